@@ -7,9 +7,9 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from neuspring.stages.stage import json_value, read_settings
+from neuspring.stages.stage import SETTINGS_HELP, json_value, read_settings
 
 __all__ = ["Device", "Positional", "Results", "Settings", "arg", "json_value", "read_settings"]
-Settings = Annotated[str, arg(help="JSON, or YAML files separated by commas; defaults otherwise")]
+Settings = Annotated[str, arg(help=SETTINGS_HELP)]
 Device = Annotated[str, arg(help="auto, cpu or cuda:N")]
 Results = Annotated[Path, arg(help="results folder")]

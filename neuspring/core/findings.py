@@ -87,7 +87,7 @@ def refuse(findings: Iterable[Finding]) -> None:
             print(one)
 
 
-def told(findings: Sequence[Finding]) -> dict[str, Any]:
+def findings_as_facts(findings: Sequence[Finding]) -> dict[str, Any]:
     """Print findings in the job's log; returns them as a fact of its record (none: no fact)."""
     for one in findings:
         print(one, flush=True)

@@ -21,7 +21,7 @@ def lift(capture: Capture, masks: Sequence[Before], tracks: Sequence[Before], se
 
     Of color alone also image.npz: what losses read of the image.
     """
-    from neuspring.core.findings import told
+    from neuspring.core.findings import findings_as_facts
     from neuspring.perception import figures
     from neuspring.perception.color import from_color
     from neuspring.perception.findings import look_at_lifted
@@ -46,4 +46,4 @@ def lift(capture: Capture, masks: Sequence[Before], tracks: Sequence[Before], se
     prior.save(files["shape"])
     figures.lifted_figure(lifted, prior, files["picture"])
     facts = lifted.facts | {"shape": prior.backend} | {f"shape_{name}": value for name, value in prior.facts.items()}
-    return Written(files=files, facts=facts | told(look_at_lifted(lifted, prior, capture.description.up_sign, image)))
+    return Written(files=files, facts=facts | findings_as_facts(look_at_lifted(lifted, prior, capture.description.up_sign, image)))

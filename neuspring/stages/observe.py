@@ -36,7 +36,7 @@ def observe(
         rule = f"scenarios of source {scenario.source} need --capture and --lifted"
         raise InputError(f"scenario {scenario.scenario}", rule, "neither", "Run neuspring capture, segment, track and lift first.")
     from neuspring.core.artifacts import ImageObservations
-    from neuspring.core.findings import refuse_errors, told
+    from neuspring.core.findings import findings_as_facts, refuse_errors
     from neuspring.perception.findings import look_at_observations
     from neuspring.perception.results import LiftedTracks, ShapePrior
     from neuspring.perception.sample import assemble
@@ -46,7 +46,7 @@ def observe(
     image = ImageObservations.load(lifted.file("image")) if lifted.has("image") else None
     observations = assemble(scenario, capture, points, prior, settings.perception, image)
     findings = look_at_observations(observations)
-    facts = told(findings)
+    facts = findings_as_facts(findings)
     # Before the observations are there: what no method can work with starts no search.
     refuse_errors(findings)
     observations.save(output)

@@ -20,7 +20,7 @@ from neuspring.stages.stage import Written, stage
 )
 def segment(capture: Capture, camera: str, settings: Config, run: Recorder, device: str = "auto") -> Written:
     """One camera of a capture -> masks: masks.npz and masks.png."""
-    from neuspring.core.findings import told
+    from neuspring.core.findings import findings_as_facts
     from neuspring.perception import figures
     from neuspring.perception.findings import WRONG, look_at_masks, mask_facts
     from neuspring.perception.results import Masks
@@ -38,4 +38,4 @@ def segment(capture: Capture, camera: str, settings: Config, run: Recorder, devi
     files = run.beside(masks="masks.npz", picture="masks.png")
     masks.save(files["masks"])
     figures.masks_strip(capture, camera, masks, files["picture"])
-    return Written(files=files, facts=masks.facts | told(findings))
+    return Written(files=files, facts=masks.facts | findings_as_facts(findings))

@@ -8,10 +8,13 @@ rule, the digests of the inputs and the settings in the record, the passing on o
 | `Observations`, `Capture` | a file of an earlier stage, which the function gets loaded |
 | `Before` | the record of an earlier stage; one that failed ends this stage with the same reason, unless it is `MayFail` |
 | a sequence of these | such files of all cameras, or of several recordings |
-| `Config` | the settings: those of `reads` are given to the rule and stand in the record |
-| `Recorder` | the record to be; a stage without one writes its product itself, which is its parameter `output` |
-| `device`, `threads`, `twins_per_launch` | where and how it runs, which changes no result and stands in no record |
 | anything else | an option of the command, which stands in the record |
+
+| a parameter named | is |
+|---|---|
+| `settings` | the `Config`: the keys of `reads` are given to the rule and stand in the record |
+| `run` | the `Recorder` of the record to be; a stage without one writes its product itself, which is its parameter `output` |
+| `device`, `threads`, `twins_per_launch` | where and how it runs, which changes no result and stands in no record |
 
 An input has the name of the file that it is: `masks` is the masks.json that stage `segment` writes, `search` a search.json.
 """
@@ -24,7 +27,7 @@ import json
 import re
 import types
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -40,26 +43,16 @@ from neuspring.data.capture import CAPTURE, Capture
 
 PLACES = ("device", "threads", "twins_per_launch")
 """Parameters that say where and how a stage runs."""
-Reads = Callable[[Config, Mapping[str, Any]], Sequence[str]]
-"""From the settings and the values of all parameters."""
-
-
+LOADERS: dict[Any, Callable[[Path], Any]] = {
+    Observations: Observations.load,
+    Capture: lambda path: Capture.load(path.parent),
+    Before: Before.load,
+}
+"""How a file of each type of input is read."""
 MAY_FAIL = "may have failed"
 MayFail = Annotated[Before, MAY_FAIL]
 """A record that the function wants also of a stage that failed."""
-
-
-def paths(records: Iterable[Before]) -> list[Path]:
-    """Where the records are."""
-    return [before.path for before in records]
-
-
-def require_length(capture: Capture, observations: Observations) -> None:
-    """Raise InputError unless a capture and its observations have as many frames."""
-    if capture.frame_count != observations.scenario.frame_count:
-        rule = f"must have as many frames as the observations: {observations.scenario.frame_count}"
-        remedy = "Correct the data, or set images.enabled: false to go without pictures."
-        raise InputError(capture.folder / CAPTURE, rule, capture.frame_count, remedy)
+SETTINGS_HELP = "JSON, or YAML files separated by commas; defaults otherwise"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,27 +76,18 @@ class Written:
 class Parameter:
     """A parameter of a stage: an input file, an option, or where it runs."""
 
-    name: str
     type: Any
-    """Without what says that it may be left out."""
+    """Of its value, or of the entries of a sequence; without what says that it may be left out."""
+    many: bool
+    """Whether it is a sequence."""
     default: Any
-    note: str = ""
+    note: str
     """The text beside the type, for the help of the command."""
-
-    @property
-    def many(self) -> bool:
-        """Whether it is a sequence."""
-        return typing.get_origin(self.type) is Sequence
-
-    @property
-    def one(self) -> Any:
-        """Its type, or that of its entries."""
-        return typing.get_args(self.type)[0] if self.many else self.type
 
     @property
     def is_input(self) -> bool:
         """Whether it names files."""
-        return self.one in LOADERS
+        return self.type in LOADERS
 
     @property
     def required(self) -> bool:
@@ -111,31 +95,15 @@ class Parameter:
         return self.default is inspect.Parameter.empty
 
 
-LOADERS: dict[Any, Callable[[Path], Any]] = {
-    Observations: Observations.load,
-    Capture: lambda path: Capture.load(path.parent),
-    Before: Before.load,
-}
-
-
 @dataclass(frozen=True)
 class Job:
     """A stage with everything that it was given."""
 
-    stage: Stage
     arguments: dict[str, Any]
     """Of the function."""
     record: Recorder | None
-
-    @property
-    def failed(self) -> Before | None:
-        """The first input whose failure is passed on."""
-        for name, parameter in self.stage.inputs.items():
-            value = self.arguments[name]
-            for before in value if parameter.many else [value]:
-                if isinstance(before, Before) and before.record.status == "failed" and name not in self.stage.may_fail:
-                    return before
-        return None
+    failed: Before | None
+    """The first input whose failure is passed on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,8 +113,8 @@ class Stage:
     function: Callable[..., Any]
     output: str
     """The file that it writes below the results folder, with the job's wildcards."""
-    reads: tuple[str, ...] | Reads = ()
-    """Keys of the settings that it reads."""
+    reads: tuple[str, ...] | Callable[[Config, Mapping[str, Any]], Sequence[str]] = ()
+    """Keys of the settings that it reads; or from the settings and the values of all parameters to these keys."""
     code: Callable[[Config, Mapping[str, Any]], Sequence[str]] = lambda settings, values: ()
     """Modules that it imports by name: backends, readers, baselines."""
     gpu: Literal["never", "backend", "always"] = "never"
@@ -154,6 +122,8 @@ class Stage:
     memory_mb: int = 4000
     minutes: int = 30
     """What its first jobs ask for, before any was measured."""
+
+    # --- what it declares
 
     @property
     def name(self) -> str:
@@ -181,22 +151,28 @@ class Stage:
         return "/".join(f"{{{name}}}" for name in self.wildcards)
 
     @cached_property
-    def _hints(self) -> dict[str, Any]:
-        return typing.get_type_hints(self.function, include_extras=True)
+    def signature(self) -> Mapping[str, inspect.Parameter]:
+        """The parameters of the function, as Python has them."""
+        return inspect.signature(self.function).parameters
 
     @cached_property
     def parameters(self) -> dict[str, Parameter]:
         """All parameters but the settings and the record."""
-        found = {}
-        for name, declared in inspect.signature(self.function).parameters.items():
-            hint, note = self._hints[name], ""
+        hints, found = typing.get_type_hints(self.function, include_extras=True), {}
+        for name, declared in self.signature.items():
+            if name in ("settings", "run"):
+                continue
+            hint, note = hints[name], ""
             if typing.get_origin(hint) in (typing.Union, types.UnionType):
                 parts = [part for part in typing.get_args(hint) if part is not types.NoneType]
                 hint = parts[0] if len(parts) == 1 else hint
             if typing.get_origin(hint) is Annotated:
                 hint, note = typing.get_args(hint)[:2]
-            if hint not in (Config, Recorder):
-                found[name] = Parameter(name, hint, declared.default, note)
+            many = typing.get_origin(hint) is Sequence
+            if many:
+                hint = typing.get_args(hint)[0]
+            kind = dict if typing.get_origin(hint) is dict else hint
+            found[name] = Parameter(kind, many, declared.default, note)
         return found
 
     @cached_property
@@ -209,66 +185,46 @@ class Stage:
         """What it is told beside files and settings."""
         return {n: p for n, p in self.parameters.items() if not p.is_input and n not in (*PLACES, "output")}
 
-    @cached_property
+    @property
     def places(self) -> tuple[str, ...]:
         """Which of `PLACES` it takes."""
         return tuple(name for name in PLACES if name in self.parameters)
 
-    @cached_property
-    def may_fail(self) -> frozenset[str]:
-        """Inputs that it wants also where they failed."""
-        return frozenset(name for name, parameter in self.inputs.items() if parameter.note == MAY_FAIL)
-
-    @property
-    def _settings(self) -> str | None:
-        return next((name for name, hint in self._hints.items() if hint is Config), None)
-
-    @property
-    def _record(self) -> str | None:
-        return next((name for name, hint in self._hints.items() if hint is Recorder), None)
-
     def settings(self, values: Config, given: Mapping[str, Any]) -> dict[str, Any]:
         """The part of the settings that the stage reads, given these values of its parameters."""
-        keys = self.reads(values, given) if callable(self.reads) else self.reads
-        return select(values, keys)
+        return select(values, self.reads(values, given) if callable(self.reads) else self.reads)
+
+    # --- how it runs
 
     def job(self, *, output: Path, settings: Config | None = None, **given: Any) -> Job:
         """Load the inputs, digest them, begin the record. Raises InputError for what is missing, unknown or damaged."""
-        unknown = sorted(set(given) - set(self.parameters))
+        unknown = sorted(given.keys() - self.parameters.keys())
         missing = [n for n, p in self.parameters.items() if p.required and n not in given and n != "output"]
         if unknown or missing:
             raise InputError(f"stage {self.name}", f"takes {', '.join(self.parameters)}", f"missing {missing}, unknown {unknown}")
-        values = {name: given.get(name, parameter.default) for name, parameter in self.parameters.items() if name != "output"}
+        values = {name: given.get(name, parameter.default) for name, parameter in self.parameters.items()}
         if "device" in values:
             from neuspring.core.device import resolve_device
 
             values["device"] = resolve_device(values["device"])
-        paths = dict(self._paths(values))
-        settings = settings or Config()
-        record = None
-        if self._record:
-            told = {name: values[name] for name in self.options}
-            record = Recorder(
-                self.name,
-                output,
-                inputs=paths,
-                settings=self.settings(settings, values) | told,
-                device=values.get("device", "cpu"),
-            )
+        files: dict[str, list[Path]] = {}
+        roles: dict[str, Path] = {}
         for name, parameter in self.inputs.items():
-            if parameter.many:
-                values[name] = [LOADERS[parameter.one](Path(path)) for path in values[name] or ()]
-            elif values[name] is not None:
-                values[name] = LOADERS[parameter.one](Path(values[name]))
-        extra = {self._settings: settings, self._record: record, "output": output if "output" in self.parameters else None}
-        return Job(self, values | {name: value for name, value in extra.items() if name and value is not None}, record)
-
-    def _paths(self, values: Mapping[str, Any]) -> Iterator[tuple[str, Path]]:
+            value = values[name] if parameter.many or values[name] is None else [values[name]]
+            files[name] = [Path(path) for path in value or ()]
+            roles |= {f"{name}{place}" if parameter.many else name: path for place, path in enumerate(files[name])}
+        chosen, record = settings or Config(), None
+        if "run" in self.signature:
+            read = self.settings(chosen, values) | {name: values[name] for name in self.options}
+            record = Recorder(self.name, output, inputs=roles, settings=read, device=values.get("device", "cpu"))
+        failed = None
         for name, parameter in self.inputs.items():
-            if parameter.many:
-                yield from ((f"{name}{place}", Path(path)) for place, path in enumerate(values[name] or ()))
-            elif values[name] is not None:
-                yield name, Path(values[name])
+            loaded = [LOADERS[parameter.type](path) for path in files[name]]
+            values[name] = loaded if parameter.many else loaded[0] if loaded else None
+            if parameter.type is Before and parameter.note != MAY_FAIL:
+                failed = failed or next((before for before in loaded if before.record.status == "failed"), None)
+        own = {"settings": chosen, "run": record, "output": output}
+        return Job(values | {name: value for name, value in own.items() if name in self.signature}, record, failed)
 
     def __call__(self, *, output: Path, settings: Config | None = None, **given: Any) -> None:
         """Run it, and write its record. A numerical failure is recorded, its own or that of an earlier stage."""
@@ -277,9 +233,9 @@ class Stage:
         if record is None:
             self.function(**job.arguments)
             return
-        if failed := job.failed:
-            reason = failed.record.reason.removeprefix(f"{failed.record.stage}: ")
-            record.save(failure=f"{failed.record.stage}: {reason}")
+        if job.failed:
+            earlier = job.failed.record
+            record.save(failure=f"{earlier.stage}: {earlier.reason.removeprefix(f'{earlier.stage}: ')}")
             return
         try:
             made = self.function(**job.arguments)
@@ -296,42 +252,36 @@ class Stage:
         """The command line of these values; the opposite of `parse`."""
         words: list[str] = []
         for name, value in given.items():
-            parameter, option = self.parameters.get(name), f"--{name.replace('_', '-')}"
-            if value is None or value is False or (parameter and parameter.many and not value):
+            many = self.parameters[name].many
+            if value is None or value is False or (many and not value):
                 continue
-            if value is True:
-                words.append(option)
-            elif parameter and parameter.many:
-                words += [option, *map(str, value)]
-            else:
-                words += [
-                    option,
-                    value
-                    if isinstance(value, str)
-                    else json.dumps(value, sort_keys=True)
-                    if isinstance(value, dict | list)
-                    else str(value),
-                ]
+            words.append(f"--{name.replace('_', '-')}")
+            if many:
+                words += map(str, value)
+            elif value is not True:
+                words.append(json.dumps(value, sort_keys=True) if isinstance(value, dict | list) else str(value))
         return words
 
     def parse(self, words: Sequence[str]) -> dict[str, Any]:
         """Values of a command line, as `__call__` takes them. Raises InputError, and SystemExit for words that are no options."""
         import tyro
 
-        pairs = (tyro.conf.FlagCreatePairsOff,)
-
         fields: list[Any] = []
         for name, parameter in self.parameters.items():
-            kind, default = _typed(parameter)
-            note = tyro.conf.arg(help=parameter.note or _about(parameter))
-            spec = (name, Annotated[kind, note])
-            fields.append(spec if default is dataclasses.MISSING else (*spec, dataclasses.field(default=default)))
+            kind: Any = Path if parameter.is_input else str if parameter.type in (ScenarioRow, dict) else parameter.type
+            default = parameter.default
+            if parameter.many:
+                kind, default = tuple[kind, ...], default if parameter.required else ()
+            elif default is None:
+                kind = kind | None
+            declared = (name, Annotated[kind, tyro.conf.arg(help=parameter.note or _about(name, parameter))])
+            fields.append(declared if parameter.required else (*declared, field(default=default)))
         if "output" not in self.parameters:
             fields.append(("output", Annotated[Path, tyro.conf.arg(help=f"{Path(self.output).name} to write")]))
-        if self._settings:
-            note = tyro.conf.arg(help="JSON, or YAML files separated by commas; defaults otherwise")
-            fields.append(("settings", Annotated[str, note], dataclasses.field(default="{}")))
+        if "settings" in self.signature:
+            fields.append(("settings", Annotated[str, tyro.conf.arg(help=SETTINGS_HELP)], field(default="{}")))
         made = dataclasses.make_dataclass(self.name, fields, kw_only=True)
+        pairs = (tyro.conf.FlagCreatePairsOff,)
         about = f"{self.about}."
         read = dataclasses.asdict(tyro.cli(made, args=list(words), prog=f"neuspring {self.name}", description=about, config=pairs))
         if "settings" in read:
@@ -339,7 +289,7 @@ class Stage:
         for name, parameter in self.parameters.items():
             if parameter.type is ScenarioRow:
                 read[name] = read_row(read[name], read.get("settings") or Config())
-            elif _is_json(parameter):
+            elif parameter.type is dict and read[name] is not None:
                 read[name] = json_value(f"--{name}", read[name])
             elif parameter.many:
                 read[name] = list(read[name])
@@ -351,32 +301,13 @@ def stage(output: str, **declared: Any) -> Callable[[Callable[..., Any]], Stage]
     return lambda function: Stage(function, output, **declared)
 
 
-def _is_json(parameter: Parameter) -> bool:
-    return parameter.type is dict or typing.get_origin(parameter.type) is dict
-
-
-def _typed(parameter: Parameter) -> tuple[Any, Any]:
-    """The type of an option of the command, and its default."""
-    kind: Any = Path if parameter.is_input else parameter.one
-    if parameter.type is ScenarioRow or _is_json(parameter):
-        kind = str
-    if parameter.many:
-        kind = tuple[kind, ...]
-        return kind, dataclasses.MISSING if parameter.required else ()
-    if parameter.required:
-        return kind, dataclasses.MISSING
-    if parameter.default is None:
-        return kind | None, None
-    return kind, parameter.default
-
-
-def _about(parameter: Parameter) -> str:
+def _about(name: str, parameter: Parameter) -> str:
+    """What the help of a command says of a parameter without a note."""
     if parameter.type is ScenarioRow:
         return "a row of the scenario table, by its name or as JSON"
-    if not parameter.is_input:
-        return ""
-    name = f"{parameter.name}.json" if parameter.one is Before else {Capture: "capture.json"}.get(parameter.one, "observations.npz")
-    return name + (" of every camera, in their order" if parameter.one is Before and parameter.many else "")
+    if parameter.type is Before:
+        return f"{name}.json" + (" of every camera, in their order" if parameter.many else "")
+    return {Capture: "capture.json", Observations: "observations.npz"}.get(parameter.type, "")
 
 
 def read_settings(text: str) -> Config:
@@ -410,3 +341,16 @@ def json_value(option: str, text: str, kind: type = dict) -> Any:
     if not isinstance(values, kind):
         raise InputError(option, f"must be a JSON {'object' if kind is dict else 'list'}", type(values).__name__)
     return values
+
+
+def paths(records: Iterable[Before]) -> list[Path]:
+    """Where the records are."""
+    return [before.path for before in records]
+
+
+def require_length(capture: Capture, observations: Observations) -> None:
+    """Raise InputError unless a capture and its observations have as many frames."""
+    if capture.frame_count != observations.scenario.frame_count:
+        rule = f"must have as many frames as the observations: {observations.scenario.frame_count}"
+        remedy = "Correct the data, or set images.enabled: false to go without pictures."
+        raise InputError(capture.folder / CAPTURE, rule, capture.frame_count, remedy)

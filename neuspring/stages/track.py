@@ -19,7 +19,7 @@ from neuspring.stages.stage import Written, stage
 )
 def track(capture: Capture, camera: str, masks: Before, settings: Config, run: Recorder, device: str = "auto") -> Written:
     """Masks of one camera -> tracks of pixels: tracks.npz and tracks.png."""
-    from neuspring.core.findings import told
+    from neuspring.core.findings import findings_as_facts
     from neuspring.perception import figures
     from neuspring.perception.findings import look_at_tracks
     from neuspring.perception.results import Masks, PixelTracks
@@ -36,4 +36,6 @@ def track(capture: Capture, camera: str, masks: Before, settings: Config, run: R
     files = run.beside(tracks="tracks.npz", picture="tracks.png")
     tracks.save(files["tracks"])
     figures.tracks_strip(capture, camera, tracks, files["picture"])
-    return Written(files=files, facts=tracks.facts | told(look_at_tracks(camera, labels, tracks.pixels, tracks.visible)))
+    return Written(
+        files=files, facts=tracks.facts | findings_as_facts(look_at_tracks(camera, labels, tracks.pixels, tracks.visible))
+    )
