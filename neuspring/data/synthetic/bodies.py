@@ -371,7 +371,7 @@ def dinosaur(spacing: float, skin_spacing: float) -> SoftBody:
 
 def _animal(parts: Mapping[str, Sdf], factors: Mapping[str, float], paint: Paint, spacing: float, skin_spacing: float) -> SoftBody:
     """`factors` multiply the filling's modulus in parts whose names begin so; the nearest part of a tetrahedron decides."""
-    shape = smooth_union(parts, BLEND)
+    shape = smooth_union(parts.values(), BLEND)
     low, high = (-0.24, -0.18, -0.02), (0.2, 0.18, 0.26)
     nodes, tetrahedra = fill(shape, low, high, spacing)
     vertices, faces = surface(shape, low, high, skin_spacing)

@@ -220,10 +220,6 @@ class FiniteElements:
         positions, kinetic, potential, jacobian = (np.array(column) for column in zip(*rows, strict=True))
         return Clip(positions, kinetic, potential, jacobian, self.substeps)
 
-    def velocities(self) -> np.ndarray:
-        """Velocities of the nodes in the last frame [N, 3], m/s."""
-        return np.asarray(self.now.particle_qd.numpy())
-
     def _build(self, fists: int) -> newton.Model:
         return build(self.body, fists)
 
@@ -285,14 +281,13 @@ class FiniteElements:
         """One frame; the first compiles, the second is recorded, the others replay the record."""
         if self._graph is not None:
             wp.capture_launch(self._graph)
-            return
-        if int(self._step.numpy()[0]):
+        elif int(self._step.numpy()[0]):
             with wp.ScopedCapture(device="cpu") as capture:
                 self._substeps()
             self._graph = capture.graph
             wp.capture_launch(self._graph)
-            return
-        self._substeps()
+        else:
+            self._substeps()
 
     def _substeps(self) -> None:
         model, dt, contacts = self.model, self.substep, self.contacts
@@ -314,10 +309,13 @@ class FiniteElements:
             wp.launch(kernels.advance, 1, [self._step], device="cpu")
             self.now, self.next = following, now
 
-    def _add_maxwell(self, state: newton.State, decay: float) -> None:
+    def _add_maxwell(self, state: newton.State, decay: float, fresh: bool = False) -> None:
+        """Forces of the Maxwell branch; `fresh`: of one without strain and stress, whose own stay."""
         if self._maxwell is None:
             return
         *fixed, strain, stress = self._maxwell
+        if fresh:
+            strain, stress = wp.zeros_like(strain), wp.zeros_like(stress)
         arguments = [*fixed, decay, state.particle_q, strain, stress, state.particle_f]
         wp.launch(kernels.maxwell, len(self.body.tetrahedra), arguments, device="cpu")
 
@@ -396,11 +394,8 @@ class FiniteElements:
         state.particle_q.assign(positions.astype(np.float32))
         state.particle_qd.assign(velocities.astype(np.float32))
         state.clear_forces()
-        if self._maxwell is not None:
-            # An instantaneous change of strain loads the branch like a spring of its modulus.
-            *fixed, strain, stress = self._maxwell
-            arguments = [*fixed, 1.0, state.particle_q, wp.zeros_like(strain), wp.zeros_like(stress), state.particle_f]
-            wp.launch(kernels.maxwell, len(self.body.tetrahedra), arguments, device="cpu")
+        # An instantaneous change of strain loads the branch like a spring of its modulus.
+        self._add_maxwell(state, 1.0, fresh=True)
         limit, grid = self.model.particle_max_velocity, self.model.particle_grid
         self.model.particle_max_velocity, self.model.particle_grid = np.inf, None
         self.solver.step(state, after, self.control, None, 1.0)
@@ -418,7 +413,7 @@ def settle(body: SoftBody, frame_rate: float, seconds: float = 4.0, still: float
     for _ in range(int(np.ceil(2 * seconds))):
         engine = FiniteElements(body, (), frames, frame_rate, Damping(deformation=8.0, drag=4.0), start=position)
         position = engine.run().positions[-1]
-        if np.abs(engine.velocities()).max() < still:
+        if np.abs(engine.now.particle_qd.numpy()).max() < still:
             break
     return position
 

@@ -94,7 +94,26 @@ def make(row: ScenarioRow, settings: Synthetic, folder: Path) -> tuple[Capture, 
         raise InputError(f"scenario {row.scenario}, path", rule, repr(row.path))
     engine = ENGINES[engine_name](body, hands, frames, FRAME_RATE, Damping(), start=start)
     clip = engine.run()
-    truth = _truth(body, hands, clip, engine.holder, certify(engine, clip, settings.certified_frames))
+    certificate, sensitivity = certify(engine, clip, settings.certified_frames)
+    truth = Truth(
+        nodes=clip.positions,
+        tetrahedra=body.tetrahedra,
+        triangles=body.triangles,
+        youngs_modulus=body.youngs_modulus,
+        membrane=body.membrane,
+        surface_nodes=body.surface.nodes,
+        surface_weights=body.surface.weights,
+        surface_faces=body.surface.faces,
+        hand_poses=np.stack([hand.poses(np.arange(frames) / FRAME_RATE) for hand in hands], axis=1),
+        held=engine.holder,
+        touches=clip.positions[..., 2] < body.radius + 5e-4,
+        kinetic=clip.kinetic,
+        potential=clip.potential,
+        least_jacobian=clip.least_jacobian,
+        substeps=clip.substeps,
+        certificate=certificate,
+        sensitivity=sensitivity,
+    )
     _refuse(row.scenario, truth)
     cameras = place_cameras(clip, hands, size, settings.cameras)
     description = Description(
@@ -119,29 +138,6 @@ def make(row: ScenarioRow, settings: Synthetic, folder: Path) -> tuple[Capture, 
     path = truth_path(folder)
     truth.save(path)
     return writer.finish(_annotate(truth, cameras[0], writer.capture), truth=f"sha256:{digest_file(path)}"), truth
-
-
-def _truth(body: SoftBody, hands: Sequence[Hand], clip: Clip, held: np.ndarray, deviations: tuple[float, float]) -> Truth:
-    times = np.arange(len(clip.positions)) / FRAME_RATE
-    return Truth(
-        nodes=clip.positions,
-        tetrahedra=body.tetrahedra,
-        triangles=body.triangles,
-        youngs_modulus=body.youngs_modulus,
-        membrane=body.membrane,
-        surface_nodes=body.surface.nodes,
-        surface_weights=body.surface.weights,
-        surface_faces=body.surface.faces,
-        hand_poses=np.stack([hand.poses(times) for hand in hands], axis=1),
-        held=held,
-        touches=clip.positions[..., 2] < body.radius + 5e-4,
-        kinetic=clip.kinetic,
-        potential=clip.potential,
-        least_jacobian=clip.least_jacobian,
-        substeps=clip.substeps,
-        certificate=deviations[0],
-        sensitivity=deviations[1],
-    )
 
 
 def _refuse(name: str, truth: Truth) -> None:

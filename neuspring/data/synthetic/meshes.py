@@ -7,7 +7,7 @@ signs away from the blend, which is all that meshing needs. Meshes are (nodes [N
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 import warp as wp
@@ -48,20 +48,9 @@ def capsule(start: Sequence[float], end: Sequence[float], radius: float) -> Sdf:
     return distance
 
 
-def box(center: Sequence[float], half: Sequence[float]) -> Sdf:
-    """An axis-aligned box of half extents `half`."""
-    middle, extent = np.asarray(center, float), np.asarray(half, float)
-
-    def distance(p: np.ndarray) -> np.ndarray:
-        q = np.abs(p - middle) - extent
-        return np.asarray(np.linalg.norm(np.maximum(q, 0.0), axis=-1) + np.minimum(q.max(axis=-1), 0.0))
-
-    return distance
-
-
-def smooth_union(parts: Sequence[Sdf] | Mapping[str, Sdf], blend: float) -> Sdf:
+def smooth_union(parts: Iterable[Sdf], blend: float) -> Sdf:
     """-k log sum exp(-d_i / k): the union, rounded over about the length k = `blend` where parts meet."""
-    members = list(parts.values()) if isinstance(parts, Mapping) else list(parts)
+    members = list(parts)
 
     def distance(p: np.ndarray) -> np.ndarray:
         each = np.stack([part(p) for part in members])
@@ -82,8 +71,8 @@ def surface(sdf: Sdf, low: Sequence[float], high: Sequence[float], spacing: floa
     """Marching cubes of sdf = 0 within the box: vertices [V, 3], m, and faces [F, 3], outward."""
     first = np.asarray(low, float)
     counts = np.ceil((np.asarray(high, float) - first) / spacing).astype(int) + 1
-    grid = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), axis=-1)
-    values: wp.array = wp.array(sdf((first + spacing * grid).reshape(-1, 3)).reshape(counts), dtype=wp.float32, device="cpu")
+    distances = sdf((first + spacing * _grid(counts)).reshape(-1, 3)).reshape(counts)
+    values: wp.array = wp.array(distances, dtype=wp.float32, device="cpu")
     # The extractor rejects a grid's bounds in two forms: lattice coordinates are the plain one, scaled here.
     points, indices = IsoSurfaceMarchingCubes.extract_surface_marching_cubes(values, 0.0)  # type: ignore[arg-type]
     vertices, faces = first + spacing * points.numpy().astype(float), indices.numpy().reshape(-1, 3)
@@ -150,21 +139,17 @@ def lattice(low: Sequence[float], high: Sequence[float], spacing: float) -> Mesh
     corner_grid, cell_grid = _grid(corners), _grid(cells)
     nodes = np.concatenate([first + spacing * corner_grid.reshape(-1, 3), first + spacing * (cell_grid.reshape(-1, 3) + 0.5)])
 
-    def corner(index: np.ndarray) -> np.ndarray:
-        return _flat_index(index, corners)
-
-    def center(index: np.ndarray) -> np.ndarray:
-        return len(nodes) - int(np.prod(cells)) + _flat_index(index, cells)
-
+    centers = int(np.prod(corners))
+    """Number of the first node that is a cell's center."""
     elements = []
     for axis in range(3):
         step, right, up = np.roll(np.eye(3, dtype=int), axis, axis=1)
         inner = tuple(slice(0, -1) if k == axis else slice(None) for k in range(3))
         cell = cell_grid[inner].reshape(-1, 3)
         base = cell + step
-        ring = [corner(base), corner(base + right), corner(base + right + up), corner(base + up)]
-        for k in range(4):
-            elements.append(np.stack([center(cell), center(cell + step), ring[k], ring[(k + 1) % 4]], axis=1))
+        ring = [_flat_index(at, corners) for at in (base, base + right, base + right + up, base + up)]
+        two = [centers + _flat_index(at, cells) for at in (cell, cell + step)]
+        elements += [np.stack([*two, ring[k], ring[(k + 1) % 4]], axis=1) for k in range(4)]
     return nodes, oriented(nodes, np.concatenate(elements))
 
 
@@ -176,7 +161,10 @@ def fill(sdf: Sdf, low: Sequence[float], high: Sequence[float], spacing: float) 
     the time step.
     """
     nodes, tetrahedra = lattice(low, high, spacing)
-    nodes, tetrahedra = _largest_piece(nodes, tetrahedra[sdf(nodes[tetrahedra].mean(axis=1)) < -0.05 * spacing])
+    tetrahedra = tetrahedra[sdf(nodes[tetrahedra].mean(axis=1)) < -0.05 * spacing]
+    labels = pieces(tetrahedra)
+    used, renumbered = np.unique(tetrahedra[labels == np.bincount(labels).argmax()], return_inverse=True)
+    nodes, tetrahedra = nodes[used], renumbered.reshape(-1, 4)
     skin = boundary(tetrahedra)
     outer = np.unique(skin)
     inner = np.setdiff1d(np.arange(len(nodes)), outer)
@@ -203,14 +191,6 @@ def _admissible(nodes: np.ndarray, tetrahedra: np.ndarray, move: np.ndarray, nom
             return fraction
         fraction[np.unique(tetrahedra[bad])] *= 0.4 if attempt < 7 else 0.0
     return np.zeros(len(nodes))
-
-
-def _largest_piece(nodes: np.ndarray, tetrahedra: np.ndarray) -> Mesh:
-    """The largest of the pieces that share no face."""
-    labels = pieces(tetrahedra)
-    largest = tetrahedra[labels == np.bincount(labels).argmax()]
-    used, renumbered = np.unique(largest, return_inverse=True)
-    return nodes[used], renumbered.reshape(-1, 4)
 
 
 def pieces(tetrahedra: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ law of the true stiffness. Observation adds noise and occlusion; the truth (a Tw
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -164,8 +164,7 @@ def _true_twin(row: ScenarioRow, shape: Shape, field: str, settings: Toy) -> Twi
     twin = Twin(topology=topology, material=material, simulation=simulation)
     # Half of what stability allows, so that the truth's own time-stepping error stays small.
     substeps = stability.smallest_safe_substeps(stability.twin_spectrum(twin), frame_time, 0.25)
-    simulation = Simulation(frame_time=frame_time, substeps=substeps, ground=row.ground, self_collision=row.self_collision)
-    return Twin(topology=topology, material=material, simulation=simulation)
+    return replace(twin, simulation=replace(simulation, substeps=substeps))
 
 
 def _observe(row: ScenarioRow, shape: Shape, motion: np.ndarray, hands: np.ndarray, settings: Toy) -> Observations:
