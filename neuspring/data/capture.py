@@ -40,7 +40,7 @@ CAPTURE, TRACKS, POINTS = "capture.json", "tracks.json", "points.json"
 NOTHING, OBJECT, HANDS = 0, 1, 2
 """Labels of masks."""
 TEXT_TOLERANCE = 1e-4
-"""Allowed finding from R^T R = 1 in JSON, where matrices may have five digits."""
+"""Allowed deviation from R^T R = 1 in JSON, where matrices may have five digits."""
 Row3: TypeAlias = tuple[Finite, Finite, Finite]
 Row4: TypeAlias = tuple[Finite, Finite, Finite, Finite]
 
@@ -394,14 +394,19 @@ def read_image(path: Path, camera: Camera, flag: int, remedy: str = "") -> np.nd
 
 def read_array(path: Path, camera: Camera) -> np.ndarray:
     """An .npy image [H, W] of the camera's size. Raises InputError."""
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(path, "this file must be a NumPy array without pickle", str(error)) from error
+    array = read_npy(path)
     if array.ndim != 2:
         raise InputError(path, "a depth image [H, W] is required", array.shape)
     _require_size(path, array, camera)
-    return np.asarray(array)
+    return array
+
+
+def read_npy(path: Path) -> np.ndarray:
+    """The array of an .npy file. Raises InputError."""
+    try:
+        return np.asarray(np.load(path, allow_pickle=False))
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(path, "this file must be a NumPy array without pickle", str(error)) from error
 
 
 def _require_size(path: Path, image: np.ndarray, camera: Camera) -> None:

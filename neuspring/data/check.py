@@ -1,4 +1,4 @@
-"""Departures of a data set from its described layout, file by file, and of a capture from what a scene on a table looks like.
+"""Findings about a data set: its layout, file by file, and a capture against what a scene on a table looks like.
 Nothing here raises for bad content.
 
 What cannot work is an error, what is only unusual a warning with the next move; see `plausible`. `neuspring check-data` adds
@@ -160,7 +160,7 @@ def _color_alone_findings(capture: Capture, name: str, samples: dict[int, plausi
 
 
 def obstacle_findings(path: Path, description: Description, points: np.ndarray) -> list[Finding]:
-    """Departures of obstacles in which points [n, 3], m, of the object lie in frame 0: nodes there would be thrown out."""
+    """Findings about obstacles in which points [n, 3], m, of the object lie in frame 0: nodes there would be thrown out."""
     found = []
     for number, obstacle in enumerate(description.obstacles):
         share = float((obstacle.depth(points) > INSIDE).mean()) if len(points) else 0.0
@@ -229,7 +229,7 @@ def is_case(folder: Path) -> bool:
 
 
 def render(findings: list[Finding]) -> str:
-    """Departures as text, grouped by file, ending in 'N errors, N warnings'."""
+    """Findings as text, grouped by file, ending in 'N errors, N warnings'."""
     ordered = sorted(findings, key=lambda d: d.where)
     lines = []
     for file, group in groupby(ordered, key=lambda d: d.where):

@@ -221,7 +221,7 @@ def _transported_normals(tangents: np.ndarray) -> np.ndarray:
 
 
 def recording_findings(file: Path, raw: Any) -> list[Finding]:
-    """Departures of one recording: what the reader refuses (errors) and what is not as released (warnings)."""
+    """Findings about one recording: what the reader refuses (errors) and what is not as released (warnings)."""
     if not isinstance(raw, (np.ndarray, list, tuple)):
         return [broken(file, "", "positions [T, 3, n] are required", type(raw).__name__)]
     try:

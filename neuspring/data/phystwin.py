@@ -44,7 +44,7 @@ from neuspring.data.unpickle import load_pickle
 @cache
 def released_cases() -> dict[str, dict[str, str]]:
     """The table of the 22 released cases: case -> column -> text, empty where unknown."""
-    text = resources.files("neuspring.data.tables").joinpath("phystwin22.csv").read_text(encoding="utf-8")
+    text = resources.files("neuspring.data").joinpath("tables", "phystwin22.csv").read_text(encoding="utf-8")
     return {row["case"]: row for row in csv.DictReader(text.splitlines())}
 
 
@@ -58,7 +58,7 @@ RELEASED_FRAME_RATE = 30.0
 """Frames per second of every released recording; used where metadata.json is absent."""
 MAX_FRAME_RATE = 1e6
 BINARY_TOLERANCE = 1e-5
-"""Allowed finding from R^T R = 1 in a pickle of float64 products of OpenCV rotations."""
+"""Allowed deviation from R^T R = 1 in a pickle of float64 products of OpenCV rotations."""
 
 
 @dataclass(frozen=True)

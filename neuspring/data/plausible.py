@@ -64,7 +64,7 @@ def stand(plane: Plane, pose: np.ndarray, up: float, factor: float = 1.0) -> Sta
 
 
 def table_findings(path: Path, name: str, planes: Sequence[Plane], pose: np.ndarray, up: str, unit: float | None) -> list[Finding]:
-    """Departures of one camera's table from z = 0. `unit`, m per count, is None where depth is in meters by its type."""
+    """Findings about one camera's table against z = 0. `unit`, m per count, is None where depth is in meters by its type."""
     sign = up_sign(up)
     where = f"cameras.{name}.camera_to_world"
     candidates = [plane for plane in planes if plane.share >= SMALLEST]
@@ -269,7 +269,7 @@ def on_table(camera: Camera, pixels: np.ndarray) -> np.ndarray:
 
 
 def color_alone_findings(path: Path, camera: Camera, up: str) -> list[Finding]:
-    """Departures of a camera that is not above the table z = 0, or does not look at it; else a note on how far it is."""
+    """Findings about a camera that is not above the table z = 0, or does not look at it; else a note on how far it is."""
     where, height = f"cameras.{camera.name}.camera_to_world", float(camera.camera_to_world[2, 3])
     if height * up_sign(up) <= 0:
         rule = f"{where}: the camera must be above the table z = 0, on the side of it that is up"
@@ -341,7 +341,7 @@ STRIDE = 2
 
 
 def view_findings(path: Path, cameras: Mapping[str, Camera], depths: Mapping[str, np.ndarray], up: str) -> list[Finding]:
-    """Departures of pairs of cameras by their depth images [H, W], m, of one frame."""
+    """Findings about pairs of cameras by their depth images [H, W], m, of one frame."""
     found = []
     for one, two in combinations(depths, 2):
         pairs = [_compare(cameras[a], depths[a], cameras[b], depths[b], up) for a, b in ((one, two), (two, one))]

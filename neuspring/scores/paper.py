@@ -90,7 +90,7 @@ def _printed(text: str) -> Printed:
 
 
 def _rows(name: str) -> list[dict[str, str]]:
-    text = resources.files("neuspring.data.tables").joinpath(name).read_text(encoding="utf-8")
+    text = resources.files("neuspring.data").joinpath("tables", name).read_text(encoding="utf-8")
     return list(csv.DictReader(text.splitlines()))
 
 

@@ -112,7 +112,7 @@ def trust_hidden(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         (lambda d: d | {"object_points": d["object_points"].tolist()}, "error", ("object_points", "received list")),
     ],
 )
-def test_departures_of_final_data(tmp_path: Path, change: Callable[[Any], Any], level: str, words: tuple[str, ...]) -> None:
+def test_findings_of_final_data(tmp_path: Path, change: Callable[[Any], Any], level: str, words: tuple[str, ...]) -> None:
     folder = write_case(tmp_path)
     dump(folder / "final_data.pkl", change(stored(folder)))
     judged(folder, level, "final_data.pkl", words)
@@ -131,7 +131,7 @@ def test_departures_of_final_data(tmp_path: Path, change: Callable[[Any], Any], 
         ([0, 7], "error", ("JSON object", "list")),
     ],
 )
-def test_departures_of_the_split(tmp_path: Path, split: Any, level: str, words: tuple[str, ...]) -> None:
+def test_findings_of_the_split(tmp_path: Path, split: Any, level: str, words: tuple[str, ...]) -> None:
     folder = write_case(tmp_path)
     write_json(folder / "split.json", split)
     judged(folder, level, "split.json", words)
@@ -148,7 +148,7 @@ def test_departures_of_the_split(tmp_path: Path, split: Any, level: str, words: 
         ([np.full((4, 4), np.nan), np.eye(4), np.eye(4)], ("camera 0", "deviation of nan")),
     ],
 )
-def test_departures_of_the_calibration(tmp_path: Path, cameras: Any, words: tuple[str, ...]) -> None:
+def test_findings_of_the_calibration(tmp_path: Path, cameras: Any, words: tuple[str, ...]) -> None:
     folder = write_case(tmp_path)
     dump(folder / "calibrate.pkl", cameras)
     assert holds(check_layout(folder), "error", "calibrate.pkl", *words)
@@ -170,7 +170,7 @@ K = [[60.0, 0.0, 30.0], [0.0, 60.0, 20.0], [0.0, 0.0, 1.0]]
         ([1], "error", ("JSON object",)),
     ],
 )
-def test_departures_of_the_metadata(tmp_path: Path, metadata: Any, level: str, words: tuple[str, ...]) -> None:
+def test_findings_of_the_metadata(tmp_path: Path, metadata: Any, level: str, words: tuple[str, ...]) -> None:
     folder = write_case(tmp_path)
     write_json(folder / "metadata.json", metadata)
     assert holds(check_layout(folder), level, "metadata.json", *words)
@@ -191,7 +191,7 @@ def test_tracks_that_are_none(tmp_path: Path, tracks: Any, words: tuple[str, ...
     judged(folder, "error", "gt_track_3d.pkl", words)
 
 
-def test_departures_of_the_tracks(tmp_path: Path) -> None:
+def test_findings_of_the_tracks(tmp_path: Path) -> None:
     folder = write_case(tmp_path)
     tracks = np.zeros((9, 2, 3))
     tracks[1, 1, 0] = np.nan
@@ -201,7 +201,7 @@ def test_departures_of_the_tracks(tmp_path: Path) -> None:
     assert holds(findings, "warning", "gt_track_3d.pkl", "frame 1, point 1")
 
 
-def test_all_departures_are_reported_at_once(tmp_path: Path) -> None:
+def test_all_findings_are_reported_at_once(tmp_path: Path) -> None:
     folder = write_case(tmp_path)
     data = stored(folder)
     data["object_points"][3, 0] = np.nan

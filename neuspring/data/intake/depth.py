@@ -107,7 +107,7 @@ SCORED = 800
 POINTS = 20000
 """Points of all frames together."""
 FLATNESS = 0.001
-"""m. Finding of a table from a plane, and of the sensor from its calibration."""
+"""m. Deviation of a table from a plane, and of the sensor from its calibration."""
 SIGMAS = 3.0
 """A point within so many deviations of the noise lies on the plane."""
 BEST = 8

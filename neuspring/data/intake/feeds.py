@@ -27,7 +27,7 @@ import numpy as np
 from neuspring.core.errors import InputError
 from neuspring.core.extras import needed
 from neuspring.data import phystwin
-from neuspring.data.capture import Camera
+from neuspring.data.capture import Camera, read_npy
 
 if TYPE_CHECKING:
     import av
@@ -89,10 +89,7 @@ class ImageFolder:
         """RGB [H, W, 3] uint8, or depth [H, W] as stored. Raises InputError for a damaged image or one of the wrong kind."""
         for path in self.files(places):
             if path.suffix.lower() == ".npy":
-                try:
-                    image = np.load(path, allow_pickle=False)
-                except (OSError, ValueError, EOFError) as error:
-                    raise InputError(path, "this file must be a NumPy array without pickle", str(error)) from error
+                image = read_npy(path)
             else:
                 image = cv2.imread(str(path), cv2.IMREAD_COLOR if self.kind == "color" else cv2.IMREAD_UNCHANGED)
                 if image is None:

@@ -125,7 +125,7 @@ class Published:
     @classmethod
     def load(cls) -> Published:
         """Load the table that ships."""
-        text = resources.files("neuspring.data.tables").joinpath(SCORES).read_text(encoding="utf-8")
+        text = resources.files("neuspring.data").joinpath("tables", SCORES).read_text(encoding="utf-8")
         return cls.parse(text, frozenset(released_cases()))
 
     @classmethod

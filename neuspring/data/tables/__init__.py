@@ -1,1 +1,0 @@
-"""Tables that ship with the package: the 22 cases, the paper's values, released scores, timings."""
