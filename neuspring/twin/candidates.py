@@ -176,23 +176,6 @@ class SearchProblem:
         return [values[name]] if self.clusters == 1 else [values[f"{name}.{region}"] for region in range(self.clusters)]
 
 
-def simulation_of(problem: SearchProblem, substeps: int) -> Simulation:
-    """The scenario's simulation with a given number of substeps per frame."""
-    scenario, settings = problem.observations.scenario, problem.simulation
-    return Simulation(
-        frame_time=RELEASED_FRAME_TIME if problem.quirks.frame_time_667 else 1.0 / scenario.frame_rate,
-        substeps=substeps,
-        up=scenario.up,
-        gravity=settings.gravity,
-        ground=scenario.ground,
-        obstacles=scenario.obstacles,
-        self_collision=scenario.self_collision,
-        collision_capacity=settings.collision_capacity,
-        controller_velocity=settings.controller_velocity,
-        initial_velocity=settings.initial_velocity,
-    )
-
-
 def with_substeps(problem: SearchProblem, twin: Twin) -> Twin:
     """The twin with its number of substeps: 667 with the quirk, else as configured: a fixed count or the smallest safe one.
 
@@ -212,7 +195,7 @@ def with_substeps(problem: SearchProblem, twin: Twin) -> Twin:
 
 def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
     """The twin of one set of physical values. Raises InputError or NumericalFailure if it cannot be integrated."""
-    observations = problem.observations
+    observations, settings, scenario = problem.observations, problem.simulation, problem.observations.scenario
     topology = piecewise_topology(
         observations.nodes,
         observations.controller_points[0],
@@ -229,8 +212,20 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
     if count == 0:
         raise NumericalFailure("no node has a spring")
     material = homogeneous(values, count)
+    simulation = Simulation(
+        frame_time=RELEASED_FRAME_TIME if problem.quirks.frame_time_667 else 1.0 / scenario.frame_rate,
+        substeps=1,
+        up=scenario.up,
+        gravity=settings.gravity,
+        ground=scenario.ground,
+        obstacles=scenario.obstacles,
+        self_collision=scenario.self_collision,
+        collision_capacity=settings.collision_capacity,
+        controller_velocity=settings.controller_velocity,
+        initial_velocity=settings.initial_velocity,
+    )
     hands = {name: value for name, value in values.items() if name.partition(".")[0] in HANDS}
-    return with_substeps(problem, Twin(topology=topology, material=material, simulation=simulation_of(problem, 1), hands=hands))
+    return with_substeps(problem, Twin(topology=topology, material=material, simulation=simulation, hands=hands))
 
 
 def homogeneous(values: dict[str, float], springs: int) -> Material:

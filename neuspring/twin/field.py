@@ -154,7 +154,3 @@ class SpringField(nn.Module):
             x = torch.relu(layer(x))
         result: torch.Tensor = self.layers[-1](x)
         return result
-
-    def roughness(self) -> torch.Tensor:
-        """Mean squared difference of neighboring texels; 0 without planes."""
-        return self.planes.roughness() if self.planes is not None else self.coordinates.sum() * 0.0

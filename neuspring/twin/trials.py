@@ -10,7 +10,7 @@ import functools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 import warp as wp
@@ -85,7 +85,7 @@ class LossSums:
     def __init__(self, solver: FrameSolver, loss: FrameLoss, velocity: torch.Tensor) -> None:
         b = self._buffers = solver.buffers
         self._solver, self._loss = solver, loss
-        self._kernels = Kernels(*(load(kernel, b.device) for kernel in kernels(b.width)))
+        self._kernels = [load(kernel, b.device) for kernel in kernels(b.width)]
         b.add_vectors(before=(b.nodes,), change=(b.nodes,))
         b.set_vectors("before", velocity.expand(b.twins, -1, -1))
         points = loss.points.shape[1]
@@ -101,25 +101,26 @@ class LossSums:
 
     def add(self, frame: int) -> None:
         """Add the loss of a frame, whose end the solver holds."""
-        b, k, views = self._buffers, self._kernels, self._buffers.views
+        b, views = self._buffers, self._buffers.views
+        nearest, tracked, smooth, total, check_divergence = self._kernels
         points, slot, weights = self._points.shape[1], self._solver.last, self._loss.weights
         visible, valid = self._loss.counts[frame]
         x, v = views["x"], views["v"]
-        b.launch(k.nearest, (points, b.groups), x, slot, self._loss.surface, self._points, self._visible, frame, views["chamfer"])
-        b.launch(k.tracked, (points, b.groups), x, slot, self._points, self._valid, frame, views["track"])
-        b.launch(k.smooth, (b.nodes, b.groups), v, slot, frame, views["before"], views["change"], views["acceleration"])
+        b.launch(nearest, (points, b.groups), x, slot, self._loss.surface, self._points, self._visible, frame, views["chamfer"])
+        b.launch(tracked, (points, b.groups), x, slot, self._points, self._valid, frame, views["track"])
+        b.launch(smooth, (b.nodes, b.groups), v, slot, frame, views["before"], views["change"], views["acceleration"])
         for name, size, weight in (
             ("chamfer", points, weights.chamfer / max(visible, 1)),
             ("track", points, weights.track / (3 * max(valid, 1))),
             ("acceleration", b.nodes, weights.acceleration / (3 * b.nodes)),
         ):
-            b.launch(k.total, b.groups, views[name], size, weight, self._view)
+            b.launch(total, b.groups, views[name], size, weight, self._view)
         if self._others:
             # One twin at a time, so that its sum does not depend on its batch.
             for twin, nodes in enumerate(b.get_vectors("x", slot, b.nodes)):
                 terms = self._loss.terms(frame, nodes, without=ON_LANES).values()
                 self._other_terms[twin] += sum(term.double() for term in terms)
-        b.launch(k.check_divergence, b.groups, x, slot, b.nodes, float(frame), views["diverged"])
+        b.launch(check_divergence, b.groups, x, slot, b.nodes, float(frame), views["diverged"])
 
     def costs(self, frames: int) -> list[float]:
         """Mean loss of `frames` frames, of each twin."""
@@ -137,24 +138,16 @@ class LossSums:
         return not bool(self._buffers.tensors["diverged"].all())
 
 
-class Kernels(NamedTuple):
-    """Kernels of the losses for one width."""
-
-    nearest: Any
-    """Squared distance of each visible point to the nearest surface node."""
-    tracked: Any
-    """Smooth-L1 between each tracked point and its node, summed over axes."""
-    smooth: Any
-    """Smooth-L1 between consecutive velocity changes of each node, summed over axes."""
-    total: Any
-    """Add a weighted sum to each twin's cost."""
-    check_divergence: Any
-    """Note the first frame in which a twin is out of the scene."""
-
-
 @functools.cache
-def kernels(width: int) -> Kernels:
-    """Kernels in float32 for a number of lanes."""
+def kernels(width: int) -> list[Any]:
+    """Kernels in float32 for a number of lanes:
+
+    nearest           squared distance of each visible point to the nearest surface node
+    tracked           smooth-L1 between each tracked point and its node, summed over axes
+    smooth            smooth-L1 between consecutive velocity changes of each node, summed over axes
+    total             add a weighted sum to each twin's cost
+    check_divergence  note the first frame in which a twin is out of the scene
+    """
     lane = lanes(wp.float32, width)
     Number, Vector, dot = lane.Number, lane.Vector, lane.dot
     Total = wp.types.vector(width, wp.float64)
@@ -244,4 +237,4 @@ def kernels(width: int) -> Kernels:
                 diverged[g] = frames
 
     unique = wp.kernel(module="unique", enable_backward=False)
-    return Kernels(*map(unique, (nearest, tracked, smooth, total, check_divergence)))
+    return [unique(kernel) for kernel in (nearest, tracked, smooth, total, check_divergence)]

@@ -273,7 +273,7 @@ def test_learning_rates_of_each_group():
 
 def test_the_penalty_is_the_weighted_roughness():
     trained = disturb(parameters(field={"plane_smoothness": 0.5}))
-    assert trained.penalty().item() == pytest.approx(0.5 * trained.field.roughness().item(), rel=SINGLE)
+    assert trained.penalty().item() == pytest.approx(0.5 * trained.field.planes.roughness().item(), rel=SINGLE)
     assert trained.penalty() > 0
     for other in (parameters(), parameters("springs", field={"plane_smoothness": 0.5})):
         assert disturb(other).penalty() == 0
