@@ -1,4 +1,5 @@
-"""A twin that is pulled: the grab, recordings that give the same motion again, and what another twin makes of them."""
+"""A twin that is pulled: the grab, where it begins, hands that go on as recorded, recordings that give the same motion again,
+and what another twin makes of them."""
 
 from dataclasses import replace
 
@@ -8,13 +9,16 @@ import pytest
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
 from neuspring.physics import stability
-from neuspring.play.controls import Controls, compare, digest_motion, load_controls, replay
+from neuspring.play.controls import Controls, Recording, compare, digest_motion, load_controls, replay
 from neuspring.play.live import FASTEST, Grab, nearest_to_ray
-from neuspring.play.simulator import Simulator
+from neuspring.play.results import find
+from neuspring.play.simulator import Simulator, Start, start_state
+from neuspring.twin.rollout import roll_out
 from tests.support import small
-from tests.support.played import softer
+from tests.support.played import results, softer
 
 FRAMES, NODE = 12, 3
+NAMES = {"scenario": "small", "method": "truth", "seed": "0", "twin_digest": "0"}
 STEP = 0.008
 """m per frame of a pull."""
 
@@ -35,9 +39,8 @@ def pulled(twin: Twin, frames: int = FRAMES) -> tuple[Controls, np.ndarray]:
         rows.append((twin.topology.controllers, node, target))
         seen.append(simulator.step(*rows[-1]).copy())
     hands, grabbed, target = (np.stack([np.asarray(row[column]) for row in rows]) for column in range(3))
-    names = {"scenario": "small", "method": "truth", "seed": "0", "twin_digest": "0"}
     motion = digest_motion(np.stack(seen))
-    return Controls(hands=hands, grabbed=grabbed.astype(np.int32), target=target, motion_digest=motion, **names), np.stack(seen)
+    return Controls(hands=hands, grabbed=grabbed.astype(np.int32), target=target, motion_digest=motion, **NAMES), np.stack(seen)
 
 
 def test_a_grabbed_node_follows_and_a_released_one_swings_back(twin):
@@ -114,3 +117,111 @@ def test_places_and_nodes_that_are_none_are_ignored():
     for place in places:
         one.pull(1, place)
     assert np.array_equal(one.next(1.0, np.zeros((3, 3)), np.zeros(3))[2], np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory):
+    return find([results(tmp_path_factory.mktemp("begin"))])
+
+
+def moved(simulator: Simulator, begin, node: int = -1, target=None) -> np.ndarray:
+    """Nodes in the frames of a script [E + 1, N, 3]."""
+    seen = [simulator.positions.copy()]
+    for hands, holds in zip(begin.hands, begin.holds, strict=True):
+        seen.append(simulator.step(hands, node, target, holds).copy())
+    return np.stack(seen)
+
+
+def test_hands_that_repeat_the_recording_give_its_prediction_bit_for_bit(found):
+    run = found.runs[-1]
+    begin = start_state(run, found.observations, 0, repeat=True)
+    assert np.array_equal(moved(Simulator(run.twin, start=begin.start), begin), run.trajectory.positions)
+
+
+def test_a_pull_goes_on_beside_the_recorded_hands(found):
+    run = found.runs[-1]
+    begin = start_state(run, found.observations, 0, repeat=True)
+    node = int(np.argmax(run.trajectory.positions[-1, :, 0]))
+    target = run.trajectory.positions[0, node] + [0, 0, 0.1]
+    pulled = moved(Simulator(run.twin, start=begin.start), begin, node, target)
+    assert np.linalg.norm(pulled[-1, node] - target) < np.linalg.norm(run.trajectory.positions[-1, node] - target) - 0.01
+
+
+def test_it_begins_at_any_frame_in_the_state_of_the_prediction(found):
+    run = found.runs[-1]
+    x, seconds = run.trajectory.positions, run.twin.simulation.frame_time
+    begin = start_state(run, found.observations, 3, repeat=True)
+    assert np.array_equal(begin.start.positions, x[3]) and len(begin.hands) == len(x) - 4
+    assert begin.start.velocity == pytest.approx((x[4].astype(float) - x[2]) / (2 * seconds))
+    # Half of what the nodes move in two frames is not exactly the velocity, so that the motion differs by a little.
+    apart = np.linalg.norm(moved(Simulator(run.twin, start=begin.start), begin) - x[3:], axis=2)
+    travel = np.linalg.norm(x[-1] - x[3], axis=1).max()
+    assert apart.max() < 0.25 * travel
+
+
+def letting_go(frames: int, count: int) -> np.ndarray:
+    """All hands hold, let go in frame 2, and the first one takes hold again in frame 4."""
+    valid = np.ones((frames, count), bool)
+    valid[2:4] = False
+    valid[4:, 1:] = False
+    return valid
+
+
+@pytest.mark.parametrize("frame", [3, 4, 6])
+def test_a_start_after_grips_knows_their_lengths(found, frame):
+    run, seen = found.runs[-1], found.observations
+    valid = letting_go(len(seen.controller_points), seen.controller_points.shape[1])
+    seen = replace(seen, controller_valid=valid)
+    expected, simulator = [], Simulator(run.twin)
+    rolled = roll_out(run.twin, seen.controller_points, valid=valid).positions
+    for row, holds in zip(seen.controller_points[1:], valid[1:], strict=True):
+        simulator.step(row, holds=holds)
+        expected.append((simulator.positions.copy(), simulator._v.numpy().copy()))
+    positions = np.stack([run.twin.topology.nodes, *(x for x, _ in expected)])
+    assert np.array_equal(positions, rolled) and not np.array_equal(positions, run.trajectory.positions)
+    known = replace(run, paths={"twin": run.paths["twin"]})
+    object.__setattr__(known, "trajectory", replace(run.trajectory, positions=positions))
+    begin = start_state(known, seen, frame, repeat=True)
+    exact = replace(begin.start, velocity=expected[frame - 1][1])
+    assert np.array_equal(moved(Simulator(run.twin, start=exact), begin), positions[frame:])
+
+
+def test_a_recording_from_a_frame_gives_the_same_motion_bit_for_bit(found, tmp_path):
+    run = found.runs[-1]
+    seen = found.observations
+    valid = letting_go(len(seen.controller_points), seen.controller_points.shape[1])
+    begin = start_state(run, replace(seen, controller_valid=valid), 5, repeat=True)
+    simulator, recording = Simulator(run.twin, start=begin.start), Recording()
+    recording.begin(simulator.positions)
+    for number, (hands, holds) in enumerate(zip(begin.hands, begin.holds, strict=True)):
+        node, target = (2, simulator.positions[2] + [0, 0, 0.02]) if number else (-1, np.zeros(3))
+        x = simulator.step(hands, node, target, holds)
+        recording.add((hands, node, target, simulator.holds), x)
+    recording.controls(begin.start, begin.frame, **NAMES).save(tmp_path / "controls.npz")
+    saved = load_controls(tmp_path / "controls.npz")
+    assert saved.start_frame == 5 and len(saved.start.grip_rows) == 1
+    assert np.array_equal(replay(run.twin, saved).positions[-1], simulator.positions)
+    assert recording.motion_digest() == saved.motion_digest
+
+
+def test_a_frame_without_prediction_and_a_start_of_another_twin_are_refused(found):
+    run = found.runs[-1]
+    for frame in (-1, 8):
+        with pytest.raises(InputError, match="its prediction has 8 frames"):
+            start_state(run, found.observations, frame, repeat=False)
+    recording, simulator = Recording(), Simulator(run.twin)
+    recording.begin(simulator.positions)
+    hands = run.twin.topology.controllers
+    recording.add((hands, -1, np.zeros(3), np.ones(len(hands), bool)), simulator.step(hands))
+    start = Start(positions=np.zeros((2, 3)), velocity=np.zeros((2, 3)))
+    with pytest.raises(InputError, match=r"start\.positions"):
+        replay(run.twin, recording.controls(start, 0, **NAMES))
+
+
+def test_a_recording_that_is_too_long_keeps_nothing(monkeypatch):
+    monkeypatch.setattr("neuspring.play.controls.MOST_FRAMES", 2)
+    recording, x, row = Recording(), np.zeros((3, 3)), (np.zeros((1, 3)), -1, np.zeros(3), np.ones(1, bool))
+    recording.begin(x)
+    assert [recording.add(row, x) for _ in range(4)] == [False, False, True, False]
+    with pytest.raises(InputError, match="at least one frame"):
+        recording.controls(Start(), 0, **NAMES)
