@@ -49,25 +49,21 @@ class Backend:
             return
         import_module(self.module).require(capture)
 
-    def _own(self, section: Any) -> tuple[Any, ...]:
-        return (getattr(section, self.section),) if self.section else ()
-
-    def _device(self, device: str) -> tuple[str, ...]:
-        from neuspring.core.device import resolve_device
-
-        return (resolve_device(device),) if self.gpu else ()
-
     def segment(self, capture: Capture, camera: str, settings: Perception, device: str) -> np.ndarray:
         """Labels [T, H, W] uint8 of one camera: 0 table, 1 object, 2 hands (`data.capture.OBJECT`, `HANDS`)."""
-        function = import_module(self.module).segment
-        labels: np.ndarray = function(capture, camera, *self._own(settings.segment), *self._device(device))
+        labels: np.ndarray = self._call("segment", (capture, camera), settings.segment, (), device)
         return labels
 
     def track(self, capture: Capture, camera: str, labels: np.ndarray, settings: Perception, device: str) -> Followed:
         """Tracks of pixels of the masks `labels` [T, H, W]."""
-        function = import_module(self.module).track
-        tracks: Followed = function(capture, camera, labels, *self._own(settings.track), settings.seed, *self._device(device))
+        tracks: Followed = self._call("track", (capture, camera, labels), settings.track, (settings.seed,), device)
         return tracks
+
+    def _call(self, step: str, given: tuple[Any, ...], section: Any, seed: tuple[int, ...], device: str) -> Any:
+        from neuspring.core.device import resolve_device
+
+        own = (getattr(section, self.section),) if self.section else ()
+        return getattr(import_module(self.module), step)(*given, *own, *seed, *((resolve_device(device),) if self.gpu else ()))
 
 
 BACKENDS = {
