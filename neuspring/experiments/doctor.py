@@ -42,7 +42,7 @@ DOWNLOAD = "curl -L --create-dirs -o"
 
 
 @dataclass(frozen=True)
-class Finding:
+class Check:
     """One line of the report."""
 
     subject: str
@@ -52,34 +52,34 @@ class Finding:
     """The next move, where something is absent or broken."""
 
 
-def examine(settings: Config) -> list[Finding]:
-    """All findings, for what a configuration asks for."""
+def examine(settings: Config) -> list[Check]:
+    """All checks, for what a configuration asks for."""
     return [*_libraries(settings), *_devices(settings), *_weights(settings), *_storage(settings)]
 
 
-def text(findings: list[Finding]) -> str:
+def text(checks: list[Check]) -> str:
     """The report: a line each, its next move below it, and the verdict."""
     signs = {"ok": "ok     ", "absent": "absent ", "broken": "BROKEN "}
-    width = max(len(finding.subject) for finding in findings)
+    width = max(len(check.subject) for check in checks)
     lines = []
-    for finding in findings:
-        lines.append(f"{signs[finding.state]}{finding.subject.ljust(width)}  {finding.detail}")
-        if finding.remedy and finding.state != "ok":
-            lines.append(f"{' ' * (len(signs['ok']) + width + 2)}-> {finding.remedy}")
-    broken = [finding.subject for finding in findings if finding.state == "broken"]
+    for check in checks:
+        lines.append(f"{signs[check.state]}{check.subject.ljust(width)}  {check.detail}")
+        if check.remedy and check.state != "ok":
+            lines.append(f"{' ' * (len(signs['ok']) + width + 2)}-> {check.remedy}")
+    broken = [check.subject for check in checks if check.state == "broken"]
     verdict = f"Cannot work as configured: {', '.join(broken)}." if broken else "Everything that is configured can work here."
     return "\n".join([*lines, "", verdict])
 
 
-def _libraries(settings: Config) -> Iterator[Finding]:
-    yield Finding("Python", "ok", sys.version.split()[0])
+def _libraries(settings: Config) -> Iterator[Check]:
+    yield Check("Python", "ok", sys.version.split()[0])
     cuda = f"CUDA {torch.version.cuda}" if torch.version.cuda else "build for the CPU"
-    yield Finding("torch", "ok", f"{torch.__version__}, {cuda}")
+    yield Check("torch", "ok", f"{torch.__version__}, {cuda}")
     for package in ("warp-lang", "snakemake", "mlflow", "optuna"):
         try:
-            yield Finding(package, "ok", version(package))
+            yield Check(package, "ok", version(package))
         except PackageNotFoundError:
-            yield Finding(package, "broken", "not installed", "make install")
+            yield Check(package, "broken", "not installed", "make install")
     segments = settings.perception.segment.backend == "grounded_sam2"
     wanted = {
         "gsplat": settings.images.backend == "gsplat",
@@ -89,29 +89,29 @@ def _libraries(settings: Config) -> Iterator[Finding]:
     }
     for module, extra in EXTRAS.items():
         if importlib.util.find_spec(module):
-            yield Finding(module, "ok", f"extra {extra}")
+            yield Check(module, "ok", f"extra {extra}")
         else:
-            yield Finding(module, "broken" if wanted.get(module) else "absent", f"extra {extra} is not installed", install(extra))
+            yield Check(module, "broken" if wanted.get(module) else "absent", f"extra {extra} is not installed", install(extra))
     if importlib.util.find_spec("av"):
         import av
 
         try:
             av.codec.Codec("libx264", "w")
-            yield Finding("H.264 encoder", "ok", f"libx264, av {av.__version__}")
+            yield Check("H.264 encoder", "ok", f"libx264, av {av.__version__}")
         except (ValueError, LookupError) as error:
             remedy = "Install av from its wheel: .venv/bin/pip install --force-reinstall av"
-            yield Finding("H.264 encoder", "broken", str(error), remedy)
+            yield Check("H.264 encoder", "broken", str(error), remedy)
 
 
-def _checked(subject: str, check: Callable[[], str], remedy: str = "") -> Finding:
-    """What a check says; broken where it raises InputError."""
+def _checked(subject: str, examined: Callable[[], str], remedy: str = "") -> Check:
+    """What `examined` says; broken where it raises InputError."""
     try:
-        return Finding(subject, "ok", check())
+        return Check(subject, "ok", examined())
     except InputError as error:
-        return Finding(subject, "broken", str(error), remedy)
+        return Check(subject, "broken", str(error), remedy)
 
 
-def _devices(settings: Config) -> Iterator[Finding]:
+def _devices(settings: Config) -> Iterator[Check]:
     import warp as wp
 
     found = _checked("device", lambda: resolve_device(settings.device), "Set device: cpu, or install what the message names.")
@@ -120,16 +120,16 @@ def _devices(settings: Config) -> Iterator[Finding]:
         return
     device = found.detail
     start_warp()
-    yield Finding("Warp devices", "ok", ", ".join(str(one.alias) for one in wp.get_devices()))
+    yield Check("Warp devices", "ok", ", ".join(str(one.alias) for one in wp.get_devices()))
     leased = _checked("GPUs that jobs may lease", lambda: ", ".join(needs.gpu_pool(settings.gpus, settings.device)))
-    none = Finding(leased.subject, "absent", "none: jobs run on the CPU", "Set gpus.devices, or CUDA_VISIBLE_DEVICES.")
+    none = Check(leased.subject, "absent", "none: jobs run on the CPU", "Set gpus.devices, or CUDA_VISIBLE_DEVICES.")
     yield leased if leased.detail else none
     yield _checked("rasterizer", lambda: choose_backend(settings.images.backend, device))
     if device.startswith("cuda"):
         yield from _parity(device)
 
 
-def _parity(device: str) -> Iterator[Finding]:
+def _parity(device: str) -> Iterator[Check]:
     """Simulator and rasterizer on CUDA against the CPU, in a few seconds after kernels are compiled."""
     row = ScenarioRow(
         scenario="parity", source="toy", category="cloth", path="cloth/lift/smooth", self_collision=False, ground=True
@@ -143,7 +143,7 @@ def _parity(device: str) -> Iterator[Finding]:
         ("rasterizer", float((pictures[0] - pictures[1]).abs().max()), PARITY_COLOR, "in color"),
     ):
         detail = f"{difference:.1e} {unit} from the CPU's (limit {limit:.0e})"
-        yield Finding(f"{what} on {device}", "ok" if difference <= limit else "broken", detail, "Use device: cpu, and report this.")
+        yield Check(f"{what} on {device}", "ok" if difference <= limit else "broken", detail, "Use device: cpu, and report this.")
 
 
 def _small_picture(device: str) -> torch.Tensor:
@@ -165,7 +165,7 @@ def _small_picture(device: str) -> torch.Tensor:
     ).rgb.cpu()
 
 
-def _weights(settings: Config) -> Iterator[Finding]:
+def _weights(settings: Config) -> Iterator[Check]:
     from huggingface_hub import try_to_load_from_cache
 
     # Files that are known by their checksum.
@@ -184,12 +184,12 @@ def _weights(settings: Config) -> Iterator[Finding]:
         try:
             place = find()
         except InputError as error:
-            yield Finding(subject, "broken", str(error))
+            yield Check(subject, "broken", str(error))
             continue
         if isinstance(place, str):
-            yield Finding(subject, "absent", f"{place}; what needs it is left out, and tables say so", remedy)
+            yield Check(subject, "absent", f"{place}; what needs it is left out, and tables say so", remedy)
         else:
-            yield Finding(subject, "ok", "checksum is right")
+            yield Check(subject, "ok", "checksum is right")
     # Weights of perception, which their libraries keep in caches of their own.
     segment, track = settings.perception.segment, settings.perception.track
     for subject, name in {
@@ -200,7 +200,7 @@ def _weights(settings: Config) -> Iterator[Finding]:
         wanted = segment.backend == "grounded_sam2" and not segment.grounded_sam2.download
         remedy = f".venv/bin/hf download {name}, or perception.segment.grounded_sam2.download: true"
         detail = name if there else f"{name} is not in the cache of the Hugging Face hub"
-        yield Finding(subject, "ok" if there else "broken" if wanted else "absent", detail, remedy)
+        yield Check(subject, "ok" if there else "broken" if wanted else "absent", detail, remedy)
     code = sorted(Path(torch.hub.get_dir()).glob("facebookresearch_co-tracker_*"))
     there = bool(code) and (hub_folder() / WEIGHTS).is_file()
     wanted = track.backend == "cotracker3" and not track.cotracker3.download
@@ -208,26 +208,26 @@ def _weights(settings: Config) -> Iterator[Finding]:
         f"perception.track.cotracker3.download: true (not for commercial use), or {DOWNLOAD} {hub_folder() / WEIGHTS} {ADDRESS}"
     )
     detail = WEIGHTS if there else "code or weights are not in the cache of torch.hub"
-    yield Finding("CoTracker3", "ok" if there else "broken" if wanted else "absent", detail, remedy)
+    yield Check("CoTracker3", "ok" if there else "broken" if wanted else "absent", detail, remedy)
 
 
-def _storage(settings: Config) -> Iterator[Finding]:
+def _storage(settings: Config) -> Iterator[Check]:
     results = Path(settings.results)
     place = next(folder for folder in (results.resolve(), *results.resolve().parents) if folder.is_dir())
     free = shutil.disk_usage(place).free / 1e9
     remedy = "Choose another folder: --config results=..."
-    yield Finding("disk", "ok" if free >= FREE_GB else "absent", f"{free:.0f} GB free for {settings.results}", remedy)
+    yield Check("disk", "ok" if free >= FREE_GB else "absent", f"{free:.0f} GB free for {settings.results}", remedy)
     if settings.data_root is not None:
         there = Path(settings.data_root).is_dir()
-        yield Finding("data_root", "ok" if there else "broken", str(settings.data_root), "Give the folder of the data.")
+        yield Check("data_root", "ok" if there else "broken", str(settings.data_root), "Give the folder of the data.")
     if not settings.tracking.enabled:
-        yield Finding("MLflow store", "absent", "tracking.enabled: false")
+        yield Check("MLflow store", "absent", "tracking.enabled: false")
         return
     uri = masked(store.uri_of(results, settings.tracking))
     try:
         state = "it answers" if store.find(results, settings.tracking) else "made by the first run"
-        yield Finding("MLflow store", "ok", f"{uri}: {state}")
+        yield Check("MLflow store", "ok", f"{uri}: {state}")
     except Exception as error:  # whatever MLflow or a database raises
         reason = str(error).partition("\n")[0]
         remedy = "Start the server, or correct tracking.uri; runs wait on disk meanwhile (neuspring sync)."
-        yield Finding("MLflow store", "broken", f"{uri}: {reason}", remedy)
+        yield Check("MLflow store", "broken", f"{uri}: {reason}", remedy)

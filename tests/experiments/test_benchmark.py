@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -62,56 +61,40 @@ def write(path: Path, text: str) -> Path:
     return path
 
 
-def test_methods(tmp_path: Path) -> None:
+def test_rows_lie_on_top_of_the_configuration(tmp_path: Path) -> None:
     found = tables.read_methods(write(tmp_path / "methods.yaml", METHODS))
-    assert list(found) == ["full", "coarse", "long", "ours"]
-    assert [method.fit for method in found.values()] == ["springs", None, "springs", "field"]
-    made = load("fit: {epochs: 3, learning_rate: 0.5}")
+    assert {name: method.fit for name, method in found.items()} == dict(full="springs", coarse=None, long="springs", ours="field")
+    made = load("fit: {epochs: 3, learning_rate: 0.5, field: {hidden: 8}}\nsearch: {rollouts: 44, sigma: 0.25}")
     merged = tables.with_method(made, found["long"], "long").fit
     assert (merged.horizon, merged.epochs, merged.learning_rate) == (0, 7, 0.5)
-    assert tables.with_method(made, found["full"], "full").fit == made.fit
-    assert made.fit.epochs == 3
-    ours = tables.with_method(load("fit: {epochs: 3, field: {hidden: 8}}"), found["ours"], "ours").fit
+    assert tables.with_method(made, found["full"], "full") == made
+    ours = tables.with_method(made, found["ours"], "ours").fit
     assert (ours.epochs, ours.output_bound, ours.field.triplane, ours.field.hidden) == (3, 1.5, False, 8)
+    rows = tables.read_searches(write(tmp_path / "searches.yaml", SEARCHES))
+    assert {name: row.clusters for name, row in rows.items()} == {"uniform": 1, "pieces": 5}
+    searched = tables.with_search(made, rows["pieces"], "pieces").search
+    assert (searched.rollouts, searched.sigma, searched.polish.rounds) == (33, 0.25, 1)
+    assert tables.with_search(made, rows["uniform"], "uniform") == made
 
 
-def test_searches(tmp_path: Path) -> None:
-    found = tables.read_searches(write(tmp_path / "searches.yaml", SEARCHES))
-    assert {name: row.clusters for name, row in found.items()} == {"uniform": 1, "pieces": 5}
-    made = load("search: {rollouts: 44, sigma: 0.25, polish: {variables: [drag]}}")
-    merged = tables.with_search(made, found["pieces"], "pieces").search
-    assert (merged.rollouts, merged.sigma) == (33, 0.25)
-    assert (merged.polish.rounds, merged.polish.variables) == (1, ("drag",))
-    assert tables.with_search(made, found["uniform"], "uniform").search == made.search
-
-
-BAD_SEARCHES = {
-    "no regions": ("a: {clusters: 0, description: x}", "search a.*clusters.*received 0"),
-    "missing": ("a: {description: x}", "search a.*clusters: required, but missing"),
-    "unknown": ("a: {clusters: 1, description: x, linkage: ward}", "search a.*linkage: unknown key"),
-    "not a mapping": ("a: 3", "search a"),
-    "empty": ("", "must hold a YAML mapping; received NoneType"),
+BAD_ROWS = {
+    "no regions": (tables.read_searches, "a: {clusters: 0, description: x}", "search a.*clusters.*received 0"),
+    "no clusters": (tables.read_searches, "a: {description: x}", "search a.*clusters: required, but missing"),
+    "key": (tables.read_searches, "a: {clusters: 1, description: x, linkage: ward}", "search a.*linkage: unknown key"),
+    "search": (tables.read_methods, "a: {search: ../up, description: x}", r"method a.*search.*received '\.\./up'"),
+    "fit": (tables.read_methods, "a: {search: uniform, fit: network, description: x}", "method a.*fit.*received 'network'"),
+    "missing": (tables.read_methods, "a: {search: uniform, fit: null}", "method a.*description: required, but missing"),
+    "unknown": (tables.read_methods, "a: {search: uniform, description: x, lr: 1}", "method a.*lr: unknown key"),
+    "not a mapping": (tables.read_methods, "a: 3", "method a"),
+    "empty": (tables.read_methods, "", "must hold a YAML mapping; received NoneType"),
+    "list": (tables.read_methods, "[a]", "must hold a YAML mapping; received list"),
+    "not YAML": (tables.read_methods, "a: [", "must be YAML"),
 }
 
 
-BAD_METHODS = {
-    "search": ("a: {search: ../up, fit: null, description: x}", r"method a.*search.*received '\.\./up'"),
-    "fit": ("a: {search: uniform, fit: network, description: x}", "method a.*fit.*'springs' or 'field', received 'network'"),
-    "missing": ("a: {search: uniform, fit: null}", "method a.*description: required, but missing"),
-    "unknown": ("a: {search: uniform, fit: null, description: x, lr: 1}", "method a.*lr: unknown key"),
-    "not a mapping": ("a: 3", "method a"),
-    "empty": ("", "must hold a YAML mapping; received NoneType"),
-    "list": ("[a]", "must hold a YAML mapping; received list"),
-    "not YAML": ("a: [", "must be YAML"),
-}
-
-
-BAD_ROWS = [(tables.read_searches, *case) for case in BAD_SEARCHES.values()]
-BAD_ROWS += [(tables.read_methods, *case) for case in BAD_METHODS.values()]
-
-
-@pytest.mark.parametrize(("read", "text", "message"), BAD_ROWS, ids=[*map("search: {}".format, BAD_SEARCHES), *BAD_METHODS])
-def test_bad_tables_of_searches_and_methods(read: Callable[[Path], Any], text: str, message: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", BAD_ROWS)
+def test_bad_tables_of_searches_and_methods(name: str, tmp_path: Path) -> None:
+    read, text, message = BAD_ROWS[name]
     path = write(tmp_path / "rows.yaml", text)
     with pytest.raises(InputError, match="(?s)" + message) as caught:
         read(path)
@@ -383,11 +366,14 @@ def test_methods_on_a_pool_have_searches_and_fits_of_their_own(tmp_path: Path) -
     assert graph.variant(jobs["one"])["clusters"] == 1
 
 
-def test_scenarios_without_a_pool_are_left_out_of_its_methods(tmp_path: Path) -> None:
-    made = pooled(tmp_path, scenarios=["a", "cloth"])
+def test_scenarios_without_a_pool_are_left_out_of_its_methods_which_share_no_launches(tmp_path: Path) -> None:
+    made = pooled(tmp_path, scenarios=["a", "cloth"], seeds=[0, 1, 2], twins_per_launch=8)
     assert made.whole_left_out == {"one": ("cloth",), "two": ("cloth",)}
-    assert [path for path in Graph(made).runs() if "cloth" in path] == ["results/cloth/full/0/run.json"]
+    assert [path for path in Graph(made).runs() if "cloth" in path] == [f"results/cloth/full/{seed}/run.json" for seed in range(3)]
     assert made.applies("one", "a")
+    assert made.fits_together("a") == (("full", 0), ("full", 1), ("full", 2))
+    alone = pooled(tmp_path, methods=["full"])
+    assert (alone.pools, list(alone.scenarios)) == ({}, ["a"]), "no pool is asked for without such a method"
 
 
 def test_oracles_on_a_pool_have_fits_of_their_own_over_all_frames(tmp_path: Path) -> None:
@@ -404,17 +390,6 @@ def test_oracles_on_a_pool_have_fits_of_their_own_over_all_frames(tmp_path: Path
         (True, "all"),
     ]
     assert "released_quirks" in json.loads(graph.settings(STAGES["fit"], jobs[1]))
-
-
-def test_fits_on_a_pool_share_no_launches(tmp_path: Path) -> None:
-    together = pooled(tmp_path, seeds=[0, 1, 2], twins_per_launch=8).fits_together("a")
-    assert together == (("full", 0), ("full", 1), ("full", 2))
-
-
-def test_no_pool_is_asked_for_without_such_a_method(tmp_path: Path) -> None:
-    made = pooled(tmp_path, methods=["full"])
-    assert made.pools == {}
-    assert list(made.scenarios) == ["a"]
 
 
 @pytest.mark.parametrize(
@@ -646,34 +621,19 @@ def test_only_takes_a_part_by_scenario_category_method_and_seed():
 
 
 def test_a_part_keeps_the_whole_that_tables_are_laid_out_for():
-    part = {
-        "methods": ["search_only", "baseline"],
-        "seeds": [0, 1],
-        "compare_with": "baseline",
-        "only": "method=search_only seed=1",
-    }
-    made = Benchmark(config_with(part), ROOT)
+    part = {"methods": ["search_only", "baseline"], "seeds": [0, 1], "compare_with": "baseline"}
+    made = Benchmark(config_with(part | {"only": "method=search_only seed=1"}), ROOT)
     assert (made.config.methods, made.config.seeds) == (("search_only",), (1,))
     assert (made.whole.methods, made.whole.seeds, made.compared_with) == (("search_only", "baseline"), (0, 1), "baseline")
 
 
 @pytest.mark.parametrize(
-    ("only", "message"),
-    [
-        ("category=ropes", "category 'ropes' matches none of the configuration's; received rope"),
-        ("method=neuspring", "method 'neuspring' matches none"),
-        ("color=red", "terms scenario="),
-        ("seed", "terms scenario="),
-    ],
-)
-def test_a_part_that_is_not_there_is_explained(only, message):
-    with pytest.raises(InputError, match=message):
-        Benchmark(config_with({"only": only}), ROOT)
-
-
-@pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"only": "category=ropes"}, "category 'ropes' matches none of the configuration's; received rope"),
+        ({"only": "method=neuspring"}, "method 'neuspring' matches none"),
+        ({"only": "color=red"}, "terms scenario="),
+        ({"only": "seed"}, "terms scenario="),
         ({"fit": {"learning_rate": "5e-5"}}, "YAML reads a number such as 5e-5 as text: write 5.0e-5"),
         ({"scenarios": ["../../etc"]}, "scenarios.0: string should match pattern"),
         ({"seeds": [0, 0]}, "seeds: entries must differ"),

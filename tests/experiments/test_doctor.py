@@ -7,7 +7,7 @@ from neuspring.cli.main import main
 from neuspring.experiments import doctor
 
 
-def findings(tmp_path, **values) -> dict[str, doctor.Finding]:
+def findings(tmp_path, **values) -> dict[str, doctor.Check]:
     settings = config.parse(config.Config, {"results": str(tmp_path), "device": "cpu"} | values, "test")
     return {finding.subject: finding for finding in doctor.examine(settings)}
 
