@@ -6,6 +6,7 @@ import pytest
 
 from neuspring.core.errors import InputError
 from neuspring.data.intake.feeds import ImageFolder, VideoFile, pairs
+from neuspring.data.intake.make import CHECKS
 from neuspring.data.intake.poses import choose, chosen
 from tests.support.desk import FRAMES, camera, counts, seen, write_folders, write_video
 
@@ -126,6 +127,8 @@ def test_a_stride_and_a_jump_are_known(tmp_path):
     (root / "depth_0" / "frame_6.png").unlink()
     views = pairs([root / "color_0"], [root / "depth_0"])
     assert (choose(views).step, choose(views).jumps) == (1, 1)
+    found = [one for check in CHECKS for one in check(views, choose(views))]
+    assert [(one.name, one.level) for one in found] == [("time jumps", "warning"), ("images alone", "warning")]
     with pytest.raises(InputError, match="a capture needs at least 5 frames; received 3 of the numbers 0 to 11"):
         choose(views, "0-2")
 
