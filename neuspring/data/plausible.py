@@ -126,7 +126,7 @@ def _explained(path: Path, name: str, plane: Plane, pose: np.ndarray, up: str, u
 
 
 SAMPLED = 5
-"""Frames per camera, evenly spaced, that are compared with the world."""
+"""Frames per camera, evenly spaced, that are compared with the world, or in which the table is looked for."""
 SMALL, LARGE = 0.02, 1.2
 """m. Objects whose longest side is another are a wrong mask or a wrong unit of depth."""
 SUNK, HIGH = 0.02, 1.2

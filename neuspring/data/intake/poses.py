@@ -29,7 +29,7 @@ from neuspring.data.intake.depth import (
 )
 from neuspring.data.intake.feeds import CameraFeed, Lens, Pair, open_images
 from neuspring.data.intake.lenses import Board, Straightener, depth_ratio, require_lens, sight
-from neuspring.data.plausible import color_alone_findings, table_findings
+from neuspring.data.plausible import color_alone_findings, sampled, table_findings
 
 FEWEST = 5
 """Frames of a capture."""
@@ -104,10 +104,6 @@ def choose(views: Sequence[CameraFeed], wanted: str = "") -> FrameChoice:
     return FrameChoice(kept, places, step, sum(gap != min(gaps) for gap in gaps))
 
 
-SAMPLED = 5
-"""Frames per camera, evenly spaced, in which the unit of depth and the table are looked for."""
-
-
 @dataclass(frozen=True, eq=False)
 class SampledCamera:
     """What a camera saw in a few frames."""
@@ -135,8 +131,8 @@ def look(
     lenses: dict[str, Lens] = {}
     for view in views:
         frames = sorted(choice.places[view.name])
-        picked = sorted({frames[k] for k in np.linspace(0, len(frames) - 1, SAMPLED).astype(int)})
-        samples[view.name] = list(view.read([choice.places[view.name][frame] for frame in picked]))
+        picked = [choice.places[view.name][frames[k]] for k in sorted(sampled(len(frames)))]
+        samples[view.name] = list(view.read(picked))
         lens = listed.get(view.name) or view.lens
         if lens is None:
             remedy = "Give a JSON file with fx, fy, cx, cy."
