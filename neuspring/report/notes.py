@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
@@ -72,31 +71,24 @@ def _learning(runs: Iterable[RunRecord]) -> list[str]:
         most = max(values["fit.result.at_bound"] for values in bound)
         texts.append(f"up to {most:.0%} of the springs lie at the bound of their stiffness (fit.output_bound)")
     if first:
-        texts.append(f"training improved nothing: the best epoch is the first{_seeds(len(first), len(facts))}")
-    return texts + _grip(facts)
-
-
-def _grip(facts: list[dict[str, Any]]) -> list[str]:
-    """How many springs hold the hands; the fit's, else the search's."""
+        of = f" with {len(first)} of {len(facts)} seeds" if len(facts) > 1 else ""
+        texts.append(f"training improved nothing: the best epoch is the first{of}")
     counts = [held for values in facts if (held := _gripping(values)) is not None]
-    if not counts:
-        return []
-    number = f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
-    if not max(counts):
-        return ["no spring joins a hand to the object, so nothing moves it"]
-    return [f"{number} springs join the hands to the object"]
+    if counts and not max(counts):
+        texts.append("no spring joins a hand to the object, so nothing moves it")
+    elif counts:
+        number = f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
+        texts.append(f"{number} springs join the hands to the object")
+    return texts
 
 
 def _gripping(values: Mapping[str, Any]) -> int | None:
+    """How many springs hold the hands: the fit's, else the search's."""
     for stage in ("fit", "search"):
         springs, inner = values.get(f"{stage}.result.springs"), values.get(f"{stage}.result.object_springs")
         if springs is not None and inner is not None:
             return int(springs - inner)
     return None
-
-
-def _seeds(count: int, of: int) -> str:
-    return f" with {count} of {of} seeds" if of > 1 else ""
 
 
 NOT_SETTINGS = ("seed", "device", "description", "batch")
@@ -107,67 +99,46 @@ ABSENT = "–"
 ABOUT = "Settings that differ between the rows, as the runs recorded them. A stage that a row does not have is not listed for it."
 
 
-@dataclass(frozen=True, kw_only=True)
-class Differing:
-    """A setting that not all rows have alike."""
+def differing(records: Iterable[RunRecord], labels: Mapping[str, str]) -> dict[str, str]:
+    """Settings that differ between methods, as `value: rows; value: rows` by dotted name with the stage in front.
 
-    setting: str
-    """Under its dotted name, with the stage in front."""
-    values: Mapping[str, tuple[str, ...]]
-    """Value to the labels of the rows that have it."""
-
-    @property
-    def text(self) -> str:
-        """`value: rows; value: rows`."""
-        return "; ".join(f"{value}: {', '.join(labels)}" for value, labels in self.values.items())
-
-
-def differing(records: Iterable[RunRecord], labels: Mapping[str, str]) -> list[Differing]:
-    """Settings that differ between methods; `labels` maps each to its name in the table, in order.
-
-    A setting that differs between scenarios is compared as the set of its values. Of a method without a stage, that alone is said.
+    `labels` maps each method to its name in the table, in order. A setting that differs between scenarios is compared as the set of
+    its values. Of a method without a stage, that alone is said.
     """
-    found: dict[str, dict[str, set[str]]] = {}
+    found: dict[str, dict[str, set[str]]] = {"stages": {}}
     stages: dict[str, set[str]] = {}
     for record in records:
         if record.method not in labels:
             continue
         stages.setdefault(record.method, set()).update(name for name in record.settings if name in STAGES)
-        for name, value in _settings(record).items():
-            found.setdefault(name, {}).setdefault(record.method, set()).add(_text(value))
+        for name, value in settings_of(record).items():
+            text = value if isinstance(value, str) else json.dumps(value)
+            found.setdefault(name, {}).setdefault(record.method, set()).add(text)
     methods = [method for method in labels if method in stages]
-    rows = [_row("stages", {m: {" + ".join(name for name in STAGES if name in stages[m])} for m in methods}, methods, labels)]
+    found["stages"] = {method: {" + ".join(name for name in STAGES if name in stages[method])} for method in methods}
+    rows: dict[str, str] = {}
     for name, by_method in found.items():
         stage = name.partition(".")[0]
-        have = [method for method in methods if stage == "method" or stage in stages[method]]
-        rows.append(_row(name, {method: by_method.get(method, {ABSENT}) for method in have}, have, labels))
-    return [row for row in rows if len(row.values) > 1]
+        values: dict[str, list[str]] = {}
+        for method in methods:
+            if stage in ("stages", "method") or stage in stages[method]:
+                values.setdefault(" or ".join(sorted(by_method.get(method, {ABSENT}))), []).append(labels[method])
+        if len(values) > 1:
+            rows[name] = "; ".join(f"{value}: {', '.join(names)}" for value, names in values.items())
+    return rows
 
 
-def _row(name: str, by_method: Mapping[str, set[str]], methods: Iterable[str], labels: Mapping[str, str]) -> Differing:
-    values: dict[str, tuple[str, ...]] = {}
-    for method in methods:
-        text = " or ".join(sorted(by_method[method]))
-        values[text] = (*values.get(text, ()), labels[method])
-    return Differing(setting=name, values=values)
-
-
-def _settings(record: RunRecord) -> dict[str, Any]:
-    """Every setting under its dotted name. A section of the name of its stage is not named twice."""
+def settings_of(record: RunRecord) -> dict[str, Any]:
+    """Every setting that makes a run's prediction, by its dotted name; a section of the name of its stage is not named twice."""
     named: dict[str, Any] = {}
     for stage, settings in record.settings.items():
         if stage in STAGES:
             values = {name.removeprefix(f"{stage}."): value for name, value in flat(settings).items()}
             named |= {f"{stage}.{name}": value for name, value in values.items() if name.split(".")[-1] not in NOT_SETTINGS}
-    switches = {name: record.variant[name] for name in ("search",) if name in record.variant}
-    return named | {f"method.{name}": value for name, value in switches.items()}
-
-
-def _text(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value)
+    return named | {f"method.{name}": record.variant[name] for name in ("search",) if name in record.variant}
 
 
 def differing_table(records: Iterable[RunRecord], labels: Mapping[str, str]) -> list[Table]:
     """The settings that differ between methods as a table; none where none does."""
-    rows = [[Cell(text=row.setting), Cell(text=row.text, wrap=True)] for row in differing(records, labels)]
+    rows = [[Cell(text=name), Cell(text=text, wrap=True)] for name, text in differing(records, labels).items()]
     return [Table(caption="Settings that differ", header=["Setting", "Value: rows"], rows=rows, note=ABOUT)] if rows else []

@@ -47,27 +47,19 @@ def write(table: pd.DataFrame, folder: Path) -> str:
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / "perception.csv", table.to_csv(index=False))
     columns = {key: value for key, value in COLUMNS.items() if key in table}
-    header = ["", "Scenes", *(heading for heading, _ in columns.values())]
     groups = [(str(name), rows) for name, rows in table.groupby("category", sort=True)]
-    if len(groups) > 1:
-        groups.append(("all", table))
-    lines = []
-    for name, rows in groups:
-        means = rows[list(columns)].mean()
+    rows = []
+    for name, part in [*groups, ("all", table)] if len(groups) > 1 else groups:
+        means = part[list(columns)].mean()
         cells = ["–" if pd.isna(means[key]) else format(means[key], style) for key, (_, style) in columns.items()]
-        lines.append([name, str(len(rows)), *cells])
+        rows.append([name, str(len(part)), *cells])
     sensors = ", ".join(sorted(set(table["sensor"]))) if "sensor" in table else "?"
     backends = " and ".join(f"{step}: {', '.join(sorted(set(table[step])))}" for step in ("segment", "track"))
-    text = "\n".join(
-        [
-            "# Perception against the truth",
-            "",
-            f"Means over scenes ({backends}; depth: {sensors}). Track: error of points on the object while they are followed.",
-            "Lifted: of the same points in the world; trusted: of those that move as their neighbors do, which losses use.",
-            "",
-            *Table.of_texts(header, lines).markdown(),
-            "",
-        ]
+    note = (
+        f"Means over scenes ({backends}; depth: {sensors}). Track: error of points on the object while they are followed.\n"
+        "Lifted: of the same points in the world; trusted: of those that move as their neighbors do, which losses use."
     )
+    header = ["", "Scenes", *(heading for heading, _ in columns.values())]
+    text = "\n".join(["# Perception against the truth", "", note, "", *Table.of_texts(header, rows).markdown(), ""])
     write_text(folder / "perception.md", text)
     return text

@@ -321,17 +321,41 @@ def _oracle_rows(cells: pd.DataFrame, columns: Columns, stub: int) -> list[list[
     return rows
 
 
+def _lines(
+    cells: pd.DataFrame, columns: Columns, lines: Callable[[str], Sequence[tuple[str, Callable[[Any, Metric], Cell]]]]
+) -> list[list[Cell]]:
+    """Rows of every label: `lines` of it are their names and what they show of a cell; a dash where there is no cell."""
+    rows: list[list[Cell]] = []
+    for label, part in _rows(cells):
+        for index, (name, show) in enumerate(lines(label)):
+            here = [(part.get((task, metric.name)), metric) for task, metric in columns]
+            values = [show(cell, metric) if cell else Cell(text=DASH) for cell, metric in here]
+            rows.append([Cell(text="" if index else label), Cell(text=name), *values])
+    return rows
+
+
+def _ours_cell(cell: Any, metric: Metric) -> Cell:
+    return Cell(text=_ours(cell, metric))
+
+
+def _interval_cell(cell: Any, metric: Metric) -> Cell:
+    return Cell(text=_interval(cell.low, cell.high, metric.paper_text) or DASH)
+
+
+def _change_cell(cell: Any, metric: Metric) -> Cell:
+    return Cell(text=our_change(cell, metric))
+
+
+def _direction_cell(cell: Any, _: Metric) -> Cell:
+    return Cell(chips=[verdict_chip(cell.direction)])
+
+
 def beyond_table(study: Study, cells: pd.DataFrame) -> Table:
     """Metrics that the paper does not have: ours, its interval, the change against the baseline and its verdict."""
-    columns, rows = _columns(cells), list[list[Cell]]()
-    for label, part in _rows(cells[~cells["oracle"]]):
-        here = [(part[task, metric.name], metric) for task, metric in columns]
-        rows.append([Cell(text=label), Cell(text="ours"), *(Cell(text=_ours(cell, metric)) for cell, metric in here)])
-        intervals = [_interval(cell.low, cell.high, metric.paper_text) or DASH for cell, metric in here]
-        rows.append([Cell(), Cell(text="95 %"), *(Cell(text=text) for text in intervals)])
-        if label != study.baseline:
-            rows.append([Cell(), Cell(text="change"), *(Cell(text=our_change(cell, metric)) for cell, metric in here)])
-            rows.append([Cell(), Cell(text="verdict"), *(Cell(chips=[verdict_chip(cell.direction)]) for cell, _ in here)])
+    values = [("ours", _ours_cell), ("95 %", _interval_cell)]
+    changes = [("change", _change_cell), ("verdict", _direction_cell)]
+    columns = _columns(cells)
+    rows = _lines(cells[~cells["oracle"]], columns, lambda label: values + (changes if label != study.baseline else []))
     rows += _oracle_rows(cells, columns, 2)
     note = (
         "TE bound: track error, in m, of points that move with the nodes around them. It is 0 for every rigid motion. TE has "
@@ -363,32 +387,23 @@ def both_trainings(study: Study, cells: pd.DataFrame, beside: Study, others: pd.
 def interval_table(cells: pd.DataFrame) -> Table:
     """The interval of our mean, and its distance from the paper's value, of finished rows."""
     finished = cells[cells["ours"].notna()]
-    columns, rows = _columns(finished), list[list[Cell]]()
     compared = bool(finished["difference"].notna().any())
-    for label, part in _rows(finished):
-        here = [(part.get((task, metric.name)), metric) for task, metric in columns]
-        intervals = [_interval(cell.low, cell.high, metric.paper_text) if cell else "" for cell, metric in here]
-        rows.append([Cell(text=label), Cell(text="95 %"), *(Cell(text=text or DASH) for text in intervals)])
-        if compared:
-            distances = [metric.paper_text(cell.difference, "+") if cell else DASH for cell, metric in here]
-            rows.append([Cell(), Cell(text="ours - paper"), *(Cell(text=text) for text in distances)])
+    lines = [("95 %", _interval_cell)]
+    if compared:
+        lines.append(("ours - paper", lambda cell, metric: Cell(text=metric.paper_text(cell.difference, "+"))))
     note = f"95 % bootstrap interval of our mean, over scenarios and seeds{'; ours minus the value of the paper' * compared}."
-    return _grouped("Intervals", note, ["Method", ""], columns, rows)
+    columns = _columns(finished)
+    return _grouped("Intervals", note, ["Method", ""], columns, _lines(finished, columns, lambda _: lines))
 
 
 def change_table(study: Study, cells: pd.DataFrame) -> Table:
     """The change against the baseline, in the paper and here."""
-    columns, rows = _columns(cells), list[list[Cell]]()
-    for label, part in _rows(cells[~cells["oracle"]]):
-        if label == study.baseline:
-            continue
-        here = [(part[task, metric.name], metric) for task, metric in columns]
-        printed = any(np.isfinite(cell.paper_change) for cell, _ in here)
-        if printed:
-            rows.append([Cell(text=label), Cell(text="paper"), *(Cell(text=paper_change(cell, metric)) for cell, metric in here)])
-        stub = [Cell(text="" if printed else label), Cell(text="ours")]
-        rows.append([*stub, *(Cell(text=our_change(cell, metric)) for cell, metric in here)])
-        rows.append([Cell(), Cell(text="verdict"), *(Cell(chips=[verdict_chip(cell.direction)]) for cell, _ in here)])
+    columns = _columns(cells)
+    others = cells[~cells["oracle"] & (cells["label"] != study.baseline)]
+    printed = set(others.loc[np.isfinite(others["paper_change"].astype(float)), "label"])
+    of_paper = [("paper", lambda cell, metric: Cell(text=paper_change(cell, metric)))]
+    ours = [("ours", _change_cell), ("verdict", _direction_cell)]
+    rows = _lines(others, columns, lambda label: of_paper + ours if label in printed else ours)
     in_db = " (PSNR: in dB)" if any(not metric.relative for _, metric in columns) else ""
     note = (
         f"Change against {study.baseline} on the same scenarios and seeds, in per cent of its mean{in_db}, with the paired 95 % "

@@ -399,8 +399,8 @@ def test_settings_that_differ_come_first_and_all_follow(small):
 
 def test_settings_are_read_from_the_runs_where_none_are_given(page):
     text = section(page, "setup")
-    assert "fit.epochs 200 5" in text
-    assert "search.rollouts 220 30" in text
+    assert "fit.fit.epochs 5" in text
+    assert "search.search.rollouts 30" in text
 
 
 def test_runs_of_several_commits_are_pointed_out(small):

@@ -81,8 +81,8 @@ def page(results) -> str:
 
 def test_settings_and_models_are_shown(page):
     text = section(page, "setup")
-    assert "baselines.spring_gaus.anchors 1024 77" in text
-    assert "baselines.spring_gaus.neighbors" not in text and "baselines.gs_dynamics" not in text
+    assert "train.anchors 77" in text
+    assert "train.neighbors" not in text
     assert "Method Model Search Regions" in text
     assert "spring_gaus spring_gaus – – – ignore_hands: true" in text
 

@@ -19,6 +19,7 @@ from neuspring.config import Config
 from neuspring.core.run_record import RunRecord, flat
 from neuspring.core.table import Cell, Table
 from neuspring.report.blocks import Block, Code, Fold, Grid, Items, Link, Prose, Section, Text
+from neuspring.report.explain import departures
 from neuspring.report.sections.data import UNREADABLE, ReportData, listed, several
 from neuspring.report.sections.pictures import embedded, link
 from neuspring.scores.runs import mixed_settings
@@ -115,8 +116,6 @@ COMMON = {
     "fit": "Fit",
 }
 """Switches of methods, and their headings. The model is shown only where a method has one."""
-SECTIONS = ("search", "simulation", "losses", "released_quirks", "fit")
-"""Sections of the configuration that the records of search and fit hold."""
 
 
 def setup_section(material: ReportData) -> Section:
@@ -159,55 +158,36 @@ def _short(name: str) -> str:
 
 
 def _settings(material: ReportData) -> list[Block]:
-    defaults = flat(config.plain(Config()))
+    caption = "Settings that differ from the defaults"
     if material.choice.settings is not None:
-        settings = config.plain(material.choice.settings)
-        changed = {key: {"": value} for key, value in flat(settings).items() if defaults.get(key) != value and key not in WHAT}
+        settings, defaults = config.plain(material.choice.settings), flat(config.plain(Config()))
+        changed = {key: value for key, value in flat(settings).items() if defaults.get(key) != value and key not in WHAT}
+        rows = [[key, _plain(defaults.get(key)), _plain(value)] for key, value in sorted(changed.items())]
+        table = Table.of_texts(["Setting", "Default", "Here"], rows, caption)
         text = yaml.safe_dump(settings, sort_keys=False, allow_unicode=True, width=120)
         return [
-            _changes("Settings that differ from the defaults", changed, defaults),
+            table if rows else Text(text="All settings have their defaults."),
             Fold(summary="Full configuration", blocks=[Code(text=text)]),
         ]
-    used = _used(material.runs)
+    used: dict[str, dict[str, str]] = defaultdict(dict)
+    for run in material.runs:
+        for name, value in departures(run.settings).items():
+            used[name].setdefault(run.method, _plain(value))
     if not used:
         return []
-    changed = {key: values for key, values in used.items() if any(value != defaults.get(key) for value in values.values())}
-    text = "Read from the run records, since no configuration was given: what search, fit and training were run with."
-    return [Text(text=text, tone="mute"), _changes("Settings that differ from the defaults", changed, defaults)]
-
-
-def _used(runs: Iterable[RunRecord]) -> dict[str, dict[str, Any]]:
-    """Setting to method to value, from the records of search, fit and baselines' training."""
-    used: dict[str, dict[str, Any]] = defaultdict(dict)
-    for run in runs:
-        for stage in (run.settings.get(name, {}) for name in ("search", "fit")):
-            sections = {name: stage[name] for name in SECTIONS if isinstance(stage.get(name), Mapping)}
-            for key, value in flat(sections).items():
-                used[key].setdefault(run.method, value)
-        own = {name: value for name, value in run.settings.get("train", {}).items() if name not in ("model", "seed")}
-        for key, value in flat(own, f"baselines.{run.model}.").items():
-            used[key].setdefault(run.method, value)
-    return dict(used)
-
-
-def _changes(caption: str, changed: Mapping[str, Mapping[str, Any]], defaults: Mapping[str, Any]) -> Block:
-    if not changed:
-        return Text(text="All settings have their defaults.")
-    rows = [
-        [Cell(text=key), Cell(text=_plain(defaults.get(key))), Cell(text=_by_method(values), wrap=True)]
-        for key, values in sorted(changed.items())
-    ]
-    return Table(caption=caption, header=["Setting", "Default", "Here"], rows=rows)
+    rows = [[Cell(text=name), Cell(text=_by_method(values), wrap=True)] for name, values in sorted(used.items())]
+    text = "Read from the run records, since no configuration was given: what the stages were run with."
+    return [Text(text=text, tone="mute"), Table(caption=caption, header=["Setting", "Here"], rows=rows)]
 
 
 def _plain(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _by_method(values: Mapping[str, Any]) -> str:
+def _by_method(values: Mapping[str, str]) -> str:
     groups: dict[str, list[str]] = defaultdict(list)
     for method, value in values.items():
-        groups[_plain(value)].append(method)
+        groups[value].append(method)
     if len(groups) == 1:
         return next(iter(groups))
     return "; ".join(f"{value} ({', '.join(names)})" for value, names in groups.items())

@@ -147,7 +147,7 @@ def failures_section(material: ReportData) -> Section:
     retried = [job for job in material.jobs if not job.failed and len(job.attempts) > 1 and job.last.outcome == "ok"]
     if retried:
         summary = f"{several(len(retried), 'job')} that succeeded after another attempt"
-        blocks.append(Fold(summary=summary, blocks=[_retried(retried)]))
+        blocks.append(Fold(summary=summary, blocks=[_jobs("Jobs", retried, material)]))
     if len(runs):
         blocks.append(_matrix(runs))
     return Section(key="failures", title="Failures and missing runs", blocks=blocks)
@@ -161,13 +161,14 @@ def _jobs(caption: str, jobs: Sequence[JobRecord], material: ReportData) -> Tabl
     rows = []
     for job in jobs[:MOST_ROWS]:
         last, log = job.last, material.results / job.log
-        tone = "warn" if last.outcome in ("transient", "running") else "bad"
-        outcome = Chip(text=last.outcome, tone=tone, symbol="!" if tone == "warn" else "✗")  # type: ignore[arg-type]
+        causes = dict.fromkeys(attempt.cause for attempt in job.attempts if attempt.cause)
+        tone, symbol = {"ok": ("good", "✓"), "transient": ("warn", "!"), "running": ("warn", "!")}.get(last.outcome, ("bad", "✗"))
+        outcome = Chip(text=last.outcome, tone=tone, symbol=symbol)  # type: ignore[arg-type]
         target = link(log, material.output.resolve().parent) if log.is_file() else ""
         rows.append(
             [
                 Cell(text=job.name),
-                Cell(text=last.cause, chips=[outcome]),
+                Cell(text=", ".join(causes), chips=[outcome]),
                 Cell(text=last.message, wrap=True),
                 Cell(text=str(len(job.attempts))),
                 Cell(text=duration(job.seconds), value=job.seconds),
@@ -176,15 +177,6 @@ def _jobs(caption: str, jobs: Sequence[JobRecord], material: ReportData) -> Tabl
         )
     header = ["Job", "Cause", "Message", "Attempts", "Time", "Log"]
     return Table(caption=caption, header=header, rows=rows, sortable=True, note=_rest(len(jobs)).strip())
-
-
-def _retried(jobs: Sequence[JobRecord]) -> Table:
-    rows = []
-    for job in jobs[:MOST_ROWS]:
-        causes = Counter(attempt.cause or attempt.outcome for attempt in job.attempts[:-1])
-        rows.append([Cell(text=job.name), Cell(text=str(len(job.attempts))), Cell(text=", ".join(causes))])
-    header = ["Job", "Attempts", "Causes"]
-    return Table(caption="Causes of earlier attempts", header=header, rows=rows, note=_rest(len(jobs)).strip())
 
 
 def _numerical(broken: pd.DataFrame) -> Table:
