@@ -23,14 +23,6 @@ from tests.gpu.differences import largest, relative
 from tests.gpu.parts import MARKED, NAMES, marked_files, parts, read_benchmark, read_tests
 
 ROOT = Path(__file__).parents[1]
-LIST = """
-import sys, pytest
-class List:
-    def pytest_collection_finish(self, session):
-        for item in session.items:
-            print("marked" if item.get_closest_marker("cuda") else "plain", item.nodeid)
-pytest.main(["--collect-only", "-qq", "-p", "no:cacheprovider", "-p", "no:xdist", *sys.argv[1:]], plugins=[List()])
-"""
 WRONG = 1.1
 """Factor of what a device in error answers: beyond every tolerance."""
 
@@ -197,15 +189,24 @@ def test_the_benchmark_is_a_short_one_on_a_cpu(tmp_path):
     assert on_cpu[-3:] == ["--device", "cpu", "--quick"] and on_gpu[-2:] == ["--device", "cuda:0"]
 
 
+class Collected:
+    """Plugin of pytest: names of the tests that it collects, and whether they are marked for a GPU."""
+
+    def pytest_collection_finish(self, session):
+        self.items = {item.nodeid: item.get_closest_marker("cuda") is not None for item in session.items}
+
+
 def test_every_test_on_a_gpu_is_selected():
     for path in (ROOT / "tests").rglob("test_*.py"):
         text = path.read_text()
         if re.search(r"(if|not) torch\.cuda\.is_available\(\)", text):
             assert MARKED.search(text), f"{path}: what needs a GPU takes its device or its mark from tests/support/devices.py"
-    command = [sys.executable, "-c", LIST, *marked_files()]
-    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    marked = re.findall(r"^marked (.+)$", listed, re.MULTILINE)
-    assert len(marked) > 50 and not [name for name in re.findall(r"^plain (.+)$", listed, re.MULTILINE) if "cuda:" in name]
+    listed = Collected()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(ROOT)
+        pytest.main(["--collect-only", "-qqs", "-p", "no:cacheprovider", "-p", "no:xdist", *marked_files()], plugins=[listed])
+    marked = [name for name, on_gpu in listed.items.items() if on_gpu]
+    assert len(marked) > 50 and not [name for name, on_gpu in listed.items.items() if "cuda:" in name and not on_gpu]
     assert {name.partition("::")[0] for name in marked} == set(marked_files())
 
 

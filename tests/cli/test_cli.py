@@ -2,6 +2,7 @@
 
 import json
 
+import pandas as pd
 import pytest
 
 from neuspring import config
@@ -50,6 +51,23 @@ def test_regions_and_fields_by_hand(tmp_path):
         assert (search.status, search.settings["clusters"], search.settings["seed"]) == ("ok", regions, 3)
         assert ("object_radius.1" in search.facts) == (regions == 2)
         assert (fit.status, fit.settings["kind"]) == ("ok", kind[-1] if kind else "springs")
+
+
+def test_a_numerical_failure_passes_through_every_stage_and_shows_in_the_table(tmp_path):
+    """No candidate can be integrated with a single substep, so the search fails numerically; no command does."""
+    settings = TINY | {"simulation": {"max_substeps": 1}, "search": {"rollouts": 11}}
+    common = ["--observations", str(observed(tmp_path)), "--device", "cpu"]
+    seen, folder = ["--observations", str(observed(tmp_path))], tmp_path / "toy_rope_lift_smooth" / "search_only" / "0"
+    found, rolled = folder / "search.json", folder / "rollout.json"
+    assert main(["search", *common, "--settings", json.dumps(settings), "--output", str(found)]) == 0
+    assert main(["rollout", *common, "--learned", str(found), "--output", str(rolled)]) == 0
+    run = ["--method", "search_only", "--search", str(found), "--rollout", str(rolled), "--output", str(folder / "run.json")]
+    assert main(["score", *seen, *run]) == 0
+    runs = ["--scenarios", "toy_rope_lift_smooth", "--methods", "search_only", "--seeds", "0"]
+    assert main(["tables", "--results", str(tmp_path), *runs, "--output", str(tmp_path / "tables")]) == 0
+    assert "0/1 (1 failed)" in (tmp_path / "tables" / "summary.md").read_text()
+    (row,) = pd.read_csv(tmp_path / "tables" / "runs.csv").to_dict("records")
+    assert row["status"] == "failed" and "none of 11 candidates could be simulated" in row["reason"]
 
 
 @pytest.mark.parametrize("clusters", ["0", "1000"])

@@ -5,7 +5,6 @@ import re
 import sys
 from datetime import datetime
 from itertools import pairwise
-from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -14,8 +13,7 @@ from neuspring import config
 from neuspring.core.job_records import read_jobs
 from neuspring.data.phystwin import released_cases
 from neuspring.experiments.jobs import gpus
-from tests.support.filmed import film, write_raw
-from tests.support.project import ROOT, SCENE, add_scenario, copy_workflow, jobs_in, output_of, run, start
+from tests.support.project import ROOT, SCENE, copy_workflow, jobs_in, output_of, run, start
 
 CHANGES = {"device": "auto", "seeds": [0, 1], "tracking": {"enabled": False}}
 
@@ -150,17 +148,3 @@ def test_the_whole_benchmark_is_planned_with_its_jobs(project, tmp_path):
     expected |= {"study": 5, "tables": 1, "report": 1, "all": 1}
     assert jobs_in(output) == expected
     assert f"Expected: {sum(expected.values()) - 1} jobs, " in output
-
-
-def test_damaged_data_of_one_scenario_stop_nobody_else_s_jobs(project):
-    case = write_raw(film(project / "mine" / "film", cameras=1), project / "data" / "film")
-    (case / "metadata.json").write_text("{")
-    (case / "color" / "0" / "1.png").unlink()
-    (case / "color" / "0" / "1.png").symlink_to(project / "gone.png")
-    add_scenario(project, "film", "phystwin_raw")
-    targets = [f"results/{name}/observations.npz" for name in (SCENE, "film")]
-    run(project, {"scenarios": [SCENE, "film"], "data_root": str(project / "data")}, "--", *targets, fails=True)
-    assert [Path(project / target).exists() for target in targets] == [True, False]
-    (record,) = [job for job in read_jobs(project / "results") if job.failed]
-    assert (record.rule, record.scenario) == ("capture", "film")
-    assert "metadata.json" in record.last.message

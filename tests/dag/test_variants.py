@@ -89,15 +89,6 @@ def names(folder: Path) -> list[str]:
     return [path.name for path in folder.iterdir()]
 
 
-def test_a_numerical_failure_stops_nothing_and_shows_in_the_table(project):
-    # No candidate can be integrated with a single substep, so the search fails numerically.
-    changes = {"simulation": {"max_substeps": 1}, "methods": ["search_only"], "tracking": {"enabled": False}}
-    assert "0/1 (1 failed)" in run(project, changes, "--", "results/tables/summary.md")
-    (row,) = pd.read_csv(project / "results" / "tables" / "runs.csv").to_dict("records")
-    assert row["status"] == "failed"
-    assert "none of 11 candidates could be simulated" in row["reason"]
-
-
 @pytest.mark.slow
 def test_fits_that_share_launches_end_as_they_would_one_by_one(project):
     """With `twins_per_launch: 1` there is no such job, and every twin is the same, bit for bit."""

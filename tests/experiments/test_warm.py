@@ -21,9 +21,11 @@ def server(tmp_path_factory):
     environment = os.environ | dict.fromkeys(warm.THREADS, "1")
     process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, env=environment)
     deadline = time.monotonic() + 60
-    while not path.exists():
+    # The socket is there a moment before it listens.
+    while not (first := begin(path, "--version")):
         assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.02)
+    first.wait()
     yield path
     process.stdin.close()
     assert process.wait(timeout=60) == 0
