@@ -5,12 +5,15 @@ from __future__ import annotations
 import ast
 import dataclasses
 import inspect
+import json
+import math
 import types
 import typing
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
+import yaml
 from pydantic.fields import FieldInfo
 
 from neuspring.config import rows, settings
@@ -99,21 +102,11 @@ def shown_default(spec: dataclasses.Field[Any]) -> str:
 
 
 def yaml_text(value: Any) -> str:
-    """A plain value in YAML's flow style; floats with a point, as the strict reader wants them."""
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(yaml_text, value))}]"
-    if value == "":
-        return '""'
-    if dataclasses.is_dataclass(value):
-        return f"{{{', '.join(f'{name}: {yaml_text(inner)}' for name, inner in vars(value).items())}}}"
+    """A default in YAML's flow style; floats with a point, as the strict reader wants them."""
     # Six digits: 1/6 is meant, not its last bit.
-    if not isinstance(value, float):
-        return str(value)
-    text = repr(float(f"{value:.6g}"))
-    # YAML reads 1e-15 as text.
-    return text if "." in text else text.replace("e", ".0e")
+    rounded = json.loads(json.dumps(value, default=vars), parse_float=lambda text: float(f"{float(text):.6g}"))
+    listed: str = yaml.safe_dump([rounded], default_flow_style=True, sort_keys=False, width=math.inf)
+    return listed.strip()[1:-1]
 
 
 def allowed(hint: Any) -> str:

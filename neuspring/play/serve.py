@@ -53,7 +53,7 @@ def start(
         server.stop()
         raise _taken(host, port, "another program has just taken it")
     # A page could ask viser to publish this server through a tunnel.
-    server.request_share_url = _no_tunnel  # type: ignore[method-assign]
+    server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
     server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="large")
     return server
 
@@ -86,10 +86,6 @@ def _is_visit(request: Any) -> bool:
     headers = request.headers
     navigates = (headers.get("Sec-Fetch-Mode"), headers.get("Sec-Fetch-Dest")) == ("navigate", "document")
     return navigates and "Upgrade" not in headers and VISIT.fullmatch(request.path) is not None
-
-
-def _no_tunnel(verbose: bool = True) -> None:
-    return None
 
 
 def _require_free(host: str, port: int) -> None:

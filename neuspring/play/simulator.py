@@ -102,14 +102,14 @@ def start_state(run: Run, seen: Observations, frame: int, repeat: bool) -> Start
 
 
 class Simulator:
-    """A twin's state, frame by frame. Equal controls give equal states, bit for bit, on a CPU."""
+    """A twin's state, frame by frame. Equal controls give equal states, bit for bit: it runs on the CPU."""
 
-    def __init__(self, twin: Twin, device: str = "cpu", start: Start | None = None) -> None:
+    def __init__(self, twin: Twin, start: Start | None = None) -> None:
         stability.check(twin)
         self.twin = twin
         self._start = start or Start()
-        self._device, self._load = device, stability.twin_spectrum(twin).load(twin.simulation.substep)
-        self._free = solver_for(self.twin, device, differentiable=False)
+        self._load = stability.twin_spectrum(twin).load(twin.simulation.substep)
+        self._free = solver_for(twin, "cpu", differentiable=False)
         self._held: dict[int, FrameSolver] = {}
         self.reset()
 
@@ -119,7 +119,7 @@ class Simulator:
         self.frame, self.grabbed = 0, -1
         x = start.positions if start.positions.size else topology.nodes
         v = start.velocity if start.velocity.size else np.zeros_like(x)
-        self._x, self._v = (torch.tensor(np.asarray(values, np.float32), device=self._device) for values in (x, v))
+        self._x, self._v = (torch.tensor(np.asarray(values, np.float32)) for values in (x, v))
         self.hands = (start.hands if start.hands.size else topology.controllers).astype(np.float32)
         self._holds = start.holds if start.holds.size else np.ones(len(topology.controllers), np.float32)
         self._grips = list(zip(start.grip_rows, start.grip_nodes, strict=True))
@@ -133,7 +133,7 @@ class Simulator:
     @property
     def positions(self) -> np.ndarray:
         """Nodes [N, 3], m."""
-        return np.asarray(self._x.cpu().numpy())
+        return np.asarray(self._x.numpy())
 
     def step(
         self, hands: np.ndarray, grabbed: int = -1, target: np.ndarray | None = None, holds: np.ndarray | None = None
@@ -157,13 +157,13 @@ class Simulator:
             if grabbed not in self._held:
                 if len(self._held) >= MOST_SOLVERS:
                     self._held.pop(next(iter(self._held)))
-                self._held[grabbed] = solver_for(self._with_grab(grabbed), self._device, differentiable=False)
+                self._held[grabbed] = solver_for(self._with_grab(grabbed), "cpu", differentiable=False)
             solver = self._held[grabbed]
         if begin.shape[1] == 4:
             # Each solver knows the grips of its own frames alone.
             rows = [_with_row(row, aim) if grabbed >= 0 else row for row, _ in grips]
             solver.resume(torch.tensor(np.array(rows).reshape(len(rows), *begin.shape)), [nodes for _, nodes in grips])
-        ends = (torch.tensor(np.asarray(values, np.float32), device=self._device) for values in (begin, end))
+        ends = (torch.tensor(np.asarray(values, np.float32)) for values in (begin, end))
         x, v = solver.forward(self._x, self._v, *ends)
         # NaN compares false.
         if not bool((x.abs() < FAR).all()):
