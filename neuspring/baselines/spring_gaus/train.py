@@ -25,8 +25,8 @@ import torch
 from neuspring.baselines import Pictures, TrainingRequest
 from neuspring.baselines.results import LIMIT, Trained, TrainingStopped, run_epochs
 from neuspring.baselines.spring_gaus import find_vgg16
-from neuspring.baselines.spring_gaus.model import AnchorGraph, Follower, SpringGausModel, choose_anchors
-from neuspring.baselines.spring_gaus.physics import AnchorSolver
+from neuspring.baselines.spring_gaus.model import Follower, SpringGausModel, choose_anchors
+from neuspring.baselines.spring_gaus.physics import AnchorGraph, AnchorSolver
 from neuspring.config import Config
 from neuspring.config.baselines import SpringGaus
 from neuspring.core.checkpoint import Checkpoint, adam_arrays, restore_adam
