@@ -36,14 +36,14 @@ TOOLS = {
     "study": ("results", "run records -> one of the paper's tables, beside the paper's values"),
     "explain": ("results", "a cell of a study's table -> the runs behind it, and how to make them again"),
     "report": ("results", "results folder -> one self-contained HTML file"),
-    "track-init": ("runs", "prepare the MLflow store, once before any run is logged"),
-    "log": ("runs", "log one run.json to MLflow"),
-    "sync": ("runs", "send to MLflow what is missing there, and close runs that were killed"),
-    "compare": ("runs", "runs of two commits, from MLflow -> paired differences"),
-    "ui": ("runs", "open the MLflow UI of a results folder"),
-    "tune": ("runs", "one worker of a sweep"),
-    "tune-report": ("runs", "a sweep -> summary, plots, best.yaml"),
-    "doctor": ("runs", "say what this machine can do, and what is missing"),
+    "track-init": ("results", "prepare the MLflow store, once before any run is logged"),
+    "log": ("results", "log one run.json to MLflow"),
+    "sync": ("results", "send to MLflow what is missing there, and close runs that were killed"),
+    "compare": ("results", "runs of two commits, from MLflow -> paired differences"),
+    "ui": ("results", "open the MLflow UI of a results folder"),
+    "tune": ("results", "one worker of a sweep"),
+    "tune-report": ("results", "a sweep -> summary, plots, best.yaml"),
+    "doctor": ("results", "say what this machine can do, and what is missing"),
 }
 """Command -> the module of neuspring.cli with a function of its name, and what it does."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")

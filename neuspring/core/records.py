@@ -151,7 +151,13 @@ class Recorder:
     ) -> None:
         self.stage, self.output = stage, output
         self.input_paths = dict(inputs or {})
-        self.inputs = {role: _digest_input(path) for role, path in self.input_paths.items()}
+        self.inputs: dict[str, str] = {}
+        for role, path in self.input_paths.items():
+            try:
+                self.inputs[role] = digest_file(path)
+            except OSError as error:
+                rule, remedy = "this file must be readable", "Run the step that makes it first."
+                raise InputError(path, rule, error.strerror, remedy) from error
         self.settings: dict[str, Any] = dict(settings or {})
         self.device = device
         self._started, self._start = now(), time.perf_counter()
@@ -193,10 +199,3 @@ class Recorder:
             machine=f"{platform.machine()}, Python {platform.python_version()}",
             versions={name: version(name) for name in COMPUTING},
         ).save(self.output)
-
-
-def _digest_input(path: Path) -> str:
-    try:
-        return digest_file(path)
-    except OSError as error:
-        raise InputError(path, "this file must be readable", error.strerror, "Run the step that makes it first.") from error

@@ -87,11 +87,6 @@ class RunFolder:
         """The run's twin; None if it has none."""
         return self.file("fit" if "fit" in self.stages else "search", "twin")
 
-    @property
-    def splats_file(self) -> Path | None:
-        """The splats that pictures of the run show, in frame 0."""
-        return self.file("appearance", "splats")
-
     @cached_property
     def twin(self) -> Twin | None:
         """The twin, where the method has one."""

@@ -107,6 +107,13 @@ class Lpips:
         linear = {f"lin{k}.model.1.weight": (1, channels, 1, 1) for k, channels in enumerate(CHANNELS[1:])}
         return cls(tensors[: len(LAYERS)], tensors[len(LAYERS) :], read_tensors(weights.heads, linear, device))
 
+    @classmethod
+    def configured(cls, settings: LpipsWeights, device: str) -> Lpips | str:
+        """As `load`, from the files of the configuration; one line that says which are missing."""
+        weights = configured_weights(settings)
+        # Their checksums have just been taken.
+        return weights if isinstance(weights, str) else cls.load(weights.backbone, weights.heads, device, trusted=True)
+
     def features(self, pictures: torch.Tensor) -> list[torch.Tensor]:
         """The output of each ReLU [B, channels, h, w] for normalized pictures [B, 3, H, W]."""
         from torch.nn.functional import conv2d, max_pool2d, relu

@@ -233,14 +233,6 @@ def _mean_errors(positions: np.ndarray, tracks: np.ndarray, carried: Callable[[n
     return mean
 
 
-def track_error_per_frame(positions: np.ndarray, observations: Observations) -> np.ndarray:
-    """Mean Euclidean track error per frame [T], m. A frame without any annotated track scores 0, as published.
-
-    NaN everywhere when no track is annotated at frame 0 (nothing can be matched).
-    """
-    return track_errors(positions, observations.tracks[: len(positions)])
-
-
 def errors_per_frame(positions: np.ndarray, observations: Observations) -> dict[str, np.ndarray]:
     """Every distance per frame [T], m, by the name of its metric; positions [T, N, 3]."""
     tracks = observations.tracks[: len(positions)]
@@ -316,6 +308,21 @@ def score_tasks(
                 identity = (scenario.name, scenario.category, method, seed, task, metric)
                 rows.append((*identity, float(usable.mean()), UNITS[metric], len(usable)))
     return _table(rows)
+
+
+def score_run(
+    trajectory: Trajectory | None, pictures: pd.DataFrame | None, observations: Observations, method: str, seed: int
+) -> pd.DataFrame:
+    """Scores of a prediction and, where there are any, of its pictures (`score_images`); none without a prediction."""
+    import pandas as pd
+
+    if trajectory is None:
+        return _table([])
+    scores = score(trajectory, observations, method, seed)
+    if pictures is None:
+        return scores
+    pictured = score_images(pictures, observations.scenario, len(trajectory.positions), method, seed)
+    return pd.concat([part for part in (scores, pictured) if len(part)] or [scores], ignore_index=True)
 
 
 def score_images(frames: pd.DataFrame, scenario: Scenario, drawn: int, method: str, seed: int) -> pd.DataFrame:

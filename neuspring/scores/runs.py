@@ -92,7 +92,8 @@ def collect(
             continue
         try:
             record = RunRecord.load(path)
-            tables = [_read_table(path, name) for name in _score_files(record)]
+            files = (record.scores_file, None if record.ok else record.held_file)
+            tables = [pd.read_parquet(path.parent / name)[list(COLUMNS)] if name else stacked([]) for name in files]
         except (OSError, ValueError, KeyError) as error:
             rows.append(identity | {"status": "failed", "reason": f"{DAMAGED}{one_line(error)}"})
             continue
@@ -123,15 +124,6 @@ def _paths(
 def one_line(error: Exception) -> str:
     """The error in one line."""
     return " ".join(str(error).split()) or type(error).__name__
-
-
-def _score_files(record: RunRecord) -> tuple[str | None, str | None]:
-    """The files of scores, and of those with the last frame frozen."""
-    return record.scores_file, None if record.ok else record.held_file
-
-
-def _read_table(path: Path, name: str | None) -> pd.DataFrame:
-    return pd.read_parquet(path.parent / name)[list(COLUMNS)] if name else stacked([])
 
 
 def _facts(record: RunRecord) -> dict[str, Any]:

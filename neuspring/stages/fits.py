@@ -7,8 +7,9 @@ would leave alone, and `fit` then continues from there: to its end, if nothing w
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -76,7 +77,7 @@ def fits(
     batches = batched(jobs, launch_size(twins_per_launch) or (WIDTHS[-1] if device == "cpu" else len(jobs)))
     facts["batches"] = [[job.output for job in batch] for batch in batches]
     for batch in batches:
-        results = run_batch([job.problem.twin for job in batch], device, [_work(job) for job in batch])
+        results = run_batch([job.problem.twin for job in batch], device, [partial(_fit, job) for job in batch])
         for job, result in zip(batch, results, strict=True):
             if isinstance(result, FitResult):
                 counts, frames = result.twin.counts, job.problem.frame_end - 1
@@ -105,14 +106,11 @@ def batched(jobs: Sequence[FitJob], most: int) -> list[list[FitJob]]:
     return [batch for batch in batches if len(batch) > 1]
 
 
-def _work(job: FitJob) -> Callable[[Lane], FitResult]:
+def _fit(job: FitJob, lane: Lane) -> FitResult:
     from neuspring.twin.fit import fit
 
-    def work(lane: Lane) -> FitResult:
-        job.checkpoint.parent.mkdir(parents=True, exist_ok=True)
-        return fit(job.problem, partial=job.checkpoint, key=job.key, lane=lane)
-
-    return work
+    job.checkpoint.parent.mkdir(parents=True, exist_ok=True)
+    return fit(job.problem, partial=job.checkpoint, key=job.key, lane=lane)
 
 
 def _is_done(job: Job) -> bool:

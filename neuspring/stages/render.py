@@ -59,16 +59,14 @@ def render(
     from neuspring.report.draw import images as figures
     from neuspring.report.draw.scene import chosen_frames
     from neuspring.report.video import Video
-    from neuspring.scores.lpips import Lpips, configured_weights
+    from neuspring.scores.lpips import Lpips
     from neuspring.scores.pictures import Scored, picture_scores
     from neuspring.splats.draw import orbit_view
 
     images, scenario = settings.images, observations.scenario
     require_length(capture, observations)
     scored = Scored.of(capture, masks_of_cameras(capture, paths(masks)), images, device)
-    weights = configured_weights(images.lpips)
-    # Their checksums have just been taken.
-    lpips = weights if isinstance(weights, str) else Lpips.load(weights.backbone, weights.heads, device, trusted=True)
+    lpips = Lpips.configured(images.lpips, device)
     trajectory = Trajectory.load(rollout.file("trajectory")) if rollout.has("trajectory") else None
     if trajectory is None or not len(trajectory.positions):
         raise NumericalFailure(rollout.record.reason)

@@ -6,17 +6,14 @@ import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from neuspring.core import provenance
-from neuspring.core.artifacts import Observations, Trajectory, Twin
+from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.records import StageRecord, digest_file, now
-from neuspring.core.run_folder import LEARNING, RunFolder
+from neuspring.core.run_folder import RunFolder
 from neuspring.core.run_record import RunRecord, flat, key_of
 from neuspring.stages.stage import MayFail, stage
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 PICTURE_ROLES = ("strip", "video", "turntable")
 """Files of the render stage to look at."""
@@ -47,96 +44,32 @@ def score(
     and render. `variant` are the method's switches. A run that failed also gets held.parquet: its scores with the last frame frozen
     that it reached.
     """
+    import numpy as np
     import pandas as pd
 
     from neuspring.core.files import write_table
+    from neuspring.report.draw import run as figures
     from neuspring.scores import metrics
     from neuspring.twin.hand_paths import with_hands
 
     began, folder = time.perf_counter(), output.parent
     given = {"search": search, "fit": fit, "train": train, "rollout": rollout, "appearance": appearance, "render": render}
     stages = RunFolder(folder, {name: before for name, before in given.items() if before})
-    paths = {name: before.path for name, before in stages.stages.items()}
     if stages.twin:
         observations = with_hands(observations, stages.twin)
-    frames_file = stages.file("render", "frames")
-    trajectory = stages.trajectory
+    scenario, trajectory, frames_file = observations.scenario, stages.trajectory, stages.file("render", "frames")
     pictures = pd.read_parquet(frames_file) if frames_file else None
-    scores = pd.DataFrame(columns=list(metrics.COLUMNS))
-    if trajectory is not None:
-        scores = metrics.score(trajectory, observations, method, seed)
-        if pictures is not None:
-            scores = _with_pictures(scores, pictures, len(trajectory.positions), observations, method, seed)
+    scores = metrics.score_run(trajectory, pictures, observations, method, seed)
     write_table(scores, folder / "scores.parquet")
-    frozen_file = (
-        _write_frozen(trajectory, pictures, observations, method, seed, folder) if rollout.record.status == "failed" else None
-    )
-    histories = {name: path.parent / "history.parquet" for name, path in paths.items() if _learned_steps(stages, name)}
-    artifacts = {"records": list(paths.values())} | _artifacts(
-        stages, observations, trajectory, pictures, histories, method, folder
-    )
-    content: dict[str, Any] = {
-        "scenario": observations.scenario.name,
-        "method": method,
-        "variant": flat(variant or {}),
-        "seed": seed,
-        "status": rollout.record.status,
-        "reason": rollout.record.reason,
-        "notes": _notes(stages.records),
-        "settings": {name: record.settings for name, record in stages.records.items()},
-        "data_digest": rollout.record.inputs["observations"],
-    }
-    seconds = {name: record.seconds for name, record in stages.records.items()} | {"score": round(time.perf_counter() - began, 3)}
-    RunRecord(
-        **content,
-        # Why LPIPS was not computed names places on this machine: beside the content, not in it.
-        images=_picture_facts(stages.records),
-        floors=metrics.floors(observations),
-        run_key=key_of(content, stages.results | {"scores": digest_file(folder / "scores.parquet")}),
-        source=observations.scenario.source,
-        category=observations.scenario.category,
-        attempt=max(record.attempts for record in stages.records.values()),
-        commit=provenance.commit(),
-        device=stages.maker.device,
-        started=min(record.started for record in stages.records.values()),
-        ended=now(),
-        params=_parameters(stages.records, variant or {}),
-        timings=seconds,
-        peak_memory_mb={name: record.peak_memory_mb for name, record in stages.records.items()},
-        machine=rollout.record.machine,
-        versions=stages.maker.versions,
-        scores_file="scores.parquet",
-        held_file=frozen_file,
-        histories={name: _relative(path, folder) for name, path in histories.items()},
-        artifacts={name: [_relative(path, folder) for path in files] for name, files in artifacts.items()},
-    ).save(output)
+    if rollout.record.status == "failed":
+        frozen = metrics.last_frame_frozen(trajectory, observations)
+        write_table(metrics.score_run(frozen, pictures, observations, method, seed), folder / "held.parquet")
 
-
-def _learned_steps(stages: RunFolder, name: str) -> bool:
-    return name in LEARNING and "history" in stages.records[name].files
-
-
-def _artifacts(
-    stages: RunFolder,
-    observations: Observations,
-    trajectory: Trajectory | None,
-    pictures: pd.DataFrame | None,
-    histories: Mapping[str, Path],
-    method: str,
-    folder: Path,
-) -> dict[str, list[Path]]:
-    """Kind -> files to look at or to load: the twin, plots that are drawn now, pictures of earlier stages."""
-    import numpy as np
-    import pandas as pd
-
-    from neuspring.report.draw import run
-
-    artifacts: dict[str, list[Path]] = {}
-    twin_file = stages.twin_file
-    searched_file = stages.file("search", "twin")
-    if twin_file:
-        artifacts["twin"] = [twin_file]
-    artifacts["plots"] = run.run_figures(
+    paths = {name: before.path for name, before in stages.stages.items()}
+    learned = [name for name in stages.learning if stages.stages[name].has("history")]
+    histories = {name: paths[name].with_name("history.parquet") for name in learned}
+    searched = stages.file("search", "twin")
+    plots = figures.run_figures(
         observations,
         trajectory,
         {name: pd.read_parquet(path) for name, path in histories.items()},
@@ -144,45 +77,53 @@ def _artifacts(
         folder / "plots",
         twin=stages.twin,
         # The search gives every spring the same stiffness.
-        searched=float(np.median(Twin.load(searched_file).material.stiffness)) if searched_file else None,
+        searched=float(np.median(Twin.load(searched).material.stiffness)) if searched else None,
     )
+    artifacts = {"records": list(paths.values())} | ({"twin": [stages.twin_file]} if stages.twin_file else {}) | {"plots": plots}
     if pictures is not None:
         named = [stages.file("appearance", "picture"), *(stages.file("render", role) for role in PICTURE_ROLES)]
         artifacts["images"] = [path for path in named if path]
         shown = pictures[pictures["frame"] < len(trajectory.positions)] if trajectory is not None else pictures
-        artifacts["plots"].append(run.image_scores_figure(shown, observations.scenario, method, folder / "plots"))
-    return artifacts
+        plots.append(figures.image_scores_figure(shown, scenario, method, folder / "plots"))
 
-
-def _with_pictures(
-    scores: pd.DataFrame, pictures: pd.DataFrame, frames: int, observations: Observations, method: str, seed: int
-) -> pd.DataFrame:
-    """Scores, and those of the first `frames` pictures."""
-    import pandas as pd
-
-    from neuspring.scores import metrics
-
-    pictured = metrics.score_images(pictures, observations.scenario, frames, method, seed)
-    return pd.concat([part for part in (scores, pictured) if len(part)] or [scores], ignore_index=True)
-
-
-def _write_frozen(
-    trajectory: Trajectory | None,
-    pictures: pd.DataFrame | None,
-    observations: Observations,
-    method: str,
-    seed: int,
-    folder: Path,
-) -> str:
-    """Write held.parquet: scores with the last finite frame repeated, or frame 0 where there is none. Returns the file's name."""
-    from neuspring.core.files import write_table
-    from neuspring.scores import metrics
-
-    frozen = metrics.last_frame_frozen(trajectory, observations)
-    scores = metrics.score(frozen, observations, method, seed)
-    if pictures is not None:
-        scores = _with_pictures(scores, pictures, len(frozen.positions), observations, method, seed)
-    return write_table(scores, folder / "held.parquet").name
+    records = stages.records
+    content: dict[str, Any] = {
+        "scenario": scenario.name,
+        "method": method,
+        "variant": flat(variant or {}),
+        "seed": seed,
+        "status": rollout.record.status,
+        "reason": rollout.record.reason,
+        "notes": _notes(records),
+        "settings": {name: record.settings for name, record in records.items()},
+        "data_digest": rollout.record.inputs["observations"],
+    }
+    params: dict[str, Any] = {"method": variant or {}}
+    for name, record in records.items():
+        params |= {name: record.settings, f"{name}.result": record.facts}
+    RunRecord(
+        **content,
+        # Why LPIPS was not computed names places on this machine: beside the content, not in it.
+        images=_picture_facts(records),
+        floors=metrics.floors(observations),
+        run_key=key_of(content, stages.results | {"scores": digest_file(folder / "scores.parquet")}),
+        source=scenario.source,
+        category=scenario.category,
+        attempt=max(record.attempts for record in records.values()),
+        commit=provenance.commit(),
+        device=stages.maker.device,
+        started=min(record.started for record in records.values()),
+        ended=now(),
+        params=flat(params),
+        timings={n: record.seconds for n, record in records.items()} | {"score": round(time.perf_counter() - began, 3)},
+        peak_memory_mb={name: record.peak_memory_mb for name, record in records.items()},
+        machine=rollout.record.machine,
+        versions=stages.maker.versions,
+        scores_file="scores.parquet",
+        held_file="held.parquet" if rollout.record.status == "failed" else None,
+        histories={name: _relative(path, folder) for name, path in histories.items()},
+        artifacts={name: [_relative(path, folder) for path in files] for name, files in artifacts.items()},
+    ).save(output)
 
 
 def _picture_facts(records: Mapping[str, StageRecord]) -> dict[str, Any] | None:
@@ -225,14 +166,6 @@ def _notes(records: Mapping[str, StageRecord]) -> list[str]:
         if record.facts.get("texels_moved", 1.0) < FEW_TEXELS:
             notes.append(f"{name}: only {record.facts['texels_moved']:.1%} of the texels moved by a tenth of their first scale")
     return notes
-
-
-def _parameters(records: Mapping[str, StageRecord], variant: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings and facts of all stages, under dotted names."""
-    nested: dict[str, Any] = {"method": variant}
-    for name, record in records.items():
-        nested |= {name: record.settings, f"{name}.result": record.facts}
-    return flat(nested)
 
 
 def _relative(path: Path, folder: Path) -> str:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from neuspring.baselines import BASELINES
 from neuspring.config import Config
-from neuspring.core.artifacts import Observations, Trajectory, Twin
-from neuspring.core.records import Before, Recorder
+from neuspring.core.artifacts import Observations, Twin
+from neuspring.core.records import Recorder
 from neuspring.stages.stage import MayFail, Written, stage
-
-Predictor = Callable[[Observations], tuple[Trajectory, int, dict[str, float]]]
-"""Another recording -> its prediction, the spring updates per frame that it took (0 for a model without springs), and how well the
-shapes fit (empty where the nodes are the same)."""
 
 
 @stage(
@@ -43,47 +39,35 @@ def transfer(
 
     from neuspring.core.files import write_table
     from neuspring.scores import metrics
+    from neuspring.twin.rollout import initial_velocity, roll_out
+    from neuspring.twin.transfer import move
 
     tables, diverged = [pd.DataFrame(columns=list(metrics.COLUMNS))], []
-    updates, registered = 0, {}
-    if learned.record.status == "ok":
-        predicts = (_baseline_predictor if learned.record.stage == "train" else _twin_predictor)(learned, settings, device)
-        for observations in targets:
-            trajectory, per_frame, fitted = predicts(observations)
-            if fitted:
-                registered[observations.scenario.name] = fitted
-            updates += (len(trajectory.positions) - 1) * per_frame
-            if trajectory.diverged_frame is not None:
-                diverged.append(observations.scenario.name)
-            frames = range(1, observations.scenario.frame_count)
-            tables.append(metrics.score_tasks(trajectory, observations, method, seed, {"transfer": frames}))
+    updates, registered, record = 0, {}, learned.record
+    twin = Twin.load(learned.file("twin")) if learned.has("twin") else None
+    for observations in targets if record.status == "ok" else ():
+        if twin is None:
+            trajectory = BASELINES[record.settings["model"]].predict(observations, learned.file("model"), None, device).trajectory
+        else:
+            result = move(
+                twin,
+                observations,
+                safety=settings.simulation.safety,
+                keep_lengths=bool(record.settings.get("fit", {}).get("rest_shape", {}).get("handles")),
+                keep_frame_time=record.settings["released_quirks"]["frame_time_667"],
+            )
+            velocity = initial_velocity(observations, result.twin.simulation.initial_velocity)
+            controllers, valid = observations.controller_points, observations.controller_valid
+            trajectory = roll_out(result.twin, controllers, device, velocity=velocity, valid=valid)
+            updates += (len(trajectory.positions) - 1) * result.twin.counts["springs"] * result.twin.counts["substeps"]
+            if result.facts:
+                registered[observations.scenario.name] = result.facts
+        if trajectory.diverged_frame is not None:
+            diverged.append(observations.scenario.name)
+        frames = range(1, observations.scenario.frame_count)
+        tables.append(metrics.score_tasks(trajectory, observations, method, seed, {"transfer": frames}))
     files = run.beside(scores="transfer.parquet")
     write_table(pd.concat([table for table in tables if len(table)] or tables), files["scores"])
     facts: dict[str, Any] = {"diverged": diverged, "targets": len(targets)} | ({"spring_updates": updates} if updates else {})
     facts |= {"registered": registered} if registered else {}
-    return Written(files=files, facts=facts, failure=learned.record.reason)
-
-
-def _baseline_predictor(learned: Before, settings: Config, device: str) -> Predictor:
-    """How a baseline's model predicts another recording."""
-    baseline = BASELINES[learned.record.settings["model"]]
-    return lambda observations: (baseline.predict(observations, learned.file("model"), None, device).trajectory, 0, {})
-
-
-def _twin_predictor(learned: Before, settings: Config, device: str) -> Predictor:
-    """How a twin predicts another recording."""
-    from neuspring.twin.rollout import initial_velocity, roll_out
-    from neuspring.twin.transfer import move
-
-    twin = Twin.load(learned.file("twin"))
-    keep_lengths = bool(learned.record.settings.get("fit", {}).get("rest_shape", {}).get("handles"))
-    keep_frame_time = learned.record.settings["released_quirks"]["frame_time_667"]
-
-    def predict(observations: Observations) -> tuple[Trajectory, int, dict[str, float]]:
-        safety = settings.simulation.safety
-        moved, laid = move(twin, observations, safety=safety, keep_lengths=keep_lengths, keep_frame_time=keep_frame_time)
-        velocity = initial_velocity(observations, moved.simulation.initial_velocity)
-        trajectory = roll_out(moved, observations.controller_points, device, velocity=velocity, valid=observations.controller_valid)
-        return trajectory, moved.counts["springs"] * moved.counts["substeps"], laid.facts if laid else {}
-
-    return predict
+    return Written(files=files, facts=facts, failure=record.reason)

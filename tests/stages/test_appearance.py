@@ -258,11 +258,6 @@ def test_a_camera_inside_the_object_is_named(scene, tmp_path):
         learn_from(scene, spoiled(scene, tmp_path / "inside", camera_to_world=pose.tolist()), tmp_path)
 
 
-def test_images_of_another_size_are_named(scene, tmp_path):
-    with pytest.raises(InputError, match=r"masks must have the frames and size of camera 0: \(6, 90, 200\).*\(6, 90, 160\)"):
-        learn_from(scene, spoiled(scene, tmp_path / "wide", width=200), tmp_path)
-
-
 def with_masks(scene: Scene, folder, labels: np.ndarray) -> list:
     """The scene's masks, camera 0's replaced."""
     folder.mkdir()

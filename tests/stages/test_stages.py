@@ -97,15 +97,6 @@ def test_scores_are_the_metrics_of_the_trajectory(finished):
     assert sorted(zip(expected["task"], expected["metric"], strict=True)) == sorted(pairs)
 
 
-def test_the_tracking_module_accepts_the_run_record(finished):
-    _, run, _ = finished
-    record = tracking.RunRecord.load(run)
-    assert record.status == "ok"
-    assert set(record.timings) == {"search", "fit", "rollout", "score"}
-    assert record.params["search.result.springs"] > 0
-    assert set(record.histories) == {"search", "fit"}
-
-
 def test_stages_that_simulate_count_their_spring_updates(finished, tmp_path):
     folder, run, _ = finished
     found, fitted = folder / "small/search-uniform/0/search.json", run.with_name("fit.json")
@@ -147,6 +138,8 @@ def test_regions_and_a_field_pass_through_every_stage(tmp_path):
     run = run_all(tmp_path, method="neuspring", settings=replace(SETTINGS, fit=fit))
     record = tracking.RunRecord.load(run)
     assert record.status == "ok"
+    assert set(record.timings) == {"search", "fit", "rollout", "score"} and set(record.histories) == {"search", "fit"}
+    assert record.params["search.result.springs"] > 0
     assert (record.params["search.clusters"], record.params["fit.kind"]) == (3, "field")
     assert {f"search.result.object_radius.{region}" for region in range(3)} <= record.params.keys()
     found = tmp_path / "small" / "search-piecewise_3" / "0" / "search.json"

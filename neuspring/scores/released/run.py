@@ -22,7 +22,7 @@ from neuspring.data import phystwin
 from neuspring.data.check import check_layout, find_cases
 from neuspring.data.phystwin import released_cases
 from neuspring.data.released import Released
-from neuspring.scores.lpips import Lpips, configured_weights
+from neuspring.scores.lpips import Lpips
 from neuspring.scores.released import checks
 from neuspring.scores.released.checks import MEAN, Absent, Comparison, Outcome, Published, Tools, of_means, require
 
@@ -80,7 +80,7 @@ def verify_released(
     if wrong := [check for check in checks if check not in CHECKS]:
         raise InputError("--checks", f"must be of {', '.join(map(str, CHECKS))}", wrong)
     device = resolve_device(device)
-    metric = _metric(lpips or LpipsWeights(), device) if 5 in checks else ""
+    metric = Lpips.configured(lpips or LpipsWeights(), device) if 5 in checks else ""
     tools = Tools(published=published or Published.load(), device=device, lpips=metric)
     names, findings = list(dict.fromkeys(scenarios)) or present, list[Comparison]()
     progress = Progress("verify", len(names), every=0.0)
@@ -93,21 +93,11 @@ def verify_released(
             observations = error
         findings += check_case(case, observations, sorted(set(checks)), tools)
         # After every scenario: all of them take hours on a CPU.
-        report = _report(findings, names[:done], tools)
+        complete = (*findings, *of_means(findings, tools.published))
+        report = Report(findings=complete, text=_text(complete, names[:done], tools.published, tools.device))
         _write(report, output)
         progress.update(done, name)
     return report
-
-
-def _report(findings: Sequence[Comparison], names: Sequence[str], tools: Tools) -> Report:
-    complete = (*findings, *of_means(findings, tools.published))
-    return Report(findings=complete, text=_text(complete, names, tools.published, tools.device))
-
-
-def _metric(settings: LpipsWeights, device: str) -> Lpips | str:
-    weights = configured_weights(settings)
-    # Their checksums have just been taken.
-    return weights if isinstance(weights, str) else Lpips.load(weights.backbone, weights.heads, device, trusted=True)
 
 
 def _present(root: Path) -> list[str]:
@@ -274,8 +264,13 @@ def check(folder: Path) -> list[Finding]:
     for case in cases:
         of_case, more = _check_case(case, tools)
         compared += of_case
-        # What a reader refuses is an error of the layout already.
-        findings += [one for one in more if not (one.level == "error" and _is_among(one, findings))]
+        errors = [one for one in findings if one.level == "error"]
+        findings += [
+            one
+            for one in more
+            # What a reader refuses is an error of the layout already; the reader's text goes on with the next move.
+            if one.level != "error" or not any(one.where == e.where and one.message.startswith(e.message) for e in errors)
+        ]
     if len(cases) > 1:
         findings += [_finding(mean, Path(folder)) for mean in of_means(compared, tools.published)]
     return findings
@@ -292,11 +287,6 @@ def _check_case(case: Released, tools: Tools) -> tuple[list[Comparison], list[Fi
         return [], [*reason, note(case.folder, "the reader refuses this case: conformance checks 1 to 4 skipped")]
     compared = check_case(case, observations, OF_DATA if case.loose else OF_RESULTS, tools)
     return compared, findings + [_finding(one, one.file or case.folder) for one in compared]
-
-
-def _is_among(error: Finding, findings: list[Finding]) -> bool:
-    """Whether `findings` hold this error; the text of a reader's error goes on with the next move."""
-    return any(error.where == one.where and error.message.startswith(one.message) for one in findings)
 
 
 def _finding(compared: Comparison, file: Path) -> Finding:

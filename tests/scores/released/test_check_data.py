@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
-import torch
 
 from neuspring.scores.released.run import check
 from tests.support.findings import holds, of_level, serious
@@ -56,17 +54,6 @@ def test_released_results_of_several_cases(tmp_path: Path) -> None:
     assert holds(findings, "note", tmp_path.name, "future track_error", "published 0.0220186 over 22")
 
 
-def test_other_springs_are_an_error(tmp_path: Path) -> None:
-    folder = write_case(tmp_path)
-    write_results(folder)
-    checkpoint = tmp_path / "experiments" / folder.name / "train" / "best_199.pth"
-    stored_values = torch.load(checkpoint, weights_only=True)
-    torch.save(stored_values | {"num_object_springs": 3}, checkpoint)
-    assert holds(check(folder), "error", "best_199.pth", "object springs", "differs from the released 3")
-    checkpoint.write_bytes(b"cos\nsystem\n(S'true'\ntR.")
-    assert holds(check(folder), "error", "best_199.pth", "weights_only")
-
-
 def test_bad_results_are_reported(tmp_path: Path) -> None:
     folder = write_case(tmp_path)
     write_results(folder)
@@ -82,15 +69,6 @@ def test_bad_results_are_reported(tmp_path: Path) -> None:
     assert holds(findings, "warning", "optimal_params.pkl", "unknown")
     dump(prediction, rest[:, :5])
     assert holds(check(folder), "error", "inference.pkl", "(10, 58, 3)", "(10, 5, 3)")
-
-
-@pytest.mark.parametrize("mirrored", [False, True])
-def test_the_deprojection_convention_is_told(tmp_path: Path, mirrored: bool) -> None:
-    folder = write_case(tmp_path, points=40)
-    write_raw_frame(folder, mirrored=mirrored)
-    convention = "W - c_x" if mirrored else "c_x"
-    findings = check(folder)
-    assert holds(findings, "note", "0.npz", f"lifted with {convention}: 0.000000 m", f"the data follow {convention}")
 
 
 def test_bad_raw_files_are_reported(tmp_path: Path) -> None:

@@ -413,8 +413,3 @@ def test_unknown_scenarios_checks_and_devices_are_refused(conforming, tmp_path, 
     with pytest.raises(InputError, match=named):
         verify_released(conforming, tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
-
-
-def test_a_root_without_data_is_refused(tmp_path):
-    with pytest.raises(InputError, match="different_types"):
-        verify_released(tmp_path, tmp_path / "out")
