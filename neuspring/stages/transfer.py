@@ -49,19 +49,19 @@ def transfer(
         if twin is None:
             trajectory = BASELINES[record.settings["model"]].predict(observations, learned.file("model"), None, device).trajectory
         else:
-            result = move(
+            moved, registration = move(
                 twin,
                 observations,
                 safety=settings.simulation.safety,
                 keep_lengths=bool(record.settings.get("fit", {}).get("rest_shape", {}).get("handles")),
                 keep_frame_time=record.settings["released_quirks"]["frame_time_667"],
             )
-            velocity = initial_velocity(observations, result.twin.simulation.initial_velocity)
+            velocity = initial_velocity(observations, moved.simulation.initial_velocity)
             controllers, valid = observations.controller_points, observations.controller_valid
-            trajectory = roll_out(result.twin, controllers, device, velocity=velocity, valid=valid)
-            updates += (len(trajectory.positions) - 1) * result.twin.counts["springs"] * result.twin.counts["substeps"]
-            if result.facts:
-                registered[observations.scenario.name] = result.facts
+            trajectory = roll_out(moved, controllers, device, velocity=velocity, valid=valid)
+            updates += (len(trajectory.positions) - 1) * moved.counts["springs"] * moved.counts["substeps"]
+            if registration:
+                registered[observations.scenario.name] = registration.facts
         if trajectory.diverged_frame is not None:
             diverged.append(observations.scenario.name)
         frames = range(1, observations.scenario.frame_count)
