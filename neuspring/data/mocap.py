@@ -239,8 +239,8 @@ def recording_findings(file: Path, raw: Any) -> list[Finding]:
         findings.append(broken(file, "", f"at least {MIN_FRAMES} frames are required", len(data)))
     bad = np.argwhere(~np.isfinite(data))
     if len(bad):
-        frame, axis, marker = (int(i) for i in bad[0])
-        place = f"{data[frame, axis, marker]} at frame {frame}, marker {marker} ({len(bad)} in all)"
+        t, axis, marker = (int(i) for i in bad[0])
+        place = f"{data[t, axis, marker]} at frame {t}, marker {marker} ({len(bad)} in all)"
         findings.append(broken(file, "", "every coordinate must be finite", place))
     if findings:
         return findings

@@ -171,8 +171,8 @@ def final_data_findings(path: Path, data: Any) -> list[Finding]:
         findings.append(broken(path, "object_points", "at least 2 frames are required", frames))
     hidden = np.flatnonzero(~data["object_visibilities"][0]) if frames else np.zeros(0, int)
     if len(hidden):
-        rule = "every tracked point must be visible in frame 0, which is the rest state"
-        findings.append(broken(path, "object_visibilities", rule, f"{len(hidden)} of {points} hidden, first: point {hidden[0]}"))
+        needed = "every tracked point must be visible in frame 0, which is the rest state"
+        findings.append(broken(path, "object_visibilities", needed, f"{len(hidden)} of {points} hidden, first: point {hidden[0]}"))
     return findings
 
 
