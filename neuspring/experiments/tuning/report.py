@@ -33,7 +33,7 @@ from neuspring.core.run_record import RUN_RECORD, RunRecord, key_of
 from neuspring.core.table import Table
 from neuspring.experiments.benchmark import read_methods, read_searches
 from neuspring.experiments.tuning.space import CLUSTERS, Plan, labels
-from neuspring.experiments.tuning.worker import DEFINITION, FACTS, VALUES, WORKER, Slot, slots, study_of
+from neuspring.experiments.tuning.worker import DEFINITION, WORKER, Slot, slots, study_of
 from neuspring.report.draw.sheet import DPI
 
 TABLES_OF_ROWS = {"method": "methods.yaml", "search": "searches.yaml"}
@@ -76,13 +76,12 @@ class Findings:
     def best(self) -> Slot | None:
         """The finished trial of least loss; of several, the first."""
         done = [slot for slot in self.slots if slot.state == "complete"]
-        return min(done, key=lambda slot: (slot.trials[-1].value, slot.number), default=None)
+        return min(done, key=lambda slot: (slot.loss, slot.number), default=None)
 
     @property
     def baseline(self) -> float | None:
         """Loss of the unchanged configuration, if trial 0 has finished."""
-        first = [slot for slot in self.slots if slot.number == 0 and slot.state == "complete"]
-        return first[0].trials[-1].value if first else None
+        return next((slot.loss for slot in self.slots if slot.number == 0), None)
 
 
 def report(settings: Config, tune: Tune, output: Path, root: Path = Path()) -> None:
@@ -111,12 +110,11 @@ def report(settings: Config, tune: Tune, output: Path, root: Path = Path()) -> N
 def _table(begun: Sequence[Slot], plan: Plan) -> pd.DataFrame:
     rows = []
     for slot in begun:
-        trial = slot.trials[-1]
-        facts = trial.user_attrs.get(FACTS, {})
+        trial, facts = slot.last, slot.facts
         last = trial.intermediate_values[trial.last_step] if trial.last_step is not None else None
         row: dict[str, Any] = {"trial": slot.number, "state": slot.state}
-        row |= {"loss": trial.value if slot.state == "complete" else None, "last_loss": last, "reason": slot.reason}
-        row |= dict.fromkeys(plan.tune.space) | labels(trial.user_attrs.get(VALUES, {}))
+        row |= {"loss": slot.loss, "last_loss": last, "reason": slot.reason}
+        row |= dict.fromkeys(plan.tune.space) | labels(slot.values)
         row |= {f"loss/{name}": value for name, value in facts.get("losses", {}).items()}
         row |= {f"seconds/{name}": round(value, 3) for name, value in facts.get("seconds", {}).items()}
         row |= {"attempts": len(slot.trials), "optuna_trial": trial.number, "worker": trial.user_attrs.get(WORKER)}
@@ -144,7 +142,7 @@ def write_best(findings: Findings, settings: Config, folder: Path, root: Path) -
     """
     if findings.best is None:
         return
-    plan, values = findings.plan, dict(findings.best.trials[-1].user_attrs[VALUES])
+    plan, values = findings.plan, dict(findings.best.values)
     name, method = tuned_name(plan.tune), plan.tune.method
     description = f"{method}, tuned: trial {findings.best.number} of sweep {plan.tune.study}"
     clusters = values.pop(CLUSTERS, None)
@@ -219,7 +217,7 @@ def _best_lines(findings: Findings, folder: Path) -> list[str]:
     plan, best, baseline = findings.plan, findings.best, findings.baseline
     if best is None:
         return ["No trial has finished, so there is no best one.", ""]
-    loss = best.trials[-1].value
+    loss = best.loss
     assert loss is not None
     if baseline is None:
         compared = "The unchanged configuration (trial 0) has not finished."
@@ -227,7 +225,7 @@ def _best_lines(findings: Findings, folder: Path) -> list[str]:
         compared = "That is the unchanged configuration: no trial was better."
     else:
         compared = f"The unchanged configuration (trial 0): {baseline:.4e} m²; a ratio of {loss / baseline:.3f}."
-    values, unchanged = labels(best.trials[-1].user_attrs[VALUES]), labels(plan.baseline)
+    values, unchanged = labels(best.values), labels(plan.baseline)
     lines = [
         "## Best",
         "",
@@ -293,11 +291,10 @@ def _draw(study: Study, folder: Path, *, importances: bool) -> None:
 
 def _record_trial(findings: Findings, slot: Slot, definition: Mapping[str, Any], folder: Path) -> None:
     """Write trials/<slot>/run.json and the files that it names, unless they are there."""
-    plan, trial = findings.plan, slot.trials[-1]
-    values, steps = trial.user_attrs.get(VALUES, {}), sorted(trial.intermediate_values.items())
+    plan, trial = findings.plan, slot.last
     times = {"started": _utc(trial.datetime_start), "ended": _utc(trial.datetime_complete or trial.datetime_start)}
-    facts = times | {"seconds": {}} | trial.user_attrs.get(FACTS, {})
-    scores = {"loss": trial.value} if slot.state == "complete" else {}
+    facts = times | {"seconds": {}} | slot.facts
+    scores = {"loss": slot.loss} if slot.state == "complete" else {}
     scores |= {f"loss/{name}": value for name, value in facts.get("losses", {}).items()}
     _write_record(
         plan.tune,
@@ -305,12 +302,12 @@ def _record_trial(findings: Findings, slot: Slot, definition: Mapping[str, Any],
         folder / "trials" / str(slot.number),
         facts,
         scores,
-        steps,
+        sorted(trial.intermediate_values.items()),
         scenario=f"trial-{slot.number}",
-        variant={"study": plan.tune.study, "method": plan.tune.method, "state": slot.state, **labels(values)},
+        variant={"study": plan.tune.study, "method": plan.tune.method, "state": slot.state, **labels(slot.values)},
         status="failed" if slot.state == "failed" else "ok",
         reason=slot.reason,
-        params=labels(plan.flat(values)),
+        params=labels(plan.flat(slot.values)),
         attempt=len(slot.trials),
         histories={"steps": "history.parquet"},
     )
@@ -319,18 +316,17 @@ def _record_trial(findings: Findings, slot: Slot, definition: Mapping[str, Any],
 def _record_sweep(findings: Findings, definition: Mapping[str, Any], files: Sequence[Path], folder: Path) -> None:
     """Write the run.json of the sweep. `files`, its tables and pictures, lie in `folder`."""
     tune, best = findings.plan.tune, findings.best
-    made = [slot.trials[-1].user_attrs[FACTS] for slot in findings.slots if slot.trials[-1].user_attrs.get(FACTS)]
-    made = made or [{"started": _utc(None), "ended": _utc(None), "seconds": {}}]
+    made = [slot.facts for slot in findings.slots if slot.facts] or [{"started": _utc(None), "ended": _utc(None), "seconds": {}}]
     facts = made[-1] | {"started": min(fact["started"] for fact in made), "ended": max(fact["ended"] for fact in made)}
     facts |= {"seconds": {name: sum(fact["seconds"].get(name, 0.0) for fact in made) for name in ("search", "fit")}}
-    scores = {"best": best.trials[-1].value if best else None, "baseline": findings.baseline}
+    scores = {"best": best.loss if best else None, "baseline": findings.baseline}
     _write_record(
         tune,
         definition,
         folder,
         facts,
         {name: value for name, value in scores.items() if value is not None},
-        [[slot.number, slot.state, slot.trials[-1].value] for slot in findings.slots],
+        [[slot.number, slot.state, slot.last.value] for slot in findings.slots],
         scenario="study",
         variant={"study": tune.study, "method": tune.method, "pruner": tune.pruner},
         status="ok" if best else "failed",

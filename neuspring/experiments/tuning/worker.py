@@ -110,15 +110,36 @@ class Slot:
     @property
     def state(self) -> Literal["complete", "pruned", "failed", "running", "waiting", "free"]:
         """Free: all its trials were left behind or crashed, too few times to give up. Waiting: about to run."""
-        last = self.trials[-1]
-        if last.state != TrialState.FAIL:
-            return last.state.name.lower()  # type: ignore[return-value]
-        return "failed" if REASON in last.user_attrs or len(self.trials) >= MOST_DEATHS else "free"
+        if self.last.state != TrialState.FAIL:
+            return self.last.state.name.lower()  # type: ignore[return-value]
+        return "failed" if REASON in self.last.user_attrs or len(self.trials) >= MOST_DEATHS else "free"
+
+    @property
+    def last(self) -> FrozenTrial:
+        """The newest trial."""
+        return self.trials[-1]
+
+    @property
+    def loss(self) -> float | None:
+        """Of a finished trial."""
+        return self.last.value if self.state == "complete" else None
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """How its trial went; empty before its end."""
+        facts: dict[str, Any] = self.last.user_attrs.get(FACTS, {})
+        return facts
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Setting -> value; empty before they are drawn."""
+        values: dict[str, Any] = self.last.user_attrs.get(VALUES, {})
+        return values
 
     @property
     def reason(self) -> str:
         """Why it was pruned or failed, empty otherwise."""
-        attributes = self.trials[-1].user_attrs
+        attributes = self.last.user_attrs
         if self.state not in ("pruned", "failed"):
             return ""
         given_up = f"given up after {len(self.trials)} attempts, the last: {attributes.get(CRASH, 'its worker was killed')}"
@@ -151,7 +172,7 @@ def claim(study: Study, worker: int, tune: Tune, first: Mapping[str, Any], sampl
         number = next((n for n in range(tune.trials) if n not in begun or begun[n].state == "free"), None)
         if number is None:
             return None
-        values = begun[number].trials[-1].params if number in begun else {}
+        values = begun[number].last.params if number in begun else {}
         study.enqueue_trial((dict(first) if number == 0 else {}) | values, user_attrs={SLOT: number})
     study.sampler = sampler(number)
     trial = study.ask()
