@@ -126,7 +126,7 @@ class ShapePriorSettings(Section):
     """Side of a voxel of the visual hull, m."""
     back: Literal["none", "symmetry", "fraction"] = "symmetry"
     """Where the hull ends if one camera alone shows the object in frame 0, so that its back is invented (with several cameras it is
-    carved, and this is not used). fraction: behind the seen surface by `back_fraction` of the silhouette's local width, rounded to
+    carved, and this is not used). fraction: behind the seen surface by 1.2 of the silhouette's local width, rounded to
     its edge. symmetry: where the seen surface is mirrored about the surface that the silhouette's rim spans. none: at the table, or
     `margin` behind what was seen."""
     mesh: str | None = None
