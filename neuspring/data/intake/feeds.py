@@ -89,13 +89,12 @@ class ImageFolder:
         """RGB [H, W, 3] uint8, or depth [H, W] as stored. Raises InputError for a damaged image or one of the wrong kind."""
         for path in self.files(places):
             if path.suffix.lower() == ".npy":
-                image = read_npy(path)
-            else:
-                image = cv2.imread(str(path), cv2.IMREAD_COLOR if self.kind == "color" else cv2.IMREAD_UNCHANGED)
-                if image is None:
-                    raise InputError(path, "this file must be a readable image", "a damaged file", "Copy it again from the camera.")
-                image = image[..., ::-1] if self.kind == "color" else image
-            yield require_kind(path, self.kind, image)
+                yield require_kind(path, self.kind, read_npy(path))
+                continue
+            image = cv2.imread(str(path), cv2.IMREAD_COLOR if self.kind == "color" else cv2.IMREAD_UNCHANGED)
+            if image is None:
+                raise InputError(path, "this file must be a readable image", "a damaged file", "Copy it again from the camera.")
+            yield require_kind(path, self.kind, image[..., ::-1] if self.kind == "color" else image)
 
     def files(self, places: Sequence[int]) -> list[Path]:
         """One per picture."""
