@@ -282,22 +282,34 @@ def last_frame_frozen(trajectory: Trajectory | None, observations: Observations)
     return Trajectory(positions=np.concatenate([positions, rest]), frame_count=frames)
 
 
-def score(trajectory: Trajectory, observations: Observations, method: str, seed: int) -> pd.DataFrame:
-    """Tidy scores, one row per task and metric.
+def score(
+    trajectory: Trajectory,
+    observations: Observations,
+    method: str,
+    seed: int,
+    errors: Mapping[str, np.ndarray] | None = None,
+) -> pd.DataFrame:
+    """Tidy scores, one row per task and metric; `errors` are `errors_per_frame`, where they are known already.
 
     There is no row, and never NaN, for a task without frames, a metric without annotation, a task that the rollout diverged in.
     """
     tasks = {task: task_frames(observations.scenario, task) for task in TASKS}
-    return score_tasks(trajectory, observations, method, seed, tasks)
+    return score_tasks(trajectory, observations, method, seed, tasks, errors)
 
 
 def score_tasks(
-    trajectory: Trajectory, observations: Observations, method: str, seed: int, tasks: Mapping[str, range]
+    trajectory: Trajectory,
+    observations: Observations,
+    method: str,
+    seed: int,
+    tasks: Mapping[str, range],
+    errors: Mapping[str, np.ndarray] | None = None,
 ) -> pd.DataFrame:
     """As `score`, for any tasks: `tasks` maps names to the frames that they average over."""
     scenario = observations.scenario
     rows = []
-    per_frame = errors_per_frame(trajectory.positions, observations) | marked_errors(trajectory.positions, observations)
+    known = errors_per_frame(trajectory.positions, observations) if errors is None else errors
+    per_frame = {**known, **marked_errors(trajectory.positions, observations)}
     for task, frames in tasks.items():
         if not len(frames) or frames[-1] >= len(trajectory.positions):
             continue
@@ -311,14 +323,19 @@ def score_tasks(
 
 
 def score_run(
-    trajectory: Trajectory | None, pictures: pd.DataFrame | None, observations: Observations, method: str, seed: int
+    trajectory: Trajectory | None,
+    pictures: pd.DataFrame | None,
+    observations: Observations,
+    method: str,
+    seed: int,
+    errors: Mapping[str, np.ndarray] | None = None,
 ) -> pd.DataFrame:
-    """Scores of a prediction and, where there are any, of its pictures (`score_images`); none without a prediction."""
+    """Scores of a prediction (`score`) and, where there are any, of its pictures (`score_images`); none without a prediction."""
     import pandas as pd
 
     if trajectory is None:
         return _table([])
-    scores = score(trajectory, observations, method, seed)
+    scores = score(trajectory, observations, method, seed, errors)
     if pictures is None:
         return scores
     pictured = score_images(pictures, observations.scenario, len(trajectory.positions), method, seed)

@@ -59,7 +59,8 @@ def score(
         observations = with_hands(observations, stages.twin)
     scenario, trajectory, frames_file = observations.scenario, stages.trajectory, stages.file("render", "frames")
     pictures = pd.read_parquet(frames_file) if frames_file else None
-    scores = metrics.score_run(trajectory, pictures, observations, method, seed)
+    errors = metrics.errors_per_frame(trajectory.positions, observations) if trajectory else None
+    scores = metrics.score_run(trajectory, pictures, observations, method, seed, errors)
     write_table(scores, folder / "scores.parquet")
     if rollout.record.status == "failed":
         frozen = metrics.last_frame_frozen(trajectory, observations)
@@ -75,6 +76,7 @@ def score(
         {name: pd.read_parquet(path) for name, path in histories.items()},
         method,
         folder / "plots",
+        errors=errors,
         twin=stages.twin,
         # The search gives every spring the same stiffness.
         searched=float(np.median(Twin.load(searched).material.stiffness)) if searched else None,

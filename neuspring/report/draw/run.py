@@ -47,13 +47,15 @@ def run_figures(
     method: str,
     folder: Path,
     *,
+    errors: Mapping[str, np.ndarray] | None = None,
     twin: Twin | None = None,
     searched: float | None = None,
 ) -> list[Path]:
     """Draw the figures of a run, and return the files.
 
     errors.png and motion.png need a trajectory, losses.png a history, topology.png and stiffness.png the run's last twin.
-    `searched` is the homogeneous stiffness that the search found, N, marked among the twin's.
+    `errors` are those of `metrics.errors_per_frame`, m, computed here if not given. `searched` is the homogeneous stiffness that
+    the search found, N, marked among the twin's.
     """
     title = f"{observations.scenario.name}, {method}"
     paths = []
@@ -61,7 +63,8 @@ def run_figures(
     for name in (*NAMES, IMAGE_SCORES):
         (folder / name).unlink(missing_ok=True)
     if trajectory is not None and len(trajectory.positions):
-        paths.append(save(_errors(observations, trajectory, title), folder / "errors.png"))
+        values = errors or errors_per_frame(trajectory.positions, observations)
+        paths.append(save(_errors(observations, values, title), folder / "errors.png"))
         paths.append(save(motion_figure(observations, trajectory, method), folder / "motion.png"))
     if histories:
         paths.append(save(losses_figure(histories, title), folder / "losses.png"))
@@ -76,10 +79,9 @@ def run_figures(
     return paths
 
 
-def _errors(observations: Observations, trajectory: Trajectory, title: str) -> Figure:
+def _errors(observations: Observations, values: Mapping[str, np.ndarray], title: str) -> Figure:
     figure, axis = plt.subplots(figsize=(7, 3.2), layout="constrained")
-    seconds = np.arange(len(trajectory.positions)) / observations.scenario.frame_rate
-    values = errors_per_frame(trajectory.positions, observations)
+    seconds = np.arange(len(values["track_error"])) / observations.scenario.frame_rate
     for metric, label, color in (
         ("track_error", "track error (Euclidean)", "tab:blue"),
         ("track_error_bound", "track error of bound points", "tab:green"),
