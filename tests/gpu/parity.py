@@ -37,7 +37,7 @@ from neuspring.twin.search import search
 from tests.gpu.differences import Difference, array, largest, relative
 from tests.support import golden_splats, small
 from tests.support.clips import NAMES, Clip, clip
-from tests.support.random_splats import random_splats, small_view
+from tests.support.golden_splats import random_splats, small_view
 
 QUIET_FRAME = 6
 ABSENT = "absent"

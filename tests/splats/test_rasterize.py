@@ -21,8 +21,7 @@ from neuspring.splats.rasterize import _gsplat_fault, choose_backend, rasterize,
 from neuspring.splats.train import Statistics, densify
 from neuspring.splats.view import LIMITS, Limits, View, boxes, harmonic_colors, project, radii
 from tests.support.devices import DEVICES
-from tests.support.golden_splats import CASES, Golden
-from tests.support.random_splats import random_splats, small_view
+from tests.support.golden_splats import CASES, Golden, random_splats, small_view
 
 CLOSE = "r04_culling"
 SINGLE = {"rgb": 2e-5, "alpha": 2e-5, "depth": 1e-4, "means": 1e-4, "conics": 1e-4, "gradient": 1e-4, "loss": 2e-5}
