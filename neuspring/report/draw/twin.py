@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -162,7 +162,7 @@ class TwinPicture:
         if not self.frame:
             joined = topology.springs[topology.object_spring_count :]
             ends = scene.view.project(np.concatenate([nodes, topology.controllers]))[0][joined]
-            style = {"colors": CONTROLLER, "linewidths": thick, "alpha": 0.5, "rasterized": many, "zorder": 2}
+            style: dict[str, Any] = {"colors": CONTROLLER, "linewidths": thick, "alpha": 0.5, "rasterized": many, "zorder": 2}
             axis.add_collection(LineCollection(list(ends), **style))
         near = np.argsort(-depth)
         near = near[depth[near] > 0]
@@ -217,7 +217,9 @@ def _regions(figure: Figure, body: TwinPicture, left: float, middle: float, *, c
     lonely = len(topology.nodes) - len(np.unique(topology.springs[topology.springs < len(topology.nodes)]))
     names = [f"region {k}" for k in range(count)] if count > 1 else ["one region"]
     dots = [Line2D([], [], ls="", marker="o", ms=4, color=color) for color in region_colors(count)]
-    extra = [(CROSSING, "between", int(between.sum()), "springs")] if count > 1 and body.style == "springs" else []
+    extra: list[tuple[Any, str, int, str]] = []
+    if count > 1 and body.style == "springs":
+        extra.append((CROSSING, "between", int(between.sum()), "springs"))
     if counted:
         ends = topology.labels[topology.springs[: topology.object_spring_count]]
         springs = [int(((ends == label).all(axis=1)).sum()) for label in labels]

@@ -180,9 +180,9 @@ def _panel(lines: Lines, styles: Mapping[str, Any], future: Scenario | None, cap
             end = future.frame_count / future.frame_rate
             axis.axvspan(future.train_end / future.frame_rate, end, color="#888", alpha=0.18, lw=0)
             axis.set_xlim(0, end)
-        values = np.concatenate([np.asarray(line.get_ydata(), float) for line in axis.lines])
-        values = values[np.isfinite(values)]
-        low, high = (values.min(), values.max()) if len(values) else (0.0, 0.0)
+        drawn = np.concatenate([np.asarray(line.get_ydata(), float) for line in axis.lines])
+        drawn = drawn[np.isfinite(drawn)]
+        low, high = (drawn.min(), drawn.max()) if len(drawn) else (0.0, 0.0)
         if future is None and 0 < 2 * low <= high:
             axis.set_yscale("log")
             axis.yaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 100 * low else (1.0, 2.0, 5.0), numticks=6))

@@ -175,9 +175,9 @@ def _settings(material: ReportData) -> list[Block]:
             used[name].setdefault(run.method, _plain(value))
     if not used:
         return []
-    rows = [[Cell(text=name), Cell(text=_by_method(values), wrap=True)] for name, values in sorted(used.items())]
+    cells = [[Cell(text=name), Cell(text=_by_method(values), wrap=True)] for name, values in sorted(used.items())]
     text = "Read from the run records, since no configuration was given: what the stages were run with."
-    return [Text(text=text, tone="mute"), Table(caption=caption, header=["Setting", "Here"], rows=rows)]
+    return [Text(text=text, tone="mute"), Table(caption=caption, header=["Setting", "Here"], rows=cells)]
 
 
 def _plain(value: Any) -> str:

@@ -53,10 +53,8 @@ def work_section(material: ReportData) -> Section:
     title = "Time and hardware"
     jobs = material.jobs
     if not jobs:
-        blocks: list[Block] = [Text(text="There are no job records: times are those of finished runs alone.", tone="mute")]
-        return Section(
-            key="work", title=title, blocks=[*blocks, timing_table(material.collected.runs)] if material.runs else blocks
-        )
+        note = Text(text="There are no job records: times are those of finished runs alone.", tone="mute")
+        return Section(key="work", title=title, blocks=[note, timing_table(material.collected.runs)] if material.runs else [note])
     attempts = [attempt for job in jobs for attempt in job.attempts]
     hosts = sorted({a.host for a in attempts if a.host})
     names = sorted({name for a in attempts for name in a.device_names})
