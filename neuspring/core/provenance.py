@@ -3,7 +3,7 @@
 Snakemake does not notice changes in imported code. Each rule therefore carries `code_digest(module)` as a parameter: the
 syntax trees, docstrings and comments stripped, of the module and of every package module it imports, directly or not. Editing
 `twin/fit.py` runs fits again; editing a docstring, or a table, runs no expensive step again. What a module imports by name
-(backends, readers, baselines) is named beside it (`neuspring.experiments.inputs`).
+(backends, readers, baselines) is named beside it (`neuspring.experiments.graph`).
 """
 
 from __future__ import annotations

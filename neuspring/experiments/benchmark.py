@@ -53,7 +53,7 @@ def chosen_part(config: Config, scenarios: Mapping[str, ScenarioRow]) -> Config:
     """The configuration with what `only` leaves of its scenarios, methods and seeds. Raises InputError for terms without match."""
     where = "configuration, only"
     rule = "terms scenario=..., category=..., method=..., seed=..., each with names or patterns separated by commas"
-    kept: dict[str, tuple[Any, ...]] = {"scenarios": config.scenarios, "methods": config.methods, "seeds": config.seeds}
+    kept: dict[str, Any] = {"scenarios": config.scenarios, "methods": config.methods, "seeds": config.seeds}
     try:
         terms = shlex.split(config.only)
     except ValueError as error:

@@ -303,12 +303,12 @@ class Graph:
             row = rows.searches[job.search]
             config = with_search(config, row, job.search)
             # These concern nothing where there is one region.
-            alone = {"tied_rollouts": Search().tied_rollouts} if row.clusters == 1 else {}
+            alone: dict[str, Any] = {"tied_rollouts": Search().tied_rollouts} if row.clusters == 1 else {}
             return dataclasses.replace(config, search=dataclasses.replace(config.search, **alone))
         if stage.name == "fit":
             method = rows.fits[job.method]
             config = with_search(with_method(config, method, job.method), rows.searches[method.searched], method.searched)
-            unread = {"field": SpringField()} if method.fit == "springs" else {}
+            unread: dict[str, Any] = {"field": SpringField()} if method.fit == "springs" else {}
             return dataclasses.replace(config, fit=dataclasses.replace(config.fit, **unread))
         if stage.name == "train":
             return with_method(config, rows.methods[job.method], job.method)
