@@ -223,9 +223,9 @@ class Graph:
 
     def options(self, stage: Stage, job: Any) -> dict[str, Any]:
         """The options of a job's stage, by name."""
-        return {name: self._option(name, job) for name in stage.options}
+        return {name: self._option(name, stage, job) for name in stage.options}
 
-    def _option(self, name: str, job: Any) -> Any:
+    def _option(self, name: str, stage: Stage, job: Any) -> Any:
         rows = self.benchmark
         match name:
             case "scenario":
@@ -244,7 +244,9 @@ class Graph:
                 return self.variant(job)
             case "rows":
                 return self._rows_of_fits(job.scenario)
-        return getattr(job, name)
+        # What the workflow does not know has the default of the signature; a required one is a wildcard.
+        option = stage.options[name]
+        return getattr(job, name) if option.required else getattr(job, name, option.default)
 
     def _rows_of_fits(self, scenario: str) -> str:
         """The fits of a scenario that share launches, by row of the method table, as JSON."""

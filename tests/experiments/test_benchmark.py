@@ -17,6 +17,7 @@ from neuspring.config import Config, Method, parse
 from neuspring.config.search import HANDS
 from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
+from neuspring.core.records import Before, Recorder
 from neuspring.experiments import benchmark as tables
 from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.graph import Graph
@@ -24,6 +25,7 @@ from neuspring.experiments.needs import check_storage
 from neuspring.experiments.tuning.space import Plan
 from neuspring.scores.paper import read_studies
 from neuspring.stages import STAGES
+from neuspring.stages.stage import Written, stage
 from tests.support.captures import describe
 from tests.support.colored import paint
 from tests.support.project import config_with
@@ -364,6 +366,17 @@ def test_methods_on_a_pool_have_searches_and_fits_of_their_own(tmp_path: Path) -
     assert [graph.options(STAGES["fit"], job)["leave_out"] for job in jobs.values()] == [False, False, True]
     assert [graph.variant(job).get("pool") for job in jobs.values()] == [None, "all", "others"]
     assert graph.variant(jobs["one"])["clusters"] == 1
+
+
+def test_a_new_stage_s_options_have_their_defaults_and_a_required_one_is_a_wildcard(tmp_path: Path) -> None:
+    @stage(output="{scenario}/{seed}/extent.json")
+    def extent(observations: Before, run: Recorder, seed: int, quantile: float = 0.5) -> Written:
+        raise AssertionError("not run")
+
+    graph = Graph(benchmark(tmp_path))
+    assert graph.options(extent, SimpleNamespace(scenario="a", seed=3)) == {"seed": 3, "quantile": 0.5}
+    with pytest.raises(AttributeError, match="seed"):
+        graph.options(extent, SimpleNamespace(scenario="a"))
 
 
 def test_scenarios_without_a_pool_are_left_out_of_its_methods_which_share_no_launches(tmp_path: Path) -> None:
