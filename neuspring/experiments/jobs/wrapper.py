@@ -285,7 +285,9 @@ class Watch:
 
     def _sample(self) -> None:
         start = last = time.monotonic()
-        interval, before, handles = INTERVAL, 0.0, []
+        interval, before = INTERVAL, 0.0
+        handles: list[Any] = []
+        library: Any
         with gpus.nvml() if self._devices else contextlib.nullcontext() as library:
             for device in self._devices if library else ():
                 with contextlib.suppress(Exception):  # a MIG slice: NVML does not measure it by this name
