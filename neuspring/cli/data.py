@@ -6,6 +6,7 @@ import os
 import sys
 import time
 import webbrowser
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -109,7 +110,7 @@ def make_capture(
     force: Annotated[bool, arg(help="replace the images of a capture that is there")] = False,
 ) -> None:
     """Color and depth of a camera -> a capture folder. What was found is printed, and the next command."""
-    from neuspring.data.intake.feeds import Bag, Raw, pairs
+    from neuspring.data.intake.feeds import Bag, CameraFeed, Raw, pairs
     from neuspring.data.intake.lenses import Board
     from neuspring.data.intake.make import Intake, make_capture
 
@@ -118,6 +119,7 @@ def make_capture(
         rule = "one of --color with --depth, --bag, --phystwin-raw is required"
         raise InputError("make-capture", rule, " ".join(given) or "none")
     raw = Raw.open(phystwin_raw) if phystwin_raw else None
+    views: Sequence[CameraFeed]
     if raw:
         views = raw.views
     elif bag:
