@@ -8,7 +8,7 @@ import pytest
 
 from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.errors import InputError
-from neuspring.core.findings import Finding, finding, findings_of, refuse_errors, told
+from neuspring.core.findings import Finding, finding, findings_as_facts, findings_of, refuse_errors
 from neuspring.core.records import Recorder
 from neuspring.data.capture import HANDS, OBJECT, Writer
 from neuspring.perception.findings import look_at_lifted, look_at_masks, look_at_observations, look_at_tracks, mask_facts
@@ -203,9 +203,9 @@ def test_findings_are_printed_kept_and_found_again(tmp_path, capsys):
     one = finding("a thing", "warning", "camera 0", "5 of it", "at most 3", "Look at it.")
     recorder = Recorder("segment", tmp_path / "scene" / "perception" / "0" / "masks.json")
     recorder.output.parent.mkdir(parents=True)
-    recorder.save(facts={"x": 1.0} | told([one]))
+    recorder.save(facts={"x": 1.0} | findings_as_facts([one]))
     assert capsys.readouterr().out == "warning: camera 0: a thing: 5 of it; at most 3. Look at it.\n"
     assert findings_of(tmp_path, "scene") == [one]
-    assert told([]) == {}
+    assert findings_as_facts([]) == {}
     (tmp_path / "scene" / "observations.json").write_text("{")
     assert findings_of(tmp_path, "scene") == [one]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pandas as pd
 import pytest
 
-from neuspring.core.findings import finding, told
+from neuspring.core.findings import finding, findings_as_facts
 from neuspring.core.records import Recorder
 from neuspring.report import page as report
 from neuspring.report.notes import honest_notes
@@ -84,7 +84,7 @@ def test_the_report_shows_findings_and_notes(tmp_path):
     recorder = Recorder("segment", results / "rope" / "perception" / "0" / "masks.json")
     recorder.output.parent.mkdir(parents=True)
     warning = finding("two objects", "warning", "camera 0", "2 pieces <far> apart", "one is expected", "Look at masks.png.")
-    recorder.save(facts=told([warning, replace(warning, level="note", name="quiet")]))
+    recorder.save(facts=findings_as_facts([warning, replace(warning, level="note", name="quiet")]))
     text = report.write(results, output, report.Options()).read_text()
     assert "Findings of perception" in text
     assert "2 pieces &lt;far&gt; apart; one is expected. Look at masks.png." in text
