@@ -24,7 +24,9 @@ NO_KERNELS_HERE: set[str] = set()
 """Modules that name `wp.kernel` for the kernels of others."""
 
 
-@pytest.mark.parametrize("architecture", ARCHITECTURES)
+@pytest.mark.parametrize(
+    "architecture", [ARCHITECTURES[0], *(pytest.param(one, marks=pytest.mark.slow) for one in ARCHITECTURES[1:])]
+)
 @pytest.mark.parametrize("module", modules())
 def test_every_kernel_compiles_for_gpus(module, architecture, tmp_path):
     found, entries = kernels(module), {}
