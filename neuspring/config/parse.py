@@ -45,6 +45,7 @@ _LEFT = {
         field.controllers rest_length_bound rest_prior rest_learning_rate
     """,
     "removed: splats follow the nodes that are nearest in each frame": "frozen_skinning",
+    "now losses of the whole configuration": "losses",
     "now color_rate": "colour_rate",
     "now neighborhood": "neighbourhood",
     "now outlier_neighbors": "outlier_neighbours",
@@ -57,7 +58,7 @@ _LEFT = {
     "a constant beside its user in neuspring/twin now": "betas freed_sigma hand_knots polish.step polish.tolerance",
     "a constant beside its user in neuspring/data now": "toy.frame_rate mocap.train_fraction",
     "a constant beside its user in neuspring/splats now": """
-        appearance.l1 densify_from densify_until densify_every densify_gradient split_size prune_opacity most_splats images.opacity
+        l1 densify_from densify_until densify_every densify_gradient split_size prune_opacity most_splats images.opacity
     """,
     "a constant beside its user in neuspring/baselines now": """
         coverage min_visible bound_anchors link_stiffness substeps_added substeps_raised spring_gaus.checkpoint_every
@@ -105,6 +106,10 @@ def _describe(problem: Any) -> str:
     hint = ""
     if isinstance(value, str) and problem["type"] in ("float_type", "int_type"):
         hint = " (YAML reads a number such as 5e-5 as text: write 5.0e-5)"
+    if path.endswith("images.released_quirks") and isinstance(value, dict):
+        hint = " (a list of names now; the key corner_pixels is images.corner_pixels now)"
+    if "released_quirks" in path and value == "corner_pixels":
+        hint = " (now images.corner_pixels: true)"
     message = problem["msg"].removeprefix("Value error, ")
     return f"{path}: {message[:1].lower()}{message[1:]}, received {masked(repr(value))}{hint}"
 

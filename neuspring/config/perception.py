@@ -120,7 +120,7 @@ class ShapePriorSettings(Section):
     """What the cameras do not see of the object in frame 0."""
 
     backend: Literal["auto", "none", "visual_hull", "mesh", "truth"] = "auto"
-    """auto: none for `thin` categories, else visual_hull. none: only what was seen. visual_hull: voxels carved by masks and depth.
+    """auto: none for cloth and packages, else visual_hull. none: only what was seen. visual_hull: voxels carved by masks and depth.
     mesh: a file, aligned to what was seen. truth: the surface of a synthetic capture, to measure what perception costs."""
     voxel: Positive = 0.003
     """Side of a voxel of the visual hull, m."""
@@ -128,7 +128,7 @@ class ShapePriorSettings(Section):
     """Where the hull ends if one camera alone shows the object in frame 0, so that its back is invented (with several cameras it is
     carved, and this is not used). fraction: behind the seen surface by 1.2 of the silhouette's local width, rounded to
     its edge. symmetry: where the seen surface is mirrored about the surface that the silhouette's rim spans. none: at the table, or
-    `margin` behind what was seen."""
+    a margin behind what was seen."""
     mesh: str | None = None
     """File of the mesh for `backend: mesh`."""
 

@@ -40,7 +40,7 @@ MOST_SHOWN = 6
 ANSWERED = (WITHIN, BETTER, WORSE)
 WITHOUT_DIRECTION = (study_cells.NOT_RUN, study_cells.NOT_COMPUTED, study_cells.NOTHING_TO_COMPARE, study_cells.NO_VALUE, ")")
 """Ends of verdicts on a change that name no direction; a bracket counts failed runs."""
-ORDER = (*("verdict", "studies", "scores", "curves", "pictures", "findings", "perception", "tuning", "work", "failures", "setup"),)
+ORDER = ("verdict", "studies", "scores", "curves", "pictures", "findings", "perception", "tuning", "work", "failures", "setup")
 Studies = Mapping[str, StudyNumbers]
 
 
@@ -77,7 +77,8 @@ def write(results: Path, output: Path, options: Options, written: str | None = N
     def page(shown: Section) -> str:
         # The sections that list damaged files are made last, because every other section may find some.
         last = {"pictures": shown, "failures": failures_section(material), "verdict": _summary(material, verdicts)}
-        sections = [(parts | last)[key] for key in ORDER if key in parts | last]
+        found = parts | last
+        sections = [found[key] for key in sorted(found, key=ORDER.index)]
         return html_page("NeuSpring: report", subtitle, sections, written=written)
 
     # Pictures take the room that all else leaves.

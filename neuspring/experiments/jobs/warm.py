@@ -146,15 +146,11 @@ def main(path: str) -> None:
                     watched.unregister(server)
                     server.close()
                 elif key.fileobj is server:
-                    connection, _ = server.accept()
-                    try:
-                        pid = _begin(connection)
-                    except (OSError, ValueError):  # its wrapper has gone
-                        connection.close()
-                        continue
-                    jobs[pid] = connection
-                    for file in (os.pidfd_open(pid), connection):
-                        watched.register(file, selectors.EVENT_READ, pid)
+                    with contextlib.suppress(OSError, ValueError):  # no more files, or its wrapper has gone: others go on
+                        pid, ended, connection = _begin(server, jobs)
+                        jobs[pid] = connection
+                        for file in (ended, connection):
+                            watched.register(file, selectors.EVENT_READ, pid)
                 elif key.data in jobs and key.fileobj is jobs[key.data]:
                     # The wrapper says nothing more: its connection is readable when it has gone, and then its job ends too.
                     os.kill(key.data, signal.SIGKILL)
@@ -170,19 +166,33 @@ def main(path: str) -> None:
                     os.close(key.fd)
 
 
-def _begin(connection: socket.socket) -> int:
-    """Fork the process of a job that is asked for, and tell its id. Raises OSError, ValueError."""
-    connection.settimeout(PATIENCE)
-    length, files, *_ = socket.recv_fds(connection, 4, MOST_FILES)
-    with connection.makefile("rb") as stream:
-        request = json.loads(stream.read(int.from_bytes(length)))
-    if (pid := os.fork()) == 0:
-        _run(request, *files)
-    for file in files:
-        os.close(file)
+def _begin(server: socket.socket, jobs: Mapping[int, socket.socket]) -> tuple[int, int, socket.socket]:
+    """Fork the process of a job that is asked for, and tell its id: the id, a file that is readable when it has ended, and the
+    connection to its wrapper. Raises OSError, ValueError."""
+    connection, _ = server.accept()
+    with contextlib.ExitStack() as begun:
+        begun.enter_context(connection)
+        connection.settimeout(PATIENCE)
+        length, files, *_ = socket.recv_fds(connection, 4, MOST_FILES)
+        for file in files:
+            begun.callback(os.close, file)
+        with connection.makefile("rb") as stream:
+            request = json.loads(stream.read(int.from_bytes(length)))
+        if (pid := os.fork()) == 0:
+            # A wrapper must see that this process has closed its end, whatever jobs of others go on.
+            for inherited in (server, connection, *jobs.values()):
+                inherited.close()
+            _run(request, *files)
+        try:
+            ended = os.pidfd_open(pid)
+        except OSError:
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+            raise
+        kept = connection.dup()
     with contextlib.suppress(OSError):
-        connection.sendall(f"{pid}\n".encode())
-    return pid
+        kept.sendall(f"{pid}\n".encode())
+    return pid, ended, kept
 
 
 def _run(request: Mapping[str, Any], output: int, *held: int) -> None:

@@ -108,8 +108,10 @@ class Plan:
     def is_whole(self, name: str) -> bool:
         """Whether a setting takes whole numbers only."""
         value, dimension = self.baseline[name], self.tune.space[name]
-        # A setting that may also be a number (null, auto) takes whole ones between whole ends.
-        return all(isinstance(one, int) for one in ([value] if isinstance(value, int | float) else [dimension.low, dimension.high]))
+        # A word (auto) may stand where a whole number can, null where any number can.
+        return isinstance(value, int) or (
+            isinstance(value, str) and isinstance(dimension.low, int) and isinstance(dimension.high, int)
+        )
 
     def _require_setting(self, name: str) -> None:
         where, section = f"tune.space, {name}", name.partition(".")[0]
@@ -131,6 +133,8 @@ class Plan:
             raise InputError(where, f"method {self.tune.method} has no first-order stage that would read it")
         if name.startswith("fit.field.") and self.method.fit != "field":
             raise InputError(where, f"method {self.tune.method} trains springs and reads no settings of a field")
+        if isinstance(inside, bool | list) and not self.tune.space[name].choices:
+            raise InputError(where, "is no number: `choices` are required", inside)
         if isinstance(self.tune.space[name].step, float) and self.is_whole(name):
             raise InputError(f"{where}, step", "must be a whole number", self.tune.space[name].step)
 

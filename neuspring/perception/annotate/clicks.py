@@ -51,8 +51,8 @@ FOUND_AGAIN = 0.85
 """Smallest correlation with the click's patch for a lost point to be found again."""
 SURROUND = 17
 """Side of the part of an image, pixels, from which compared patches are cut."""
-KEPT_IMAGES = 800
-"""Gray images that are kept."""
+KEPT_BYTES = 400_000_000
+"""Of gray images that are kept."""
 Title = Annotated[str, StringConstraints(min_length=1, max_length=80, pattern=r"^[^\x00-\x1f\x7f]+$")]
 CameraName = Annotated[str, StringConstraints(max_length=80)]
 
@@ -176,7 +176,9 @@ class GrayImages:
 
     def __init__(self, capture: Capture) -> None:
         self.capture = capture
-        self._read = lru_cache(KEPT_IMAGES)(lambda camera, frame: equalized(gray(capture, camera, frame)))
+        largest = max(view.width * view.height for view in capture.cameras.values())
+        kept = max(2, KEPT_BYTES // largest)
+        self._read = lru_cache(kept)(lambda camera, frame: equalized(gray(capture, camera, frame)))
 
     def __call__(self, camera: str, frame: int) -> np.ndarray:
         """The image. Raises InputError."""

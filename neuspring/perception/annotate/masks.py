@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from threading import Lock
@@ -26,7 +27,10 @@ MOST_MARKS = 2000
 class CarriedMasks:
     """Masks of one camera, as they were carried."""
 
-    carried: Carried
+    packed: Sequence[bytes]
+    """The labels of each frame, compressed: a long film would not fit into memory."""
+    doubt: np.ndarray
+    """[T], 0 sure, 1 doubtful."""
     marks: Marks
     """What they came from."""
     saved: bool = False
@@ -50,7 +54,7 @@ class MasksMode:
         with self._lock:
             carried = {
                 camera: {
-                    "doubt": [round(float(value), 3) for value in result.carried.doubt],
+                    "doubt": [round(float(value), 3) for value in result.doubt],
                     "saved": result.saved,
                     "stale": result.marks.of(camera) != marks.of(camera),
                 }
@@ -102,7 +106,7 @@ class MasksMode:
             carried = carry_camera(self.capture, camera, marks.of(camera), self.settings, progress=progress)
             doubtful += int((carried.doubt > 0.5).sum())
             with self._lock:
-                self._results[camera] = CarriedMasks(carried, marks)
+                self._results[camera] = CarriedMasks([zlib.compress(labels, 1) for labels in carried.labels], carried.doubt, marks)
         names = f"{'camera' if len(cameras) == 1 else 'cameras'} {', '.join(cameras)}"
         frames = f"{doubtful or 'no'} very doubtful frame{'' if doubtful == 1 else 's'}"
         return f"Carried {names}; {frames}. Look at the frames that are listed, then save."
@@ -112,7 +116,7 @@ class MasksMode:
         if source == "carried":
             with self._lock:
                 result = self._results.get(camera)
-            return result.carried.labels[frame] if result and self.capture.has(camera, frame) else None
+            return self._unpacked(camera, result.packed[frame]) if result and self.capture.has(camera, frame) else None
         exists = self.capture.has(camera, frame) and self.capture.path("mask", camera, frame).exists()
         return self.capture.mask(camera, frame) if source == "saved" and exists else None
 
@@ -126,11 +130,16 @@ class MasksMode:
         with self._saving:
             for camera, result in results.items():
                 source = source_digest(self.capture, camera, result.marks.of(camera), "marks", self.settings)
-                save_carried(self.capture, camera, result.carried, source, "marks")
+                carried = Carried(np.stack([self._unpacked(camera, labels) for labels in result.packed]), result.doubt)
+                save_carried(self.capture, camera, carried, source, "marks")
                 with self._lock:
                     if self._results.get(camera) is result:
                         self._results[camera] = replace(result, saved=True)
         return list(results)
+
+    def _unpacked(self, camera: str, labels: bytes) -> np.ndarray:
+        view = self.capture.cameras[camera]
+        return np.frombuffer(zlib.decompress(labels), np.uint8).reshape(view.height, view.width)
 
     def saved_cameras(self) -> list[str]:
         """Cameras with a mask in the capture."""

@@ -188,6 +188,10 @@ class Foreign(Exception):
     """tracks.json was there before, and nobody said that it may be replaced."""
 
 
+class Outdated(Exception):
+    """The clicks have changed while their points were followed."""
+
+
 class TracksMode:
     """State of the tracks mode, shared by all tabs: a thread follows the clicks, and only what changed is followed again."""
 
@@ -254,11 +258,15 @@ class TracksMode:
     def _work(self, wanted: int) -> None:
         """Follow all points, unless the clicks change meanwhile."""
         failure, points = "", []
+
+        def run(*click: Any) -> OneWay:
+            if self._wanted != wanted:
+                raise Outdated
+            return self._run(*click)
+
         try:
             for point in self.document.read()[1].points:
-                if self._wanted != wanted:
-                    return
-                trails, places, notes = follow_point(point, self._images, self._run, self._lift)
+                trails, places, notes = follow_point(point, self._images, run, self._lift)
                 shown = {
                     "name": point.name,
                     "trails": {camera: _listed(trail.places, 2) for camera, trail in trails.items()},
@@ -266,6 +274,8 @@ class TracksMode:
                     "notes": [asdict(note) for note in notes],
                 }
                 points.append((places, shown))
+        except Outdated:
+            return
         except InputError as error:
             failure, points = str(error), []
         except Exception as error:  # the thread goes on: the page must hear of it, and the terminal gets the trace
