@@ -53,11 +53,12 @@ class SpringGaus(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class GsDynamics(Section):
-    """A graph network that moves particles by what the hands do next, with a step per centimeter of hand motion."""
+    """A graph network that moves particles by what the hands do next, with a step per centimeter of hand motion.
 
-    preset: Literal["auto", "rope", "animals", "cloth"] = "auto"
-    """Public configuration from which keys that are null take their values. auto: by the scenario's category: rope and DLO cables
-    take rope, cloth and package take cloth, all others take animals."""
+    Keys that are null have the values of a public configuration, by the scenario's category: rope and DLO cables take rope, cloth
+    and package take cloth, all others take animals.
+    """
+
     radius: Positive | None = None
     """Distance below which nodes feel each other, m. rope 0.08, animals 0.08, cloth 0.075."""
     neighbors: Count | None = None

@@ -54,6 +54,7 @@ _LEFT = {
     "of a search now variables.NAME: {start: ...}": "start",
     "now lift.released": "sequential_motion_filter coordinate_outliers whole_pixels depth_window",
     "a third of the scenarios now": "warmup_scenarios",
+    "by the scenario's category now": "gs_dynamics.preset",
     "a constant in neuspring/config/search.py now": "polish.share",
     "a constant beside its user in neuspring/twin now": "betas freed_sigma hand_knots polish.step polish.tolerance",
     "a constant beside its user in neuspring/data now": "toy.frame_rate mocap.train_fraction",

@@ -254,9 +254,9 @@ def test_the_losses_by_hand():
 
 
 def test_presets_and_what_replaces_them():
-    named = [preset_name(GsDynamics(), name) for name in ("rope", "DLO1", "cloth", "package", "sloth", "blob")]
+    named = [preset_name(name) for name in ("rope", "DLO1", "cloth", "package", "sloth", "blob")]
     assert named == ["rope", "rope", "cloth", "cloth", "animals", "animals"]
-    rules, recipe = resolve(GsDynamics(preset="cloth", noise=0.0, neighbors=9), "rope")
+    rules, recipe = resolve(GsDynamics(noise=0.0, neighbors=9), "cloth")
     assert (rules.neighbors, rules.particles, recipe.noise, recipe.length_weight, recipe.batch) == (9, 150, 0.0, 0.1, 64)
     assert not resolve(GsDynamics(), "rope")[0].heights and rules.heights
 

@@ -94,10 +94,8 @@ class Recipe:
     batch: int
 
 
-def preset_name(settings: GsDynamics, category: str) -> PresetName:
+def preset_name(category: str) -> PresetName:
     """The preset of an object's category."""
-    if settings.preset != "auto":
-        return settings.preset
     # The cables of the motion-capture data are DLO1, DLO2, ...
     if category == "rope" or category.startswith("DLO"):
         return "rope"
@@ -106,7 +104,7 @@ def preset_name(settings: GsDynamics, category: str) -> PresetName:
 
 def resolve(settings: GsDynamics, category: str) -> tuple[Rules, Recipe]:
     """The settings of a model and of its training, with every null replaced by the value of the preset."""
-    values = dict(zip(PRESET_COLUMNS, PRESETS[preset_name(settings, category)], strict=True))
+    values = dict(zip(PRESET_COLUMNS, PRESETS[preset_name(category)], strict=True))
     values |= {"coverage": COVERAGE} | {name: value for name, value in vars(settings).items() if value is not None}
     rules, recipe = ({field.name: values[field.name] for field in fields(kind)} for kind in (Rules, Recipe))
     return Rules(**rules), Recipe(**recipe)

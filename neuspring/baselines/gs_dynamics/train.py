@@ -332,7 +332,7 @@ class Training:
         """Facts for the record."""
         return {
             "epochs": epochs,
-            "preset": preset_name(self.settings, self.category),
+            "preset": preset_name(self.category),
             "weights": len(self.network.weights),
             "windows": len(self.windows),
             "tracks": self.tracks.points.shape[1],
