@@ -70,9 +70,7 @@ if workflow.is_main_process:
 
 def finish():
     end()
-    messages.finished(
-        GRAPH, time.monotonic() - RUN.begun
-    )
+    messages.finished(GRAPH, time.monotonic() - RUN.begun)
 
 
 def give_up():

@@ -36,7 +36,9 @@ rule tables:
         runtime=NEEDS.minutes("tables"),
     params:
         arguments=GRAPH.tables(),
-        code=code_digest("neuspring.report.benchmark", "neuspring.report.sections.pictures"),
+        code=code_digest(
+            "neuspring.report.benchmark", "neuspring.report.sections.pictures"
+        ),
     shell:
         common_job("tables {params.arguments:q}")
 
