@@ -16,6 +16,7 @@ from argparse import ArgumentParser
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -44,6 +45,11 @@ class Film:
     @property
     def frame_count(self) -> int:
         return len(self.colors)
+
+    @property
+    def cameras(self) -> dict[str, SimpleNamespace]:
+        height, width = self.colors[0].shape[:2]
+        return {"0": SimpleNamespace(width=width, height=height)}
 
     def has(self, camera: str, frame: int) -> bool:
         return True
