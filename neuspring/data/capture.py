@@ -15,6 +15,7 @@ and has no files.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Mapping
@@ -25,6 +26,8 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 import cv2
 import numpy as np
+from PIL import Image
+from PIL.ExifTags import Base
 from pydantic import Field, TypeAdapter
 
 from neuspring.config import parse
@@ -37,6 +40,8 @@ from neuspring.core.geometry import Obstacle
 from neuspring.core.records import digest_file
 
 CAPTURE, TRACKS, POINTS = "capture.json", "tracks.json", "points.json"
+RECIPE = ".make-capture.json"
+"""What a folder is made of that make-capture has not finished. It is removed at the end."""
 NOTHING, OBJECT, HANDS = 0, 1, 2
 """Labels of masks."""
 TEXT_TOLERANCE = 1e-4
@@ -153,6 +158,11 @@ class Capture:
         description = read_description(path)
         refuse(description_findings(path, description))
         return cls(folder, description)
+
+    @staticmethod
+    def begun(folder: Path) -> bool:
+        """Whether a folder holds a capture, or one that is not finished."""
+        return (folder / CAPTURE).exists() or (folder / RECIPE).exists()
 
     @cached_property
     def cameras(self) -> dict[str, Camera]:
@@ -325,10 +335,18 @@ def images_digest(folder: Path) -> str:
 
 def read_description(path: Path) -> Description:
     """capture.json, every key and type checked. Raises InputError that lists each problem."""
+    require_finished(path.parent)
     values = load_json(path)
     if not isinstance(values, dict):
         raise InputError(path, "a JSON object is required", type(values).__name__)
     return parse(Description, values, str(path))
+
+
+def require_finished(folder: Path) -> None:
+    """Raise InputError for a folder that make-capture has begun and not finished."""
+    if (folder / RECIPE).exists() and not (folder / CAPTURE).exists():
+        remedy = "Give the same make-capture command again: it goes on where it stopped."
+        raise InputError(folder, "a whole capture is required", "one that make-capture has not finished", remedy)
 
 
 def description_findings(path: Path, description: Description) -> list[Finding]:
@@ -385,10 +403,26 @@ def read_image(path: Path, camera: Camera, flag: int, remedy: str = "") -> np.nd
     """A PNG of the camera's size, read with one of OpenCV's flags. Raises InputError, with `remedy` for a missing file."""
     if not path.is_file():
         raise InputError(path, "this image must exist", "no such file", remedy)
+    image = read_picture(path, flag)
+    _require_size(path, image, camera)
+    return image
+
+
+def read_picture(path: Path, flag: int) -> np.ndarray:
+    """An image by one of OpenCV's flags. Raises InputError for a damaged one, or one whose EXIF data turn it: some readers turn it,
+    others do not, and intrinsics and depth are of one of the two."""
+    with contextlib.suppress(OSError), Image.open(path) as header:
+        # Of a PNG without EXIF data PIL would decode the pixels to look for them.
+        turned = header.getexif().get(Base.Orientation, 1) if header.format != "PNG" or "exif" in header.info else 1
+        if turned not in (0, 1):
+            remedy = (
+                "Are intrinsics and depth those of the image as viewers show it? Then turn it: mogrify -auto-orient FILES. "
+                "Are they those of the sensor? Then remove the mark: exiftool -Orientation= FILES"
+            )
+            raise InputError(path, "an image must be stored upright, with EXIF orientation 1", turned, remedy)
     image = cv2.imread(str(path), flag)
     if image is None:
-        raise InputError(path, "this file must be a readable PNG", "a damaged file")
-    _require_size(path, image, camera)
+        raise InputError(path, "this file must be a readable image", "a damaged file", "Copy it again from where it was made.")
     return image
 
 

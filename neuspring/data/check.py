@@ -43,7 +43,7 @@ class Inspection:
         try:
             return reader(path)
         except InputError as error:
-            self.findings.append(Finding(name="", level="error", where=str(path), text=str(error).removeprefix(f"{path}: ")))
+            self.findings.append(refusal(error))
             return None
 
     def load_optional(self, path: Path, reader: Callable[[Path], Any], skipped: str) -> Any:
@@ -241,7 +241,7 @@ def render(findings: list[Finding]) -> str:
 
 
 def _captures(folder: Path) -> list[Path]:
-    return [path for path in (folder, *_subfolders(folder)) if (path / CAPTURE).exists()]
+    return [path for path in (folder, *_subfolders(folder)) if Capture.begun(path)]
 
 
 def _subfolders(folder: Path) -> list[Path]:

@@ -305,7 +305,8 @@ def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
             for kind, ending in (("color", "png"), ("depth", "npy")):
                 source, target = case / kind / name / f"{frame}.{ending}", folder / kind / name / f"{frame:05d}.{ending}"
                 if not source.is_file():
-                    raise InputError(source, "this image must exist", "no such file")
+                    remedy = f"Make a capture of the frames that are there: `neuspring make-capture --phystwin-raw {case}`."
+                    raise InputError(source, "this image must exist", "no such file", remedy)
                 make_way(target)
                 try:
                     os.link(source, target)

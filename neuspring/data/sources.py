@@ -107,6 +107,7 @@ def read_scenarios(path: Path) -> dict[str, ScenarioRow]:
 
 
 def _required_capture(folder: Path) -> None:
+    capture.require_finished(folder)
     if not (folder / capture.CAPTURE).exists():
         remedy = "Correct the path in the scenario table, or data_root, or make a capture: `neuspring make-capture --help`."
         raise InputError(folder, "a capture is a folder with capture.json", "a folder without", remedy)

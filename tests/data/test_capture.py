@@ -137,7 +137,7 @@ def test_missing_and_damaged_files_and_unknown_labels_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"camera 0 has images of 32 x 24; received 16 x 12\. Depth must be aligned to color"):
         capture.depth("0", 2)
     capture.path("color", "0", 2).write_bytes(b"no picture")
-    with pytest.raises(InputError, match="must be a readable PNG"):
+    with pytest.raises(InputError, match="must be a readable image"):
         capture.color("0", 2)
     cv2.imwrite(str(capture.path("depth", "0", 1)), np.zeros((24, 32), np.uint8))
     with pytest.raises(InputError, match="depth must be 16-bit integers"):

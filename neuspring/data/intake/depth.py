@@ -86,9 +86,9 @@ def find_rate(given: float | None, known: Sequence[float | None], step: int) -> 
     if not (np.isfinite(rate) and SLOWEST <= rate <= FASTEST):
         rule = f"frames per second of a camera lie between {SLOWEST:g} and {FASTEST:g}"
         raise InputError("--rate", rule, f"{rate:g}", "Give the rate at which it was filmed, not a time step.")
-    how = "given" if given is not None else "as the video says"
+    how = "given" if given is not None else "as the source says"
     if given is not None and told and abs(told[0] - given) > 0.02 * given:
-        how = f"given; the video says {told[0]:.3g}"
+        how = f"given; the source says {told[0]:.3g}"
     thinned = f", one in {step} of {rate:g}" if step > 1 else ""
     return rate / step, f"{rate / step:g} frames per second, {how}{thinned}"
 

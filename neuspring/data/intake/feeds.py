@@ -4,8 +4,8 @@ An image source has pictures of one kind (color or depth). A feed is one camera:
 the files say about the camera. `ImageFolder` and `VideoFile` are sources, `Paired` and `Bag` feeds. All have
 
     path         for messages
-    numbers      of every picture or pair, ascending: that in its name, or its place, from 0
-    rate         frames per second, where the files know
+    series       when every picture or pair was taken: see `moments`
+    rate(places) of a feed: frames per second, where the files know
     read(places) the pictures or pairs at ascending places
     files(places) the files that hold them
 """
@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import importlib
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
@@ -27,7 +27,8 @@ import numpy as np
 from neuspring.core.errors import InputError
 from neuspring.core.extras import needed
 from neuspring.data import phystwin
-from neuspring.data.capture import Camera, read_npy
+from neuspring.data.capture import Camera, read_npy, read_picture
+from neuspring.data.intake.moments import Series, matched, spans
 
 if TYPE_CHECKING:
     import av
@@ -39,8 +40,9 @@ VIDEOS = (".mkv", ".mp4", ".mov", ".avi", ".m4v", ".webm")
 DEEP = ("gray16le", "gray16be")
 """Pixel formats of a video that holds depth. Those of 10 and 12 bits would be scaled when they are read."""
 LOSSLESS = ("ffv1", "png", "rawvideo", "tiff", "apng")
-GAP = 1.5
-"""Pictures this many times farther apart than usual have others missing between them."""
+STAMP = re.compile(r"(?<![0-9])([0-9]{10,19})(\.[0-9]+)?(?![0-9])")
+SECOND = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}
+"""s per count of a time since 1970 with so many digits before the point."""
 
 
 def _picked(path: Path, pictures: Iterable[T], places: Sequence[int]) -> Iterator[T]:
@@ -62,7 +64,6 @@ class ImageFolder:
 
     path: Path
     kind: Kind
-    rate = None
 
     @cached_property
     def paths(self) -> list[Path]:
@@ -72,18 +73,25 @@ class ImageFolder:
         if len(endings) != 1:
             rule = f"{self.kind} images of one format are required ({' '.join(PICTURES[self.kind])})"
             raise InputError(self.path, rule, " and ".join(endings) or "none", "Color and depth need a folder of their own each.")
+        if None not in (times := {path: _stamp(path) for path in found}).values():
+            return sorted(found, key=lambda path: (times[path], path.stem))
         # re.split with a group alternates text and digits.
         return sorted(
             found, key=lambda path: [(p.isdigit(), int(p) if p.isdigit() else 0, p) for p in re.split(r"([0-9]+)", path.stem)]
         )
 
     @cached_property
-    def numbers(self) -> list[int]:
-        """The numbers at the end of the names where they differ in nothing else, else places from 0."""
-        matches = [match for path in self.paths if (match := re.fullmatch(r"(.*?)([0-9]{1,9})", path.stem))]
-        numbers = [int(match[2]) for match in matches]
-        counted = len({match[1] for match in matches}) == 1 and len(set(numbers)) == len(self.paths)
-        return numbers if counted else list(range(len(self.paths)))
+    def series(self) -> Series:
+        """By times since 1970 in the names, else by the only number in which the names differ, else places from 0."""
+        stems = [path.stem for path in self.paths]
+        times = np.array([_stamp(path) for path in self.paths], dtype=float)
+        if np.isfinite(times).all() and (np.diff(times) > 0).all():
+            return Series(list(range(len(stems))), times=times, clock="wall")
+        words = [re.split(r"([0-9]+)", stem) for stem in stems]
+        counts = list(zip(*(word[1::2] for word in words), strict=True)) if len({tuple(word[::2]) for word in words}) == 1 else []
+        moving = [column for column in counts if len(set(column)) > 1]
+        numbers = [int(digits) for digits in moving[0]] if len(moving) == 1 else []
+        return Series(numbers, named=True) if len(set(numbers)) == len(stems) else Series(list(range(len(stems))))
 
     def read(self, places: Sequence[int]) -> Iterator[np.ndarray]:
         """RGB [H, W, 3] uint8, or depth [H, W] as stored. Raises InputError for a damaged image or one of the wrong kind."""
@@ -91,9 +99,7 @@ class ImageFolder:
             if path.suffix.lower() == ".npy":
                 yield require_kind(path, self.kind, read_npy(path))
                 continue
-            image = cv2.imread(str(path), cv2.IMREAD_COLOR if self.kind == "color" else cv2.IMREAD_UNCHANGED)
-            if image is None:
-                raise InputError(path, "this file must be a readable image", "a damaged file", "Copy it again from the camera.")
+            image = read_picture(path, cv2.IMREAD_COLOR if self.kind == "color" else cv2.IMREAD_UNCHANGED)
             yield require_kind(path, self.kind, image[..., ::-1] if self.kind == "color" else image)
 
     def files(self, places: Sequence[int]) -> list[Path]:
@@ -107,68 +113,98 @@ class VideoFile:
 
     path: Path
     kind: Kind
+    track: int | None = None
+    """Which of its video tracks, from 0; None: the first."""
 
     @cached_property
-    def _times(self) -> list[Fraction]:
-        """s, of every picture, ascending. Raises InputError for a file without video, or one that is stored turned."""
-        with _opened(self.path) as container:
-            stream = container.streams.video[0]
+    def tracks(self) -> list[str]:
+        """What its video tracks hold."""
+        with self._opened() as (container, _):
+            return [f"{s.name} {s.width} x {s.height} {s.pix_fmt}" for s in _films(container)]
+
+    @cached_property
+    def series(self) -> Series:
+        """By the times of its pictures as they are decoded: a trimmed file holds more than it shows.
+
+        Raises InputError for a file without video, or one that is stored turned.
+        """
+        with self._opened() as (container, stream):
+            tracks = len(_films(container))
             if self.kind == "depth" and stream.codec_context.pix_fmt not in DEEP:
                 remedy = "Color maps and 8 bits lose the depth: store gray16le in FFV1 (mkv), or a folder of 16-bit PNG."
+                if tracks > 1 and self.track is None:
+                    remedy = f"It has {tracks} video tracks: name that of depth, like {self.path}#1."
                 raise InputError(self.path, "a depth video must be gray with 16 bits", stream.codec_context.pix_fmt, remedy)
             if self.kind == "depth" and stream.codec_context.name not in LOSSLESS:
                 rule = f"a depth video must be lossless ({' '.join(LOSSLESS)})"
                 raise InputError(self.path, rule, stream.codec_context.name, "Store gray16le in FFV1 (mkv).")
-            first = next(container.decode(stream), None)
-            if first is not None and first.rotation:
-                remedy = "Write it upright, as the intrinsics are: ffmpeg -i VIDEO -crf 12 upright.mp4"
-                raise InputError(self.path, "a video must be stored upright", f"turned by {first.rotation} degrees", remedy)
-        with _opened(self.path) as container:
-            stream = container.streams.video[0]
-            base = stream.time_base or Fraction(1)
-            return sorted(packet.pts * base for packet in container.demux(stream) if packet.pts is not None and packet.size)
-
-    @cached_property
-    def _steps(self) -> np.ndarray:
-        """s, from each picture to the next."""
-        return np.diff([float(time) for time in self._times])
-
-    @property
-    def numbers(self) -> list[int]:
-        """Places from 0."""
-        return list(range(len(self._times)))
-
-    @property
-    def rate(self) -> float | None:
-        """The mean distance of pictures decides, as time stamps may be whole milliseconds; gaps of dropped ones do not count."""
-        steps = self._steps
-        return float(1 / steps[steps <= GAP * np.median(steps)].mean()) if len(steps) else None
-
-    def dropped(self) -> int:
-        """Pictures that are missing in between."""
-        steps = self._steps
-        return int(np.round(steps[steps > GAP * np.median(steps)] / np.median(steps) - 1).sum()) if len(steps) else 0
+            base, stamps = float(stream.time_base or 1), []
+            for frame in container.decode(stream):
+                if not stamps and frame.rotation:
+                    remedy = "Write it upright, as the intrinsics are: ffmpeg -i VIDEO -crf 12 upright.mp4"
+                    raise InputError(self.path, "a video must be stored upright", f"turned by {frame.rotation} degrees", remedy)
+                stamps.append(np.nan if frame.pts is None else frame.pts * base)
+            if not stamps:
+                raise InputError(self.path, "a video must have pictures", "none")
+            numbers, times = list(range(len(stamps))), np.sort(stamps)
+            if not np.isfinite(times).all() or not (np.diff(times) > 0).all():
+                return Series(numbers)
+            # Tracks of one file have one clock; of a file alone the first picture is the start.
+            return Series(numbers, times=times if tracks > 1 else times - times[:1], clock=str(self.path) if tracks > 1 else "")
 
     def read(self, places: Sequence[int]) -> Iterator[np.ndarray]:
         """As a folder. The video is decoded from its beginning. Raises InputError where it ends early."""
         form = "rgb24" if self.kind == "color" else "gray16le"
-        with _opened(self.path) as container:
-            try:
-                for frame in _picked(self.path, container.decode(container.streams.video[0]), places):
-                    yield require_kind(self.path, self.kind, frame.to_ndarray(format=form))
-            except needed("av").error.FFmpegError as error:
-                raise InputError(self.path, "this video must be readable", str(error)) from error
+        with self._opened() as (container, stream):
+            for frame in _picked(self.path, container.decode(stream), places):
+                yield require_kind(self.path, self.kind, frame.to_ndarray(format=form))
 
     def files(self, places: Sequence[int]) -> list[Path]:
         """The video."""
         return [self.path]
+
+    @contextmanager
+    def _opened(self) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
+        """The file with its track. Raises InputError for what is no video, or is damaged."""
+        needed("av")
+        import av
+
+        try:
+            with av.open(str(self.path)) as container:
+                films, track = _films(container), self.track or 0
+                if track >= len(films):
+                    received = f"track {track}" if films else "none"
+                    raise InputError(self.path, f"a video track is required; the file has {len(films)}, from 0", received)
+                films[track].thread_type = "AUTO"
+                yield container, films[track]
+        except (av.error.FFmpegError, OSError) as error:
+            raise InputError(self.path, "this file must be a readable video", str(error)) from error
+
+
+def _films(container: av.container.InputContainer) -> list[av.VideoStream]:
+    """Video tracks that are not the picture of a cover."""
+    import av.stream
+
+    return [s for s in container.streams.video if not s.disposition & av.stream.Disposition.attached_pic]
+
+
+def _stamp(path: Path) -> float | None:
+    """s since 1970 of a name with such a time, in s with a fraction, ms, us or ns."""
+    found = STAMP.search(path.stem)
+    if not found or len(found[1]) not in SECOND or not (found[2] or len(found[1]) > min(SECOND)):
+        return None
+    time = (int(found[1]) + float(found[2] or 0)) * SECOND[len(found[1])]
+    return time if time > 1e9 else None
 
 
 ImageSource: TypeAlias = ImageFolder | VideoFile
 
 
 def open_images(path: Path, kind: Kind) -> ImageSource:
-    """A folder or a video. Raises InputError for anything else."""
+    """A folder or a video, FILE or FILE#TRACK. Raises InputError for anything else."""
+    file, mark, track = str(path).rpartition("#")
+    if mark and track.isdigit() and Path(file).is_file():
+        return VideoFile(Path(file), kind, int(track))
     if path.is_dir():
         return ImageFolder(path, kind)
     if path.is_file() and path.suffix.lower() in VIDEOS:
@@ -195,24 +231,8 @@ def require_kind(path: Path, kind: Kind, image: np.ndarray) -> np.ndarray:
     return image
 
 
-def _opened(path: Path) -> av.container.InputContainer:
-    needed("av")
-    import av
-
-    try:
-        container = av.open(str(path))
-    except (av.error.FFmpegError, OSError) as error:
-        raise InputError(path, "this file must be a readable video", str(error)) from error
-    if not container.streams.video:
-        container.close()
-        raise InputError(path, "this file must have a video stream", "none")
-    return container
-
-
 Pair: TypeAlias = tuple[np.ndarray, np.ndarray | None]
 """RGB [H, W, 3] uint8, and depth [H, W] as stored; None: color alone."""
-COMMON = 0.5
-"""Color and depth are paired by their numbers if this part of them is common, else by their order."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -237,6 +257,8 @@ class Paired:
     unit: float | None = None
     lens: Lens | None = None
     pose: np.ndarray | None = None
+    numbered: bool = False
+    """Whether numbers in names are known to count the same moments everywhere."""
 
     @property
     def path(self) -> Path:
@@ -244,29 +266,29 @@ class Paired:
         return self.color.path
 
     @cached_property
-    def _pairs(self) -> list[tuple[int, int, int]]:
-        """(number, place of color, place of depth). Raises InputError where they cannot be paired."""
+    def match(self) -> tuple[dict[int, int], str]:
+        """Number of color -> place of depth, and what decided; nothing of color alone. Raises InputError; see `moments`."""
         if self.depth is None:
-            return [(number, place, place) for place, number in enumerate(self.color.numbers)]
-        left, right = ({number: place for place, number in enumerate(images.numbers)} for images in (self.color, self.depth))
-        common = sorted(left.keys() & right.keys())
-        if len(common) >= COMMON * max(len(left), len(right)) and len(common):
-            return [(number, left[number], right[number]) for number in common]
-        if len(left) == len(right):
-            return [(number, place, place) for place, number in enumerate(self.color.numbers)]
-        rule = f"camera {self.name} needs as many depth images as color images, or the same numbers in their names"
-        remedy = "Where both have time stamps for names, copy the nearest pairs to two folders first."
-        raise InputError(self.depth.path, rule, f"{len(right)} for {len(left)}, {len(common)} numbers in common", remedy)
+            return {}, ""
+        names = (f"camera {self.name}: color", "depth")
+        return matched(self.depth.path, names, self.color.series, self.depth.series, self.numbered)
 
-    @property
-    def numbers(self) -> list[int]:
+    @cached_property
+    def _pairs(self) -> list[tuple[int, int]]:
+        """(place of color, place of depth)."""
+        numbers, of = self.color.series.numbers, self.match[0]
+        if self.depth is None:
+            return [(place, place) for place in range(len(numbers))]
+        return [(place, of[number]) for place, number in enumerate(numbers) if number in of]
+
+    @cached_property
+    def series(self) -> Series:
         """Of the pairs."""
-        return [number for number, *_ in self._pairs]
+        return self.color.series.part([left for left, _ in self._pairs])
 
-    @property
-    def rate(self) -> float | None:
-        """That of the color video."""
-        return self.color.rate
+    def rate(self, places: Sequence[int]) -> float | None:
+        """Frames per second around some pairs, by their time stamps."""
+        return self.series.part(range(min(places), max(places) + 1)).rate
 
     @property
     def sources(self) -> list[ImageSource]:
@@ -274,23 +296,27 @@ class Paired:
         return [self.color] if self.depth is None else [self.color, self.depth]
 
     @property
-    def alone(self) -> int:
-        """Images without a partner."""
-        return max(len(images.numbers) for images in self.sources) - len(self._pairs)
+    def alone(self) -> dict[str, list[int]]:
+        """Numbers of images without a partner, by kind."""
+        used = zip(*self._pairs, strict=True) if self._pairs else ((), ())
+        return {
+            images.kind: [number for place, number in enumerate(images.series.numbers) if place not in taken]
+            for images, taken in zip(self.sources, map(set, used), strict=False)
+        }
 
     def read(self, places: Sequence[int]) -> Iterator[Pair]:
         """With depth all of them, or none."""
         pairs = [self._pairs[place] for place in places]
-        colors = self.color.read([left for _, left, _ in pairs])
+        colors = self.color.read([left for left, _ in pairs])
         if self.depth is None:
             return zip(colors, [None] * len(pairs), strict=True)
-        return zip(colors, self.depth.read([right for *_, right in pairs]), strict=True)
+        return zip(colors, self.depth.read([right for _, right in pairs]), strict=True)
 
     def files(self, places: Sequence[int]) -> list[Path]:
         """Those of color, then those of depth."""
         pairs = [self._pairs[place] for place in places]
-        deep = [] if self.depth is None else self.depth.files([right for *_, right in pairs])
-        return self.color.files([left for _, left, _ in pairs]) + deep
+        deep = [] if self.depth is None else self.depth.files([right for _, right in pairs])
+        return self.color.files([left for left, _ in pairs]) + deep
 
 
 def pairs(colors: Sequence[Path], depths: Sequence[Path], names: Sequence[str] = ()) -> list[CameraFeed]:
@@ -332,7 +358,7 @@ class Bag:
         for profile, _, _ in self._play(True):
             if not count:
                 stream = profile.get_stream(_library().stream.color)
-                self.rate = float(stream.fps())
+                self._rate = float(stream.fps())
                 self.unit = float(profile.get_device().first_depth_sensor().get_depth_scale())
                 about = stream.as_video_stream_profile().get_intrinsics()
                 self.model = str(about.model).rpartition(".")[2]
@@ -343,7 +369,11 @@ class Bag:
             count += 1
         if not count:
             raise InputError(path, "pairs of color and depth are required", "none", "Record both streams.")
-        self.numbers = list(range(count))
+        self.series = Series(list(range(count)))
+
+    def rate(self, places: Sequence[int]) -> float:
+        """Frames per second that were set."""
+        return self._rate
 
     @property
     def straightens(self) -> bool:
@@ -436,10 +466,16 @@ class Raw:
                 unit=0.001,
                 lens=Lens(matrix=camera.intrinsics, size=(camera.width, camera.height)),
                 pose=camera.camera_to_world,
+                numbered=True,
             )
             for name, camera in cameras.items()
         ]
         frames = int(metadata["frame_num"])
+        for images in (images for view in views for images in view.sources):
+            series = images.series
+            if not series.named or series.numbers[-1] >= frames:
+                rule = f"names must be frame numbers below frame_num of {phystwin.METADATA}, {frames}"
+                raise InputError(images.path, rule, spans(series.numbers) if series.named else images.files([0])[0].name)
         return cls(
             case,
             views,
@@ -449,6 +485,14 @@ class Raw:
             phystwin.annotated(case, frames),
             {name: phystwin.detections(case, name) for name in cameras} if (case / "mask").is_dir() else {},
         )
+
+    def require_masks(self, numbers: Mapping[str, Sequence[int]]) -> None:
+        """Raise InputError unless every detection of a camera has masks of its frames with these numbers."""
+        for name, one in ((name, one) for name, ids in self.ids.items() for listed in ids.values() for one in listed):
+            folder = self.case / "mask" / name / one
+            if lacking := [number for number in numbers[name] if not (folder / f"{number}.png").is_file()]:
+                remedy = "Make them, take images of these frames away, or choose others with --frames."
+                raise InputError(folder, "a mask of every frame with color is required", f"none of {spans(lacking)}", remedy)
 
     def labels(self, camera: str, number: int) -> np.ndarray:
         """Mask [H, W] uint8 of a camera's frame with this number in its name. Raises InputError."""

@@ -16,13 +16,15 @@ from pydantic import TypeAdapter
 from neuspring.config import parse
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
-from neuspring.core.findings import Finding, refuse, refuse_errors
+from neuspring.core.findings import Finding, finding, refuse, refuse_errors
 from neuspring.core.records import digest_file
 from neuspring.core.text import Progress
+from neuspring.data import capture
 from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Camera, CameraEntry, Capture, Description, Writer, description_findings
 from neuspring.data.intake.depth import Unit, find_rate
 from neuspring.data.intake.feeds import Bag, CameraFeed, Paired, Raw, VideoFile
 from neuspring.data.intake.lenses import Board, Straightener, read_lenses, read_poses
+from neuspring.data.intake.moments import DEPARTURE, LOST, Evenness, spans
 from neuspring.data.intake.poses import (
     FrameChoice,
     Placed,
@@ -98,7 +100,10 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     choice = choose(intake.views, intake.frames)
     findings = [one for check in CHECKS for one in check(intake.views, choice)]
     refuse_errors(findings)
-    rate, rate_text = find_rate(intake.rate, [view.rate for view in intake.views], choice.step)
+    if intake.raw is not None:
+        intake.raw.require_masks({name: [choice.numbers[frame] for frame in places] for name, places in choice.places.items()})
+    known = [view.rate([*choice.places[view.name].values()]) for view in intake.views]
+    rate, rate_text = find_rate(intake.rate, known, choice.step)
     names = [view.name for view in intake.views]
     listed = read_lenses(intake.intrinsics, names) if intake.intrinsics else {}
     seen, unit = look(intake.views, choice, listed, intake.intrinsics, intake.depth_unit)
@@ -124,22 +129,59 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
 def time_jumps(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[Finding]:
     """Frames that are left out between others."""
     if choice.jumps:
-        yield _odd("time jumps", "--frames", f"at {choice.jumps} places, where frame numbers are left out")
+        yield _odd("time jumps", "--frames", f"frame numbers are left out after {spans(choice.jumps)}")
 
 
 def images_alone(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[Finding]:
     """Color without depth, or depth without color."""
     for view in views:
-        if isinstance(view, Paired) and view.alone:
-            yield _odd("images alone", view.path, f"camera {view.name}: {view.alone} images without their partner are left out")
+        if isinstance(view, Paired) and (alone := [f"{kind} {spans(numbers)}" for kind, numbers in view.alone.items() if numbers]):
+            text = f"camera {view.name}: images without their partner are left out: {'; '.join(alone)}"
+            yield _odd("images alone", view.path, text)
 
 
-def dropped_pictures(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[Finding]:
-    """Gaps in the time stamps of a video."""
+def missing_frames(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[Finding]:
+    """Frames that some cameras have and others lack."""
+    for view in views:
+        if missing := choice.missing(view.name):
+            text = f"camera {view.name} lacks {spans([choice.numbers[frame] for frame in missing])}; other cameras have them"
+            yield _odd("missing frames", view.path, text)
+
+
+def not_by_numbers(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[Finding]:
+    """How frames belong together, where numbers in names do not say it."""
+    own = {f"camera {view.name}, color and depth": view.match[1] for view in views if isinstance(view, Paired)}
+    for names, by in (own | choice.pairing).items():
+        if by and "numbers" not in by:
+            yield Finding(name="pairs", level="note", where=names, text=f"{names}: by {by}")
+
+
+def uneven_time(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[Finding]:
+    """Time stamps that follow no even clock, as of a phone in dim light: a capture has one rate."""
+    for view in views:
+        times, places = view.series.times, choice.places[view.name]
+        if times is None:
+            continue
+        found, numbers = Evenness.of(times[[*places.values()]], [*places.values()]), [choice.numbers[frame] for frame in places]
+        text = f"camera {view.name}: {found.text()}"
+        if found.bad:
+            first, last = max(found.runs, key=lambda run: run[1] - run[0])
+            slow = 1 / sorted(found.steps)[int(0.9 * len(found.steps))]
+            anew = f"ffmpeg -i FILE -vf fps={slow:.0f} -crf 12 even.mp4 (depth: -c:v ffv1 even.mkv)"
+            rule = f"at most {DEPARTURE:g} frame and 1 lost picture in {1 / LOST:.0f} are allowed"
+            remedy = f"Keep the part of one rate, --frames {numbers[first]}-{numbers[last]}"
+            remedy += f", or write videos anew: {anew}" if view.path.is_file() else ""
+            yield finding("uneven time", "error", str(view.path), text, rule, remedy)
+        elif found.missing or found.odd:
+            yield Finding(name="uneven time", level="warning" if found.missing else "note", where=str(view.path), text=text)
+
+
+def several_tracks(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[Finding]:
+    """A file of which one video track of several is read, unnamed."""
     for images in (images for view in views if isinstance(view, Paired) for images in view.sources):
-        if isinstance(images, VideoFile) and (count := images.dropped()):
-            text = f"{images.path}: about {count} pictures were dropped when it was filmed; time jumps there"
-            yield _odd("dropped pictures", images.path, text)
+        if isinstance(images, VideoFile) and images.track is None and len(images.tracks) > 1:
+            listed = "; ".join(f"{images.path}#{number} is {text}" for number, text in enumerate(images.tracks))
+            yield _odd("several tracks", images.path, f"the first is read as {images.kind}: {listed}. Name the one you mean")
 
 
 def distortion_that_stays(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[Finding]:
@@ -155,7 +197,7 @@ def _odd(name: str, where: object, text: str) -> Finding:
     return Finding(name=name, level="warning", where=str(where), text=text)
 
 
-CHECKS = (time_jumps, images_alone, dropped_pictures, distortion_that_stays)
+CHECKS = (time_jumps, images_alone, missing_frames, not_by_numbers, uneven_time, several_tracks, distortion_that_stays)
 
 
 def _require_for_color_alone(intake: Intake) -> None:
@@ -190,7 +232,7 @@ def _place(intake: Intake, seen: Mapping[str, SampledCamera], unit: Unit | None)
         shown = dict(seen)
         if not intake.board_images:
             for view in intake.views:
-                pairs = list(view.read(range(min(FIRST, len(view.numbers)))))
+                pairs = list(view.read(range(min(FIRST, len(view.series.numbers)))))
                 shown[view.name] = straightened(view, pairs, seen[view.name].lens, unit)
         poses, lines = by_board(intake.board, shown, intake.board_images)
         if unit is None:
@@ -288,11 +330,9 @@ def _write(
     if intake.raw is not None and intake.raw.tracks is not None:
         tracks = intake.raw.tracks[choice.numbers] @ placed.motion[:3, :3].T + placed.motion[:3, 3]
     writer.finish(tracks)
-    (intake.folder / RECIPE).unlink()
+    (intake.folder / capture.RECIPE).unlink()
 
 
-RECIPE = ".make-capture.json"
-"""What an unfinished folder is made of. It is removed at the end."""
 PRECIOUS = ("mask", "marks.json", "annotations.json", TRACKS, POINTS)
 """Work of people and of hours, which --force does not remove."""
 
@@ -302,7 +342,7 @@ def prepare(folder: Path, recipe: dict[str, Any], force: bool) -> bool:
 
     Raises InputError for a folder with anything else in it, unless `force` replaces the images of a capture.
     """
-    path = folder / RECIPE
+    path = folder / capture.RECIPE
     if folder.exists() and not folder.is_dir():
         raise InputError(folder, "--output must be a folder", "a file")
     if path.exists() and not (folder / CAPTURE).exists() and load_json(path) == recipe:
@@ -316,6 +356,7 @@ def prepare(folder: Path, recipe: dict[str, Any], force: bool) -> bool:
         if kept := [name for name in PRECIOUS if (folder / name).exists()]:
             rule = "--force does not remove masks, marks, clicks or tracks"
             raise InputError(folder, rule, " and ".join(kept), "Move them away first.")
+        write_text(path, "{}\n")  # Of no input: what is interrupted here is not taken for a part of the new capture.
         (folder / CAPTURE).unlink(missing_ok=True)
         for kind in ("color", "depth"):
             if (folder / kind).is_dir():

@@ -27,8 +27,9 @@ from neuspring.data.intake.depth import (
     planes,
     pose_on,
 )
-from neuspring.data.intake.feeds import CameraFeed, Lens, Pair, open_images
+from neuspring.data.intake.feeds import CameraFeed, Lens, Pair, Paired, open_images
 from neuspring.data.intake.lenses import Board, Straightener, depth_ratio, require_lens, sight
+from neuspring.data.intake.moments import matched
 from neuspring.data.plausible import color_alone_findings, sampled, table_findings
 
 FEWEST = 5
@@ -46,8 +47,10 @@ class FrameChoice:
     """Camera -> frame of the capture -> place in its view; a frame that the camera lacks is absent."""
     step: int
     """Every so many frames of the source are kept; the rate falls by it."""
-    jumps: int
-    """Places where more numbers are left out: there time jumps."""
+    jumps: list[int]
+    """Numbers after which more are left out than elsewhere: there time jumps."""
+    pairing: dict[str, str]
+    """Cameras -> by what their frames belong together."""
 
     def missing(self, camera: str) -> tuple[int, ...]:
         """Frames that the camera lacks."""
@@ -78,30 +81,36 @@ def chosen(wanted: str, numbers: Sequence[int]) -> list[int]:
 
 
 def choose(views: Sequence[CameraFeed], wanted: str = "") -> FrameChoice:
-    """The frames of all cameras that are kept.
+    """The frames of all cameras that are kept, numbered as those of the first.
 
-    Cameras with equally many frames go by their order, others by the numbers in the names of their images; a number that the first
-    camera has and another lacks is a missing frame. Raises InputError for too few frames.
+    See `moments.matched` for which frames of others belong to them. A number that one camera has and another lacks is a missing
+    frame of that one. Raises InputError for too few frames, or where cameras have no moments in common.
     """
     first = views[0]
-    alike = all(len(view.numbers) == len(first.numbers) for view in views)
-    kept = chosen(wanted, first.numbers)
-    received = f"{len(kept)} of the numbers {first.numbers[0]} to {first.numbers[-1]}" if first.numbers else "none"
+    where, pairing = {first.name: {number: place for place, number in enumerate(first.series.numbers)}}, dict[str, str]()
+    for view in views[1:]:
+        numbered = isinstance(view, Paired) and view.numbered
+        names = f"camera {first.name}", f"camera {view.name}"
+        where[view.name], pairing[" and ".join(names)] = matched(view.path, names, first.series, view.series, numbered)
+    numbers = sorted({number for of in where.values() for number in of})
+    kept = chosen(wanted, numbers)
+    received = f"{len(kept)} of the numbers {numbers[0]} to {numbers[-1]}" if numbers else "none"
     if len(kept) < FEWEST:
         raise InputError("--frames", f"a capture needs at least {FEWEST} frames", received)
-    places: dict[str, dict[int, int]] = {}
+    places = {name: {frame: of[number] for frame, number in enumerate(kept) if number in of} for name, of in where.items()}
+    start = next((number for number in kept if all(number in of for of in where.values())), None)
     for view in views:
-        where = {number: place for place, number in enumerate(first.numbers if alike else view.numbers)}
-        places[view.name] = {frame: where[number] for frame, number in enumerate(kept) if number in where}
         if len(places[view.name]) < len(kept) / 2 or 0 not in places[view.name]:
-            rule = f"camera {view.name} must have the frames of camera {first.name}: the first of them, and half of the others"
-            remedy = "Name the images of all cameras by the same frame numbers, or give --frames."
+            rule = f"camera {view.name} must have the first of the chosen frames, number {kept[0]}, and half of the others"
+            remedy = "Name the images of all cameras by the same frame numbers"
+            remedy += "." if start in (None, kept[0]) else f", or begin where all have a frame: --frames {start}-"
             raise InputError(view.path, rule, f"{len(places[view.name])} of {len(kept)}", remedy)
-    of_first = [place for _, place in sorted(places[first.name].items())]
     # The rate is that of the files that are there; a number that is not there is a moment that is missing.
-    step = min(after - before for before, after in pairwise(of_first))
+    order = {number: place for place, number in enumerate(numbers)}
+    step = min(order[after] - order[before] for before, after in pairwise(kept))
     gaps = [after - before for before, after in pairwise(kept)]
-    return FrameChoice(kept, places, step, sum(gap != min(gaps) for gap in gaps))
+    jumps = [number for number, gap in zip(kept, gaps, strict=False) if gap != min(gaps)]
+    return FrameChoice(kept, places, step, jumps, pairing)
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,7 +331,7 @@ def _point(seen: SampledCamera, at: tuple[float, float]) -> np.ndarray:
 def _pictures(path: Path, view: SampledCamera) -> list[np.ndarray]:
     """Images of a board, without distortion."""
     source = open_images(path if path.is_dir() else path.parent, "color")
-    places = [k for k, file in enumerate(source.files(range(len(source.numbers)))) if path.is_dir() or file == path]
+    places = [k for k, file in enumerate(source.files(range(len(source.series.numbers)))) if path.is_dir() or file == path]
     if not places:
         raise InputError(path, "an image of the board, or a folder of them, is required", "nothing there")
     straight, pictures = Straightener(view.lens, view.size), []

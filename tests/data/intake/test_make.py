@@ -9,12 +9,13 @@ import pytest
 
 from neuspring.cli.main import main
 from neuspring.core.errors import InputError
-from neuspring.data.capture import CAPTURE, Capture
+from neuspring.data.capture import CAPTURE, RECIPE, Capture
 from neuspring.data.check import check_layout
 from neuspring.data.intake import make
 from neuspring.data.intake.feeds import pairs
 from neuspring.data.intake.lenses import Board
-from neuspring.data.intake.make import RECIPE, Intake, make_capture
+from neuspring.data.intake.make import Intake, make_capture
+from neuspring.data.sources import SOURCES
 from tests.support import realsense
 from tests.support.board import BOARD, LENS, board_image, depth_of_table
 from tests.support.desk import FRAMES, SIZE, K, camera, counts, looking, seen, write_folders, write_json, write_poses, write_video
@@ -57,7 +58,7 @@ def test_a_color_video_and_a_depth_video_become_a_capture(tmp_path):
         Intake(folder=tmp_path / "capture", name="v", category="ball", views=pairs([color], [depth]), intrinsics=lens)
     )
     assert capture.description.frame_rate == pytest.approx(15, rel=0.01)
-    assert any("as the video says" in line for line in report)
+    assert any("as the source says" in line for line in report)
     np.testing.assert_array_equal(capture.color("0", 3), pictures[3][0])
     np.testing.assert_allclose(capture.depth("0", 3), counts(pictures[3][1]) / 1000)
 
@@ -163,6 +164,29 @@ def test_an_interrupted_call_goes_on_where_it_was(tmp_path, monkeypatch):
     capture, _ = make_capture(intake(root))
     assert written == [0, 1, 2, 3, 3, 4, 5, 6]
     assert capture.description.provenance["images"] == whole.description.provenance["images"]
+
+
+def test_an_unfinished_capture_is_no_capture_for_anybody(tmp_path):
+    make.prepare(tmp_path / "capture", {"frames": 7}, force=False)
+    said = "a whole capture is required; received one that make-capture has not finished. Give the same make-capture command again"
+    for refuse in (Capture.load, SOURCES["capture"].required):
+        with pytest.raises(InputError, match=said):
+            refuse(tmp_path / "capture")
+    for folder in (tmp_path / "capture", tmp_path):
+        assert [str(one) for one in check_layout(folder)] == [
+            f"error: {tmp_path / 'capture'}: {said}: it goes on where it stopped."
+        ]
+    assert make.prepare(tmp_path / "capture", {"frames": 7}, force=False)
+
+
+def test_a_replacement_that_stops_early_takes_no_image_of_the_old_capture(tmp_path, monkeypatch):
+    (tmp_path / "color").mkdir()
+    (tmp_path / CAPTURE).touch()
+    monkeypatch.setattr(make.shutil, "rmtree", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        make.prepare(tmp_path, {"rate": 15}, force=True)
+    with pytest.raises(InputError, match=r"received an unfinished capture from other input.* or give --force"):
+        make.prepare(tmp_path, {"rate": 15}, force=False)
 
 
 def test_an_unfinished_folder_of_other_input_is_not_mixed(tmp_path, monkeypatch):

@@ -14,7 +14,7 @@ from tests.support.desk import FRAMES, camera, counts, seen, write_folders, writ
 def test_numbers_sort_as_numbers_and_count_from_the_names(tmp_path):
     root = write_folders(tmp_path, frames=12, first=5)
     folder = ImageFolder(root / "color_0", "color")
-    assert folder.numbers == list(range(5, 17))
+    assert folder.series.numbers == list(range(5, 17))
     assert [path.stem for path in folder.paths][-1] == "frame_16"
     np.testing.assert_array_equal(next(folder.read([10])), seen(camera(), 10)[0])
 
@@ -23,7 +23,7 @@ def test_names_without_a_common_form_count_from_zero(tmp_path):
     for name in ("12.10", "9.3", "12.9"):
         cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros((4, 4, 3), np.uint8))
     folder = ImageFolder(tmp_path, "color")
-    assert folder.numbers == [0, 1, 2]
+    assert folder.series.numbers == [0, 1, 2]
     assert [path.name for path in folder.paths] == ["9.3.png", "12.9.png", "12.10.png"]
 
 
@@ -49,18 +49,17 @@ def image_of(value, ending=".png"):
 def test_what_is_no_folder_of_images_is_refused(tmp_path, write, kind, message):
     write(tmp_path)
     with pytest.raises(InputError) as caught:
-        list(ImageFolder(tmp_path, kind).read(range(len(ImageFolder(tmp_path, kind).numbers))))
+        list(ImageFolder(tmp_path, kind).read(range(len(ImageFolder(tmp_path, kind).series.numbers))))
     assert message in str(caught.value)
 
 
 def test_a_depth_video_keeps_every_count(tmp_path):
     depths = [counts(seen(camera(), frame)[1]) for frame in range(4)]
     film = VideoFile(write_video(tmp_path / "depth.mkv", depths, "ffv1", "gray16le"), "depth")
-    assert film.numbers == [0, 1, 2, 3]
+    assert film.series.numbers == [0, 1, 2, 3]
     for found, depth in zip(film.read([1, 3]), [depths[1], depths[3]], strict=True):
         np.testing.assert_array_equal(found, depth)
-    assert film.rate == pytest.approx(15, rel=0.01)
-    assert film.dropped() == 0
+    assert film.series.rate == pytest.approx(15, rel=0.01)
 
 
 @pytest.mark.parametrize(
@@ -71,15 +70,15 @@ def test_a_depth_video_that_loses_depth_is_refused(tmp_path, codec, stored, mess
     images = [np.zeros((48, 64, 3), np.uint8) if stored == "yuv420p" else np.zeros((48, 64), np.uint16)] * 2
     path = write_video(tmp_path / "depth.mkv", images, codec, stored)
     with pytest.raises(InputError, match="a depth video must be") as caught:
-        list(VideoFile(path, "depth").numbers)
+        list(VideoFile(path, "depth").series)
     assert message in str(caught.value)
 
 
 def test_a_video_in_whole_milliseconds_knows_its_rate(tmp_path):
     frames = [np.full((16, 16, 3), 8 * k, np.uint8) for k in range(31)]
     film = VideoFile(write_video(tmp_path / "color.mkv", frames, "mpeg4", "yuv420p", rate=30), "color")
-    assert film.rate == pytest.approx(30, rel=1e-3)
-    assert len(film.numbers) == 31 and film.dropped() == 0
+    assert film.series.rate == pytest.approx(30, rel=1e-3)
+    assert len(film.series.numbers) == 31
     dark, light = film.read([2, 30])
     assert dark.mean() < light.mean() - 100
 
@@ -87,22 +86,24 @@ def test_a_video_in_whole_milliseconds_knows_its_rate(tmp_path):
 def test_a_damaged_video_is_refused(tmp_path):
     (tmp_path / "color.mp4").write_bytes(b"no video")
     with pytest.raises(InputError, match="this file must be a readable video"):
-        list(VideoFile(tmp_path / "color.mp4", "color").numbers)
+        list(VideoFile(tmp_path / "color.mp4", "color").series)
 
 
 def test_color_and_depth_pair_by_their_numbers_and_else_by_their_order(tmp_path):
     root = write_folders(tmp_path, first=10)
     (root / "depth_0" / "frame_12.png").unlink()
     view = pairs([root / "color_0"], [root / "depth_0"])[0]
-    assert view.numbers == [10, 11, 13, 14, 15, 16]
-    assert view.alone == 1
+    assert view.series.numbers == [10, 11, 13, 14, 15, 16]
+    assert view.alone == {"color": [12], "depth": []}
     color, depth = next(view.read([2]))
     np.testing.assert_array_equal(depth, counts(seen(camera(), 3)[1]))
     np.testing.assert_array_equal(color, seen(camera(), 3)[0])
     for path in sorted((root / "depth_0").iterdir()):
         path.rename(path.with_name(f"frame_{500 + int(path.stem[6:])}.png"))
-    with pytest.raises(InputError, match="received 6 for 7, 0 numbers in common"):
-        list(pairs([root / "color_0"], [root / "depth_0"])[0].numbers)
+    with pytest.raises(
+        InputError, match=r"camera 0: color and depth must show the same moments; received 7 pic.* 10 to 16 and 6 .* 510, 511, 513"
+    ):
+        list(pairs([root / "color_0"], [root / "depth_0"])[0].series.numbers)
 
 
 @pytest.mark.parametrize(
@@ -122,11 +123,11 @@ def test_ranges_that_are_none(wanted):
 def test_a_stride_and_a_jump_are_known(tmp_path):
     root = write_folders(tmp_path, frames=12)
     views = pairs([root / "color_0"], [root / "depth_0"])
-    assert (choose(views, "0-10/2").step, choose(views, "0-10/2").jumps) == (2, 0)
-    assert choose(views, "0-3,8-11").jumps == 1
+    assert (choose(views, "0-10/2").step, choose(views, "0-10/2").jumps) == (2, [])
+    assert choose(views, "0-3,8-11").jumps == [3]
     (root / "depth_0" / "frame_6.png").unlink()
     views = pairs([root / "color_0"], [root / "depth_0"])
-    assert (choose(views).step, choose(views).jumps) == (1, 1)
+    assert (choose(views).step, choose(views).jumps) == (1, [5])
     found = [one for check in CHECKS for one in check(views, choose(views))]
     assert [(one.name, one.level) for one in found] == [("time jumps", "warning"), ("images alone", "warning")]
     with pytest.raises(InputError, match="a capture needs at least 5 frames; received 3 of the numbers 0 to 11"):
@@ -146,5 +147,7 @@ def test_a_camera_without_the_first_frame_is_refused(tmp_path):
     root = write_folders(tmp_path, cameras=2)
     for kind in ("color", "depth"):
         (root / f"{kind}_1" / "frame_0.png").unlink()
-    with pytest.raises(InputError, match="camera 1 must have the frames of camera 0"):
+    with pytest.raises(
+        InputError, match=r"camera 1 must have the first of the chosen frames, number 0.*begin where all have a frame: --frames 1-"
+    ):
         choose(pairs([root / "color_0", root / "color_1"], [root / "depth_0", root / "depth_1"]))

@@ -49,7 +49,7 @@ def test_units_that_cannot_be(value, given, message):
 def test_the_rate_is_given_or_of_the_video_and_falls_with_the_stride():
     assert find_rate(30.0, [None], 1) == (30.0, "30 frames per second, given")
     assert find_rate(None, [29.97, 29.97], 2)[0] == pytest.approx(14.985, abs=0.02)
-    assert "the video says 60" in find_rate(30.0, [60.0], 1)[1]
+    assert "the source says 60" in find_rate(30.0, [60.0], 1)[1]
 
 
 @pytest.mark.parametrize(
