@@ -1,3 +1,24 @@
-"""NeuSpring: spring-mass twins of deformable objects from RGBD video, as an open, workflow-orchestrated platform."""
+"""NeuSpring: spring-mass twins of deformable objects from RGBD video, as an open, workflow-orchestrated platform.
+
+The functions and classes of `neuspring.api` stand here as well, and are imported when they are first asked for.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from neuspring.api import Observations, Topology, Trajectory, Twin, fit, load_run, roll_out, score, search
 
 __version__ = "0.2.0"
+__all__ = ["Observations", "Topology", "Trajectory", "Twin", "fit", "load_run", "roll_out", "score", "search"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from neuspring import api
+
+    return getattr(api, name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

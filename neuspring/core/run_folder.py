@@ -10,10 +10,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from neuspring.core.artifacts import Observations, Trajectory, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.records import Before, StageRecord, digest_file
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 LEARNING = ("search", "fit", "train")
 """Stages that produce a model, in order. A run's model is from the last of these that it has."""
@@ -97,6 +101,16 @@ class RunFolder:
         """The prediction, where there is one."""
         path = self.file("rollout", "trajectory")
         return Trajectory.load(path) if path else None
+
+    @cached_property
+    def scores(self) -> pd.DataFrame:
+        """Errors per task and metric, in the unit that each row names. Raises InputError if there are none."""
+        import pandas as pd
+
+        path = self.folder / "scores.parquet"
+        if not path.is_file():
+            raise InputError(path, "the scores of the run must be there", "no such file", "Run the workflow again.")
+        return pd.read_parquet(path)
 
     @cached_property
     def observations(self) -> Observations:

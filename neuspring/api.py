@@ -1,0 +1,130 @@
+"""What a researcher calls from Python: `import neuspring as ns`.
+
+    run = ns.load_run("results/synthetic_single_lift_sloth/neuspring/0")
+    predicted = ns.roll_out(run.twin, run.observations)
+    print(ns.score(predicted, run.observations))
+
+The workflow's stages call the same functions with the same defaults, so that results are equal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from neuspring.config import Config, Kind, parse
+from neuspring.core.artifacts import Observations, Topology, Trajectory, Twin
+from neuspring.core.errors import InputError
+from neuspring.core.run_folder import RunFolder
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from neuspring.twin.fit import FitResult
+    from neuspring.twin.search import SearchResult
+
+__all__ = ["Observations", "Topology", "Trajectory", "Twin", "fit", "load_run", "roll_out", "score", "search"]
+Settings = Config | Mapping[str, Any] | Path | str | None
+"""An object, values as in a YAML file (`{"fit": {"epochs": 60}}`), YAML files (with commas between them), or none: the defaults."""
+
+
+def load_run(folder: Path | str) -> RunFolder:
+    """A run of the workflow, `results/<scenario>/<method>/<seed>`: its `twin`, `trajectory`, `observations`, `scores`, `records`.
+
+    Raises InputError if the folder holds no run, and where what was asked for is missing, damaged or of another version.
+    """
+    run = RunFolder.of(Path(folder))
+    if not run.stages:
+        remedy = "Name results/<scenario>/<method>/<seed>; `make demo` makes some."
+        raise InputError(folder, "must be the folder of a run", "no record of a stage", remedy)
+    return run
+
+
+def roll_out(twin: Twin, hands: Observations | np.ndarray, device: str = "auto") -> Trajectory:
+    """Simulate a twin from frame 0 under hands that move: positions [T, N, 3], m.
+
+    `hands` are observations, or the position of every controller in every frame [T, C, 3], m, the first as in the twin. A
+    rollout that diverges is a result: its `diverged_frame` and `reason` say so. Raises InputError for another shape.
+    """
+    from neuspring.core.device import resolve_device
+    from neuspring.twin import rollout
+    from neuspring.twin.hand_paths import with_hands
+
+    device = resolve_device(device)
+    if isinstance(hands, Observations):
+        seen = with_hands(hands, twin)
+        velocity = rollout.initial_velocity(seen, twin.simulation.initial_velocity)
+        return rollout.roll_out(twin, seen.controller_points, device, velocity=velocity, valid=seen.controller_valid)
+    paths, controllers = np.asarray(hands), len(twin.topology.controllers)
+    if paths.ndim != 3 or paths.shape[1:] != (controllers, 3) or not len(paths):
+        raise InputError("hands", f"must be observations, or positions [T, {controllers}, 3] in meters", paths.shape)
+    return rollout.roll_out(twin, paths, device)
+
+
+def score(trajectory: Trajectory, observations: Observations) -> pd.DataFrame:
+    """Mean errors of a prediction, in meters: one row per task (reconstruction: training frames; future) and metric."""
+    from neuspring.scores import metrics
+
+    return metrics.score(trajectory, observations, method="", seed=0)[["task", "metric", "value", "unit", "frames"]]
+
+
+def search(
+    observations: Observations,
+    settings: Settings = None,
+    *,
+    clusters: int = 1,
+    seed: int = 0,
+    device: str = "auto",
+    threads: int = 1,
+    record: Path | None = None,
+) -> SearchResult:
+    """CMA-ES over material and topology, with `clusters` regions of the topology: the best `twin`, its `cost`, the `trace`.
+
+    The trace is kept in the file `record`, and a search that was stopped goes on from it. Raises InputError, NumericalFailure.
+    """
+    from neuspring.core.device import resolve_device
+    from neuspring.twin.candidates import SearchProblem
+    from neuspring.twin.search import search as search_twin
+
+    read = read_settings(settings)
+    shared = (read.search, read.simulation, read.losses, read.released_quirks, resolve_device(device))
+    return search_twin(SearchProblem(observations, *shared, clusters=clusters, threads=threads), seed, record=record)
+
+
+def fit(
+    observations: Observations,
+    twin: Twin,
+    settings: Settings = None,
+    *,
+    kind: Kind = "field",
+    seed: int = 0,
+    device: str = "auto",
+    checkpoint: Path | None = None,
+) -> FitResult:
+    """Train a twin's stiffness by gradients through the simulation, as a neural spring `field` or each of the `springs` apart.
+
+    The result has the best `twin` and the `history` of losses. With a `checkpoint`, a fit that was stopped goes on. Raises
+    InputError, NumericalFailure.
+    """
+    from neuspring.core.device import resolve_device
+    from neuspring.twin.fit import FitProblem
+    from neuspring.twin.fit import fit as fit_twin
+    from neuspring.twin.hand_paths import with_hands
+
+    read = read_settings(settings)
+    shared = (read.fit, read.simulation, read.losses, read.released_quirks, resolve_device(device))
+    return fit_twin(FitProblem(with_hands(observations, twin), twin, *shared, kind=kind, seed=seed), partial=checkpoint)
+
+
+def read_settings(settings: Settings) -> Config:
+    """Settings from any of their forms. Raises InputError for unknown keys and wrong values."""
+    from neuspring.stages.stage import read_settings as read
+
+    if isinstance(settings, Config):
+        return settings
+    if settings is None or isinstance(settings, Mapping):
+        return parse(Config, settings or {}, "settings")
+    return read(str(settings))
