@@ -54,8 +54,8 @@ class Mocap(Section):
 class Synthetic(Section):
     """Synthetic captures: finite elements seen by a ray caster through a model of a depth sensor."""
 
-    size: Literal["tiny", "demo", "full"] = "demo"
-    """Size of the images, with meshes to match: 120 x 68, 424 x 240 or 848 x 480 pixels."""
+    size: Literal["tiny", "small", "demo", "full"] = "demo"
+    """Size of the images, with meshes to match: 120 x 68, 424 x 240 (small: with coarser bodies) or 848 x 480 pixels."""
     frames: Annotated[int, Field(ge=5)] | None = None
     """Number of frames that are kept, the first ones; null keeps all."""
     certified_frames: Count = 20

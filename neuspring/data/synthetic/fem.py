@@ -7,6 +7,7 @@ explicit (semi-implicit Euler); `VertexBlockDescent` is a second engine, for a h
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
@@ -127,6 +128,8 @@ COLLIDE_EVERY = 5
 """Substeps between searches for contacts, whose margin covers what happens between."""
 DAMP_EVERY = 4
 """Substeps between dampings of the deformation, a slow process."""
+PERIOD = math.lcm(COLLIDE_EVERY, DAMP_EVERY, 2)
+"""Substeps after which a frame's pattern of contacts, dampings and exchanged states begins again."""
 CONTACT_MARGIN = 0.02
 """m."""
 POWER_ITERATIONS = 60
@@ -166,7 +169,7 @@ class Clip:
 class FiniteElements:
     """A body with its hands, from `start` (rest shape where None), on one core.
 
-    `substeps` defaults to the even number that the critical step asks for. `holder` [N] says which hand holds each node (-1: none);
+    `substeps`, an even number, defaults to what the critical step asks for. `holder` [N] says which hand holds each node (-1: none);
     by default a hand holds the nodes in its reach.
     """
 
@@ -197,7 +200,7 @@ class FiniteElements:
         self._maxwell = self._maxwell_state()
         self.substeps = self._choose_substeps(substeps)
         self._hold(fists, holder)
-        self._graph: wp.Graph | None = None
+        self._graphs: dict[int, wp.Graph] = {}
 
     @property
     def substep(self) -> float:
@@ -278,20 +281,21 @@ class FiniteElements:
         self._sums = wp.zeros(16, dtype=wp.float32, device="cpu")
 
     def _frame(self) -> None:
-        """One frame; the first compiles, the second is recorded, the others replay the record."""
-        if self._graph is not None:
-            wp.capture_launch(self._graph)
-        elif int(self._step.numpy()[0]):
-            with wp.ScopedCapture(device="cpu") as capture:
-                self._substeps()
-            self._graph = capture.graph
-            wp.capture_launch(self._graph)
-        else:
-            self._substeps()
+        """One frame, in runs of substeps that repeat: the first of a length compiles, the second is recorded, others replay it."""
+        whole, rest = divmod(self.substeps, PERIOD)
+        for count in [PERIOD] * whole + [rest] * (rest > 0):
+            if count not in self._graphs:
+                self._substeps(count)
+                with wp.ScopedCapture(device="cpu") as capture:
+                    self._substeps(count)
+                self._graphs[count] = capture.graph
+            else:
+                wp.capture_launch(self._graphs[count])
 
-    def _substeps(self) -> None:
+    def _substeps(self, count: int) -> None:
+        """The first substeps of a frame; every PERIOD they begin again."""
         model, dt, contacts = self.model, self.substep, self.contacts
-        for k in range(self.substeps):
+        for k in range(count):
             now, following = self.now, self.next
             now.clear_forces()
             held = [self._step, self._poses, self._holder, self._local, dt, now.particle_q, now.particle_qd]
@@ -471,8 +475,8 @@ class VertexBlockDescent(FiniteElements):
         flags = np.where(self.holder < 0, int(newton.ParticleFlags.ACTIVE), 0)
         self.model.particle_flags.assign(flags.astype(np.int32))
 
-    def _substeps(self) -> None:
-        for _ in range(self.substeps):
+    def _substeps(self, count: int) -> None:
+        for _ in range(count):
             now, following = self.now, self.next
             now.clear_forces()
             # Held nodes do not move within a step: they are put where they are at its end.

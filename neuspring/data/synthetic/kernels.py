@@ -211,6 +211,41 @@ def table(place: wp.vec3, state: wp.uint32):
     return wp.vec3(0.62, 0.50, 0.38) * (1.0 + 0.22 * streak + 0.1 * pore)
 
 
+@wp.func
+def ray_of(x: int, y: int, offset: wp.vec2, focal: wp.vec2, center: wp.vec2):
+    """Direction of a sample in the camera's axes, z forward."""
+    u = (float(x) + offset[0] - center[0]) / focal[0]
+    v = (float(y) + offset[1] - center[1]) / focal[1]
+    return wp.normalize(wp.vec3(u, v, 1.0))
+
+
+@wp.func
+def to_table(origin: wp.vec3, ray: wp.vec3):
+    """Distance along a ray to the table, z = 0."""
+    distance = float(1.0e9)
+    if ray[2] < -1.0e-6:
+        distance = -origin[2] / ray[2]
+    return distance
+
+
+@wp.kernel(enable_backward=False)
+def shade_table(
+    pose: wp.transform,
+    focal: wp.vec2,
+    center: wp.vec2,
+    offsets: wp.array[wp.vec2],
+    farthest: float,
+    shades: wp.array3d[wp.vec3],
+):
+    """The empty table's color in every sample, before light falls on it: a camera and its table do not move."""
+    y, x, s = wp.tid()
+    ray = wp.transform_vector(pose, ray_of(x, y, offsets[s], focal, center))
+    origin = wp.transform_get_translation(pose)
+    distance = to_table(origin, ray)
+    if distance < farthest:
+        shades[y, x, s] = table(origin + ray * distance, wp.uint32(7))
+
+
 @wp.kernel(enable_backward=False)
 def cast(
     mesh: wp.uint64,
@@ -224,6 +259,7 @@ def cast(
     focal: wp.vec2,
     center: wp.vec2,
     offsets: wp.array[wp.vec2],
+    shades: wp.array3d[wp.vec3],
     light: wp.vec3,
     gamma: float,
     farthest: float,
@@ -232,26 +268,22 @@ def cast(
     label: wp.array2d[wp.uint8],
     slope: wp.array2d[float],
 ):
-    """One pixel: color is the mean over `offsets`, depth, label and slope are those of the first."""
+    """One pixel: color is the mean over `offsets`, depth, label and slope are those of the first; `shades` by `shade_table`."""
     y, x = wp.tid()
     origin = wp.transform_get_translation(pose)
     state = wp.uint32(7)
     total = wp.vec3(0.0)
     for s in range(offsets.shape[0]):
-        u = (float(x) + offsets[s][0] - center[0]) / focal[0]
-        v = (float(y) + offsets[s][1] - center[1]) / focal[1]
-        ray = wp.normalize(wp.vec3(u, v, 1.0))
+        ray = ray_of(x, y, offsets[s], focal, center)
         axial = ray[2]
         ray = wp.transform_vector(pose, ray)
-        to_table = 1.0e9
-        if ray[2] < -1.0e-6:
-            to_table = -origin[2] / ray[2]
+        table_at = to_table(origin, ray)
         hit = wp.mesh_query_ray(mesh, origin, ray, farthest)
         shade = wp.vec3(0.55, 0.58, 0.62)
         normal = wp.vec3(0.0, 0.0, 1.0)
         distance = 0.0
         seen = 0
-        if hit.result and hit.t < to_table:
+        if hit.result and hit.t < table_at:
             a = indices[3 * hit.face]
             b = indices[3 * hit.face + 1]
             c = indices[3 * hit.face + 2]
@@ -265,9 +297,9 @@ def cast(
             texture = grains[seen]
             shade = base * grain(place, texture[0], texture[1], state)
             distance = hit.t
-        elif to_table < farthest:
-            shade = table(origin + ray * to_table, state)
-            distance = to_table
+        elif table_at < farthest:
+            shade = shades[y, x, s]
+            distance = table_at
         if distance > 0.0:
             incoming = wp.max(wp.dot(normal, light), 0.0)
             if incoming > 0.0:

@@ -60,6 +60,7 @@ class CaptureSize:
 
 SIZES = {
     "tiny": CaptureSize(120, 68, 0.02, 0.008),
+    "small": CaptureSize(424, 240, 0.018, 0.004),
     "demo": CaptureSize(424, 240, 0.014, 0.004),
     "full": CaptureSize(848, 480, 0.014, 0.003),
 }

@@ -17,7 +17,7 @@ import warp as wp
 from scipy.sparse import coo_matrix
 
 from neuspring.data.capture import Camera
-from neuspring.data.synthetic.kernels import cast
+from neuspring.data.synthetic.kernels import cast, shade_table
 
 OBJECT, HAND = 1, 2
 LIGHT = np.array([0.35, -0.45, 0.85]) / np.linalg.norm([0.35, -0.45, 0.85])
@@ -77,6 +77,7 @@ class Renderer:
         self._normals = wp.zeros_like(self._points)
         self._offsets: wp.array = wp.array(SUBPIXELS, dtype=wp.vec2, device="cpu")
         self._mesh: wp.Mesh | None = None
+        self._tables: dict[tuple[object, ...], wp.array] = {}
         corners = self._faces.T.ravel()
         owners = np.tile(np.arange(len(self._faces)), 3)
         self._sum_faces = coo_matrix((np.ones(len(corners)), (corners, owners)), shape=(int(counts[-1]), len(self._faces))).tocsr()
@@ -101,11 +102,16 @@ class Renderer:
         color = wp.zeros((*size, 3), dtype=wp.uint8, device="cpu")
         depth, slope = (wp.zeros(size, dtype=wp.float32, device="cpu") for _ in range(2))
         label = wp.zeros(size, dtype=wp.uint8, device="cpu")
-        k = camera.intrinsics
+        k, pose = camera.intrinsics, wp.transform_from_matrix(wp.mat44(camera.camera_to_world))
+        view = [pose, wp.vec2(k[0, 0], k[1, 1]), wp.vec2(k[0, 2], k[1, 2]), self._offsets]
+        key = (camera.camera_to_world.tobytes(), k.tobytes(), size)
+        if key not in self._tables:
+            shades = wp.zeros((*size, len(SUBPIXELS)), dtype=wp.vec3, device="cpu")
+            wp.launch(shade_table, shades.shape, [*view, FARTHEST, shades], device="cpu")
+            self._tables[key] = shades
         arguments = [
             *(self._mesh.id, self._normals, self._rest, self._colors, self._indices, self._labels, self._grains),
-            *(wp.transform_from_matrix(wp.mat44(camera.camera_to_world)), wp.vec2(k[0, 0], k[1, 1]), wp.vec2(k[0, 2], k[1, 2])),
-            *(self._offsets, wp.vec3(*LIGHT), GAMMA, FARTHEST, color, depth, label, slope),
+            *(*view, self._tables[key], wp.vec3(*LIGHT), GAMMA, FARTHEST, color, depth, label, slope),
         ]
         wp.launch(cast, size, arguments, device="cpu")
         return RenderedView(color.numpy(), depth.numpy(), label.numpy(), slope.numpy())
