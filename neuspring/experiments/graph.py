@@ -68,6 +68,11 @@ class Graph:
             "appearance": {"looks": one_of([SPLATS, *(f"{SPLATS}-{name}" for name in self.benchmark.splats)])},
         }.get(stage.name, {})
 
+    def earliness(self, scenario: str) -> float:
+        """From 1 for the first scenario that is run down to 0."""
+        names = self.config.scenarios
+        return 1 - names.index(scenario) / len(names) if scenario in names else 0.0
+
     def judged(self, names: Sequence[str]) -> dict[str, str]:
         """Scenarios whose truth is known, and their categories."""
         rows = self.benchmark.whole_scenarios

@@ -104,6 +104,12 @@ wildcard_constraints:
     study=one_of(BENCHMARK.studies),
 
 
+def priority_of(stage):
+    """Jobs for a GPU first, then those of earlier scenarios: the first scenario is finished long before the last one."""
+    first = GPU_FIRST if stage.gpu != "never" else 0
+    return lambda wildcards: first + GRAPH.earliness(wildcards.scenario)
+
+
 def log_of(stage, name):
     """The log of a job; its record has the same name (`neuspring.core.job_records`)."""
     return f"{RESULTS}/logs/{stage}/{name}.log"

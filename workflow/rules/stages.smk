@@ -25,7 +25,7 @@ for STAGE in STAGES.values():
             log_of(STAGE.name, STAGE.job_name),
         wildcard_constraints:
             **GRAPH.constraints(STAGE),
-        priority: GPU_FIRST if STAGE.gpu != "never" else 0
+        priority: priority_of(STAGE)
         conda:
             ENVIRONMENT
         resources:

@@ -29,6 +29,8 @@ else:
 
 GRAVITY = 9.81
 """m/s^2, towards -z."""
+GRID = (32, 32, 32)
+"""Cells in which near nodes are looked for. The engine's 128 in each direction are emptied in every substep: most of its time."""
 LEAST_MASS = 0.3
 """Nodes of a solid weigh at least this fraction of the median node; lighter ones alone would dictate the step."""
 MAX_SPEED = 20.0
@@ -72,6 +74,7 @@ def build(body: SoftBody, fists: int, moduli: Moduli = stable_moduli, dashpots: 
     if body.self_contact:
         model.particle_ke, model.particle_kd = body.self_contact_stiffness, 0.01
         model.particle_kf, model.particle_mu = 0.0, 0.3
+        model.particle_grid = wp.HashGrid(*GRID, device="cpu")
     else:
         model.particle_grid = None
     model.soft_contact_ke, model.soft_contact_kd = body.contact_stiffness, body.contact_damping
@@ -169,8 +172,8 @@ class Clip:
 class FiniteElements:
     """A body with its hands, from `start` (rest shape where None), on one core.
 
-    `substeps`, an even number, defaults to what the critical step asks for. `holder` [N] says which hand holds each node (-1: none);
-    by default a hand holds the nodes in its reach.
+    `substeps`, an even number, defaults to what the critical step asks for. `holder` [N] says which hand holds each node (-1:
+    none); by default a hand holds the nodes in its reach.
     """
 
     def __init__(

@@ -222,7 +222,7 @@ def ray_of(x: int, y: int, offset: wp.vec2, focal: wp.vec2, center: wp.vec2):
 @wp.func
 def to_table(origin: wp.vec3, ray: wp.vec3):
     """Distance along a ray to the table, z = 0."""
-    distance = float(1.0e9)
+    distance = 1.0e9
     if ray[2] < -1.0e-6:
         distance = -origin[2] / ray[2]
     return distance
