@@ -31,8 +31,8 @@ EVERY = 1.0
 
 
 class Overview:
-    """How far a quiet run is: a line per rule when its last job has succeeded, a table per scenario when its last run has scores, and on a
-    terminal a line that moves.
+    """How far a quiet run is: a line per rule when its last job has succeeded, a table per scenario when its last run has scores,
+    and on a terminal a line that moves.
 
     It watches the records of the run's jobs, in a thread of its own, from `start` to `stop`.
     """
