@@ -73,16 +73,14 @@ class ImageFolder:
         if len(endings) != 1:
             rule = f"{self.kind} images of one format are required ({' '.join(PICTURES[self.kind])})"
             raise InputError(self.path, rule, " and ".join(endings) or "none", "Color and depth need a folder of their own each.")
-        if None not in (times := {path: _stamp(path) for path in found}).values():
-            return sorted(found, key=lambda path: (times[path], path.stem))
+        stamps = {path: _stamp(path) or 0.0 for path in found}
         # re.split with a group alternates text and digits.
-        return sorted(
-            found, key=lambda path: [(p.isdigit(), int(p) if p.isdigit() else 0, p) for p in re.split(r"([0-9]+)", path.stem)]
-        )
+        words = {path: [(p.isdigit(), int(p) if p.isdigit() else 0, p) for p in re.split(r"([0-9]+)", path.stem)] for path in found}
+        return sorted(found, key=lambda path: (stamps[path] if all(stamps.values()) else 0.0, words[path]))
 
     @cached_property
     def series(self) -> Series:
-        """By times since 1970 in the names, else by the only number in which the names differ, else places from 0."""
+        """Times since 1970 in the names, with places as numbers; else the only number in which names differ; else places."""
         stems = [path.stem for path in self.paths]
         times = np.array([_stamp(path) for path in self.paths], dtype=float)
         if np.isfinite(times).all() and (np.diff(times) > 0).all():
@@ -194,7 +192,7 @@ def _stamp(path: Path) -> float | None:
     if not found or len(found[1]) not in SECOND or not (found[2] or len(found[1]) > min(SECOND)):
         return None
     time = (int(found[1]) + float(found[2] or 0)) * SECOND[len(found[1])]
-    return time if time > 1e9 else None
+    return time if 1e9 < time < 2e9 else None  # From 2e9 on digits are a date: 20260131...
 
 
 ImageSource: TypeAlias = ImageFolder | VideoFile

@@ -127,6 +127,13 @@ def test_names_that_are_times_are_paired_by_the_nearest(tmp_path, write, offset)
     assert any("about 2 lost pictures, up to" in line and "warning" in line for line in lines)
 
 
+@pytest.mark.parametrize(("form", "step"), [("1681234567123_{}.png", 1), ("2026013112305{:03d}.png", 3), ("{:010d}.png", 1)])
+def test_digits_that_are_no_time_count(tmp_path, form, step):
+    """The start of a session, a date, and a counter with ten digits."""
+    folder = ImageFolder(named(tmp_path, "color", range(0, 45 * step, step), form), "color")
+    assert folder.series.times is None and np.diff(folder.series.numbers).tolist() == [step] * 44
+
+
 def test_sixty_hertz_beside_thirty_is_paired_by_time_stamps():
     fast, slow = Series([*range(90)], times=np.arange(90) / 60), Series([*range(45)], times=np.arange(45) / 30)
     assert matched("x", ("a", "b"), fast, slow)[0] == {2 * k: k for k in range(45)}
@@ -138,18 +145,20 @@ def test_sixty_hertz_beside_thirty_is_paired_by_time_stamps():
         matched("x", ("a", "b"), Series(slow.numbers, times=slow.times, clock="wall"), later)
 
 
-def film(path, moments, tracks=1):
-    """A lossless video of gray pictures at these ms, picture k of track t with the value 4 k + 40 t."""
+def film(path, *tracks):
+    """A lossless video with a track of color for each list of ms, and of depth for each of negative ones; picture k is k + 1."""
     with av.open(str(path), "w") as container:
-        streams = [container.add_stream("ffv1", rate=1000, width=16, height=16, pix_fmt="bgr0") for _ in range(tracks)]
-        for stream in streams:
-            stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
-        for k, moment in enumerate(moments):
-            for t, stream in enumerate(streams):
-                frame = av.VideoFrame.from_ndarray(np.full((16, 16, 3), 4 * k + 40 * t, np.uint8), format="rgb24")
-                frame.pts, frame.time_base = moment, Fraction(1, 1000)
+        streams = []
+        for moments in tracks:
+            stored = "gray16le" if min(moments) < 0 else "bgr0"
+            streams.append(container.add_stream("ffv1", rate=1000, width=16, height=16, pix_fmt=stored))
+            streams[-1].time_base = streams[-1].codec_context.time_base = Fraction(1, 1000)
+        for moments, stream in zip(tracks, streams, strict=True):
+            for k, moment in enumerate(moments):
+                shape, kind, form = ((16, 16), np.uint16, "gray16le") if min(moments) < 0 else ((16, 16, 3), np.uint8, "rgb24")
+                frame = av.VideoFrame.from_ndarray(np.full(shape, k + 1, kind), format=form)
+                frame.pts, frame.time_base = abs(moment), Fraction(1, 1000)
                 container.mux(stream.encode(frame))
-        for stream in streams:
             container.mux(stream.encode())
     return path
 
@@ -213,16 +222,27 @@ def test_a_film_that_was_trimmed_without_encoding_has_the_pictures_that_it_shows
 
 
 def test_of_several_tracks_the_first_is_read_and_said_or_the_one_that_is_named(tmp_path):
-    path = film(tmp_path / "a.mkv", ms([30] * 9), tracks=2)
+    path = film(tmp_path / "a.mkv", ms([30] * 9), ms([10] * 5))
     views = pairs([path], [])
     assert f"the first is read as color: {path}#0 is ffv1 16 x 16 bgr0; {path}#1 is ffv1" in said(views, choose(views))[0]
     views = pairs([tmp_path / "a.mkv#1"], [])
     assert said(views, choose(views)) == []
-    assert next(open_images(tmp_path / "a.mkv#1", "color").read([3])).mean() == pytest.approx(52)
+    assert len(views[0].series.numbers) == 6 and views[0].rate([0, 5]) == pytest.approx(10)
+    assert next(open_images(tmp_path / "a.mkv#1", "color").read([3])).mean() == 4
     with pytest.raises(InputError, match="a video track is required; the file has 2, from 0; received track 2"):
         open_images(tmp_path / "a.mkv#2", "color").series  # noqa: B018
     with pytest.raises(InputError, match=r"received bgr0\. It has 2 video tracks: name that of depth, like .*a\.mkv#1"):
         open_images(path, "depth").series  # noqa: B018
+
+
+def test_tracks_of_one_file_have_one_clock(tmp_path):
+    """Depth began two pictures after color: its first belongs to the third of color."""
+    moments = ms([30] * 11)
+    film(tmp_path / "a.mkv", moments, [-moment for moment in moments[2:]])
+    view = pairs([tmp_path / "a.mkv#0"], [tmp_path / "a.mkv#1"])[0]
+    assert view.series.numbers == [*range(2, 12)] and view.alone == {"color": [0, 1], "depth": []}
+    color, depth = next(view.read([0]))
+    assert (color.mean(), depth.mean()) == (3, 1)
 
 
 @pytest.mark.parametrize("ending", ["jpg", "png"])
