@@ -136,7 +136,7 @@ class VideoFile:
             if self.kind == "depth" and stream.codec_context.name not in LOSSLESS:
                 rule = f"a depth video must be lossless ({' '.join(LOSSLESS)})"
                 raise InputError(self.path, rule, stream.codec_context.name, "Store gray16le in FFV1 (mkv).")
-            base, stamps = float(stream.time_base or 1), []
+            base, stamps = float(stream.time_base or 1), list[float]()
             for frame in container.decode(stream):
                 if not stamps and frame.rotation:
                     remedy = "Write it upright, as the intrinsics are: ffmpeg -i VIDEO -crf 12 upright.mp4"
