@@ -81,7 +81,7 @@ def make_capture(
     output: Annotated[Path, arg(help="the capture folder to write")],
     category: Annotated[str, arg(help="kind of object: cloth, rope, package, or any other word")],
     name: Annotated[str | None, arg(help="name of the capture; that of the folder by default")] = None,
-    color: Annotated[tuple[Path, ...], arg(help="per camera: a folder of images, or a video; see --depth")] = (),
+    color: Annotated[tuple[Path, ...], arg(help="per camera: a folder of images, or a video; FILE#1 is its second track")] = (),
     depth: Annotated[
         tuple[Path, ...],
         arg(help="per camera: a folder, or a 16-bit gray video; none: color alone, of one camera with --intrinsics and --poses"),
