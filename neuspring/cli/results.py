@@ -31,8 +31,8 @@ COMMIT = "a commit, its first letters, HEAD~1, or a branch; a working copy with 
 def tables(
     output: Folder,
     results: Results = Path("results"),
-    scenarios: tuple[str, ...] = (),
-    methods: tuple[str, ...] = (),
+    scenarios: Names = (),
+    methods: Names = (),
     seeds: tuple[int, ...] = (),
     transfers: Transfers = (),
     baseline: Annotated[str | None, arg(help="method that others are compared with; the first by default")] = None,
@@ -40,11 +40,15 @@ def tables(
     aims: Annotated[str, arg(help="JSON: ratios that are aimed at (config/README.md, aims)")] = "[]",
     scores: Scores = None,
     left_out: LeftOut = "{}",
+    brief: Annotated[bool, arg(help="print the verdict and the first table alone")] = False,
 ) -> None:
     """Run records -> tables."""
     from neuspring.config.settings import Aim
+    from neuspring.core.findings import warnings_of
     from neuspring.report.benchmark import Benchmark, write
+    from neuspring.report.sections.data import job_records, traces
     from neuspring.report.sections.pictures import write_gallery
+    from neuspring.report.verdict import headline
     from neuspring.scores.runs import collect, collect_transfers, read_scores
 
     wanted = tuple(parse(Aim, row, "--aims") for row in json_value("--aims", aims, list))
@@ -55,12 +59,17 @@ def tables(
         found = replace(found, left_out=without)
         print(write(Benchmark(everything=found, baseline=against, objects=objects, aims=wanted), output))
         return
+    there = traces(results, job_records(results)[0])
+    scenarios, methods, seeds = scenarios or tuple(there[0]), methods or tuple(there[1]), seeds or tuple(there[2])
     if not (scenarios and methods and seeds):
-        raise InputError("tables", WHAT)
+        raise InputError(results, "a results folder with runs is required", "none", "Run the workflow first, or name another.")
     collected = collect(results, scenarios, methods, seeds, without)
     moved = collect_transfers(results, transfers, methods, seeds)
     against = baseline or methods[0]
-    print(write(Benchmark(everything=collected, baseline=against, objects=objects, aims=wanted, transfers=moved), output))
+    warned = warnings_of(results, scenarios)
+    benchmark = Benchmark(everything=collected, baseline=against, objects=objects, aims=wanted, transfers=moved, warnings=warned)
+    text = write(benchmark, output)
+    print(headline(text) if brief else text)
     print(f"Tables: {output / 'summary.md'}")
     finished = collected.runs.loc[collected.runs["status"] == "ok", "seed"].to_list()
     seed = next((seed for seed in seeds if seed in finished), seeds[0])
@@ -107,16 +116,30 @@ def study(
 
 
 def explain(
-    cell: Annotated[Positional[str], arg(help="STUDY/ROW/TASK/METRIC, for example table1/NeuSpring/future/chamfer")],
+    what: Annotated[
+        Positional[str],
+        arg(help="METHOD/TASK/METRIC, STUDY/ROW/TASK/METRIC, SCENARIO/METHOD/SEED, or a folder; lists what there is by default"),
+    ] = "",
     results: Results = Path("results"),
     tables: Annotated[str, arg(help="folder of the tables in the results folder")] = "tables",
     configfile: Annotated[tuple[str, ...], arg(help="files the benchmark was run with, for the commands")] = (),
     json: bool = False,
 ) -> int:
-    """A cell of a study's table -> the runs behind it, and how to make them again; 1 if a run behind it has changed."""
-    from neuspring.report.explain import explain, text
+    """A number or a run -> what is behind it, and how to make it again; 1 if a run has changed since."""
+    from neuspring.report.explain import explain, known, run_text, runs_of, text
 
-    explanation = explain(cell, results, results / tables / "studies", configfile)
+    folder = results / tables / "studies"
+    if not what:
+        print(known(results, folder))
+        return 0
+    if runs := runs_of(what, results):
+        found = [run_text(path, configfile) for path in runs]
+        print("\n\n".join(lines for lines, _ in found))
+        return 0 if all(same for _, same in found) else 1
+    if what.count("/") < 2:
+        rule = "must be METHOD/TASK/METRIC, STUDY/ROW/TASK/METRIC, or a run that there is"
+        raise InputError(f"explain {what}", rule, remedy="`neuspring explain` lists what there is.")
+    explanation = explain(what, results, folder, configfile)
     print(explanation.as_json() if json else text(explanation), end="")
     return 1 if explanation.problems else 0
 

@@ -101,6 +101,11 @@ def refuse_errors(findings: Iterable[Finding]) -> None:
             raise InputError(one.where, f"{one.name}: {one.text.rstrip('.')}")
 
 
+def warnings_of(results: Path, scenarios: Iterable[str]) -> tuple[tuple[str, Finding], ...]:
+    """Scenario and finding of all steps of scenarios, notes left out."""
+    return tuple((name, one) for name in scenarios for one in findings_of(results, name) if one.level != "note")
+
+
 def findings_of(results: Path, scenario: str) -> list[Finding]:
     """The findings of all steps of a scenario, in the order of the steps; records that cannot be read have none."""
     found = []

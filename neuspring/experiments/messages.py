@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import shlex
@@ -16,7 +15,7 @@ from typing import IO
 
 from neuspring.config import plain
 from neuspring.core.errors import InputError
-from neuspring.core.findings import findings_of
+from neuspring.core.findings import warnings_of
 from neuspring.core.job_records import FOLDER, RUN, JobRecord, failure_lines, read_jobs, this_run
 from neuspring.core.table import Table
 from neuspring.experiments.graph import Graph
@@ -144,23 +143,25 @@ def failed(graph: Graph) -> None:
 
 
 def finished(graph: Graph, seconds: float) -> None:
-    """After success: a table, what to open, where the runs are in MLflow, how long it took."""
-    config, folder = graph.config, graph.folder
+    """After success: the verdict, a table, what to open, where the runs are in MLflow, how long it took."""
+    from neuspring.report.verdict import headline
+
+    config, folder, neuspring = graph.config, graph.folder, Path(sys.executable).parent / "neuspring"
     begun = (Path(config.results) / FOLDER / RUN).stat().st_mtime
+    summary = Path(folder) / "summary.md"
+    if summary.exists():
+        print(f"\n{headline(summary.read_text())}\n")
+        tell_findings(Path(config.results), config.scenarios)
+        print(f"Open in a browser: {folder}/report.html (everything), {folder}/pictures.html (films of every method)")
+        print(f"All tables: {summary}. Scores, trajectories, plots: {config.results}/<scenario>/<method>/<seed>/")
     for study in graph.benchmark.studies:
         path = Path(folder) / "studies" / f"{study}.md"
         if path.exists() and path.stat().st_mtime >= begun:
-            cell = f"neuspring explain {study}/ROW/future/chamfer --results {shlex.quote(config.results)}"
-            print(f"{study}: {path}; the runs behind a number: {cell}")
-    summary = Path(folder) / "summary.md"
+            print(f"{study}: {path}")
     if not summary.exists():
         return
-    print(f"\n{first_table(summary.read_text())}\n")
-    tell_findings(Path(config.results), config.scenarios)
-    print(f"All tables: {summary}. Scores, trajectories, plots: {config.results}/<scenario>/<method>/<seed>/")
-    print(f"Open in a browser: {folder}/report.html (everything), {folder}/pictures.html (videos of every method)")
+    print(f"What is behind a number: {neuspring} explain --results {shlex.quote(config.results)}")
     if config.tracking.enabled:
-        neuspring = Path(sys.executable).parent / "neuspring"
         tracking = json.dumps({"tracking": plain(config.tracking)}, sort_keys=True)
         place = ["--results", config.results, *(["--settings", tracking] if config.tracking.uri else [])]
         waiting = [path for path in map(Path, graph.logged_runs()) if path.exists() and "logged" not in path.read_text()]
@@ -174,17 +175,10 @@ def finished(graph: Graph, seconds: float) -> None:
 
 def tell_findings(results: Path, scenarios: Sequence[str]) -> None:
     """What the steps of perception noticed: warnings of all scenarios; notes are in the report."""
-    found = [(name, one) for name in scenarios for one in findings_of(results, name) if one.level != "note"]
+    found = warnings_of(results, scenarios)
     if found:
         print(f"Perception noticed {len(found)} thing{'s' * (len(found) > 1)} that may make results worse:")
         print("\n".join(f"  {name}: {one}" for name, one in found[:MOST_FINDINGS]))
         if len(found) > MOST_FINDINGS:
             print(f"  {len(found) - MOST_FINDINGS} more are in the report.")
         print()
-
-
-def first_table(summary: str) -> str:
-    """The first table of a summary, with the lines above it but not the heading."""
-    before, bar, rest = summary.partition("\n|")
-    rows = "".join(itertools.takewhile(lambda line: line.startswith("|"), (bar[1:] + rest).splitlines(keepends=True)))
-    return "\n".join(line for line in f"{before}\n{rows}".splitlines() if not line.startswith("#")).strip()

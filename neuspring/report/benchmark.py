@@ -19,12 +19,14 @@ from matplotlib.figure import Figure
 
 from neuspring.config.settings import Aim
 from neuspring.core.files import write_atomically, write_text
+from neuspring.core.findings import Finding
 from neuspring.core.table import Cell, Chip, Table
 from neuspring.report.blocks import Block, Fold, Items, Text, markdown
 from neuspring.report.draw.benchmark import cluster_methods, clusters_figure, ratios_figure
 from neuspring.report.draw.sheet import save
 from neuspring.report.notes import differing_table, honest_notes
 from neuspring.report.study_cells import LEAST_SCENARIOS, ORACLE_LINE
+from neuspring.report.verdict import NOUNS, verdict
 from neuspring.scores import failures
 from neuspring.scores import statistics as ratios
 from neuspring.scores.metrics import (
@@ -47,6 +49,8 @@ from neuspring.scores.runs import Collected, comparable, finished_scores, mixed_
 from neuspring.scores.statistics import paired_differences
 
 NOT_COMPUTED = "not computed"
+MOST_OPEN = 12
+"""Most rows of a breakdown that is not folded."""
 LISTED = 12
 """At most so many missing runs, or notes, are listed one by one. If there are more, they are counted by method."""
 NUMBER = r"(?<![\w.])\d+(?:\.\d+)?(?!\w)"
@@ -74,6 +78,8 @@ class Benchmark:
     """Ratios that are aimed at."""
     transfers: Collected | None = None
     """Twins on other recordings of the same object, as runs."""
+    warnings: tuple[tuple[str, Finding], ...] = ()
+    """Scenarios, and what steps of perception warned of."""
 
     @cached_property
     def collected(self) -> Collected:
@@ -135,9 +141,8 @@ class Benchmark:
 
 
 def score_blocks(benchmark: Benchmark) -> list[Block]:
-    """Averages, floors, ratios and aims, paired differences, failures, pictures, marked points, what to be careful with."""
+    """Averages of all methods, aims, per scenario and category, pictures, marked points."""
     usable, runs = benchmark.usable, benchmark.collected.runs
-    headings = published(HEADINGS, usable)
     blocks: list[Block] = []
     if warning := mixed_settings(runs):
         blocks.append(Text(text=warning, tone="warn"))
@@ -145,20 +150,29 @@ def score_blocks(benchmark: Benchmark) -> list[Block]:
         blocks.append(Text(text=" ".join([_kept(benchmark), *removed])))
     if not len(usable) and not (runs["status"] == "ok").any():
         blocks.append(Text(text="No run has finished, so there is nothing to average.", tone="mute"))
-    blocks.append(errors_table(benchmark))
-    blocks += [Text(text=line) for line in floor_lines(runs)]
+    blocks += [errors_table(benchmark), *aim_table(benchmark.judged)]
+    blocks += [*breakdown_blocks(benchmark), *image_blocks(benchmark), *marked_blocks(usable, runs), *transfer_blocks(benchmark)]
+    return blocks
+
+
+def detail_blocks(benchmark: Benchmark) -> list[Block]:
+    """How sure the averages are: floors, spread, ratios, paired differences, failures, and what to be careful with."""
+    usable, runs = benchmark.usable, benchmark.collected.runs
+    headings = published(HEADINGS, usable)
+    blocks: list[Block] = [Text(text=line) for line in floor_lines(runs)]
     if len(benchmark.seeds):
         about = "Standard deviation of the log error, in per cent, mean over scenarios."
         cells = published(HEADINGS, benchmark.seeds)
         blocks.append(by_method("Spread over seeds", benchmark.seeds, cells, lambda r: Cell(text=f"{100 * r.spread:.1f} %"), about))
     if len(benchmark.ratios):
         blocks.append(ratio_table(f"Ratio of the error to that of {benchmark.baseline}", benchmark, benchmark.ratios, HEADINGS))
-    blocks += aim_table(benchmark.judged)
     if len(benchmark.differences):
         blocks.append(_differences(f"Paired difference to {benchmark.baseline}, mm", benchmark.differences, headings))
+        own = benchmark.differences[benchmark.differences["metric"].isin([metric for _, metric in IMAGE_HEADINGS])]
+        if len(own):
+            shown = {key: text for key, text in IMAGE_HEADINGS.items() if key in present(own)}
+            blocks.append(_differences(f"Pictures: paired difference to {benchmark.baseline}", own, shown))
     blocks += failure_blocks(benchmark.means)
-    blocks += image_blocks(benchmark)
-    blocks += marked_blocks(usable, runs)
     everyone = benchmark.everything.runs
     blocks += differing_table(benchmark.everything.records.values(), {name: name for name in dict.fromkeys(everyone["method"])})
     blocks += [Text(text=line) for line in failures.left_out_lines(benchmark.collected.left_out)]
@@ -179,7 +193,8 @@ def errors_table(benchmark: Benchmark) -> Table:
     shown = {metric for _, metric in headings}
     explained = "; ".join(f"{metric.heading}: {metric.explained or metric.title}" for metric in DISTANCES if metric.name in shown)
     spread = ", ± standard deviation over seeds" if _several_seeds(usable) else ""
-    note = f"Lower is better ({size}; {explained}). Mean over scenarios{spread}; in brackets the frame-weighted mean. Best in bold."
+    weighted = "; in brackets the frame-weighted mean" if _weighted(usable) else ""
+    note = f"In mm, lower is better ({size}; {explained}). Mean over scenarios{spread}{weighted}. Best in bold."
     rows = _method_rows(usable, runs, runs, headings)
     oracles = benchmark.everything.of(benchmark.everything.oracles)
     if len(oracles.runs):
@@ -201,7 +216,7 @@ def _method_rows(
     marked: bool = True,
 ) -> list[list[Cell]]:
     """Both averages of every method of `runs`, and how many of its runs in `counted` finished; `absent` stands for no value."""
-    several = _several_seeds(scores)
+    several, weighted = _several_seeds(scores), _weighted(scores)
     table: list[Any] = list(averages(scores).itertuples()) if len(scores) else []
     means = {(row.method, row.task, row.metric): row for row in table}
     best = _best((row.task, row.metric, row.equal) for row in table) if marked else {}
@@ -210,8 +225,8 @@ def _method_rows(
         metric = METRICS[row.metric]
         spread = f" ± {metric.text(row.seed_std) if np.isfinite(row.seed_std) else DASH}" if several else ""
         top = row.equal == best.get((row.task, row.metric))
-        frames = f"({metric.text(row.frames)})"
-        return Cell(text=metric.text(row.equal) + spread, small=[frames], value=row.equal, mark="best" if top else "")
+        frames = [f"({metric.text(row.frames)})"] if weighted else []
+        return Cell(text=metric.text(row.equal) + spread, small=frames, value=row.equal, mark="best" if top else "")
 
     rows = []
     for method in dict.fromkeys(runs["method"]):
@@ -249,7 +264,7 @@ def ratio_table(caption: str, benchmark: Benchmark, table: pd.DataFrame, heading
         small = [*interval, f"(n = {row.n})"]
         return Cell(text=f"{row.ratio:.3f}", small=small, chips=[RATIO_CHIPS[row.verdict]], value=float(row.ratio))
 
-    what = {"scenario": "scenarios", "category": "categories"}[benchmark.objects]
+    what = NOUNS[benchmark.objects]
     note = (
         f"Geometric mean over objects of the paired log ratio to {benchmark.baseline}, seeds averaged within an object; 95 % "
         f"t-interval over objects ({what}), none below {ratios.LEAST_OBJECTS}; n objects. Every row takes all pairs of scenario "
@@ -360,7 +375,7 @@ def floors_of(runs: pd.DataFrame) -> pd.DataFrame:
 
 def image_blocks(benchmark: Benchmark) -> list[Block]:
     """How pictures were scored, both averages and paired differences; a sentence if there are none."""
-    collected, scores, baseline = benchmark.collected, benchmark.usable, benchmark.baseline
+    collected, scores = benchmark.collected, benchmark.usable
     if "images" not in collected.runs:
         return [Text(text="No scores of pictures: no run has finished.")]
     runs = collected.runs.dropna(subset="images")
@@ -375,22 +390,19 @@ def image_blocks(benchmark: Benchmark) -> list[Block]:
         return [Text(text=f"No scores of pictures: {'; '.join(reasons) or 'no run that can be compared has them'}.")]
     have, asked = pictured["scenario"].nunique(), collected.runs["scenario"].nunique()
     some = "" if have == asked else f"Of {asked} scenarios {have} have scores of pictures. "
-    note = f"{some}{_image_conditions(rendered['images'])} Mean over scenarios; in brackets the frame-weighted mean."
-    rows = _method_rows(pictured, collected.runs, runs, IMAGE_HEADINGS, Cell(text=NOT_COMPUTED, value=""))
-    header = ["Method", *IMAGE_HEADINGS.values(), "Runs"]
-    caption = "Pictures: PSNR in dB, SSIM and IoU, higher is better; LPIPS, lower is better"
+    weighted = "; in brackets the frame-weighted mean" if _weighted(pictured) else ""
+    note = (
+        f"Higher is better; LPIPS: lower; PSNR in dB. {some}{_image_conditions(rendered['images'])} Mean over scenarios{weighted}."
+    )
+    headings = {key: text for key, text in IMAGE_HEADINGS.items() if key[1] in set(pictured["metric"])}
+    rows = _method_rows(pictured, collected.runs, runs, headings, Cell(text=NOT_COMPUTED, value=""))
+    header = ["Method", *headings.values(), "Runs"]
+    caption = "Scores of pictures"
     blocks: list[Block] = [Table(caption=caption, header=header, rows=rows, note=note, sortable=True)]
     blocks.append(Text(text=f"Part of the surface that no camera sees in frame 0: {_unseen(rendered)}."))
-    computed = {metric for _, metric in IMAGE_HEADINGS} & set(pictured["metric"])
-    where = "in some runs " if "lpips" in computed else ""
+    where = "in some runs " if "lpips" in set(pictured["metric"]) else ""
     reasons = sorted({str(facts["lpips"]) for facts in rendered["images"]} - {"computed"})
     blocks += [Text(text=f"LPIPS {where}not computed: {reason}") for reason in reasons]
-    differences = benchmark.differences
-    own = differences[differences["metric"].isin(computed)] if len(differences) else differences
-    if len(own):
-        headings = {key: text for key, text in IMAGE_HEADINGS.items() if key[1] in computed}
-        table = _differences(f"Pictures: paired difference to {baseline}", own, headings)
-        blocks.append(Fold(summary="Paired differences of pictures", blocks=[table]))
     return blocks
 
 
@@ -451,9 +463,12 @@ def transfer_blocks(benchmark: Benchmark) -> list[Block]:
 def breakdown_blocks(benchmark: Benchmark) -> list[Block]:
     """Per category and per scenario, of all finished runs."""
     finished = benchmark.finished
-    headings = {key: text for key, text in headings_of(finished).items() if key in present(finished)} if len(finished) else {}
+    headings = {key: text for key, text in HEADINGS.items() if key in present(finished)} if len(finished) else {}
     blocks: list[Block] = []
     for column, counted in (("category", "Scenarios"), ("scenario", "Seeds")) if headings else ():
+        count, scenarios = finished[column].nunique(), finished["scenario"].nunique()
+        if count == 1 or (column == "category" and count == scenarios):
+            continue  # the same as the averages, or as the other breakdown
         rows = []
         for name, part in finished.groupby(column, sort=False):
             means = part.groupby(["method", "task", "metric", "scenario"])["value"].mean().groupby(level=[0, 1, 2]).mean()
@@ -468,7 +483,7 @@ def breakdown_blocks(benchmark: Benchmark) -> list[Block]:
             [column.capitalize(), "Method", *headings.values(), counted],
         )
         table = Table(caption=caption, header=header, rows=rows, stub=2, sortable=True, note="All finished runs.")
-        blocks.append(Fold(summary=f"Per {column}", blocks=[table]))
+        blocks.append(Fold(summary=f"Per {column}", blocks=[table], open=column == "scenario" and len(rows) <= MOST_OPEN))
     return blocks
 
 
@@ -501,6 +516,11 @@ def _kept(benchmark: Benchmark) -> str:
     if not len(usable):
         return "No pair of scenario and seed was finished by every method, so there is no average of all methods."
     return f"Averages take {pairs(usable)} of {pairs(runs)} pairs of scenario and seed, those that every method finished."
+
+
+def _weighted(scores: pd.DataFrame) -> bool:
+    """Whether scenarios have different numbers of frames, so that both averages differ."""
+    return len(scores) > 0 and bool((scores.groupby(["task", "metric"])["frames"].nunique() > 1).any())
 
 
 def _several_seeds(scores: pd.DataFrame) -> bool:
@@ -585,11 +605,12 @@ def write(benchmark: Benchmark, folder: Path) -> str:
         (folder / name).unlink(missing_ok=True)
     shown = [f"![{caption}]({save(figure, folder / name).name})\n" for name, caption, figure in pictures(benchmark)]
     parts = ["# Scores\n", summary, *shown]
-    parts += [markdown([*transfer_blocks(benchmark), *breakdown_blocks(benchmark), timing_table(collected.runs)])]
+    parts += [markdown([timing_table(collected.runs)])]
     write_text(folder / "summary.md", "\n".join(part for part in parts if part))
     return summary
 
 
 def summary_text(benchmark: Benchmark) -> str:
-    """The scores in Markdown, and the runs that are not among them."""
-    return markdown([*score_blocks(benchmark), *not_counted(benchmark.everything.runs)])
+    """The verdict, the scores, and the runs that are not among them, in Markdown."""
+    blocks = [*verdict(benchmark), *score_blocks(benchmark), *detail_blocks(benchmark)]
+    return markdown([*blocks, *not_counted(benchmark.everything.runs)])

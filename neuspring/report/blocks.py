@@ -18,11 +18,12 @@ SYMBOLS: dict[Tone, str] = {"good": "✓", "bad": "✗", "warn": "!", "mute": "�
 
 @dataclass(frozen=True, kw_only=True)
 class Text:
-    """A paragraph; `tone` makes it a note."""
+    """A paragraph; `tone` makes it a note, `label` stands in front of it."""
 
     kind: ClassVar[str] = "text"
     text: str
     tone: Tone = ""
+    label: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,15 +42,6 @@ class Link:
     text: str
     target: str
     note: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Facts:
-    """Large numbers with a label each."""
-
-    kind: ClassVar[str] = "facts"
-    facts: Sequence[tuple[str, str, str]]
-    """Number, label, small print."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,6 +123,8 @@ class Grid:
     blocks: Sequence[Block]
     least: int = 17
     """Smallest width of a column, rem."""
+    films: bool = False
+    """The videos among them play in step, with one control."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,7 +138,7 @@ class Fold:
     key: str = ""
 
 
-Block = Table | Text | Items | Facts | Verdict | Picture | Video | Legend | Prose | Code | Grid | Fold
+Block = Table | Text | Items | Verdict | Picture | Video | Legend | Prose | Code | Grid | Fold
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,7 +160,8 @@ def markdown(blocks: Sequence[Block], level: str = "##") -> str:
             parts += [block.note] if block.note else []
             parts.append("\n".join(block.markdown()))
         elif isinstance(block, Text):
-            parts.append(f"**{block.text}**" if block.tone == "warn" else block.text)
+            text = f"**{block.label}:** {block.text}" if block.label else block.text
+            parts.append(f"**{text}**" if block.tone == "warn" else text)
         elif isinstance(block, Items):
             parts += [f"{block.title}:"] if block.title else []
             parts.append("\n".join(f"- {item}" for item in block.items))

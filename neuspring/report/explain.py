@@ -1,4 +1,5 @@
-"""Where a cell of a study's table comes from: every run behind it, its settings, code and data, and how to make it again.
+"""Where a number comes from, of a study's table or of the benchmark's: every run behind it, its settings, code and data, and how to
+make it again. The same of single runs.
 
 Everything is read from the records on disk, nothing from MLflow. The value is computed again and compared with the table's. All
 files that the records of the runs name are compared with their digests. `text` is the explanation for people.
@@ -31,10 +32,13 @@ from neuspring.report.study import StudyRecord, our_change, paper_change
 from neuspring.report.study_cells import accounted, cells, counted, restricted
 from neuspring.scores import paper
 from neuspring.scores.failures import left_out_lines
-from neuspring.scores.metrics import DASH, IN_STUDIES, Metric
+from neuspring.scores.metrics import DASH, IN_STUDIES, METRICS, Metric
 from neuspring.scores.runs import Collected, collect, one_line
 
 FACTS = ("run_key", "source", "commit", "device", "machine", "started", "ended", "data_digest")
+ROUND_OFF = 1e-12
+BENCHMARK = "summary"
+"""Stands for a study where a cell of the benchmark's own table is meant."""
 PICTURE_STAGES = ("appearance", "render")
 """Their settings are those of `images` and of perception's lifting."""
 
@@ -49,7 +53,7 @@ class Behind:
     why: str = ""
     """Why it is left out; empty for a run that counts."""
     value: float | None = None
-    """In the paper's unit."""
+    """In mm, or the unit of the metric."""
     frames: int | None = None
     record: str = ""
     """Path of run.json; empty if there is none."""
@@ -84,7 +88,10 @@ class Explanation:
     def problems(self) -> list[str]:
         """A table that is older than its runs, and files that are not as recorded."""
         ours = self.row["ours"]
-        stale = [] if ours == self.in_table else [f"the table says {self.in_table}, its runs now say {ours}: make it again"]
+        same = ours == self.in_table or (
+            None not in (ours, self.in_table) and math.isclose(ours, self.in_table or 0, rel_tol=ROUND_OFF)
+        )
+        stale = [] if same else [f"the table says {self.in_table}, its runs now say {ours}: make it again"]
         return stale + [f"{run.scenario} / seed {run.seed}: {text}" for run in self.runs for text in run.problems]
 
     def as_json(self) -> str:
@@ -93,12 +100,13 @@ class Explanation:
 
 
 def explain(cell: str, results: Path, folder: Path, configfiles: Sequence[str] = ()) -> Explanation:
-    """Explain `cell`, named STUDY/ROW/TASK/METRIC, of the tables in `folder`.
+    """Explain `cell`, named STUDY/ROW/TASK/METRIC, of the tables in `folder`, or METHOD/TASK/METRIC of the benchmark's beside it.
 
     ROW is a label or a method. Labels, tasks and metrics may be shortened where only one fits; the paper's names work too.
     `configfiles` are those that the runs were made with; the commands name them. Raises InputError for an unknown cell, and lists
     the known ones.
     """
+    cell = f"{BENCHMARK}/{cell}" if cell.count("/") == 2 else cell
     files, table = _find_table(cell, folder)
     label, task, metric = _find_cell(cell, files, table)
     study = restricted(files.study, collect(results, files.scenarios, files.methods, files.seeds, files.left_out))
@@ -145,12 +153,15 @@ def _only(table: pd.DataFrame, label: str, task: str, metric: str) -> pd.DataFra
 
 def _find_table(cell: str, folder: Path) -> tuple[StudyRecord, pd.DataFrame]:
     """The study that a cell names: what its table was made of, and its CSV."""
-    names = sorted(path.stem for path in Path(folder).glob("*.json") if path.with_suffix(".csv").is_file())
-    if not names:
+    names = studies_in(folder)
+    own = [BENCHMARK] if (Path(folder).parent / "averages.csv").is_file() else []
+    if not names and not own:
         raise InputError(
-            folder, "the tables of studies must be here", "none", "Make one first: snakemake table1 (or another study)."
+            folder, "tables must be here", "none", "Make them first: `neuspring tables` (a study: `snakemake table1`, or another)."
         )
-    study = _choose(cell.partition("/")[0], {name: name for name in names}, "study", cell)
+    study = _choose(cell.partition("/")[0], {name: name for name in [*own, *names]}, "study", cell)
+    if study == BENCHMARK:
+        return _benchmark(Path(folder).parent)
     assert SAFE_NAME.fullmatch(study)
     # Text stays text: a label may be a number, and the paper's digits count.
     text = dict.fromkeys(("label", "paper", "baseline", "unit"), str)
@@ -160,12 +171,70 @@ def _find_table(cell: str, folder: Path) -> tuple[StudyRecord, pd.DataFrame]:
     return StudyRecord.load(Path(folder) / f"{study}.json"), table
 
 
+def studies_in(folder: Path) -> list[str]:
+    """The studies whose tables are in a folder."""
+    return sorted(path.stem for path in Path(folder).glob("*.json") if path.with_suffix(".csv").is_file())
+
+
+def _benchmark(folder: Path) -> tuple[StudyRecord, pd.DataFrame]:
+    """The benchmark's own table as a study, whose rows are its methods."""
+    runs, means = (pd.read_csv(folder / f"{name}.csv", float_precision="round_trip") for name in ("runs", "averages"))
+    means = means[means["metric"].isin(list(IN_STUDIES))]
+    metrics = [IN_STUDIES[str(name)] for name in means["metric"]]
+    ours = [metric.paper_factor * row[metric.average] for metric, row in zip(metrics, _records(means), strict=True)]
+    scenarios, methods, seeds = (tuple(dict.fromkeys(runs[name].tolist())) for name in ("scenario", "method", "seed"))
+    there = set(zip(runs["method"], runs["scenario"], strict=True))
+    study = paper.Study(title="Scores", reference=None, baseline=methods[0], rows={name: name for name in methods})
+    left_out = {name: tuple(place for place in scenarios if (name, place) not in there) for name in methods}
+    record = StudyRecord(name=BENCHMARK, study=study, scenarios=scenarios, methods=methods, seeds=seeds, left_out=left_out)
+    return record, means.assign(label=means["method"], ours=ours)
+
+
+def runs_of(word: str, results: Path) -> list[Path]:
+    """The records of runs that a word names: a folder, SCENARIO, SCENARIO/METHOD/SEED, or METHOD."""
+    word = word.removesuffix(f"/{RUN_RECORD}")
+    places = [Path(word), Path(results) / word, *(Path(results).glob(f"*/{word}") if SAFE_NAME.fullmatch(word) else ())]
+    return sorted({path for place in places for below in ("", "*/", "*/*/") for path in place.glob(f"{below}{RUN_RECORD}")})
+
+
+def run_text(path: Path, configfiles: Sequence[str] = ()) -> tuple[str, bool]:
+    """What is known of a run, and whether all is as recorded."""
+    record, results = RunRecord.load(path), path.parents[3]
+    found = _behind(asdict(record), "", None, results, configfiles)
+    scores = pd.read_parquet(path.parent / record.scores_file) if record.scores_file else pd.DataFrame()
+    lines = [f"{record.name}: {record.status}{': ' * bool(record.reason)}{record.reason}"]
+    for task, part in scores.groupby("task", sort=False) if len(scores) else ():
+        values = [(METRICS[row["metric"]], row["value"]) for row in _records(part)]
+        texts = [f"{metric.heading} {metric.text(value)} {metric.shown_unit}".rstrip() for metric, value in values]
+        lines.append(f"  {task}: {', '.join(texts)}")
+    lines += [f"  note: {note}" for note in record.notes]
+    facts = [f"  {name}: {_commit(str(value)) if name == 'commit' else value}" for name, value in found.facts.items()]
+    lines += [*facts, *(f"  {name}: {json.dumps(value)}" for name, value in found.settings.items())]
+    lines += [f"  {found.files} files compared with their digests; {len(found.problems) or 'nothing'} not as recorded"]
+    return "\n".join([*lines, *(f"  - {problem}" for problem in found.problems), f"  again: {found.command}"]), not found.problems
+
+
+def known(results: Path, folder: Path) -> str:
+    """What can be explained here."""
+    runs = [path.parent.relative_to(results).as_posix() for path in sorted(Path(results).glob(f"*/*/*/{RUN_RECORD}"))]
+    if not runs:
+        raise InputError(results, "a results folder with finished runs is required", "none", "Name another: --results FOLDER.")
+    lines = [f"A study: {name}/ROW/TASK/METRIC" for name in studies_in(folder)]
+    if (folder.parent / "averages.csv").is_file():
+        _, table = _benchmark(folder.parent)
+        names = [" | ".join(dict.fromkeys(table[column])) for column in ("label", "task", "metric")]
+        lines.insert(0, f"A number of {folder.parent}/summary.md: METHOD/TASK/METRIC, of\n  " + "\n  ".join(names))
+    more = [f"and {len(runs) - MOST} more"] if len(runs) > MOST else []
+    return "\n".join([*lines, "A run: " + "\n       ".join([*runs[:MOST], *more])])
+
+
 def _find_cell(cell: str, files: StudyRecord, table: pd.DataFrame) -> tuple[str, str, str]:
     """Label, task and metric of a cell. Labels may hold a slash."""
     cells = [f"{files.name}/{row.label}/{row.task}/{row.metric}" for row in table.itertuples()]
     parts = cell.split("/")
     if len(parts) < 4:
-        raise InputError(f"cell {cell!r}", "a cell is STUDY/ROW/TASK/METRIC", None, _suggestions(cell, cells))
+        rule = "a number is METHOD/TASK/METRIC or STUDY/ROW/TASK/METRIC, a run SCENARIO/METHOD/SEED"
+        raise InputError(f"cell {cell!r}", rule, None, _suggestions(cell, cells))
     labels = {label: label for label in files.study.rows}
     labels |= {method: label for label, method in files.study.rows.items() if method not in labels}
     label = _choose("/".join(parts[1:-2]), labels, "row", cell)
@@ -255,7 +324,7 @@ def check_files(path: Path, record: RunRecord, observations: Path) -> tuple[int,
 def departures(settings: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """The settings of every stage that differ from the defaults or have no default, under dotted names."""
     defaults = config.plain(config.Config())
-    pictures = defaults["images"] | {"lift": defaults["perception"]["lift"]}
+    pictures = defaults | defaults["images"] | {"lift": defaults["perception"]["lift"]}
     models = {None: defaults, **defaults["baselines"]}
     different: dict[str, Any] = {}
     for stage, values in settings.items():
@@ -289,6 +358,8 @@ def rerun(results: Path, scenario: str, method: str, seed: int, record: RunRecor
     return shlex.join(words)
 
 
+MOST = 12
+"""Runs that are listed."""
 SHORT = 12
 """Characters of a digest; --json has all."""
 
@@ -332,8 +403,9 @@ def _value(explanation: Explanation, metric: Metric) -> list[str]:
     if np.isfinite(cell.low):
         lines.append(f"         95 % bootstrap interval: [{metric.paper_text(cell.low)}, {metric.paper_text(cell.high)}]")
     difference = metric.paper_text(cell.difference, "+")
-    lines.append(f"paper    {cell.paper or DASH}{unit * bool(cell.paper)}; ours - paper: {difference}")
-    lines.append(f"verdict  {cell.verdict}")
+    if explanation.cell.partition("/")[0] != BENCHMARK:
+        lines.append(f"paper    {cell.paper or DASH}{unit * bool(cell.paper)}; ours - paper: {difference}")
+        lines.append(f"verdict  {cell.verdict}")
     if cell.label != cell.baseline:
         change = f"paper {paper_change(cell, metric)}, ours {our_change(cell, metric)}"
         lines.append(f"change   against {cell.baseline}: {change}: {cell.direction}")

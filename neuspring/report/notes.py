@@ -33,7 +33,7 @@ def honest_notes(collected: Collected) -> list[str]:
         notes += _against_static(scenario, scores[scores["scenario"] == scenario])
         for method in dict.fromkeys(method for _, method, _ in records):
             runs = [record for key, record in records.items() if key[1] == method]
-            notes += [f"{scenario} / {method}: {text}" for text in _learning(runs)]
+            notes += [f"{scenario} / {method}: {text}" for text, _ in [*causes(runs), *_grip(runs)]]
     return notes
 
 
@@ -58,28 +58,32 @@ def _against_static(scenario: str, scores: pd.DataFrame) -> list[str]:
     return notes
 
 
-def _learning(runs: Iterable[RunRecord]) -> list[str]:
-    """What the records of one method's seeds say of search, training and grip."""
+def causes(runs: Iterable[RunRecord]) -> list[tuple[str, str]]:
+    """What the records of one method's seeds say against search and training, each with the next move."""
     facts = [record.params for record in runs]
     ends = {name.strip() for values in facts for name in str(values.get("search.result.at_ends", "")).split(",") if name.strip()}
     bound = [values for values in facts if values.get("fit.result.at_bound", 0.0) > AT_BOUND]
     first = [values for values in facts if values.get("fit.result.best_epoch", 1) <= 0]
-    texts = []
-    if ends:
-        texts.append(f"the search ended at an end of its range in {', '.join(sorted(ends))} (search.variables)")
+    found = []
+    if not max((held for values in facts if (held := _gripping(values)) is not None), default=1):
+        found.append(("no spring joins a hand to the object, so nothing moves it", "Look at the hands in lifted.png."))
     if bound:
         most = max(values["fit.result.at_bound"] for values in bound)
-        texts.append(f"up to {most:.0%} of the springs lie at the bound of their stiffness (fit.output_bound)")
+        found.append((f"up to {most:.0%} of the springs lie at the bound of their stiffness", "Raise fit.output_bound."))
+    if ends:
+        names = ", ".join(sorted(ends))
+        found.append((f"the search ended at an end of its range in {names}", f"Widen search.variables for {names}."))
     if first:
         of = f" with {len(first)} of {len(facts)} seeds" if len(facts) > 1 else ""
-        texts.append(f"training improved nothing: the best epoch is the first{of}")
-    counts = [held for values in facts if (held := _gripping(values)) is not None]
-    if counts and not max(counts):
-        texts.append("no spring joins a hand to the object, so nothing moves it")
-    elif counts:
-        number = f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
-        texts.append(f"{number} springs join the hands to the object")
-    return texts
+        found.append((f"training improved nothing: the best epoch is the first{of}", "Lower fit.learning_rate."))
+    return found
+
+
+def _grip(runs: Iterable[RunRecord]) -> list[tuple[str, str]]:
+    """How many springs hold the hands, if any do."""
+    counts = [held for record in runs if (held := _gripping(record.params))]
+    number = f"{min(counts)}" if len(set(counts)) == 1 else f"{min(counts)} to {max(counts)}" if counts else ""
+    return [(f"{number} springs join the hands to the object", "")] if counts else []
 
 
 def _gripping(values: Mapping[str, Any]) -> int | None:

@@ -1,4 +1,4 @@
-"""The report: one HTML file that says whether the paper was reproduced, and shows everything a results folder holds.
+"""The report: one HTML file that opens with the verdict in words, and shows everything a results folder holds.
 
 It needs no network and no script. It is made from what is on disk, also while a benchmark runs, and lists the files that it cannot
 read.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,20 +17,23 @@ import pandas as pd
 from neuspring.config import Config
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
+from neuspring.core.findings import warnings_of
 from neuspring.core.records import now
 from neuspring.core.table import Tone
 from neuspring.report import study_cells
-from neuspring.report.benchmark import Benchmark, breakdown_blocks, pictures, score_blocks, transfer_blocks
-from neuspring.report.blocks import Block, Facts, Fold, Grid, Section, Text, Verdict, html_page
+from neuspring.report.benchmark import Benchmark, detail_blocks, pictures, score_blocks
+from neuspring.report.blocks import Block, Fold, Grid, Section, Text, Verdict, html_page
 from neuspring.report.draw.sheet import DPI
 from neuspring.report.sections.curves import curves_section
-from neuspring.report.sections.data import Options, ReportData, damaged_files, hours, job_records, listed, several, traces
+from neuspring.report.sections.data import Options, ReportData, damaged_files, job_records, listed, several, traces
 from neuspring.report.sections.pictures import Media, embedded, pictures_section
 from neuspring.report.sections.setup import perception_section, setup_section, tuning_section
-from neuspring.report.sections.work import failures_section, findings_section, gpu_hours, work_section
+from neuspring.report.sections.work import failures_section, findings_section, work_section
 from neuspring.report.study import StudyNumbers, kind, study_blocks, verdict_chip
 from neuspring.report.study_cells import BETTER, WITHIN, WORSE
+from neuspring.report.verdict import verdict
 from neuspring.scores import paper
+from neuspring.scores.paper import Study
 from neuspring.scores.runs import collect, collect_transfers
 
 __all__ = ["Options", "write"]
@@ -40,7 +43,10 @@ MOST_SHOWN = 6
 ANSWERED = (WITHIN, BETTER, WORSE)
 WITHOUT_DIRECTION = (study_cells.NOT_RUN, study_cells.NOT_COMPUTED, study_cells.NOTHING_TO_COMPARE, study_cells.NO_VALUE, ")")
 """Ends of verdicts on a change that name no direction; a bracket counts failed runs."""
-ORDER = ("verdict", "studies", "scores", "curves", "pictures", "findings", "perception", "tuning", "work", "failures", "setup")
+ORDER = (
+    *("verdict", "scores", "pictures", "curves", "details", "studies"),
+    *("findings", "perception", "tuning", "work", "failures", "setup"),
+)
 Studies = Mapping[str, StudyNumbers]
 
 
@@ -53,15 +59,25 @@ def write(results: Path, output: Path, options: Options, written: str | None = N
     if not results.is_dir():
         raise InputError(results, "the results folder must exist", "no such folder", "Run the workflow first, or name another.")
     material, written = gather(results, Path(output), options), written or now()
-    choice, known = material.choice, material.choice.studies
+    choice, known, config = material.choice, material.choice.studies, material.choice.settings or Config()
     studies = {
         name: StudyNumbers(name=name, study=study, collected=material.collected, beside=known.get(study.beside or ""))
         for name, study in (known.items() if choice.size else ())
+        if _ran(material, name, study)
     }
+    benchmark = Benchmark(
+        everything=material.collected,
+        baseline=choice.baseline or "",
+        objects=config.objects,
+        aims=config.aims,
+        transfers=material.transfers,
+        warnings=warnings_of(results, choice.scenarios),
+    )
     made = [
-        _study_section(studies) if studies else None,
-        _score_section(material),
+        _score_section(benchmark),
         curves_section(material),
+        _detail_section(benchmark),
+        _study_section(studies, material.collected.runs) if studies else None,
         findings_section(material),
         perception_section(material),
         tuning_section(material),
@@ -69,14 +85,13 @@ def write(results: Path, output: Path, options: Options, written: str | None = N
         setup_section(material),
     ]
     parts = {section.key: section for section in made if section is not None}
-    seeds = f"seeds {listed([str(seed) for seed in choice.seeds])}" if choice.seeds else "no seeds"
+    seeds = f"seed{'s' * (len(choice.seeds) > 1)} {listed([*map(str, choice.seeds)])}" if choice.seeds else "no seeds"
     numbers = f"{several(len(choice.scenarios), 'scenario')}, {several(len(choice.methods), 'method')}, {seeds}"
-    subtitle = f"{numbers}; {results.resolve().name}"
-    verdicts = [_verdict(one) for one in studies.values() if one.study.reference]
+    subtitle = f"{numbers}; {results.resolve().name}. Errors are in mm."
 
     def page(shown: Section) -> str:
         # The sections that list damaged files are made last, because every other section may find some.
-        last = {"pictures": shown, "failures": failures_section(material), "verdict": _summary(material, verdicts)}
+        last = {"pictures": shown, "failures": failures_section(material), "verdict": _summary(material, benchmark)}
         found = parts | last
         sections = [found[key] for key in sorted(found, key=ORDER.index)]
         return html_page("NeuSpring: report", subtitle, sections, written=written)
@@ -129,39 +144,35 @@ def _filled(results: Path, options: Options, there: tuple[list[str], list[str], 
     )
 
 
-def _summary(material: ReportData, verdicts: Sequence[Block]) -> Section:
-    runs, choice = material.collected.runs, material.choice
-    title = "Did it reproduce?"
-    if not choice.size:
+def _summary(material: ReportData, benchmark: Benchmark) -> Section:
+    """The verdict in words, first of all."""
+    blocks: list[Block] = [*verdict(benchmark)] if material.choice.size else []
+    if not blocks:
         text = f"Nothing to report yet: {material.results.resolve().name} holds no run, and none was asked for."
-        return Section(key="verdict", title=title, blocks=[Text(text=text, tone="warn")])
-    status = runs["status"].value_counts().to_dict()
-    damaged = f", or of {several(len(material.damaged), 'damaged file')}" if material.damaged else ""
-    failed_jobs = sum(job.failed for job in material.jobs)
-    facts = [
-        (f"{status.get('ok', 0)} of {choice.size}", "runs finished", f"{status.get('missing', 0)} missing"),
-        (f"{status.get('failed', 0)}", "failed runs", f"numerical{damaged}"),
-        (f"{failed_jobs}", "failed jobs", f"of {len(material.jobs)}") if material.jobs else ("–", "failed jobs", "no job records"),
-        (hours(3600 * gpu_hours(material.jobs)) if material.jobs else "–", "GPU-hours so far", "job records"),
-        (f"{len(choice.scenarios)} × {len(choice.methods)} × {len(choice.seeds)}", "scenarios × methods × seeds", ""),
-    ]
-    blocks: list[Block] = [*([Grid(blocks=verdicts, least=17)] if verdicts else []), Facts(facts=facts), _data(runs)]
-    return Section(key="verdict", title=title, blocks=blocks)
+        blocks.append(Text(text=text, tone="warn"))
+    failed, damaged = sum(job.failed for job in material.jobs), len(material.damaged)
+    for count, noun, what in ((failed, "job", "failed"), (damaged, "file", "cannot be read")):
+        if count:
+            blocks.append(Text(text=f"{several(count, noun)} {what}: see Failures and missing runs.", tone="warn"))
+    return Section(key="verdict", title="Verdict", blocks=blocks)
 
 
-def _data(runs: pd.DataFrame) -> Text:
-    """Whether the data are PhysTwin's, by the sources of finished runs."""
-    finished = runs[runs["source"] != ""]
-    if not len(finished):
-        return Text(text="No run has finished, so nothing is known of the data.", tone="mute")
-    counts = finished.groupby("source")["scenario"].nunique().to_dict()
-    named = ", ".join(f"{source} ({several(int(count), 'scenario')})" for source, count in counts.items())
+def _foreign(runs: pd.DataFrame) -> str:
+    """A sentence on data that are not all PhysTwin's, by the sources of finished runs; empty if they are."""
+    counts = runs[runs["source"] != ""].groupby("source")["scenario"].nunique().to_dict()
     if set(counts) == {"phystwin"}:
-        return Text(text=f"The data are PhysTwin's: {named}.", tone="good")
-    text = f"The data are {'only partly' if 'phystwin' in counts else 'not'} PhysTwin's: {named}. "
-    return Text(
-        text=text + "Values beside the paper's are for orientation; changes against a baseline can be compared.", tone="warn"
-    )
+        return ""
+    named = ", ".join(f"{source} ({several(int(count), 'scenario')})" for source, count in counts.items()) or "unknown"
+    part = "only partly" if "phystwin" in counts else "not"
+    return f"The data are {part} the paper's: {named}. Compare changes against a baseline, not values."
+
+
+def _ran(material: ReportData, name: str, study: Study) -> bool:
+    """Whether a study was asked for, or several of its rows ran on the paper's data."""
+    settings = material.choice.settings
+    table = material.results / material.choice.tables / "studies" / f"{name}.md"
+    paired = {run.method for run in material.runs if run.ok and run.source == "phystwin"} & set(study.rows.values())
+    return table.is_file() or len(paired) > 1 or (settings is not None and name in settings.studies)
 
 
 def _verdict(numbers: StudyNumbers) -> Verdict:
@@ -193,33 +204,31 @@ def _answer(counts: Counter[str], total: int) -> tuple[str, Tone]:
     return f"{agree} of {total} cells within the interval or better, {counts[WORSE]} worse, {total - answered} open.", tone
 
 
-def _study_section(studies: Studies) -> Section:
-    """The tables of the studies, as `neuspring study` writes them; those without any run are folded."""
-    folds: list[Block] = []
-    for name, numbers in studies.items():
-        has_runs = len(numbers.cells) > 0 and bool(numbers.cells["ours"].notna().any())
-        summary = f"{name}: {numbers.study.title}" + ("" if has_runs else " (not run)")
-        folds.append(Fold(summary=summary, blocks=study_blocks(numbers), open=has_runs, key=f"study-{name}"))
-    about = "The command neuspring explain STUDY/ROW/TASK/METRIC says what a cell is made of."
-    return Section(key="studies", title="The paper's tables", blocks=folds, about=about)
+def _study_section(studies: Studies, runs: pd.DataFrame) -> Section:
+    """The verdict on each study, then its tables, as `neuspring study` writes them."""
+    cards = [_verdict(one) for one in studies.values() if one.study.reference]
+    folds = [
+        Fold(summary=f"{name}: {numbers.study.title}", blocks=study_blocks(numbers), open=True, key=f"study-{name}")
+        for name, numbers in studies.items()
+    ]
+    about = f"{_foreign(runs)} The command neuspring explain STUDY/ROW/TASK/METRIC says what a cell is made of."
+    return Section(key="studies", title="The paper's tables", blocks=[Grid(blocks=cards, least=17), *folds], about=about.strip())
 
 
-def _score_section(material: ReportData) -> Section:
-    """The benchmark's own tables and pictures, as `neuspring tables` writes them."""
-    if not len(material.collected.runs):
-        return Section(key="scores", title="Scores", blocks=[Text(text="No run has finished.", tone="mute")])
-    config, choice = material.choice.settings or Config(), material.choice
-    benchmark = Benchmark(
-        everything=material.collected,
-        baseline=choice.baseline or "",
-        objects=config.objects,
-        aims=config.aims,
-        transfers=material.transfers,
-    )
+def _score_section(benchmark: Benchmark) -> Section:
+    """The benchmark's own tables, as `neuspring tables` writes them."""
+    some = len(benchmark.everything.runs)
+    blocks = score_blocks(benchmark) if some else [Text(text="No run has finished.", tone="mute")]
+    return Section(key="scores", title="Scores", blocks=blocks)
+
+
+def _detail_section(benchmark: Benchmark) -> Section | None:
+    """How sure the scores are, with a picture of the ratios."""
+    if not len(benchmark.everything.runs):
+        return None
     blocks: list[Block] = []
     for _, caption, figure in pictures(benchmark) if len(benchmark.usable) else ():
         stream = io.BytesIO()
         figure.savefig(stream, dpi=DPI, format="png")
         blocks.append(embedded(stream.getvalue(), caption, caption, wide=True))
-    blocks += [*score_blocks(benchmark), *transfer_blocks(benchmark), *breakdown_blocks(benchmark)]
-    return Section(key="scores", title="Scores", blocks=blocks)
+    return Section(key="details", title="How sure the scores are", blocks=[*blocks, *detail_blocks(benchmark)])

@@ -358,7 +358,7 @@ def beyond_table(study: Study, cells: pd.DataFrame) -> Table:
     rows = _lines(cells[~cells["oracle"]], columns, lambda label: values + (changes if label != study.baseline else []))
     rows += _oracle_rows(cells, columns, 2)
     note = (
-        "TE bound: track error, in m, of points that move with the nodes around them. It is 0 for every rigid motion. TE has "
+        "TE bound: track error, in mm, of points that move with the nodes around them. It is 0 for every rigid motion. TE has "
         f"a floor, its value in frame 0. Change against {study.baseline} with the paired 95 % bootstrap interval."
     )
     return _grouped("Without a floor", note, ["Method", ""], columns, rows)
@@ -496,7 +496,7 @@ def _runs(cell: Any) -> str:
 
 
 def _units(columns: Columns) -> str:
-    text = "CD (single-directional L1 Chamfer distance) and TE (track error) in m"
+    text = "CD (single-directional L1 Chamfer distance) and TE (track error) in mm"
     return f"{text}, PSNR in dB." if any(metric.name == "psnr" for _, metric in columns) else f"{text}."
 
 
@@ -550,12 +550,13 @@ def by_category(study: Study, scores: pd.DataFrame) -> pd.DataFrame:
 
 
 def released_comparison(own: Collected, method: str) -> pd.DataFrame:
-    """Every value of the released PhysTwin with ours beside it, m; NaN where there is no finished run on the released data."""
+    """Every value of the released PhysTwin with ours beside it, mm; NaN where there is no finished run on the released data."""
     mine = (own.runs["status"] == "ok") & (own.runs["source"] == "phystwin") & (own.runs["method"] == method)
     finished = own.runs.loc[mine, ["scenario", "method", "seed"]]
     keys = ["scenario", "task", "metric"]
     ours = own.scores.merge(finished).groupby(keys)["value"].agg(ours="mean", spread="std", seeds="count").reset_index()
-    table = paper.released().rename(columns={"value": "released"}).merge(ours, on=keys, how="left")
+    released = paper.released().assign(released=1e3 * paper.released()["value"]).drop(columns="value")
+    table = released.merge(ours, on=keys, how="left")
     table["seeds"] = table["seeds"].fillna(0).astype(int)
     return table.assign(difference=table["ours"] - table["released"], ratio=table["ours"] / table["released"])
 
@@ -627,7 +628,7 @@ def _write_released(numbers: StudyNumbers, folder: Path) -> str:
     table, stem = released_comparison(own, method), f"{name}_released_phystwin"
     write_text(folder / f"{stem}.csv", table.to_csv(index=False))
     head = f"# Ours ({method}) beside the released PhysTwin, per scenario\n"
-    note = "m; mean over seeds (± standard deviation). The released values of the training frames are known for 11 scenarios.\n"
+    note = "mm; mean over seeds (± standard deviation). The released values of the training frames are known for 11 scenarios.\n"
     tables = []
     for (task, metric), part in table.groupby(["task", "metric"], sort=True):
         both = part.dropna(subset="ours")

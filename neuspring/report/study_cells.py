@@ -1,7 +1,7 @@
 """The numbers of a study's table: for every row, task and metric ours beside the paper's, with intervals and verdicts.
 
 Two questions have two verdicts. Is the value the paper's? That can be asked on its 22 scenarios alone. Does the change against
-the study's baseline go where the paper's goes? That can be asked on any data. All values are in the paper's units.
+the study's baseline go where the paper's goes? That can be asked on any data. All values are in the units of `Metric.paper_unit`.
 """
 
 from __future__ import annotations
@@ -62,14 +62,14 @@ Estimates = dict[tuple[str, str, str], Estimate]
 
 
 def restricted(study: Study, collected: Collected) -> Collected:
-    """The scores, in the paper's units, and the runs of a study's methods."""
+    """The scores, in the units of studies, and the runs of a study's methods."""
     methods = list(study.rows.values())
     own = collected.of(methods)
     return replace(own, scores=_in_paper_units(own.scores), frozen=_in_paper_units(own.frozen))
 
 
 def _in_paper_units(scores: pd.DataFrame) -> pd.DataFrame:
-    """The scores in the metrics of studies, in the paper's units."""
+    """The scores in the metrics of studies, in their units."""
     scores = scores[scores["metric"].isin(list(IN_STUDIES))]
     factors = scores["metric"].map({name: metric.paper_factor for name, metric in IN_STUDIES.items()}).astype(float)
     return scores.assign(value=scores["value"].astype(float) * factors)

@@ -38,7 +38,7 @@ below tables alike."""
 
 @dataclass(frozen=True, kw_only=True)
 class Metric:
-    """A metric, and how tables show it: in summaries, and beside the paper's values in the units and digits of the paper."""
+    """A metric, and how tables show it: in summaries, and beside the paper's values, which stand in mm where they are lengths."""
 
     name: str
     title: str
@@ -70,7 +70,7 @@ class Metric:
     paper_unit: str = ""
     """Empty for plain numbers."""
     paper_factor: float = 1.0
-    """From the stored unit to the paper's."""
+    """From the stored unit to `paper_unit`."""
     paper_digits: int = 3
     """After the point, for our values beside the paper's."""
 
@@ -83,6 +83,11 @@ class Metric:
     def label(self) -> str:
         """For an axis: heading and unit."""
         return self.heading if self.unit == "1" else f"{self.heading} [{self.unit}]"
+
+    @property
+    def shown_unit(self) -> str:
+        """The unit of summaries; empty for plain numbers."""
+        return "mm" if self.unit == "m" else "" if self.unit == "1" else self.unit
 
     @property
     def paper_column(self) -> str:
@@ -102,16 +107,16 @@ _ALL = (
     Metric(
         name="chamfer", title="Chamfer distance", heading="CD", unit="m", factor=1e3, digits=2, tolerance=1e-6,
         explained="single-directional L1 Chamfer",
-        paper_name="cd", paper_heading="CD", paper_unit="m", paper_digits=5,
+        paper_name="cd", paper_heading="CD", paper_unit="mm", paper_factor=1e3, paper_digits=2,
     ),
     Metric(
         name="track_error", title="track error", heading="TE", unit="m", factor=1e3, digits=2, tolerance=1e-6,
-        paper_name="track_error", paper_heading="TE", paper_unit="m", paper_digits=5,
+        paper_name="track_error", paper_heading="TE", paper_unit="mm", paper_factor=1e3, paper_digits=2,
     ),
     Metric(
         name="track_error_bound", title="bound track error", heading="TE bound", unit="m", factor=1e3, digits=2, tolerance=1e-6,
         explained="track error of points bound to the nodes around them, 0 for any rigid motion",
-        paper_heading="TE bound", paper_unit="m", paper_digits=5,
+        paper_heading="TE bound", paper_unit="mm", paper_factor=1e3, paper_digits=2,
     ),
     Metric(
         name="psnr", title="PSNR", heading="PSNR", unit="dB", digits=2, tolerance=0.02, relative=False,

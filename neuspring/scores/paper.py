@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import functools
 from dataclasses import dataclass
+from decimal import Decimal
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -34,7 +35,7 @@ _MEANS = "MEAN22"
 
 @dataclass(frozen=True, kw_only=True)
 class Printed:
-    """A value that the paper prints, in its unit."""
+    """A value that the paper prints; lengths in mm, of which the paper prints m."""
 
     text: str
     value: float
@@ -50,9 +51,9 @@ Values = dict[tuple[str, str, str], Printed]
 def table(name: str) -> Values:
     """One of the paper's tables; empty if there is none of that name."""
     tasks = {theirs: ours for ours, theirs in TASKS.items()}
-    metrics = {metric.paper_name: metric.name for metric in IN_PAPER.values()}
+    metrics = {metric.paper_name: metric for metric in IN_PAPER.values()}
     return {
-        (row["method"], tasks[row["task"]], metrics[row["metric"]]): _printed(row["value"])
+        (row["method"], tasks[row["task"]], metrics[row["metric"]].name): _printed(row["value"], metrics[row["metric"]].unit == "m")
         for row in _rows("paper_tables.csv")
         if row["table"] == name
     }
@@ -84,7 +85,8 @@ def scenarios() -> frozenset[str]:
     return frozenset(released()["scenario"])
 
 
-def _printed(text: str) -> Printed:
+def _printed(text: str, in_meters: bool) -> Printed:
+    text = f"{Decimal(text).scaleb(3):f}" if in_meters else text
     digits = len(text.partition(".")[2])
     return Printed(text=text, value=float(text), slack=0.5 * 10.0**-digits)
 

@@ -137,6 +137,16 @@ def t_interval(values: np.ndarray) -> tuple[float, float]:
     return float(values.mean() - reach), float(values.mean() + reach)
 
 
+def needed(low: float, high: float, count: int, most: int = 200) -> int | None:
+    """How many objects resolve a ratio whose interval over `count` of them is [low, high], if all scatter alike; None: too many."""
+    from scipy.stats import t
+
+    mean, reach = 0.5 * math.log(low * high), 0.5 * math.log(high / low)
+    scatter = reach * math.sqrt(count) / t.ppf(0.975, count - 1)
+    enough = (n for n in range(count, most + 1) if t.ppf(0.975, n - 1) * scatter / math.sqrt(n) < abs(mean))
+    return next(enough, None)
+
+
 def verdict(low: float, high: float) -> str:
     """Where an interval lies with respect to 1."""
     if math.isnan(low):

@@ -7,7 +7,7 @@ import pandas as pd
 
 from neuspring.core.files import write_table, write_text
 from neuspring.core.job_records import Attempt, JobRecord, begin_run, this_run
-from neuspring.experiments.messages import Overview, first_table
+from neuspring.experiments.messages import Overview
 
 
 def save(results, name: str, **facts) -> None:
@@ -66,9 +66,3 @@ def test_a_scenario_is_shown_when_its_last_run_has_its_scores_but_not_the_last_s
         save(tmp_path, f"score/{run}")
     overview._look()
     assert "cloth" not in stream.getvalue(), "the table of all scenarios follows"
-
-
-def test_the_first_table_of_a_summary_is_a_table_and_what_stands_above_it():
-    text = "# Scores\n\nErrors in mm.\n\n| a | b |\n|---|---|\n| 1 | 2 |\n\nPaired:\n\n| c |\n|---|\n| 3 |\n"
-    assert first_table(text) == "Errors in mm.\n\n| a | b |\n|---|---|\n| 1 | 2 |"
-    assert first_table("# Scores\n\nNo run has finished.\n") == "No run has finished."

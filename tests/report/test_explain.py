@@ -1,7 +1,10 @@
 """A cell of a table can be followed to its runs, and says when they are no longer what they were."""
 
+import io
 import json
+import re
 import shutil
+from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,15 +13,18 @@ import pandas as pd
 import pytest
 
 from neuspring import config
+from neuspring.cli.main import main
 from neuspring.core.artifacts import Trajectory
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.core.run_record import RunRecord
 from neuspring.report import explain as explain_text
 from neuspring.report import study as tables_paper
+from neuspring.report.benchmark import Benchmark, write
 from neuspring.report.explain import check_files, departures, explain, rerun
 from neuspring.scores import paper
 from neuspring.scores.paper import read_studies
+from neuspring.scores.runs import collect
 from neuspring.stages.score import score
 from tests.support import small
 from tests.support.runs import STARTED, run_record
@@ -152,7 +158,7 @@ def test_labels_may_hold_a_slash(results, cell):
         ("table3/w/future/cd", "must name one row; it could be w/o AR .*, w/o TP"),
         ("table3/NeuSpring/past/cd", "must name one task.*Known: reconstruction"),
         ("table3/NeuSpring/future/psnr", "must name one metric.*Known: cd, chamfer"),
-        ("table3/NeuSpring", "a cell is STUDY/ROW/TASK/METRIC.*Did you mean table3/NeuSpring/"),
+        ("table3/NeuSpring", "a number is METHOD/TASK/METRIC or STUDY/ROW/TASK/METRIC.*Did you mean table3/NeuSpring/"),
         ("", "must name one study"),
     ],
 )
@@ -162,7 +168,7 @@ def test_a_cell_that_there_is_not_is_refused_with_those_that_there_are(results, 
 
 
 def test_without_tables_it_says_how_to_make_them(tmp_path):
-    with pytest.raises(InputError, match="Make one first"):
+    with pytest.raises(InputError, match="Make them first"):
         explain("table1/NeuSpring/future/cd", tmp_path, tmp_path)
 
 
@@ -254,3 +260,66 @@ def test_the_key_is_that_of_a_real_run(tmp_path):
     assert check_files(folder / "run.json", record, seen) == (3, [])
     _, problems = check_files(folder / "run.json", replace(record, seed=1), seen)
     assert len(problems) == 1
+
+
+@pytest.fixture
+def done(results):
+    """The tables of the benchmark beside those of a study, as a finished workflow leaves them."""
+    found = collect(results, NAMES, METHODS, [0, 1])
+    write(Benchmark(everything=found, baseline="fixed_resolution"), results / "tables")
+    (results / "tables" / "studies").mkdir()
+    for path in (results / "tables").glob("table3*"):
+        path.rename(results / "tables" / "studies" / path.name)
+    return results
+
+
+def told(results: Path, *words: str) -> tuple[int, str]:
+    """Exit status and output of the command."""
+    with redirect_stdout(io.StringIO()) as stream:
+        status = main(["explain", *words, "--results", str(results)])
+    return status, stream.getvalue()
+
+
+def test_a_number_of_the_summary_is_explained_without_any_study(done):
+    shutil.rmtree(done / "tables" / "studies")
+    status, text = told(done, "neuspring/future/TE")
+    assert status == 0 and text.startswith("summary/neuspring/future/track_error (method neuspring)")
+    means = pd.read_csv(done / "tables" / "averages.csv").set_index(["method", "task", "metric"])["equal"]
+    assert f"ours     {1e3 * means['neuspring', 'future', 'track_error']:.2f} mm" in text
+    assert "4 runs behind it" in text and "paper  " not in text and "0 not as recorded" not in text
+
+
+@pytest.mark.parametrize(
+    "form", ["{name}/neuspring/0", "{name}/neuspring/0/", "{folder}/{name}/neuspring/0/run.json", "{name}", "neuspring"]
+)
+def test_a_run_is_explained_by_its_folder_scenario_or_method(done, form):
+    status, text = told(done, form.format(name=NAMES[0], folder=done))
+    assert status == 0 and f"{NAMES[0]}/neuspring/0: ok" in text
+    assert re.search(r"future: CD \d+\.\d\d mm, TE \d+\.\d\d mm", text) and "again: snakemake " in text
+    assert (f"{NAMES[0]}/fixed_resolution/1: ok" in text) == (form == "{name}")
+    assert (f"{NAMES[2]}/neuspring/1: ok" in text) == (form == "neuspring")
+
+
+def test_a_run_that_changed_is_an_exit_status(done):
+    (done / NAMES[0] / "neuspring" / "0" / "twin.npz").write_bytes(b"another twin")
+    status, text = told(done, f"{NAMES[0]}/neuspring/0")
+    assert status == 1 and "received other content" in text
+
+
+def test_without_a_word_it_lists_what_can_be_explained_and_every_such_word_works(done, tmp_path, capsys):
+    status, text = told(done)
+    assert status == 0 and "A study: table3/ROW/TASK/METRIC" in text and f"A run: {NAMES[0]}/fixed_resolution/0" in text
+    methods, tasks, metrics = (line.strip().split(" | ") for line in text.splitlines()[1:4])
+    assert (methods, tasks) == (METHODS, ["reconstruction", "future"]) and "chamfer" in metrics
+    assert told(done, f"{methods[0]}/{tasks[1]}/{metrics[0]}")[0] == 0
+    assert main(["explain", "neus/fut", "--results", str(done)]) == 2
+    assert "must be METHOD/TASK/METRIC, STUDY/ROW/TASK/METRIC, or a run that there is" in capsys.readouterr().err
+    assert main(["explain", "--results", str(tmp_path / "nothing")]) == 2
+    assert "a results folder with finished runs is required" in capsys.readouterr().err
+
+
+def test_pictures_settings_are_compared_with_their_defaults():
+    images = config.plain(config.Config())["images"]
+    assert departures({"appearance": {"images": images}, "render": {"images": images | {"video": not images["video"]}}}) == {
+        "render.images.video": not images["video"]
+    }

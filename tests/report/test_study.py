@@ -66,10 +66,10 @@ def varied(changes: Mapping[str, float], scenarios=RELEASED, metric=CD, noise: f
     }
 
 
-def test_the_papers_values_keep_their_digits():
+def test_the_papers_values_keep_their_digits_in_mm():
     values = paper.table("table1_comparison")
     assert [len(paper.table(name)) for name in paper.tables()] == [48, 48, 24]
-    assert values["Spring-Gaus", "reconstruction", "track_error"] == paper.Printed(text="0.050", value=0.05, slack=0.0005)
+    assert values["Spring-Gaus", "reconstruction", "track_error"] == paper.Printed(text="50", value=50.0, slack=0.5)
     assert values["NeuSpring", "future", "iou"].slack == pytest.approx(0.05)
     assert set(released_cases()) == paper.scenarios()
     assert paper.released().groupby(["task", "metric"]).size().to_dict() == {
@@ -106,11 +106,11 @@ def test_a_study_does_not_take_the_name_of_another_table(tmp_path):
 
 @pytest.mark.parametrize(("ours", "verdict"), [(0.00549, "within"), (0.00451, "within"), (0.00551, "worse"), (0.00449, "better")])
 def test_rounding_makes_no_difference_to_the_paper(ours, verdict):
-    """PhysTwin's Chamfer distance is printed as 0.005."""
+    """PhysTwin's Chamfer distance is printed as 0.005 m."""
     key = ("reconstruction", "chamfer")
     found = cells_of("table1", collected(everywhere("baseline", {key: ours}))).loc[("PhysTwin", *key)]
     assert found["verdict"] == verdict
-    assert found["difference"] == pytest.approx(ours - 0.005)
+    assert found["difference"] == pytest.approx(1e3 * ours - 5)
 
 
 def test_the_overlap_of_silhouettes_is_compared_in_per_cent():
@@ -129,7 +129,7 @@ def test_absolute_values_are_compared_on_the_papers_scenarios_alone():
         found = cells_of("table1", others).loc[("PhysTwin", *CD)]
         assert found["verdict"] == "other data"
         assert np.isnan(found["difference"])
-        assert found["ours"] == pytest.approx(0.012)
+        assert found["ours"] == pytest.approx(12.0)
 
 
 def test_what_is_not_there_is_said():
@@ -145,7 +145,7 @@ def test_what_is_not_there_is_said():
 def test_errors_weigh_scenarios_and_pictures_weigh_frames():
     values = {("a", "baseline", 0): {CD: 0.01, PSNR: 20.0}, ("b", "baseline", 0): {CD: 0.03, PSNR: 40.0}}
     found = cells_of("table1", collected(values, {"a": 30, "b": 10})).loc["PhysTwin"]
-    assert found.loc[CD, ["ours", "other_average"]].tolist() == pytest.approx([0.02, 0.015])
+    assert found.loc[CD, ["ours", "other_average"]].tolist() == pytest.approx([20.0, 15.0])
     assert found.loc[PSNR, ["ours", "other_average"]].tolist() == pytest.approx([25.0, 30.0])
 
 
@@ -153,7 +153,7 @@ def test_the_spread_is_that_of_the_averages():
     runs = collected(varied({"baseline": 1.0, "neuspring_one_frame": 0.8}, noise=0.1))
     expected = averages(runs.scores).set_index("method")["seed_std"]
     found = cells_of("table2", runs)["spread"]
-    assert found[("Baseline", *CD)] == pytest.approx(expected["baseline"])
+    assert found[("Baseline", *CD)] == pytest.approx(1e3 * expected["baseline"])
     # A seed that lacks a scenario has another mean for that reason alone.
     less = Collected(runs.scores.drop(index=3), runs.runs)
     assert np.isnan(cells_of("table2", less)["spread"][("Baseline", *CD)])
@@ -165,10 +165,10 @@ def test_intervals_agree_with_those_of_the_summary():
     found = cells_of("table2", runs).loc[("NeuSpring (PT+NSF)", *CD)]
     row = paired_differences(runs.scores, "baseline").iloc[0]
     width = row["high"] - row["low"]
-    assert found["change"] == pytest.approx(row["difference"])
+    assert found["change"] == pytest.approx(1e3 * row["difference"])
     assert found["relative"] == pytest.approx(row["relative"])
-    assert found["change_low"] == pytest.approx(row["low"], abs=0.05 * width)
-    assert found["change_high"] == pytest.approx(row["high"], abs=0.05 * width)
+    assert found["change_low"] == pytest.approx(1e3 * row["low"], abs=50 * width)
+    assert found["change_high"] == pytest.approx(1e3 * row["high"], abs=50 * width)
     assert found["low"] < found["ours"] < found["high"]
 
 
@@ -228,7 +228,7 @@ def test_a_pair_that_one_method_failed_is_left_out_for_all_and_listed():
     runs = collected(values, failed=(("b", "neuspring_one_frame", 0),))
     own = tables_cells.restricted(STUDIES["table2"], runs)
     found = cells_of("table2", runs)
-    assert found.loc[("Baseline", *CD), "ours"] == pytest.approx(0.01)
+    assert found.loc[("Baseline", *CD), "ours"] == pytest.approx(10.0)
     assert found.loc[("NeuSpring (PT+NSF)", *CD), ["ok", "failed", "missing"]].tolist() == [1, 1, 0]
     why = tables_cells.accounted(STUDIES["table2"], own).set_index(["label", "scenario"])["why"]
     assert why["NeuSpring (PT+NSF)", "b"] == "failed: it diverged"
@@ -244,13 +244,13 @@ def test_a_score_that_one_method_lacks_is_left_out_for_all():
     values["b", "baseline", 0] = {CD: 0.01, PSNR: 90.0}
     found = cells_of("table2", collected(values))
     assert found.loc[("Baseline", *PSNR), ["ours", "scenarios"]].tolist() == [30.0, 1]
-    assert found.loc[("NeuSpring (PT+NSF)", *CD), ["ours", "scenarios"]].tolist() == [pytest.approx(0.03), 2]
+    assert found.loc[("NeuSpring (PT+NSF)", *CD), ["ours", "scenarios"]].tolist() == [pytest.approx(30.0), 2]
 
 
 def test_a_table_of_nothing_holds_the_papers_values(tmp_path):
     text = tables_paper.write_study("table1", STUDIES["table1"], tmp_path, RELEASED, [0], [], tmp_path / "out")
     assert "Nothing has finished." in text
-    assert "| **0.009**" in text
+    assert "| **9**" in text
     assert "- Spring-Gaus: spring_gaus is not among the methods of this benchmark" in text
     table = pd.read_csv(tmp_path / "out" / "table1.csv", dtype={"paper": str})
     assert set(table["verdict"]) == {"not run"}
@@ -291,11 +291,11 @@ def test_best_and_second_best_are_marked_where_the_paper_marks_them(written):
     _, out, text = written
     ours = {line.split("|")[3].strip() + str(i): line for i, line in enumerate(text.splitlines()) if "| ours " in line}
     rows = [line.split("|")[4].strip() for line in ours.values()][:4]
-    assert rows[2].startswith("<ins>0.0")
-    assert rows[3].startswith("**0.0")
+    assert rows[2].startswith("<ins>")
+    assert rows[3].startswith("**")
     latex = (out / "table1.tex").read_text()
-    assert r"\underline{0.005}" in latex
-    assert r"\textbf{0.004}" in latex
+    assert r"\underline{5}" in latex
+    assert r"\textbf{4}" in latex
     of_two = tables_paper.main_table(STUDIES["table2"], cells_of("table2", collected({})).reset_index())
     assert "second" not in {cell.mark for row in of_two.rows for cell in row}
 
@@ -336,8 +336,8 @@ def test_ours_stands_beside_the_released_values(written):
     known = paper.released().set_index(["scenario", "task", "metric"])["value"]
     scores = [pd.read_parquet(folder / name / "baseline" / str(seed) / "scores.parquet") for seed in (0, 1)]
     ours = np.mean([table.set_index(["task", "metric"]).loc[CD, "value"] for table in scores])
-    assert row["released"] == known[(name, *CD)]
-    assert row["ours"] == pytest.approx(ours)
+    assert row["released"] == pytest.approx(1e3 * known[(name, *CD)])
+    assert row["ours"] == pytest.approx(1e3 * ours)
     assert row["ratio"] == pytest.approx(ours / known[(name, *CD)])
     assert "[Per scenario](table1_released_phystwin.md): 8 of 22 scenarios have finished." in text
     assert "mean of 8" in (out / "table1_released_phystwin.md").read_text()

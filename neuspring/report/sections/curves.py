@@ -56,7 +56,7 @@ PLOTS = (
         "search",
         "Over candidate rollouts; thin: other seeds. Methods that share a search have one curve.",
     ),
-    ("Fit: loss", "fit", "In m², over epochs; thin: other seeds. Losses of methods with other horizons differ in height."),
+    ("Fit: loss", "fit", "In mm², over epochs; thin: other seeds. Losses of methods with other horizons differ in height."),
     (
         "Training of baselines: loss",
         "train",
@@ -140,7 +140,7 @@ def _history(material: ReportData, run: RunRecord, stage: str) -> pd.Series | No
     except UNREADABLE as error:
         material.lost(path, error)
         return None
-    return values[values < PENALTY] if stage == "search" else values
+    return values[values < PENALTY] if stage == "search" else 1e6 * values if stage == "fit" else values
 
 
 def _error(material: ReportData, run: RunRecord, metric: str, observations: Observations | None) -> pd.Series | None:

@@ -32,7 +32,9 @@ NO_ROOM = "not embedded, to keep this page small"
 ADDRESS = "http://127.0.0.1:8080/"
 """Where `neuspring play` listens unless it is told otherwise."""
 GALLERY = "pictures.html"
-CAPTIONED = ("psnr", "iou")
+MOST_OPEN = 3
+"""Scenarios whose films are not folded."""
+CAPTIONED = ("track_error", "iou")
 """Metrics in captions of the gallery."""
 
 
@@ -51,13 +53,12 @@ class Kind:
     """Least width in the page, rem."""
     frames: bool = False
     """Shows the frames that `frame_links` names."""
-    open: bool = False
 
 
 KINDS = (
-    Kind(artifact="images", stem="images", title="Observed, predicted, difference", width=1100, frames=True),
-    Kind(artifact="images", stem="video", title="Films: observed, predicted, difference", open=True),
-    Kind(artifact="images", stem="turntable", title="Films: the twin from all around", least=13),
+    Kind(artifact="images", stem="video", title="Film: observed, predicted, difference", least=56),
+    Kind(artifact="images", stem="images", title="Frames: observed, predicted, difference", width=1100, frames=True),
+    Kind(artifact="images", stem="turntable", title="Film: the twin from all around", least=13),
     Kind(artifact="plots", stem="motion", title="Motion: predicted nodes and observed points", width=1200, paper=True, frames=True),
     Kind(artifact="plots", stem="stiffness", title="Stiffness of the springs", width=900, paper=True, least=27),
     Kind(artifact="plots", stem="topology", title="Regions and springs", width=900, paper=True, least=27),
@@ -161,14 +162,14 @@ def pictures_section(material: ReportData, media: Media) -> Section:
             command = shlex.join(["neuspring", "play", *(str(material.folder(run)) for run in runs.values())])
             seeds = sorted({run.seed for run in runs.values()})
             summary = f"{scenario}: {several(len(runs), 'method')}, seed {', '.join(map(str, seeds))}"
-            folds.append(Fold(summary=summary, blocks=[*blocks, Code(text=command, whole=True)], open=not folds))
+            folds.append(Fold(summary=summary, blocks=[*blocks, Code(text=command, whole=True)], open=len(folds) < MOST_OPEN))
     if not folds:
-        return Section(key="pictures", title="Pictures", blocks=[Text(text="No run has left pictures yet.", tone="mute")])
+        return Section(key="pictures", title="Film", blocks=[Text(text="No run has left pictures yet.", tone="mute")])
     about = (
-        "One seed of every scenario, methods side by side. Blue bars stand for training frames, orange ones for the future. The "
-        "command below a scenario's pictures opens its twins in the browser, to be turned and pulled; links to frames lead there."
+        "All methods in step, one seed of every scenario. The bar above a film is blue in training frames and orange in the "
+        "future. The command below opens the twins in the browser, to be turned and pulled; links to frames lead there."
     )
-    return Section(key="pictures", title="Pictures", about=about, blocks=folds)
+    return Section(key="pictures", title="Film", about=about, blocks=folds)
 
 
 def _scenario(material: ReportData, runs: dict[str, RunRecord], media: Media, frames: Sequence[tuple[str, str]]) -> list[Block]:
@@ -188,8 +189,9 @@ def _scenario(material: ReportData, runs: dict[str, RunRecord], media: Media, fr
             alt = f"{kind.title}: {run.scenario}, {', '.join(methods)}, seed {run.seed}"
             figures.append(media.show(path, caption, alt, kind, frames if kind.frames else ()))
         if figures:
+            grid = Grid(blocks=figures, least=kind.least, films=not kind.width)
             # The first kind that there is can be seen at once.
-            blocks.append(Fold(summary=kind.title, blocks=[Grid(blocks=figures, least=kind.least)], open=kind.open or not blocks))
+            blocks.append(Fold(summary=kind.title, blocks=[grid]) if blocks else grid)
     return blocks
 
 
@@ -201,7 +203,7 @@ def write_gallery(
     Films and pictures are linked, not embedded, so that the page works wherever the results folder is. Runs that are missing are
     left out.
     """
-    sections = []
+    sections: list[Section] = []
     for scenario in scenarios:
         place = Path(results) / scenario
         figures: list[Block] = []
@@ -213,11 +215,12 @@ def write_gallery(
         splats = [Picture(caption="", alt=path.stem, data=link(path, folder)) for path in learned]
         blocks: list[Block] = [Text(text="No pictures: no images, or no finished run.")]
         if figures:
-            blocks = [Fold(summary="Splats of frame 0", blocks=splats), Grid(blocks=figures, least=28)]
+            shown: list[Block] = [Grid(blocks=figures, least=28, films=True)]
+            blocks = [*shown, Fold(summary="Splats of frame 0", blocks=[Grid(blocks=splats, least=28)])] if splats else shown
         sections.append(Section(key=scenario, title=scenario, blocks=blocks))
     about = (
-        "Observed, predicted and their difference, first camera; below, the twin from all around. The bar above each video shows "
-        f"the time: blue stands for training frames, orange for the future. Seed {seed}."
+        "Observed, predicted and their difference, first camera; beside them the twin from all around. The bar above a film is "
+        f"blue in training frames and orange in the future. Seed {seed}."
     )
     write_text(folder / GALLERY, html_page("NeuSpring: pictures", about, sections, embedded=False))
     return folder / GALLERY
@@ -230,7 +233,7 @@ def _films(record: RunRecord, run: Path, scores: pd.DataFrame, folder: Path) -> 
     values, parts = own.set_index(["task", "metric"])["value"], []
     for task, name in (("reconstruction", "training"), ("future", "future")):
         metrics = [METRICS[metric] for metric in CAPTIONED if (task, metric) in values.index]
-        texts = [f"{metric.label} {metric.text(values[task, metric.name])}" for metric in metrics]
+        texts = [f"{one.heading} {one.text(values[task, one.name])} {one.shown_unit}".rstrip() for one in metrics]
         parts += [f"{name} {', '.join(texts)}"] if texts else []
     caption = f"{record.method}: {'; '.join(parts)}".removesuffix(": ")
     if "video" in paths:

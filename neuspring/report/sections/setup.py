@@ -22,7 +22,6 @@ from neuspring.report.blocks import Block, Code, Fold, Grid, Items, Link, Prose,
 from neuspring.report.explain import departures
 from neuspring.report.sections.data import UNREADABLE, ReportData, listed, several
 from neuspring.report.sections.pictures import embedded, link
-from neuspring.scores.runs import mixed_settings
 
 DATA = (".md", ".csv", ".tex", ".html", ".parquet")
 SO_FAR = "so_far"
@@ -109,24 +108,12 @@ PACKAGES = (
 WHAT = ("scenarios", "methods", "seeds", "results", "tables")
 """Keys that say what the benchmark is, not how it runs."""
 DIRTY = "-dirty"
-COMMON = {
-    "model": "Model",
-    "search": "Search",
-    "clusters": "Regions",
-    "fit": "Fit",
-}
-"""Switches of methods, and their headings. The model is shown only where a method has one."""
 
 
 def setup_section(material: ReportData) -> Section:
     """Configuration, versions, machines, files."""
     blocks: list[Block] = [_commits(material.runs)] if material.runs else []
-    if warning := mixed_settings(material.collected.runs):
-        blocks.append(Text(text=warning, tone="warn"))
     blocks += _settings(material)
-    variants = _variants(material.runs)
-    if variants is not None:
-        blocks.append(variants)
     blocks.append(_versions())
     if machines := Counter(f"{run.machine}; {run.device}" for run in material.runs):
         rows = [[Cell(text=name), Cell(text=str(count))] for name, count in sorted(machines.items())]
@@ -191,27 +178,6 @@ def _by_method(values: Mapping[str, str]) -> str:
     if len(groups) == 1:
         return next(iter(groups))
     return "; ".join(f"{value} ({', '.join(names)})" for value, names in groups.items())
-
-
-def _variants(runs: Iterable[RunRecord]) -> Table | None:
-    """The switches of each method, as its runs record them."""
-    variants: dict[str, Mapping[str, Any]] = {}
-    for run in runs:
-        variants.setdefault(run.method, run.variant)
-    if not variants:
-        return None
-    common = {name: text for name, text in COMMON.items() if name != "model" or any("model" in own for own in variants.values())}
-    rows = []
-    for method, variant in variants.items():
-        own = ", ".join(f"{key}: {_plain(value)}" for key, value in variant.items() if key not in common)
-        cells = [Cell(text=_word(variant.get(name))) for name in common]
-        rows.append([Cell(text=method), *cells, Cell(text=own, wrap=True)])
-    header = ["Method", *common.values(), "Settings of its own"]
-    return Table(caption="Methods", header=header, rows=rows)
-
-
-def _word(value: Any) -> str:
-    return {None: "–", True: "yes", False: "no"}[value] if value is None or isinstance(value, bool) else str(value)
 
 
 def _versions() -> Table:

@@ -74,6 +74,8 @@ def _costs(caption: str, what: str, groups: Mapping[str, Sequence[JobRecord]], *
     header = [what, "Jobs", "Failed", "Retries", "Median", "Longest", "GPU-hours", "CPU-hours", "Waited", "Peak memory"]
     header += ["GPU memory", "GPU use"]
     rows = [_cost(name, jobs) for name, jobs in groups.items()]
+    used = [k for k in range(len(header)) if any(row[k].text != DASH for row in rows)]
+    header, rows = [header[k] for k in used], [[row[k] for k in used] for row in rows]
     on_gpu = any(attempt.devices for jobs in groups.values() for job in jobs for attempt in job.attempts)
     note = "Waited: for a GPU. A GPU that two jobs share counts for both." if on_gpu else ""
     return Table(caption=caption, header=header, rows=rows, sortable=sortable, note=note)

@@ -1,4 +1,4 @@
-// Sorting and filtering; everything can be read without.
+// Sorting and filtering, and films in step; everything can be read without.
 for (const table of document.querySelectorAll("table.sortable")) {
   const body = table.tBodies[0];
   if (body.rows.length < 3) continue;
@@ -37,5 +37,38 @@ for (const table of document.querySelectorAll("table.sortable")) {
     });
     table.parentElement.before(search);
   }
+}
+// The films of a group have one control, and play while they can be seen.
+const make = (kind, facts, ...inside) => {
+  const made = Object.assign(document.createElement(kind), facts);
+  made.append(...inside);
+  return made;
+};
+for (const group of document.querySelectorAll(".films")) {
+  const films = [...group.querySelectorAll("video")];
+  if (!films.length) continue;
+  const [first] = films;
+  const button = make("button", { type: "button" });
+  const slider = make("input", { type: "range", min: 0, max: 1, step: 0.001, value: 0 });
+  const speed = make("select", {}, ...[1, 0.5, 0.25].map((rate) => make("option", { value: rate }, `${rate} ×`)));
+  slider.setAttribute("aria-label", "Time of all films");
+  speed.setAttribute("aria-label", "Speed");
+  for (const film of films) Object.assign(film, { controls: false, loop: false });
+  const label = () => (button.textContent = first.paused ? "▶ Play" : "❚❚ Pause");
+  const seek = (time) => films.forEach((film) => (film.currentTime = Math.min(time, film.duration || time)));
+  const play = () => Promise.allSettled(films.map((film) => film.play())).then(label);
+  const pause = () => (films.forEach((film) => film.pause()), seek(first.currentTime), label());
+  let wanted = !matchMedia("(prefers-reduced-motion: reduce)").matches;
+  button.addEventListener("click", () => ((wanted = first.paused), wanted ? play() : pause()));
+  slider.addEventListener("input", () => ((wanted = false), (first.currentTime = slider.value * first.duration), pause()));
+  speed.addEventListener("change", () => films.forEach((film) => (film.playbackRate = +speed.value)));
+  first.addEventListener("ended", () => wanted && (seek(0), play()));
+  first.addEventListener("timeupdate", () => {
+    slider.value = first.currentTime / (first.duration || 1);
+    for (const film of films) if (Math.abs(film.currentTime - first.currentTime) > 0.08) film.currentTime = first.currentTime;
+  });
+  new IntersectionObserver(([seen]) => (seen.isIntersecting && wanted ? play() : pause())).observe(group);
+  label();
+  group.prepend(make("div", { className: "control" }, button, slider, speed));
 }
 addEventListener("beforeprint", () => document.querySelectorAll("details").forEach((fold) => (fold.open = true)));
