@@ -162,10 +162,14 @@ def mask(
     backend: Annotated[Literal["marks", "sam2"], arg(help="sam2 needs its weights")] = "marks",
     cameras: Annotated[tuple[str, ...], arg(help="all that have marks by default")] = (),
     again: Annotated[bool, arg(help="also where marks, images and settings are unchanged")] = False,
+    masks: Annotated[
+        tuple[Path, ...], arg(help="instead of marks: per camera a folder of another tool's masks, 0 nothing, 1 object, 2 hands")
+    ] = (),
+    hands: Annotated[tuple[Path, ...], arg(help="per camera a folder of masks of the hands; all but 0 counts in both")] = (),
     settings: Settings = "{}",
     device: Device = "auto",
 ) -> None:
-    """Marks on a few frames -> masks of object and hands in every frame of a capture."""
+    """Marks on a few frames, or masks of other tools -> masks of object and hands in every frame of a capture."""
     from neuspring.data.capture import Capture
     from neuspring.perception import segment_sam2
     from neuspring.perception.marks import store
@@ -173,6 +177,16 @@ def mask(
     from neuspring.perception.marks.marks import MARKS, Marks
 
     read, path = Capture.load(capture), marks or capture / MARKS
+    if masks or hands:
+        named = cameras or tuple(read.cameras)
+        if len(masks) != len(named) or len(hands) not in (0, len(named)):
+            rule = f"a folder is required for each of the cameras {' '.join(named)}; --cameras chooses some"
+            raise InputError("--masks, --hands", rule, f"{len(masks)} and {len(hands)}")
+        for name, folder, held in zip(named, masks, hands or [None] * len(named), strict=True):
+            read.require_camera(name)
+            print(f"camera {name}: masks are in {store.import_masks(read, name, folder, held)}")
+        print(f"next:\n  neuspring check-data {capture}")
+        return
     marked = Marks.load(path)
     marked.require(read, path)
     segmentation = read_settings(settings).perception.segment

@@ -223,17 +223,13 @@ class Capture:
 
     def mask(self, camera: str, frame: int) -> np.ndarray:
         """Labels [H, W] uint8: 0 nothing, 1 object, 2 hands. Raises InputError."""
-        path = self.path("mask", camera, frame)
-        labels = self._image("mask", camera, frame, cv2.IMREAD_UNCHANGED)
-        if labels.dtype != np.uint8 or labels.ndim != 2:
-            raise InputError(path, "masks are gray images of 8 bits", f"{labels.dtype} of shape {labels.shape}")
-        if labels.max() > HANDS:
-            raise InputError(path, "labels must be 0 (nothing), 1 (object) or 2 (hands)", int(labels.max()))
-        return labels
+        return read_labels(self.path("mask", camera, frame), self.cameras[camera], self._absent(camera))
 
-    def _image(self, what: Literal["color", "depth", "mask"], camera: str, frame: int, flag: int) -> np.ndarray:
-        remedy = f"List the frame in cameras.{camera}.missing of {CAPTURE} if the camera does not have it."
-        return read_image(self.path(what, camera, frame), self.cameras[camera], flag, remedy)
+    def _image(self, what: Literal["color", "depth"], camera: str, frame: int, flag: int) -> np.ndarray:
+        return read_image(self.path(what, camera, frame), self.cameras[camera], flag, self._absent(camera))
+
+    def _absent(self, camera: str) -> str:
+        return f"List the frame in cameras.{camera}.missing of {CAPTURE} if the camera does not have it."
 
     def tracks(self) -> np.ndarray:
         """Annotated tracks [T, K, 3], m, NaN where not annotated; K = 0 without tracks.json. Raises InputError."""
@@ -424,6 +420,34 @@ def read_picture(path: Path, flag: int) -> np.ndarray:
     if image is None:
         raise InputError(path, "this file must be a readable image", "a damaged file", "Copy it again from where it was made.")
     return image
+
+
+def read_labels(path: Path, camera: Camera | None = None, remedy: str = "", *, binary: bool = False) -> np.ndarray:
+    """Labels [H, W] uint8 of a mask as we or other tools write it: gray, one bit, or colors of a palette, whose indices count.
+
+    In a mask of 0 and 255 alone, and with `binary`, all but 0 is 1. Raises InputError, also where the size is not that of
+    `camera`, and with `remedy` for a missing file.
+    """
+    if not path.is_file():
+        raise InputError(path, "this image must exist", "no such file", remedy)
+    try:
+        # OpenCV replaces the indices of a palette by its colors.
+        with Image.open(path) as image:
+            labels = np.asarray(image)
+    except (OSError, SyntaxError, ValueError) as error:
+        raise InputError(path, "this file must be a readable PNG", "a damaged file") from error
+    if camera is not None:
+        _require_size(path, labels, camera)
+    if labels.ndim != 2:
+        next_move = "Write the label of each pixel as its gray value, or a palette image whose indices are the labels."
+        raise InputError(path, "masks are gray, palette or one-bit images", f"{labels.shape[2]} channels of color", next_move)
+    found = set(np.unique(labels).tolist())
+    if found <= {0, 255} or binary:
+        labels = labels > 0
+    elif max(found) > HANDS:
+        next_move = "Of two folders, of the object and of hands, `neuspring mask --masks FOLDER --hands FOLDER` makes masks."
+        raise InputError(path, "labels must be 0 (nothing), 1 (object) or 2 (hands)", f"label {max(found)}", next_move)
+    return labels.astype(np.uint8)
 
 
 def read_array(path: Path, camera: Camera) -> np.ndarray:

@@ -89,13 +89,13 @@ def _check_camera(case: Inspection, capture: Capture, name: str, calibrated: boo
     view = capture.cameras[name]
     depths, shown = [], plausible.Shown(capture.frame_count, (view.width, view.height))
     samples: dict[int, plausible.Sample] = {}
+    refused: dict[str, list[Finding]] = {}
     wanted = plausible.sampled(capture.frame_count)
     for frame in range(capture.frame_count):
         if not capture.has(name, frame):
             continue
         try:
-            capture.color(name, frame)
-            depth = capture.depth(name, frame)
+            color, depth = capture.color(name, frame), capture.depth(name, frame)
             if capture.has_depth:
                 depths.append(float(np.median(depth[depth > 0])) if (depth > 0).any() else np.nan)
             mask = np.zeros(depth.shape, np.uint8)
@@ -103,9 +103,13 @@ def _check_camera(case: Inspection, capture: Capture, name: str, calibrated: boo
                 mask = capture.mask(name, frame)
                 shown.see(frame, mask)
             if frame in wanted:
-                samples[frame] = plausible.Sample(depth, mask)
+                samples[frame] = plausible.Sample(depth, mask, color)
         except InputError as error:
-            case.findings.append(refusal(error))
+            one = refusal(error)
+            refused.setdefault(f"{Path(one.where).parent} {one.text}", []).append(one)
+    for first, *others in refused.values():
+        more = f" The same in {len(others)} more files of the folder." if others else ""
+        case.findings.append(replace(first, text=first.text + more))
     path, measured = capture.folder / CAPTURE, [median for median in depths if np.isfinite(median)]
     typical = float(np.median(measured)) if measured else 0.0
     if depths and not measured:
@@ -133,7 +137,9 @@ def _world_findings(capture: Capture, name: str, samples: dict[int, plausible.Sa
     found = planes(cloud(around, camera.intrinsics)) if enough else []
     findings = plausible.table_findings(path, name, found, camera.camera_to_world, up, unit)
     bodies = {frame: plausible.lifted(camera, sample, OBJECT) for frame, sample in samples.items()}
+    pairs = [(s.mask if s.mask.any() else s.color, s.depth) for s in samples.values() if s.color is not None]
     things = [
+        *plausible.edge_findings(f"camera {name}", pairs),
         *plausible.depth_findings(camera, samples),
         *plausible.place_findings(f"camera {name}, object", list(bodies.values()), up_sign(up)),
         *plausible.hand_findings(camera, samples),

@@ -2,6 +2,7 @@
 
 - The table that each camera sees against z = 0 and `up`, and what explains a finding.
 - Object and hands of one camera, by masks and depth: size, height above the table, depth, and whether they meet.
+- Edges of depth against those of color.
 - Color alone: the table is z = 0 as the camera's pose says, and what lies on it is measured there.
 - Cameras against each other: a point that camera A measured is projected into camera B. Where B measured more depth there, B looked
   through it: one of the poses is wrong. Less depth is no contradiction: something may hide the point from B. Only what stands out
@@ -11,13 +12,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
 from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.spatial import KDTree
 
 from neuspring.core.artifacts import up_sign
@@ -158,6 +160,8 @@ class Sample:
     """[H, W], m, 0: none."""
     mask: np.ndarray
     """[H, W] labels."""
+    color: np.ndarray | None = None
+    """[H, W, 3] uint8 RGB, where it was read too."""
 
 
 def sampled(frames: int) -> set[int]:
@@ -500,3 +504,85 @@ def mask_findings(camera: str, shown: Shown) -> list[Finding]:
         value = f"the object's area changes {ratio:.1f}-fold from frame {frame - 1} to {frame} (so in {len(wild)} frames)"
         say("mask jumps", value, f"less than {JUMP:g}-fold is expected")
     return found
+
+
+ALIGNED = 0.015
+"""Part of the image's width by which edges of depth may lie beside those of color: sensors are registered to 1 %."""
+BESIDE = 0.12
+"""Part of the width by which they are looked for elsewhere: 6 cm between two sensors, 0.4 m from them."""
+BETTER = 1.4
+"""A shift is believed if edges agree so many times as well with it as without. Right recordings have up to 0.9, depth of another
+sensor 1.7 and more."""
+FEWEST_EDGES = 200
+"""Pixels at edges of depth, of all frames together."""
+EDGE_STEP = (0.03, 0.04)
+"""m, and part of the depth: a larger step is an edge."""
+SOFT = 0.3
+"""Part of the strongest edge from which one counts in full, as do the strongest 5 % of the pixels."""
+SQUARE = np.ones((3, 3), np.uint8)
+SCALES = (1.0, 0.7, 0.8, 0.9, 1.1, 1.2, 1.3, 1.4)
+"""Sizes of the picture of depth, to try: the lens of a depth sensor is another."""
+WIDE = 400
+"""Images are thinned until they are about as wide, pixels."""
+
+
+def edge_findings(where: str, pairs: Iterable[tuple[np.ndarray, np.ndarray]]) -> list[Finding]:
+    """A warning where edges of depth [H, W], m, lie beside those of color [H, W, 3] or of masks [H, W]: depth of another sensor."""
+    right, down, scale, gain = edge_shift(list(pairs))
+    if gain < BETTER:
+        return []
+    ways = [f"made {scale:g} times as large"] if scale != 1 else []
+    ways += [f"moved {abs(right)} pixels to the {'right' if right > 0 else 'left'}"] if abs(right) > 1 else []
+    ways += [f"moved {abs(down)} pixels {'down' if down > 0 else 'up'}"] if abs(down) > 1 else []
+    value = f"edges of depth fit those of color when depth is {' and '.join(ways)}"
+    rule = f"as it is they must fit within {ALIGNED:.1%} of the width"
+    remedy = "Let the camera's software align depth to color (RealSense: rs.align; ROS: aligned_depth_to_color)."
+    return [finding("depth not aligned to color", "warning", where, value, rule, remedy)]
+
+
+def edge_shift(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[int, int, float, float]:
+    """What must be done to depth so that its edges agree best with those of color, and how many times as well as they do within
+    ALIGNED: pixels to the right and down, after a scaling about the center of the image. 0 times where there are too few edges.
+
+    The agreement is the mean strength of color's edges over depth's edge pixels, above its median over all shifts.
+    """
+    width = pairs[0][1].shape[1] if pairs else 1
+    stride = max(round(width / WIDE), 1)
+    reach, near = round(BESIDE * width / stride), max(round(ALIGNED * width / stride), 4)
+    pictures = []
+    for picture, depth in pairs:
+        thin = np.ascontiguousarray(picture[::stride, ::stride])
+        shades = cv2.cvtColor(thin, cv2.COLOR_RGB2LAB) if thin.ndim == 3 else np.repeat(255 * (thin[..., None] > 0), 3, axis=2)
+        shades = cv2.GaussianBlur(shades.astype(np.float32), (0, 0), 1)
+        steps = np.hypot(cv2.Sobel(shades, cv2.CV_32F, 1, 0), cv2.Sobel(shades, cv2.CV_32F, 0, 1)).max(axis=2)
+        strength = np.minimum(steps / max(float(np.quantile(steps, 0.95)), SOFT * float(steps.max()), 1.0), 1.0)
+        thin = depth[::stride, ::stride].astype(np.float32)
+        # A step beside a pixel and none on its other side: a slope has both.
+        low, high = cv2.erode(np.where(thin > 0, thin, np.inf).astype(np.float32), SQUARE), cv2.dilate(thin, SQUARE)
+        edges = (thin > 0) & (high + low - 2 * thin > np.maximum(EDGE_STEP[0], EDGE_STEP[1] * thin))
+        pictures.append((strength, np.argwhere(edges)))
+    if sum(len(edges) for _, edges in pictures) < FEWEST_EDGES:
+        return 0, 0, 1.0, 0.0
+    shape = np.array(pictures[0][0].shape)
+    size = [next_fast_len(int(side) + 2 * reach, real=True) for side in shape]
+    inside, best, found = 0.05, 0.0, (0, 0, 1.0)
+    tables = [[rfft2(table, size) for table in (strength, np.ones_like(strength))] for strength, _ in pictures]
+    for scale in SCALES:
+        sums = np.zeros((2, 2 * reach + 1, 2 * reach + 1))
+        for (_, edges), spectra in zip(pictures, tables, strict=True):
+            placed = np.round((edges - shape / 2) * scale + shape / 2).astype(int)
+            row, column = placed[((placed >= 0) & (placed < shape)).all(axis=1)].T
+            drawn = np.zeros(shape, np.float32)
+            drawn[row, column] = 1.0
+            own = np.conj(rfft2(drawn, size))
+            for k, spectrum in enumerate(spectra):
+                sums[k] += np.roll(irfft2(own * spectrum, size), (reach, reach), (0, 1))[: 2 * reach + 1, : 2 * reach + 1]
+        agreement = np.where(sums[1] > 0.5 * sums[1].max(), sums[0] / np.maximum(sums[1], 1.0), 0.0)
+        agreement -= np.median(agreement)
+        if scale == 1:
+            inside = max(float(agreement[reach - near : reach + near + 1, reach - near : reach + near + 1].max()), inside)
+        if agreement.max() > best:
+            best = float(agreement.max())
+            down, right = (stride * (int(k) - reach) for k in np.unravel_index(agreement.argmax(), agreement.shape))
+            found = (right, down, scale)
+    return *found, best / inside

@@ -43,18 +43,22 @@ class Splats(Artifact):
             raise InputError("splats", "at least one splat is required", "none")
 
     def save(self, path: Path) -> None:
-        """Write `path` (.ply) atomically, with the properties and order of splat files."""
-        columns = _columns(self.log_scales.shape[1], self.harmonics.shape[1])
+        """Write `path` (.ply) atomically, with the properties and order of splat files: three scales, also where one is for all."""
+        columns = _columns(3, self.harmonics.shape[1])
         bands = self.harmonics[:, 1:].transpose(0, 2, 1).reshape(len(self.means), -1)
         parts = (self.means, np.zeros_like(self.means), self.harmonics[:, 0], bands, self.opacity_logits[:, None])
-        table = np.concatenate([*parts, self.log_scales, self.quaternions], axis=1).astype("<f4")
+        scales = np.broadcast_to(self.log_scales, self.means.shape)
+        table = np.concatenate([*parts, scales, self.quaternions], axis=1).astype("<f4")
         properties = [f"property float {name}" for name in columns]
         header = "\n".join(["ply", PLY_FORMAT, f"element vertex {len(table)}", *properties, "end_header", ""])
         write_atomically(Path(path), lambda temporary: temporary.write_bytes(header.encode() + table.tobytes()))
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read a splat file, ours or another trainer's. Raises InputError if it is missing, truncated or holds something else."""
+        """Read a splat file, ours or another trainer's; three scales that are equal in every splat are one.
+
+        Raises InputError if it is missing, truncated or holds something else.
+        """
         table = _read_ply(Path(path))
         names = table.dtype.names or ()
         bands, scales = (sum(name.startswith(prefix) for name in names) for prefix in ("f_rest_", "scale_"))
@@ -70,11 +74,12 @@ class Splats(Artifact):
             group = [column for name, column in values.items() if name.startswith(prefix)]
             return np.stack(group, axis=1) if group else np.zeros((len(table), 0), np.float32)
 
+        log_scales = stacked("scale_")
         try:
             return cls(
                 means=np.stack([values["x"], values["y"], values["z"]], axis=1),
                 quaternions=stacked("rot_"),
-                log_scales=stacked("scale_"),
+                log_scales=log_scales[:, :1] if (log_scales == log_scales[:, :1]).all() else log_scales,
                 opacity_logits=values["opacity"],
                 harmonics=np.concatenate(
                     [stacked("f_dc_")[:, None], stacked("f_rest_").reshape(len(table), 3, -1).transpose(0, 2, 1)], axis=1

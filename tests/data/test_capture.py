@@ -5,11 +5,12 @@ import json
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
 
 from neuspring.core.errors import InputError
-from neuspring.data.capture import CAPTURE, Camera, CameraEntry, Capture, Description, Writer
+from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Camera, CameraEntry, Capture, Description, Writer
 from tests.support.captures import FRAMES, POSE, describe, entry
 
 
@@ -142,12 +143,42 @@ def test_missing_and_damaged_files_and_unknown_labels_are_refused(tmp_path):
     cv2.imwrite(str(capture.path("depth", "0", 1)), np.zeros((24, 32), np.uint8))
     with pytest.raises(InputError, match="depth must be 16-bit integers"):
         capture.depth("0", 1)
-    cv2.imwrite(str(capture.path("mask", "0", 1)), np.ones((24, 32), np.uint16))
-    with pytest.raises(InputError, match="masks are gray images of 8 bits; received uint16"):
+    cv2.imwrite(str(capture.path("mask", "0", 1)), np.ones((24, 32, 3), np.uint8))
+    with pytest.raises(InputError, match="masks are gray, palette or one-bit images; received 3 channels of color"):
         capture.mask("0", 1)
-    cv2.imwrite(str(capture.path("mask", "0", 2)), np.full((24, 32), 255, np.uint8))
-    with pytest.raises(InputError, match=r"labels must be 0 \(nothing\), 1 \(object\) or 2 \(hands\); received 255"):
+    cv2.imwrite(str(capture.path("mask", "0", 2)), np.full((24, 32), 7, np.uint8))
+    with pytest.raises(InputError, match=r"labels must be 0 \(nothing\), 1 \(object\) or 2 \(hands\); received label 7"):
         capture.mask("0", 2)
+    capture.path("mask", "0", 3).write_bytes(b"no picture")
+    with pytest.raises(InputError, match=r"00003\.png: this file must be a readable PNG"):
+        capture.mask("0", 3)
+
+
+def palette(labels):
+    image = Image.fromarray(labels, "P")
+    image.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0])
+    return image
+
+
+@pytest.mark.parametrize(
+    ("made", "hands"),
+    [
+        (palette, True),
+        (Image.fromarray, True),
+        (lambda labels: Image.fromarray(labels.astype(np.uint16)), True),
+        (lambda labels: Image.fromarray(np.uint8(labels == OBJECT) * 255), False),
+        (lambda labels: Image.fromarray(labels == OBJECT), False),
+    ],
+    ids=["palette", "gray", "16 bits", "0 and 255", "one bit"],
+)
+def test_masks_of_other_tools_are_read_as_what_they_say(tmp_path, made, hands):
+    labels = np.zeros((24, 32), np.uint8)
+    labels[4:12, 5:20], labels[12:18, 8:10] = OBJECT, HANDS
+    capture = write(tmp_path)
+    made(labels).save(capture.path("mask", "0", 1))
+    read = capture.mask("0", 1)
+    assert read.dtype == np.uint8
+    np.testing.assert_array_equal(read, labels if hands else np.where(labels == OBJECT, OBJECT, 0))
 
 
 def test_writing_never_reaches_through_links(tmp_path):

@@ -140,6 +140,21 @@ def test_masks_that_show_something_else(capture, change, words):
     assert any(holds(found, "warning", file, "camera 0", *words) for file in (CAPTURE, "0"))
 
 
+def test_what_is_wrong_with_every_mask_is_said_once(capture):
+    for frame in range(capture.frame_count):
+        cv2.imwrite(str(capture.path("mask", "0", frame)), np.repeat(capture.mask("0", frame)[..., None], 3, axis=2))
+    found = of_level(check_layout(capture.folder), "error")
+    assert len(found) == 1
+    assert "00000.png: masks are gray, palette or one-bit images; received 3 channels" in found[0]
+    assert found[0].endswith("The same in 5 more files of the folder.")
+
+
+def test_depth_of_a_sensor_that_stands_elsewhere(capture):
+    rewrite_depth(capture, lambda depth, mask: np.roll(depth, 8, axis=1))
+    words = ("camera 0: depth not aligned to color", "moved 8 pixels to the left", "rs.align")
+    assert holds(check_layout(capture.folder), "warning", CAPTURE, *words)
+
+
 def rewrite_depth(capture, change) -> None:
     for frame in range(capture.frame_count):
         path = capture.path("depth", "0", frame)

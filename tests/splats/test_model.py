@@ -29,6 +29,20 @@ def test_what_is_written_is_read_back(tmp_path, axes, coefficients):
     assert np.array_equal(Gaussians.of(again).stored().harmonics, splats.harmonics)
 
 
+def test_public_viewers_find_every_property_that_they_read(tmp_path):
+    """The list of the original viewer, in its order; one scale is written three times."""
+    plyfile = pytest.importorskip("plyfile", reason="plyfile is not installed (extra `dev`)")
+    splats = some(coefficients=16)
+    splats.save(tmp_path / "splats.ply")
+    vertex = plyfile.PlyData.read(tmp_path / "splats.ply")["vertex"]
+    wanted = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{k}" for k in range(45)), "opacity"]
+    assert [one.name for one in vertex.properties] == [*wanted, *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4))]
+    for k in range(3):
+        assert np.array_equal(vertex[f"scale_{k}"], splats.log_scales[:, 0])
+        assert np.array_equal(vertex[f"f_rest_{15 * k}"], splats.harmonics[:, 1, k])
+    assert {one.val_dtype for one in vertex.properties} == {"f4"}
+
+
 def test_the_layout_is_that_of_splat_viewers(tmp_path):
     """Bands above the first are stored channel by channel; written here by hand, with normals and another order."""
     splats = some(count=2)

@@ -240,9 +240,13 @@ class Lens:
     matrix: np.ndarray
     """K [3, 3], pixels."""
     distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    """Coefficients of OpenCV's model (4, 5, 8, 12 or 14); none: no distortion."""
+    """Coefficients; none: no distortion."""
+    model: str = "opencv"
+    """Of the distortion, as the source says it; see `lenses.MODELS`."""
     size: tuple[int, int] | None = None
     """(width, height) for which it holds, where it is said."""
+    unread: tuple[str, ...] = ()
+    """Keys beside them that were not read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,8 +344,6 @@ def pairs(colors: Sequence[Path], depths: Sequence[Path], names: Sequence[str] =
 MODULE = "pyrealsense2"
 PATIENCE = 5000
 """ms until the next frames of a file; none within it: the file ends."""
-MODELS = {"none": True, "brown_conrady": True, "modified_brown_conrady": False, "inverse_brown_conrady": False}
-"""Whether OpenCV's coefficients (k1, k2, p1, p2, k3) mean the same."""
 
 
 class Bag:
@@ -359,11 +361,9 @@ class Bag:
                 self._rate = float(stream.fps())
                 self.unit = float(profile.get_device().first_depth_sensor().get_depth_scale())
                 about = stream.as_video_stream_profile().get_intrinsics()
-                self.model = str(about.model).rpartition(".")[2]
-                self.coefficients = np.array(about.coeffs, dtype=float)
+                coefficients, model = np.array(about.coeffs, dtype=float), str(about.model).rpartition(".")[2]
                 matrix = np.array([[about.fx, 0, about.ppx], [0, about.fy, about.ppy], [0, 0, 1.0]])
-                distortion = self.coefficients if self.straightens else np.zeros(0)
-                self.lens = Lens(matrix=matrix, distortion=distortion, size=(int(about.width), int(about.height)))
+                self.lens = Lens(matrix=matrix, distortion=coefficients, model=model, size=(int(about.width), int(about.height)))
             count += 1
         if not count:
             raise InputError(path, "pairs of color and depth are required", "none", "Record both streams.")
@@ -372,11 +372,6 @@ class Bag:
     def rate(self, places: Sequence[int]) -> float:
         """Frames per second that were set."""
         return self._rate
-
-    @property
-    def straightens(self) -> bool:
-        """Whether its distortion can be removed."""
-        return not self.coefficients.any() or MODELS.get(self.model, False)
 
     def read(self, places: Sequence[int]) -> Iterator[Pair]:
         """Color with depth that is aligned to it. Raises InputError where the file ends early."""

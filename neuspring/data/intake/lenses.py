@@ -1,8 +1,14 @@
 """Intrinsics and poses from JSON files of other programs, the removal of distortion, and poses by a ChArUco board that lies still.
 
-Intrinsics: an object with fx, fy, cx, cy (also ppx, ppy) or K [3, 3] (also intrinsics, camera_matrix; intrinsic_matrix has 9
-numbers, column by column, as Open3D writes them), and optionally width, height, distortion (also coeffs). For several cameras: a
-list of such objects in the order of the cameras, or an object of them by name, also under the key cameras. One alone is for all.
+Intrinsics: an object with fx, fy, cx, cy or K [3, 3] (intrinsic_matrix has 9 numbers, column by column, as Open3D writes them), and
+optionally width, height, distortion, model. `KEYS` has the spellings of other programs; another key that may be of the lens is an
+error. For several cameras: a list of such objects in the order of the cameras, or an object of them by name, also under the key
+cameras. One alone is for all.
+
+Distortion: with ideal (x, y) = ((u - cx) / fx, (v - cy) / fy) and P the polynomial of OpenCV's coefficients k1, k2, p1, p2, k3, ...
+`opencv` shows (x, y) at P(x, y); `distorted_to_ideal` shows at (x, y) what belongs at P(x, y); `fisheye` is OpenCV's, of 4
+coefficients of the angle. librealsense says inverse_brown_conrady. Its documentation means distorted_to_ideal; its functions, and
+with them aligned depth, apply the coefficients as opencv. So nothing is taken for granted: the file must say which.
 
 Poses: {"camera_to_world": ...} or {"world_to_camera": ...}, [4, 4] or [3, 4] in meters per camera: a list, or an object by name.
 
@@ -12,9 +18,10 @@ on the table puts the table at z = minus its thickness.
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +34,42 @@ from neuspring.core.findings import refuse
 from neuspring.data.capture import TEXT_TOLERANCE, intrinsics_findings, pose_findings
 from neuspring.data.intake.feeds import Lens
 
-MATRIX = ("K", "intrinsics", "camera_matrix")
 OPEN3D = "intrinsic_matrix"
-DISTORTION = ("distortion", "coeffs", "dist_coeffs")
-COUNTS = (0, 4, 5, 8, 12, 14)
-"""Coefficients of OpenCV's models."""
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "taux", "tauy")
+"""In OpenCV's order."""
+KEYS = {
+    "fx": ("fx", "fl_x"),
+    "fy": ("fy", "fl_y"),
+    "cx": ("cx", "ppx"),
+    "cy": ("cy", "ppy"),
+    "K": ("K", "intrinsics", "camera_matrix"),
+    OPEN3D: (OPEN3D,),
+    "width": ("width", "w", "image_width"),
+    "height": ("height", "h", "image_height"),
+    "distortion": ("distortion", "D", "dist", "coeffs", "dist_coeffs", "distortion_coeffs", "distortion_coefficients"),
+    "model": ("model", "distortion_model"),
+    "camera_model": ("camera_model",),
+} | {name: (name,) for name in COEFFICIENTS}
+"""What is read, and its spellings: ours, and those of OpenCV, ROS, librealsense, Open3D, nerfstudio and Kalibr."""
+SILENT = "R P rectification_matrix projection_matrix roi header frames applied_transform camera_name camera_angle_x camera_angle_y"
+"""Keys beside them that say nothing about a lens, or the same once more."""
+TELLING = re.compile(
+    r"dist|coef|lens|model|skew|fish|radial|tang|focal|princip|camera|proj|^f[xy_]|^c[xy_]|^[a-z]_?\d+$", re.IGNORECASE
+)
+"""A key like this may be of the lens, as may one with several numbers."""
+RATIONAL = ("rational_polynomial", "full_opencv")
+"""Models of which k4 to k6 are OpenCV's. Other programs have other polynomials with these names."""
+MODELS = {
+    **dict.fromkeys(("opencv", "brown_conrady", "plumb_bob", "radtan", "pinhole", "simple_radial", "radial", *RATIONAL), "opencv"),
+    **dict.fromkeys(("fisheye", "opencv_fisheye", "kannala_brandt4", "equidistant"), "fisheye"),
+    "distorted_to_ideal": "distorted_to_ideal",
+}
+"""Names of models and what we call them."""
+TWO_READINGS = "inverse_brown_conrady"
+COUNTS = {"opencv": (4, 5, 8, 12, 14), "distorted_to_ideal": (4, 5), "fisheye": (4,)}
+"""Coefficients of a model."""
+STEPS = 20
+"""Of the solution; each leaves a fifth of the error at the corner of a wide lens."""
 NARROWEST, WIDEST = 10.0, 150.0
 """Degrees. A field of view outside this range is a wrong focal length."""
 FARTHEST = 20.0
@@ -42,8 +80,11 @@ DIRECTIONS = ("camera_to_world", "world_to_camera")
 def read_lenses(path: Path, names: Sequence[str]) -> dict[str, Lens]:
     """Intrinsics of each camera. Raises InputError naming the file and the key."""
     content = load_json(path)
-    if isinstance(content, dict) and "cameras" in content:
-        content = content["cameras"]
+    if isinstance(content, dict) and not _describes(content):
+        loose = [key for key, value in content.items() if not isinstance(value, dict) and key != "cameras" and TELLING.search(key)]
+        if loose and ("cameras" in content or any(name in content for name in names)):
+            raise InputError(path, "what describes a lens belongs into its camera's object", f"{loose[0]!r} beside the cameras")
+        content = content.get("cameras", content)
     if isinstance(content, dict) and _describes(content):
         content = dict.fromkeys(names, content)
     return {name: _lens(path, name, entry) for name, entry in _by_camera(path, "intrinsics", content, names).items()}
@@ -86,6 +127,8 @@ def require_lens(where: Path, name: str, lens: Lens, size: tuple[int, int]) -> N
         rule = f"camera {name}: width and height must be those of its images, {size[0]} x {size[1]}"
         raise InputError(where, rule, f"{lens.size[0]} x {lens.size[1]}", remedy)
     refuse(intrinsics_findings(where, f"intrinsics of camera {name}", lens.matrix, size))
+    if lens.distortion.any():
+        _require_model(where, name, lens, size)
     for side, pixels, focal in zip(("width", "height"), size, np.diag(lens.matrix)[:2], strict=True):
         view = float(np.degrees(2 * np.arctan(0.5 * pixels / focal)))
         if not NARROWEST < view < WIDEST:
@@ -99,9 +142,29 @@ class Straightener:
 
     def __init__(self, lens: Lens, size: tuple[int, int]) -> None:
         self.maps: tuple[np.ndarray, np.ndarray] | None = None
-        if lens.distortion.any():
-            k = lens.matrix
-            self.maps = cv2.initUndistortRectifyMap(k, lens.distortion, None, k, size, cv2.CV_32FC1)
+        k, coefficients = lens.matrix, lens.distortion
+        model = MODELS.get(lens.model) if coefficients.any() else None
+        if model == "opencv":
+            self.maps = cv2.initUndistortRectifyMap(k, coefficients, None, k, size, cv2.CV_32FC1)
+        elif model == "fisheye":
+            self.maps = cv2.fisheye.initUndistortRectifyMap(k, coefficients, np.eye(3), k, size, cv2.CV_32FC1)
+        elif model == "distorted_to_ideal":
+            # What belongs at an ideal pixel is seen at the pixel from which P leads there: a fixed point.
+            ideal = np.stack([(_grid(size)[side] - k[side, 2]) / k[side, side] for side in (0, 1)], axis=-1).reshape(-1, 2)
+            seen, still = ideal.astype(float), np.zeros(3)
+            for _ in range(STEPS):
+                points = np.concatenate([seen, np.ones((len(seen), 1))], axis=1)
+                seen = seen + ideal - cv2.projectPoints(points, still, still, np.eye(3), coefficients)[0].reshape(-1, 2)
+            x, y = (seen * np.diag(k)[:2] + k[:2, 2]).T.reshape(2, size[1], size[0]).astype(np.float32)
+            self.maps = (x, y)
+        self.shown = _grid(size) if self.maps is None else np.stack(self.maps)
+        """Where ideal pixels are seen, x and y [2, H, W]."""
+        moved = np.hypot(*(self.shown - _grid(size)))
+        self.most, self.mean = float(moved.max()), float(moved.mean())
+
+    def text(self, name: str) -> str:
+        """What was removed, in one line."""
+        return f"distortion, camera {name}: removed, up to {self.most:.1f} pixels and {self.mean:.1f} on average"
 
     def color(self, image: np.ndarray) -> np.ndarray:
         """Interpolated."""
@@ -112,8 +175,52 @@ class Straightener:
         return image if self.maps is None else cv2.remap(np.ascontiguousarray(image), *self.maps, cv2.INTER_NEAREST)
 
 
+def _grid(size: tuple[int, int]) -> np.ndarray:
+    """x and y of all pixels [2, H, W]."""
+    return np.stack(np.meshgrid(np.arange(size[0]), np.arange(size[1]))).astype(np.float32)
+
+
+def _require_model(where: Path, name: str, lens: Lens, size: tuple[int, int]) -> None:
+    """Raise InputError unless the distortion is of a model that we have."""
+    rule = f"camera {name}: the model of the distortion must be one of {' '.join(MODELS)}"
+    if lens.model == TWO_READINGS:
+        one, two = (Straightener(replace(lens, model=model), size).shown for model in ("brown_conrady", "distorted_to_ideal"))
+        apart = float(np.hypot(*(one - two)).max())
+        rule = f"camera {name}: {TWO_READINGS} has two meanings, here up to {apart:.1f} pixels apart, and the file must say which"
+        remedy = (
+            'Write "model": "brown_conrady" if librealsense or its ROS driver aligned depth: they read it so. Write "model": '
+            '"distorted_to_ideal" if the coefficients undistort, as its documentation says. A straight edge near the border of the '
+            "image shows which is right."
+        )
+        raise InputError(where, rule, remedy=remedy)
+    if lens.model not in MODELS:
+        remedy = "Undistort the images with the camera's software, and give the intrinsics of the result without coefficients."
+        raise InputError(where, rule, lens.model, remedy)
+    counts = COUNTS[MODELS[lens.model]]
+    if len(lens.distortion) not in counts:
+        wanted = " or ".join(map(str, counts))
+        raise InputError(where, f"camera {name}: the model {lens.model} has {wanted} coefficients", len(lens.distortion))
+
+
+def _spelled(entry: dict[str, Any], key: str) -> list[Any]:
+    """The values of a key in all its spellings."""
+    return [entry[word] for word in KEYS[key] if word in entry]
+
+
 def _describes(entry: dict[str, Any]) -> bool:
-    return any(key in entry for key in ("fx", OPEN3D)) or any(isinstance(entry.get(key), list) for key in MATRIX)
+    matrices = (value for value in _spelled(entry, "K") if isinstance(value, list) or (isinstance(value, dict) and "data" in value))
+    return bool(_spelled(entry, "fx") or OPEN3D in entry) or any(True for _ in matrices)
+
+
+def _unread(path: Path, where: str, entry: dict[str, Any]) -> tuple[str, ...]:
+    """The keys that are not read. Raises InputError where one may be of the lens."""
+    read = [word for words in KEYS.values() for word in words]
+    unread = [key for key in entry if key not in read and key not in SILENT.split()]
+    if telling := [key for key in unread if TELLING.search(key) or isinstance(entry[key], (list, dict))]:
+        close = difflib.get_close_matches(telling[0], read, n=1)
+        remedy = (f"Is {close[0]} meant? " if close else "") + "Remove it if it says nothing about the lens."
+        raise InputError(path, f"{where}: the keys that are read are {' '.join(read)}", repr(telling[0]), remedy)
+    return tuple(unread)
 
 
 def _by_camera(path: Path, key: str, content: Any, names: Sequence[str]) -> dict[str, Any]:
@@ -131,19 +238,60 @@ def _lens(path: Path, name: str, entry: Any) -> Lens:
     if not isinstance(entry, dict) or not _describes(entry):
         rule = f"{where}: fx, fy, cx, cy are required, or K [3, 3]"
         raise InputError(path, rule, sorted(entry) if isinstance(entry, dict) else type(entry).__name__)
-    if "fx" in entry:
-        values = [entry.get("fx"), entry.get("fy"), entry.get("cx", entry.get("ppx")), entry.get("cy", entry.get("ppy"))]
+    unread = _unread(path, where, entry)
+    for words in KEYS.values():
+        if len(twice := [word for word in words if word in entry]) > 1:
+            raise InputError(path, f"{where}: one spelling of a key is required", " and ".join(twice), "Remove the others.")
+    said = {key: values[0] for key in KEYS if (values := _spelled(entry, key))}
+    if "fx" in said:
+        values = [said.get(key) for key in ("fx", "fy", "cx", "cy")]
         fx, fy, cx, cy = _numbers(path, f"{where}: fx, fy, cx, cy", values, ((4,),))
         matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    elif OPEN3D in entry:
-        matrix = _numbers(path, f"{where}: {OPEN3D}", entry[OPEN3D], ((9,),)).reshape(3, 3).T
+    elif OPEN3D in said:
+        matrix = _numbers(path, f"{where}: {OPEN3D}", said[OPEN3D], ((9,),)).reshape(3, 3).T
     else:
-        key = next(key for key in MATRIX if key in entry)
-        matrix = _numbers(path, f"{where}: {key}", entry[key], ((3, 3),))
-    listed: Any = next((entry[key] for key in DISTORTION if key in entry), [])
-    distortion = _numbers(path, f"{where}: distortion", listed, tuple((count,) for count in COUNTS))
-    size = (entry["width"], entry["height"]) if type(entry.get("width")) is type(entry.get("height")) is int else None
-    return Lens(matrix=matrix, distortion=distortion, size=size)
+        matrix = _numbers(path, f"{where}: K", _plain(said["K"]), ((3, 3), (9,))).reshape(3, 3)
+    named = [str(said[key]).rpartition(".")[2].lower() for key in ("model", "camera_model") if key in said]
+    models = {word.removeprefix("rs2_distortion_") for word in named}
+    models -= {"pinhole"} if len(models) > 1 else set()
+    if len(models) > 1:
+        raise InputError(path, f"{where}: one model is required", " and ".join(sorted(models)))
+    model = models.pop() if models else "opencv"
+    distortion = _coefficients(path, where, said, model)
+    size = (said["width"], said["height"]) if type(said.get("width")) is type(said.get("height")) is int else None
+    return Lens(matrix=matrix, distortion=distortion, model=model, size=size, unread=unread)
+
+
+def _coefficients(path: Path, where: str, said: dict[str, Any], model: str) -> np.ndarray:
+    """Of a list in OpenCV's order, or by name; none without any."""
+    named = {key: said[key] for key in COEFFICIENTS if key in said}
+    listed = _plain(said.get("distortion", []))
+    if isinstance(listed, dict):
+        if unknown := sorted(listed.keys() - set(COEFFICIENTS)):
+            raise InputError(path, f"{where}: distortion: names {' '.join(COEFFICIENTS)} are required", unknown[0])
+        named, listed = named | listed, []
+    if not named:
+        counts = sorted({0, *(count for counts in COUNTS.values() for count in counts)})
+        return _numbers(path, f"{where}: distortion", listed, tuple((count,) for count in counts))
+    if np.size(listed):
+        rule = f"{where}: coefficients are required in a list or by name, not both"
+        raise InputError(path, rule, f"distortion and {next(iter(named))}")
+    if MODELS.get(model) == "fisheye":
+        order: tuple[str, ...] = ("k1", "k2", "k3", "k4")
+    else:
+        order = COEFFICIENTS[: next(count for count in COUNTS["opencv"] if named.keys() <= set(COEFFICIENTS[:count]))]
+        if any(named.get(key) for key in ("k4", "k5", "k6")) and model not in RATIONAL:
+            rule = f"{where}: k4 to k6 differ between programs: the model must be {' or '.join(RATIONAL)}, OpenCV's"
+            raise InputError(path, rule, model, "Or give OpenCV's coefficients as the list distortion.")
+    return _numbers(path, f"{where}: {' '.join(order)}", [named.get(key, 0.0) for key in order], ((len(order),),))
+
+
+def _plain(value: Any) -> Any:
+    """The numbers of a matrix that OpenCV or ROS wrote with rows, cols and data; the inside of a list of one row or one column."""
+    value = value["data"] if isinstance(value, dict) and "data" in value else value
+    if isinstance(value, list) and value and all(isinstance(row, list) for row in value):
+        return value[0] if len(value) == 1 else [row[0] for row in value] if {len(row) for row in value} == {1} else value
+    return value
 
 
 def _numbers(path: Path, key: str, listed: Any, shapes: Sequence[tuple[int, ...]]) -> np.ndarray:

@@ -22,7 +22,7 @@ from neuspring.core.text import Progress
 from neuspring.data import capture
 from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Camera, CameraEntry, Capture, Description, Writer, description_findings
 from neuspring.data.intake.depth import Unit, find_rate
-from neuspring.data.intake.feeds import Bag, CameraFeed, Paired, Raw, VideoFile
+from neuspring.data.intake.feeds import CameraFeed, Paired, Raw, VideoFile
 from neuspring.data.intake.lenses import Board, Straightener, read_lenses, read_poses
 from neuspring.data.intake.moments import DEPARTURE, LOST, Evenness, spans
 from neuspring.data.intake.poses import (
@@ -42,6 +42,7 @@ from neuspring.data.intake.poses import (
     stored_as,
     straightened,
 )
+from neuspring.data.plausible import edge_findings
 
 NAMES = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 FIRST = 5
@@ -107,12 +108,19 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     names = [view.name for view in intake.views]
     listed = read_lenses(intake.intrinsics, names) if intake.intrinsics else {}
     seen, unit = look(intake.views, choice, listed, intake.intrinsics, intake.depth_unit)
+    for name, view in seen.items():
+        beside = edge_findings(str(view.path), zip(view.colors, view.depths, strict=False))
+        findings += [replace(one, name=f"camera {name}: {one.name}") for one in beside]
     placed, how = _place(intake, seen, unit)
     made = _describe(intake, choice, rate, unit, seen, placed, how)
     _write(intake, made, choice, unit, seen, placed)
     sizes = ", ".join(f"{name} {view.size[0]} x {view.size[1]}" for name, view in seen.items())
     depth = "none, color alone" if unit is None else unit.text()
-    lines = [f"cameras: {sizes}", f"frames: {choice.text()}; {rate_text}", f"depth: {depth}", f"poses: {how}, up {placed.up}"]
+    lines = [f"cameras: {sizes}"]
+    unread = dict.fromkeys(key for lens in listed.values() for key in lens.unread)
+    lines += [f"intrinsics: not read: {' '.join(unread)}"] if unread else []
+    lines += [Straightener(view.lens, view.size).text(name) for name, view in seen.items() if view.lens.distortion.any()]
+    lines += [f"frames: {choice.text()}; {rate_text}", f"depth: {depth}", f"poses: {how}, up {placed.up}"]
     training = made.train_end or int(0.7 * made.frame_count)
     lines += [
         *placed.lines,
@@ -184,20 +192,11 @@ def several_tracks(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator
             yield _odd("several tracks", images.path, f"the first is read as {images.kind}: {listed}. Name the one you mean")
 
 
-def distortion_that_stays(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[Finding]:
-    """A lens model of RealSense that OpenCV does not have."""
-    for view in views:
-        if isinstance(view, Bag) and not view.straightens:
-            largest = f"largest coefficient {abs(view.coefficients).max():.3g}"
-            text = f"{view.path}: distortion of the model {view.model} is not removed; {largest}"
-            yield _odd("lens model", view.path, text)
-
-
 def _odd(name: str, where: object, text: str) -> Finding:
     return Finding(name=name, level="warning", where=str(where), text=text)
 
 
-CHECKS = (time_jumps, images_alone, missing_frames, not_by_numbers, uneven_time, several_tracks, distortion_that_stays)
+CHECKS = (time_jumps, images_alone, missing_frames, not_by_numbers, uneven_time, several_tracks)
 
 
 def _require_for_color_alone(intake: Intake) -> None:
@@ -301,7 +300,7 @@ def _write(
     intake: Intake, made: Description, choice: FrameChoice, unit: Unit | None, seen: Mapping[str, SampledCamera], placed: Placed
 ) -> None:
     recipe = TypeAdapter(Description).dump_python(made, mode="json")
-    recipe["distortion"] = {name: view.lens.distortion.tolist() for name, view in seen.items()}
+    recipe["distortion"] = {name: [view.lens.model, *view.lens.distortion.tolist()] for name, view in seen.items()}
     begun = prepare(intake.folder, recipe, intake.force)
     writer, done = Writer(intake.folder, made), 0
     kinds: tuple[Literal["color", "depth"], ...] = ("color",) if unit is None else ("color", "depth")

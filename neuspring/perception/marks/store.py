@@ -25,7 +25,7 @@ from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
 from neuspring.core.records import canonical, digest_file
-from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, images_digest
+from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, images_digest, read_labels
 from neuspring.perception.frames import frames_of, overlap, spread, write_png
 from neuspring.perception.marks.carry import Carried, carry_camera
 from neuspring.perception.marks.marks import MARKS, Mark, Marks, marks_digest
@@ -87,6 +87,24 @@ def save_masks(capture: Capture, camera: str, labels: np.ndarray) -> Path:
             values["provenance"]["images"] = images_digest(capture.folder)
         write_text(path, json.dumps(values, indent=1) + "\n")
     return capture.folder / "mask" / camera
+
+
+def import_masks(capture: Capture, camera: str, masks: Path, hands: Path | None = None) -> Path:
+    """Save the masks of other tools as those of a camera: folders of <frame>.png, see `capture.read_labels`.
+
+    With `hands` all but 0 counts: in `masks` as the object, in `hands` as hands, who lie before it. Raises InputError.
+    """
+    view = capture.cameras[camera]
+    labels = np.zeros((capture.frame_count, view.height, view.width), np.uint8)
+    for folder, label in ((masks, OBJECT), (hands, HANDS)):
+        files = _numbered(folder) if folder is not None else {}
+        for frame in frames_of(capture, camera) if files else []:
+            if frame not in files:
+                rule = f"a mask of frame {frame} of camera {camera} is required, with its number as the name: {frame:05d}.png"
+                raise InputError(folder, rule, f"frames {min(files)} to {max(files)}, {len(files)} in all")
+            found = read_labels(files[frame], view, binary=hands is not None)
+            labels[frame] = np.where(found > 0, np.where(hands is None, found, label), labels[frame])
+    return save_masks(capture, camera, labels)
 
 
 def has_masks(capture: Capture, cameras: Sequence[str] = ()) -> bool:
@@ -202,10 +220,9 @@ def compare(masks: Path, truth: Path) -> dict[int, tuple[float, float]]:
     for frame, path in known.items():
         if frame not in there:
             raise InputError(masks, f"a mask of frame {frame} is required: {truth} has one", sorted(there)[:5])
-        one, other = (cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in (there[frame], path))
-        if one is None or other is None or one.shape != other.shape or one.ndim != 2:
-            sizes = [None if image is None else image.shape for image in (one, other)]
-            raise InputError(there[frame], f"must be a gray image of the size of {path}", sizes)
+        one, other = (read_labels(file) for file in (there[frame], path))
+        if one.shape != other.shape:
+            raise InputError(there[frame], f"must have the size of {path}", [image.shape for image in (one, other)])
         rows[frame] = (overlap(one == OBJECT, other == OBJECT), overlap(one == HANDS, other == HANDS))
     return rows
 

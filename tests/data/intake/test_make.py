@@ -219,10 +219,56 @@ def test_a_realsense_recording_says_all_but_the_category(tmp_path, monkeypatch, 
     assert "as the source says" in capsys.readouterr().out
 
 
-def test_distortion_that_opencv_does_not_have_is_said(tmp_path, monkeypatch, capsys):
-    bent = ABOUT | {"coeffs": [0.1, 0, 0, 0, 0]}
-    assert main(stand_in(monkeypatch, tmp_path, intrinsics=bent)) == 0
-    assert "distortion of the model inverse_brown_conrady is not removed; largest coefficient 0.1" in capsys.readouterr().out
+def test_a_recording_whose_lens_has_two_meanings_is_refused(tmp_path, monkeypatch, capsys):
+    words = stand_in(monkeypatch, tmp_path, intrinsics=ABOUT | {"coeffs": [0.1, 0, 0, 0, 0]})
+    assert main(words) == 2
+    assert "a.bag: camera 0: inverse_brown_conrady has two meanings" in capsys.readouterr().err
+    said = write_json(tmp_path / "k.json", ABOUT | {"coeffs": [0.1, 0, 0, 0, 0], "model": "brown_conrady"})
+    assert main([*words, "--intrinsics", str(said)]) == 0
+    assert "distortion, camera 0: removed, up to" in capsys.readouterr().out
+
+
+BENT = np.array([-0.3, 0.1, 0.0, 0.0, 0.0])
+
+
+def bent(image):
+    """A picture of the desk as a lens with the coefficients BENT shows it."""
+    y, x = np.mgrid[: SIZE[1], : SIZE[0]].astype(np.float32)
+    ideal = cv2.undistortPoints(np.stack([x, y], axis=-1).reshape(-1, 1, 2), K, BENT, P=K).reshape(SIZE[1], SIZE[0], 2)
+    return cv2.remap(np.ascontiguousarray(image), ideal[..., 0], ideal[..., 1], cv2.INTER_NEAREST)
+
+
+@pytest.mark.parametrize("distorted", [False, True])
+def test_intrinsics_of_the_capture_are_those_given_and_fit_its_images(tmp_path, distorted):
+    root = write_folders(tmp_path)
+    if distorted:
+        for path in [*root.glob("color_0/*"), *root.glob("depth_0/*")]:
+            cv2.imwrite(str(path), bent(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
+        write_json(root / "intrinsics.json", {"K": K.tolist(), "dist": BENT.tolist()})
+    capture, report = make_capture(intake(root))
+    np.testing.assert_array_equal(capture.cameras["0"].intrinsics, K)
+    assert distorted == any(line.startswith("distortion, camera 0: removed, up to") for line in report)
+    # The table is flat by these intrinsics: one of another focal length, or of an image that is still bent, is not.
+    y, x = np.mgrid[: SIZE[1], : SIZE[0]]
+    truth = seen(camera(), 2, noise=0.0)[1]
+    found = capture.depth("0", 2)
+    inside = (found > 0) & (truth > 0) & (x > 12) & (x < 68) & (y > 12) & (y < 48)
+    assert inside.sum() > 1500 and np.median(np.abs(found - truth)[inside]) < 0.002
+
+
+def test_depth_of_a_sensor_that_stands_elsewhere(tmp_path):
+    root = write_folders(tmp_path, cameras=2)
+    views = pairs([root / "color_1"], [root / "depth_1"])
+    assert not any("not aligned" in line for line in make_capture(intake(root, views=views))[1])
+    for path in root.glob("depth_1/*"):
+        cv2.imwrite(str(path), np.roll(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), 7, axis=1))
+    _, report = make_capture(intake(root, folder=tmp_path / "moved", views=views))
+    line = next(line for line in report if "not aligned" in line)
+    assert line.startswith("warning: camera 0: depth not aligned to color: edges of depth fit those of color when depth is ")
+    assert (
+        "pixels to the left; as it is they must fit within 1.5% of the width. Let the camera's software align depth to color"
+        in line
+    )
 
 
 def test_without_pyrealsense2_the_command_names_it(tmp_path, monkeypatch, capsys):

@@ -49,6 +49,37 @@ def polygon(truth, label, name):
     return mark(name, "polygon", [tuple(map(float, point)) for point in coarse], radius=2.0)
 
 
+def test_masks_of_another_tool_become_those_of_a_capture(folder, tmp_path, capsys):
+    truth = {name: folder / "truth" / name for name in ("0", "1")}
+    assert main(["mask", str(folder), "--masks", str(truth["0"]), str(truth["1"])]) == 0
+    assert f"camera 1: masks are in {folder}/mask/1" in capsys.readouterr().out
+    capture = Capture.load(folder)
+    assert capture.description.masks
+    labels = capture.mask("0", 2)
+    assert set(np.unique(labels)) == {0, OBJECT, HANDS}
+    np.testing.assert_array_equal(labels, cv2.imread(str(truth["0"] / "00002.png"), cv2.IMREAD_UNCHANGED))
+    # The same as a tool with a folder per thing writes it: each with a number of its own.
+    for name, label, number in (("thing", OBJECT, 255), ("fingers", HANDS, 3)):
+        (tmp_path / name).mkdir()
+        for path in truth["0"].iterdir():
+            mask = (cv2.imread(str(path), cv2.IMREAD_UNCHANGED) == label) * number
+            cv2.imwrite(str(tmp_path / name / path.name), mask.astype(np.uint8))
+    words = ["mask", str(folder), "--cameras", "0", "--masks", str(tmp_path / "thing")]
+    assert main([*words, "--hands", str(tmp_path / "fingers")]) == 0
+    np.testing.assert_array_equal(capture.mask("0", 2), labels)
+    assert main(words) == 0
+    np.testing.assert_array_equal(capture.mask("0", 2) == OBJECT, labels == OBJECT)
+
+
+def test_masks_of_another_tool_that_do_not_fit(folder, capsys):
+    truth = folder / "truth"
+    assert main(["mask", str(folder), "--masks", str(truth / "0")]) == 2
+    assert "a folder is required for each of the cameras 0 1; --cameras chooses some; received 1 and 0" in capsys.readouterr().err
+    (truth / "0" / "00004.png").rename(truth / "0" / "00044.png")
+    assert main(["mask", str(folder), "--masks", str(truth / "0"), "--cameras", "0"]) == 2
+    assert "a mask of frame 4 of camera 0 is required, with its number as the name: 00004.png; received" in capsys.readouterr().err
+
+
 def test_marks_become_the_masks_of_a_capture(folder, capsys):
     assert main(["mask", str(folder)]) == 0
     out, err = capsys.readouterr()
