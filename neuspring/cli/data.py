@@ -1,4 +1,4 @@
-"""Commands on data: fetch, check-data, verify-released, make-capture, mask, compare-masks, annotate."""
+"""Commands on data: fetch, check-data, verify-released, make-capture, cut-capture, mask, compare-masks, annotate."""
 
 from __future__ import annotations
 
@@ -156,6 +156,21 @@ def make_capture(
         print(f"  neuspring annotate {capture.folder}")
 
 
+def cut_capture(
+    capture: Annotated[Positional[Path], arg(help="capture folder")],
+    frames: Annotated[str, arg(help="first and last frame that are kept, like 12-97")],
+    output: Annotated[Path, arg(help="the capture folder to write")],
+) -> None:
+    """Some frames of a capture, with their masks and tracks -> another capture; marks stay behind."""
+    from neuspring.data.capture import Capture, cut
+
+    first, _, last = frames.partition("-")
+    if not (first.isdigit() and last.isdigit()):
+        raise InputError("--frames", "a first and a last frame are required, as in 12-97", frames)
+    made = cut(Capture.load(capture), int(first), int(last), output)
+    print(f"written: {made.folder}, {made.frame_count} frames\nnext:\n  neuspring check-data {made.folder}")
+
+
 def mask(
     capture: Annotated[Positional[Path], arg(help="capture folder")],
     marks: Annotated[Path | None, arg(help="marks of object and hands; marks.json of the capture by default")] = None,
@@ -172,6 +187,7 @@ def mask(
     """Marks on a few frames, or masks of other tools -> masks of object and hands in every frame of a capture."""
     from neuspring.data.capture import Capture
     from neuspring.perception import segment_sam2
+    from neuspring.perception.findings import look_at_masks, mask_facts
     from neuspring.perception.marks import store
     from neuspring.perception.marks.carry import carry_camera
     from neuspring.perception.marks.marks import MARKS, Marks
@@ -213,6 +229,8 @@ def mask(
                 bar = _bar(f"camera {name}")
                 carried = carry_camera(read, name, marked.of(name), segmentation.marks, progress=bar)
             doubts = store.save_carried(read, name, carried, source, backend).doubt
+            for finding in look_at_masks(read, name, carried.labels, mask_facts(read, name, carried.labels)):
+                print(finding)
             told = f"masks are in {capture / 'mask' / name}"
         print(f"camera {name}: {told}; look at {store.sheet_of(read, name)}")
         worst = sorted(range(len(doubts)), key=lambda frame: -doubts[frame])[:SHOWN]

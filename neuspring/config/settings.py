@@ -101,7 +101,7 @@ class Config(Section):
     """One benchmark: which scenarios, methods and seeds, and how."""
 
     scenarios: tuple[Name, ...] = ()
-    """Rows of the scenario table that are run."""
+    """Rows of the scenario table that are run, and captures in `data_root` by the names of their folders."""
     methods: tuple[Name, ...] = ()
     """Rows of the method table that are run, beside the methods in the rows of `studies`. If studies add any, all methods stand in
     the order of the method table."""

@@ -28,6 +28,8 @@ MOST_BYTES = 50_000_000
 """What a record may have: it is read whole."""
 COMPUTING = ("numpy", "scipy", "torch", "warp-lang")
 """Packages on whose versions results depend."""
+CAPTURE_FOLDER = "capture_folder"
+"""The fact of a scenario's observations.json that says where its capture lies."""
 Status = Literal["ok", "failed"]
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -132,6 +133,10 @@ class Description:
     """Training frames are [0, train_end); null: the first 70 %."""
     masks: bool = False
     """Whether the capture has masks."""
+    self_collision: bool | None = None
+    """Whether the object may touch itself, for a scenario without a row of its own; null: where the category is cloth."""
+    ground: bool = True
+    """Whether there is a table, for a scenario without a row of its own."""
     obstacles: tuple[Obstacle, ...] = ()
     """What else stands in the scene and does not move, besides the table, m: {"shape": "box", "center": [x, y, z], "half_sizes":
     [a, b, c], "rotation": [3 rows; own axes to world]} or {"shape": "sphere", "center": [x, y, z], "radius": r}."""
@@ -306,6 +311,33 @@ class Writer:
             del plain["depth"]
         write_text(folder / CAPTURE, json.dumps(plain, indent=1) + "\n")
         return Capture(folder, description)
+
+
+def cut(capture: Capture, first: int, last: int, folder: Path) -> Capture:
+    """Frames `first` to `last` of a capture, both included, as a capture of its own in a new `folder`, with masks and tracks.
+
+    Raises InputError for frames that it does not have, a first frame that a camera missed, or a folder with files.
+    """
+    description = capture.description
+    if not 0 <= first < last - 3 or last >= capture.frame_count:
+        rule = f"five frames or more of 0 to {capture.frame_count - 1} are required, as in 12-97"
+        raise InputError("--frames", rule, f"{first}-{last}")
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(folder, "--output must be a new or empty folder", "other files", "Choose another folder.")
+    kept = range(first, last + 1)
+    cameras = tuple(replace(c, missing=tuple(k - first for k in c.missing if k in kept)) for c in description.cameras)
+    if late := [c.name for c in cameras if 0 in c.missing]:
+        raise InputError("--frames", f"camera {late[0]} must have the first frame", f"{first}, which it missed", "Begin later.")
+    for path in [path for name in ("color", "depth", "mask") for path in (capture.folder / name).glob("*/*")]:
+        if path.stem.isdigit() and int(path.stem) in kept:
+            there = folder / path.relative_to(capture.folder).with_name(f"{int(path.stem) - first:05d}{path.suffix}")
+            make_way(there)
+            shutil.copyfile(path, there)
+    source = {"cut of": f"sha256:{digest_file(capture.folder / CAPTURE)}", "frames of it": f"{first}-{last}"}
+    own = replace(description, name=folder.resolve().name, frame_count=len(kept), cameras=cameras, train_end=None)
+    points = {name: capture.points(name)[kept] for name in capture.cameras} if (capture.folder / POINTS).exists() else None
+    tracks = capture.tracks()[kept] if (capture.folder / TRACKS).exists() else None
+    return Writer(folder, own).finish(tracks, points, **source)
 
 
 def write_tracks(folder: Path, tracks: np.ndarray) -> None:

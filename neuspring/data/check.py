@@ -66,7 +66,9 @@ def check_capture(folder: Path) -> list[Finding]:
         case.findings.append(broken(path, "frame_rate", rule, f"{description.frame_rate:g}"))
     capture = Capture(folder, description)
     calibrated = not any(d.level == "error" for d in case.findings)
-    samples = {name: _check_camera(case, capture, name, calibrated) for name in capture.cameras}
+    grips = np.zeros(capture.frame_count, int)
+    samples = {name: _check_camera(case, capture, name, calibrated, grips) for name in capture.cameras}
+    case.findings += plausible.grip_findings(folder, grips, description.frame_rate)
     if calibrated and len(samples) > 1:
         first = {name: found[0].depth for name, found in samples.items() if 0 in found}
         case.findings += plausible.view_findings(path, capture.cameras, first, description.up)
@@ -84,8 +86,10 @@ def _at(file: Path, findings: Iterable[Finding]) -> list[Finding]:
     return [replace(one, where=str(file), name=f"{one.where}: {one.name}") for one in findings]
 
 
-def _check_camera(case: Inspection, capture: Capture, name: str, calibrated: bool) -> dict[int, plausible.Sample]:
-    """Check every image of a camera, and a few frames against the world; returns these."""
+def _check_camera(
+    case: Inspection, capture: Capture, name: str, calibrated: bool, grips: np.ndarray
+) -> dict[int, plausible.Sample]:
+    """Check every image of a camera, and a few frames against the world; returns these. `grips` [T] counts hands at the object."""
     view = capture.cameras[name]
     depths, shown = [], plausible.Shown(capture.frame_count, (view.width, view.height))
     samples: dict[int, plausible.Sample] = {}
@@ -102,6 +106,8 @@ def _check_camera(case: Inspection, capture: Capture, name: str, calibrated: boo
             if capture.description.masks:
                 mask = capture.mask(name, frame)
                 shown.see(frame, mask)
+                if capture.has_depth:
+                    grips[frame] = max(grips[frame], plausible.hands_on(view, plausible.Sample(depth, mask)))
             if frame in wanted:
                 samples[frame] = plausible.Sample(depth, mask, color)
         except InputError as error:

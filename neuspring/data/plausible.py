@@ -20,11 +20,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 from scipy.fft import irfft2, next_fast_len, rfft2
+from scipy.ndimage import median_filter
 from scipy.spatial import KDTree
 
 from neuspring.core.artifacts import up_sign
 from neuspring.core.findings import Finding, broken, finding, note, unusual
-from neuspring.data.capture import HANDS, OBJECT, Camera
+from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Camera
 from neuspring.data.intake.depth import FAR, NEAR, Plane
 from neuspring.data.intake.lenses import rigid_inverse
 
@@ -258,6 +259,40 @@ def reach_findings(camera: Camera, samples: Mapping[int, Sample]) -> list[Findin
     rule = f"within {100 * REACH:g} cm it can move it"
     remedy = "Look at the masks for a hand that is something else, or for the wrong object."
     return [finding("hand far from the object", "warning", f"camera {camera.name}", value, rule, remedy)]
+
+
+BESIDE = 0.04
+"""Distance between two pieces of the hands' mask, as a part of the image, within which they are one hand."""
+STEADY = 5
+"""Frames over whose median hands are counted."""
+SHORTEST = 1.0
+"""s. Shorter times with one constant grip are not proposed."""
+
+
+def hands_on(camera: Camera, sample: Sample) -> int:
+    """How many hands are within REACH of the object in a frame."""
+    body, own = lifted(camera, sample, OBJECT), sample.mask == HANDS
+    reach = max(int(0.5 * BESIDE * camera.width), 1)
+    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2)
+    count, pieces = cv2.connectedComponents(cv2.dilate(own.astype(np.uint8), disk))
+    each = [lifted(camera, Sample(sample.depth, np.where(own & (pieces == k), HANDS, 0)), HANDS) for k in range(1, count)]
+    return sum((KDTree(body).query(hand)[0] <= REACH).sum() >= FEW for hand in each) if len(body) >= FEW else 0
+
+
+def grip_findings(folder: Path, grips: np.ndarray, rate: float) -> list[Finding]:
+    """A note on the hands at the object [T], counted by all cameras, and the longest times in which their number is constant."""
+    steady = median_filter(grips, STEADY, mode="nearest")
+    edges = [0, *(np.flatnonzero(np.diff(steady)) + 1).tolist(), len(steady)]
+    spans = [(first, end - 1, int(steady[first])) for first, end in pairwise(edges)]
+    if len(spans) < 2:
+        return []
+    told = ", ".join(f"{first}-{last}: {count}" for first, last, count in spans)
+    held = [span for span in spans if span[2] and span[1] - span[0] + 1 >= SHORTEST * rate]
+    longest = sorted(held, key=lambda span: span[0] - span[1])[:3]
+    text = f"hands within {100 * REACH:g} cm of the object, by frames: {told}. A twin is best learned from one constant grip"
+    commands = " or ".join(f"--frames {first}-{last}" for first, last, _ in longest)
+    text += f": neuspring cut-capture {folder} {commands} --output ..." if longest else f"; none lasts {SHORTEST:g} s"
+    return [note(folder / CAPTURE, text)]
 
 
 POSE = "Look at camera_to_world: the table must be z = 0 in meters, and the camera's z points forward."

@@ -80,6 +80,27 @@ def location(row: ScenarioRow, settings: Config) -> Path:
     return Path(settings.data_root or ".") / row.path
 
 
+def scenario_rows(settings: Config, root: Path = Path()) -> dict[str, ScenarioRow]:
+    """All scenarios, name -> row: those of the table, which lies below `root`, and each capture in `data_root` that no row names.
+
+    Such a capture needs no row: its folder is the scenario's name, and capture.json says the rest. Raises InputError.
+    """
+    rows = read_scenarios(root / settings.scenario_table)
+    for path in sorted(Path(settings.data_root).glob(f"*/{capture.CAPTURE}")) if settings.data_root else ():
+        name = path.parent.name
+        try:
+            if name not in rows:
+                own = capture.read_description(path)
+                touches = own.category == "cloth" if own.self_collision is None else own.self_collision
+                values = {"scenario": name, "source": "capture", "category": own.category, "path": name}
+                rows[name] = parse(ScenarioRow, values | {"self_collision": touches, "ground": own.ground}, str(path))
+        except InputError:
+            # Another capture that is damaged is no reason to stop.
+            if name in settings.scenarios:
+                raise
+    return rows
+
+
 def read_scenarios(path: Path) -> dict[str, ScenarioRow]:
     """The scenario table (tab-separated, one header line, `#` comments): name -> row. Raises InputError."""
     lines = [line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]

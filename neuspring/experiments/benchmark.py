@@ -16,7 +16,7 @@ from neuspring.baselines import BASELINES, REFERENCES
 from neuspring.config import Config, Method, ScenarioRow, SearchRow, merge, parse, plain, read_yaml
 from neuspring.config.rows import RENAMED_ROWS
 from neuspring.core.errors import InputError
-from neuspring.data.sources import SOURCES, Source, location, read_scenarios
+from neuspring.data.sources import SOURCES, Source, location, scenario_rows
 from neuspring.perception.backends import BACKENDS
 from neuspring.scores.lpips import configured_weights
 from neuspring.scores.paper import read_studies
@@ -117,7 +117,7 @@ class Benchmark:
 
     def __init__(self, values: Mapping[str, Any], root: Path) -> None:
         self.root, whole = root, parse(Config, values, "configuration")
-        scenarios, methods = read_scenarios(root / whole.scenario_table), read_methods(root / whole.method_table)
+        scenarios, methods = scenario_rows(whole, root), read_methods(root / whole.method_table)
         self.studies = read_studies(root / whole.study_table)
         """All rows of the study table; `config.studies` names those that are made without being asked for."""
         _require_known("studies", whole.studies, self.studies, whole.study_table)
@@ -130,7 +130,7 @@ class Benchmark:
         for name in ("scenarios", "methods", "seeds"):
             if not getattr(whole, name):
                 raise InputError(f"configuration, {name}", "at least one entry is required", None, REMEDY)
-        _require_known("scenarios", whole.scenarios, scenarios, whole.scenario_table)
+        _require_known("scenarios", whole.scenarios, scenarios, f"{whole.scenario_table}, or a capture in data_root")
         self.whole = whole = with_references(whole, scenarios, methods)
         """The configuration as it was given: what tables are laid out for, whatever part of it is run now."""
         self.config = config = chosen_part(whole, scenarios)

@@ -28,6 +28,10 @@ ALWAYS = np.zeros((0, 0), dtype=bool)
 """All controllers hold in all frames."""
 RELEASE_AFTER = 10
 """Frames without any hand in view after which hands have let go, and the fewest that a hand is away."""
+CELL = 0.01
+"""m: pixels of hands in one cube count once where pieces of them are sought."""
+LEAST_OF_HAND = 20
+"""Pixels of a hand near the object that are not noise of a mask."""
 GUIDES = 5
 """Followed points of the object that say which part of it is near a hand."""
 
@@ -140,11 +144,22 @@ class Body:
     """[T, n] bool."""
 
 
+@dataclass(frozen=True, eq=False)
+class Grips:
+    """When controllers hold, and hands that none of them stands for."""
+
+    holds: np.ndarray
+    """[T, C] bool; `ALWAYS` if all hold in all frames."""
+    elsewhere: int | None
+    """The first frame in which a hand came back to another part of the object, which no spring joins to it."""
+    strays: list[int]
+    """Frames in which a hand without controllers is within `release` of the body."""
+
+
 def holding(
     controllers: np.ndarray, hands: tuple[np.ndarray, np.ndarray], body: Body, in_view: np.ndarray, release: float
-) -> tuple[np.ndarray, int | None]:
-    """When each of `controllers` [T, C, 3] holds, [T, C] bool; `ALWAYS` if all hold in all frames. And the first frame in which a
-    hand came back to another part of the object, which no spring joins to it.
+) -> Grips:
+    """When each of `controllers` [T, C, 3] holds, and where pixels of hands have no controllers.
 
     `hands` are tracked points [T, n, 3], m, and whether they are seen [T, n]; `in_view` [T]: whether any mask shows a hand. The
     body is known in the training frames: later a hand lets go only by leaving the view, and takes no hold.
@@ -159,22 +174,25 @@ def holding(
     for number, group in enumerate(groups := hands_of(points[0])):
         label[group] = number
     hand_of = label[cKDTree(points[0]).query(controllers[0])[1]]
-    valid, elsewhere = np.ones(controllers.shape[:2], dtype=bool), list[int]()
-    for number, group in enumerate(groups):
-        members = np.flatnonzero(hand_of == number)
-        if not len(members):
+    followed = np.stack([seen[:, group].sum(axis=1) >= LEAST_FOR_POSE for group in groups])
+    apart, strays = np.full(followed.shape, np.nan), list[int]()
+    for frame, (cloud, pixels) in enumerate(zip(body.clouds, body.hands, strict=True)):
+        if not len(cloud):
             continue
-        followed = seen[:, group].sum(axis=1) >= LEAST_FOR_POSE
-        apart = np.full(len(points), np.nan)
-        for frame in np.flatnonzero(followed[: len(body.clouds)]).tolist():
-            # Followed points lie anywhere on a hand, and of few of them the pose is rough: what masks show of it counts too.
-            pixels = body.hands[frame]
-            here = np.flatnonzero(seen[frame])
-            own = pixels[label[here[cKDTree(points[frame, here]).query(pixels)[1]]] == number] if len(pixels) else pixels
-            if len(body.clouds[frame]):
-                hand = np.concatenate([controllers[frame, members], own])
-                apart[frame] = cKDTree(body.clouds[frame]).query(hand)[0].min()
-        for begin, end in _gaps(apart <= release, apart > release, in_view):
+        # Followed points lie anywhere on a hand, and of few of them the pose is rough: what masks show of it counts too.
+        here, posed = np.flatnonzero(seen[frame] & np.isin(label, hand_of)), followed[hand_of, frame]
+        known = np.concatenate([points[frame, here], controllers[frame, posed]])
+        owner = _owners(pixels, known, np.concatenate([label[here], hand_of[posed]]))
+        distance = cKDTree(cloud).query(pixels)[0]
+        if (distance[owner < 0] <= release).sum() >= LEAST_OF_HAND:
+            strays.append(frame)
+        for number in np.unique(hand_of[posed]):
+            own = cKDTree(cloud).query(controllers[frame, hand_of == number])[0]
+            apart[number, frame] = np.concatenate([own, distance[owner == number]]).min()
+    valid, elsewhere = np.ones(controllers.shape[:2], dtype=bool), list[int]()
+    for number in np.unique(hand_of):
+        members = np.flatnonzero(hand_of == number)
+        for begin, end in _gaps(apart[number] <= release, apart[number] > release, in_view):
             valid[begin:end, members] = False
             if end == len(points):
                 break
@@ -186,7 +204,25 @@ def holding(
                 valid[end:, members] = False
                 elsewhere.append(end)
                 break
-    return ALWAYS if valid.all() else valid, min(elsewhere, default=None)
+    return Grips(ALWAYS if valid.all() else valid, min(elsewhere, default=None), strays)
+
+
+def _owners(pixels: np.ndarray, known: np.ndarray, hand: np.ndarray) -> np.ndarray:
+    """The hand [P] of each pixel of hands [P, 3], m, by the `known` points [n, 3] of hand `hand` [n]; -1: of none of them.
+
+    Pixels in one piece that known points lie on belong to the hand of the nearest. A piece without any is another hand: it came
+    later, or its tracks are lost.
+    """
+    owner = np.full(len(pixels), -1)
+    if not len(pixels) or not len(known):
+        return owner
+    cells, cell_of = np.unique(np.floor(pixels / CELL).astype(int), axis=0, return_inverse=True)
+    for piece in hands_of(CELL * cells):
+        own = np.isin(cell_of.ravel(), piece)
+        on_it = cKDTree(pixels[own]).query(known)[0] <= HAND_GAP
+        if on_it.any():
+            owner[own] = hand[on_it][cKDTree(known[on_it]).query(pixels[own])[1]]
+    return owner
 
 
 def _gaps(near: np.ndarray, away: np.ndarray, in_view: np.ndarray) -> list[tuple[int, int]]:

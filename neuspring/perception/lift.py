@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from neuspring.config.perception import Lift
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Camera, Capture
-from neuspring.perception.controllers import ALWAYS, Body, choose_controllers, holding
+from neuspring.perception.controllers import ALWAYS, HAND_GAP, Body, choose_controllers, holding
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks
 
 REFERENCE_FOCAL = 430.0
@@ -70,16 +70,16 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
     valid = agreeing_motion(objects, settings)
     moving = agreeing_motion(hands, settings)
     controllers, facts = choose_controllers(hands.points, hands.visible, moving, cloud, settings, where)
-    holds, elsewhere = ALWAYS, None
-    if settings.release is not None:
-        body, in_view = _body(capture, cameras, labels, objects)
-        seen = (hands.points, hands.visible)
-        holds, elsewhere = holding(controllers, seen, body, in_view, settings.release)
+    body, in_view = _body(capture, cameras, labels, objects)
+    grips = holding(controllers, (hands.points, hands.visible), body, in_view, settings.release or HAND_GAP)
+    holds = ALWAYS if settings.release is None else grips.holds
     if len(holds):
         first = float(np.flatnonzero(~holds.all(axis=1))[0])
         facts |= {"controllers_let_go": float((~holds).any(axis=0).sum()), "first_let_go": first}
-    if elsewhere is not None:
-        facts["grip_elsewhere"] = float(elsewhere)
+    if settings.release is not None and grips.elsewhere is not None:
+        facts["grip_elsewhere"] = float(grips.elsewhere)
+    if grips.strays:
+        facts |= {"stray_hand_frames": float(len(grips.strays)), "stray_hand_first": float(grips.strays[0])}
     facts |= {
         "object_tracks": float(objects.points.shape[1]),
         "hand_tracks": float(hands.points.shape[1]),

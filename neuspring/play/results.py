@@ -17,7 +17,7 @@ from typing import TypeVar
 from neuspring.core.artifacts import Artifact, Observations, SplatCenters, Trajectory, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.files import META, DamagedFile, read_head
-from neuspring.core.records import digest_file
+from neuspring.core.records import CAPTURE_FOLDER, StageRecord, digest_file
 from neuspring.core.run_folder import RunFolder
 from neuspring.core.run_record import RUN_RECORD
 from neuspring.data.capture import CAPTURE, Capture
@@ -141,7 +141,7 @@ def find(paths: Sequence[Path]) -> Scene:
     if not runs:
         raise InputError(folder, "must have at least one run <method>/<seed>", _content(folder), "Run the benchmark first.")
     shown = tuple(run.name for run in runs if run.folder in named) or _first(runs)
-    return Scene(folder, observations, runs, shown, _capture(folder, notes), tuple(notes))
+    return Scene(folder, observations, runs, shown, _capture(folder, observations, notes), tuple(notes))
 
 
 def _is_run(path: Path) -> bool:
@@ -185,12 +185,20 @@ def _run(folder: Path, scenario_folder: Path) -> Run:
     return Run(folder, tuple(notes), paths)
 
 
-def _capture(folder: Path, notes: list[str]) -> Capture | None:
-    """The capture in the scenario's folder, if it can be used."""
+def _capture(folder: Path, observations: Observations, notes: list[str]) -> Capture | None:
+    """The capture in the scenario's folder, or the user's own that its record names, if it can be used."""
     path = folder / "capture" / CAPTURE
-    if not path.is_file():
-        return None
     try:
+        if not path.is_file():
+            record = (folder / OBSERVATIONS).with_suffix(".json")
+            own = StageRecord.load(record).facts.get(CAPTURE_FOLDER) if record.is_file() else None
+            if own is None:
+                return None
+            # Named by a record, and so only believed if it is the one that was observed.
+            path = Path(str(own)) / CAPTURE
+            require_small(path)
+            if observations.scenario.provenance.get(CAPTURE) != f"sha256:{digest_file(path)}":
+                raise InputError(path, "must be the capture of this run", "one that was changed since", "Run the benchmark again.")
         require_small(path)
         return Capture.load(path.parent)
     except InputError as error:

@@ -37,6 +37,8 @@ def lift(capture: Capture, masks: Sequence[Before], tracks: Sequence[Before], se
         prior = shape_prior(capture, masks_of, lifted.cloud, perception.shape)
     else:
         lifted, prior, image = from_color(capture, masks_of, tracks_of, perception)
+    # Whether its picture changes where no point is followed, `observe` cannot see.
+    lifted.facts["object_moves"] = max(masks.facts.get("object_moves", 0.0) for masks in masks_of.values())
     files = run.beside(lifted="lifted.npz", shape="shape.npz", picture="lifted.png")
     if image is not None:
         files |= run.beside(image="image.npz", hands="hands.png")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from neuspring.config import Config, ScenarioRow
 from neuspring.core.errors import InputError
-from neuspring.core.records import Before, Recorder
+from neuspring.core.records import CAPTURE_FOLDER, Before, Recorder
 from neuspring.data.capture import Capture
 from neuspring.data.sources import SOURCES, read_observations
 from neuspring.stages.stage import stage
@@ -45,9 +45,11 @@ def observe(
     points, prior = LiftedTracks.load(lifted.file("lifted")), ShapePrior.load(lifted.file("shape"))
     image = ImageObservations.load(lifted.file("image")) if lifted.has("image") else None
     observations = assemble(scenario, capture, points, prior, settings.perception, image)
-    findings = look_at_observations(observations)
+    findings = look_at_observations(observations, points.facts.get("object_moves", 0.0))
     facts = findings_as_facts(findings)
     # Before the observations are there: what no method can work with starts no search.
     refuse_errors(findings)
     observations.save(output)
-    record.save({"observations": output}, {"nodes": len(observations.nodes), **facts})
+    # A capture of the user's own lies outside of the results: what draws the scenario finds it by this.
+    here = {CAPTURE_FOLDER: str(capture.folder.absolute())}
+    record.save({"observations": output}, {"nodes": len(observations.nodes), **here, **facts})

@@ -322,13 +322,14 @@ def read_settings(text: str) -> Config:
 
 def read_row(text: str, settings: Config) -> ScenarioRow:
     """A row of the scenario table, by its name or as JSON. Raises InputError."""
-    from neuspring.data.sources import read_scenarios
+    from neuspring.data.sources import scenario_rows
 
     if text.lstrip().startswith("{"):
         return config.parse(ScenarioRow, json_value("--scenario", text), "--scenario")
-    rows = read_scenarios(Path(settings.scenario_table))
+    rows = scenario_rows(settings)
     if text not in rows:
-        raise InputError("--scenario", f"must be a row of {settings.scenario_table}, or JSON", text)
+        rule = f"must be a row of {settings.scenario_table}, a capture in data_root, or JSON"
+        raise InputError("--scenario", rule, text)
     return rows[text]
 
 

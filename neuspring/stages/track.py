@@ -36,6 +36,5 @@ def track(capture: Capture, camera: str, masks: Before, settings: Config, run: R
     files = run.beside(tracks="tracks.npz", picture="tracks.png")
     tracks.save(files["tracks"])
     figures.tracks_strip(capture, camera, tracks, files["picture"])
-    return Written(
-        files=files, facts=tracks.facts | findings_as_facts(look_at_tracks(camera, labels, tracks.pixels, tracks.visible))
-    )
+    findings = look_at_tracks(capture, camera, labels, tracks.pixels, tracks.visible)
+    return Written(files=files, facts=tracks.facts | findings_as_facts(findings))

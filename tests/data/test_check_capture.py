@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
+from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, Writer
 from neuspring.data.check import check_layout
 from neuspring.data.intake.lenses import rigid_inverse
+from tests.support.captures import describe, entry
 from tests.support.filmed import film
 from tests.support.findings import holds, of_level, serious
 
@@ -189,3 +190,16 @@ def test_an_object_inside_an_obstacle(capture):
     assert of_level(check_layout(capture.folder), "error") == []
     edit(capture, lambda values: values.update(obstacles=[beside, around]))
     assert holds(check_layout(capture.folder), "error", CAPTURE, "obstacles[1]", "100% more than 10 mm inside")
+
+
+def test_times_with_one_constant_grip_are_proposed(tmp_path):
+    """Of two hands one lets go in frame 20 of 60; at 10 frames/s both times last longer than a second."""
+    writer = Writer(tmp_path, describe(frame_count=60, frame_rate=10.0, cameras=(entry(width=120, height=68),)))
+    for frame in range(60):
+        labels = np.zeros((68, 120), np.uint8)
+        labels[20:50, 40:80], labels[20:40, 30:40] = OBJECT, HANDS
+        labels[20:40, 80:90] = HANDS if frame < 20 else 0
+        writer.frame("0", frame, np.zeros((68, 120, 3), np.uint8), np.full((68, 120), 900, np.uint16), labels)
+    found = check_layout(writer.finish().folder)
+    words = ("hands within 6 cm of the object, by frames: 0-19: 2, 20-59: 1.", "--frames 20-59 or --frames 0-19 --output")
+    assert holds(found, "note", CAPTURE, *words)

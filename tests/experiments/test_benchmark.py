@@ -18,6 +18,7 @@ from neuspring.config.search import HANDS
 from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
 from neuspring.core.records import Before, Recorder
+from neuspring.data.sources import read_scenarios
 from neuspring.experiments import benchmark as tables
 from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.graph import Graph
@@ -107,7 +108,7 @@ def test_unreadable_files(tmp_path: Path) -> None:
     """Missing, a folder, and not UTF-8."""
     latin = tmp_path / "latin"
     latin.write_bytes("# Größe\n".encode("latin-1"))
-    for read in (tables.read_methods, tables.read_searches, tables.read_scenarios):
+    for read in (tables.read_methods, tables.read_searches, read_scenarios):
         for path in (tmp_path / "missing", tmp_path, latin):
             with pytest.raises(InputError, match="must be readable") as caught:
                 read(path)
@@ -122,7 +123,7 @@ ROW = "rope\ttoy\ttoy\trope\tfalse\ttrue\n"
 
 def test_scenarios(tmp_path: Path) -> None:
     path = write(tmp_path / "scenarios.tsv", f"# a comment\n{HEADER}\n{ROW}# more\ncloth\tphystwin\tcloth\ta/b c\ttrue\tfalse\n")
-    rows = tables.read_scenarios(path)
+    rows = read_scenarios(path)
     assert list(rows) == ["rope", "cloth"]
     assert (rows["rope"].ground, rows["rope"].self_collision, rows["cloth"].self_collision) == (True, False, True)
     assert rows["cloth"].path == "a/b c"
@@ -145,7 +146,7 @@ def test_bad_scenario_tables(name: str, tmp_path: Path) -> None:
     text, message = BAD_TABLES[name]
     path = write(tmp_path / "scenarios.tsv", text)
     with pytest.raises(InputError, match=message) as caught:
-        tables.read_scenarios(path)
+        read_scenarios(path)
     assert str(path) in str(caught.value)
 
 
@@ -175,6 +176,24 @@ def test_a_benchmark_holds_the_rows_it_names(tmp_path: Path) -> None:
     assert found.data_path("cable") == tmp_path / "cable.csv"
 
 
+def test_a_capture_in_data_root_is_a_scenario_without_a_row(tmp_path: Path) -> None:
+    for name, changes in {"towel": {}, "box": {"category": "box", "self_collision": True, "ground": False}, "mine": {}}.items():
+        path = paint(tmp_path / name, frames=5).folder / "capture.json"
+        write(path, json.dumps(json.loads(path.read_text()) | changes))
+    (tmp_path / "half").mkdir()
+    write(tmp_path / "half" / "capture.json", "{")
+    whole = benchmark(tmp_path, scenarios=["towel", "box", "mine"], data_root=str(tmp_path))
+    towel, box, mine = whole.scenarios.values()
+    assert (towel.source, towel.category, towel.path) == ("capture", "cloth", "towel")
+    assert (towel.self_collision, towel.ground) == (True, True)
+    assert (box.category, box.self_collision, box.ground) == ("box", True, False)
+    assert mine.category == "toy", "a row is believed before capture.json"
+    with pytest.raises(InputError, match=r"half/capture\.json"):
+        benchmark(tmp_path, scenarios=["half"], data_root=str(tmp_path))
+    with pytest.raises(InputError, match=r"or a capture in data_root; received 'towl' \(did you mean 'towel'"):
+        benchmark(tmp_path, scenarios=["towl"], data_root=str(tmp_path))
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [
@@ -182,7 +201,7 @@ def test_a_benchmark_holds_the_rows_it_names(tmp_path: Path) -> None:
         ({"methods": []}, "configuration, methods: at least one entry is required"),
         ({"seeds": []}, "configuration, seeds: at least one entry is required"),
         ({"methods": ["ful"]}, r"every entry must be a row of methods\.yaml; received 'ful' \(did you mean 'full'\?\)"),
-        ({"scenarios": ["nothing"]}, r"every entry must be a row of scenarios\.tsv; received 'nothing'.*Known: rope, cable"),
+        ({"scenarios": ["nothing"]}, r"row of scenarios\.tsv, or a capture in data_root; received 'nothing'.*Known: rope, cable"),
         ({"scenarios": ["cable"]}, "scenario cable: mocap scenarios need data_root"),
         ({"scenarios": ["cable"], "data_root": "/nowhere"}, "scenario cable: its data must exist; received /nowhere/cable.csv"),
         ({"method_table": "missing.yaml"}, "must be readable"),
@@ -450,7 +469,7 @@ def test_pools_that_cannot_be(tmp_path: Path, changes: dict[str, object], messag
 )
 def test_every_configuration_that_is_shipped_is_valid(overlays, tmp_path):
     values = shipped(*overlays)
-    for row in tables.read_scenarios(ROOT / "config" / "scenarios.tsv").values():
+    for row in read_scenarios(ROOT / "config" / "scenarios.tsv").values():
         if row.source == "capture" and "footage" in overlays:
             paint(tmp_path / row.path, frames=5)
         elif row.source not in ("capture", "synthetic", "toy"):
@@ -489,7 +508,7 @@ def test_the_whole_benchmark_has_every_method_and_study_of_the_paper(tmp_path):
     whole, paper = shipped("phystwin"), config.read_yaml(ROOT / "config" / "studies" / "paper.yaml")
     assert {name: whole[name] for name in paper} == paper
     assert list(read_studies(ROOT / "config" / "studies.yaml")) == paper["studies"]
-    rows = tables.read_scenarios(ROOT / "config" / "scenarios.tsv").values()
+    rows = read_scenarios(ROOT / "config" / "scenarios.tsv").values()
     released = [row for row in rows if row.source == "phystwin"]
     assert {row.scenario for row in released} == set(whole["scenarios"])
     assert (len(released), sum(row.self_collision for row in released)) == (22, 9)

@@ -111,15 +111,83 @@ def test_a_finding_says_where_value_limit_and_next_move(capture):
     assert text in map(str, looked_at(capture, labels))
 
 
-def test_lost_and_few_tracks_are_said():
+LONG, LEFT, TOP, SIDE = 30, 20, 30, 30
+"""A film of LONG frames in which a square of SIDE pixels goes right, a pixel per frame."""
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory):
+    """Two grained squares on a gray table, one below the other: the upper one moves, the lower one stands still."""
+    rng = np.random.default_rng(0)
+    grain = cv2.GaussianBlur(rng.normal(0, 1, (2 * SIDE, SIDE, 3)), (0, 0), 1.5)
+    grain = np.clip(128 + 60 * grain / grain.std(), 0, 255)
+    camera = replace(entry(width=SIZE[1], height=SIZE[0]), intrinsics=((150.0, 0.0, 59.5), (0.0, 150.0, 44.5), (0.0, 0.0, 1.0)))
+    writer = Writer(tmp_path_factory.mktemp("moving"), describe(frame_count=LONG, cameras=(camera,)))
+    for frame in range(LONG):
+        image = np.full((*SIZE, 3), 90.0)
+        image[TOP : TOP + SIDE, LEFT + frame : LEFT + frame + SIDE] = grain[:SIDE]
+        image[TOP + SIDE : SIZE[0], LEFT : LEFT + SIDE] = grain[SIDE : SIZE[0] - TOP]
+        image += rng.normal(0, 1, image.shape)
+        writer.frame("0", frame, image.astype(np.uint8), np.full(SIZE, 800, np.uint16))
+    return writer.finish()
+
+
+def both_squares(upper: int = OBJECT) -> np.ndarray:
+    """Labels of `moving`: the lower square is the object, and the upper one what is said."""
+    labels = np.zeros((LONG, *SIZE), np.uint8)
+    labels[:, TOP + SIDE : SIZE[0], LEFT : LEFT + SIDE] = OBJECT
+    for frame in range(LONG):
+        labels[frame, TOP : TOP + SIDE, LEFT + frame : LEFT + frame + SIDE] = upper
+    return labels
+
+
+def test_what_moves_at_the_object_and_lies_in_no_mask_is_said(moving):
+    """A corner that is lifted and lost, and a hand that comes in unmarked, look alike: the picture changes where no mask is."""
+    name = "motion outside of the masks"
+    for right in (both_squares(), both_squares(HANDS)):
+        assert name not in {one.name for one in looked_at(moving, right)}
+    lost = both_squares()
+    lost[4:] = np.where(both_squares(0)[4:] == 0, 0, OBJECT)
+    [found] = [one for one in looked_at(moving, lost) if one.name == name]
+    assert found.level == "warning" and "of the times that were looked at, first in frame 4, more than 25%" in found.text
+    assert "a part of the object, or a hand that came in, lies in no mask" in found.text
+
+
+def test_tracks_that_end_where_the_picture_moves_are_said(moving):
+    """Half of the points are followed to the end: those that stand still."""
+    labels = both_squares()
+    y, x = (values[::5] for values in np.nonzero(labels[0] == OBJECT))
+    upper = y < TOP + SIDE
+    pixels = np.repeat(np.stack([x, y], axis=1)[None].astype(float), LONG, axis=0)
+    pixels[:, upper, 0] += np.arange(LONG)[:, None]
+    visible = np.ones(pixels.shape[:2], bool)
+    assert look_at_tracks(moving, "0", labels, pixels, visible) == []
+    visible[5:, upper] = False
+    [found] = look_at_tracks(moving, "0", labels, pixels, visible)
+    assert (found.name, found.level) == ("tracks lost where it moves", "warning")
+    # At first the points of the lower square are near.
+    assert "first in frame 16, the part of the object that moves has followed points on less than 15% of it" in found.text
+
+
+def test_an_object_that_folds_is_not_said_to_stand_still(moving):
+    """Its followed points do not move; its picture does."""
+    still = observed(ABOVE, SLOW, follows=False)
+    assert "warning: object stands still" in said(look_at_observations(still))
+    moves = mask_facts(moving, "0", both_squares())["object_moves"]
+    found = look_at_observations(still, moves)
+    assert said(found) == {"warning: object not followed"} and "static" not in found[0].text
+    assert mask_facts(moving, "0", both_squares(HANDS))["object_moves"] == 0.0
+
+
+def test_lost_and_few_tracks_are_said(capture):
     labels = scene()
     y, x = (values[::10] for values in np.nonzero(labels[0] == OBJECT))
     pixels = np.repeat(np.stack([x, y], axis=1)[None].astype(float), FRAMES, axis=0)
     visible = np.ones(pixels.shape[:2], bool)
-    assert look_at_tracks("0", labels, pixels, visible) == []
+    assert look_at_tracks(capture, "0", labels, pixels, visible) == []
     visible[3:, 3:] = False
-    assert said(look_at_tracks("0", labels, pixels, visible)) == {"warning: tracks lost"}
-    assert said(look_at_tracks("0", labels, pixels[:, :20], np.ones((FRAMES, 20), bool))) == {"warning: few tracks"}
+    assert said(look_at_tracks(capture, "0", labels, pixels, visible)) == {"warning: tracks lost"}
+    assert said(look_at_tracks(capture, "0", labels, pixels[:, :20], np.ones((FRAMES, 20), bool))) == {"warning: few tracks"}
 
 
 BOX = np.random.default_rng(0).uniform((0, 0, 0), (0.1, 0.1, 0.1), (200, 3))

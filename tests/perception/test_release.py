@@ -7,7 +7,7 @@ import pytest
 
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
-from neuspring.perception.controllers import ALWAYS, Body, holding
+from neuspring.perception.controllers import ALWAYS, Body, Grips, holding
 from neuspring.perception.findings import look_at_observations
 from tests.support.small import observations
 
@@ -36,17 +36,17 @@ def scene(away: np.ndarray):
     return points, seen, bodies, np.ones(bodies.shape[:2], bool), np.ones(FRAMES, bool)
 
 
-def grips(away: np.ndarray, train_end: int = FRAMES, **changes: np.ndarray) -> tuple[np.ndarray, int | None]:
+def grips(away: np.ndarray, train_end: int = FRAMES, pixels: list[np.ndarray] | None = None, **changes: np.ndarray) -> Grips:
     points, seen, bodies, shown, in_view = scene(away)
     seen, in_view, bodies = changes.get("seen", seen), changes.get("in_view", in_view), changes.get("bodies", bodies)
-    body = Body(list(bodies[:train_end]), list(points[:train_end]), bodies, changes.get("shown", shown))
+    body = Body(list(bodies[:train_end]), pixels or list(points[:train_end]), bodies, changes.get("shown", shown))
     return holding(points[:, [0, 3, 4]], (points, seen), body, in_view, RELEASE)
 
 
 def held(away: np.ndarray, train_end: int = FRAMES, **changes: np.ndarray) -> np.ndarray:
-    valid, elsewhere = grips(away, train_end, **changes)
-    assert elsewhere is None
-    return valid
+    found = grips(away, train_end, **changes)
+    assert found.elsewhere is None and not found.strays
+    return found.holds
 
 
 def leaving(at: int) -> np.ndarray:
@@ -102,13 +102,13 @@ def test_it_takes_hold_of_the_part_that_has_turned_to_it_only_if_that_is_the_sam
     bodies = scene(away)[2]
     turned = bodies.copy()
     turned[15:, :60, 2] *= -1
-    valid, elsewhere = grips(away, bodies=turned)
-    assert elsewhere == 20
-    assert not valid[20:, :2].any()
+    found = grips(away, bodies=turned)
+    assert found.elsewhere == 20
+    assert not found.holds[20:, :2].any()
     # Without any followed point nobody knows.
     shown = np.ones(bodies.shape[:2], bool)
     shown[20, :60] = shown[20, 60:] = False
-    assert grips(away, shown=shown)[1] == 20
+    assert grips(away, shown=shown).elsewhere == 20
 
 
 def test_no_hold_is_taken_after_the_training_frames():
@@ -122,7 +122,35 @@ def test_a_hand_is_near_if_what_is_seen_of_it_is():
     controllers = points[:, [0, 3, 4]].copy()
     controllers[12:, :2] += 0.4
     body = Body(list(bodies), list(points), bodies, shown)
-    assert holding(controllers, (points, seen), body, in_view, RELEASE)[0] is ALWAYS
+    assert holding(controllers, (points, seen), body, in_view, RELEASE).holds is ALWAYS
+
+
+ARRIVES = 8
+
+
+def test_a_hand_that_lets_go_is_not_held_by_another_that_arrives():
+    """Pixels of a hand that nobody follows were given to the one that left, which held on at any distance."""
+    away = leaving(10)
+    arriving = np.random.default_rng(1).uniform(-0.02, 0.02, (40, 3)) - [0, 0, 0.07]
+    pixels = [np.concatenate([own, arriving][: 1 + (frame >= ARRIVES)]) for frame, own in enumerate(scene(away)[0])]
+    found = grips(away, pixels=pixels)
+    first = np.flatnonzero(~found.holds[:, 0])[0]
+    assert first in (11, 12)
+    assert not found.holds[first:, :2].any() and found.holds[:, 2].all()
+    assert found.strays == list(range(ARRIVES, FRAMES))
+
+
+def test_pixels_apart_from_what_is_followed_of_a_hand_are_its_own_where_its_controllers_are():
+    """Fingertips beyond the object, which hides the rest of them, move as their hand does."""
+    bodies = scene(np.zeros(FRAMES))[2][:, :60]
+    hand = np.array([[x, 0, z] for z in (0.06, 0.09, 0.12, 0.15, 0.18) for x in (0.0, 0.01)])
+    points = np.repeat(hand[None], FRAMES, axis=0)
+    seen = np.ones(points.shape[:2], bool)
+    seen[5:, :6] = False
+    tips, forearm = np.repeat(hand[:2], 20, axis=0), hand[6:]
+    body = Body(list(bodies), [np.concatenate([tips, forearm])] * FRAMES, bodies, np.ones(bodies.shape[:2], bool))
+    found = holding(points[:, :2], (points, seen), body, np.ones(FRAMES, bool), RELEASE)
+    assert found.holds is ALWAYS and not found.strays
 
 
 def test_a_hand_out_of_view_lets_go_after_some_frames():

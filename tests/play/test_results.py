@@ -2,12 +2,17 @@
 
 import io
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
+from neuspring.core.records import CAPTURE_FOLDER, Recorder, digest_file
+from neuspring.data.capture import CAPTURE
 from neuspring.play.results import find
+from tests.support import small
+from tests.support.colored import paint
 from tests.support.played import record, results, spoil
 
 
@@ -75,3 +80,18 @@ def test_a_header_that_promises_more_than_the_file_and_a_pickle_are_refused_befo
     record(path.parent)
     with pytest.raises(InputError, match="must be readable"):
         _ = find([scenario]).runs[0].twin
+
+
+def test_a_capture_of_ones_own_is_found_where_its_record_says(scenario, tmp_path):
+    own, seen = paint(tmp_path / "captures" / "mine", frames=5), small.observations()
+    origin = {CAPTURE: f"sha256:{digest_file(own.folder / CAPTURE)}"}
+    path = scenario / "observations.npz"
+    replace(seen, scenario=replace(seen.scenario, provenance=origin)).save(path)
+    Recorder("observe", path.with_suffix(".json")).save(facts={CAPTURE_FOLDER: str(own.folder)})
+    found = find([scenario])
+    assert found.capture.folder == own.folder and not found.notes
+    spoil(own.folder / CAPTURE, '"name": ', ' "name": ')
+    assert find([scenario]).capture is None
+    assert "must be the capture of this run; received one that was changed since" in find([scenario]).notes[0]
+    (own.folder / CAPTURE).unlink()
+    assert "no cameras: " in find([scenario]).notes[0]
