@@ -182,7 +182,7 @@ def _outside(capture: Capture, camera: str, labels: np.ndarray) -> dict[str, flo
     for motion in _motions(capture, camera, labels):
         both, begin, looked = motion.labels[:2], motion.labels[2] == OBJECT, looked + 1
         near = motion.moving & _grown((both == OBJECT).any(axis=0), BESIDE)
-        bare = int((near & ~_grown((both > 0).any(axis=0), RIM)).sum())
+        bare = int((near & ~_grown(np.any(both, axis=0), RIM)).sum())
         if bare > max(OUTSIDE * near.sum(), RIM * (both[0] == OBJECT).sum()):
             outside.append(motion.frame)
         if motion.frame < capture.train_end:
