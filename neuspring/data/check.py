@@ -160,12 +160,17 @@ def _world_findings(capture: Capture, name: str, samples: dict[int, plausible.Sa
 def _color_alone_findings(capture: Capture, name: str, samples: dict[int, plausible.Sample]) -> list[Finding]:
     """The camera above the table, and the object in the mask of frame 0 on it, without depth."""
     path, camera, up = capture.folder / CAPTURE, capture.cameras[name], capture.description.up
-    findings = plausible.color_alone_findings(path, camera, up)
+    findings = plausible.color_alone_findings(path, camera, up, f"poses {capture.description.provenance.get('poses', '')}".rstrip())
     if any(d.level == "error" for d in findings) or 0 not in samples:
         return findings
     mask = samples[0].mask
     findings += plausible.horizon_findings(path, camera, mask)
     findings += _at(path, plausible.size_findings(camera, mask))
+    # Hands are about as far as the object on the table.
+    depth = np.nanmedian(camera.project(plausible.object_on_table(camera, mask))[1]) if (mask == OBJECT).any() else np.nan
+    if np.isfinite(depth):
+        supposed = {frame: replace(sample, depth=np.full(mask.shape, depth)) for frame, sample in samples.items()}
+        findings += _at(path, plausible.hand_findings(camera, supposed, plausible.HAND_LEAST))
     # Obstacles stand on the table: what lies beneath one is met above it.
     on_table = plausible.object_on_table(camera, mask) + np.array([0.0, 0.0, 2 * INSIDE * up_sign(up)])
     return findings + obstacle_findings(path, capture.description, on_table[np.isfinite(on_table[:, 0])])

@@ -13,7 +13,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from pathlib import Path
 
@@ -26,7 +26,7 @@ from scipy.spatial import KDTree
 from neuspring.core.artifacts import up_sign
 from neuspring.core.findings import Finding, broken, finding, note, unusual
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Camera
-from neuspring.data.intake.depth import FAR, NEAR, Plane
+from neuspring.data.intake.depth import FAR, NEAR, ROLL, Plane
 from neuspring.data.intake.lenses import rigid_inverse
 
 SMALLEST = 0.08
@@ -43,6 +43,9 @@ HIGHEST = 3.0
 """m. Cameras higher above the table have too coarse a picture of what lies on it, or another unit of depth."""
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """From OpenCV's axes of a camera to OpenGL's, where y is up and z points backward."""
+
+Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+"""From a world with y up to one with z up."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,19 @@ def table_findings(path: Path, name: str, planes: Sequence[Plane], pose: np.ndar
     return [unusual(path, where, "the table that the camera sees should be z = 0", f"{where_it_is}. {remedy}")]
 
 
+def variants(pose: np.ndarray) -> dict[str, np.ndarray]:
+    """What a pose [4, 4] may be instead, with the next move, and the pose that is meant then."""
+    return {
+        "a world-to-camera matrix. Invert it": rigid_inverse(pose),
+        "a matrix for OpenGL's axes (y up, z backward). Change the signs of its second and third column": pose @ OPENGL,
+        "a world-to-camera matrix for OpenGL's axes (y up, z backward). Invert it, then change the signs of its second and third "
+        "column": rigid_inverse(pose) @ OPENGL,
+        f"a pose in a world with y up. Multiply it from the left by {Y_UP.astype(int).tolist()}": Y_UP @ pose,
+        "a pose in a world with y up, for OpenGL's axes. Change the signs of its second and third column, then multiply it from "
+        f"the left by {Y_UP.astype(int).tolist()}": Y_UP @ pose @ OPENGL,
+    }
+
+
 def _explained(path: Path, name: str, plane: Plane, pose: np.ndarray, up: str, unit: float | None) -> Finding | None:
     """The one change that puts the table at z = 0, as an error; None if there is none."""
     sign = up_sign(up)
@@ -113,13 +129,7 @@ def _explained(path: Path, name: str, plane: Plane, pose: np.ndarray, up: str, u
                 return broken(path, f"depth of camera {name}", rule, f"{factor:g} times")
             plausible = f"Plausible would be {unit / factor:g}"
             return broken(path, "depth_unit", rule, f"{unit:g}, which makes it {factor:g} times as far. {plausible}")
-    variants: Mapping[str, np.ndarray] = {
-        "a world-to-camera matrix. Invert it": rigid_inverse(pose),
-        "a matrix for OpenGL's axes (y up, z backward). Change the signs of its second and third column": pose @ OPENGL,
-        "a world-to-camera matrix for OpenGL's axes (y up, z backward). Invert it, then change the signs of its second and third "
-        "column": rigid_inverse(pose) @ OPENGL,
-    }
-    for what, variant in variants.items():
+    for what, variant in variants(pose).items():
         for direction in (sign, -sign):
             if stand(plane, variant, direction).near(plane.height):
                 rule = "camera-to-world is required (x right, y down, z forward): with it the table is z = 0"
@@ -141,6 +151,8 @@ HOLES, BAD_HOLES = 0.4, 0.8
 tenth of a cloth or a toy in the synthetic scenes, and a third of a rope."""
 HAND_AREA = 0.12
 """m². Two hands and forearms seen from one side have less; sleeves and a torso have more."""
+HAND_LEAST = 0.002
+"""m². Real hands with a part of the forearm have 0.015 to 0.05 in color alone; fewer are a wrong scale of the pose."""
 HAND_RATIO = 12.0
 """Hands this many times as large as the object in the image are another thing."""
 REACH = 0.06
@@ -150,7 +162,10 @@ POINTS = 1500
 FEW = 20
 """Points below which nothing is said of a thing in a frame."""
 TABLE = "Look at the mask of frame 0 and at depth_unit; make-capture --level puts the table at z = 0."
-SCALE = "Look at the mask of frame 0, and at the units of depth and poses: meters, with the table at z = 0."
+SCALE = (
+    "Look at the mask of frame 0, and at the units of depth and poses: meters, with the table at z = 0. Poses of COLMAP have no "
+    "scale: multiply their positions by a true length over the measured one."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,8 +209,8 @@ def depth_findings(camera: Camera, samples: Mapping[int, Sample]) -> list[Findin
     return [finding("depth holes", "warning", f"camera {camera.name}", value, rule, remedy)]
 
 
-def hand_findings(camera: Camera, samples: Mapping[int, Sample]) -> list[Finding]:
-    """Hands that are too large to be hands, in a few frames by number."""
+def hand_findings(camera: Camera, samples: Mapping[int, Sample], least: float = 0.0) -> list[Finding]:
+    """Hands that are too large to be hands, or smaller than `least`, m², in a few frames by number."""
     areas, ratios = [], []
     for sample in samples.values():
         own = sample.mask == HANDS
@@ -208,6 +223,9 @@ def hand_findings(camera: Camera, samples: Mapping[int, Sample]) -> list[Finding
     if not areas:
         return []
     area, ratio = float(np.median(areas)), float(np.median(ratios))
+    if area < least:
+        value, rule = f"hands (label {HANDS}) of {1e4 * area:.2g} cm²", f"at least {1e4 * least:g} cm² are expected"
+        return [finding("hands too small", "warning", f"camera {camera.name}", value, rule, SCALE)]
     if area <= HAND_AREA and ratio <= HAND_RATIO:
         return []
     value = f"hands (label {HANDS}) of {1e4 * area:.0f} cm², {ratio:.1f} times the object's pixels"
@@ -298,6 +316,10 @@ def grip_findings(folder: Path, grips: np.ndarray, rate: float) -> list[Finding]
 POSE = "Look at camera_to_world: the table must be z = 0 in meters, and the camera's z points forward."
 
 
+STEEP = 20.0
+"""Degrees from straight above, within which a camera has no upper side."""
+
+
 def on_table(camera: Camera, pixels: np.ndarray) -> np.ndarray:
     """World points [n, 3], m, at which the rays of pixels (x, y) [n, 2] meet z = 0; NaN for rays that never do."""
     eye = camera.camera_to_world[:3, 3]
@@ -307,24 +329,53 @@ def on_table(camera: Camera, pixels: np.ndarray) -> np.ndarray:
     return np.asarray(eye + np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)[:, None] * rays)
 
 
-def color_alone_findings(path: Path, camera: Camera, up: str) -> list[Finding]:
-    """Findings about a camera that is not above the table z = 0, or does not look at it; else a note on how far it is."""
-    where, height = f"cameras.{camera.name}.camera_to_world", float(camera.camera_to_world[2, 3])
-    if height * up_sign(up) <= 0:
-        rule = f"{where}: the camera must be above the table z = 0, on the side of it that is up"
-        return [broken(path, "", rule, f"its center at z = {height:.3f} m, and up {up}. {POSE}")]
-    center = np.array([[(camera.width - 1) / 2, (camera.height - 1) / 2]])
-    away = float(np.linalg.norm(on_table(camera, center)[0] - camera.camera_to_world[:3, 3]))
-    if not NEAR <= away <= FAR:
-        rule = f"{where}: the table z = 0 must be {NEAR:g} to {FAR:g} m away in the center of the image"
-        received = f"{away:.3g} m" if np.isfinite(away) else "a view past it"
-        return [broken(path, "", rule, f"{received}. {POSE}")]
-    text = f"the table is z = 0 as given, {away:.2f} m away in the center of the image"
-    found = [note(path, f"camera {camera.name}: color alone: {text}, {abs(height):.2f} m below the camera")]
-    if abs(height) > HIGHEST:
+def color_alone_findings(path: Path, camera: Camera, up: str, source: str = "") -> list[Finding]:
+    """Findings about a camera that is not above the table z = 0, does not look at it, or is turned; else a note on how far it is.
+
+    `source` says where the pose is from.
+    """
+    where, sign = f"cameras.{camera.name}.camera_to_world{f' ({source})' if source else ''}", up_sign(up)
+    if wrong := _wrong_view(camera, sign):
+        alike = [
+            f"{what}{'' if direction == sign else ', and set up to ' + ('-z' if up == '+z' else '+z')}"
+            for what, pose in variants(camera.camera_to_world).items()
+            for direction in (sign, -sign)
+            if not _wrong_view(replace(camera, camera_to_world=pose), direction)
+        ]
+        rule, received, possible = wrong
+        meant = f"This looks like {'. Or like '.join(alike)}" if alike else POSE.rstrip(".")
+        if possible:
+            return [unusual(path, "", f"{where}: {rule}", f"{received}. {meant}. If the camera is mounted so, go on")]
+        return [broken(path, "", f"{where}: {rule}", f"{received}. {meant}")]
+    height = abs(float(camera.camera_to_world[2, 3]))
+    text = f"the table is z = 0 as given, {_away(camera):.2f} m away in the center of the image"
+    found = [note(path, f"camera {camera.name}: color alone: {text}, {height:.2f} m below the camera")]
+    if height > HIGHEST:
         rule = f"{where}: a camera should be at most {HIGHEST:g} m above the table"
-        found.append(unusual(path, "", rule, f"{abs(height):.2f} m. Is camera_to_world in meters?"))
+        found.append(unusual(path, "", rule, f"{height:.2f} m. Is camera_to_world in meters?"))
     return found
+
+
+def _away(camera: Camera) -> float:
+    """Distance, m, of the table z = 0 in the center of the image; NaN where it is not there."""
+    center = np.array([[(camera.width - 1) / 2, (camera.height - 1) / 2]])
+    return float(np.linalg.norm(on_table(camera, center)[0] - camera.camera_to_world[:3, 3]))
+
+
+def _wrong_view(camera: Camera, sign: float) -> tuple[str, str, bool] | None:
+    """What is wrong with the view of the table z = 0, the value, and whether a camera may be so all the same; None: nothing."""
+    height, away = float(camera.camera_to_world[2, 3]), _away(camera)
+    if height * sign <= 0:
+        rule = "the camera must be above the table z = 0, on the side of it that is up"
+        return rule, f"its center at z = {height:.3f} m, and up {'+z' if sign > 0 else '-z'}", False
+    if not NEAR <= away <= FAR:
+        rule = f"the table z = 0 must be {NEAR:g} to {FAR:g} m away in the center of the image"
+        return rule, f"{away:.3g} m" if np.isfinite(away) else "a view past it", False
+    x, y, _ = sign * camera.camera_to_world[2, :3]
+    roll = float(np.degrees(np.arctan2(abs(x), -y)))
+    if roll > ROLL and np.hypot(x, y) > np.sin(np.radians(STEEP)):
+        return "up should point up in the image", f"a camera that is turned by {roll:.0f} degrees about its axis", True
+    return None
 
 
 def horizon_findings(path: Path, camera: Camera, mask: np.ndarray) -> list[Finding]:

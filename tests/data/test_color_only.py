@@ -12,7 +12,7 @@ from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, OBJECT, Capture
 from neuspring.data.check import check_layout
 from neuspring.data.intake.feeds import pairs
-from neuspring.data.intake.lenses import Board
+from neuspring.data.intake.lenses import Board, rigid_inverse
 from neuspring.data.intake.make import Intake, make_capture
 from neuspring.data.plausible import on_table
 from neuspring.perception import segment_opencv
@@ -146,6 +146,48 @@ def test_a_camera_that_does_not_look_at_the_table(capture, change, message):
     pose = change(capture.cameras["0"].camera_to_world)
     edit(capture, lambda values: values["cameras"][0].update(camera_to_world=pose.tolist()))
     assert message in errors(capture)
+
+
+Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""From a world with z up to one with y up."""
+MEANT = "up should point up in the image; received a camera that is turned by"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (rigid_inverse, "This looks like a world-to-camera matrix. Invert it"),
+        (
+            lambda pose: Y_UP @ pose,
+            "a pose in a world with y up. Multiply it from the left by [[1, 0, 0, 0], [0, 0, -1, 0]",
+        ),
+        (lambda pose: Y_UP @ pose @ FLIP, "a pose in a world with y up, for OpenGL's axes"),
+        (lambda pose: pose @ FLIP, "a matrix for OpenGL's axes (y up, z backward). Change"),
+        (lambda pose: pose @ np.diag([-1.0, -1, 1, 1]), "If the camera is mounted so, go on"),
+    ],
+)
+def test_a_pose_of_another_kind_is_named_with_its_file(tmp_path, change, message):
+    pose = change(camera().camera_to_world)
+    poses = write_json(tmp_path / "mine.json", {"camera_to_world": [pose.tolist()]})
+    try:
+        text = "\n".join(make_capture(intake(write_folders(tmp_path), poses=poses))[1])
+        made = Capture.load(tmp_path / "capture")
+        assert holds(check_layout(made.folder), "warning", CAPTURE, message, "cameras.0.camera_to_world (poses of mine.json)")
+        assert MEANT in text and "warning: " in text
+    except InputError as error:
+        text = str(error)
+        assert text.startswith(f"{poses}: cameras.0.camera_to_world")
+    assert message in text
+
+
+@pytest.mark.parametrize(("factor", "words"), [(8.0, "hands too large"), (0.2, "hands too small: hands (label 2) of")])
+def test_poses_of_another_scale_show_in_the_hands(capture, factor, words):
+    def scaled(values):
+        for row in values["cameras"][0]["camera_to_world"][:3]:
+            row[3] *= factor
+
+    edit(capture, scaled)
+    assert holds(check_layout(capture.folder), "warning", CAPTURE, words)
 
 
 def test_a_mask_above_the_horizon(capture):

@@ -226,7 +226,8 @@ def _place(intake: Intake, seen: Mapping[str, SampledCamera], unit: Unit | None)
     if intake.poses is not None and unit is None:
         return given_alone(read_poses(intake.poses, names), seen, intake.poses), f"of {intake.poses.name}"
     if intake.poses is not None:
-        return stand(read_poses(intake.poses, names), seen, level=level, top_down=top_down), f"of {intake.poses.name}"
+        poses = read_poses(intake.poses, names)
+        return stand(poses, seen, level=level, top_down=top_down, file=intake.poses), f"of {intake.poses.name}"
     if intake.board is not None:
         shown = dict(seen)
         if not intake.board_images:

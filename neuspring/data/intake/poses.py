@@ -262,8 +262,9 @@ def stand(
     level: bool,
     top_down: bool = False,
     up: str | None = None,
+    file: Path | None = None,
 ) -> Placed:
-    """Given poses against the table that the cameras see; with `level` the world is moved so that it is z = 0.
+    """Given poses, of `file`, against the table that the cameras see; with `level` the world is moved so that it is z = 0.
 
     `up` is that of the source; None: +z where the world is moved, else the side on which the cameras are. Raises InputError where
     the table is elsewhere, with what explains it; see `plausible`.
@@ -290,7 +291,11 @@ def stand(
         lines.append(f"leveled: the world was turned by {turn:.1f} degrees; {rise}")
     found = {name: planes(points) for name, points in clouds.items()}
     judged = {
-        side: [d for name, view in seen.items() for d in table_findings(view.path, name, found[name], moved[name], side, view.unit)]
+        side: [
+            d
+            for name, view in seen.items()
+            for d in table_findings(file or view.path, name, found[name], moved[name], side, view.unit)
+        ]
         for side in ([up] if up else ["+z", "-z"])
     }
     side = min(judged, key=lambda key: sum(d.level == "error" for d in judged[key]))
