@@ -28,8 +28,7 @@ localrules:
 rule all:
     default_target: True
     input:
-        tables=rules.tables.output,
-        report=rules.report.input,
+        **SHOWN,
         page=rules.report.output,
         logged=GRAPH.logged_runs(),
 

@@ -41,6 +41,7 @@ def tables(
     scores: Scores = None,
     left_out: LeftOut = "{}",
     brief: Annotated[bool, arg(help="print the verdict and the first table alone")] = False,
+    settings: Annotated[str, arg(help="of the benchmark: runs that were made with something else are named")] = "",
 ) -> None:
     """Run records -> tables."""
     from neuspring.config.settings import Aim
@@ -67,13 +68,35 @@ def tables(
     moved = collect_transfers(results, transfers, methods, seeds)
     against = baseline or methods[0]
     warned = warnings_of(results, scenarios)
-    benchmark = Benchmark(everything=collected, baseline=against, objects=objects, aims=wanted, transfers=moved, warnings=warned)
+    benchmark = Benchmark(
+        everything=collected,
+        baseline=against,
+        objects=objects,
+        aims=wanted,
+        transfers=moved,
+        warnings=warned,
+        made_otherwise=_made_otherwise(settings, results),
+    )
     text = write(benchmark, output)
     print(headline(text) if brief else text)
     print(f"Tables: {output / 'summary.md'}")
     finished = collected.runs.loc[collected.runs["status"] == "ok", "seed"].to_list()
     seed = next((seed for seed in seeds if seed in finished), seeds[0])
     print(f"Pictures and videos: {write_gallery(results, scenarios, methods, seed, collected, output)}")
+
+
+def _made_otherwise(settings: str, results: Path) -> tuple[str, ...]:
+    """Lines on runs that are there but are not what these settings would make."""
+    from neuspring.config import plain
+    from neuspring.core.provenance import ROOT
+    from neuspring.experiments.benchmark import Benchmark
+    from neuspring.experiments.freshness import Freshness
+    from neuspring.experiments.graph import Graph
+
+    if not settings:
+        return ()
+    values = plain(read_settings(settings)) | {"results": str(results)}
+    return tuple(Freshness(Graph(Benchmark(values, ROOT.parent))).of_runs())
 
 
 def perception_table(

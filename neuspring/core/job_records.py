@@ -81,6 +81,8 @@ class JobRecord:
     """Relative to the results folder."""
     attempts: list[Attempt]
     scenario: str = ""
+    stamp: str = ""
+    """Of a job of no stage that succeeded: a digest of what it was told and of its code. Stages have records of their own."""
 
     @property
     def last(self) -> Attempt:

@@ -1,8 +1,8 @@
 """What code made a result: a digest of the package modules a stage uses, and the commit.
 
-Snakemake does not notice changes in imported code. Each rule therefore carries `code_digest(module)` as a parameter: the
-syntax trees, docstrings and comments stripped, of the module and of every package module it imports, directly or not. Editing
-`twin/fit.py` runs fits again; editing a docstring, or a table, runs no expensive step again. What a module imports by name
+Snakemake does not notice changes in imported code. Each record of a stage therefore holds `code_digest(module)`, which the workflow
+compares: the syntax trees, docstrings and comments stripped, of the module and of every package module it imports, directly or not.
+Editing `twin/fit.py` runs fits again; editing a docstring, or a table, runs no expensive step again. What a module imports by name
 (backends, readers, baselines) is named beside it (`neuspring.experiments.graph`).
 """
 
@@ -100,7 +100,7 @@ def _declares(module: str) -> bool:
 
 @functools.cache
 def _module_code(module: str) -> bytes:
-    return ast.dump(_tree(module)).encode()
+    return hashlib.sha256(ast.dump(_tree(module)).encode()).digest()
 
 
 @functools.cache
@@ -111,6 +111,20 @@ def code_digest(*modules: str) -> str:
     for name in sorted(used):
         digest.update(name.encode())
         digest.update(_module_code(name))
+    # What was taken from them is kept; a job need not carry the trees through its run.
+    _tree.cache_clear()
+    return digest.hexdigest()[:16]
+
+
+def image_stamps(folder: Path) -> str:
+    """A digest of names, sizes and times of a capture's images and marks: it tells those that a user has changed."""
+    digest = hashlib.sha256()
+    # Marks are segmented from as images are.
+    files = [path for kind in ("color", "depth", "mask") for path in (folder / kind).rglob("*")]
+    for path in sorted([*files, *folder.glob("marks.json")]):
+        # A link without target must not end the planning either: whoever reads it says so.
+        facts = path.stat() if path.exists() else path.lstat()
+        digest.update(f"{path.relative_to(folder)} {facts.st_size} {facts.st_mtime_ns}".encode())
     return digest.hexdigest()[:16]
 
 

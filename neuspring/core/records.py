@@ -72,6 +72,8 @@ class StageRecord:
     machine: str = ""
     versions: dict[str, str] = field(default_factory=dict)
     """Of the packages that compute."""
+    code: str = ""
+    """Digest of the code that made it (`neuspring.core.provenance`); empty in records of older versions."""
 
     def save(self, path: Path) -> None:
         """Write as JSON, atomically."""
@@ -149,9 +151,16 @@ class Recorder:
     """
 
     def __init__(
-        self, stage: str, output: Path, *, inputs: Mapping[str, Path] | None = None, settings: Any = None, device: str = "cpu"
+        self,
+        stage: str,
+        output: Path,
+        *,
+        inputs: Mapping[str, Path] | None = None,
+        settings: Any = None,
+        device: str = "cpu",
+        code: str = "",
     ) -> None:
-        self.stage, self.output = stage, output
+        self.stage, self.output, self.code = stage, output, code
         self.input_paths = dict(inputs or {})
         self.inputs: dict[str, str] = {}
         for role, path in self.input_paths.items():
@@ -200,4 +209,5 @@ class Recorder:
             device=self.device,
             machine=f"{platform.machine()}, Python {platform.python_version()}",
             versions={name: version(name) for name in COMPUTING},
+            code=self.code,
         ).save(self.output)

@@ -21,7 +21,7 @@ from neuspring.baselines import BASELINES
 from neuspring.config import Config, Search, SpringField, plain
 from neuspring.config.settings import select
 from neuspring.core.errors import InputError
-from neuspring.core.provenance import code_digest
+from neuspring.core.provenance import image_stamps
 from neuspring.data.sources import SOURCES
 from neuspring.experiments.benchmark import Benchmark, read_methods, read_searches, section_of, with_method, with_search
 from neuspring.perception.backends import BACKENDS
@@ -32,7 +32,10 @@ from neuspring.stages.stage import Stage
 TEMPLATES = Path(__file__).parents[1] / "report" / "templates"
 SPLATS = "appearance"
 """Folder of the splats that all methods share; those of one method have its name behind a hyphen."""
+CHANGES_NOTHING = {"only": "", "gpus": {}, "tracking": {}, "twins_per_launch": "auto", "device": "auto", "tune": None}
+"""Keys that no result depends on, with what stands for them where settings are compared."""
 Files = str | list[str]
+_stamps = functools.cache(image_stamps)
 
 
 def one_of(names: Sequence[str]) -> str:
@@ -72,6 +75,22 @@ class Graph:
         """From 1 for the first scenario that is run down to 0."""
         names = self.config.scenarios
         return 1 - names.index(scenario) / len(names) if scenario in names else 0.0
+
+    def behind(self, scenario: str, method: str, seed: int) -> list[tuple[Stage, Any]]:
+        """The jobs behind a run's scores, but for those of one camera."""
+        row, job = self.benchmark.methods[method], SimpleNamespace(scenario=scenario, method=method, seed=seed)
+        source = self.benchmark.source(scenario)
+        names = ["capture"] * bool(source.write_capture) + ["lift"] * source.films + ["observe"]
+        jobs = [(STAGES[name], job) for name in names]
+        if row.search:
+            jobs.append((STAGES["search"], SimpleNamespace(scenario=scenario, search=row.searched, seed=seed)))
+        if owner := self.benchmark.fit_of_method.get(method):
+            jobs.append((STAGES["fit"], SimpleNamespace(scenario=scenario, method=owner, seed=seed)))
+        if row.model:
+            jobs += [(STAGES[name], job) for name in ("train", "predict") if name == "predict" or BASELINES[row.model].trained]
+        else:
+            jobs.append((STAGES["rollout"], job))
+        return [*jobs, *([(STAGES["render"], job)] if self.benchmark.has_images(scenario) else []), (STAGES["score"], job)]
 
     def judged(self, names: Sequence[str]) -> dict[str, str]:
         """Scenarios whose truth is known, and their categories."""
@@ -162,8 +181,7 @@ class Graph:
                 return self._output("appearance", scenario=job.scenario, looks=looks, seed=job.seed)
             case "render" if not self.benchmark.has_images(job.scenario):
                 return []
-        maker = next(other for other in STAGES.values() if other.product == name)
-        return self._output(maker.name, **{wildcard: getattr(job, wildcard) for wildcard in maker.wildcards})
+        return self.output_of(next(other for other in STAGES.values() if other.product == name), job)
 
     def _also(self, stage: Stage, job: Any) -> list[str]:
         """Files without which a job cannot run, or whose change makes it run again, and which its command does not name."""
@@ -178,13 +196,25 @@ class Graph:
             case "lift" if self.config.perception.shape.mesh:
                 return [str(self.config.perception.shape.mesh)]
             case "fits":
-                return list(dict.fromkeys(self._search(member) for member in self._members(job.scenario)))
+                return list(dict.fromkeys(self._search(member) for member in self.members(job.scenario)))
         return []
 
     def shared_launches(self, job: Any) -> list[str]:
         """The record of the launches that a fit shared with others, if it is one of several."""
         together = (job.method, int(job.seed)) in self.benchmark.fits_together(job.scenario)
         return [self._output("fits", scenario=job.scenario)] if together else []
+
+    def output_of(self, stage: Stage, job: Any) -> str:
+        """The file that a job writes."""
+        return self._output(stage.name, **{name: getattr(job, name) for name in stage.wildcards})
+
+    def recorded(self, stage: Stage, job: Any) -> dict[str, Any]:
+        """The settings and options that the record of a job would hold."""
+        options = self.options(stage, job)
+        # Wildcards are text.
+        options |= {name: int(options[name]) for name, option in stage.options.items() if option.type is int}
+        values: dict[str, Any] = json.loads(_json(json.loads(self.settings(stage, job)) | options))
+        return values
 
     def _output(self, stage: str, **wildcards: Any) -> str:
         return f"{self.results}/{STAGES[stage].output.format(**wildcards)}"
@@ -207,7 +237,8 @@ class Graph:
         """Whether the method is trained on pictures, and moves splats itself."""
         return job.method in self.benchmark.pictured
 
-    def _members(self, scenario: str) -> list[Any]:
+    def members(self, scenario: str) -> list[Any]:
+        """The fits of a scenario that share launches."""
         pairs = self.benchmark.fits_together(scenario)
         return [SimpleNamespace(scenario=scenario, method=method, seed=seed) for method, seed in pairs]
 
@@ -256,7 +287,7 @@ class Graph:
     def _rows_of_fits(self, scenario: str) -> str:
         """The fits of a scenario that share launches, by row of the method table, as JSON."""
         rows: dict[str, dict[str, Any]] = {}
-        for member in self._members(scenario):
+        for member in self.members(scenario):
             method = self.benchmark.fits[member.method]
             row: dict[str, Any] = {"kind": method.fit, "oracle": method.oracle, "fits": {}}
             row["settings"] = self.settings(STAGES["fit"], member)
@@ -326,19 +357,20 @@ class Graph:
 
     # --- what makes a job run again beside its command
 
-    def stamp(self, stage: Stage) -> Callable[..., str]:
-        """Wildcards of a job -> its options and settings, digests of its code and of images that the user may change, weights.
+    def code(self, stage: Stage, job: Any) -> str:
+        """The digest of the code that makes a job's result."""
+        return stage.code_of(self.config_of(stage, job), self._given(stage, job))
 
-        Of the command Snakemake remembers nothing: what is made from a job's inputs is no parameter of its own to it.
+    def stamp(self, stage: Stage) -> Callable[..., str]:
+        """Wildcards of a job -> what no record holds of it: images that a capture is made of, weights that are there.
+
+        Settings, code and inputs are compared with the records themselves (`neuspring.experiments.freshness`).
         """
 
         def digest(wildcards: Any) -> str:
-            config = self.config_of(stage, wildcards)
-            modules = stage.code(config, self._given(stage, wildcards))
-            parts = [_json(self.options(stage, wildcards)), self.settings(stage, wildcards)]
-            parts.append(code_digest(f"neuspring.stages.{stage.name}", *modules))
-            if "capture" in stage.inputs or stage.name == "capture":
-                parts.append(self._image_stamps(wildcards.scenario))
+            config, parts = self.config_of(stage, wildcards), []
+            if stage.name == "capture":
+                parts.append(self.image_stamps(wildcards.scenario))
             if stage.name == "render":
                 parts.append("absent" if isinstance(configured_weights(self.config.images.lpips), str) else "found")
             if stage.name == "train" and self.pictured(wildcards):
@@ -348,7 +380,8 @@ class Graph:
 
         return digest
 
-    def _image_stamps(self, scenario: str) -> str:
+    def image_stamps(self, scenario: str) -> str:
+        """A digest that tells changed images of the user's apart; empty where images are made here, or there are none."""
         folder, source = self.benchmark.data_path(scenario), self.benchmark.source(scenario)
         return _stamps(folder) if folder and (source.films or source.capture_files) else ""
 
@@ -370,7 +403,8 @@ class Graph:
         objects = [] if self.config.objects == "scenario" else ["--objects", self.config.objects]
         aims = ["--aims", _json(plain(self.config)["aims"])] if self.config.aims else []
         compared = ["--baseline", self.benchmark.compared_with]
-        return [*self._runs(output or self.folder), *self._transfers(), *compared, *objects, *aims]
+        settings = ["--settings", _json(plain(self.whole) | CHANGES_NOTHING)]
+        return [*self._runs(output or self.folder), *self._transfers(), *compared, *objects, *aims, *settings]
 
     def study(self, name: str) -> list[str]:
         """Of `neuspring study`."""
@@ -442,20 +476,6 @@ def _paths(files: Any, many: bool) -> Any:
         return None
     paths = [files] if isinstance(files, str) else [str(path) for path in files]
     return paths if many else paths[0]
-
-
-@functools.cache
-def _stamps(folder: Path) -> str:
-    """A digest of names, sizes and times of the images that the user may change, so that changed ones are read again."""
-    digest = hashlib.sha256()
-    kinds = [folder / kind for kind in ("color", "depth", "mask")]
-    # Marks are segmented from as images are.
-    marks = [path for path in [folder / "marks.json"] if path.exists()]
-    for path in sorted([*marks, *(path for kind in kinds for path in kind.rglob("*"))]):
-        # A link without target must not end the planning either: whoever reads it says so.
-        facts = path.stat() if path.exists() else path.lstat()
-        digest.update(f"{path} {facts.st_size} {facts.st_mtime_ns}".encode())
-    return digest.hexdigest()[:16]
 
 
 def _json(values: Any) -> str:

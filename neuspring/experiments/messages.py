@@ -11,13 +11,14 @@ import threading
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from neuspring.config import plain
 from neuspring.core.errors import InputError
 from neuspring.core.findings import warnings_of
 from neuspring.core.job_records import FOLDER, RUN, JobRecord, failure_lines, read_jobs, this_run
 from neuspring.core.table import Table
+from neuspring.experiments.freshness import told
 from neuspring.experiments.graph import Graph
 from neuspring.scores.metrics import METRICS, SHORT, TASKS
 
@@ -121,6 +122,16 @@ def scene_text(scenario: str, runs: Sequence[Path]) -> str:
     films = sorted({str(run / "video.mp4") for run in runs if (run / "video.mp4").is_file()})
     table = Table.of_texts(header, rows).markdown()
     return "\n".join([f"{scenario} is finished:", "", *table, "", *(f"  {film}" for film in films)])
+
+
+def replaced(jobs: Iterable[tuple[str, Any, tuple[str, ...]]]) -> str:
+    """What is made again although it is there, of (rule, wildcards, departures); empty for no job."""
+    rows = [(rule, str(getattr(w, "method", getattr(w, "search", ""))), why) for rule, w, why in jobs]
+    if not rows:
+        return ""
+    head = "Made again, and replaced, because what is there was made with something else:"
+    keep = "To keep what is there, give another folder: --config results=...; to take it as it is: --rerun-triggers mtime"
+    return "\n".join([head, *told(rows), keep, ""])
 
 
 def failed(graph: Graph) -> None:

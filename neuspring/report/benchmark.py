@@ -80,6 +80,8 @@ class Benchmark:
     """Twins on other recordings of the same object, as runs."""
     warnings: tuple[tuple[str, Finding], ...] = ()
     """Scenarios, and what steps of perception warned of."""
+    made_otherwise: tuple[str, ...] = ()
+    """Lines on runs that were not made with the configuration that the tables are laid out for."""
 
     @cached_property
     def collected(self) -> Collected:
@@ -146,6 +148,9 @@ def score_blocks(benchmark: Benchmark) -> list[Block]:
     blocks: list[Block] = []
     if warning := mixed_settings(runs):
         blocks.append(Text(text=warning, tone="warn"))
+    if benchmark.made_otherwise:
+        about = "Runs that were made with something else than this configuration; without `only` the workflow makes them again"
+        blocks.append(Items(title=about, items=[line.strip() for line in benchmark.made_otherwise]))
     if removed := failures.removed_lines(runs, benchmark.collected.left_out):
         blocks.append(Text(text=" ".join([_kept(benchmark), *removed])))
     if not len(usable) and not (runs["status"] == "ok").any():

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @stage(
     output="{scenario}/{method}/{seed}/rollout.json",
-    code=lambda settings, given: BASELINES[given["model"]].modules,
+    code=lambda settings, given: BASELINES[given["model"]].modules if given["model"] in BASELINES else (),
     gpu="always",
     minutes=60,
 )

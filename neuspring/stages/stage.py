@@ -13,7 +13,7 @@ rule, the digests of the inputs and the settings in the record, the passing on o
 | a parameter named | is |
 |---|---|
 | `settings` | the `Config`: the keys of `reads` are given to the rule and stand in the record |
-| `run` | the `Recorder` of the record to be; a stage without one writes its product itself, which is its parameter `output` |
+| `run` | the `Recorder` of the record to be; a stage without one writes its product, its parameter `output`, beside its record |
 | `device`, `threads`, `twins_per_launch` | where and how it runs, which changes no result and stands in no record |
 
 An input has the name of the file that it is: `masks` is the masks.json that stage `segment` writes, `search` a search.json.
@@ -38,6 +38,7 @@ from neuspring.config import Config, ScenarioRow
 from neuspring.config.settings import select
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.provenance import code_digest, image_stamps
 from neuspring.core.records import Before, Recorder
 from neuspring.data.capture import CAPTURE, Capture
 
@@ -101,7 +102,7 @@ class Job:
 
     arguments: dict[str, Any]
     """Of the function."""
-    record: Recorder | None
+    record: Recorder
     failed: Before | None
     """The first input whose failure is passed on."""
 
@@ -190,6 +191,15 @@ class Stage:
         """Which of `PLACES` it takes."""
         return tuple(name for name in PLACES if name in self.parameters)
 
+    def record_of(self, output: Path) -> Path:
+        """Where the record lies of a job that writes `output`: there, or beside a product that is no record."""
+        return output if "run" in self.signature else output.with_name(f"{self.name}.record.json")
+
+    def code_of(self, values: Config, given: Mapping[str, Any]) -> str:
+        """The digest of the code that makes it, given these values of its parameters."""
+        own = self.function.__module__
+        return code_digest(*([own] if own.startswith("neuspring.") else ()), *self.code(values, given))
+
     def settings(self, values: Config, given: Mapping[str, Any]) -> dict[str, Any]:
         """The part of the settings that the stage reads, given these values of its parameters."""
         return select(values, self.reads(values, given) if callable(self.reads) else self.reads)
@@ -213,10 +223,13 @@ class Stage:
             value = values[name] if parameter.many or values[name] is None else [values[name]]
             files[name] = [Path(path) for path in value or ()]
             roles |= {f"{name}{place}" if parameter.many else name: path for place, path in enumerate(files[name])}
-        chosen, record = settings or Config(), None
-        if "run" in self.signature:
-            read = self.settings(chosen, values) | {name: values[name] for name in self.options}
-            record = Recorder(self.name, output, inputs=roles, settings=read, device=values.get("device", "cpu"))
+        chosen = settings or Config()
+        options = {n: config.plain(v) if dataclasses.is_dataclass(v := values[n]) else v for n in self.options}
+        read, code = self.settings(chosen, values) | options, self.code_of(chosen, values)
+        device = values.get("device", "cpu")
+        record = Recorder(self.name, self.record_of(output), inputs=roles, settings=read, device=device, code=code)
+        for path in (files[name][0].parent for name, one in self.inputs.items() if one.type is Capture and files[name]):
+            record.inputs["images"] = image_stamps(path)
         failed = None
         for name, parameter in self.inputs.items():
             loaded = [LOADERS[parameter.type](path) for path in files[name]]
@@ -230,8 +243,9 @@ class Stage:
         """Run it, and write its record. A numerical failure is recorded, its own or that of an earlier stage."""
         job = self.job(output=Path(output), settings=settings, **given)
         record = job.record
-        if record is None:
+        if "run" not in self.signature:
             self.function(**job.arguments)
+            record.save()
             return
         if job.failed:
             earlier = job.failed.record

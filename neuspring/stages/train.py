@@ -25,7 +25,7 @@ def _reads(settings: Config, given: Any) -> tuple[str, ...]:
 @stage(
     output="{scenario}/{method}/{seed}/train.json",
     reads=_reads,
-    code=lambda settings, given: BASELINES[given["model"]].modules,
+    code=lambda settings, given: BASELINES[given["model"]].modules if given["model"] in BASELINES else (),
     gpu="always",
     memory_mb=8000,
     minutes=480,

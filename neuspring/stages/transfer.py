@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 from neuspring.baselines import BASELINES
 from neuspring.config import Config
@@ -15,7 +15,7 @@ from neuspring.stages.stage import MayFail, Written, stage
 @stage(
     output="{scenario}/{method}/{seed}/transfer.json",
     reads=("simulation",),
-    code=lambda settings, given: BASELINES[given["model"]].modules if given.get("model") else (),
+    code=lambda settings, given: BASELINES[given["model"]].modules if given["model"] in BASELINES else (),
     gpu="always",
     minutes=60,
 )
@@ -25,6 +25,7 @@ def transfer(
     method: str,
     settings: Config,
     run: Recorder,
+    model: Annotated[str | None, "of a baseline, whose code then counts; none for twins"] = None,
     seed: int = 0,
     device: str = "auto",
 ) -> Written:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -70,6 +71,26 @@ def test_changed_settings_rerun_the_stages_that_use_them_and_no_others(tiny_run)
     assert plan(project, changes) == fitted | {"track_init": 1, "log_run": 2}
     both_seeds = plan(project, {"seeds": [0, 1]})
     assert both_seeds == {"search": 1, "fit": 1, "rollout": 2, "score": 2, "log_run": 2, "tables": 1, "report": 1, "all": 1}
+
+
+def test_what_results_were_made_with_is_read_from_their_records_and_from_nothing_that_stays_behind(tiny_run, tmp_path):
+    """A results folder that was renamed, and whose `.snakemake` is gone: Snakemake would take it as finished whatever is asked."""
+    project = copy_project(tiny_run[0], tmp_path / "project")
+    shutil.rmtree(project / ".snakemake")
+    (project / "results").rename(project / "kept")
+    assert plan(project, {"results": "kept"}) == {}
+    output = run(project, {"results": "kept", "fit": {"epochs": 4}}, "--dry-run", "--quiet", "rules")
+    assert jobs_in(output) == dict.fromkeys(["fit", "rollout", "score", "log_run", "tables", "report", "all"], 1)
+    assert "  fit (baseline, 1 job): fit.epochs 3 -> 4\n" in output
+    assert "To keep what is there, give another folder: --config results=" in output
+    # Of an older version, whose code is not on record; of a stage whose product is no record; of rules that are no stages.
+    path = project / "kept" / SCENE / "search-uniform" / "0" / "search.json"
+    path.write_text(json.dumps({name: value for name, value in json.loads(path.read_text()).items() if name != "code"}))
+    output = run(project, {"results": "kept", "toy": {"frames": 9}, "compare_with": "baseline"}, "--dry-run", "--quiet", "rules")
+    assert "  observe (1 job): toy.frames 8 -> 9\n" in output
+    assert "  search (uniform, 1 job): code (an older version)\n" in output
+    assert "  tables (1 job): what it was told, or its code\n" in output
+    assert plan(project, {"results": "kept", "toy": {"frames": 9}}, "--rerun-triggers", "mtime") == {}
 
 
 def test_a_killed_run_continues_in_the_middle_of_the_fit_and_ends_the_same(tiny_run, tmp_path):

@@ -12,9 +12,11 @@ from pathlib import Path
 from snakemake.logging import logger
 
 from neuspring import config as settings
+from snakemake.settings.enums import RerunTrigger
+
 from neuspring.core.errors import InputError
-from neuspring.core.provenance import code_digest
 from neuspring.experiments import needs
+from neuspring.experiments.freshness import Freshness, stamp_of, stamped
 from neuspring.experiments.graph import Graph, one_of
 from neuspring.experiments.jobs import warm, wrapper
 from neuspring.stages import STAGES
@@ -58,6 +60,7 @@ GPU = int(
 )
 BENCHMARK.on_gpu = bool(GPU)
 GRAPH = Graph(BENCHMARK)
+FRESH = Freshness(GRAPH)
 NEEDS = needs.Needs(BENCHMARK, "gpu" if GPU else "cpu")
 # No GPU waits for one of its jobs while cores are taken by jobs that need none.
 GPU_FIRST = 10 * GPU
@@ -120,6 +123,56 @@ def section(name):
     return json.dumps({name: settings.plain(CONFIG)[name]}, sort_keys=True)
 
 
+def made_again(output, departures):
+    """Makes a job run whose output is there but departs from what it would be now, whatever Snakemake remembers of it.
+
+    Input functions ask for this: they are called for every job of the DAG, before Snakemake decides which of them run. With
+    `--rerun-triggers mtime` results are taken as they are.
+    """
+    asked = RerunTrigger.PARAMS in workflow.rerun_triggers
+    if departures and asked and workflow.is_main_process:
+        FRESH.departures[output] = departures
+        workflow.dag.forcefiles.add(output)
+
+
+def compared_with_records(stage):
+    """The input function of a stage, which compares its record on the way."""
+    find = GRAPH.inputs(stage)
+
+    def found(wildcards):
+        made_again(GRAPH.output_of(stage, wildcards), FRESH.look(stage, wildcards))
+        return find(wildcards)
+
+    return found
+
+
+def compared_with_stamp(log, output, stamp):
+    """An input function without files, of jobs of no stage. It compares the stamp in the record of the last such job."""
+
+    def nothing(wildcards):
+        path, names = Path(output.format(**wildcards)), dict(wildcards)
+        if path.exists() and not stamped(
+            Path(RESULTS), Path(log.format(**names)), stamp(wildcards)
+        ):
+            made_again(str(path), ("what it was told, or its code",))
+        return []
+
+    return nothing
+
+
+def stamped_job(rule, name, output, told, *modules):
+    """Of jobs of no stage: their log, the input function that compares their stamp, and the stamp.
+
+    The stamp is of what a job is told (wildcards -> words) and of the code of modules; its record holds it.
+    """
+
+    def stamp(wildcards):
+        return stamp_of(RESULTS, told(wildcards), *modules)
+
+    log = log_of(rule, name)
+    return log, compared_with_stamp(log, output, stamp), stamp
+
+
 def wrapped(flags, command):
     """A command in the wrapper that every job runs in: GPU lease, log, record, cause of failure."""
     quiet = "--quiet " if QUIET and "--quiet" not in flags else ""
@@ -128,7 +181,8 @@ def wrapped(flags, command):
 
 def common_job(command, gpus=False):
     """A job of no scenario."""
-    return wrapped("--gpus {resources.gpu}" if gpus else "--quiet", command)
+    flags = "--gpus {resources.gpu}" if gpus else "--quiet"
+    return wrapped(f"{flags} --stamp {{params.stamp}}", command)
 
 
 def stage_job(stage):

@@ -8,6 +8,21 @@ from neuspring.experiments import messages
 RUN = SimpleNamespace(begun=0.0, overview=None, warm=None)
 
 
+def tell_what_is_made_again():
+    """Which results are replaced although they are there, and why."""
+    jobs = workflow.dag.needrun_jobs(exclude_finished=False)
+    found = [
+        (job, FRESH.departures.get(str(job.output[0]))) for job in jobs if job.output
+    ]
+    print(
+        messages.replaced(
+            [(job.rule.name, job.wildcards, why) for job, why in found if why]
+        ),
+        end="",
+        flush=True,
+    )
+
+
 def plan_of_run():
     """How much time the run is expected to take."""
     slots = {
@@ -32,6 +47,7 @@ def begin():
             str(InputError("--cores", reason, workflow.resource_settings.cores, remedy))
         )
     begin_run(Path(RESULTS))
+    tell_what_is_made_again()
     RUN.begun = time.monotonic()
     if not QUIET:
         plan_of_run()
@@ -61,6 +77,7 @@ def end():
 def plan_of_dry_run():
     # Snakemake has no hook for the end of a dry run.
     if workflow.dryrun and workflow.dag:
+        tell_what_is_made_again()
         plan_of_run()
 
 

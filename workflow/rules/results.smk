@@ -1,14 +1,57 @@
 # Tables, report, and MLflow, which is an index of the records: its rules never fail a run, and no number depends on them.
+PERCEIVED, TABULATED, STUDIED, REPORTED, TRACKED = (
+    stamped_job(
+        "perception_table",
+        CONFIG.tables,
+        PERCEPTION_TABLE,
+        lambda wildcards: GRAPH.perception(),
+        "neuspring.report.perception",
+    ),
+    stamped_job(
+        "tables",
+        CONFIG.tables,
+        TABLES,
+        lambda wildcards: GRAPH.tables(),
+        "neuspring.report.benchmark",
+        "neuspring.report.sections.pictures",
+    ),
+    stamped_job(
+        "study",
+        f"{CONFIG.tables}/{{study}}",
+        f"{GRAPH.folder}/studies/{{study}}.md",
+        lambda wildcards: [
+            *GRAPH.study(wildcards.study),
+            json.dumps(settings.plain(BENCHMARK.studies[wildcards.study])),
+        ],
+        "neuspring.report.study",
+    ),
+    stamped_job(
+        "report",
+        CONFIG.tables,
+        REPORT,
+        lambda wildcards: [*GRAPH.report(), *GRAPH.report_stamp()],
+        "neuspring.report.page",
+    ),
+    stamped_job(
+        "track_init",
+        "mlflow",
+        f"{RESULTS}/mlflow.json",
+        lambda wildcards: [section("tracking")],
+    ),
+)
+
+
 rule perception_table:
     input:
         [
             f"{RESULTS}/{name}/perception/judged.json"
             for name in GRAPH.judged(CONFIG.scenarios)
         ],
+        PERCEIVED[1],
     output:
         PERCEPTION_TABLE,
     log:
-        log_of("perception_table", CONFIG.tables),
+        PERCEIVED[0],
     conda:
         ENVIRONMENT
     resources:
@@ -16,7 +59,7 @@ rule perception_table:
         runtime=NEEDS.minutes("perception_table"),
     params:
         arguments=GRAPH.perception(),
-        code=code_digest("neuspring.report.perception"),
+        stamp=PERCEIVED[2],
     shell:
         common_job("perception-table {params.arguments:q} --output {output:q}")
 
@@ -25,10 +68,11 @@ rule tables:
     input:
         runs=GRAPH.runs(),
         transfers=GRAPH.transfers(),
+        compared=TABULATED[1],
     output:
         TABLES,
     log:
-        log_of("tables", CONFIG.tables),
+        TABULATED[0],
     conda:
         ENVIRONMENT
     resources:
@@ -36,9 +80,7 @@ rule tables:
         runtime=NEEDS.minutes("tables"),
     params:
         arguments=GRAPH.tables(),
-        code=code_digest(
-            "neuspring.report.benchmark", "neuspring.report.sections.pictures"
-        ),
+        stamp=TABULATED[2],
     shell:
         common_job("tables {params.arguments:q}")
 
@@ -46,10 +88,11 @@ rule tables:
 rule study:
     input:
         lambda wildcards: GRAPH.runs(BENCHMARK.methods_of(wildcards.study)),
+        STUDIED[1],
     output:
         f"{GRAPH.folder}/studies/{{study}}.md",
     log:
-        log_of("study", f"{CONFIG.tables}/{{study}}"),
+        STUDIED[0],
     conda:
         ENVIRONMENT
     resources:
@@ -57,23 +100,27 @@ rule study:
         runtime=NEEDS.minutes("study"),
     params:
         arguments=lambda wildcards: GRAPH.study(wildcards.study),
-        definition=lambda wildcards: json.dumps(
-            settings.plain(BENCHMARK.studies[wildcards.study])
-        ),
-        code=code_digest("neuspring.report.study"),
+        stamp=STUDIED[2],
     shell:
         common_job("study {params.arguments:q}")
 
 
+# What the report shows, beside the runs.
+SHOWN = {
+    "tables": TABLES,
+    "studies": expand(rules.study.output, study=CONFIG.studies),
+    "perception": [PERCEPTION_TABLE] if GRAPH.judged(CONFIG.scenarios) else [],
+}
+
+
 rule report:
     input:
-        tables=TABLES,
-        studies=expand(rules.study.output, study=CONFIG.studies),
-        perception=[PERCEPTION_TABLE] if GRAPH.judged(CONFIG.scenarios) else [],
+        **SHOWN,
+        compared=REPORTED[1],
     output:
         REPORT,
     log:
-        log_of("report", CONFIG.tables),
+        REPORTED[0],
     conda:
         ENVIRONMENT
     resources:
@@ -81,17 +128,18 @@ rule report:
         runtime=NEEDS.minutes("report"),
     params:
         arguments=GRAPH.report(),
-        stamp=GRAPH.report_stamp(),
-        code=code_digest("neuspring.report.page"),
+        stamp=REPORTED[2],
     shell:
         common_job("report {params.arguments:q}")
 
 
 rule track_init:
+    input:
+        compared=TRACKED[1],
     output:
         f"{RESULTS}/mlflow.json",
     log:
-        log_of("track_init", "mlflow"),
+        TRACKED[0],
     conda:
         ENVIRONMENT
     resources:
@@ -99,6 +147,7 @@ rule track_init:
         runtime=NEEDS.minutes("track_init"),
     params:
         settings=section("tracking"),
+        stamp=TRACKED[2],
         results=lambda wildcards, output: str(Path(output[0]).parent),
     shell:
         common_job(

@@ -8,7 +8,7 @@ for STAGE in STAGES.values():
         name:
             STAGE.name
         input:
-            unpack(GRAPH.inputs(STAGE)),
+            unpack(compared_with_records(STAGE)),
             **(
                 {
                     # Their checkpoints, from which a fit goes on, are those that it would have left alone.

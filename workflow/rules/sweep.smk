@@ -1,16 +1,33 @@
 # A sweep: workers share one Optuna study; each is a job, and the sweep is as long as the configuration says, however many there are.
 SWEEP = GRAPH.sweep_folder
 if CONFIG.tune:
+    TUNED, SWEPT = (
+        stamped_job(
+            "tune",
+            f"{CONFIG.tune.study}/{{worker}}",
+            f"{SWEEP}/worker-{{worker}}.json",
+            lambda wildcards: [GRAPH.sweep(), GRAPH.tuned_rows()],
+            "neuspring.experiments.tuning.trial",
+        ),
+        stamped_job(
+            "sweep",
+            CONFIG.tune.study,
+            f"{SWEEP}/summary.md",
+            lambda wildcards: [GRAPH.sweep()],
+            "neuspring.experiments.tuning.report",
+        ),
+    )
 
     rule tune:
         input:
             observations=[
                 f"{RESULTS}/{name}/observations.npz" for name in BENCHMARK.tuned
             ],
+            compared=TUNED[1],
         output:
             f"{SWEEP}/worker-{{worker}}.json",
         log:
-            log_of("tune", f"{CONFIG.tune.study}/{{worker}}"),
+            TUNED[0],
         wildcard_constraints:
             worker=r"\d+",
         priority: GPU_FIRST
@@ -22,8 +39,7 @@ if CONFIG.tune:
             runtime=NEEDS.minutes("tune"),
         params:
             settings=GRAPH.sweep(),
-            rows=GRAPH.tuned_rows(),
-            code=code_digest("neuspring.experiments.tuning.trial"),
+            stamp=TUNED[2],
         shell:
             common_job(
                 "tune --observations {input.observations:q} --settings {params.settings:q} --worker {wildcards.worker}"
@@ -34,10 +50,11 @@ if CONFIG.tune:
     rule sweep_report:
         input:
             workers=expand(rules.tune.output, worker=range(CONFIG.tune.workers)),
+            compared=SWEPT[1],
         output:
             f"{SWEEP}/summary.md",
         log:
-            log_of("sweep", CONFIG.tune.study),
+            SWEPT[0],
         conda:
             ENVIRONMENT
         resources:
@@ -45,7 +62,7 @@ if CONFIG.tune:
             runtime=NEEDS.minutes("sweep"),
         params:
             settings=GRAPH.sweep(),
-            code=code_digest("neuspring.experiments.tuning.report"),
+            stamp=SWEPT[2],
         shell:
             common_job("tune-report --settings {params.settings:q} --output {output:q}")
 
@@ -64,6 +81,7 @@ if CONFIG.tune:
             runtime=NEEDS.minutes("log_sweep"),
         params:
             settings=section("tracking"),
+            stamp="none",
             results=lambda wildcards, input: str(Path(input.store[0]).parent),
             folder=lambda wildcards, input: str(Path(input.summary[0]).parent),
         shell:

@@ -53,6 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--gpus", type=int, default=0, help="GPUs that it needs")
     parser.add_argument("--scenario", default="", help="its scenario; jobs of one scenario prefer the same GPU")
     parser.add_argument("--quiet", action="store_true", help="write output to the log alone, unless the command fails")
+    parser.add_argument("--stamp", default="", help="what its record holds once it has succeeded")
     parser.add_argument("command", nargs=argparse.REMAINDER)
     a = parser.parse_args(arguments)
     command = a.command[1:] if a.command[:1] == ["--"] else a.command
@@ -65,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         record = JobRecord.of_log(results, a.log, a.scenario)
         # A job runs once at a time: wrapper and command may outlive Snakemake, and meet those of the next run at the same files.
         with alone(record.path(results), say) as lock:
-            return _run(command, record, results, lock, gpu_count=a.gpus, quiet=a.quiet)
+            return _run(command, record, results, lock, gpu_count=a.gpus, quiet=a.quiet, stamp=a.stamp)
     except (InputError, TimeoutError) as error:
         print(f"neuspring: error: {error}", file=sys.stderr)
         return faults.BAD_INPUT
@@ -106,7 +107,16 @@ def alone(record: Path, waiting: Callable[[str], object]) -> Iterator[IO[str] | 
             file.close()
 
 
-def _run(command: Sequence[str], record: JobRecord, results: Path, lock: IO[str] | None, *, gpu_count: int, quiet: bool) -> int:
+def _run(
+    command: Sequence[str],
+    record: JobRecord,
+    results: Path,
+    lock: IO[str] | None,
+    *,
+    gpu_count: int,
+    quiet: bool,
+    stamp: str,
+) -> int:
     """Run a job whose record has no attempts yet; returns its exit status (1 if a signal ended it).
 
     Raises InputError if it needs more GPUs than there are.
@@ -123,7 +133,7 @@ def _run(command: Sequence[str], record: JobRecord, results: Path, lock: IO[str]
 
     def save(attempt: Attempt) -> None:
         try:
-            replace(record, attempts=[*earlier, attempt]).save(results)
+            replace(record, attempts=[*earlier, attempt], stamp=stamp if attempt.outcome == "ok" else "").save(results)
         except (OSError, InputError) as error:
             print(f"warning: the record of this job could not be written: {error}", file=sys.stderr)
 
