@@ -7,7 +7,7 @@ import difflib
 import fnmatch
 import shlex
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,7 +19,7 @@ from neuspring.core.errors import InputError
 from neuspring.data.sources import SOURCES, Source, location, scenario_rows
 from neuspring.perception.backends import BACKENDS
 from neuspring.scores.lpips import configured_weights
-from neuspring.scores.paper import read_studies
+from neuspring.scores.paper import Study, read_studies
 
 T = TypeVar("T")
 RESERVED = ("tables", "logs", "benchmarks", "jobs", "tune", "mlartifacts", "published", "appearance", "perception", "capture")
@@ -73,6 +73,29 @@ def chosen_part(config: Config, scenarios: Mapping[str, ScenarioRow]) -> Config:
     return dataclasses.replace(config, **kept)
 
 
+def for_targets(values: Mapping[str, Any], targets: Collection[str], root: Path) -> dict[str, Any]:
+    """What targets that are studies change in a configuration: `studies`; where all are, `only` with the methods of their rows.
+
+    So a table of the paper is made of its rows and no others, whatever methods the configuration names. Raises InputError.
+    """
+    studies, listed = read_studies(root / values.get("study_table", Config.study_table)), values.get("studies") or []
+    asked = [name for name in studies if name in targets]
+    if not asked or not isinstance(listed, list):
+        return {}
+    changes: dict[str, Any] = {"studies": [*listed, *(name for name in asked if name not in listed)]}
+    if len(asked) == len(targets):
+        known = read_methods(root / values.get("method_table", Config.method_table))
+        shown = [name for study in asked for name in rows_of(studies, study) if name in known]
+        changes["only"] = f"method={','.join(dict.fromkeys(shown))} {values.get('only', '')}".strip()
+    return changes
+
+
+def rows_of(studies: Mapping[str, Study], name: str) -> tuple[str, ...]:
+    """The methods in the rows of a study, and in those of the study beside it."""
+    shown = [studies[each] for each in (name, studies[name].beside) if each]
+    return tuple(dict.fromkeys(method for study in shown for method in study.rows.values()))
+
+
 def overlaid(settings: T, own: Mapping[str, Any], where: str) -> T:
     """A section of the settings with a row's own on top. Raises InputError for unknown keys."""
     values = plain(settings)
@@ -123,7 +146,7 @@ class Benchmark:
         _require_known("studies", whole.studies, self.studies, whole.study_table)
         _require_known("methods", whole.methods, methods, whole.method_table)
         # The methods in the rows of its studies come too. If they add any, all are in the order of the method table.
-        implied = {method for study in whole.studies for method in self.studies[study].rows.values() if method in methods}
+        implied = {method for study in whole.studies for method in rows_of(self.studies, study) if method in methods}
         if not implied <= set(whole.methods):
             union = implied | set(whole.methods)
             whole = dataclasses.replace(whole, methods=tuple(name for name in methods if name in union))
@@ -240,8 +263,7 @@ class Benchmark:
 
     def methods_of(self, study: str) -> tuple[str, ...]:
         """The chosen methods that stand in a study's rows, and in those of the study beside it."""
-        shown = [self.studies[name] for name in (study, self.studies[study].beside) if name]
-        return tuple(dict.fromkeys(name for rows in shown for name in rows.rows.values() if name in self.methods))
+        return tuple(name for name in rows_of(self.studies, study) if name in self.methods)
 
     def _row(self, name: str) -> ScenarioRow:
         """Of a scenario, whether it is chosen or not."""

@@ -23,7 +23,7 @@ from neuspring.config.settings import select
 from neuspring.core.errors import InputError
 from neuspring.core.provenance import image_stamps
 from neuspring.data.sources import SOURCES
-from neuspring.experiments.benchmark import Benchmark, read_methods, read_searches, section_of, with_method, with_search
+from neuspring.experiments.benchmark import Benchmark, read_methods, read_searches, rows_of, section_of, with_method, with_search
 from neuspring.perception.backends import BACKENDS
 from neuspring.scores.lpips import configured_weights
 from neuspring.stages import STAGES
@@ -408,7 +408,10 @@ class Graph:
 
     def study(self, name: str) -> list[str]:
         """Of `neuspring study`."""
-        return ["--study", name, "--table", str(self.root / self.config.study_table), *self._runs(f"{self.folder}/studies")]
+        # Of the methods those that it shows: it is the same table however many others the configuration names.
+        shown = [method for method in rows_of(self.benchmark.studies, name) if method in self.whole.methods]
+        table = str(self.root / self.config.study_table)
+        return ["--study", name, "--table", table, *self._runs(f"{self.folder}/studies", shown)]
 
     def perception(self) -> list[str]:
         """Of `neuspring perception-table`."""
@@ -425,18 +428,18 @@ class Graph:
             *("--baseline", self.benchmark.compared_with, *self._transfers(), *self._left_out()),
         ]
 
-    def _runs(self, output: str) -> list[str]:
-        whole = self.whole
-        runs = ["--scenarios", *whole.scenarios, "--methods", *whole.methods, "--seeds", *map(str, whole.seeds)]
-        return ["--results", self.results, "--output", output, *runs, *self._left_out()]
+    def _runs(self, output: str, methods: Sequence[str] = ()) -> list[str]:
+        whole, names = self.whole, methods or self.whole.methods
+        runs = ["--scenarios", *whole.scenarios, "--methods", *names, "--seeds", *map(str, whole.seeds)]
+        return ["--results", self.results, "--output", output, *runs, *self._left_out(names)]
 
     def _transfers(self) -> list[str]:
         sources = [name for name in self.whole.transfers or {} if name in self.whole.scenarios]
         return ["--transfers", *sources] if sources else []
 
-    def _left_out(self) -> list[str]:
-        """Which methods do not apply to which scenarios, so that nothing is missing there."""
-        left_out = self.benchmark.whole_left_out
+    def _left_out(self, methods: Sequence[str] = ()) -> list[str]:
+        """Which methods (of all or of these) do not apply to which scenarios, so that nothing is missing there."""
+        left_out = {name: where for name, where in self.benchmark.whole_left_out.items() if not methods or name in methods}
         return ["--left-out", _json(left_out)] if left_out else []
 
     def report_stamp(self) -> list[str]:

@@ -83,6 +83,9 @@ def test_what_results_were_made_with_is_read_from_their_records_and_from_nothing
     assert jobs_in(output) == dict.fromkeys(["fit", "rollout", "score", "log_run", "tables", "report", "all"], 1)
     assert "  fit (baseline, 1 job): fit.epochs 3 -> 4\n" in output
     assert "To keep what is there, give another folder: --config results=" in output
+    # A target of a table brings its rows, which this configuration does not name.
+    planned = plan(project, {"results": "kept"}, "--", "table3")
+    assert (planned["fit"], planned["score"], planned["search"], planned["table3"]) == (3, 3, 1, 1)
     # Of an older version, whose code is not on record; of a stage whose product is no record; of rules that are no stages.
     path = project / "kept" / SCENE / "search-uniform" / "0" / "search.json"
     path.write_text(json.dumps({name: value for name, value in json.loads(path.read_text()).items() if name != "code"}))

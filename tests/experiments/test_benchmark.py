@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -149,6 +150,8 @@ def test_bad_scenario_tables(name: str, tmp_path: Path) -> None:
         read_scenarios(path)
     assert str(path) in str(caught.value)
 
+
+SCENES_OF_TARGETS = ["synthetic_single_lift_rope", "synthetic_single_lift_sloth"]
 
 # A benchmark: the configuration with its tables -----------------------------------------------------------------------
 
@@ -529,6 +532,60 @@ def test_studies_bring_the_methods_of_their_rows_in_the_order_of_the_table():
         "no_triplane",
         "fixed_resolution",
     )
+
+
+def jobs_of(graph: Graph, files: list[str]) -> Counter[str]:
+    """How many jobs of each stage make these files, and all that they are made of."""
+    patterns = {name: re.compile(re.sub(r"{(\w+)}", r"(?P<\1>[^/]+)", stage.output)) for name, stage in STAGES.items()}
+    counts, waiting, seen = Counter(), [*files], set()
+    while waiting:
+        path = waiting.pop().removeprefix(f"{graph.results}/")
+        # Twins and baselines write the same rollout.json.
+        method = graph.benchmark.methods.get(path.split("/")[1])
+        others = {"rollout" if method and method.model else "predict"}
+        found = [(STAGES[name], match) for name in STAGES.keys() - others if (match := patterns[name].fullmatch(path))]
+        if path in seen or not found:
+            continue
+        seen.add(path)
+        [(stage, match)] = found
+        job = SimpleNamespace(**match.groupdict())
+        counts[stage.name] += 1
+        inputs = graph.inputs(stage)(job) | ({"shared": graph.shared_launches(job)} if stage.name == "fit" else {})
+        waiting += [path for value in inputs.values() for path in ([value] if isinstance(value, str) else value)]
+    return counts
+
+
+@pytest.mark.parametrize("overlays", [["synthetic"], ["synthetic", "paper"]], ids="-".join)
+@pytest.mark.parametrize(
+    ("study", "runs", "searches", "fits", "trainings"),
+    [
+        ("table1", 24, 12, 12, 12),
+        ("table2", 24, 12, 24, 0),
+        ("table2_ours", 48, 12, 48, 0),
+        ("table3", 18, 6, 18, 0),
+        ("clusters", 48, 48, 48, 0),
+    ],
+)
+def test_a_target_of_a_table_means_its_rows_and_no_others_with_any_data(overlays, study, runs, searches, fits, trainings):
+    """Two scenes and three seeds, whatever methods and studies the configuration names beside."""
+    values = shipped(*overlays) | {"scenarios": SCENES_OF_TARGETS, "transfers": None, "seeds": [0, 1, 2]}
+    made = Benchmark(values | tables.for_targets(values, [study], ROOT), ROOT)
+    graph = Graph(made)
+    count = jobs_of(graph, graph.runs(made.methods_of(study)))
+    assert (count["score"], count["search"], count["fit"], count["train"]) == (runs, searches, fits, trainings)
+    assert count["rollout"] + count["predict"] == runs
+    # The table itself is the same whatever else the configuration names.
+    words = graph.study(study)
+    assert set(words[words.index("--methods") + 1 : words.index("--seeds")]) == set(made.methods)
+
+
+def test_targets_leave_a_part_that_was_asked_for_and_other_targets_as_they_are():
+    values = shipped("synthetic") | {"only": "seed=1 method=baseline"}
+    chosen = tables.for_targets(values, ["table2"], ROOT)
+    part = Benchmark(values | chosen, ROOT).config
+    assert (part.methods, part.seeds) == (("baseline",), (1,))
+    assert tables.for_targets(values, ["report"], ROOT) == tables.for_targets(values, [], ROOT) == {}
+    assert tables.for_targets(shipped("toy"), ["table3", "report"], ROOT) == {"studies": ["table3"]}
 
 
 def test_every_method_that_is_shipped_is_valid():

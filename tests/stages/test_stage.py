@@ -57,6 +57,18 @@ def test_a_record_holds_digests_of_inputs_settings_that_are_read_and_options(giv
     assert record.file("text", given["output"]).read_text() == str(0.5 * len(small.observations().nodes))
 
 
+def test_every_record_names_the_code_and_a_product_that_is_no_record_has_one_beside_it(tmp_path):
+    row = config.ScenarioRow(
+        scenario="a", source="toy", category="rope", path="rope/lift/smooth", self_collision=False, ground=True
+    )
+    settings = Config(toy=config.Toy(frames=4))
+    STAGES["observe"](scenario=row, settings=settings, output=tmp_path / "observations.npz")
+    record = StageRecord.load(STAGES["observe"].record_of(tmp_path / "observations.npz"))
+    assert record.settings["scenario"] == config.plain(row) and record.settings["toy"]["frames"] == 4
+    assert record.code == STAGES["observe"].code_of(settings, {"scenario": row}) and len(record.code) == 16
+    assert STAGES["fit"].record_of(tmp_path / "fit.json") == tmp_path / "fit.json"
+
+
 def test_failures_are_passed_on_unless_the_signature_takes_them(given, tmp_path):
     Recorder("fit", tmp_path / "fit.json").save(failure="diverged")
     weigh(**given, fit=tmp_path / "fit.json")

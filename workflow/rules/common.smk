@@ -9,6 +9,7 @@ import tempfile
 import uuid
 from pathlib import Path
 
+from snakemake.cli import get_argument_parser
 from snakemake.logging import logger
 
 from neuspring import config as settings
@@ -16,6 +17,7 @@ from snakemake.settings.enums import RerunTrigger
 
 from neuspring.core.errors import InputError
 from neuspring.experiments import needs
+from neuspring.experiments.benchmark import for_targets
 from neuspring.experiments.freshness import Freshness, stamp_of, stamped
 from neuspring.experiments.graph import Graph, one_of
 from neuspring.experiments.jobs import warm, wrapper
@@ -51,6 +53,22 @@ def or_workflow_error(check, *arguments, **named):
         raise WorkflowError(str(error)) from None
 
 
+# A target that is a study chooses methods. Snakemake knows the targets only when the rules are there, so they are read from the command
+# line. Jobs of a cluster are not told them, but what follows from them.
+TARGETS = (
+    get_argument_parser().parse_args(sys.argv[1:]).targets
+    if workflow.is_main_process and Path(sys.argv[0]).stem in ("snakemake", "__main__")
+    else []
+)
+CHOSEN = or_workflow_error(for_targets, config, TARGETS, ROOT)
+config.update(CHOSEN)
+workflow.config_settings.config_args = [
+    *(workflow.config_settings.config_args or []),
+    *(
+        f"{key}={value if key == 'only' else json.dumps(value)}"
+        for key, value in CHOSEN.items()
+    ),
+]
 BENCHMARK = or_workflow_error(needs.checked, config, ROOT, cluster=CLUSTER)
 CONFIG = BENCHMARK.config
 RESULTS = CONFIG.results
