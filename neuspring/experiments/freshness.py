@@ -123,7 +123,8 @@ def _short(value: Any) -> str:
 
 def stamp_of(results: str, told: Iterable[str], *modules: str) -> str:
     """A digest of what a job of no stage is told, wherever the results folder lies, and of the code of its modules."""
-    words = [re.sub(rf"^{re.escape(results)}(?=/|$)", ".", word) for word in told]
+    # As a path of its own, and as a setting in JSON.
+    words = [re.sub(rf"^{re.escape(results)}(?=/|$)", ".", word.replace(f": {json.dumps(results)}", ': "."')) for word in told]
     return hashlib.sha256(json.dumps([words, code_digest(*modules)]).encode()).hexdigest()[:16]
 
 

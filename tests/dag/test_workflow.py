@@ -89,7 +89,7 @@ def test_what_results_were_made_with_is_read_from_their_records_and_from_nothing
     # Of an older version, whose code is not on record; of a stage whose product is no record; of rules that are no stages.
     path = project / "kept" / SCENE / "search-uniform" / "0" / "search.json"
     path.write_text(json.dumps({name: value for name, value in json.loads(path.read_text()).items() if name != "code"}))
-    output = run(project, {"results": "kept", "toy": {"frames": 9}, "compare_with": "baseline"}, "--dry-run", "--quiet", "rules")
+    output = run(project, {"results": "kept", "toy": {"frames": 9}, "compare_with": "search_only"}, "--dry-run", "--quiet", "rules")
     assert "  observe (1 job): toy.frames 8 -> 9\n" in output
     assert "  search (uniform, 1 job): code (an older version)\n" in output
     assert "  tables (1 job): what it was told, or its code\n" in output

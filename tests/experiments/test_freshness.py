@@ -139,7 +139,7 @@ def test_what_is_made_again_is_said_once_for_jobs_alike():
 
 
 def test_a_stamp_follows_words_and_code_and_not_the_place_of_the_results(tmp_path):
-    words = ["--results", "a/b", "--output", "a/b/tables", "--methods", "a"]
+    words = ["--results", "a/b", "--output", "a/b/tables", "--methods", "a", "--settings", '{"results": "a/b", "seeds": [0]}']
     moved = [word.replace("a/b", "c") for word in words]
     assert stamp_of("a/b", words, "neuspring.core.text") == stamp_of("c", moved, "neuspring.core.text")
     assert stamp_of("a/b", words, "neuspring.core.text") != stamp_of("a/b", [*words, "b"], "neuspring.core.text")
