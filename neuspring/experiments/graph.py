@@ -32,7 +32,14 @@ from neuspring.stages.stage import Stage
 TEMPLATES = Path(__file__).parents[1] / "report" / "templates"
 SPLATS = "appearance"
 """Folder of the splats that all methods share; those of one method have its name behind a hyphen."""
-CHANGES_NOTHING = {"only": "", "gpus": {}, "tracking": {}, "twins_per_launch": "auto", "device": "auto", "tune": None}
+CHANGES_NOTHING: dict[str, Any] = {
+    "only": "",
+    "gpus": {},
+    "tracking": {},
+    "twins_per_launch": "auto",
+    "device": "auto",
+    "tune": None,
+}
 """Keys that no result depends on, with what stands for them where settings are compared."""
 Files = str | list[str]
 _stamps = functools.cache(image_stamps)
