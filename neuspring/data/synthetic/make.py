@@ -10,7 +10,6 @@ import numpy as np
 
 from neuspring.config import Config, ScenarioRow
 from neuspring.config.data import Synthetic
-from neuspring.core.device import quiet
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.geometry import farthest
 from neuspring.core.records import digest_file
@@ -80,7 +79,6 @@ def make(row: ScenarioRow, settings: Synthetic, folder: Path) -> tuple[Capture, 
 
     Raises InputError for an unknown scene, NumericalFailure for a clip that must not be shipped.
     """
-    quiet()
     engine_name, _, name = row.path.rpartition("/")
     if name not in SCENES or engine_name not in ENGINES:
         rule = f"must be a scene, or vbd/<scene> for the held-out engine; scenes: {sorted(SCENES)}"
