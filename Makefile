@@ -20,7 +20,7 @@ define INSTALL
 @test -n "$(PYTHON)" || { echo "Python 3.11, 3.12 or 3.13 is needed; set PYTHON=/path/to/python3.12"; exit 2; }
 @echo "Installing neuspring[$(1)] with $(PYTHON) into .venv (two to four minutes, up to 3.1 GB)"
 $(PYTHON) -m venv .venv
-PYTHONWARNINGS=ignore PIP_CONSTRAINT="$(CURDIR)/workflow/envs/constraints.txt" $(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[$(1)]"
+PYTHONWARNINGS=ignore PIP_CONSTRAINT="$(CURDIR)/workflow/envs/constraints.txt" $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -e ".[$(1)]"
 @touch $@
 endef
 

@@ -501,10 +501,13 @@ def test_the_default_configuration_names_the_tables_alone():
         Benchmark(default, ROOT)
 
 
-def test_the_synthetic_benchmark_sees_what_the_demo_sees():
-    demo, synthetic = shipped("demo"), shipped("synthetic")
-    for section in ("perception", "images", "baselines"):
-        assert synthetic[section] == demo[section]
+def test_the_synthetic_benchmark_sees_what_studies_of_the_demo_see():
+    synthetic = shipped("synthetic")
+    for study in ("heldout", "perception"):
+        studied = shipped("demo", study)
+        for section in ("perception", "images", "baselines"):
+            assert synthetic[section] == studied[section]
+        assert studied["synthetic"]["size"] == synthetic["synthetic"].get("size", "demo")
 
 
 def test_the_whole_benchmark_has_every_method_and_study_of_the_paper(tmp_path):
