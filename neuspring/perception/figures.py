@@ -10,13 +10,12 @@ import numpy as np
 
 from neuspring.core.artifacts import ImageObservations
 from neuspring.core.files import write_atomically
-from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.perception.frames import frames_of, spread, write_png
+from neuspring.data.capture import Capture
+from neuspring.perception.frames import frames_of, overlay, spread, tints_of, write_png
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
 
 FRAMES = 5
 """How many frames a strip shows."""
-TINTS = {OBJECT: np.array([40, 200, 60]), HANDS: np.array([70, 110, 255])}
 TRAIL = 8
 """How many frames back the tail of a track reaches."""
 MOST_TRACKS = 400
@@ -25,14 +24,10 @@ HAND_ARROW = 40.0
 
 
 def masks_strip(capture: Capture, camera: str, masks: Masks, path: Path) -> Path:
-    """Frames of the video side by side: object tinted green, hands blue."""
-    tiles = []
-    for frame in spread(frames_of(capture, camera), FRAMES):
-        image = capture.color(camera, frame).astype(float)
-        for label, tint in TINTS.items():
-            own = masks.labels[frame] == label
-            image[own] = 0.5 * image[own] + 0.5 * tint
-        tiles.append(image.astype(np.uint8))
+    """Frames of the video side by side, object and hands tinted."""
+    shown = spread(frames_of(capture, camera), FRAMES)
+    tints = tints_of(capture.color(camera, shown[0]), masks.labels[shown[0]])
+    tiles = [overlay(capture.color(camera, frame), masks.labels[frame], tints) for frame in shown]
     return write_png(path, np.hstack(tiles))
 
 

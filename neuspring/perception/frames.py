@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeAlias, TypeVar
 
 import cv2
 import numpy as np
 
 from neuspring.core.files import write_atomically
-from neuspring.data.capture import Capture
+from neuspring.data.capture import HANDS, OBJECT, Capture
 
 T = TypeVar("T")
+Color: TypeAlias = tuple[int, int, int]
+"""RGB."""
+TINTS = {OBJECT: (40, 220, 60), HANDS: (70, 110, 255)}
+"""RGB of labels in pictures of masks: green and blue, where the picture has other colors."""
+OTHERS = ((255, 140, 0), (240, 50, 220), (250, 230, 30))
+"""Tints in their place."""
+CLEAR, AROUND = 40.0, 15
+"""Difference in a and b of Lab from which a tint is seen, and pixels around a mask whose colors count too."""
 
 
 def frames_of(capture: Capture, camera: str) -> list[int]:
@@ -41,6 +49,33 @@ def overlap(one: np.ndarray, other: np.ndarray) -> float:
     """Intersection over union of two masks [...] bool; NaN if both are empty."""
     union = int((one | other).sum())
     return float((one & other).sum() / union) if union else float("nan")
+
+
+def tints_of(image: np.ndarray, labels: np.ndarray) -> dict[int, Color]:
+    """The tint, RGB, of each label in pictures of this camera: the usual one, or the farthest from an image's own colors.
+
+    `image` [H, W, 3] and `labels` [H, W] are one frame. A tint is seen if nine tenths of the colors at the masks are CLEAR of it.
+    """
+    at = cv2.dilate((labels > 0).astype(np.uint8), np.ones((2 * AROUND + 1,) * 2, np.uint8)) > 0
+    own = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2LAB)[at][:, 1:].astype(float)
+    chosen: dict[int, Color] = {}
+    for label, usual in TINTS.items():
+        free = [tint for tint in (usual, *OTHERS) if tint not in chosen.values()]
+        colors = cv2.cvtColor(np.array([free], np.uint8), cv2.COLOR_RGB2LAB)[0, :, 1:].astype(float)
+        clear = [float(np.quantile(np.linalg.norm(own - color, axis=1), 0.1)) if len(own) else CLEAR for color in colors]
+        chosen[label] = usual if clear[0] >= CLEAR else free[int(np.argmax(clear))]
+    return chosen
+
+
+def overlay(image: np.ndarray, labels: np.ndarray, tints: Mapping[int, Color]) -> np.ndarray:
+    """An RGB image [H, W, 3] with the pixels of labels [H, W] tinted and their borders drawn."""
+    result = np.array(image, order="C")
+    for label, tint in tints.items():
+        own = (labels == label).astype(np.uint8)
+        result[own > 0] = (0.6 * image[own > 0] + 0.4 * np.array(tint)).astype(np.uint8)
+        outlines, _ = cv2.findContours(own, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(result, outlines, -1, tint, 1)
+    return result
 
 
 def write_png(path: Path, image: np.ndarray) -> Path:

@@ -20,10 +20,9 @@ import numpy as np
 
 from neuspring.config.perception import MarksSegmentation
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.perception.frames import overlap
+from neuspring.perception.frames import TINTS, overlap, overlay
 from neuspring.perception.marks.carry import Carried, carry, carry_camera
 from neuspring.perception.marks.marks import Mark, Marks
-from neuspring.perception.marks.store import overlay
 
 MARKS = Path(__file__).parents[2] / "tests" / "data" / "marks"
 MOST_MARKS = 5
@@ -140,7 +139,7 @@ def _tell(
     if pictures:
         pictures.mkdir(parents=True, exist_ok=True)
         frames = shown or np.linspace(0, len(carried.labels) - 1, 8).astype(int).tolist()
-        tiles = [overlay(np.ascontiguousarray(images.color(frame)), carried.labels[frame]) for frame in frames]
+        tiles = [overlay(images.color(frame), carried.labels[frame], TINTS) for frame in frames]
         cv2.imwrite(str(pictures / f"{name.replace(' ', '_')}.png"), np.hstack(tiles)[..., ::-1])
 
 

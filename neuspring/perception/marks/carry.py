@@ -20,9 +20,9 @@ import numpy as np
 
 from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
-from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture
 from neuspring.perception.frames import frames_of, heights, overlap, spread
-from neuspring.perception.marks.colors import Background, apart, lab_of, mixed
+from neuspring.perception.marks.colors import DIFFERENT, Background, apart, lab_of, mixed
 from neuspring.perception.marks.marks import Mark, Seeds, require_marks
 from neuspring.perception.marks.solve import LABELS, CarriedFrame, MarkedFrame, Pass, start
 
@@ -38,6 +38,8 @@ REACH = 4.0
 """How far the border may be from where the flow carries it, pixels."""
 BACKGROUND_FRAMES = 60
 """How many frames the background of the whole film is learned from."""
+LATER, GONE = 12, 0.2
+"""How many later frames say whether what is ignored leaves, and the share of them that must show another thing in its place."""
 APART = 4
 """Pixels around object and hands that teach no background."""
 Progress: TypeAlias = Callable[[int, int], None]
@@ -263,7 +265,7 @@ class _Work:
         labels = np.zeros((count, *self.size), np.uint8)
         self.starts[begin] = self.start(begin)
         labels[begin] = self.starts[begin].labels
-        self.background = Background.empty(self.size) if self.settings.background else None
+        self.background = Background.empty(self.size, self.guests()) if self.settings.background else None
         for frames in (range(begin + 1, count), range(begin - 1, -1, -1)):
             walk = self.walk_from(begin, learns=True)
             for frame in frames:
@@ -281,7 +283,7 @@ class _Work:
         count = self.film.count
         if self.background is not None:
             # The background of the whole film, from frames where their labels say nothing.
-            self.background = Background.empty(self.size)
+            self.background = Background.empty(self.size, self.background.guests)
             for frame in spread(range(count), BACKGROUND_FRAMES):
                 self.background.learn(self.lab(frame), apart(first[frame], APART), self.resized(self.film.depth(frame)))
             # What was uncovered later shows where the object ended at first.
@@ -311,6 +313,21 @@ class _Work:
                 labels[frame] = self.full_labels((1 - weight) * there + weight * step.probability)
                 self.tick()
         return Carried(labels, doubt_of(labels, cues))
+
+    def guests(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+        """What is ignored in a marked frame and leaves: where [h, w] bool, and its look, Lab [h, w, 3].
+
+        It differs in the film's last frame and in GONE of those after the marked one. What stays is background.
+        """
+        found = []
+        for frame, marks in self.marks.items():
+            later = spread(range(frame + 1, self.film.count), LATER) if frame + 1 < self.film.count else []
+            if later and any(mark.label == "ignore" for mark in marks):
+                look = self.lab(frame)
+                other = np.stack([cv2.absdiff(self.lab(k), look).max(axis=-1) > DIFFERENT for k in later])
+                place = (self.seeds(frame).certain == NOTHING) & other[-1] & (other.mean(axis=0) >= GONE)
+                found.append((place, look))
+        return tuple(found)
 
     @property
     def begin(self) -> int:

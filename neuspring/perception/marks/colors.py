@@ -88,19 +88,26 @@ class Background:
     """[H, W] float32, how often."""
     depth: np.ndarray
     """[H, W] float32, m, running mean; 0 where never measured."""
+    guests: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
+    """Places [H, W] bool and looks, Lab [H, W, 3], of what is ignored and leaves. While it is there it is nothing by its own look,
+    and teaches none of what it hides."""
 
     @classmethod
-    def empty(cls, size: tuple[int, int]) -> Background:
+    def empty(cls, size: tuple[int, int], guests: tuple[tuple[np.ndarray, np.ndarray], ...] = ()) -> Background:
         """Nothing is known."""
         color = (*size, 3)
-        return cls(np.zeros(color, np.float32), np.zeros(color, np.float32), np.zeros(size, np.float32), np.zeros(size, np.float32))
+        blank = [np.zeros(shape, np.float32) for shape in (color, color, size, size)]
+        return cls(*blank, guests)
 
     def part(self, window: tuple[slice, slice]) -> Background:
         """A window of it, without a copy."""
-        return Background(self.mean[window], self.variance[window], self.seen[window], self.depth[window])
+        guests = tuple((place[window], look[window]) for place, look in self.guests)
+        return Background(self.mean[window], self.variance[window], self.seen[window], self.depth[window], guests)
 
     def learn(self, lab: np.ndarray, where: np.ndarray, depth: np.ndarray | None = None) -> None:
         """Take a frame's pixels [H, W, 3] where it shows the background [H, W] bool, and their depth [H, W], m, 0 none."""
+        for place, look in self.guests:
+            where = where & ~(place & _alike(lab, look))
         self.seen += where
         weight = np.where(where, np.maximum(1.0 / np.maximum(self.seen, 1.0), FORGET), 0.0).astype(np.float32)[..., None]
         step = lab.astype(np.float32) - self.mean
@@ -125,7 +132,12 @@ class Background:
     def explain(self, logs: np.ndarray, lab: np.ndarray, gain: np.ndarray) -> np.ndarray:
         """Log densities [H, W] of the background: from `logs`, those of its colors anywhere, and the usual color of each pixel."""
         known = np.clip(self.seen / SURE_AFTER, 0, 1) * USUAL
-        mixture = np.logaddexp(np.log(known + 1e-9) + self.usual_density(lab, gain), np.log(1 - known) + logs)
+        usual = self.usual_density(lab, gain)
+        for place, look in self.guests:
+            there = place & _alike(lab, look)
+            own = shaded_density(lab.astype(np.float32) - look - gain, 2 * LEAST_SPREAD)
+            known, usual = np.where(there, USUAL, known), np.where(there, own, usual)
+        mixture = np.logaddexp(np.log(known + 1e-9) + usual, np.log(1 - known) + logs)
         return np.asarray(np.where(known > 0, mixture, logs), dtype=np.float32)
 
     def gain(self, lab: np.ndarray, where: np.ndarray) -> np.ndarray:
@@ -148,6 +160,11 @@ class Background:
         same = -0.5 * ((depth - self.depth) / spread) ** 2 - np.log(np.sqrt(2 * np.pi) * spread)
         ratio = np.clip(same + np.log(IN_FRONT), -MOST_DEPTH, MOST_DEPTH)
         return np.where((depth > 0) & (self.depth > 0), ratio, 0.0).astype(np.float32)
+
+
+def _alike(lab: np.ndarray, look: np.ndarray) -> np.ndarray:
+    """Where two images in Lab [H, W, 3] do not differ plainly [H, W] bool."""
+    return np.asarray(cv2.absdiff(np.ascontiguousarray(lab), np.ascontiguousarray(look)).max(axis=-1) <= DIFFERENT)
 
 
 def shaded_density(step: np.ndarray, spread: np.ndarray) -> np.ndarray:

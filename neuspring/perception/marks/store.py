@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -26,14 +26,12 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
 from neuspring.core.records import canonical, digest_file
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, images_digest, read_labels
-from neuspring.perception.frames import frames_of, overlap, spread, write_png
+from neuspring.perception.frames import Color, frames_of, overlap, overlay, spread, tints_of, write_png
 from neuspring.perception.marks.carry import Carried, carry_camera
 from neuspring.perception.marks.marks import MARKS, Mark, Marks, marks_digest
 
 MADE = "masks.json"
 """What the masks of a capture were made from, and how far each frame is doubted; in its folder."""
-TINTS = {OBJECT: (40, 220, 60), HANDS: (70, 110, 255)}
-"""RGB, as in the other pictures of masks."""
 COLUMNS = 4
 EVEN, DOUBTFUL = 8, 8
 """How many frames are shown evenly over the video, and in doubt."""
@@ -172,17 +170,6 @@ def source_digest(capture: Capture, camera: str, marks: Sequence[Mark], backend:
     return f"sha256:{digest.hexdigest()}"
 
 
-def overlay(image: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """An RGB image [H, W, 3] with object tinted green and hands blue, their borders drawn."""
-    result = image.copy()
-    for label, tint in TINTS.items():
-        own = (labels == label).astype(np.uint8)
-        result[own > 0] = (0.6 * image[own > 0] + 0.4 * np.array(tint)).astype(np.uint8)
-        outlines, _ = cv2.findContours(own, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-        cv2.drawContours(result, outlines, -1, tint, 1)
-    return result
-
-
 def sheet_of(capture: Capture, camera: str) -> Path:
     """Where the sheet of a camera lies: beside the masks."""
     return capture.folder / f"mask_{camera}.png"
@@ -191,17 +178,18 @@ def sheet_of(capture: Capture, camera: str) -> Path:
 def save_sheet(capture: Capture, camera: str, carried: Carried) -> Path:
     """Write `sheet_of` a camera: the most doubtful frames first, then frames evenly spaced."""
     frames = frames_of(capture, camera)
+    tints = tints_of(capture.color(camera, frames[0]), carried.labels[frames[0]])
     doubtful = sorted(frames, key=lambda frame: -carried.doubt[frame])[:DOUBTFUL]
-    tiles = [_tile(capture, camera, carried, frame, f"{frame}: doubt {carried.doubt[frame]:.2f}") for frame in doubtful]
+    tiles = [_tile(capture, camera, carried, tints, frame, f"{frame}: doubt {carried.doubt[frame]:.2f}") for frame in doubtful]
     tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % COLUMNS)
-    tiles += [_tile(capture, camera, carried, frame, str(frame)) for frame in spread(frames, EVEN)]
+    tiles += [_tile(capture, camera, carried, tints, frame, str(frame)) for frame in spread(frames, EVEN)]
     tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % COLUMNS)
     rows = [np.hstack(tiles[index : index + COLUMNS]) for index in range(0, len(tiles), COLUMNS)]
     return write_png(sheet_of(capture, camera), np.vstack(rows))
 
 
-def _tile(capture: Capture, camera: str, carried: Carried, frame: int, text: str) -> np.ndarray:
-    image = overlay(np.ascontiguousarray(capture.color(camera, frame)), carried.labels[frame])
+def _tile(capture: Capture, camera: str, carried: Carried, tints: Mapping[int, Color], frame: int, text: str) -> np.ndarray:
+    image = overlay(capture.color(camera, frame), carried.labels[frame], tints)
     height, width = image.shape[:2]
     if width > WIDTH:
         image = cv2.resize(image, (WIDTH, round(height * WIDTH / width)), interpolation=cv2.INTER_AREA)
