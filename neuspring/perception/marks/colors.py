@@ -96,8 +96,8 @@ class Background:
     def empty(cls, size: tuple[int, int], guests: tuple[tuple[np.ndarray, np.ndarray], ...] = ()) -> Background:
         """Nothing is known."""
         color = (*size, 3)
-        blank = [np.zeros(shape, np.float32) for shape in (color, color, size, size)]
-        return cls(*blank, guests)
+        mean, variance, seen, depth = (np.zeros(shape, np.float32) for shape in (color, color, size, size))
+        return cls(mean, variance, seen, depth, guests)
 
     def part(self, window: tuple[slice, slice]) -> Background:
         """A window of it, without a copy."""
