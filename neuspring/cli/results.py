@@ -272,17 +272,29 @@ def compare(
 
 def ui(results: Results = Path("results"), settings: Settings = "{}", host: str = "127.0.0.1", port: int = 5000) -> None:
     """Open the MLflow UI of a results folder."""
-    from neuspring.experiments.tracking.store import default_uri
+    import time
+    import urllib.request
 
-    uri = read_settings(settings).tracking.uri or default_uri(results)
+    from neuspring.experiments.tracking.store import ENVIRONMENT, default_uri, page
+
+    tracking = read_settings(settings).tracking
+    uri, place = tracking.uri or default_uri(results), page(results, tracking)
     if uri.startswith("http"):
-        print(f"The tracking server is at {uri}")
+        print(f"The tracking server is at {uri}/{place}")
         return
-    environment = os.environ | {"MLFLOW_DISABLE_TELEMETRY": "true", "DO_NOT_TRACK": "true"}
-    environment.setdefault("MLFLOW_SERVER_ENABLE_JOB_EXECUTION", "false")
+    address, server = f"http://{host}:{port}", os.getpid()
+    if os.fork() == 0:
+        # Beside the server: it tells the address when there is an answer.
+        while os.getppid() == server:
+            try:
+                urllib.request.urlopen(f"{address}/health", timeout=5).close()
+                print(f"MLflow UI: {address}/{place} (stop with Ctrl-C)", flush=True)
+                break
+            except OSError:
+                time.sleep(0.2)
+        os._exit(0)
     command = [sys.executable, "-m", "mlflow", "ui", "--backend-store-uri", uri, "--host", host, "--port", str(port)]
-    print(f"MLflow UI: http://{host}:{port} (stop with Ctrl-C)", flush=True)
-    os.execve(sys.executable, command, environment)
+    os.execve(sys.executable, command, ENVIRONMENT | {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"} | os.environ)
 
 
 def tune(

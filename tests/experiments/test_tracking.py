@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import multiprocessing
+import re
 import socket
+import sqlite3
 import subprocess
 import time
 from pathlib import Path
@@ -13,7 +16,8 @@ from typing import Any
 
 import pytest
 
-from neuspring.config import Tracking
+from neuspring import config
+from neuspring.config import Config, Tracking
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import Attempt, JobRecord
 from neuspring.core.run_record import RunRecord
@@ -56,8 +60,10 @@ def test_a_run_is_logged_completely_and_once(results: Path) -> None:
     expected |= {"play": f"neuspring play {record.parent}"}
     assert expected.items() <= run.data.tags.items()
     assert f"\nneuspring play {record.parent}\n" in run.data.tags["mlflow.note.content"]
-    assert len(run.data.params) == 122
-    assert (run.data.params["fit.p7"], run.data.params["fit.betas"], len(run.data.params["long"])) == ("7", "[0.9, 0.99]", 500)
+    assert len(run.data.params) == 60, "run.json has all 122"
+    assert (run.data.params["fit.p7"], run.data.params["clusters"], len(run.data.params["settings"])) == ("7", "4", 16)
+    # Scores come first, here as on MLflow's page.
+    assert list(run.data.metrics)[:2] == ["future.track_error", "future.chamfer"]
 
     metrics = run.data.metrics
     assert metrics["future.track_error"] == 0.0125 and metrics["future.chamfer"] == 0.005 and metrics["seconds.fit"] == 12.5
@@ -67,6 +73,46 @@ def test_a_run_is_logged_completely_and_once(results: Path) -> None:
     assert {m.step: m.value for m in client.get_metric_history(run.info.run_id, "search.best")} == {0: 3.0, 1: 2.0}
     assert artifacts_of(results, run) == {"run.json", "twin", "twin/twin.npz", "search", "search/coarse.npz"}
     assert (results / "mlartifacts").is_dir()
+
+
+def test_parameters_are_what_has_not_its_default_under_the_names_of_the_configuration(results: Path) -> None:
+    settings = config.plain(Config())
+    params = {"fit.fit.epochs": 60, "fit.fit.horizon": settings["fit"]["horizon"], "fit.kind": "field", "long": "x" * 900}
+    params |= {"search.search.rollouts": 11, "search.seed": 0, "search.result.cost": 0.5, "method.clusters": 4}
+    path = write_run(results, params=params)
+    found = dict(tracking.payload(RunRecord.load(path), path, results).params)
+    assert found.pop("settings") and len(found.pop("long")) == 500
+    variant = {"search": "uniform", "fit": "springs", "clusters": "4", "frozen": "False"}
+    assert found == variant | {"fit.epochs": "60", "fit.kind": "field", "search.rollouts": "11", "search.seed": "0"}
+
+
+def test_the_page_opens_with_scores_as_columns_and_says_what_is_missing(results: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"a results folder with runs is required; received no run\.json"):
+        tracking_store.page(results, SETTINGS)
+    assert tracking.log_run(write_run(results), results, SETTINGS) == "logged"
+    place = tracking_store.page(results, SETTINGS)
+    client, experiment = tracking_store.connect(results, SETTINGS)
+    assert place == f"#/experiments/{experiment}/runs?viewStateShareKey=scores"
+    view = json.loads(client.get_experiment(experiment).tags["mlflow.sharedViewState.scores"])
+    assert "metrics.`future.chamfer`" in view["selectedColumns"]
+    (results / "mlartifacts").rename(tmp_path / "away")
+    with pytest.raises(InputError, match=r"mlartifacts: must hold the files of the 1 runs.*Delete mlflow\.db .* `neuspring sync"):
+        tracking_store.page(results, SETTINGS)
+    (results / "mlflow.db").rename(tmp_path / "mlflow.db")
+    with pytest.raises(InputError, match=r"mlflow\.db: MLflow's index must be there; .* Make it: `neuspring sync --results"):
+        tracking_store.page(results, SETTINGS)
+
+
+def test_a_database_of_another_version_is_named_with_what_to_do(results: Path) -> None:
+    write_run(results)
+    with contextlib.closing(sqlite3.connect(results / "mlflow.db")) as connection, connection:
+        connection.execute("UPDATE alembic_version SET version_num = 'ffffffffffff'")
+    message = (
+        r"written by another version of MLflow than .*; use that one, or delete mlflow\.db and mlartifacts .* `neuspring sync`"
+    )
+    with pytest.raises(InputError, match=message):
+        tracking_store.page(results, SETTINGS)
+    assert re.search(message, tracking.init(results, SETTINGS)["outcome"])
 
 
 def write_job(results: Path, name: str, *attempts: Attempt) -> None:
@@ -90,14 +136,14 @@ def test_the_use_of_the_machine_is_logged_where_jobs_recorded_it(results: Path) 
     assert tracking.log_run(write_run(results, artifacts=artifacts), results, SETTINGS) == "logged"
 
     (run,) = runs_of(results)
-    metrics = {name.removeprefix("system/"): value for name, value in run.data.metrics.items() if name.startswith("system/")}
+    metrics = {name.removeprefix("usage/"): value for name, value in run.data.metrics.items() if name.startswith("usage/")}
     peaks = {f"{stage}.peak_memory_mb": 64.0 for stage in ("fit", "appearance", "score")}
     whole = {"peak_memory_mb": 512.0, "peak_gpu_memory_mb": 1000.0, "mean_gpu_percent": 50.0}
     last = {"cpu_percent": 110.0, "memory_mb": 500.0, "gpu_percent": 50.0, "gpu_memory_mb": 900.0}
     assert metrics == peaks | {f"search.{name}": value for name, value in (whole | last).items()}, (
         "no rollout: it has no job record"
     )
-    history = client_of(results).get_metric_history(run.info.run_id, "system/search.memory_mb")
+    history = client_of(results).get_metric_history(run.info.run_id, "usage/search.memory_mb")
     begin = STARTED_MS - 30 * 60_000
     assert [(m.step, m.value, m.timestamp - begin) for m in history] == [(0, 400.0, 500), (3, 500.0, 2600)]
 
@@ -117,9 +163,9 @@ def test_the_jobs_of_a_baseline_are_found_by_the_rules_that_made_them(results: P
     record = RunRecord.load(write_run(results, artifacts={"records": records}, variant={"model": "spring_gaus"}))
     points = _system_metrics(record, results / "rope" / "ours" / "0" / "run.json", results)
     assert {point.name: point.value for point in points if point.name.endswith("memory_mb")} == {
-        "system/train.peak_memory_mb": 1.0,
-        "system/rollout.peak_memory_mb": 2.0,
-        "system/appearance.peak_memory_mb": 3.0,
+        "usage/train.peak_memory_mb": 1.0,
+        "usage/rollout.peak_memory_mb": 2.0,
+        "usage/appearance.peak_memory_mb": 3.0,
     }
 
 
@@ -135,7 +181,7 @@ def test_batches_stay_within_the_limits_of_the_api(results: Path, monkeypatch: p
 
     monkeypatch.setattr(MlflowClient, "log_batch", spy)
     assert tracking.log_run(write_run(results), results, SETTINGS) == "logged"
-    assert sizes == [(0, 100), (0, 22), (1000, 0), (STEPS + 7 - 1000, 0)], "7: scores, a timing, the search's history"
+    assert sizes == [(0, 60), (1000, 0), (STEPS + 7 - 1000, 0)], "7: scores, a timing, the search's history"
 
 
 def test_a_failed_run_is_logged_as_failed(results: Path) -> None:
@@ -365,7 +411,8 @@ import os, sys
 from pathlib import Path
 os.environ["MLFLOW_HTTP_REQUEST_TIMEOUT"] = "7"
 from neuspring.experiments.tracking import log as tracking
-from neuspring.config import Tracking
+from neuspring import config
+from neuspring.config import Config, Tracking
 assert not {"mlflow", "pandas", "filelock"} & set(sys.modules)
 tracking.init(Path(sys.argv[1]), Tracking())
 import mlflow.telemetry.client

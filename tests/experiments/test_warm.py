@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -55,20 +56,26 @@ def test_output_and_exit_status_are_those_of_the_command(server, tmp_path):
     assert output.read_bytes() == cold.read_bytes()
 
 
-def test_a_signal_reaches_the_job_and_is_its_status(server):
-    process = begin(server, "ui", "--port", "0", MLFLOW_DISABLE_TELEMETRY="true")
+def opening(folder: Path) -> list[str]:
+    """A command that goes on until it is ended."""
+    tracking = {"tracking": {"uri": f"sqlite:///{folder / 'mlflow.db'}"}}
+    return ["ui", "--port", "0", "--settings", json.dumps(tracking)]
+
+
+def test_a_signal_reaches_the_job_and_is_its_status(server, tmp_path):
+    process = begin(server, *opening(tmp_path), MLFLOW_DISABLE_TELEMETRY="true")
     process.send_signal(signal.SIGTERM)
     assert process.wait() == -signal.SIGTERM
 
 
-def test_a_job_ends_with_its_wrapper(server):
+def test_a_job_ends_with_its_wrapper(server, tmp_path):
     code = (
         "import os, sys, time; from neuspring.experiments.jobs import warm;"
-        "process = warm.start([*warm.COMMAND, 'ui', '--port', '0'], [], dict(os.environ));"
+        "process = warm.start([*warm.COMMAND, *sys.argv[1:]], [], dict(os.environ));"
         "print(process.pid, flush=True); time.sleep(600)"
     )
     environment = os.environ | {warm.SOCKET: str(server), "OMP_NUM_THREADS": "1"}
-    wrapper = subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
+    wrapper = subprocess.Popen([sys.executable, "-c", code, *opening(tmp_path)], env=environment, stdout=subprocess.PIPE, text=True)
     pid = int(wrapper.stdout.readline())
     wrapper.kill()
     wrapper.wait()

@@ -20,17 +20,18 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from neuspring.config import Tracking
+from neuspring.config import Config, Tracking, plain
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from neuspring.core.job_records import FOLDER as JOBS
 from neuspring.core.job_records import JobRecord
-from neuspring.core.run_record import RUN_RECORD, RunRecord
+from neuspring.core.run_record import RUN_RECORD, RunRecord, flat, key_of
 from neuspring.core.text import masked
 from neuspring.experiments.tracking.store import (
     AGAIN,
     ARTIFACTS,
     connect,
+    explained,
     is_complete,
     lock,
     lock_path,
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities import Run
 
+MOST_PARAMS = 60
 PARAM_LENGTH, TAG_LENGTH = 500, 5000
 """These keep MLflow's tables readable. The full text stays in run.json."""
 METRIC_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.:/ -]{0,249}")
@@ -50,8 +52,8 @@ SAMPLES = ("cpu_percent", "memory_mb", "gpu_percent", "gpu_memory_mb")
 """Columns of a job record's samples, after the time."""
 OUTCOME = "mlflow.txt"
 """The outcome of logging a record, beside it; the workflow's rule writes it."""
-METRICS_PER_CALL, PARAMS_PER_CALL = 1000, 100
-"""Limits of MLflow's API."""
+METRICS_PER_CALL = 1000
+"""Limit of MLflow's API; that of parameters is 100."""
 
 
 def init(results: Path, settings: Tracking) -> dict[str, str]:
@@ -67,7 +69,8 @@ def init(results: Path, settings: Tracking) -> dict[str, str]:
     try:
         _, experiment = prepare(Path(results), settings)
     except Exception as error:
-        return {"outcome": _unreachable(error, "no run will be logged until `init` succeeds"), **facts}
+        line = explained(error, results, settings)
+        return {"outcome": _unreachable(line, "no run will be logged until `init` succeeds"), **facts}
     return {"outcome": "ready", **facts, "experiment_id": experiment}
 
 
@@ -90,7 +93,8 @@ def log_run(run_json: Path, results: Path, settings: Tracking) -> str:
     except InputError:
         raise
     except Exception as error:
-        return _unreachable(error, f"{record.name} is not logged; its files are complete, `sync` will log it")
+        line = explained(error, results, settings)
+        return _unreachable(line, f"{record.name} is not logged; its files are complete, `sync` will log it")
 
 
 def sync(
@@ -165,8 +169,7 @@ def _send(client: MlflowClient, experiment: str, record: RunRecord, content: Pay
     run_id = client.create_run(experiment, start_time=start, tags=content.tags, run_name=record.name).info.run_id
     params = [Param(name, value) for name, value in content.params]
     metrics = [Metric(point.name, point.value, point.time, point.step) for point in content.metrics]
-    for first in range(0, len(params), PARAMS_PER_CALL):
-        client.log_batch(run_id, params=params[first : first + PARAMS_PER_CALL])
+    client.log_batch(run_id, params=params)
     for first in range(0, len(metrics), METRICS_PER_CALL):
         client.log_batch(run_id, metrics=metrics[first : first + METRICS_PER_CALL])
     for path, folder in content.files:
@@ -195,7 +198,7 @@ def _close_leftovers(results: Path, settings: Tracking, note: Callable[[str, str
             if ours and _close_if_free(client, run, path):
                 note(run.info.run_name or run.info.run_id, "closed")
     except Exception as error:
-        return _unreachable(error, "the runs not yet logged are left for the next `sync`")
+        return _unreachable(explained(error, results, settings), "the runs not yet logged are left for the next `sync`")
     return None
 
 
@@ -210,10 +213,9 @@ def _close_if_free(client: MlflowClient, run: Run, path: Path) -> bool:
     return False
 
 
-def _unreachable(error: Exception, consequence: str) -> str:
+def _unreachable(line: str, consequence: str) -> str:
     """The outcome, with the first line of the error, short and without passwords; told as a warning with its consequence."""
-    line = (str(error).strip().splitlines() or [""])[0] or type(error).__name__
-    outcome = f"unreachable: {masked(cut(line, 300))}"
+    outcome = f"unreachable: {cut(line, 300)}"
     _warn(f"{outcome}; {consequence}.")
     return outcome
 
@@ -259,8 +261,23 @@ def payload(record: RunRecord, run_json: Path, results: Path) -> Payload:
     for name in [*record.params, *{point.name for point in metrics}]:
         if not METRIC_NAME.fullmatch(name):
             raise InputError(run_json, f"names of parameters and metrics must match {METRIC_NAME.pattern}", repr(name))
-    params = [(name, cut(str(value), PARAM_LENGTH)) for name, value in record.params.items()]
+    params = [(name, cut(str(value), PARAM_LENGTH)) for name, value in _params(record).items()]
     return Payload(tags=_tags(record, folder), params=params, metrics=metrics, files=files)
+
+
+def _params(record: RunRecord) -> dict[str, Any]:
+    """The settings that tell runs apart, named as in the configuration: the method's switches, and what has not its default value.
+
+    `settings` is a digest of all, so that a comparison sees also what is not listed. In full they are in run.json.
+    """
+    defaults = flat(plain(Config()))
+    given = {name: value for name, value in record.params.items() if ".result." not in name}
+    found = dict(record.variant)
+    for name, value in given.items():
+        stage, _, key = name.partition(".")
+        if stage != "method" and (key not in defaults or defaults[key] != value):
+            found.setdefault(key if "." in key else name, value)
+    return {"settings": key_of(given)[:16], **dict(list(found.items())[: MOST_PARAMS - 1])}
 
 
 def milliseconds(time: str) -> int:
@@ -288,18 +305,20 @@ def _tags(record: RunRecord, folder: Path) -> dict[str, str]:
 def _metrics(record: RunRecord, run_json: Path) -> Iterator[Point]:
     """Scores as `{task}.{metric}`, timings as `seconds.{stage}`, histories as `{history}.{metric}` by step."""
     end = milliseconds(record.ended)
-    for stage, seconds in record.timings.items():
-        yield Point(f"seconds.{stage}", seconds, 0, end)
     if record.scores_file:
         for task, metric, value in _table(run_json, record.scores_file, ("task", "metric", "value")):
             yield Point(f"{task}.{metric}", value, 0, end)
+    for stage, seconds in record.timings.items():
+        yield Point(f"seconds.{stage}", seconds, 0, end)
     for history, name in record.histories.items():
         for step, metric, value in _table(run_json, name, ("step", "metric", "value")):
             yield Point(f"{history}.{metric}", value, int(step), end)
 
 
 def _system_metrics(record: RunRecord, run_json: Path, results: Path) -> Iterator[Point]:
-    """Use of processor, memory and GPU as `system/{stage}.{what}`, which MLflow shows as system metrics; steps are seconds.
+    """Use of processor, memory and GPU as `usage/{stage}.{what}`; steps are seconds.
+
+    Not under `system/`: MLflow's page shows what is named so before everything else, and scores come first.
 
     They are those of each job's last attempt, which made the result. A stage that was run by hand has no job record and no such
     metrics.
@@ -311,7 +330,7 @@ def _system_metrics(record: RunRecord, run_json: Path, results: Path) -> Iterato
             for seconds, *values in attempt.samples:
                 for what, value in zip(SAMPLES, values, strict=True):
                     if seconds is not None and value is not None:
-                        yield Point(f"system/{stage}.{what}", value, round(seconds), start + round(1000 * seconds))
+                        yield Point(f"usage/{stage}.{what}", value, round(seconds), start + round(1000 * seconds))
             totals = {
                 "peak_memory_mb": attempt.peak_memory_mb,
                 "peak_gpu_memory_mb": attempt.peak_gpu_memory_mb,
@@ -319,7 +338,7 @@ def _system_metrics(record: RunRecord, run_json: Path, results: Path) -> Iterato
             }
             for what, value in totals.items():
                 if value is not None:
-                    yield Point(f"system/{stage}.{what}", value, 0, start)
+                    yield Point(f"usage/{stage}.{what}", value, 0, start)
 
 
 def _jobs(record: RunRecord, run_json: Path, results: Path) -> dict[str, Path]:

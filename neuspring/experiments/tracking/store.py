@@ -5,12 +5,14 @@ mlflow is imported only when it is used, after its environment is set.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import socket
 import sqlite3
 from contextlib import closing
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
@@ -38,6 +40,9 @@ ARTIFACTS = "mlartifacts"
 PORTS = {"postgresql": 5432, "mysql": 3306, "mssql": 1433}
 AGAIN = "commit."
 """Prefix of the tags that name further commits, or a later time, at which the same results were made."""
+VIEW = "scores"
+"""Name of the view of the table of runs that has scores as columns; a tag of the experiment holds it, as its page would."""
+COLUMNS = [f"metrics.`{task}.{metric}`" for task in ("reconstruction", "future") for metric in ("chamfer", "track_error", "psnr")]
 PATIENCE = 600.0
 """Seconds to wait for another process that logs the same record or creates the database."""
 
@@ -61,6 +66,37 @@ def find(results: Path, settings: Tracking) -> tuple[MlflowClient, str] | None:
     client = _client(uri)
     experiment = _experiment(client, results, settings)
     return (client, experiment) if experiment else None
+
+
+def explained(error: Exception, results: Path, settings: Tracking) -> str:
+    """The first line of an error of MLflow; of a database that a newer version wrote, what to do."""
+    line = (str(error).strip().splitlines() or [""])[0] or type(error).__name__
+    if not re.search("Can't locate revision|out-of-date database schema", str(error)):
+        return masked(line)
+    other = f"{masked(uri_of(results, settings))} was written by another version of MLflow than {version('mlflow')}"
+    return f"{other}; use that one, or delete mlflow.db and {ARTIFACTS} in {results} and run `neuspring sync`, which rebuilds both"
+
+
+def page(results: Path, settings: Tracking) -> str:
+    """The place in MLflow's pages where the runs are, with the scores as columns. Raises InputError where it cannot be shown."""
+    uri, again = masked(uri_of(results, settings)), f"`neuspring sync --results {results}`"
+    if settings.uri is None and not any(Path(results).glob("*/*/*/run.json")):
+        raise InputError(results, "a results folder with runs is required", "no run.json", "Name it: --results ...")
+    if settings.uri is None and _is_missing(uri):
+        raise InputError(uri, "MLflow's index must be there", "no such file", f"Make it: {again}.")
+    try:
+        client, experiment = prepare(results, settings)
+        client.set_experiment_tag(experiment, f"mlflow.sharedViewState.{VIEW}", json.dumps({"selectedColumns": COLUMNS}))
+        held = len(search(client, experiment, logged="complete"))
+    except Exception as error:
+        rule = "MLflow must be able to open it"
+        raise InputError(uri, rule, explained(error, results, settings)) from error
+    if settings.uri is None and held and not (Path(results) / ARTIFACTS).is_dir():
+        remedy = f"Delete mlflow.db in {results} and run `neuspring sync --results {results}`."
+        raise InputError(
+            Path(results) / ARTIFACTS, f"must hold the files of the {held} runs in mlflow.db", "no such folder", remedy
+        )
+    return f"#/experiments/{experiment}/runs?viewStateShareKey={VIEW}"
 
 
 def connect(results: Path, settings: Tracking) -> tuple[MlflowClient, str]:
