@@ -1,6 +1,6 @@
 # make install | demo | test | test-all | lint | bench | gpu: each makes or reuses .venv by itself.
-PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
-	$$p -c 'import sys; raise SystemExit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null && echo $$p && break; done)
+SUITS := -c 'import sys; raise SystemExit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null
+PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do $$p $(SUITS) && echo $$p && break; done)
 BIN := .venv/bin
 # Two marks: what the demo needs is installed; and so is what tests and linters need, which has the demo's.
 COMMA := ,
@@ -17,7 +17,9 @@ export DO_NOT_TRACK = true
 .PHONY: install demo test test-slow test-all lint format bench gpu clean
 
 define INSTALL
-@test -n "$(PYTHON)" || { echo "Python 3.11, 3.12 or 3.13 is needed; set PYTHON=/path/to/python3.12"; exit 2; }
+@test -n "$(PYTHON)" && $(PYTHON) $(SUITS) || { echo "PYTHON=$(PYTHON): Python 3.11, 3.12 or 3.13 is needed;" \
+	"received $$($(PYTHON) --version 2>&1 || echo none). Set PYTHON=/path/to/python3.12"; exit 2; }
+@test ! -e .venv -a ! -L .venv || $(BIN)/python $(SUITS) || { echo "Replacing .venv: its Python is missing or too old"; rm -rf .venv; }
 @echo "Installing neuspring[$(1)] with $(PYTHON) into .venv (two to four minutes, up to 3.1 GB)"
 $(PYTHON) -m venv .venv
 PYTHONWARNINGS=ignore PIP_CONSTRAINT="$(CURDIR)/workflow/envs/constraints.txt" $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -e ".[$(1)]"
@@ -32,6 +34,12 @@ $(INSTALLED): pyproject.toml workflow/envs/constraints.txt
 	@touch $(DEMO)
 
 install: $(INSTALLED)
+
+# Whatever marks it holds, a .venv whose Python is gone or too old is made again.
+ifneq ($(shell test ! -e .venv -a ! -L .venv || $(BIN)/python $(SUITS) || echo wrong),)
+.PHONY: again
+$(DEMO) $(INSTALLED): again
+endif
 
 demo: $(if $(wildcard $(INSTALLED)),$(INSTALLED),$(DEMO))
 	$(SNAKEMAKE) --cores $(CORES) --quiet all --configfile config/data/demo.yaml

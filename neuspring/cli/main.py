@@ -9,10 +9,14 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import errno
 import importlib
 import os
+import shutil
+import signal
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from neuspring import __version__
 from neuspring.core.errors import InputError, NumericalFailure
@@ -64,6 +68,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     except BrokenPipeError:
         return 1
+    except KeyboardInterrupt:
+        print("neuspring: stopped. What is finished is kept; searches and fits go on from their checkpoints.", file=sys.stderr)
+        print("Start the same command again to continue.", file=sys.stderr)
+        return 128 + signal.SIGINT
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        print(f"neuspring: error: {full_disk(Path(error.filename or '.'))}", file=sys.stderr)
+        return 1
+
+
+def full_disk(path: Path) -> InputError:
+    """What is said where a file does not fit on its disk."""
+    disk = next(folder for folder in [path.absolute(), *path.absolute().parents] if folder.is_mount())
+    free, whole = (size / 1e9 for size in (shutil.disk_usage(disk).free, shutil.disk_usage(disk).total))
+    rule = f"no space left on device: the disk at {disk} has {free:.1f} of {whole:.1f} GB free"
+    return InputError(path, rule, None, "Free some space there; the same command continues, and what is finished is kept.")
 
 
 def _threads(words: Sequence[str]) -> str:

@@ -12,7 +12,7 @@ Nothing here imports torch, Warp or MLflow, because the workflow reads the confi
 """
 
 from neuspring.config.data import Mocap, Synthetic, Toy
-from neuspring.config.parse import merge, parse, plain, read_text, read_yaml
+from neuspring.config.parse import merge, parse, plain, read_text, read_yaml, typed
 from neuspring.config.rows import Kind, Method, ScenarioRow, SearchRow
 from neuspring.config.search import Polish, Search, SearchVariables, Variable
 from neuspring.config.settings import Config, Tracking
@@ -44,4 +44,5 @@ __all__ = [
     "plain",
     "read_text",
     "read_yaml",
+    "typed",
 ]

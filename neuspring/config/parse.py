@@ -140,6 +140,21 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return values
 
 
+def typed(value: Any) -> Any:
+    """A mapping or list of `--config` as YAML has it: inside it Snakemake leaves numbers, true, false and null as text."""
+    if isinstance(value, Mapping):
+        return {key: typed(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [typed(each) for each in value]
+    if isinstance(value, str):
+        try:
+            read = yaml.safe_load(value)
+        except yaml.YAMLError:
+            return value
+        return read if isinstance(read, bool | int | float | None) else value
+    return value
+
+
 def merge(base: dict[str, Any], overlay: Mapping[str, Any]) -> None:
     """Put `overlay` on top of `base`, in place: mappings merge, everything else replaces."""
     for key, value in overlay.items():

@@ -51,6 +51,10 @@ def _seed_list(value: Any) -> Any:
     return tuple(entries)
 
 
+def _place(path: str) -> str:
+    return os.path.normpath(os.path.expanduser(path))
+
+
 def _transfers(value: Any) -> Any:
     """`--config transfers=null` arrives as text; pools too."""
     if isinstance(value, dict):
@@ -127,11 +131,11 @@ class Config(Section):
     """Scenario -> other recordings of the same object, on which its twins are rolled out as well; null: none."""
     pools: Annotated[dict[Name, tuple[Name, ...]] | None, BeforeValidator(_transfers)] = None
     """Name -> scenarios that are recordings of one object, with the same nodes, for methods with `pool`; null: none."""
-    results: Annotated[str, StringConstraints(pattern=r"^[^{}\n]+$"), AfterValidator(os.path.normpath)] = "results"
-    """Folder for everything that is written."""
+    results: Annotated[str, StringConstraints(pattern=r"^[^{}\n]+$"), AfterValidator(_place)] = "results"
+    """Folder for everything that is written; `~` is the home folder."""
     tables: Name = "tables"
     """Folder for tables in the results folder. Use another name to keep the tables of another choice of methods apart."""
-    data_root: str | None = None
+    data_root: Annotated[str, AfterValidator(os.path.expanduser)] | None = None
     """Folder from which relative paths of scenarios start."""
     scenario_table: str = "config/scenarios.tsv"
     """The scenario table; its path is relative to the Snakefile."""

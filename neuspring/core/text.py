@@ -5,11 +5,18 @@ from __future__ import annotations
 import re
 import sys
 import time
+from collections.abc import Iterable
 
 
 def masked(text: str) -> str:
     """Text without the user and password of any URI in it."""
     return re.sub(r"://[^/@\s]+@", "://***@", text)
+
+
+def listed(names: Iterable[object], most: int = 12) -> str:
+    """The names, separated by commas; of more than `most` the first ones, and how many others there are."""
+    texts = [str(name) for name in names]
+    return ", ".join(texts) if len(texts) <= most else f"{', '.join(texts[:most])} and {len(texts) - most} more"
 
 
 def refuse_password(key: str, uri: str, instead: str) -> None:

@@ -16,6 +16,7 @@ from neuspring.baselines import BASELINES, REFERENCES
 from neuspring.config import Config, Method, ScenarioRow, SearchRow, merge, parse, plain, read_yaml
 from neuspring.config.rows import RENAMED_ROWS
 from neuspring.core.errors import InputError
+from neuspring.core.text import listed
 from neuspring.data.sources import SOURCES, Source, location, scenario_rows
 from neuspring.perception.backends import BACKENDS
 from neuspring.scores.lpips import configured_weights
@@ -67,7 +68,7 @@ def chosen_part(config: Config, scenarios: Mapping[str, ScenarioRow]) -> Config:
         patterns = text.split(",")
         for pattern in patterns:
             if not fnmatch.filter(words.values(), pattern):
-                known = ", ".join(dict.fromkeys(words.values()))
+                known = listed(dict.fromkeys(words.values()))
                 raise InputError(where, f"{key} {pattern!r} matches none of the configuration's", known)
         kept[names[key]] = tuple(each for each, word in words.items() if any(fnmatch.fnmatchcase(word, one) for one in patterns))
     return dataclasses.replace(config, **kept)
@@ -387,5 +388,5 @@ def _require_known(key: str, names: tuple[str, ...], known: Mapping[str, Any], t
             hints.append(f"{name!r} (did you mean {alike[0]!r}?)" if alike else f"{name!r}")
     if hints:
         raise InputError(
-            f"configuration, {key}", f"every entry must be a row of {table}", ", ".join(hints), f"Known: {', '.join(known)}"
+            f"configuration, {key}", f"every entry must be a row of {table}", ", ".join(hints), f"Known: {listed(known)}"
         )

@@ -18,6 +18,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.findings import warnings_of
 from neuspring.core.job_records import FOLDER, RUN, JobRecord, failure_lines, read_jobs, this_run
 from neuspring.core.table import Table
+from neuspring.core.text import listed
 from neuspring.experiments.freshness import told
 from neuspring.experiments.graph import Graph
 from neuspring.scores.metrics import METRICS, SHORT, TASKS
@@ -136,21 +137,25 @@ def replaced(jobs: Iterable[tuple[str, Any, tuple[str, ...]]]) -> str:
 
 def failed(graph: Graph) -> None:
     """After a failure or an interruption: tables and report of what is finished, what failed and why, how to continue."""
-    results = Path(graph.config.results)
-    print("\nThe run did not finish. What is done so far:", flush=True)
-    # In a folder of their own: otherwise Snakemake would take the tables as finished.
-    so_far = f"{graph.folder}/so_far"
-    command = [sys.executable, "-m", "neuspring"]
-    subprocess.run([*command, "tables", *graph.tables(so_far)], check=False)
-    page = f"{so_far}/report.html"
-    subprocess.run([*command, "report", *graph.report(page)], check=False, stdout=subprocess.DEVNULL)
-    damaged: list[str] = []
+    results, damaged = Path(graph.config.results), list[str]()
     jobs = read_jobs(results, damaged)
-    lines = failure_lines([record for record in jobs if record.last.run == this_run(results)], results) + damaged
+    own = [record for record in jobs if record.last.run == this_run(results) and record.last.outcome != "ok"]
+    if all(record.last.outcome in ("killed", "running") for record in own) and not damaged and own:
+        print(f"\nStopped, with {len(own)} jobs at work: {listed([record.name for record in own], 6)}.")
+        print("What is finished is kept. The same command continues; searches and fits go on from their checkpoints.", flush=True)
+        return
+    print("\nThe run did not finish. What is finished is kept.", flush=True)
+    if any(Path(path).exists() for path in graph.runs()):
+        # In a folder of their own: otherwise Snakemake would take the tables as finished.
+        command, page = [sys.executable, "-m", "neuspring"], f"{graph.folder}/so_far/report.html"
+        subprocess.run([*command, "tables", *graph.tables(f"{graph.folder}/so_far"), "--brief"], check=False)
+        subprocess.run([*command, "report", *graph.report(page)], check=False, stdout=subprocess.DEVNULL)
+        print(f"Report so far: {page}")
+    lines = failure_lines(own, results) + damaged
     print("\n".join(["Failed:", *(f"  {line}" for line in lines)] if lines else []))
     if earlier := len(failure_lines(jobs, results)) + len(damaged) - len(lines):
         print(f"{earlier} jobs that failed in earlier runs have not been run again.")
-    print(f"Report so far: {page}. The same command continues where this one stopped.", flush=True)
+    print("Mend the cause; the same command continues where this one stopped.", flush=True)
 
 
 def finished(graph: Graph, seconds: float) -> None:

@@ -1,16 +1,21 @@
 """The command line: exit status and messages."""
 
+import errno
 import json
+import re
 
 import pandas as pd
 import pytest
 
 from neuspring import config
+from neuspring.cli import main as main_module
 from neuspring.cli.main import _threads, main
+from neuspring.core import files
 from neuspring.core.artifacts import Observations
 from neuspring.core.device import resolve_device
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.records import StageRecord
+from neuspring.experiments.jobs import faults
 from neuspring.experiments.tracking import log as tracking
 from tests.support.phystwin_case import write_case
 
@@ -176,3 +181,47 @@ def test_libraries_take_the_threads_that_a_command_does_not_take_itself():
     assert _threads(["fit", "--threads", "4"]) == "4"
     assert _threads(["search", "--threads", "4"]) == "1"
     assert _threads(["fit"]) == _threads([]) == "1"
+
+
+def stopped_by(monkeypatch, capsys, ends):
+    """Exit status and message of a command that `ends` like this, and the cause that its job would have."""
+
+    def run(words):
+        ends()
+
+    monkeypatch.setattr(main_module, "_run", run)
+    status, text = main_module.main(["fit"]), capsys.readouterr().err
+    return status, text, faults.diagnose(status, text.splitlines())
+
+
+def test_a_full_disk_is_one_message_with_the_file_the_disk_and_how_to_go_on(monkeypatch, capsys, tmp_path):
+    def full(handle):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(files.os, "fsync", full)
+    path = tmp_path / "twin.ply"
+    status, text, fault = stopped_by(monkeypatch, capsys, lambda: files.write_text(path, "text"))
+    assert (status, fault) == (1, faults.FULL)
+    where = rf"neuspring: error: {re.escape(str(path))}: no space left on device: the disk at /\S* has [\d.]+ of [\d.]+ GB free\. "
+    remedy = r"Free some space there; the same command continues, and what is finished is kept\.\n"
+    assert re.fullmatch(where + remedy, text)
+
+
+def test_ctrl_c_is_two_lines_that_say_what_is_kept_and_no_cause_of_failure(monkeypatch, capsys):
+    def pressed():
+        raise KeyboardInterrupt
+
+    status, text, fault = stopped_by(monkeypatch, capsys, pressed)
+    assert (status, fault) == (130, faults.STOPPED)
+    assert text.splitlines() == [
+        "neuspring: stopped. What is finished is kept; searches and fits go on from their checkpoints.",
+        "Start the same command again to continue.",
+    ]
+
+
+def test_other_errors_of_the_system_are_not_taken_for_a_full_disk(monkeypatch, capsys):
+    def missing():
+        raise FileNotFoundError(errno.ENOENT, "no such file")
+
+    with pytest.raises(FileNotFoundError):
+        stopped_by(monkeypatch, capsys, missing)

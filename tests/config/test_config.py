@@ -10,9 +10,11 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from neuspring import config
 from neuspring.config import Config, parse, plain
 from neuspring.core import artifacts
 from neuspring.core.errors import InputError
+from neuspring.core.text import listed
 
 ROOT = Path(__file__).parents[2]
 
@@ -183,3 +185,23 @@ def test_configuration_and_artifacts_agree_on_names(name: str) -> None:
     except InputError:
         accepted = False
     assert accepted == bool(artifacts.SAFE_NAME.fullmatch(name))
+
+
+def test_values_inside_a_mapping_or_list_of_the_command_line_are_what_yaml_says():
+    """Snakemake hands `--config 'fit={epochs: 60}'` over with the number as text."""
+    given = {"epochs": "60", "field": {"triplane": "false", "hidden": "8"}, "learning_rate": "5.0e-5", "damping": "fixed"}
+    typed = config.typed(given)
+    assert typed == {"epochs": 60, "field": {"triplane": False, "hidden": 8}, "learning_rate": 5e-5, "damping": "fixed"}
+    assert config.parse(config.Config, {"fit": typed}, "--config").fit.epochs == 60
+    assert config.typed(["0", "rope", "2020-01-01", "[", None]) == [0, "rope", "2020-01-01", "[", None]
+
+
+def test_the_home_folder_may_be_written_as_a_tilde(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/me")
+    made = config.parse(config.Config, {"results": "~/x/", "data_root": "~/data"}, "--config")
+    assert (made.results, made.data_root) == ("/home/me/x", "/home/me/data")
+
+
+def test_many_names_are_shortened():
+    assert listed(["a", "b"]) == "a, b"
+    assert listed(range(100)) == "0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11 and 88 more"

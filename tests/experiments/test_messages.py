@@ -2,12 +2,13 @@
 
 import io
 from pathlib import Path
+from types import SimpleNamespace
 
 import pandas as pd
 
 from neuspring.core.files import write_table, write_text
 from neuspring.core.job_records import Attempt, JobRecord, begin_run, this_run
-from neuspring.experiments.messages import Overview
+from neuspring.experiments.messages import Overview, failed
 
 
 def save(results, name: str, **facts) -> None:
@@ -66,3 +67,29 @@ def test_a_scenario_is_shown_when_its_last_run_has_its_scores_but_not_the_last_s
         save(tmp_path, f"score/{run}")
     overview._look()
     assert "cloth" not in stream.getvalue(), "the table of all scenarios follows"
+
+
+def interrupted(results, **outcomes):
+    """Jobs of this run that ended so, in a graph of runs that are not there."""
+    begin_run(results)
+    for name, outcome in outcomes.items():
+        facts = {"outcome": outcome, "cause": "bad input", "message": "x: must be y."} if outcome == "permanent" else {}
+        save(results, f"fit/{name}", **({"outcome": outcome} | facts))
+    return SimpleNamespace(config=SimpleNamespace(results=str(results)), folder=f"{results}/tables", runs=lambda: ["nowhere"])
+
+
+def test_a_run_that_was_stopped_says_what_is_kept_and_names_no_failure(tmp_path, capsys):
+    failed(interrupted(tmp_path, a="killed", b="running", c="ok"))
+    assert capsys.readouterr().out.splitlines() == [
+        "",
+        "Stopped, with 2 jobs at work: fit/a, fit/b.",
+        "What is finished is kept. The same command continues; searches and fits go on from their checkpoints.",
+    ]
+
+
+def test_a_run_that_failed_ends_with_a_line_per_job_its_cause_and_what_to_do(tmp_path, capsys):
+    failed(interrupted(tmp_path, a="killed", b="permanent"))
+    output = capsys.readouterr().out.splitlines()
+    assert output[1] == "The run did not finish. What is finished is kept."
+    assert f"  fit/b: bad input (attempt 1): x: must be y.; {tmp_path}/logs/fit/b.log" in output
+    assert output[-1] == "Mend the cause; the same command continues where this one stopped." and len(output) < 8

@@ -14,6 +14,7 @@ from snakemake.logging import logger
 
 from neuspring import config as settings
 from snakemake.settings.enums import RerunTrigger
+from snakemake_interface_logger_plugins.common import LogEvent
 
 from neuspring.core.errors import InputError
 from neuspring.experiments import needs
@@ -41,6 +42,10 @@ QUIET = "all" in {level.name.lower() for level in workflow.output_settings.quiet
 if QUIET:
     errors = logging.StreamHandler()
     errors.setLevel(logging.ERROR)
+    # Of a job that failed its wrapper says why in a line. Snakemake would print its command, which holds all settings.
+    errors.addFilter(
+        lambda record: getattr(record, "event", None) != LogEvent.JOB_ERROR
+    )
     errors.setFormatter(next(each.formatter for each in logger.handlers))
     logger.addHandler(errors)
 
@@ -53,6 +58,15 @@ def or_workflow_error(check, *arguments, **named):
         raise WorkflowError(str(error)) from None
 
 
+# `--config 'fit={epochs: 60}'`: Snakemake leaves the number as text.
+settings.merge(
+    config,
+    {
+        key: settings.typed(value)
+        for key, value in workflow.config_settings.config.items()
+        if isinstance(value, (dict, list))
+    },
+)
 # A target that is a study chooses methods. Snakemake knows the targets only when the rules are there, so they are read from the command
 # line. Jobs of a cluster are not told them, but what follows from them.
 TARGETS = (

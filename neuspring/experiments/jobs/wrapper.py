@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--log", type=Path, required=True, help="its log, under <results>/logs/<rule>/")
     parser.add_argument("--gpus", type=int, default=0, help="GPUs that it needs")
     parser.add_argument("--scenario", default="", help="its scenario; jobs of one scenario prefer the same GPU")
-    parser.add_argument("--quiet", action="store_true", help="write output to the log alone, unless the command fails")
+    parser.add_argument("--quiet", action="store_true", help="write output to the log alone")
     parser.add_argument("--stamp", default="", help="what its record holds once it has succeeded")
     parser.add_argument("command", nargs=argparse.REMAINDER)
     a = parser.parse_args(arguments)
@@ -180,7 +180,7 @@ def execute(
     """Run a command, which inherits `locks`, to its end: (the finished attempt, why it failed if it did).
 
     Its output goes to the log, signals are passed on to it, its use of the machine is sampled from outside. `quiet`: the output
-    goes to the log alone, unless the command fails.
+    goes to the log alone.
     """
     write = _log(log)
     write(f"# {begun.started} {shlex.join(command)}\n")
@@ -217,11 +217,9 @@ def execute(
     fault = faults.diagnose(status, list(tail))
     if fault is None:
         return ended, None
-    if quiet:
-        _print("".join(tail))
-    again = " (may be tried again)" if fault.outcome == "transient" else ""
-    say(f"{fault.cause}{again}. {fault.remedy}".strip())
-    return replace(ended, outcome=fault.outcome, cause=fault.cause, message=faults.last_words(list(tail))), fault
+    again, message = " (may be tried again)" if fault.outcome == "transient" else "", faults.last_words(list(tail))
+    say(f"{fault.cause}{again}: {message} {fault.remedy}".rstrip() + f" (log: {log})")
+    return replace(ended, outcome=fault.outcome, cause=fault.cause, message=message), fault
 
 
 def say(text: str) -> None:
