@@ -45,6 +45,8 @@ RECIPE = ".make-capture.json"
 """What a folder is made of that make-capture has not finished. It is removed at the end."""
 NOTHING, OBJECT, HANDS = 0, 1, 2
 """Labels of masks."""
+THIN = ("cloth", "package")
+"""Categories of which no volume is made; those of all other words are filled."""
 TEXT_TOLERANCE = 1e-4
 """Allowed deviation from R^T R = 1 in JSON, where matrices may have five digits."""
 Row3: TypeAlias = tuple[Finite, Finite, Finite]

@@ -20,7 +20,16 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
 from neuspring.core.findings import Finding, broken, note, refusal, unusual
 from neuspring.data import mocap, phystwin, plausible
-from neuspring.data.capture import CAPTURE, OBJECT, POINTS, TRACKS, Capture, Description, description_findings, read_description
+from neuspring.data.capture import (
+    CAPTURE,
+    OBJECT,
+    POINTS,
+    TRACKS,
+    Capture,
+    Description,
+    description_findings,
+    read_description,
+)
 from neuspring.data.intake.depth import FAR, FASTEST, NEAR, SLOWEST, cloud, planes
 from neuspring.data.released import Released, parameter_findings, prediction_findings, read_checkpoint
 from neuspring.data.unpickle import load_pickle
@@ -65,6 +74,7 @@ def check_capture(folder: Path) -> list[Finding]:
         rule = f"frames per second at which it was filmed are required, {SLOWEST:g} to {FASTEST:g}"
         case.findings.append(broken(path, "frame_rate", rule, f"{description.frame_rate:g}"))
     capture = Capture(folder, description)
+    case.findings += plausible.category_findings(path, description.category)
     calibrated = not any(d.level == "error" for d in case.findings)
     grips = np.zeros(capture.frame_count, int)
     samples = {name: _check_camera(case, capture, name, calibrated, grips) for name in capture.cameras}
@@ -151,6 +161,11 @@ def _world_findings(capture: Capture, name: str, samples: dict[int, plausible.Sa
         *plausible.hand_findings(camera, samples),
         *plausible.reach_findings(camera, samples),
     ]
+    if 0 in bodies:
+        things += plausible.support_findings(camera, samples[0], up_sign(up), capture.description.obstacles)
+    if 0 in bodies and capture.description.category not in plausible.THIN:
+        made = f"the category {capture.description.category!r} makes a filled body of it"
+        things += plausible.sheet_findings(f"camera {name}, object", bodies[0], up_sign(up), made)
     findings += _at(path, things)
     if 0 in bodies:
         findings += obstacle_findings(path, capture.description, bodies[0])

@@ -12,6 +12,8 @@
 
 from __future__ import annotations
 
+import difflib
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
@@ -22,10 +24,12 @@ import numpy as np
 from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import median_filter
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from neuspring.core.artifacts import up_sign
 from neuspring.core.findings import Finding, broken, finding, note, unusual
-from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Camera
+from neuspring.core.geometry import Obstacle
+from neuspring.data.capture import CAPTURE, HANDS, OBJECT, THIN, Camera
 from neuspring.data.intake.depth import FAR, NEAR, ROLL, Plane
 from neuspring.data.intake.lenses import rigid_inverse
 
@@ -313,6 +317,83 @@ def grip_findings(folder: Path, grips: np.ndarray, rate: float) -> list[Finding]
     return [note(folder / CAPTURE, text)]
 
 
+SHEET_HIGH, SHEET_SIDE = 0.015, 0.08
+"""m: a sheet that lies on the table is lower, but for a tenth of it, and each of its sides is longer."""
+COVERED = 0.6
+"""Part of its outline that a sheet covers; a rope in turns covers less."""
+BODIES = ("sloth", "plush", "toy", "ball", "cable", "rod")
+"""Words for bodies that are near to those that mean another thing."""
+THINNER = 'If it is a sheet, write "category": "cloth" in capture.json: then no volume is made of it.'
+
+
+def category_findings(path: Path, category: str) -> list[Finding]:
+    """A warning about a word that is nearly one of those that mean something."""
+    close = difflib.get_close_matches(category.casefold(), (*THIN, "rope", *BODIES), n=1, cutoff=0.75)
+    if not close or category == close[0] or close[0] in BODIES:
+        return []
+    rule = f"only {' and '.join(THIN)} mean a thin thing, and only rope a round one; any other word is a filled body"
+    return [unusual(path, "category", rule, f"{category!r}. Is {close[0]} meant?")]
+
+
+def sheet_findings(where: str, points: np.ndarray, up: float, made: str) -> list[Finding]:
+    """A warning where points [n, 3], m, of the object in frame 0 are those of a sheet on the table; `made`: what is made of it."""
+    flat = points[:, :2].astype(np.float32)
+    if len(points) < FEW or (high := float(np.quantile(up * points[:, 2], 0.9))) > SHEET_HIGH:
+        return []
+    sides, outline = sorted(cv2.minAreaRect(flat)[1], reverse=True), cv2.contourArea(cv2.convexHull(flat))
+    # Cells of which a sheet has 2.25 points each: one in ten is empty.
+    cell = 1.5 * float(np.sqrt(outline / len(points)))
+    if sides[1] < SHEET_SIDE or len(np.unique(flat // cell, axis=0)) * cell**2 < COVERED * outline:
+        return []
+    value = f"a flat thing of {100 * sides[0]:.0f} x {100 * sides[1]:.0f} cm, {1e3 * high:.0f} mm high"
+    return [finding("shape and category", "warning", where, value, made, THINNER)]
+
+
+RAISED, AIR = 0.025, (0.05, 0.3)
+"""m that a support is high; and the height above the table, m and as part of its own height, from which an object that is seen from
+the side is not on it. The lowest visible points of a ball on the table are a tenth of its height above it."""
+SIDE = 50.0
+"""Degrees: a camera that looks down more steeply does not see where an object ends below."""
+LEVEL, BY = 0.01, 0.1
+"""m: how even a support is, and how far from the object it is looked for."""
+RIM = 9
+"""Pixels beside a mask may still be of its object."""
+
+
+def support_findings(camera: Camera, sample: Sample, up: float, obstacles: Sequence[Obstacle]) -> list[Finding]:
+    """A warning where the object of frame 0 begins above the table and no obstacle is under it: the twin would fall.
+
+    Where a level surface is seen around its foot, the finding has the box that stands for it.
+    """
+    own = lifted(camera, sample, OBJECT) * (1, 1, up)
+    if len(own) < FEW:
+        return []
+    low, high = np.quantile(own[:, 2], WITHIN)
+    foot, away = own[own[:, 2] < low + LEVEL], max(AIR[0], AIR[1] * (high - low))
+    if low < RAISED or any((one.depth((foot - (0, 0, away)) * (1, 1, up)) > 0).any() for one in obstacles):
+        return []
+    y, x = np.nonzero((cv2.dilate(np.uint8(sample.mask > 0), np.ones((RIM, RIM), np.uint8)) == 0) & (sample.depth > 0))
+    seen = camera.lift(np.stack([x, y], axis=1).astype(float), sample.depth[y, x]) * (1, 1, up)
+    near = ((seen[:, :2] > foot[:, :2].min(axis=0) - BY) & (seen[:, :2] < foot[:, :2].max(axis=0) + BY)).all(axis=1)
+    top = seen[near & (seen[:, 2] > max(RAISED, low - away)) & (seen[:, 2] < low + LEVEL)]
+    level = float(np.median(top[:, 2])) if len(top) > 2 * FEW else 0.0
+    where, text = f"camera {camera.name}, object", f"what is seen of it in frame 0 begins {100 * low:.0f} cm above the table"
+    if level and np.mean(np.abs(top[:, 2] - level) < LEVEL) > 0.8:
+        (x0, y0), sides, angle = cv2.minAreaRect(np.concatenate([top, foot])[:, :2].astype(np.float32))
+        turn = Rotation.from_euler("z", angle, degrees=True).as_matrix()
+        center, half = np.round([[x0, y0, up * level / 2], [*np.divide(sides, 2), level / 2]], 3).tolist()
+        value = f"{text}, on something {100 * level:.1f} cm high"
+        box = json.dumps({"shape": "box", "center": center, "half_sizes": half, "rotation": (turn.round(4) + 0.0).tolist()})
+        remedy = f'Add to capture.json, as measured here: "obstacles": [{box}]. Or mark it as the object too, if both move.'
+    else:
+        hands, steep = lifted(camera, sample, HANDS), -up * camera.camera_to_world[2, 2] > np.sin(np.radians(SIDE))
+        if low < away or steep or (len(hands) and KDTree(own).query(hands * (1, 1, up))[0].min() < REACH):
+            return []
+        value = f"{text}, and no hand is near"
+        remedy = "Measure what it stands on, and add it to obstacles of capture.json; or mark it as the object too."
+    return [finding("object above the table", "warning", where, value, "there is nothing under the twin, and it falls", remedy)]
+
+
 POSE = "Look at camera_to_world: the table must be z = 0 in meters, and the camera's z points forward."
 
 
@@ -594,7 +675,7 @@ def mask_findings(camera: str, shown: Shown) -> list[Finding]:
 
 ALIGNED = 0.015
 """Part of the image's width by which edges of depth may lie beside those of color: sensors are registered to 1 %."""
-BESIDE = 0.12
+MISPLACED = 0.12
 """Part of the width by which they are looked for elsewhere: 6 cm between two sensors, 0.4 m from them."""
 BETTER = 1.4
 """A shift is believed if edges agree so many times as well with it as without. Right recordings have up to 0.9, depth of another
@@ -634,7 +715,7 @@ def edge_shift(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[int, int
     """
     width = pairs[0][1].shape[1] if pairs else 1
     stride = max(round(width / WIDE), 1)
-    reach, near = round(BESIDE * width / stride), max(round(ALIGNED * width / stride), 4)
+    reach, near = round(MISPLACED * width / stride), max(round(ALIGNED * width / stride), 4)
     pictures = []
     for picture, depth in pairs:
         thin = np.ascontiguousarray(picture[::stride, ::stride])

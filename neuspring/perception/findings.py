@@ -27,6 +27,7 @@ from neuspring.data.plausible import (
     mask_findings,
     place_findings,
     sampled,
+    sheet_findings,
 )
 from neuspring.perception.frames import frames_of, gray, spread
 from neuspring.perception.results import LiftedTracks, ShapePrior
@@ -293,7 +294,9 @@ def _few(visible: np.ndarray, least: float, what: str) -> tuple[str, list[int]]:
 def look_at_lifted(lifted: LiftedTracks, prior: ShapePrior, up: float, image: ImageObservations | None = None) -> list[Finding]:
     """Findings about points in the world and the shape; `up` is +1 or -1. `image`: the evidence of color alone."""
     moving = _motion(lifted) if image is None else _in_image(image)
-    return [*place_findings("object in frame 0", [lifted.cloud], up), *_shape(prior), *moving]
+    filled = image is None and prior.backend.startswith("visual_hull")
+    flat = sheet_findings("object in frame 0", lifted.cloud, up, "a filled hull was made of it") if filled else []
+    return [*place_findings("object in frame 0", [lifted.cloud], up), *flat, *_shape(prior), *moving]
 
 
 def look_at_observations(observations: Observations, moves: float = 0.0) -> list[Finding]:

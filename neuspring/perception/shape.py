@@ -37,12 +37,10 @@ from warp.geometry import IsoSurfaceMarchingCubes
 
 from neuspring.config.perception import ShapePriorSettings
 from neuspring.core.errors import InputError
-from neuspring.data.capture import HANDS, OBJECT, Camera, Capture
+from neuspring.data.capture import HANDS, OBJECT, THIN, Camera, Capture
 from neuspring.perception.results import Masks, ShapePrior
 from neuspring.perception.sample import on_surface
 
-THIN = ("cloth", "package")
-"""Categories that need no prior."""
 BACK_FRACTION = 1.2
 """Thickness of the object in local widths of its silhouette, with `back: fraction`; 1: a round cross-section."""
 MARGIN = 0.02

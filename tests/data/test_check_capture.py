@@ -2,6 +2,8 @@
 
 import json
 import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, Writer
 from neuspring.data.check import check_layout
 from neuspring.data.intake.lenses import rigid_inverse
+from neuspring.data.plausible import Sample, category_findings, on_table, sheet_findings, support_findings
 from tests.support.captures import describe, entry
-from tests.support.filmed import film
+from tests.support.filmed import TURNED, film
 from tests.support.findings import holds, of_level, serious
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -181,6 +184,70 @@ def test_images_of_another_size_or_missing(both):
     found = check_layout(both.folder)
     assert holds(found, "error", "00002.png", "160 x 90", "received 20 x 10")
     assert holds(found, "error", "00004.png", "cameras.1.missing")
+
+
+@pytest.mark.parametrize("up", ["+z", "-z"])
+def test_an_object_on_something_is_said_with_the_box_to_add(tmp_path, up):
+    capture = film(tmp_path / "film", cameras=1, up=up, stand=0.08)
+    found = [one.message for one in check_layout(capture.folder) if one.level == "warning"]
+    assert len(found) == 1
+    assert (
+        "object above the table: what is seen of it in frame 0 begins 11 cm above the table, on something 8.0 cm high" in found[0]
+    )
+    box = json.loads(found[0].split('"obstacles": ')[1].split(". Or mark")[0])
+    sign = 1.0 if up == "+z" else -1.0
+    # The box of the film, as far as it is seen: two of its sides end behind the object.
+    assert box[0]["center"] == pytest.approx([0.03, 0.0, sign * 0.04], abs=0.01)
+    assert sorted(box[0]["half_sizes"]) == pytest.approx([0.04, 0.1, 0.13], abs=0.01)
+    long = np.array(box[0]["rotation"])[:, int(np.argmax(box[0]["half_sizes"]))]
+    assert abs(long @ [np.cos(np.radians(TURNED)), sign * np.sin(np.radians(TURNED)), 0]) > 0.99
+    edit(capture, lambda values: values.update(obstacles=box))
+    assert serious(check_layout(capture.folder)) == []
+
+
+def test_an_object_in_the_air_needs_a_hand_that_holds_it(filmed):
+    view = filmed.cameras["0"]
+    lifted = view.camera_to_world.copy()
+    lifted[2, 3] += 0.08
+    depth, mask = filmed.depth("0", 0), filmed.mask("0", 0)
+    for labels, words in (((OBJECT,), "begins 12 cm above the table, and no hand is near"), ((OBJECT, HANDS), "")):
+        sample = Sample(np.where(np.isin(mask, labels), depth, 0.0), mask)
+        found = support_findings(replace(view, camera_to_world=lifted), sample, 1.0, ())
+        assert [words in one.text for one in found] == ([True] if words else [])
+        assert support_findings(view, sample, 1.0, ()) == []
+
+
+def sheet(view):
+    """A mask of 24 x 24 cm of the table beside the film's body."""
+    y, x = np.mgrid[: view.height, : view.width]
+    points = on_table(view, np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(view.height, view.width, 3)
+    return np.where((np.abs(points[..., :2] - (0.28, 0.2)) < 0.12).all(axis=-1), OBJECT, 0).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("category", "words"), [("towel", "the category 'towel' makes a filled body of it"), ("cloth", "")])
+def test_a_sheet_whose_category_is_a_body(capture, category, words):
+    for frame in range(capture.frame_count):
+        cv2.imwrite(str(capture.path("mask", "0", frame)), sheet(capture.cameras["0"]))
+    edit(capture, lambda values: values.update(category=category))
+    found = [text for text in of_level(check_layout(capture.folder), "warning") if "shape and category" in text]
+    assert [words in text and '"category": "cloth"' in text for text in found] == [True] * bool(words)
+
+
+@pytest.mark.parametrize(
+    ("category", "meant"),
+    [("Cloth", "cloth"), ("cloths", "cloth"), ("packge", "package"), ("Rope", "rope"), ("sloth", ""), ("bear", "")],
+)
+def test_a_category_that_is_nearly_another(category, meant):
+    found = category_findings(Path("capture.json"), category)
+    assert [one.message.endswith(f"received {category!r}. Is {meant} meant?") for one in found] == [True] * bool(meant)
+
+
+@pytest.mark.parametrize(("width", "turns"), [(0.01, 4), (0.012, 6)])
+def test_a_rope_in_turns_is_no_sheet(width, turns):
+    along = np.linspace(0, turns, 1500)
+    middle = np.stack([0.12 * np.cos(np.pi * along), 0.04 * along, np.full(len(along), 0.008)], axis=1)
+    points = middle + np.random.default_rng(0).uniform(-width / 2, width / 2, (len(along), 3))
+    assert sheet_findings("object", points, 1.0, "") == []
 
 
 def test_an_object_inside_an_obstacle(capture):

@@ -193,6 +193,14 @@ def test_lost_and_few_tracks_are_said(capture):
 BOX = np.random.default_rng(0).uniform((0, 0, 0), (0.1, 0.1, 0.1), (200, 3))
 
 
+def test_a_hull_of_a_sheet_is_said():
+    flat = np.random.default_rng(0).uniform((0, 0, 0), (0.3, 0.25, 0.01), (1500, 3))
+    hull = ShapePrior(vertices=np.eye(3), faces=np.array([[0, 1, 2]]), backend="visual_hull", facts={"cameras": 3.0})
+    assert "warning: shape and category" in said(look_at_lifted(tracked(flat), hull, 1.0))
+    assert "warning: shape and category" not in said(look_at_lifted(tracked(flat), no_prior(), 1.0))
+    assert "warning: shape and category" not in said(look_at_lifted(tracked(flat * (1, 1, 8)), hull, 1.0))
+
+
 def test_size_and_place_of_the_object_are_said():
     assert said(look_at_lifted(tracked(BOX), no_prior(), 1.0)) == {"note: size of the object"}
     assert "warning: implausible size" in said(look_at_lifted(tracked(20.0 * BOX), no_prior(), 1.0))

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import trimesh
 
-from neuspring.data.capture import HANDS, OBJECT, CameraEntry, Capture, Description, Writer
+from neuspring.data.capture import HANDS, NOTHING, OBJECT, CameraEntry, Capture, Description, Writer
 from neuspring.data.synthetic.make import looking
 from neuspring.data.synthetic.meshes import capsule, smooth_union, sphere, surface
 from neuspring.data.synthetic.render import Part, Renderer, quantized
@@ -22,6 +23,7 @@ STEP = np.array([0.004, 0.002, 0.006])
 BODY = smooth_union([sphere((0, 0, 0.06), 0.05), capsule((0, 0, 0.06), (0.1, 0, 0.04), 0.03)], 0.005)
 HAND_PLACE = np.array([-0.02, 0.0, 0.145])
 EYES = ((0.45, -0.35, 0.4), (-0.2, 0.55, 0.4), (-0.4, -0.4, 0.45))
+TURNED = 20.0
 SIZE = (160, 90)
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """From a world with z up to one with z down, as PhysTwin's."""
@@ -38,19 +40,27 @@ def film(
     sizes: Sequence[tuple[int, int]] = (SIZE, SIZE, SIZE),
     missing: Mapping[int, tuple[int, ...]] | None = None,
     up: str = "+z",
+    stand: float = 0.0,
     **changes: object,
 ) -> Capture:
-    """A capture with masks; `missing` frames by camera. Annotated tracks: twenty vertices of the body."""
+    """A capture with masks; `missing` frames by camera. Annotated tracks: twenty vertices of the body.
+
+    The body begins on a box that is `stand` m high, turned by TURNED degrees.
+    """
     missing = missing or {}
     vertices, faces = surface(BODY, (-0.08, -0.08, -0.01), (0.15, 0.08, 0.13), 0.004)
     ball, ball_faces = surface(sphere((0, 0, 0), 0.032), (-0.04,) * 3, (0.04,) * 3, 0.004)
     colors = np.where(np.sin(90 * vertices[:, :1] + 60 * vertices[:, 1:2]) > 0, [0.15, 0.3, 0.65], [0.3, 0.55, 0.3])
-    renderer = Renderer(
-        [
-            Part(vertices, faces, colors, OBJECT, (60.0, 0.8)),
-            Part(ball, ball_faces, np.tile(SKIN, (len(ball), 1)), HANDS, (45.0, 0.6)),
-        ]
-    )
+    parts = [
+        Part(vertices, faces, colors, OBJECT, (60.0, 0.8)),
+        Part(ball, ball_faces, np.tile(SKIN, (len(ball), 1)), HANDS, (45.0, 0.6)),
+    ]
+    fixed = []
+    if stand:
+        box = trimesh.creation.box((0.26, 0.2, stand), trimesh.transformations.rotation_matrix(np.radians(TURNED), (0, 0, 1)))
+        fixed = [box.vertices + np.array([0.03, 0, stand / 2])]
+        parts.append(Part(fixed[0], np.asarray(box.faces), np.tile((0.4, 0.4, 0.4), (8, 1)), NOTHING, (60.0, 0.0)))
+    renderer = Renderer(parts)
     turn = FLIP if up == "-z" else np.eye(4)
     poses = [looking(np.array(eye), np.array([0.03, 0, 0.08])) for eye in EYES[:cameras]]
     entries = tuple(
@@ -68,7 +78,8 @@ def film(
     writer = Writer(folder, Description(**(plain | {"cameras": entries, "up": up} | changes)))
     upright = {entry.name: (entry, pose) for entry, pose in zip(entries, poses, strict=True)}
     for frame in range(FRAMES):
-        renderer.move([vertices + frame * STEP, ball + HAND_PLACE + frame * STEP])
+        rise = frame * STEP + np.array([0, 0, stand])
+        renderer.move([vertices + rise, ball + HAND_PLACE + rise, *fixed])
         for name, camera in writer.capture.cameras.items():
             entry, pose = upright[name]
             if frame not in entry.missing:

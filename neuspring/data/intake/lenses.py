@@ -37,19 +37,11 @@ from neuspring.data.intake.feeds import Lens
 OPEN3D = "intrinsic_matrix"
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "taux", "tauy")
 """In OpenCV's order."""
-KEYS = {
-    "fx": ("fx", "fl_x"),
-    "fy": ("fy", "fl_y"),
-    "cx": ("cx", "ppx"),
-    "cy": ("cy", "ppy"),
-    "K": ("K", "intrinsics", "camera_matrix"),
-    OPEN3D: (OPEN3D,),
-    "width": ("width", "w", "image_width"),
-    "height": ("height", "h", "image_height"),
-    "distortion": ("distortion", "D", "dist", "coeffs", "dist_coeffs", "distortion_coeffs", "distortion_coefficients"),
-    "model": ("model", "distortion_model"),
-    "camera_model": ("camera_model",),
-} | {name: (name,) for name in COEFFICIENTS}
+SPELLINGS = (
+    "fx fl_x / fy fl_y / cx ppx / cy ppy / K intrinsics camera_matrix / width w image_width / height h image_height / model "
+    "distortion_model / camera_model / distortion D dist coeffs dist_coeffs distortion_coeffs distortion_coefficients"
+)
+KEYS = {words.split()[0]: words.split() for words in (*SPELLINGS.split(" / "), OPEN3D, *COEFFICIENTS)}
 """What is read, and its spellings: ours, and those of OpenCV, ROS, librealsense, Open3D, nerfstudio and Kalibr."""
 SILENT = "R P rectification_matrix projection_matrix roi header frames applied_transform camera_name camera_angle_x camera_angle_y"
 """Keys beside them that say nothing about a lens, or the same once more."""

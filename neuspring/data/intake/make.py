@@ -42,7 +42,7 @@ from neuspring.data.intake.poses import (
     stored_as,
     straightened,
 )
-from neuspring.data.plausible import edge_findings
+from neuspring.data.plausible import category_findings, edge_findings
 
 NAMES = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 FIRST = 5
@@ -111,12 +111,14 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     for name, view in seen.items():
         beside = edge_findings(str(view.path), zip(view.colors, view.depths, strict=False))
         findings += [replace(one, name=f"camera {name}: {one.name}") for one in beside]
+    findings += category_findings(intake.folder, intake.category)
     placed, how = _place(intake, seen, unit)
     made = _describe(intake, choice, rate, unit, seen, placed, how)
     _write(intake, made, choice, unit, seen, placed)
     sizes = ", ".join(f"{name} {view.size[0]} x {view.size[1]}" for name, view in seen.items())
     depth = "none, color alone" if unit is None else unit.text()
-    lines = [f"cameras: {sizes}"]
+    thin = "thin: no volume is made of it" if intake.category in capture.THIN else "a volume is made of what is seen"
+    lines = [f"category: {intake.category}, {thin}", f"cameras: {sizes}"]
     unread = dict.fromkeys(key for lens in listed.values() for key in lens.unread)
     lines += [f"intrinsics: not read: {' '.join(unread)}"] if unread else []
     lines += [Straightener(view.lens, view.size).text(name) for name, view in seen.items() if view.lens.distortion.any()]

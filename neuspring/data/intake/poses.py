@@ -7,7 +7,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
@@ -290,14 +290,9 @@ def stand(
         rise = f"its plane was {100 * abs(point[2]):.1f} cm from z = 0 there, {1e3 * rms:.1f} mm rms over all cameras"
         lines.append(f"leveled: the world was turned by {turn:.1f} degrees; {rise}")
     found = {name: planes(points) for name, points in clouds.items()}
-    judged = {
-        side: [
-            d
-            for name, view in seen.items()
-            for d in table_findings(file or view.path, name, found[name], moved[name], side, view.unit)
-        ]
-        for side in ([up] if up else ["+z", "-z"])
-    }
+    judged: dict[str, list[Finding]] = {side: [] for side in ([up] if up else ["+z", "-z"])}
+    for (side, listed), (name, view) in product(judged.items(), seen.items()):
+        listed += table_findings(file or view.path, name, found[name], moved[name], side, view.unit)
     side = min(judged, key=lambda key: sum(d.level == "error" for d in judged[key]))
     refuse(one for one in judged[side] if one.level == "error")
     lines += [in_report(one) for one in judged[side]]
