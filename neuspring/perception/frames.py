@@ -19,8 +19,8 @@ TINTS = {OBJECT: (40, 220, 60), HANDS: (70, 110, 255)}
 """RGB of labels in pictures of masks: green and blue, where the picture has other colors."""
 OTHERS = ((255, 140, 0), (240, 50, 220), (250, 230, 30))
 """Tints in their place."""
-CLEAR, AROUND = 40.0, 15
-"""Difference in a and b of Lab from which a tint is seen, and pixels around a mask whose colors count too."""
+CLEAR, AROUND = 20.0, 15
+"""Difference in a and b of Lab from which a tint is seen, and how far around a label it is compared, pixels."""
 
 
 def frames_of(capture: Capture, camera: str) -> list[int]:
@@ -52,19 +52,32 @@ def overlap(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def tints_of(image: np.ndarray, labels: np.ndarray) -> dict[int, Color]:
-    """The tint, RGB, of each label in pictures of this camera: the usual one, or the farthest from an image's own colors.
+    """The tint, RGB, of each label in pictures of this camera: the usual one if it is seen, else the one that is seen best.
 
-    `image` [H, W, 3] and `labels` [H, W] are one frame. A tint is seen if nine tenths of the colors at the masks are CLEAR of it.
+    `image` [H, W, 3] and `labels` [H, W] are one frame. A tint is seen if what it makes of the label's own color differs by CLEAR
+    from nine tenths of the colors around it.
     """
-    at = cv2.dilate((labels > 0).astype(np.uint8), np.ones((2 * AROUND + 1,) * 2, np.uint8)) > 0
-    own = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2LAB)[at][:, 1:].astype(float)
+
+    def hues(colors: np.ndarray) -> np.ndarray:
+        """a and b of Lab [n, 2]."""
+        return np.asarray(cv2.cvtColor(colors.reshape(1, -1, 3).astype(np.uint8), cv2.COLOR_RGB2LAB)[0, :, 1:], dtype=float)
+
     chosen: dict[int, Color] = {}
     for label, usual in TINTS.items():
+        own = labels == label
+        around = cv2.dilate(own.astype(np.uint8), np.ones((2 * AROUND + 1,) * 2, np.uint8)).astype(bool) & ~own
         free = [tint for tint in (usual, *OTHERS) if tint not in chosen.values()]
-        colors = cv2.cvtColor(np.array([free], np.uint8), cv2.COLOR_RGB2LAB)[0, :, 1:].astype(float)
-        clear = [float(np.quantile(np.linalg.norm(own - color, axis=1), 0.1)) if len(own) else CLEAR for color in colors]
+        clear = [CLEAR]
+        if own.any() and around.any():
+            drawn = hues(tinted(np.median(image[own], axis=0), np.array(free)))
+            clear = [float(np.quantile(np.linalg.norm(hues(image[around]) - hue, axis=1), 0.1)) for hue in drawn]
         chosen[label] = usual if clear[0] >= CLEAR else free[int(np.argmax(clear))]
     return chosen
+
+
+def tinted(color: np.ndarray, tint: np.ndarray) -> np.ndarray:
+    """RGB under a tint [..., 3]."""
+    return np.asarray(0.6 * color + 0.4 * tint)
 
 
 def overlay(image: np.ndarray, labels: np.ndarray, tints: Mapping[int, Color]) -> np.ndarray:
@@ -72,7 +85,7 @@ def overlay(image: np.ndarray, labels: np.ndarray, tints: Mapping[int, Color]) -
     result = np.array(image, order="C")
     for label, tint in tints.items():
         own = (labels == label).astype(np.uint8)
-        result[own > 0] = (0.6 * image[own > 0] + 0.4 * np.array(tint)).astype(np.uint8)
+        result[own > 0] = tinted(image[own > 0], np.array(tint)).astype(np.uint8)
         outlines, _ = cv2.findContours(own, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(result, outlines, -1, tint, 1)
     return result
