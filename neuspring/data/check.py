@@ -163,9 +163,7 @@ def _world_findings(capture: Capture, name: str, samples: dict[int, plausible.Sa
     ]
     if 0 in bodies:
         things += plausible.support_findings(camera, samples[0], up_sign(up), capture.description.obstacles)
-    if 0 in bodies and capture.description.category not in plausible.THIN:
-        made = f"the category {capture.description.category!r} makes a filled body of it"
-        things += plausible.sheet_findings(f"camera {name}, object", bodies[0], up_sign(up), made)
+        things += plausible.sheet_findings(f"camera {name}, object", bodies[0], up_sign(up), capture.description.category)
     findings += _at(path, things)
     if 0 in bodies:
         findings += obstacle_findings(path, capture.description, bodies[0])

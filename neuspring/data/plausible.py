@@ -335,10 +335,10 @@ def category_findings(path: Path, category: str) -> list[Finding]:
     return [unusual(path, "category", rule, f"{category!r}. Is {close[0]} meant?")]
 
 
-def sheet_findings(where: str, points: np.ndarray, up: float, made: str) -> list[Finding]:
-    """A warning where points [n, 3], m, of the object in frame 0 are those of a sheet on the table; `made`: what is made of it."""
+def sheet_findings(where: str, points: np.ndarray, up: float, category: str = "") -> list[Finding]:
+    """A warning where points [n, 3], m, of the object in frame 0 are those of a sheet on the table whose category is not thin."""
     flat = points[:, :2].astype(np.float32)
-    if len(points) < FEW or (high := float(np.quantile(up * points[:, 2], 0.9))) > SHEET_HIGH:
+    if category in THIN or len(points) < FEW or (high := float(np.quantile(up * points[:, 2], 0.9))) > SHEET_HIGH:
         return []
     sides, outline = sorted(cv2.minAreaRect(flat)[1], reverse=True), cv2.contourArea(cv2.convexHull(flat))
     # Cells of which a sheet has 2.25 points each: one in ten is empty.
@@ -346,7 +346,8 @@ def sheet_findings(where: str, points: np.ndarray, up: float, made: str) -> list
     if sides[1] < SHEET_SIDE or len(np.unique(flat // cell, axis=0)) * cell**2 < COVERED * outline:
         return []
     value = f"a flat thing of {100 * sides[0]:.0f} x {100 * sides[1]:.0f} cm, {1e3 * high:.0f} mm high"
-    return [finding("shape and category", "warning", where, value, made, THINNER)]
+    rule = f"the category {category!r} makes a filled body of it" if category else "a filled hull was made of it"
+    return [finding("shape and category", "warning", where, value, rule, THINNER)]
 
 
 RAISED, AIR = 0.025, (0.05, 0.3)
@@ -372,7 +373,7 @@ def support_findings(camera: Camera, sample: Sample, up: float, obstacles: Seque
     foot, away = own[own[:, 2] < low + LEVEL], max(AIR[0], AIR[1] * (high - low))
     if low < RAISED or any((one.depth((foot - (0, 0, away)) * (1, 1, up)) > 0).any() for one in obstacles):
         return []
-    y, x = np.nonzero((cv2.dilate(np.uint8(sample.mask > 0), np.ones((RIM, RIM), np.uint8)) == 0) & (sample.depth > 0))
+    y, x = np.nonzero((cv2.dilate((sample.mask > 0).astype(np.uint8), np.ones((RIM, RIM), np.uint8)) == 0) & (sample.depth > 0))
     seen = camera.lift(np.stack([x, y], axis=1).astype(float), sample.depth[y, x]) * (1, 1, up)
     near = ((seen[:, :2] > foot[:, :2].min(axis=0) - BY) & (seen[:, :2] < foot[:, :2].max(axis=0) + BY)).all(axis=1)
     top = seen[near & (seen[:, 2] > max(RAISED, low - away)) & (seen[:, 2] < low + LEVEL)]

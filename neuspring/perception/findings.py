@@ -295,7 +295,7 @@ def look_at_lifted(lifted: LiftedTracks, prior: ShapePrior, up: float, image: Im
     """Findings about points in the world and the shape; `up` is +1 or -1. `image`: the evidence of color alone."""
     moving = _motion(lifted) if image is None else _in_image(image)
     filled = image is None and prior.backend.startswith("visual_hull")
-    flat = sheet_findings("object in frame 0", lifted.cloud, up, "a filled hull was made of it") if filled else []
+    flat = sheet_findings("object in frame 0", lifted.cloud, up) if filled else []
     return [*place_findings("object in frame 0", [lifted.cloud], up), *flat, *_shape(prior), *moving]
 
 

@@ -247,7 +247,7 @@ def test_a_rope_in_turns_is_no_sheet(width, turns):
     along = np.linspace(0, turns, 1500)
     middle = np.stack([0.12 * np.cos(np.pi * along), 0.04 * along, np.full(len(along), 0.008)], axis=1)
     points = middle + np.random.default_rng(0).uniform(-width / 2, width / 2, (len(along), 3))
-    assert sheet_findings("object", points, 1.0, "") == []
+    assert sheet_findings("object", points, 1.0) == []
 
 
 def test_an_object_inside_an_obstacle(capture):
