@@ -69,8 +69,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         return 1
     except KeyboardInterrupt:
-        print("neuspring: stopped. What is finished is kept; searches and fits go on from their checkpoints.", file=sys.stderr)
-        print("Start the same command again to continue.", file=sys.stderr)
+        again = "Start the same command again to continue; searches and fits go on from their checkpoints."
+        print(f"neuspring: stopped. What is finished is kept. {again}", file=sys.stderr)
         return 128 + signal.SIGINT
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):

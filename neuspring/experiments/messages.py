@@ -141,7 +141,7 @@ def failed(graph: Graph) -> None:
     jobs = read_jobs(results, damaged)
     own = [record for record in jobs if record.last.run == this_run(results) and record.last.outcome != "ok"]
     if all(record.last.outcome in ("killed", "running") for record in own) and not damaged and own:
-        print(f"\nStopped, with {len(own)} jobs at work: {listed([record.name for record in own], 6)}.")
+        print(f"\nStopped, with {len(own)} job{'s' * (len(own) > 1)} at work: {listed([record.name for record in own], 6)}.")
         print("What is finished is kept. The same command continues; searches and fits go on from their checkpoints.", flush=True)
         return
     print("\nThe run did not finish. What is finished is kept.", flush=True)

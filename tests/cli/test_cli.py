@@ -207,16 +207,14 @@ def test_a_full_disk_is_one_message_with_the_file_the_disk_and_how_to_go_on(monk
     assert re.fullmatch(where + remedy, text)
 
 
-def test_ctrl_c_is_two_lines_that_say_what_is_kept_and_no_cause_of_failure(monkeypatch, capsys):
+def test_ctrl_c_is_a_line_that_says_what_is_kept_and_no_cause_of_failure(monkeypatch, capsys):
     def pressed():
         raise KeyboardInterrupt
 
     status, text, fault = stopped_by(monkeypatch, capsys, pressed)
     assert (status, fault) == (130, faults.STOPPED)
-    assert text.splitlines() == [
-        "neuspring: stopped. What is finished is kept; searches and fits go on from their checkpoints.",
-        "Start the same command again to continue.",
-    ]
+    again = "Start the same command again to continue; searches and fits go on from their checkpoints."
+    assert text == f"neuspring: stopped. What is finished is kept. {again}\n"
 
 
 def test_other_errors_of_the_system_are_not_taken_for_a_full_disk(monkeypatch, capsys):

@@ -124,7 +124,7 @@ def test_each_fault_costs_one_job_and_the_same_command_continues(project, tmp_pa
     assert record(results, f"observe/{RELEASED}").last.cause == "bad input"
     assert f"observe/{RELEASED}: bad input (attempt 1)" in output
     assert f"neuspring: error: {case / 'final_data.pkl'}" in output
-    assert "not tried again (bad input)" in output
+    assert "not tried again (bad input; said above)" in output
     assert "MissingOutputException" not in output, "the command fails by its status"
     # The server is away: the runs wait on disk.
     assert {path.read_text().split(":")[0] for path in results.glob("*/*/*/mlflow.txt")} == {"unreachable"}

@@ -44,7 +44,10 @@ if QUIET:
     errors.setLevel(logging.ERROR)
     # Of a job that failed its wrapper says why in a line. Snakemake would print its command, which holds all settings.
     errors.addFilter(
-        lambda record: getattr(record, "event", None) != LogEvent.JOB_ERROR
+        lambda record: (
+            getattr(record, "event", None) != LogEvent.JOB_ERROR
+            and "CalledProcessError" not in record.getMessage()
+        )
     )
     errors.setFormatter(next(each.formatter for each in logger.handlers))
     logger.addHandler(errors)

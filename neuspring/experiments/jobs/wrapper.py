@@ -128,7 +128,7 @@ def _run(
     this = this_run(results)
     if this and earlier and earlier[-1].outcome == "permanent" and earlier[-1].run == this:
         # Snakemake cannot tell causes apart; its second try ends here.
-        print(f"not tried again ({earlier[-1].cause}): {earlier[-1].message}", file=sys.stderr)
+        print(f"not tried again ({earlier[-1].cause}; said above)", file=sys.stderr)
         return earlier[-1].exit or 1
 
     def save(attempt: Attempt) -> None:
