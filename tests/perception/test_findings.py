@@ -233,6 +233,18 @@ def test_lifted_tracks_that_cannot_be_right_are_said(changes, name):
     assert f"warning: {name}" in said(look_at_lifted(replace(tracked(BOX), **changes), no_prior(), 1.0))
 
 
+@pytest.mark.parametrize(("count", "frames", "level"), [(3, 20, "warning"), (1, 20, "note")])
+def test_a_hand_on_the_object_without_controllers_is_said(count, frames, level):
+    short = tracked(BOX)
+    many = {name: np.repeat(getattr(short, name)[:1], frames, axis=0) for name in ("object_points", "object_visibility")}
+    many |= {"object_motion_valid": np.ones((frames, len(BOX)), bool), "controller_points": np.zeros((frames, 3, 3))}
+    long = replace(short, **many, facts={"stray_hand_frames": float(count), "stray_hand_first": 2.0})
+    [found] = [one for one in look_at_lifted(long, no_prior(), 1.0) if one.name == "hand without controllers"]
+    assert found.level == level
+    assert f"in {count} training frames, first in frame 2, a hand is on the object that no controller follows" in found.text
+    assert "End the capture before frame 2, or begin it when all hands are in view (make-capture --frames)." in found.text
+
+
 def observed(hand: np.ndarray, step: np.ndarray, rate: float = 30.0, follows: bool = True) -> Observations:
     """A box of points and three controllers at `hand`, which move by `step` per frame; the box with them if it follows."""
     motion = np.arange(FRAMES)[:, None, None] * step
