@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ import torch
 import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from trimesh.visual.material import PBRMaterial
 
 from neuspring.core.artifacts import Observations, SplatCenters, Twin
 from neuspring.core.errors import InputError
@@ -50,13 +52,13 @@ class Display:
     """What is shown, and how."""
 
     quantity: str = "stiffness"
-    nodes: bool = True
-    springs: bool = True
-    hands: bool = True
-    splats: bool = False
-    points: bool = True
-    tracks: bool = True
-    cameras: bool = True
+    splats: bool = True
+    nodes: bool = False
+    springs: bool = False
+    hands: bool = False
+    points: bool = False
+    tracks: bool = False
+    cameras: bool = False
     images: bool = False
     gap: float = 1.2
     """Distance between runs, as a part of the scene's size; 0: all in one place."""
@@ -93,10 +95,11 @@ class BodyLayer:
         return len(self.twin.topology.springs) - len(self.parts.pairs) if self.twin and self.parts else 0
 
     def show(self, display: Display) -> None:
-        """Show the parts that are wanted."""
-        self.nodes.visible, self.hands.visible = display.nodes, display.hands
+        """Show the parts that are wanted; nodes and springs in place of splats that it lacks."""
+        bare = display.splats and self.splats is None
+        self.nodes.visible, self.hands.visible = display.nodes or bare, display.hands
         if self.springs is not None:
-            self.springs.visible = display.springs
+            self.springs.visible = display.springs or bare
         if self.splats is not None:
             self.splats.show(display.splats)
         if self.overlay is not None:
@@ -128,10 +131,18 @@ class BodyLayer:
         self.nodes.batched_colors = linear(colors)
 
     def handles(self) -> Any:
-        """Unseen balls about the nodes, large enough to be hit with a mouse."""
+        """Unseen balls about the nodes, large enough to be hit with a mouse.
+
+        All their pixels are cut out (alpha mask): what is merely transparent would hide the splats behind it.
+        """
         if self._handles is None:
             places = self.nodes.batched_positions
-            self._handles = _balls(self._scene, f"/{self.name}/handles", places, self._reach, NODE, opacity=0.0)
+            ball = trimesh.creation.icosphere(subdivisions=1, radius=self._reach)
+            unseen = PBRMaterial(baseColorFactor=(0, 0, 0, 0), alphaMode="MASK", alphaCutoff=0.5)
+            ball.visual = trimesh.visual.TextureVisuals(material=unseen)
+            turns = np.tile(np.array([1.0, 0, 0, 0], np.float32), (len(places), 1))
+            make = functools.partial(self._scene.add_batched_glb, lod="off", cast_shadow=False, receive_shadow=False)
+            self._handles = make(f"/{self.name}/handles", ball.export(file_type="glb"), turns, places)
         return self._handles
 
     def remove(self) -> None:
@@ -146,7 +157,7 @@ def spacing(nodes: np.ndarray) -> float:
     return max(float(np.median(cKDTree(nodes).query(nodes, k=2)[0][:, 1])), 1e-4)
 
 
-def _balls(scene: viser.SceneApi, name: str, centers: np.ndarray, radius: float, colors: Any, opacity: float | None = None) -> Any:
+def _balls(scene: viser.SceneApi, name: str, centers: np.ndarray, radius: float, colors: Any) -> Any:
     ball = trimesh.creation.icosphere(subdivisions=1, radius=radius)
     turns = np.tile(np.array([1.0, 0, 0, 0], np.float32), (len(centers), 1))
     return scene.add_batched_meshes_simple(
@@ -156,7 +167,6 @@ def _balls(scene: viser.SceneApi, name: str, centers: np.ndarray, radius: float,
         turns,
         np.asarray(centers, np.float32),
         batched_colors=linear(np.asarray(colors, np.uint8)),
-        opacity=opacity,
         lod="off",
         cast_shadow=False,
         receive_shadow=False,

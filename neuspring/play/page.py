@@ -37,9 +37,17 @@ PARTS = {
 DRAG = "Start, then drag a node or a hand (red) with the left button. Drag beside them to turn the view."
 REPEAT = "Hands move as recorded, while you pull elsewhere. Switching begins again."
 FROM = "Begins in the state of the prediction in this frame"
-KEYS = "Keys: space plays, arrows left and right step, home and end jump, R resets a live twin."
+KEYS = "Keys: space plays, arrows left and right step, home and end jump, R resets a live twin, Escape leaves it."
+BACK = "Back to the recording"
 OPENING = math.radians(45)
 """Vertical angle of view."""
+PHONE, COVERED = 576, 0.45
+"""A window narrower than this, CSS pixels, has its panel below, over this part of it."""
+FIT = (
+    f"<style>@media (max-width: {PHONE}px) {{ [style*='max-height: 60%'] {{ width: 100% !important; "
+    f"max-height: {COVERED:.0%} !important }} [style*='width: 20em'] {{ width: 100% !important }} }}</style>"
+)
+"""viser's panel on a phone is as wide as the window."""
 SMALL = "margin:0 .8em;font-size:.8em"
 MARKS = {
     "observed points": layers.SEEN,
@@ -58,7 +66,9 @@ class Page:
     def __init__(self, server: viser.ViserServer, found: Scene, save_to: Path = Path()) -> None:
         self.server, self.found, self.player = server, found, Player(server.scene, found)
         self._stop, self._moved = threading.Event(), False
-        self._alive, self._before = False, self.player.display.quantity
+        self._watched = threading.Event()
+        self._watched.set()
+        self._alive, self._before = False, (self.player.display.quantity, self.player.display.hands)
         self.boxes: dict[str, Any] = {}
         self.parts: dict[str, Any] = {}
         scenario, gui = found.observations.scenario, server.gui
@@ -69,10 +79,13 @@ class Page:
         camera = server.initial_camera
         camera.fov = OPENING
         camera.up, camera.look_at, camera.position = self.player.view(OPENING)
+        server.on_client_connect(self._connected)
+        server.on_client_disconnect(lambda client: self._left())
+        gui.add_html(FIT)
         gui.add_markdown(
             f"**{scenario.name}** ({scenario.category}): {scenario.frame_count} frames at {scenario.frame_rate:g} per second"
         )
-        self.quantity: Any = gui.add_dropdown("Springs by", QUANTITIES, initial_value=self._before)
+        self.quantity: Any = gui.add_dropdown("Springs by", QUANTITIES, initial_value=self._before[0])
         self.legend = gui.add_html("")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Recording"):
@@ -81,7 +94,7 @@ class Page:
         with tabs.add_tab("Show"):
             self._add_parts()
         with tabs.add_tab("Live"):
-            self.panel = LivePanel(server, self.player, save_to, self._lived)
+            self.panel = LivePanel(server, self.player, save_to, self._lived, self._watched)
         for handle in (self.quantity, self.gap, *self.boxes.values(), *self.parts.values()):
             handle.on_update(lambda _: self._changed())
         self._changed()
@@ -145,7 +158,8 @@ class Page:
             gui.add_command(label, hotkey=key).on_trigger(lambda _, action=action: action())  # type: ignore[misc,arg-type]
 
     def toggle(self) -> None:
-        """Play, or pause."""
+        """Play, or pause; a live twin ends."""
+        self.panel.stop()
         clock = self.player.clock
         with self.player.lock:
             if not clock.playing and clock.frame == clock.count - 1:
@@ -154,7 +168,8 @@ class Page:
         self.play.label = "Pause" if clock.playing else "Play"
 
     def show(self, frame: int) -> None:
-        """Go to a frame, and stay there."""
+        """Go to a frame, and stay there; a live twin ends."""
+        self.panel.stop()
         with self.player.lock:
             self.player.clock.playing = False
             self.player.clock.show(frame)
@@ -184,16 +199,43 @@ class Page:
         self._update_error_text()
 
     def _lived(self) -> None:
-        """A live twin has begun or ended: it is shown by strain, unless something else was chosen."""
+        """A live twin has begun or ended: it is shown by strain, with hands to be pulled, unless something else was chosen."""
         live = self.panel.live is not None
         if live != self._alive:
-            self._alive = live
+            self._alive, hands = live, self.parts["hands"]
             if live:
-                self._before = self.quantity.value
-                self.quantity.value = "strain"
-            elif self.quantity.value == "strain":
-                self.quantity.value = self._before
+                self._before = self.quantity.value, hands.value
+                self.quantity.value, hands.value = "strain", True
+            else:
+                self.quantity.value = self._before[0] if self.quantity.value == "strain" else self.quantity.value
+                hands.value = self._before[1]
+            for client in self.server.get_clients().values() if len(self.player.display.runs) > 1 else ():
+                self._frame(client)
         self._changed()
+
+    def _connected(self, client: viser.ClientHandle) -> None:
+        self._watched.set()
+        self._frame(client)
+        wide, end = client.camera.image_width, time.monotonic() + 5
+        # The panel takes its place a moment later.
+        while client.camera.image_width == wide and time.monotonic() < end and not self._stop.wait(0.1):
+            pass
+        if client.camera.image_width != wide:
+            self._frame(client)
+
+    def _left(self) -> None:
+        """Time stands still while nobody has the page open."""
+        if not self.server.get_clients():
+            self._watched.clear()
+
+    def _frame(self, client: viser.ClientHandle) -> None:
+        """Let a browser see all that is shown, whatever the shape of its window."""
+        camera = client.camera
+        wide, high = max(camera.image_width, 1), max(camera.image_height, 1)
+        covered, count = (COVERED if wide < PHONE else 0.0), (1 if self._alive else MOST_SHOWN)
+        # A new place moves what is looked at, so that this comes last.
+        _, look_at, camera.position = self.player.view(camera.fov, wide / high, covered, count)
+        camera.look_at = look_at
 
     def _update_error_text(self) -> None:
         found = self.player.errors()
@@ -205,7 +247,7 @@ class Page:
         while not self._stop.wait(1 / RATE):
             now = time.monotonic()
             with self.player.lock:
-                changed = self.player.clock.advance(now - last) or self._moved
+                changed = (self._watched.is_set() and self.player.clock.advance(now - last)) or self._moved
                 self._moved, last = False, now
                 if changed:
                     with self.server.atomic():
@@ -224,9 +266,11 @@ class Page:
 class LivePanel:
     """Starts and ends a live twin; `changed` is called when it has begun or ended."""
 
-    def __init__(self, server: viser.ViserServer, player: Player, save_to: Path, changed: Callable[[], None]) -> None:
+    def __init__(
+        self, server: viser.ViserServer, player: Player, save_to: Path, changed: Callable[[], None], watched: threading.Event
+    ) -> None:
         self.live: Live | None = None
-        self._server, self._player, self._save_to, self._changed = server, player, save_to, changed
+        self._server, self._player, self._save_to, self._changed, self._watched = server, player, save_to, changed, watched
         self._lock = threading.RLock()
         names = [run.name for run in player.found.runs if "twin" in run.paths]
         gui = server.gui
@@ -249,6 +293,7 @@ class LivePanel:
         for choice in (self.twin, self.frame, self.repeat):
             choice.on_update(lambda _: self._chosen())
         gui.add_command("Reset the live twin", hotkey="R").on_trigger(lambda _: self._reset())
+        gui.add_command(BACK, hotkey="escape").on_trigger(lambda _: self.stop())
         server.on_client_disconnect(lambda client: self._disconnected(client.client_id))
 
     def start(self, name: str, played: Controls | None = None) -> None:
@@ -260,13 +305,13 @@ class LivePanel:
                 seen, frame = self._player.found.observations, int(self.frame.value)
                 begin = StartState(played.start_frame, played.start) if played else start_state(run, seen, frame, self.repeat.value)
                 self._player.hide(True, float(self.most.value))
-                self.live = Live(self._server, self._player, run, begin, played)
+                self.live = Live(self._server, self._player, run, begin, played, self._watched)
             except InputError as error:
                 self._player.hide(False)
                 self.text.content = f"<div style='margin:0 .8em'>{escape(str(error))}</div>"
                 return
             self._limit()
-            self.switch.label, self.again.disabled, self.save.disabled = "Stop", False, played is not None
+            self.switch.label, self.again.disabled, self.save.disabled = BACK, False, played is not None
 
     def stop(self) -> None:
         """Back to the recording."""

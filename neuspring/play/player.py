@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import threading
 from dataclasses import dataclass
@@ -18,8 +19,10 @@ if TYPE_CHECKING:
     import viser
 
 SPEEDS = {"0.1 ×": 0.1, "0.25 ×": 0.25, "0.5 ×": 0.5, "1 ×": 1.0, "2 ×": 2.0, "4 ×": 4.0}
-ROOM = 1.1
+ROOM = 1.08
 """The first view shows so much of what the runs fill."""
+WAY = (1.0, -0.35, 0.45)
+"""Where it is seen from: across the row of runs, from above."""
 SAMPLES = 12
 """Frames that the range of strain and force is taken from."""
 MOST_SHOWN = 8
@@ -92,7 +95,9 @@ class Player:
         scenario = found.observations.scenario
         self.found, self.lock = found, threading.RLock()
         self.clock = Clock(scenario.frame_count, scenario.frame_rate, scenario.train_end)
-        self.display = Display(runs=list(found.shown))
+        bare = not any("splats" in run.paths for run in found.runs)
+        plain = dict.fromkeys(("nodes", "springs", "hands", "points", "tracks"), bare)
+        self.display = Display(runs=list(found.shown), splats=not bare, **plain)
         self.scale: Scale | None = None
         self.notes: dict[str, str] = {}
         """Run -> why it is not shown, or what to know about it."""
@@ -155,14 +160,23 @@ class Player:
         """Where a run stands: beside the others along y, the first one where it was observed."""
         return (0.0, index * self.display.gap * max(float(self.high[1] - self.low[1]), 0.5 * self.size), 0.0)
 
-    def view(self, opening: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Up [3], the middle of the shown runs [3], m, and from where all are seen [3], m, with an angle of view, rad."""
+    def view(self, opening: float, aspect: float = 1.0, covered: float = 0.0, count: int = MOST_SHOWN) -> tuple[np.ndarray, ...]:
+        """Up [3], where to look [3], m, and from where [3], m, so that the first `count` shown runs fill the window in all frames.
+
+        `opening` is the vertical angle of view, rad, `aspect` width over height; a panel hides the lower part `covered` of it.
+        """
         sign = self.found.observations.scenario.up_sign
-        last = np.array(self.offset(max(min(len(self.display.runs), MOST_SHOWN) - 1, 0)))
-        middle, reach = 0.5 * (self.low + self.high + last), self.size + float(np.linalg.norm(last))
-        way = np.array([1.0, -0.35, 0.45 * sign])
-        distance = ROOM * 0.5 * reach / math.tan(opening / 2)
-        return np.array([0.0, 0.0, sign]), middle, middle + distance * way / np.linalg.norm(way)
+        shifts = np.array([self.offset(index) for index in range(max(min(len(self.display.runs), count), 1))])
+        corners = np.array(list(itertools.product(*zip(self.low, self.high, strict=True))))
+        points = (corners + shifts[:, None]).reshape(-1, 3)
+        middle, up = 0.5 * (points.min(axis=0) + points.max(axis=0)), np.array([0.0, 0.0, sign])
+        way = np.array(WAY) * (1.0, 1.0, sign) / np.linalg.norm(WAY)
+        right = np.cross(up, way) / np.linalg.norm(np.cross(up, way))
+        top, half = np.cross(way, right), math.tan(opening / 2)
+        x, y, z = np.stack([right, top, way]) @ (points - middle).T
+        distance = ROOM * float(np.max([z + np.abs(x) / (half * aspect), z + np.abs(y) / (half * (1 - covered))]))
+        look_at = middle - covered * half * distance * top
+        return up, look_at, look_at + distance * way
 
     def draw(self) -> None:
         """Show the clock's frame."""
@@ -181,7 +195,7 @@ class Player:
     def legend(self) -> str:
         """The legend of the springs' colors as HTML."""
         twins = [body.twin for body in self._bodies.values() if body.twin]
-        if not twins or not self.display.springs:
+        if not any(body.springs is not None and body.springs.visible for body in self._bodies.values()):
             return ""
         if self.scale is None:
             return region_legend(twins[0])

@@ -51,14 +51,63 @@ def until(what) -> None:
 
 
 def test_a_live_twin_is_shown_by_strain_and_the_recording_as_before(opened, scenario):
+    dressed(scenario)
     page = opened(scenario)
+    page.parts["springs"].value = True
+    assert not page.parts["hands"].value
     page.panel.start(RUN)
     assert page.quantity.value == "strain" and "-0.3" in page.legend.content
+    assert page.panel.live.body.hands.visible and page.panel.switch.label == "Back to the recording"
     page.panel.most.value = 0.5
     page.panel._limit()
     assert "-0.5" in page.legend.content
     page.panel.stop()
     assert page.quantity.value == "stiffness" and "stiffness Y" in page.legend.content
+    assert not page.player._bodies[RUN].hands.visible
+
+
+@pytest.mark.parametrize("action", [lambda page: page.toggle(), lambda page: page.show(3)])
+def test_playing_and_stepping_lead_back_from_a_live_twin(opened, scenario, action):
+    page = opened(scenario)
+    page.panel.start(RUN)
+    action(page)
+    assert page.panel.live is None and page.player._bodies[RUN].root.visible
+
+
+def test_time_stands_still_while_nobody_has_the_page_open(opened, scenario):
+    page = opened(scenario)
+    page.panel.start(RUN)
+    live = page.panel.live
+    until(lambda: live.simulator.frame > 2)
+    page._left()
+    time.sleep(0.3)
+    frame = live.simulator.frame
+    time.sleep(0.3)
+    assert live.simulator.frame == frame
+    page._watched.set()
+    until(lambda: live.simulator.frame > frame)
+    page.toggle()
+    page._left()
+    time.sleep(0.1)
+    before = page.player.clock.time
+    time.sleep(0.2)
+    assert page.player.clock.time == before and page.player.clock.playing
+
+
+@pytest.mark.parametrize(("aspect", "covered"), [(1.6, 0.0), (0.46, 0.45)])
+def test_the_first_view_holds_all_runs_and_no_more_room_than_needed(opened, scenario, aspect, covered):
+    player, opening = opened(scenario).player, 0.8
+    assert len(player.display.runs) == 2
+    up, look_at, position = player.view(opening, aspect, covered)
+    far = (look_at - position) / np.linalg.norm(look_at - position)
+    right = np.cross(far, up) / np.linalg.norm(np.cross(far, up))
+    corners = np.stack(np.meshgrid(*zip(player.low, player.high, strict=True)), axis=-1).reshape(-1, 3)
+    points = np.concatenate([corners + player.offset(index) for index in range(2)]) - position
+    x, y = (points @ axis / (points @ far) / np.tan(opening / 2) for axis in (right, np.cross(right, far)))
+    x /= aspect
+    # The lower part of the window is covered.
+    assert np.abs(x).max() <= 1 and y.max() <= 1 and y.min() >= 2 * covered - 1
+    assert max(np.abs(x).max(), (np.abs(y - covered) / (1 - covered)).max()) > 0.85
 
 
 def test_a_stretch_above_the_limit_is_red_and_said(opened, scenario):
@@ -102,14 +151,16 @@ def test_the_track_error_in_a_frame_is_that_of_the_scores(opened, scenario):
     assert f"{RUN} {1e3 * expected:.1f} mm" in page.player.errors()
 
 
-def test_splats_are_put_on_when_they_are_wanted(opened, scenario):
+def test_splats_come_first_and_nodes_springs_and_hands_at_a_switch(opened, scenario):
     dressed(scenario)
     page = opened(scenario)
     body = page.player._bodies[RUN]
-    assert body.splats is None
-    page.parts["splats"].value = True
+    parts = (body.nodes, body.springs, body.hands)
+    assert body.splats.shown and not any(part.visible for part in parts) and not page.legend.content
+    for name in ("nodes", "springs", "hands"):
+        page.parts[name].value = True
     page._changed()
-    assert body.splats.shown
+    assert all(part.visible for part in parts) and "stiffness Y" in page.legend.content
     before = body.splats.handle.centers.copy()
     page.player.clock.show(7)
     page.player.draw()

@@ -171,7 +171,7 @@ def test_a_method_left_out_everywhere_takes_nothing_from_the_others(results):
     assert set(found.runs["method"]) == {"ours"}
     text = tables.summary_text(tables.Benchmark(everything=found, baseline="ours"))
     assert "Left out: spring_gaus on cable" in text and "does not apply" not in text
-    assert "10.00 (10.00)" in text
+    assert "10.00" in text
 
 
 def test_a_damaged_held_file_is_a_damaged_run(results):
@@ -187,9 +187,9 @@ def test_a_study_has_the_success_count_and_both_averages(results, tmp_path):
     assert "| 1/2 (1 failed) *" in text and "| 3/3 " in text
     assert "* Some runs failed; the table of failures has both averages" in text
     section = text.partition("## Failures")[2].partition("\n## ")[0]
-    own, kept = ([cell.strip() for cell in line.split("|")[1:-1]] for line in section.splitlines() if "| 0." in line)
-    assert own == ["Spring-Gaus", "1/2", "its successes", "0.00400", "0.03000"]
-    assert kept == ["", "", "all, failures held", "0.05200", "0.26500"]
+    own, kept = ([cell.strip() for cell in line.split("|")[1:-1]] for line in section.splitlines() if ".00" in line)
+    assert own == ["Spring-Gaus", "1/2", "its successes", "4.00", "30.00"]
+    assert kept == ["", "", "all, failures held", "52.00", "265.00"]
     assert "Spring-Gaus 1 (1 by its failures alone)" in text
     assert "- Left out: Spring-Gaus on cable: it needs images." in text
     assert "- Ours, cable / seed 0: not comparable, since without this scenario and seed: Spring-Gaus (does not apply)" in text
@@ -223,7 +223,8 @@ def test_every_command_of_tables_takes_what_is_left_out(results, tmp_path, capsy
     runs = ["--scenarios", "a", "b", "cable", "--methods", "ours", "spring_gaus", "--seeds", "0"]
     common = ["--results", str(results), *runs, "--left-out", '{"spring_gaus": ["cable"]}']
     assert main(["tables", *common, "--output", str(tmp_path / "out")]) == 0
-    assert main(["study", *common, "--study", "systems", "--table", str(studies), "--output", str(tmp_path / "out")]) == 0
+    made = str(results / "tables" / "studies")
+    assert main(["study", *common, "--study", "systems", "--table", str(studies), "--output", made]) == 0
     assert main(["report", *common, "--table", str(studies), "--output", str(tmp_path / "out" / "report.html")]) == 0
     told = capsys.readouterr().out
     assert "Left out: spring_gaus on cable" in told and "Left out: SG on cable" in told
