@@ -6,7 +6,7 @@ import itertools
 import math
 import threading
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -96,7 +96,7 @@ class Player:
         self.found, self.lock = found, threading.RLock()
         self.clock = Clock(scenario.frame_count, scenario.frame_rate, scenario.train_end)
         bare = not any("splats" in run.paths for run in found.runs)
-        plain = dict.fromkeys(("nodes", "springs", "hands", "points", "tracks"), bare)
+        plain: Any = dict.fromkeys(("nodes", "springs", "hands", "points", "tracks"), bare)
         self.display = Display(runs=list(found.shown), splats=not bare, **plain)
         self.scale: Scale | None = None
         self.notes: dict[str, str] = {}
