@@ -202,7 +202,9 @@ def stamped_job(rule, name, output, told, *modules):
     """
 
     def stamp(wildcards):
-        return stamp_of(RESULTS, told(wildcards), *modules)
+        # Wherever the project lies.
+        words = [word.replace(f"{ROOT}/", "") for word in told(wildcards)]
+        return stamp_of(RESULTS, words, *modules)
 
     log = log_of(rule, name)
     return log, compared_with_stamp(log, output, stamp), stamp
