@@ -17,7 +17,6 @@ EXTRAS = {
     "torchvision": "perception",
     "gsplat": "gpu",
     "psycopg2": "postgresql",
-    "snakemake_executor_plugin_slurm": "slurm",
     "snakemake_executor_plugin_cluster_generic": "kubernetes",
 }
 """Module -> extra, as in pyproject.toml."""

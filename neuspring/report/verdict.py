@@ -94,7 +94,8 @@ class Duel:
         self.rival = benchmark.baseline if benchmark.baseline in others else next(iter(others), "")
         self.scenarios, self.seeds = part["scenario"].nunique(), part["seed"].nunique()
         finished = benchmark.finished[benchmark.finished["metric"] == name]
-        self.each: Any = finished.groupby(["method", "task", "scenario"])["value"].mean().to_dict()
+        each = finished.groupby(["method", "task", "scenario"])["value"].mean()
+        self.each: dict[Any, float] = dict(zip(each.index.tolist(), each.tolist(), strict=True))
         own = {scenario: value for (method, at, scenario), value in self.each.items() if (method, at) == (self.best, task)}
         self.by_scenario = dict(sorted(own.items(), key=lambda pair: -pair[1]))
         self.weakest = next(iter(self.by_scenario))

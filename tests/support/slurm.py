@@ -60,7 +60,7 @@ def _check() -> None:
     if missing:
         raise NoSlurmError(f"needs Debian's packages slurm-wlm and munge; missing: {', '.join(missing)}")
     if importlib.util.find_spec("snakemake_executor_plugin_slurm") is None:
-        raise NoSlurmError("needs snakemake-executor-plugin-slurm: pip install 'neuspring[slurm]'")
+        raise NoSlurmError("needs snakemake-executor-plugin-slurm: make install")
     if "SLURM_CONF" in os.environ:
         raise NoSlurmError("SLURM_CONF names another Slurm")
 
