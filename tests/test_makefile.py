@@ -50,5 +50,5 @@ def test_an_environment_whose_python_is_gone_or_too_old_is_replaced_with_a_word(
     assert install(folder, "./old").startswith("PYTHON=./old: "), "nothing is removed for a Python that does not suit"
     assert (folder / ".venv" / ".installed").exists()
     output = install(folder, "./good").splitlines()
-    assert output[0] == "Replacing .venv: its Python is missing or too old"
+    assert output[0] == "Replacing .venv: its Python is missing or not 3.11 to 3.13"
     assert output[-1] == "ran: -m venv .venv" and not (folder / ".venv").exists()

@@ -69,8 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         return 1
     except KeyboardInterrupt:
-        again = "Start the same command again to continue; searches and fits go on from their checkpoints."
-        print(f"neuspring: stopped. What is finished is kept. {again}", file=sys.stderr)
+        print("neuspring: stopped. Start it again; searches and fits go on from their checkpoints.", file=sys.stderr)
         return 128 + signal.SIGINT
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -67,16 +68,8 @@ def tables(
     collected = collect(results, scenarios, methods, seeds, without)
     moved = collect_transfers(results, transfers, methods, seeds)
     against = baseline or methods[0]
-    warned = warnings_of(results, scenarios)
-    benchmark = Benchmark(
-        everything=collected,
-        baseline=against,
-        objects=objects,
-        aims=wanted,
-        transfers=moved,
-        warnings=warned,
-        made_otherwise=_made_otherwise(settings, results),
-    )
+    noticed = {"warnings": warnings_of(results, scenarios), "made_otherwise": _made_otherwise(settings, results)}
+    benchmark = Benchmark(everything=collected, baseline=against, objects=objects, aims=wanted, transfers=moved, **noticed)
     text = write(benchmark, output)
     print(headline(text) if brief else text)
     print(f"Tables: {output / 'summary.md'}")
@@ -96,7 +89,11 @@ def _made_otherwise(settings: str, results: Path) -> tuple[str, ...]:
     if not settings:
         return ()
     values = plain(read_settings(settings)) | {"results": str(results)}
-    return tuple(Freshness(Graph(Benchmark(values, ROOT.parent))).of_runs())
+    try:
+        return tuple(Freshness(Graph(Benchmark(values, ROOT.parent))).of_runs())
+    except InputError as error:
+        # Of a part of the scenarios, for example, whose others have no data here.
+        return (f"  Not compared with the configuration: {error}",)
 
 
 def perception_table(
@@ -282,6 +279,10 @@ def ui(results: Results = Path("results"), settings: Settings = "{}", host: str 
     if uri.startswith("http"):
         print(f"The tracking server is at {uri}/{place}")
         return
+    try:
+        socket.create_server((host, port)).close()
+    except OSError as error:
+        raise InputError("--port", "must be free", f"{port} ({error.strerror})", f"Give another: --port {port + 1}.") from error
     address, server = f"http://{host}:{port}", os.getpid()
     if os.fork() == 0:
         # Beside the server: it tells the address when there is an answer.

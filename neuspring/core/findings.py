@@ -35,6 +35,8 @@ class Finding:
     """The file, the camera, or what else was looked at."""
     text: str
     """The value, the rule that it departs from, and the next move."""
+    remedy: str = ""
+    """The next move alone, where it is known apart."""
 
     @property
     def message(self) -> str:
@@ -47,7 +49,7 @@ class Finding:
 
 def finding(name: str, level: Level, where: str, value: str, rule: str, remedy: str = "") -> Finding:
     """A finding whose text is `value` (what was received), the `rule`, and the next move."""
-    return Finding(name=name, level=level, where=where, text=f"{value}; {rule}. {remedy}".rstrip())
+    return Finding(name=name, level=level, where=where, text=f"{value}; {rule}. {remedy}".rstrip(), remedy=remedy)
 
 
 def broken(file: Path, key: str, rule: str, value: object = None) -> Finding:

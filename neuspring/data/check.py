@@ -20,16 +20,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
 from neuspring.core.findings import Finding, broken, note, refusal, unusual
 from neuspring.data import mocap, phystwin, plausible
-from neuspring.data.capture import (
-    CAPTURE,
-    OBJECT,
-    POINTS,
-    TRACKS,
-    Capture,
-    Description,
-    description_findings,
-    read_description,
-)
+from neuspring.data.capture import CAPTURE, OBJECT, POINTS, TRACKS, Capture, Description, description_findings, read_description
 from neuspring.data.intake.depth import FAR, FASTEST, NEAR, SLOWEST, cloud, planes
 from neuspring.data.released import Released, parameter_findings, prediction_findings, read_checkpoint
 from neuspring.data.unpickle import load_pickle

@@ -79,15 +79,20 @@ def for_targets(values: Mapping[str, Any], targets: Collection[str], root: Path)
 
     So a table of the paper is made of its rows and no others, whatever methods the configuration names. Raises InputError.
     """
-    studies, listed = read_studies(root / values.get("study_table", Config.study_table)), values.get("studies") or []
+    tables = [values.get(key, getattr(Config, key)) for key in ("study_table", "method_table")]
+    listed = values.get("studies") or []
+    # What is of another type is refused where settings are read.
+    if not targets or not isinstance(listed, list) or not all(isinstance(table, str) for table in tables):
+        return {}
+    studies = read_studies(root / tables[0])
     asked = [name for name in studies if name in targets]
-    if not asked or not isinstance(listed, list):
+    if not asked:
         return {}
     changes: dict[str, Any] = {"studies": [*listed, *(name for name in asked if name not in listed)]}
     if len(asked) == len(targets):
-        known = read_methods(root / values.get("method_table", Config.method_table))
+        known = read_methods(root / tables[1])
         shown = [name for study in asked for name in rows_of(studies, study) if name in known]
-        changes["only"] = f"method={','.join(dict.fromkeys(shown))} {values.get('only', '')}".strip()
+        changes["only"] = f"method={','.join(dict.fromkeys(shown))} {values.get('only') or ''}".strip()
     return changes
 
 

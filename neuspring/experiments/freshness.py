@@ -62,16 +62,16 @@ class Freshness:
     def _of_record(self, stage: Stage, job: Any, output: Path) -> Iterator[str]:
         try:
             record = read_json(stage.record_of(output), RECORD_FORMAT)
-            settings, inputs = record["settings"], dict(record["inputs"])
-        except (InputError, KeyError):
+            maker, settings, inputs = record["stage"], record["settings"], dict(record["inputs"])
+        except (InputError, KeyError, TypeError, ValueError):
             yield "no record of how it was made"
             return
-        if record["stage"] != stage.name:
-            yield f"made by {record['stage']}"
+        if maker != stage.name:
+            yield f"made by {maker}"
         before, now = (flat(values) for values in (settings, self.graph.recorded(stage, job)))
-        for name, value in now.items():
-            if before.get(name) != value:
-                yield f"{name} {_short(before.get(name))} -> {_short(value)}"
+        for name in dict.fromkeys([*now, *before]):
+            if name not in before or name not in now or before[name] != now[name]:
+                yield f"{name} {_short(before.get(name))} -> {_short(now.get(name))}"
         if record.get("code", "") != self.graph.code(stage, job):
             yield "code" if record.get("code") else "code (an older version)"
         for role, path in self._roles(stage, job).items():

@@ -32,14 +32,7 @@ from neuspring.stages.stage import Stage
 TEMPLATES = Path(__file__).parents[1] / "report" / "templates"
 SPLATS = "appearance"
 """Folder of the splats that all methods share; those of one method have its name behind a hyphen."""
-CHANGES_NOTHING: dict[str, Any] = {
-    "only": "",
-    "gpus": {},
-    "tracking": {},
-    "twins_per_launch": "auto",
-    "device": "auto",
-    "tune": None,
-}
+NEUTRAL: dict[str, Any] = {"only": "", "gpus": {}, "tracking": {}, "twins_per_launch": "auto", "device": "auto", "tune": None}
 """Keys that no result depends on, with what stands for them where settings are compared."""
 Files = str | list[str]
 _stamps = functools.cache(image_stamps)
@@ -410,7 +403,7 @@ class Graph:
         objects = [] if self.config.objects == "scenario" else ["--objects", self.config.objects]
         aims = ["--aims", _json(plain(self.config)["aims"])] if self.config.aims else []
         compared = ["--baseline", self.benchmark.compared_with]
-        settings = ["--settings", _json(plain(self.whole) | CHANGES_NOTHING)]
+        settings = ["--settings", _json(plain(self.whole) | NEUTRAL)]
         return [*self._runs(output or self.folder), *self._transfers(), *compared, *objects, *aims, *settings]
 
     def study(self, name: str) -> list[str]:

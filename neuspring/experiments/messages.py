@@ -40,7 +40,7 @@ class Overview:
 
     def __init__(self, results: Path, logs: Iterable[Path], stream: IO[str] | None = None) -> None:
         self._stream, self._run, self._begun = stream or sys.stdout, this_run(results), time.monotonic()
-        self._results, self._waiting = results, dict[str, set[Path]]()
+        self._waiting: dict[str, set[Path]] = {}
         self._scenes: dict[str, dict[Path, Path]] = {}
         """Scenario -> the job records of its scores, and the folders of their runs."""
         for log in logs:

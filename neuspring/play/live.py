@@ -35,17 +35,11 @@ FOR_SPLATS = 0.4
 class Live:
     """One twin, simulated in a thread of its own, one frame of the twin after another; `played`: a recording to show again.
 
-    It stands still while `watched` is not set.
+    It stands still while nobody watches the player.
     """
 
     def __init__(
-        self,
-        server: viser.ViserServer,
-        player: Player,
-        run: Run,
-        begin: StartState,
-        played: Controls | None = None,
-        watched: threading.Event | None = None,
+        self, server: viser.ViserServer, player: Player, run: Run, begin: StartState, played: Controls | None = None
     ) -> None:
         twin = run.twin
         if twin is None:
@@ -64,7 +58,7 @@ class Live:
         self.recording.begin(self.simulator.positions)
         self._latencies: deque[float] = deque(maxlen=WINDOW)
         self._splat_seconds = 0.0
-        self._again, self._stop, self._watched = threading.Event(), threading.Event(), watched
+        self._again, self._stop = threading.Event(), threading.Event()
         self.body = BodyLayer(server.scene, f"live {run.name}", twin, self.simulator.positions, hands)
         if played is None:
             self._listen()
@@ -153,7 +147,7 @@ class Live:
         ends: deque[float] = deque(maxlen=WINDOW)
         due = time.monotonic()
         while not self._stop.is_set():
-            if self._watched and not self._watched.wait(0.2):
+            if not self._player.watched.wait(0.2):
                 continue
             if self._again.is_set():
                 self._restart()

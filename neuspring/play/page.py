@@ -66,8 +66,6 @@ class Page:
     def __init__(self, server: viser.ViserServer, found: Scene, save_to: Path = Path()) -> None:
         self.server, self.found, self.player = server, found, Player(server.scene, found)
         self._stop, self._moved = threading.Event(), False
-        self._watched = threading.Event()
-        self._watched.set()
         self._alive, self._before = False, (self.player.display.quantity, self.player.display.hands)
         self.boxes: dict[str, Any] = {}
         self.parts: dict[str, Any] = {}
@@ -94,7 +92,7 @@ class Page:
         with tabs.add_tab("Show"):
             self._add_parts()
         with tabs.add_tab("Live"):
-            self.panel = LivePanel(server, self.player, save_to, self._lived, self._watched)
+            self.panel = LivePanel(server, self.player, save_to, self._lived)
         for handle in (self.quantity, self.gap, *self.boxes.values(), *self.parts.values()):
             handle.on_update(lambda _: self._changed())
         self._changed()
@@ -214,7 +212,7 @@ class Page:
         self._changed()
 
     def _connected(self, client: viser.ClientHandle) -> None:
-        self._watched.set()
+        self.player.watched.set()
         self._frame(client)
         wide, end = client.camera.image_width, time.monotonic() + 5
         # The panel takes its place a moment later.
@@ -226,7 +224,7 @@ class Page:
     def _left(self) -> None:
         """Time stands still while nobody has the page open."""
         if not self.server.get_clients():
-            self._watched.clear()
+            self.player.watched.clear()
 
     def _frame(self, client: viser.ClientHandle) -> None:
         """Let a browser see all that is shown, whatever the shape of its window."""
@@ -247,7 +245,7 @@ class Page:
         while not self._stop.wait(1 / RATE):
             now = time.monotonic()
             with self.player.lock:
-                changed = (self._watched.is_set() and self.player.clock.advance(now - last)) or self._moved
+                changed = (self.player.watched.is_set() and self.player.clock.advance(now - last)) or self._moved
                 self._moved, last = False, now
                 if changed:
                     with self.server.atomic():
@@ -266,11 +264,9 @@ class Page:
 class LivePanel:
     """Starts and ends a live twin; `changed` is called when it has begun or ended."""
 
-    def __init__(
-        self, server: viser.ViserServer, player: Player, save_to: Path, changed: Callable[[], None], watched: threading.Event
-    ) -> None:
+    def __init__(self, server: viser.ViserServer, player: Player, save_to: Path, changed: Callable[[], None]) -> None:
         self.live: Live | None = None
-        self._server, self._player, self._save_to, self._changed, self._watched = server, player, save_to, changed, watched
+        self._server, self._player, self._save_to, self._changed = server, player, save_to, changed
         self._lock = threading.RLock()
         names = [run.name for run in player.found.runs if "twin" in run.paths]
         gui = server.gui
@@ -305,7 +301,7 @@ class LivePanel:
                 seen, frame = self._player.found.observations, int(self.frame.value)
                 begin = StartState(played.start_frame, played.start) if played else start_state(run, seen, frame, self.repeat.value)
                 self._player.hide(True, float(self.most.value))
-                self.live = Live(self._server, self._player, run, begin, played, self._watched)
+                self.live = Live(self._server, self._player, run, begin, played)
             except InputError as error:
                 self._player.hide(False)
                 self.text.content = f"<div style='margin:0 .8em'>{escape(str(error))}</div>"

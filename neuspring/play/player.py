@@ -93,7 +93,8 @@ class Player:
 
     def __init__(self, scene: viser.SceneApi, found: Scene) -> None:
         scenario = found.observations.scenario
-        self.found, self.lock = found, threading.RLock()
+        self.found, self.lock, self.watched = found, threading.RLock(), threading.Event()
+        self.watched.set()
         self.clock = Clock(scenario.frame_count, scenario.frame_rate, scenario.train_end)
         bare = not any("splats" in run.paths for run in found.runs)
         plain: Any = dict.fromkeys(("nodes", "springs", "hands", "points", "tracks"), bare)

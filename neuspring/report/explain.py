@@ -154,7 +154,7 @@ def _only(table: pd.DataFrame, label: str, task: str, metric: str) -> pd.DataFra
 def _find_table(cell: str, folder: Path) -> tuple[StudyRecord, pd.DataFrame]:
     """The study that a cell names: what its table was made of, and its CSV."""
     names = studies_in(folder)
-    own = [BENCHMARK] if (Path(folder).parent / "averages.csv").is_file() else []
+    own = [BENCHMARK] if _has_numbers(Path(folder).parent) else []
     if not names and not own:
         raise InputError(
             folder, "tables must be here", "none", "Make them first: `neuspring tables` (a study: `snakemake table1`, or another)."
@@ -174,6 +174,12 @@ def _find_table(cell: str, folder: Path) -> tuple[StudyRecord, pd.DataFrame]:
 def studies_in(folder: Path) -> list[str]:
     """The studies whose tables are in a folder."""
     return sorted(path.stem for path in Path(folder).glob("*.json") if path.with_suffix(".csv").is_file())
+
+
+def _has_numbers(folder: Path) -> bool:
+    """Whether a folder of tables has averages; where no run can be compared, their file is there and empty."""
+    averages = folder / "averages.csv"
+    return averages.is_file() and averages.stat().st_size > 1
 
 
 def _benchmark(folder: Path) -> tuple[StudyRecord, pd.DataFrame]:
@@ -199,7 +205,7 @@ def runs_of(word: str, results: Path) -> list[Path]:
 
 def run_text(path: Path, configfiles: Sequence[str] = ()) -> tuple[str, bool]:
     """What is known of a run, and whether all is as recorded."""
-    record, results = RunRecord.load(path), path.parents[3]
+    record, results = RunRecord.load(path), path.absolute().parents[3]
     found = _behind(asdict(record), "", None, results, configfiles)
     scores = pd.read_parquet(path.parent / record.scores_file) if record.scores_file else pd.DataFrame()
     lines = [f"{record.name}: {record.status}{': ' * bool(record.reason)}{record.reason}"]
@@ -220,7 +226,7 @@ def known(results: Path, folder: Path) -> str:
     if not runs:
         raise InputError(results, "a results folder with finished runs is required", "none", "Name another: --results FOLDER.")
     lines = [f"A study: {name}/ROW/TASK/METRIC" for name in studies_in(folder)]
-    if (folder.parent / "averages.csv").is_file():
+    if _has_numbers(folder.parent):
         _, table = _benchmark(folder.parent)
         names = [" | ".join(dict.fromkeys(table[column])) for column in ("label", "task", "metric")]
         lines.insert(0, f"A number of {folder.parent}/summary.md: METHOD/TASK/METRIC, of\n  " + "\n  ".join(names))

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
 from neuspring.baselines import REFERENCES
+from neuspring.core.text import listed
 from neuspring.report.blocks import Text
 from neuspring.report.notes import causes
 from neuspring.report.study_cells import LEAST_SCENARIOS
@@ -50,7 +50,7 @@ def verdict(benchmark: Benchmark) -> list[Text]:
         "Is it resolved": duel.resolved(),
         "What went wrong": [*_unfinished(runs), *duel.weak(), *duel.others()] or ["Nothing that the runs recorded."],
         "Probable cause": [cause for cause, _ in why],
-        "Next move": list(dict.fromkeys(move for _, move in why)),
+        "Next move": list(dict.fromkeys(move for _, move in why if move)),
     }
     return _paragraphs(said)
 
@@ -65,10 +65,6 @@ def headline(summary: str) -> str:
 
 def _paragraphs(said: dict[str, list[str]]) -> list[Text]:
     return [Text(label=label, text=" ".join(sentences)) for label, sentences in said.items() if sentences]
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:MOST]) + (f" and {len(names) - MOST} more" if len(names) > MOST else "")
 
 
 def _unfinished(runs: pd.DataFrame) -> list[str]:
@@ -150,7 +146,7 @@ class Duel:
             said.append(f"{self.best} is weakest in {self.weakest} ({self.text(self.by_scenario[self.weakest])}).")
         rivals = {name: self.each.get((self.rival, self.task, name)) for name in self.by_scenario}
         worse = [name for name, value in rivals.items() if value is not None and value < self.by_scenario[name]]
-        said += [f"{self.rival} is better in {_listed(worse)}."] if worse else []
+        said += [f"{self.rival} is better in {listed(worse, MOST)}."] if worse else []
         return [*said, f"{self.best} learns nothing, and no method that learns is better."] if self.best in REFERENCES else said
 
     def others(self) -> list[str]:
@@ -167,7 +163,7 @@ class Duel:
     def causes(self) -> list[tuple[str, str]]:
         """What records say, with the next move, weakest scenario first: warnings of perception there, then search and fit."""
         warned = [one for scenario, one in self.benchmark.warnings if scenario == self.weakest]
-        found = [(f"{self.weakest}: {one.name} ({one.where}).", one.text.rpartition("; ")[2]) for one in warned]
+        found = [(f"{self.weakest}: {one.name} ({one.where}).", one.remedy) for one in warned]
         for scenario in self.by_scenario:
             records = self.benchmark.everything.records.items()
             own = [record for (place, method, _), record in records if (place, method) == (scenario, self.best)]

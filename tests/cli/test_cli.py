@@ -213,8 +213,7 @@ def test_ctrl_c_is_a_line_that_says_what_is_kept_and_no_cause_of_failure(monkeyp
 
     status, text, fault = stopped_by(monkeypatch, capsys, pressed)
     assert (status, fault) == (130, faults.STOPPED)
-    again = "Start the same command again to continue; searches and fits go on from their checkpoints."
-    assert text == f"neuspring: stopped. What is finished is kept. {again}\n"
+    assert text == "neuspring: stopped. Start it again; searches and fits go on from their checkpoints.\n"
 
 
 def test_other_errors_of_the_system_are_not_taken_for_a_full_disk(monkeypatch, capsys):

@@ -108,7 +108,7 @@ def test_a_database_of_another_version_is_named_with_what_to_do(results: Path) -
     with contextlib.closing(sqlite3.connect(results / "mlflow.db")) as connection, connection:
         connection.execute("UPDATE alembic_version SET version_num = 'ffffffffffff'")
     message = (
-        r"written by another version of MLflow than .*; use that one, or delete mlflow\.db and mlartifacts .* `neuspring sync`"
+        r"written by another version of MLflow than .*; use that one, or delete mlflow\.db and mlartifacts and run `neuspring sync`"
     )
     with pytest.raises(InputError, match=message):
         tracking_store.page(results, SETTINGS)

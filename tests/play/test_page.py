@@ -57,13 +57,14 @@ def test_a_live_twin_is_shown_by_strain_and_the_recording_as_before(opened, scen
     assert not page.parts["hands"].value
     page.panel.start(RUN)
     assert page.quantity.value == "strain" and "-0.3" in page.legend.content
-    assert page.panel.live.body.hands.visible and page.panel.switch.label == "Back to the recording"
+    until(lambda: page.panel.live.body.hands.visible)
+    assert page.panel.switch.label == "Back to the recording"
     page.panel.most.value = 0.5
     page.panel._limit()
     assert "-0.5" in page.legend.content
     page.panel.stop()
     assert page.quantity.value == "stiffness" and "stiffness Y" in page.legend.content
-    assert not page.player._bodies[RUN].hands.visible
+    until(lambda: not page.player._bodies[RUN].hands.visible)
 
 
 @pytest.mark.parametrize("action", [lambda page: page.toggle(), lambda page: page.show(3)])

@@ -52,7 +52,7 @@ def test_splats_show_frame_0_and_say_what_they_could_not_see(scene):
     assert all(record.facts[f"psnr_{name}"] > 28 for name in scene.capture.cameras)
     # Below, no camera looks.
     assert 0.05 < record.facts["unseen_surface"] < 0.6
-    assert record.inputs.keys() == {"capture", "masks0", "masks1", "masks2", "lifted"}
+    assert record.inputs.keys() == {"capture", "images", "masks0", "masks1", "masks2", "lifted"}
     assert record.facts["backend"] == "warp"
     assert {"splats", "history", "picture"} == set(record.files)
 

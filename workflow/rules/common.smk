@@ -67,7 +67,7 @@ settings.merge(
     {
         key: settings.typed(value)
         for key, value in workflow.config_settings.config.items()
-        if isinstance(value, (dict, list))
+        if isinstance(value, dict)
     },
 )
 # A target that is a study chooses methods. Snakemake knows the targets only when the rules are there, so they are read from the command

@@ -63,10 +63,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         results = next((folder.parent for folder in a.log.parents if folder.name == LOGS), None)
         if results is None:
             raise InputError(a.log, f"the log of a job must lie in a folder {LOGS} of the results")
-        record = JobRecord.of_log(results, a.log, a.scenario)
+        record = replace(JobRecord.of_log(results, a.log, a.scenario), stamp=a.stamp)
         # A job runs once at a time: wrapper and command may outlive Snakemake, and meet those of the next run at the same files.
         with alone(record.path(results), say) as lock:
-            return _run(command, record, results, lock, gpu_count=a.gpus, quiet=a.quiet, stamp=a.stamp)
+            return _run(command, record, results, lock, gpu_count=a.gpus, quiet=a.quiet)
     except (InputError, TimeoutError) as error:
         print(f"neuspring: error: {error}", file=sys.stderr)
         return faults.BAD_INPUT
@@ -107,17 +107,8 @@ def alone(record: Path, waiting: Callable[[str], object]) -> Iterator[IO[str] | 
             file.close()
 
 
-def _run(
-    command: Sequence[str],
-    record: JobRecord,
-    results: Path,
-    lock: IO[str] | None,
-    *,
-    gpu_count: int,
-    quiet: bool,
-    stamp: str,
-) -> int:
-    """Run a job whose record has no attempts yet; returns its exit status (1 if a signal ended it).
+def _run(command: Sequence[str], record: JobRecord, results: Path, lock: IO[str] | None, *, gpu_count: int, quiet: bool) -> int:
+    """Run a job whose record has no attempts yet; returns its exit status (1 if a signal ended it). Its stamp is for success.
 
     Raises InputError if it needs more GPUs than there are.
     """
@@ -133,7 +124,7 @@ def _run(
 
     def save(attempt: Attempt) -> None:
         try:
-            replace(record, attempts=[*earlier, attempt], stamp=stamp if attempt.outcome == "ok" else "").save(results)
+            replace(record, attempts=[*earlier, attempt], stamp=record.stamp if attempt.outcome == "ok" else "").save(results)
         except (OSError, InputError) as error:
             print(f"warning: the record of this job could not be written: {error}", file=sys.stderr)
 

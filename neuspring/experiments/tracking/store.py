@@ -73,8 +73,8 @@ def explained(error: Exception, results: Path, settings: Tracking) -> str:
     line = (str(error).strip().splitlines() or [""])[0] or type(error).__name__
     if not re.search("Can't locate revision|out-of-date database schema", str(error)):
         return masked(line)
-    other = f"{masked(uri_of(results, settings))} was written by another version of MLflow than {version('mlflow')}"
-    return f"{other}; use that one, or delete mlflow.db and {ARTIFACTS} in {results} and run `neuspring sync`, which rebuilds both"
+    what = f"written by another version of MLflow than {version('mlflow')}; use that one, or delete mlflow.db and {ARTIFACTS}"
+    return f"{what} and run `neuspring sync`, which rebuilds both: {masked(uri_of(results, settings))}"
 
 
 def page(results: Path, settings: Tracking) -> str:
