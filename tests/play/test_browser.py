@@ -118,9 +118,9 @@ def test_one_of_two_browsers_holds_and_lets_go_when_it_is_closed_or_left(tmp_pat
         until(lambda: live.simulator.grabbed >= 0)
         assert live.grab.owner == first
         browser.call("Page.navigate", url="about:blank")
-        until(lambda: live.grab.owner is None and not page._watched.is_set())
+        until(lambda: live.grab.owner is None and not page.player.watched.is_set())
         # Nobody watches any more, so that the twin rests; it lets go as soon as somebody does.
-        page._watched.set()
+        page.player.watched.set()
         until(lambda: live.simulator.grabbed < 0)
         later(live, 3)
         assert live.grab.owner is None and not live.message

@@ -85,7 +85,7 @@ def test_time_stands_still_while_nobody_has_the_page_open(opened, scenario):
     frame = live.simulator.frame
     time.sleep(0.3)
     assert live.simulator.frame == frame
-    page._watched.set()
+    page.player.watched.set()
     until(lambda: live.simulator.frame > frame)
     page.toggle()
     page._left()
