@@ -20,6 +20,8 @@ from tests.support.cuda_kernels import (
     variants,
 )
 
+LONG = {"neuspring.physics.frame"}
+"""Modules that take half a minute."""
 NO_KERNELS_HERE: set[str] = set()
 """Modules that name `wp.kernel` for the kernels of others."""
 
@@ -27,7 +29,7 @@ NO_KERNELS_HERE: set[str] = set()
 @pytest.mark.parametrize(
     "architecture", [ARCHITECTURES[0], *(pytest.param(one, marks=pytest.mark.slow) for one in ARCHITECTURES[1:])]
 )
-@pytest.mark.parametrize("module", modules())
+@pytest.mark.parametrize("module", [pytest.param(one, marks=pytest.mark.slow) if one in LONG else one for one in modules()])
 def test_every_kernel_compiles_for_gpus(module, architecture, tmp_path):
     found, entries = kernels(module), {}
     for path in compile_for_gpus(found, tmp_path, (architecture,)):

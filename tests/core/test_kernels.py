@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 LOAD = """
 import logging, sys
 import torch
@@ -18,6 +20,7 @@ solver.backward(*solver.forward(points, points, nobody, nobody))
 """
 
 
+@pytest.mark.slow
 def test_processes_that_start_together_compile_each_kernel_once(tmp_path):
     environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path)}
     start = [sys.executable, "-c", LOAD]

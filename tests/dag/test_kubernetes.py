@@ -39,6 +39,7 @@ def test_cores_are_refused_before_any_pod(project, tmp_path):
     assert not (tmp_path / "called").exists()
 
 
+@pytest.mark.slow
 def test_jobs_run_as_pods_with_what_they_need_and_an_evicted_one_is_tried_again_with_more_memory(project, tmp_path):
     pods = tmp_path / "pods"
     pods.mkdir()

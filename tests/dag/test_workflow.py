@@ -96,6 +96,7 @@ def test_what_results_were_made_with_is_read_from_their_records_and_from_nothing
     assert "  tables (1 job): what it was told, or its code\n" in output
 
 
+@pytest.mark.slow
 def test_a_killed_run_continues_in_the_middle_of_the_fit_and_ends_the_same(tiny_run, tmp_path):
     changes = {"methods": ["baseline"], "fit": {"epochs": 30}, "tracking": {"enabled": False}}
     target = f"results/{SCENE}/baseline/0/fit.json"

@@ -50,6 +50,7 @@ def opened(folder):
         server.stop()
 
 
+@pytest.mark.slow
 def test_switches_change_what_is_drawn_scrubbing_moves_it_and_a_drag_pulls_a_live_twin(tmp_path):
     with opened(tmp_path) as (server, page, browser):
         body = page.player._bodies[RUN]
@@ -101,6 +102,7 @@ def seen(browser, server, path, enough) -> int:
     return until(count)
 
 
+@pytest.mark.slow
 def test_one_of_two_browsers_holds_and_lets_go_when_it_is_closed_or_left(tmp_path):
     with opened(tmp_path) as (server, page, browser):
         live, (x, y) = begun(server, page, browser, tmp_path)

@@ -383,6 +383,7 @@ def test_the_same_folder_makes_the_same_page_but_for_its_date(full, page):
     assert "Written" in different[0]
 
 
+@pytest.mark.slow
 def test_a_page_keeps_to_its_size_and_says_what_it_leaves_out(full):
     none = report(full, megabytes=0.0)
     size = len(none.encode())
