@@ -69,7 +69,9 @@ class Freshness:
         if maker != stage.name:
             yield f"made by {maker}"
         before, now = (flat(values) for values in (settings, self.graph.recorded(stage, job)))
-        for name in dict.fromkeys([*now, *before]):
+        # A name of its own that only the record has was found by the stage, such as `oracle`; one in a section was a setting.
+        gone = [name for name in before if name not in now and "." in name]
+        for name in [*now, *gone]:
             if name not in before or name not in now or before[name] != now[name]:
                 yield f"{name} {_short(before.get(name))} -> {_short(now.get(name))}"
         if record.get("code", "") != self.graph.code(stage, job):

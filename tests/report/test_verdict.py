@@ -105,13 +105,13 @@ def test_nothing_finished_is_no_verdict():
 def test_the_cause_is_what_the_records_of_the_weakest_scenario_say_with_the_next_move():
     params = {"search.result.at_ends": "drag", "fit.result.at_bound": 0.38}
     records = {(s, "ours", 0): run_record(scenario=s, method="ours", params=params if s == "b" else {}) for s in "ab"}
-    warned = finding("two objects", "warning", "camera 0", "2 pieces", "one is expected", "Look at masks.png.")
+    warned = finding("two objects", "warning", "camera 0", "2 pieces", "one is expected", "Look at masks.png; mark it.")
     texts = said(replace(collected(TWO), records=records), warnings=(("b", warned), ("a", replace(warned, name="other"))))
     assert texts["Probable cause"] == (
         "b: two objects (camera 0). ours on b: up to 38% of the springs lie at the bound of their stiffness. "
         "ours on b: the search ended at an end of its range in drag."
     )
-    assert "Look at masks.png." in texts["Next move"]
+    assert "Look at masks.png; mark it." in texts["Next move"]
     assert texts["Next move"].endswith("Raise fit.output_bound. Widen search.variables for drag.")
 
 

@@ -98,8 +98,9 @@ def matched(where: Path, names: tuple[str, str], one: Series, other: Series, num
     if numbered or (one.named and other.named):
         common = len({*one.numbers} & {*other.numbers})
         # A counter of its own has no gaps and begins at its own start: it says nothing of moments.
-        ends = one.numbers[-1] != other.numbers[-1] and abs(one.numbers[0] - other.numbers[0]) <= one.step
-        own = one.whole and other.whole and one.step == other.step and ends and not alike
+        begins = not common or abs(one.numbers[0] - other.numbers[0]) <= one.step
+        ends = one.numbers[-1] != other.numbers[-1]
+        own = one.whole and other.whole and one.step == other.step and begins and ends and not alike
         if numbered or (common >= COMMON * max(counts) and not own):
             return {number: place for place, number in enumerate(other.numbers)}, "the numbers in their names"
         if [number + other.numbers[0] - one.numbers[0] for number in one.numbers] != other.numbers:

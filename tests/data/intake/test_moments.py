@@ -79,6 +79,7 @@ def test_counters_of_their_own_are_refused(tmp_path, color, depth, words):
     [
         (range(45), range(0, 45, 2), [*range(0, 45, 2)]),  # half as often, by one counter
         (range(45), range(5, 45), [*range(5, 45)]),  # began later
+        (range(45), range(3, 43), [*range(3, 43)]),  # and ended earlier: one counter, whose inner part one has
         (range(45), without(7)[:40], without(7)[:40]),  # a gap: numbers of frames, and an early end
         (range(45), range(1000, 1045), [*range(45)]),  # counters of their own that ran alike
         (without(4), [1000 + number for number in without(4)], without(4)),
