@@ -20,7 +20,7 @@ define INSTALL
 @test -n "$(PYTHON)" && $(PYTHON) $(SUITS) || { echo "PYTHON=$(PYTHON): Python 3.11, 3.12 or 3.13 is needed;" \
 	"received $$($(PYTHON) --version 2>&1 || echo none). Set PYTHON=/path/to/python3.12"; exit 2; }
 @test ! -e .venv -a ! -L .venv || $(BIN)/python $(SUITS) || { echo "Replacing .venv: its Python is missing or not 3.11 to 3.13"; rm -rf .venv; }
-@echo "Installing neuspring[$(1)] with $(PYTHON) into .venv (two to four minutes, up to 3.1 GB)"
+@echo "Installing neuspring[$(1)] with $(PYTHON) into .venv (one to four minutes, up to 2.6 GB)"
 $(PYTHON) -m venv .venv
 PYTHONWARNINGS=ignore PIP_CONSTRAINT="$(CURDIR)/workflow/envs/constraints.txt" $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -e ".[$(1)]"
 @touch $@
