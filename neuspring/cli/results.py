@@ -68,8 +68,10 @@ def tables(
     collected = collect(results, scenarios, methods, seeds, without)
     moved = collect_transfers(results, transfers, methods, seeds)
     against = baseline or methods[0]
-    noticed = {"warnings": warnings_of(results, scenarios), "made_otherwise": _made_otherwise(settings, results)}
-    benchmark = Benchmark(everything=collected, baseline=against, objects=objects, aims=wanted, transfers=moved, **noticed)
+    found, old = warnings_of(results, scenarios), _made_otherwise(settings, results)
+    benchmark = Benchmark(
+        everything=collected, baseline=against, objects=objects, aims=wanted, transfers=moved, warnings=found, made_otherwise=old
+    )
     text = write(benchmark, output)
     print(headline(text) if brief else text)
     print(f"Tables: {output / 'summary.md'}")
