@@ -68,9 +68,9 @@ def tables(
     collected = collect(results, scenarios, methods, seeds, without)
     moved = collect_transfers(results, transfers, methods, seeds)
     against = baseline or methods[0]
-    found, old = warnings_of(results, scenarios), _made_otherwise(settings, results)
+    noted, old = warnings_of(results, scenarios), _made_otherwise(settings, results)
     benchmark = Benchmark(
-        everything=collected, baseline=against, objects=objects, aims=wanted, transfers=moved, warnings=found, made_otherwise=old
+        everything=collected, baseline=against, objects=objects, aims=wanted, transfers=moved, warnings=noted, made_otherwise=old
     )
     text = write(benchmark, output)
     print(headline(text) if brief else text)
