@@ -102,7 +102,7 @@ def test_predictions_are_drawn_scored_and_filmed(perceived_run):
     links = re.findall(r'src="([^"]+)"', page)
     assert {Path(link).name for link in links} == {"video.mp4", "turntable.mp4", "appearance.png"}
     assert all((tables / link).is_file() for link in links)
-    assert "search_only" in page and "dB" in page
+    assert "search_only" in page and "IoU" in page
     folder = perceived_run / "results" / PACKAGE / "appearance" / "0"
     assert {path.name for path in folder.iterdir()} == {"appearance.json", "appearance.png", "history.parquet", "splats.ply"}
 
@@ -131,7 +131,9 @@ def test_spring_gaus_has_splats_of_its_own_and_draws_with_them(perceived_run, tm
 def test_the_truth_lies_beside_the_capture_and_not_in_it(perceived_run):
     folder = perceived_run / "results" / PACKAGE
     assert (folder / "capture_truth.npz").is_file()
-    assert {path.name for path in (folder / "capture").iterdir()} == {"capture.json", "color", "depth", "mask", "tracks.json"}
+    assert {path.name for path in (folder / "capture").iterdir()} == {
+        *("capture.json", "capture.record.json", "color", "depth", "mask", "tracks.json")
+    }
 
 
 @pytest.mark.slow
