@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shlex
+import shutil
 import subprocess
 import sys
 import threading
@@ -27,6 +28,8 @@ MOST_FINDINGS = 20
 """Warnings that are printed at the end of a run."""
 
 
+LITTLE = 2_000_000
+"""Bytes; with less a disk counts as full."""
 EVERY = 1.0
 """s between two looks at the records of jobs."""
 
@@ -139,6 +142,10 @@ def failed(graph: Graph) -> None:
     """After a failure or an interruption: tables and report of what is finished, what failed and why, how to continue."""
     results, damaged = Path(graph.config.results), list[str]()
     jobs = read_jobs(results, damaged)
+    if shutil.disk_usage(results).free < LITTLE:
+        # Then records of jobs say nothing: they could not be written.
+        print(f"\n{results}: no space left on the disk. Free some space; the same command continues.", flush=True)
+        return
     own = [record for record in jobs if record.last.run == this_run(results) and record.last.outcome != "ok"]
     if all(record.last.outcome in ("killed", "running") for record in own) and not damaged and own:
         print(f"\nStopped, with {len(own)} job{'s' * (len(own) > 1)} at work: {listed([record.name for record in own], 6)}.")

@@ -78,7 +78,7 @@ def assert_every_run_is_there_once(results: Path, settings: Tracking, groups: li
     assert {(run.info.status, run.data.tags.get("superseded")) for run in others} <= {("KILLED", "true")}
     for run in runs:
         if tracking_store.is_complete(run):
-            assert run.data.params == {"fit.epochs": "3"} and run.data.metrics["future.chamfer"] == 0.005
+            assert run.data.params["fit.epochs"] == "3" and run.data.metrics["future.chamfer"] == 0.005
 
 
 def kill_in_the_middle(index: int, out: Path, process: subprocess.Popen[str], results: Path, settings: Tracking) -> None:
