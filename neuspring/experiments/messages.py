@@ -123,9 +123,8 @@ def scene_text(scenario: str, runs: Sequence[Path]) -> str:
     header = ["Errors [mm]", *(f"{SHORT[task]} {METRICS[name].heading}" for task, name in columns)]
     methods = list(dict.fromkeys(run.parent.name for run in runs))
     rows = [[method, *(METRICS[key[1]].text(means.get((method, *key), math.nan)) for key in columns)] for method in methods]
-    films = sorted({str(run / "video.mp4") for run in runs if (run / "video.mp4").is_file()})
-    table = Table.of_texts(header, rows).markdown()
-    return "\n".join([f"{scenario} is finished:", "", *table, "", *(f"  {film}" for film in films)])
+    films = sorted({f"  {run / 'video.mp4'}" for run in runs if (run / "video.mp4").is_file()})
+    return "\n".join([f"{scenario} is finished:", "", *Table.of_texts(header, rows).markdown(), "", *films])
 
 
 def replaced(jobs: Iterable[tuple[str, Any, tuple[str, ...]]]) -> str:
