@@ -25,7 +25,7 @@ from neuspring.core.geometry import Obstacle, obstacles_of
 FORMAT_VERSION = 2
 """Of the files of all artifacts; files of another version are refused."""
 Up = Literal["+z", "-z"]
-InitialVelocity = Literal["rest", "observed"]
+InitialVelocity = Literal["rest", "observed", "before"]
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 """Names become folder names and command-line words: no separators, spaces or shell characters."""
 OMITTED = {"empty": "omitted"}
@@ -301,6 +301,20 @@ class Observations(Artifact):
     rest_shape: np.ndarray = array(
         "R,3", np.float32, "m", "unloaded positions of nodes, then controllers; empty: frame 0 is the rest shape", optional=True
     )
+    line: np.ndarray = array(
+        "V",
+        np.int32,
+        "1",
+        "center line of a long thin body: nodes, or N + c for controller c, in order; empty: not known",
+        omitted=True,
+    )
+    velocity_before: np.ndarray = array(
+        "P,3",
+        np.float32,
+        "m/s",
+        "of tracked points, then controllers, in frame 0, from the sample before it; empty: none",
+        omitted=True,
+    )
     image: ImageObservations | None = field(default=None, metadata=OMITTED)
     """What a camera without depth saw. Then object points are known in frame 0 alone, and controllers move as a guess says, which
     a twin's `hands` replace (twin/hand_paths.py)."""
@@ -319,7 +333,17 @@ class Observations(Artifact):
             raise InputError(
                 name, "every tracked point must be visible in frame 0, where every rollout starts", f"{count} of {points} are not"
             )
-        _require_rest_shape(name, self.rest_shape, len(self.nodes) + self.controller_points.shape[1])
+        hands = self.controller_points.shape[1]
+        _require_rest_shape(name, self.rest_shape, len(self.nodes) + hands)
+        total = len(self.nodes) + hands
+        if self.line.size and not (
+            len(set(self.line.tolist())) == len(self.line) > 2 and 0 <= self.line.min() <= self.line.max() < total
+        ):
+            rule = f"at least 3 different indices in [0, {total})"
+            raise InputError(f"{name}.line", rule, self.line.tolist())
+        if len(self.velocity_before) not in (0, points + hands):
+            rule = f"one velocity per tracked point and controller ({points + hands}), or none"
+            raise InputError(f"{name}.velocity_before", rule, len(self.velocity_before))
         if self.image is not None:
             sizes = (*self.image.visible.shape, len(self.image.hand_of))
             wanted = (frames, points, self.controller_points.shape[1])
@@ -477,6 +501,51 @@ class Simulation:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Rod(Artifact):
+    """A long thin body as a discrete elastic rod (Bergou 2008, 2010): a center line of V vertices, and a material frame per edge.
+
+    Edge j joins vertices j and j + 1. Its frame is the unit tangent t and two directors m1, m2 = t x m1. In frame 0 directors of
+    edge 0 are `axis` projected, those of the last edge the same turned by `roll` about its tangent; between them the twist is in
+    equilibrium. With kb = 2 t_(i-1) x t_i / (1 + t_(i-1) t_i) the curvatures of joint i are k1 = kb (m2_(i-1) + m2_i) / 2 and
+    k2 = -kb (m1_(i-1) + m1_i) / 2. Nodes of the topology follow the line (`edge`, `place`).
+    """
+
+    kind: ClassVar[str] = "rod"
+    vertices: np.ndarray = array("V,3", np.float64, "m", "center line in frame 0")
+    held: np.ndarray = array("V", np.int32, "1", "the controller that sets each vertex; -1: free")
+    lengths: np.ndarray = array("E", np.float64, "m", "unloaded length of each edge")
+    mass: np.ndarray = array("V", np.float64, "kg", "mass of each vertex")
+    bending: np.ndarray = array("V", np.float64, "N m^2", "EI at each vertex; the ends are not used")
+    twisting: np.ndarray = array("V", np.float64, "N m^2", "GJ at each vertex; the ends are not used")
+    curvature: np.ndarray = array("V,2", np.float64, "1", "unloaded curvatures k1, k2 of each joint; the ends are not used")
+    edge: np.ndarray = array("N", np.int32, "1", "the edge that each node of the topology follows")
+    place: np.ndarray = array("N,3", np.float64, "1, m, m", "of each node: fraction along its edge, distances along m1 and m2")
+    axis: np.ndarray = array("3", np.float64, "1", "direction whose projection is m1 of the first edge in frame 0")
+    stretching: float = number("N", "EA")
+    damping: float = number("s", "time of inner damping: moments are EI / l (k - k0 + damping dk/dt)")
+    drag_quadratic: float = number("1/m", "deceleration by air is this times speed squared; linear drag is the material's")
+    roll: float = number("rad", "turn of the last edge's directors in frame 0, from `axis` projected")
+
+    def check(self) -> None:
+        edges = len(self.vertices) - 1
+        if edges < 2 or len(self.lengths) != edges:
+            raise InputError(
+                "rod.lengths", "at least 3 vertices, and one length per edge between them", (edges + 1, len(self.lengths))
+            )
+        for name in ("lengths", "mass"):
+            if not (getattr(self, name) > 0).all():
+                raise InputError(f"rod.{name}", "must be positive", float(getattr(self, name).min()))
+        for name in ("bending", "twisting"):
+            if (getattr(self, name) < 0).any():
+                raise InputError(f"rod.{name}", "must not be negative", float(getattr(self, name).min()))
+        if not (self.stretching > 0 and self.damping >= 0 and self.drag_quadratic >= 0 and np.isfinite(self.roll)):
+            rule = "stretching > 0, damping >= 0, drag_quadratic >= 0 and a finite roll are required"
+            raise InputError("rod", rule, (self.stretching, self.damping, self.drag_quadratic, self.roll))
+        if len(self.edge) and not 0 <= self.edge.min() <= self.edge.max() < edges:
+            raise InputError("rod.edge", f"indices must lie in [0, {edges})", [int(self.edge.min()), int(self.edge.max())])
+
+
+@dataclass(frozen=True, kw_only=True)
 class Twin(Artifact):
     """Topology + Material + Simulation: enough to roll out anywhere."""
 
@@ -486,6 +555,8 @@ class Twin(Artifact):
     simulation: Simulation
     hands: dict[str, float] = field(default_factory=dict, metadata=OMITTED)
     """How far the hands are from a camera without depth: searched variables of twin/hand_paths.py. Empty: hands were measured."""
+    rod: Rod | None = field(default=None, metadata=OMITTED)
+    """The body where it is a rod. Then springs are those of controllers alone, and the nodes follow the center line."""
 
     def check(self) -> None:
         springs, values = len(self.topology.springs), len(self.material.stiffness)
@@ -494,11 +565,21 @@ class Twin(Artifact):
         nodes, masses = len(self.topology.nodes), len(self.material.mass)
         if masses not in (0, nodes):
             raise InputError("twin", f"the material must have one mass per node ({nodes}), or none", masses)
+        if self.rod is not None:
+            self._check_rod(self.rod)
+
+    def _check_rod(self, rod: Rod) -> None:
+        if len(rod.edge) != len(self.topology.nodes):
+            raise InputError("twin.rod", f"one edge per node ({len(self.topology.nodes)})", len(rod.edge))
+        if self.topology.object_spring_count:
+            raise InputError("twin.rod", "a rod has no springs between its nodes", self.topology.object_spring_count)
+        if rod.held.max() >= len(self.topology.controllers):
+            raise InputError("twin.rod.held", f"controllers lie in [0, {len(self.topology.controllers)})", int(rod.held.max()))
 
     @property
     def counts(self) -> dict[str, int]:
         """Sizes worth keeping in a record."""
-        return {
+        return ({"vertices": len(self.rod.vertices)} if self.rod else {}) | {
             "nodes": len(self.topology.nodes),
             "springs": len(self.topology.springs),
             "object_springs": self.topology.object_spring_count,
