@@ -360,6 +360,11 @@ class Observations(Artifact):
         """Nodes, then controllers [N + C, 3], m, in the shape that topology, regions and the field are defined on."""
         return canonical_shape(self.nodes, self.controller_points[0], self.rest_shape)
 
+    def on_line(self, positions: np.ndarray) -> np.ndarray:
+        """The center line [F, V, 3], m, of nodes at positions [F, N, 3], with the controllers of the first F frames."""
+        joined: np.ndarray = np.concatenate([positions, self.controller_points[: len(positions)]], axis=1)[:, self.line]
+        return joined
+
     @property
     def surface_count(self) -> int:
         """How many of the first nodes count as surface: No + Ns."""

@@ -1,11 +1,11 @@
-"""What the paper printed, as data: its tables and the released PhysTwin's scores; and studies, which say which of our methods
-stands in each row of its tables."""
+"""What was printed, as data: the paper's tables, the released PhysTwin's scores, published errors on DEFORM's cables; and studies,
+which say which of our methods stands in each row of a table."""
 
 from __future__ import annotations
 
 import csv
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from importlib import resources
 from pathlib import Path
@@ -31,6 +31,16 @@ CLUSTER_CLAIM = (
     "It takes K = 5 everywhere."
 )
 _MEANS = "MEAN22"
+CLIPS = "deform_published"
+"""The table of numbers that were published on DEFORM's cables. It has cables in place of tasks, and one metric."""
+CLIP_METRIC = "deform_l1"
+TAGS = {
+    "second-hand": "The paper printed the number. We read it second-hand, from a page that was made of the paper's TeX.",
+    "log": "The number stands in logs that DEFORM's authors published with their code.",
+    "others": "Others than DEFORM's authors trained DEFORM and published the number.",
+    "reference": "We measured it. It is no method: it shows what one gets without learning, or the least that is possible.",
+}
+"""What the tag of a number in `CLIPS` means."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,15 +51,23 @@ class Printed:
     value: float
     slack: float
     """Half a unit of the last digit: what rounding may have hidden."""
+    source: str = ""
+    tag: str = ""
+    """Of `TAGS`; empty: printed by the paper."""
 
 
 Values = dict[tuple[str, str, str], Printed]
-"""By label of the row, our task, our metric."""
+"""By label of the row, our task (of `CLIPS`: cable), our metric."""
 
 
 @functools.cache
 def table(name: str) -> Values:
-    """One of the paper's tables; empty if there is none of that name."""
+    """One of the paper's tables, or `CLIPS`; empty if there is none of that name."""
+    if name == CLIPS:
+        return {
+            (row["method"], row["cable"], CLIP_METRIC): replace(_printed(row["l1_mm"], False), source=row["source"], tag=row["tag"])
+            for row in _rows(f"{CLIPS}.csv")
+        }
     tasks = {theirs: ours for ours, theirs in TASKS.items()}
     metrics = {metric.paper_name: metric for metric in IN_PAPER.values()}
     return {
@@ -117,12 +135,12 @@ TAKEN = (
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """A row of studies.yaml: one of the paper's tables, or a table of ours."""
+    """A row of studies.yaml: one of the paper's tables, published numbers on cables, or a table of ours."""
 
     __pydantic_config__ = STRICT
     title: Text
     reference: str | None
-    """Name of the table in paper_tables.csv; null: the paper gives no numbers."""
+    """Name of the table in paper_tables.csv, or `CLIPS`; null: the paper gives no numbers."""
     baseline: str
     """Label of the row that the others are compared with, on the same scenarios and seeds."""
     rows: dict[Text, Name]
@@ -132,16 +150,26 @@ class Study:
     """How the rows are trained, in words."""
     beside: Name | None = None
     """A study of the same labels whose numbers this one shows next to its own: the same rows, trained in another way."""
+    clips: bool = False
+    """Whether the table is of twins on other recordings (`transfers`): a column per category, for example a cable. Published rows
+    stand above ours, under labels of their own."""
+    filmed: str | None = None
+    """Of a study of clips: the label of the row that its film shows; null: the baseline."""
 
     def __post_init__(self) -> None:
         if self.baseline not in self.rows:
             raise ValueError(f"baseline: must be a label of rows ({', '.join(self.rows)}), received {self.baseline!r}")
         if len(set(self.rows.values())) != len(self.rows):
             raise ValueError(f"rows: methods must differ, received {list(self.rows.values())}")
+        if self.filmed is not None and not (self.clips and self.filmed in self.rows):
+            raise ValueError(f"filmed: must be a label of rows, in a study of clips, received {self.filmed!r}")
         if self.reference is None:
             return
-        if self.reference not in tables():
-            raise ValueError(f"reference: must be null or one of {', '.join(tables())}, received {self.reference!r}")
+        known = (CLIPS,) if self.clips else tables()
+        if self.reference not in known:
+            raise ValueError(f"reference: must be null or one of {', '.join(known)}, received {self.reference!r}")
+        if self.clips:
+            return
         missing = [label for label in dict.fromkeys(label for label, _, _ in self.values) if label not in self.rows]
         if missing:
             raise ValueError(f"rows: the paper's {self.reference} also has {missing}; labels must be spelled as there")

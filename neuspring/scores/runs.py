@@ -170,8 +170,10 @@ def read_scores(path: Path) -> Collected:
     return Collected(scores, runs.assign(source=path.name, **nothing))
 
 
-def collect_transfers(results: Path, sources: Iterable[str], methods: Iterable[str], seeds: Iterable[int]) -> Collected:
-    """Transferred twins as runs: `scenario` is the source, and its score the mean over its targets."""
+def read_transfers(
+    results: Path, sources: Iterable[str], methods: Iterable[str], seeds: Iterable[int]
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Scores of transferred twins on each target, with the column `source`; and a row per source, method and seed with a record."""
     tables, rows = [], []
     for identity, path in _paths(results, sources, methods, seeds, "transfer.json"):
         if not path.is_file():
@@ -186,10 +188,18 @@ def collect_transfers(results: Path, sources: Iterable[str], methods: Iterable[s
         reason = record.reason or ", ".join(f"diverged on {name}" for name in diverged)
         status = "ok" if record.status == "ok" and not diverged else "failed"
         rows.append(identity | {"status": status, "reason": reason, "notes": ""})
-        keys = ["category", "method", "seed", "task", "metric", "unit"]
-        mean = table.groupby(keys, sort=False).agg(value=("value", "mean"), frames=("frames", "sum")).reset_index()
-        tables.append(mean.assign(scenario=identity["scenario"])[list(COLUMNS)])
-    return Collected(stacked(tables), pd.DataFrame(rows))
+        tables.append(table.assign(source=identity["scenario"]))
+    return stacked(tables), pd.DataFrame(rows, columns=["scenario", "method", "seed", "status", "reason", "notes"])
+
+
+def collect_transfers(results: Path, sources: Iterable[str], methods: Iterable[str], seeds: Iterable[int]) -> Collected:
+    """Transferred twins as runs: `scenario` is the source, and its score the mean over its targets."""
+    table, runs = read_transfers(results, sources, methods, seeds)
+    if not len(table):
+        return Collected(table, runs)
+    keys = ["source", "category", "method", "seed", "task", "metric", "unit"]
+    mean = table.groupby(keys, sort=False).agg(value=("value", "mean"), frames=("frames", "sum")).reset_index()
+    return Collected(mean.rename(columns={"source": "scenario"})[list(COLUMNS)], runs)
 
 
 def pairs(table: pd.DataFrame) -> int:

@@ -29,21 +29,26 @@ def transfer(
     seed: int = 0,
     device: str = "auto",
 ) -> Written:
-    """Learned model -> scores on other recordings of the object: transfer.parquet (task `transfer`).
+    """Learned model -> scores on other recordings of the object: transfer.parquet (task `transfer`), transfer_frames.parquet.
+
+    The latter has every distance in every frame (`scenario` is the target). Of targets with a center line, transfer_lines.npz has
+    the predicted line by target [F, V, 3], float32, m; vertices that a controller holds are where it is.
 
     `learned` names a twin (search.json, fit.json), or a trained baseline that can be transferred (train.json). All frames after the
     first of a target count. With `simulation.initial_velocity: observed`, frames 1 and 2 also set the initial velocity. A twin's
     rest lengths are re-based on the target's rest shape, unless they were trained. Other nodes are registered (twin/transfer.py),
     and the record says how well they fit. A rollout that diverges leaves out its target.
     """
+    import numpy as np
     import pandas as pd
 
-    from neuspring.core.files import write_table
+    from neuspring.core.files import write_npz, write_table
     from neuspring.scores import metrics
     from neuspring.twin.rollout import initial_velocity, roll_out
     from neuspring.twin.transfer import move
 
     tables, diverged = [pd.DataFrame(columns=list(metrics.COLUMNS))], []
+    courses, lines = [pd.DataFrame(columns=["scenario", "frame", "seconds", "metric", "value"])], {}
     updates, registered, record = 0, {}, learned.record
     twin = Twin.load(learned.file("twin")) if learned.has("twin") else None
     for observations in targets if record.status == "ok" else ():
@@ -66,9 +71,19 @@ def transfer(
         if trajectory.diverged_frame is not None:
             diverged.append(observations.scenario.name)
         frames = range(1, observations.scenario.frame_count)
-        tables.append(metrics.score_tasks(trajectory, observations, method, seed, {"transfer": frames}))
-    files = run.beside(scores="transfer.parquet")
-    write_table(pd.concat([table for table in tables if len(table)] or tables), files["scores"])
+        errors = metrics.errors_per_frame(trajectory.positions, observations)
+        tables.append(metrics.score_tasks(trajectory, observations, method, seed, {"transfer": frames}, errors))
+        course = pd.DataFrame(errors).rename_axis("frame").melt(var_name="metric", ignore_index=False).reset_index()
+        course = course.assign(scenario=observations.scenario.name, seconds=course["frame"] / observations.scenario.frame_rate)
+        courses.append(course[list(courses[0])])
+        if observations.line.size:
+            lines[observations.scenario.name] = observations.on_line(trajectory.positions).astype(np.float32)
+    files = run.beside(scores="transfer.parquet", frames="transfer_frames.parquet")
+    for role, parts in (("scores", tables), ("frames", courses)):
+        write_table(pd.concat([part for part in parts if len(part)] or parts), files[role])
+    if lines:
+        files |= run.beside(lines="transfer_lines.npz")
+        write_npz(files["lines"], lines, "{}", compress=True)
     facts: dict[str, Any] = {"diverged": diverged, "targets": len(targets)} | ({"spring_updates": updates} if updates else {})
     facts |= {"registered": registered} if registered else {}
     return Written(files=files, facts=facts, failure=record.reason)

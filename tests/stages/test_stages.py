@@ -10,6 +10,7 @@ import pytest
 from neuspring import config
 from neuspring.core.artifacts import Observations, Trajectory, Twin
 from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.files import read_npz
 from neuspring.core.records import StageRecord
 from neuspring.experiments.tracking import log as tracking
 from neuspring.report import benchmark as tables
@@ -123,6 +124,28 @@ def test_stages_that_simulate_count_their_spring_updates(finished, tmp_path):
     moved = StageRecord.load(tmp_path / "transfer.json").facts["spring_updates"]
     # Substeps are added where the other recording's distances need more.
     assert moved >= 2 * frames * per_frame and moved % (2 * frames * facts["fit"]["springs"]) == 0
+
+
+def test_a_transfer_keeps_the_course_of_errors_and_the_line(finished, tmp_path):
+    folder, run, _ = finished
+    seen = Observations.load(folder / "small" / "observations.npz")
+    line = [len(seen.nodes), 3, 1]
+    replace(seen, line=np.array(line), scenario=replace(seen.scenario, name="other")).save(tmp_path / "other.npz")
+    found = {"learned": run.with_name("fit.json"), "method": "phystwin", "settings": SETTINGS, "device": "cpu"}
+    transfer(targets=[tmp_path / "other.npz", folder / "small/observations.npz"], **found, output=tmp_path / "transfer.json")
+    record = StageRecord.load(tmp_path / "transfer.json")
+    course, scores = (pd.read_parquet(record.file(role, tmp_path / "transfer.json")) for role in ("frames", "scores"))
+    frames = seen.scenario.frame_count
+    assert course.groupby(["scenario", "metric"])["frame"].apply(list).map(lambda each: each == list(range(frames))).all()
+    means = course[course["frame"] > 0].groupby(["scenario", "metric"])["value"].mean()
+    expected = scores.set_index(["scenario", "metric"])["value"]
+    pd.testing.assert_series_equal(means, expected, check_like=True)
+    lines, _ = read_npz(record.file("lines", tmp_path / "transfer.json"))
+    trajectory = Trajectory.load(run.with_name("trajectory.npz"))
+    assert list(lines) == ["other"] and lines["other"].dtype == np.float32, "the other target has no line"
+    np.testing.assert_array_equal(lines["other"][:, 0], seen.controller_points[:, 0])
+    np.testing.assert_allclose(lines["other"][:, 1:], trajectory.positions[:, line[1:]], atol=1e-5)
+    assert course["seconds"].max() == (frames - 1) / seen.scenario.frame_rate
 
 
 def test_a_method_without_second_stage_shares_the_search(finished):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
+from neuspring.core.artifacts import Scenario
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_atomically
 from neuspring.report.draw.painter import ERRORS, Painter
@@ -65,11 +67,34 @@ def write_film(painter: Painter, path: Path, width: int, speed: float = 1.0, meg
     """
     _require(width, speed, megabytes)
     rate = painter.scene.observations.scenario.frame_rate * speed
+    return _write_pictures(partial(film_pictures, painter), painter.frames, rate, path, width, megabytes)
+
+
+def write_clips(painters: Sequence[Painter], path: Path, width: int, megabytes: float = 2.0) -> Made:
+    """Write a film of several clips side by side, each with its observed points and its first prediction in one view.
+
+    All painters have the same frames, in real time, equally spaced. Sizes as `write_film`.
+    """
+    _require(width, 1.0, megabytes)
+    frames = painters[0].frames
+    rate = painters[0].scene.observations.scenario.frame_rate / max(frames[1] - frames[0], 1)
+    return _write_pictures(partial(clip_pictures, painters), frames, rate, path, width, megabytes)
+
+
+def _write_pictures(
+    draw: Callable[[Sequence[int], int], Iterator[np.ndarray]],
+    frames: Sequence[int],
+    rate: float,
+    path: Path,
+    width: int,
+    megabytes: float,
+) -> Made:
+    """Write what `draw` (frames, width) gives, coarser until it fits."""
     gif = path.suffix.lower() == ".gif"
     made, every, scale = path.with_name(f".{path.name}.try{path.suffix}"), 1, 1.0
     try:
         while True:
-            pictures = list(film_pictures(painter, painter.frames[::every], max(round(scale * width), 80)))
+            pictures = list(draw(frames[::every], max(round(scale * width), 80)))
             (_write_gif if gif else _write_mp4)(made, pictures, rate / every)
             size, (high, wide) = made.stat().st_size, pictures[0].shape[:2]
             if size <= 1e6 * megabytes:
@@ -99,14 +124,48 @@ def _require(width: int, speed: float, megabytes: float) -> None:
 
 def film_pictures(painter: Painter, frames: Sequence[int], width: int) -> Iterator[np.ndarray]:
     """Pictures [H, W, 3] uint8, both sides even: observed and the methods side by side, errors below, time on top."""
+    figure, panels, clock = _layout(painter, max(width / DOTS, 1.5))
+    scenario = painter.scene.observations.scenario
+    parts = [(0, scenario.train_end, TRAINING, "training"), (scenario.train_end, scenario.frame_count, FUTURE, "future")]
+
+    def fill(frame: int) -> None:
+        _fill(painter, panels, frame)
+        _tell(scenario, clock, frame, parts)
+
+    yield from _drawn(figure, width, frames, fill)
+
+
+def clip_pictures(painters: Sequence[Painter], frames: Sequence[int], width: int) -> Iterator[np.ndarray]:
+    """As `film_pictures`, of several clips: a panel for each, named by the label of its prediction."""
     inches = max(width / DOTS, 1.5)
-    figure, panels, clock = _layout(painter, inches)
-    figure.set_dpi(width / inches)
+    across = (inches - 2 * EDGE - GAP * (len(painters) - 1)) / len(painters)
+    highs = [across * painter.scene.view.height / painter.scene.view.width for painter in painters]
+    total = EDGE + CLOCK + HEAD + max(highs) + EDGE
+    figure = plt.figure(figsize=(inches, total), facecolor="white")
+    top, axes = total - EDGE - CLOCK - HEAD, []
+    for column, (painter, high) in enumerate(zip(painters, highs, strict=True)):
+        left = EDGE + column * (across + GAP)
+        axes.append(place(figure, left, top - high, across, high))
+        _name(figure, left + across / 2, top, painter.takes[0].label)
+    clock = place(figure, EDGE, total - EDGE - CLOCK, inches - 2 * EDGE, CLOCK)
+    scenario = painters[0].scene.observations.scenario
+
+    def fill(frame: int) -> None:
+        for painter, axis in zip(painters, axes, strict=True):
+            axis.clear()
+            painter.draw_predicted(axis, 0, frame)
+        _tell(scenario, clock, frame, [(0, scenario.frame_count, FUTURE, "observed: blue; predicted: dark; held: red")])
+
+    yield from _drawn(figure, width, frames, fill)
+
+
+def _drawn(figure: Figure, width: int, frames: Sequence[int], fill: Callable[[int], None]) -> Iterator[np.ndarray]:
+    """Pictures of a figure, `width` pixels wide, that `fill` draws frame by frame; the figure is closed at the end."""
+    figure.set_dpi(width / figure.get_figwidth())
     canvas = FigureCanvasAgg(figure)
     try:
         for frame in frames:
-            _fill(painter, panels, frame)
-            _tell(painter, clock, frame)
+            fill(frame)
             canvas.draw()
             shown = np.asarray(canvas.buffer_rgba())[..., :3]
             yield np.ascontiguousarray(shown[: shown.shape[0] // 2 * 2, : shown.shape[1] // 2 * 2])
@@ -126,13 +185,19 @@ def _layout(painter: Painter, width: float) -> tuple[Figure, list[list[Axes]], A
     lefts = [EDGE + k * (across + GAP) for k in range(columns)]
     panels = [[place(figure, left, top - high, across, high) for left in lefts]]
     for left, name in zip(lefts, ["observed", *(take.label for take in painter.takes)], strict=True):
-        figure.text((left + across / 2) / width, (top + 0.05) / total, name, ha="center", va="bottom", fontsize=TEXT)
+        _name(figure, left + across / 2, top, name)
     if errors:
         panels.append([place(figure, left, top - 2 * high - GAP, across, high) for left in lefts[1:]])
         cax = place(figure, width - BAR + 0.06, top - 2 * high - GAP + 0.04, 0.09, high - 0.08)
         color_bar(figure, cax, painter.norm, ERRORS, painter.error_label, extend="max")
     clock = place(figure, EDGE, total - EDGE - CLOCK, width - 2 * EDGE, CLOCK)
     return figure, panels, clock
+
+
+def _name(figure: Figure, middle: float, top: float, text: str) -> None:
+    """The name of a panel, above it, inches."""
+    width, total = figure.get_size_inches()
+    figure.text(middle / width, (top + 0.05) / total, text, ha="center", va="bottom", fontsize=TEXT)
 
 
 def _fill(painter: Painter, panels: list[list[Axes]], frame: int) -> None:
@@ -147,22 +212,21 @@ def _fill(painter: Painter, panels: list[list[Axes]], frame: int) -> None:
                 painter.draw_observed(axis, frame)
 
 
-def _tell(painter: Painter, clock: Axes, frame: int) -> None:
-    """The bar of time, filled up to the frame: training and future in their colors, the border in black."""
-    scenario = painter.scene.observations.scenario
+def _tell(scenario: Scenario, clock: Axes, frame: int, parts: Sequence[tuple[int, int, Sequence[int], str]]) -> None:
+    """The bar of time, filled up to the frame: parts (start, stop, color, word), their borders in black."""
     clock.clear()
     clock.set(xticks=[], yticks=[], xlim=(0, scenario.frame_count), ylim=(0, 1))
     style: dict[str, Any] = {"height": 1.0, "align": "center", "linewidth": 0}
-    for start, stop, color in ((0, scenario.train_end, TRAINING), (scenario.train_end, scenario.frame_count, FUTURE)):
+    words: dict[str, Any] = {"fontsize": TEXT - 1.5, "va": "center_baseline"}
+    margin = 0.006 * scenario.frame_count
+    for start, stop, color, word in parts:
         clock.barh(0.5, stop - start, left=start, color=rgb(color), alpha=0.25, **style)
         if frame >= start:
             clock.barh(0.5, min(stop, frame + 1) - start, left=start, color=rgb(color), **style)
-    clock.axvline(scenario.train_end, color="black", linewidth=1.0)
-    words: dict[str, Any] = {"fontsize": TEXT - 1.5, "va": "center_baseline"}
-    margin = 0.006 * scenario.frame_count
-    clock.text(margin, 0.5, "training", ha="left", **words)
-    if scenario.train_end < scenario.frame_count:
-        clock.text(scenario.train_end + margin, 0.5, "future", ha="left", **words)
+        if start:
+            clock.axvline(start, color="black", linewidth=1.0)
+        if start < stop:
+            clock.text(start + margin, 0.5, word, ha="left", **words)
     clock.text(scenario.frame_count - margin, 0.5, f"{frame / scenario.frame_rate:.2f} s", ha="right", **words)
     for side in clock.spines.values():
         side.set_visible(False)

@@ -135,6 +135,7 @@ class Painter:
         if self.scene.capture is not None:
             self._note(axis, f"camera {self.scene.camera.name} missed it")
         observations = self.scene.observations
+        self._line(axis, observations.object_points[frame], frame, SEEN)
         self._points(axis, observations.object_points[frame][observations.object_visibility[frame]], SEEN)
         hands(axis, self.scene, frame)
 
@@ -154,7 +155,9 @@ class Painter:
             self._image(axis, below)
         else:
             observations = self.scene.observations
+            self._line(axis, observations.object_points[frame], frame, SEEN, alpha=0.5)
             self._points(axis, observations.object_points[frame][observations.object_visibility[frame]], SEEN, alpha=0.5)
+        self._line(axis, take.positions[frame], frame, PREDICTED)
         self._points(axis, take.positions[frame], PREDICTED)
         hands(axis, self.scene, frame)
 
@@ -208,6 +211,16 @@ class Painter:
         x, y = 0.025 + 0.95 * right, 0.035 + 0.93 * upper
         size = float(np.clip(0.075 * points_across(axis), SMALLEST, NOTE))
         axis.text(x, y, text, fontsize=size, bbox=box, transform=axis.transAxes, zorder=9, **place)
+
+    def _line(self, axis: Axes, nodes: np.ndarray, frame: int, color: str, alpha: float = 1.0) -> None:
+        """The center line of a long thin body through its nodes [P, 3], m (the first ones at least); nothing if none is known."""
+        observations = self.scene.observations
+        if not observations.line.size:
+            return
+        others = np.full((len(observations.nodes) - len(nodes), 3), np.nan)
+        line = np.concatenate([nodes, others, observations.controller_points[frame]])[observations.line]
+        flat = self.scene.view.project(line.astype(float))[0]
+        axis.plot(flat[:, 0], flat[:, 1], color=color, alpha=alpha, linewidth=0.008 * points_across(axis), zorder=2)
 
     def _points(
         self, axis: Axes, points: np.ndarray, color: str | None = None, *, values: np.ndarray | None = None, alpha: float = 1.0
