@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.parse import Count, NonNegative, Positive, Section
+from neuspring.config.parse import Count, Name, NonNegative, Positive, Section
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,9 +31,12 @@ class Mocap(Section):
     stride: Count = 2
     """Use every n-th sample of the 100 Hz record."""
     start: Annotated[int, Field(ge=0)] = 0
-    """Samples left out at the beginning of the record."""
+    """Samples left out at the beginning of the record. With at least one, the velocity in frame 0 is known from the sample before
+    it (`simulation.initial_velocity: before`)."""
     frames: Annotated[int, Field(ge=5)] | None = None
-    """Number of frames that are kept, the first ones, counted after the stride; null keeps all."""
+    """Number of frames that are kept, the first ones, counted after the stride; shorter recordings are refused. null keeps all."""
+    train_fraction: Annotated[float, Field(gt=0, le=1)] = 0.7
+    """Part of the frames that are for training, the first ones. 1: all, where future frames are those of other recordings."""
     spacing: Positive = 0.012
     """Distance of rings along the center line, m."""
     rings: Annotated[int, Field(ge=2)] | None = None
@@ -42,12 +45,26 @@ class Mocap(Section):
     """Radius of the rings, m."""
     ring: Annotated[int, Field(ge=3)] = 4
     """Nodes per ring."""
+    roll_axis: Literal["x", "y", "z"] = "y"
+    """Direction of the world from which the roll of rings and clamps starts at both ends in frame 0, so that node i is the same
+    node in all recordings of a cable. Neither end may lie along it. y: DEFORM's cables hang about in the plane of x and z."""
     rest_shape: Literal["first_frame", "straight"] = "first_frame"
     """Shape without forces. first_frame: frame 0, as in the paper. straight: a straight cable with the arc lengths of frame 0."""
     grip: Literal["markers", "clamp"] = "markers"
     """What holds an end. markers: its two markers, which leave its roll free. clamp: and a ring of `ring` points around each, which
     turns with the direction of the two without spinning, so that direction and roll are held. With a straight rest shape set
     `search.controller_rest: first_frame` too."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deform(Section):
+    """DEFORM's benchmark. For each cable: a pool of training recordings, whose twins go to all evaluation recordings."""
+
+    cables: tuple[Name, ...] = ()
+    """Folders of `data_root`, each with recordings `train/NUMBER.pkl` and `eval/NUMBER.pkl`. They are added to `scenarios`, `pools`
+    and `transfers`."""
+    clips: Annotated[int, Field(ge=2)] = 8
+    """Training recordings per cable, equally spaced in the order of their numbers. The first of them names the pool's scenario."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -57,7 +57,7 @@ _LEFT = {
     "by the scenario's category now": "gs_dynamics.preset",
     "a constant in neuspring/config/search.py now": "polish.share",
     "a constant beside its user in neuspring/twin now": "betas freed_sigma hand_knots polish.step polish.tolerance",
-    "a constant beside its user in neuspring/data now": "toy.frame_rate mocap.train_fraction",
+    "a constant beside its user in neuspring/data now": "toy.frame_rate",
     "a constant beside its user in neuspring/splats now": """
         l1 densify_from densify_until densify_every densify_gradient split_size prune_opacity most_splats images.opacity
     """,

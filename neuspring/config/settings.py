@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, StringConstraints
 
 from neuspring.config.baselines import Baselines
-from neuspring.config.data import Mocap, Synthetic, Toy
+from neuspring.config.data import Deform, Mocap, Synthetic, Toy
 from neuspring.config.images import Images
 from neuspring.config.parse import Count, Name, Section, plain
 from neuspring.config.perception import Perception
@@ -92,7 +92,7 @@ class Aim(Section):
     """The method whose error is below the line."""
     task: Literal["reconstruction", "future", "transfer"] = "future"
     """Training frames, future frames, or twins on other recordings."""
-    metric: Literal["chamfer", "track_error", "track_error_bound"] = "track_error"
+    metric: Literal["chamfer", "track_error", "track_error_bound", "deform_l1"] = "track_error"
     """The error."""
     ratio: Annotated[float, Field(gt=0.0)]
     """Largest geometric mean."""
@@ -105,7 +105,8 @@ class Config(Section):
     """One benchmark: which scenarios, methods and seeds, and how."""
 
     scenarios: tuple[Name, ...] = ()
-    """Rows of the scenario table that are run, and captures in `data_root` by the names of their folders."""
+    """What is run: rows of the scenario table, captures in `data_root` by the names of their folders, and recordings of cables
+    there: `DLO3_train_15` is `DLO3/train/15.pkl`."""
     methods: tuple[Name, ...] = ()
     """Rows of the method table that are run, beside the methods in the rows of `studies`. If studies add any, all methods stand in
     the order of the method table."""
@@ -158,6 +159,7 @@ class Config(Section):
     released_quirks: ReleasedQuirks = field(default_factory=ReleasedQuirks)
     toy: Toy = field(default_factory=Toy)
     mocap: Mocap = field(default_factory=Mocap)
+    deform: Deform = field(default_factory=Deform)
     synthetic: Synthetic = field(default_factory=Synthetic)
     perception: Perception = field(default_factory=Perception)
     images: Images = field(default_factory=Images)

@@ -26,8 +26,9 @@ class Simulation(Section):
     """Candidate partners for self-collision, per node and frame; overflow is reported."""
     controller_velocity: bool = False
     """Dashpots use the controllers' velocity (finite differences); false: zero velocity, as in the released simulator."""
-    initial_velocity: Literal["rest", "observed"] = "rest"
-    """Velocity in frame 0. rest: zero, as released. observed: from the first three frames, for captures that begin in motion."""
+    initial_velocity: Literal["rest", "observed", "before"] = "rest"
+    """Velocity in frame 0. rest: zero, as released. observed: from the first three frames, for captures that begin in motion.
+    before: from the sample before frame 0, where a recording has one (`mocap.start` of at least 1); no later frame is used."""
 
 
 @dataclass(frozen=True, kw_only=True)

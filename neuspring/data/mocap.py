@@ -13,6 +13,9 @@ d(t) is the unit direction of the end's two markers. n(t) is normal to it and pa
 rotation that turns d carries n along, so the ring follows every turn of the end and never spins about it. A spin that the gripper
 did make is not in the data. Half a step of the angle keeps the points away from the body's own ring around the first and the last
 marker.
+
+In frame 0 the roll of both ends is that of one direction of the world (`mocap.roll_axis`), projected. So ring node i is the same
+node in every recording of a cable, as far as its grippers begin alike.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from neuspring.config import Config, Mocap, ScenarioRow
 from neuspring.core.artifacts import NO_REST_SHAPE, Observations, Scenario
@@ -84,8 +88,8 @@ RECORD_RATE = 100.0
 MIN_MARKERS = 6
 """Two controllers at either end and at least two observed markers."""
 MIN_FRAMES = 4
-TRAIN_FRACTION = 0.7
-"""Of the frames, the first ones."""
+LARGEST_ALONG = 0.99
+"""Cosine of the angle between an end of the cable and the roll axis: nearer to 1 a small turn of the end is a large roll."""
 MIN_DISTANCE = 1e-4
 """Nodes must be farther apart than this, m; otherwise their spring would have no length."""
 RELEASED_SAMPLES = 500
@@ -115,11 +119,20 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
     if frames < MIN_FRAMES:
         rule = f"at least {MIN_FRAMES} frames must remain after mocap.start = {settings.start} and mocap.stride = {settings.stride}"
         raise InputError(file, rule, f"{frames} of {len(raw)} samples", "Choose a smaller start or stride.")
-    train_end = int(TRAIN_FRACTION * frames)
+    if settings.frames is not None and frames < settings.frames:
+        rule = f"{settings.frames} frames are required after start {settings.start} and stride {settings.stride} (mocap.frames)"
+        raise InputError(file, rule, f"{frames} of {len(raw)} samples", "Leave this recording out, or lower mocap.frames.")
+    axis = np.eye(3)["xyz".index(settings.roll_axis)]
 
     held = [0, 1, count - 2, count - 1]
     observed = markers[:, 2:-2]
-    body = rings(markers[0], settings.spacing, settings.radius, settings.ring, settings.rings)
+    centers, tangents = centerline(markers[0], settings.spacing, settings.rings)
+    if (along := np.abs(tangents[[0, -1]] @ axis).max()) > LARGEST_ALONG:
+        rule = "in frame 0 neither end of the cable may lie along mocap.roll_axis, from which the roll of its rings starts"
+        value = f"{np.degrees(np.arccos(min(along, 1.0))):.1f} degrees between an end and {settings.roll_axis}"
+        raise InputError(file, rule, value, "Name the axis that is farthest from the ends in all recordings of the cable.")
+    normals = rolled(tangents, axis)
+    body = rings(centers, tangents, normals, settings.radius, settings.ring)
     points = np.concatenate([markers[0], body])
     nearest = float(cKDTree(points).query(points, k=2)[0][:, 1].min())
     if nearest < MIN_DISTANCE:
@@ -130,18 +143,22 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
         line, rest_body = straightened(markers[0], len(body) // settings.ring, settings.radius, settings.ring)
         rest_shape = np.concatenate([line[2:-2], rest_body, line[held]])
     controllers = markers[:, held]
+    before = np.asarray(raw)[max(settings.start - 1, 0)].T
+    back = np.stack([markers[0], before])[:, held]
     if settings.grip == "clamp":
         # Rings turn at the full rate of the record: the fewer samples, the less of a turn is seen.
         recorded = np.asarray(raw)[settings.start :].transpose(0, 2, 1)[: (frames - 1) * settings.stride + 1, held]
-        normals = _transported_normals(centerline(markers[0], settings.spacing, settings.rings)[1])[[0, -1]]
-        turning = clamps(recorded, normals, settings.radius, settings.ring, MIN_DISTANCE, str(file))
-        controllers = np.concatenate([controllers, turning[:: settings.stride]], axis=1)
+        grips = normals[[0, -1]], settings.radius, settings.ring, MIN_DISTANCE, str(file)
+        controllers = np.concatenate([controllers, clamps(recorded, *grips)[:: settings.stride]], axis=1)
+        back = np.concatenate([back, clamps(back, *grips)], axis=1)
         if len(rest_shape):
             around = circle(Y, Z, settings.radius, settings.ring, 0.5)
             rest_shape = np.concatenate([rest_shape, (line[held][:, None] + around).reshape(-1, 3)])
     visible = np.ones(observed.shape[:2], dtype=bool)
     motion_valid = visible.copy()
     motion_valid[-1] = False
+    first = np.concatenate([observed[0] - before[2:-2], back[0] - back[1]]) * RECORD_RATE
+    nodes = len(observed[0]) + len(body)
     options = ", ".join(f"{name}={getattr(settings, name)}" for name in Mocap.__dataclass_fields__)
     return Observations(
         scenario=Scenario(
@@ -149,7 +166,7 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
             source="mocap",
             category=row.category,
             frame_count=frames,
-            train_end=train_end,
+            train_end=int(settings.train_fraction * frames),
             frame_rate=RECORD_RATE / settings.stride,
             up="+z",
             self_collision=row.self_collision,
@@ -164,19 +181,30 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
         interior_points=np.zeros((0, 3)),
         tracks=observed,
         rest_shape=rest_shape,
+        line=np.array([nodes, nodes + 1, *range(count - 4), nodes + 2, nodes + 3]),
+        velocity_before=first if settings.start else np.zeros((0, 3)),
     )
 
 
-def rings(markers: np.ndarray, spacing: float, radius: float, count: int, number: int | None = None) -> np.ndarray:
-    """Nodes [R * count, 3], m, on R circles around the centerline through `markers` [n, 3], ring after ring.
+def rings(centers: np.ndarray, tangents: np.ndarray, normals: np.ndarray, radius: float, count: int) -> np.ndarray:
+    """Nodes [R * count, 3], m, on circles around `centers` [R, 3] in the planes normal to unit `tangents` [R, 3], ring after ring.
 
-    The first and last ring lie at the first and last marker. Between them rings are equally spaced along the arc: `number` rings
-    in all, or the spacing nearest to `spacing` that divides the arc evenly. Each circle lies in the plane normal to the tangent.
-    Its first node follows a parallel-transported frame, so node k of one ring is nearest to node k of the next.
+    The first node of each lies along its unit normal [R, 3] (`rolled`), so node k of one ring is nearest to node k of the next.
     """
-    centers, tangents = centerline(markers, spacing, number)
-    normals = _transported_normals(tangents)
-    return np.asarray((centers[:, None] + circle(normals, np.cross(tangents, normals), radius, count)).reshape(-1, 3))
+    nodes: np.ndarray = centers[:, None] + circle(normals, np.cross(tangents, normals), radius, count)
+    return nodes.reshape(-1, 3)
+
+
+def rolled(tangents: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Unit normals [R, 3] to unit tangents [R, 3], equally spaced along the arc: `axis` [3], projected, at both ends.
+
+    Between them they are transported by the smallest rotations, and what is missing at the far end, at most half a turn, is twist
+    that is even along the arc.
+    """
+    normals, last = transport(tangents, axis), tangents[-1]
+    missing = np.arctan2(np.cross(normals[-1], axis) @ last, normals[-1] @ axis)
+    turns = Rotation.from_rotvec(np.linspace(0.0, missing, len(tangents))[:, None] * tangents)
+    return np.asarray(turns.apply(normals))
 
 
 def straightened(markers: np.ndarray, number: int, radius: float, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -192,7 +220,11 @@ def straightened(markers: np.ndarray, number: int, radius: float, count: int) ->
 
 
 def centerline(markers: np.ndarray, spacing: float, number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Points and unit tangents [R, 3] of a natural cubic spline through `markers`, equally spaced along its arc."""
+    """Points and unit tangents [R, 3] of a natural cubic spline through `markers` [n, 3], equally spaced along its arc.
+
+    The first and last point are the first and last marker: `number` points in all, or the spacing nearest to `spacing` that divides
+    the arc evenly.
+    """
     spline, _, dense, arc = _arc(markers)
     number = max(round(arc[-1] / spacing), 1) + 1 if number is None else number
     at = np.interp(np.linspace(0.0, arc[-1], number), arc, dense)
@@ -207,17 +239,6 @@ def _arc(markers: np.ndarray) -> tuple[CubicSpline, np.ndarray, np.ndarray, np.n
     dense = np.unique(np.concatenate([np.linspace(a, b, OVERSAMPLING) for a, b in pairwise(knots)]))
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(spline(dense), axis=0), axis=1))])
     return spline, knots, dense, arc
-
-
-def _transported_normals(tangents: np.ndarray) -> np.ndarray:
-    """Unit normals [R, 3]: each is the previous one projected into the next normal plane (parallel transport for small turns)."""
-    helper = np.eye(3)[np.abs(tangents[0]).argmin()]
-    normals = np.empty_like(tangents)
-    previous = helper
-    for i, tangent in enumerate(tangents):
-        projected = previous - (previous @ tangent) * tangent
-        normals[i] = previous = projected / np.linalg.norm(projected)
-    return normals
 
 
 def recording_findings(file: Path, raw: Any) -> list[Finding]:

@@ -12,7 +12,8 @@ with `path` where its data lie.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from neuspring.config import Config, ScenarioRow, parse, read_text
 from neuspring.core.errors import InputError
+from neuspring.core.text import listed
 from neuspring.data import capture, phystwin
 
 if TYPE_CHECKING:
@@ -80,12 +82,50 @@ def location(row: ScenarioRow, settings: Config) -> Path:
     return Path(settings.data_root or ".") / row.path
 
 
-def scenario_rows(settings: Config, root: Path = Path()) -> dict[str, ScenarioRow]:
+RECORDING = re.compile(r"(?P<cable>[A-Za-z0-9][\w.-]*)_(?P<part>train|eval)_(?P<number>\d+)")
+"""Name of a recording of DEFORM's data set, which lies in CABLE/PART/NUMBER.pkl."""
+
+
+def with_deform(settings: Config) -> Config:
+    """The configuration with the scenarios, pools and transfers of its section `deform`. Raises InputError where files lack."""
+    chosen = settings.deform
+    if chosen.cables and settings.data_root is None:
+        raise InputError(
+            "configuration, deform", "DEFORM's data need data_root", "null", "Give it: --config data_root=/path/to/data."
+        )
+    pools, transfers = dict(settings.pools or {}), dict(settings.transfers or {})
+    for cable in chosen.cables:
+        folder = Path(settings.data_root or ".") / cable
+        found = {
+            part: sorted(int(file.stem) for file in folder.glob(f"{part}/*.pkl") if file.stem.isdecimal())
+            for part in ("train", "eval")
+        }
+        if len(found["train"]) < chosen.clips or not found["eval"]:
+            rule = f"at least {chosen.clips} recordings train/NUMBER.pkl (deform.clips) and one eval/NUMBER.pkl are required"
+            there = listed(sorted({path.parent.parent.name for path in folder.parent.glob("*/eval/*.pkl")})) or "none"
+            received = f"{len(found['train'])} and {len(found['eval'])}"
+            raise InputError(folder, rule, received, f"Correct data_root, deform.cables (there: {there}) or deform.clips.")
+        last = len(found["train"]) - 1
+        picked = [found["train"][i * last // (chosen.clips - 1)] for i in range(chosen.clips)]
+        pools[cable] = tuple(f"{cable}_train_{number}" for number in picked)
+        transfers[pools[cable][0]] = tuple(f"{cable}_eval_{number}" for number in found["eval"])
+    scenarios = tuple(dict.fromkeys([*settings.scenarios, *(pools[cable][0] for cable in chosen.cables)]))
+    return dataclasses.replace(settings, scenarios=scenarios, pools=pools or None, transfers=transfers or None)
+
+
+def scenario_rows(settings: Config, root: Path = Path(), also: Iterable[str] = ()) -> dict[str, ScenarioRow]:
     """All scenarios, name -> row: those of the table, which lies below `root`, and each capture in `data_root` that no row names.
 
-    Such a capture needs no row: its folder is the scenario's name, and capture.json says the rest. Raises InputError.
+    Such a capture needs no row: its folder is the scenario's name, and capture.json says the rest. A recording of a cable that the
+    configuration or `also` names needs none either: its name says where it lies. Raises InputError.
     """
     rows = read_scenarios(root / settings.scenario_table)
+    groups = [*(settings.pools or {}).items(), *(settings.transfers or {}).items()]
+    for name in dict.fromkeys([*settings.scenarios, *also, *(name for first, others in groups for name in (first, *others))]):
+        if name not in rows and (found := RECORDING.fullmatch(name)):
+            file = f"{found['cable']}/{found['part']}/{found['number']}.pkl"
+            values = {"scenario": name, "source": "mocap", "category": found["cable"], "path": file}
+            rows[name] = parse(ScenarioRow, values | {"self_collision": False, "ground": False}, f"scenario {name}")
     for path in sorted(Path(settings.data_root).glob(f"*/{capture.CAPTURE}")) if settings.data_root else ():
         name = path.parent.name
         try:

@@ -17,7 +17,7 @@ from neuspring.config import Config, Method, ScenarioRow, SearchRow, merge, pars
 from neuspring.config.rows import RENAMED_ROWS
 from neuspring.core.errors import InputError
 from neuspring.core.text import listed
-from neuspring.data.sources import SOURCES, Source, location, scenario_rows
+from neuspring.data.sources import SOURCES, Source, location, scenario_rows, with_deform
 from neuspring.perception.backends import BACKENDS
 from neuspring.scores.lpips import configured_weights
 from neuspring.scores.paper import Study, read_studies
@@ -145,7 +145,7 @@ class Benchmark:
     """
 
     def __init__(self, values: Mapping[str, Any], root: Path) -> None:
-        self.root, whole = root, parse(Config, values, "configuration")
+        self.root, whole = root, with_deform(parse(Config, values, "configuration"))
         scenarios, methods = scenario_rows(whole, root), read_methods(root / whole.method_table)
         self.studies = read_studies(root / whole.study_table)
         """All rows of the study table; `config.studies` names those that are made without being asked for."""
@@ -159,7 +159,7 @@ class Benchmark:
         for name in ("scenarios", "methods", "seeds"):
             if not getattr(whole, name):
                 raise InputError(f"configuration, {name}", "at least one entry is required", None, REMEDY)
-        _require_known("scenarios", whole.scenarios, scenarios, f"{whole.scenario_table}, or a capture in data_root")
+        _require_known("scenarios", whole.scenarios, scenarios, f"{whole.scenario_table}, or a capture or recording in data_root")
         self.whole = whole = with_references(whole, scenarios, methods)
         """The configuration as it was given: what tables are laid out for, whatever part of it is run now."""
         self.config = config = chosen_part(whole, scenarios)
@@ -326,7 +326,9 @@ class Benchmark:
                     "Give it: --config data_root=/path/to/data.",
                 )
             if not path.exists():
-                raise InputError(f"scenario {name}", "its data must exist", path, "Correct data_root or the scenario table's path.")
+                raise InputError(
+                    f"scenario {name}", "its data must exist", path, "Correct data_root, or the scenario's name or path."
+                )
             SOURCES[row.source].required(path)
             if SOURCES[row.source].films and not SOURCES[row.source].write_capture:
                 BACKENDS["segment"][self.config.perception.segment.backend].require(path)

@@ -3,7 +3,8 @@
 Chamfer distance: each visible observed point to its nearest surface node, one direction, in the L1 norm |dx| + |dy| + |dz|.
 Track error: annotated tracks, matched to the nearest of all nodes at frame 0, Euclidean distance.
 Both follow the released evaluation of PhysTwin. The track error has a floor, its value in frame 0. The bound track error has none:
-its points move with the nodes around them (`carried`). Metrics of pictures are in `pictures` and `lpips`.
+its points move with the nodes around them (`carried`). DEFORM's L1 error is that of its evaluation, of markers along a cable.
+Metrics of pictures are in `pictures` and `lpips`.
 
 pandas and SciPy are imported where they are used, because the workflow reads the declarations at its start.
 
@@ -117,6 +118,11 @@ _ALL = (
         name="track_error_bound", title="bound track error", heading="TE bound", unit="m", factor=1e3, digits=2, tolerance=1e-6,
         explained="track error of points bound to the nodes around them, 0 for any rigid motion",
         paper_heading="TE bound", paper_unit="mm", paper_factor=1e3, paper_digits=2,
+    ),
+    Metric(
+        name="deform_l1", title="L1 error of DEFORM", heading="L1", unit="m", factor=1e3, digits=2, tolerance=1e-6,
+        explained="mean absolute difference of all coordinates of the markers along a cable, held ones (0) included",
+        paper_heading="L1", paper_unit="mm", paper_factor=1e3, paper_digits=2,
     ),
     Metric(
         name="psnr", title="PSNR", heading="PSNR", unit="dB", digits=2, tolerance=0.02, relative=False,
@@ -238,10 +244,29 @@ def _mean_errors(positions: np.ndarray, tracks: np.ndarray, carried: Callable[[n
     return mean
 
 
+LOWEST = 0.002001
+"""Height, m, below which DEFORM's evaluation lifts observed markers."""
+
+
+def deform_l1(positions: np.ndarray, observations: Observations) -> np.ndarray:
+    """Mean absolute difference per frame [F], m, over the markers of the line and coordinates, of positions [F, N, 3].
+
+    As DEFORM's evaluation has it: held markers count with 0, and observed ones are at least `LOWEST` high. The line must consist of
+    tracked points, which are visible always, and controllers.
+    """
+    free = observations.line[observations.line < len(observations.nodes)]
+    seen = observations.object_points[: len(positions), free].astype(np.float64)
+    seen[..., 2] = np.maximum(seen[..., 2], LOWEST)
+    total: np.ndarray = np.abs(positions[:, free] - seen).sum(axis=(1, 2))
+    return total / (3 * len(observations.line))
+
+
 def errors_per_frame(positions: np.ndarray, observations: Observations) -> dict[str, np.ndarray]:
-    """Every distance per frame [T], m, by the name of its metric; positions [T, N, 3]."""
-    tracks = observations.tracks[: len(positions)]
-    return {
+    """Every distance per frame [T], m, by the name of its metric; positions [T, N, 3]. DEFORM's with a line of markers alone."""
+    tracks, line = observations.tracks[: len(positions)], observations.line
+    of_markers = not ((line >= observations.object_points.shape[1]) & (line < len(observations.nodes))).any()
+    of_markers &= bool(line.size) and observations.scenario.up == "+z" and bool(observations.object_visibility.all())
+    return ({"deform_l1": deform_l1(positions, observations)} if of_markers else {}) | {
         "chamfer": chamfer_per_frame(positions, observations),
         "track_error": track_errors(positions, tracks),
         "track_error_bound": bound_track_errors(positions, tracks),

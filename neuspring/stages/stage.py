@@ -340,9 +340,9 @@ def read_row(text: str, settings: Config) -> ScenarioRow:
 
     if text.lstrip().startswith("{"):
         return config.parse(ScenarioRow, json_value("--scenario", text), "--scenario")
-    rows = scenario_rows(settings)
+    rows = scenario_rows(settings, also=(text,))
     if text not in rows:
-        rule = f"must be a row of {settings.scenario_table}, a capture in data_root, or JSON"
+        rule = f"must be a row of {settings.scenario_table}, a capture or recording in data_root, or JSON"
         raise InputError("--scenario", rule, text)
     return rows[text]
 

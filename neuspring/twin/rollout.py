@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from neuspring.core.artifacts import InitialVelocity, Observations, Trajectory, Twin
+from neuspring.core.errors import InputError
 from neuspring.physics import stability
 from neuspring.physics.controllers import waypoints
 from neuspring.physics.solver import FrameSolver, solver_for
@@ -107,11 +108,19 @@ def initial_velocity(observations: Observations, kind: InitialVelocity) -> np.nd
 
     rest: zero, as in the released simulator. observed: (-3 x0 + 4 x1 - x2) / (2 dt) of tracked points and of controllers that hold,
     exact for constant acceleration, spread over the nodes; (x1 - x0) / dt where frame 2 is not visible or not for training.
+    before: the recorded `velocity_before` of tracked points and controllers, spread alike. Raises InputError where there is none.
     """
     nodes = observations.nodes
     if kind == "rest":
         return np.zeros(nodes.shape)
     scenario = observations.scenario
+    if kind == "before":
+        if not len(observations.velocity_before):
+            rule = "before needs a recording that knows the sample before frame 0"
+            where = f"{scenario.name}, simulation.initial_velocity"
+            raise InputError(where, rule, "none", "Set mocap.start: 1, or choose observed.")
+        places = np.concatenate([observations.object_points[0], observations.controller_points[0]])
+        return spread(places, observations.velocity_before, nodes)
     x, hands = (values[:3].astype(np.float64) for values in (observations.object_points, observations.controller_points))
     visible, valid = observations.object_visibility, observations.object_motion_valid
     once = visible[1] & valid[0]

@@ -274,8 +274,36 @@ def _means(places: np.ndarray, at: np.ndarray) -> Callable[[np.ndarray], np.ndar
     return mean
 
 
+LARGEST_ROLL = 60.0
+"""Degrees. Recordings of one cable whose rings start alike differ by less, by how their ends point; others by a quarter turn."""
+END_NODES = 8
+"""Nodes at an end of a line whose turn is measured."""
+
+
+def roll_between(here: Observations, there: Observations) -> float:
+    """How far the nodes at either end of the line are turned about it from one recording to the other, degrees, the larger.
+
+    The rotation of the nearest nodes about the end is the smallest one that turns its direction, after a turn about it: the roll.
+    It says nothing, and counts as 0, where the direction turns by more than 60 degrees.
+    """
+    from scipy.spatial.transform import Rotation
+
+    first, other = (np.concatenate([seen.nodes, seen.controller_points[0]]).astype(np.float64) for seen in (here, there))
+    rolls = []
+    for end, inner in (here.line[:2], here.line[:-3:-1]):
+        near = np.argsort(np.linalg.norm(first[: len(here.nodes)] - first[end], axis=1))[:END_NODES]
+        turn, _ = Rotation.align_vectors(other[near] - other[end], first[near] - first[end])
+        along = (first[inner] - first[end]) / np.linalg.norm(first[inner] - first[end])
+        sine, cosine = turn.as_quat(canonical=True)[:3] @ along, turn.as_quat(canonical=True)[3]
+        rolls.append(np.degrees(2 * np.arctan(abs(sine) / cosine)) if along @ turn.apply(along) > 0.5 else 0.0)
+    return float(max(rolls))
+
+
 def require_pool(here: Observations, pool: Sequence[Observations], leave_out: bool) -> None:
-    """Raise InputError unless a twin can be judged on the pool: other recordings, with as many nodes and hands."""
+    """Raise InputError unless a twin can be judged on the pool: other recordings, with as many nodes and hands, node i on node i.
+
+    Along a line neighbors tell nothing of a turn about it, so that is measured (`roll_between`).
+    """
     name = f"pool of {here.scenario.name}"
     if leave_out and not pool:
         raise InputError(name, "at least one other recording is required where this one is left out", "none")
@@ -286,6 +314,12 @@ def require_pool(here: Observations, pool: Sequence[Observations], leave_out: bo
             rule = f"recordings of a pool must have as many nodes and controllers: {counts[0]} and {counts[1]}"
             value = f"{received[0]} and {received[1]} in {there.scenario.name}"
             raise InputError(name, rule, value, "Sample all alike (mocap.rings).")
+        if here.line.size and there.line.size and (roll := roll_between(here, there)) > LARGEST_ROLL:
+            rule = (
+                f"node i of a cable must be node i in every recording: its ends may be rolled by {LARGEST_ROLL:g} degrees at most"
+            )
+            remedy = "Name another mocap.roll_axis, or leave this recording out."
+            raise InputError(name, rule, f"{roll:.0f} degrees in {there.scenario.name}", remedy)
 
 
 def on_recording(twin: Twin, observations: Observations, quirks: config.ReleasedQuirks) -> Twin:

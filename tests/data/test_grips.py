@@ -105,7 +105,7 @@ def cable(samples: int = 41, count: int = 12) -> np.ndarray:
 def read(folder: Path, **settings: object) -> mocap.Observations:
     path = folder / "7.pkl"
     path.write_bytes(pickle.dumps(cable(), protocol=4))
-    return mocap.read(ROW, path, Mocap(ring=3, **settings))  # type: ignore[arg-type]
+    return mocap.read(ROW, path, Mocap(ring=3, roll_axis="z", **settings))  # type: ignore[arg-type]
 
 
 def test_clamps_follow_the_markers_among_the_controllers(tmp_path: Path) -> None:

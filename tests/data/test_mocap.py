@@ -107,7 +107,7 @@ def test_frames_are_cut_after_the_stride(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("spacing", "radius", "ring"), [(0.012, 0.006, 4), (0.02, 0.003, 3), (0.01, 0.01, 8)])
 def test_ring_geometry(spacing: float, radius: float, ring: int) -> None:
     centers, tangents = mocap.centerline(helix(), spacing)
-    nodes = mocap.rings(helix(), spacing, radius, ring).reshape(-1, ring, 3)
+    nodes = rings(helix(), spacing, radius, ring).reshape(-1, ring, 3)
     offsets = nodes - centers[:, None]
     np.testing.assert_allclose(np.linalg.norm(offsets, axis=2), radius, rtol=0, atol=EDGE)
     np.testing.assert_allclose(np.einsum("rki,ri->rk", offsets, tangents), 0, atol=EDGE)
@@ -132,10 +132,71 @@ def assert_no_twist(nodes: np.ndarray, ring: int) -> None:
         assert (cKDTree(other).query(one)[1] == np.arange(ring)).all()
 
 
-def test_rings_do_not_twist() -> None:
-    assert_no_twist(mocap.rings(helix(), 0.012, 0.006, 4), 4)
+def rings(markers: np.ndarray, spacing: float, radius: float, ring: int, number: int | None = None) -> np.ndarray:
+    """Nodes [R * ring, 3] of rings whose roll starts from y."""
+    centers, tangents = mocap.centerline(markers, spacing, number)
+    return mocap.rings(centers, tangents, mocap.rolled(tangents, mocap.Y), radius, ring)
+
+
+def test_neighboring_nodes_of_rings_have_the_same_number() -> None:
+    assert_no_twist(rings(helix(), 0.012, 0.006, 4), 4)
     vertical = np.array([[0.0, 0.0, 1.0 - 0.1 * i] for i in range(8)])  # a tangent along a coordinate axis
-    assert_no_twist(mocap.rings(vertical, 0.012, 0.006, 4), 4)
+    assert_no_twist(rings(vertical, 0.012, 0.006, 4), 4)
+
+
+def test_both_ends_are_rolled_from_one_axis_and_the_twist_between_them_is_even() -> None:
+    _, tangents = mocap.centerline(helix(), 0.005)
+    normals = mocap.rolled(tangents, mocap.Y)
+    for normal, tangent in zip(normals[[0, -1]], tangents[[0, -1]], strict=True):
+        projected = mocap.Y - (mocap.Y @ tangent) * tangent
+        np.testing.assert_allclose(normal, projected / np.linalg.norm(projected), atol=EDGE)
+    np.testing.assert_allclose(np.einsum("ri,ri->r", normals, tangents), 0, atol=EDGE)
+    # The turn of each normal against the one before it, carried along by the smallest rotation.
+    steps = [
+        np.arctan2(np.cross(carried, after) @ tangent, carried @ after)
+        for carried, after, tangent in (
+            (mocap.transport(tangents[i : i + 2], normals[i])[1], normals[i + 1], tangents[i + 1]) for i in range(len(tangents) - 1)
+        )
+    ]
+    np.testing.assert_allclose(steps, steps[0], atol=1e-9)
+    assert abs(sum(steps)) > 0.1
+
+
+def test_an_end_along_the_roll_axis_is_refused_with_the_remedy(tmp_path: Path) -> None:
+    along_y = np.repeat(np.linspace([0.1, 0.2, 0.3], [0.1, 0.9, 0.31], 12).T[None], 40, axis=0)
+    path = write(tmp_path, along_y)
+    with pytest.raises(InputError, match=r"7\.pkl.*mocap\.roll_axis.*degrees between an end and y.*farthest"):
+        mocap.read(ROW, path, Mocap())
+    assert len(mocap.read(ROW, path, Mocap(roll_axis="z")).nodes)
+
+
+@pytest.mark.parametrize("grip", ["markers", "clamp"])
+def test_the_line_runs_through_all_markers_and_its_velocity_is_that_before_frame_0(tmp_path: Path, grip: Any) -> None:
+    data = recording()
+    # The ends turn too, so that points of clamps have velocities of their own.
+    data[:, :, :2] += 0.01 * np.sin(np.linspace(0, 3, 40))[:, None, None] * np.array([[0.0, 0.0], [0.3, 0.0], [0.0, 0.5]])
+    seen = mocap.read(ROW, write(tmp_path, data), Mocap(start=3, stride=2, grip=grip))
+    places = np.concatenate([seen.nodes, seen.controller_points[0]])
+    np.testing.assert_array_equal(places[seen.line], data[3].T.astype(np.float32))
+    before = mocap.read(ROW, write(tmp_path, data), Mocap(start=2, stride=1, grip=grip))
+    first = np.concatenate([before.object_points, before.controller_points], axis=1)
+    if grip == "markers":
+        np.testing.assert_allclose(seen.velocity_before, (first[1] - first[0]) * 100.0, atol=1e-4)
+    else:
+        # A rigid turn of the ring with the direction of the end: its points keep their distance to the marker.
+        marker, ring = seen.velocity_before[8], seen.velocity_before[12:16]
+        offsets = seen.controller_points[0, 4:8] - seen.controller_points[0, 0]
+        np.testing.assert_allclose(np.einsum("ki,ki->k", ring - marker, offsets), 0, atol=1e-4)
+        assert np.abs(ring - marker).max() > 1e-3
+    assert len(mocap.read(ROW, write(tmp_path, data), Mocap()).velocity_before) == 0
+
+
+def test_whole_recordings_may_be_for_training_and_short_ones_are_refused(tmp_path: Path) -> None:
+    path = write(tmp_path, recording())
+    seen = mocap.read(ROW, path, Mocap(start=1, stride=1, frames=39, train_fraction=1.0))
+    assert (seen.scenario.frame_count, seen.scenario.train_end) == (39, 39)
+    with pytest.raises(InputError, match=r"7\.pkl: 40 frames are required after start 1 and stride 1.*39 of 40 samples"):
+        mocap.read(ROW, path, Mocap(start=1, stride=1, frames=40))
 
 
 @pytest.mark.parametrize(
@@ -199,7 +260,7 @@ def test_released_recordings(cable: str, observed: int) -> None:
 
 
 def test_a_given_number_of_rings_spaces_them_equally_from_end_to_end() -> None:
-    nodes = mocap.rings(helix(), 0.012, 0.006, 3, number=9).reshape(-1, 3, 3)
+    nodes = rings(helix(), 0.012, 0.006, 3, number=9).reshape(-1, 3, 3)
     centers = nodes.mean(axis=1)
     assert len(centers) == 9
     np.testing.assert_allclose(centers[[0, -1]], helix()[[0, -1]], atol=1e-9)

@@ -19,7 +19,7 @@ from neuspring.config.search import HANDS
 from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
 from neuspring.core.records import Before, Recorder
-from neuspring.data.sources import read_scenarios
+from neuspring.data.sources import read_scenarios, scenario_rows, with_deform
 from neuspring.experiments import benchmark as tables
 from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.graph import Graph
@@ -193,8 +193,57 @@ def test_a_capture_in_data_root_is_a_scenario_without_a_row(tmp_path: Path) -> N
     assert mine.category == "toy", "a row is believed before capture.json"
     with pytest.raises(InputError, match=r"half/capture\.json"):
         benchmark(tmp_path, scenarios=["half"], data_root=str(tmp_path))
-    with pytest.raises(InputError, match=r"or a capture in data_root; received 'towl' \(did you mean 'towel'"):
+    with pytest.raises(InputError, match=r"or a capture or recording in data_root; received 'towl' \(did you mean 'towel'"):
         benchmark(tmp_path, scenarios=["towl"], data_root=str(tmp_path))
+
+
+def record(root: Path, cable: str, train: int, evaluation: int) -> None:
+    """Files of a cable as DEFORM's data set has them: training recordings 3, 6, 9, ... and evaluation recordings 1, 2, ..."""
+    for part, numbers in (("train", range(3, 3 * train + 1, 3)), ("eval", range(1, evaluation + 1))):
+        (root / cable / part).mkdir(parents=True, exist_ok=True)
+        for number in numbers:
+            (root / cable / part / f"{number}.pkl").touch()
+
+
+def test_a_recording_in_data_root_is_a_scenario_by_its_name(tmp_path: Path) -> None:
+    record(tmp_path, "DLO7", 4, 1)
+    given = {"scenarios": ["DLO7_train_12"], "data_root": str(tmp_path), "mocap": {"rings": 20}}
+    made = benchmark(tmp_path, **given, transfers={"DLO7_train_12": ["DLO7_eval_1"]})
+    (one, other) = made.scenarios.values()
+    assert (one.source, one.category, one.path, one.ground) == ("mocap", "DLO7", "DLO7/train/12.pkl", False)
+    assert other.path == "DLO7/eval/1.pkl"
+    assert made.data_path("DLO7_train_12") == tmp_path / "DLO7" / "train" / "12.pkl"
+    with pytest.raises(InputError, match=r"scenario DLO7_train_13: its data must exist; received .*DLO7/train/13\.pkl"):
+        benchmark(tmp_path, scenarios=["DLO7_train_13"], data_root=str(tmp_path))
+    with pytest.raises(InputError, match="scenario DLO7_train_12: mocap scenarios need data_root"):
+        benchmark(tmp_path, scenarios=["DLO7_train_12"])
+    with pytest.raises(InputError, match=r"every entry must be a row of .*received 'DLO7_test_12'"):
+        benchmark(tmp_path, scenarios=["DLO7_test_12"], data_root=str(tmp_path))
+
+
+def test_deforms_benchmark_is_a_pool_of_evenly_spaced_recordings_per_cable(tmp_path: Path) -> None:
+    record(tmp_path, "DLO7", 10, 2)
+    record(tmp_path, "DLO8", 3, 14)
+    pooled(tmp_path)
+    tables = {"method_table": "pooled.yaml", "methods": ["one"], "scenarios": [], "pools": None, "mocap": {"rings": 20}}
+
+    def made(**deform: object) -> Benchmark:
+        return pooled(tmp_path, **tables, deform=deform, data_root=str(tmp_path))
+
+    found = made(cables=["DLO7", "DLO8"], clips=3)
+    assert found.config.scenarios == ("DLO7_train_3", "DLO8_train_3")
+    # In the order of numbers, not of text; both ends belong to it.
+    assert found.pools["DLO7_train_3"] == ("DLO7_train_15", "DLO7_train_30")
+    assert found.pools["DLO8_train_3"] == ("DLO8_train_6", "DLO8_train_9")
+    assert found.transfers["DLO7_train_3"] == ("DLO7_eval_1", "DLO7_eval_2")
+    assert len(found.transfers["DLO8_train_3"]) == 14
+    assert found.applies("one", "DLO8_train_3")
+    with pytest.raises(InputError, match=r"DLO8: at least 4 recordings.*received 3 and 14.*there: DLO7, DLO8"):
+        made(cables=["DLO8"], clips=4)
+    with pytest.raises(InputError, match=r"DLO9: at least 2 recordings.*received 0 and 0"):
+        made(cables=["DLO9"], clips=2)
+    with pytest.raises(InputError, match="configuration, deform: DEFORM's data need data_root"):
+        pooled(tmp_path, **tables, deform={"cables": ["DLO7"]})
 
 
 @pytest.mark.parametrize(
@@ -204,7 +253,7 @@ def test_a_capture_in_data_root_is_a_scenario_without_a_row(tmp_path: Path) -> N
         ({"methods": []}, "configuration, methods: at least one entry is required"),
         ({"seeds": []}, "configuration, seeds: at least one entry is required"),
         ({"methods": ["ful"]}, r"every entry must be a row of methods\.yaml; received 'ful' \(did you mean 'full'\?\)"),
-        ({"scenarios": ["nothing"]}, r"row of scenarios\.tsv, or a capture in data_root; received 'nothing'.*Known: rope, cable"),
+        ({"scenarios": ["nothing"]}, r"row of scenarios\.tsv, or a capture or recording in data_root; received 'nothing'.*cable"),
         ({"scenarios": ["cable"]}, "scenario cable: mocap scenarios need data_root"),
         ({"scenarios": ["cable"], "data_root": "/nowhere"}, "scenario cable: its data must exist; received /nowhere/cable.csv"),
         ({"method_table": "missing.yaml"}, "must be readable"),
@@ -465,6 +514,7 @@ def test_pools_that_cannot_be(tmp_path: Path, changes: dict[str, object], messag
         ["mocap", "mocap_heldout", "headline"],
         ["mocap", "mocap_field"],
         ["mocap", "paper"],
+        ["deform"],
         ["color", "footage"],
         ["phystwin"],
         ["phystwin", "tune"],
@@ -478,7 +528,14 @@ def test_every_configuration_that_is_shipped_is_valid(overlays, tmp_path):
         elif row.source not in ("capture", "synthetic", "toy"):
             (tmp_path / row.path).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / row.path).touch()
-    benchmark = Benchmark(values | {"data_root": str(tmp_path)}, ROOT)
+    for cable in values.get("deform", {}).get("cables", ()):
+        record(tmp_path, cable, 56, 14)
+    values |= {"data_root": str(tmp_path)}
+    for row in scenario_rows(with_deform(config.parse(Config, values, "shipped"))).values():
+        if row.source == "mocap":
+            (tmp_path / row.path).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / row.path).touch()
+    benchmark = Benchmark(values, ROOT)
     assert benchmark.compared_with in benchmark.methods
     assert set(benchmark.fits) <= set(tables.read_methods(ROOT / "config" / "methods.yaml"))
     if benchmark.config.tune:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from neuspring import config
+from neuspring.core.errors import InputError
 from neuspring.twin.candidates import candidate
 from neuspring.twin.fit import fit
 from neuspring.twin.losses import FrameLoss
@@ -70,6 +71,15 @@ def test_only_training_frames_are_read():
     points = np.array(seen.object_points)
     points[2:] += 1.0
     assert np.array_equal(initial_velocity(early, "observed"), initial_velocity(replace(early, object_points=points), "observed"))
+
+
+def test_the_velocity_before_frame_0_reads_no_later_frame():
+    seen = moving([0, 0, -9.8], [0.3, -0.2, 1.0])
+    count = seen.object_points.shape[1] + seen.controller_points.shape[1]
+    known = replace(seen, velocity_before=np.tile([1.0, 2.0, 3.0], (count, 1)))
+    np.testing.assert_allclose(initial_velocity(known, "before"), np.tile([1.0, 2.0, 3.0], (len(seen.nodes), 1)), atol=ROUNDING)
+    with pytest.raises(InputError, match=r"simulation\.initial_velocity: before needs.*mocap\.start: 1"):
+        initial_velocity(seen, "before")
 
 
 def test_a_rollout_starts_with_the_velocity_it_is_given():

@@ -1,14 +1,19 @@
 """Twins on other recordings of the same object."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from neuspring import config
 from neuspring.core.artifacts import Twin
+from neuspring.core.errors import InputError
+from neuspring.data import mocap
 from neuspring.twin.candidates import candidate
 from neuspring.twin.rollout import roll_out
-from neuspring.twin.transfer import corresponds, move
+from neuspring.twin.topology import piecewise_topology
+from neuspring.twin.transfer import corresponds, move, require_pool, roll_between
 from tests.support import small
 
 # Rest lengths are float32.
@@ -141,3 +146,44 @@ def test_the_same_nodes_in_another_order_make_the_same_motion():
     # The longest springs ask by rank among equal distances of a regular body, so a few differ.
     moved = np.linalg.norm(here - here[0], axis=2).mean()
     assert np.linalg.norm(there - here, axis=2).mean() < 0.05 * moved
+
+
+def cable(folder, sag, **settings):
+    """A cable that hangs between two grippers, about in the plane of x and z, as recorded."""
+    x = np.linspace(-0.3, 0.3, 12)
+    line = np.stack([x, 0.05 * np.sin(5 * x), sag * (x / 0.3) ** 2 + 0.5], axis=1)
+    path = folder / f"{sag}.pkl"
+    path.write_bytes(pickle.dumps(np.repeat(line.T[None], 5, axis=0), protocol=4))
+    row = config.ScenarioRow(
+        scenario=f"cable_{sag}", source="mocap", category="cable", path="x", self_collision=False, ground=False
+    )
+    return mocap.read(row, path, config.Mocap(ring=4, rings=12, grip="clamp", stride=1, **settings))
+
+
+def test_a_pool_whose_rings_are_turned_about_the_cable_is_refused(tmp_path):
+    here, there = cable(tmp_path, 0.3), cable(tmp_path, 0.45)
+    require_pool(here, [there], leave_out=False)
+    assert 0.0 < roll_between(here, there) < 10.0
+    # As when the roll starts from the axis that is least along the first tangent: y here, x in a steeper recording.
+    turned = cable(tmp_path, 0.45, roll_axis="x")
+    topology = piecewise_topology(
+        here.nodes, here.controller_points[0], np.zeros(len(here.nodes), int), [0.07], [20], 0.02, 5, repair=True
+    )
+    assert corresponds(topology, turned), "lengths of springs do not tell"
+    with pytest.raises(
+        InputError, match=r"pool of cable_0\.3: node i of a cable.*; received \d+ degrees in cable_0\.45.*mocap\.roll"
+    ):
+        require_pool(here, [turned], leave_out=False)
+    # One end alone, by as much as its ring has room.
+    nodes = there.surface_points.reshape(12, 4, 3).copy()
+    nodes[-3:] = np.roll(nodes[-3:], 1, axis=1)
+    assert roll_between(here, replace(there, surface_points=nodes.reshape(-1, 3))) == pytest.approx(90, abs=10)
+
+
+def test_an_end_that_points_elsewhere_tells_nothing_of_its_roll(tmp_path):
+    here = cable(tmp_path, 0.3)
+    over = replace(
+        here,
+        **{name: getattr(here, name) * np.float32([1, 1, -1]) for name in ("object_points", "surface_points", "controller_points")},
+    )
+    assert roll_between(here, over) == 0.0

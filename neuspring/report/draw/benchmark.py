@@ -14,7 +14,7 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from neuspring.scores.metrics import DISTANCES, averages
 
-METRIC_STYLES = (("tab:orange", "s"), ("tab:blue", "o"), ("tab:green", "^"), ("tab:purple", "D"))
+METRIC_STYLES = (("tab:orange", "s"), ("tab:blue", "o"), ("tab:green", "^"), ("tab:purple", "D"), ("tab:red", "v"))
 """Color and marker of each distance."""
 SHIFT = 0.24
 """The markers of a method stand within so much of its line."""
