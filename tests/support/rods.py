@@ -1,0 +1,78 @@
+"""Rods of the physics tests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from neuspring.core.artifacts import Rod, Simulation
+
+
+def rod(vertices: Any, held: Any = (), *, density: float = 1.0, **changes: Any) -> Rod:
+    """A rod through `vertices` [V, 3], by default straight at rest, of 1 kg/m, EI 1e-3, GJ 1e-3 N m^2 and EA 100 N.
+
+    `held` are indices of vertices that are held. Numbers for `bending`, `twisting` mean all joints.
+    """
+    points = np.asarray(vertices, np.float64)
+    count = len(points)
+    lengths = np.asarray(changes.pop("lengths", np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    mass = density * (np.append(lengths, 0) + np.append(0, lengths)) / 2
+    controllers = np.full(count, -1, np.int32)
+    controllers[list(held)] = np.arange(len(held))
+    values: dict[str, Any] = {
+        "bending": 1e-3,
+        "twisting": 1e-3,
+        "stretching": 100.0,
+        "damping": 0.0,
+        "drag_quadratic": 0.0,
+        "roll": 0.0,
+        "axis": np.array([0.0, 0.6, 0.8]),
+        "curvature": np.zeros((count, 2)),
+        "edge": np.zeros(0, np.int32),
+        "place": np.zeros((0, 3)),
+        "mass": mass,
+    } | changes
+    for name in ("bending", "twisting"):
+        values[name] = np.broadcast_to(values[name], count).astype(np.float64)
+    return Rod(vertices=points, held=controllers, lengths=lengths, **values)
+
+
+def straight(vertices: int, length: float = 1.0, direction: Any = (1.0, 0.0, 0.0)) -> np.ndarray:
+    """Vertices [V, 3] on a line."""
+    return np.linspace(0, length, vertices)[:, None] * np.array(direction)
+
+
+def crooked(vertices: int = 8, spacing: float = 0.05, bend: float = 0.2, seed: int = 0) -> np.ndarray:
+    """Vertices [V, 3] on a line with random changes."""
+    noise = np.random.default_rng(seed).normal(0, bend * spacing, (vertices, 3))
+    return straight(vertices, spacing * (vertices - 1)) + noise
+
+
+def helix(vertices: int, radius: float, rise: float, turn: float) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] of a helix about z, `turn` rad and `rise` m from each to the next, and the curvatures [V, 2] that it has.
+
+    A joint bends by the angle phi, and the plane of bending turns by psi about the edge from a joint to the next; a frame without
+    twist sees kb = 2 tan(phi / 2) turn by psi. Curvatures belong to directors whose m2 is, at joint 1, along kb.
+    """
+    angles = turn * np.arange(vertices)
+    points = np.stack([radius * np.cos(angles), radius * np.sin(angles), rise * np.arange(vertices)], axis=1)
+    edges = np.diff(points, axis=0)
+    t = edges / np.linalg.norm(edges, axis=1, keepdims=True)
+    normals = np.cross(t[:-1], t[1:])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    phi = np.arccos(t[0] @ t[1])
+    psi = np.arctan2(np.cross(normals[0], normals[1]) @ t[1], normals[0] @ normals[1])
+    around = psi * (np.arange(vertices) - 1)
+    return points, 2 * np.tan(phi / 2) * np.stack([np.cos(around), np.sin(around)], axis=1)
+
+
+def simulation(**changes: Any) -> Simulation:
+    """Frames of 10 ms without gravity and ground."""
+    return Simulation(**({"frame_time": 0.01, "substeps": 5, "gravity": 0.0, "ground": False} | changes))
+
+
+def real(values: Any) -> torch.Tensor:
+    """A float64 tensor."""
+    return torch.tensor(np.asarray(values), dtype=torch.float64)
