@@ -1,7 +1,7 @@
 """Every setting: its meaning, unit, range and default, as frozen dataclasses that refuse unknown keys.
 
     settings                       the whole configuration (`Config`), GPUs, a part of it for one step
-    simulation, search, twin       integration; the zero-order search; losses, field, fit
+    simulation, search, twin, rod  integration; the zero-order search; losses, field, fit; rods
     data, perception, images       sources; raw video to observations; splats and their scores
     baselines, tuning              Spring-Gaus, GS-Dynamics; sweeps over settings
     rows                           rows of the scenario, method and search tables
@@ -13,6 +13,7 @@ Nothing here imports torch, Warp or MLflow, because the workflow reads the confi
 
 from neuspring.config.data import Mocap, Synthetic, Toy
 from neuspring.config.parse import merge, parse, plain, read_text, read_yaml, typed
+from neuspring.config.rod import Rod
 from neuspring.config.rows import Kind, Method, ScenarioRow, SearchRow
 from neuspring.config.search import Polish, Search, SearchVariables, Variable
 from neuspring.config.settings import Config, Tracking
@@ -29,6 +30,7 @@ __all__ = [
     "Polish",
     "ReleasedQuirks",
     "RestShape",
+    "Rod",
     "ScenarioRow",
     "Search",
     "SearchRow",

@@ -14,6 +14,7 @@ from neuspring.config.data import Deform, Mocap, Synthetic, Toy
 from neuspring.config.images import Images
 from neuspring.config.parse import Count, Name, Section, plain
 from neuspring.config.perception import Perception
+from neuspring.config.rod import Rod
 from neuspring.config.search import Search
 from neuspring.config.simulation import ReleasedQuirks, Simulation
 from neuspring.config.tuning import Tune
@@ -156,6 +157,7 @@ class Config(Section):
     losses: Losses = field(default_factory=Losses)
     search: Search = field(default_factory=Search)
     fit: Fit = field(default_factory=Fit)
+    rod: Rod = field(default_factory=Rod)
     released_quirks: ReleasedQuirks = field(default_factory=ReleasedQuirks)
     toy: Toy = field(default_factory=Toy)
     mocap: Mocap = field(default_factory=Mocap)
