@@ -1,0 +1,544 @@
+"""Discrete elastic rods (Bergou et al. 2008, 2010) in lanes: many rods of as many vertices advance together, one thread each.
+
+`rod_reference.py` is the specification: energies, and forces as their gradients. Here the same forces are written out, and a
+substep is implicit, so that it stays stable for the stiffest cable. With BDF2 (backward Euler in the first substep and after a
+contact)
+
+    x1 = x* + g v1,   v1 = v* + g a(x1, v1),   x* = (4 x0 - x_) / 3,   v* = (4 v0 - v_) / 3,   g = 2 h / 3,
+
+and x1 = p + d around the extrapolated p = 2 x0 - x_, where forces are evaluated once:
+
+    (M (1 + g c) / g^2 + K) d = f(p) + M (v* / g - (1 + g c) (p - x*) / g^2).
+
+c is the drag, K the Gauss-Newton matrix of bending (with its inner damping) and stretching, and the tension of the substep before
+turns edges. K couples three neighbors, so the system is banded and solved by Cholesky. Twist is quasi-static: inner angles minimize
+the energy of twist and bending, by Gauss-Newton from those of the substep before. Held vertices and the directors of clamps follow
+their paths linearly within a frame.
+"""
+# No postponed annotations here: Warp reads the evaluated types of the kernels below.
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from neuspring.core.artifacts import Rod, Simulation
+from neuspring.core.device import load
+
+TWIST_STEPS = wp.constant(3)
+"""Gauss-Newton steps of the twist per substep; it starts from the one before."""
+FIRST_TWIST_STEPS = wp.constant(60)
+"""In frame 0, where it starts from an even twist."""
+MAX_TURN = wp.constant(wp.float64(0.5))
+"""Largest change of an angle in one of these steps, rad."""
+TINY = wp.constant(wp.float64(1e-12))
+BAND = wp.constant(9)
+"""Entries of a row of the banded matrix, from the diagonal to the left."""
+
+real = wp.float64
+vec3 = wp.vec3d
+vec2 = wp.vec2d
+mat33 = wp.mat33d
+Scalars: Any = wp.array2d(dtype=real)
+Vectors: Any = wp.array2d(dtype=vec3)
+Pairs: Any = wp.array2d(dtype=vec2)
+Numbers: Any = wp.array(dtype=real)
+Indices: Any = wp.array2d(dtype=wp.int32)
+
+
+@wp.struct
+class Lanes:
+    """Parameters and state of B rods."""
+
+    lengths: Scalars
+    mass: Scalars
+    bending: Scalars
+    twisting: Scalars
+    curvature: Pairs
+    stretching: Numbers
+    damping: Numbers
+    drag: Numbers
+    drag_quadratic: Numbers
+    roll: Numbers
+    axis: wp.array(dtype=vec3)
+    held: Indices
+    x: Vectors
+    v: Vectors
+    x_before: Vectors
+    v_before: Vectors
+    p: Vectors
+    """Extrapolated positions."""
+    t: Vectors
+    u: Vectors
+    """Reference directors, carried by parallel transport."""
+    m1: Vectors
+    m2: Vectors
+    kb: Vectors
+    theta: Scalars
+    reference: Scalars
+    """Twist of the reference directors at each joint."""
+    tension: Scalars
+    k: Pairs
+    k_before: Pairs
+    history: wp.array(dtype=wp.int32)
+    """Substeps since the last start or contact."""
+    a: wp.array3d(dtype=real)
+    """Banded matrix [B, 3 V, 9]: entry q of row i is A[i, i - q]."""
+    b: Scalars
+    lower: Scalars
+    diagonal: Scalars
+    rest: Scalars
+
+
+@wp.func
+def transported(u: vec3, before: vec3, after: vec3):
+    """A unit vector normal to `before`, turned by the smallest rotation to `after`."""
+    w = u - (wp.dot(after, u) / (real(1.0) + wp.dot(before, after) + TINY)) * (before + after)
+    w = w - wp.dot(w, after) * after
+    return wp.normalize(w)
+
+
+@wp.func
+def projected(d: vec3, t: vec3):
+    """The unit vector along the part of d that is normal to t."""
+    w = d - wp.dot(d, t) * t
+    return wp.normalize(w)
+
+
+@wp.func
+def turn(a: vec3, b: vec3, t: vec3):
+    """Angle from a to b about t."""
+    return wp.atan2(wp.dot(wp.cross(a, b), t), wp.dot(a, b))
+
+
+@wp.func
+def near(angle: real, before: real):
+    """The angle plus the multiple of 2 pi that brings it nearest to `before`."""
+    circle = real(6.283185307179586)
+    return angle - circle * wp.round((angle - before) / circle)
+
+
+@wp.func
+def set_directors(s: Lanes, lane: int, edges: int):
+    """Material directors from reference directors and angles."""
+    for j in range(edges):
+        c = wp.cos(s.theta[lane, j])
+        n = wp.sin(s.theta[lane, j])
+        w = wp.cross(s.t[lane, j], s.u[lane, j])
+        s.m1[lane, j] = c * s.u[lane, j] + n * w
+        s.m2[lane, j] = c * w - n * s.u[lane, j]
+
+
+@wp.func
+def curvature(s: Lanes, lane: int, i: int):
+    """k1 and k2 of joint i, see `Rod`."""
+    kb = s.kb[lane, i]
+    k1 = real(0.5) * wp.dot(kb, s.m2[lane, i - 1] + s.m2[lane, i])
+    k2 = real(-0.5) * wp.dot(kb, s.m1[lane, i - 1] + s.m1[lane, i])
+    return vec2(k1, k2)
+
+
+@wp.func
+def joint_length(s: Lanes, lane: int, i: int):
+    """Half of the two edges of joint i, m."""
+    return real(0.5) * (s.lengths[lane, i - 1] + s.lengths[lane, i])
+
+
+@wp.func
+def solve_twist(s: Lanes, lane: int, edges: int, first_held: bool, last_held: bool, steps: int):
+    """Minimize the energy over the angles of edges that no clamp holds; tridiagonal Gauss-Newton steps."""
+    low = wp.where(first_held, 1, 0)
+    high = wp.where(last_held, edges - 2, edges - 1)
+    for _step in range(steps):
+        set_directors(s, lane, edges)
+        for j in range(edges):
+            s.lower[lane, j] = real(0.0)
+            s.diagonal[lane, j] = TINY
+            s.rest[lane, j] = real(0.0)
+        for i in range(1, edges):
+            joint = joint_length(s, lane, i)
+            m = s.theta[lane, i] - s.theta[lane, i - 1] + s.reference[lane, i]
+            y = s.twisting[lane, i] / joint
+            e = s.bending[lane, i] / joint
+            k = curvature(s, lane, i) - s.curvature[lane, i]
+            kb = s.kb[lane, i]
+            # Derivatives of k1 and k2 with respect to the two angles.
+            a1 = real(-0.5) * wp.dot(kb, s.m1[lane, i - 1])
+            a2 = real(-0.5) * wp.dot(kb, s.m2[lane, i - 1])
+            b1 = real(-0.5) * wp.dot(kb, s.m1[lane, i])
+            b2 = real(-0.5) * wp.dot(kb, s.m2[lane, i])
+            s.rest[lane, i - 1] = s.rest[lane, i - 1] - y * m + e * (k[0] * a1 + k[1] * a2)
+            s.rest[lane, i] = s.rest[lane, i] + y * m + e * (k[0] * b1 + k[1] * b2)
+            s.diagonal[lane, i - 1] = s.diagonal[lane, i - 1] + y + e * (a1 * a1 + a2 * a2)
+            s.diagonal[lane, i] = s.diagonal[lane, i] + y + e * (b1 * b1 + b2 * b2)
+            s.lower[lane, i] = e * (a1 * b1 + a2 * b2) - y
+        for j in range(low + 1, high + 1):
+            w = s.lower[lane, j] / s.diagonal[lane, j - 1]
+            s.diagonal[lane, j] = s.diagonal[lane, j] - w * s.lower[lane, j]
+            s.rest[lane, j] = s.rest[lane, j] - w * s.rest[lane, j - 1]
+        z = real(0.0)
+        largest = real(0.0)
+        for back in range(high - low + 1):
+            j = high - back
+            r = s.rest[lane, j]
+            if j < high:
+                r = r - s.lower[lane, j + 1] * z
+            z = r / s.diagonal[lane, j]
+            step = wp.clamp(z, -MAX_TURN, MAX_TURN)
+            largest = wp.max(largest, wp.abs(step))
+            s.theta[lane, j] = s.theta[lane, j] - step
+        if largest < real(1e-9):
+            break
+    set_directors(s, lane, edges)
+
+
+@wp.func
+def set_geometry(s: Lanes, lane: int, edges: int):
+    """Tangents, reference directors, their twist, and curvature binormals at the positions p."""
+    for j in range(edges):
+        t = wp.normalize(s.p[lane, j + 1] - s.p[lane, j])
+        s.u[lane, j] = transported(s.u[lane, j], s.t[lane, j], t)
+        s.t[lane, j] = t
+    for i in range(1, edges):
+        before = s.t[lane, i - 1]
+        t = s.t[lane, i]
+        w = transported(s.u[lane, i - 1], before, t)
+        s.reference[lane, i] = near(turn(w, s.u[lane, i], t), s.reference[lane, i])
+        s.kb[lane, i] = (real(2.0) / (real(1.0) + wp.dot(before, t) + TINY)) * wp.cross(before, t)
+
+
+@wp.kernel
+def begin(s: Lanes):
+    """Directors and twist of frame 0 at the positions x."""
+    lane = wp.tid()
+    edges = s.x.shape[1] - 1
+    first_held = s.held[lane, 0] >= 0 and s.held[lane, 1] >= 0
+    last_held = s.held[lane, edges] >= 0 and s.held[lane, edges - 1] >= 0
+    total = real(0.0)
+    for i in range(edges + 1):
+        s.p[lane, i] = s.x[lane, i]
+    for j in range(edges):
+        s.t[lane, j] = wp.normalize(s.x[lane, j + 1] - s.x[lane, j])
+        if j == 0:
+            s.u[lane, j] = projected(s.axis[lane], s.t[lane, j])
+        else:
+            s.u[lane, j] = transported(s.u[lane, j - 1], s.t[lane, j - 1], s.t[lane, j])
+        s.reference[lane, j] = real(0.0)
+        total += s.lengths[lane, j]
+    end = real(0.0)
+    if last_held:
+        last = edges - 1
+        end = s.roll[lane] + turn(s.u[lane, last], projected(s.axis[lane], s.t[lane, last]), s.t[lane, last])
+    along = real(0.0)
+    for j in range(edges):
+        s.theta[lane, j] = end * along / (total - s.lengths[lane, edges - 1])
+        along += s.lengths[lane, j]
+    set_geometry(s, lane, edges)
+    solve_twist(s, lane, edges, first_held, last_held, FIRST_TWIST_STEPS)
+    for i in range(1, edges):
+        s.k[lane, i] = curvature(s, lane, i)
+        s.k_before[lane, i] = s.k[lane, i]
+    for j in range(edges):
+        s.tension[lane, j] = real(0.0)
+    s.history[lane] = 0
+
+
+@wp.func
+def add_block(s: Lanes, lane: int, i: int, j: int, block: mat33):
+    """Add to the rows of vertex i and the columns of vertex j <= i."""
+    for r in range(3):
+        for c in range(3):
+            q = 3 * (i - j) + r - c
+            if q >= 0:
+                s.a[lane, 3 * i + r, q] = s.a[lane, 3 * i + r, q] + block[r, c]
+
+
+@wp.func
+def add_force(s: Lanes, lane: int, i: int, force: vec3):
+    """Add to the right-hand side of vertex i."""
+    for r in range(3):
+        s.b[lane, 3 * i + r] = s.b[lane, 3 * i + r] + force[r]
+
+
+@wp.func
+def assemble_bending(s: Lanes, lane: int, edges: int, rate: real, older: real, oldest: real):
+    """Forces and Gauss-Newton matrix of bending and twist; dk/dt = rate k - older k0 + oldest k_."""
+    tau = s.damping[lane]
+    for i in range(1, edges):
+        joint = joint_length(s, lane, i)
+        e = s.bending[lane, i] / joint
+        before = s.t[lane, i - 1]
+        after = s.t[lane, i]
+        k = curvature(s, lane, i)
+        moment = e * (k - s.curvature[lane, i] + tau * (rate * k - older * s.k[lane, i] + oldest * s.k_before[lane, i]))
+        inverse = real(1.0) / (real(1.0) + wp.dot(before, after) + TINY)
+        middle = inverse * (before + after)
+        n1 = inverse * (s.m1[lane, i - 1] + s.m1[lane, i])
+        n2 = inverse * (s.m2[lane, i - 1] + s.m2[lane, i])
+        r0 = real(1.0) / wp.length(s.p[lane, i] - s.p[lane, i - 1])
+        r1 = real(1.0) / wp.length(s.p[lane, i + 1] - s.p[lane, i])
+        # Derivatives of k1 and k2 with respect to the two edges.
+        a1 = r0 * (wp.cross(after, n2) - k[0] * middle)
+        b1 = r1 * (-k[0] * middle - wp.cross(before, n2))
+        a2 = r0 * (-k[1] * middle - wp.cross(after, n1))
+        b2 = r1 * (wp.cross(before, n1) - k[1] * middle)
+        twist = s.twisting[lane, i] / joint * (s.theta[lane, i] - s.theta[lane, i - 1] + s.reference[lane, i])
+        ga = moment[0] * a1 + moment[1] * a2 + real(0.5) * twist * r0 * s.kb[lane, i]
+        gb = moment[0] * b1 + moment[1] * b2 + real(0.5) * twist * r1 * s.kb[lane, i]
+        add_force(s, lane, i - 1, ga)
+        add_force(s, lane, i, gb - ga)
+        add_force(s, lane, i + 1, -gb)
+        # With respect to the three vertices.
+        y = e * (real(1.0) + tau * rate)
+        c1 = a1 - b1
+        c2 = a2 - b2
+        add_block(s, lane, i - 1, i - 1, y * (wp.outer(a1, a1) + wp.outer(a2, a2)))
+        add_block(s, lane, i, i, y * (wp.outer(c1, c1) + wp.outer(c2, c2)))
+        add_block(s, lane, i + 1, i + 1, y * (wp.outer(b1, b1) + wp.outer(b2, b2)))
+        add_block(s, lane, i, i - 1, -y * (wp.outer(c1, a1) + wp.outer(c2, a2)))
+        add_block(s, lane, i + 1, i, y * (wp.outer(b1, c1) + wp.outer(b2, c2)))
+        add_block(s, lane, i + 1, i - 1, -y * (wp.outer(b1, a1) + wp.outer(b2, a2)))
+
+
+@wp.func
+def assemble_stretching(s: Lanes, lane: int, edges: int):
+    """Forces and matrix of stretching, with the tension of the substep before across edges."""
+    unit = wp.identity(n=3, dtype=real)
+    for j in range(edges):
+        t = s.t[lane, j]
+        length = wp.length(s.p[lane, j + 1] - s.p[lane, j])
+        y = s.stretching[lane] / s.lengths[lane, j]
+        force = y * (length - s.lengths[lane, j])
+        along = wp.outer(t, t)
+        block = y * along + (wp.max(s.tension[lane, j], real(0.0)) / length) * (unit - along)
+        add_force(s, lane, j, force * t)
+        add_force(s, lane, j + 1, -force * t)
+        add_block(s, lane, j, j, block)
+        add_block(s, lane, j + 1, j + 1, block)
+        add_block(s, lane, j + 1, j, -block)
+
+
+@wp.func
+def solve(s: Lanes, lane: int, rows: int):
+    """Banded Cholesky in place; the solution is in b."""
+    for i in range(rows):
+        first = wp.max(0, i - BAND + 1)
+        for j in range(first, i + 1):
+            value = s.a[lane, i, i - j]
+            for k in range(wp.max(first, j - BAND + 1), j):
+                value = value - s.a[lane, i, i - k] * s.a[lane, j, j - k]
+            if j == i:
+                s.a[lane, i, 0] = wp.sqrt(wp.max(value, TINY))
+            else:
+                s.a[lane, i, i - j] = value / s.a[lane, j, 0]
+        value = s.b[lane, i]
+        for k in range(first, i):
+            value = value - s.a[lane, i, i - k] * s.b[lane, k]
+        s.b[lane, i] = value / s.a[lane, i, 0]
+    for back in range(rows):
+        i = rows - 1 - back
+        value = s.b[lane, i]
+        for k in range(i + 1, wp.min(rows, i + BAND)):
+            value = value - s.a[lane, k, k - i] * s.b[lane, k]
+        s.b[lane, i] = value / s.a[lane, i, 0]
+
+
+@wp.kernel
+def advance(
+    s: Lanes,
+    held_from: Vectors,
+    held_to: Vectors,
+    directors_from: Vectors,
+    directors_to: Vectors,
+    given: bool,
+    substeps: int,
+    h: real,
+    gravity: real,
+):
+    """One frame of each lane."""
+    lane = wp.tid()
+    vertices = s.x.shape[1]
+    edges = vertices - 1
+    first_held = s.held[lane, 0] >= 0 and s.held[lane, 1] >= 0
+    last_held = s.held[lane, edges] >= 0 and s.held[lane, edges - 1] >= 0
+    for step in range(substeps):
+        part = real(step + 1) / real(substeps)
+        # BDF2, or backward Euler where there is no substep before.
+        g = h
+        more = real(0.0)
+        if s.history[lane] > 0:
+            g = real(2.0) * h / real(3.0)
+            more = real(1.0) / real(3.0)
+        rate = real(1.0) / g
+        older = (real(1.0) + more) * rate
+        oldest = more * rate
+        for i in range(vertices):
+            if s.held[lane, i] >= 0:
+                s.p[lane, i] = (real(1.0) - part) * held_from[lane, i] + part * held_to[lane, i]
+            elif s.history[lane] > 0:
+                s.p[lane, i] = real(2.0) * s.x[lane, i] - s.x_before[lane, i]
+            else:
+                s.p[lane, i] = s.x[lane, i] + h * s.v[lane, i]
+        set_geometry(s, lane, edges)
+        if given:
+            # Clamps turn as they are told.
+            if first_held:
+                d = projected((real(1.0) - part) * directors_from[lane, 0] + part * directors_to[lane, 0], s.t[lane, 0])
+                s.theta[lane, 0] = near(turn(s.u[lane, 0], d, s.t[lane, 0]), s.theta[lane, 0])
+            if last_held:
+                last = edges - 1
+                d = projected((real(1.0) - part) * directors_from[lane, 1] + part * directors_to[lane, 1], s.t[lane, last])
+                s.theta[lane, last] = near(turn(s.u[lane, last], d, s.t[lane, last]), s.theta[lane, last])
+        solve_twist(s, lane, edges, first_held, last_held, TWIST_STEPS)
+        for i in range(3 * vertices):
+            s.b[lane, i] = real(0.0)
+            for q in range(BAND):
+                s.a[lane, i, q] = real(0.0)
+        assemble_bending(s, lane, edges, rate, older, oldest)
+        assemble_stretching(s, lane, edges)
+        for i in range(vertices):
+            if s.held[lane, i] >= 0:
+                for r in range(3):
+                    row = 3 * i + r
+                    for q in range(BAND):
+                        s.a[lane, row, q] = real(0.0)
+                        if row + q < 3 * vertices:
+                            s.a[lane, row + q, q] = real(0.0)
+                    s.a[lane, row, 0] = real(1.0)
+                    s.b[lane, row] = real(0.0)
+            else:
+                m = s.mass[lane, i]
+                c = real(1.0) + g * (s.drag[lane] + s.drag_quadratic[lane] * wp.length(s.v[lane, i]))
+                x = (real(1.0) + more) * s.x[lane, i] - more * s.x_before[lane, i]
+                v = (real(1.0) + more) * s.v[lane, i] - more * s.v_before[lane, i]
+                force = m * (rate * v - (c * rate * rate) * (s.p[lane, i] - x))
+                add_force(s, lane, i, force + vec3(real(0.0), real(0.0), m * gravity))
+                for r in range(3):
+                    s.a[lane, 3 * i + r, 0] = s.a[lane, 3 * i + r, 0] + m * c * rate * rate
+        solve(s, lane, 3 * vertices)
+        for i in range(vertices):
+            d = vec3(s.b[lane, 3 * i], s.b[lane, 3 * i + 1], s.b[lane, 3 * i + 2])
+            after = s.p[lane, i] + d
+            x = (real(1.0) + more) * s.x[lane, i] - more * s.x_before[lane, i]
+            v = rate * (after - x)
+            if s.held[lane, i] >= 0:
+                v = (held_to[lane, i] - held_from[lane, i]) / (h * real(substeps))
+            s.x_before[lane, i] = s.x[lane, i]
+            s.v_before[lane, i] = s.v[lane, i]
+            s.x[lane, i] = after
+            s.v[lane, i] = v
+        for j in range(edges):
+            d = s.x[lane, j + 1] - s.p[lane, j + 1] - s.x[lane, j] + s.p[lane, j]
+            length = wp.length(s.p[lane, j + 1] - s.p[lane, j]) + wp.dot(s.t[lane, j], d)
+            s.tension[lane, j] = s.stretching[lane] * (length / s.lengths[lane, j] - real(1.0))
+        for i in range(1, edges):
+            s.k_before[lane, i] = s.k[lane, i]
+            s.k[lane, i] = curvature(s, lane, i)
+        s.history[lane] = s.history[lane] + 1
+
+
+PARAMETERS = ("lengths", "mass", "bending", "twisting", "curvature", "axis", "stretching", "damping", "drag_quadratic", "roll")
+"""Fields of a `Rod` that lanes have one value of each."""
+
+
+@dataclass(frozen=True)
+class RodLanes:
+    """Parameters of B rods with as many vertices, float64 on the CPU: those of `Rod` with a leading axis [B]."""
+
+    lengths: np.ndarray
+    mass: np.ndarray
+    bending: np.ndarray
+    twisting: np.ndarray
+    curvature: np.ndarray
+    axis: np.ndarray
+    stretching: np.ndarray
+    damping: np.ndarray
+    drag_quadratic: np.ndarray
+    roll: np.ndarray
+    drag: np.ndarray
+    """Linear drag, 1/s."""
+    held: np.ndarray
+
+    @classmethod
+    def of(cls, rods: Sequence[Rod], drags: Sequence[float]) -> "RodLanes":
+        """Lanes of rods and their linear drags, 1/s."""
+        values = {name: np.array([getattr(rod, name) for rod in rods], dtype=np.float64) for name in PARAMETERS}
+        return cls(**values, drag=np.array(drags, dtype=np.float64), held=np.array([rod.held for rod in rods], dtype=np.int32))
+
+
+class RodSolver:
+    """Simulates frames of rods in lanes. Tensors are float64 and have a leading axis [B]."""
+
+    def __init__(self, lanes: RodLanes, simulation: Simulation, device: str = "cpu") -> None:
+        self.lanes, self.simulation, self.device = lanes, simulation, device
+        count, vertices = lanes.mass.shape
+        self.count, self.vertices = count, vertices
+        kinds: dict[str, Any] = {
+            "x": vec3,
+            "v": vec3,
+            "x_before": vec3,
+            "v_before": vec3,
+            "p": vec3,
+            "t": vec3,
+            "u": vec3,
+            "m1": vec3,
+            "m2": vec3,
+        }
+        kinds |= {"kb": vec3, "theta": real, "reference": real, "tension": real, "k": vec2, "k_before": vec2}
+        kinds |= {"lower": real, "diagonal": real, "rest": real}
+        self._state = Lanes()
+        for name, dtype in kinds.items():
+            setattr(self._state, name, wp.zeros((count, vertices), dtype=dtype, device=device))
+        self._state.history = wp.zeros(count, dtype=wp.int32, device=device)
+        self._state.a = wp.zeros((count, 3 * vertices, 9), dtype=real, device=device)
+        self._state.b = wp.zeros((count, 3 * vertices), dtype=real, device=device)
+        vectors: dict[str, Any] = {"curvature": vec2, "axis": vec3}
+        for each in fields(RodLanes):
+            kind: Any = wp.int32 if each.name == "held" else vectors.get(each.name, real)
+            values = np.ascontiguousarray(getattr(lanes, each.name))
+            setattr(self._state, each.name, wp.array(values, dtype=kind, device=device))
+        self._directors: Any = None
+
+    def start(self, x: torch.Tensor, v: torch.Tensor, directors: torch.Tensor | None = None) -> None:
+        """State of frame 0: positions [B, V, 3], m, velocities [B, V, 3], m/s; clamps' directors [B, 2, 3], where they turn."""
+        for name, values in (("x", x), ("v", v)):
+            self._put(getattr(self._state, name), values)
+        wp.launch(load(begin, self.device), dim=self.count, inputs=[self._state], device=self.device)
+        self._directors = None if directors is None else self._vectors(directors)
+
+    def frame(self, held_from: torch.Tensor, held_to: torch.Tensor, directors: torch.Tensor | None = None) -> None:
+        """One frame. Held vertices move linearly between rows of [B, V, 3]; the clamps' directors turn to `directors` [B, 2, 3]."""
+        simulation = self.simulation
+        begins, ends = self._vectors(held_from), self._vectors(held_to)
+        given = directors is not None and self._directors is not None
+        turned = self._vectors(directors) if directors is not None else begins
+        inputs = [
+            self._state, begins, ends, self._directors if given else begins, turned, given,
+            simulation.substeps, simulation.substep, -simulation.up_sign * simulation.gravity,
+        ]  # fmt: skip
+        wp.launch(load(advance, self.device), dim=self.count, inputs=inputs, device=self.device)
+        if directors is not None:
+            self._directors = turned
+
+    def _vectors(self, values: torch.Tensor) -> Any:
+        return wp.from_torch(values.to(device=self.device, dtype=torch.float64).contiguous(), dtype=vec3)
+
+    def _put(self, array: Any, values: torch.Tensor) -> None:
+        wp.to_torch(array).copy_(values)
+
+    @property
+    def x(self) -> torch.Tensor:
+        """Positions [B, V, 3], m."""
+        return wp.to_torch(self._state.x)
+
+    @property
+    def v(self) -> torch.Tensor:
+        """Velocities [B, V, 3], m/s."""
+        return wp.to_torch(self._state.v)
+
+    def directors(self) -> torch.Tensor:
+        """m1 of each edge [B, E, 3]."""
+        return wp.to_torch(self._state.m1)[:, :-1]
