@@ -111,12 +111,19 @@ class Graph:
         """Files that say that a run is in MLflow; none where tracking is off."""
         return [path.replace("run.json", "mlflow.txt") for path in self.runs(methods) if self.config.tracking.enabled]
 
-    def transfers(self) -> list[str]:
-        """Records of transfers: per source, method and seed. Oracles concern their own recording alone, and are not transferred."""
+    def study_runs(self, name: str) -> list[str]:
+        """The records that a study is made of."""
+        methods, clips = self.benchmark.methods_of(name), self.benchmark.studies[name].clips
+        return [*self.runs(methods), *(self.transfers(methods) if clips else ())]
+
+    def transfers(self, some: Sequence[str] | None = None) -> list[str]:
+        """Records of transfers: per source, method (of some) and seed. Oracles concern their own recording alone: they have none."""
         methods = [
             name
             for name, method in self.benchmark.methods.items()
-            if (method.search or (method.model and BASELINES[method.model].transfers)) and not method.oracle
+            if (some is None or name in some)
+            and (method.search or (method.model and BASELINES[method.model].transfers))
+            and not method.oracle
         ]
         return [
             self._output("transfer", scenario=scenario, method=method, seed=seed)

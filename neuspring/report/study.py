@@ -24,6 +24,7 @@ import pandas as pd
 
 from neuspring.config import parse
 from neuspring.config.parse import STRICT, Name
+from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from neuspring.core.records import RECORD_FORMAT, read_json
 from neuspring.core.table import LATEX_PREAMBLE, Cell, Chip, Table, Tone
@@ -47,6 +48,7 @@ from neuspring.report.study_cells import (
     in_order,
     restricted,
 )
+from neuspring.report.study_clips import read_clips, write_clips
 from neuspring.scores import paper
 from neuspring.scores.failures import (
     DASHES,
@@ -188,6 +190,8 @@ def write_study(
 
     `left_out` maps a method to the scenarios to which it does not apply. `beside` is the study that is shown next to this one.
     """
+    if study.clips:
+        return write_clips(name, read_clips(study, results, scenarios, seeds, set(known_methods)), folder)
     benchmark, shown = set(known_methods), [*study.rows.values(), *(beside.rows.values() if beside else ())]
     methods = [method for method in dict.fromkeys(shown) if method in benchmark]
     return write_collected(name, study, collect(results, scenarios, methods, seeds, left_out), folder, beside)
@@ -195,6 +199,9 @@ def write_study(
 
 def write_collected(name: str, study: Study, collected: Collected, folder: Path, beside: Study | None = None) -> str:
     """As `write_study`, from runs that are read already. Methods of other studies are ignored."""
+    if study.clips:
+        remedy = "Leave out --scores; name --results, --scenarios, --methods and --seeds."
+        raise InputError(f"study {name}", "a study of clips needs the transfers of a results folder", "scores alone", remedy)
     numbers = StudyNumbers(name=name, study=study, collected=collected, beside=beside)
     own = numbers.own
     files = {"": numbers.cells.assign(study=name), "_runs": numbers.runs, "_scenarios": numbers.scenarios}

@@ -87,7 +87,7 @@ rule tables:
 
 rule study:
     input:
-        lambda wildcards: GRAPH.runs(BENCHMARK.methods_of(wildcards.study)),
+        lambda wildcards: GRAPH.study_runs(wildcards.study),
         STUDIED[1],
     output:
         f"{GRAPH.folder}/studies/{{study}}.md",

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from neuspring.core.artifacts import Scenario
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_atomically
 from neuspring.report.draw.painter import ERRORS, Painter
@@ -60,41 +58,22 @@ class Made:
         return text + (" (coarser than asked for, to fit --megabytes)" if self.coarser else "")
 
 
-def write_film(painter: Painter, path: Path, width: int, speed: float = 1.0, megabytes: float = 2.0) -> Made:
+def write_film(
+    painter: Painter, path: Path, width: int, speed: float = 1.0, megabytes: float = 2.0, beside: Sequence[Painter] = ()
+) -> Made:
     """Write the film; if it does not fit, a GIF of every other frame, then fewer pixels until it does.
 
-    Raises InputError for a bad size or speed, and where nothing fits.
+    Painters `beside` the first one, of other scenes, paint the same frames at its side. Raises InputError for a bad size or speed, and where nothing fits.
     """
     _require(width, speed, megabytes)
     rate = painter.scene.observations.scenario.frame_rate * speed
-    return _write_pictures(partial(film_pictures, painter), painter.frames, rate, path, width, megabytes)
-
-
-def write_clips(painters: Sequence[Painter], path: Path, width: int, megabytes: float = 2.0) -> Made:
-    """Write a film of several clips side by side, each with its observed points and its first prediction in one view.
-
-    All painters have the same frames, in real time, equally spaced. Sizes as `write_film`.
-    """
-    _require(width, 1.0, megabytes)
-    frames = painters[0].frames
-    rate = painters[0].scene.observations.scenario.frame_rate / max(frames[1] - frames[0], 1)
-    return _write_pictures(partial(clip_pictures, painters), frames, rate, path, width, megabytes)
-
-
-def _write_pictures(
-    draw: Callable[[Sequence[int], int], Iterator[np.ndarray]],
-    frames: Sequence[int],
-    rate: float,
-    path: Path,
-    width: int,
-    megabytes: float,
-) -> Made:
-    """Write what `draw` (frames, width) gives, coarser until it fits."""
     gif = path.suffix.lower() == ".gif"
     made, every, scale = path.with_name(f".{path.name}.try{path.suffix}"), 1, 1.0
     try:
         while True:
-            pictures = list(draw(frames[::every], max(round(scale * width), 80)))
+            across = max(round(scale * width / (1 + len(beside))), 80)
+            films = [film_pictures(each, painter.frames[::every], across) for each in (painter, *beside)]
+            pictures = [_beside(each) for each in zip(*films, strict=True)]
             (_write_gif if gif else _write_mp4)(made, pictures, rate / every)
             size, (high, wide) = made.stat().st_size, pictures[0].shape[:2]
             if size <= 1e6 * megabytes:
@@ -122,50 +101,22 @@ def _require(width: int, speed: float, megabytes: float) -> None:
             raise InputError(name, f"must be {least:g} to {most:g}" if least else f"must be above 0, at most {most:g}", value)
 
 
+def _beside(pictures: Sequence[np.ndarray]) -> np.ndarray:
+    """Pictures [H, W, 3] side by side, with white below the lower ones."""
+    high = max(map(len, pictures))
+    return np.hstack([np.pad(each, ((0, high - len(each)), (0, 0), (0, 0)), constant_values=255) for each in pictures])
+
+
 def film_pictures(painter: Painter, frames: Sequence[int], width: int) -> Iterator[np.ndarray]:
     """Pictures [H, W, 3] uint8, both sides even: observed and the methods side by side, errors below, time on top."""
-    figure, panels, clock = _layout(painter, max(width / DOTS, 1.5))
-    scenario = painter.scene.observations.scenario
-    parts = [(0, scenario.train_end, TRAINING, "training"), (scenario.train_end, scenario.frame_count, FUTURE, "future")]
-
-    def fill(frame: int) -> None:
-        _fill(painter, panels, frame)
-        _tell(scenario, clock, frame, parts)
-
-    yield from _drawn(figure, width, frames, fill)
-
-
-def clip_pictures(painters: Sequence[Painter], frames: Sequence[int], width: int) -> Iterator[np.ndarray]:
-    """As `film_pictures`, of several clips: a panel for each, named by the label of its prediction."""
     inches = max(width / DOTS, 1.5)
-    across = (inches - 2 * EDGE - GAP * (len(painters) - 1)) / len(painters)
-    highs = [across * painter.scene.view.height / painter.scene.view.width for painter in painters]
-    total = EDGE + CLOCK + HEAD + max(highs) + EDGE
-    figure = plt.figure(figsize=(inches, total), facecolor="white")
-    top, axes = total - EDGE - CLOCK - HEAD, []
-    for column, (painter, high) in enumerate(zip(painters, highs, strict=True)):
-        left = EDGE + column * (across + GAP)
-        axes.append(place(figure, left, top - high, across, high))
-        _name(figure, left + across / 2, top, painter.takes[0].label)
-    clock = place(figure, EDGE, total - EDGE - CLOCK, inches - 2 * EDGE, CLOCK)
-    scenario = painters[0].scene.observations.scenario
-
-    def fill(frame: int) -> None:
-        for painter, axis in zip(painters, axes, strict=True):
-            axis.clear()
-            painter.draw_predicted(axis, 0, frame)
-        _tell(scenario, clock, frame, [(0, scenario.frame_count, FUTURE, "observed: blue; predicted: dark; held: red")])
-
-    yield from _drawn(figure, width, frames, fill)
-
-
-def _drawn(figure: Figure, width: int, frames: Sequence[int], fill: Callable[[int], None]) -> Iterator[np.ndarray]:
-    """Pictures of a figure, `width` pixels wide, that `fill` draws frame by frame; the figure is closed at the end."""
-    figure.set_dpi(width / figure.get_figwidth())
+    figure, panels, clock = _layout(painter, inches)
+    figure.set_dpi(width / inches)
     canvas = FigureCanvasAgg(figure)
     try:
         for frame in frames:
-            fill(frame)
+            _fill(painter, panels, frame)
+            _tell(painter, clock, frame)
             canvas.draw()
             shown = np.asarray(canvas.buffer_rgba())[..., :3]
             yield np.ascontiguousarray(shown[: shown.shape[0] // 2 * 2, : shown.shape[1] // 2 * 2])
@@ -175,7 +126,8 @@ def _drawn(figure: Figure, width: int, frames: Sequence[int], fill: Callable[[in
 
 def _layout(painter: Painter, width: float) -> tuple[Figure, list[list[Axes]], Axes]:
     """The figure, its panels (observed and methods; below, errors of methods), and the bar of time."""
-    view, columns, errors = painter.scene.view, 1 + len(painter.takes), painter.manner.error != "none"
+    names = ["observed"][painter.manner.together :] + [take.label for take in painter.takes]
+    view, columns, errors = painter.scene.view, len(names), painter.manner.error != "none"
     right = BAR if errors else EDGE
     across = (width - EDGE - right - GAP * (columns - 1)) / columns
     high = across * view.height / view.width
@@ -184,8 +136,8 @@ def _layout(painter: Painter, width: float) -> tuple[Figure, list[list[Axes]], A
     top = total - EDGE - CLOCK - HEAD
     lefts = [EDGE + k * (across + GAP) for k in range(columns)]
     panels = [[place(figure, left, top - high, across, high) for left in lefts]]
-    for left, name in zip(lefts, ["observed", *(take.label for take in painter.takes)], strict=True):
-        _name(figure, left + across / 2, top, name)
+    for left, name in zip(lefts, names, strict=True):
+        figure.text((left + across / 2) / width, (top + 0.05) / total, name, ha="center", va="bottom", fontsize=TEXT)
     if errors:
         panels.append([place(figure, left, top - 2 * high - GAP, across, high) for left in lefts[1:]])
         cax = place(figure, width - BAR + 0.06, top - 2 * high - GAP + 0.04, 0.09, high - 0.08)
@@ -194,39 +146,37 @@ def _layout(painter: Painter, width: float) -> tuple[Figure, list[list[Axes]], A
     return figure, panels, clock
 
 
-def _name(figure: Figure, middle: float, top: float, text: str) -> None:
-    """The name of a panel, above it, inches."""
-    width, total = figure.get_size_inches()
-    figure.text(middle / width, (top + 0.05) / total, text, ha="center", va="bottom", fontsize=TEXT)
-
-
 def _fill(painter: Painter, panels: list[list[Axes]], frame: int) -> None:
     for row, axes in enumerate(panels):
         for column, axis in enumerate(axes):
             axis.clear()
             if row:
                 painter.draw_error(axis, column, frame)
-            elif column:
-                painter.draw_predicted(axis, column - 1, frame)
+            elif column or painter.manner.together:
+                painter.draw_predicted(axis, column - (not painter.manner.together), frame)
             else:
                 painter.draw_observed(axis, frame)
 
 
-def _tell(scenario: Scenario, clock: Axes, frame: int, parts: Sequence[tuple[int, int, Sequence[int], str]]) -> None:
-    """The bar of time, filled up to the frame: parts (start, stop, color, word), their borders in black."""
+def _tell(painter: Painter, clock: Axes, frame: int) -> None:
+    """The bar of time, filled up to the frame: training and future in their colors, the border in black."""
+    scenario = painter.scene.observations.scenario
+    # A recording of its own, which was not trained on.
+    train_end = 0 if painter.manner.together else scenario.train_end
     clock.clear()
     clock.set(xticks=[], yticks=[], xlim=(0, scenario.frame_count), ylim=(0, 1))
     style: dict[str, Any] = {"height": 1.0, "align": "center", "linewidth": 0}
-    words: dict[str, Any] = {"fontsize": TEXT - 1.5, "va": "center_baseline"}
-    margin = 0.006 * scenario.frame_count
-    for start, stop, color, word in parts:
+    for start, stop, color in ((0, train_end, TRAINING), (train_end, scenario.frame_count, FUTURE)):
         clock.barh(0.5, stop - start, left=start, color=rgb(color), alpha=0.25, **style)
         if frame >= start:
             clock.barh(0.5, min(stop, frame + 1) - start, left=start, color=rgb(color), **style)
-        if start:
-            clock.axvline(start, color="black", linewidth=1.0)
-        if start < stop:
-            clock.text(start + margin, 0.5, word, ha="left", **words)
+    clock.axvline(train_end, color="black", linewidth=1.0)
+    words: dict[str, Any] = {"fontsize": TEXT - 1.5, "va": "center_baseline"}
+    margin = 0.006 * scenario.frame_count
+    if train_end:
+        clock.text(margin, 0.5, "training", ha="left", **words)
+    if train_end < scenario.frame_count:
+        clock.text(train_end + margin, 0.5, "future" if train_end else "predicted", ha="left", **words)
     clock.text(scenario.frame_count - margin, 0.5, f"{frame / scenario.frame_rate:.2f} s", ha="right", **words)
     for side in clock.spines.values():
         side.set_visible(False)

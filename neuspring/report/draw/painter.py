@@ -60,6 +60,9 @@ class DrawingStyle:
     ground: Ground
     most: float | None = None
     """Upper end of the range of errors: of 1 for colors, mm for distances; None: from the data."""
+    together: bool = False
+    """Films show no panel of what was observed, which nodes without a photo stand before anyway: for recordings that a model was
+    not trained on."""
 
 
 def distances(take: Prediction, observations: Observations, frame: int) -> tuple[np.ndarray, np.ndarray]:
