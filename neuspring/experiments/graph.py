@@ -117,7 +117,7 @@ class Graph:
         return [*self.runs(methods), *(self.transfers(methods) if clips else ())]
 
     def transfers(self, some: Sequence[str] | None = None) -> list[str]:
-        """Records of transfers: per source, method (of some) and seed. Oracles concern their own recording alone: they have none."""
+        """Records of transfers: per source, method (of some) and seed. Oracles, of their own recording alone, have none."""
         methods = [
             name
             for name, method in self.benchmark.methods.items()

@@ -30,8 +30,8 @@ from neuspring.report.sections.pictures import Media, embedded, pictures_section
 from neuspring.report.sections.setup import perception_section, setup_section, tuning_section
 from neuspring.report.sections.work import failures_section, findings_section, work_section
 from neuspring.report.study import StudyNumbers, kind, study_blocks, verdict_chip
-from neuspring.report.study_clips import Clips, clip_tables, left_out, read_clips
 from neuspring.report.study_cells import BETTER, WITHIN, WORSE
+from neuspring.report.study_clips import clip_blocks, read_clips
 from neuspring.report.verdict import verdict
 from neuspring.scores import paper
 from neuspring.scores.paper import Study
@@ -67,7 +67,7 @@ def write(results: Path, output: Path, options: Options, written: str | None = N
         if _ran(material, name, study)
     }
     clips = {
-        name: read_clips(one.study, results, choice.scenarios, choice.seeds, choice.methods)
+        name: clip_blocks(read_clips(one.study, results, choice.scenarios, choice.seeds, choice.methods))
         for name, one in studies.items()
         if one.study.clips
     }
@@ -210,17 +210,12 @@ def _answer(counts: Counter[str], total: int) -> tuple[str, Tone]:
     return f"{agree} of {total} cells within the interval or better, {counts[WORSE]} worse, {total - answered} open.", tone
 
 
-def _study_section(studies: Studies, clips: Mapping[str, Clips], runs: pd.DataFrame) -> Section:
+def _study_section(studies: Studies, clips: Mapping[str, list[Block]], runs: pd.DataFrame) -> Section:
     """The verdict on each study, then its tables, as `neuspring study` writes them."""
     cards = [_verdict(one) for one in studies.values() if one.study.reference and not one.study.clips]
-    blocks = {name: [*clip_tables(found), *left_out(found)] for name, found in clips.items()}
+    blocks = {name: clips.get(name) or study_blocks(numbers) for name, numbers in studies.items()}
     folds = [
-        Fold(
-            summary=f"{name}: {numbers.study.title}",
-            blocks=blocks.get(name) or study_blocks(numbers),
-            open=True,
-            key=f"study-{name}",
-        )
+        Fold(summary=f"{name}: {numbers.study.title}", blocks=blocks[name], open=True, key=f"study-{name}")
         for name, numbers in studies.items()
     ]
     about = f"{_foreign(runs)} The command neuspring explain STUDY/ROW/TASK/METRIC says what a cell is made of."

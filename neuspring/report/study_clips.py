@@ -1,8 +1,8 @@
 """A study of twins on other recordings of the same object, beside published numbers: DEFORM's benchmark.
 
-Per study, in one folder: <study>.md and .tex (to read), .csv (a row per cable and row of the table), _clips.csv (every clip and seed),
-_growth.csv and _growth.png (mean error of free markers over time), and per cable _<cable>.mp4 and .gif: the best, the median and the
-worst clip of one row. All of it is made of what the stage `transfer` keeps.
+Per study, in one folder: <study>.md and .tex (to read), .csv (a row per cable and row of the table), _clips.csv (every clip
+and seed), _growth.csv and .png (mean error of free markers over time), per cable _<cable>.mp4 and .gif: the best, the median and
+the worst clip of one row. All of it is made of what the stage `transfer` keeps.
 """
 
 from __future__ import annotations
@@ -113,11 +113,10 @@ class Clips:
                 if len(part) and (path := self._file(run, "lines")):
                     lines, last = read_npz(path)[0], len(part) - 1
                     # Of fewer than three clips one stands for two.
-                    chosen = {last: "worst", last // 2: "median", 0: "best"}
-                    shown = [(part.iloc[place], chosen[place]) for place in sorted(chosen)]
-                    return [
-                        _painter(self.results, row, f"{label}, {word}: {row['clip']}", lines[row["clip"]]) for row, word in shown
-                    ]
+                    words = {last: "worst", last // 2: "median", 0: "best"}
+                    shown = [(part.iloc[place], f"{label}, {words[place]}") for place in sorted(words)]
+                    count = min(len(lines[clip["clip"]]) for clip, _ in shown)
+                    return [_painter(self.results, clip, title, lines[clip["clip"]][:count]) for clip, title in shown]
         return []
 
 
@@ -131,7 +130,7 @@ def _painter(results: Path, clip: pd.Series, title: str, line: np.ndarray) -> Pa
     free = seen.line < len(seen.nodes)
     positions = np.full((len(line), *seen.object_points.shape[1:]), np.nan)
     positions[:, seen.line[free]] = line[:, free]
-    take = Prediction(f"{title}, {clip['l1_mm']:.1f} mm", positions)
+    take = Prediction(f"{title}: {clip['clip']}, {clip['l1_mm']:.1f} mm", positions)
     frames = range(0, len(line), max(round(seen.scenario.frame_rate / FILM_RATE), 1))
     manner = DrawingStyle(style="nodes", error="none", ground="white", together=True)
     return Painter(Scene.from_side(seen, [take], frames), [take], frames, manner, Images(), "cpu")
@@ -154,17 +153,13 @@ def read_clips(study: Study, results: Path, sources: Sequence[str], seeds: Seque
     return Clips(study=study, results=Path(results), clips=clips, records=records, minutes=minutes)
 
 
-def clip_tables(found: Clips) -> list[Table]:
-    """L1 per cable beside published numbers; ours in detail; every clip. Those that have rows."""
-    return [table for table in (_overview(found), _details(found), _per_clip(found)) if table.rows]
-
-
-def left_out(found: Clips) -> list[Block]:
-    """The rows and runs that are not in the tables, and why."""
+def clip_blocks(found: Clips) -> list[Block]:
+    """L1 per cable beside published numbers; ours in detail; every clip. Then the rows and runs that are not there, and why."""
     lines = [f"{label}: not run" for label in found.study.rows if label not in set(found.clips["label"])]
     failed = found.records[found.records["status"] != "ok"].itertuples()
     lines += [f"{_labels(found.study)[str(run.method)]}, {run.scenario} / seed {run.seed}: {run.reason}" for run in failed]
-    return [Items(title="Not in the tables, or not whole", items=lines)] if lines else []
+    last = [Items(title="Not in the tables, or not whole", items=lines)] if lines else []
+    return [_overview(found), *([_details(found), _per_clip(found)] if len(found.clips) else []), *last]
 
 
 def _overview(found: Clips) -> Table:
@@ -175,11 +170,9 @@ def _overview(found: Clips) -> Table:
         values = [_l1(of[cable], best) if cable in of else Cell(text=DASH) for cable in found.cables]
         rows.append([Cell(text=str(label)), Cell(text=str(source)), *values])
     note = "mm: mean absolute error over clips, all markers (held ones count with 0), three coordinates and frames. "
-    if len(counts):
-        note += (
-            f"Ours: evaluation clips ({', '.join(f'{cable} {count}' for cable, count in counts.items())}), predicted open loop; "
-        )
-        note += f"± standard deviation over seeds; * clips are missing. {found.study.training}. "
+    clips = ", ".join(f"{cable} {count}" for cable, count in counts.items()) or "not run"
+    note += f"Ours: evaluation clips ({clips}), predicted open loop; ± standard deviation over seeds; * clips are missing. "
+    note += f"{found.study.training}. "
     note += " ".join(f"{SIGNS[tag]} {text}" for tag, text in TAGS.items() if tag in set(cells["tag"]))
     return Table(caption="L1 per cable", note=note.strip(), header=["Method", "Source", *found.cables], rows=rows, stub=2)
 
@@ -204,15 +197,11 @@ def _details(found: Clips) -> Table:
 
 def _per_clip(found: Clips) -> Table:
     means = found.clips.groupby(["cable", "clip", "label"], sort=False)["l1_mm"].mean()
-    labels = [label for label in found.study.rows if label in set(found.clips["label"])]
-    rows = []
-    for (cable, clip), part in means.groupby(level=["cable", "clip"], sort=False):
+    labels, rows = [label for label in found.study.rows if label in set(found.clips["label"])], []
+    for clip, part in means.groupby(level=["cable", "clip"], sort=False):
         values = part.droplevel([0, 1])
-        texts = [f"{values[label]:.2f}" if label in values else DASH for label in labels]
-        marks = ["best" if len(values) > 1 and values.get(label) == values.min() else "" for label in labels]
-        cells = [Cell(text=text, mark=mark) for text, mark in zip(texts, marks, strict=True)]  # type: ignore[arg-type]
-        rows.append([Cell(text=str(cable)), Cell(text=str(clip)), *cells])
-    return Table(caption="L1 per clip", note="mm, seeds averaged.", header=["Cable", "Clip", *labels], rows=rows, stub=2)
+        rows.append([*clip, *(f"{values[label]:.2f}" if label in values else DASH for label in labels)])
+    return replace(Table.of_texts(["Cable", "Clip", *labels], rows, "L1 per clip"), note="mm, seeds averaged.", stub=2)
 
 
 def write_clips(name: str, found: Clips, folder: Path) -> str:
@@ -221,23 +210,20 @@ def write_clips(name: str, found: Clips, folder: Path) -> str:
         old.unlink()
     for suffix, rows in {"": found.cells, "_clips": found.clips, "_growth": found.growth}.items():
         write_text(folder / f"{name}{suffix}.csv", rows.to_csv(index=False))
-    first, *rest = clip_tables(found)
-    title = found.study.title
-    floats = [table.latex(f"{name}-{k}", f"{title}: {table.caption}") for k, table in enumerate((first, *rest), 1)]
+    title, (first, *rest) = found.study.title, clip_blocks(found)
+    tables = [block for block in (first, *rest) if isinstance(block, Table)]
+    floats = [table.latex(f"{name}-{k}", f"{title}: {table.caption}") for k, table in enumerate(tables, 1)]
     write_text(folder / f"{name}.tex", "\n".join([LATEX_PREAMBLE, *floats]))
     parts = [f"# {title}\n", markdown([first])]
     if len(found.growth):
         path = save(growth_figure(found.growth, list(found.study.rows)), folder / f"{name}_growth.png")
         parts.append(f"![Mean error of free markers over time, per cable]({path.name})\n")
-    for cable in found.cables if len(found.clips) else ():
-        painter, *beside = found.filmed(cable) or [None]
-        for ending in ("gif", "mp4") if painter else ():
-            path = folder / f"{name}_{cable}.{ending}"
-            speed = (painter.frames[1] - painter.frames[0]) ** -1.0
-            write_film(painter, path, FILM_WIDTH, speed, FILM_MEGABYTES, beside)
-            parts.append(
-                f"{'!' * (ending == 'gif')}[{cable}: observed in blue, predicted dark, held red ({ending})]({path.name})\n"
-            )
-    text = "\n".join([*parts, markdown([*rest, *left_out(found)])])
+    for cable in dict.fromkeys(found.clips["cable"]):
+        painters = found.filmed(cable)
+        for ending in ("gif", "mp4") if painters else ():
+            path, (before, after) = folder / f"{name}_{cable}.{ending}", painters[0].frames[:2]
+            write_film(painters[0], path, FILM_WIDTH, 1 / (after - before), FILM_MEGABYTES, painters[1:])
+            parts.append(f"{'!' * (ending == 'gif')}[{cable}: observed blue, predicted dark, held red ({ending})]({path.name})\n")
+    text = "\n".join([*parts, markdown(rest)])
     write_text(folder / f"{name}.md", text)
     return text

@@ -63,7 +63,8 @@ def write_film(
 ) -> Made:
     """Write the film; if it does not fit, a GIF of every other frame, then fewer pixels until it does.
 
-    Painters `beside` the first one, of other scenes, paint the same frames at its side. Raises InputError for a bad size or speed, and where nothing fits.
+    Painters `beside` the first one, of other scenes, paint the same frames at its side. Raises InputError for a bad size or speed,
+    and where nothing fits.
     """
     _require(width, speed, megabytes)
     rate = painter.scene.observations.scenario.frame_rate * speed

@@ -1,0 +1,79 @@
+"""Transfers of twins to clips of cables, without the twins: the files that the stage leaves, and the observations of the clips."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from neuspring.core.artifacts import Observations, Scenario
+from neuspring.core.files import write_npz, write_table
+from neuspring.core.records import StageRecord, digest_file
+from neuspring.scores.metrics import COLUMNS
+
+FRAMES, RATE, MARKERS = 9, 100.0, 7
+HELD = (0, 1, MARKERS - 2, MARKERS - 1)
+
+
+def swinging(name: str, cable: str) -> Observations:
+    """A hanging cable of 7 markers that turns about the vertical; the controllers hold two at either end."""
+    along, time = np.linspace(0, 1, MARKERS), np.arange(FRAMES) / RATE
+    shape = np.stack([along - 0.5, 0 * along, 0.8 - 0.6 * np.sin(np.pi * along)], axis=1)
+    c, s = np.cos(3 * time), np.sin(3 * time)
+    turns = np.moveaxis(np.array([[c, -s, 0 * c], [s, c, 0 * c], [0 * c, 0 * c, 1 + 0 * c]]), -1, 0)
+    markers = np.einsum("tij,vj->tvi", turns, shape)
+    free = markers[:, 2:-2]
+    visible = np.ones(free.shape[:2], dtype=bool)
+    facts = {"source": "mocap", "frame_count": FRAMES, "train_end": FRAMES, "frame_rate": RATE, "up": "+z", "ground": False}
+    return Observations(
+        scenario=Scenario(name=name, category=cable, **facts),
+        object_points=free,
+        object_visibility=visible,
+        object_motion_valid=visible,
+        controller_points=markers[:, HELD],
+        surface_points=shape[2:4] + 0.01,
+        interior_points=np.zeros((0, 3)),
+        tracks=free,
+        line=np.array([5, 6, 0, 1, 2, 7, 8]),
+    )
+
+
+def write_transfer(
+    results: Path,
+    cable: str,
+    method: str,
+    seed: int,
+    l1: Mapping[str, float],
+    *,
+    diverged: tuple[str, ...] = (),
+    line: bool = True,
+) -> Path:
+    """A transfer from `<cable>_train` with the error l1, m, on each clip, three times that of free markers; returns its record."""
+    source, courses, lines = f"{cable}_train", [], {}
+    record = results / source / method / str(seed) / "transfer.json"
+    record.parent.mkdir(parents=True, exist_ok=True)
+    identity = {"category": cable, "method": method, "seed": seed, "task": "transfer", "unit": "m", "frames": FRAMES - 1}
+    rows = []
+    for clip, value in l1.items():
+        seen = swinging(clip, cable)
+        seen.save(results / clip / "observations.npz")
+        errors = {"deform_l1": value, "track_error": 3 * value}
+        rows += [identity | {"scenario": clip, "metric": name, "value": error} for name, error in errors.items()]
+        frames = np.arange(FRAMES)
+        course = {"scenario": clip, "frame": frames, "seconds": frames / RATE}
+        courses += [pd.DataFrame(course | {"metric": name, "value": error * (frames > 0)}) for name, error in errors.items()]
+        nodes = np.concatenate([seen.object_points, np.repeat(seen.nodes[None, 3:], FRAMES, axis=0)], axis=1)
+        lines[clip] = seen.on_line(nodes + np.array([0.0, 0.0, 3 * value])).astype(np.float32)
+    paths = {
+        role: record.with_name(f"transfer{suffix}") for role, suffix in (("scores", ".parquet"), ("frames", "_frames.parquet"))
+    }
+    write_table(pd.DataFrame(rows, columns=list(COLUMNS)), paths["scores"])
+    write_table(pd.concat(courses), paths["frames"])
+    if line:
+        paths["lines"] = record.with_name("transfer_lines.npz")
+        write_npz(paths["lines"], lines, "{}", compress=True)
+    files = {role: [path.name, digest_file(path)] for role, path in paths.items()}
+    StageRecord(stage="transfer", status="ok", files=files, facts={"diverged": list(diverged)}).save(record)
+    return record
