@@ -38,7 +38,7 @@ LEARNING = ("search", "fit", "train")
 """Stages whose time is that of the model."""
 SIGNS = {"second-hand": "†", "log": "‡", "others": "§", "reference": "◦", "": ""}
 """Tag of a published number to the sign behind it."""
-FILM_RATE, FILM_WIDTH, FILM_MEGABYTES = 25, 960, 3.0
+FILM_RATE, FILM_WIDTH, FILM_MEGABYTES = 20, 960, 3.0
 """Pictures per second, pixels, and size of a film."""
 COLUMNS = ["cable", "clip", "label", "method", "source", "seed", "l1_mm", "euclid_mm"]
 FACTS = ["l1_mm", "spread_mm", "median_mm", "worst_mm", "euclid_mm", "minutes", "worst_clip", "clips", "of", "seeds"]
@@ -73,7 +73,8 @@ class Clips:
         for (label, cable, _), value in self.study.values.items():
             facts = {"source": value.source, "tag": value.tag, "text": value.text, "ranked": value.tag != "reference"}
             rows += [{"cable": cable, "label": label, "l1_mm": value.value, **facts}] if cable in self.cables else []
-        for (cable, label), part in self.clips.groupby(["cable", "label"], sort=False):
+        for key, part in self.clips.groupby(["cable", "label"], sort=False):
+            cable, label = map(str, key)
             of = self.clips.loc[self.clips["cable"] == cable, "clip"].nunique()
             means, seeds = part.groupby("clip")[["l1_mm", "euclid_mm"]].mean(), part.groupby("seed")
             l1, spread = means["l1_mm"], seeds["l1_mm"].mean()[seeds["clip"].nunique() == of].std(ddof=1)
@@ -93,8 +94,8 @@ class Clips:
             if path := self._file(run, "frames"):
                 table = pd.read_parquet(path)
                 table = table[(table["metric"] == EUCLID) & table["scenario"].isin(list(cables))]
-                own = {"label": labels[str(run.method)], "cable": table["scenario"].map(cables), "euclid_mm": MM * table["value"]}
-                tables.append(table.assign(**own))
+                table = table.assign(label=labels[str(run.method)], cable=table["scenario"].map(cables))
+                tables.append(table.assign(euclid_mm=MM * table["value"]))
         table = pd.concat([table for table in tables if len(table)] or tables)
         return table.groupby(["cable", "label", "seconds"], sort=False)["euclid_mm"].mean().reset_index()
 
@@ -130,7 +131,7 @@ def _painter(results: Path, clip: pd.Series, title: str, line: np.ndarray) -> Pa
     free = seen.line < len(seen.nodes)
     positions = np.full((len(line), *seen.object_points.shape[1:]), np.nan)
     positions[:, seen.line[free]] = line[:, free]
-    take = Prediction(f"{title}: {clip['clip']}, {clip['l1_mm']:.1f} mm", positions)
+    take = Prediction(f"{title}: {clip['clip']}, L1 {clip['l1_mm']:.1f} mm", positions)
     frames = range(0, len(line), max(round(seen.scenario.frame_rate / FILM_RATE), 1))
     manner = DrawingStyle(style="nodes", error="none", ground="white", together=True)
     return Painter(Scene.from_side(seen, [take], frames), [take], frames, manner, Images(), "cpu")
@@ -188,7 +189,8 @@ def _details(found: Clips) -> Table:
     for cell in found.cells[found.cells["text"] == ""].itertuples():
         numbers = [getattr(cell, name) for name in FACTS[:6]]
         texts = [DASH if np.isnan(value) else f"{value:.2f}" for value in numbers]
-        rows.append([cell.cable, cell.label, *texts, cell.worst_clip, f"{cell.clips:.0f}/{cell.of:.0f}", f"{cell.seeds:.0f}"])
+        texts += [str(cell.worst_clip), f"{cell.clips:.0f}/{cell.of:.0f}", f"{cell.seeds:.0f}"]
+        rows.append([str(cell.cable), str(cell.label), *texts])
     note = "L1 in mm: mean, median and worst over clips, seeds averaged within each. Euclidean: mean distance of free markers, mm. "
     note += "Minutes: search and fit of one twin, mean over seeds; rows that share a search count it each."
     header = ["Cable", "Method", "Mean", "± seeds", "Median clip", "Worst clip", "Euclidean", "Minutes", "Worst", "Clips", "Seeds"]
@@ -198,9 +200,9 @@ def _details(found: Clips) -> Table:
 def _per_clip(found: Clips) -> Table:
     means = found.clips.groupby(["cable", "clip", "label"], sort=False)["l1_mm"].mean()
     labels, rows = [label for label in found.study.rows if label in set(found.clips["label"])], []
-    for clip, part in means.groupby(level=["cable", "clip"], sort=False):
+    for key, part in means.groupby(level=["cable", "clip"], sort=False):
         values = part.droplevel([0, 1])
-        rows.append([*clip, *(f"{values[label]:.2f}" if label in values else DASH for label in labels)])
+        rows.append([*map(str, key), *(f"{values[label]:.2f}" if label in values else DASH for label in labels)])
     return replace(Table.of_texts(["Cable", "Clip", *labels], rows, "L1 per clip"), note="mm, seeds averaged.", stub=2)
 
 

@@ -570,7 +570,8 @@ def test_the_synthetic_benchmark_sees_what_studies_of_the_demo_see():
 def test_the_whole_benchmark_has_every_method_and_study_of_the_paper(tmp_path):
     whole, paper = shipped("phystwin"), config.read_yaml(ROOT / "config" / "studies" / "paper.yaml")
     assert {name: whole[name] for name in paper} == paper
-    assert list(read_studies(ROOT / "config" / "studies.yaml")) == paper["studies"]
+    of_paper = [name for name, study in read_studies(ROOT / "config" / "studies.yaml").items() if not study.clips]
+    assert of_paper == paper["studies"]
     rows = read_scenarios(ROOT / "config" / "scenarios.tsv").values()
     released = [row for row in rows if row.source == "phystwin"]
     assert {row.scenario for row in released} == set(whole["scenarios"])
@@ -581,7 +582,7 @@ def test_the_whole_benchmark_has_every_method_and_study_of_the_paper(tmp_path):
 def test_studies_bring_the_methods_of_their_rows_in_the_order_of_the_table():
     studies, methods = (config.read_yaml(ROOT / "config" / f"{name}.yaml") for name in ("studies", "methods"))
     made = Benchmark(shipped("toy", "paper"), ROOT).whole.methods
-    named = {method for study in studies.values() for method in study["rows"].values()}
+    named = {method for name in shipped("toy", "paper")["studies"] for method in studies[name]["rows"].values()}
     listed = set(shipped("toy", "paper")["methods"])
     assert made == tuple(name for name in methods if name in named | listed)
     # Methods that are all listed keep the order in which they are listed.
@@ -592,6 +593,18 @@ def test_studies_bring_the_methods_of_their_rows_in_the_order_of_the_table():
         "no_triplane",
         "fixed_resolution",
     )
+
+
+def test_a_study_of_clips_is_made_of_transfers_of_its_rows():
+    values = shipped("toy") | {"studies": ["deform"], "methods": ["search_only"], "seeds": [0], "only": ""}
+    scene, other = "toy_rope_lift_smooth", "toy_rope_shake_smooth"
+    values |= {"scenarios": [scene], "transfers": {scene: [other]}, "pools": {"ropes": [scene, other]}}
+    graph = Graph(Benchmark(values, ROOT))
+    rows = [name for name in graph.benchmark.studies["deform"].rows.values() if name in graph.benchmark.methods]
+    assert rows and "search_only" not in rows
+    records = {Path(path).relative_to(values["results"]).as_posix() for path in graph.study_runs("deform")}
+    assert records == {f"{scene}/{name}/0/{record}.json" for name in rows for record in ("run", "transfer")}
+    assert not any(path.endswith("transfer.json") for path in graph.study_runs("table3"))
 
 
 def jobs_of(graph: Graph, files: list[str]) -> Counter[str]:

@@ -128,8 +128,8 @@ def test_the_command_writes_tables_growth_and_films(tmp_path, capsys, monkeypatc
     np.testing.assert_allclose(rod["seconds"], np.arange(FRAMES) / RATE)
     np.testing.assert_allclose(rod["euclid_mm"], [0.0, *[12.0] * (FRAMES - 1)])
     with Image.open(output / "deform_DLO3.gif") as film:
-        # 25 of 100 frames per second.
-        assert film.n_frames == 3 and film.info["duration"] == 40
+        # 20 of 100 frames per second.
+        assert film.n_frames == 2 and film.info["duration"] == 50
     assert "![DLO3" in (output / "deform.md").read_text() and "7.7†" in capsys.readouterr().out
     pd.DataFrame(columns=list(COLUMNS)).to_csv(tmp_path / "scores.csv")
     assert main([*command, "--scores", str(tmp_path / "scores.csv")]) != 0
@@ -140,15 +140,15 @@ def test_the_film_shows_the_best_the_median_and_the_worst_clip_of_the_chosen_row
     write_transfer(tmp_path, "DLO3", "model_b_pooled", 0, CLIPS)
     titles = [painter.takes[0].label for painter in found(tmp_path).filmed("DLO3")]
     assert titles == [
-        "Field, best: DLO3_eval_a, 2.0 mm",
-        "Field, median: DLO3_eval_c, 4.0 mm",
-        "Field, worst: DLO3_eval_b, 6.0 mm",
+        "Field, best: DLO3_eval_a, L1 2.0 mm",
+        "Field, median: DLO3_eval_c, L1 4.0 mm",
+        "Field, worst: DLO3_eval_b, L1 6.0 mm",
     ], "the baseline where the rod has not run"
     write_transfer(tmp_path, "DLO3", "rod", 0, {"DLO3_eval_a": 0.002, "DLO3_eval_b": 0.006})
     painters = found(tmp_path).filmed("DLO3")
     assert [painter.takes[0].label for painter in painters] == [
-        "Rod, best: DLO3_eval_a, 2.0 mm",
-        "Rod, worst: DLO3_eval_b, 6.0 mm",
+        "Rod, best: DLO3_eval_a, L1 2.0 mm",
+        "Rod, worst: DLO3_eval_b, L1 6.0 mm",
     ]
     seen = painters[1].scene.observations
     np.testing.assert_allclose(

@@ -11,6 +11,7 @@ import pandas as pd
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from neuspring.scores.metrics import DISTANCES, averages
@@ -175,7 +176,7 @@ def growth_figure(growth: pd.DataFrame, labels: Sequence[str]) -> Figure:
     size = (3.2 * columns + 0.6, 2.5 * rows + 0.8)
     figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False, sharex=True, sharey=True)
     colors = plt.get_cmap("tab10" if len(labels) <= 10 else "tab20")
-    handles = [plt.Line2D([], [], color=colors(labels.index(label)), label=label) for label in shown]
+    handles = [Line2D([], [], color=colors(labels.index(label)), label=label) for label in shown]
     for axis, cable in zip(axes.flat, cables, strict=False):
         for label in shown:
             part = growth[(growth["cable"] == cable) & (growth["label"] == label)].sort_values("seconds")
