@@ -509,9 +509,9 @@ class Simulation:
 class Rod(Artifact):
     """A long thin body as a discrete elastic rod (Bergou 2008, 2010): a center line of V vertices, and a material frame per edge.
 
-    Edge j joins vertices j and j + 1. Its frame is the unit tangent t and two directors m1, m2 = t x m1. In frame 0 directors of
-    edge 0 are `axis` projected, those of the last edge the same turned by `roll` about its tangent; between them the twist is in
-    equilibrium. With kb = 2 t_(i-1) x t_i / (1 + t_(i-1) t_i) the curvatures of joint i are k1 = kb (m2_(i-1) + m2_i) / 2 and
+    Edge j joins vertices j and j + 1. Its frame is the unit tangent t and two directors m1, m2 = t x m1. A clamp holds the two
+    outer vertices of an end: m1 of edge 0 is `axis` projected, that of the last edge the same turned by `roll` about its tangent.
+    Between them the twist is in equilibrium. With kb = 2 t_(i-1) x t_i / (1 + t_(i-1) t_i) the curvatures of joint i are k1 = kb (m2_(i-1) + m2_i) / 2 and
     k2 = -kb (m1_(i-1) + m1_i) / 2. Nodes of the topology follow the line (`edge`, `place`).
     """
 
@@ -525,11 +525,22 @@ class Rod(Artifact):
     curvature: np.ndarray = array("V,2", np.float64, "1", "unloaded curvatures k1, k2 of each joint; the ends are not used")
     edge: np.ndarray = array("N", np.int32, "1", "the edge that each node of the topology follows")
     place: np.ndarray = array("N,3", np.float64, "1, m, m", "of each node: fraction along its edge, distances along m1 and m2")
-    axis: np.ndarray = array("3", np.float64, "1", "direction whose projection is m1 of the first edge in frame 0")
+    axis: np.ndarray = array("3", np.float64, "1", "direction in the world whose projection is m1 of the first edge")
+    clamps: np.ndarray = array(
+        "2,3",
+        np.float64,
+        "m",
+        "inner held vertex of either end from its controller: along t, m1 (without `roll`), m2",
+        omitted=True,
+    )
+    """Markers lie beside a cable. The outer held vertex follows with the direction between the two controllers."""
+    offsets: np.ndarray = array(
+        "V,2", np.float64, "m", "point of the observed line from each free vertex: along m1, m2 of the edge behind it", omitted=True
+    )
     stretching: float = number("N", "EA")
     damping: float = number("s", "time of inner damping: moments are EI / l (k - k0 + damping dk/dt)")
     drag_quadratic: float = number("1/m", "deceleration by air is this times speed squared; linear drag is the material's")
-    roll: float = number("rad", "turn of the last edge's directors in frame 0, from `axis` projected")
+    roll: float = number("rad", "turn of the last edge's directors from `axis` projected")
 
     def check(self) -> None:
         edges = len(self.vertices) - 1

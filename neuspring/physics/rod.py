@@ -12,8 +12,8 @@ and x1 = p + d around the extrapolated p = 2 x0 - x_, where forces are evaluated
 
 c is the drag, K the Gauss-Newton matrix of bending (with its inner damping) and stretching, and the tension of the substep before
 turns edges. K couples three neighbors, so the system is banded and solved by Cholesky. Twist is quasi-static: inner angles minimize
-the energy of twist and bending, by Gauss-Newton from those of the substep before. Held vertices and the directors of clamps follow
-their paths linearly within a frame.
+the energy of twist and bending, by Gauss-Newton from those of the substep before. Held vertices follow their paths
+linearly within a frame, and the directors of clamps are the axis projected.
 """
 # No postponed annotations here: Warp reads the evaluated types of the kernels below.
 
@@ -351,9 +351,6 @@ def advance(
     s: Lanes,
     held_from: Vectors,
     held_to: Vectors,
-    directors_from: Vectors,
-    directors_to: Vectors,
-    given: bool,
     substeps: int,
     h: real,
     gravity: real,
@@ -383,15 +380,13 @@ def advance(
             else:
                 s.p[lane, i] = s.x[lane, i] + h * s.v[lane, i]
         set_geometry(s, lane, edges)
-        if given:
-            # Clamps turn as they are told.
-            if first_held:
-                d = projected((real(1.0) - part) * directors_from[lane, 0] + part * directors_to[lane, 0], s.t[lane, 0])
-                s.theta[lane, 0] = near(turn(s.u[lane, 0], d, s.t[lane, 0]), s.theta[lane, 0])
-            if last_held:
-                last = edges - 1
-                d = projected((real(1.0) - part) * directors_from[lane, 1] + part * directors_to[lane, 1], s.t[lane, last])
-                s.theta[lane, last] = near(turn(s.u[lane, last], d, s.t[lane, last]), s.theta[lane, last])
+        # The directors of clamps keep to the axis, whatever way the tangents took.
+        if first_held:
+            s.theta[lane, 0] = near(turn(s.u[lane, 0], projected(s.axis[lane], s.t[lane, 0]), s.t[lane, 0]), s.theta[lane, 0])
+        if last_held:
+            last = edges - 1
+            angle = s.roll[lane] + turn(s.u[lane, last], projected(s.axis[lane], s.t[lane, last]), s.t[lane, last])
+            s.theta[lane, last] = near(angle, s.theta[lane, last])
         solve_twist(s, lane, edges, first_held, last_held, TWIST_STEPS)
         for i in range(3 * vertices):
             s.b[lane, i] = real(0.0)
@@ -500,28 +495,19 @@ class RodSolver:
             kind: Any = wp.int32 if each.name == "held" else vectors.get(each.name, real)
             values = np.ascontiguousarray(getattr(lanes, each.name))
             setattr(self._state, each.name, wp.array(values, dtype=kind, device=device))
-        self._directors: Any = None
 
-    def start(self, x: torch.Tensor, v: torch.Tensor, directors: torch.Tensor | None = None) -> None:
-        """State of frame 0: positions [B, V, 3], m, velocities [B, V, 3], m/s; clamps' directors [B, 2, 3], where they turn."""
+    def start(self, x: torch.Tensor, v: torch.Tensor) -> None:
+        """State of frame 0: positions [B, V, 3], m, and velocities [B, V, 3], m/s."""
         for name, values in (("x", x), ("v", v)):
             self._put(getattr(self._state, name), values)
         wp.launch(load(begin, self.device), dim=self.count, inputs=[self._state], device=self.device)
-        self._directors = None if directors is None else self._vectors(directors)
 
-    def frame(self, held_from: torch.Tensor, held_to: torch.Tensor, directors: torch.Tensor | None = None) -> None:
-        """One frame. Held vertices move linearly between rows of [B, V, 3]; the clamps' directors turn to `directors` [B, 2, 3]."""
-        simulation = self.simulation
-        begins, ends = self._vectors(held_from), self._vectors(held_to)
-        given = directors is not None and self._directors is not None
-        turned = self._vectors(directors) if directors is not None else begins
-        inputs = [
-            self._state, begins, ends, self._directors if given else begins, turned, given,
-            simulation.substeps, simulation.substep, -simulation.up_sign * simulation.gravity,
-        ]  # fmt: skip
+    def frame(self, held_from: torch.Tensor, held_to: torch.Tensor) -> None:
+        """One frame. Held vertices move linearly between rows of [B, V, 3]."""
+        simulation, ends = self.simulation, (self._vectors(held_from), self._vectors(held_to))
+        gravity = -simulation.up_sign * simulation.gravity
+        inputs = [self._state, *ends, simulation.substeps, simulation.substep, gravity]
         wp.launch(load(advance, self.device), dim=self.count, inputs=inputs, device=self.device)
-        if directors is not None:
-            self._directors = turned
 
     def _vectors(self, values: torch.Tensor) -> Any:
         return wp.from_torch(values.to(device=self.device, dtype=torch.float64).contiguous(), dtype=vec3)

@@ -130,6 +130,17 @@ def start(parameters: Parameters, x: Tensor) -> tuple[Frames, Tensor]:
     return frames, relaxed(parameters, x, frames, end * along)
 
 
+def clamped(parameters: Parameters, frames: Frames, theta: Tensor) -> Tensor:
+    """Theta [E] with the directors of clamped ends where `axis` and `roll` want them, by the smallest change."""
+    rows, inner, edges = list(theta), parameters.inner, len(theta)
+    for end, roll, held in ((0, 0.0, inner.start > 0), (edges - 1, parameters.roll, inner.stop < edges)):
+        if held:
+            t = frames.tangents[end]
+            wanted = angle(frames.directors[end], projected(parameters.axis, t), t) + roll
+            rows[end] = theta[end] + torch.remainder(wanted - theta[end] + pi, 2 * pi) - pi
+    return torch.stack(rows)
+
+
 def curvatures(frames: Frames, theta: Tensor) -> Tensor:
     """k1, k2 of each joint [J, 2], as the docstring of `Rod` says."""
     t, u = frames.tangents, frames.directors
@@ -245,7 +256,7 @@ def advanced(p: Parameters, state: State, h: float, middle: Tensor, end: Tensor,
     x = torch.where(fixed, middle, state.x + h / 2 * state.v)
     frames = carried(state.frames, x)
     rate = Rate(2 / h, 2 / h * k) if k_before is None else Rate(1.5 / h, (2 * k - k_before / 2) / h)
-    theta = relaxed(p, x, frames, state.theta, rate)
+    theta = relaxed(p, x, frames, clamped(p, frames, state.theta), rate)
     k_now = curvatures(frames, theta)
     push = forces(p, x, frames, theta, rate) / p.mass[:, None] + gravity
     v = state.v + h * (push - slowed(p, state.v + h / 2 * (push - slowed(p, state.v))))
