@@ -511,8 +511,8 @@ class Rod(Artifact):
 
     Edge j joins vertices j and j + 1. Its frame is the unit tangent t and two directors m1, m2 = t x m1. A clamp holds the two
     outer vertices of an end: m1 of edge 0 is `axis` projected, that of the last edge the same turned by `roll` about its tangent.
-    Between them the twist is in equilibrium. With kb = 2 t_(i-1) x t_i / (1 + t_(i-1) t_i) the curvatures of joint i are k1 = kb (m2_(i-1) + m2_i) / 2 and
-    k2 = -kb (m1_(i-1) + m1_i) / 2. Nodes of the topology follow the line (`edge`, `place`).
+    Between them the twist is in equilibrium. With kb = 2 t_(i-1) x t_i / (1 + t_(i-1) t_i) the curvatures of joint i are
+    k1 = kb (m2_(i-1) + m2_i) / 2 and k2 = -kb (m1_(i-1) + m1_i) / 2. Nodes of the topology follow the line (`edge`, `place`).
     """
 
     kind: ClassVar[str] = "rod"
