@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from neuspring.core.artifacts import Rod
 from neuspring.physics import rod_reference as reference
 from neuspring.physics.rod_reference import Frames, Parameters, Rate
-from tests.support.rods import crooked, helix, real, rod, simulation, straight
+from tests.support.rods import GREENHILL, SAG, buckling_load, cantilever, coil, column, crooked, real, rod, simulation, twisted
 
 # Central differences over STEP: rounding of 1e-16 / STEP, and STEP^2 / 6 times third derivatives of about 3 EA / L^2 = 1e3 N/m^2.
 STEP = 1e-6
@@ -152,75 +152,45 @@ def test_gradients_of_a_rollout_are_its_differences(name: str) -> None:
     assert float((gradient * direction).sum()) == pytest.approx(float((ahead - behind) / (2 * STEP)), rel=1e-6, abs=1e-9)
 
 
-def test_a_helix_is_at_rest_in_its_own_curvatures() -> None:
+@pytest.mark.parametrize("held", [(), (0, 1)])
+def test_a_helix_is_at_rest_in_its_own_curvatures(held: tuple[int, ...]) -> None:
     """Neither mirrored nor turned: signs of curvatures, directors and axis are those that the docstring of `Rod` says."""
-    points, curvature = helix(8, radius=0.05, rise=0.02, turn=0.7)
-    t = reference.tangents(real(points))
-    binormal = torch.linalg.cross(t[0], t[1])
-    # m2 of edge 0 is along kb, so m1 = m2 x t.
-    axis = torch.linalg.cross(binormal / binormal.norm(), t[0]).numpy()
-    for held in [(), (0, 1)]:
-        p = Parameters.of(rod(points, held, curvature=curvature, axis=axis))
-        frames, theta = reference.start(p, p.vertices)
-        assert float(reference.energy(p, p.vertices, frames, theta)) < 1e-20
-        np.testing.assert_allclose(reference.forces(p, p.vertices, frames, theta), 0, atol=ROUNDING)
-    mirrored = points * [1, 1, -1]
-    p = Parameters.of(rod(mirrored, (), curvature=curvature, axis=axis))
-    assert float(reference.energy(p, p.vertices, *reference.start(p, p.vertices))) > 1e-5
+    p = Parameters.of(coil(8, held))
+    frames, theta = reference.start(p, p.vertices)
+    assert float(reference.energy(p, p.vertices, frames, theta)) < 1e-20
+    np.testing.assert_allclose(reference.forces(p, p.vertices, frames, theta), 0, atol=ROUNDING)
+    mirrored = p.vertices * real([1, 1, -1])
+    assert float(reference.energy(p, mirrored, *reference.start(p, mirrored))) > 1e-5
 
 
-def cantilever(vertices: int) -> float:
-    """Deflection of the end of a beam of 1 m and 1 kg/m over that of the closed form, q L^4 / (8 EI) = 1 mm.
-
-    A clamp holds the middle of an edge, so the free length ends there.
-    """
-    spacing = 1 / (vertices - 1.5)
-    bending = 9.8 / 8e-3
-    body = rod(straight(vertices, spacing * (vertices - 1)), (0, 1), bending=bending, twisting=bending, stretching=1e7)
-    p = Parameters.of(body)
-    load = torch.zeros(vertices, 3, dtype=torch.float64)
-    load[:, 2] = -9.8 * p.mass
+def sag(vertices: int) -> float:
+    """Of the end of a cantilever over that of theory: three steps of Newton."""
+    p = Parameters.of(cantilever(vertices))
     x = p.vertices.clone()
     for _ in range(3):
         frames, theta = reference.start(p, x)
-        push = (reference.forces(p, x, frames, theta) + load)[2:].ravel()
+        push = (reference.forces(p, x, frames, theta) + p.mass[:, None] * real([0, 0, -9.8]))[2:].ravel()
         x[2:] += torch.linalg.solve(stiffness(p, x), push).reshape(-1, 3)
-    return float(-x[-1, 2]) / 1e-3
+    return float(-x[-1, 2]) / SAG
 
 
 def test_a_cantilever_sags_as_theory_says_with_second_order_in_segments() -> None:
-    coarse, fine = (abs(cantilever(vertices) - 1) for vertices in (6, 11))
+    coarse, fine = (abs(sag(vertices) - 1) for vertices in (6, 11))
     assert fine < 0.006
     # Segments from the clamp to the end: 4.5 and 9.5.
     assert np.log(coarse / fine) / np.log(9.5 / 4.5) == pytest.approx(2, abs=0.1)
 
 
 def test_a_pinned_column_buckles_at_the_load_of_its_segments() -> None:
-    """Euler: pi^2 EI / L^2; of N segments exactly 4 EI / h^2 sin^2(pi / 2 N)."""
-    n = 6
-    h, bending, stretching = 1 / n, 1.0, 1e7
-
-    def level(load: float) -> float:
-        # Lengths at rest are so much longer that the column of 1 m carries the load.
-        body = rod(straight(n + 1), (0, n), bending=bending, stretching=stretching, lengths=np.full(n, h / (1 - load / stretching)))
-        p = Parameters.of(body)
-        return softest(p)
-
-    found = brentq(level, 5, 12, rtol=1e-6)
-    # The column is shorter at rest by its strain of 1e-6, and so are spans.
-    assert found == pytest.approx(4 / h**2 * np.sin(np.pi / 2 / n) ** 2, rel=4e-6)
+    found = brentq(lambda load: softest(Parameters.of(column(6, load))), 5, 12, rtol=1e-6)
+    # The column is shorter than at rest by its strain of 1e-6.
+    assert found == pytest.approx(buckling_load(6), rel=4e-6)
+    assert buckling_load(1000) == pytest.approx(np.pi**2, rel=1e-6)
 
 
-def twisted(segments: int) -> float:
-    """Critical twisting moment of a straight rod with clamped ends over that of Greenhill: M = 2 x EI / L, tan x = x = 4.4934."""
-    spacing = 1 / segments
-    points = straight(segments + 2, spacing * (segments + 1))
-
-    def level(moment: float) -> float:
-        p = Parameters.of(rod(points, (0, 1, segments, segments + 1), bending=1.0, twisting=2.0, stretching=1e4, roll=moment / 2.0))
-        return softest(p)
-
-    return brentq(level, 6, 12, rtol=1e-4) / 8.98682
+def greenhill(segments: int) -> float:
+    """Critical twisting moment of a straight rod over that of theory."""
+    return brentq(lambda moment: softest(Parameters.of(twisted(segments, moment))), 6, 12, rtol=1e-4) / GREENHILL
 
 
 def ring(segments: int) -> float:
@@ -237,7 +207,7 @@ def ring(segments: int) -> float:
     return brentq(level, 5, 12, rtol=1e-4) / (2 * np.pi * 3**0.5 / 1.5)
 
 
-@pytest.mark.parametrize(("ratio", "segments", "rest"), [(twisted, 8, 1e-3), (ring, 16, 5e-3)])
+@pytest.mark.parametrize(("ratio", "segments", "rest"), [(greenhill, 8, 1e-3), (ring, 16, 5e-3)])
 def test_twist_makes_a_straight_rod_and_a_ring_unstable(ratio: Any, segments: int, rest: float) -> None:
     """Second order in segments: what is left of the error after Richardson's extrapolation is of fourth order."""
     coarse, fine = ratio(segments), ratio(2 * segments)

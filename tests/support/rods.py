@@ -68,6 +68,47 @@ def helix(vertices: int, radius: float, rise: float, turn: float) -> tuple[np.nd
     return points, 2 * np.tan(phi / 2) * np.stack([np.cos(around), np.sin(around)], axis=1)
 
 
+def coil(vertices: int, held: Any) -> Rod:
+    """A rod at rest in a helix of 5 cm radius."""
+    points, curvature = helix(vertices, radius=0.05, rise=0.02, turn=0.7)
+    first, second = points[1] - points[0], points[2] - points[1]
+    # m2 of edge 0 is along kb, so m1 is along kb x t.
+    return rod(points, held, curvature=curvature, axis=np.cross(np.cross(first, second), first))
+
+
+SAG = 1e-3
+"""Of the end of `cantilever` in theory, q L^4 / (8 EI), m."""
+
+
+def cantilever(vertices: int) -> Rod:
+    """A beam of 1 m and 1 kg/m for 9.8 m/s^2. A clamp holds the middle of an edge: there the free length ends."""
+    spacing = 1 / (vertices - 1.5)
+    bending = 9.8 / (8 * SAG)
+    return rod(straight(vertices, spacing * (vertices - 1)), (0, 1), bending=bending, twisting=bending, stretching=1e7)
+
+
+def column(segments: int, load: float, stretching: float = 1e7) -> Rod:
+    """A column of 1 m and EI = 1 N m^2 between two hinges; its length at rest is so much longer that it carries `load`, N."""
+    lengths = np.full(segments, 1 / segments / (1 - load / stretching))
+    return rod(straight(segments + 1), (0, segments), bending=1.0, twisting=1.0, stretching=stretching, lengths=lengths)
+
+
+def buckling_load(segments: int) -> float:
+    """Of `column`, N: 4 EI / h^2 sin^2(pi / (2 N)) exactly, Euler's pi^2 EI / L^2 for N segments without end."""
+    return float(4 * segments**2 * np.sin(np.pi / 2 / segments) ** 2)
+
+
+GREENHILL = 2 * 4.493409
+"""Critical moment of a straight rod with clamped ends, EI / L: 2 x with tan x = x."""
+
+
+def twisted(segments: int, moment: float, **changes: Any) -> Rod:
+    """A straight rod of 1 m and EI = 1 N m^2 between two clamps that twist it with `moment`, N m."""
+    points = straight(segments + 2, 1 + 1 / segments)
+    values = {"bending": 1.0, "twisting": 2.0, "stretching": 1e4, "roll": moment / 2.0}
+    return rod(points, (0, 1, segments, segments + 1), **(values | changes))
+
+
 def simulation(**changes: Any) -> Simulation:
     """Frames of 10 ms without gravity and ground."""
     return Simulation(**({"frame_time": 0.01, "substeps": 5, "gravity": 0.0, "ground": False} | changes))
