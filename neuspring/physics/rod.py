@@ -34,6 +34,8 @@ FIRST_TWIST_STEPS = wp.constant(60)
 """In frame 0, where it starts from an even twist."""
 MAX_TURN = wp.constant(wp.float64(0.5))
 """Largest change of an angle in one of these steps, rad."""
+LEAST_PIVOT = wp.constant(wp.float64(1e-3))
+"""Of the matrix of these steps, over the entry of the diagonal."""
 TINY = wp.constant(wp.float64(1e-12))
 BAND = wp.constant(9)
 """Entries of a row of the banded matrix, from the diagonal to the left."""
@@ -148,8 +150,20 @@ def joint_length(s: Lanes, lane: int, i: int):
 
 
 @wp.func
-def solve_twist(s: Lanes, lane: int, edges: int, first_held: bool, last_held: bool, steps: int):
-    """Minimize the energy over the angles of edges that no clamp holds; tridiagonal Gauss-Newton steps."""
+def moments(s: Lanes, lane: int, i: int, k: vec2, rate: real, older: real, oldest: real):
+    """k - k0 + damping dk/dt of a joint, with dk/dt = rate k - older k_ + oldest k__ and the curvatures of two substeps before."""
+    change = rate * k - older * s.k[lane, i] + oldest * s.k_before[lane, i]
+    return k - s.curvature[lane, i] + s.damping[lane] * change
+
+
+@wp.func
+def solve_twist(
+    s: Lanes, lane: int, edges: int, first_held: bool, last_held: bool, steps: int, rate: real, older: real, oldest: real
+):
+    """Angles of edges that no clamp holds where moments about their tangents, inner damping among them, are in balance.
+
+    Tridiagonal Newton steps. Without the moments of damping a free rod would gain angular momentum, and a stiff one energy.
+    """
     low = wp.where(first_held, 1, 0)
     high = wp.where(last_held, edges - 2, edges - 1)
     for _step in range(steps):
@@ -163,7 +177,8 @@ def solve_twist(s: Lanes, lane: int, edges: int, first_held: bool, last_held: bo
             m = s.theta[lane, i] - s.theta[lane, i - 1] + s.reference[lane, i]
             y = s.twisting[lane, i] / joint
             e = s.bending[lane, i] / joint
-            k = curvature(s, lane, i) - s.curvature[lane, i]
+            k = moments(s, lane, i, curvature(s, lane, i), rate, older, oldest)
+            f = e * (real(1.0) + s.damping[lane] * rate)
             kb = s.kb[lane, i]
             # Derivatives of k1 and k2 with respect to the two angles.
             a1 = real(-0.5) * wp.dot(kb, s.m1[lane, i - 1])
@@ -172,13 +187,18 @@ def solve_twist(s: Lanes, lane: int, edges: int, first_held: bool, last_held: bo
             b2 = real(-0.5) * wp.dot(kb, s.m2[lane, i])
             s.rest[lane, i - 1] = s.rest[lane, i - 1] - y * m + e * (k[0] * a1 + k[1] * a2)
             s.rest[lane, i] = s.rest[lane, i] + y * m + e * (k[0] * b1 + k[1] * b2)
-            s.diagonal[lane, i - 1] = s.diagonal[lane, i - 1] + y + e * (a1 * a1 + a2 * a2)
-            s.diagonal[lane, i] = s.diagonal[lane, i] + y + e * (b1 * b1 + b2 * b2)
-            s.lower[lane, i] = e * (a1 * b1 + a2 * b2) - y
-        for j in range(low + 1, high + 1):
-            w = s.lower[lane, j] / s.diagonal[lane, j - 1]
-            s.diagonal[lane, j] = s.diagonal[lane, j] - w * s.lower[lane, j]
-            s.rest[lane, j] = s.rest[lane, j] - w * s.rest[lane, j - 1]
+            # The last terms are of second derivatives: those of k1 are a2 and b2, those of k2 -a1 and -b1.
+            s.diagonal[lane, i - 1] = s.diagonal[lane, i - 1] + y + f * (a1 * a1 + a2 * a2) + e * (k[0] * a2 - k[1] * a1)
+            s.diagonal[lane, i] = s.diagonal[lane, i] + y + f * (b1 * b1 + b2 * b2) + e * (k[0] * b2 - k[1] * b1)
+            s.lower[lane, i] = f * (a1 * b1 + a2 * b2) - y
+        for j in range(low, high + 1):
+            pivot = s.diagonal[lane, j]
+            if j > low:
+                w = s.lower[lane, j] / s.diagonal[lane, j - 1]
+                pivot = pivot - w * s.lower[lane, j]
+                s.rest[lane, j] = s.rest[lane, j] - w * s.rest[lane, j - 1]
+            # Positive pivots lead to a minimum, not to a saddle.
+            s.diagonal[lane, j] = wp.max(wp.abs(pivot), LEAST_PIVOT * wp.abs(s.diagonal[lane, j]) + TINY)
         z = real(0.0)
         largest = real(0.0)
         for back in range(high - low + 1):
@@ -237,7 +257,7 @@ def begin(s: Lanes):
         s.theta[lane, j] = end * along / (total - s.lengths[lane, edges - 1])
         along += s.lengths[lane, j]
     set_geometry(s, lane, edges)
-    solve_twist(s, lane, edges, first_held, last_held, FIRST_TWIST_STEPS)
+    solve_twist(s, lane, edges, first_held, last_held, FIRST_TWIST_STEPS, real(0.0), real(0.0), real(0.0))
     for i in range(1, edges):
         s.k[lane, i] = curvature(s, lane, i)
         s.k_before[lane, i] = s.k[lane, i]
@@ -263,44 +283,62 @@ def add_force(s: Lanes, lane: int, i: int, force: vec3):
         s.b[lane, 3 * i + r] = s.b[lane, 3 * i + r] + force[r]
 
 
+@wp.struct
+class Slopes:
+    """Derivatives of k1 and k2 of a joint with respect to the edge before it, a, and behind it, b."""
+
+    a1: vec3
+    b1: vec3
+    a2: vec3
+    b2: vec3
+
+
+@wp.func
+def slopes(s: Lanes, lane: int, i: int, k: vec2):
+    """Of joint i with the curvatures k, at the positions p and fixed angles."""
+    before = s.t[lane, i - 1]
+    after = s.t[lane, i]
+    inverse = real(1.0) / (real(1.0) + wp.dot(before, after) + TINY)
+    middle = inverse * (before + after)
+    n1 = inverse * (s.m1[lane, i - 1] + s.m1[lane, i])
+    n2 = inverse * (s.m2[lane, i - 1] + s.m2[lane, i])
+    r0 = real(1.0) / wp.length(s.p[lane, i] - s.p[lane, i - 1])
+    r1 = real(1.0) / wp.length(s.p[lane, i + 1] - s.p[lane, i])
+    return Slopes(
+        r0 * (wp.cross(after, n2) - k[0] * middle),
+        r1 * (-k[0] * middle - wp.cross(before, n2)),
+        r0 * (-k[1] * middle - wp.cross(after, n1)),
+        r1 * (wp.cross(before, n1) - k[1] * middle),
+    )
+
+
 @wp.func
 def assemble_bending(s: Lanes, lane: int, edges: int, rate: real, older: real, oldest: real):
-    """Forces and Gauss-Newton matrix of bending and twist; dk/dt = rate k - older k0 + oldest k_."""
-    tau = s.damping[lane]
+    """Forces and Gauss-Newton matrix of bending and twist."""
     for i in range(1, edges):
         joint = joint_length(s, lane, i)
         e = s.bending[lane, i] / joint
-        before = s.t[lane, i - 1]
-        after = s.t[lane, i]
         k = curvature(s, lane, i)
-        moment = e * (k - s.curvature[lane, i] + tau * (rate * k - older * s.k[lane, i] + oldest * s.k_before[lane, i]))
-        inverse = real(1.0) / (real(1.0) + wp.dot(before, after) + TINY)
-        middle = inverse * (before + after)
-        n1 = inverse * (s.m1[lane, i - 1] + s.m1[lane, i])
-        n2 = inverse * (s.m2[lane, i - 1] + s.m2[lane, i])
+        moment = e * moments(s, lane, i, k, rate, older, oldest)
+        w = slopes(s, lane, i, k)
         r0 = real(1.0) / wp.length(s.p[lane, i] - s.p[lane, i - 1])
         r1 = real(1.0) / wp.length(s.p[lane, i + 1] - s.p[lane, i])
-        # Derivatives of k1 and k2 with respect to the two edges.
-        a1 = r0 * (wp.cross(after, n2) - k[0] * middle)
-        b1 = r1 * (-k[0] * middle - wp.cross(before, n2))
-        a2 = r0 * (-k[1] * middle - wp.cross(after, n1))
-        b2 = r1 * (wp.cross(before, n1) - k[1] * middle)
         twist = s.twisting[lane, i] / joint * (s.theta[lane, i] - s.theta[lane, i - 1] + s.reference[lane, i])
-        ga = moment[0] * a1 + moment[1] * a2 + real(0.5) * twist * r0 * s.kb[lane, i]
-        gb = moment[0] * b1 + moment[1] * b2 + real(0.5) * twist * r1 * s.kb[lane, i]
+        ga = moment[0] * w.a1 + moment[1] * w.a2 + real(0.5) * twist * r0 * s.kb[lane, i]
+        gb = moment[0] * w.b1 + moment[1] * w.b2 + real(0.5) * twist * r1 * s.kb[lane, i]
         add_force(s, lane, i - 1, ga)
         add_force(s, lane, i, gb - ga)
         add_force(s, lane, i + 1, -gb)
         # With respect to the three vertices.
-        y = e * (real(1.0) + tau * rate)
-        c1 = a1 - b1
-        c2 = a2 - b2
-        add_block(s, lane, i - 1, i - 1, y * (wp.outer(a1, a1) + wp.outer(a2, a2)))
+        y = e * (real(1.0) + s.damping[lane] * rate)
+        c1 = w.a1 - w.b1
+        c2 = w.a2 - w.b2
+        add_block(s, lane, i - 1, i - 1, y * (wp.outer(w.a1, w.a1) + wp.outer(w.a2, w.a2)))
         add_block(s, lane, i, i, y * (wp.outer(c1, c1) + wp.outer(c2, c2)))
-        add_block(s, lane, i + 1, i + 1, y * (wp.outer(b1, b1) + wp.outer(b2, b2)))
-        add_block(s, lane, i, i - 1, -y * (wp.outer(c1, a1) + wp.outer(c2, a2)))
-        add_block(s, lane, i + 1, i, y * (wp.outer(b1, c1) + wp.outer(b2, c2)))
-        add_block(s, lane, i + 1, i - 1, -y * (wp.outer(b1, a1) + wp.outer(b2, a2)))
+        add_block(s, lane, i + 1, i + 1, y * (wp.outer(w.b1, w.b1) + wp.outer(w.b2, w.b2)))
+        add_block(s, lane, i, i - 1, -y * (wp.outer(c1, w.a1) + wp.outer(c2, w.a2)))
+        add_block(s, lane, i + 1, i, y * (wp.outer(w.b1, c1) + wp.outer(w.b2, c2)))
+        add_block(s, lane, i + 1, i - 1, -y * (wp.outer(w.b1, w.a1) + wp.outer(w.b2, w.a2)))
 
 
 @wp.func
@@ -387,7 +425,7 @@ def advance(
             last = edges - 1
             angle = s.roll[lane] + turn(s.u[lane, last], projected(s.axis[lane], s.t[lane, last]), s.t[lane, last])
             s.theta[lane, last] = near(angle, s.theta[lane, last])
-        solve_twist(s, lane, edges, first_held, last_held, TWIST_STEPS)
+        solve_twist(s, lane, edges, first_held, last_held, TWIST_STEPS, rate, older, oldest)
         for i in range(3 * vertices):
             s.b[lane, i] = real(0.0)
             for q in range(BAND):
@@ -431,7 +469,12 @@ def advance(
             s.tension[lane, j] = s.stretching[lane] * (length / s.lengths[lane, j] - real(1.0))
         for i in range(1, edges):
             s.k_before[lane, i] = s.k[lane, i]
-            s.k[lane, i] = curvature(s, lane, i)
+            # At the positions x, not p: else rates were of first order.
+            k = curvature(s, lane, i)
+            w = slopes(s, lane, i, k)
+            left = (s.x[lane, i] - s.p[lane, i]) - (s.x[lane, i - 1] - s.p[lane, i - 1])
+            right = (s.x[lane, i + 1] - s.p[lane, i + 1]) - (s.x[lane, i] - s.p[lane, i])
+            s.k[lane, i] = k + vec2(wp.dot(w.a1, left) + wp.dot(w.b1, right), wp.dot(w.a2, left) + wp.dot(w.b2, right))
         s.history[lane] = s.history[lane] + 1
 
 
