@@ -8,4 +8,5 @@ fit         Adam through the simulation, on one recording or several: parameters
 losses      every term of the training loss, for search, fit and polish
 rollout     prediction; hand_paths: hands in front of one camera without depth
 transfer    a twin on another recording, with register where its nodes are others
+residual    what rollouts of a cable leave, learned by ridge regression: no physics
 """
