@@ -200,9 +200,9 @@ def _details(found: Clips) -> Table:
 def _per_clip(found: Clips) -> Table:
     means = found.clips.groupby(["cable", "clip", "label"], sort=False)["l1_mm"].mean()
     labels, rows = [label for label in found.study.rows if label in set(found.clips["label"])], []
-    for key, part in means.groupby(level=["cable", "clip"], sort=False):
+    for _, part in means.groupby(level=["cable", "clip"], sort=False):
         values = part.droplevel([0, 1])
-        rows.append([*map(str, key), *(f"{values[label]:.2f}" if label in values else DASH for label in labels)])
+        rows.append([*map(str, part.index[0][:2]), *(f"{values[label]:.2f}" if label in values else DASH for label in labels)])
     return replace(Table.of_texts(["Cable", "Clip", *labels], rows, "L1 per clip"), note="mm, seeds averaged.", stub=2)
 
 
