@@ -10,10 +10,11 @@ and x1 = p + d around the extrapolated p = 2 x0 - x_, where forces are evaluated
 
     (M (1 + g c) / g^2 + K) d = f(p) + M (v* / g - (1 + g c) (p - x*) / g^2).
 
-c is the drag, K the Gauss-Newton matrix of bending (with its inner damping) and stretching, and the tension of the substep before
-turns edges. K couples three neighbors, so the system is banded and solved by Cholesky. Twist is quasi-static: inner angles minimize
-the energy of twist and bending, by Gauss-Newton from those of the substep before. Held vertices follow their paths
-linearly within a frame, and the directors of clamps are the axis projected.
+c is the drag. Twist is quasi-static: the angles theta have no mass, and moments about the tangents are in balance, those of inner
+damping among them. So d goes on with changes of the angles, extrapolated as p is, and K is the Gauss-Newton matrix of bending,
+damping, twist and stretching by both; the tension of the substep before turns edges. K couples three neighbors, so the system is
+banded and solved by Cholesky. Held vertices follow their paths linearly within a frame, and the directors of clamps are the axis
+projected.
 """
 # No postponed annotations here: Warp reads the evaluated types of the kernels below.
 
@@ -28,17 +29,19 @@ import warp as wp
 from neuspring.core.artifacts import Rod, Simulation
 from neuspring.core.device import load
 
-TWIST_STEPS = wp.constant(3)
-"""Gauss-Newton steps of the twist per substep; it starts from the one before."""
-FIRST_TWIST_STEPS = wp.constant(60)
-"""In frame 0, where it starts from an even twist."""
+TWIST_STEPS = wp.constant(60)
+"""Newton steps of the twist in frame 0, where it starts from an even one, at most."""
 MAX_TURN = wp.constant(wp.float64(0.5))
-"""Largest change of an angle in one of these steps, rad."""
+"""Largest change of an angle in a step of Newton, rad."""
 LEAST_PIVOT = wp.constant(wp.float64(1e-3))
-"""Of the matrix of these steps, over the entry of the diagonal."""
+"""Of the matrix of the steps in frame 0, over the entry of the diagonal."""
 TINY = wp.constant(wp.float64(1e-12))
-BAND = wp.constant(9)
-"""Entries of a row of the banded matrix, from the diagonal to the left."""
+BAND = wp.constant(11)
+"""Entries of a row of the banded matrix, from the diagonal to the left. Row 4 i + r is of x_i, row 4 j + 3 of theta_j."""
+JOINT = wp.constant(11)
+"""What a joint depends on: x_(i-1), theta_(i-1), x_i, theta_i, x_(i+1), in this order."""
+REST = wp.constant(wp.float64(1e-9))
+"""Of GJ / l: stiffness against turning of a rod that nothing else turns."""
 
 real = wp.float64
 vec3 = wp.vec3d
@@ -80,6 +83,9 @@ class Lanes:
     m2: Vectors
     kb: Vectors
     theta: Scalars
+    theta_before: Scalars
+    w: wp.array3d(dtype=real)
+    """Derivatives of k1, k2 and the twist of a joint [B, 3, 11]."""
     reference: Scalars
     """Twist of the reference directors at each joint."""
     tension: Scalars
@@ -88,7 +94,7 @@ class Lanes:
     history: wp.array(dtype=wp.int32)
     """Substeps since the last start or contact."""
     a: wp.array3d(dtype=real)
-    """Banded matrix [B, 3 V, 9]: entry q of row i is A[i, i - q]."""
+    """Banded matrix [B, 4 V, 11]: entry q of row i is A[i, i - q]."""
     b: Scalars
     lower: Scalars
     diagonal: Scalars
@@ -150,23 +156,11 @@ def joint_length(s: Lanes, lane: int, i: int):
 
 
 @wp.func
-def moments(s: Lanes, lane: int, i: int, k: vec2, rate: real, older: real, oldest: real):
-    """k - k0 + damping dk/dt of a joint, with dk/dt = rate k - older k_ + oldest k__ and the curvatures of two substeps before."""
-    change = rate * k - older * s.k[lane, i] + oldest * s.k_before[lane, i]
-    return k - s.curvature[lane, i] + s.damping[lane] * change
-
-
-@wp.func
-def solve_twist(
-    s: Lanes, lane: int, edges: int, first_held: bool, last_held: bool, steps: int, rate: real, older: real, oldest: real
-):
-    """Angles of edges that no clamp holds where moments about their tangents, inner damping among them, are in balance.
-
-    Tridiagonal Newton steps. Without the moments of damping a free rod would gain angular momentum, and a stiff one energy.
-    """
+def solve_twist(s: Lanes, lane: int, edges: int, first_held: bool, last_held: bool):
+    """Angles of edges that no clamp holds, from `theta` to a minimum of the energy, by tridiagonal Newton steps."""
     low = wp.where(first_held, 1, 0)
     high = wp.where(last_held, edges - 2, edges - 1)
-    for _step in range(steps):
+    for _step in range(TWIST_STEPS):
         set_directors(s, lane, edges)
         for j in range(edges):
             s.lower[lane, j] = real(0.0)
@@ -177,8 +171,7 @@ def solve_twist(
             m = s.theta[lane, i] - s.theta[lane, i - 1] + s.reference[lane, i]
             y = s.twisting[lane, i] / joint
             e = s.bending[lane, i] / joint
-            k = moments(s, lane, i, curvature(s, lane, i), rate, older, oldest)
-            f = e * (real(1.0) + s.damping[lane] * rate)
+            k = curvature(s, lane, i) - s.curvature[lane, i]
             kb = s.kb[lane, i]
             # Derivatives of k1 and k2 with respect to the two angles.
             a1 = real(-0.5) * wp.dot(kb, s.m1[lane, i - 1])
@@ -188,9 +181,9 @@ def solve_twist(
             s.rest[lane, i - 1] = s.rest[lane, i - 1] - y * m + e * (k[0] * a1 + k[1] * a2)
             s.rest[lane, i] = s.rest[lane, i] + y * m + e * (k[0] * b1 + k[1] * b2)
             # The last terms are of second derivatives: those of k1 are a2 and b2, those of k2 -a1 and -b1.
-            s.diagonal[lane, i - 1] = s.diagonal[lane, i - 1] + y + f * (a1 * a1 + a2 * a2) + e * (k[0] * a2 - k[1] * a1)
-            s.diagonal[lane, i] = s.diagonal[lane, i] + y + f * (b1 * b1 + b2 * b2) + e * (k[0] * b2 - k[1] * b1)
-            s.lower[lane, i] = f * (a1 * b1 + a2 * b2) - y
+            s.diagonal[lane, i - 1] = s.diagonal[lane, i - 1] + y + e * (a1 * a1 + a2 * a2 + k[0] * a2 - k[1] * a1)
+            s.diagonal[lane, i] = s.diagonal[lane, i] + y + e * (b1 * b1 + b2 * b2 + k[0] * b2 - k[1] * b1)
+            s.lower[lane, i] = e * (a1 * b1 + a2 * b2) - y
         for j in range(low, high + 1):
             pivot = s.diagonal[lane, j]
             if j > low:
@@ -257,7 +250,7 @@ def begin(s: Lanes):
         s.theta[lane, j] = end * along / (total - s.lengths[lane, edges - 1])
         along += s.lengths[lane, j]
     set_geometry(s, lane, edges)
-    solve_twist(s, lane, edges, first_held, last_held, FIRST_TWIST_STEPS, real(0.0), real(0.0), real(0.0))
+    solve_twist(s, lane, edges, first_held, last_held)
     for i in range(1, edges):
         s.k[lane, i] = curvature(s, lane, i)
         s.k_before[lane, i] = s.k[lane, i]
@@ -271,31 +264,28 @@ def add_block(s: Lanes, lane: int, i: int, j: int, block: mat33):
     """Add to the rows of vertex i and the columns of vertex j <= i."""
     for r in range(3):
         for c in range(3):
-            q = 3 * (i - j) + r - c
+            q = 4 * (i - j) + r - c
             if q >= 0:
-                s.a[lane, 3 * i + r, q] = s.a[lane, 3 * i + r, q] + block[r, c]
+                s.a[lane, 4 * i + r, q] = s.a[lane, 4 * i + r, q] + block[r, c]
 
 
 @wp.func
 def add_force(s: Lanes, lane: int, i: int, force: vec3):
     """Add to the right-hand side of vertex i."""
     for r in range(3):
-        s.b[lane, 3 * i + r] = s.b[lane, 3 * i + r] + force[r]
+        s.b[lane, 4 * i + r] = s.b[lane, 4 * i + r] + force[r]
 
 
-@wp.struct
-class Slopes:
-    """Derivatives of k1 and k2 of a joint with respect to the edge before it, a, and behind it, b."""
-
-    a1: vec3
-    b1: vec3
-    a2: vec3
-    b2: vec3
+@wp.func
+def put(s: Lanes, lane: int, row: int, column: int, value: vec3):
+    """A derivative by a position."""
+    for r in range(3):
+        s.w[lane, row, column + r] = value[r]
 
 
 @wp.func
 def slopes(s: Lanes, lane: int, i: int, k: vec2):
-    """Of joint i with the curvatures k, at the positions p and fixed angles."""
+    """Derivatives of k1, k2 and the twist of joint i with the curvatures k, by what it depends on."""
     before = s.t[lane, i - 1]
     after = s.t[lane, i]
     inverse = real(1.0) / (real(1.0) + wp.dot(before, after) + TINY)
@@ -304,41 +294,59 @@ def slopes(s: Lanes, lane: int, i: int, k: vec2):
     n2 = inverse * (s.m2[lane, i - 1] + s.m2[lane, i])
     r0 = real(1.0) / wp.length(s.p[lane, i] - s.p[lane, i - 1])
     r1 = real(1.0) / wp.length(s.p[lane, i + 1] - s.p[lane, i])
-    return Slopes(
-        r0 * (wp.cross(after, n2) - k[0] * middle),
-        r1 * (-k[0] * middle - wp.cross(before, n2)),
-        r0 * (-k[1] * middle - wp.cross(after, n1)),
-        r1 * (wp.cross(before, n1) - k[1] * middle),
-    )
+    kb = s.kb[lane, i]
+    half = real(0.5)
+    # By the two edges.
+    a1 = r0 * (wp.cross(after, n2) - k[0] * middle)
+    b1 = r1 * (-k[0] * middle - wp.cross(before, n2))
+    a2 = r0 * (-k[1] * middle - wp.cross(after, n1))
+    b2 = r1 * (wp.cross(before, n1) - k[1] * middle)
+    a3 = half * r0 * kb
+    b3 = half * r1 * kb
+    put(s, lane, 0, 0, -a1)
+    put(s, lane, 0, 4, a1 - b1)
+    put(s, lane, 0, 8, b1)
+    put(s, lane, 1, 0, -a2)
+    put(s, lane, 1, 4, a2 - b2)
+    put(s, lane, 1, 8, b2)
+    put(s, lane, 2, 0, -a3)
+    put(s, lane, 2, 4, a3 - b3)
+    put(s, lane, 2, 8, b3)
+    s.w[lane, 0, 3] = -half * wp.dot(kb, s.m1[lane, i - 1])
+    s.w[lane, 0, 7] = -half * wp.dot(kb, s.m1[lane, i])
+    s.w[lane, 1, 3] = -half * wp.dot(kb, s.m2[lane, i - 1])
+    s.w[lane, 1, 7] = -half * wp.dot(kb, s.m2[lane, i])
+    s.w[lane, 2, 3] = real(-1.0)
+    s.w[lane, 2, 7] = real(1.0)
 
 
 @wp.func
 def assemble_bending(s: Lanes, lane: int, edges: int, rate: real, older: real, oldest: real):
-    """Forces and Gauss-Newton matrix of bending and twist."""
+    """Forces and moments of bending and twist, and their Gauss-Newton matrix. dk/dt = rate k - older k_ + oldest k__."""
     for i in range(1, edges):
         joint = joint_length(s, lane, i)
         e = s.bending[lane, i] / joint
-        k = curvature(s, lane, i)
-        moment = e * moments(s, lane, i, k, rate, older, oldest)
-        w = slopes(s, lane, i, k)
-        r0 = real(1.0) / wp.length(s.p[lane, i] - s.p[lane, i - 1])
-        r1 = real(1.0) / wp.length(s.p[lane, i + 1] - s.p[lane, i])
-        twist = s.twisting[lane, i] / joint * (s.theta[lane, i] - s.theta[lane, i - 1] + s.reference[lane, i])
-        ga = moment[0] * w.a1 + moment[1] * w.a2 + real(0.5) * twist * r0 * s.kb[lane, i]
-        gb = moment[0] * w.b1 + moment[1] * w.b2 + real(0.5) * twist * r1 * s.kb[lane, i]
-        add_force(s, lane, i - 1, ga)
-        add_force(s, lane, i, gb - ga)
-        add_force(s, lane, i + 1, -gb)
-        # With respect to the three vertices.
         y = e * (real(1.0) + s.damping[lane] * rate)
-        c1 = w.a1 - w.b1
-        c2 = w.a2 - w.b2
-        add_block(s, lane, i - 1, i - 1, y * (wp.outer(w.a1, w.a1) + wp.outer(w.a2, w.a2)))
-        add_block(s, lane, i, i, y * (wp.outer(c1, c1) + wp.outer(c2, c2)))
-        add_block(s, lane, i + 1, i + 1, y * (wp.outer(w.b1, w.b1) + wp.outer(w.b2, w.b2)))
-        add_block(s, lane, i, i - 1, -y * (wp.outer(c1, w.a1) + wp.outer(c2, w.a2)))
-        add_block(s, lane, i + 1, i, y * (wp.outer(w.b1, c1) + wp.outer(w.b2, c2)))
-        add_block(s, lane, i + 1, i - 1, -y * (wp.outer(w.b1, w.a1) + wp.outer(w.b2, w.a2)))
+        z = s.twisting[lane, i] / joint
+        k = curvature(s, lane, i)
+        change = rate * k - older * s.k[lane, i] + oldest * s.k_before[lane, i]
+        moment = e * (k - s.curvature[lane, i] + s.damping[lane] * change)
+        twist = z * (s.theta[lane, i] - s.theta[lane, i - 1] + s.reference[lane, i])
+        slopes(s, lane, i, k)
+        first = 4 * (i - 1)
+        for r in range(JOINT):
+            w1 = s.w[lane, 0, r]
+            w2 = s.w[lane, 1, r]
+            w3 = s.w[lane, 2, r]
+            s.b[lane, first + r] = s.b[lane, first + r] - moment[0] * w1 - moment[1] * w2 - twist * w3
+            for c in range(r + 1):
+                value = y * (w1 * s.w[lane, 0, c] + w2 * s.w[lane, 1, c]) + z * w3 * s.w[lane, 2, c]
+                s.a[lane, first + r, r - c] = s.a[lane, first + r, r - c] + value
+        for side in range(2):
+            c = 3 + 4 * side
+            # The second derivative of k1 by an angle is the first of k2, and that of k2 less that of k1.
+            second = moment[0] * s.w[lane, 1, c] - moment[1] * s.w[lane, 0, c]
+            s.a[lane, first + c, 0] = s.a[lane, first + c, 0] + wp.max(second, real(0.0)) + REST * z
 
 
 @wp.func
@@ -357,6 +365,17 @@ def assemble_stretching(s: Lanes, lane: int, edges: int):
         add_block(s, lane, j, j, block)
         add_block(s, lane, j + 1, j + 1, block)
         add_block(s, lane, j + 1, j, -block)
+
+
+@wp.func
+def set_known(s: Lanes, lane: int, row: int, rows: int):
+    """An unknown that does not change: its equation is 1 d = 0."""
+    for q in range(BAND):
+        s.a[lane, row, q] = real(0.0)
+        if row + q < rows:
+            s.a[lane, row + q, q] = real(0.0)
+    s.a[lane, row, 0] = real(1.0)
+    s.b[lane, row] = real(0.0)
 
 
 @wp.func
@@ -418,6 +437,12 @@ def advance(
             else:
                 s.p[lane, i] = s.x[lane, i] + h * s.v[lane, i]
         set_geometry(s, lane, edges)
+        # Angles go on as they went.
+        for j in range(edges):
+            before = s.theta_before[lane, j]
+            s.theta_before[lane, j] = s.theta[lane, j]
+            if s.history[lane] > 0:
+                s.theta[lane, j] = real(2.0) * s.theta[lane, j] - before
         # The directors of clamps keep to the axis, whatever way the tangents took.
         if first_held:
             s.theta[lane, 0] = near(turn(s.u[lane, 0], projected(s.axis[lane], s.t[lane, 0]), s.t[lane, 0]), s.theta[lane, 0])
@@ -425,8 +450,8 @@ def advance(
             last = edges - 1
             angle = s.roll[lane] + turn(s.u[lane, last], projected(s.axis[lane], s.t[lane, last]), s.t[lane, last])
             s.theta[lane, last] = near(angle, s.theta[lane, last])
-        solve_twist(s, lane, edges, first_held, last_held, TWIST_STEPS, rate, older, oldest)
-        for i in range(3 * vertices):
+        set_directors(s, lane, edges)
+        for i in range(4 * vertices):
             s.b[lane, i] = real(0.0)
             for q in range(BAND):
                 s.a[lane, i, q] = real(0.0)
@@ -435,13 +460,7 @@ def advance(
         for i in range(vertices):
             if s.held[lane, i] >= 0:
                 for r in range(3):
-                    row = 3 * i + r
-                    for q in range(BAND):
-                        s.a[lane, row, q] = real(0.0)
-                        if row + q < 3 * vertices:
-                            s.a[lane, row + q, q] = real(0.0)
-                    s.a[lane, row, 0] = real(1.0)
-                    s.b[lane, row] = real(0.0)
+                    set_known(s, lane, 4 * i + r, 4 * vertices)
             else:
                 m = s.mass[lane, i]
                 c = real(1.0) + g * (s.drag[lane] + s.drag_quadratic[lane] * wp.length(s.v[lane, i]))
@@ -450,10 +469,13 @@ def advance(
                 force = m * (rate * v - (c * rate * rate) * (s.p[lane, i] - x))
                 add_force(s, lane, i, force + vec3(real(0.0), real(0.0), m * gravity))
                 for r in range(3):
-                    s.a[lane, 3 * i + r, 0] = s.a[lane, 3 * i + r, 0] + m * c * rate * rate
-        solve(s, lane, 3 * vertices)
+                    s.a[lane, 4 * i + r, 0] = s.a[lane, 4 * i + r, 0] + m * c * rate * rate
+        for j in range(vertices):
+            if j == edges or (j == 0 and first_held) or (j == edges - 1 and last_held):
+                set_known(s, lane, 4 * j + 3, 4 * vertices)
+        solve(s, lane, 4 * vertices)
         for i in range(vertices):
-            d = vec3(s.b[lane, 3 * i], s.b[lane, 3 * i + 1], s.b[lane, 3 * i + 2])
+            d = vec3(s.b[lane, 4 * i], s.b[lane, 4 * i + 1], s.b[lane, 4 * i + 2])
             after = s.p[lane, i] + d
             x = (real(1.0) + more) * s.x[lane, i] - more * s.x_before[lane, i]
             v = rate * (after - x)
@@ -469,12 +491,14 @@ def advance(
             s.tension[lane, j] = s.stretching[lane] * (length / s.lengths[lane, j] - real(1.0))
         for i in range(1, edges):
             s.k_before[lane, i] = s.k[lane, i]
-            # At the positions x, not p: else rates were of first order.
             k = curvature(s, lane, i)
-            w = slopes(s, lane, i, k)
-            left = (s.x[lane, i] - s.p[lane, i]) - (s.x[lane, i - 1] - s.p[lane, i - 1])
-            right = (s.x[lane, i + 1] - s.p[lane, i + 1]) - (s.x[lane, i] - s.p[lane, i])
-            s.k[lane, i] = k + vec2(wp.dot(w.a1, left) + wp.dot(w.b1, right), wp.dot(w.a2, left) + wp.dot(w.b2, right))
+            slopes(s, lane, i, k)
+            for r in range(JOINT):
+                moved = s.b[lane, 4 * (i - 1) + r]
+                k = k + vec2(s.w[lane, 0, r] * moved, s.w[lane, 1, r] * moved)
+            s.k[lane, i] = k
+        for j in range(edges):
+            s.theta[lane, j] = s.theta[lane, j] + wp.clamp(s.b[lane, 4 * j + 3], -MAX_TURN, MAX_TURN)
         s.history[lane] = s.history[lane] + 1
 
 
@@ -525,14 +549,15 @@ class RodSolver:
             "m1": vec3,
             "m2": vec3,
         }
-        kinds |= {"kb": vec3, "theta": real, "reference": real, "tension": real, "k": vec2, "k_before": vec2}
+        kinds |= {"kb": vec3, "theta": real, "theta_before": real, "reference": real, "tension": real, "k": vec2, "k_before": vec2}
         kinds |= {"lower": real, "diagonal": real, "rest": real}
         self._state = Lanes()
         for name, dtype in kinds.items():
             setattr(self._state, name, wp.zeros((count, vertices), dtype=dtype, device=device))
         self._state.history = wp.zeros(count, dtype=wp.int32, device=device)
-        self._state.a = wp.zeros((count, 3 * vertices, 9), dtype=real, device=device)
-        self._state.b = wp.zeros((count, 3 * vertices), dtype=real, device=device)
+        self._state.a = wp.zeros((count, 4 * vertices, 11), dtype=real, device=device)
+        self._state.w = wp.zeros((count, 3, 11), dtype=real, device=device)
+        self._state.b = wp.zeros((count, 4 * vertices), dtype=real, device=device)
         vectors: dict[str, Any] = {"curvature": vec2, "axis": vec3}
         for each in fields(RodLanes):
             kind: Any = wp.int32 if each.name == "held" else vectors.get(each.name, real)
