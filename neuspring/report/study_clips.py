@@ -7,7 +7,7 @@ the worst clip of one row. All of it is made of what the stage `transfer` keeps.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -40,7 +40,7 @@ SIGNS = {"second-hand": "†", "log": "‡", "others": "§", "reference": "◦",
 """Tag of a published number to the sign behind it."""
 FILM_RATE, FILM_WIDTH, FILM_MEGABYTES = 20, 960, 3.0
 """Pictures per second, pixels, and size of a film."""
-COLUMNS = ["cable", "clip", "label", "method", "source", "seed", "l1_mm", "euclid_mm"]
+COLUMNS = ["cable", "clip", "label", "method", "source", "seed", "l1_mm", "euclid_mm", "minutes"]
 FACTS = ["l1_mm", "spread_mm", "median_mm", "worst_mm", "euclid_mm", "minutes", "worst_clip", "clips", "of", "seeds"]
 
 
@@ -51,11 +51,9 @@ class Clips:
     study: Study
     results: Path
     clips: pd.DataFrame
-    """Every clip, row, source and seed (`COLUMNS`), mm."""
+    """Every clip, row, source and seed (`COLUMNS`), mm; minutes of search and fit."""
     records: pd.DataFrame
     """Every transfer that has a record."""
-    minutes: Mapping[tuple[str, str, int], float]
-    """Source, method and seed to the minutes of search and fit."""
 
     @property
     def cables(self) -> list[str]:
@@ -76,11 +74,10 @@ class Clips:
         for key, part in self.clips.groupby(["cable", "label"], sort=False):
             cable, label = map(str, key)
             of = self.clips.loc[self.clips["cable"] == cable, "clip"].nunique()
-            means, seeds = part.groupby("clip")[["l1_mm", "euclid_mm"]].mean(), part.groupby("seed")
+            means, seeds = part.groupby("clip")[["l1_mm", "euclid_mm", "minutes"]].mean(), part.groupby("seed")
             l1, spread = means["l1_mm"], seeds["l1_mm"].mean()[seeds["clip"].nunique() == of].std(ddof=1)
-            runs = part[["source", "method", "seed"]].drop_duplicates().itertuples(index=False, name=None)
-            minutes = float(np.mean([self.minutes.get(run, np.nan) for run in runs]))
-            facts = dict(zip(FACTS, [l1.mean(), spread, l1.median(), l1.max(), means["euclid_mm"].mean(), minutes], strict=False))
+            numbers = [l1.mean(), spread, l1.median(), l1.max(), means["euclid_mm"].mean(), means["minutes"].mean()]
+            facts = dict(zip(FACTS, numbers, strict=False))
             facts |= {"worst_clip": l1.idxmax(), "clips": len(l1), "of": of, "seeds": len(seeds), "ranked": len(l1) == of}
             rows.append({"cable": cable, "label": label, **facts, "source": "ours", "tag": "", "text": ""})
         return pd.DataFrame(rows, columns=["cable", "label", *FACTS, "source", "tag", "text", "ranked"])
@@ -88,14 +85,13 @@ class Clips:
     @cached_property
     def growth(self) -> pd.DataFrame:
         """Mean error of free markers over clips and seeds: cable, label, seconds, euclid_mm."""
-        tables, labels = [pd.DataFrame(columns=["cable", "label", "seconds", "euclid_mm"])], _labels(self.study)
+        tables = [pd.DataFrame(columns=["cable", "label", "seconds", "euclid_mm"])]
         cables = dict(zip(self.clips["clip"], self.clips["cable"], strict=True))
         for run in self.records.itertuples():
             if path := self._file(run, "frames"):
                 table = pd.read_parquet(path)
-                table = table[(table["metric"] == EUCLID) & table["scenario"].isin(list(cables))]
-                table = table.assign(label=labels[str(run.method)], cable=table["scenario"].map(cables))
-                tables.append(table.assign(euclid_mm=MM * table["value"]))
+                table = table[(table["metric"] == EUCLID) & table["scenario"].isin(list(cables))].assign(label=str(run.label))
+                tables.append(table.assign(cable=table["scenario"].map(cables), euclid_mm=MM * table["value"]))
         table = pd.concat([table for table in tables if len(table)] or tables)
         return table.groupby(["cable", "label", "seconds"], sort=False)["euclid_mm"].mean().reset_index()
 
@@ -109,7 +105,7 @@ class Clips:
         """Who paints the best, the median and the worst clip of a cable, of the row that is filmed; empty where none is kept."""
         here = self.clips[self.clips["cable"] == cable].sort_values("l1_mm")
         for label in dict.fromkeys([self.study.filmed or self.study.baseline, self.study.baseline, *self.study.rows]):
-            for run in self.records[self.records["method"] == self.study.rows[label]].sort_values("seed").itertuples():
+            for run in self.records[self.records["label"] == label].sort_values("seed").itertuples():
                 part = here[(here["source"] == run.scenario) & (here["seed"] == run.seed) & (here["label"] == label)]
                 if len(part) and (path := self._file(run, "lines")):
                     lines, last = read_npz(path)[0], len(part) - 1
@@ -119,10 +115,6 @@ class Clips:
                     count = min(len(lines[clip["clip"]]) for clip, _ in shown)
                     return [_painter(self.results, clip, title, lines[clip["clip"]][:count]) for clip, title in shown]
         return []
-
-
-def _labels(study: Study) -> dict[str, str]:
-    return {method: label for label, method in study.rows.items()}
 
 
 def _painter(results: Path, clip: pd.Series, title: str, line: np.ndarray) -> Painter:
@@ -139,26 +131,27 @@ def _painter(results: Path, clip: pd.Series, title: str, line: np.ndarray) -> Pa
 
 def read_clips(study: Study, results: Path, sources: Sequence[str], seeds: Sequence[int], known_methods: Collection[str]) -> Clips:
     """What the methods of a study predicted on other recordings, by the records in a results folder."""
-    methods = [method for method in study.rows.values() if method in known_methods]
-    table, records = read_transfers(results, sources, methods, seeds)
+    labels = {method: label for label, method in study.rows.items() if method in known_methods}
+    table, records = read_transfers(results, sources, labels, seeds)
     clips = pd.DataFrame(columns=COLUMNS)
     if len(table):
         keys = {"category": "cable", "scenario": "clip", "method": "method", "source": "source", "seed": "seed"}
-        wide = MM * table.pivot_table(index=list(keys), columns="metric", values="value", sort=False)
-        wide = wide.reindex(columns=[CLIP_METRIC, EUCLID]).dropna(subset=CLIP_METRIC).reset_index()
-        wide = wide.rename(columns=keys | {CLIP_METRIC: "l1_mm", EUCLID: "euclid_mm"})
-        clips = wide.assign(label=wide["method"].map(_labels(study)))[COLUMNS]
+        clips = MM * table.pivot_table(index=list(keys), columns="metric", values="value", sort=False)
+        clips = clips.reindex(columns=[CLIP_METRIC, EUCLID]).dropna(subset=CLIP_METRIC).reset_index()
+        clips = clips.rename(columns=keys | {CLIP_METRIC: "l1_mm", EUCLID: "euclid_mm"})
+        runs = collect(results, sources, labels, seeds).records.items()
+        minutes = {key: sum(record.timings.get(stage, 0.0) for stage in LEARNING) / 60 for key, record in runs}
+        times = [minutes.get(key, np.nan) for key in zip(clips["source"], clips["method"], clips["seed"], strict=True)]
+        clips = clips.assign(label=clips["method"].map(labels), minutes=times)[COLUMNS]
         clips = clips.sort_values("cable", kind="stable", key=lambda names: names.map(list(dict.fromkeys(names)).index))
-    runs = collect(results, sources, methods, seeds).records.items()
-    minutes = {key: sum(record.timings.get(stage, 0.0) for stage in LEARNING) / 60 for key, record in runs}
-    return Clips(study=study, results=Path(results), clips=clips, records=records, minutes=minutes)
+    return Clips(study=study, results=Path(results), clips=clips, records=records.assign(label=records["method"].map(labels)))
 
 
 def clip_blocks(found: Clips) -> list[Block]:
     """L1 per cable beside published numbers; ours in detail; every clip. Then the rows and runs that are not there, and why."""
     lines = [f"{label}: not run" for label in found.study.rows if label not in set(found.clips["label"])]
     failed = found.records[found.records["status"] != "ok"].itertuples()
-    lines += [f"{_labels(found.study)[str(run.method)]}, {run.scenario} / seed {run.seed}: {run.reason}" for run in failed]
+    lines += [f"{run.label}, {run.scenario} / seed {run.seed}: {run.reason}" for run in failed]
     last = [Items(title="Not in the tables, or not whole", items=lines)] if lines else []
     return [_overview(found), *([_details(found), _per_clip(found)] if len(found.clips) else []), *last]
 

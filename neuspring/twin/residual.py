@@ -100,16 +100,15 @@ def fit(
     names = np.array(groups)
 
     def solved(kept: np.ndarray, ridge: float) -> np.ndarray:
-        gram = grams[kept].sum(axis=0) / kept.mean() + ridge * np.eye(len(scale))
-        return np.asarray(np.linalg.solve(gram, products[kept].sum(axis=0) / kept.mean()))
+        gram = grams[kept].sum(axis=0) + kept.mean() * ridge * np.eye(len(scale))
+        return np.asarray(np.linalg.solve(gram, products[kept].sum(axis=0)))
 
     def left_out(ridge: float) -> float:
         total = 0.0
         for name in dict.fromkeys(groups):
-            w = solved(names != name, ridge)
-            for gram, product in zip(grams[names == name], products[names == name], strict=True):
-                total += 1 - 2 * (w * product).sum() + (w * (gram @ w)).sum()
-        return total / len(groups)
+            out, w = names == name, solved(names != name, ridge)
+            total += out.sum() - 2 * (w * products[out].sum(axis=0)).sum() + (w * (grams[out].sum(axis=0) @ w)).sum()
+        return total / len(names)
 
     errors = {ridge: left_out(ridge) for ridge in RIDGES}
     best = min(errors, key=errors.__getitem__)
