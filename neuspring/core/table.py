@@ -91,10 +91,10 @@ class Table:
         return [_markdown_row(self.headings, widths), *lines]
 
     def latex(self, label: str, title: str) -> str:
-        """A float to \\input; `LATEX_PREAMBLE` says what it needs. A table with groups is as wide as the lines of the page."""
-        count, stub = len(self.header), self.stub
-        head, tail = ("\\small\n\\resizebox{\\linewidth}{!}{%", "}") if self.groups else ("\\footnotesize", "")
-        spec = f"{'l' * stub} {'r' * (count - stub)}" if self.groups else f"{'l' * (count - 1)} p{{0.75\\linewidth}}"
+        """A float to \\input; `LATEX_PREAMBLE` says what it needs. One with groups or a stub of several is as wide as a line."""
+        count, stub, numbers = len(self.header), self.stub, bool(self.groups) or self.stub > 1
+        head, tail = ("\\small\n\\resizebox{\\linewidth}{!}{%", "}") if numbers else ("\\footnotesize", "")
+        spec = f"{'l' * stub} {'r' * (count - stub)}" if numbers else f"{'l' * (count - 1)} p{{0.75\\linewidth}}"
         lines = [f"\\begin{{table*}}[t]\n\\centering\n{head}", f"\\begin{{tabular}}{{@{{}} {spec} @{{}}}}", "\\toprule"]
         if self.groups:
             spans, rules, first = [], [], stub + 1

@@ -36,7 +36,7 @@ EUCLID = "track_error"
 """Markers of cables are nodes, so it is the mean Euclidean error of free markers."""
 LEARNING = ("search", "fit", "train")
 """Stages whose time is that of the model."""
-SIGNS = {"second-hand": "†", "log": "‡", "others": "§", "reference": "◦", "": ""}
+SIGNS = {"second-hand": "†", "log": "‡", "others": "§", "reference": "¶", "": ""}
 """Tag of a published number to the sign behind it."""
 FILM_RATE, FILM_WIDTH, FILM_MEGABYTES = 20, 960, 3.0
 """Pictures per second, pixels, and size of a film."""

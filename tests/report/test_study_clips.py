@@ -71,7 +71,7 @@ def test_ours_stand_beside_published_numbers_with_clips_seeds_and_time(tmp_path)
     assert overview["Rod"]["DLO3"].text == "5.00 ± 1.41" and overview["Rod"]["DLO3"].mark == "best"
     assert overview["DEFORM"]["DLO3"].text == "7.7†" and overview["DEFORM"]["DLO3"].mark == ""
     floor = overview["Floor: segments of constant length"]["DLO3"]
-    assert floor.text == "0.42◦" and floor.mark == "", "it is no method"
+    assert floor.text == "0.42¶" and floor.mark == "", "it is no method"
     note = tables["L1 per cable"].note
     assert "evaluation clips (DLO3 3)" in note and STUDY.training in note and paper.TAGS["second-hand"] in note
     detail = rows_of(tables["Ours in detail"])["DLO3"]
@@ -130,6 +130,7 @@ def test_the_command_writes_tables_growth_and_films(tmp_path, capsys, monkeypatc
     with Image.open(output / "deform_DLO3.gif") as film:
         # 20 of 100 frames per second.
         assert film.n_frames == 2 and film.info["duration"] == 50
+    assert "\\begin{tabular}{@{} ll r @{}}" in (output / "deform.tex").read_text(), "numbers, and no paragraphs"
     assert "![DLO3" in (output / "deform.md").read_text() and "7.7†" in capsys.readouterr().out
     pd.DataFrame(columns=list(COLUMNS)).to_csv(tmp_path / "scores.csv")
     assert main([*command, "--scores", str(tmp_path / "scores.csv")]) != 0
