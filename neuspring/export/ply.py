@@ -9,6 +9,7 @@ import numpy as np
 
 from neuspring.core.files import write_atomically
 from neuspring.export.source import Source
+from neuspring.report.draw.twin import Lines
 
 VERTEX = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("mass", "<f4"), ("region", "<i4"), ("controller", "u1"), ("stiffness", "<f4")]
 EDGE = [
@@ -33,33 +34,41 @@ def write(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
 
 
 def points(source: Source, frame: int) -> np.ndarray:
-    """Nodes, then controllers [N + C, 3], m."""
-    return np.concatenate([source.positions[frame], source.hands[frame]])
+    """Nodes, then controllers, then, of a rod, the vertices of its center line [P, 3], m."""
+    return Lines.of(source.twin).points(source.positions[frame], source.hands[frame])
 
 
 def vertices(source: Source, frame: int) -> np.ndarray:
-    """A row per node, then per controller; a controller has no mass and region -1. Stiffness is 0 where there are no springs."""
-    nodes, placed = len(source.positions[frame]), points(source, frame)
+    """A row per point; a controller has no mass and region -1. Stiffness is 0 where there are no springs.
+
+    Of a rod, vertices of the line have the mass, and nodes none.
+    """
+    nodes, placed, lines = len(source.positions[frame]), points(source, frame), Lines.of(source.twin)
+    moved, rod = nodes + len(source.hands[frame]), source.twin.rod
     table = np.zeros(len(placed), VERTEX)
     table["x"], table["y"], table["z"] = placed.T
-    table["mass"][:nodes] = source.masses
+    if rod is None:
+        table["mass"][:nodes] = source.masses
+    else:
+        table["mass"][moved:] = rod.mass
     table["region"] = -1
     table["region"][:nodes] = source.twin.topology.labels
-    table["controller"][nodes:] = 1
-    springs, count = source.twin.topology.springs, len(placed)
-    total = np.bincount(springs.ravel(), np.repeat(source.twin.material.stiffness, 2), count)
+    table["controller"][nodes:moved] = 1
+    springs, count = lines.pairs, len(placed)
+    total = np.bincount(springs.ravel(), np.repeat(lines.stiffness, 2), count)
     table["stiffness"] = total / np.maximum(np.bincount(springs.ravel(), minlength=count), 1)
     return table
 
 
 def edges(source: Source, frame: int) -> np.ndarray:
-    """A row per spring."""
-    topology, material = source.twin.topology, source.twin.material
-    table = np.zeros(len(topology.springs), EDGE)
-    table["vertex1"], table["vertex2"] = topology.springs.T
-    table["stiffness"], table["dashpot"], table["rest_length"] = material.stiffness, material.dashpot, topology.rest_lengths
-    ends = points(source, frame)[topology.springs]
-    table["strain"] = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / topology.rest_lengths - 1
+    """A row per spring; of a rod, per edge of the line, whose stiffness is EI / l^2, and then per spring."""
+    lines, dashpot = Lines.of(source.twin), source.twin.material.dashpot
+    table = np.zeros(len(lines.pairs), EDGE)
+    table["vertex1"], table["vertex2"] = lines.pairs.T
+    table["stiffness"], table["rest_length"] = lines.stiffness, lines.rest_lengths
+    table["dashpot"][len(table) - len(dashpot) :] = dashpot
+    ends = points(source, frame)[lines.pairs]
+    table["strain"] = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / lines.rest_lengths - 1
     return table
 
 

@@ -7,21 +7,23 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
-import numpy as np
-
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
-from neuspring.export import plain
+from neuspring.export import cable, plain
+from neuspring.export.cable import AXES, text
 from neuspring.export.source import Source
+from neuspring.physics.rod_nodes import radius_of
 
 SCRIPT = Path(__file__).with_name("newton_twin.py")
 MODEL = "twin.xml"
-AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
 
 
 def write_newton(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
     """Write arrays.npz, description.json and newton_twin.py to the folder `output`."""
     require_start(frames)
+    if source.twin.rod is not None:
+        rule = "Newton's model is of nodes and springs"
+        raise InputError("--to newton", rule, f"{source.name}, whose twin is a rod", "Take --to mujoco, or a run with a lattice.")
     write_text(output / SCRIPT.name, SCRIPT.read_text(encoding="utf-8"))
     return [*plain.write(source, frames, output), output / SCRIPT.name]
 
@@ -45,48 +47,50 @@ def mjcf(source: Source) -> str:
 
     A tendon's force is stiffness (l - springlength) + damping dl/dt, so it is our spring with stiffness / rest length. Slides damp
     as our drag does. MuJoCo's ground is soft. Bodies and sites are node0, node1, ..., hand0, ..., tendons spring0, ...
+
+    Of a rod, nodes are sites of a cable (cable.py), and the time step is `cable.STEP` at most.
     """
     twin = source.twin
     simulation, material, topology = twin.simulation, twin.material, twin.topology
     radius = material.contact_distance / 2
     root = ET.Element("mujoco", model=source.name)
     gravity = (0, 0, -simulation.gravity * simulation.up_sign)
-    ET.SubElement(root, "option", timestep=_text(simulation.substep), integrator="Euler", gravity=_text(*gravity))
+    rod = twin.rod
+    radius = radius if rod is None else max(radius_of(rod), cable.THICKNESS)
+    step, integrator = (simulation.substep, "Euler") if rod is None else (min(simulation.substep, cable.STEP), "implicitfast")
+    ET.SubElement(root, "option", timestep=text(step), integrator=integrator, gravity=text(*gravity))
     world = ET.SubElement(root, "worldbody")
     if simulation.ground:
         # Nodes are points for us and balls here, which touch a plane that is lower by their radius.
         height, turn = -radius * simulation.up_sign, "0 0 0" if simulation.up == "+z" else "180 0 0"
-        friction = _text(material.ground_friction, 0.005, 0.0001)
+        friction = text(material.ground_friction, 0.005, 0.0001)
         kind: dict[str, Any] = {"type": "plane", "size": "5 5 0.1", "contype": "1", "conaffinity": "0", "friction": friction}
-        ET.SubElement(world, "geom", name="ground", pos=_text(0, 0, height), euler=turn, **kind)
+        ET.SubElement(world, "geom", name="ground", pos=text(0, 0, height), euler=turn, **kind)
     # The plane meets nodes; nodes meet each other only with self-collision.
     meets: dict[str, Any] = {"contype": "1" if simulation.self_collision else "0", "conaffinity": "1"}
-    for index, (place, mass) in enumerate(zip(topology.nodes, source.masses, strict=True)):
-        body = ET.SubElement(world, "body", name=f"node{index}", pos=_text(*place))
+    if rod is not None:
+        cable.add(source, root, world, meets)
+    for index, (place, mass) in enumerate(zip(topology.nodes, source.masses, strict=True) if rod is None else ()):
+        body = ET.SubElement(world, "body", name=f"node{index}", pos=text(*place))
         for axis, direction in AXES.items():
-            damping = _text(material.drag * float(mass))
+            damping = text(material.drag * float(mass))
             ET.SubElement(body, "joint", name=f"node{index}{axis}", type="slide", axis=direction, damping=damping)
-        ET.SubElement(body, "geom", type="sphere", size=_text(radius), mass=_text(mass), **meets)
-        ET.SubElement(body, "site", name=f"node{index}", size=_text(radius))
+        ET.SubElement(body, "geom", type="sphere", size=text(radius), mass=text(mass), **meets)
+        ET.SubElement(body, "site", name=f"node{index}", size=text(radius))
     for index, place in enumerate(topology.controllers):
-        body = ET.SubElement(world, "body", name=f"hand{index}", pos=_text(*place), mocap="true")
-        ET.SubElement(body, "site", name=f"hand{index}", size=_text(radius), rgba="1 0.6 0.1 1")
+        body = ET.SubElement(world, "body", name=f"hand{index}", pos=text(*place), mocap="true")
+        ET.SubElement(body, "site", name=f"hand{index}", size=text(radius), rgba="1 0.6 0.1 1")
     tendons = ET.SubElement(root, "tendon") if len(topology.springs) else root
     names = [f"node{index}" for index in range(len(topology.nodes))] + [f"hand{c}" for c in range(len(topology.controllers))]
     columns = (topology.springs, material.stiffness, topology.rest_lengths, material.dashpot)
     for index, (ends, stiffness, length, dashpot) in enumerate(zip(*columns, strict=True)):
-        force = _text(float(stiffness) / float(length))
-        law: dict[str, Any] = {"stiffness": force, "damping": _text(dashpot), "springlength": _text(length)}
-        tendon = ET.SubElement(tendons, "spatial", name=f"spring{index}", width=_text(radius / 5), **law)
+        force = text(float(stiffness) / float(length))
+        law: dict[str, Any] = {"stiffness": force, "damping": text(dashpot), "springlength": text(length)}
+        tendon = ET.SubElement(tendons, "spatial", name=f"spring{index}", width=text(radius / 5), **law)
         for end in ends:
             ET.SubElement(tendon, "site", site=names[end])
-    if source.velocity.any():
+    if rod is None and source.velocity.any():
         keys = ET.SubElement(root, "keyframe")
-        ET.SubElement(keys, "key", name="start", qvel=_text(*source.velocity.ravel()))
+        ET.SubElement(keys, "key", name="start", qvel=text(*source.velocity.ravel()))
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
-
-
-def _text(*values: float | np.floating) -> str:
-    """Numbers as MJCF has them; float32 to the last bit."""
-    return " ".join(f"{float(value):.9g}" for value in values)

@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from neuspring.core.artifacts import Rod
 from neuspring.core.errors import InputError
 from neuspring.core.extras import needed
 from neuspring.core.files import write_atomically
 from neuspring.export import ply
 from neuspring.export.source import Source
+from neuspring.physics.rod_nodes import radius_of
 from neuspring.splats.view import C0
 
 SUFFIXES = (".usdc", ".usda", ".usd")
@@ -73,7 +75,7 @@ class _Shapes:
         self._stage, self._geom, self._vt, self._gf = stage, geom, vt, gf
 
     def graph(self, source: Source, codes: dict[int, float]) -> None:
-        """Nodes, controllers and springs."""
+        """Nodes, controllers and springs; of a rod, its center line."""
         topology, material, token = source.twin.topology, source.twin.material, self._geom.Tokens
         unit = float(np.median(topology.rest_lengths)) if len(topology.rest_lengths) else 0.01
         nodes = self._points("Nodes", THICK * unit, (0.8, 0.8, 0.8))
@@ -87,12 +89,30 @@ class _Shapes:
         values = {"stiffness": material.stiffness, "dashpot": material.dashpot, "restLength": topology.rest_lengths}
         for name, value in values.items():
             self._primvar(springs, name, "float[]", self._vt.FloatArray.FromNumpy(value), token.uniform)
-        self._primvar(nodes, "mass", "float[]", self._vt.FloatArray.FromNumpy(source.masses), token.vertex)
+        rod = source.twin.rod
+        if rod is None:
+            self._primvar(nodes, "mass", "float[]", self._vt.FloatArray.FromNumpy(source.masses), token.vertex)
+        else:
+            line = self._line(rod)
         for frame, code in codes.items():
             both = ply.points(source, frame)
             shown = {nodes: source.positions[frame], hands: source.hands[frame], springs: both[topology.springs].reshape(-1, 3)}
+            if rod is not None:
+                shown[line] = both[-len(rod.vertices) :]
             for prim, points in shown.items():
                 self._place(prim, prim.CreatePointsAttr(), points, code)
+
+    def _line(self, rod: Rod) -> Any:
+        """A curve through the vertices, as thick as the nodes are far, with what the rod is made of."""
+        token = self._geom.Tokens
+        curve = self._geom.BasisCurves.Define(self._stage, f"{ROOT}/CenterLine")
+        curve.CreateTypeAttr(token.linear)
+        curve.CreateCurveVertexCountsAttr([len(rod.vertices)])
+        curve.CreateWidthsAttr([2 * max(radius_of(rod), 0.5 * THIN * float(rod.lengths.mean()))])
+        curve.SetWidthsInterpolation(token.constant)
+        for name, value in {"mass": rod.mass, "bending": rod.bending, "twisting": rod.twisting}.items():
+            self._primvar(curve, name, "float[]", self._vt.FloatArray.FromNumpy(value.astype(np.float32)), token.vertex)
+        return curve
 
     def splats(self, source: Source, codes: dict[int, float]) -> None:
         """Splats for renderers that know Gaussians, and points (purpose proxy) for those that do not."""

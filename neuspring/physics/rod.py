@@ -99,6 +99,20 @@ class Lanes:
     lower: Scalars
     diagonal: Scalars
     rest: Scalars
+    spring_edge: Indices
+    """Of the springs of hands [B, S]: the edge that each acts on,"""
+    spring_place: Vectors
+    """fraction along it, distances along m1 and m2,"""
+    leader: Indices
+    """the controller that pulls,"""
+    law: Vectors
+    """stiffness, N/m, rest length, m, dashpot, N s/m."""
+    hands: Vectors
+    """Where controllers are at the end of the substep."""
+    clearance: Scalars
+    """Height over the ground at which each vertex touches it, m; below -1: there is no ground."""
+    elasticity: Numbers
+    friction: Numbers
 
 
 @wp.func
@@ -368,6 +382,71 @@ def assemble_stretching(s: Lanes, lane: int, edges: int):
 
 
 @wp.func
+def assemble_hands(s: Lanes, lane: int, rate: real, more: real):
+    """Forces, moments and Gauss-Newton matrix of springs from controllers to places on edges; only tension is stiff across.
+
+    With the offset o of the place, which turns with its edge e, and the fraction f along it, the place moves by
+    J0 dx_j + (t x o) dtheta_j + J1 dx_(j+1), J0 = (1 - f) 1 + t o^T / |e|, J1 = f 1 - t o^T / |e|.
+    """
+    unit = wp.identity(n=3, dtype=real)
+    for k in range(s.law.shape[1]):
+        law = s.law[lane, k]
+        if law[0] > real(0.0) or law[2] > real(0.0):
+            j = s.spring_edge[lane, k]
+            at = s.spring_place[lane, k]
+            t = s.t[lane, j]
+            o = at[1] * s.m1[lane, j] + at[2] * s.m2[lane, j]
+            turned = wp.outer(t, o) / wp.length(s.p[lane, j + 1] - s.p[lane, j])
+            j0 = (real(1.0) - at[0]) * unit + turned
+            j1 = at[0] * unit - turned
+            arm = wp.cross(t, o)
+            for r in range(3):
+                for c in range(3):
+                    s.w[lane, r, c] = j0[r, c]
+                    s.w[lane, r, 4 + c] = j1[r, c]
+                s.w[lane, r, 3] = arm[r]
+            on_line = (real(1.0) - at[0]) * s.p[lane, j] + at[0] * s.p[lane, j + 1]
+            away = s.hands[lane, s.leader[lane, k]] - on_line - o
+            length = wp.max(wp.length(away), TINY)
+            d = away / length
+            pull = law[0] * (length - law[1])
+            along = wp.outer(d, d)
+            block = (law[0] + law[2] * rate) * along + (wp.max(pull, real(0.0)) / length) * (unit - along)
+            v = j0 * velocity_at(s, lane, j, rate, more) + j1 * velocity_at(s, lane, j + 1, rate, more)
+            force = (pull - law[2] * wp.dot(v, d)) * d
+            first = 4 * j
+            for r in range(7):
+                column = vec3(s.w[lane, 0, r], s.w[lane, 1, r], s.w[lane, 2, r])
+                s.b[lane, first + r] = s.b[lane, first + r] + wp.dot(column, force)
+                column = block * column
+                for c in range(r + 1):
+                    value = column[0] * s.w[lane, 0, c] + column[1] * s.w[lane, 1, c] + column[2] * s.w[lane, 2, c]
+                    s.a[lane, first + r, r - c] = s.a[lane, first + r, r - c] + value
+            # The second derivative by the angle, where it makes the twist stiffer.
+            s.a[lane, first + 3, 0] = s.a[lane, first + 3, 0] + wp.max(pull * wp.dot(d, o), real(0.0))
+
+
+@wp.func
+def velocity_at(s: Lanes, lane: int, i: int, rate: real, more: real):
+    """The velocity at the end of the substep of a vertex that is at p then."""
+    return rate * (s.p[lane, i] - (real(1.0) + more) * s.x[lane, i] + more * s.x_before[lane, i])
+
+
+@wp.func
+def touch_ground(s: Lanes, lane: int, i: int, up: real):
+    """A vertex that went below its clearance is put on it, and reflected as a node is (motion.py); then backward Euler follows."""
+    x = s.x[lane, i]
+    v = s.v[lane, i]
+    if x[2] * up < s.clearance[lane, i] and v[2] * up < real(0.0):
+        speed = wp.sqrt(v[0] * v[0] + v[1] * v[1])
+        e = s.elasticity[lane]
+        keep = wp.max(real(0.0), real(1.0) - s.friction[lane] * (real(1.0) + e) * wp.abs(v[2]) / wp.max(speed, TINY))
+        s.x[lane, i] = vec3(x[0], x[1], up * s.clearance[lane, i])
+        s.v[lane, i] = vec3(keep * v[0], keep * v[1], -e * v[2])
+        s.history[lane] = 0
+
+
+@wp.func
 def set_known(s: Lanes, lane: int, row: int, rows: int):
     """An unknown that does not change: its equation is 1 d = 0."""
     for q in range(BAND):
@@ -408,9 +487,13 @@ def advance(
     s: Lanes,
     held_from: Vectors,
     held_to: Vectors,
+    hands_from: Vectors,
+    hands_to: Vectors,
+    ground: bool,
     substeps: int,
     h: real,
     gravity: real,
+    up: real,
 ):
     """One frame of each lane."""
     lane = wp.tid()
@@ -457,6 +540,9 @@ def advance(
                 s.a[lane, i, q] = real(0.0)
         assemble_bending(s, lane, edges, rate, older, oldest)
         assemble_stretching(s, lane, edges)
+        for hand in range(s.hands.shape[1]):
+            s.hands[lane, hand] = (real(1.0) - part) * hands_from[lane, hand] + part * hands_to[lane, hand]
+        assemble_hands(s, lane, rate, more)
         for i in range(vertices):
             if s.held[lane, i] >= 0:
                 for r in range(3):
@@ -500,6 +586,10 @@ def advance(
         for j in range(edges):
             s.theta[lane, j] = s.theta[lane, j] + wp.clamp(s.b[lane, 4 * j + 3], -MAX_TURN, MAX_TURN)
         s.history[lane] = s.history[lane] + 1
+        if ground:
+            for i in range(vertices):
+                if s.held[lane, i] < 0:
+                    touch_ground(s, lane, i, up)
 
 
 PARAMETERS = ("lengths", "mass", "bending", "twisting", "curvature", "axis", "stretching", "damping", "drag_quadratic", "roll")
@@ -531,11 +621,44 @@ class RodLanes:
         return cls(**values, drag=np.array(drags, dtype=np.float64), held=np.array([rod.held for rod in rods], dtype=np.int32))
 
 
+@dataclass(frozen=True)
+class RodHands:
+    """What pulls and carries B rods besides clamps: S springs of controllers, and the ground."""
+
+    controllers: int
+    leader: np.ndarray
+    """The controller of each spring [B, S]."""
+    clearance: np.ndarray
+    """Height over the ground at which each vertex touches it [B, V], m."""
+    elasticity: np.ndarray
+    friction: np.ndarray
+
+
+STATE = (
+    "x",
+    "v",
+    "x_before",
+    "v_before",
+    "t",
+    "u",
+    "m1",
+    "m2",
+    "theta",
+    "theta_before",
+    "reference",
+    "tension",
+    "k",
+    "k_before",
+    "history",
+)
+"""What `RodSolver.follow` takes over."""
+
+
 class RodSolver:
     """Simulates frames of rods in lanes. Tensors are float64 and have a leading axis [B]."""
 
-    def __init__(self, lanes: RodLanes, simulation: Simulation, device: str = "cpu") -> None:
-        self.lanes, self.simulation, self.device = lanes, simulation, device
+    def __init__(self, lanes: RodLanes, simulation: Simulation, device: str = "cpu", hands: RodHands | None = None) -> None:
+        self.lanes, self.simulation, self.device, self.hands = lanes, simulation, device, hands
         count, vertices = lanes.mass.shape
         self.count, self.vertices = count, vertices
         kinds: dict[str, Any] = {
@@ -563,6 +686,39 @@ class RodSolver:
             kind: Any = wp.int32 if each.name == "held" else vectors.get(each.name, real)
             values = np.ascontiguousarray(getattr(lanes, each.name))
             setattr(self._state, each.name, wp.array(values, dtype=kind, device=device))
+        self._add_hands(hands)
+
+    def _add_hands(self, hands: RodHands | None) -> None:
+        """Buffers of springs and ground; sizes of 0 where there are none."""
+        springs, controllers = (hands.leader.shape[1], hands.controllers) if hands else (0, 0)
+        shapes: dict[str, tuple[Any, int]] = {"spring_edge": (wp.int32, springs), "spring_place": (vec3, springs)}
+        shapes |= {"law": (vec3, springs), "hands": (vec3, controllers)}
+        for name, (dtype, size) in shapes.items():
+            setattr(self._state, name, wp.zeros((self.count, size), dtype=dtype, device=self.device))
+        if hands is not None:
+            kinds: dict[str, Any] = {"leader": wp.int32, "clearance": real, "elasticity": real, "friction": real}
+            for name, dtype in kinds.items():
+                values = np.ascontiguousarray(getattr(hands, name))
+                setattr(self._state, name, wp.array(values, dtype=dtype, device=self.device))
+        self._ends: Any = (self._state.hands, self._state.hands)
+
+    def bind(self, edge: torch.Tensor, place: torch.Tensor) -> None:
+        """Where the springs of hands act: on edges [B, S], at places [B, S, 3] as in `Rod.place`."""
+        self._put(self._state.spring_edge, edge)
+        self._put(self._state.spring_place, place)
+
+    def pull(self, law: torch.Tensor, begin: torch.Tensor, end: torch.Tensor) -> None:
+        """How they act in the next frame: stiffness, N/m, rest length, m, and dashpot, N s/m [B, S, 3]; none where both are 0.
+
+        Controllers move linearly from begin to end [B, C, 3], m.
+        """
+        self._put(self._state.law, law)
+        self._ends = self._vectors(begin), self._vectors(end)
+
+    def follow(self, other: "RodSolver") -> None:
+        """Take the state of another solver of the same rods."""
+        for name in STATE:
+            wp.copy(getattr(self._state, name), getattr(other._state, name))
 
     def start(self, x: torch.Tensor, v: torch.Tensor) -> None:
         """State of frame 0: positions [B, V, 3], m, and velocities [B, V, 3], m/s."""
@@ -574,7 +730,8 @@ class RodSolver:
         """One frame. Held vertices move linearly between rows of [B, V, 3]."""
         simulation, ends = self.simulation, (self._vectors(held_from), self._vectors(held_to))
         gravity = -simulation.up_sign * simulation.gravity
-        inputs = [self._state, *ends, simulation.substeps, simulation.substep, gravity]
+        ground, up = simulation.ground and self.hands is not None, simulation.up_sign
+        inputs = [self._state, *ends, *self._ends, ground, simulation.substeps, simulation.substep, gravity, up]
         wp.launch(load(advance, self.device), dim=self.count, inputs=inputs, device=self.device)
 
     def _vectors(self, values: torch.Tensor) -> Any:
@@ -596,3 +753,8 @@ class RodSolver:
     def directors(self) -> torch.Tensor:
         """m1 of each edge [B, E, 3]."""
         return wp.to_torch(self._state.m1)[:, :-1]
+
+    @property
+    def curvatures(self) -> torch.Tensor:
+        """k1 and k2 of each joint [B, V, 2]."""
+        return wp.to_torch(self._state.k)

@@ -25,6 +25,7 @@ from neuspring.physics import collision, frame, obstacles, springs
 from neuspring.physics.arrays import Buffers, Graphs
 from neuspring.physics.controllers import Grips, begins, begun
 from neuspring.physics.parameters import PARAMETERS, Parameters, packed
+from neuspring.physics.rod_nodes import RodFrames
 
 PER_TWIN = ("frame_time", "substeps", "initial_velocity")
 """What may differ between the simulations of one solver; it does not read the last."""
@@ -302,10 +303,15 @@ def simulate_frame(
 
 def solver_for(
     twins: Twin | Sequence[Twin], device: str = "cpu", dtype: torch.dtype = torch.float32, *, differentiable: bool = True
-) -> FrameSolver:
-    """A solver with parameters set: of a twin, or of several of the same nodes and controllers, whose tensors have an axis [B]."""
+) -> Any:
+    """A solver with parameters set: of a twin, or of several of the same nodes and controllers, whose tensors have an axis [B].
+
+    A `FrameSolver`; of rods, `RodFrames`, which have its calls for rollouts, and no gradients.
+    """
     options: dict[str, Any] = {"device": device, "dtype": dtype, "differentiable": differentiable}
     first = twins.topology if isinstance(twins, Twin) else twins[0].topology
+    if (twins if isinstance(twins, Twin) else twins[0]).rod is not None:
+        return RodFrames(twins, device)
     if isinstance(twins, Twin):
         solver = FrameSolver(first.springs, len(first.nodes), len(first.controllers), twins.simulation, **options)
         solver.set_parameters(packed(twins, device, dtype))

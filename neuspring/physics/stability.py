@@ -131,6 +131,8 @@ def smallest_safe_substeps(spectrum: Spectrum, frame_time: float, safety: float)
 
 def check(twin: Twin) -> None:
     """Raise Unstable, naming node, bound and remedy, if the twin's substep is beyond the stability limit."""
+    if twin.rod is not None:
+        return  # implicit (rod.py)
     topology, simulation = twin.topology, twin.simulation
     bound = gershgorin(topology.springs, len(topology.nodes), *_strengths(twin), twin.material.mass)
     if bound.load(simulation.substep) < LIMIT:

@@ -11,7 +11,7 @@ from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
 from neuspring.core.artifacts import Twin
-from neuspring.report.draw.twin import COLORS, region_colors, stiffness_limits
+from neuspring.report.draw.twin import COLORS, Lines, region_colors, stiffness_limits
 
 QUANTITIES = ("stiffness", "strain", "force", "region")
 DIVERGING = "coolwarm"
@@ -59,10 +59,11 @@ class Scale:
 
 @dataclass(frozen=True, eq=False)
 class Springs:
-    """The springs that are drawn, all of a twin's or a part of them."""
+    """The springs that are drawn, all of a twin's or a part of them; of a rod, the edges of its center line and springs of hands."""
 
+    lines: Lines
     pairs: np.ndarray
-    """[S, 2]: nodes, then controllers."""
+    """[S, 2]: points of `lines`."""
     rest_lengths: np.ndarray
     stiffness: np.ndarray
     regions: np.ndarray
@@ -71,13 +72,13 @@ class Springs:
     @classmethod
     def of(cls, twin: Twin, chosen: np.ndarray | None = None) -> Springs:
         """The chosen springs of a twin, or all."""
-        topology = twin.topology
-        part = np.arange(len(topology.springs)) if chosen is None else chosen
-        return cls(topology.springs[part], topology.rest_lengths[part], twin.material.stiffness[part], _regions(twin)[part])
+        lines = Lines.of(twin)
+        part = np.arange(len(lines.pairs)) if chosen is None else chosen
+        return cls(lines, lines.pairs[part], lines.rest_lengths[part], lines.stiffness[part], _regions(lines)[part])
 
     def ends(self, nodes: np.ndarray, hands: np.ndarray) -> np.ndarray:
         """[S, 2, 3] float32, m."""
-        return np.asarray(np.concatenate([nodes, hands]).astype(np.float32)[self.pairs])
+        return np.asarray(self.lines.points(nodes, hands).astype(np.float32)[self.pairs])
 
     def strain(self, ends: np.ndarray) -> np.ndarray:
         """l / l0 - 1 [S] of ends [S, 2, 3], m."""
@@ -128,17 +129,13 @@ def node_colors(twin: Twin) -> np.ndarray:
     return np.asarray(255 * region_colors(len(names))[region][:, :3] + 0.5, np.uint8)
 
 
-def _regions(twin: Twin) -> np.ndarray:
+def _regions(lines: Lines) -> np.ndarray:
     """A region's color within it; dark between regions; gray for springs of hands."""
-    springs, count = twin.topology.springs, len(twin.topology.nodes)
-    of_nodes = node_colors(twin)
-    inner = np.asarray((springs < count).all(axis=1))
-    labels = twin.topology.labels
-    colors = np.tile(PLAIN, (len(springs), 1))
-    same = inner.copy()
-    same[inner] = labels[springs[inner, 0]] == labels[springs[inner, 1]]
-    colors[same] = of_nodes[springs[same, 0]]
-    colors[inner & ~same] = CROSSING
+    names, region = np.unique(lines.labels, return_inverse=True)
+    ends = region[lines.pairs[: lines.inner]]
+    colors = np.tile(PLAIN, (len(lines.pairs), 1))
+    colors[: lines.inner] = np.asarray(255 * region_colors(len(names))[ends[:, 0]][:, :3] + 0.5, np.uint8)
+    colors[: lines.inner][ends[:, 0] != ends[:, 1]] = CROSSING
     return colors
 
 

@@ -19,6 +19,7 @@ from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
 from neuspring.play.colors import OVER, Scale, Springs, linear, node_colors
 from neuspring.report.draw.sheet import sample
+from neuspring.report.draw.twin import Lines
 from neuspring.splats.model import Splats
 from neuspring.splats.skinning import Skin
 from neuspring.splats.view import C0
@@ -71,7 +72,8 @@ class BodyLayer:
 
     def __init__(self, scene: viser.SceneApi, name: str, twin: Twin | None, nodes: np.ndarray, hands: np.ndarray) -> None:
         self.twin, self.name, self._scene = twin, name, scene
-        self.parts = Springs.of(twin, sample(len(twin.topology.springs))) if twin and len(twin.topology.springs) else None
+        count = len(Lines.of(twin).pairs) if twin else 0
+        self.parts = Springs.of(twin, sample(count)) if twin and count else None
         self.root = scene.add_frame(f"/{name}", show_axes=False)
         size = float(np.linalg.norm(np.ptp(nodes, axis=0)))
         self.radius = radius = max(SIZE * spacing(nodes), LEAST * size)
@@ -92,7 +94,7 @@ class BodyLayer:
     @property
     def left_out(self) -> int:
         """How many springs are not drawn."""
-        return len(self.twin.topology.springs) - len(self.parts.pairs) if self.twin and self.parts else 0
+        return len(self.parts.lines.pairs) - len(self.parts.pairs) if self.parts else 0
 
     def show(self, display: Display) -> None:
         """Show the parts that are wanted; nodes and springs in place of splats that it lacks."""

@@ -8,7 +8,7 @@ and c critical for the node's mass, bounded in the same way. The target is a con
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -19,7 +19,8 @@ from neuspring.core.artifacts import Artifact, Observations, Twin, array
 from neuspring.core.errors import InputError
 from neuspring.physics import stability
 from neuspring.physics.controllers import BEGINS, begins, waypoints
-from neuspring.physics.solver import FrameSolver, solver_for
+from neuspring.physics.rod_nodes import RodFrames
+from neuspring.physics.solver import solver_for
 from neuspring.twin.hand_paths import with_hands
 from neuspring.twin.rollout import FAR, Diverged, initial_velocity
 
@@ -80,6 +81,9 @@ def start_state(run: Run, seen: Observations, frame: int, repeat: bool) -> Start
     count, hands = len(twin.topology.controllers), seen.controller_points
     if frame == 0 and not repeat:
         return StartState()
+    if frame and twin.rod is not None:
+        rule = "a rod begins in frame 0: a later frame does not say how it is twisted"
+        raise InputError(f"{run.name}, frame {frame}", rule, frame, "Begin at frame 0.")
     if hands.shape[1] != count:
         raise InputError(run.folder, f"its twin has {count} controllers, the observations must too", hands.shape[1])
     holds = seen.controller_valid if seen.controller_valid.size else np.ones(hands.shape[:2], bool)
@@ -108,15 +112,16 @@ class Simulator:
         stability.check(twin)
         self.twin = twin
         self._start = start or Start()
-        self._load = stability.twin_spectrum(twin).load(twin.simulation.substep)
+        self._load = 0.0 if twin.rod is not None else stability.twin_spectrum(twin).load(twin.simulation.substep)
         self._free = solver_for(twin, "cpu", differentiable=False)
-        self._held: dict[int, FrameSolver] = {}
+        self._held: dict[int, Any] = {}
         self.reset()
 
     def reset(self) -> None:
         """Back to the start."""
         topology, start = self.twin.topology, self._start
         self.frame, self.grabbed = 0, -1
+        self._last: Any = None
         x = start.positions if start.positions.size else topology.nodes
         v = start.velocity if start.velocity.size else np.zeros_like(x)
         self._x, self._v = (torch.tensor(np.asarray(values, np.float32)) for values in (x, v))
@@ -163,6 +168,8 @@ class Simulator:
             # Each solver knows the grips of its own frames alone.
             rows = [_with_row(row, aim) if grabbed >= 0 else row for row, _ in grips]
             solver.resume(torch.tensor(np.array(rows).reshape(len(rows), *begin.shape)), [nodes for _, nodes in grips])
+        if isinstance(solver, RodFrames) and self._last not in (None, solver):
+            solver.follow(self._last)
         ends = (torch.tensor(np.asarray(values, np.float32)) for values in (begin, end))
         x, v = solver.forward(self._x, self._v, *ends)
         # NaN compares false.
@@ -170,6 +177,7 @@ class Simulator:
             raise Diverged(self.frame + 1, f"a node left the scene in frame {self.frame + 1}")
         if (now == BEGINS).any():
             grips.append((np.column_stack([self.hands, now]), self.positions.copy()))
+        self._last = solver
         self._x, self._v, self.hands, self.grabbed, self.target, self._holds = x, v, hands, grabbed, aim, after
         self.frame += 1
         return self.positions
@@ -179,6 +187,9 @@ class Simulator:
         topology, material, dt = self.twin.topology, self.twin.material, self.twin.simulation.substep
         own = (topology.springs == node).any(axis=1)
         mass = float(material.mass[node]) if len(material.mass) else 1.0
+        if self.twin.rod is not None:
+            edge = self.twin.rod.edge[node]
+            mass = float(self.twin.rod.mass[edge : edge + 2].sum())
         wanted = float((material.stiffness[own] / topology.rest_lengths[own]).sum())
         # Half of what is left is for k, half for c: dt^2 k / m + 2 dt c / m < MARGIN LIMIT - load.
         room = max(MARGIN * stability.LIMIT - self._load, 0.05) / 2

@@ -19,6 +19,7 @@ from neuspring.play.controls import Controls, replay
 from neuspring.play.live import TOO_MUCH
 from neuspring.play.results import Run, Scene
 from neuspring.report.draw.sheet import sample
+from neuspring.report.draw.twin import Lines
 from neuspring.report.video import Video
 from neuspring.splats.draw import WHITE, picture, view_of
 from neuspring.splats.model import Gaussians
@@ -101,7 +102,7 @@ def _splats(start: Gaussians, twin: Twin, positions: np.ndarray, camera: Camera)
 
 def _points(twin: Twin, positions: np.ndarray, hands: np.ndarray, camera: Camera) -> Iterator[np.ndarray]:
     """Pictures [H, W, 3] of springs, colored by strain, and nodes."""
-    parts, scale = Springs.of(twin, sample(len(twin.topology.springs))), strain_scale(TOO_MUCH)
+    parts, scale = Springs.of(twin, sample(len(Lines.of(twin).pairs))), strain_scale(TOO_MUCH)
     for nodes, held in zip(positions, hands, strict=False):
         image = np.full((camera.height, camera.width, 3), 255, np.uint8)
         ends = parts.ends(nodes, held)

@@ -53,10 +53,14 @@ def move(
     controllers that rest in frame 0 belong to the grip, and follow the new one. Nodes keep their masses. Other nodes, as of filmed
     objects, take springs and masses of their own (`resample`), and always keep the ratio. Up, ground and, unless
     `keep_frame_time`, the frame time are the recording's. Substeps are added if the new distances need more. Raises InputError if
-    the shapes do not fit, or a spring would have no length.
+    the shapes do not fit, or a spring would have no length. A rod: `rod.on_recording`.
     """
+    from neuspring.twin.rod import on_recording as rod_on_recording
+
     scenario, registration = observations.scenario, None
-    if corresponds(twin.topology, observations):
+    if twin.rod is not None:
+        moved = rod_on_recording(twin, observations)
+    elif corresponds(twin.topology, observations):
         moved = replace(twin, topology=_same_nodes(twin.topology, observations, keep_lengths))
     else:
         moved, registration = resampled(twin, observations)
@@ -69,6 +73,8 @@ def move(
         self_collision=scenario.self_collision,
     )
     moved = replace(moved, simulation=simulation)
+    if moved.rod is not None:
+        return moved, None  # implicit: no bound on the substep
     count = stability.smallest_safe_substeps(stability.twin_spectrum(moved), simulation.frame_time, safety)
     return replace(moved, simulation=replace(simulation, substeps=max(count, simulation.substeps))), registration
 

@@ -14,8 +14,8 @@ from neuspring.play.live import FASTEST, Grab, nearest_to_ray
 from neuspring.play.results import find
 from neuspring.play.simulator import Simulator, Start, start_state
 from neuspring.twin.rollout import roll_out
-from tests.support import small
-from tests.support.played import results, softer
+from tests.support import ropes, small
+from tests.support.played import results, rod_results, softer
 
 FRAMES, NODE = 12, 3
 NAMES = {"scenario": "small", "method": "truth", "seed": "0", "twin_digest": "0"}
@@ -50,6 +50,27 @@ def test_a_grabbed_node_follows_and_a_released_one_swings_back(twin):
     assert 0.5 * 30 * STEP < moved[30] < 30 * STEP
     assert moved[60] < 0.5 * moved[30]
     stability.check(Simulator(twin)._with_grab(NODE))
+
+
+def test_a_rod_is_pulled_and_let_go_in_one_motion_that_repeats_bit_for_bit():
+    rod = ropes.twin()
+    controls, seen = pulled(rod, 20)
+    assert seen[10, NODE, 0] - seen[0, NODE, 0] > 5 * STEP, "the grabbed node follows"
+    # The state passes from the solver of the grab to the one without: speed does not jump.
+    speeds = np.linalg.norm(np.diff(seen[:, NODE], axis=0), axis=1)
+    assert speeds[10] > 0.3 * speeds[9]
+    assert np.array_equal(replay(rod, controls).positions, seen)
+
+
+def test_a_rod_begins_at_frame_0_alone(tmp_path):
+    found = find([rod_results(tmp_path)])
+    (run,) = found.runs
+    begin = start_state(run, found.observations, 0, True)
+    simulator = Simulator(run.twin, begin.start)
+    moved = np.stack([simulator.positions, *(simulator.step(hands).copy() for hands in begin.hands)])
+    assert np.array_equal(moved, run.trajectory.positions)
+    with pytest.raises(InputError, match="begins in frame 0"):
+        start_state(run, found.observations, 3, True)
 
 
 def test_a_saved_recording_gives_the_same_motion_bit_for_bit(twin, tmp_path):

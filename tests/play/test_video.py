@@ -9,7 +9,7 @@ from neuspring.core.errors import InputError
 from neuspring.play.controls import Controls
 from neuspring.play.results import find
 from neuspring.play.video import HAND, _camera, write_video
-from tests.support.played import dressed, results
+from tests.support.played import dressed, results, rod_results
 
 FRAMES, NODE = 5, 4
 
@@ -43,6 +43,15 @@ def test_a_recording_is_written_as_a_video(scenario, tmp_path, capsys):
     assert f"{FRAMES + 1} frames, nodes and springs" in capsys.readouterr().out
     pictures = read(wanted)
     assert pictures.shape == (FRAMES + 1, 720, 960, 3)
+    assert (pictures[0] < 200).any(axis=2).mean() > 0.002 and (pictures[0] != pictures[-1]).mean() > 0.001
+
+
+def test_a_rod_is_drawn_as_its_center_line(tmp_path):
+    found = find([rod_results(tmp_path)])
+    (run,) = found.runs
+    film = write_video(found, run, pulled(run), tmp_path / "film.mp4")
+    assert film.kind == "nodes and springs"
+    pictures = read(film.path)
     assert (pictures[0] < 200).any(axis=2).mean() > 0.002 and (pictures[0] != pictures[-1]).mean() > 0.001
 
 

@@ -18,7 +18,7 @@ from neuspring.report.draw.painter import DrawingStyle, Painter
 from neuspring.report.draw.scene import Prediction, Scene, chosen_frames
 from neuspring.report.draw.sheet import place, save
 from neuspring.report.draw.strip import strip_figure
-from neuspring.report.draw.twin import BAR, TwinPicture, histogram, twin_figure
+from neuspring.report.draw.twin import BAR, Lines, TwinPicture, histogram, twin_figure
 from neuspring.scores.metrics import PICTURES, errors_per_frame
 
 NAMES = ("errors.png", "motion.png", "losses.png", "topology.png", "stiffness.png")
@@ -69,12 +69,12 @@ def run_figures(
     if histories:
         paths.append(save(losses_figure(histories, title), folder / "losses.png"))
     if twin is not None:
-        take, topology = Prediction(title, twin.topology.nodes[None], twin), twin.topology
-        label = f"{title}: {len(topology.nodes)} nodes, {len(topology.springs)} springs"
+        take, lines = Prediction(title, twin.topology.nodes[None], twin), Lines.of(twin)
+        label = f"{title}: {len(twin.topology.nodes)} nodes, {len(lines.pairs)} {'springs' if twin.rod is None else 'edges and springs'}"
         paths.append(
             save(twin_figure(_from_two_sides(observations, take, label, "region"), WIDTH, COUNTS), folder / "topology.png")
         )
-        if topology.object_spring_count:
+        if lines.inner:
             paths.append(save(stiffness_figure(observations, take, searched), folder / "stiffness.png"))
     return paths
 
@@ -161,13 +161,15 @@ def _from_two_sides(observations: Observations, take: Prediction, label: str, *q
 
 
 def stiffness_figure(observations: Observations, take: Prediction, searched: float | None) -> Figure:
-    """Object springs in frame 0 colored by stiffness in two views, and their histogram with the searched stiffness [N] marked.
+    """The body's lines in frame 0 colored by stiffness in two views, and their histogram with the searched stiffness [N] marked.
 
-    The twin must have an object spring.
+    The twin must have an object spring, or be a rod.
     """
     assert take.twin is not None
-    stiffness = take.twin.material.stiffness[: take.twin.topology.object_spring_count].astype(float)
-    body = _from_two_sides(observations, take, f"{take.label}: {len(stiffness)} object springs", "stiffness")
+    lines = Lines.of(take.twin)
+    stiffness = lines.stiffness[: lines.inner].astype(float)
+    kind = "object springs" if take.twin.rod is None else "edges, EI / l²"
+    body = _from_two_sides(observations, take, f"{take.label}: {len(stiffness)} {kind}", "stiffness")
     figure = twin_figure(body, WIDTH + HISTOGRAM, BAR + HISTOGRAM)
     high = figure.get_figheight()
     axis = place(figure, WIDTH + 0.6, FOOT, HISTOGRAM - 0.9, max(high - FOOT - 0.1, 0.5))

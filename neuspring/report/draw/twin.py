@@ -21,7 +21,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from scipy.spatial import cKDTree
 
 from neuspring.config.images import Images
-from neuspring.core.artifacts import Topology, Twin
+from neuspring.core.artifacts import Twin
+from neuspring.physics.rod_nodes import at_vertices
 from neuspring.report.draw.painter import empty, hands
 from neuspring.report.draw.scene import Prediction, Scene, faded, finer, over_white
 from neuspring.report.draw.sheet import CONTROLLER, TEXT, color_bar, place, points_across, sample
@@ -74,8 +75,57 @@ def _widened(low: float, high: float) -> tuple[float, float]:
     return middle / LEAST_RATIO**0.5, middle * LEAST_RATIO**0.5
 
 
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Lines that a twin is drawn with: its springs, or, of a rod, the edges of the center line and then the springs of hands.
+
+    A point is a node, then a controller, then a vertex of the line.
+    """
+
+    twin: Twin
+    pairs: np.ndarray
+    """Ends [L, 2]."""
+    rest_lengths: np.ndarray
+    stiffness: np.ndarray
+    """N; of an edge of a rod EI / l^2."""
+    inner: int
+    """How many are the body's; the others are those of hands."""
+
+    @classmethod
+    def of(cls, twin: Twin) -> Lines:
+        """All lines of a twin."""
+        topology, rod, strength = twin.topology, twin.rod, twin.material.stiffness
+        if rod is None:
+            return cls(twin, topology.springs, topology.rest_lengths, strength, topology.object_spring_count)
+        edges = len(topology.nodes) + len(topology.controllers) + np.arange(len(rod.lengths))
+        of_edges = (rod.bending[:-1] + rod.bending[1:]) / 2 / rod.lengths**2
+        return cls(
+            twin,
+            np.concatenate([np.stack([edges, edges + 1], axis=1), topology.springs]),
+            np.concatenate([rod.lengths, topology.rest_lengths]),
+            np.concatenate([of_edges, strength]),
+            len(edges),
+        )
+
+    def points(self, nodes: np.ndarray, hands: np.ndarray) -> np.ndarray:
+        """All points [P, 3], m, with the nodes at [N, 3] and the controllers at [C, 3]."""
+        line = [] if self.twin.rod is None else [at_vertices(self.twin.rod, nodes, hands)]
+        return np.concatenate([nodes, hands, *line])
+
+    @property
+    def labels(self) -> np.ndarray:
+        """The region of each point; all of a rod is one."""
+        labels = self.twin.topology.labels
+        return np.pad(labels, (0, int(self.pairs.max(initial=0)) + 1), constant_values=labels.min())
+
+
 def node_stiffness(twin: Twin) -> np.ndarray:
-    """Geometric mean of the stiffness of each node's object springs [N], N; the median of all for a node without any."""
+    """Geometric mean of the stiffness of each node's object springs [N], N; the median of all for a node without any.
+
+    Of a rod, that of the node's edge.
+    """
+    if twin.rod is not None:
+        return Lines.of(twin).stiffness[twin.rod.edge]
     count = twin.topology.object_spring_count
     pairs, values = twin.topology.springs[:count], np.maximum(twin.material.stiffness[:count].astype(float), 1e-30)
     nodes = len(twin.topology.nodes)
@@ -105,7 +155,7 @@ class TwinPicture:
         if self.limits:
             return LogNorm(*self.limits)
         twins = [_twin(take) for _, take in self.columns]
-        return LogNorm(*stiffness_limits(np.concatenate([t.material.stiffness[: t.topology.object_spring_count] for t in twins])))
+        return LogNorm(*stiffness_limits(np.concatenate([lines.stiffness[: lines.inner] for lines in map(Lines.of, twins)])))
 
     def node_colors(self, take: Prediction, quantity: Quantity) -> np.ndarray:
         """RGBA [N, 4]."""
@@ -117,11 +167,12 @@ class TwinPicture:
 
     def spring_colors(self, take: Prediction, quantity: Quantity) -> np.ndarray:
         """RGBA [S, 4] of object springs."""
-        topology, count = _twin(take).topology, _twin(take).topology.object_spring_count
+        lines = Lines.of(_twin(take))
         if quantity == "stiffness":
-            return self._of_stiffness(_twin(take).material.stiffness[:count])
-        colors = self.node_colors(take, "region")[topology.springs[:count, 0]]
-        colors[_between(topology)] = CROSSING
+            return self._of_stiffness(lines.stiffness[: lines.inner])
+        names, region = np.unique(lines.labels, return_inverse=True)
+        colors = region_colors(len(names))[region[lines.pairs[: lines.inner, 0]]]
+        colors[_between(lines)] = CROSSING
         return np.asarray(colors)
 
     def _of_stiffness(self, values: np.ndarray) -> np.ndarray:
@@ -146,10 +197,12 @@ class TwinPicture:
 
     def _lines(self, axis: Axes, scene: Scene, take: Prediction, quantity: Quantity) -> None:
         """Springs and nodes, the farthest first, so that the nearest are on top; by region also the springs of hands in frame 0."""
-        topology, nodes = _twin(take).topology, take.positions[self.frame].astype(float)
-        flat, depth = scene.view.project(nodes)
-        chosen = sample(topology.object_spring_count)
-        pairs = topology.springs[chosen]
+        lines, nodes = Lines.of(_twin(take)), take.positions[self.frame].astype(float)
+        seen = scene.observations.controller_points
+        everything = lines.points(nodes, seen[min(self.frame, len(seen) - 1)].astype(float))
+        flat, depth = scene.view.project(everything)
+        chosen = sample(lines.inner)
+        pairs = lines.pairs[chosen]
         order = np.argsort(-depth[pairs].mean(axis=1), kind="stable")
         order = order[(depth[pairs[order]] > 0).all(axis=1)]
         width = points_across(axis)
@@ -160,11 +213,10 @@ class TwinPicture:
         if quantity == "stiffness":
             return
         if not self.frame:
-            joined = topology.springs[topology.object_spring_count :]
-            ends = scene.view.project(np.concatenate([nodes, topology.controllers]))[0][joined]
+            ends = flat[lines.pairs[lines.inner :]]
             style: dict[str, Any] = {"colors": CONTROLLER, "linewidths": thick, "alpha": 0.5, "rasterized": many, "zorder": 2}
             axis.add_collection(LineCollection(list(ends), **style))
-        near = np.argsort(-depth)
+        near = np.argsort(-depth[: len(nodes)])
         near = near[depth[near] > 0]
         size = float(np.clip((0.2 * width) ** 2 / max(len(nodes), 1), 1.0, 14.0))
         axis.scatter(flat[near, 0], flat[near, 1], c=self.node_colors(take, quantity)[near], s=size, linewidths=0, zorder=3)
@@ -211,19 +263,21 @@ def twin_figure(body: TwinPicture, width: float, room: float = BAR) -> Figure:
 
 def _regions(figure: Figure, body: TwinPicture, left: float, middle: float, *, counted: bool) -> None:
     """Names of the regions; twins of one scene are divided alike, and the one with most regions names them all."""
-    topology = max((_twin(take).topology for _, take in body.columns), key=lambda found: len(np.unique(found.labels)))
+    twin = max((_twin(take) for _, take in body.columns), key=lambda found: len(np.unique(found.topology.labels)))
+    topology, lines = twin.topology, Lines.of(twin)
     labels, sizes = np.unique(topology.labels, return_counts=True)
-    count, between, joined = len(labels), _between(topology), len(topology.springs) - topology.object_spring_count
+    count, between, joined = len(labels), _between(lines), len(lines.pairs) - lines.inner
     lonely = len(topology.nodes) - len(np.unique(topology.springs[topology.springs < len(topology.nodes)]))
+    lonely, what_lines = (lonely, "springs") if twin.rod is None else (0, "edges")
     names = [f"region {k}" for k in range(count)] if count > 1 else ["one region"]
     dots = [Line2D([], [], ls="", marker="o", ms=4, color=color) for color in region_colors(count)]
     extra: list[tuple[Any, str, int, str]] = []
     if count > 1 and body.style == "springs":
         extra.append((CROSSING, "between", int(between.sum()), "springs"))
     if counted:
-        ends = topology.labels[topology.springs[: topology.object_spring_count]]
+        ends = lines.labels[lines.pairs[: lines.inner]]
         springs = [int(((ends == label).all(axis=1)).sum()) for label in labels]
-        names = [f"{name}: {n} nodes, {s} springs" for name, n, s in zip(names, sizes, springs, strict=True)]
+        names = [f"{name}: {n} nodes, {s} {what_lines}" for name, n, s in zip(names, sizes, springs, strict=True)]
         extra += [(CONTROLLER, "of hands", joined, "springs")] + ([("white", "without spring", lonely, "nodes")] if lonely else [])
     for color, name, number, what in extra:
         dots.append(Line2D([], [], color=color, linewidth=1.0))
@@ -264,9 +318,9 @@ def _newtons(value: float) -> str:
     return f"{value:,.0f} N" if value >= 100 else f"{value:.3g} N"
 
 
-def _between(topology: Topology) -> np.ndarray:
-    """Whether an object spring joins two regions [S]."""
-    ends = topology.labels[topology.springs[: topology.object_spring_count]]
+def _between(lines: Lines) -> np.ndarray:
+    """Whether a line of the body joins two regions [S]."""
+    ends = lines.labels[lines.pairs[: lines.inner]]
     return np.asarray(ends[:, 0] != ends[:, 1])
 
 

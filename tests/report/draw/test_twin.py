@@ -7,9 +7,11 @@ import pytest
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PathCollection
 
+from neuspring.play.results import find
+from neuspring.report.draw.scene import Prediction, Scene
 from neuspring.report.draw.sheet import CONTROLLER
-from neuspring.report.draw.twin import CROSSING, TwinPicture, node_stiffness, region_colors, twin_figure
-from tests.support.played import results
+from neuspring.report.draw.twin import CROSSING, Lines, TwinPicture, node_stiffness, region_colors, twin_figure
+from tests.support.played import results, rod_results
 from tests.support.shown import METHODS, filmed, painter
 
 LUMA = np.array([0.2126, 0.7152, 0.0722])
@@ -109,3 +111,26 @@ def test_a_surface_has_the_colors_of_its_nodes(tmp_path):
     opaque = np.unique(shown.reshape(-1, 3), axis=0).astype(float) / 255
     for color in region_colors(3)[:, :3]:
         assert np.abs(opaque - color).max(axis=1).min() < 0.05
+
+
+@pytest.mark.parametrize("clamped", [False, True])
+def test_a_rod_is_drawn_as_its_center_line_colored_by_its_bending_stiffness(tmp_path, clamped):
+    found = find([rod_results(tmp_path, clamped=clamped)])
+    (run,) = found.runs
+    take, rod = Prediction("rod", run.trajectory.positions, run.twin), run.twin.rod
+    scene = Scene.from_side(found.observations, [take], [0])
+    uneven = replace(run.twin, rod=replace(rod, bending=np.linspace(1, 2, len(rod.bending)) * rod.bending))
+    take = replace(take, twin=uneven)
+    lines = Lines.of(uneven)
+    assert lines.inner == len(rod.lengths) == len(lines.pairs) - len(uneven.topology.springs)
+    points = lines.points(take.positions[0], found.observations.controller_points[0])
+    # A tube's nodes are not even at its ends.
+    tolerance = 1e-6 if clamped else 2e-3
+    np.testing.assert_allclose(points[lines.pairs[: lines.inner, 0]], rod.vertices[:-1], atol=tolerance)
+    body = TwinPicture([(scene, take)], 0, ("stiffness", "region"))
+    assert (np.diff(body.spring_colors(take, "stiffness")[:, :3] @ LUMA) > 0).all()
+    drawn = twin_figure(body, 5.0, room=2.0)
+    (line,) = [
+        one for one in drawn.axes[0].collections if isinstance(one, LineCollection) and len(one.get_segments()) == lines.inner
+    ]
+    assert f"{lines.inner} edges" in drawn.legends[0].get_texts()[0].get_text()

@@ -1,0 +1,73 @@
+"""Small ropes and cables whose twins are rods."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from neuspring import config
+from neuspring.core.artifacts import Observations, Twin
+from neuspring.twin.rod import rod_twin
+from tests.support import scenarios
+
+RADIUS, LENGTH, HEIGHT = 0.01, 0.4, 0.1
+SETTINGS = config.Config(rod=config.Rod(vertices=10))
+MARKERS = 7
+
+
+def tube(line: np.ndarray, radius: float = RADIUS, around: int = 6) -> np.ndarray:
+    """Nodes [n * around, 3] on circles around a line [n, 3] in the plane z = constant."""
+    along = np.gradient(line, axis=0)
+    side = np.cross(along / np.linalg.norm(along, axis=1, keepdims=True), [0, 0, 1.0])
+    angle = 2 * np.pi * np.arange(around) / around
+    offset = np.cos(angle)[:, None] * side[:, None] + np.sin(angle)[:, None] * np.array([0, 0, 1.0])
+    return np.asarray((line[:, None] + radius * offset).reshape(-1, 3))
+
+
+def straight(count: int = 20, height: float = HEIGHT) -> np.ndarray:
+    """Points along x."""
+    return np.stack([np.linspace(0, LENGTH, count), np.zeros(count), np.full(count, height)], axis=1)
+
+
+def rope(frames: int = 4, height: float = HEIGHT, move: Any = (0.0, 0.0, 0.0), **changes: Any) -> Observations:
+    """A straight rope that a hand of three points holds in the middle and moves by `move` per frame."""
+    nodes = tube(straight(height=height))
+    hand = np.array([[0.19, 0, 0.02], [0.2, 0.01, 0.02], [0.21, 0, 0.02]]) + [0, 0, height]
+    return scenarios.observations(
+        frames=frames,
+        object_points=np.tile(nodes, (frames, 1, 1)),
+        object_visibility=np.ones((frames, len(nodes)), bool),
+        object_motion_valid=np.ones((frames, len(nodes)), bool),
+        controller_points=hand + np.arange(frames)[:, None, None] * np.asarray(move),
+        surface_points=np.zeros((0, 3)),
+        interior_points=np.zeros((0, 3)),
+        **changes,
+    )
+
+
+def cable(frames: int = 4, move: Any = (0.0, 0.0, 0.0), sag: float = 0.5, **changes: Any) -> Observations:
+    """A cable of markers on the parabola z = 0.5 + sag (x - 0.2)^2, m, the two at either end held; the last two move by `move` per frame."""
+    x = np.linspace(0, LENGTH, MARKERS)
+    line = np.stack([x, np.zeros(MARKERS), 0.5 + sag * (x - 0.2) ** 2], axis=1)
+    held = np.array([0, 1, MARKERS - 2, MARKERS - 1])
+    nodes, hands = line[2:-2], line[held]
+    path = np.tile(hands, (frames, 1, 1))
+    path[:, 2:] += np.arange(frames)[:, None, None] * np.asarray(move)
+    count = len(nodes)
+    return scenarios.observations(
+        frames=frames,
+        object_points=np.tile(nodes, (frames, 1, 1)),
+        object_visibility=np.ones((frames, count), bool),
+        object_motion_valid=np.ones((frames, count), bool),
+        controller_points=path,
+        surface_points=np.zeros((0, 3)),
+        interior_points=np.zeros((0, 3)),
+        line=np.array([count, count + 1, *range(count), count + 2, count + 3]),
+        **changes,
+    )
+
+
+def twin(observations: Observations | None = None, settings: config.Config = SETTINGS) -> Twin:
+    """The rod that a fit would start from."""
+    return rod_twin(rope() if observations is None else observations, settings)
