@@ -1,9 +1,9 @@
 """A rod as a chain of MuJoCo's bodies, one per edge. Its plugin for cables has left MuJoCo, and knew one stiffness of the whole.
 
-The rest pose of the bodies is the unloaded shape (unloaded curvatures, no twist), the keyframe `start` is frame 0. A body's axes are t,
-m1, m2. Between two edges are three hinges, about t with stiffness GJ / l and about m1 and m2 with EI / l, and with the rod's damping
-times as much. Edges keep their lengths, and their mass lies along them; a clamp is a mocap body that the end is welded to; drag is left
-out.
+The rest pose of the bodies is the unloaded shape (unloaded curvatures, no twist), the keyframe `start` is frame 0. A body's axes
+are t, m1, m2. Between two edges are three hinges, about t with stiffness GJ / l, about m1 and m2 with EI / l, each with the rod's
+damping times that. Edges keep their lengths, and their mass lies along them. A clamp is a mocap body that the end is welded to.
+Drag is left out.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def text(*values: float | np.floating) -> str:
 
 
 def add(source: Source, root: ET.Element, world: ET.Element, meets: dict[str, str]) -> None:
-    """Add the chain edge0, edge1, ..., with a site per node, clamps clamp0 and clamp1, and the keyframe `start`, qpos of frame 0."""
+    """Add the chain edge0, edge1, ..., a site per node, clamps clamp0 and clamp1, and the keyframe `start` of frame 0."""
     rod = source.twin.rod
     assert rod is not None
     edges, radius = len(rod.lengths), max(radius_of(rod), THICKNESS)

@@ -85,24 +85,26 @@ and it goes on for the rest of dt.
 """
 """A step of the simulator, in its order, for readers who have only the exported files; a paragraph each."""
 ROD_EQUATIONS = """
-A discrete elastic rod (Bergou et al. 2008, 2010). Vertices x_0 .. x_E, edges e_j = x_(j+1) - x_j with tangents t_j and unit directors
-m1_j, m2_j = t_j x m1_j. The curvature binormal of inner vertex i is kb = 2 t_(i-1) x t_i / (1 + t_(i-1) . t_i), its curvatures are k1 =
-kb . (m2_(i-1) + m2_i) / 2 and k2 = -kb . (m1_(i-1) + m1_i) / 2, and l_i is half of the unloaded lengths of its edges.
+A discrete elastic rod (Bergou et al. 2008, 2010). Vertices x_0 .. x_E, edges e_j = x_(j+1) - x_j with tangents t_j and unit
+directors m1_j, m2_j = t_j x m1_j. The curvature binormal of inner vertex i is kb = 2 t_(i-1) x t_i / (1 + t_(i-1) . t_i), its
+curvatures are k1 = kb . (m2_(i-1) + m2_i) / 2 and k2 = -kb . (m1_(i-1) + m1_i) / 2, and l_i is half of the unloaded lengths of
+its edges.
 
-Energy: sum_i bending_i |k_i - curvature_i|^2 / (2 l_i) + sum_i twisting_i m_i^2 / (2 l_i) + sum_j stretching (|e_j| / length_j - 1)^2
-length_j / 2. The twist m_i is the angle from m1_(i-1), parallel-transported to t_i, to m1_i. Inner damping: k_i + damping dk_i/dt takes
-the place of k_i in the moments of bending.
+Energy: sum_i bending_i |k_i - curvature_i|^2 / (2 l_i) + sum_i twisting_i m_i^2 / (2 l_i) + sum_j stretching (|e_j| / length_j
+- 1)^2 length_j / 2. The twist m_i is the angle from m1_(i-1), parallel-transported to t_i, to m1_i. Inner damping: k_i +
+damping dk_i/dt takes the place of k_i in the moments of bending.
 
-Directors of an end are held where its two outer vertices are: in frame 0 m1 of the first is rod_axis projected, that of the last the same
-turned by roll about its tangent; later they are parallel-transported in time. All others minimize the energy at each moment.
+Directors of an end are held where its two outer vertices are: in frame 0 m1 of the first is rod_axis projected, that of the
+last the same turned by roll about its tangent; later they are parallel-transported in time. All others minimize the energy at
+each moment.
 
-mass_i dv_i/dt = force - mass_i (gravity up_sign (0, 0, 1) + (drag + drag_quadratic |v_i|) v_i). A vertex with rod_held >= 0 is where that
-controller is. The implicit integration is BDF2 with `substeps` steps per frame.
+mass_i dv_i/dt = force - mass_i (gravity up_sign (0, 0, 1) + (drag + drag_quadratic |v_i|) v_i). A vertex with rod_held >= 0 is
+where that controller is. The implicit integration is BDF2 with `substeps` steps per frame.
 
-A node n is at x_j + f e_j + a m1_j + b m2_j with j = rod_edge and (f, a, b) = rod_place. A spring (controller, node) pulls there with
-stiffness (l / rest_length - 1) + dashpot dl/dt; it acts where `holds` is true in this frame and the next. A vertex that passes the ground
-(the nodes' 0.9 quantile of (a^2 + b^2)^(1/2), or its height in frame 0, above z = 0) is reflected: (c v_x, c v_y, -ground_elasticity
-v_z), c = max(0, 1 - ground_friction (1 + ground_elasticity) |v_z| / |v_xy|).
+A node n is at x_j + f e_j + a m1_j + b m2_j with j = rod_edge and (f, a, b) = rod_place. A spring (controller, node) pulls
+there with stiffness (l / rest_length - 1) + dashpot dl/dt; it acts where `holds` is true in this frame and the next. A vertex
+that passes the ground (the nodes' 0.9 quantile of (a^2 + b^2)^(1/2), or its height in frame 0, above z = 0) is reflected: (c
+v_x, c v_y, -ground_elasticity v_z), c = max(0, 1 - ground_friction (1 + ground_elasticity) |v_z| / |v_xy|).
 """
 """The same of a rod."""
 

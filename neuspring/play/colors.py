@@ -59,7 +59,7 @@ class Scale:
 
 @dataclass(frozen=True, eq=False)
 class Springs:
-    """The springs that are drawn, all of a twin's or a part of them; of a rod, the edges of its center line and springs of hands."""
+    """The springs that are drawn, all of a twin's or a part of them; of a rod, also the edges of its center line."""
 
     lines: Lines
     pairs: np.ndarray

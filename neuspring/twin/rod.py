@@ -4,8 +4,8 @@ Where the observations give the line (`Observations.line`: markers of a cable), 
 controller is held by it. Elsewhere the line is found among the nodes of frame 0 (`center_line`), and springs of controllers pull it
 where they pull a lattice.
 
-Only stiffness over mass matters to the motion, as gravity and drag act per mass. A body that is held by its vertices has 1 kg/m. One
-that springs pull has 1 kg per node, as a lattice has, so that the searched ranges of springs mean the same.
+Only stiffness over mass matters to the motion, as gravity and drag act per mass. A body that is held by its vertices has 1 kg/m.
+One that springs pull has 1 kg per node, as a lattice has, so that the searched ranges of springs mean the same.
 """
 
 from __future__ import annotations
@@ -108,9 +108,9 @@ def rod_twin(observations: Observations, settings: config.Config) -> Twin:
 def on_recording(twin: Twin, observations: Observations) -> Twin:
     """The rod of a twin in frame 0 of another recording of the same body; its simulation is still the twin's.
 
-    Lengths, masses, stiffnesses and unloaded curvatures are kept: they belong to the body. Where the line is found among nodes, hands
-    hold within the twin's reach, with springs that are alike and together as strong as the twin's. Raises InputError if the bodies have other
-    vertices, or another length.
+    Lengths, masses, stiffnesses and unloaded curvatures are kept: they belong to the body. Where the line is found among nodes,
+    hands hold within the twin's reach, with springs that are alike and together as strong as the twin's. Raises InputError if the
+    bodies have other vertices, or another length.
     """
     from neuspring.twin.transfer import infer_controller_radius
 

@@ -1,4 +1,4 @@
-"""A rod in other tools: MuJoCo's cable hangs as ours does, viewers show the center line, and no reader takes it for springs alone."""
+"""A rod in other tools: it hangs in MuJoCo as here, viewers show the center line, and no reader takes it for springs alone."""
 
 import json
 from dataclasses import replace
@@ -17,8 +17,8 @@ from tests.support import ropes
 from tests.support.played import rod_results
 
 HANGING = 0.03
-"""Of the sag: MuJoCo's edges are rigid bodies with a mass along them, ours have it at their ends, and clamps are soft there. Measured:
-0.021."""
+"""Of the sag: MuJoCo's edges are rigid bodies with a mass along them, ours have it at their ends, and clamps are soft there.
+Measured: 0.021."""
 
 
 def source_of(tmp_path, **options):

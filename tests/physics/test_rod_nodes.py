@@ -1,6 +1,7 @@
 """Nodes on a rod's edges, springs of hands that pull them, and the ground, against closed forms."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ def twin(
     friction: float = 0.0,
     **changes: object,
 ) -> Twin:
-    """A straight rod along x at a height, of 1 kg/m, whose nodes [N, 3] relative to its first vertex springs pull to one hand [3]."""
+    """A straight rod along x, of 1 kg/m; springs pull its nodes [N, 3] to one hand [3], both relative to its first vertex."""
     x = np.stack([EDGE * np.arange(VERTICES), np.zeros(VERTICES), np.full(VERTICES, height)], axis=1)
     points = nodes + x[0]
     edge, place = bind(x, np.tile([0, 0, 1.0], (VERTICES - 1, 1)), points)
@@ -164,7 +165,7 @@ def test_lanes_are_the_same_as_rods_alone():
     hands[:, 0, 1] += 0.01 * np.arange(5)
     together = RodFrames([one, soft])
     x, v = torch.tensor(one.topology.nodes).expand(2, -1, -1), torch.zeros(2, 2, 3)
-    for begin, end in zip(hands, hands[1:], strict=False):
+    for begin, end in pairwise(hands):
         x, v = together.forward(x, v, *(torch.tensor(points).expand(2, -1, -1) for points in (begin, end)))
     for lane, body in enumerate((one, soft)):
         assert np.array_equal(x[lane].numpy(), roll_out(body, hands).positions[-1])

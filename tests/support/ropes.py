@@ -33,7 +33,7 @@ def straight(count: int = 20, height: float = HEIGHT) -> np.ndarray:
 def rope(frames: int = 4, height: float = HEIGHT, move: Any = (0.0, 0.0, 0.0), **changes: Any) -> Observations:
     """A straight rope that a hand of three points holds in the middle and moves by `move` per frame."""
     nodes = tube(straight(height=height))
-    hand = np.array([[0.19, 0, 0.02], [0.2, 0.01, 0.02], [0.21, 0, 0.02]]) + [0, 0, height]
+    hand = np.array([[0.19, 0, 0.02], [0.2, 0.01, 0.02], [0.21, 0, 0.02]]) + np.array([0, 0, height])
     return scenarios.observations(
         frames=frames,
         object_points=np.tile(nodes, (frames, 1, 1)),
@@ -47,7 +47,7 @@ def rope(frames: int = 4, height: float = HEIGHT, move: Any = (0.0, 0.0, 0.0), *
 
 
 def cable(frames: int = 4, move: Any = (0.0, 0.0, 0.0), sag: float = 0.5, **changes: Any) -> Observations:
-    """A cable of markers on the parabola z = 0.5 + sag (x - 0.2)^2, m, the two at either end held; the last two move by `move` per frame."""
+    """Markers on z = 0.5 + sag (x - 0.2)^2, m, the two at either end held; the last two move by `move` per frame."""
     x = np.linspace(0, LENGTH, MARKERS)
     line = np.stack([x, np.zeros(MARKERS), 0.5 + sag * (x - 0.2) ** 2], axis=1)
     held = np.array([0, 1, MARKERS - 2, MARKERS - 1])

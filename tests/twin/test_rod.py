@@ -54,7 +54,7 @@ def test_what_is_no_rod_is_refused(shape):
         ),
         "ring": ropes.tube(0.1 * np.stack([np.cos(circle), np.sin(circle), 0 * circle], axis=1)),
     }
-    with pytest.raises(InputError, match="long and thin.*lattice"):
+    with pytest.raises(InputError, match=r"long and thin.*lattice"):
         center_line(shapes[shape], 12)
 
 
@@ -114,7 +114,7 @@ def test_a_rod_that_nothing_holds_is_refused():
     away = replace(seen, controller_points=seen.controller_points)
     variables = config.SearchVariables(controller_radius=config.Variable(0.0, 1.0, 0.0))
     none = replace(ropes.SETTINGS, search=config.Search(variables=variables))
-    with pytest.raises(InputError, match="a hand must hold the rod.*controller_radius"):
+    with pytest.raises(InputError, match=r"a hand must hold the rod.*controller_radius"):
         rod_twin(away, none)
 
 
@@ -144,7 +144,7 @@ def test_another_recording_moves_the_same_elsewhere(body):
 
 def test_lengths_belong_to_the_cable_and_not_to_a_recording():
     here = ropes.cable(frames=3)
-    longer = replace(here, object_points=here.object_points + [0, 0, 0.002])
+    longer = replace(here, object_points=here.object_points + np.array([0, 0, 0.002]))
     moved = move(ropes.twin(here), longer)[0]
     np.testing.assert_array_equal(moved.rod.lengths, ropes.twin(here).rod.lengths)
     np.testing.assert_allclose(moved.rod.vertices[2:5], longer.nodes, atol=SINGLE)
@@ -155,5 +155,5 @@ def test_recordings_of_another_body_are_refused():
     double = replace(here, object_points=2 * here.object_points, controller_points=2 * here.controller_points)
     with pytest.raises(InputError, match="as long as the twin's"):
         move(ropes.twin(here), double)
-    with pytest.raises(InputError, match="center line of 7 vertices.*no line"):
+    with pytest.raises(InputError, match=r"center line of 7 vertices.*no line"):
         move(ropes.twin(here), ropes.rope())

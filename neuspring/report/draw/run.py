@@ -70,7 +70,8 @@ def run_figures(
         paths.append(save(losses_figure(histories, title), folder / "losses.png"))
     if twin is not None:
         take, lines = Prediction(title, twin.topology.nodes[None], twin), Lines.of(twin)
-        label = f"{title}: {len(twin.topology.nodes)} nodes, {len(lines.pairs)} {'springs' if twin.rod is None else 'edges and springs'}"
+        what = "springs" if twin.rod is None else "edges and springs"
+        label = f"{title}: {len(twin.topology.nodes)} nodes, {len(lines.pairs)} {what}"
         paths.append(
             save(twin_figure(_from_two_sides(observations, take, label, "region"), WIDTH, COUNTS), folder / "topology.png")
         )
