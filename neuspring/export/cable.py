@@ -8,6 +8,7 @@ Drag is left out.
 
 from __future__ import annotations
 
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -20,7 +21,7 @@ STEP = 2e-4
 """s, at most: springs of joints are explicit there."""
 THICKNESS = 0.002
 """Least radius, m: nodes on the line show none."""
-WELD = {"solref": f"{2 * STEP} 1", "solimp": "0.999 0.9999 1e-4"}
+WELD: dict[str, Any] = {"solref": f"{2 * STEP} 1", "solimp": "0.999 0.9999 1e-4"}
 """A clamp is as stiff as the time step allows."""
 
 
@@ -32,7 +33,7 @@ def text(*values: float | np.floating) -> str:
     return " ".join(f"{float(value):.9g}" for value in values)
 
 
-def add(source: Source, root: ET.Element, world: ET.Element, meets: dict[str, str]) -> None:
+def add(source: Source, root: ET.Element, world: ET.Element, meets: dict[str, Any]) -> None:
     """Add the chain edge0, edge1, ..., a site per node, clamps clamp0 and clamp1, and the keyframe `start` of frame 0."""
     rod = source.twin.rod
     assert rod is not None
@@ -42,17 +43,22 @@ def add(source: Source, root: ET.Element, world: ET.Element, meets: dict[str, st
     frames, rest = _frames(source), _rest(rod.curvature)
     share = rod.mass / np.where(np.isin(np.arange(edges + 1), (0, edges)), 1, 2)
     pose = [*rod.vertices[0], *frames[0].as_quat(scalar_first=True)]
-    parent, at = world, {"pos": text(*rod.vertices[0]), "quat": text(*pose[3:])}
+    parent = world
+    at: dict[str, Any] = {"pos": text(*rod.vertices[0]), "quat": text(*pose[3:])}
     for j in range(edges):
         parent = ET.SubElement(parent, "body", name=f"edge{j}", **at)
         if j:
             for axis, k in zip(AXES, (twist[j - 1], bend[j - 1], bend[j - 1]), strict=True):
-                law = {"stiffness": text(k), "damping": text(rod.damping * k)}
+                law: dict[str, Any] = {"stiffness": text(k), "damping": text(rod.damping * k)}
                 ET.SubElement(parent, "joint", name=f"joint{j}{axis}", type="hinge", axis=AXES[axis], **law)
             pose += (rest[j - 1].inv() * frames[j - 1].inv() * frames[j]).as_euler("XYZ").tolist()
         else:
             ET.SubElement(parent, "freejoint", name="joint0")
-        along = {"type": "capsule", "fromto": text(0, 0, 0, rod.lengths[j], 0, 0), "mass": text(share[j] + share[j + 1])}
+        along: dict[str, Any] = {
+            "type": "capsule",
+            "fromto": text(0, 0, 0, rod.lengths[j], 0, 0),
+            "mass": text(share[j] + share[j + 1]),
+        }
         ET.SubElement(parent, "geom", size=text(radius), **along, **meets)
         for n in np.flatnonzero(rod.edge == j):
             f, a, b = rod.place[n]

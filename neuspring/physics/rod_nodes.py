@@ -70,7 +70,8 @@ def placed(vertices: torch.Tensor, directors: torch.Tensor, edge: torch.Tensor, 
     along = of_edges(vertices, edge + 1) - begin
     m2 = torch.linalg.cross(along / along.norm(dim=-1, keepdim=True), m1)
     f, a, b = place.split(1, dim=-1)
-    return begin + f * along + a * m1 + b * m2
+    found: torch.Tensor = begin + f * along + a * m1 + b * m2
+    return found
 
 
 def of_edges(values: torch.Tensor, edge: torch.Tensor) -> torch.Tensor:

@@ -119,9 +119,7 @@ def on_recording(twin: Twin, observations: Observations) -> Twin:
     nodes, hands, held = observations.nodes, observations.controller_points[0], _line(observations)
     if (held is None) != (not (rod.held >= 0).any()) or (held is not None and len(held) != len(rod.held)):
         found = "no line" if held is None else f"{len(held)} vertices"
-        rule = f"the recording must have the twin's center line of {len(rod.held)} vertices" + (
-            ", held alike" if held is None else ""
-        )
+        rule = f"the recording must have the twin's center line of {len(rod.held)} vertices"
         raise InputError(where, rule, found, "Name a recording of the same body.")
     topology, material = replace(twin.topology, nodes=nodes, controllers=hands, rest_shape=observations.rest_shape), twin.material
     if held is None:
@@ -135,8 +133,8 @@ def on_recording(twin: Twin, observations: Observations) -> Twin:
         topology, old = build(nodes, hands, pairs), twin.topology
         # The body keeps its mass, so all springs together keep their force per displacement, and their damping.
         stiffness = (material.stiffness / old.rest_lengths).sum() / (1 / topology.rest_lengths).sum()
-        own = {"stiffness": stiffness, "dashpot": material.dashpot.sum() / len(pairs)}
-        material = replace(material, **{name: np.full(len(pairs), value) for name, value in own.items()})
+        dashpot = material.dashpot.sum() / len(pairs)
+        material = replace(material, stiffness=np.full(len(pairs), stiffness), dashpot=np.full(len(pairs), dashpot))
     else:
         vertices = line_of(observations)
     found = np.linalg.norm(np.diff(vertices, axis=0), axis=1).sum() / rod.lengths.sum()
@@ -151,7 +149,7 @@ def _line(observations: Observations) -> np.ndarray | None:
     """The controller that holds each vertex of the line [V] that the observations give, -1: none; None: they give no line."""
     if not observations.line.size:
         return None
-    return np.maximum(observations.line - len(observations.nodes), -1)
+    return np.asarray(np.maximum(observations.line - len(observations.nodes), -1))
 
 
 def line_of(observations: Observations) -> np.ndarray:

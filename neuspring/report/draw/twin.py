@@ -125,7 +125,7 @@ def node_stiffness(twin: Twin) -> np.ndarray:
     Of a rod, that of the node's edge.
     """
     if twin.rod is not None:
-        return Lines.of(twin).stiffness[twin.rod.edge]
+        return np.asarray(Lines.of(twin).stiffness[twin.rod.edge])
     count = twin.topology.object_spring_count
     pairs, values = twin.topology.springs[:count], np.maximum(twin.material.stiffness[:count].astype(float), 1e-30)
     nodes = len(twin.topology.nodes)
