@@ -11,7 +11,7 @@ from PIL import Image
 from neuspring.cli.main import main
 from neuspring.config import parse
 from neuspring.core.errors import InputError
-from neuspring.report import study_clips
+from neuspring.report import page, study_clips
 from neuspring.report.blocks import markdown
 from neuspring.report.study_clips import clip_blocks, read_clips
 from neuspring.scores import paper
@@ -155,3 +155,15 @@ def test_the_film_shows_the_best_the_median_and_the_worst_clip_of_the_chosen_row
     np.testing.assert_allclose(
         painters[1].takes[0].positions - seen.object_points, np.tile([0, 0, 0.018], (FRAMES, 3, 1)), atol=1e-6
     )
+
+
+def test_the_page_shows_the_same_tables_once_the_study_was_made(tmp_path):
+    write_transfer(tmp_path, "DLO3", "rod", 0, CLIPS)
+    write_run(tmp_path, "DLO3_train", "rod", 0, {("future", "chamfer"): 0.01}, category="DLO3", source="mocap")
+    options = page.Options(studies={"deform": STUDY})
+    assert "L1 per clip" not in page.write(tmp_path, tmp_path / "report.html", options).read_text()
+    table = tmp_path / "tables" / "studies" / "deform.md"
+    table.parent.mkdir(parents=True)
+    table.write_text("")
+    text = page.write(tmp_path, tmp_path / "report.html", options).read_text()
+    assert "L1 per clip" in text and "7.7†" in text and "DLO3_eval_b" in text
