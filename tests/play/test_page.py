@@ -22,7 +22,7 @@ from neuspring.play.results import find
 from neuspring.scores.metrics import track_errors
 from neuspring.splats.model import Gaussians
 from neuspring.splats.view import C0
-from tests.support.played import dressed, record, spoil
+from tests.support.played import dressed, record, rod_results, spoil
 
 RUN = "baseline/0"
 
@@ -65,6 +65,23 @@ def test_a_live_twin_is_shown_by_strain_and_the_recording_as_before(opened, scen
     page.panel.stop()
     assert page.quantity.value == "stiffness" and "stiffness Y" in page.legend.content
     until(lambda: not page.player._bodies[RUN].hands.visible)
+
+
+def test_a_rod_is_shown_and_pulled_live(opened, tmp_path):
+    page = opened(rod_results(tmp_path))
+    page.panel.start("rod/0")
+    live = page.panel.live
+    edges = len(live.simulator.twin.rod.lengths)
+    assert len(live.body.parts.pairs) == edges + len(live.simulator.twin.topology.springs)
+    until(lambda: live.simulator.frame > 2)
+    place = live.simulator.positions[4].copy()
+    assert live.grab.take(1, "node", 4, place, place)
+    live.grab.pull(1, place + [0, 0.03, 0.0])
+    until(lambda: live.simulator.positions[4, 1] > place[1] + 0.01)
+    live.grab.release(1)
+    until(lambda: live.simulator.grabbed == -1)
+    assert not live.message
+    assert live.strain < 0.3
 
 
 @pytest.mark.parametrize("action", [lambda page: page.toggle(), lambda page: page.show(3)])
