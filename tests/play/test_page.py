@@ -76,7 +76,7 @@ def test_a_rod_is_shown_and_pulled_live(opened, tmp_path):
     until(lambda: live.simulator.frame > 2)
     place = live.simulator.positions[4].copy()
     assert live.grab.take(1, "node", 4, place, place)
-    live.grab.pull(1, place + [0, 0.03, 0.0])
+    live.grab.pull(1, place + np.array([0, 0.03, 0.0]))
     until(lambda: live.simulator.positions[4, 1] > place[1] + 0.01)
     live.grab.release(1)
     until(lambda: live.simulator.grabbed == -1)
