@@ -90,7 +90,7 @@ def transport(u: Tensor, a: Tensor, b: Tensor) -> Tensor:
     """
     w = torch.linalg.cross(a, b)
     once = torch.linalg.cross(w, u)
-    return u + once + torch.linalg.cross(w, once) / (1 + dot(a, b))[..., None]
+    return u + once + torch.linalg.cross(w, once) / (1 + dot(a, b))[..., None]  # type: ignore[no-any-return]
 
 
 def angle(a: Tensor, b: Tensor, t: Tensor) -> Tensor:
@@ -101,13 +101,13 @@ def angle(a: Tensor, b: Tensor, t: Tensor) -> Tensor:
 def tangents(x: Tensor) -> Tensor:
     """Of the edges between vertices x [V, 3]."""
     edges = x[1:] - x[:-1]
-    return edges / edges.norm(dim=1, keepdim=True)
+    return edges / edges.norm(dim=1, keepdim=True)  # type: ignore[no-any-return]
 
 
 def projected(axis: Tensor, t: Tensor) -> Tensor:
     """The unit vector perpendicular to t that is nearest to `axis`."""
     across = axis - dot(axis, t) * t
-    return across / across.norm()
+    return across / across.norm()  # type: ignore[no-any-return]
 
 
 def carried(frames: Frames, x: Tensor) -> Frames:
@@ -160,7 +160,7 @@ def energy(parameters: Parameters, x: Tensor, frames: Frames, theta: Tensor) -> 
     bent = (curvatures(frames, theta) - p.curvature[1:-1]).square().sum(1)
     twist = theta[1:] - theta[:-1] + frames.twist
     joints = (p.bending[1:-1] * bent + p.twisting[1:-1] * twist.square()) / p.spans
-    return (p.stretching * (p.lengths * strain.square()).sum() + joints.sum()) / 2
+    return (p.stretching * (p.lengths * strain.square()).sum() + joints.sum()) / 2  # type: ignore[no-any-return]
 
 
 class Rate(NamedTuple):
@@ -232,7 +232,7 @@ def steps_needed(parameters: Parameters, frame_time: float) -> int:
     length, mass = float(p.lengths.min()), float(p.mass[~p.held].min())
     bending = 16 * float(p.bending.max()) / length**3 / mass
     highest = (bending + 4 * float(p.stretching) / length / mass) ** 0.5
-    return max(1, ceil(frame_time * (highest + float(p.damping) * bending) / 0.7))
+    return max(1, ceil(frame_time * (highest + float(p.damping) * bending) / 0.7))  # type: ignore[no-any-return]
 
 
 class State(NamedTuple):
@@ -266,7 +266,7 @@ def advanced(p: Parameters, state: State, h: float, middle: Tensor, end: Tensor,
 
 def slowed(p: Parameters, v: Tensor) -> Tensor:
     """Deceleration by drag, m/s^2: c v + b |v| v."""
-    return (p.drag + p.drag_quadratic * v.norm(dim=1, keepdim=True)) * v
+    return (p.drag + p.drag_quadratic * v.norm(dim=1, keepdim=True)) * v  # type: ignore[no-any-return]
 
 
 def beginning(p: Parameters, v: Tensor) -> State:

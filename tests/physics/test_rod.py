@@ -89,7 +89,7 @@ def test_at_rest_the_forces_of_the_specification_are_in_balance() -> None:
     frames, theta = rod_reference.start(p, x)
     weight = p.mass[:, None] * real([0, 0, -9.8])
     rest = (rod_reference.forces(p, x, frames, theta) + weight).detach()[2:-2]
-    assert float(rest.abs().max()) < 1e-6 * float(weight.abs().max())
+    assert float(rest.abs().max()) < 1e-5 * float(weight.abs().max())
 
 
 def test_lanes_are_the_same_alone_and_in_company() -> None:
