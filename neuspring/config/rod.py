@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.parse import Finite, NonNegative, Positive, Section
+from neuspring.config.parse import Finite, Positive, Section
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,25 +20,53 @@ class Rod(Section):
 
     vertices: Annotated[int, Field(ge=4)] = 24
     """Vertices of a center line that is found among nodes. One that the observations give has its own."""
-    bending: Positive = 0.03
+    bending: Positive = 0.1
     """EI, N m^2."""
-    twisting: Positive = 0.03
+    twisting: Positive = 0.1
     """GJ, N m^2."""
     stretching: Positive = 2e4
     """EA, N."""
-    damping: NonNegative = 0.01
+    damping: Positive = 0.05
     """Time of inner damping, s."""
-    marker_mass: NonNegative = 0.01
+    marker_mass: Positive = 0.03
     """Mass of a marker at each vertex of a center line that the observations give, kg."""
-    drag: NonNegative = 0.3
+    drag: Positive = 0.1
     """Linear drag, 1/s."""
-    drag_quadratic: NonNegative = 0.1
+    drag_quadratic: Positive = 0.05
     """Quadratic drag, 1/m."""
     rest: Literal["straight", "first_frame"] = "straight"
     """The shape without moments: straight, or as in frame 0."""
-    axis: tuple[Finite, Finite, Finite] = (0.0, 0.6, 0.8)
-    """Direction of the world whose projection is the first director of clamped ends in frame 0."""
+    axes: tuple[tuple[Finite, Finite, Finite], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    """Directions of the world whose projection may be the first director of clamped ends; the search chooses (twin/rod_fit.py)."""
     roll: Finite = 0.0
-    """Turn of the last clamp's directors in frame 0, rad."""
-    substep: Positive = 0.002
+    """Turn of the last clamp's directors, rad."""
+    substep: Positive = 0.005
     """Longest integration step with `simulation.substeps: auto`, s."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RodFit(Section):
+    """Levenberg-Marquardt on whole recordings (twin/rod_fit.py), for methods whose `fit` is rod."""
+
+    stiffness: Literal["constant", "knots", "free"] = "constant"
+    """EI and GJ along the arc: one value each; a smooth field, cubic between `knots`; free at each joint."""
+    curvature: Literal["straight", "constant", "knots", "free"] = "free"
+    """Unloaded curvature along the arc: as at the start; one of all; a smooth field; free at each joint."""
+    knots: Annotated[int, Field(ge=4)] = 5
+    """Knots of a field along the arc."""
+    markers: bool = True
+    """Also fit how far markers lie beside the center line, and the lengths between them."""
+    horizons: tuple[Annotated[int, Field(ge=0)], ...] = (60, 150, 0)
+    """Training frames that count, one stage of the fit after the other; 0: all."""
+    rounds: Annotated[int, Field(ge=1)] = 8
+    """Steps per stage, at most; a stage ends where a step gains less than 0.2 %."""
+    every: Annotated[int, Field(ge=1)] = 4
+    """Of the frames every n-th counts."""
+    robust: Positive = 0.02
+    """Errors e count as sqrt(e^2 + robust^2), so that recordings that flip do not decide, m."""
+    residual: bool = False
+    """Add what a ridge regression learns of errors on training recordings (twin/residual.py): no physics, so a row of its own."""
+
+    def __post_init__(self) -> None:
+        if not self.horizons:
+            raise ValueError("horizons: at least one stage is required, received none")

@@ -7,8 +7,10 @@ from typing import Any, Literal
 
 from neuspring.config.parse import REMOVED, Count, Name, Section
 
-Kind = Literal["springs", "field"]
-"""What a first-order stage trains: each spring by itself, or the neural spring field."""
+Kind = Literal["springs", "field", "rod"]
+"""What a first-order stage trains: each spring by itself, the neural spring field, or what is unknown of a rod."""
+Body = Literal["lattice", "rod"]
+"""What a twin is made of: springs between nodes, or an elastic rod."""
 
 LEFT = """
     spring_gaus_alpha spring_gaus_ignore_hands spring_gaus_shared_splats gs_dynamics_all_tracks gs_dynamics_centroids
@@ -30,6 +32,8 @@ class SearchRow(Section):
 
     clusters: Count
     """Number K of regions, each with its own radius and neighbors: 2K + 10 variables. 1 is the uniform topology."""
+    body: Body = "lattice"
+    """lattice: springs between nodes. rod: a discrete elastic rod, for long thin bodies; it has no regions."""
     description: str
     """What the row is, for people."""
     settings: dict[str, Any] = field(default_factory=dict)
@@ -47,7 +51,8 @@ class Method(Section):
     search: Name | None = None
     """A row of the search table; methods that name the same row share the search."""
     fit: Kind | None = None
-    """What the first-order stage trains: each spring by itself, or the neural spring field; null: there is no such stage."""
+    """What the first-order stage trains: each spring by itself, the neural spring field, or a rod (of a search with `body: rod`);
+    null: there is no such stage."""
     model: Name | None = None
     """A baseline, which has neither search nor fit: spring_gaus, gs_dynamics, static or controller_lbs."""
     settings: dict[str, Any] = field(default_factory=dict)

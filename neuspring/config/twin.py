@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from neuspring.config.parse import Count, NonNegative, Positive, Range, Section
+from neuspring.config.rod import RodFit
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,6 +111,7 @@ class Fit(Section):
     field: SpringField = dataclasses.field(default_factory=SpringField)
     checkpoint_every: Count = 5
     """Epochs between checkpoints from which a killed job continues."""
+    rod: RodFit = dataclasses.field(default_factory=RodFit)
 
     def __post_init__(self) -> None:
         low, high = self.stiffness_range

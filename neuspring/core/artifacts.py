@@ -560,6 +560,11 @@ class Rod(Artifact):
         if len(self.edge) and not 0 <= self.edge.min() <= self.edge.max() < edges:
             raise InputError("rod.edge", f"indices must lie in [0, {edges})", [int(self.edge.min()), int(self.edge.max())])
 
+    @property
+    def spans(self) -> np.ndarray:
+        """Unloaded length that belongs to each vertex [V], m: half of its edges."""
+        return np.convolve(self.lengths, [0.5, 0.5])
+
 
 @dataclass(frozen=True, kw_only=True)
 class Twin(Artifact):

@@ -250,8 +250,9 @@ class Benchmark:
         most = self.config.twins_per_launch
         if most == 1 or (most == "auto" and self.on_gpu) or scenario not in self.config.scenarios:
             return ()
-        # A fit on several recordings takes turns between them, and shares launches with nobody.
-        rows = [name for name, method in self.fits.items() if self.applies(name, scenario) and not method.pool]
+        # A fit on several recordings takes turns between them, and shares launches with nobody; a rod has lanes of its own.
+        alone = [name for name, method in self.fits.items() if method.pool or method.fit == "rod"]
+        rows = [name for name in self.fits if self.applies(name, scenario) and name not in alone]
         seeds = self.config.seeds
         alike = Counter(self._steps[name] for name in rows)
         return tuple((name, seed) for name in rows if alike[self._steps[name]] * len(seeds) >= LEAST_TOGETHER for seed in seeds)

@@ -275,6 +275,8 @@ class Graph:
                 return plain(rows.scenarios[job.scenario])
             case "clusters":
                 return rows.searches[job.search].clusters
+            case "body":
+                return rows.searches[job.search].body
             case "leave_out":
                 return rows.pool_kind(job) == "others"
             case "kind":

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -24,6 +25,8 @@ from neuspring.physics.rod import RodHands, RodLanes, RodSolver
 
 SMOOTHING = 1e-6
 """Weight of second differences along the vertices against nodes: decides where no node is."""
+SETTLING = 4
+"""Rounds in which vertices and directors of frame 0 are made to agree."""
 SURFACE = ("ground_elasticity", "ground_friction")
 PARALLEL = 0.99
 """Cosine to an end's tangent from which `Rod.axis` has no projection worth the name."""
@@ -52,6 +55,62 @@ def frame_zero(rod: Rod) -> tuple[np.ndarray, np.ndarray]:
     solver = RodSolver(RodLanes.of([rod], [0.0]), Simulation(frame_time=1.0, substeps=1))
     solver.start(torch.tensor(rod.vertices)[None], torch.zeros((1, *rod.vertices.shape), dtype=torch.float64))
     return solver.directors()[0].numpy().copy(), solver.curvatures[0].numpy().copy()
+
+
+def clamped(points: torch.Tensor, clamps: torch.Tensor, axis: torch.Tensor, ends: Sequence[bool]) -> torch.Tensor:
+    """Held vertices [B, V, 3], m, of clamps whose controllers are at points [B, V, 3]; other rows stay. See `Rod.clamps` [B, 2, 3].
+
+    `ends`: whether the first and the last two vertices are held. `axis` [B, 3].
+    """
+    result = points.clone()
+    for end, (inner, outer) in enumerate(((1, 0), (-2, -1))):
+        if not ends[end]:
+            continue
+        along = (points[:, inner] - points[:, outer]) * (1 - 2 * end)
+        length = along.norm(dim=-1, keepdim=True)
+        t = along / length
+        m1 = axis - (axis * t).sum(dim=-1, keepdim=True) * t
+        m1 = m1 / m1.norm(dim=-1, keepdim=True)
+        local = torch.stack([t, m1, torch.linalg.cross(t, m1)], dim=1)
+        result[:, inner] = points[:, inner] + (clamps[:, end, :, None] * local).sum(dim=1)
+        result[:, outer] = result[:, inner] - (1 - 2 * end) * along
+    return result
+
+
+def settled(rods: Sequence[Rod], lines: np.ndarray) -> np.ndarray:
+    """Vertices [B, V, 3], m, in frame 0 of rods with observed lines [B, V, 3]: beside them, as `offsets` and `clamps` say."""
+    points = torch.tensor(np.asarray(lines, np.float64))
+    if not rods[0].offsets.size:
+        return points.numpy()
+    free = rods[0].held < 0
+    clamps, axis = (torch.tensor(np.stack([getattr(rod, name) for rod in rods])) for name in ("clamps", "axis"))
+    offsets = torch.tensor(np.stack([rod.offsets for rod in rods]))[:, free]
+    solver = RodSolver(RodLanes.of(rods, [0.0] * len(rods)), Simulation(frame_time=1.0, substeps=1))
+    x = clamped(points, clamps, axis, _ends(rods[0]))
+    edges = np.minimum(np.flatnonzero(free), len(free) - 2)
+    for _ in range(SETTLING):
+        solver.start(x, torch.zeros_like(x))
+        m1 = solver.directors()[:, edges]
+        along = x[:, edges + 1] - x[:, edges]
+        m2 = torch.linalg.cross(along / along.norm(dim=-1, keepdim=True), m1)
+        x[:, free] = points[:, free] - offsets[..., :1] * m1 - offsets[..., 1:] * m2
+    return x.numpy()
+
+
+def _ends(rod: Rod) -> tuple[bool, bool]:
+    """Whether either end is clamped."""
+    held = rod.held >= 0
+    return bool(held[:2].all()), bool(held[-2:].all())
+
+
+def turn_of(line: np.ndarray, axis: np.ndarray) -> float:
+    """Angle about the last tangent of a line [V, 3] from `axis`, projected at the first edge and carried along, to `axis` there."""
+    tangents = np.diff(line, axis=0)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    first, last = (axis - (axis @ t) * t for t in tangents[[0, -1]])
+    for before, after in pairwise(tangents):
+        first = first - (after @ first) / (1 + before @ after) * (before + after)
+    return float(np.arctan2(np.cross(first, last) @ tangents[-1], first @ last))
 
 
 def place_on(vertices: np.ndarray, directors: np.ndarray, nodes: np.ndarray, edge: np.ndarray) -> np.ndarray:
@@ -128,6 +187,8 @@ class RodFrames:
         held, edge = (np.stack([getattr(rod, name) for rod in self.rods]) for name in ("held", "edge"))
         self._held, self._edge = (torch.tensor(np.maximum(a, 0), dtype=torch.long, device=device) for a in (held, edge))
         self._place = self._tensor([rod.place for rod in self.rods])
+        beside = bool(self.rods[0].offsets.size)
+        self._clamps = [self._tensor([getattr(rod, name) for rod in self.rods]) for name in ("clamps", "axis")] if beside else None
         self._x: torch.Tensor | None = None
         self._lengths: torch.Tensor | None = None
         """Rest lengths of grips that began since the start [B, S]."""
@@ -145,7 +206,10 @@ class RodFrames:
         begin, end = (points if self.together else points[None] for points in (begin, end))
         ends = [points[..., :3].to(self.device, torch.float64) for points in (begin, end)]
         self.solver.pull(self._law(begin, end), *ends)
-        self.solver.frame(*(of_edges(points, self._held) for points in ends))
+        paths = [of_edges(points, self._held) for points in ends]
+        if self._clamps:
+            paths = [clamped(path, *self._clamps, _ends(self.rods[0])) for path in paths]
+        self.solver.frame(*paths)
         return self._state()
 
     def resume(self, rows: torch.Tensor, positions: Sequence[np.ndarray]) -> None:
@@ -173,7 +237,7 @@ class RodFrames:
     def _law(self, begin: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
         """Stiffness, N/m, rest length, m, and dashpot, N s/m, of the springs of hands [B, S, 3] in a frame (controllers.py)."""
         if begin.shape[-1] == 4:
-            self._lengths = self.grips.taken(self._lengths, self._where()[0], begin.to(self.device, torch.float64))
+            self._lengths = self.grips.taken(self._lengths, self.nodes()[0], begin.to(self.device, torch.float64))
         y, inverse, dashpot = self.grips.applied(self._packed, self._lengths).unbind(dim=-1)
         acts = torch.ones_like(y)
         if begin.shape[-1] == 4:
@@ -200,12 +264,12 @@ class RodFrames:
         self.solver.bind(self._edge[:, self.grips.nodes], self._place[:, self.grips.nodes])
 
     def _state(self) -> tuple[torch.Tensor, torch.Tensor]:
-        x, v = (values.to(self.dtype) if self.together else values[0].to(self.dtype) for values in self._where())
+        x, v = (values.to(self.dtype) if self.together else values[0].to(self.dtype) for values in self.nodes())
         self._x = x
         return x, v
 
-    def _where(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Nodes and their velocities [B, N, 3]; what the turn of directors adds to these is left out."""
+    def nodes(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Nodes and their velocities [B, N, 3] in double precision; what the turn of directors adds to these is left out."""
         f, v = self._place[..., :1], self.solver.v
         speeds = (1 - f) * of_edges(v, self._edge) + f * of_edges(v, self._edge + 1)
         return placed(self.solver.x, self.solver.directors(), self._edge, self._place), speeds

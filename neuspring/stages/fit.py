@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from neuspring.config import Config, Kind
 from neuspring.core.artifacts import Observations
+from neuspring.core.errors import InputError
 from neuspring.core.records import Before, Recorder
 from neuspring.stages.stage import Written, stage
 
@@ -29,21 +30,28 @@ def fit(
     run: Recorder,
     pool: Sequence[Observations] = (),
     leave_out: bool = False,
-    kind: Annotated[Kind, "train each spring, or the neural spring field"] = "springs",
+    kind: Annotated[Kind, "train each spring, the neural spring field, or a rod"] = "springs",
     oracle: Annotated[bool, "fit all frames, the future included: what fitting could reach at best"] = False,
     device: str = "auto",
+    threads: int = 1,
 ) -> Written:
     """Coarse twin -> fitted twin, by gradients: twin.npz, history.parquet (losses per epoch).
 
     A field's first weights follow the search's seed. An `oracle` fits all frames, the future included, and the record says so. With
     a `pool` of other recordings the twin is fitted on all; with `leave_out`, on those alone. A checkpoint that a killed fit left,
-    or one that ran together with others (`fits`), is continued.
+    or one that ran together with others (`fits`), is continued. A rod has Levenberg-Marquardt in place of gradients, on `threads`
+    cores, and begins anew.
     """
     from neuspring.core.files import write_history
     from neuspring.twin.fit import fit as fit_twin
     from neuspring.twin.losses import frames_seen
 
     problem, checkpoint, key = prepared(observations, search, settings, run, pool, leave_out, kind, oracle, device)
+    if (kind == "rod") != (problem.twin.rod is not None):
+        rule = "rods are fitted as rods, and lattices as springs or field"
+        raise InputError(f"{search.path}, twin", rule, f"--kind {kind}", "Correct the method's row: its search and its fit.")
+    if kind == "rod":
+        return _rod(problem, run, threads)
     result = fit_twin(problem, partial=checkpoint, key=key)
     files = run.beside(twin="twin.npz", history="history.parquet")
     result.twin.save(files["twin"])
@@ -69,6 +77,20 @@ def fit(
     return Written(
         files=files, facts=facts, attempts=result.attempts, earlier_seconds=result.earlier_seconds, checkpoint=checkpoint
     )
+
+
+def _rod(problem: FitProblem, run: Recorder, threads: int) -> Written:
+    """The fit of a rod."""
+    from neuspring.core.files import write_history
+    from neuspring.twin.rod_fit import fit_rod
+
+    result = fit_rod(problem, threads)
+    files = run.beside(twin="twin.npz", history="history.parquet")
+    result.twin.save(files["twin"])
+    columns = {name: result.history[name] for name in ("loss", "gradient_norm", "learning_rate")}
+    write_history(result.history.index, columns, files["history"])
+    facts = {"best_loss": result.value, "steps": len(result.history), "rollouts": result.rollouts, "collision_overflow": 0}
+    return Written(files=files, facts=facts | result.facts | result.twin.counts)
 
 
 def prepared(

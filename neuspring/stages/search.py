@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
-from neuspring.config import Config
+from neuspring.config import Body, Config
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.core.records import Recorder
@@ -22,7 +22,7 @@ END = 0.01
 
 @stage(
     output="{scenario}/search-{search}/{seed}/search.json",
-    reads=("search", "simulation", "losses", "released_quirks"),
+    reads=("search", "simulation", "losses", "released_quirks", "rod", "fit.rod"),
     gpu="always",
     memory_mb=8000,
     minutes=240,
@@ -34,6 +34,7 @@ def search(
     pool: Sequence[Observations] = (),
     leave_out: bool = False,
     clusters: int = 1,
+    body: Body = "lattice",
     seed: int = 0,
     device: str = "auto",
     threads: int = 1,
@@ -44,7 +45,8 @@ def search(
     `clusters` regions of the topology have values of their own (1: uniform). At most `twins_per_launch` candidates share a launch
     (auto: as many as pay), and `threads` launches run at the same time on a CPU; neither changes a number there. A trace of the
     same search is continued, so a larger `search.rollouts` costs only the difference. With a `pool` of other recordings a
-    candidate's cost is the mean over all; with `leave_out`, over those alone.
+    candidate's cost is the mean over all; with `leave_out`, over those alone. A `body` that is a rod has no topology to search: its
+    constants are found by Levenberg-Marquardt on the first frames (twin/rod_fit.py).
     """
     from neuspring.core.checkpoint import checkpoint_key
     from neuspring.core.files import write_history
@@ -54,6 +56,8 @@ def search(
 
     if threads < 1:
         raise InputError("--threads", "must be at least 1", threads)
+    if body == "rod":
+        return _rod(observations, settings, run, pool, leave_out, device, threads)
     shared = (settings.simulation, settings.losses, settings.released_quirks, device)
     problem = SearchProblem(
         observations,
@@ -90,6 +94,31 @@ def search(
     if held := at_ends(result.trace, problem.variables):
         facts["at_ends"] = ", ".join(held)
     return Written(files=files, facts=facts, attempts=result.attempts, earlier_seconds=result.earlier_seconds)
+
+
+def _rod(
+    observations: Observations,
+    settings: Config,
+    run: Recorder,
+    pool: Sequence[Observations],
+    leave_out: bool,
+    device: str,
+    threads: int,
+) -> Written:
+    """The search of a rod; files as of a lattice."""
+    from neuspring.core.files import write_history, write_table
+    from neuspring.twin.rod_fit import search_rod
+    from neuspring.twin.transfer import require_pool
+
+    require_pool(observations, pool, leave_out)
+    files = run.beside(twin="twin.npz", trace="trace.parquet", history="history.parquet")
+    result = search_rod(observations, pool, settings, leave_out=leave_out, device=device, threads=threads)
+    result.twin.save(files["twin"])
+    write_table(result.history, files["trace"])
+    costs = result.history["loss"]
+    write_history(costs.index, {"cost": costs, "best_cost": costs.cummin()}, files["history"])
+    facts = {"cost": result.value, "rollouts": result.rollouts, "collision_overflow": 0, **result.facts, **result.twin.counts}
+    return Written(files=files, facts=facts)
 
 
 def launch_size(twins_per_launch: int | Literal["auto"]) -> int:

@@ -10,6 +10,7 @@ One that springs pull has 1 kg per node, as a lattice has, so that the searched 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +19,7 @@ from neuspring import config
 from neuspring.config.search import VARIABLES
 from neuspring.core.artifacts import Observations, Rod, Simulation, Twin
 from neuspring.core.errors import InputError
-from neuspring.physics.rod_nodes import bind, bound, frame_zero, radius_of
+from neuspring.physics.rod_nodes import bind, bound, frame_zero, place_on, radius_of, settled
 from neuspring.twin.candidates import homogeneous
 from neuspring.twin.topology import build, controller_reach, controller_springs, node_spacing
 
@@ -43,8 +44,8 @@ PENALTY = 1e-3
 """Of the spline's second differences, where the mean weight of a piece's points is 1."""
 
 
-def rod_twin(observations: Observations, settings: config.Config) -> Twin:
-    """The rod that a fit starts from (`settings.rod`), on the body of a recording in frame 0.
+def rod_twin(observations: Observations, settings: config.Config, axis: Sequence[float]) -> Twin:
+    """The rod that a fit starts from (`settings.rod`), on the body of a recording in frame 0; `axis` [3]: see `Rod`.
 
     Springs of controllers and all scalars have the starts of `search.variables`, as a lattice's search does, but the linear drag of
     `rod`. Raises InputError if the body is not long and thin, or nothing holds it.
@@ -68,7 +69,7 @@ def rod_twin(observations: Observations, settings: config.Config) -> Twin:
     own = np.convolve(lengths, [0.5, 0.5])
     density = len(nodes) / lengths.sum() if len(pairs) else 1.0
     mass = density * own if len(pairs) else own + start.marker_mass
-    axis = np.array(start.axis) if (held >= 0).any() else np.eye(3)[np.abs(vertices[1] - vertices[0]).argmin()]
+    direction = np.array(axis, np.float64) if (held >= 0).any() else np.eye(3)[np.abs(vertices[1] - vertices[0]).argmin()]
     rod = Rod(
         vertices=vertices,
         held=held,
@@ -81,13 +82,13 @@ def rod_twin(observations: Observations, settings: config.Config) -> Twin:
         damping=start.damping,
         drag_quadratic=start.drag_quadratic,
         roll=start.roll,
-        axis=axis,
+        axis=direction,
         edge=np.zeros(0, np.int32),
         place=np.zeros((0, 3)),
     )
     if start.rest == "first_frame":
         rod = replace(rod, curvature=frame_zero(rod)[1])
-    rod = bound(rod, nodes)
+    rod = _bound(rod, observations)
     values = {name: float(getattr(variables, name).start) for name in VARIABLES}
     values |= {"drag": start.drag, "contact_distance": max(radius_of(rod), 0.05 * float(lengths.mean()))}
     frame_time, substeps = 1.0 / scenario.frame_rate, settings.simulation.substeps
@@ -141,8 +142,31 @@ def on_recording(twin: Twin, observations: Observations) -> Twin:
     if abs(found - 1) > MOST_STRETCH:
         rule = f"the center line must be as long as the twin's within {MOST_STRETCH:.0%}: {rod.lengths.sum():.3f} m"
         raise InputError(where, rule, f"{found * rod.lengths.sum():.3f} m", "Name a recording of the same body.")
-    moved = replace(rod, vertices=vertices, held=held)
-    return replace(twin, topology=topology, material=material, rod=bound(moved, nodes))
+    moved = replace(rod, held=held, vertices=settled([rod], vertices[None])[0])
+    return replace(twin, topology=topology, material=material, rod=_bound(moved, observations))
+
+
+def of_markers(twin: Twin, observations: Observations) -> Twin:
+    """The same for a body whose line is observed, with tracked points as its only nodes; they are not yet settled or bound."""
+    rod, line = twin.rod, observations.line
+    assert rod is not None
+    hands, nodes = observations.controller_points[0], observations.object_points[0]
+    edge = np.zeros(len(nodes), np.int32)
+    edge[line[line < len(nodes)]] = np.flatnonzero(line < len(nodes))
+    topology = build(nodes, hands, np.zeros((0, 2), np.int32))
+    own = replace(rod, vertices=line_of(observations), edge=edge, place=np.zeros((len(nodes), 3)))
+    return replace(twin, topology=topology, rod=own)
+
+
+def _bound(rod: Rod, observations: Observations) -> Rod:
+    """The rod with all nodes of a recording; those of an observed line follow the edge behind their vertex."""
+    line, nodes = observations.line, observations.nodes
+    found = bound(rod, nodes)
+    if not line.size:
+        return found
+    edge, own = found.edge.copy(), line < len(nodes)
+    edge[line[own]] = np.minimum(np.flatnonzero(own), len(line) - 2)
+    return replace(found, edge=edge, place=place_on(rod.vertices, frame_zero(rod)[0], nodes, edge))
 
 
 def _line(observations: Observations) -> np.ndarray | None:

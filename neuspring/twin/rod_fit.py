@@ -1,0 +1,359 @@
+"""Fit of a rod to whole recordings: Levenberg-Marquardt in everything that is unknown of a cable, through rising horizons.
+
+With errors e of all coordinates of tracked points in the frames of the horizon, and variables q with start 0 and scale s, it lowers
+
+    mean(sqrt(e^2 + b^2) - b) + PRIOR sum((q / s)^2).
+
+Derivatives are finite differences: a rollout per variable and recording, all of them lanes of one solver in double precision.
+Positive numbers are varied on logarithmic scales, and those along the arc as fields (`RodFit`) or joint by joint.
+
+Markers lie beside the center line of a cable, by 1 to 2 cm. How far (`Rod.offsets`, `Rod.clamps`) and the unloaded lengths are
+variables too: without them held ends are in a wrong place, and distances between markers change as the cable bends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from neuspring import config
+from neuspring.config.rod import RodFit
+from neuspring.core.artifacts import Observations, Rod, Twin
+from neuspring.core.errors import NumericalFailure
+from neuspring.core.text import Progress
+from neuspring.physics.rod_nodes import RodFrames, settled, turn_of
+from neuspring.twin import rod as rods
+from neuspring.twin.losses import frames_seen
+from neuspring.twin.polish import damped_step
+from neuspring.twin.rollout import initial_velocity
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from neuspring.twin.fit import FitProblem
+
+PRIOR = 1e-6
+"""Weight of the variables' squares, m: they decide where recordings say nothing."""
+STEP = 5e-3
+"""Step of the finite differences, in scales."""
+FARTHEST = 2.0
+"""Largest error of a coordinate that counts, m: what left the scene."""
+LEAST_GAIN = 2e-3
+"""A step that lowers the objective by less than this part of it is a stage's last."""
+DAMPINGS = (0.1, 1.0, 10.0, 100.0)
+"""What the damping is multiplied with, for each step that is tried."""
+FIRST_DAMPING, MOST_DAMPING = 1e-2, 1e6
+LANES = 512
+"""Rollouts that run in one solver at most."""
+SCALES = {
+    "bending": 1.0, "twisting": 1.0, "damping": 1.0, "drag": 1.0, "drag_quadratic": 1.0, "marker_mass": 1.0, "hands": 1.0,
+    "dashpots": 1.0, "roll": 1.0, "curvature": 0.3, "bending_along": 0.5, "twisting_along": 0.5, "clamps": 0.02, "offsets": 0.01,
+    "stretch": 0.01,
+}  # fmt: skip
+"""Scale of each kind of variable: of logarithms, rad, curvatures (1), and m."""
+
+
+@dataclass(frozen=True)
+class Variables:
+    """What is varied of a twin, as one vector q [Q], 0 at the start."""
+
+    twin: Twin
+    sizes: dict[str, int]
+    stiffness_along: np.ndarray
+    """Basis [V, n] of log EI and log GJ along the arc."""
+    curvature_along: np.ndarray
+    """Basis [V, n] of k1 and k2 over the joint's length, along the arc."""
+
+    @classmethod
+    def of(cls, twin: Twin, settings: RodFit) -> Variables:
+        """The variables of a fit."""
+        rod, held = _rod(twin), _rod(twin).held >= 0
+        joints = len(held) - 2
+        along = _basis(rod, {"constant": "none"}.get(settings.stiffness, settings.stiffness), settings.knots)
+        bent = _basis(rod, {"straight": "none"}.get(settings.curvature, settings.curvature), settings.knots)
+        if settings.curvature != "free":
+            # A field of the curvature per length.
+            bent = bent * (rod.spans / rod.spans[1:-1].mean())[:, None]
+        clamped = bool(held[:2].all() and held[-2:].all())
+        sizes = dict.fromkeys(("bending", "twisting", "damping", "drag", "drag_quadratic"), 1)
+        sizes |= {"marker_mass": 1} if held.any() else {"hands": 1, "dashpots": 1}
+        sizes |= {"roll": int(clamped), "curvature": 2 * bent.shape[1]}
+        sizes |= {"bending_along": along.shape[1], "twisting_along": along.shape[1]}
+        if settings.markers and clamped:
+            sizes |= {"clamps": 6, "offsets": 2 * int((~held).sum()), "stretch": joints - 1}
+        return cls(twin, {name: size for name, size in sizes.items() if size}, along, bent)
+
+    @property
+    def scale(self) -> np.ndarray:
+        """Scale of each variable [Q]."""
+        return np.concatenate([np.full(size, SCALES[name]) for name, size in self.sizes.items()])
+
+    def part(self, q: np.ndarray, name: str) -> np.ndarray:
+        """The variables of one kind; zeros where they are not varied."""
+        begin = 0
+        for kind, size in self.sizes.items():
+            if kind == name:
+                return q[begin : begin + size]
+            begin += size
+        return np.zeros(1)
+
+    def made(self, q: np.ndarray) -> Twin:
+        """The twin of variables q [Q]."""
+        start, twin = _rod(self.twin), self.twin
+        factor = {name: float(np.exp(self.part(q, name)[0])) for name in SCALES if SCALES[name] == 1.0}
+        bending, twisting = (start.bending * factor["bending"], start.twisting * factor["twisting"])
+        if self.stiffness_along.shape[1]:
+            bending = bending * np.exp(self.stiffness_along @ self.part(q, "bending_along"))
+            twisting = twisting * np.exp(self.stiffness_along @ self.part(q, "twisting_along"))
+        changes: dict[str, Any] = {"bending": bending, "twisting": twisting, "roll": start.roll + float(self.part(q, "roll")[0])}
+        changes |= {name: getattr(start, name) * factor[name] for name in ("damping", "drag_quadratic")}
+        if self.curvature_along.shape[1]:
+            coefficients = self.part(q, "curvature").reshape(2, -1)
+            changes["curvature"] = start.curvature + (self.curvature_along @ coefficients.T)
+        lengths = start.lengths.copy()
+        if "clamps" in self.sizes:
+            free = start.held < 0
+            lengths[1:-1] = np.maximum(lengths[1:-1] + self.part(q, "stretch"), 0.1 * lengths[1:-1])
+            offsets = np.zeros((len(free), 2)) if not start.offsets.size else start.offsets.copy()
+            offsets[free] += self.part(q, "offsets").reshape(-1, 2)
+            clamps = start.clamps + self.part(q, "clamps").reshape(2, 3)
+            changes |= {"lengths": lengths, "offsets": offsets, "clamps": clamps}
+        if "marker_mass" in self.sizes:
+            before, own = (np.convolve(each, [0.5, 0.5]) for each in (start.lengths, lengths))
+            changes["mass"] = own + (start.mass - before) * factor["marker_mass"]
+        material = replace(twin.material, drag=twin.material.drag * factor["drag"])
+        if "hands" in self.sizes:
+            material = replace(
+                material, stiffness=material.stiffness * factor["hands"], dashpot=material.dashpot * factor["dashpots"]
+            )
+        return replace(twin, material=material, rod=replace(start, **changes))
+
+
+def _rod(twin: Twin) -> Rod:
+    assert twin.rod is not None
+    return twin.rod
+
+
+def _basis(rod: Rod, kind: str, knots: int) -> np.ndarray:
+    """Functions along the arc at the vertices [V, n]: none, one per inner joint, or cubic splines between knots."""
+    joints = len(rod.mass) - 2
+    if kind == "none":
+        return np.zeros((joints + 2, 0))
+    if kind == "free":
+        return np.eye(joints + 2)[:, 1:-1]
+    if kind == "constant":
+        return np.ones((joints + 2, 1))
+    from scipy.interpolate import CubicSpline
+
+    arc = np.concatenate([[0.0], np.cumsum(rod.lengths)])
+    basis = CubicSpline(np.linspace(arc[1], arc[-2], knots), np.eye(knots), bc_type="natural")(np.clip(arc, arc[1], arc[-2]))
+    return np.asarray(basis)
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """Tracked points and hands of C recordings of one body, padded to as many frames."""
+
+    observations: tuple[Observations, ...]
+    hands: torch.Tensor
+    """[T, C, hands, 3], m."""
+    points: np.ndarray
+    """Tracked points [C, T, No, 3], m."""
+    counts: np.ndarray
+    """Whether a point is seen in a training frame [C, T, No]."""
+    velocities: tuple[np.ndarray, ...]
+    """Of tracked points or of all nodes in frame 0, m/s."""
+
+    @classmethod
+    def of(cls, observations: Sequence[Observations], twin: Twin, oracle: bool = False) -> Recordings:
+        """Recordings with as many tracked points and hands each; frames before the split, or all for an oracle."""
+        frames = [frames_seen(each, oracle=oracle) for each in observations]
+        rows = [np.minimum(np.arange(max(frames)), end - 1) for end in frames]
+        pairs = list(zip(observations, rows, strict=True))
+        inside = [np.arange(max(frames)) < end for end in frames]
+        counts = [each.object_visibility[index] & known[:, None] for (each, index), known in zip(pairs, inside, strict=True)]
+        return cls(
+            tuple(observations),
+            torch.tensor(np.stack([each.controller_points[index] for each, index in pairs], axis=1)),
+            np.stack([each.object_points[index] for each, index in pairs]).astype(np.float64),
+            np.stack(counts),
+            tuple(initial_velocity(each, twin.simulation.initial_velocity) for each in observations),
+        )
+
+    def bodies(self, twins: Sequence[Twin]) -> list[Twin]:
+        """Each twin in frame 0 of each recording. Of a cable that clamps hold, tracked points are the only nodes."""
+        pairs = [(twin, each) for twin in twins for each in self.observations]
+        if len(twins[0].topology.springs):
+            return [rods.on_recording(twin, each) for twin, each in pairs]
+        moved = [rods.of_markers(twin, each) for twin, each in pairs]
+        vertices = settled([_rod(twin) for twin in moved], np.stack([_rod(twin).vertices for twin in moved]))
+        return [replace(twin, rod=replace(_rod(twin), vertices=x)) for twin, x in zip(moved, vertices, strict=True)]
+
+    def predicted(self, twins: Sequence[Twin], frames: int, every: int, device: str) -> np.ndarray:
+        """Tracked points [K, C, frames kept, No, 3], m, of K twins: frames 1, 1 + every, ... below `frames`."""
+        count, tracked = len(self.observations), self.points.shape[2]
+        bodies = self.bodies(twins)
+        solver = RodFrames(bodies, device)
+        x = torch.tensor(np.stack([body.topology.nodes for body in bodies]))
+        nodes = x.shape[1]
+        v = torch.tensor(np.stack([v[:nodes] for _ in twins for v in self.velocities]), dtype=torch.float32)
+        kept = []
+        for frame in range(1, frames):
+            begin, end = (self.hands[row].repeat(len(twins), 1, 1) for row in (frame - 1, frame))
+            x, v = solver.forward(x, v, begin, end)
+            if (frame - 1) % every == 0:
+                kept.append(solver.nodes()[0][:, :tracked].cpu())
+        found = torch.stack(kept, dim=1).reshape(len(twins), count, len(kept), tracked, 3).numpy()
+        return np.nan_to_num(found, nan=FARTHEST * 10, posinf=FARTHEST * 10, neginf=-FARTHEST * 10)
+
+
+class Levenberg:
+    """Lowers the objective of some variables on some recordings."""
+
+    def __init__(self, recordings: Recordings, settings: RodFit, device: str = "cpu", threads: int = 1) -> None:
+        self.recordings, self.settings, self.device, self.threads = recordings, settings, device, threads
+        self.rollouts = 0
+
+    def errors(self, variables: Variables, qs: Sequence[np.ndarray], frames: int, every: int) -> np.ndarray:
+        """Errors [K, R], m, of K candidates in all coordinates that count."""
+        recordings, kept = self.recordings, slice(1, frames, every)
+        size = max(LANES // len(recordings.observations), 1)
+        parts = np.array_split(np.arange(len(qs)), max(-(-len(qs) // size), min(self.threads, len(qs))))
+
+        def one(part: np.ndarray) -> np.ndarray:
+            found = recordings.predicted([variables.made(qs[k]) for k in part], frames, every, self.device)
+            apart = np.clip(found - recordings.points[None, :, kept], -FARTHEST, FARTHEST)
+            return apart[:, recordings.counts[:, kept]].reshape(len(part), -1)
+
+        self.rollouts += len(qs) * len(recordings.observations)
+        with ThreadPoolExecutor(max(self.threads, 1)) as pool:
+            return np.concatenate(list((pool.map if self.threads > 1 else map)(one, parts)))
+
+    def objective(self, errors: np.ndarray, q: np.ndarray, scale: np.ndarray) -> np.ndarray:
+        """Of candidates: errors [K, R] and variables [K, Q]; m."""
+        b = self.settings.robust
+        value: np.ndarray = np.mean(np.sqrt(errors**2 + b**2) - b, axis=-1) + PRIOR * ((q / scale) ** 2).sum(axis=-1)
+        return value
+
+    def lowered(self, twin: Twin, progress: Progress) -> tuple[Twin, float, list[dict[str, Any]]]:
+        """The twin after the stages of the settings, its objective on all frames, m, and a row per step."""
+        variables, history = Variables.of(twin, self.settings), list[dict[str, Any]]()
+        q, end = np.zeros(len(variables.scale)), self.recordings.points.shape[1]
+        for horizon in self.settings.horizons:
+            frames = min(horizon + 1, end) if horizon else end
+
+            def report(row: dict[str, float], frames: int = frames) -> None:
+                history.append(row | {"stage": str(frames - 1)})
+                progress.update(len(history), f"{frames - 1} frames, error {1e3 * row['loss'] ** 0.5:.1f} mm")
+
+            q = self.stage(variables, q, frames, report)
+        last = self.errors(variables, [q], frames, self.settings.every)
+        return variables.made(q), float(self.objective(last, q, variables.scale)[0]), history
+
+    def stage(self, variables: Variables, q: np.ndarray, frames: int, report: Callable[[dict[str, float]], None]) -> np.ndarray:
+        """Steps on the first frames, from q. `report` gets a row after each."""
+        every = self.settings.every
+        if frames <= 30 * every:
+            every = max(every // 2, 1)
+        scale, b, damping = variables.scale, self.settings.robust, FIRST_DAMPING
+        errors = self.errors(variables, [q], frames, every)[0]
+        value = float(self.objective(errors, q, scale))
+        for _ in range(self.settings.rounds):
+            steps = np.diag(STEP * scale)
+            # In the units of their scales, so that bounds and damping mean the same for all.
+            slopes = (self.errors(variables, list(q + steps), frames, every) - errors) / STEP
+            weights = 1 / np.sqrt(errors**2 + b**2) / len(errors)
+            products = (slopes * weights) @ slopes.T + 2 * PRIOR * np.eye(len(q))
+            gradient = slopes @ (weights * errors) + 2 * PRIOR * q / scale
+            bound = np.ones(len(q))
+            while damping <= MOST_DAMPING:
+                tried = [q + scale * damped_step(products, gradient, damping * factor, -bound, bound) for factor in DAMPINGS]
+                found = self.errors(variables, tried, frames, every)
+                values = self.objective(found, np.array(tried), scale)
+                best = int(np.argmin(values))
+                if values[best] < value:
+                    break
+                damping *= DAMPINGS[-1] * 10
+            else:
+                return q
+            gain = (value - float(values[best])) / value
+            q, errors, value = tried[best], found[best], float(values[best])
+            damping = max(damping * DAMPINGS[best], 1e-6)
+            report(
+                {"loss": float(3 * np.mean(errors**2)), "gradient_norm": float(np.linalg.norm(gradient)), "learning_rate": damping}
+            )
+            if gain < LEAST_GAIN:
+                break
+        return q
+
+
+@dataclass(frozen=True)
+class RodResult:
+    """The best rod, and how it was found."""
+
+    twin: Twin
+    value: float
+    """The objective at the end, m."""
+    history: pd.DataFrame
+    """A row per step: stage, loss (mean squared error of the horizon's frames, m^2), gradient_norm, learning_rate (the damping)."""
+    rollouts: int
+    facts: dict[str, Any]
+    """What a reader of the record wants to know of the rod."""
+
+
+def search_rod(
+    observations: Observations,
+    pool: Sequence[Observations],
+    settings: config.Config,
+    *,
+    leave_out: bool = False,
+    device: str = "cpu",
+    threads: int = 1,
+) -> RodResult:
+    """The constants of a rod, on the frames of the first horizon.
+
+    A turn of the last clamp against the first is known but for whole turns. Of `rod.axes` that axis is taken for which turns in
+    frame 0 of the recordings lie farthest from half a turn, where recordings of one body would be told apart by a whole one.
+    """
+    first = replace(settings.fit.rod, stiffness="constant", curvature="constant", markers=False)
+    first = replace(first, horizons=first.horizons[:1])
+    seen = [] if leave_out else [observations]
+    lines = [rods.line_of(each) for each in [*seen, *pool] if each.line.size]
+    axis = max(settings.rod.axes, key=lambda axis: sum(np.cos(turn_of(line, np.array(axis))) for line in lines))
+    start = rods.rod_twin(observations, settings, axis)
+    solver = Levenberg(_recordings(observations, pool, leave_out, start), first, device, threads)
+    twin, value, history = solver.lowered(start, Progress(f"search {observations.scenario.name}, rod", first.rounds))
+    return _result(twin, value, history, solver.rollouts)
+
+
+def fit_rod(problem: FitProblem, threads: int = 1) -> RodResult:
+    """All variables of a rod, stage by stage, from the twin of its search. Raises NumericalFailure."""
+    settings = problem.fit.rod
+    recordings = _recordings(problem.observations, problem.pool, problem.leave_out, problem.twin, oracle=problem.oracle)
+    solver = Levenberg(recordings, settings, problem.device, threads)
+    progress = Progress(f"fit {problem.observations.scenario.name}, rod", settings.rounds * len(settings.horizons))
+    twin, value, history = solver.lowered(problem.twin, progress)
+    return _result(twin, value, history, solver.rollouts)
+
+
+def _recordings(
+    observations: Observations, pool: Sequence[Observations], leave_out: bool, twin: Twin, oracle: bool = False
+) -> Recordings:
+    return Recordings.of([*([] if leave_out else [observations]), *pool], twin, oracle)
+
+
+def _result(twin: Twin, value: float, history: list[dict[str, Any]], rollouts: int) -> RodResult:
+    import pandas as pd
+
+    if not history or not np.isfinite(value):
+        raise NumericalFailure(f"no step lowers the error of the rod from its start ({value:.3g} m)")
+    rod = _rod(twin)
+    inner = slice(1, -1)
+    facts = {name: float(np.median(getattr(rod, name)[inner])) for name in ("bending", "twisting", "mass")}
+    facts |= {name: float(getattr(rod, name)) for name in ("damping", "drag_quadratic", "roll")}
+    return RodResult(twin, value, pd.DataFrame(history), rollouts, facts | {"drag": twin.material.drag, "axis": rod.axis.tolist()})
