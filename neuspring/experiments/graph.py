@@ -113,17 +113,15 @@ class Graph:
 
     def study_runs(self, name: str) -> list[str]:
         """The records that a study is made of."""
-        methods, clips = self.benchmark.methods_of(name), self.benchmark.studies[name].clips
-        return [*self.runs(methods), *(self.transfers(methods) if clips else ())]
+        moved = self.transfers() if self.benchmark.studies[name].clips else ()
+        return [*self.runs(self.benchmark.methods_of(name)), *moved]
 
-    def transfers(self, some: Sequence[str] | None = None) -> list[str]:
-        """Records of transfers: per source, method (of some) and seed. Oracles, of their own recording alone, have none."""
+    def transfers(self) -> list[str]:
+        """Records of transfers: per source, method and seed. Oracles concern their own recording alone, and are not transferred."""
         methods = [
             name
             for name, method in self.benchmark.methods.items()
-            if (some is None or name in some)
-            and (method.search or (method.model and BASELINES[method.model].transfers))
-            and not method.oracle
+            if (method.search or (method.model and BASELINES[method.model].transfers)) and not method.oracle
         ]
         return [
             self._output("transfer", scenario=scenario, method=method, seed=seed)

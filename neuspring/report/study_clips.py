@@ -102,9 +102,9 @@ class Clips:
         return record.file(role, path) if record and role in record.files else None
 
     def filmed(self, cable: str) -> list[Painter]:
-        """Who paints the best, the median and the worst clip of a cable, of the row that is filmed; empty where none is kept."""
+        """Who paints the best, the median and the worst clip of a cable: by the baseline, else the last row that kept any."""
         here = self.clips[self.clips["cable"] == cable].sort_values("l1_mm")
-        for label in dict.fromkeys([self.study.filmed or self.study.baseline, self.study.baseline, *self.study.rows]):
+        for label in dict.fromkeys([self.study.baseline, *reversed(self.study.rows)]):
             for run in self.records[self.records["label"] == label].sort_values("seed").itertuples():
                 part = here[(here["source"] == run.scenario) & (here["seed"] == run.seed) & (here["label"] == label)]
                 if len(part) and (path := self._file(run, "lines")):

@@ -152,17 +152,13 @@ class Study:
     """A study of the same labels whose numbers this one shows next to its own: the same rows, trained in another way."""
     clips: bool = False
     """Whether the table is of twins on other recordings (`transfers`): a column per category, for example a cable. Published rows
-    stand above ours, under labels of their own."""
-    filmed: str | None = None
-    """Of a study of clips: the label of the row that its film shows; null: the baseline."""
+    stand above ours, under labels of their own. Its films show the baseline."""
 
     def __post_init__(self) -> None:
         if self.baseline not in self.rows:
             raise ValueError(f"baseline: must be a label of rows ({', '.join(self.rows)}), received {self.baseline!r}")
         if len(set(self.rows.values())) != len(self.rows):
             raise ValueError(f"rows: methods must differ, received {list(self.rows.values())}")
-        if self.filmed is not None and not (self.clips and self.filmed in self.rows):
-            raise ValueError(f"filmed: must be a label of rows, in a study of clips, received {self.filmed!r}")
         if self.reference is None:
             return
         known = (CLIPS,) if self.clips else tables()

@@ -25,8 +25,7 @@ VALUES = {
     "title": "T",
     "reference": "deform_published",
     "clips": True,
-    "baseline": "Field",
-    "filmed": "Rod",
+    "baseline": "Rod",
     "training": "Choices were made on training clips",
     "rows": {"Field": "model_b_pooled", "Rod": "rod", "Residual": "rod_residual"},
 }
@@ -51,10 +50,9 @@ def test_published_numbers_keep_their_digits_their_sources_and_what_the_tag_mean
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"clips": False, "filmed": None}, "reference: must be null or one of table1_comparison"),
+        ({"clips": False}, "reference: must be null or one of table1_comparison"),
         ({"reference": "table2_ablation"}, "reference: must be null or one of deform_published"),
-        ({"filmed": "Snake"}, "filmed: must be a label of rows"),
-        ({"clips": False, "reference": None}, "filmed: must be a label of rows, in a study of clips"),
+        ({"baseline": "Snake"}, "baseline: must be a label of rows"),
     ],
 )
 def test_a_wrong_study_of_clips_is_refused(change, message):
@@ -144,7 +142,7 @@ def test_the_film_shows_the_best_the_median_and_the_worst_clip_of_the_chosen_row
         "Field, best: DLO3_eval_a, L1 2.0 mm",
         "Field, median: DLO3_eval_c, L1 4.0 mm",
         "Field, worst: DLO3_eval_b, L1 6.0 mm",
-    ], "the baseline where the rod has not run"
+    ], "the last row that ran, where the baseline has not"
     write_transfer(tmp_path, "DLO3", "rod", 0, {"DLO3_eval_a": 0.002, "DLO3_eval_b": 0.006})
     painters = found(tmp_path).filmed("DLO3")
     assert [painter.takes[0].label for painter in painters] == [

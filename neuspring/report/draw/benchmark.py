@@ -162,30 +162,23 @@ def _draw(axis: Axes, curves: pd.DataFrame, *, faint: bool = False) -> None:
             axis.errorbar(part["clusters"], part["mean"], bars, color=color, marker=marker, ms=4, capsize=3, label=task)
 
 
-ACROSS = 3
-"""Panels in a row of `growth_figure`."""
-
-
 def growth_figure(growth: pd.DataFrame, labels: Sequence[str]) -> Figure:
     """Draw the mean error of free markers over time, a panel per cable, from rows cable, label, seconds, euclid_mm.
 
     A row of the table has its color by its place in `labels`, whichever of them are there.
     """
     cables, shown = list(dict.fromkeys(growth["cable"])), [label for label in labels if label in set(growth["label"])]
-    columns, rows = min(len(cables), ACROSS), -(-len(cables) // ACROSS)
-    size = (3.2 * columns + 0.6, 2.5 * rows + 0.8)
-    figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False, sharex=True, sharey=True)
+    size = (2.6 * len(cables) + 0.6, 3.0)
+    figure, axes = plt.subplots(1, len(cables), figsize=size, layout="constrained", squeeze=False, sharex=True, sharey=True)
     colors = plt.get_cmap("tab10" if len(labels) <= 10 else "tab20")
     handles = [Line2D([], [], color=colors(labels.index(label)), label=label) for label in shown]
-    for axis, cable in zip(axes.flat, cables, strict=False):
+    for axis, cable in zip(axes[0], cables, strict=True):
         for label in shown:
             part = growth[(growth["cable"] == cable) & (growth["label"] == label)].sort_values("seconds")
             axis.plot(part["seconds"], part["euclid_mm"], color=colors(labels.index(label)), lw=1.2)
         axis.set(title=cable, xlim=(0, growth["seconds"].max()), ylim=(0, None))
         axis.grid(color="0.92")
-    for axis in axes.flat[len(cables) :]:
-        axis.set_visible(False)
     figure.supxlabel("time [s]", fontsize=9)
     figure.supylabel("error of free markers [mm]", fontsize=9)
-    figure.legend(handles=handles, loc="outside upper center", ncols=min(len(shown), 4), frameon=False, fontsize=8)
+    figure.legend(handles=handles, loc="outside upper center", ncols=min(len(shown), 2 * len(cables)), frameon=False, fontsize=8)
     return figure
