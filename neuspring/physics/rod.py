@@ -47,6 +47,7 @@ real = wp.float64
 vec3 = wp.vec3d
 vec2 = wp.vec2d
 mat33 = wp.mat33d
+Row: Any = wp.types.vector(length=11, dtype=wp.float64)
 Scalars: Any = wp.array2d(dtype=real)
 Vectors: Any = wp.array2d(dtype=vec3)
 Pairs: Any = wp.array2d(dtype=vec2)
@@ -237,7 +238,7 @@ def set_geometry(s: Lanes, lane: int, edges: int):
         s.kb[lane, i] = (real(2.0) / (real(1.0) + wp.dot(before, t) + TINY)) * wp.cross(before, t)
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def begin(s: Lanes):
     """Directors and twist of frame 0 at the positions x."""
     lane = wp.tid()
@@ -459,30 +460,39 @@ def set_known(s: Lanes, lane: int, row: int, rows: int):
 
 @wp.func
 def solve(s: Lanes, lane: int, rows: int):
-    """Banded Cholesky in place; the solution is in b."""
+    """Banded Cholesky in place, with inverse diagonals; the solution is in b. A row is in registers, and its loops are unrolled."""
     for i in range(rows):
-        first = wp.max(0, i - BAND + 1)
-        for j in range(first, i + 1):
-            value = s.a[lane, i, i - j]
-            for k in range(wp.max(first, j - BAND + 1), j):
-                value = value - s.a[lane, i, i - k] * s.a[lane, j, j - k]
-            if j == i:
-                s.a[lane, i, 0] = wp.sqrt(wp.max(value, TINY))
-            else:
-                s.a[lane, i, i - j] = value / s.a[lane, j, 0]
+        row = Row()
+        for q in range(11):
+            row[q] = s.a[lane, i, q]
+        square = row[0]
         value = s.b[lane, i]
-        for k in range(first, i):
-            value = value - s.a[lane, i, i - k] * s.b[lane, k]
-        s.b[lane, i] = value / s.a[lane, i, 0]
+        for left in range(10):
+            q = 10 - left
+            j = i - q
+            if j >= 0:
+                entry = row[q]
+                for p in range(1, 11):
+                    if q + p < 11:
+                        entry = entry - row[q + p] * s.a[lane, j, p]
+                entry = entry * s.a[lane, j, 0]
+                row[q] = entry
+                s.a[lane, i, q] = entry
+                square = square - entry * entry
+                value = value - entry * s.b[lane, j]
+        inverse = real(1.0) / wp.sqrt(wp.max(square, TINY))
+        s.a[lane, i, 0] = inverse
+        s.b[lane, i] = value * inverse
     for back in range(rows):
         i = rows - 1 - back
-        value = s.b[lane, i]
-        for k in range(i + 1, wp.min(rows, i + BAND)):
-            value = value - s.a[lane, k, k - i] * s.b[lane, k]
-        s.b[lane, i] = value / s.a[lane, i, 0]
+        value = s.b[lane, i] * s.a[lane, i, 0]
+        s.b[lane, i] = value
+        for q in range(1, 11):
+            if i >= q:
+                s.b[lane, i - q] = s.b[lane, i - q] - s.a[lane, i, q] * value
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def advance(
     s: Lanes,
     held_from: Vectors,
