@@ -44,6 +44,9 @@ _LEFT = {
         bending_reach homogeneous_epochs fit.warmup_epochs schedule fit.clip_gradient_norm weight_decay rest_lengths_by field.scale
         field.controllers rest_length_bound rest_prior rest_learning_rate
     """,
+    "removed, marks serve such scenes (segment.backend: marks); commit a72d24c is the last that has it": """
+        opencv.boxes opencv.table opencv.sleeves opencv.clutter opencv.object opencv.thin
+    """,
     "removed: splats follow the nodes that are nearest in each frame": "frozen_skinning",
     "now losses of the whole configuration": "losses",
     "now color_rate": "colour_rate",

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.parse import Count, Finite, Name, NonNegative, Positive, Range, Section
+from neuspring.config.parse import Count, NonNegative, Positive, Range, Section
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,20 +20,6 @@ class OpenCvSegmentation(Section):
     """Hue of hands or gloves in Lab, degrees (atan2(b, a)); the default is skin."""
     hand_chroma: Range = (9.0, 36.0)
     """Chroma of hands or gloves in Lab."""
-    boxes: dict[Name, tuple[Finite, Finite, Finite, Finite]] = field(default_factory=dict)
-    """Region of interest: by camera, left, top, right and bottom, pixels. Cameras that are not named have none."""
-    table: tuple[Range, Range] | None = None
-    """Region of interest: ranges of x and y on the table, m in the world; null: everywhere."""
-    sleeves: bool = False
-    """What moves, touches a hand and reaches the border of the image is hand too, whatever its color."""
-    clutter: Literal["keep", "drop"] = "keep"
-    """drop: what never moves and is not held is not the object."""
-    object: Literal["all", "largest", "moving", "nearest_hand"] = "all"
-    """Which of several pieces of frame 0, and what overlaps with it later. all: every one. moving: the one with most pixels that
-    change during the video."""
-    thin: bool = False
-    """For ropes of a few pixels: nothing is opened, neighbors decide the border less than in GrabCut, and what is wider than a rope
-    and touches a hand is hand."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,29 +5,24 @@
 2. Per frame, the log ratio of both and the height make seeds, and GrabCut draws the border.
 3. Foreground is divided into hands and object by the same kind of ratio. The hands' histogram starts from skin tones and is made
    again from the hands that these show. Only pieces of some size are hands.
-4. Where settings ask for it, pieces are judged over the whole video: sleeves, clutter that never moves, which of several is the
-   object.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
-from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.ndimage import gaussian_filter
 
 from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
-from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture
-from neuspring.perception.frames import frames_of, gray, heights, spread
+from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.perception.frames import frames_of, heights, spread
 from neuspring.perception.marks.colors import bins_of, count, lab_of
-from neuspring.perception.marks.solve import solve
 
 BINS = (12, 64, 64)
 """Bins of L, a and b."""
 SAMPLED_FRAMES = 24
-"""How many frames the histograms are made from, and from which it is learned which pixels change."""
+"""How many frames the histograms are made from."""
 BORDER = 0.08
 """Part of the image, at each side, that is taken for the table."""
 SMOOTHING = 1.0
@@ -51,22 +46,6 @@ DECISION = 1.5
 SMALLEST = 0.0004
 """Smallest area of a piece, as part of the image; smaller ones join what surrounds them."""
 SPECK = np.ones((3, 3), np.uint8)
-THIN_WIDTH = 7
-"""What is as wide, pixels, is no thin rope."""
-THIN_HAND_PIECE = 0.03
-"""HAND_PIECE where the object is a thin rope: no part of it is as large as what is seen of a hand."""
-THIN_COLOR, THIN_SMOOTHNESS = 4.0, 0.5
-"""Largest log odds of a color, and smoothness of the field of labels, for thin ropes."""
-CHANGES = 24
-"""Range of gray over the video from which a pixel changes."""
-MOVING = 0.1
-"""Part of a piece's pixels that change, from which it moves."""
-CONTACT = 5
-"""Distance, pixels, within which things touch."""
-BREAK = 0.03
-"""Step of depth, m, that divides pieces which touch in the image alone."""
-BORDER_RUN = 4
-"""Pixels at the image's border from which a piece reaches it."""
 
 
 def require(capture: Capture) -> None:
@@ -85,7 +64,7 @@ def segment(capture: Capture, camera: str, settings: OpenCvSegmentation) -> np.n
     labels = np.zeros((capture.frame_count, view.height, view.width), dtype=np.uint8)
     for frame in frames_of(capture, camera):
         labels[frame] = _frame(capture, camera, frame, rise, hand, settings)
-    return sort_pieces(capture, camera, labels, settings)
+    return labels
 
 
 def learn(capture: Capture, camera: str, settings: OpenCvSegmentation) -> tuple[np.ndarray, np.ndarray]:
@@ -98,7 +77,7 @@ def learn(capture: Capture, camera: str, settings: OpenCvSegmentation) -> tuple[
     views = []
     for frame in spread(frames_of(capture, camera), SAMPLED_FRAMES):
         image, height = capture.color(camera, frame), heights(capture, camera, capture.depth(camera, frame))
-        risen = (height > settings.height) & _region(capture, camera, frame, settings)
+        risen = height > settings.height
         views.append((image, risen))
         above += count(_bins(image), risen, BINS)
         edge = ~(height > settings.height / 2)
@@ -109,20 +88,20 @@ def learn(capture: Capture, camera: str, settings: OpenCvSegmentation) -> tuple[
     where = f"{capture.folder}, camera {camera}"
     if not above.sum():
         raise InputError(where, f"an object more than {1e3 * settings.height:g} mm above the table z = 0 is required", "nothing")
-    hands, body = _divide([(image, risen, _skin(image, settings)) for image, risen in views], settings)
+    hands, body = _divide([(image, risen, _skin(image, settings)) for image, risen in views])
     if not hands.sum():
         skin = f"hue in {list(settings.hand_hue)} degrees, chroma in {list(settings.hand_chroma)} (Lab)"
         print(f"{where}: nothing above the table has the color of hands ({skin}); all of it is the object", flush=True)
     first = _log_probability(hands) - _log_probability(body)
-    hands, body = _divide([(image, risen, first[_bins(image)] > 0) for image, risen in views], settings)
+    hands, body = _divide([(image, risen, first[_bins(image)] > 0) for image, risen in views])
     return _log_probability(above) - _log_probability(table), _log_probability(hands) - _log_probability(body)
 
 
-def _divide(views: list[tuple[np.ndarray, np.ndarray, np.ndarray]], settings: OpenCvSegmentation) -> tuple[np.ndarray, np.ndarray]:
+def _divide(views: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """Histograms of hands and of the object in views of (image, what has risen, what has a hand's color)."""
     hands, body = np.zeros(np.prod(BINS)), np.zeros(np.prod(BINS))
     for image, risen, like_hand in views:
-        labels = _tidy(np.where(risen, np.where(like_hand, HANDS, OBJECT), 0).astype(np.uint8), settings)
+        labels = _tidy(np.where(risen, np.where(like_hand, HANDS, OBJECT), 0).astype(np.uint8))
         hands += count(_bins(image), labels == HANDS, BINS)
         body += count(_bins(image), labels == OBJECT, BINS)
     return hands, body
@@ -138,17 +117,11 @@ def _frame(
     flat = np.nan_to_num(height, nan=0.0) < settings.height
     # High things are foreground whatever their color; low ones need the color of something that rises in some frame.
     seeds = (height > settings.height) | (flat & (ratio > CERTAIN))
-    region = _region(capture, camera, frame, settings)
-    seeds &= region
-    if settings.thin:
-        foreground = _thin(image, rise[bins], height, settings) & region
-    else:
-        seeds = cv2.morphologyEx(seeds.astype(np.uint8), cv2.MORPH_OPEN, SPECK).astype(bool)
-        foreground = _grab(image, seeds, ratio, height > HIGH * settings.height) & region if seeds.any() else seeds
+    seeds = cv2.morphologyEx(seeds.astype(np.uint8), cv2.MORPH_OPEN, SPECK).astype(bool)
+    foreground = _grab(image, seeds, ratio, height > HIGH * settings.height) if seeds.any() else seeds
     foreground |= _holes(foreground)
     in_hand = cv2.GaussianBlur(hand[bins], (0, 0), DECISION) > 0
-    labels = np.where(foreground, np.where(in_hand, HANDS, OBJECT), 0).astype(np.uint8)
-    return _slim(_tidy(labels, settings)) if settings.thin else _tidy(labels, settings)
+    return _tidy(np.where(foreground, np.where(in_hand, HANDS, OBJECT), 0).astype(np.uint8))
 
 
 def _grab(image: np.ndarray, seeds: np.ndarray, ratio: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -173,56 +146,6 @@ def _grab(image: np.ndarray, seeds: np.ndarray, ratio: np.ndarray, high: np.ndar
     return mask
 
 
-def _thin(image: np.ndarray, ratio: np.ndarray, height: np.ndarray, settings: OpenCvSegmentation) -> np.ndarray:
-    """Foreground [H, W] bool by color and height, each pixel nearly for itself: a rope of three pixels is all border.
-
-    A pixel's log odds are those of its color, and 2 for being as high as `height` or -1 for lying lower; none without depth.
-    """
-    rise = np.where(
-        np.isnan(height), 0.0, np.clip(2 * height / settings.height, -1.0, 2.0) - np.where(height < settings.height, 1, 0)
-    )
-    odds = np.clip(ratio, -THIN_COLOR, THIN_COLOR) + rise
-    high = np.where(height > HIGH * settings.height, THIN_COLOR, 0.0)
-    logs = np.stack([np.zeros_like(odds), odds + high]).astype(np.float32)
-    return np.asarray(solve(logs, lab_of(image), THIN_SMOOTHNESS)[1] > 0.5)
-
-
-def _slim(labels: np.ndarray) -> np.ndarray:
-    """Labels [H, W] in which what is wider than a rope and touches a hand is hand: fingers in the shade lack its colors."""
-    own = (labels == OBJECT).astype(np.uint8)
-    wide = cv2.morphologyEx(own, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (THIN_WIDTH,) * 2))
-    near = cv2.dilate((labels == HANDS).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    _, pieces = cv2.connectedComponents(wide)
-    fingers = np.isin(pieces, np.setdiff1d(pieces[near], 0)).astype(np.uint8)
-    slim = labels.copy()
-    slim[(cv2.dilate(fingers, SPECK) > 0) & (own > 0)] = HANDS
-    return slim
-
-
-def _region(capture: Capture, camera: str, frame: int, settings: OpenCvSegmentation) -> np.ndarray:
-    """The region of interest [H, W] bool. Pixels without depth are judged by the point of the table behind them."""
-    view = capture.cameras[camera]
-    region = np.ones((view.height, view.width), dtype=bool)
-    if camera in settings.boxes:
-        left, top, right, bottom = settings.boxes[camera]
-        rows, columns = np.indices(region.shape)
-        region &= (columns >= left) & (columns <= right) & (rows >= top) & (rows <= bottom)
-        if not region.any():
-            rule = f"must hold a pixel of the image of {view.width} x {view.height}"
-            raise InputError(f"perception.segment.opencv.boxes.{camera}", rule, settings.boxes[camera])
-    if settings.table is not None:
-        pixels = np.stack(np.meshgrid(np.arange(view.width), np.arange(view.height)), axis=-1).astype(float)
-        depth, eye = capture.depth(camera, frame), view.camera_to_world[:3, 3]
-        one = view.lift(pixels, np.ones_like(depth))
-        fall = eye[2] - one[..., 2]
-        behind = np.where(np.abs(fall) > 1e-9, eye[2] / np.where(np.abs(fall) > 1e-9, fall, 1.0), np.inf)
-        points = view.lift(pixels, np.where(depth > 0, depth, np.clip(behind, 0.0, 100.0)))
-        (least_x, most_x), (least_y, most_y) = settings.table
-        x, y = points[..., 0], points[..., 1]
-        region &= (least_x <= x) & (x <= most_x) & (least_y <= y) & (y <= most_y)
-    return region
-
-
 def _holes(foreground: np.ndarray) -> np.ndarray:
     """Small enclosed pieces of background [H, W] bool."""
     _, pieces, boxes, _ = cv2.connectedComponentsWithStats((~foreground).astype(np.uint8), connectivity=4)
@@ -234,10 +157,10 @@ def _holes(foreground: np.ndarray) -> np.ndarray:
     return np.asarray(small[pieces])
 
 
-def _tidy(labels: np.ndarray, settings: OpenCvSegmentation) -> np.ndarray:
+def _tidy(labels: np.ndarray) -> np.ndarray:
     """Specks, and pieces of hand color much smaller than the hand, become what surrounds them: nothing, or the other label."""
     tidy = labels.copy()
-    for label, share in ((HANDS, THIN_HAND_PIECE if settings.thin else HAND_PIECE), (OBJECT, 0.0)):
+    for label, share in ((HANDS, HAND_PIECE), (OBJECT, 0.0)):
         _, pieces, boxes, _ = cv2.connectedComponentsWithStats((tidy == label).astype(np.uint8), connectivity=4)
         areas = boxes[1:, cv2.CC_STAT_AREA]
         least = max(SMALLEST * labels.size, share * areas.max(initial=0))
@@ -265,97 +188,3 @@ def _bins(image: np.ndarray) -> np.ndarray:
 def _log_probability(counts: np.ndarray) -> np.ndarray:
     blurred = gaussian_filter(counts.reshape(BINS), SMOOTHING).ravel()
     return np.asarray(np.log(blurred / max(blurred.sum(), 1.0) + FLOOR))
-
-
-@dataclass(frozen=True, eq=False)
-class Piece:
-    """A connected piece of the object's mask in one frame."""
-
-    mask: np.ndarray
-    area: int
-    moving: float
-    """Part of its pixels that change during the video."""
-    at_border: bool
-    at_hand: bool
-    hand_distance: float
-    """Pixels to the nearest hand; infinite without one."""
-
-
-def sort_pieces(capture: Capture, camera: str, labels: np.ndarray, settings: OpenCvSegmentation) -> np.ndarray:
-    """Labels [T, H, W] in which sleeves are hands, clutter is nothing and one object is left, as far as settings ask for it."""
-    if not settings.sleeves and settings.clutter == "keep" and settings.object == "all":
-        return labels
-    result, changes = labels.copy(), changing(capture, camera)
-    chosen: np.ndarray | None = None
-    for frame in frames_of(capture, camera):
-        own = pieces_of(labels[frame], capture.depth(camera, frame), changes)
-        if settings.sleeves:
-            sleeves = [piece for piece in own if piece.at_border and piece.at_hand and piece.moving > MOVING]
-            for piece in sleeves:
-                result[frame][piece.mask] = HANDS
-            own = [piece for piece in own if piece not in sleeves]
-        if settings.clutter == "drop":
-            still = [piece for piece in own if piece.moving < MOVING and not piece.at_hand]
-            for piece in still:
-                result[frame][piece.mask] = NOTHING
-            own = [piece for piece in own if piece not in still]
-        if settings.object != "all" and own:
-            chosen = _choose(own, chosen, settings.object, f"{capture.folder}, camera {camera}, frame {frame}")
-            result[frame][(result[frame] == OBJECT) & ~chosen] = NOTHING
-    return result
-
-
-def changing(capture: Capture, camera: str) -> np.ndarray:
-    """Which pixels [H, W] bool change during the video: their range of gray, a little blurred."""
-    frames = spread(frames_of(capture, camera), SAMPLED_FRAMES)
-    grays = [cv2.GaussianBlur(gray(capture, camera, frame), (0, 0), 1.0) for frame in frames]
-    return np.asarray(np.ptp(np.stack(grays), axis=0) > CHANGES)
-
-
-def pieces_of(labels: np.ndarray, depth: np.ndarray, changes: np.ndarray) -> list[Piece]:
-    """Connected pieces of the object [H, W], divided where the depth [H, W], m, has a step."""
-    own = labels == OBJECT
-    if not own.any():
-        return []
-    # Unknown depth divides nothing.
-    far = cv2.dilate(np.where(depth > 0, depth, 0.0).astype(np.float32), SPECK)
-    near = cv2.erode(np.where(depth > 0, depth, 100.0).astype(np.float32), SPECK)
-    whole = own & ~(far - near > BREAK)
-    number_of, numbers = cv2.connectedComponents(whole.astype(np.uint8), connectivity=4)
-    if number_of == 1:
-        whole = own
-        number_of, numbers = cv2.connectedComponents(whole.astype(np.uint8), connectivity=4)
-    rows, columns = distance_transform_edt(~whole, return_distances=False, return_indices=True)
-    numbers = np.where(own, numbers[rows, columns], 0)
-    hands = labels == HANDS
-    away = cv2.distanceTransform((~hands).astype(np.uint8), cv2.DIST_L2, 5) if hands.any() else np.full(labels.shape, np.inf)
-    pieces = []
-    for number in range(1, number_of):
-        mask = numbers == number
-        area = int(mask.sum())
-        rim = int(mask[0].sum() + mask[-1].sum() + mask[:, 0].sum() + mask[:, -1].sum())
-        distance = float(away[mask].min())
-        pieces.append(Piece(mask, area, float(changes[mask].mean()), rim >= BORDER_RUN, distance <= CONTACT, distance))
-    return pieces
-
-
-def _choose(pieces: list[Piece], before: np.ndarray | None, rule: str, where: str) -> np.ndarray:
-    """The mask [H, W] bool of the object: what overlaps with the one before, else what the rule says."""
-    if before is not None:
-        reach = cv2.dilate(before.astype(np.uint8), np.ones((2 * CONTACT + 1,) * 2, np.uint8)).astype(bool)
-        kept = [piece.mask for piece in pieces if (piece.mask & reach).sum() > 0.1 * piece.area]
-        return np.any(kept, axis=0) if kept else before
-    scores = {
-        "largest": [float(piece.area) for piece in pieces],
-        "moving": [piece.moving * piece.area for piece in pieces],
-        "nearest_hand": [-piece.hand_distance + 1e-6 * piece.area for piece in pieces],
-    }[rule]
-    best = pieces[int(np.argmax(scores))]
-    if len(pieces) > 1:
-        y, x = (round(float(values.mean())) for values in np.nonzero(best.mask))
-        others = ", ".join(f"{piece.area}" for piece in pieces if piece is not best)
-        print(
-            f"{where}: {len(pieces)} pieces; taken ({rule}): {best.area} pixels around ({x}, {y}); left: {others} pixels",
-            flush=True,
-        )
-    return best.mask

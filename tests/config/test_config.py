@@ -114,6 +114,10 @@ MISTAKES = {
     "unknown scale": ("search: {variables: {drag: {scale: cubic}}}", "search.variables.drag.scale", "received 'cubic'"),
     "unit of lengths": ("search: {lengths: inch}", "search.lengths", "received 'inch'"),
     "what lost its trial": ("search: {bending_reach: [1.6, 2.6]}", "search.bending_reach: unknown key (removed; commit 7308a7b"),
+    "masks of scenes that need marks": (
+        "perception: {segment: {opencv: {sleeves: true}}}",
+        "perception.segment.opencv.sleeves: unknown key (removed, marks serve such scenes",
+    ),
     "a fixed stranger": ("search: {fixed: [mass]}", "fixed: different ones of stiffness, object_radius", "received ['mass']"),
     "polish of springs": (
         "search: {polish: {variables: [object_radius]}}",
