@@ -44,13 +44,16 @@ TOOLS = {
     "track-init": ("results", "prepare the MLflow store, once before any run is logged"),
     "log": ("results", "log one run.json to MLflow"),
     "sync": ("results", "send to MLflow what is missing there, and close runs that were killed"),
-    "compare": ("results", "runs of two commits, from MLflow -> paired differences"),
     "ui": ("results", "open the MLflow UI of a results folder"),
     "tune": ("results", "one worker of a sweep"),
     "tune-report": ("results", "a sweep -> summary, plots, best.yaml"),
     "doctor": ("results", "say what this machine can do, and what is missing"),
 }
 """Command -> the module of neuspring.cli with a function of its name, and what it does."""
+LEFT = {
+    "compare": "Removed: name two runs on MLflow's page (`neuspring ui`) and press Compare; commit a72d24c is the last that has it."
+}
+"""Commands of older versions -> what to do now."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 OWN_THREADS = ("search",)
 """Commands that share their work among --threads threads of their own: numerical libraries have one in each of them."""
@@ -121,7 +124,7 @@ def _run(words: list[str]) -> int:
         return 0
     close = [name for name in TOOLS if name.startswith(f"{words[0]} ")]
     close = close or difflib.get_close_matches(command, [*STAGES, *TOOLS], n=1)
-    remedy = f"Did you mean {' or '.join(close)}?" if close else "neuspring --help names all."
+    remedy = LEFT.get(command) or (f"Did you mean {' or '.join(close)}?" if close else "neuspring --help names all.")
     raise InputError("command", "must be a stage or a tool", command, remedy)
 
 

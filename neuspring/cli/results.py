@@ -1,4 +1,4 @@
-"""Commands on finished runs (tables, perception-table, study, explain, report), on MLflow (track-init, log, sync, compare, ui), on
+"""Commands on finished runs (tables, perception-table, study, explain, report), on MLflow (track-init, log, sync, ui), on
 sweeps (tune, tune-report), and on this machine (doctor)."""
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ StudyTable = Annotated[Path, arg(help="the study table")]
 Folder = Annotated[Path, arg(help="folder to write to")]
 Transfers = Annotated[tuple[str, ...], arg(help="scenarios whose twins were rolled out on other recordings")]
 WHAT = "--scores, or --scenarios, --methods and --seeds of a results folder, are required"
-COMMIT = "a commit, its first letters, HEAD~1, or a branch; a working copy with changes is ...-dirty"
 
 
 def tables(
@@ -253,20 +252,6 @@ def sync(
         write_text(output, f"{counts}\n")
         return 0
     return 1 if any(outcome.startswith(("unreachable", "damaged")) for outcome in outcomes) else 0
-
-
-def compare(
-    first: Annotated[Positional[str], arg(help=COMMIT)],
-    second: Positional[str],
-    results: Results = Path("results"),
-    settings: Settings = "{}",
-    output: Annotated[Path | None, arg(help="CSV file of the differences")] = None,
-) -> None:
-    """Runs of two commits, from MLflow -> paired differences."""
-    from neuspring.core.provenance import commit_named
-    from neuspring.experiments.tracking.compare import compare
-
-    print(compare(results, read_settings(settings).tracking, commit_named(first), commit_named(second), output), end="")
 
 
 def ui(results: Results = Path("results"), settings: Settings = "{}", host: str = "127.0.0.1", port: int = 5000) -> None:

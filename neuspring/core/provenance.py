@@ -128,16 +128,6 @@ def image_stamps(folder: Path) -> str:
     return digest.hexdigest()[:16]
 
 
-def commit_named(name: str) -> str:
-    """The commit that git means by a name such as HEAD~1 or a branch in the working copy; the name itself where it means none."""
-    try:
-        ask = ["git", "rev-parse", "--verify", "--quiet", "--end-of-options", f"{name}^{{commit}}"]
-        found = subprocess.run(ask, cwd=ROOT.parent, capture_output=True, text=True, timeout=10, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return name
-    return found.stdout.strip()
-
-
 def commit() -> str:
     """The commit of the working copy this package runs from, with `-dirty` if it has changes; empty if unknown."""
     try:

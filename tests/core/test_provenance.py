@@ -109,11 +109,3 @@ def test_declarations_and_reporting_do_not_count(copy):
     edit(copy / "config" / "parse.py", "Field(ge=1)", "Field(ge=2)")
     edit(copy / "core" / "text.py", "0.2 if", "0.3 if")
     assert digest("neuspring.stages.search") == before
-
-
-def test_a_commit_is_found_by_the_names_that_git_knows():
-    if not (here := provenance.commit().removesuffix("-dirty")):
-        pytest.skip("not a working copy")
-    assert provenance.commit_named("HEAD") == provenance.commit_named(here[:10]) == here
-    assert provenance.commit_named("no-such-commit") == "no-such-commit"
-    assert provenance.commit_named(f"{here}-dirty") == f"{here}-dirty"

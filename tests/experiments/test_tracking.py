@@ -283,8 +283,9 @@ def test_results_that_another_commit_made_again_are_one_run_of_both(results: Pat
     again = write_run(results, commit="def456-dirty", ended="2026-11-21T12:00:00+00:00")
     for _ in range(2):
         assert tracking.log_run(again, results, SETTINGS) == "already logged"
-    (run,) = tracking_store.logged_runs(results, SETTINGS)
-    assert run.commits == {"abc123": ENDED_MS, "def456-dirty": STARTED_MS + 2 * 3600_000}
+    (run,) = runs_of(results)
+    assert run.info.end_time == ENDED_MS and run.data.tags["commit"] == "abc123"
+    assert run.data.tags["commit.def456-dirty"] == str(STARTED_MS + 2 * 3600_000)
 
 
 def test_damaged_records_are_input_errors(results: Path) -> None:

@@ -11,7 +11,6 @@ import re
 import socket
 import sqlite3
 from contextlib import closing
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -130,62 +129,6 @@ def prepare(results: Path, settings: Tracking) -> tuple[MlflowClient, str]:
             if identifier := _experiment(client, results, settings):
                 return client, identifier
             raise
-
-
-# --- what it holds ---
-
-
-@dataclass(frozen=True, kw_only=True)
-class LoggedRun:
-    """A complete run, as MLflow holds it."""
-
-    run_key: str
-    """Equal for equal results."""
-    scenario: str
-    category: str
-    method: str
-    seed: int
-    status: str
-    """ok or failed."""
-    reason: str
-    device: str
-    data_digest: str
-    commits: dict[str, int]
-    """Commit -> when it last made this run, ms since 1970."""
-    params: dict[str, str]
-    metrics: dict[str, float]
-    """Last values."""
-
-    @property
-    def place(self) -> tuple[str, str, int]:
-        """Scenario, method and seed."""
-        return self.scenario, self.method, self.seed
-
-
-def logged_runs(results: Path, settings: Tracking) -> list[LoggedRun]:
-    """All complete runs of the experiment. Raises InputError where MLflow does not answer or has no such experiment."""
-    uri = masked(uri_of(Path(results), settings))
-    try:
-        store = find(Path(results), settings)
-        runs = search(*store, logged="complete") if store else None
-    except Exception as error:
-        reason = masked(str(error).partition("\n")[0])
-        raise InputError(
-            uri, "MLflow must answer", reason or type(error).__name__, "Start its server, or correct tracking.uri."
-        ) from error
-    if runs is None:
-        raise InputError(uri, f"MLflow must hold the experiment {settings.experiment}", "none", "Run `neuspring sync` first.")
-    names = ("run_key", "scenario", "category", "method", "status", "reason", "device", "data_digest")
-    found = []
-    for run in runs:
-        tags = run.data.tags
-        if not is_complete(run) or "run_key" not in tags:
-            continue
-        commits = {tags["commit"]: run.info.end_time or 0}
-        commits |= {name.removeprefix(AGAIN): int(value) for name, value in tags.items() if name.startswith(AGAIN)}
-        plain = {name: tags[name] for name in names}
-        found.append(LoggedRun(**plain, seed=int(tags["seed"]), commits=commits, params=run.data.params, metrics=run.data.metrics))
-    return found
 
 
 def search(client: MlflowClient, experiment: str, status: str | None = None, **tags: str) -> list[Run]:
