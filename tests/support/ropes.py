@@ -12,8 +12,12 @@ from neuspring.twin.rod import rod_twin
 from tests.support import scenarios
 
 RADIUS, LENGTH, HEIGHT = 0.01, 0.4, 0.1
-SETTINGS = config.Config(rod=config.Rod(vertices=10))
+ROD = config.Rod(
+    vertices=10, bending=0.03, twisting=0.03, damping=0.01, marker_mass=0.01, drag=0.3, drag_quadratic=0.1, substep=0.002
+)
+SETTINGS = config.Config(rod=ROD)
 MARKERS = 7
+AXIS = (0.0, 0.6, 0.8)
 
 
 def tube(line: np.ndarray, radius: float = RADIUS, around: int = 6) -> np.ndarray:
@@ -70,4 +74,4 @@ def cable(frames: int = 4, move: Any = (0.0, 0.0, 0.0), sag: float = 0.5, **chan
 
 def twin(observations: Observations | None = None, settings: config.Config = SETTINGS) -> Twin:
     """The rod that a fit would start from."""
-    return rod_twin(rope() if observations is None else observations, settings)
+    return rod_twin(rope() if observations is None else observations, settings, AXIS)

@@ -85,7 +85,7 @@ def test_a_start_velocity_moves_the_vertices():
 
 def test_the_shape_of_frame_0_may_be_without_moments():
     seen = ropes.cable(frames=8)
-    settings = replace(ropes.SETTINGS, rod=config.Rod(rest="first_frame"), simulation=config.Simulation(gravity=0.0))
+    settings = replace(ropes.SETTINGS, rod=replace(ropes.ROD, rest="first_frame"), simulation=config.Simulation(gravity=0.0))
     twin = ropes.twin(seen, settings)
     at_rest = roll_out(twin, seen.controller_points).positions
     assert np.abs(at_rest - at_rest[0]).max() < SINGLE
@@ -115,7 +115,7 @@ def test_a_rod_that_nothing_holds_is_refused():
     variables = config.SearchVariables(controller_radius=config.Variable(0.0, 1.0, 0.0))
     none = replace(ropes.SETTINGS, search=config.Search(variables=variables))
     with pytest.raises(InputError, match=r"a hand must hold the rod.*controller_radius"):
-        rod_twin(away, none)
+        rod_twin(away, none, ropes.AXIS)
 
 
 def test_a_scene_with_self_collision_is_refused_before_it_is_simulated():
