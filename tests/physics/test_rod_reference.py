@@ -15,7 +15,20 @@ from scipy.spatial.transform import Rotation
 from neuspring.core.artifacts import Rod
 from neuspring.physics import rod_reference as reference
 from neuspring.physics.rod_reference import Frames, Parameters, Rate
-from tests.support.rods import GREENHILL, SAG, buckling_load, cantilever, coil, column, crooked, real, rod, simulation, twisted
+from tests.support.rods import (
+    GREENHILL,
+    SAG,
+    buckling_load,
+    cantilever,
+    coil,
+    column,
+    crooked,
+    real,
+    rod,
+    simulation,
+    straight,
+    twisted,
+)
 
 # Central differences over STEP: rounding of 1e-16 / STEP, and STEP^2 / 6 times third derivatives of about 3 EA / L^2 = 1e3 N/m^2.
 STEP = 1e-6
@@ -127,6 +140,24 @@ def test_steps_converge_with_second_order() -> None:
     )
     order = np.log2(float((middle - coarse).norm() / (fine - middle).norm()))
     assert order == pytest.approx(2, abs=0.2)
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.01])
+def test_steps_that_are_needed_are_stable_and_few(damping: float) -> None:
+    """A stiff rod swings on in them; in five times fewer it does not, without damping."""
+    body = rod(straight(4, 0.15), (0, 1), bending=0.1, stretching=2000.0, damping=damping)
+    frame_time = 0.01
+    needed = reference.steps_needed(Parameters.of(body), frame_time)
+    v = torch.zeros(4, 3, dtype=torch.float64)
+    v[3, 2] = 0.5
+
+    def reach(steps: int) -> float:
+        h = frame_time / steps
+        hands = real(body.vertices).expand(2, 4, 3)
+        return float(reference.roll_out(body, simulation(frame_time=25 * h), hands, v, steps=25)[-1].abs().max())
+
+    assert reach(needed) < 0.2
+    assert damping or not reach(needed // 5) < 0.2
 
 
 @pytest.mark.parametrize(
