@@ -69,7 +69,7 @@ def rod_twin(observations: Observations, settings: config.Config, axis: Sequence
     own = np.convolve(lengths, [0.5, 0.5])
     density = len(nodes) / lengths.sum() if len(pairs) else 1.0
     mass = density * own if len(pairs) else own + start.marker_mass
-    direction = np.array(axis, np.float64) if (held >= 0).any() else np.eye(3)[np.abs(vertices[1] - vertices[0]).argmin()]
+    direction = np.array(axis, np.float64) if (held >= 0).any() else _across(vertices)
     rod = Rod(
         vertices=vertices,
         held=held,
@@ -110,7 +110,8 @@ def on_recording(twin: Twin, observations: Observations) -> Twin:
     """The rod of a twin in frame 0 of another recording of the same body; its simulation is still the twin's.
 
     Lengths, masses, stiffnesses and unloaded curvatures are kept: they belong to the body. Where the line is found among nodes,
-    hands hold within the twin's reach, with springs that are alike and together as strong as the twin's. Raises InputError if the
+    hands hold within the twin's reach, with springs that are alike and together as strong as the twin's; its first end is the one
+    that comes first in x, and the rod is turned about itself as the unloaded curvatures ask. Raises InputError if the
     bodies have other vertices, or another length.
     """
     from neuspring.twin.transfer import infer_controller_radius
@@ -128,6 +129,7 @@ def on_recording(twin: Twin, observations: Observations) -> Twin:
     topology, material = replace(twin.topology, nodes=nodes, controllers=hands, rest_shape=observations.rest_shape), twin.material
     if held is None:
         vertices, held = center_line(nodes, len(rod.held), where), rod.held
+        rod = replace(rod, axis=_across(vertices))
         reach, neighbors = infer_controller_radius(twin.topology)
         grown = max(round(neighbors * len(nodes) / len(twin.topology.nodes)), 1)
         pairs = controller_springs(nodes, hands, reach, grown)
@@ -147,6 +149,11 @@ def on_recording(twin: Twin, observations: Observations) -> Twin:
         raise InputError(where, rule, f"{found * rod.lengths.sum():.3f} m", "Name a recording of the same body.")
     moved = replace(rod, held=held, vertices=settled([rod], vertices[None])[0])
     return replace(twin, topology=topology, material=material, rod=_bound(moved, observations))
+
+
+def _across(vertices: np.ndarray) -> np.ndarray:
+    """The coordinate axis that lies least along the first edge of a line [V, 3]: a rod that no clamp holds may have any."""
+    return np.asarray(np.eye(3)[np.abs(vertices[1] - vertices[0]).argmin()])
 
 
 def of_markers(twin: Twin, observations: Observations) -> Twin:

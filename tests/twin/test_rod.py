@@ -142,6 +142,17 @@ def test_another_recording_moves_the_same_elsewhere(body):
     np.testing.assert_allclose(roll_out(moved, there.controller_points).positions, expected, atol=1e-4)
 
 
+def test_a_rope_that_lies_along_another_axis_moves_as_the_same_turned():
+    here = ropes.rope(frames=5, move=(0.0, 0.01, 0.004))
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    there = replace(here, object_points=here.object_points @ turn.T, controller_points=here.controller_points @ turn.T)
+    twin = ropes.twin(here)
+    expected = roll_out(twin, here.controller_points).positions @ turn.T
+    found = roll_out(move(twin, there)[0], there.controller_points).positions
+    # Nodes come in another order to the search for the line.
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+
+
 def test_lengths_belong_to_the_cable_and_not_to_a_recording():
     here = ropes.cable(frames=3)
     longer = replace(here, object_points=here.object_points + np.array([0, 0, 0.002]))
