@@ -232,25 +232,14 @@ def log(
     print(f"MLflow: {record}: {outcome}")
 
 
-def sync(
-    results: Results = Path("results"),
-    settings: Settings = "{}",
-    under: Annotated[Path | None, arg(help="only the records under this folder of the results")] = None,
-    output: Annotated[Path | None, arg(help="file for the counts; failures are then not an error")] = None,
-) -> int:
+def sync(results: Results = Path("results"), settings: Settings = "{}") -> int:
     """Send to MLflow what is missing there, and close runs that were killed; 1 where something could not be sent."""
-    from neuspring.core.files import write_text
     from neuspring.experiments.tracking import log
 
     tracking = read_settings(settings).tracking
     log.init(results, tracking)
-    outcomes = log.sync(results, tracking, progress=print, under=under)
-    counts = "\n".join(f"{outcome}: {len(names)}" for outcome, names in outcomes.items())
-    print(counts)
-    if output:
-        # A step of the workflow: what could not be sent waits on disk and fails nothing.
-        write_text(output, f"{counts}\n")
-        return 0
+    outcomes = log.sync(results, tracking, progress=print)
+    print("\n".join(f"{outcome}: {len(names)}" for outcome, names in outcomes.items()))
     return 1 if any(outcome.startswith(("unreachable", "damaged")) for outcome in outcomes) else 0
 
 

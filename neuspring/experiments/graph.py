@@ -464,8 +464,7 @@ class Graph:
         if not self.sweep_folder:
             remedy = "Add the section `tune` (config/README.md, config/studies/tune.yaml)."
             raise InputError("configuration, tune", "the target sweep needs a sweep", None, remedy)
-        logged = [f"{self.sweep_folder}/mlflow.txt"] if self.config.tracking.enabled else []
-        return [f"{self.sweep_folder}/summary.md", *logged]
+        return [f"{self.sweep_folder}/summary.md"]
 
     def sweep(self) -> str:
         """Settings of a sweep's workers, as JSON; its tables of methods and searches are found wherever a job runs."""

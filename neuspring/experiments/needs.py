@@ -49,7 +49,6 @@ FIRST_REQUEST = {name: (stage.memory_mb, stage.minutes) for name, stage in STAGE
     "log_run": (2000, 10),
     "tune": (8000, 2880),
     "sweep": (4000, 20),
-    "log_sweep": (2000, 30),
 }
 """Rule -> MB and minutes to ask for, before any job of it was measured."""
 

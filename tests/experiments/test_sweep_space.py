@@ -11,7 +11,7 @@ from neuspring import config
 from neuspring.core.errors import InputError
 from neuspring.experiments.tuning.space import Plan
 from neuspring.twin.field import SpringField
-from tests.support.sweeps import plan, report, settings, slots, sweep, work
+from tests.support.sweeps import plan, report, settings, sweep, trials, work
 
 RANGE = {"low": 1, "high": 2}
 
@@ -95,7 +95,7 @@ def test_settings_that_exclude_each_other_only_inside_their_ranges_fail_the_tria
 
     monkeypatch.setattr(Plan, "at", at)
     work(folder, sweep(trials=2))
-    reasons = [slot.reason for slot in slots(folder, sweep()).values()]
+    reasons = [one.user_attrs["reason"] for one in trials(folder, sweep()).values()]
     assert reasons == [f"trial {number}: these settings exclude each other." for number in (0, 1)]
     assert "2 of 3 trials: 0 finished, 0 pruned, 2 failed." in report(folder, sweep())
 

@@ -8,9 +8,10 @@ import pytest
 from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
 from neuspring.experiments.tuning import trial, worker
+from neuspring.experiments.tuning.report import state
 from neuspring.twin.fit import TwinFit
 from tests.support import stores
-from tests.support.sweeps import furnish, report, results_of, slots, sweep, work
+from tests.support.sweeps import furnish, report, results_of, study, sweep, trials, work
 
 
 def test_a_killed_and_continued_sweep_finds_what_one_in_a_single_go_finds(tmp_path, finished, monkeypatch):
@@ -29,8 +30,8 @@ def test_a_killed_and_continued_sweep_finds_what_one_in_a_single_go_finds(tmp_pa
     monkeypatch.setattr(TwinFit, "epoch", dying)
     with pytest.raises(KeyboardInterrupt):
         work(folder, tune)
-    assert [slot.state for slot in slots(folder, tune).values()] == ["complete", "complete", "running"]
-    assert work(folder, tune) == [2, 3]
+    assert [state(one) for one in trials(folder, tune).values()] == ["complete", "complete", "running"]
+    assert work(folder, tune) == [2, 4], "number 3 is the trial that continues 2"
     assert results_of(folder, tune) == results_of(whole, tune)
     assert epochs == 4 * 3 + 1, "two epochs of the third trial were not repeated"
 
@@ -52,9 +53,9 @@ def test_a_kill_between_asking_for_a_trial_and_taking_it_costs_nothing(folder, m
             patch.setattr(optuna.Study, "ask", stand_in)
             with pytest.raises(KeyboardInterrupt):
                 work(folder, tune)
-    assert work(folder, tune) == [0, 1]
-    assert [len(slot.trials) for slot in slots(folder, tune).values()] == [2, 1]
-    assert work(folder, sweep(trials=3)) == [2], "more trials continue a sweep"
+    assert work(folder, tune) == [0, 2]
+    assert len(study(folder, tune).trials) == 3
+    assert work(folder, sweep(trials=3)) == [3], "more trials continue a sweep"
 
 
 def counting(calls: Path) -> None:
@@ -97,7 +98,7 @@ def two_workers(folder: Path, tune: Tune) -> None:
         counting(calls)
         start.wait(120)
         mine = work(folder, tune, after=lambda: hangs.wait(120))
-        states = {number: slot.state for number, slot in slots(folder, tune).items()}
+        states = {number: state(one) for number, one in trials(folder, tune).items()}
         left = [number for number, state in states.items() if state == "running"]
         assert len(states) == 6
         assert len(mine) == 4
@@ -106,10 +107,9 @@ def two_workers(folder: Path, tune: Tune) -> None:
         other.kill()
         other.join()
     assert work(folder, tune, 1) == left, "the worker that was killed starts again"
-    by_slot = slots(folder, tune)
-    assert [slot.state in ("complete", "pruned") for slot in by_slot.values()] == [True] * 6
-    assert {number: len(slot.trials) for number, slot in by_slot.items() if number in left} == {left[0]: 2}
-    assert sum(len(slot.trials) for slot in by_slot.values()) == 7
+    by_number = trials(folder, tune)
+    assert [state(one) in ("complete", "pruned") for one in by_number.values()] == [True] * 6
+    assert len(study(folder, tune).trials) == 7 and by_number[left[0]].number == 6
     assert calls.read_text() == "search\n", "workers that need the same search make it once"
 
 

@@ -8,15 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from optuna.study import Study
+from optuna.trial import FrozenTrial
 
 from neuspring import config
 from neuspring.config.tuning import Tune
 from neuspring.core.artifacts import Observations
 from neuspring.experiments.tuning import report as tuning_report
 from neuspring.experiments.tuning import worker
+from neuspring.experiments.tuning.report import state
 from neuspring.experiments.tuning.space import Plan
-from neuspring.experiments.tuning.worker import Slot, study_of
-from neuspring.experiments.tuning.worker import slots as slots_of
+from neuspring.experiments.tuning.worker import counted, origin, study_of
 from tests.support import small
 
 OBSERVATIONS = "observations.npz"
@@ -71,7 +73,7 @@ def work(
     base: config.Config | None = None,
     after: Callable[[], object] = lambda: None,
 ) -> list[int]:
-    """Run a worker and call `after` after each of its trials; returns the slots that it ran."""
+    """Run a worker and call `after` after each of its trials; returns the trials that it ran."""
     ended: list[int] = []
     worker.work(
         base or settings(),
@@ -81,7 +83,7 @@ def work(
         "cpu",
         folder / f"worker-{number}.json",
         folder.parent,
-        lambda slot, text: (ended.append(slot), after()),  # type: ignore[arg-type, return-value, func-returns-value]
+        lambda number, text: (ended.append(number), after()),  # type: ignore[arg-type, return-value, func-returns-value]
     )
     return ended
 
@@ -92,12 +94,17 @@ def report(folder: Path, tune: Tune, base: config.Config | None = None) -> str:
     return (folder / "summary.md").read_text()
 
 
-def slots(folder: Path, tune: Tune, base: config.Config | None = None) -> dict[int, Slot]:
-    """The sweep's slots as its storage has them."""
-    return slots_of(study_of(folder, tune, plan(folder, tune, base).facts()))
+def study(folder: Path, tune: Tune, base: config.Config | None = None) -> Study:
+    """The sweep as Optuna has it."""
+    return study_of(folder, tune, plan(folder, tune, base).facts())
+
+
+def trials(folder: Path, tune: Tune, base: config.Config | None = None) -> dict[int, FrozenTrial]:
+    """The trials that count."""
+    return {origin(trial): trial for trial in counted(study(folder, tune, base))}
 
 
 def results_of(folder: Path, tune: Tune) -> list[tuple[Any, ...]]:
-    """State, value, values and intermediate losses of every slot."""
-    trials = [(slot.state, slot.trials[-1]) for slot in slots(folder, tune).values()]
-    return [(state, trial.value, trial.user_attrs.get("values"), trial.intermediate_values) for state, trial in trials]
+    """State, value, values and intermediate losses of every trial."""
+    ended = trials(folder, tune).values()
+    return [(state(trial), trial.value, trial.user_attrs.get("values"), trial.intermediate_values) for trial in ended]

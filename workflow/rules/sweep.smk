@@ -66,29 +66,6 @@ if CONFIG.tune:
         shell:
             common_job("tune-report --settings {params.settings:q} --output {output:q}")
 
-    rule log_sweep:
-        input:
-            store=rules.track_init.output,
-            summary=rules.sweep_report.output,
-        output:
-            f"{SWEEP}/mlflow.txt",
-        log:
-            log_of("log_sweep", CONFIG.tune.study),
-        conda:
-            ENVIRONMENT
-        resources:
-            mem_mb=NEEDS.memory("log_sweep"),
-            runtime=NEEDS.minutes("log_sweep"),
-        params:
-            settings=section("tracking"),
-            stamp="none",
-            results=lambda wildcards, input: str(Path(input.store[0]).parent),
-            folder=lambda wildcards, input: str(Path(input.summary[0]).parent),
-        shell:
-            common_job(
-                "sync --results {params.results:q} --under {params.folder:q} --settings {params.settings:q} --output {output:q}"
-            )
-
 
 rule sweep:
     input:

@@ -97,18 +97,14 @@ def log_run(run_json: Path, results: Path, settings: Tracking) -> str:
         return _unreachable(line, f"{record.name} is not logged; its files are complete, `sync` will log it")
 
 
-def sync(
-    results: Path, settings: Tracking, progress: Callable[[str], object] = lambda line: None, under: Path | None = None
-) -> dict[str, list[str]]:
-    """Log every run.json under `results`, or under its folder `under`, that MLflow lacks; an empty database is rebuilt like this.
+def sync(results: Path, settings: Tracking, progress: Callable[[str], object] = lambda line: None) -> dict[str, list[str]]:
+    """Log every run.json under `results` that MLflow lacks; an empty database is rebuilt like this.
 
     Runs that killed loggers left RUNNING are closed as KILLED. An mlflow.txt beside a record that says "unreachable" is corrected.
     `progress` receives one line per run. Returns the run names by outcome: those of `log_run`, "damaged" (details on stderr) and
     "closed" (leftovers).
     """
-    results, under = Path(results).resolve(), Path(under or results).resolve()
-    if not under.is_relative_to(results):
-        raise InputError("--under", f"must lie in the results folder {results}", under)
+    results = Path(results).resolve()
     outcomes: dict[str, list[str]] = {}
 
     def note(name: str, outcome: str) -> None:
@@ -116,7 +112,7 @@ def sync(
         progress(f"{name}: {outcome}")
 
     records: list[Path] = []
-    for folder, folders, files in os.walk(under):
+    for folder, folders, files in os.walk(results):
         # Neither the copies among MLflow's artifacts, nor hidden folders.
         folders[:] = sorted(name for name in folders if not name.startswith(".") and name != ARTIFACTS)
         records += [Path(folder) / RUN_RECORD] if RUN_RECORD in files else []

@@ -1,20 +1,17 @@
-"""The report of a sweep: trials.csv, run records, the best trial as an overlay, pictures, and a summary, which is written last.
+"""The report of a sweep: trials.csv, the best trial as an overlay, pictures, and a summary, which is written last.
 
-Everything is made from the sweep's storage, of a sweep that is finished or not. Run records of trials and sweep go to MLflow as
-those of any run do (`neuspring sync`). Trials have the numbers of their slots. In Optuna's pictures they have its own, which differ
-where a trial was begun again.
+Everything is made from the sweep's storage, of a sweep that is finished or not. A trial that continues another has its number;
+in Optuna's pictures it has one of its own.
 """
 
 from __future__ import annotations
 
 import functools
-import hashlib
 import json
 import warnings
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +20,16 @@ import optuna
 import pandas as pd
 import yaml
 from optuna.study import Study
+from optuna.trial import FrozenTrial, TrialState
 
 from neuspring import config
 from neuspring.config import Config
 from neuspring.config.tuning import Tune
-from neuspring.core.files import write_atomically, write_table, write_text
-from neuspring.core.records import canonical
-from neuspring.core.run_record import RUN_RECORD, RunRecord, key_of
+from neuspring.core.files import write_atomically, write_text
 from neuspring.core.table import Table
 from neuspring.experiments.benchmark import read_methods, read_searches
 from neuspring.experiments.tuning.space import CLUSTERS, Plan, labels
-from neuspring.experiments.tuning.worker import DEFINITION, WORKER, Slot, slots, study_of
+from neuspring.experiments.tuning.worker import DEFINITION, FACTS, REASON, VALUES, WORKER, counted, origin, study_of
 from neuspring.report.draw.sheet import DPI
 
 TABLES_OF_ROWS = {"method": "methods.yaml", "search": "searches.yaml"}
@@ -56,8 +52,6 @@ LEGEND = 16
 """The most entries of a legend that is shown."""
 WIDTH, HEIGHT = 2.9, 3.8
 """Size of a panel, inches."""
-KEYED = ("scenario", "source", "category", "method", "variant", "seed", "status", "reason", "data_digest", "params")
-"""Fields that the key of a run record is made of, beside its scores and results."""
 
 
 @dataclass(frozen=True)
@@ -65,36 +59,37 @@ class Findings:
     """A sweep as it is read."""
 
     plan: Plan
-    slots: tuple[Slot, ...]
+    trials: tuple[FrozenTrial, ...]
+    """Those that count."""
     table: pd.DataFrame
-    """A row per slot that has a trial."""
+    """A row per trial."""
     importances: dict[str, float]
     """Setting -> importance, largest first; empty where too few trials finished."""
     scenes: tuple[str, ...]
 
     @property
-    def best(self) -> Slot | None:
+    def best(self) -> FrozenTrial | None:
         """The finished trial of least loss; of several, the first."""
-        done = [slot for slot in self.slots if slot.state == "complete"]
-        return min(done, key=lambda slot: (slot.loss, slot.number), default=None)
+        return min((t for t in self.trials if t.state == TrialState.COMPLETE), key=lambda t: (t.value, origin(t)), default=None)
 
     @property
     def baseline(self) -> float | None:
         """Loss of the unchanged configuration, if trial 0 has finished."""
-        return next((slot.loss for slot in self.slots if slot.number == 0), None)
+        return next((trial.value for trial in self.trials if origin(trial) == 0), None)
+
+
+def state(trial: FrozenTrial) -> str:
+    """complete, pruned, failed or running."""
+    return "failed" if trial.state == TrialState.FAIL else trial.state.name.lower()
 
 
 def report(settings: Config, tune: Tune, output: Path, root: Path = Path()) -> None:
     """Sum up a sweep, finished or not. It lies in `output`'s folder. Raises InputError if there is none."""
     plan, folder = Plan.of(settings, tune, root), output.parent
     study = study_of(folder, tune, plan.facts())
-    definition = study.user_attrs[DEFINITION]
     # Trials beyond a `tune.trials` that was lowered count as well.
-    begun = tuple(slots(study).values())
-    findings = Findings(plan, begun, _table(begun, plan), _importances(study), tuple(definition["frames"]))
-    for slot in begun:
-        if slot.state in ("complete", "pruned", "failed"):
-            _record_trial(findings, slot, definition, folder)
+    begun = tuple(counted(study))
+    findings = Findings(plan, begun, _table(begun, plan), _importances(study), tuple(study.user_attrs[DEFINITION]["frames"]))
     # No file of an earlier report may stay beside this one's.
     for name in (*TABLES, *PICTURES):
         (folder / name).unlink(missing_ok=True)
@@ -103,21 +98,20 @@ def report(settings: Config, tune: Tune, output: Path, root: Path = Path()) -> N
     if findings.table["state"].isin(["complete", "pruned"]).any():
         _draw(study, folder, importances=bool(findings.importances))
     write_text(output, summary(findings, folder))
-    files = [output, *(folder / name for name in (*TABLES, *PICTURES) if (folder / name).is_file())]
-    _record_sweep(findings, definition, files, folder)
 
 
-def _table(begun: Sequence[Slot], plan: Plan) -> pd.DataFrame:
+def _table(begun: Sequence[FrozenTrial], plan: Plan) -> pd.DataFrame:
     rows = []
-    for slot in begun:
-        trial, facts = slot.last, slot.facts
+    for trial in begun:
+        facts = trial.user_attrs.get(FACTS, {})
         last = trial.intermediate_values[trial.last_step] if trial.last_step is not None else None
-        row: dict[str, Any] = {"trial": slot.number, "state": slot.state}
-        row |= {"loss": slot.loss, "last_loss": last, "reason": slot.reason}
-        row |= dict.fromkeys(plan.tune.space) | labels(slot.values)
+        loss = trial.value if trial.state == TrialState.COMPLETE else None
+        row: dict[str, Any] = {"trial": origin(trial), "state": state(trial), "loss": loss, "last_loss": last}
+        row |= {"reason": trial.user_attrs.get(REASON, "")}
+        row |= dict.fromkeys(plan.tune.space) | labels(trial.user_attrs.get(VALUES, {}))
         row |= {f"loss/{name}": value for name, value in facts.get("losses", {}).items()}
         row |= {f"seconds/{name}": round(value, 3) for name, value in facts.get("seconds", {}).items()}
-        row |= {"attempts": len(slot.trials), "optuna_trial": trial.number, "worker": trial.user_attrs.get(WORKER)}
+        row |= {"optuna_trial": trial.number, "worker": trial.user_attrs.get(WORKER)}
         rows.append(row | {name: facts.get(name) for name in ("device", "started", "ended", "commit", "code")})
     # As objects: null is a value, not a missing number.
     table = pd.DataFrame(rows, dtype=object)
@@ -142,9 +136,9 @@ def write_best(findings: Findings, settings: Config, folder: Path, root: Path) -
     """
     if findings.best is None:
         return
-    plan, values = findings.plan, dict(findings.best.values)
+    plan, values = findings.plan, dict(findings.best.user_attrs[VALUES])
     name, method = tuned_name(plan.tune), plan.tune.method
-    description = f"{method}, tuned: trial {findings.best.number} of sweep {plan.tune.study}"
+    description = f"{method}, tuned: trial {origin(findings.best)} of sweep {plan.tune.study}"
     clusters = values.pop(CLUSTERS, None)
     sections: dict[str, dict[str, Any]] = {}
     for path, value in values.items():
@@ -174,7 +168,7 @@ def tuned_name(tune: Tune) -> str:
 def summary(findings: Findings, folder: Path) -> str:
     """The sweep in Markdown."""
     plan, tune = findings.plan, findings.plan.tune
-    counts = Counter(slot.state for slot in findings.slots)
+    counts = Counter(map(state, findings.trials))
     ended = counts["complete"] + counts["pruned"] + counts["failed"]
     share, many = plan.base["fit"]["tail_fraction"], f"{len(findings.scenes)} scenario{'s' * (len(findings.scenes) > 1)}"
     lines = [
@@ -207,7 +201,7 @@ def summary(findings: Findings, folder: Path) -> str:
     ]
     table = Table.of_texts(["Trial", "Loss [m²]", *tune.space], rows).markdown() if rows else ["None."]
     lines += [f"## The best {SHOWN} finished trials", "", *table, "", "All trials: `trials.csv`.", ""]
-    if failed := [f"- trial {slot.number}: {slot.reason}" for slot in findings.slots if slot.state == "failed"]:
+    if failed := [f"- trial {origin(t)}: {t.user_attrs[REASON]}" for t in findings.trials if t.state == TrialState.FAIL]:
         lines += ["## Failed", "", *failed, ""]
     lines += [line for name, text in PICTURES.items() if (folder / name).is_file() for line in (f"![{text}]({name})", "")]
     return "\n".join(lines)
@@ -217,19 +211,19 @@ def _best_lines(findings: Findings, folder: Path) -> list[str]:
     plan, best, baseline = findings.plan, findings.best, findings.baseline
     if best is None:
         return ["No trial has finished, so there is no best one.", ""]
-    loss = best.loss
+    loss = best.value
     assert loss is not None
     if baseline is None:
         compared = "The unchanged configuration (trial 0) has not finished."
-    elif best.number == 0:
+    elif origin(best) == 0:
         compared = "That is the unchanged configuration: no trial was better."
     else:
         compared = f"The unchanged configuration (trial 0): {baseline:.4e} m²; a ratio of {loss / baseline:.3f}."
-    values, unchanged = labels(best.values), labels(plan.baseline)
+    values, unchanged = labels(best.user_attrs[VALUES]), labels(plan.baseline)
     lines = [
         "## Best",
         "",
-        f"Trial {best.number}: {loss:.4e} m².",
+        f"Trial {origin(best)}: {loss:.4e} m².",
         compared,
         "The smallest of many losses on the same few frames is optimistic: compare the two methods on test frames.",
         "",
@@ -287,97 +281,3 @@ def _draw(study: Study, folder: Path, *, importances: bool) -> None:
     if steps:
         told = {"xlabel": "epoch, counted through the scenarios", "ylabel": f"mean {LOSS}", "title": ""}
         save("steps.png", 3.0, lambda: plots.plot_intermediate_values(study), steps, **told)
-
-
-def _record_trial(findings: Findings, slot: Slot, definition: Mapping[str, Any], folder: Path) -> None:
-    """Write trials/<slot>/run.json and the files that it names, unless they are there."""
-    plan, trial = findings.plan, slot.last
-    times = {"started": _utc(trial.datetime_start), "ended": _utc(trial.datetime_complete or trial.datetime_start)}
-    facts = times | {"seconds": {}} | slot.facts
-    scores = {"loss": slot.loss} if slot.state == "complete" else {}
-    scores |= {f"loss/{name}": value for name, value in facts.get("losses", {}).items()}
-    _write_record(
-        plan.tune,
-        definition,
-        folder / "trials" / str(slot.number),
-        facts,
-        scores,
-        sorted(trial.intermediate_values.items()),
-        scenario=f"trial-{slot.number}",
-        variant={"study": plan.tune.study, "method": plan.tune.method, "state": slot.state, **labels(slot.values)},
-        status="failed" if slot.state == "failed" else "ok",
-        reason=slot.reason,
-        params=labels(plan.flat(slot.values)),
-        attempt=len(slot.trials),
-        histories={"steps": "history.parquet"},
-    )
-
-
-def _record_sweep(findings: Findings, definition: Mapping[str, Any], files: Sequence[Path], folder: Path) -> None:
-    """Write the run.json of the sweep. `files`, its tables and pictures, lie in `folder`."""
-    tune, best = findings.plan.tune, findings.best
-    made = [slot.facts for slot in findings.slots if slot.facts] or [{"started": _utc(None), "ended": _utc(None), "seconds": {}}]
-    facts = made[-1] | {"started": min(fact["started"] for fact in made), "ended": max(fact["ended"] for fact in made)}
-    facts |= {"seconds": {name: sum(fact["seconds"].get(name, 0.0) for fact in made) for name in ("search", "fit")}}
-    scores = {"best": best.loss if best else None, "baseline": findings.baseline}
-    _write_record(
-        tune,
-        definition,
-        folder,
-        facts,
-        {name: value for name, value in scores.items() if value is not None},
-        [[slot.number, slot.state, slot.last.value] for slot in findings.slots],
-        scenario="study",
-        variant={"study": tune.study, "method": tune.method, "pruner": tune.pruner},
-        status="ok" if best else "failed",
-        reason="" if best else "no trial has finished",
-        params={"trials": tune.trials, "workers": tune.workers, "startup_trials": tune.startup_trials},
-        attempt=1,
-        artifacts={
-            "tables": [path.name for path in files if path.suffix != ".png"],
-            "plots": [path.name for path in files if path.suffix == ".png"],
-        },
-    )
-
-
-def _write_record(
-    tune: Tune,
-    definition: Mapping[str, Any],
-    folder: Path,
-    facts: Mapping[str, Any],
-    scores: Mapping[str, Any],
-    results: Sequence[Any],
-    **fields: Any,
-) -> None:
-    """Write a run record under its key, with its scores and history, unless a record of that key is there."""
-    record = RunRecord(
-        run_key="0" * 8,  # until the record is complete
-        source="tune",
-        category="tune",
-        method=f"tune-{tune.study}",
-        seed=tune.seed,
-        data_digest=hashlib.sha256(canonical(definition.get("frames", {})).encode()).hexdigest(),
-        commit=facts.get("commit", ""),
-        device=facts.get("device", ""),
-        started=facts["started"],
-        ended=facts["ended"],
-        timings=facts["seconds"],
-        scores_file="scores.parquet",
-        **fields,
-    )
-    path = folder / RUN_RECORD
-    # Without timings: the same results have the same key.
-    key = key_of({name: getattr(record, name) for name in KEYED}, scores, results)
-    if path.is_file() and RunRecord.load(path).run_key == key:
-        return
-    tables = {"scores.parquet": [("task", "metric", "value"), *(("tail", *score) for score in scores.items())]}
-    if record.histories:
-        tables["history.parquet"] = [("step", "metric", "value"), *((step, "tail_loss", value) for step, value in results)]
-    for name, (header, *rows) in tables.items():
-        write_table(pd.DataFrame(rows, columns=list(header)).astype({"value": "float64"}), folder / name)
-    replace(record, run_key=key).save(path)
-
-
-def _utc(time: datetime | None) -> str:
-    """A time of Optuna's, which is local and names no zone, in UTC, ISO 8601; now if there is none."""
-    return (time or datetime.now()).astimezone(UTC).isoformat(timespec="seconds")

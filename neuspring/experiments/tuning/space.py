@@ -22,7 +22,6 @@ from neuspring.config import Config, Method, SearchRow
 from neuspring.config.tuning import Dimension, Tune
 from neuspring.core.errors import InputError
 from neuspring.core.records import canonical
-from neuspring.core.run_record import flat
 from neuspring.experiments.benchmark import read_methods, read_searches, with_method, with_search
 
 SECTIONS = ("simulation", "losses", "search", "fit", "released_quirks")
@@ -100,10 +99,6 @@ class Plan:
         """What must not change while a sweep lasts, as plain values."""
         space = {name: config.plain(dimension) for name, dimension in self.tune.space.items()}
         return {"method": self.tune.method, "fit": self.method.fit, "base": self.base, "space": space, "seed": self.tune.seed}
-
-    def flat(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """All settings of a trial under their dotted names."""
-        return flat(self.base) | dict(values)
 
     def is_whole(self, name: str) -> bool:
         """Whether a setting takes whole numbers only."""

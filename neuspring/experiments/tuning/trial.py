@@ -102,17 +102,17 @@ def run(
     values: Mapping[str, Any],
     scenes: Sequence[Scene],
     folder: Path,
-    slot: int,
+    number: int,
     device: str,
     report: Report,
     outcome: Outcome,
 ) -> None:
     """Search and fit every scenario with a trial's values; `outcome` receives the results.
 
-    `folder` is the sweep's. Trials share the searches in it, and the slot's fits continue from their checkpoints in it. Raises what
-    `report` raises; NumericalFailure; InputError for settings that exclude each other or do not fit the data.
+    `folder` is the sweep's. Trials share the searches in it, and the fits continue from the checkpoints of trial `number`. Raises
+    what `report` raises; NumericalFailure; InputError for settings that exclude each other or do not fit the data.
     """
-    settings, clusters = plan.at(values, f"trial {slot}")
+    settings, clusters = plan.at(values, f"trial {number}")
     # The loss over the tail is needed after every epoch, whichever rule selects one.
     tailed = replace(settings, fit=replace(settings.fit, selection="tail"))
     for index, scene in enumerate(scenes):
@@ -136,7 +136,7 @@ def run(
                     report_epoch(0, loss)
                 else:
                     key = _key(problem, record.files["twin"][1], device)
-                    loss = _fitted(problem, settings, checkpoint(folder, slot, scene.name), key, report_epoch)
+                    loss = _fitted(problem, settings, checkpoint(folder, number, scene.name), key, report_epoch)
         except (NonFinite, NumericalFailure) as failure:
             raise NumericalFailure(f"{scene.name}, fit: {failure}") from failure
         outcome.losses[scene.name] = loss
@@ -168,9 +168,9 @@ def searched(scene: Scene, settings: Config, clusters: int, seed: int, device: s
     return record
 
 
-def checkpoint(folder: Path, slot: int, scene: str) -> Path:
-    """The checkpoint of a slot's fit."""
-    return folder / "trials" / str(slot) / f"{scene}.partial.npz"
+def checkpoint(folder: Path, number: int, scene: str) -> Path:
+    """The checkpoint of a trial's fit."""
+    return folder / "trials" / str(number) / f"{scene}.partial.npz"
 
 
 def _key(problem: FitProblem, twin: str, device: str) -> str:

@@ -1,13 +1,9 @@
 """One worker of a sweep, a job of the workflow: it runs trials until the sweep has as many as configured.
 
-Workers share an Optuna study, in SQLite or PostgreSQL, so each may be on another GPU or machine. A sweep has slots 0 .. trials - 1.
-Each is filled by one finished, pruned or failed trial. A worker takes the lowest free slot under a lock in the sweep's folder, so
-that together workers make exactly as many trials as were asked for. When a killed worker starts again, it frees the slot of the
-trial that it left running. The slot keeps its values, so that fits continue from their checkpoints. The sampler is seeded for every
-slot by itself: a sweep of one worker that was killed and continued finds what it would have found in one go.
-
-Optuna's own means do not give that. `MaxTrialsCallback` counts after a trial, when other workers have begun more. Its heartbeat
-notices a dead worker only after minutes, and never one that died before the first beat; a worker's number tells at once.
+Workers share an Optuna study, in SQLite or PostgreSQL, so each may be on another GPU or machine. A worker asks for a trial under a
+lock in the sweep's folder, and only while fewer count than were asked for: Optuna's `MaxTrialsCallback` counts after a trial, when
+other workers have begun more. When a killed worker starts again, the trial that it left running is queued anew with its values, so
+that its fits continue from their checkpoints.
 """
 
 from __future__ import annotations
@@ -22,9 +18,8 @@ import socket
 import tempfile
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import optuna
 import sqlalchemy
@@ -48,12 +43,12 @@ from neuspring.experiments.tuning.trial import Outcome, Scene, checkpoint, run
 DATABASE = "optuna.db"
 DEFINITION = "definition"
 """Attribute of the study: what must not change while it lasts."""
-SLOT, WORKER, REASON, CRASH = "slot", "worker", "reason", "crash"
-"""Attributes of a trial. A failed trial with a reason fills its slot; one without was left behind or crashed."""
+ORIGIN, WORKER, REASON = "origin", "worker", "reason"
+"""Attributes of a trial: the number of the one that it continues, its worker, why it ended early (unless it was left behind)."""
 FACTS, VALUES = "facts", "values"
 """Attributes of a trial: how it went, and its values. The baseline's include those that the space cannot hold."""
 MOST_DEATHS = 5
-"""A slot whose trial ends its worker this often counts as failed, so that the sweep ends."""
+"""A trial that ends its worker this often is not continued; another takes its place."""
 PATIENCE = 60.0
 """Seconds that SQLite waits for another writer."""
 
@@ -100,89 +95,46 @@ def study_of(folder: Path, tune: Tune, facts: Mapping[str, Any], pruner: BasePru
     return study
 
 
-@dataclass(frozen=True)
-class Slot:
-    """A place for one trial, with the trials that were begun for it, oldest first. The last one decides."""
-
-    number: int
-    trials: tuple[FrozenTrial, ...]
-
-    @property
-    def state(self) -> Literal["complete", "pruned", "failed", "running", "waiting", "free"]:
-        """Free: all its trials were left behind or crashed, too few times to give up. Waiting: about to run."""
-        if self.last.state != TrialState.FAIL:
-            return self.last.state.name.lower()  # type: ignore[return-value]
-        return "failed" if REASON in self.last.user_attrs or len(self.trials) >= MOST_DEATHS else "free"
-
-    @property
-    def last(self) -> FrozenTrial:
-        """The newest trial."""
-        return self.trials[-1]
-
-    @property
-    def loss(self) -> float | None:
-        """Of a finished trial."""
-        return self.last.value if self.state == "complete" else None
-
-    @property
-    def facts(self) -> dict[str, Any]:
-        """How its trial went; empty before its end."""
-        facts: dict[str, Any] = self.last.user_attrs.get(FACTS, {})
-        return facts
-
-    @property
-    def values(self) -> dict[str, Any]:
-        """Setting -> value; empty before they are drawn."""
-        values: dict[str, Any] = self.last.user_attrs.get(VALUES, {})
-        return values
-
-    @property
-    def reason(self) -> str:
-        """Why it was pruned or failed, empty otherwise."""
-        attributes = self.last.user_attrs
-        if self.state not in ("pruned", "failed"):
-            return ""
-        given_up = f"given up after {len(self.trials)} attempts, the last: {attributes.get(CRASH, 'its worker was killed')}"
-        return str(attributes.get(REASON, given_up))
+def origin(trial: FrozenTrial | Trial) -> int:
+    """The number of the trial that it continues; its own if none. Trial 0 is the baseline."""
+    return int(trial.user_attrs.get(ORIGIN, trial.number))
 
 
-def slots(study: Study) -> dict[int, Slot]:
-    """The slots for which trials were begun, in order."""
-    trials: dict[int, list[FrozenTrial]] = {}
-    for trial in study.get_trials(deepcopy=False):
-        trials.setdefault(trial.user_attrs[SLOT], []).append(trial)
-    return {number: Slot(number, tuple(trials[number])) for number in sorted(trials)}
+def counted(study: Study) -> list[FrozenTrial]:
+    """The trials that count, by origin: finished, pruned and running ones, and those that failed by their settings."""
+    there = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.RUNNING)
+    return sorted((t for t in study.get_trials(deepcopy=False) if t.state in there or REASON in t.user_attrs), key=origin)
 
 
 def claim(study: Study, worker: int, tune: Tune, first: Mapping[str, Any], sampler: Callable[[int], BaseSampler]) -> Trial | None:
-    """A trial of the lowest free slot, None if there is none. `first` are the values of slot 0; each slot has its `sampler`.
+    """A trial to run, None if there are enough. `first` are the values of the baseline; the n-th that counts has its `sampler`.
 
     The caller holds the sweep's lock, is the only process that is `worker`, and runs no other trial.
     """
-    for running in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
-        owner = running.user_attrs.get(WORKER)
+    begun = study.get_trials(deepcopy=False)
+    for left in begun:
+        owner = left.user_attrs.get(WORKER)
         # Left behind by this worker's earlier process; by a process killed under this lock, before it named its worker; or by a
         # worker that the configuration no longer has.
-        if owner in (None, worker) or owner >= tune.workers:
-            study.tell(running.number, state=TrialState.FAIL)
-    begun = slots(study)
-    # A trial that waits was left between being queued and being taken.
-    number = next((n for n, slot in begun.items() if slot.state == "waiting"), None)
-    if number is None:
-        number = next((n for n in range(tune.trials) if n not in begun or begun[n].state == "free"), None)
-        if number is None:
-            return None
-        values = begun[number].last.params if number in begun else {}
-        study.enqueue_trial((dict(first) if number == 0 else {}) | values, user_attrs={SLOT: number})
-    study.sampler = sampler(number)
+        if left.state == TrialState.RUNNING and (owner in (None, worker) or owner >= tune.workers):
+            if sum(origin(trial) == origin(left) for trial in begun) < MOST_DEATHS:
+                values = (dict(first) if origin(left) == 0 else {}) | left.params
+                study.enqueue_trial(values, user_attrs={ORIGIN: origin(left)})
+            study.tell(left.number, state=TrialState.FAIL)
+    if not begun:
+        study.enqueue_trial(dict(first))
+    count = len(counted(study))
+    if count >= tune.trials and not study.get_trials(deepcopy=False, states=(TrialState.WAITING,)):
+        return None
+    study.sampler = sampler(count)
     trial = study.ask()
     trial.set_user_attr(WORKER, worker)
     return trial
 
 
-def sampler_of(tune: Tune, slot: int, *, grouped: bool) -> BaseSampler:
-    """TPE with the seed of a slot. `grouped`: the baseline has values that the space cannot hold, so that its trial lacks them."""
-    seed = int.from_bytes(hashlib.sha256(f"{tune.seed} {slot}".encode()).digest()[:4], "big")
+def sampler_of(tune: Tune, count: int, *, grouped: bool) -> BaseSampler:
+    """TPE with a seed of its own behind `count` trials. `grouped`: the baseline's trial lacks values that the space cannot hold."""
+    seed = int.from_bytes(hashlib.sha256(f"{tune.seed} {count}".encode()).digest()[:4], "big")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         return TPESampler(seed=seed, n_startup_trials=tune.startup_trials, multivariate=True, group=grouped, constant_liar=True)
@@ -234,7 +186,7 @@ def work(
     device: str,
     output: Path,
     root: Path = Path(),
-    done: Callable[[int, str], None] = lambda slot, text: print(f"trial {slot}: {text}", flush=True),
+    done: Callable[[int, str], None] = lambda number, text: print(f"trial {number}: {text}", flush=True),
 ) -> None:
     """Run trials until the sweep has `tune.trials`, or others run the last ones; then write `output`, a JSON record.
 
@@ -262,19 +214,19 @@ def work(
                 if trial is None:
                     break
                 outcome = _attempt(study, trial, plan, scenes, folder, device)
-                finished.append(trial.user_attrs[SLOT])
+                finished.append(origin(trial))
                 done(finished[-1], outcome)
     except Timeout as error:
         rule = "one process at a time may be this worker"
         raise InputError("--worker", rule, worker, "Wait for the other one to end.") from error
-    content = {"study": tune.study, "worker": worker, "slots": finished, "ended": now(), "device": device}
+    content = {"study": tune.study, "worker": worker, "trials": finished, "ended": now(), "device": device}
     content |= {"format": RECORD_FORMAT, "host": socket.gethostname()}
     write_text(output, json.dumps(content, indent=1, sort_keys=True) + "\n")
 
 
 def _attempt(study: Study, trial: Trial, plan: Plan, scenes: Sequence[Scene], folder: Path, device: str) -> str:
     """Run a trial and tell Optuna how it ended; returns that as text. Raises errors that say nothing about its settings."""
-    slot, started = trial.user_attrs[SLOT], now()
+    number, started = origin(trial), now()
     outcome = Outcome()
 
     def report(step: int, loss: float, what: str) -> None:
@@ -290,11 +242,11 @@ def _attempt(study: Study, trial: Trial, plan: Plan, scenes: Sequence[Scene], fo
             trial.set_user_attr(REASON, reason)
         study.tell(trial, value, state=state)
         for scene in scenes:
-            checkpoint(folder, slot, scene.name).unlink(missing_ok=True)
+            checkpoint(folder, number, scene.name).unlink(missing_ok=True)
 
     try:
         values = _values(trial, plan)
-        run(plan, values, scenes, folder, slot, device, report, outcome)
+        run(plan, values, scenes, folder, number, device, report, outcome)
         tell(TrialState.COMPLETE, outcome.value)
         return f"{outcome.value:.3e} m^2"
     except optuna.TrialPruned as cut:
@@ -305,17 +257,12 @@ def _attempt(study: Study, trial: Trial, plan: Plan, scenes: Sequence[Scene], fo
         tempfile.TemporaryFile(dir=folder).close()
         tell(TrialState.FAIL, reason=str(failure))
         return f"failed: {failure}"
-    except Exception as crash:
-        with contextlib.suppress(Exception):
-            trial.set_user_attr(CRASH, f"{type(crash).__name__}: {crash}"[:500])
-            study.tell(trial, state=TrialState.FAIL)
-        raise
 
 
 def _values(trial: Trial, plan: Plan) -> dict[str, Any]:
-    """Setting -> value of a trial; slot 0 is the baseline, whatever the space."""
+    """Setting -> value of a trial; trial 0 is the baseline, whatever the space."""
     space = plan.tune.space
-    if trial.user_attrs[SLOT] == 0:
+    if origin(trial) == 0:
         values = plan.baseline
         for name, value in values.items():
             if holds(space[name], value):
