@@ -208,7 +208,8 @@ class RodFrames:
         self.solver.pull(self._law(begin, end), *ends)
         paths = [of_edges(points, self._held) for points in ends]
         if self._clamps:
-            paths = [clamped(path, *self._clamps, _ends(self.rods[0])) for path in paths]
+            clamps, axis = self._clamps
+            paths = [clamped(path, clamps, axis, _ends(self.rods[0])) for path in paths]
         self.solver.frame(*paths)
         return self._state()
 

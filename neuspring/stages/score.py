@@ -44,11 +44,11 @@ def score(
     and render. `variant` are the method's switches. A run that failed also gets held.parquet: its scores with the last frame frozen
     that it reached.
     """
-    import numpy as np
     import pandas as pd
 
     from neuspring.core.files import write_table
     from neuspring.report.draw import run as figures
+    from neuspring.report.draw.twin import Lines
     from neuspring.scores import metrics
     from neuspring.twin.hand_paths import with_hands
 
@@ -79,7 +79,7 @@ def score(
         errors=errors,
         twin=stages.twin,
         # The search gives every spring the same stiffness.
-        searched=float(np.median(Twin.load(searched).material.stiffness)) if searched else None,
+        searched=Lines.of(Twin.load(searched)).typical if searched else None,
     )
     artifacts = {"records": list(paths.values())} | ({"twin": [stages.twin_file]} if stages.twin_file else {}) | {"plots": plots}
     if pictures is not None:

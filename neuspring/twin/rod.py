@@ -48,10 +48,13 @@ def rod_twin(observations: Observations, settings: config.Config, axis: Sequence
     """The rod that a fit starts from (`settings.rod`), on the body of a recording in frame 0; `axis` [3]: see `Rod`.
 
     Springs of controllers and all scalars have the starts of `search.variables`, as a lattice's search does, but the linear drag of
-    `rod`. Raises InputError if the body is not long and thin, or nothing holds it.
+    `rod`. Raises InputError if the body is not long and thin, nothing holds it, or only a camera without depth saw it.
     """
     start, variables, scenario = settings.rod, settings.search.variables, observations.scenario
     where = f"observations of {scenario.name}"
+    if observations.image is not None:
+        rule = "a rod is fitted to points that are tracked in space"
+        raise InputError(where, rule, "a camera without depth", "Choose a method whose twin is a lattice.")
     nodes, hands, held = observations.nodes, observations.controller_points[0], _line(observations)
     pairs = np.zeros((0, 2), np.int32)
     if held is None:

@@ -10,7 +10,7 @@ from neuspring.core.errors import InputError
 from neuspring.twin.rod import center_line, rod_twin
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.transfer import move
-from tests.support import ropes
+from tests.support import colored, ropes
 
 SINGLE = 1e-6
 """m: rounding of float32 nodes."""
@@ -116,6 +116,11 @@ def test_a_rod_that_nothing_holds_is_refused():
     none = replace(ropes.SETTINGS, search=config.Search(variables=variables))
     with pytest.raises(InputError, match=r"a hand must hold the rod.*controller_radius"):
         rod_twin(away, none, ropes.AXIS)
+
+
+def test_a_body_that_was_seen_without_depth_is_refused():
+    with pytest.raises(InputError, match=r"tracked in space.*without depth.*lattice"):
+        ropes.twin(colored.observed())
 
 
 def test_a_scene_with_self_collision_is_refused_before_it_is_simulated():

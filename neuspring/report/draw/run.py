@@ -175,4 +175,5 @@ def stiffness_figure(observations: Observations, take: Prediction, searched: flo
     high = figure.get_figheight()
     axis = place(figure, WIDTH + 0.6, FOOT, HISTOGRAM - 0.9, max(high - FOOT - 0.1, 0.5))
     histogram(axis, stiffness, body.norm, searched)
+    axis.set_ylabel("springs" if take.twin.rod is None else "edges")
     return figure

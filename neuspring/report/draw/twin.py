@@ -113,6 +113,11 @@ class Lines:
         return np.concatenate([nodes, hands, *line])
 
     @property
+    def typical(self) -> float:
+        """Median stiffness of the body's lines, N; of all where it has none."""
+        return float(np.median(self.stiffness[: self.inner or None]))
+
+    @property
     def labels(self) -> np.ndarray:
         """The region of each point; all of a rod is one."""
         labels = self.twin.topology.labels
