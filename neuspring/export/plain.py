@@ -94,12 +94,14 @@ Energy: sum_i bending_i |k_i - curvature_i|^2 / (2 l_i) + sum_i twisting_i m_i^2
 - 1)^2 length_j / 2. The twist m_i is the angle from m1_(i-1), parallel-transported to t_i, to m1_i. Inner damping: k_i +
 damping dk_i/dt takes the place of k_i in the moments of bending.
 
-Directors of an end are held where its two outer vertices are: in frame 0 m1 of the first is rod_axis projected, that of the
-last the same turned by roll about its tangent; later they are parallel-transported in time. All others minimize the energy at
-each moment.
+Directors of an end are held where its two outer vertices are: m1 of the first edge is rod_axis projected, that of the last the
+same turned by roll about its tangent. All others are where moments about the tangents, inner damping among them, are in
+balance.
 
 mass_i dv_i/dt = force - mass_i (gravity up_sign (0, 0, 1) + (drag + drag_quadratic |v_i|) v_i). A vertex with rod_held >= 0 is
-where that controller is. The implicit integration is BDF2 with `substeps` steps per frame.
+where that controller is. With rod_clamps, the inner held vertex of an end is beside its controller by these distances along t,
+m1 (without roll) and m2, with t along the two controllers, and the outer one follows at the controllers' distance along -t or
+t. The implicit integration is BDF2 with `substeps` steps per frame.
 
 A node n is at x_j + f e_j + a m1_j + b m2_j with j = rod_edge and (f, a, b) = rod_place. A spring (controller, node) pulls
 there with stiffness (l / rest_length - 1) + dashpot dl/dt; it acts where `holds` is true in this frame and the next. A vertex
