@@ -525,6 +525,9 @@ class Rod(Artifact):
     curvature: np.ndarray = array("V,2", np.float64, "1", "unloaded curvatures k1, k2 of each joint; the ends are not used")
     edge: np.ndarray = array("N", np.int32, "1", "the edge that each node of the topology follows")
     place: np.ndarray = array("N,3", np.float64, "1, m, m", "of each node: fraction along its edge, distances along m1 and m2")
+    line: np.ndarray = array(
+        "V", np.int32, "1", "the observed line, see `Observations.line`; empty: found among nodes", omitted=True
+    )
     axis: np.ndarray = array("3", np.float64, "1", "direction in the world whose projection is m1 of the first edge")
     clamps: np.ndarray = array(
         "2,3",
@@ -567,6 +570,16 @@ class Rod(Artifact):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Residual(Artifact):
+    """A learned correction."""
+
+    kind: ClassVar[str] = "residual"
+    weights: np.ndarray = array("F,3", np.float64, "m", "of each feature, in the frame of gravity and clamps; 0: no correction")
+    ridge: float = number("1", "the ridge weight that was chosen")
+    left_out: float = number("1", "with it, squared error of clips that were left out, over that without a correction")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Twin(Artifact):
     """Topology + Material + Simulation: enough to roll out anywhere."""
 
@@ -578,6 +591,8 @@ class Twin(Artifact):
     """How far the hands are from a camera without depth: searched variables of twin/hand_paths.py. Empty: hands were measured."""
     rod: Rod | None = field(default=None, metadata=OMITTED)
     """The body where it is a rod. Then springs are those of controllers alone, and the nodes follow the center line."""
+    residual: Residual | None = field(default=None, metadata=OMITTED)
+    """What a regression learned of the errors of a rod (twin/residual.py), added to its rollouts."""
 
     def check(self) -> None:
         springs, values = len(self.topology.springs), len(self.material.stiffness)

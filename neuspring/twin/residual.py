@@ -19,12 +19,10 @@ rollout, and never the target's.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from neuspring.core.artifacts import Artifact, array, number
+from neuspring.core.artifacts import Residual, Twin
 from neuspring.core.errors import InputError
 
 WAVES = 3
@@ -35,16 +33,6 @@ RIDGES = tuple(10.0 ** np.arange(-6.0, 2.0))
 """Ridge weights that are tried."""
 LEAST = 1e-6
 """Ends whose horizontal distance is smaller, m, lie above each other: the frame keeps its last direction."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Residual(Artifact):
-    """A learned correction."""
-
-    kind: ClassVar[str] = "residual"
-    weights: np.ndarray = array("F,3", np.float64, "m", "of each feature, in the frame of gravity and clamps; 0: no correction")
-    ridge: float = number("1", "the ridge weight that was chosen")
-    left_out: float = number("1", "with it, squared error of clips that were left out, over that without a correction")
 
 
 def features(positions: np.ndarray, dt: float, free: np.ndarray) -> np.ndarray:
@@ -122,3 +110,15 @@ def apply(residual: Residual, positions: np.ndarray, dt: float, free: np.ndarray
     change = features(corrected, dt, free) @ residual.weights
     corrected[:, free] += change @ np.moveaxis(_axes(corrected), 1, 2)
     return corrected
+
+
+def corrected(twin: Twin, positions: np.ndarray, hands: np.ndarray) -> np.ndarray:
+    """Nodes [T, N, 3], m, of a rollout of a rod with its correction added; hands [T, C, 3], m. Nodes go with the line."""
+    rod, residual = twin.rod, twin.residual
+    assert rod is not None
+    assert residual is not None
+    line = np.concatenate([positions, hands], axis=1)[:, rod.line].astype(np.float64)
+    change = apply(residual, line, twin.simulation.frame_time, rod.held < 0) - line
+    part = rod.place[:, :1]
+    moved: np.ndarray = positions + (1 - part) * change[:, rod.edge] + part * change[:, rod.edge + 1]
+    return moved

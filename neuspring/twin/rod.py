@@ -44,7 +44,7 @@ PENALTY = 1e-3
 """Of the spline's second differences, where the mean weight of a piece's points is 1."""
 
 
-def rod_twin(observations: Observations, settings: config.Config, axis: Sequence[float]) -> Twin:
+def rod_twin(observations: Observations, settings: config.Config, axis: Sequence[float] = (0.0, 1.0, 0.0)) -> Twin:
     """The rod that a fit starts from (`settings.rod`), on the body of a recording in frame 0; `axis` [3]: see `Rod`.
 
     Springs of controllers and all scalars have the starts of `search.variables`, as a lattice's search does, but the linear drag of
@@ -85,6 +85,7 @@ def rod_twin(observations: Observations, settings: config.Config, axis: Sequence
         damping=start.damping,
         drag_quadratic=start.drag_quadratic,
         roll=start.roll,
+        line=observations.line,
         axis=direction,
         edge=np.zeros(0, np.int32),
         place=np.zeros((0, 3)),
@@ -150,7 +151,7 @@ def on_recording(twin: Twin, observations: Observations) -> Twin:
     if abs(found - 1) > MOST_STRETCH:
         rule = f"the center line must be as long as the twin's within {MOST_STRETCH:.0%}: {rod.lengths.sum():.3f} m"
         raise InputError(where, rule, f"{found * rod.lengths.sum():.3f} m", "Name a recording of the same body.")
-    moved = replace(rod, held=held, vertices=settled([rod], vertices[None])[0])
+    moved = replace(rod, held=held, line=observations.line, vertices=settled([rod], vertices[None])[0])
     return replace(twin, topology=topology, material=material, rod=_bound(moved, observations))
 
 

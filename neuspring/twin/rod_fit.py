@@ -23,10 +23,11 @@ import torch
 
 from neuspring import config
 from neuspring.config.rod import RodFit
-from neuspring.core.artifacts import Observations, Rod, Twin
+from neuspring.core.artifacts import Observations, Residual, Rod, Twin
 from neuspring.core.errors import NumericalFailure
 from neuspring.core.text import Progress
 from neuspring.physics.rod_nodes import RodFrames, settled, turn_of
+from neuspring.twin import residual
 from neuspring.twin import rod as rods
 from neuspring.twin.losses import frames_seen
 from neuspring.twin.polish import damped_step
@@ -211,6 +212,24 @@ class Recordings:
         found = torch.stack(kept, dim=1).reshape(len(twins), count, len(kept), tracked, 3).numpy()
         return np.nan_to_num(found, nan=FARTHEST * 10, posinf=FARTHEST * 10, neginf=-FARTHEST * 10)
 
+    def residual(self, twin: Twin, device: str) -> Residual:
+        """What a regression learns of the errors of a twin. Raises InputError for less than two recordings."""
+        found = self.predicted([twin], len(self.hands), 1, device)[0]
+        lines = []
+        for each, later, seen in zip(self.observations, found, self.counts, strict=True):
+            last = int(seen.any(axis=1).sum())
+            points = each.object_points[:last].astype(np.float64)
+            predicted = np.concatenate([points[:1], later[: last - 1]])
+            hands = each.controller_points[:last]
+            lines.append([np.concatenate([nodes, hands], axis=1) for nodes in (predicted, points)])
+            count = len(each.nodes) - points.shape[1]
+            # Tracked points are the first nodes; controllers come behind all nodes.
+            index = np.where(each.line >= len(each.nodes), each.line - count, each.line)
+            lines[-1] = [line[:, index] for line in lines[-1]]
+        names = [each.scenario.name for each in self.observations]
+        rollouts, targets = zip(*lines, strict=True)
+        return residual.fit(rollouts, targets, names, twin.simulation.frame_time, _rod(twin).held < 0)
+
 
 class Levenberg:
     """Lowers the objective of some variables on some recordings."""
@@ -338,7 +357,12 @@ def fit_rod(problem: FitProblem, threads: int = 1) -> RodResult:
     solver = Levenberg(recordings, settings, problem.device, threads)
     progress = Progress(f"fit {problem.observations.scenario.name}, rod", settings.rounds * len(settings.horizons))
     twin, value, history = solver.lowered(problem.twin, progress)
-    return _result(twin, value, history, solver.rollouts)
+    result = _result(twin, value, history, solver.rollouts)
+    if not settings.residual:
+        return result
+    learned = recordings.residual(twin, problem.device)
+    facts = result.facts | {"ridge": learned.ridge, "left_out": learned.left_out}
+    return replace(result, twin=replace(twin, residual=learned), facts=facts)
 
 
 def _recordings(

@@ -12,6 +12,7 @@ from neuspring.core.errors import InputError
 from neuspring.physics import stability
 from neuspring.physics.controllers import waypoints
 from neuspring.physics.solver import FrameSolver, solver_for
+from neuspring.twin.residual import corrected
 
 FAR = 1e3
 """A node this far from the origin has left any plausible scene, m."""
@@ -75,8 +76,11 @@ def roll_out(
                 progress(frame)
     except Diverged as end:
         diverged, reason = end.frame, end.reason
+    predicted = torch.stack(positions).numpy()
+    if twin.residual is not None:
+        predicted = corrected(twin, predicted, np.asarray(controller_points)[: len(predicted)]).astype(np.float32)
     return Trajectory(
-        positions=torch.stack(positions).numpy(),
+        positions=predicted,
         frame_count=len(hands),
         diverged_frame=diverged,
         reason=reason,

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from neuspring.core.artifacts import Residual
 from neuspring.core.errors import InputError
-from neuspring.twin.residual import Residual, apply, features, fit
+from neuspring.twin.residual import apply, features, fit
 
 DT, FRAMES, VERTICES = 0.01, 40, 8
 FREE = np.isin(np.arange(VERTICES), [2, 3, 4, 5])

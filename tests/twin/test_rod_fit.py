@@ -1,0 +1,147 @@
+"""The fit of a rod: planted cables are found again, on recordings of several lengths, with markers beside the line."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from neuspring import config
+from neuspring.config.rod import RodFit
+from neuspring.core.artifacts import Observations, Scenario, Twin
+from neuspring.core.errors import InputError
+from neuspring.twin.fit import FitProblem
+from neuspring.twin.rod import rod_twin
+from neuspring.twin.rod_fit import Levenberg, Recordings, Variables, fit_rod, search_rod
+from neuspring.twin.rollout import roll_out
+from neuspring.twin.transfer import move
+
+SETTINGS = config.parse(config.Config, {"fit": {"rod": {"horizons": [0], "rounds": 6, "every": 1, "robust": 1e-3}}}, "test")
+VERTICES = 8
+AXIS = (0.0, 1.0, 0.0)
+WITHOUT_MARKERS = replace(SETTINGS.fit.rod, markers=False)
+
+
+def cable(name: str, seed: int, frames: int = 13) -> Observations:
+    """A hanging line of markers every 5 cm, whose held ends wander smoothly; inner markers are still to be predicted."""
+    rng = np.random.default_rng(seed)
+    along = np.linspace(-1, 1, VERTICES)
+    angles = 1.3 * np.sin(0.5 * np.pi * along) + 0.05 * rng.normal(size=VERTICES)
+    edges = 0.05 * np.stack([np.cos(angles), 0.1 * rng.normal(size=VERTICES), np.sin(angles)], axis=1)
+    line = np.cumsum(edges, axis=0) + [0, 0, 0.5]
+    held = np.array([0, 1, VERTICES - 2, VERTICES - 1])
+    time = np.arange(frames)[:, None, None] * 0.02
+    sway = 0.05 * np.sin(8 * time * rng.uniform(0.7, 1.3, 3) + rng.uniform(0, 6, 3)) * [1, 1, 0.5]
+    hands = line[held] + np.where(np.arange(4)[:, None] < 2, sway - sway[:1], sway[:1] - sway)
+    inner = np.repeat(line[None, 2:-2], frames, axis=0)
+    scenario = Scenario(
+        name=name, source="mocap", category="cable", frame_count=frames, train_end=frames, frame_rate=50.0, up="+z", ground=False
+    )
+    seen = np.ones(inner.shape[:2], dtype=bool)
+    none = np.zeros((0, 3))
+    index = np.array([4, 5, 0, 1, 2, 3, 6, 7])
+    return Observations(
+        scenario=scenario, object_points=inner, object_visibility=seen, object_motion_valid=seen, controller_points=hands,
+        surface_points=none, interior_points=none, tracks=inner, line=index,
+    )  # fmt: skip
+
+
+def recorded(twin: Twin, observations: Observations) -> Observations:
+    """The recording as a twin moves."""
+    points = roll_out(move(twin, observations)[0], observations.controller_points).positions
+    return replace(observations, object_points=points, tracks=points)
+
+
+def planted(settings: RodFit, seed: int, size: float) -> tuple[Twin, list[Observations], Variables, np.ndarray]:
+    """A twin with random variables, and two recordings of it; the start, and the variables."""
+    shapes = [cable("one", 0), cable("two", 1, frames=10)]
+    variables = Variables.of(rod_twin(shapes[0], SETTINGS, AXIS), settings)
+    q = size * variables.scale * np.random.default_rng(seed).normal(size=len(variables.scale))
+    twin = variables.made(q)
+    return twin, [recorded(twin, shape) for shape in shapes], variables, q
+
+
+def problem(twin: Twin, seen: list[Observations], **settings: object) -> FitProblem:
+    fit = replace(SETTINGS.fit, rod=replace(SETTINGS.fit.rod, **settings))
+    return FitProblem(
+        seen[0], twin, fit, SETTINGS.simulation, SETTINGS.losses, SETTINGS.released_quirks, kind="rod", pool=seen[1:]
+    )
+
+
+def error(twin: Twin, seen: list[Observations]) -> float:
+    """Mean distance, m."""
+    found = [roll_out(move(twin, each)[0], each.controller_points).positions - each.object_points for each in seen]
+    return float(np.mean([np.linalg.norm(each, axis=2).mean() for each in found]))
+
+
+def test_a_planted_rod_is_found_and_predicts_another_recording():
+    truth, seen, _, _ = planted(WITHOUT_MARKERS, 0, 0.5)
+    search = search_rod(seen[0], seen[1:], SETTINGS)
+    result = fit_rod(problem(search.twin, seen, markers=False))
+    new = recorded(truth, cable("three", 2))
+    before, after = error(search.twin, [new]), error(result.twin, [new])
+    assert after < 0.1 * before
+    assert result.twin.rod.bending[1] / truth.rod.bending[1] == pytest.approx(
+        result.twin.rod.mass[3] / truth.rod.mass[3], rel=0.1
+    ), "only stiffness over mass is in the motion"
+    losses = result.history["loss"].to_numpy()
+    assert losses[-1] < 0.01 * losses[0]
+
+
+def test_markers_beside_the_line_are_found():
+    truth, seen, _, _ = planted(SETTINGS.fit.rod, 3, 0.3)
+    start = rod_twin(seen[0], SETTINGS, AXIS)
+    without, with_markers = (fit_rod(problem(start, seen, markers=markers)).twin for markers in (False, True))
+    new = recorded(truth, cable("three", 2))
+    assert error(with_markers, [new]) < 0.3 * error(without, [new])
+    # In frame 0 markers lie where they were seen, whatever the line is.
+    moved = move(with_markers, new)[0]
+    np.testing.assert_allclose(moved.topology.nodes, new.nodes, atol=1e-6)
+    assert np.abs(moved.rod.vertices[2:-2] - new.nodes).max() > 1e-3
+
+
+def test_slopes_are_derivatives_of_rollouts():
+    """Those of half the step agree within the step's own error, in all variables."""
+    _, seen, variables, q = planted(replace(SETTINGS.fit.rod, stiffness="knots", knots=4), 5, 0.2)
+    solver = Levenberg(Recordings.of(seen, variables.twin), SETTINGS.fit.rod)
+    base = solver.errors(variables, [q], 10, 1)[0]
+    slopes = [
+        (solver.errors(variables, list(q + step * np.diag(variables.scale)), 10, 1) - base) / step for step in (1e-3, 5e-4)
+    ]
+    apart = np.abs(slopes[1] - slopes[0]).max(axis=1) / (np.abs(slopes[0]).max(axis=1) + 1e-6)
+    assert apart.max() < 0.02, dict(zip(np.repeat(list(variables.sizes), list(variables.sizes.values())), apart, strict=False))
+
+
+def test_recordings_share_a_launch_and_shorter_ones_count_less():
+    _, seen, variables, q = planted(WITHOUT_MARKERS, 1, 0.3)
+    together = Levenberg(Recordings.of(seen, variables.twin), WITHOUT_MARKERS)
+    errors = together.errors(variables, [q, 0 * q], 13, 1)
+    assert errors.shape == (2, 4 * 3 * (12 + 9))
+    assert np.abs(errors[0]).max() < 1e-5, "the planted twin leaves nothing"
+    alone = Levenberg(Recordings.of(seen[:1], variables.twin), WITHOUT_MARKERS).errors(variables, [0 * q], 13, 1)
+    np.testing.assert_array_equal(errors[1].reshape(-1)[: alone.size], alone[0])
+    threads = Levenberg(Recordings.of(seen, variables.twin), WITHOUT_MARKERS, threads=2)
+    np.testing.assert_array_equal(threads.errors(variables, [q, 0 * q], 13, 1), errors)
+
+
+def test_fields_along_the_arc():
+    twin = rod_twin(cable("one", 0), SETTINGS, AXIS)
+    sizes = {}
+    for kind in ("constant", "knots", "free"):
+        variables = Variables.of(twin, replace(WITHOUT_MARKERS, stiffness=kind, curvature=kind, knots=4))
+        sizes[kind] = variables.sizes.get("bending_along", 0), variables.sizes["curvature"]
+        # A constant is in each of them.
+        made = variables.made(np.zeros(len(variables.scale)))
+        np.testing.assert_array_equal(made.rod.bending, twin.rod.bending)
+    assert sizes == {"constant": (0, 2), "knots": (4, 8), "free": (6, 12)}
+
+
+def test_the_residual_row_adds_a_correction_that_saves_and_loads(tmp_path):
+    truth, seen, _, _ = planted(WITHOUT_MARKERS, 2, 0.5)
+    start = rod_twin(seen[0], SETTINGS, AXIS)
+    result = fit_rod(problem(start, seen, markers=False, horizons=(3,), rounds=1, residual=True))
+    result.twin.save(tmp_path / "twin.npz")
+    again = Twin.load(tmp_path / "twin.npz")
+    np.testing.assert_array_equal(again.residual.weights, result.twin.residual.weights)
+    assert error(again, seen) < error(replace(again, residual=None), seen)
+    with pytest.raises(InputError, match="two training clips"):
+        fit_rod(problem(start, seen[:1], markers=False, horizons=(3,), rounds=1, residual=True))
