@@ -31,7 +31,7 @@ def cable(name: str, seed: int, frames: int = 21) -> Observations:
     along = np.linspace(-1, 1, VERTICES)
     angles = 1.3 * np.sin(0.5 * np.pi * along) + 0.05 * rng.normal(size=VERTICES)
     edges = 0.1 * np.stack([np.cos(angles), 0.1 * rng.normal(size=VERTICES), np.sin(angles)], axis=1)
-    line = np.cumsum(edges, axis=0) + [0, 0, 0.5]
+    line = np.cumsum(edges, axis=0) + np.array([0, 0, 0.5])
     held = np.array([0, 1, VERTICES - 2, VERTICES - 1])
     time = np.arange(frames)[:, None, None] * 0.02
     sway = 0.1 * np.sin(8 * time * rng.uniform(0.7, 1.3, 3) + rng.uniform(0, 6, 3)) * [1, 1, 0.5]
@@ -134,7 +134,7 @@ def test_fields_along_the_arc():
 
 
 def test_the_residual_row_adds_a_correction_that_saves_and_loads(tmp_path):
-    truth, seen, _, _ = planted(WITHOUT_MARKERS, 2, 0.5)
+    _, seen, _, _ = planted(WITHOUT_MARKERS, 2, 0.5)
     start = rod_twin(seen[0], SETTINGS, AXIS)
     result = fit_rod(problem(start, seen, markers=False, horizons=(3,), rounds=1, residual=True))
     result.twin.save(tmp_path / "twin.npz")
