@@ -87,8 +87,10 @@ def _grip(runs: Iterable[RunRecord]) -> list[tuple[str, str]]:
 
 
 def _gripping(values: Mapping[str, Any]) -> int | None:
-    """How many springs hold the hands: the fit's, else the search's."""
+    """How many springs hold the hands: the fit's, else the search's. None of rods, whose clamps have none."""
     for stage in ("fit", "search"):
+        if f"{stage}.result.vertices" in values:
+            return None
         springs, inner = values.get(f"{stage}.result.springs"), values.get(f"{stage}.result.object_springs")
         if springs is not None and inner is not None:
             return int(springs - inner)
