@@ -56,8 +56,6 @@ def play(
     save: Annotated[Path, arg(help="folder where recordings are saved")] = Path(),
     replay: Annotated[Path | None, arg(help="show a saved recording again")] = None,
     compare: Annotated[bool, arg(help="with --replay: print how the other twins move under it, and end")] = False,
-    video: Annotated[Path | None, arg(help="with --replay: write it as a video, and end")] = None,
-    camera: Annotated[str | None, arg(help="with --video: a camera of the capture; a view from the side by default")] = None,
 ) -> None:
     """Runs of a results folder in the browser, until Ctrl-C; twins that can be pulled by hand."""
     from neuspring.play.controls import comparison, load_controls, pulled_run
@@ -69,21 +67,12 @@ def play(
         raise InputError("--frame", f"{found.folder.name} has the frames 0 to {frames - 1}", frame)
     controls = load_controls(replay) if replay else None
     own = pulled_run(found, controls, replay) if controls and replay else None
-    if controls is None or own is None:
-        for name, value in (("compare", compare), ("video", video), ("camera", camera)):
-            if value:
-                raise InputError(f"--{name}", "a recording is required", "none", "Give it with --replay FILE.")
-    elif compare or video:
-        for line in comparison(found, controls, own) if compare else ():
+    if compare:
+        if controls is None or own is None:
+            raise InputError("--compare", "a recording is required", "none", "Give it with --replay FILE.")
+        for line in comparison(found, controls, own):
             print(line, flush=True)
-        if video:
-            from neuspring.play.video import write_video
-
-            made = write_video(found, own, controls, video, camera)
-            print(f"Wrote {made.path}: {made.frames} frames, {made.kind}" + (f" ({made.reason})" if made.reason else ""))
         return
-    elif camera:
-        raise InputError("--camera", "is for --video", camera, "Add --video FILE.mp4.")
     from neuspring.perception.annotate.guard import is_loopback
     from neuspring.play.page import Page
     from neuspring.play.serve import address, start
