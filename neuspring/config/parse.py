@@ -37,7 +37,8 @@ class Section:
 
 T = TypeVar("T")
 REMOVED = "removed; commit 7308a7b is the last that has it"
-"""The sentence for what lost its trial."""
+LEFT = "removed; commit a72d24c is the last that has it"
+"""The sentences for what lost its trial."""
 _LEFT = {
     REMOVED: """
         controller_path drag_quadratic carry_over average_seeds last_frame losses.alpha simulation.mass search.clusters extra
@@ -47,6 +48,8 @@ _LEFT = {
     "removed, marks serve such scenes (segment.backend: marks); commit a72d24c is the last that has it": """
         opencv.boxes opencv.table opencv.sleeves opencv.clutter opencv.object opencv.thin
     """,
+    "removed, on coordinates and feature always; commit a72d24c is the last that has it": "field.fourier",
+    LEFT: "plane_smoothness",
     "removed: splats follow the nodes that are nearest in each frame": "frozen_skinning",
     "now losses of the whole configuration": "losses",
     "now color_rate": "colour_rate",

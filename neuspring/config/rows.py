@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from neuspring.config.parse import REMOVED, Count, Name, Section
+from neuspring.config.parse import LEFT, REMOVED, Count, Name, Section
 
 Kind = Literal["springs", "field", "rod"]
 """What a first-order stage trains: each spring by itself, the neural spring field, or what is unknown of a rod."""
 Body = Literal["lattice", "rod"]
 """What a twin is made of: springs between nodes, or an elastic rod."""
 
-LEFT = """
+_LEFT = """
     spring_gaus_alpha spring_gaus_ignore_hands spring_gaus_shared_splats gs_dynamics_all_tracks gs_dynamics_centroids
     gs_dynamics_nearest baseline_long neuspring_long baseline_plus_long neuspring_plus_long plus_tail plus_rest_shape
     plus_rest_lengths no_factors plus_average neuspring_plus_average slow_planes oracle_plus search_only_from_last_frame
@@ -22,7 +22,8 @@ LEFT = """
     color_silhouettes color_alpha color_with_alpha hands_fixed hands_in_plane hands_by_size tracks_alone silhouettes_alone
     alpha_alone with_alpha
 """
-RENAMED_ROWS = {"phystwin": "baseline", "clusters_1": "model_b", "clusters_5": "neuspring"} | dict.fromkeys(LEFT.split(), REMOVED)
+RENAMED_ROWS = {"phystwin": "baseline", "clusters_1": "model_b", "clusters_5": "neuspring"} | dict.fromkeys(_LEFT.split(), REMOVED)
+RENAMED_ROWS |= dict.fromkeys(("fourier_feature", "fourier_coordinates", "fourier_none"), LEFT)
 """Methods and searches of older tables -> their name now, or a sentence that says where they went."""
 
 

@@ -43,16 +43,12 @@ class SpringField(Section):
     """Features per texel, C."""
     hidden: Count = 128
     """Units per hidden layer of the MLP, which has three layers."""
-    fourier: Literal["feature", "coordinates", "both", "none"] = "both"
-    """What the Fourier transform is applied to: the summed plane feature, the coordinates (concatenated), or both."""
     bands: Count = 4
     """Number of frequencies 1, 2, 4, ... (times pi) of the Fourier transform."""
     texel_scale: Positive = 0.1
     """Standard deviation of the texels at the start, which are white noise."""
     plane_learning_rate: Positive | None = None
     """Learning rate of the texels; null: that of the MLP."""
-    plane_smoothness: NonNegative = 0.0
-    """Weight of the mean squared difference of neighboring texels, in the loss unit (`fit.loss_unit`)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,5 +113,3 @@ class Fit(Section):
         low, high = self.stiffness_range
         if not 0 <= low < high:
             raise ValueError(f"stiffness_range: 0 <= low < high is required, received [{low}, {high}]")
-        if not self.field.triplane and self.field.fourier not in ("coordinates", "both"):
-            raise ValueError(f"field.fourier: coordinates is required without the tri-plane, received {self.field.fourier}")

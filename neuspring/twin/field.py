@@ -55,7 +55,6 @@ class TriPlane(nn.Module):
 
     indices: torch.Tensor
     weights: torch.Tensor
-    neighbors: torch.Tensor
 
     def __init__(self, points: np.ndarray, resolution: int, channels: int, scale: float, generator: torch.Generator) -> None:
         """`points` [S, 3] in [-1, 1]^3; texels start as N(0, scale^2), drawn for the full planes."""
@@ -66,16 +65,10 @@ class TriPlane(nn.Module):
         self.texels = nn.Parameter(full[torch.from_numpy(active)])
         self.register_buffer("indices", torch.from_numpy(inverse.reshape(cells.shape)), persistent=False)
         self.register_buffer("weights", torch.from_numpy(weights.astype(np.float32)), persistent=False)
-        self.register_buffer("neighbors", torch.from_numpy(_neighbors(active, resolution)), persistent=False)
 
     def forward(self) -> torch.Tensor:
         """Summed features [S, C]."""
         return embedding_bag(self.indices, self.texels, per_sample_weights=self.weights, mode="sum")
-
-    def roughness(self) -> torch.Tensor:
-        """Mean squared difference of neighboring texels in use; every point uses 2 x 2 of each plane."""
-        first, second = self.neighbors.unbind(dim=1)
-        return (self.texels[first] - self.texels[second]).square().mean()
 
 
 def bilinear(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
@@ -94,18 +87,6 @@ def bilinear(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarra
                 along, up = (part[:, a], part[:, b])
                 weights.append((along if column else 1 - along) * (up if row else 1 - up))
     return np.stack(cells, axis=1), np.stack(weights, axis=1)
-
-
-def _neighbors(active: np.ndarray, resolution: int) -> np.ndarray:
-    """Pairs [P, 2] of positions in the sorted `active` whose texels adjoin in the same plane."""
-    right, up = active % resolution < resolution - 1, active % resolution**2 < resolution**2 - resolution
-    pairs = []
-    for step, inside in ((1, right), (resolution, up)):
-        neighbor = active + step
-        place = np.minimum(np.searchsorted(active, neighbor), len(active) - 1)
-        both = inside & (active[place] == neighbor)
-        pairs.append(np.stack([np.flatnonzero(both), place[both]], axis=1))
-    return np.concatenate(pairs)
 
 
 class SpringField(nn.Module):
@@ -138,14 +119,9 @@ class SpringField(nn.Module):
                 tensor.zero_()
 
     def encoded(self) -> torch.Tensor:
-        """Inputs of the MLP [S, width]: the plane feature and the coordinates, each transformed as the settings say."""
-        s, parts = self.settings, []
-        if self.planes is not None:
-            feature = self.planes()
-            parts.append(fourier(feature, s.bands) if s.fourier in ("feature", "both") else feature)
-        if s.fourier in ("coordinates", "both"):
-            parts.append(fourier(self.coordinates, s.bands))
-        return torch.cat(parts, dim=1)
+        """Inputs of the MLP [S, width]: the plane feature and the coordinates, transformed."""
+        parts = [self.coordinates] if self.planes is None else [self.planes(), self.coordinates]
+        return torch.cat([fourier(part, self.settings.bands) for part in parts], dim=1)
 
     def forward(self) -> torch.Tensor:
         """F [S, outputs]."""

@@ -212,13 +212,9 @@ class TwinParameters(nn.Module):
         return pack(**self.physical(), substep=substep)
 
     def penalty(self) -> torch.Tensor:
-        """The regularizers of a step, in the loss unit: roughness of the planes, changes of rest lengths, each with its weight."""
-        s, total = self.settings, torch.zeros(())
-        if self.field is not None and self.field.planes is not None and s.field.plane_smoothness:
-            total = total + s.field.plane_smoothness * self.field.planes.roughness()
-        if self.unloaded is not None and s.rest_shape.prior:
-            total = total + s.rest_shape.prior * (self.unloaded() - 1).square().mean()
-        return total
+        """The regularizer of a step, in the loss unit: changes of rest lengths, with their weight."""
+        prior = self.settings.rest_shape.prior
+        return prior * (self.unloaded() - 1).square().mean() if self.unloaded is not None and prior else torch.zeros(())
 
     def copy(self) -> dict[str, np.ndarray]:
         """The trained values as arrays."""

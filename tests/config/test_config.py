@@ -129,9 +129,9 @@ MISTAKES = {
     "resolution word": ("fit: {field: {resolution: fine}}", "fit.field.resolution", "'adaptive'"),
     "no texels": ("fit: {field: {resolution: 0}}", "fit.field.resolution", "received 0"),
     "unknown field key": ("fit: {field: {layers: 3}}", "fit.field.layers: unknown key"),
-    "nothing to feed the network": (
-        "fit: {field: {triplane: false, fourier: feature}}",
-        "field.fourier: coordinates is required without the tri-plane, received feature",
+    "where the Fourier transform goes": (
+        "fit: {field: {fourier: feature}}",
+        "fit.field.fourier: unknown key (removed, on coordinates and feature always; commit a72d24c",
     ),
     "tail fraction": ("fit: {tail_fraction: 0}", "fit.tail_fraction", "greater than 0"),
     "null for a rate": ("fit: {learning_rate: null}", "fit.learning_rate", "received None"),

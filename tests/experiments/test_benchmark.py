@@ -512,7 +512,6 @@ def test_pools_that_cannot_be(tmp_path: Path, changes: dict[str, object], messag
         ["mocap", "clusters"],
         ["mocap", "mocap_heldout"],
         ["mocap", "mocap_heldout", "headline"],
-        ["mocap", "mocap_field"],
         ["mocap", "paper"],
         ["deform"],
         ["color", "footage"],

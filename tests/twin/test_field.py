@@ -15,7 +15,6 @@ EXACT = 1e-12
 STEPS = 1e-8
 """Absolute, for weights of order 1 after optimizer steps in float64: Adam divides by gradients, which magnifies rounding."""
 SMALL = {"channels": 3, "hidden": 8, "bands": 2}
-FOURIER = ("feature", "coordinates", "both", "none")
 
 
 def points(count: int = 30, seed: int = 0) -> np.ndarray:
@@ -40,7 +39,7 @@ def train(field: SpringField, target: torch.Tensor, steps: int = 5) -> None:
 # The start ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("settings", [{}, {"triplane": False}, {"fourier": "none"}, {"resolution": 256}])
+@pytest.mark.parametrize("settings", [{}, {"triplane": False}, {"resolution": 256}])
 def test_the_field_is_zero_at_the_start_and_can_leave_it(settings):
     field = field_of(**settings)
     assert not field().any()
@@ -82,17 +81,6 @@ def test_the_network_has_three_layers_of_the_paper_s_width():
     assert [tuple(layer.weight.shape) for layer in field.layers] == [(128, (32 + 3) * 8), (128, 128), (1, 128)]
     assert field.planes is not None
     assert field.planes.texels.shape[1] == 32
-
-
-@pytest.mark.parametrize("option", FOURIER)
-def test_every_fourier_option_has_its_width_and_trains(option):
-    width = {"feature": 3 * 4, "coordinates": 3 + 3 * 4, "both": 3 * 4 + 3 * 4, "none": 3}[option]
-    field = field_of(fourier=option)
-    assert field.encoded().shape == (30, width)
-    assert field.layers[0].in_features == width
-    before = field.planes.texels.detach().clone()
-    train(field, torch.from_numpy(np.sin(points(30)[:, :2])))
-    assert not torch.equal(field.planes.texels, before), "the planes take part"
 
 
 def test_the_fourier_transform_by_hand():
@@ -217,33 +205,3 @@ def test_texels_in_use_take_the_same_steps_as_full_planes():
     assert (planes.texels.detach() - start[active]).abs().max() > 1e-3
     unread = np.setdiff1d(np.arange(3 * resolution**2), active)
     assert torch.equal(flat[unread], start[unread])
-
-
-def test_roughness_by_hand():
-    """N = 2, one point inside: all four texels of each plane are in use, so each plane has four pairs of neighbors."""
-    planes, full = dense(np.zeros((1, 3)), 2, 2, 1.0)
-    squares = []
-    for plane in full:
-        (a, b), (c, d) = plane.permute(1, 2, 0)
-        squares += [(p - q).square() for p, q in ((a, b), (c, d), (a, c), (b, d))]
-    torch.testing.assert_close(planes.roughness(), torch.stack(squares).mean(), rtol=0, atol=EXACT)
-
-
-@pytest.mark.parametrize("count", [1, 2, 40])
-def test_roughness_counts_neighbors_in_use_and_no_others(count):
-    """Neither across the end of a row nor from one plane to the next, nor texels that no point reads."""
-    at, resolution = scattered()[:count], 5
-    planes, full = dense(at, resolution, 2, 1.0)
-    used = np.zeros(3 * resolution**2, bool)
-    used[bilinear(at, resolution)[0]] = True
-    used = used.reshape(3, resolution, resolution)
-    values = full.permute(0, 2, 3, 1).numpy()
-    squares = [
-        np.square(values[p, i, j] - values[p, i + down, j + right])
-        for p in range(3)
-        for i in range(resolution)
-        for j in range(resolution)
-        for down, right in ((1, 0), (0, 1))
-        if i + down < resolution and j + right < resolution and used[p, i, j] and used[p, i + down, j + right]
-    ]
-    assert planes.roughness().item() == pytest.approx(np.mean(squares), rel=EXACT)

@@ -81,7 +81,7 @@ EVERYTHING = {
         rest_shape=config.RestShape(handles=3, prior=10.0),
         output_bound=1.5,
         selection="tail",
-        field=replace(FIELD, plane_smoothness=1e-3),
+        field=FIELD,
     ),
 }
 LIMITED = {

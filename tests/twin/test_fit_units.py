@@ -13,7 +13,7 @@ from tests.support import small
 
 SINGLE = 1e-5
 """Relative: sums of gradients in float32."""
-FIELD = config.SpringField(channels=4, hidden=16, bands=2, plane_smoothness=1e-2)
+FIELD = config.SpringField(channels=4, hidden=16, bands=2)
 SETTINGS = {
     "springs": {"rest_shape": config.RestShape(handles=4)},
     "field": {"output_bound": 1.5, "horizon": 2},

@@ -271,15 +271,6 @@ def test_learning_rates_of_each_group():
     assert not names, "every trained value belongs to one group"
 
 
-def test_the_penalty_is_the_weighted_roughness():
-    trained = disturb(parameters(field={"plane_smoothness": 0.5}))
-    assert trained.penalty().item() == pytest.approx(0.5 * trained.field.planes.roughness().item(), rel=SINGLE)
-    assert trained.penalty() > 0
-    for other in (parameters(), parameters("springs", field={"plane_smoothness": 0.5})):
-        assert disturb(other).penalty() == 0
-    assert parameters(field={"plane_smoothness": 0.5, "triplane": False}).penalty() == 0
-
-
 def test_the_prior_of_the_unloaded_shape_is_its_mean_squared_strain():
     trained = disturb(parameters("springs", rest_shape=config.RestShape(handles=3, prior=2.0)))
     strain = trained.physical()["rest_lengths"].detach() / trained.start["rest_lengths"] - 1
