@@ -130,7 +130,7 @@ def on_recording(twin: Twin, observations: Observations) -> Twin:
     here = twin.topology
     if held is None and np.array_equal(here.nodes, nodes) and np.array_equal(here.controllers, hands):
         return twin  # as it is
-    topology, material = replace(twin.topology, nodes=nodes, controllers=hands, rest_shape=observations.rest_shape), twin.material
+    material = twin.material
     if held is None:
         vertices, held = center_line(nodes, len(rod.held), where), rod.held
         rod = replace(rod, axis=_across(vertices))
@@ -140,13 +140,13 @@ def on_recording(twin: Twin, observations: Observations) -> Twin:
         if not len(pairs):
             rule = f"a hand must be within {reach:.3g} m of a node, as the twin's hands are"
             raise InputError(where, rule, "none is", "Check the controllers of frame 0.")
-        topology, old = build(nodes, hands, pairs), twin.topology
+        topology = build(nodes, hands, pairs)
         # The body keeps its mass, so all springs together keep their force per displacement, and their damping.
-        stiffness = (material.stiffness / old.rest_lengths).sum() / (1 / topology.rest_lengths).sum()
+        stiffness = (material.stiffness / here.rest_lengths).sum() / (1 / topology.rest_lengths).sum()
         dashpot = material.dashpot.sum() / len(pairs)
         material = replace(material, stiffness=np.full(len(pairs), stiffness), dashpot=np.full(len(pairs), dashpot))
     else:
-        vertices = line_of(observations)
+        topology, vertices = build(nodes, hands, here.springs), line_of(observations)
     found = np.linalg.norm(np.diff(vertices, axis=0), axis=1).sum() / rod.lengths.sum()
     if abs(found - 1) > MOST_STRETCH:
         rule = f"the center line must be as long as the twin's within {MOST_STRETCH:.0%}: {rod.lengths.sum():.3f} m"

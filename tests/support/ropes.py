@@ -34,9 +34,9 @@ def straight(count: int = 20, height: float = HEIGHT) -> np.ndarray:
     return np.stack([np.linspace(0, LENGTH, count), np.zeros(count), np.full(count, height)], axis=1)
 
 
-def rope(frames: int = 4, height: float = HEIGHT, move: Any = (0.0, 0.0, 0.0), **changes: Any) -> Observations:
+def rope(frames: int = 4, height: float = HEIGHT, move: Any = (0.0, 0.0, 0.0), count: int = 20, **changes: Any) -> Observations:
     """A straight rope that a hand of three points holds in the middle and moves by `move` per frame."""
-    nodes = tube(straight(height=height))
+    nodes = tube(straight(count, height))
     hand = np.array([[0.19, 0, 0.02], [0.2, 0.01, 0.02], [0.21, 0, 0.02]]) + np.array([0, 0, height])
     return scenarios.observations(
         frames=frames,

@@ -158,6 +158,19 @@ def test_a_rope_that_lies_along_another_axis_moves_as_the_same_turned():
     np.testing.assert_allclose(found, expected, atol=1e-3)
 
 
+def test_a_rope_that_was_sampled_with_other_nodes_moves_alike():
+    here, there = (ropes.rope(frames=5, move=(0.0, 0.01, 0.004), count=count) for count in (20, 27))
+    twin = ropes.twin(here)
+    moved = move(twin, there)[0]
+    assert moved.rod.mass.sum() == twin.rod.mass.sum()
+    strength = [float((one.material.stiffness / one.topology.rest_lengths).sum()) for one in (twin, moved)]
+    assert strength[1] == pytest.approx(strength[0], rel=1e-5)
+    first, other = (roll_out(*pair).positions[-1] for pair in ((twin, here.controller_points), (moved, there.controller_points)))
+    # Lines of both, by the mean of the first and the last circle; other nodes are held.
+    for part in (slice(0, 6), slice(-6, None)):
+        np.testing.assert_allclose(other[part].mean(axis=0), first[part].mean(axis=0), atol=5e-3)
+
+
 def test_lengths_belong_to_the_cable_and_not_to_a_recording():
     here = ropes.cable(frames=3)
     longer = replace(here, object_points=here.object_points + np.array([0, 0, 0.002]))
