@@ -20,12 +20,13 @@ from neuspring.core.files import write_text
 from neuspring.core.findings import warnings_of
 from neuspring.core.records import now
 from neuspring.core.table import Tone
+from neuspring.core.text import listed
 from neuspring.report import study_cells
 from neuspring.report.benchmark import Benchmark, detail_blocks, pictures, score_blocks
 from neuspring.report.blocks import Block, Fold, Grid, Section, Text, Verdict, html_page
 from neuspring.report.draw.sheet import DPI
 from neuspring.report.sections.curves import curves_section
-from neuspring.report.sections.data import Options, ReportData, damaged_files, job_records, listed, several, traces
+from neuspring.report.sections.data import Options, ReportData, damaged_files, job_records, several, traces
 from neuspring.report.sections.pictures import Media, embedded, pictures_section
 from neuspring.report.sections.setup import perception_section, setup_section, tuning_section
 from neuspring.report.sections.work import failures_section, findings_section, work_section

@@ -1,7 +1,7 @@
-"""The report of a sweep: trials.csv, the best trial as an overlay, pictures, and a summary, which is written last.
+"""The report of a sweep: trials.csv, the best trial as an overlay, and a summary, which is written last.
 
-Everything is made from the sweep's storage, of a sweep that is finished or not. A trial that continues another has its number;
-in Optuna's pictures it has one of its own.
+Everything is made from the sweep's storage, of a sweep that is finished or not. A trial that continues another has its number.
+`optuna-dashboard` draws pictures of the storage.
 """
 
 from __future__ import annotations
@@ -10,12 +10,11 @@ import functools
 import json
 import warnings
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import optuna
 import pandas as pd
 import yaml
@@ -25,12 +24,11 @@ from optuna.trial import FrozenTrial, TrialState
 from neuspring import config
 from neuspring.config import Config
 from neuspring.config.tuning import Tune
-from neuspring.core.files import write_atomically, write_text
+from neuspring.core.files import write_text
 from neuspring.core.table import Table
 from neuspring.experiments.benchmark import read_methods, read_searches
 from neuspring.experiments.tuning.space import CLUSTERS, Plan, labels
 from neuspring.experiments.tuning.worker import DEFINITION, FACTS, REASON, VALUES, WORKER, counted, origin, study_of
-from neuspring.report.draw.sheet import DPI
 
 TABLES_OF_ROWS = {"method": "methods.yaml", "search": "searches.yaml"}
 SHARED = ("simulation", "losses", "released_quirks")
@@ -38,20 +36,6 @@ SHARED = ("simulation", "losses", "released_quirks")
 SHOWN = 10
 """Trials in the summary's table."""
 TABLES = ("trials.csv", "best.yaml", *TABLES_OF_ROWS.values())
-PICTURES = {
-    "history.png": "Loss of every trial",
-    "slices.png": "Loss against each setting",
-    "parallel.png": "Settings of the finished trials",
-    "importances.png": "Importance of the settings",
-    "steps.png": "What pruning saw",
-}
-LOSS = "loss of the tail [m²]"
-LOG_FROM = 3.0
-"""A loss has a log axis if its largest value is at least this many times its smallest."""
-LEGEND = 16
-"""The most entries of a legend that is shown."""
-WIDTH, HEIGHT = 2.9, 3.8
-"""Size of a panel, inches."""
 
 
 @dataclass(frozen=True)
@@ -91,12 +75,10 @@ def report(settings: Config, tune: Tune, output: Path, root: Path = Path()) -> N
     begun = tuple(counted(study))
     findings = Findings(plan, begun, _table(begun, plan), _importances(study), tuple(study.user_attrs[DEFINITION]["frames"]))
     # No file of an earlier report may stay beside this one's.
-    for name in (*TABLES, *PICTURES):
+    for name in TABLES:
         (folder / name).unlink(missing_ok=True)
     write_text(folder / "trials.csv", findings.table.to_csv(index=False))
     write_best(findings, settings, folder, root)
-    if findings.table["state"].isin(["complete", "pruned"]).any():
-        _draw(study, folder, importances=bool(findings.importances))
     write_text(output, summary(findings, folder))
 
 
@@ -203,7 +185,6 @@ def summary(findings: Findings, folder: Path) -> str:
     lines += [f"## The best {SHOWN} finished trials", "", *table, "", "All trials: `trials.csv`.", ""]
     if failed := [f"- trial {origin(t)}: {t.user_attrs[REASON]}" for t in findings.trials if t.state == TrialState.FAIL]:
         lines += ["## Failed", "", *failed, ""]
-    lines += [line for name, text in PICTURES.items() if (folder / name).is_file() for line in (f"![{text}]({name})", "")]
     return "\n".join(lines)
 
 
@@ -246,38 +227,3 @@ def _best_lines(findings: Findings, folder: Path) -> list[str]:
 def _shown(value: Any) -> str:
     """A setting's value as YAML has it, floats short."""
     return f"{value:.4g}" if isinstance(value, float) else value if isinstance(value, str) else json.dumps(value)
-
-
-def _draw(study: Study, folder: Path, *, importances: bool) -> None:
-    """Draw a sweep that has a finished or pruned trial; `importances`: whether they can be computed."""
-    import optuna.visualization.matplotlib as plots
-    from matplotlib import pyplot as plt
-
-    def save(name: str, columns: float, plot: Callable[[], Any], losses: Sequence[float] = (), **labels: str) -> None:
-        """Save a picture of `columns` panels; `losses` are those on its y axis."""
-        with warnings.catch_warnings(), plt.style.context("default"):
-            warnings.simplefilter("ignore")
-            axes = list(np.ravel(plot()))
-        figure = axes[0].figure.get_figure(root=True)
-        figure.set_size_inches(WIDTH * columns + 0.8, HEIGHT)
-        if losses and max(losses) >= LOG_FROM * min(losses) > 0:
-            axes[0].set_yscale("log")
-        if (legend := axes[0].get_legend()) and len(legend.get_texts()) > LEGEND:
-            legend.remove()
-        axes[0].set(**labels)
-        write_atomically(folder / name, lambda path: figure.savefig(path, dpi=DPI, format="png", bbox_inches="tight"))
-        plt.close(figure)
-
-    trials = study.get_trials(deepcopy=False)
-    losses = [trial.value for trial in trials if trial.value is not None]
-    steps = [value for trial in trials for value in trial.intermediate_values.values()]
-    columns = len({name for trial in trials for name in trial.params})
-    if losses:
-        save("history.png", 2.4, lambda: plots.plot_optimization_history(study, target_name=LOSS), losses)
-        save("slices.png", columns, lambda: plots.plot_slice(study, target_name=LOSS), losses)
-        save("parallel.png", columns, lambda: plots.plot_parallel_coordinate(study, target_name=LOSS))
-    if importances:
-        save("importances.png", 2.4, lambda: plots.plot_param_importances(study, target_name=LOSS))
-    if steps:
-        told = {"xlabel": "epoch, counted through the scenarios", "ylabel": f"mean {LOSS}", "title": ""}
-        save("steps.png", 3.0, lambda: plots.plot_intermediate_values(study), steps, **told)

@@ -135,12 +135,6 @@ def several(count: int, noun: str) -> str:
     return f"{count:,} {noun}{'s' * (count != 1)}"
 
 
-def listed(names: Sequence[str], most: int = 8) -> str:
-    """Names for a sentence. Of more than `most`, the rest is counted."""
-    shown = ", ".join(names[:most])
-    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
-
-
 def duration(seconds: float) -> str:
     """A time for people."""
     if not math.isfinite(seconds):

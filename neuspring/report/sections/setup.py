@@ -5,43 +5,37 @@ from __future__ import annotations
 import json
 import platform
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import yaml
 from markdown_it import MarkdownIt
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
 from neuspring import config
 from neuspring.config import Config
 from neuspring.core.run_record import RunRecord, flat
 from neuspring.core.table import Cell, Table
-from neuspring.report.blocks import Block, Code, Fold, Grid, Items, Link, Prose, Section, Text
+from neuspring.core.text import listed
+from neuspring.report.blocks import Block, Code, Fold, Items, Link, Prose, Section, Text
 from neuspring.report.explain import departures
-from neuspring.report.sections.data import UNREADABLE, ReportData, listed, several
-from neuspring.report.sections.pictures import embedded, link
+from neuspring.report.sections.data import UNREADABLE, ReportData, several
+from neuspring.report.sections.pictures import link
 
 DATA = (".md", ".csv", ".tex", ".html", ".parquet")
 SO_FAR = "so_far"
 """Folder of tables that an interrupted run left."""
 
 
-def render(text: str, picture: Callable[[str], str]) -> Markup:
-    """Markdown as HTML with smaller headings. `picture` returns the data URI of a picture that the text names, or nothing."""
-    parser = MarkdownIt("commonmark", {"html": False}).enable("table")
-
-    def image(_: Any, tokens: Sequence[Any], index: int, *rest: Any) -> str:
-        token = tokens[index]
-        source = picture(str(token.attrs.get("src", "")))
-        alt = escape(token.content)
-        return f'<img class="paper" alt="{alt}" src="{escape(source)}">' if source else f"<em>{alt}</em>"
+def render(text: str) -> Markup:
+    """Markdown as HTML with smaller headings, without links and pictures."""
+    parser = MarkdownIt("commonmark", {"html": False}).enable("table").disable(["image", "link"])
 
     def opened(*_: Any) -> str:
         return '<div class="scroll" tabindex="0" role="region" aria-label="Table"><table>'
 
-    parser.add_render_rule("image", image)
     parser.add_render_rule("table_open", opened)
     parser.add_render_rule("table_close", lambda *_: "</table></div>")
     tokens = parser.parse(text)
@@ -51,39 +45,21 @@ def render(text: str, picture: Callable[[str], str]) -> Markup:
     return Markup(parser.renderer.render(tokens, parser.options, {}))
 
 
-def file(material: ReportData, path: Path) -> tuple[Prose | None, set[Path]]:
-    """A Markdown file, and the pictures in it that were embedded; None if it is not there or cannot be read."""
-    shown: set[Path] = set()
-
-    def picture(source: str) -> str:
-        place = path.parent / source
-        if "://" in source or place.suffix != ".png" or not place.is_file():
-            return ""
-        shown.add(place.resolve())
-        return embedded(place.read_bytes(), "", "").data
-
+def file(material: ReportData, path: Path) -> Prose | None:
+    """A Markdown file; None if it is not there or cannot be read."""
     if not path.is_file():
-        return None, shown
+        return None
     try:
-        return Prose(html=render(path.read_text(encoding="utf-8"), picture)), shown
+        return Prose(html=render(path.read_text(encoding="utf-8")))
     except UNREADABLE as error:
         material.lost(path, error)
-        return None, shown
+        return None
 
 
 def tuning_section(material: ReportData) -> Section | None:
     """The sweeps under results/tune; None without any."""
-    folds: list[Block] = []
-    for path in sorted((material.results / "tune").glob("*/summary.md")):
-        text, shown = file(material, path)
-        if text is None:
-            continue
-        pictures = []
-        for drawing in sorted(path.parent.glob("*.png")):
-            if drawing.resolve() not in shown:
-                name = drawing.stem.replace("_", " ")
-                pictures.append(embedded(drawing.read_bytes(), name, f"{name}, study {path.parent.name}"))
-        folds.append(Fold(summary=path.parent.name, blocks=[text, Grid(blocks=pictures, least=26)], open=not folds))
+    texts = {path.parent.name: file(material, path) for path in sorted((material.results / "tune").glob("*/summary.md"))}
+    folds: list[Block] = [Fold(summary=name, blocks=[text]) for name, text in texts.items() if text]
     return Section(key="tuning", title="Tuning", blocks=folds) if folds else None
 
 
@@ -97,7 +73,7 @@ def files(material: ReportData) -> list[tuple[str, str]]:
 
 def perception_section(material: ReportData) -> Section | None:
     """Perception against the truth of synthetic captures; None where it was not judged."""
-    text, _ = file(material, material.results / material.choice.tables / "perception.md")
+    text = file(material, material.results / material.choice.tables / "perception.md")
     return Section(key="perception", title="Perception", blocks=[text]) if text else None
 
 
