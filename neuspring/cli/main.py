@@ -27,7 +27,7 @@ TOOLS = {
     "draw film": ("pictures", "observed beside predicted, moving -> MP4 or GIF of limited size"),
     "draw frames": ("pictures", "splats and trajectory -> RGBA pictures of any camera"),
     "play": ("twins", "runs of a results folder in the browser; twins that can be pulled by hand"),
-    "export": ("twins", "a twin -> USD, PLY, SPZ, Newton, MuJoCo, or npz with a JSON description"),
+    "export": ("twins", "a twin -> USD, PLY, Newton, MuJoCo, or npz with a JSON description"),
     "fetch": ("data", "released archives -> the folders that the readers expect"),
     "make-capture": ("data", "color and depth of a camera -> a capture folder"),
     "cut-capture": ("data", "some frames of a capture, with their masks -> another capture"),

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 FORMATS = {
     "npz": ("plain.write", "", "{name}_npz"),
     "ply": ("ply.write", "0", "{name}"),
-    "spz": ("spz.write", "0", "{name}"),
     "newton": ("simulators.write_newton", "", "{name}_newton"),
     "mujoco": ("simulators.write_mujoco", "", "{name}_mujoco"),
     "usd": ("usd.write", "", "{name}.usdc"),
@@ -26,12 +25,12 @@ FORMATS = {
 
 def export(
     twin: Annotated[Positional[Path], arg(help="a run's folder, results/<scenario>/<method>/<seed>, or a twin.npz")],
-    to: Annotated[Literal["npz", "ply", "spz", "newton", "mujoco", "usd"], arg(help="format")],
+    to: Annotated[Literal["npz", "ply", "newton", "mujoco", "usd"], arg(help="format")],
     output: Annotated[Path | None, arg(help="file or folder to write; by default it is named after the run")] = None,
-    frames: Annotated[str | None, arg(help="FIRST, FIRST:STOP or FIRST:STOP:STEP; all by default, of ply and spz frame 0")] = None,
+    frames: Annotated[str | None, arg(help="FIRST, FIRST:STOP or FIRST:STOP:STEP; all by default, of ply frame 0")] = None,
     rate: Annotated[float | None, arg(help="time codes per second (usd); the capture's frames per second by default")] = None,
 ) -> None:
-    """A twin -> USD, PLY, SPZ, Newton, MuJoCo, or npz with a JSON description."""
+    """A twin -> USD, PLY, Newton, MuJoCo, or npz with a JSON description."""
     from neuspring.export.source import chosen_frames, read_source
 
     writer, default, name = FORMATS[to]

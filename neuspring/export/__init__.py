@@ -4,6 +4,6 @@
 |---|---|
 | what is exported: a run's folder or a twin | `source` |
 | arrays and a JSON description | `plain` |
-| viewers | `ply`, `usd`, `spz` |
+| viewers | `ply`, `usd` |
 | simulators: Newton, MuJoCo | `simulators`; `newton_twin` is the script that is exported |
 """
