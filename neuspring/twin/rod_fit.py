@@ -210,7 +210,7 @@ class Recordings:
             if (frame - 1) % every == 0:
                 kept.append(solver.nodes()[0][:, :tracked].cpu())
         found = torch.stack(kept, dim=1).reshape(len(twins), count, len(kept), tracked, 3).numpy()
-        return np.nan_to_num(found, nan=FARTHEST * 10, posinf=FARTHEST * 10, neginf=-FARTHEST * 10)
+        return np.asarray(np.nan_to_num(found, nan=FARTHEST * 10, posinf=FARTHEST * 10, neginf=-FARTHEST * 10))
 
     def residual(self, twin: Twin, device: str) -> Residual:
         """What a regression learns of the errors of a twin. Raises InputError for less than two recordings."""
@@ -247,7 +247,7 @@ class Levenberg:
         def one(part: np.ndarray) -> np.ndarray:
             found = recordings.predicted([variables.made(qs[k]) for k in part], frames, every, self.device)
             apart = np.clip(found - recordings.points[None, :, kept], -FARTHEST, FARTHEST)
-            return apart[:, recordings.counts[:, kept]].reshape(len(part), -1)
+            return np.asarray(apart[:, recordings.counts[:, kept]].reshape(len(part), -1))
 
         self.rollouts += len(qs) * len(recordings.observations)
         with ThreadPoolExecutor(max(self.threads, 1)) as pool:
