@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neuspring.config import Config, Kind, parse
+from neuspring.config import Body, Config, Kind, parse
 from neuspring.core.artifacts import Observations, Topology, Trajectory, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.run_folder import RunFolder
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from neuspring.twin.fit import FitResult
+    from neuspring.twin.rod_fit import RodResult
     from neuspring.twin.search import SearchResult
 
 __all__ = ["Observations", "Topology", "Trajectory", "Twin", "fit", "load_run", "roll_out", "score", "search"]
@@ -76,20 +77,25 @@ def search(
     settings: Settings = None,
     *,
     clusters: int = 1,
+    body: Body = "lattice",
     seed: int = 0,
     device: str = "auto",
     threads: int = 1,
     record: Path | None = None,
-) -> SearchResult:
+) -> SearchResult | RodResult:
     """CMA-ES over material and topology, with `clusters` regions of the topology: the best `twin`, its `cost`, the `trace`.
 
-    The trace is kept in the file `record`, and a search that was stopped goes on from it. Raises InputError, NumericalFailure.
+    The trace is kept in the file `record`, and a search that was stopped goes on from it. With `body="rod"` the constants of an
+    elastic rod are found, for a long thin object. Raises InputError, NumericalFailure.
     """
     from neuspring.core.device import resolve_device
     from neuspring.twin.candidates import SearchProblem
+    from neuspring.twin.rod_fit import search_rod
     from neuspring.twin.search import search as search_twin
 
     read = read_settings(settings)
+    if body == "rod":
+        return search_rod(observations, (), read, device=resolve_device(device), threads=threads)
     shared = (read.search, read.simulation, read.losses, read.released_quirks, resolve_device(device))
     return search_twin(SearchProblem(observations, *shared, clusters=clusters, threads=threads), seed, record=record)
 
@@ -103,8 +109,10 @@ def fit(
     seed: int = 0,
     device: str = "auto",
     checkpoint: Path | None = None,
-) -> FitResult:
+) -> FitResult | RodResult:
     """Train a twin's stiffness by gradients through the simulation, as a neural spring `field` or each of the `springs` apart.
+
+    A rod is fitted as `kind="rod"`, in everything that is unknown of it.
 
     The result has the best `twin` and the `history` of losses. With a `checkpoint`, a fit that was stopped goes on. Raises
     InputError, NumericalFailure.
@@ -113,10 +121,12 @@ def fit(
     from neuspring.twin.fit import FitProblem
     from neuspring.twin.fit import fit as fit_twin
     from neuspring.twin.hand_paths import with_hands
+    from neuspring.twin.rod_fit import fit_rod
 
     read = read_settings(settings)
     shared = (read.fit, read.simulation, read.losses, read.released_quirks, resolve_device(device))
-    return fit_twin(FitProblem(with_hands(observations, twin), twin, *shared, kind=kind, seed=seed), partial=checkpoint)
+    problem = FitProblem(with_hands(observations, twin), twin, *shared, kind=kind, seed=seed)
+    return fit_rod(problem) if kind == "rod" else fit_twin(problem, partial=checkpoint)
 
 
 def read_settings(settings: Settings) -> Config:

@@ -224,9 +224,13 @@ class Benchmark:
             BASELINES[method.model or ""].features(section_of(config, method))
         if not method.search:
             return
-        wanted = with_search(self.config, self.searches[method.searched], method.search).search.variables.stiffness
+        row = self.searches[method.searched]
+        wanted = with_search(self.config, row, method.search).search.variables.stiffness
         if not method.fit:
             return
+        if (method.fit == "rod") != (row.body == "rod"):
+            rule = f"search {method.search} makes a {row.body}; a rod is fitted as rod, a lattice as springs or field"
+            raise InputError(f"method {name}, fit", rule, method.fit)
         if method.oracle and config.fit.selection == "tail":
             rule = "an oracle is fitted on all frames and holds none back"
             raise InputError(f"method {name}, fit.selection", rule, "tail", "Use training_loss.")

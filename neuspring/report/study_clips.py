@@ -61,11 +61,17 @@ class Clips:
         return list(dict.fromkeys(self.clips["cable"])) or list(dict.fromkeys(cable for _, cable, _ in self.study.values))
 
     @cached_property
+    def asked(self) -> dict[str, int]:
+        """Scenario of a twin -> clips that it was to be rolled out on."""
+        found = {run.scenario: self._record(run) for run in self.records.itertuples()}
+        return {name: int(record.facts["targets"]) for name, record in found.items() if record}
+
+    @cached_property
     def cells(self) -> pd.DataFrame:
         """A row per cable and row of the table, published numbers first; those have a `text`.
 
         `l1_mm` is the mean over clips, seeds averaged within each; `spread_mm` the standard deviation over the seeds that have
-        every clip. `ranked`: it is a method, and has every clip of the cable that another row has.
+        every clip. `ranked`: it is a method, and has every clip that it was to be judged on, with every seed.
         """
         rows: list[dict[str, Any]] = []
         for (label, cable, _), value in self.study.values.items():
@@ -73,12 +79,13 @@ class Clips:
             rows += [{"cable": cable, "label": label, "l1_mm": value.value, **facts}] if cable in self.cables else []
         for key, part in self.clips.groupby(["cable", "label"], sort=False):
             cable, label = map(str, key)
-            of = self.clips.loc[self.clips["cable"] == cable, "clip"].nunique()
+            of = sum(self.asked.get(source, 0) for source in part["source"].unique())
             means, seeds = part.groupby("clip")[["l1_mm", "euclid_mm", "minutes"]].mean(), part.groupby("seed")
             l1, spread = means["l1_mm"], seeds["l1_mm"].mean()[seeds["clip"].nunique() == of].std(ddof=1)
             numbers = [l1.mean(), spread, l1.median(), l1.max(), means["euclid_mm"].mean(), means["minutes"].mean()]
             facts = dict(zip(FACTS, numbers, strict=False))
-            facts |= {"worst_clip": l1.idxmax(), "clips": len(l1), "of": of, "seeds": len(seeds), "ranked": len(l1) == of}
+            facts |= {"worst_clip": l1.idxmax(), "clips": int(seeds["clip"].nunique().min()), "of": of, "seeds": len(seeds)}
+            facts["ranked"] = facts["clips"] == of
             rows.append({"cable": cable, "label": label, **facts, "source": "ours", "tag": "", "text": ""})
         return pd.DataFrame(rows, columns=["cable", "label", *FACTS, "source", "tag", "text", "ranked"])
 
@@ -97,9 +104,14 @@ class Clips:
 
     def _file(self, run: Any, role: str) -> Path | None:
         """A file that a transfer kept; None: it has none."""
-        path = self.results / run.scenario / run.method / str(run.seed) / "transfer.json"
-        record = None if run.reason.startswith(DAMAGED) else StageRecord.load(path)
-        return record.file(role, path) if record and role in record.files else None
+        record = self._record(run)
+        return record.file(role, self._path(run)) if record and role in record.files else None
+
+    def _path(self, run: Any) -> Path:
+        return self.results / run.scenario / run.method / str(run.seed) / "transfer.json"
+
+    def _record(self, run: Any) -> StageRecord | None:
+        return None if run.reason.startswith(DAMAGED) else StageRecord.load(self._path(run))
 
     def filmed(self, cable: str) -> list[Painter]:
         """Who paints the best, the median and the worst clip of a cable: by the baseline, else the last row that kept any."""

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 from neuspring.config import Config, Kind
 from neuspring.core.artifacts import Observations
-from neuspring.core.errors import InputError
 from neuspring.core.records import Before, Recorder
 from neuspring.stages.stage import Written, stage
 
@@ -47,9 +46,6 @@ def fit(
     from neuspring.twin.losses import frames_seen
 
     problem, checkpoint, key = prepared(observations, search, settings, run, pool, leave_out, kind, oracle, device)
-    if (kind == "rod") != (problem.twin.rod is not None):
-        rule = "rods are fitted as rods, and lattices as springs or field"
-        raise InputError(f"{search.path}, twin", rule, f"--kind {kind}", "Correct the method's row: its search and its fit.")
     if kind == "rod":
         return _rod(problem, run, threads)
     result = fit_twin(problem, partial=checkpoint, key=key)

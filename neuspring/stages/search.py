@@ -14,6 +14,7 @@ from neuspring.stages.stage import Written, stage
 if TYPE_CHECKING:
     import pandas as pd
 
+READS = ("search", "simulation", "losses", "released_quirks")
 SURFACES = ("ground_", "contact_")
 """How the names of variables begin that have no effect where nothing touches."""
 END = 0.01
@@ -22,7 +23,7 @@ END = 0.01
 
 @stage(
     output="{scenario}/search-{search}/{seed}/search.json",
-    reads=("search", "simulation", "losses", "released_quirks", "rod", "fit.rod"),
+    reads=lambda settings, given: (*READS, *(("rod", "fit.rod") if given["body"] == "rod" else ())),
     gpu="always",
     memory_mb=8000,
     minutes=240,

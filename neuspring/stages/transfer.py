@@ -75,7 +75,8 @@ def transfer(
         tables.append(metrics.score_tasks(trajectory, observations, method, seed, {"transfer": frames}, errors))
         course = pd.DataFrame(errors).rename_axis("frame").melt(var_name="metric", ignore_index=False).reset_index()
         course = course.assign(scenario=observations.scenario.name, seconds=course["frame"] / observations.scenario.frame_rate)
-        courses.append(course[list(courses[0])])
+        if trajectory.diverged_frame is None:
+            courses.append(course[list(courses[0])])
         if observations.line.size:
             lines[observations.scenario.name] = observations.on_line(trajectory.positions).astype(np.float32)
     files = run.beside(scores="transfer.parquet", frames="transfer_frames.parquet")

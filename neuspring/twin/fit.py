@@ -79,6 +79,9 @@ class FitProblem:
 
     def __post_init__(self) -> None:
         require_pool(self.observations, self.pool, self.leave_out)
+        if (self.kind == "rod") != (self.twin.rod is not None):
+            body = "a rod" if self.twin.rod is not None else "a lattice"
+            raise InputError("fit, kind", "rods are fitted as rod, lattices as springs or field", f"{self.kind} of {body}")
         if self.oracle and self.fit.selection == "tail":
             raise InputError("fit.selection", "an oracle is fitted on all frames and holds none back", "tail", "Use training_loss.")
 

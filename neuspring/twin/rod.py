@@ -161,7 +161,7 @@ def _across(vertices: np.ndarray) -> np.ndarray:
 
 
 def of_markers(twin: Twin, observations: Observations) -> Twin:
-    """The same for a body whose line is observed, with tracked points as its only nodes; they are not yet settled or bound."""
+    """A twin in frame 0 of a recording whose line is observed, with tracked points as its only nodes, not yet settled or bound."""
     rod, line = twin.rod, observations.line
     assert rod is not None
     hands, nodes = observations.controller_points[0], observations.object_points[0]

@@ -24,8 +24,9 @@ import torch
 from neuspring import config
 from neuspring.config.rod import RodFit
 from neuspring.core.artifacts import Observations, Residual, Rod, Twin
-from neuspring.core.errors import NumericalFailure
+from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.text import Progress
+from neuspring.physics.controllers import waypoints
 from neuspring.physics.rod_nodes import RodFrames, settled, turn_of
 from neuspring.twin import residual
 from neuspring.twin import rod as rods
@@ -57,6 +58,7 @@ SCALES = {
     "stretch": 0.01,
 }  # fmt: skip
 """Scale of each kind of variable: of logarithms, rad, curvatures (1), and m."""
+LOGARITHMIC = ("bending", "twisting", "damping", "drag", "drag_quadratic", "marker_mass", "hands", "dashpots")
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ class Variables:
     def made(self, q: np.ndarray) -> Twin:
         """The twin of variables q [Q]."""
         start, twin = _rod(self.twin), self.twin
-        factor = {name: float(np.exp(self.part(q, name)[0])) for name in SCALES if SCALES[name] == 1.0}
+        factor = {name: float(np.exp(self.part(q, name)[0])) for name in LOGARITHMIC}
         bending, twisting = (start.bending * factor["bending"], start.twisting * factor["twisting"])
         if self.stiffness_along.shape[1]:
             bending = bending * np.exp(self.stiffness_along @ self.part(q, "bending_along"))
@@ -162,7 +164,7 @@ class Recordings:
 
     observations: tuple[Observations, ...]
     hands: torch.Tensor
-    """[T, C, hands, 3], m."""
+    """Way points [T, C, hands, 3 or 4] (controllers.py)."""
     points: np.ndarray
     """Tracked points [C, T, No, 3], m."""
     counts: np.ndarray
@@ -180,7 +182,7 @@ class Recordings:
         counts = [each.object_visibility[index] & known[:, None] for (each, index), known in zip(pairs, inside, strict=True)]
         return cls(
             tuple(observations),
-            torch.tensor(np.stack([each.controller_points[index] for each, index in pairs], axis=1)),
+            _paths(pairs),
             np.stack([each.object_points[index] for each, index in pairs]).astype(np.float64),
             np.stack(counts),
             tuple(initial_velocity(each, twin.simulation.initial_velocity) for each in observations),
@@ -231,11 +233,22 @@ class Recordings:
         return residual.fit(rollouts, targets, names, twin.simulation.frame_time, _rod(twin).held < 0)
 
 
+def _paths(pairs: Sequence[tuple[Observations, np.ndarray]]) -> torch.Tensor:
+    """Way points of the hands of recordings, in these frames of each [T, C, hands, 3 or 4]: 4 where some do not always hold."""
+    parts = []
+    for each, rows in pairs:
+        valid = each.controller_valid[rows] if each.controller_valid.size else None
+        parts.append(waypoints(torch.tensor(each.controller_points[rows]), valid))
+    width = max(part.shape[-1] for part in parts)
+    return torch.stack([torch.cat([part, torch.ones_like(part[..., : width - part.shape[-1]])], dim=-1) for part in parts], dim=1)
+
+
 class Levenberg:
     """Lowers the objective of some variables on some recordings."""
 
     def __init__(self, recordings: Recordings, settings: RodFit, device: str = "cpu", threads: int = 1) -> None:
-        self.recordings, self.settings, self.device, self.threads = recordings, settings, device, threads
+        self.recordings, self.settings, self.device = recordings, settings, device
+        self.threads = threads if device == "cpu" else 1
         self.rollouts = 0
 
     def errors(self, variables: Variables, qs: Sequence[np.ndarray], frames: int, every: int) -> np.ndarray:
@@ -260,7 +273,7 @@ class Levenberg:
         return value
 
     def lowered(self, twin: Twin, progress: Progress) -> tuple[Twin, float, list[dict[str, Any]]]:
-        """The twin after the stages of the settings, its objective on all frames, m, and a row per step."""
+        """The twin after the stages of the settings, the objective of the last one, m, and a row per step."""
         variables, history = Variables.of(twin, self.settings), list[dict[str, Any]]()
         q, end = np.zeros(len(variables.scale)), self.recordings.points.shape[1]
         for horizon in self.settings.horizons:
@@ -354,9 +367,14 @@ def fit_rod(problem: FitProblem, threads: int = 1) -> RodResult:
     """All variables of a rod, stage by stage, from the twin of its search. Raises NumericalFailure."""
     settings = problem.fit.rod
     recordings = _recordings(problem.observations, problem.pool, problem.leave_out, problem.twin, oracle=problem.oracle)
+    if settings.residual and not (len(recordings.observations) > 1 and _rod(problem.twin).line.size):
+        rule = "a residual is learned on two or more recordings of a cable with markers"
+        raise InputError("fit.rod.residual", rule, len(recordings.observations), "Name a pool (`pools`), or choose row rod_single.")
     solver = Levenberg(recordings, settings, problem.device, threads)
     progress = Progress(f"fit {problem.observations.scenario.name}, rod", settings.rounds * len(settings.horizons))
     twin, value, history = solver.lowered(problem.twin, progress)
+    # Where markers lie beside the line, frame 0 has another line now.
+    twin = rods.on_recording(twin, problem.observations)
     result = _result(twin, value, history, solver.rollouts)
     if not settings.residual:
         return result
@@ -368,7 +386,11 @@ def fit_rod(problem: FitProblem, threads: int = 1) -> RodResult:
 def _recordings(
     observations: Observations, pool: Sequence[Observations], leave_out: bool, twin: Twin, oracle: bool = False
 ) -> Recordings:
-    return Recordings.of([*([] if leave_out else [observations]), *pool], twin, oracle)
+    seen = [*([] if leave_out else [observations]), *pool]
+    if len(seen) > 1 and not observations.line.size:
+        rule = "recordings of a pool must have markers along the line, for a rod"
+        raise InputError(f"pool of {observations.scenario.name}", rule, "none", "Choose row rod_single.")
+    return Recordings.of(seen, twin, oracle)
 
 
 def _result(twin: Twin, value: float, history: list[dict[str, Any]], rollouts: int) -> RodResult:

@@ -77,7 +77,7 @@ def roll_out(
     except Diverged as end:
         diverged, reason = end.frame, end.reason
     predicted = torch.stack(positions).numpy()
-    if twin.residual is not None:
+    if twin.residual is not None and diverged is None:
         predicted = corrected(twin, predicted, np.asarray(controller_points)[: len(predicted)]).astype(np.float32)
     return Trajectory(
         positions=predicted,

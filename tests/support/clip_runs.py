@@ -75,5 +75,7 @@ def write_transfer(
         paths["lines"] = record.with_name("transfer_lines.npz")
         write_npz(paths["lines"], lines, "{}", compress=True)
     files = {role: [path.name, digest_file(path)] for role, path in paths.items()}
-    StageRecord(stage="transfer", status="ok", files=files, facts={"diverged": list(diverged)}).save(record)
+    StageRecord(
+        stage="transfer", status="ok", files=files, facts={"diverged": list(diverged), "targets": len(l1) + len(diverged)}
+    ).save(record)
     return record

@@ -14,6 +14,7 @@ from neuspring.twin.rod import rod_twin
 from neuspring.twin.rod_fit import Levenberg, Recordings, Variables, fit_rod, search_rod
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.transfer import move
+from tests.support import ropes
 
 SETTINGS = config.parse(
     config.Config,
@@ -93,10 +94,34 @@ def test_markers_beside_the_line_are_found():
     without, with_markers = (fit_rod(problem(start, seen, markers=markers)).twin for markers in (False, True))
     new = recorded(truth, cable("three", 2))
     assert error(with_markers, seen) < 0.5 * error(without, seen)
+    # The twin is in frame 0 of its own recording, and rolls out as it was fitted.
+    own = roll_out(with_markers, seen[0].controller_points).positions
+    np.testing.assert_allclose(own, roll_out(move(with_markers, seen[0])[0], seen[0].controller_points).positions, atol=1e-5)
     # In frame 0 markers lie where they were seen, whatever the line is.
     moved = move(with_markers, new)[0]
     np.testing.assert_allclose(moved.topology.nodes, new.nodes, atol=1e-6)
     assert np.abs(moved.rod.vertices[2:-2] - new.nodes).max() > 1e-3
+
+
+def test_a_hand_that_lets_go_does_not_pull_in_the_fit_either():
+    whole = ropes.rope(frames=8, move=(0.0, 0.02, 0.01))
+    valid = np.ones(whole.controller_points.shape[:2], dtype=bool)
+    valid[3:] = False
+    seen = replace(whole, controller_valid=valid)
+    twin = rod_twin(seen, ropes.SETTINGS)
+    found = Recordings.of([seen], twin).predicted([twin], seen.scenario.train_end, 1, "cpu")[0, 0]
+    rolled = roll_out(twin, seen.controller_points, valid=valid).positions[1 : 1 + len(found)]
+    np.testing.assert_allclose(found, rolled, atol=1e-5)
+    assert np.abs(roll_out(twin, seen.controller_points).positions[1 : 1 + len(found)] - rolled).max() > 1e-3
+
+
+def test_what_a_rod_cannot_be_fitted_to_is_refused():
+    rope = ropes.rope()
+    with pytest.raises(InputError, match=r"markers along the line.*rod_single"):
+        search_rod(rope, [rope], ropes.SETTINGS)
+    twin = rod_twin(cable("one", 0), SETTINGS, AXIS)
+    with pytest.raises(InputError, match="rods are fitted as rod"):
+        replace(problem(twin, [cable("one", 0)]), kind="field")
 
 
 def test_slopes_are_derivatives_of_rollouts():
@@ -141,5 +166,5 @@ def test_the_residual_row_adds_a_correction_that_saves_and_loads(tmp_path):
     again = Twin.load(tmp_path / "twin.npz")
     np.testing.assert_array_equal(again.residual.weights, result.twin.residual.weights)
     assert error(again, seen) < error(replace(again, residual=None), seen)
-    with pytest.raises(InputError, match="two training clips"):
+    with pytest.raises(InputError, match="two or more recordings"):
         fit_rod(problem(start, seen[:1], markers=False, horizons=(3,), rounds=1, residual=True))

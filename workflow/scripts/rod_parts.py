@@ -3,7 +3,7 @@
     python workflow/scripts/rod_parts.py DATA_SET CABLE OUTPUT.csv [--clips 8] [--threads 2] [--parts all,straight,...]
 
 DATA_SET is DEFORM's data set (config/data/deform.yaml). Fits take that many training recordings, evenly spaced, and are judged on
-every fourth of the others; evaluation recordings are not opened. Prints L1, mm (mean, median, worst recording) and seconds.
+every fourth, which no fit takes; evaluation recordings are not opened. Prints L1, mm (mean, median, worst recording) and seconds.
 Finished rows of OUTPUT.csv are kept.
 """
 
@@ -20,7 +20,7 @@ import pandas as pd
 from neuspring import config
 from neuspring.core.device import start_warp
 from neuspring.data import mocap
-from neuspring.data.sources import scenario_rows, with_deform
+from neuspring.data.sources import scenario_rows
 from neuspring.scores.metrics import deform_l1
 from neuspring.twin.fit import FitProblem
 from neuspring.twin.rod_fit import fit_rod, search_rod
@@ -51,13 +51,13 @@ PARTS: dict[str, tuple[dict[str, Any], int | None]] = {
 def judged(cable: str, data: Path, clips: int, changes: dict[str, Any], threads: int) -> dict[str, Any]:
     """Errors, mm, of a fit on recordings that it has not seen, and its seconds."""
     values = config.read_yaml(Path("config/data/deform.yaml"))
-    values |= {"data_root": str(data), "deform": {"cables": [cable], "clips": clips}}
+    values |= {"data_root": str(data), "deform": {}}
     config.merge(values, changes)
-    settings = with_deform(config.parse(config.Config, values, "rod_parts"))
-    assert settings.pools is not None
-    pool = settings.pools[cable]
+    settings = config.parse(config.Config, values, "rod_parts")
     numbers = sorted(int(file.stem) for file in (data / cable / "train").glob("*.pkl"))
-    others = [name for number in numbers[1::4] if (name := f"{cable}_train_{number}") not in pool]
+    names = [f"{cable}_train_{number}" for number in numbers]
+    others, rest = names[1::4], [name for place, name in enumerate(names) if place % 4 != 1]
+    pool = [rest[place] for place in np.linspace(0, len(rest) - 1, clips).astype(int)]
     rows = scenario_rows(settings, also=[*pool, *others])
 
     def read(name: str) -> Any:

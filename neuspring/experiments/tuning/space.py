@@ -54,6 +54,8 @@ class Plan:
         if method.oracle:
             raise InputError("tune.method", "an oracle sees the future, and chooses nothing", tune.method, "Name another method.")
         row = _row(f"method {tune.method}, search", method.search, searches, settings.search_table)
+        if row.body == "rod":
+            raise InputError("tune.method", "a sweep tunes lattices", f"{tune.method}, a rod", "Name another method.")
         own = with_search(with_method(settings, method, tune.method), row, method.search)
         base = {name: config.plain(getattr(own, name)) for name in SECTIONS} | {CLUSTERS: row.clusters}
         plan = cls(tune, method, row, base)
