@@ -126,7 +126,9 @@ def fit(
     read = read_settings(settings)
     shared = (read.fit, read.simulation, read.losses, read.released_quirks, resolve_device(device))
     problem = FitProblem(with_hands(observations, twin), twin, *shared, kind=kind, seed=seed)
-    return fit_rod(problem) if kind == "rod" else fit_twin(problem, partial=checkpoint)
+    if kind == "rod":
+        return fit_rod(problem.observations, (), twin, read.fit.rod, device=problem.device)
+    return fit_twin(problem, partial=checkpoint)
 
 
 def read_settings(settings: Settings) -> Config:

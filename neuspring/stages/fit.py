@@ -80,7 +80,9 @@ def _rod(problem: FitProblem, run: Recorder, threads: int) -> Written:
     from neuspring.core.files import write_history
     from neuspring.twin.rod_fit import fit_rod
 
-    result = fit_rod(problem, threads)
+    given = (problem.observations, problem.pool, problem.twin, problem.fit.rod)
+    places = {"device": problem.device, "threads": threads}
+    result = fit_rod(*given, leave_out=problem.leave_out, oracle=problem.oracle, **places)
     files = run.beside(twin="twin.npz", history="history.parquet")
     result.twin.save(files["twin"])
     columns = {name: result.history[name] for name in ("loss", "gradient_norm", "learning_rate")}

@@ -37,8 +37,6 @@ from neuspring.twin.rollout import initial_velocity
 if TYPE_CHECKING:
     import pandas as pd
 
-    from neuspring.twin.fit import FitProblem
-
 PRIOR = 1e-6
 """Weight of the variables' squares, m: they decide where recordings say nothing."""
 STEP = 5e-3
@@ -363,22 +361,31 @@ def search_rod(
     return _result(twin, value, history, solver.rollouts)
 
 
-def fit_rod(problem: FitProblem, threads: int = 1) -> RodResult:
-    """All variables of a rod, stage by stage, from the twin of its search. Raises NumericalFailure."""
-    settings = problem.fit.rod
-    recordings = _recordings(problem.observations, problem.pool, problem.leave_out, problem.twin, oracle=problem.oracle)
-    if settings.residual and not (len(recordings.observations) > 1 and _rod(problem.twin).line.size):
+def fit_rod(
+    observations: Observations,
+    pool: Sequence[Observations],
+    twin: Twin,
+    settings: RodFit,
+    *,
+    leave_out: bool = False,
+    oracle: bool = False,
+    device: str = "cpu",
+    threads: int = 1,
+) -> RodResult:
+    """All variables of a rod, stage by stage, from the twin of its search. Raises InputError, NumericalFailure."""
+    recordings = _recordings(observations, pool, leave_out, twin, oracle)
+    if settings.residual and not (len(recordings.observations) > 1 and _rod(twin).line.size):
         rule = "a residual is learned on two or more recordings of a cable with markers"
         raise InputError("fit.rod.residual", rule, len(recordings.observations), "Name a pool (`pools`), or choose row rod_single.")
-    solver = Levenberg(recordings, settings, problem.device, threads)
-    progress = Progress(f"fit {problem.observations.scenario.name}, rod", settings.rounds * len(settings.horizons))
-    twin, value, history = solver.lowered(problem.twin, progress)
+    solver = Levenberg(recordings, settings, device, threads)
+    progress = Progress(f"fit {observations.scenario.name}, rod", settings.rounds * len(settings.horizons))
+    twin, value, history = solver.lowered(twin, progress)
     # Where markers lie beside the line, frame 0 has another line now.
-    twin = rods.on_recording(twin, problem.observations)
+    twin = rods.on_recording(twin, observations)
     result = _result(twin, value, history, solver.rollouts)
     if not settings.residual:
         return result
-    learned = recordings.residual(twin, problem.device)
+    learned = recordings.residual(twin, device)
     facts = result.facts | {"ridge": learned.ridge, "left_out": learned.left_out}
     return replace(result, twin=replace(twin, residual=learned), facts=facts)
 

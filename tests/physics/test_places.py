@@ -28,7 +28,7 @@ VALUES = {
 """Files that give or translate the value that drag, which has no default, has in their case. A new parameter has a default."""
 OTHERS = {"data/synthetic/fem.py", "data/synthetic/kernels.py", "play/page.py"}
 """Drag of another simulator; dragging with a mouse."""
-RODS = {"config/rod.py", "physics/rod.py", "physics/rod_nodes.py", "physics/rod_reference.py", "twin/rod.py"}
+RODS = {"config/rod.py", "physics/rod.py", "physics/rod_nodes.py", "physics/rod_reference.py", "twin/rod.py", "twin/rod_fit.py"}
 """Rods are a simulator of their own."""
 
 

@@ -11,7 +11,7 @@ from neuspring.core.artifacts import Observations, Scenario, Twin
 from neuspring.core.errors import InputError
 from neuspring.twin.fit import FitProblem
 from neuspring.twin.rod import rod_twin
-from neuspring.twin.rod_fit import Levenberg, Recordings, Variables, fit_rod, search_rod
+from neuspring.twin.rod_fit import Levenberg, Recordings, RodResult, Variables, fit_rod, search_rod
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.transfer import move
 from tests.support import ropes
@@ -65,9 +65,9 @@ def planted(settings: RodFit, seed: int, size: float) -> tuple[Twin, list[Observ
     return twin, [recorded(twin, shape) for shape in shapes], variables, q
 
 
-def problem(twin: Twin, seen: list[Observations], **settings: object) -> FitProblem:
-    fit = replace(SETTINGS.fit, rod=replace(SETTINGS.fit.rod, **settings))
-    return FitProblem(seen[0], twin, fit, SETTINGS.simulation, SETTINGS.losses, SETTINGS.released_quirks, kind="rod", pool=seen[1:])
+def fitted(twin: Twin, seen: list[Observations], **settings: object) -> RodResult:
+    """A fit of the twin to all recordings."""
+    return fit_rod(seen[0], seen[1:], twin, replace(SETTINGS.fit.rod, **settings))
 
 
 def error(twin: Twin, seen: list[Observations]) -> float:
@@ -79,7 +79,7 @@ def error(twin: Twin, seen: list[Observations]) -> float:
 def test_a_planted_rod_is_found_and_predicts_another_recording():
     truth, seen, _, _ = planted(WITHOUT_MARKERS, 0, 0.5)
     start, search = rod_twin(seen[0], SETTINGS, AXIS), search_rod(seen[0], seen[1:], SETTINGS)
-    result = fit_rod(problem(search.twin, seen, markers=False))
+    result = fitted(search.twin, seen, markers=False)
     new = recorded(truth, cable("three", 2))
     seen_before, seen_after = (error(twin, seen) for twin in (start, result.twin))
     assert seen_after < 0.25 * seen_before
@@ -91,7 +91,7 @@ def test_a_planted_rod_is_found_and_predicts_another_recording():
 def test_markers_beside_the_line_are_found():
     truth, seen, _, _ = planted(SETTINGS.fit.rod, 3, 0.3)
     start = rod_twin(seen[0], SETTINGS, AXIS)
-    without, with_markers = (fit_rod(problem(start, seen, markers=markers)).twin for markers in (False, True))
+    without, with_markers = (fitted(start, seen, markers=markers).twin for markers in (False, True))
     new = recorded(truth, cable("three", 2))
     assert error(with_markers, seen) < 0.5 * error(without, seen)
     # The twin is in frame 0 of its own recording, and rolls out as it was fitted.
@@ -120,8 +120,9 @@ def test_what_a_rod_cannot_be_fitted_to_is_refused():
     with pytest.raises(InputError, match=r"markers along the line.*rod_single"):
         search_rod(rope, [rope], ropes.SETTINGS)
     twin = rod_twin(cable("one", 0), SETTINGS, AXIS)
+    sections = SETTINGS.fit, SETTINGS.simulation, SETTINGS.losses, SETTINGS.released_quirks
     with pytest.raises(InputError, match="rods are fitted as rod"):
-        replace(problem(twin, [cable("one", 0)]), kind="field")
+        FitProblem(cable("one", 0), twin, *sections, kind="field")
 
 
 def test_slopes_are_derivatives_of_rollouts():
@@ -161,10 +162,10 @@ def test_fields_along_the_arc():
 def test_the_residual_row_adds_a_correction_that_saves_and_loads(tmp_path):
     _, seen, _, _ = planted(WITHOUT_MARKERS, 2, 0.5)
     start = rod_twin(seen[0], SETTINGS, AXIS)
-    result = fit_rod(problem(start, seen, markers=False, horizons=(3,), rounds=1, residual=True))
+    result = fitted(start, seen, markers=False, horizons=(3,), rounds=1, residual=True)
     result.twin.save(tmp_path / "twin.npz")
     again = Twin.load(tmp_path / "twin.npz")
     np.testing.assert_array_equal(again.residual.weights, result.twin.residual.weights)
     assert error(again, seen) < error(replace(again, residual=None), seen)
     with pytest.raises(InputError, match="two or more recordings"):
-        fit_rod(problem(start, seen[:1], markers=False, horizons=(3,), rounds=1, residual=True))
+        fitted(start, seen[:1], markers=False, horizons=(3,), rounds=1, residual=True)

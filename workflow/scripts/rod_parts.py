@@ -22,7 +22,6 @@ from neuspring.core.device import start_warp
 from neuspring.data import mocap
 from neuspring.data.sources import scenario_rows
 from neuspring.scores.metrics import deform_l1
-from neuspring.twin.fit import FitProblem
 from neuspring.twin.rod_fit import fit_rod, search_rod
 from neuspring.twin.rollout import initial_velocity, roll_out
 from neuspring.twin.transfer import move
@@ -65,8 +64,7 @@ def judged(cable: str, data: Path, clips: int, changes: dict[str, Any], threads:
 
     seen, began = [read(name) for name in pool], time.perf_counter()
     start = search_rod(seen[0], seen[1:], settings, threads=threads).twin
-    sections = settings.fit, settings.simulation, settings.losses, settings.released_quirks
-    twin = fit_rod(FitProblem(seen[0], start, *sections, kind="rod", pool=seen[1:]), threads).twin
+    twin = fit_rod(seen[0], seen[1:], start, settings.fit.rod, threads=threads).twin
     seconds, errors = time.perf_counter() - began, {}
     for observations in map(read, others):
         velocity = initial_velocity(observations, twin.simulation.initial_velocity)
