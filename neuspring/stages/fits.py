@@ -93,8 +93,8 @@ def _jobs(observations: Path, row: Row, device: str) -> Iterator[FitJob]:
     for output, search in row.fits.items():
         job = alone.fit.job(output=Path(output), observations=observations, search=Path(search), **given)
         if not (job.failed or _is_done(job)):
-            given = {name: value for name, value in job.arguments.items() if name != "threads"}
-            yield FitJob(output, *alone.prepared(**given))
+            read = {name: value for name, value in job.arguments.items() if name != "threads"}
+            yield FitJob(output, *alone.prepared(**read))
 
 
 def batched(jobs: Sequence[FitJob], most: int) -> list[list[FitJob]]:
