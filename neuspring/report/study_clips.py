@@ -63,8 +63,8 @@ class Clips:
     @cached_property
     def asked(self) -> dict[str, int]:
         """Scenario of a twin -> clips that it was to be rolled out on."""
-        found = {run.scenario: self._record(run) for run in self.records.itertuples()}
-        return {name: int(record.facts["targets"]) for name, record in found.items() if record}
+        found = {str(run.scenario): self._record(run) for run in self.records.itertuples()}
+        return {name: int(record.facts["targets"]) for name, record in found.items() if record and record.facts}
 
     @cached_property
     def cells(self) -> pd.DataFrame:
@@ -108,7 +108,7 @@ class Clips:
         return record.file(role, self._path(run)) if record and role in record.files else None
 
     def _path(self, run: Any) -> Path:
-        return self.results / run.scenario / run.method / str(run.seed) / "transfer.json"
+        return Path(self.results, str(run.scenario), str(run.method), str(run.seed), "transfer.json")
 
     def _record(self, run: Any) -> StageRecord | None:
         return None if run.reason.startswith(DAMAGED) else StageRecord.load(self._path(run))

@@ -80,9 +80,8 @@ def _rod(problem: FitProblem, run: Recorder, threads: int) -> Written:
     from neuspring.core.files import write_history
     from neuspring.twin.rod_fit import fit_rod
 
-    given = (problem.observations, problem.pool, problem.twin, problem.fit.rod)
-    places = {"device": problem.device, "threads": threads}
-    result = fit_rod(*given, leave_out=problem.leave_out, oracle=problem.oracle, **places)
+    read = (problem.observations, problem.pool, problem.twin, problem.fit.rod)
+    result = fit_rod(*read, leave_out=problem.leave_out, oracle=problem.oracle, device=problem.device, threads=threads)
     files = run.beside(twin="twin.npz", history="history.parquet")
     result.twin.save(files["twin"])
     columns = {name: result.history[name] for name in ("loss", "gradient_norm", "learning_rate")}
