@@ -295,6 +295,7 @@ class Observations(Artifact):
     controller_valid: np.ndarray = array(
         "T,C", np.bool_, "1", "whether each controller holds the object in each frame; empty: all do in all frames", omitted=True
     )
+    controller_hand: np.ndarray = array("C", np.int32, "1", "the hand of each controller; empty: not known", omitted=True)
     surface_points: np.ndarray = array("Ns,3", np.float32, "m", "further surface nodes of frame 0")
     interior_points: np.ndarray = array("Ni,3", np.float32, "m", "interior nodes of frame 0")
     tracks: np.ndarray = array("T,K,3", np.float32, "m", "annotated tracks for scoring only; NaN where not annotated", nan=True)

@@ -85,3 +85,10 @@ def farthest(points: np.ndarray, count: int) -> np.ndarray:
         chosen.append(int(distance.argmax()))
         distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
     return np.array(chosen)
+
+
+def on_table(points: np.ndarray, up: float) -> np.ndarray:
+    """Points [..., 3] with those below the table z = 0 moved up to it; `up` is +1 or -1."""
+    lifted = np.array(points, dtype=float)
+    lifted[..., 2] = up * np.maximum(up * lifted[..., 2], 0.0)
+    return lifted

@@ -119,9 +119,9 @@ def code_digest(*modules: str) -> str:
 def image_stamps(folder: Path) -> str:
     """A digest of names, sizes and times of a capture's images and marks: it tells those that a user has changed."""
     digest = hashlib.sha256()
-    # Marks are segmented from as images are.
+    # Marks are segmented from as images are, and hands and nodes are lifted with them.
     files = [path for kind in ("color", "depth", "mask") for path in (folder / kind).rglob("*")]
-    for path in sorted([*files, *folder.glob("marks.json")]):
+    for path in sorted([*files, *folder.glob("marks.json"), *folder.glob("controllers.*"), *folder.glob("nodes.*")]):
         # A link without target must not end the planning either: whoever reads it says so.
         facts = path.stat() if path.exists() else path.lstat()
         digest.update(f"{path.relative_to(folder)} {facts.st_size} {facts.st_mtime_ns}".encode())

@@ -1,11 +1,12 @@
-"""The capture folder: RGBD video of one or more cameras, or color alone of one, as JSON and images only.
+"""The capture folder: RGBD video of one or more cameras, color alone of one, or points in space alone.
 
     capture.json                       everything but images, see `Description`
     color/<camera>/<frame>.png         8-bit RGB
     depth/<camera>/<frame>.png | .npy  uint16 in units of `depth_unit` m (png, npy) or float meters (npy); along the optical axis,
                                        0: none; not there with `depth: none`
     mask/<camera>/<frame>.png          optional: 8-bit, 0 nothing, 1 object, 2 hands
-    tracks.json                        optional, for scoring alone: [K][T] of [x, y, z] m in the world, or null where not annotated
+    tracks.json                        optional: [K][T] of [x, y, z] m in the world, or null where not annotated; see `tracks`
+    controllers.npz|csv, nodes.npz|ply optional: hands in all frames and the body of frame 0, m in the world (points.py)
     points.json                        optional, for scoring alone: {camera: [K][T] of [x, y] pixels, or null where not marked}
 
 Frames are numbered from 0 with five digits. Pixel centers lie at whole coordinates, x right, y down, z forward (OpenCV). The world
@@ -41,6 +42,7 @@ from neuspring.core.geometry import Obstacle
 from neuspring.core.records import digest_file
 
 CAPTURE, TRACKS, POINTS = "capture.json", "tracks.json", "points.json"
+CONTROLLERS, NODES = ("controllers.npz", "controllers.csv"), ("nodes.npz", "nodes.ply")
 RECIPE = ".make-capture.json"
 """What a folder is made of that make-capture has not finished. It is removed at the end."""
 NOTHING, OBJECT, HANDS = 0, 1, 2
@@ -123,9 +125,12 @@ class Description:
     frame_count: Annotated[int, Field(ge=5)]
     frame_rate: Positive
     """Frames per second."""
-    cameras: Annotated[tuple[CameraEntry, ...], Field(min_length=1)]
+    cameras: tuple[CameraEntry, ...]
+    """None: points in space alone, with `depth: none` and `tracks: train` (points.py)."""
     depth: Literal["measured", "none"] = "measured"
-    """none: color alone, of one camera, with the table at z = 0 (neuspring/perception/color)."""
+    """none: color alone, of one camera, with the table at z = 0 (neuspring/perception/color.py), or no camera."""
+    tracks: Literal["score", "train"] = "score"
+    """score: annotated points are for scoring alone. train: those of training frames teach the twin too."""
     depth_unit: Positive = 0.001
     """Meters per count of an integer depth image."""
     depth_format: Literal["png", "npy"] = "png"
@@ -274,7 +279,7 @@ class Writer:
 
     def __init__(self, folder: Path, description: Description) -> None:
         self.capture = Capture(Path(folder), description)
-        for name in (CAPTURE, TRACKS, POINTS):
+        for name in (CAPTURE, TRACKS, POINTS, *CONTROLLERS, *NODES):
             (self.capture.folder / name).unlink(missing_ok=True)
 
     def frame(self, camera: str, frame: int, color: np.ndarray, depth: np.ndarray | None, mask: np.ndarray | None = None) -> None:
@@ -311,15 +316,19 @@ class Writer:
             del plain["obstacles"]
         if self.capture.has_depth:
             del plain["depth"]
+        if description.tracks == "score":
+            del plain["tracks"]
         write_text(folder / CAPTURE, json.dumps(plain, indent=1) + "\n")
         return Capture(folder, description)
 
 
 def cut(capture: Capture, first: int, last: int, folder: Path) -> Capture:
-    """Frames `first` to `last` of a capture, both included, as a capture of its own in a new `folder`, with masks and tracks.
+    """Frames `first` to `last` of a capture, both included, as a capture of its own in a new `folder`, without marks and clicks.
 
     Raises InputError for frames that it does not have, a first frame that a camera missed, or a folder with files.
     """
+    from neuspring.data import points as in_space
+
     description = capture.description
     if not 0 <= first < last - 3 or last >= capture.frame_count:
         rule = f"five frames or more of 0 to {capture.frame_count - 1} are required, as in 12-97"
@@ -339,7 +348,9 @@ def cut(capture: Capture, first: int, last: int, folder: Path) -> Capture:
     own = replace(description, name=folder.resolve().name, frame_count=len(kept), cameras=cameras, train_end=None)
     points = {name: capture.points(name)[kept] for name in capture.cameras} if (capture.folder / POINTS).exists() else None
     tracks = capture.tracks()[kept] if (capture.folder / TRACKS).exists() else None
-    return Writer(folder, own).finish(tracks, points, **source)
+    writer = Writer(folder, own)
+    in_space.cut(capture, kept, folder)
+    return writer.finish(tracks, points, **source)
 
 
 def write_tracks(folder: Path, tracks: np.ndarray) -> None:
@@ -388,6 +399,9 @@ def description_findings(path: Path, description: Description) -> list[Finding]:
     if description.train_end is not None and description.train_end > description.frame_count:
         rule = f"must be at most frame_count = {description.frame_count}"
         findings.append(broken(path, "train_end", rule, description.train_end))
+    if not names and (description.depth, description.tracks) != ("none", "train"):
+        rule = "at least one is required; a capture of points alone has depth: none and tracks: train"
+        findings.append(broken(path, "cameras", rule, f"none, depth: {description.depth} and tracks: {description.tracks}"))
     if description.depth == "none" and len(names) > 1:
         findings.append(broken(path, "depth", "none is for one camera", f"{len(names)} cameras"))
     for number, obstacle in enumerate(description.obstacles):

@@ -22,6 +22,7 @@ from neuspring.core.findings import Finding, broken, note, refusal, unusual
 from neuspring.data import mocap, phystwin, plausible
 from neuspring.data.capture import CAPTURE, OBJECT, POINTS, TRACKS, Capture, Description, description_findings, read_description
 from neuspring.data.intake.depth import FAR, FASTEST, NEAR, SLOWEST, cloud, planes
+from neuspring.data.points import look
 from neuspring.data.released import Released, parameter_findings, prediction_findings, read_checkpoint
 from neuspring.data.unpickle import load_pickle
 
@@ -73,10 +74,12 @@ def check_capture(folder: Path) -> list[Finding]:
     if calibrated and len(samples) > 1:
         first = {name: found[0].depth for name, found in samples.items() if 0 in found}
         case.findings += plausible.view_findings(path, capture.cameras, first, description.up)
-    case.load(folder / TRACKS, lambda _: capture.tracks())
+    if description.tracks == "score":
+        case.load(folder / TRACKS, lambda _: capture.tracks())
+    case.findings += look(capture)[1]
     for name in capture.cameras:
         case.load(folder / POINTS, lambda _, name=name: capture.points(name))  # type: ignore[misc]
-    if not description.masks:
+    if capture.cameras and not description.masks:
         message = f"no masks yet (masks: false). Draw them: `neuspring annotate {folder}`; then check again"
         case.findings.append(note(path, message))
     return case.findings

@@ -283,6 +283,65 @@ def reach_findings(camera: Camera, samples: Mapping[int, Sample]) -> list[Findin
     return [finding("hand far from the object", "warning", f"camera {camera.name}", value, rule, remedy)]
 
 
+UNITS = {"millimeters": 1000.0, "tenths of a millimeter": 10000.0, "centimeters": 100.0}
+"""What meters may be instead."""
+AWAY = 0.3
+"""m. Hands that never come nearer to the nodes, and nodes that are farther from annotated points, are of another scene."""
+
+
+def space_findings(file: Path, points: np.ndarray, up: float | None, *, is_body: bool) -> list[Finding]:
+    """Unit and axes of points [n, 3] of a file, m; of a body in frame 0 also its size. `up` is +1 or -1; None: no table."""
+    most, sides = float(np.abs(points).max()), np.ptp(points, axis=0)
+    size = " x ".join(f"{side:.3g}" for side in sides)
+    if most > FAR:
+        fitting = [f"divide by {by:g} if they are {unit}" for unit, by in UNITS.items() if most / by < FAR]
+        remedy = f"Likely: {', or '.join(fitting)}" if fitting else "Look at its unit"
+        rule = f"coordinates must be meters, at most {FAR:g} from the origin"
+        return [broken(file, "points", rule, f"{most:.4g}, in {size}. {remedy}")]
+    found = implausible(str(file), float(sides.max())) if is_body else []
+    if up is None:
+        return found
+    height, sign = up * points[:, 2], "+-" if up > 0 else "-+"
+    low, high = np.quantile(height, WITHIN)
+    # A body may hang in the air, and need not.
+    if low >= -SUNK and high <= HIGH and not (is_body and low > FAR_OFF):
+        return found
+    where = "z from {:.3g} to {:.3g} m".format(*np.quantile(points[:, 2], (0, 1)) + 0.0)
+    rule = f"with up {sign[0]}z points must lie between the table, z = 0, and {HIGH:g} m above it"
+    rests = [turn for turn in (1, -1) if abs((turn * points[:, 1]).min()) < SUNK]
+    if is_body and rests and abs(high) > SUNK:
+        words = "(x, -z, y)" if rests[0] == up else "(x, z, -y)"
+        text = f"{where}. It rests at y = 0: if y is up, write {words} in place of (x, y, z)"
+        return [*found, (unusual if low > FAR_OFF else broken)(file, "points", rule, text)]
+    if high <= SUNK:
+        return [*found, broken(file, "points", rule, f"{where}. Is up {sign[1]}z? Then write so in {CAPTURE}")]
+    if low > FAR_OFF and high <= HIGH:
+        return found
+    remedy = f"Move the world so that the table is z = 0, or write ground: false in {CAPTURE}"
+    return [*found, (broken if low < -FAR_OFF else unusual)(file, "points", rule, f"{where}. {remedy}")]
+
+
+def annotated_findings(file: Path, points: np.ndarray, nodes: np.ndarray) -> list[Finding]:
+    """Annotated points of frame 0 [K, 3], m, that are far from the nodes [N, 3] of the body that they are on."""
+    away = KDTree(nodes).query(points)[0] if len(points) else np.zeros(0)
+    if not (away > REACH).any():
+        return []
+    rule = f"annotated points must lie on the body: within {100 * REACH:g} cm of a node in frame 0"
+    value = f"point {away.argmax()} is {100 * away.max():.1f} cm away, {(away > REACH).sum()} of {len(away)} are farther"
+    level = broken if np.median(away) > REACH else unusual
+    return [level(file, "", rule, f"{value}. Are points and nodes of one recording, in one world?")]
+
+
+def contact_findings(file: Path, hands: np.ndarray, nodes: np.ndarray) -> list[Finding]:
+    """Controllers [T, C, 3], m, that come near to none of the nodes [N, 3] of frame 0."""
+    gap = float(KDTree(nodes).query(hands)[0].min())
+    if gap <= REACH:
+        return []
+    rule = f"in some training frame a controller must come within {100 * REACH:g} cm of a node of frame 0 to move it"
+    value = f"{100 * gap:.1f} cm at the nearest. Are hands and nodes of one recording, in one world?"
+    return [(broken if gap > AWAY else unusual)(file, "points", rule, value)]
+
+
 BESIDE = 0.04
 """Distance between two pieces of the hands' mask, as a part of the image, within which they are one hand."""
 STEADY = 5

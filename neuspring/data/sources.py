@@ -132,7 +132,8 @@ def scenario_rows(settings: Config, root: Path = Path(), also: Iterable[str] = (
             if name not in rows:
                 own = capture.read_description(path)
                 touches = own.category == "cloth" if own.self_collision is None else own.self_collision
-                values = {"scenario": name, "source": "capture", "category": own.category, "path": name}
+                source = "capture" if own.cameras else "points"
+                values = {"scenario": name, "source": source, "category": own.category, "path": name}
                 rows[name] = parse(ScenarioRow, values | {"self_collision": touches, "ground": own.ground}, str(path))
         except InputError:
             # Another capture that is damaged is no reason to stop.
@@ -172,6 +173,10 @@ def _required_capture(folder: Path) -> None:
     if not (folder / capture.CAPTURE).exists():
         remedy = "Correct the path in the scenario table, or data_root, or make a capture: `neuspring make-capture --help`."
         raise InputError(folder, "a capture is a folder with capture.json", "a folder without", remedy)
+    if any((folder / name).exists() for name in IN_SPACE) or not capture.read_description(folder / capture.CAPTURE).cameras:
+        from neuspring.data.points import read
+
+        read(capture.Capture.load(folder))
 
 
 def _require_rings(config: Config) -> None:
@@ -184,6 +189,7 @@ def _counted(folder: Path, config: Config) -> tuple[str, ...]:
     return tuple(map(str, range(phystwin.camera_count(folder))))
 
 
+IN_SPACE = (*capture.CONTROLLERS, *capture.NODES)
 SOURCES = {
     "toy": Source(module="neuspring.data.synthetic.toy", reads=("toy",), needs_data=False),
     "mocap": Source(module="neuspring.data.mocap", reads=("data_root", "mocap"), require_alike=_require_rings),
@@ -203,6 +209,13 @@ SOURCES = {
         own=True,
         required=_required_capture,
         cameras=lambda folder, config: tuple(c.name for c in capture.read_description(folder / capture.CAPTURE).cameras),
+    ),
+    "points": Source(
+        module="neuspring.data.points",
+        reads=("data_root",),
+        own=True,
+        required=_required_capture,
+        files=(capture.CAPTURE, capture.TRACKS, *IN_SPACE),
     ),
     "phystwin_raw": Source(
         module="neuspring.data.phystwin",

@@ -15,6 +15,7 @@ import warp as wp
 from neuspring.config import ScenarioRow
 from neuspring.config.perception import Perception, Sampling
 from neuspring.core.artifacts import ImageObservations, Observations, Scenario
+from neuspring.core.geometry import on_table
 from neuspring.core.records import digest_file
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.perception.results import LiftedTracks, ShapePrior
@@ -121,13 +122,6 @@ def voxel_for(points: np.ndarray, most: int, least: float) -> float:
         if len(np.unique(np.ravel_multi_index(tuple(cells.T), tuple(size)))) <= most:
             break
     return voxel
-
-
-def on_table(points: np.ndarray, up: float) -> np.ndarray:
-    """Points [..., 3] with those below the table z = 0 moved up to it; `up` is +1 or -1."""
-    lifted = np.array(points, dtype=float)
-    lifted[..., 2] = up * np.maximum(up * lifted[..., 2], 0.0)
-    return lifted
 
 
 def on_surface(vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:

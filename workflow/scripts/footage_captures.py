@@ -60,14 +60,18 @@ def points_of(path: Path, frames: int) -> np.ndarray:
     return points
 
 
-def write_capture(folder: Path, output: Path, case: str, most: int | None = None) -> Capture:
-    """Write OUTPUT/CASE, of the first `most` frames, all by default. Raises InputError for a wrong calibration or wrong marks."""
+def write_capture(folder: Path, output: Path, case: str, most: int | None = None, name: str | None = None) -> Capture:
+    """Write OUTPUT/NAME (CASE by default), of the first `most` frames, all by default.
+
+    Raises InputError for a wrong calibration or wrong marks.
+    """
+    name = name or case
     colors, marks = film(folder, case, most), MARKS / "phystwin_camera0" / f"{case}.json"
     row = released_cases().get(case)
     whole = row is not None and int(row["frames"]) == len(colors)
     described = Description(
         format=1,
-        name=case,
+        name=name,
         category=category_of(case),
         frame_count=len(colors),
         frame_rate=RATE,
@@ -78,13 +82,13 @@ def write_capture(folder: Path, output: Path, case: str, most: int | None = None
         masks=True,
         provenance={"source": "footage", "masks": f"carried from {marks.name}"},
     )
-    writer, labels = Writer(output / case, described), carried(colors, case)
+    writer, labels = Writer(output / name, described), carried(colors, case)
     for frame, (color, mask) in enumerate(zip(colors, labels, strict=True)):
         writer.frame(NAME, frame, color, None, mask)
-    shutil.copyfile(marks, output / case / MARKS_FILE)
+    shutil.copyfile(marks, output / name / MARKS_FILE)
     tracks = folder / "tracks" / f"{case}.json"
     writer.finish(points={NAME: points_of(tracks, len(colors))} if tracks.exists() else None)
-    return Capture.load(output / case)
+    return Capture.load(output / name)
 
 
 def main() -> None:

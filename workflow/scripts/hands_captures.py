@@ -1,0 +1,149 @@
+"""Captures of PhysTwin scenes with hands in space: points alone, film with hands, and both.
+
+    python -m workflow.scripts.hands_captures FOLDER OUTPUT [--films FOLDER] [--cases ...] [--force]
+
+Any folder below FOLDER is a case that has, in integers of 0.1 mm, controller.txt and landmarks.txt (a line per frame: its number,
+then points x y z; 0 0 0 of a landmark: not visible) and rest.txt (a line x y z per node of frame 0). Of each
+
+    OUTPUT/CASE_points   hands, nodes and annotated points alone; those of training frames teach the twin
+    OUTPUT/CASE_film     color of camera 0 and the hands; annotated points are for scoring alone
+    OUTPUT/CASE_both     color, hands, nodes and annotated points
+
+is written, the last two where FOLDER of --films (that of `workflow.scripts.footage_captures`) has a film of the case and
+tests/data/marks has marks. The world is that of the cameras: z = 0 is the table, up is -z. The split is the released one.
+A capture that is there is left alone without --force.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from argparse import ArgumentParser
+from pathlib import Path
+
+import numpy as np
+
+from neuspring.core.files import write_text
+from neuspring.data.capture import CAPTURE, Capture, Description, Writer, write_tracks
+from neuspring.data.phystwin import released_cases
+from neuspring.data.points import Hands, read, write
+from workflow.scripts.footage_captures import RATE, cases_of, category_of, write_capture
+from workflow.scripts.masks import MARKS
+
+UNIT = 1e-4
+"""m per count."""
+FILES = ("controller.txt", "landmarks.txt", "rest.txt")
+NO_BOOLS, NO_INTS = np.zeros((0, 0), bool), np.zeros(0, int)
+
+
+def folders_of(folder: Path) -> dict[str, Path]:
+    """Case -> its folder."""
+    return {
+        path.parent.name: path.parent for path in sorted(folder.rglob(FILES[0])) if all((path.parent / n).exists() for n in FILES)
+    }
+
+
+def moving(path: Path) -> np.ndarray:
+    """Points [T, n, 3], counts, of a file with a line per frame. Raises ValueError where frames are not 0, 1, 2, ..."""
+    rows = np.loadtxt(path, dtype=int, ndmin=2)
+    if not np.array_equal(rows[:, 0], np.arange(len(rows))) or (rows.shape[1] - 1) % 3:
+        raise ValueError(f"{path}: a line per frame, from 0, of its number and points x y z is required")
+    return rows[:, 1:].reshape(len(rows), -1, 3)
+
+
+def read_case(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Hands [T, C, 3], annotated points [T, K, 3] (NaN: not visible) and nodes [N, 3] of a case, m."""
+    hands, marked = moving(folder / FILES[0]), moving(folder / FILES[1])
+    tracks = np.where((marked != 0).any(axis=2, keepdims=True), UNIT * marked, np.nan)
+    nodes = np.unique(np.loadtxt(folder / FILES[2], dtype=int, ndmin=2), axis=0)
+    return UNIT * hands, tracks, UNIT * nodes
+
+
+def described(case: str, name: str, frames: int) -> Description:
+    """What capture.json says of the points alone."""
+    row = released_cases().get(case)
+    split = int(row["train_end"]) if row is not None and int(row["frames"]) == frames else None
+    return Description(
+        format=1,
+        name=name,
+        category=category_of(case),
+        frame_count=frames,
+        frame_rate=RATE,
+        cameras=(),
+        depth="none",
+        tracks="train",
+        up="-z",
+        train_end=split,
+        provenance={"source": "hands in space"},
+    )
+
+
+def write_points(folder: Path, output: Path, case: str) -> Capture:
+    """Write OUTPUT/CASE_points. Raises InputError or ValueError for what cannot be read."""
+    hands, tracks, nodes = read_case(folder)
+    name = f"{case}_points"
+    writer = Writer(output / name, described(case, name, len(hands)))
+    write(output / name, Hands(hands, NO_BOOLS, NO_INTS), nodes)
+    made = writer.finish(tracks)
+    read(made)
+    return made
+
+
+def add_hands(film: Path, folder: Path, *, both: bool) -> Capture:
+    """Hands and annotated points beside a film; with `both` nodes too, and the points teach the twin."""
+    made = Capture.load(film)
+    hands, tracks, nodes = read_case(folder)
+    if made.frame_count > len(hands):
+        raise ValueError(f"{folder}: {len(hands)} frames, but the film has {made.frame_count}")
+    kept = slice(made.frame_count)
+    write(made.folder, Hands(hands[kept], NO_BOOLS, NO_INTS), nodes if both else nodes[:0])
+    write_tracks(made.folder, tracks[kept])
+    path = made.folder / CAPTURE
+    values = json.loads(path.read_text()) | {"name": made.folder.name, "tracks": "train" if both else "score"}
+    write_text(path, json.dumps(values, indent=1) + "\n")
+    capture = Capture.load(made.folder)
+    read(capture)
+    return capture
+
+
+def told(capture: Capture) -> str:
+    """A line about a capture."""
+    space, tracks = read(capture), capture.tracks()
+    assert space.hands is not None
+    words = f"{space.hands.points.shape[1]} hand points, {len(space.nodes)} nodes, {tracks.shape[1]} annotated points"
+    return f"{capture.folder.name}: {capture.frame_count} frames, training before {capture.train_end}, {words}"
+
+
+def main() -> None:
+    parser = ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("output", type=Path)
+    parser.add_argument("--films", type=Path, help="folder with videos and cameras.json")
+    parser.add_argument("--cases", nargs="+", help="all that are there by default")
+    parser.add_argument("--force", action="store_true", help="write captures anew that are there")
+    a = parser.parse_args()
+    found = folders_of(a.folder)
+    if not found or (missing := set(a.cases or ()) - set(found)):
+        parser.error(f"{a.folder} has no case {' '.join(sorted(missing)) if found else ''} with {', '.join(FILES)}")
+    films = cases_of(a.films) if a.films else []
+    for case in a.cases or found:
+        marked = (MARKS / "phystwin_camera0" / f"{case}.json").exists()
+        if a.films and not (case in films and marked):
+            print(f"{case}: {'no marks' if case in films else 'no film'}, so points alone", flush=True)
+        for row in ("points", *(("film", "both") if case in films and marked else ())):
+            folder = a.output / f"{case}_{row}"
+            if (folder / CAPTURE).exists() and not a.force:
+                print(f"{folder.name}: is there", flush=True)
+            elif row == "points":
+                print(told(write_points(found[case], a.output, case)), flush=True)
+            elif row == "film":
+                write_capture(a.films, a.output, case, name=folder.name)
+                print(told(add_hands(folder, found[case], both=False)), flush=True)
+            else:
+                shutil.rmtree(folder, ignore_errors=True)
+                shutil.copytree(a.output / f"{case}_film", folder)
+                print(told(add_hands(folder, found[case], both=True)), flush=True)
+
+
+if __name__ == "__main__":
+    main()
