@@ -88,7 +88,7 @@ class TrainingLoop:
         `every` epochs and after the last; one that lies there is continued from if it has the same `key`. `share` is the part of
         the time that counts for this training, where several run together."""
         self._share, self._alone = share, share == 1.0
-        self._begun = time.monotonic()
+        self._begun, self._processor_begun = time.monotonic(), time.process_time()
         self._epochs, self._every, self._partial, self._key = epochs, every, partial, key
         self._progress = Progress(label, epochs)
         self.history: list[dict[str, Any]] = []
@@ -97,6 +97,8 @@ class TrainingLoop:
         """1, plus one for every time that the training continued from a checkpoint of a killed one."""
         self.earlier_seconds = 0.0
         """Wall time of earlier attempts, up to their last checkpoint; this training's share of what it had together with others."""
+        self.earlier_processor_seconds = 0.0
+        """Processor time of the same, of all threads."""
         self.epochs_together = 0
         """How many epochs ran together with those of other trainings."""
         self.restored = Checkpoint.load(partial, key, what)
@@ -104,6 +106,7 @@ class TrainingLoop:
         if self.restored:
             run = self.restored.values.pop("run")
             self.history, self.earlier_seconds, self.epochs_together = run["history"], run["seconds"], run["epochs_together"]
+            self.earlier_processor_seconds = run["processor_seconds"]
             # To go on alone after what was planned to run together is no second attempt.
             self.attempts = run["attempts"] + (self.epochs_together < len(self.history) or not self._alone)
             print(f"continuing {what} after epoch {len(self.history) - 1}")
@@ -126,7 +129,9 @@ class TrainingLoop:
             return
         state = checkpoint()
         seconds = self.earlier_seconds + self._share * (time.monotonic() - self._begun)
+        processor = self.earlier_processor_seconds + self._share * (time.process_time() - self._processor_begun)
         run = {"history": self.history, "attempts": self.attempts, "seconds": seconds, "epochs_together": self.epochs_together}
+        run["processor_seconds"] = processor
         Checkpoint(state.arrays, {**state.values, "run": run}).save(self._partial, self._key)
 
 

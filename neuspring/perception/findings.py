@@ -51,6 +51,11 @@ OUTSIDE = 0.25
 pairs; masks that lose half of the object, in 3 or more."""
 STIRRED = 0.05
 """Part of the object's pixels that change where it moves."""
+NEW, DARKER, TINT = 0.01, 0.05, 0.12
+"""Part of the object's pixels that must look new; how much lighter, as a log ratio, a shadow may make a pixel, and by how much the
+ratios of its three colors may differ."""
+KEPT = 0.5
+"""Share of what the object seems to cover newly that lies in its mask. Masks drawn by hand on six real films keep 0.61 to 0.95."""
 UNMARKED = (
     "Look there: a part of the object, or a hand that came in, lies in no mask. Mark it in that frame (`neuspring annotate`), and "
     "carry again. If neither moves there, ignore this."
@@ -79,6 +84,8 @@ GRIP = 0.04
 """m from the object within which a controller can hold it."""
 APART = 0.15
 """m between hand and object, at their nearest, from which there is no interaction to learn from."""
+LOST = 0.1
+"""Share of the object's points that are lost in a training frame, from which the others do not tell that it stands still."""
 STILL = 0.005
 """m: motions smaller than this are noise."""
 RESIZED = 1.8
@@ -141,6 +148,8 @@ class _Motion:
     """[h, w] bool: what changes within LAG frames."""
     since: np.ndarray
     """[h, w] bool: what has changed plainly since frame 0."""
+    shaded: np.ndarray
+    """[h, w] bool: what looks as in frame 0 in a shadow."""
     labels: np.ndarray
     """[3, h, w]: of the frame, of that LAG later, and of frame 0."""
 
@@ -165,7 +174,9 @@ def _motions(capture: Capture, camera: str, labels: np.ndarray) -> Iterator[_Mot
         image = small(here)
         three = [cv2.resize(labels[k], size, interpolation=cv2.INTER_NEAREST) for k in (here, there, frames[0])]
         assert first is not None
-        yield _Motion(here, change(image, small(there), MOVED), change(image, first, 2 * MOVED), np.stack(three))
+        ratio = np.log((image + 8) / (first + 8))
+        shaded = (ratio.max(axis=-1) < DARKER) & (np.ptp(ratio, axis=-1) < TINT)
+        yield _Motion(here, change(image, small(there), MOVED), change(image, first, 2 * MOVED), shaded, np.stack(three))
 
 
 def _grown(mask: np.ndarray, share: float) -> np.ndarray:
@@ -177,22 +188,41 @@ def _grown(mask: np.ndarray, share: float) -> np.ndarray:
 def _outside(capture: Capture, camera: str, labels: np.ndarray) -> dict[str, float]:
     """Share of the times with motion at the object that no mask covers, and the first of them.
 
-    And the share of training frames in which the picture is another where the object was in frame 0 and no hand is.
+    And the share of training frames in which the picture is another where the object was in frame 0 and no hand is. And how much
+    of what seems newly covered since frame 0 lies in the object's mask: what changed where neither object nor hand was or is
+    near, is no shadow, and touches the object.
     """
-    outside, stirred, looked = [], [], 0
+    outside, stirred, newly, looked = [], [], [], 0
     for motion in _motions(capture, camera, labels):
         both, begin, looked = motion.labels[:2], motion.labels[2] == OBJECT, looked + 1
         near = motion.moving & _grown((both == OBJECT).any(axis=0), BESIDE)
         bare = int((near & ~_grown(np.any(both, axis=0), RIM)).sum())
         if bare > max(OUTSIDE * near.sum(), RIM * (both[0] == OBJECT).sum()):
             outside.append(motion.frame)
+        if (covered := _newly(motion))[1] > NEW * begin.sum():
+            newly.append((motion.frame, *covered))
         if motion.frame < capture.train_end:
             own = motion.since & begin & ~_grown((motion.labels == HANDS).any(axis=0), RIM)
             stirred.append(own.sum() > STIRRED * max(begin.sum(), 1))
     if len(outside) < FEWEST_STEPS:
         outside = []
     first = {"first_outside": float(outside[0])} if outside else {}
+    if len(newly) >= FEWEST_STEPS:
+        first["newly_kept"] = sum(kept for _, kept, _ in newly) / sum(seen for *_, seen in newly)
+        lost = [frame for frame, kept, seen in newly if kept < KEPT * seen]
+        first |= {"first_newly_lost": float(lost[0])} if lost else {}
     return {"moves_outside": len(outside) / max(looked, 1), "object_moves": float(np.mean(stirred or [0])), **first}
+
+
+def _newly(motion: _Motion) -> tuple[int, int]:
+    """Pixels that the object seems to cover newly since frame 0: those in its mask, and all."""
+    now, first = motion.labels[0], motion.labels[2]
+    new = cv2.morphologyEx((motion.since & ~motion.shaded).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+    new &= ~_grown((first > 0) | (now == HANDS), RIM)
+    around = _grown((first == OBJECT) | (now == OBJECT), 2 * RIM)
+    pieces = cv2.connectedComponents((new | around).astype(np.uint8))[1]
+    new &= np.isin(pieces, np.unique(pieces[around]))
+    return int((new & (now == OBJECT)).sum()), int(new.sum())
 
 
 def _inside(labels: np.ndarray) -> float:
@@ -233,6 +263,11 @@ def look_at_masks(capture: Capture, camera: str, labels: np.ndarray, facts: Mapp
         found.append(
             finding("motion outside of the masks", "warning", where, value, f"less than {OFTEN:.0%} is expected", UNMARKED)
         )
+    if facts.get("newly_kept", 1.0) < KEPT:
+        value = f"of what the object seems to cover newly since frame 0, its mask keeps {facts['newly_kept']:.0%}, "
+        value += f"too little first in frame {int(facts['first_newly_lost'])}"
+        rule = f"at least {KEPT:.0%} is expected"
+        found.append(finding("newly covered parts lost", "warning", where, value, rule, UNMARKED))
     return found
 
 
@@ -324,9 +359,12 @@ def look_at_observations(observations: Observations, moves: float = 0.0) -> list
     farthest = max(
         (float(np.quantile(row[shown], 0.9)) for row, shown in zip(moved, seen, strict=True) if shown.any()), default=0.0
     )
-    if farthest < STILL and moves >= OFTEN:
-        value = f"points of the object move {1e3 * farthest:.1f} mm in the training frames, and its picture changes in {moves:.0%}"
-        rule = "it moves, and is not followed where it does"
+    # What is lost may have moved: neither is known then.
+    lost = 1 - min((float(shown.mean()) for shown in seen), default=1.0)
+    if farthest < STILL and (moves >= OFTEN or lost > LOST):
+        value = f"points of the object move {1e3 * farthest:.1f} mm in the training frames, its picture changes in {moves:.0%} of "
+        value += f"them, and up to {lost:.0%} of the points are lost"
+        rule = "where it moves it is not followed"
         remedy = "Look at masks.png and tracks.png: mark what the masks lose, use more light or shorter exposures, or cotracker3."
         found.append(finding("object not followed", "warning", where, value, rule, remedy))
     elif farthest < STILL:

@@ -64,6 +64,7 @@ def fit(
         "epochs": len(result.history),
         "epochs_asked": problem.fit.epochs,
         "epochs_together": result.epochs_together,
+        "earlier_processor_seconds": round(result.earlier_processor_seconds, 3),
         "rollbacks": result.rollbacks,
         "collision_overflow": result.collision_overflow,
         **result.figures,

@@ -109,6 +109,8 @@ class FitResult:
     """1, plus one for every time the fit continued from a checkpoint."""
     earlier_seconds: float
     """Wall time of the attempts that this one continued, up to their last checkpoint."""
+    earlier_processor_seconds: float
+    """Processor time of the same; of what ran together with other fits, this one's share."""
     collision_overflow: int
     epochs_together: int
     """Epochs that ran together with those of other fits."""
@@ -450,6 +452,7 @@ def fit(
         state.rollbacks,
         loop.attempts,
         loop.earlier_seconds,
+        loop.earlier_processor_seconds,
         state.overflow,
         loop.epochs_together,
         run.figures(state),

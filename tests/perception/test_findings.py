@@ -1,5 +1,6 @@
 """Findings of the steps of perception, each provoked once: its name and level."""
 
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -10,7 +11,7 @@ from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.errors import InputError
 from neuspring.core.findings import Finding, finding, findings_as_facts, findings_of, refuse_errors
 from neuspring.core.records import Recorder
-from neuspring.data.capture import HANDS, OBJECT, Writer
+from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
 from neuspring.perception.findings import look_at_lifted, look_at_masks, look_at_observations, look_at_tracks, mask_facts
 from neuspring.perception.results import ShapePrior
 from neuspring.perception.shape import no_prior
@@ -153,6 +154,26 @@ def test_what_moves_at_the_object_and_lies_in_no_mask_is_said(moving):
     assert "a part of the object, or a hand that came in, lies in no mask" in found.text
 
 
+def test_newly_covered_parts_that_a_mask_loses_are_said(moving):
+    """The mask keeps what the object covered in frame 0, and loses what it moves to."""
+    right, lost = both_squares(), both_squares()
+    lost[:, TOP : TOP + SIDE, LEFT + SIDE :] = 0
+    assert mask_facts(moving, "0", right)["newly_kept"] > 0.9
+    assert "newly covered parts lost" not in {one.name for one in looked_at(moving, right)}
+    assert mask_facts(moving, "0", lost)["newly_kept"] < 0.05
+    [found] = [one for one in looked_at(moving, lost) if one.name == "newly covered parts lost"]
+    assert found.level == "warning" and "first in frame 2; at least 50% is expected" in found.text
+
+
+def test_a_shadow_is_not_taken_for_a_newly_covered_part(moving, tmp_path):
+    capture = Capture.load(shutil.copytree(moving.folder, tmp_path / "shaded"))
+    for frame in range(5, LONG):
+        image = capture.color("0", frame).copy()
+        image[: TOP - 2, LEFT:] = (0.6 * image[: TOP - 2, LEFT:]).astype(np.uint8)
+        cv2.imwrite(str(capture.path("color", "0", frame)), image)
+    assert mask_facts(capture, "0", both_squares())["newly_kept"] > 0.9
+
+
 def test_tracks_that_end_where_the_picture_moves_are_said(moving):
     """Half of the points are followed to the end: those that stand still."""
     labels = both_squares()
@@ -177,6 +198,15 @@ def test_an_object_that_folds_is_not_said_to_stand_still(moving):
     found = look_at_observations(still, moves)
     assert said(found) == {"warning: object not followed"} and "static" not in found[0].text
     assert mask_facts(moving, "0", both_squares(HANDS))["object_moves"] == 0.0
+
+
+def test_an_object_whose_points_are_lost_is_not_said_to_stand_still():
+    """Those that are lost may be the ones that move."""
+    still = observed(ABOVE, SLOW, follows=False)
+    visibility = still.object_visibility.copy()
+    visibility[2:, : len(BOX) // 4] = False
+    [found] = look_at_observations(replace(still, object_visibility=visibility))
+    assert found.name == "object not followed" and "up to 25% of the points are lost" in found.text
 
 
 def test_lost_and_few_tracks_are_said(capture):

@@ -4,7 +4,8 @@
 
 FOLDER is that of `workflow.scripts.footage`, with cameras.json. Of each case with a video and with marks (tests/data/marks) a
 capture OUTPUT/CASE is written: the film, masks carried from the marks of frame 0, the marks, and as points.json the points that
-were marked by hand and are sure. A capture that is there is left alone without --force.
+were marked by hand and are sure. Its provenance has the processor seconds of the carrying, for the table of costs.
+A capture that is there is left alone without --force.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ NAME = "0"
 """The only camera."""
 RATE = 30.0
 """Frames per second of the films."""
+CARRYING = "carrying_seconds"
+"""The entry of a capture's provenance with the processor seconds that its masks took."""
 CATEGORIES = ("cloth", "rope", "sloth", "zebra")
 
 
@@ -82,12 +85,14 @@ def write_capture(folder: Path, output: Path, case: str, most: int | None = None
         masks=True,
         provenance={"source": "footage", "masks": f"carried from {marks.name}"},
     )
-    writer, labels = Writer(output / name, described), carried(colors, case)
+    writer, began = Writer(output / name, described), time.process_time()
+    labels, seconds = carried(colors, case), time.process_time() - began
     for frame, (color, mask) in enumerate(zip(colors, labels, strict=True)):
         writer.frame(NAME, frame, color, None, mask)
     shutil.copyfile(marks, output / name / MARKS_FILE)
     tracks = folder / "tracks" / f"{case}.json"
-    writer.finish(points={NAME: points_of(tracks, len(colors))} if tracks.exists() else None)
+    points = {NAME: points_of(tracks, len(colors))} if tracks.exists() else None
+    writer.finish(points=points, **{CARRYING: f"{seconds:.1f}"})
     return Capture.load(output / name)
 
 

@@ -56,6 +56,9 @@ ANYWHERE = (0.01, 0.004, 0.015)
 hiding, hands come in. Without it for nothing, the shadow of an object that left stays its part for good."""
 CHANGED = 12.0
 """Difference of L, a, b, from which the flow is doubted."""
+MOST_HOLE, FILLED = 0.2, 2.0
+"""Largest hole that is filled, as part of what is nothing, and the mean log ratio of color from which it is. From 0 on, the table
+between a toy and hands was filled too."""
 CONFIDENT = 0.95
 """Probability from which a pixel teaches colors."""
 LEARN, EVERY = 0.2, 4
@@ -310,6 +313,7 @@ class Pass:
         if part is not None:
             logs += corrections(place, part, self.reach)
         solved = self.tidy(solve(logs.astype(np.float32), near), place, window, part)
+        self.fill(solved, near, window)
         self.probability = np.zeros_like(self.probability)
         self.probability[NOTHING] = 1.0
         self.probability[(slice(None), *window)] = solved
@@ -408,6 +412,27 @@ class Pass:
             drop[0] = False
             probability[:, drop[pieces]] = np.array([0.98, 0.01, 0.01], np.float32)[:, None]
         return probability
+
+    def fill(self, probability: np.ndarray, lab: np.ndarray, window: tuple[slice, slice]) -> None:
+        """Holes in object and hands are object where no background was ever seen, unless they look like the background around.
+
+        What a hand uncovers of a cloth has colors that no mark knows, such as those of folds.
+        """
+        if self.background is None:
+            return
+        nothing, seen = probability.argmax(axis=0) == NOTHING, self.background.part(window).seen > 0
+        number, pieces, boxes, _ = cv2.connectedComponentsWithStats(nothing.astype(np.uint8), connectivity=4)
+        left, top, width, height, areas = boxes.T
+        holes = (left > 0) & (top > 0) & (left + width < nothing.shape[1]) & (top + height < nothing.shape[0])
+        # The piece 0 is what is not nothing.
+        holes &= (np.arange(number) > 0) & (areas < MOST_HOLE * nothing.sum())
+        unseen = holes[pieces] & ~seen
+        if unseen.any():
+            ratio = self.colors[OBJECT][bins_of(lab)] - _local_density(lab, nothing & seen)
+            gain = np.bincount(pieces[unseen], np.clip(ratio[unseen], -MOST_COLOR, MOST_COLOR), minlength=number)
+            count_unseen = np.bincount(pieces[unseen], minlength=number)
+            holes &= (gain > FILLED * count_unseen) & (count_unseen > 0.5 * areas)
+            probability[:, holes[pieces]] = np.array([0.01, 0.98, 0.01], np.float32)[:, None]
 
     def _learn(self, depth: np.ndarray | None) -> None:
         """Colors, from each fourth frame, and the background."""
