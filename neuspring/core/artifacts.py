@@ -250,6 +250,8 @@ class Scenario(Artifact):
 class ImageObservations(Artifact):
     """What one calibrated camera without depth saw: the object in training frames, the hands in all frames.
 
+    Where the capture brings hands in space (data/points.py) there are none here: H = 0, and `hand_of` is empty.
+
     Pixel centers lie at whole coordinates, x right, y down (data/capture.py).
     """
 
@@ -346,7 +348,7 @@ class Observations(Artifact):
             rule = f"one velocity per tracked point and controller ({points + hands}), or none"
             raise InputError(f"{name}.velocity_before", rule, len(self.velocity_before))
         if self.image is not None:
-            sizes = (*self.image.visible.shape, len(self.image.hand_of))
+            sizes = (*self.image.visible.shape, len(self.image.hand_of) if self.image.hands else hands)
             wanted = (frames, points, self.controller_points.shape[1])
             if sizes != wanted:
                 raise InputError(f"{name}.image", f"frames, tracked points and controllers must be {wanted}", sizes)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import ast
 import functools
 import hashlib
+import re
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -121,7 +122,11 @@ def image_stamps(folder: Path) -> str:
     digest = hashlib.sha256()
     # Marks are segmented from as images are, and hands and nodes are lifted with them.
     files = [path for kind in ("color", "depth", "mask") for path in (folder / kind).rglob("*")]
-    for path in sorted([*files, *folder.glob("marks.json"), *folder.glob("controllers.*"), *folder.glob("nodes.*")]):
+    names = ["marks.json", "controllers.*", "nodes.*"]
+    described = folder / "capture.json"
+    if described.exists() and re.search(r'"tracks":\s*"train"', described.read_text(encoding="utf-8", errors="replace")):
+        names.append("tracks.json")
+    for path in sorted([*files, *(path for name in names for path in folder.glob(name))]):
         # A link without target must not end the planning either: whoever reads it says so.
         facts = path.stat() if path.exists() else path.lstat()
         digest.update(f"{path.relative_to(folder)} {facts.st_size} {facts.st_mtime_ns}".encode())

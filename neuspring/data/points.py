@@ -272,9 +272,8 @@ def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Obser
     capture = Capture.load(path)
     description, space = capture.description, read(capture)
     assert space.hands is not None, "read has refused a capture without hands"
-    seen = np.isfinite(space.tracks).all(axis=2)
-    visible = seen[:, seen[0]]
-    points, nodes = np.where(visible[..., None], space.tracks[:, seen[0]], 0.0), space.nodes
+    points, visible = taught_by(space.tracks)
+    nodes = space.nodes
     if row.ground:
         points, nodes = (on_table(places, description.up_sign) for places in (points, nodes))
     nodes = nodes[cKDTree(points[0]).query(nodes)[0] > SAME]
@@ -303,6 +302,18 @@ def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Obser
         interior_points=np.zeros((0, 3)),
         tracks=space.tracks,
     )
+
+
+def taught_by(tracks: np.ndarray, end: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Of annotated tracks [T, K, 3] those that are seen in frame 0: their places, zeros where not seen, and whether they are seen.
+
+    From frame `end` on, if it is given, none is.
+    """
+    seen = np.isfinite(tracks).all(axis=2)
+    visible = seen[:, seen[0]]
+    if end is not None:
+        visible[end:] = False
+    return np.where(visible[..., None], tracks[:, seen[0]], 0.0), visible
 
 
 def in_both(visible: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -25,8 +26,10 @@ from neuspring.config.perception import ColorSettings, Perception
 from neuspring.core.artifacts import ImageObservations
 from neuspring.core.errors import InputError
 from neuspring.core.geometry import farthest
-from neuspring.data.capture import CAPTURE, HANDS, NOTHING, OBJECT, Camera, Capture
+from neuspring.data.capture import CAPTURE, CONTROLLERS, HANDS, NOTHING, OBJECT, Camera, Capture
+from neuspring.data.points import InSpace, held, read
 from neuspring.perception.color_hands import follow_hands, grips
+from neuspring.perception.controllers import ALWAYS
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
 from neuspring.perception.shape import no_prior, round_chord, shape_prior
 from neuspring.twin.hand_paths import depths_of, place
@@ -51,6 +54,10 @@ ROPE_WIDEST = 1.5
 """Largest thickness of a rope over its median."""
 HIDDEN_STRIDE = 3
 """Of the object's pixels beneath hands each third gets a point."""
+
+
+SeenHands: TypeAlias = tuple[dict[str, np.ndarray], list[np.ndarray], dict[str, float]]
+"""What ImageObservations hold of hands, the pixels of each grip, and facts."""
 
 
 @dataclass(frozen=True)
@@ -147,12 +154,18 @@ def beneath_hands(labels: np.ndarray, reach: float) -> np.ndarray:
 
 
 def lift_color(
-    capture: Capture, labels: np.ndarray, tracks: PixelTracks, first: FirstFrame, settings: ColorSettings, controllers: int
+    capture: Capture,
+    labels: np.ndarray,
+    tracks: PixelTracks,
+    first: FirstFrame,
+    controllers: int,
+    space: InSpace,
 ) -> tuple[LiftedTracks, ImageObservations]:
     """Tracks and hands in the world as far as they are known, and the evidence in the image.
 
-    labels [T, H, W] are masks. The object's points are known in frame 0; beneath hands some are added that no track has. Raises
-    InputError without tracks on the object, or without a hand.
+    labels [T, H, W] are masks. The object's points are known in frame 0; beneath hands some are added that no track has. Hands are
+    those that the capture brings (`space`), or at most so many `controllers` of what is seen. Raises InputError without tracks on
+    the object, or without a hand.
     """
     camera, name, frames = first.camera, first.camera.name, capture.frame_count
     where = f"{capture.folder}, perception"
@@ -172,15 +185,8 @@ def lift_color(
     points[0] = first.points(places)
     known = np.zeros((frames, len(places)), bool)
     known[0] = True
-    # A hand above a sheet hides more of it than its fingers hold.
-    length = GRIP_LENGTH if first.kind == "flat" else np.inf
-    sizes = (GRIP_REACH, HANDS_APART, length)
-    held = grips(labels[0], first.filled, *(size / first.pixel_size for size in sizes))
-    if not held:
-        raise InputError(f"{where}, masks of frame 0", "at least one hand must be in view", "none", "Mark the hands in frame 0.")
-    motion = follow_hands(capture, name, labels, held, HAND_RADIUS / first.pixel_size)
-    chosen = [grip[farthest(grip.astype(float), max(controllers // len(held), 4))] for grip in held]
-    hand_of = np.concatenate([np.full(len(grip), hand) for hand, grip in enumerate(chosen)])
+    unseen: SeenHands = no_seen_hands(frames), [], {}
+    seen, chosen, facts = _seen_hands(capture, labels, first, controllers, where) if space.hands is None else unseen
     image = ImageObservations(
         width=camera.width,
         height=camera.height,
@@ -191,27 +197,23 @@ def lift_color(
         visible=visible,
         **silhouettes(labels[: capture.train_end]),
         cell=CELL,
-        hand_of=hand_of,
-        hand_centers=motion.centers,
-        hand_angles=motion.angles,
-        hand_sizes=motion.sizes,
+        **seen,
         marked=capture.points(name),
     )
-    grip_points = np.concatenate([first.fingers(grip) for grip in chosen])
-    guess = depths_of(image, {"hand_tilt": 0.0, "hand_size": 0.0}, capture.train_end, first.up)
+    if space.hands is None:
+        guess = depths_of(image, {"hand_tilt": 0.0, "hand_size": 0.0}, capture.train_end, first.up)
+        hands = place(image, np.concatenate([first.fingers(grip) for grip in chosen]), guess)
+    else:
+        hands = held(space.hands, space.tracks, capture.train_end)
     y, x = np.nonzero(first.filled)
     cloud_pixels = np.stack([x, y], axis=1)
     colors = capture.color(name, 0) / 255.0
     place_rows = np.round(places).astype(int)
-    facts = {
+    facts |= {
         "object_tracks": float(own.sum()),
         "hidden_points": float(len(hidden)),
         "visible_share": float(visible[: capture.train_end].mean()),
-        "controllers": float(len(hand_of)),
-        "hands": float(len(held)),
-        "hand_lost_frames": float(motion.lost),
-        "smallest_hand": float(motion.sizes.min()),
-        "largest_hand": float(motion.sizes.max()),
+        "controllers": float(hands.shape[1]),
         "pixel_size_mm": 1e3 * first.pixel_size,
         "highest_mm": 1e3 * float(first.heights.max()),
     }
@@ -220,13 +222,41 @@ def lift_color(
         object_visibility=known,
         object_motion_valid=np.zeros_like(known),
         object_colors=colors[place_rows[:, 1], place_rows[:, 0]],
-        controller_points=place(image, grip_points, guess),
+        controller_points=hands,
+        controller_valid=ALWAYS if space.hands is None else space.hands.holds,
         cloud=first.points(cloud_pixels),
         cloud_colors=colors[y, x],
         backend=f"color alone, {first.kind}",
         facts=facts,
     )
     return lifted, image
+
+
+def _seen_hands(capture: Capture, labels: np.ndarray, first: FirstFrame, controllers: int, where: str) -> SeenHands:
+    """Of the hands in the masks. Raises InputError for none."""
+    # A hand above a sheet hides more of it than its fingers hold.
+    sizes = (GRIP_REACH, HANDS_APART, GRIP_LENGTH if first.kind == "flat" else np.inf)
+    found = grips(labels[0], first.filled, *(size / first.pixel_size for size in sizes))
+    if not found:
+        remedy = f"Mark the hands in frame 0, or bring them in space ({CONTROLLERS[0]})."
+        raise InputError(f"{where}, masks of frame 0", "at least one hand must be in view", "none", remedy)
+    motion = follow_hands(capture, first.camera.name, labels, found, HAND_RADIUS / first.pixel_size)
+    chosen = [grip[farthest(grip.astype(float), max(controllers // len(found), 4))] for grip in found]
+    hand_of = np.concatenate([np.full(len(grip), hand) for hand, grip in enumerate(chosen)])
+    seen = {"hand_of": hand_of, "hand_centers": motion.centers, "hand_angles": motion.angles, "hand_sizes": motion.sizes}
+    facts = {
+        "hands": float(len(found)),
+        "hand_lost_frames": float(motion.lost),
+        "smallest_hand": float(motion.sizes.min()),
+        "largest_hand": float(motion.sizes.max()),
+    }
+    return seen, chosen, facts
+
+
+def no_seen_hands(frames: int) -> dict[str, np.ndarray]:
+    """What ImageObservations hold of hands that the capture brings: nothing."""
+    flat = np.zeros((frames, 0), np.float32)
+    return {"hand_of": np.zeros(0, int), "hand_centers": flat[..., None].repeat(2, 2), "hand_angles": flat, "hand_sizes": flat}
 
 
 def silhouettes(labels: np.ndarray, samples: int = SAMPLES) -> dict[str, np.ndarray]:
@@ -277,7 +307,7 @@ def from_color(
     name = next(iter(capture.cameras))
     labels = masks[name].labels
     first = FirstFrame.of(capture, labels[0], settings.color)
-    lifted, image = lift_color(capture, labels, tracks[name], first, settings.color, settings.lift.controllers)
+    lifted, image = lift_color(capture, labels, tracks[name], first, settings.lift.controllers, read(capture))
     supposed = Supposed(capture.folder, capture.description, first.depths(1.0))
     whole = replace(masks[name], labels=np.where(first.filled, OBJECT, labels[0])[None].astype(np.uint8))
     shape = settings.shape

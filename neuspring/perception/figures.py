@@ -51,11 +51,16 @@ def tracks_strip(capture: Capture, camera: str, tracks: PixelTracks, path: Path)
     return write_png(path, np.hstack(tiles))
 
 
-def hands_strip(capture: Capture, image: ImageObservations, path: Path) -> Path:
-    """Frames of the video with the grip of each hand: its place, turn and size, and where it was."""
+def hands_strip(capture: Capture, image: ImageObservations, controllers: np.ndarray, path: Path) -> Path:
+    """Frames of the video with the grip of each hand: its place, turn and size, and where it was; of hands that the capture brings
+    the controllers [T, C, 3], m."""
     tiles, camera = [], next(iter(capture.cameras))
     for frame in spread(frames_of(capture, camera), FRAMES):
         tile = np.ascontiguousarray(capture.color(camera, frame))
+        if not image.hands:
+            pixels, depth = capture.cameras[camera].project(controllers[frame].astype(float))
+            for pixel in np.round(pixels[depth > 0]).astype(int).tolist():
+                cv2.circle(tile, tuple(pixel), 2, (255, 60, 60), -1, cv2.LINE_AA)
         for hand in range(image.hands):
             way = np.round(image.hand_centers[: frame + 1, hand]).astype(np.int32)
             cv2.polylines(tile, [way[:, None]], False, (255, 210, 0), 1, cv2.LINE_AA)

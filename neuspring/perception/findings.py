@@ -422,7 +422,7 @@ def _in_image(image: ImageObservations) -> list[Finding]:
     if low:
         rule = f"at least {SEEN:.0%} are expected in every training frame; silhouettes alone say where the object is in the others"
         found.append(finding("points lost", "warning", "tracks", value, rule, "Look at tracks.png."))
-    if image.hand_sizes.max() > RESIZED or image.hand_sizes.min() < 1 / RESIZED:
+    if image.hands and (image.hand_sizes.max() > RESIZED or image.hand_sizes.min() < 1 / RESIZED):
         value = f"a hand appears {image.hand_sizes.min():.2f} to {image.hand_sizes.max():.2f} times as large as in frame 0"
         rule = f"a hand at arm's length changes by less than {RESIZED:g} times; it was not followed well"
         found.append(finding("size of hands", "warning", "hands", value, rule, "Look at hands.png, and mark the hands anew."))

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from neuspring.config.perception import Lift
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Camera, Capture
+from neuspring.data.points import held, read
 from neuspring.perception.controllers import ALWAYS, HAND_GAP, Body, choose_controllers, holding
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks
 
@@ -50,7 +51,7 @@ class Seen:
 
 
 def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTracks], settings: Lift) -> LiftedTracks:
-    """All tracks as points in the world, with the controllers chosen among those of the hands.
+    """All tracks as points in the world, with the controllers that the capture brings, or chosen among those of the hands.
 
     Raises InputError where nothing of the object or too little of the hands remains.
     """
@@ -68,18 +69,23 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
         remedy = "Look at masks and tracks; perception.lift has depth_range, neighborhood and outlier_neighbors."
         raise InputError(where, "at least one tracked point must lie on the object in frame 0", received, remedy)
     valid = agreeing_motion(objects, settings)
-    moving = agreeing_motion(hands, settings)
-    controllers, facts = choose_controllers(hands.points, hands.visible, moving, cloud, settings, where)
-    body, in_view = _body(capture, cameras, labels, objects)
-    grips = holding(controllers, (hands.points, hands.visible), body, in_view, settings.release or HAND_GAP)
-    holds = ALWAYS if settings.release is None else grips.holds
+    space = read(capture)
+    if space.hands is None:
+        moving = agreeing_motion(hands, settings)
+        controllers, facts = choose_controllers(hands.points, hands.visible, moving, cloud, settings, where)
+        body, in_view = _body(capture, cameras, labels, objects)
+        grips = holding(controllers, (hands.points, hands.visible), body, in_view, settings.release or HAND_GAP)
+        holds = ALWAYS if settings.release is None else grips.holds
+        if settings.release is not None and grips.elsewhere is not None:
+            facts["grip_elsewhere"] = float(grips.elsewhere)
+        if grips.strays:
+            facts |= {"stray_hand_frames": float(len(grips.strays)), "stray_hand_first": float(grips.strays[0])}
+    else:
+        controllers, holds = held(space.hands, space.tracks, capture.train_end), space.hands.holds
+        facts = {"controllers": float(controllers.shape[1])}
     if len(holds):
         first = float(np.flatnonzero(~holds.all(axis=1))[0])
         facts |= {"controllers_let_go": float((~holds).any(axis=0).sum()), "first_let_go": first}
-    if settings.release is not None and grips.elsewhere is not None:
-        facts["grip_elsewhere"] = float(grips.elsewhere)
-    if grips.strays:
-        facts |= {"stray_hand_frames": float(len(grips.strays)), "stray_hand_first": float(grips.strays[0])}
     facts |= {
         "object_tracks": float(objects.points.shape[1]),
         "hand_tracks": float(hands.points.shape[1]),

@@ -11,13 +11,15 @@ from itertools import count
 
 import numpy as np
 import warp as wp
+from scipy.spatial import cKDTree
 
 from neuspring.config import ScenarioRow
 from neuspring.config.perception import Perception, Sampling
 from neuspring.core.artifacts import ImageObservations, Observations, Scenario
 from neuspring.core.geometry import on_table
 from neuspring.core.records import digest_file
-from neuspring.data.capture import CAPTURE, Capture
+from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, Capture
+from neuspring.data.points import SAME, in_both, read, taught_by
 from neuspring.perception.results import LiftedTracks, ShapePrior
 
 SURFACE, INTERIOR = 1024, 10000
@@ -34,21 +36,46 @@ def assemble(
     settings: Perception,
     image: ImageObservations | None = None,
 ) -> Observations:
-    """What every method reads. Points that are invisible are zero. `image` is the evidence of color alone, of all tracks."""
-    up = capture.description.up_sign
+    """What every method reads. Points that are invisible are zero. `image` is the evidence of color alone, of all tracks.
+
+    Nodes that the capture brings take the place of those that are sampled. Annotated points that teach (`tracks: train`) and are
+    seen in frame 0 come first, are seen in training frames, and have no place in the image.
+    """
+    up, space = capture.description.up_sign, read(capture)
     # In the image every node should have a track that is followed for long.
     followed = None if image is None else image.visible.sum(axis=0)
-    indices, surface, interior, voxel = structure(lifted, prior, settings.sample, up, settings.seed, followed)
+    if given := len(space.nodes):
+        nodes = on_table(space.nodes, up)
+        rank = lifted.object_visibility.sum(axis=0) if followed is None else followed
+        indices, kept = among(on_table(lifted.object_points[0], up), rank, nodes)
+        surface, interior, voxel = nodes[kept], nodes[:0], spacing(nodes)
+    else:
+        indices, surface, interior, voxel = structure(lifted, prior, settings.sample, up, settings.seed, followed)
+    visible, valid = lifted.object_visibility[:, indices], lifted.object_motion_valid[:, indices]
+    points = np.where(visible[..., None], on_table(lifted.object_points[:, indices], up), 0.0)
     if image is not None:
         image = replace(image, pixels=image.pixels[:, indices], visible=image.visible[:, indices])
-    visible = lifted.object_visibility[:, indices]
-    points = np.where(visible[..., None], on_table(lifted.object_points[:, indices], up), 0.0)
-    origin = {
+    marked, seen = taught_by(space.tracks, capture.train_end)
+    if marked.shape[1]:
+        apart = np.flatnonzero(cKDTree(marked[0]).query(points[0])[0] > SAME)
+        points = np.concatenate([np.where(seen[..., None], on_table(marked, up), 0.0), points[:, apart]], axis=1)
+        visible = np.concatenate([seen, visible[:, apart]], axis=1)
+        valid = np.concatenate([in_both(seen), valid[:, apart]], axis=1)
+        surface = surface[cKDTree(marked[0]).query(surface)[0] > SAME] if len(surface) else surface
+        if image is not None:
+            nowhere = np.zeros((*seen.shape, 2), np.float32)
+            image = replace(
+                image,
+                pixels=np.concatenate([nowhere, image.pixels[:, apart]], axis=1),
+                visible=np.concatenate([nowhere[..., 0] > 0, image.visible[:, apart]], axis=1),
+            )
+    files = [name for name in (*CONTROLLERS, *NODES) if (capture.folder / name).exists()]
+    origin = {name: f"sha256:{digest_file(capture.folder / name)}" for name in files} | {
         CAPTURE: f"sha256:{digest_file(capture.folder / CAPTURE)}",
         "lift": lifted.backend,
-        "shape prior": prior.backend,
+        "shape prior": files[-1] if given else prior.backend,
     }
-    if settings.sample.nodes is not None:
+    if given or settings.sample.nodes is not None:
         origin["node spacing"] = f"{voxel:.6g} m"
     return Observations(
         scenario=Scenario(
@@ -66,9 +93,10 @@ def assemble(
         ),
         object_points=points,
         object_visibility=visible,
-        object_motion_valid=lifted.object_motion_valid[:, indices],
+        object_motion_valid=valid,
         controller_points=lifted.controller_points,
         controller_valid=lifted.controller_valid,
+        controller_hand=space.hands.hand if space.hands else np.zeros(0, int),
         surface_points=surface,
         interior_points=interior,
         tracks=capture.tracks(),
@@ -102,6 +130,25 @@ def structure(
     first_of_cell[np.unique(cells_of(everything, voxel), axis=0, return_index=True)[1]] = True
     own, outer, inner = np.split(first_of_cell, np.cumsum([len(unique), len(surface)]))
     return unique[own], surface[outer], interior[inner], voxel
+
+
+def spacing(nodes: np.ndarray) -> float:
+    """Distance from a node [N, 3] to the next, m (median)."""
+    return float(np.median(cKDTree(nodes).query(nodes, k=2)[0][:, 1]))
+
+
+def among(points: np.ndarray, rank: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which tracked points [n, 3] become nodes, and which of the given nodes [N, 3] stay: indices, and [N] bool.
+
+    Of points nearer to each other than nodes are, that of the highest `rank` [n] stays. A node gives way to a point within half of
+    that distance: together they are as dense as the nodes alone.
+    """
+    apart, chosen = spacing(nodes), np.zeros(0, int)
+    for number in np.argsort(-rank, kind="stable"):
+        if not len(chosen) or np.linalg.norm(points[chosen] - points[number], axis=1).min() >= apart:
+            chosen = np.append(chosen, number)
+    away = cKDTree(points[chosen]).query(nodes)[0] if len(chosen) else np.full(len(nodes), np.inf)
+    return chosen, away >= 0.5 * apart
 
 
 def cells_of(points: np.ndarray, voxel: float) -> np.ndarray:

@@ -22,28 +22,30 @@ def lift(capture: Capture, masks: Sequence[Before], tracks: Sequence[Before], se
     Of color alone also image.npz: what losses read of the image.
     """
     from neuspring.core.findings import findings_as_facts
+    from neuspring.data.points import read
     from neuspring.perception import figures
-    from neuspring.perception.color import from_color
     from neuspring.perception.findings import look_at_lifted
+    from neuspring.perception.given import from_image
     from neuspring.perception.lift import lift as lift_points
     from neuspring.perception.results import masks_of_cameras, tracks_of_cameras
-    from neuspring.perception.shape import shape_prior
+    from neuspring.perception.shape import no_prior, shape_prior
 
     perception = settings.perception
     masks_of, tracks_of = masks_of_cameras(capture, paths(masks)), tracks_of_cameras(capture, paths(tracks))
     image = None
     if capture.has_depth:
         lifted = lift_points(capture, masks_of, tracks_of, perception.lift)
-        prior = shape_prior(capture, masks_of, lifted.cloud, perception.shape)
+        given = len(read(capture).nodes)
+        prior = no_prior() if given else shape_prior(capture, masks_of, lifted.cloud, perception.shape)
     else:
-        lifted, prior, image = from_color(capture, masks_of, tracks_of, perception)
+        lifted, prior, image = from_image(capture, masks_of, tracks_of, perception)
     # Whether its picture changes where no point is followed, `observe` cannot see.
     lifted.facts["object_moves"] = max(masks.facts.get("object_moves", 0.0) for masks in masks_of.values())
     files = run.beside(lifted="lifted.npz", shape="shape.npz", picture="lifted.png")
     if image is not None:
         files |= run.beside(image="image.npz", hands="hands.png")
         image.save(files["image"])
-        figures.hands_strip(capture, image, files["hands"])
+        figures.hands_strip(capture, image, lifted.controller_points, files["hands"])
     lifted.save(files["lifted"])
     prior.save(files["shape"])
     figures.lifted_figure(lifted, prior, files["picture"])

@@ -247,7 +247,7 @@ def _motion(problem: SearchProblem, twins: Sequence[Twin]) -> tuple[torch.Tensor
         hands = torch.tensor(points, dtype=torch.float32, device=problem.device)[:end]
         return waypoints(hands, observations.controller_valid)
 
-    if observations.image is None:
+    if observations.image is None or not observations.image.hands:
         hands = path(observations.controller_points)
     else:
         hands = torch.stack([path(hand_paths.hand_points(observations, twin.hands)) for twin in twins], dim=1)

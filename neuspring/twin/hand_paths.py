@@ -35,12 +35,14 @@ NEAREST, FARTHEST = 0.5, 2.0
 
 
 def names(image: ImageObservations) -> tuple[str, ...]:
-    """Variables of the hands: tilt and size of all, and the factors of each hand, knot by knot."""
+    """Variables of the hands: tilt and size of all, and the factors of each hand, knot by knot. None where hands are given."""
+    if not image.hands:
+        return ()
     return ("hand_tilt", "hand_size", *(f"hand_depth.{k}" for k in range(KNOTS * image.hands)))
 
 
 def with_hands(observations: Observations, twin: Twin) -> Observations:
-    """The observations with the controllers where the twin's hands are; of captures with depth, as they are."""
+    """The observations with the controllers where the twin's hands are; where they are known in space, as they are."""
     if observations.image is None or not twin.hands:
         return observations
     return replace(observations, controller_points=hand_points(observations, twin.hands))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from neuspring.data.capture import Capture, Writer
+from neuspring.data.capture import CAPTURE, Capture, Writer
 from neuspring.data.points import Hands, write
 from tests.support.captures import describe
 
@@ -32,3 +33,10 @@ def spaced(folder: Path, frames: int = 8, *, up: float = 1.0, **changes: Any) ->
     tracks[0, 3] = np.nan
     write(folder, Hands(risen(GRIP, frames) * mirror, np.zeros((0, 0), bool), np.array([0, 1, 0, 1])), NODES * mirror)
     return writer.finish(tracks)
+
+
+def describe_as(capture: Capture, **changes: Any) -> Capture:
+    """The capture with changed entries of capture.json."""
+    path = capture.folder / CAPTURE
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+    return Capture.load(capture.folder)

@@ -7,6 +7,7 @@ import pytest
 from neuspring.config import Config
 from neuspring.config.perception import ColorSettings
 from neuspring.data.capture import HANDS, OBJECT
+from neuspring.data.points import read
 from neuspring.perception.color import FirstFrame, lift_color, silhouettes
 from neuspring.perception.color_hands import along_arms, follow_hands, grips
 from neuspring.perception.results import PixelTracks
@@ -133,7 +134,7 @@ def test_sheets_alone_are_held_by_fingers_alone(tmp_path, monkeypatch, category,
     pixels = np.repeat(np.stack([x, y], axis=1)[None, ::50].astype(np.float32), 3, axis=0)
     tracks = PixelTracks(pixels=pixels, visible=np.ones(pixels.shape[:2], bool), backend="test")
     monkeypatch.setattr("neuspring.perception.color.GRIP_LENGTH", 3 * first.pixel_size)
-    _, image = lift_color(capture, labels, tracks, first, ColorSettings(), 30)
+    _, image = lift_color(capture, labels, tracks, first, 30, read(capture))
     assert (len(image.hand_of) < 30) == fingers
 
 
