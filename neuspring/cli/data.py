@@ -104,6 +104,9 @@ def make_capture(
     board_images: Annotated[
         tuple[Path, ...], arg(help="per camera: an image of the board, or a folder of them; the first frames by default")
     ] = (),
+    pose: Annotated[
+        Literal["lying", "standing"] | None, arg(help="color alone: how the object is in frame 0, which one picture cannot say")
+    ] = None,
     level: Annotated[bool, arg(help="move the world of given poses so that the table is z = 0")] = False,
     top_down: Annotated[bool, arg(help="the camera looks straight down: the plane it faces is the table")] = False,
     table_at: Annotated[tuple[float, float] | None, arg(help="a pixel of the table, where another plane is larger")] = None,
@@ -145,6 +148,7 @@ def make_capture(
         top_down=top_down,
         table_at=table_at,
         train_end=train_end,
+        pose=pose,
         raw=raw,
         force=force,
     )

@@ -140,8 +140,14 @@ class ColorSettings(Section):
     """Categories of ropes: as thick as they are wide."""
     sheet_thickness: Positive = 0.004
     """Thickness of a sheet, m."""
-    body_thickness: Positive = 0.8
-    """Height of a body above the table in local widths of its silhouette, of all categories that are neither flat nor round."""
+    body_thickness: Positive = 1.0
+    """Thickness of a body, of all categories that are neither flat nor round, in local widths of its silhouette; 1: as thick as it
+    is wide."""
+    footprint: Positive = 1.2
+    """How far from the camera a body extends at most, measured along the table from its nearest point, in widths across the view:
+    what would lie farther off rises. It holds where `pose` of the capture is not given; with `pose: lying` nothing rises."""
+    standing_footprint: Positive = 0.3
+    """The same with `pose: standing`."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -134,6 +134,9 @@ class Description:
     depth_unit: Positive = 0.001
     """Meters per count of an integer depth image."""
     depth_format: Literal["png", "npy"] = "png"
+    pose: Literal["lying", "standing"] | None = None
+    """How the object is in frame 0, where `depth` is none and it is neither a sheet nor a rope. null: not known; what would lie too
+    far behind rises (perception.color.footprint)."""
     up: Literal["+z", "-z"] = "+z"
     """Direction of up along the world's z axis."""
     train_end: Annotated[int, Field(ge=2)] | None = None
@@ -318,6 +321,8 @@ class Writer:
             del plain["depth"]
         if description.tracks == "score":
             del plain["tracks"]
+        if description.pose is None:
+            del plain["pose"]
         write_text(folder / CAPTURE, json.dumps(plain, indent=1) + "\n")
         return Capture(folder, description)
 

@@ -3,7 +3,8 @@
 - The table that each camera sees against z = 0 and `up`, and what explains a finding.
 - Object and hands of one camera, by masks and depth: size, height above the table, depth, and whether they meet.
 - Edges of depth against those of color.
-- Color alone: the table is z = 0 as the camera's pose says, and what lies on it is measured there.
+- Color alone: the table is z = 0 as the camera's pose says, and what lies on it is measured there. The outline is
+  one of its category.
 - Cameras against each other: a point that camera A measured is projected into camera B. Where B measured more depth there, B looked
   through it: one of the poses is wrong. Less depth is no contradiction: something may hide the point from B. Only what stands out
   of the table counts, because a table that is moved along itself looks the same.
@@ -407,6 +408,26 @@ def sheet_findings(where: str, points: np.ndarray, up: float, category: str = ""
     value = f"a flat thing of {100 * sides[0]:.0f} x {100 * sides[1]:.0f} cm, {1e3 * high:.0f} mm high"
     rule = f"the category {category!r} makes a filled body of it" if category else "a filled hull was made of it"
     return [finding("shape and category", "warning", where, value, rule, THINNER)]
+
+
+SLENDER = 6.0
+"""Area of an outline over the square of its greatest width. Ropes of real films that lie have 8.9 and more; toys, cloths, rods and
+boxes, real and rendered from all sides, up to 4.1."""
+
+
+def outline_findings(where: str, mask: np.ndarray, category: str) -> list[Finding]:
+    """A warning where the outline of the object in a mask [H, W] of frame 0 is not one of its category; of color alone."""
+    own = np.pad(mask == OBJECT, 1).astype(np.uint8)
+    if own.sum() < FEW:
+        return []
+    slender = float(own.sum() / (2 * cv2.distanceTransform(own, cv2.DIST_L2, 5).max()) ** 2)
+    if (slender > SLENDER) == (category == "rope"):
+        return []
+    shape = "a long thin thing" if slender > SLENDER else "a compact thing"
+    value = f"the category is {category!r}, and the outline is that of {shape}: {slender:.1f} squares of its greatest width"
+    rule = f"a rope has more than {SLENDER:g}, all else less"
+    other = "rope" if slender > SLENDER else "cloth, or another word for a body,"
+    return [finding("outline and category", "warning", where, value, rule, f"Is {other} meant? Or look at the mask of frame 0.")]
 
 
 RAISED, AIR = 0.025, (0.05, 0.3)

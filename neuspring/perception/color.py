@@ -3,14 +3,24 @@ the table; hands and silhouettes of later frames are evidence in the image.
 
 With up as +z, the pixel p shows the object's upper side at height t(p), where its ray meets the plane z = t(p):
 
-    sheets   (`flat`, such as cloth)  t = `sheet_thickness`; nodes lie at t / 2
-    ropes    (`round`)                t = c(p) s, a round cross-section on the table
-    bodies   (all others)             t = `body_thickness` c(p) s
+    sheets   (`flat`, such as cloth)         t = `sheet_thickness`; nodes lie at t / 2
+    ropes    (`round`), bodies (all others)  t of the nearest of the ellipsoids below, and their lower side is that of the farthest
 
-The lower side of ropes and bodies is the table: the silhouette is inflated symmetrically about its middle t / 2, and rests. Nodes
-fill it, as single nodes in the middle would fall to the table.
+Each of the largest discs inside the silhouette (shape.discs), with center q and radius r, pixels, is an ellipsoid that is
+w = 2 k r z / f thick, k = 1 for ropes and `body_thickness` for bodies: thickness follows the outline's width, symmetric about the
+medial surface on which the centers lie. f is the focal length, z the depth of the center. Where it lies on the table its center is
+at half its thickness above it:
 
-c(p) is the width of the silhouette at p, in pixels, rounded towards its edge (shape.round_chord), and s the width of a pixel.
+    z = h / (d(q) + k r / f)
+
+h is the height of the camera and d(q) how far the ray of q sinks per meter of depth. What stands would be laid far behind itself
+so. Therefore no center is farther from the camera than the upright plane
+
+    a(q) <= min a + `footprint` (max s - min s)
+
+a is the distance along the table in the direction in which the camera looks, s that across, on the plane through the nearest
+center. What would be beyond the plane rises in it, above what touches the table. `pose` of the capture says lying (no such plane)
+or standing (`standing_footprint`): one picture cannot say which.
 """
 
 from __future__ import annotations
@@ -31,7 +41,7 @@ from neuspring.data.points import InSpace, held, read
 from neuspring.perception.color_hands import follow_hands, grips
 from neuspring.perception.controllers import ALWAYS
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
-from neuspring.perception.shape import no_prior, round_chord, shape_prior
+from neuspring.perception.shape import discs, inflated, no_prior, shape_prior
 from neuspring.twin.hand_paths import depths_of, place
 
 BAND = 30.0
@@ -52,6 +62,8 @@ CELL = 4
 """Side of the cells of the distance from object and hands, pixels."""
 ROPE_WIDEST = 1.5
 """Largest thickness of a rope over its median."""
+STEEP = 0.35
+"""Part of a view's direction that is level, below which the camera looks down on things: nothing rises in its picture."""
 HIDDEN_STRIDE = 3
 """Of the object's pixels beneath hands each third gets a point."""
 
@@ -72,8 +84,13 @@ class FirstFrame:
     """[H, W] bool: the object, and what of it lies beneath hands."""
     heights: np.ndarray
     """t [H, W], m; 0 outside."""
+    lower: np.ndarray
+    """Height of the lower side [H, W], m; 0 outside."""
     pixel_size: float
     """Width of a pixel at the object, m (median)."""
+    facts: dict[str, float]
+    """What was supposed of a rope or a body: `longest`, how far behind its nearest point it would lie on the table, m; `across`,
+    its width there, m; and `raised`, the part of its discs that rises instead."""
 
     @classmethod
     def of(cls, capture: Capture, labels: np.ndarray, settings: ColorSettings) -> FirstFrame:
@@ -91,13 +108,23 @@ class FirstFrame:
             raise InputError(f"{capture.folder / CAPTURE}, camera_to_world", rule, "some look above the horizon", remedy)
         size = float(np.median(below)) / camera.intrinsics[0, 0]
         filled = beneath_hands(labels, BENEATH / size)
-        chord = round_chord(filled) * size
-        factor = settings.body_thickness if kind == "body" else 1.0
-        heights = np.where(filled, settings.sheet_thickness, 0.0) if kind == "flat" else factor * chord
+        up = capture.description.up_sign
+        if kind == "flat":
+            heights = np.where(filled, settings.sheet_thickness, 0.0)
+            return cls(camera, up, kind, filled, heights, np.zeros_like(heights), size, {})
         if kind == "round":
             # Where the silhouette is wider than a rope it shows two turns, or a shadow.
-            heights = np.minimum(heights, ROPE_WIDEST * np.median(heights[filled]))
-        return cls(camera, capture.description.up_sign, kind, filled, heights, size)
+            depth, thick, facts = medial(camera, up, filled, 1.0, np.inf, ROPE_WIDEST)
+        else:
+            bounds = {None: settings.footprint, "lying": np.inf, "standing": settings.standing_footprint}
+            depth, thick, facts = medial(camera, up, filled, settings.body_thickness, bounds[capture.description.pose])
+        y, x = np.nonzero(filled)
+        pixels, sides = np.stack([x, y], axis=1).astype(float), []
+        for side in inflated(filled, depth, thick):
+            sides.append(np.zeros(filled.shape))
+            # The table cuts off what would be below it.
+            sides[-1][y, x] = np.maximum(up * camera.lift(pixels, side[y, x])[:, 2], 0.0)
+        return cls(camera, up, kind, filled, *sides, size, facts)
 
     def points(self, pixels: np.ndarray) -> np.ndarray:
         """World points [n, 3], m, of pixels (x, y) [n, 2]: of a sheet its middle, of others their upper side.
@@ -114,23 +141,50 @@ class FirstFrame:
         return self._lifted(pixels, 1.0 if self.kind == "flat" else 0.5)
 
     def _lifted(self, pixels: np.ndarray, share: float) -> np.ndarray:
-        return self.camera.lift(pixels.astype(float), camera_depth(self.camera, pixels, share * self._up(pixels)))
+        return self.camera.lift(pixels.astype(float), camera_depth(self.camera, pixels, self._up(pixels, share)))
 
-    def _up(self, pixels: np.ndarray) -> np.ndarray:
-        """z of the upper side at pixels [n], m."""
+    def _up(self, pixels: np.ndarray, share: float) -> np.ndarray:
+        """z at pixels [n], m: of the upper side (share 1), the lower one (0), or between."""
         _, labels = cv2.distanceTransformWithLabels((~self.filled).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
         height_of = np.zeros(labels.max() + 1)
-        height_of[labels[self.filled]] = self.heights[self.filled]
+        height_of[labels[self.filled]] = self._between(share)[self.filled]
         x, y = np.round(pixels).astype(int).T
         rows, columns = np.clip(y, 0, labels.shape[0] - 1), np.clip(x, 0, labels.shape[1] - 1)
         return np.asarray(self.up * height_of[labels[rows, columns]])
 
+    def _between(self, share: float) -> np.ndarray:
+        return self.lower + share * (self.heights - self.lower)
+
     def depths(self, share: float) -> np.ndarray:
-        """Depth [H, W], m, of the upper side (share 1) or of the lower one, the table (0); 0 outside."""
+        """Depth [H, W], m, of the upper side (share 1) or of the lower one (0); 0 outside."""
         y, x = np.nonzero(self.filled)
         depth = np.zeros(self.filled.shape)
-        depth[y, x] = camera_depth(self.camera, np.stack([x, y], axis=1), share * self.up * self.heights[y, x])
+        depth[y, x] = camera_depth(self.camera, np.stack([x, y], axis=1), self.up * self._between(share)[y, x])
         return depth
+
+
+def medial(
+    camera: Camera, up: float, filled: np.ndarray, factor: float, footprint: float, widest: float = np.inf
+) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
+    """Depth [n] and thickness [n], m, of the ellipsoids of the `discs` of a silhouette `filled` [H, W], and `FirstFrame.facts`.
+
+    `factor` is k and `footprint` that of the head of this file; up is +1 or -1. No ellipsoid is thicker than `widest` times the
+    median one.
+    """
+    centers, radii, _ = discs(filled)
+    rays = camera.lift(centers.astype(float), np.ones(len(centers))) - camera.camera_to_world[:3, 3]
+    # Per meter of depth.
+    thick = 2 * factor * radii / camera.intrinsics[0, 0]
+    thick = np.minimum(thick, widest * np.median(thick))
+    depth = up * camera.camera_to_world[2, 3] / (thick / 2 - up * rays[:, 2])
+    x, y = camera.camera_to_world[:2, 2]
+    level = max(float(np.hypot(x, y)), 1e-9)
+    away, aside = depth * (rays[:, :2] @ (x, y)) / level, depth * (rays[:, :2] @ (-y, x)) / level
+    nearest = away.min()
+    across = max(float(np.ptp(aside * nearest / away)), 1e-6)
+    shorter = np.minimum((nearest + footprint * across) / away, 1.0) if level > STEEP else np.ones(len(away))
+    facts = {"longest": float(away.max() - nearest), "across": across, "raised": float((shorter < 1).mean())}
+    return shorter * depth, shorter * depth * thick, facts
 
 
 def camera_depth(camera: Camera, pixels: np.ndarray, z: np.ndarray | float) -> np.ndarray:
@@ -216,6 +270,7 @@ def lift_color(
         "controllers": float(hands.shape[1]),
         "pixel_size_mm": 1e3 * first.pixel_size,
         "highest_mm": 1e3 * float(first.heights.max()),
+        **{f"shape_{name}": value for name, value in first.facts.items()},
     }
     lifted = LiftedTracks(
         object_points=points,
@@ -226,7 +281,7 @@ def lift_color(
         controller_valid=ALWAYS if space.hands is None else space.hands.holds,
         cloud=first.points(cloud_pixels),
         cloud_colors=colors[y, x],
-        backend=f"color alone, {first.kind}",
+        backend=", ".join(filter(None, ("color alone", first.kind, first.kind == "body" and capture.description.pose))),
         facts=facts,
     )
     return lifted, image
@@ -301,8 +356,8 @@ def from_color(
 ) -> tuple[LiftedTracks, ShapePrior, ImageObservations]:
     """What `lift` and `shape_prior` make of captures with depth, and the evidence of the image.
 
-    The prior of ropes and bodies is what lies between their supposed upper side and the table (`first_frame`), or a mesh that is
-    placed on the upper side. Sheets have none. Raises InputError without object, hands or tracks.
+    The prior of ropes and bodies is what lies between their supposed upper and lower side (`FirstFrame`), or a mesh that is placed
+    on the upper side. Sheets have none. Raises InputError without object, hands or tracks.
     """
     name = next(iter(capture.cameras))
     labels = masks[name].labels
@@ -313,9 +368,6 @@ def from_color(
     shape = settings.shape
     if first.kind == "flat" and shape.backend == "auto":
         return lifted, no_prior(), image
-    y, x = np.nonzero(first.filled)
-    lower = first.camera.lift(np.stack([x, y], axis=1).astype(float), first.depths(0.0)[y, x])
-    cloud = lifted.cloud if shape.backend == "mesh" else np.concatenate([lifted.cloud, lower])
-    # Behind the upper side all belongs to the object, down to the table.
-    prior = shape_prior(supposed, {name: whole}, cloud, replace(shape, back="none"))
+    # Between its upper and its lower side all belongs to the object.
+    prior = shape_prior(supposed, {name: whole}, lifted.cloud, replace(shape, back="none"), first.depths(0.0))
     return lifted, replace(prior, backend=f"{prior.backend}, {lifted.backend}"), image

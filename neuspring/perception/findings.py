@@ -25,6 +25,7 @@ from neuspring.data.plausible import (
     depth_findings,
     hand_findings,
     mask_findings,
+    outline_findings,
     place_findings,
     sampled,
     sheet_findings,
@@ -76,6 +77,8 @@ VOLUME = 0.012
 """m^3 of a hull: a large plush animal has 5 liters."""
 INVENTED = 0.8
 """Share of the surface that no camera saw; of a body seen from one side it is about two thirds."""
+RISES = 0.05
+"""Part of a body that is not laid onto the table, because it would lie too far behind. Two sloths that lie have up to 0.03."""
 TRUSTED = 0.5
 """Share of motions that agree with their neighbors, of points that are seen in both frames; points that are lost are said apart."""
 SEEN = 0.05
@@ -250,6 +253,8 @@ def look_at_masks(capture: Capture, camera: str, labels: np.ndarray, facts: Mapp
         }
         found += [one for one in depth_findings(view, samples) if one.level != "note"]
         found += hand_findings(view, samples)
+    else:
+        found += outline_findings(f"camera {camera}, object", labels[0], capture.description.category)
     if facts["hands_inside"] > HANDS_INSIDE:
         value = f"{facts['hands_inside']:.0%} of the hands' pixels lie inside of the object"
         rule = f"at most {HANDS_INSIDE:.0%} are expected; its own colors are taken for hands"
@@ -331,7 +336,7 @@ def look_at_lifted(lifted: LiftedTracks, prior: ShapePrior, up: float, image: Im
     moving = _motion(lifted) if image is None else _in_image(image)
     filled = image is None and prior.backend.startswith("visual_hull")
     flat = sheet_findings("object in frame 0", lifted.cloud, up) if filled else []
-    return [*place_findings("object in frame 0", [lifted.cloud], up), *flat, *_shape(prior), *moving]
+    return [*place_findings("object in frame 0", [lifted.cloud], up), *flat, *_pose(lifted), *_shape(prior), *moving]
 
 
 def look_at_observations(observations: Observations, moves: float = 0.0) -> list[Finding]:
@@ -372,6 +377,22 @@ def look_at_observations(observations: Observations, moves: float = 0.0) -> list
         rule = f"at least {1e3 * STILL:g} mm are needed to learn from; `static` cannot be beaten"
         found.append(finding("object stands still", "warning", where, value, rule, "Film an interaction, or move the split."))
     return found
+
+
+def _pose(lifted: LiftedTracks) -> list[Finding]:
+    """What was supposed of how a body lies or stands, where color alone shows it and the capture does not say it."""
+    if not lifted.backend.startswith("color alone, body"):
+        return []
+    longest, across, raised = (lifted.facts[f"shape_{name}"] for name in ("longest", "across", "raised"))
+    if lifted.backend != "color alone, body":
+        value = f"{lifted.backend.rsplit(', ', 1)[1]}, as capture.json says; {raised:.0%} of it rises from what touches the table"
+        return [finding("pose", "note", "shape", value, "thickness follows the width of the outline")]
+    value = f"if it lies, it reaches {100 * longest:.0f} cm behind its nearest point and is {100 * across:.0f} cm wide"
+    if raised > RISES:
+        value += f", so {raised:.0%} of it is supposed to rise"
+    rule = "one picture cannot say whether it lies or stands"
+    remedy = 'Write "pose": "lying" or "standing" in capture.json.'
+    return [finding("pose", "warning" if raised > RISES else "note", "shape", value, rule, remedy)]
 
 
 def _shape(prior: ShapePrior) -> list[Finding]:

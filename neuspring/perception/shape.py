@@ -72,12 +72,15 @@ Fit = tuple[float, Rotation, float, np.ndarray]
 """RMS distance, m, and the similarity: rotation, scale, shift."""
 
 
-def shape_prior(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray, settings: ShapePriorSettings) -> ShapePrior:
+def shape_prior(
+    capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray, settings: ShapePriorSettings, end: np.ndarray | None = None
+) -> ShapePrior:
     """The prior of the backend that `settings` names, with the share of its surface that no camera saw.
 
-    `cloud` [P, 3], m, is what was seen of the object in frame 0.
+    `cloud` [P, 3], m, is what was seen of the object in frame 0. With one camera, `end` [H, W] is the depth at which the object
+    ends, m, where that is supposed otherwise than by `settings.back`.
     """
-    prior = _prior(capture, masks, cloud, settings)
+    prior = _prior(capture, masks, cloud, settings, end)
     if not len(prior.faces):
         return prior
     was_seen = seen(prior.vertices, capture, masks, SEEN_WITHIN * settings.voxel, prior.faces)
@@ -88,12 +91,14 @@ def shape_prior(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray,
     return replace(prior, seen=was_seen, facts={**prior.facts, "invented_share": share})
 
 
-def _prior(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray, settings: ShapePriorSettings) -> ShapePrior:
+def _prior(
+    capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray, settings: ShapePriorSettings, end: np.ndarray | None
+) -> ShapePrior:
     backend = settings.backend
     if backend == "auto":
         backend = "none" if capture.description.category in THIN else "visual_hull"
     if backend == "visual_hull":
-        return visual_hull(capture, masks, cloud, settings)
+        return visual_hull(capture, masks, cloud, settings, end)
     if backend == "mesh":
         return align(capture, masks, cloud, settings)
     if backend == "truth":
@@ -108,8 +113,13 @@ def no_prior() -> ShapePrior:
     return ShapePrior(vertices=np.zeros((0, 3)), faces=np.zeros((0, 3), dtype=int), backend="none")
 
 
-def visual_hull(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray, settings: ShapePriorSettings) -> ShapePrior:
-    """Carve the surroundings of the object's `cloud` [P, 3], m, of frame 0. Raises InputError if nothing remains."""
+def visual_hull(
+    capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray, settings: ShapePriorSettings, end: np.ndarray | None = None
+) -> ShapePrior:
+    """Carve the surroundings of the object's `cloud` [P, 3], m, of frame 0; `end` as in `shape_prior`.
+
+    Raises InputError if nothing remains.
+    """
     # A camera that does not have the object in view says nothing about it.
     showing = [name for name in capture.cameras if (masks[name].labels[0] == OBJECT).any()]
     # Measured depth by camera, and where the object ends, if that is guessed.
@@ -117,7 +127,8 @@ def visual_hull(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray,
     space, facts = cloud, dict[str, float]()
     if len(showing) == 1:
         camera, labels = capture.cameras[showing[0]], masks[showing[0]].labels[0]
-        filled, end = one_sided(camera, labels, sides[camera.name][0], cloud, settings)
+        filled, guessed = one_sided(camera, labels, sides[camera.name][0], cloud, settings)
+        end = guessed if end is None else end
         facts["depth_filled"] = float((filled != sides[camera.name][0])[labels == OBJECT].mean())
         sides[camera.name] = (filled, end)
         if end is not None:
@@ -225,15 +236,50 @@ def back(labels: np.ndarray, seen: np.ndarray, focal: float, how: Literal["symme
 
 def round_chord(mask: np.ndarray) -> np.ndarray:
     """c(d) [H, W], pixels, of a silhouette `mask` [H, W]; zero outside it."""
+    centers, radii, distance = discs(mask)
+    radius = np.ascontiguousarray(distance)
+    # Larger discs are drawn over smaller ones.
+    for (x, y), own in zip(centers.tolist(), radii.tolist(), strict=True):
+        cv2.circle(radius, (x, y), int(own), own, -1)
+    radius = np.maximum(radius, distance)
+    return np.where(mask, 2.0 * np.sqrt(np.maximum(distance * (2.0 * radius - distance), 0.0)), 0.0)
+
+
+def discs(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The largest discs inside a silhouette `mask` [H, W], and the distance of each pixel from its edge [H, W], pixels.
+
+    Their centers (x, y) [n, 2] lie on the ridges of that distance, which is their radius [n]; the largest is the last.
+    """
     distance = cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
     ridge = mask & (distance >= ndimage.maximum_filter(distance, 3) - 0.5)
     y, x = np.nonzero(ridge)
-    radius = np.ascontiguousarray(distance)
-    # Larger discs are drawn over smaller ones.
-    for k in np.argsort(distance[y, x], kind="stable"):
-        cv2.circle(radius, (int(x[k]), int(y[k])), int(distance[y[k], x[k]]), float(distance[y[k], x[k]]), -1)
-    radius = np.maximum(radius, distance)
-    return np.where(mask, 2.0 * np.sqrt(np.maximum(distance * (2.0 * radius - distance), 0.0)), 0.0)
+    order = np.argsort(distance[y, x], kind="stable")
+    return np.stack([x, y], axis=1)[order], distance[y, x][order], distance
+
+
+def inflated(mask: np.ndarray, depth: np.ndarray, widest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Depth of the front and of the back [H, W], m, of the ellipsoids whose outlines are the `discs` of a silhouette `mask` [H, W].
+
+    The disc at q with radius r belongs to an ellipsoid with its center at `depth` [n] and `widest` [n] thick, m. The pixel p shows
+    its surfaces at depth_q -+ widest_q / 2 sqrt(1 - |p - q|^2 / r^2); the front is the nearest of all, the back the farthest.
+    Pixels that no disc covers, of pointed corners, are as thick as their distance from the edge says, about the middle of the
+    nearest other pixel. Zero outside.
+    """
+    centers, radii, distance = discs(mask)
+    front, back = np.full(mask.shape, np.inf), np.full(mask.shape, -np.inf)
+    for (x, y), r, d, w in zip(centers.tolist(), radii.tolist(), depth.tolist(), widest.tolist(), strict=True):
+        reach = int(r)
+        rows, columns = slice(max(y - reach, 0), y + reach + 1), slice(max(x - reach, 0), x + reach + 1)
+        v, u = np.ogrid[rows.start : min(rows.stop, len(mask)), columns.start : min(columns.stop, mask.shape[1])]
+        inside = r * r - (v - y) ** 2 - (u - x) ** 2
+        half = np.where(inside > 0, 0.5 * w / r * np.sqrt(np.maximum(inside, 0.0)), np.nan)
+        front[rows, columns] = np.fmin(front[rows, columns], d - half)
+        back[rows, columns] = np.fmax(back[rows, columns], d + half)
+    bare = ~np.isfinite(front)
+    nearest = tuple(ndimage.distance_transform_edt(bare, return_distances=False, return_indices=True))
+    middle, half = 0.5 * (front[nearest] + back[nearest]), distance * float(np.median(0.5 * widest / radii))
+    front, back = np.where(bare, middle - half, front), np.where(bare, middle + half, back)
+    return np.where(mask, front, 0.0), np.where(mask, back, 0.0)
 
 
 def _grown(mask: np.ndarray, reach: int) -> np.ndarray:

@@ -14,7 +14,7 @@ from neuspring.data.check import check_layout
 from neuspring.data.intake.feeds import pairs
 from neuspring.data.intake.lenses import Board, rigid_inverse
 from neuspring.data.intake.make import Intake, make_capture
-from neuspring.data.plausible import on_table
+from neuspring.data.plausible import on_table, outline_findings
 from neuspring.perception import segment_opencv
 from neuspring.perception.annotate.clicks import Annotations, Click, ClickedPoint
 from neuspring.perception.annotate.tracks import TracksMode, tracks_of
@@ -206,6 +206,61 @@ def test_a_pose_in_another_unit_makes_an_implausible_size(capture):
 
     edit(capture, five_times)
     assert "implausible size: 13" in "\n".join(of_level(check_layout(capture.folder), "warning"))
+
+
+def strip(length, width):
+    """A mask of the desk: a band on the table of these sides, m."""
+    y, x = np.mgrid[: SIZE[1], : SIZE[0]]
+    points = on_table(camera(), np.stack([x, y], axis=-1).reshape(-1, 2))[:, :2].reshape(SIZE[1], SIZE[0], 2)
+    return (np.abs(points) < (length / 2, width / 2)).all(axis=-1).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("category", "mask", "words"),
+    [
+        ("rope", disk(), "a compact thing"),
+        ("cloth", strip(0.35, 0.025), "a long thin thing"),
+        ("toy", strip(0.35, 0.025), "a long thin thing"),
+        ("rope", strip(0.35, 0.025), None),
+        ("cloth", disk(), None),
+        ("toy", disk(), None),
+        ("toy", strip(0.2, 0.08), None),
+        ("toy", 0 * disk(), None),
+    ],
+)
+def test_an_outline_of_another_category(capture, category, mask, words):
+    found = outline_findings("object", mask, category)
+    assert [one.name for one in found] == (["outline and category"] if words else [])
+    if words:
+        assert words in found[0].text and repr(category) in found[0].text and "meant?" in found[0].remedy
+
+
+def test_the_outline_is_checked_before_a_run_and_in_it(capture):
+    edit(capture, lambda values: values.update(category="rope"))
+    rope = Capture.load(capture.folder)
+    assert holds(check_layout(rope.folder), "warning", CAPTURE, "outline and category")
+    labels = np.stack([disk()] * FRAMES)
+    assert "outline and category" in {one.name for one in look_at_masks(rope, "0", labels, mask_facts(rope, "0", labels))}
+
+
+def test_the_pose_of_a_body_is_asked_for_and_kept(tmp_path):
+    made, _ = make_capture(intake(write_folders(tmp_path)))
+    assert '"pose"' not in (made.folder / CAPTURE).read_text()
+    save_masks(made, "0", np.stack([disk()] * FRAMES))
+    asked = 'write "pose": "lying" or "standing"'
+    assert holds(check_layout(made.folder), "note", CAPTURE, asked)
+    edit(made, lambda values: values.update(category="cloth"))
+    assert not holds(check_layout(made.folder), "note", CAPTURE, asked)
+    known, _ = make_capture(intake(tmp_path, folder=tmp_path / "known", pose="standing"))
+    assert Capture.load(known.folder).description.pose == "standing"
+    save_masks(known, "0", np.stack([disk()] * FRAMES))
+    assert not holds(check_layout(known.folder), "note", CAPTURE, asked)
+
+
+def test_a_pose_is_refused_where_depth_is_measured(tmp_path):
+    root = write_folders(tmp_path)
+    with pytest.raises(InputError, match=r"--pose: is for color alone.*received standing"):
+        make_capture(intake(root, views=pairs([root / "color_0"], [root / "depth_0"]), pose="standing"))
 
 
 def test_masks_of_a_run_are_not_judged_by_depth(capture):

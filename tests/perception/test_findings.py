@@ -248,6 +248,23 @@ def test_volume_and_invented_surface_are_said():
     assert said(look_at_lifted(tracked(BOX), half, 1.0)) == {"note: size of the object", "note: invented surface"}
 
 
+@pytest.mark.parametrize(
+    ("backend", "raised", "level", "words"),
+    [
+        ("body", 0.4, "warning", "it reaches 55 cm behind its nearest point and is 30 cm wide, so 40% of it is supposed to rise"),
+        ("body", 0.0, "note", 'Write "pose": "lying" or "standing"'),
+        ("body, standing", 0.4, "note", "standing, as capture.json says; 40% of it rises"),
+        ("round", 0.0, None, ""),
+    ],
+)
+def test_how_a_body_lies_or_stands_is_said(backend, raised, level, words):
+    facts = {"shape_longest": 0.55, "shape_across": 0.3, "shape_raised": raised}
+    found = look_at_lifted(replace(tracked(BOX), backend=f"color alone, {backend}", facts=facts), no_prior(), 1.0)
+    poses = [one for one in found if one.name == "pose"]
+    assert [one.level for one in poses] == ([level] if level else [])
+    assert all(words in one.text for one in poses)
+
+
 VISIBLE = np.ones((FRAMES, 200), bool)
 
 

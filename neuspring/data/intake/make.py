@@ -81,6 +81,8 @@ class Intake:
     """A pixel (x, y) of the table, with one camera."""
     train_end: int | None = None
     """Training frames are [0, train_end); None: the first 70 %."""
+    pose: Literal["lying", "standing"] | None = None
+    """How the object is in frame 0, where there is color alone; None: not known."""
     raw: Raw | None = None
     """PhysTwin's case of which the views are: its masks, tracks and split come along."""
     force: bool = False
@@ -98,6 +100,8 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
             raise InputError(option, "letters, digits, '.', '_' and '-' are required, a letter or digit first", repr(name))
     if all(isinstance(view, Paired) and view.depth is None for view in intake.views):
         _require_for_color_alone(intake)
+    elif intake.pose:
+        raise InputError("--pose", "is for color alone: depth shows how the object is", intake.pose, "Leave it out.")
     choice = choose(intake.views, intake.frames)
     findings = [one for check in CHECKS for one in check(intake.views, choice)]
     refuse_errors(findings)
@@ -289,6 +293,7 @@ def _describe(
         "depth": "none" if unit is None else "measured",
         "depth_unit": unit.meters if unit is not None and is_counted else 0.001,
         "depth_format": "png" if unit is None or is_counted else "npy",
+        "pose": intake.pose,
         "up": placed.up,
         "train_end": train_end,
         "masks": bool(intake.raw and intake.raw.ids),

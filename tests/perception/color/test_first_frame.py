@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from neuspring.config.perception import ColorSettings, Perception, Sampling
+from neuspring.config.perception import ColorSettings, Perception, Sampling, ShapePriorSettings
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT
@@ -22,9 +22,9 @@ PIXEL = 0.005
 """m: the width of a pixel at 0.8 m."""
 
 
-def capture_of(category: str, up: str = "+z") -> SimpleNamespace:
+def capture_of(category: str, up: str = "+z", pose: str | None = None) -> SimpleNamespace:
     view = camera(np.zeros(3))
-    described = SimpleNamespace(up_sign=up_sign(up), category=category)
+    described = SimpleNamespace(up_sign=up_sign(up), category=category, pose=pose)
     return SimpleNamespace(folder=Path("painted"), cameras={"0": view}, description=described, frame_count=1, train_end=1)
 
 
@@ -62,18 +62,89 @@ def test_a_rope_is_as_thick_as_it_is_wide():
     assert upper.min() > 0
 
 
-def test_a_body_rests_on_the_table_and_its_silhouette_is_that_of_the_mask():
-    settings = ColorSettings(body_thickness=0.8)
-    labels = shown(SQUARE)
-    first = FirstFrame.of(capture_of("zebra"), labels, settings)
+def filled_outline(points: np.ndarray) -> np.ndarray:
+    """Labels of a convex body of these points [n, 3], m."""
+    labels = np.zeros((HEIGHT, WIDTH), np.uint8)
+    pixels = camera(np.zeros(3)).project(points)[0]
+    cv2.fillConvexPoly(labels, cv2.convexHull(np.round(pixels).astype(np.int32)), OBJECT)
+    return labels
+
+
+def ball(radius: float) -> np.ndarray:
+    """Points [n, 3] of a sphere that rests on the table."""
+    points = np.random.default_rng(0).normal(size=(4000, 3))
+    return radius * points / np.linalg.norm(points, axis=1, keepdims=True) + (0, 0, radius)
+
+
+def box(x: float, y: float, z: float) -> np.ndarray:
+    """Corners [8, 3] of a box of these sides on the table."""
+    return np.array([[a * x, b * y, c * z] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (0, 1)])
+
+
+def sides(labels: np.ndarray, pose: str | None) -> tuple[np.ndarray, np.ndarray]:
+    """Upper and lower points [n, 3], m, of a body in a pose."""
+    first = FirstFrame.of(capture_of("toy", pose=pose), labels, ColorSettings())
     y, x = np.nonzero(labels == OBJECT)
     pixels = np.stack([x, y], axis=1)
     upper, lower = first.points(pixels), first.camera.lift(pixels.astype(float), first.depths(0.0)[y, x])
-    np.testing.assert_allclose(lower[:, 2], 0.0, atol=1e-9)
     np.testing.assert_allclose(first.camera.project(upper)[0], pixels, atol=1e-6)
-    np.testing.assert_allclose(first.fingers(pixels)[:, 2], 0.5 * upper[:, 2], atol=1e-9)
-    half = 0.5 * 0.2 * np.sin(np.deg2rad(40))
-    assert upper[:, 2].max() == pytest.approx(0.8 * 2 * half, rel=0.15)
+    assert (lower[:, 2] > -1e-9).all()
+    np.testing.assert_allclose(first.fingers(pixels)[:, 2], 0.5 * (upper + lower)[:, 2], atol=1e-9)
+    return upper, lower
+
+
+@pytest.mark.parametrize("pose", [None, "lying", "standing"])
+def test_a_ball_is_a_ball(pose):
+    """Both of its sides are on the sphere, in every pose: nothing of it lies behind, and nothing rises."""
+    radius = 0.07
+    for side in sides(filled_outline(ball(radius)), pose):
+        off = np.abs(np.linalg.norm(side - (0, 0, radius), axis=1) - radius)
+        assert np.mean(off) < PIXEL
+        assert np.quantile(off, 0.95) < 3 * PIXEL
+
+
+@pytest.mark.parametrize("pose", [None, "standing"])
+def test_a_box_that_stands_rises_from_where_it_touches_the_table(pose):
+    upper, lower = sides(filled_outline(box(0.06, 0.06, 0.24)), pose)
+    both = np.concatenate([upper, lower])
+    assert both[:, 2].max() == pytest.approx(0.24, abs=0.03)
+    assert np.abs(both[:, :2]).max() < 0.03 + 0.04
+    # Laid onto the table it is as long as its shadow, 24 cm / tan(40 degrees).
+    laid = sides(filled_outline(box(0.06, 0.06, 0.24)), "lying")[1]
+    assert laid[:, 1].max() > 0.28
+    assert laid[:, 2].max() < 0.12
+
+
+@pytest.mark.parametrize(("x", "y"), [(0.3, 0.06), (0.15, 0.15)])
+def test_a_box_that_lies_keeps_its_place(x, y):
+    """Whether its pose is known or not, if it is no longer than it is wide in this view."""
+    for pose in (None, "lying"):
+        upper, lower = sides(filled_outline(box(x, y, 0.06)), pose)
+        middle = 0.5 * (upper + lower)
+        assert np.abs(middle[:, 0]).max() < 0.5 * x + 2 * PIXEL
+        assert np.abs(middle[:, 1]).max() < 0.5 * y + 0.03
+        assert lower[:, 2].min() == pytest.approx(0, abs=PIXEL)
+
+
+def test_a_long_body_that_points_away_lies_only_if_the_capture_says_so():
+    labels = filled_outline(box(0.05, 0.3, 0.05))
+    unknown, lying = (sides(labels, pose)[0] for pose in (None, "lying"))
+    assert np.ptp(lying[:, 1]) == pytest.approx(0.3, abs=0.05)
+    assert lying[:, 2].max() < 0.07
+    assert unknown[:, 2].max() > 0.15
+    known = [FirstFrame.of(capture_of("toy", pose=pose), labels, ColorSettings()).facts for pose in (None, "lying")]
+    assert known[0]["raised"] > 0.5
+    assert known[1]["raised"] == 0
+    assert known[0]["longest"] == pytest.approx(0.3, abs=0.05)
+
+
+def test_nothing_rises_below_a_camera_that_looks_straight_down():
+    view = camera(np.zeros(3), elevation=80.0)
+    labels = np.zeros((HEIGHT, WIDTH), np.uint8)
+    labels[20:70, 78:84] = OBJECT
+    capture = capture_of("toy")
+    capture.cameras = {"0": view}
+    assert FirstFrame.of(capture, labels, ColorSettings()).facts["raised"] == 0
 
 
 def test_up_may_be_minus_z():
@@ -127,12 +198,18 @@ def test_observations_of_a_painted_capture(tmp_path, category):
     still = np.repeat(start[None], capture.frame_count, axis=0)
     tracks = PixelTracks(pixels=still, visible=np.ones(still.shape[:2], bool), backend="test")
     masks = {"0": Masks(labels=labels, backend="given")}
-    settings = Perception(sample=Sampling(voxel=0.01, nodes=300))
+    settings = Perception(sample=Sampling(voxel=0.01, nodes=300), shape=ShapePriorSettings(voxel=0.006))
     lifted, prior, image = from_color(capture, masks, {"0": tracks}, settings)
     assert image.hands == 1
     assert not image.visible[capture.train_end :].any()
     assert len(image.inside) == capture.train_end
-    assert abs(lifted.controller_points[0, :, 1].mean() - 0.1) < 0.03
+    # The hand holds the far edge: there in the image, and at half the height of what it holds.
+    view, held = capture.cameras["0"], lifted.controller_points[0].astype(float)
+    edge = view.project(np.array([0.0, 0.1, 0.0]))[0][1]
+    assert abs(view.project(held)[0][:, 1].mean() - edge) < 3
+    assert 0 < held[:, 2].mean() < 0.1
+    if category == "cloth":
+        assert abs(held[:, 1].mean() - 0.1) < 0.03
     # It rises by 28 mm in a plane that faces the camera.
     rise = lifted.controller_points[-1].mean(axis=0) - lifted.controller_points[0].mean(axis=0)
     np.testing.assert_allclose(rise, [0, 0, 0.028], atol=0.006)
