@@ -3,8 +3,9 @@
     python -m workflow.scripts.first_frames [--films FOLDER --nodes FOLDER]
 
 Bodies of the synthetic scenes, and some more, are rendered from eight directions and two heights. FOLDER of --films is that of
-`workflow.scripts.footage`, with cameras.json; that of --nodes has CASE/rest.txt, true nodes of frame 0, 0.1 mm. An error is the mean
-of two: of the mean distance from true nodes to the nearest supposed point, and of that from supposed points to the nearest true node.
+`workflow.scripts.footage`, with cameras.json; that of --nodes has CASE/rest.txt, true nodes of frame 0, 0.1 mm. An error is the
+mean of two: the mean distance from true nodes to the nearest supposed point, and that from supposed points to the nearest true
+node.
 """
 
 from __future__ import annotations
