@@ -110,16 +110,21 @@ def make_capture(
     level: Annotated[bool, arg(help="move the world of given poses so that the table is z = 0")] = False,
     top_down: Annotated[bool, arg(help="the camera looks straight down: the plane it faces is the table")] = False,
     table_at: Annotated[tuple[float, float] | None, arg(help="a pixel of the table, where another plane is larger")] = None,
+    controllers: Annotated[Path | None, arg(help="hands in space: .npz or .csv, m, a row per frame of the capture")] = None,
+    nodes: Annotated[Path | None, arg(help="the body of frame 0: .npz or .ply, m")] = None,
+    tracks: Annotated[Path | None, arg(help="annotated points in space: JSON, m")] = None,
+    teach: Annotated[bool, arg(help="annotated points of training frames teach the twin; without color they always do")] = False,
+    up: Annotated[Literal["+z", "-z"], arg(help="up of points in space alone")] = "+z",
     force: Annotated[bool, arg(help="replace the images of a capture that is there")] = False,
 ) -> None:
-    """Color and depth of a camera -> a capture folder. What was found is printed, and the next command."""
+    """Color and depth of a camera, or points in space -> a capture folder. What was found is printed, and the next command."""
     from neuspring.data.intake.feeds import Bag, CameraFeed, Raw, pairs
     from neuspring.data.intake.lenses import Board
     from neuspring.data.intake.make import Intake, make_capture
 
     given = [option for option, value in (("--color", color), ("--bag", bag), ("--phystwin-raw", phystwin_raw)) if value]
-    if len(given) != 1:
-        rule = "one of --color with --depth, --bag, --phystwin-raw is required"
+    if len(given) != 1 and (given or not controllers):
+        rule = "one of --color with --depth, --bag, --phystwin-raw is required, or --controllers with --nodes and --tracks"
         raise InputError("make-capture", rule, " ".join(given) or "none")
     raw = Raw.open(phystwin_raw) if phystwin_raw else None
     views: Sequence[CameraFeed]
@@ -131,7 +136,7 @@ def make_capture(
             raise InputError("--cameras", f"{len(bag)} different names are required", " ".join(names))
         views = [Bag(camera, path) for camera, path in zip(names, bag, strict=True)]
     else:
-        views = pairs(color, depth, cameras)
+        views = pairs(color, depth, cameras) if color else ()
     intake = Intake(
         folder=output,
         name=name or output.resolve().name,
@@ -149,6 +154,11 @@ def make_capture(
         table_at=table_at,
         train_end=train_end,
         pose=pose,
+        controllers=controllers,
+        nodes=nodes,
+        tracks=tracks,
+        teach=teach,
+        up=up,
         raw=raw,
         force=force,
     )
@@ -156,7 +166,7 @@ def make_capture(
     print("\n".join(report))
     print(f"written: {capture.folder}\nnext:")
     print(f"  neuspring check-data {capture.folder}")
-    if not capture.description.masks:
+    if capture.cameras and not capture.description.masks:
         print(f"  neuspring annotate {capture.folder}")
 
 

@@ -29,7 +29,7 @@ TOOLS = {
     "play": ("twins", "runs of a results folder in the browser; twins that can be pulled by hand"),
     "export": ("twins", "a twin -> USD, PLY, Newton, MuJoCo, or npz with a JSON description"),
     "fetch": ("data", "released archives -> the folders that the readers expect"),
-    "make-capture": ("data", "color and depth of a camera -> a capture folder"),
+    "make-capture": ("data", "color and depth of a camera, or points in space -> a capture folder"),
     "cut-capture": ("data", "some frames of a capture, with their masks -> another capture"),
     "check-data": ("data", "report how a data folder departs from the expected layout"),
     "mask": ("data", "marks on a few frames -> masks of object and hands in every frame of a capture"),

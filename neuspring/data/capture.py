@@ -246,9 +246,9 @@ class Capture:
     def _absent(self, camera: str) -> str:
         return f"List the frame in cameras.{camera}.missing of {CAPTURE} if the camera does not have it."
 
-    def tracks(self) -> np.ndarray:
-        """Annotated tracks [T, K, 3], m, NaN where not annotated; K = 0 without tracks.json. Raises InputError."""
-        path = self.folder / TRACKS
+    def tracks(self, path: Path | None = None) -> np.ndarray:
+        """Annotated tracks [T, K, 3], m, NaN where not annotated; K = 0 without tracks.json (or `path`). Raises InputError."""
+        path = path or self.folder / TRACKS
         return _read_tracks(path, load_json(path) if path.exists() else [], self.frame_count, 3)
 
     def points(self, camera: str) -> np.ndarray:

@@ -20,7 +20,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
 from neuspring.core.findings import Finding, broken, note, refusal, unusual
 from neuspring.data import mocap, phystwin, plausible
-from neuspring.data.capture import CAPTURE, OBJECT, POINTS, TRACKS, Capture, Description, description_findings, read_description
+from neuspring.data.capture import CAPTURE, OBJECT, POINTS, Capture, Description, description_findings, read_description
 from neuspring.data.intake.depth import FAR, FASTEST, NEAR, SLOWEST, cloud, planes
 from neuspring.data.points import look
 from neuspring.data.released import Released, parameter_findings, prediction_findings, read_checkpoint
@@ -74,8 +74,6 @@ def check_capture(folder: Path) -> list[Finding]:
     if calibrated and len(samples) > 1:
         first = {name: found[0].depth for name, found in samples.items() if 0 in found}
         case.findings += plausible.view_findings(path, capture.cameras, first, description.up)
-    if description.tracks == "score":
-        case.load(folder / TRACKS, lambda _: capture.tracks())
     case.findings += look(capture)[1]
     for name in capture.cameras:
         case.load(folder / POINTS, lambda _, name=name: capture.points(name))  # type: ignore[misc]

@@ -315,7 +315,7 @@ def space_findings(file: Path, points: np.ndarray, up: float | None, *, is_body:
         text = f"{where}. It rests at y = 0: if y is up, write {words} in place of (x, y, z)"
         return [*found, (unusual if low > FAR_OFF else broken)(file, "points", rule, text)]
     if high <= SUNK:
-        return [*found, broken(file, "points", rule, f"{where}. Is up {sign[1]}z? Then write so in {CAPTURE}")]
+        return [*found, broken(file, "points", rule, f"{where}. Is up {sign[1]}z? Then write so in {CAPTURE} (make-capture: --up)")]
     if low > FAR_OFF and high <= HIGH:
         return found
     remedy = f"Move the world so that the table is z = 0, or write ground: false in {CAPTURE}"

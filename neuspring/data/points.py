@@ -11,6 +11,7 @@ Meters, in the capture's world. Files of another form, in other units or axes ar
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -74,15 +75,18 @@ def read(capture: Capture) -> InSpace:
     return space
 
 
-def look(capture: Capture) -> tuple[InSpace, list[Finding]]:
-    """Hands, nodes and points of a capture as far as they can be read, and every finding about them."""
+def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[InSpace, list[Finding]]:
+    """Hands, nodes and points of a capture as far as they can be read, and every finding about them.
+
+    `brought` are files of `controllers`, `nodes` and `tracks` that are not in its folder yet.
+    """
     folder, description = capture.folder, capture.description
     findings: list[Finding] = []
     hands, nodes, tracks = None, np.zeros((0, 3)), np.zeros((capture.frame_count, 0, 3))
     files: dict[str, Path | None] = {}
     for what, names in (("controllers", CONTROLLERS), ("nodes", NODES)):
         try:
-            files[what] = file = given(folder, names)
+            files[what] = file = given(folder, names) if brought is None else brought.get(what)
             if file is None:
                 if not description.cameras:
                     rule = f"a capture without cameras needs {' or '.join(names)}"
@@ -93,36 +97,37 @@ def look(capture: Capture) -> tuple[InSpace, list[Finding]]:
                 hands = read_hands(file, capture.frame_count)
         except InputError as error:
             findings.append(refusal(error))
+    marked = (brought or {}).get("tracks", folder / TRACKS)
+    try:
+        annotated = capture.tracks(marked)
+    except InputError as error:
+        findings.append(refusal(error))
+        annotated = tracks
+    first = annotated[0][np.isfinite(annotated[0]).all(axis=1)]
     if description.tracks == "train":
-        try:
-            tracks = capture.tracks()
-        except InputError as error:
-            findings.append(refusal(error))
-        else:
-            if (count := int(np.isfinite(tracks[0]).all(axis=1).sum())) < LEAST:
-                rule = f"with tracks: train at least {LEAST} points must be annotated in frame 0, where the twin starts"
-                findings.append(broken(folder / TRACKS, "", rule, f"{count} of {tracks.shape[1]}"))
-    body = [(files.get("nodes"), nodes), (folder / TRACKS, tracks[0][np.isfinite(tracks[0]).all(axis=1)])]
-    moving = [(files.get("controllers"), None if hands is None else hands.points)]
-    ground = description.up_sign if description.ground else None
-    for file, points in [*body, *moving]:
-        if file is not None and points is not None and points.size:
-            findings += plausible.space_findings(file, points.reshape(-1, 3), ground, is_body=file.name in NODES)
+        tracks = annotated
+        if len(first) < LEAST:
+            rule = f"with tracks: train at least {LEAST} points must be annotated in frame 0, where the twin starts"
+            findings.append(broken(marked, "", rule, f"{len(first)} of {tracks.shape[1]}"))
+    ground, held_at = description.up_sign if description.ground else None, np.zeros((0, 3)) if hands is None else hands.points
+    for what, file, points in (("nodes", files.get("nodes"), nodes), ("", marked, first), ("", files.get("controllers"), held_at)):
+        if file is not None and points.size:
+            findings += plausible.space_findings(file, points.reshape(-1, 3), ground, is_body=what == "nodes")
     if any(one.level == "error" for one in findings):
         return InSpace(hands, nodes, tracks), findings
-    if (file := files["nodes"]) is not None:
-        findings += plausible.annotated_findings(folder / TRACKS, body[1][1], nodes)
-        if hands is not None:
-            findings += plausible.contact_findings(folder / str(files["controllers"]), hands.points[: capture.train_end], nodes)
+    if len(nodes):
+        findings += plausible.annotated_findings(marked, first, nodes)
+        if (file := files["controllers"]) is not None:
+            findings += plausible.contact_findings(file, held_at[: capture.train_end], nodes)
     return InSpace(hands, nodes, tracks), findings
 
 
-def read_hands(path: Path, frames: int) -> Hands:
-    """controllers.npz or controllers.csv, of so many frames. Raises InputError."""
+def read_hands(path: Path, frames: int | None = None) -> Hands:
+    """controllers.npz or controllers.csv, of so many frames, if given. Raises InputError."""
     arrays = _rows(path) if path.suffix == ".csv" else _arrays(path, ("points", "holds", "hand"))
     points = _places(path, arrays["points"], 3)
     count, number = points.shape[:2]
-    if count != frames:
+    if frames is not None and count != frames:
         rule = f"{frames} frames are required, as frame_count of {CAPTURE} says"
         raise InputError(path, rule, count, "Cut or resample the file: a row per frame of the capture.")
     if not number:
@@ -173,31 +178,26 @@ def _arrays(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray]:
 
 
 def _rows(path: Path) -> dict[str, np.ndarray]:
+    import pandas as pd
+
     try:
-        table = np.atleast_1d(np.genfromtxt(path, delimiter=",", names=True, dtype=float, encoding="utf-8"))
+        table = pd.read_csv(path)
     except (OSError, ValueError) as error:
-        raise InputError(path, "rows of numbers with one header line are required", " ".join(str(error).split())) from error
-    names = table.dtype.names or ()
-    if not set(COLUMNS[:5]) <= set(names) <= set(COLUMNS):
+        raise InputError(path, "rows of numbers with one header line are required", str(error)) from error
+    if not set(COLUMNS[:5]) <= set(table) <= set(COLUMNS):
         rule = f"the header must be {','.join(COLUMNS[:5])}, and may have holds and hand"
-        raise InputError(path, rule, ",".join(names))
-    values = {name: table[name] for name in names}
-    for name, column in values.items():
+        raise InputError(path, rule, ",".join(map(str, table)))
+    for name, column in (table := table.apply(pd.to_numeric, errors="coerce")).items():
         if len(bad := np.flatnonzero(~np.isfinite(column))):
             raise InputError(path, f"{name}: every entry must be a number", f"another in row {bad[0] + 1} ({len(bad)} in all)")
-    frames, row = np.unique(values["frame"], return_inverse=True)
-    numbers, column_of = np.unique(values["point"], return_inverse=True)
-    count = len(frames) * len(numbers)
-    if len(set(zip(row.tolist(), column_of.tolist(), strict=True))) != count or len(table) != count:
-        rule = "each point needs one row in each frame"
-        raise InputError(path, rule, f"{len(table)} rows, {len(frames)} frames, {len(numbers)} points")
-    if not np.array_equal(frames, np.arange(len(frames))):
-        raise InputError(path, "frame: frames must be 0, 1, 2, ... without a gap", f"{frames[0]:g} to {frames[-1]:g}")
-    order = np.lexsort([column_of, row])
-    arrays = {"points": np.stack([values[name][order] for name in "xyz"], axis=-1).reshape(len(frames), len(numbers), 3)}
-    grid = {name: values[name][order].reshape(len(frames), len(numbers)) for name in COLUMNS[5:] if name in names}
+    sizes = table["frame"].nunique(), table["point"].nunique()
+    if table.duplicated(["frame", "point"]).any() or len(table) != np.prod(sizes) or table["frame"].max() != sizes[0] - 1:
+        rule = "each point needs one row in each frame, and frames are 0, 1, 2, ..."
+        raise InputError(path, rule, f"{len(table)} rows, {sizes[0]} frames up to {table['frame'].max():g}, {sizes[1]} points")
+    grid = {name: column.to_numpy().reshape(sizes) for name, column in table.sort_values(["frame", "point"]).items()}
+    arrays = {"points": np.stack([grid[name] for name in "xyz"], axis=-1)}
     if "holds" in grid:
-        if not set(np.unique(grid["holds"])) <= {0.0, 1.0}:
+        if not set(np.unique(grid["holds"])) <= {0, 1}:
             raise InputError(path, "holds: must be 0 or 1", f"{np.unique(grid['holds'])[:4]}")
         arrays["holds"] = grid["holds"] > 0
     if "hand" in grid:

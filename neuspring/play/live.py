@@ -49,7 +49,7 @@ class Live:
         self.run, self.begin, self.played, self._server, self._player = run, begin, played, server, player
         self.simulator = Simulator(twin, start=begin.start if played is None else played.start)
         hands = self.simulator.hands
-        self.grab = Grab(len(twin.topology.nodes), hands, hands_of(hands))
+        self.grab = Grab(len(twin.topology.nodes), hands, hands_of(hands, player.found.observations.controller_hand))
         self.grab.following = played is not None or len(begin.hands) > 0
         self.most, self.message = TOO_MUCH, ""
         self.strain, self.over = 0.0, 0

@@ -33,6 +33,8 @@ MARGIN = 0.9
 """Part of the stability bound that twin and grab may use together."""
 MOST_SOLVERS = 8
 """Solvers of grabbed nodes that are kept."""
+UNKNOWN = np.zeros(0, np.int32)
+"""Nothing says which hand a controller belongs to."""
 HAND_GAP = 0.15
 """Controllers nearer than this, m, directly or through others, are one hand."""
 
@@ -220,6 +222,8 @@ def _with_row(rows: np.ndarray, place: np.ndarray) -> np.ndarray:
     return np.concatenate([rows, np.append(place, np.ones(rows.shape[1] - 3))[None]]).astype(np.float32)
 
 
-def hands_of(controllers: np.ndarray) -> np.ndarray:
-    """The hand [C] of each controller [C, 3], m: those that move together."""
+def hands_of(controllers: np.ndarray, given: np.ndarray = UNKNOWN) -> np.ndarray:
+    """The hand [C] of each controller [C, 3], m: those that move together. `given` is what observations know of it."""
+    if len(given) == len(controllers):
+        return given
     return np.asarray(connected_components(cdist(controllers, controllers) < HAND_GAP)[1])

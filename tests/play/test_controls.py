@@ -12,7 +12,7 @@ from neuspring.physics import stability
 from neuspring.play.controls import Controls, Recording, compare, digest_motion, load_controls, replay
 from neuspring.play.live import FASTEST, Grab, nearest_to_ray
 from neuspring.play.results import find
-from neuspring.play.simulator import Simulator, Start, start_state
+from neuspring.play.simulator import Simulator, Start, hands_of, start_state
 from neuspring.twin.rollout import roll_out
 from tests.support import ropes, small
 from tests.support.played import results, rod_results, softer
@@ -118,6 +118,14 @@ def test_one_browser_holds_at_a_time_and_a_closed_tab_lets_go():
     # The node nearest to the mouse's ray is the one that is taken.
     points = np.array([[0.0, 0, 1], [0.1, 0, 5], [0.3, 0, 1]])
     assert nearest_to_ray(points, (0, 0, 0), (0.021, 0, 1)) == 1
+
+
+def test_hands_are_those_that_the_capture_groups_and_else_those_that_are_near():
+    places = np.array([[0.0, 0, 0], [0.01, 0, 0], [1.0, 0, 0]])
+    assert hands_of(places).tolist() == [0, 0, 1]
+    assert hands_of(places, np.array([3, 1, 3])).tolist() == [3, 1, 3]
+    # What is known of another number of controllers says nothing.
+    assert hands_of(places, np.array([1, 1])).tolist() == [0, 0, 1]
 
 
 def test_a_hand_moves_as_one_and_no_faster_than_allowed():

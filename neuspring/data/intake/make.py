@@ -11,16 +11,30 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import TypeAdapter
 
 from neuspring.config import parse
+from neuspring.core.artifacts import Up
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
 from neuspring.core.findings import Finding, finding, refuse, refuse_errors
 from neuspring.core.records import digest_file
 from neuspring.core.text import Progress
-from neuspring.data import capture
-from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Camera, CameraEntry, Capture, Description, Writer, description_findings
+from neuspring.data import capture, points
+from neuspring.data.capture import (
+    CAPTURE,
+    CONTROLLERS,
+    NODES,
+    POINTS,
+    TRACKS,
+    Camera,
+    CameraEntry,
+    Capture,
+    Description,
+    Writer,
+    description_findings,
+)
 from neuspring.data.intake.depth import Unit, find_rate
 from neuspring.data.intake.feeds import CameraFeed, Paired, Raw, VideoFile
 from neuspring.data.intake.lenses import Board, Straightener, read_lenses, read_poses
@@ -83,10 +97,27 @@ class Intake:
     """Training frames are [0, train_end); None: the first 70 %."""
     pose: Literal["lying", "standing"] | None = None
     """How the object is in frame 0, where there is color alone; None: not known."""
+    controllers: Path | None = None
+    """Hands in space, see `neuspring.data.points`, in the capture's world and frames; so are nodes and tracks."""
+    nodes: Path | None = None
+    tracks: Path | None = None
+    teach: bool = False
+    """Tracks teach the twin; without cameras they always do."""
+    up: Up = "+z"
+    """Of a capture without cameras; with them it is found."""
     raw: Raw | None = None
     """PhysTwin's case of which the views are: its masks, tracks and split come along."""
     force: bool = False
     """Replace the images of a capture that is there."""
+
+    @property
+    def brought(self) -> dict[str, Path]:
+        """The files of points in space, by option."""
+        return {name: path for name in BROUGHT if (path := getattr(self, name)) is not None}
+
+
+BROUGHT = ("controllers", "nodes", "tracks")
+"""Options of files of points in space."""
 
 
 def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
@@ -95,6 +126,8 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     All is checked before the first image is written. An interrupted call goes on where it was. Raises InputError naming the option
     or file, the rule, what was received and the next move.
     """
+    if not intake.views:
+        return _of_points(intake)
     for option, name in (("--name", intake.name), *(("--cameras", view.name) for view in intake.views)):
         if not NAMES.fullmatch(name):
             raise InputError(option, "letters, digits, '.', '_' and '-' are required, a letter or digit first", repr(name))
@@ -118,6 +151,11 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     findings += category_findings(intake.folder, intake.category)
     placed, how = _place(intake, seen, unit)
     made = _describe(intake, choice, rate, unit, seen, placed, how)
+    if intake.brought and (intake.level or not (intake.poses or intake.board)):
+        rule = "points in space need the world of the cameras: --poses or --board, without --level"
+        raise InputError(f"--{next(iter(intake.brought))}", rule, "the table gives the world", "Write the points in that world.")
+    made = replace(made, tracks="train" if intake.teach else "score")
+    brought_by(intake, made)
     _write(intake, made, choice, unit, seen, placed)
     sizes = ", ".join(f"{name} {view.size[0]} x {view.size[1]}" for name, view in seen.items())
     depth = "none, color alone" if unit is None else unit.text()
@@ -283,6 +321,7 @@ def _describe(
     for option, given in (("intrinsics", intake.intrinsics), ("poses file", intake.poses)):
         if given is not None:
             provenance[option] = f"sha256:{digest_file(given)}"
+    provenance |= digests(intake)
     entries = {
         "format": 1,
         "name": intake.name,
@@ -333,14 +372,65 @@ def _write(
             writer.frame(view.name, frame, straight.color(color), stored, mask)
             done += 1
             progress.update(done)
-    tracks = None
+    tracks = _bring(intake, writer)
     if intake.raw is not None and intake.raw.tracks is not None:
         tracks = intake.raw.tracks[choice.numbers] @ placed.motion[:3, :3].T + placed.motion[:3, 3]
     writer.finish(tracks)
     (intake.folder / capture.RECIPE).unlink()
 
 
-PRECIOUS = ("mask", "marks.json", "annotations.json", TRACKS, POINTS)
+def _of_points(intake: Intake) -> tuple[Capture, list[str]]:
+    """A capture of points in space alone."""
+    if missing := [f"--{name}" for name in BROUGHT if name not in intake.brought]:
+        rule = "without --color, --bag and --phystwin-raw, --controllers, --nodes and --tracks are required"
+        raise InputError("make-capture", rule, f"no {' '.join(missing)}")
+    if intake.rate is None:
+        raise InputError("--rate", "frames per second are required where there is no video", "none")
+    entries = {
+        "format": 1,
+        "name": intake.name,
+        "category": intake.category,
+        "frame_count": len(points.read_hands(intake.brought["controllers"]).points),
+        "frame_rate": intake.rate,
+        "cameras": (),
+        "depth": "none",
+        "tracks": "train",
+        "up": intake.up,
+        "train_end": intake.train_end,
+        "provenance": digests(intake),
+    }
+    made = parse(Description, entries, "make-capture")
+    refuse(description_findings(Path("make-capture"), made))
+    space = brought_by(intake, made)
+    prepare(intake.folder, TypeAdapter(Description).dump_python(made, mode="json"), intake.force)
+    writer = Writer(intake.folder, made)
+    writer.finish(_bring(intake, writer))
+    (intake.folder / capture.RECIPE).unlink()
+    hands = 0 if space.hands is None else space.hands.points.shape[1]
+    text = f"{hands} controllers, {len(space.nodes)} nodes, {space.tracks.shape[1]} annotated points, {made.frame_count} frames"
+    return Capture.load(intake.folder), [f"points in space alone: {text}"]
+
+
+def brought_by(intake: Intake, made: Description) -> points.InSpace:
+    """What a user brings in space, before anything is written. Raises InputError for what no twin can be made of."""
+    space, findings = points.look(Capture(intake.folder, made), intake.brought)
+    refuse(findings)
+    return space
+
+
+def _bring(intake: Intake, writer: Writer) -> np.ndarray | None:
+    """Write hands and nodes into the folder; returns the tracks."""
+    space = brought_by(intake, writer.capture.description)
+    points.write(intake.folder, space.hands, space.nodes)
+    return writer.capture.tracks(intake.tracks) if intake.tracks else None
+
+
+def digests(intake: Intake) -> dict[str, str]:
+    """Of the files that a user brings, for the provenance."""
+    return {f"{name} file": f"sha256:{digest_file(path)}" for name, path in intake.brought.items()}
+
+
+PRECIOUS = ("mask", "marks.json", "annotations.json", TRACKS, POINTS, *CONTROLLERS, *NODES)
 """Work of people and of hours, which --force does not remove."""
 
 
