@@ -47,7 +47,8 @@ class GivenFrame(FirstFrame):
             raise InputError(f"{capture.folder}, nodes", "nodes of frame 0 must lie in front of the camera", "none")
         size = float(np.median(front[:, 2])) / camera.intrinsics[0, 0]
         filled = beneath_hands(labels, BENEATH / size)
-        return cls(camera, capture.description.up_sign, "given nodes", filled, np.zeros(labels.shape), size, front, apart)
+        none = np.zeros(labels.shape)
+        return cls(camera, capture.description.up_sign, "given nodes", filled, none, none, size, {}, front, apart)
 
     def _lifted(self, pixels: np.ndarray, share: float) -> np.ndarray:
         """On the surface (share 1), else half a distance of nodes beneath it.

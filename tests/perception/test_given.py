@@ -165,6 +165,8 @@ def test_a_pixel_between_nodes_is_as_deep_as_they_are():
         kind="given nodes",
         filled=np.zeros((1, 1), bool),
         heights=np.zeros((1, 1)),
+        lower=np.zeros((1, 1)),
+        facts={},
         pixel_size=0.004,
         front=facing(view, slope),
         apart=spacing(slope),
