@@ -448,6 +448,7 @@ class Material(Artifact):
     contact_friction: float = number("1", "as ground_friction, between nodes")
     contact_distance: float = number("m", "distance below which approaching nodes collide")
     mass: np.ndarray = array("N", np.float32, "kg", "mass of each node; empty: 1 kg each", optional=True)
+    hold: float = number("1", "part of its force that a stretched spring of a controller keeps; 0: hands only push", default=1.0)
 
     def check(self) -> None:
         if (self.mass <= 0).any():
@@ -460,6 +461,8 @@ class Material(Artifact):
             value = getattr(self, name)
             if not np.isfinite(value):
                 raise InputError(f"material.{name}", "must be finite", value)
+        if not 0 <= self.hold <= 1:
+            raise InputError("material.hold", "must lie in [0, 1]", self.hold)
         if self.drag < 0 or self.contact_distance <= 0:
             raise InputError("material", "drag >= 0 and contact_distance > 0 are required", (self.drag, self.contact_distance))
 

@@ -47,6 +47,10 @@ def _inverse_mass(values: Values, substep: float | torch.Tensor) -> torch.Tensor
     return values["drag"].detach().new_ones(1) if mass is None or not len(mass) else 1.0 / mass
 
 
+def _hold(values: Values, substep: float | torch.Tensor) -> torch.Tensor:
+    return values.get("hold", torch.ones_like(values["drag"]))
+
+
 def _clamped(name: str) -> Callable[[Values, float | torch.Tensor], torch.Tensor]:
     return lambda values, substep: values[name].clamp(*LIMITS[name])
 
@@ -62,6 +66,8 @@ PARAMETERS = {
     "contact_mu": Parameter("twin", _clamped("contact_friction")),
     # m. It only selects pairs.
     "distance": Parameter("twin", lambda values, substep: values["contact_distance"], trained=False),
+    # The part of its force that a controller's spring keeps where it is stretched.
+    "hold": Parameter("twin", _hold, trained=False),
     # 1/kg; [1] where all nodes have 1 kg. Masses are not trained.
     "inverse_mass": Parameter("node", _inverse_mass, trained=False),
 }

@@ -32,6 +32,8 @@ class Scene:
     simulation: Simulation
     mass: np.ndarray | float = 1.0
     """Of each node [N], or of all, kg."""
+    hold: float = 1.0
+    """Part of its force that a controller's spring keeps where it is stretched."""
 
     @classmethod
     def of(cls, twin: Twin) -> Scene:
@@ -49,6 +51,7 @@ class Scene:
             contact_distance=m.contact_distance,
             simulation=twin.simulation,
             mass=m.mass.astype(np.float64) if len(m.mass) else 1.0,
+            hold=m.hold,
         )
 
 
@@ -135,13 +138,16 @@ def substep(
 
 
 def spring_forces(scene: Scene, x: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Force [S, 3] on the first end of each spring: (Y (l / l0 - 1) + gamma (v_j - v_i) . d) d."""
+    """Force [S, 3] on the first end of each spring: (Y (l / l0 - 1) + gamma (v_j - v_i) . d) d, of stretched controllers' springs
+    the part `hold`."""
     i, j = scene.springs[:, 0], scene.springs[:, 1]
     offset = x[j] - x[i]
     length = np.linalg.norm(offset, axis=1)
     d = offset / np.maximum(length, MIN_LENGTH)[:, None]
     closing = np.einsum("ek,ek->e", v[j] - v[i], d)
     magnitude = scene.stiffness * (length / scene.rest_lengths - 1.0) + scene.dashpot * closing
+    led = (scene.springs >= scene.nodes).any(axis=1)
+    magnitude = np.where(led & (length > scene.rest_lengths), scene.hold * magnitude, magnitude)
     forces: np.ndarray = magnitude[:, None] * d
     return forces
 

@@ -4,6 +4,8 @@ With d = (x_j - x_i) / l, l = |x_j - x_i|, strain s = l / l0 - 1 and closing spe
 
     f_e = (Y s + gamma w) d        to node i, and -f_e to node j.
 
+A controller's spring that is stretched (s > 0) keeps the part `hold` of its force: 1 where hands hold, 0 where they only push.
+
 `allocate` lists the springs twice: as rows, each spring once at its lower end, for one thread that goes through all nodes in turn;
 and as links, each spring at both ends, for a thread per node that shares nothing with others. A node's sum goes through its
 partners in ascending order both ways, so both give the same numbers.
@@ -80,13 +82,37 @@ def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
         return adj_offset, scaled(offset, drift), scaled(wp.matrix_from_rows(strain, length, wd), cd)
 
     @wp.func
+    def kept(offset: Vector, p: Vector, hold: Number) -> Number:
+        """The part of its force that a controller's spring keeps."""
+        ratio = wp.cw_mul(root(dot(offset, offset)), p[1])
+        part = Number()
+        for q in range(width):
+            part[q] = wp.where(ratio[q] > real(1.0), hold[q], real(1.0))
+        return part
+
+    @wp.func
+    def weakened(p: Vector, part: Number) -> Vector:
+        return wp.matrix_from_rows(wp.cw_mul(p[0], part), p[1], wp.cw_mul(p[2], part))
+
+    @wp.func
     def pull(model: Model, state: State, slot: int, e: int, j: int, g: int, x: Vector, v: Vector) -> Vector:
         """The force of spring e on an end at x with velocity v, from its other end j."""
-        return force(state.x[slot, j, g] - x, state.v[slot, j, g] - v, model.springs[e, g])
+        offset = state.x[slot, j, g] - x
+        p = model.springs[e, g]
+        if j >= model.nodes:
+            p = weakened(p, kept(offset, p, model.hold[g]))
+        return force(offset, state.v[slot, j, g] - v, p)
 
     @wp.func
     def pull_adjoint(model: Model, state: State, slot: int, e: int, j: int, g: int, x: Vector, v: Vector, c: Vector):
-        return force_adjoint(state.x[slot, j, g] - x, state.v[slot, j, g] - v, model.springs[e, g], c)
+        offset = state.x[slot, j, g] - x
+        relative = state.v[slot, j, g] - v
+        p = model.springs[e, g]
+        if j >= model.nodes:
+            part = kept(offset, p, model.hold[g])
+            adj_offset, adj_relative, adj_p = force_adjoint(offset, relative, weakened(p, part), c)
+            return adj_offset, adj_relative, scaled(adj_p, part)
+        return force_adjoint(offset, relative, p, c)
 
     @wp.func
     def add_row(model: Model, state: State, slot: int, i: int, g: int):

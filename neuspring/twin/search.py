@@ -1,8 +1,10 @@
 """Zero-order stage: CMA-ES over topology and homogeneous material (as in the released PhysTwin code), then a polish (polish.py).
 
-The best candidate wins. With `search.tied_rollouts` the first part of the budget searches the 12 variables of the uniform topology;
-then the regions are freed around the best candidate. A trace records every candidate. A killed search continues from it, and so
-does a finished one with a larger budget: CMA-ES is replayed with the recorded costs, the polish with the recorded products.
+The best candidate wins. With `search.hands: auto` the first generation is judged with hands that hold and with hands that push, and
+the way of its best candidate is kept. With `search.tied_rollouts` the first part of the budget searches the 12 variables of the
+uniform topology; then the regions are freed around the best candidate. A trace records every candidate. A killed search continues
+from it, and so does a finished one with a larger budget: CMA-ES is replayed with the recorded costs, the polish with the recorded
+products.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_atomically
 from neuspring.core.text import Progress
-from neuspring.twin.candidates import CMAES, PENALTY, UNSTABLE, Map, SearchProblem, candidate, evaluate
+from neuspring.twin.candidates import CMAES, OTHER_WAY, PENALTY, UNSTABLE, WAYS, Map, SearchProblem, candidate, evaluate
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.polish import POLISH, SLOPES, Polish, slope_rows
 
@@ -114,8 +116,10 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
 
     clock = time.perf_counter()
     rows, attempts, earlier = recorded_trace(record, key)
-    trace = [row for row in rows if row["stage"] == CMAES]
+    trace, other = ([row for row in rows if row["stage"] == stage] for stage in (CMAES, OTHER_WAY))
     saved = len(trace)
+    ways = WAYS[problem.search.hands]
+    problem = replace(problem, hold=ways[0])
     proposals = Proposals(problem, seed)
     loss = FrameLoss.of(problem.observations, problem.losses, problem.device, frozen_counts=problem.quirks.frozen_loss_denominators)
     budget = problem.search.cma_rollouts_of(len(problem.polished))
@@ -137,22 +141,27 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
                 print(f"{record}: does not replay on this machine; the search continues afresh from rollout {start}")
                 trace, saved = trace[:start], start
                 if not start:
-                    attempts, earlier = 1, 0.0
+                    other, attempts, earlier = [], 1, 0.0
+            if not start and len(ways) > 1:
+                if len(trace) < stop or len(other) < len(population):
+                    trace, other = _ways(problem, population, loss, ways, each)
+                budget -= len(other)
+                problem = replace(problem, hold=trace[0]["hold"])
             fresh = population[max(len(trace) - start, 0) :]
             if fresh:
-                trace += evaluate(problem, fresh, loss, len(trace), proposals.generation, each)
-            progress.update(len(trace), f"best cost {min(row['cost'] for row in trace):.3e}")
+                trace += evaluate(problem, fresh, loss, len(other) + len(trace), proposals.generation, each)
+            progress.update(len(other) + len(trace), f"best cost {min(row['cost'] for row in trace):.3e}")
             proposals.tell([row["cost"] for row in trace[start:stop]])
             start = stop
             if len(trace) > saved:
-                save(trace)
-        polished: list[dict[str, Any]] = []
-        recorded = [row for row in rows if row["stage"] != CMAES]
-        for polished in _polished(problem, trace[:budget], recorded, loss, proposals.generation, each):
+                save(other + trace)
+        done, polished = other + trace[:budget], list[dict[str, Any]]()
+        recorded = [row for row in rows if row["stage"] not in (CMAES, OTHER_WAY)]
+        for polished in _polished(problem, done, recorded, loss, proposals.generation, each):
             if len(polished) > len(recorded) or polished[-1] is not recorded[len(polished) - 1]:
-                save(trace + polished)
-            progress.update(budget + len(polished), "polish")
-    table = pd.DataFrame(trace[:budget] + polished)
+                save(other + trace + polished)
+            progress.update(len(done) + len(polished), "polish")
+    table = pd.DataFrame(done + polished)
     judged = table[table["stage"] != SLOPES]
     best = judged.iloc[int(judged["cost"].to_numpy().argmin())]
     if best["cost"] >= PENALTY:
@@ -164,6 +173,17 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
     if problem.quirks.integer_damping:
         values |= {name: float(int(values[name])) for name in ("drag", "dashpot")}
     return SearchResult(candidate(problem, values), values, float(best["cost"]), table, attempts, earlier)
+
+
+def _ways(
+    problem: SearchProblem, population: Sequence[np.ndarray], loss: FrameLoss, ways: Sequence[float], each: Map
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """The rows of the first generation in the way of its best candidate, and those in the other ways, which were judged first."""
+    judged = [evaluate(replace(problem, hold=hold), population, loss, 0, 0, each) for hold in ways]
+    best = min(judged, key=lambda rows: min(row["cost"] for row in rows))
+    other = [row | {"stage": OTHER_WAY} for rows in judged if rows is not best for row in rows]
+    numbered = [row | {"rollout": number} for number, row in enumerate(other + best)]
+    return numbered[len(other) :], numbered[: len(other)]
 
 
 def _polished(

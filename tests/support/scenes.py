@@ -34,6 +34,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "self-collision": {"self_collision": True},
     "all": {"self_collision": True, "up": "-z", "controller_velocity": True},
     "masses": {"self_collision": True, "mass": MASSES},
+    "pushes": {"hold": 0.3},
 }
 """Options of `random_scene` that together reach every term."""
 SCALARS = ("drag", "ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction", "contact_distance")
@@ -53,6 +54,7 @@ def scene(
     contact: tuple[float, float] = (0.7, 0.3),
     contact_distance: float = 0.02,
     mass: Any = 1.0,
+    hold: float = 1.0,
     on_ground: bool = False,
     **simulation: Any,
 ) -> Scene:
@@ -71,6 +73,7 @@ def scene(
         contact_distance=contact_distance,
         simulation=Simulation(**options),
         mass=mass,
+        hold=hold,
     )
 
 
@@ -87,6 +90,7 @@ def tensors(scene: Scene, device: str = "cpu", dtype: torch.dtype = torch.float6
         "contact_friction": scene.contact[1],
         "contact_distance": scene.contact_distance,
         "mass": np.atleast_1d(scene.mass),
+        "hold": scene.hold,
     }
     return {name: torch.tensor(np.array(value), dtype=dtype, device=device) for name, value in values.items()}
 
@@ -197,5 +201,5 @@ def twin_of(scene: Scene, x: np.ndarray, controllers: np.ndarray) -> Twin:
     )
     scalars = dict(zip(SCALARS, (scene.drag, *scene.ground, *scene.contact, scene.contact_distance), strict=True))
     mass = scene.mass if np.ndim(scene.mass) else ()
-    material = Material(stiffness=scene.stiffness, dashpot=scene.dashpot, mass=np.array(mass, float), **scalars)
+    material = Material(stiffness=scene.stiffness, dashpot=scene.dashpot, mass=np.array(mass, float), hold=scene.hold, **scalars)
     return Twin(topology=topology, material=material, simulation=scene.simulation)
