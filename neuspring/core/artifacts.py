@@ -397,6 +397,9 @@ class Topology(Artifact):
     rest_shape: np.ndarray = array(
         "R,3", np.float32, "m", "unloaded positions of nodes, then controllers; empty: frame 0 is the rest shape", optional=True
     )
+    pushes: np.ndarray = array(
+        "S", np.bool_, "1", "springs of controllers that act only while they are shorter than at rest; empty: none", omitted=True
+    )
     controller_rest: str = "rest_shape"
     """Where the springs of controllers have no force: in the rest shape, or in the first_frame, whatever the rest shape is."""
 
@@ -412,6 +415,8 @@ class Topology(Artifact):
             raise InputError("topology.springs", "object springs must come before controller springs")
         if (self.springs >= nodes).all(axis=1).any():
             raise InputError("topology.springs", "a spring may not join two controllers")
+        if self.pushes.size and (self.pushes & ~of_controller).any():
+            raise InputError("topology.pushes", "only springs of controllers may push alone", "an object spring")
         if self.controller_rest not in ("rest_shape", "first_frame"):
             raise InputError("topology.controller_rest", "must be 'rest_shape' or 'first_frame'", repr(self.controller_rest))
         short = np.flatnonzero(~(self.rest_lengths > 0))
@@ -448,7 +453,6 @@ class Material(Artifact):
     contact_friction: float = number("1", "as ground_friction, between nodes")
     contact_distance: float = number("m", "distance below which approaching nodes collide")
     mass: np.ndarray = array("N", np.float32, "kg", "mass of each node; empty: 1 kg each", optional=True)
-    hold: float = number("1", "part of its force that a stretched spring of a controller keeps; 0: hands only push", default=1.0)
 
     def check(self) -> None:
         if (self.mass <= 0).any():
@@ -461,8 +465,6 @@ class Material(Artifact):
             value = getattr(self, name)
             if not np.isfinite(value):
                 raise InputError(f"material.{name}", "must be finite", value)
-        if not 0 <= self.hold <= 1:
-            raise InputError("material.hold", "must lie in [0, 1]", self.hold)
         if self.drag < 0 or self.contact_distance <= 0:
             raise InputError("material", "drag >= 0 and contact_distance > 0 are required", (self.drag, self.contact_distance))
 

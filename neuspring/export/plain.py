@@ -66,7 +66,7 @@ the next. Nodes are where the step before left them.
 
 2. Spring (i, j): d = (x_j - x_i) / l, l = |x_j - x_i|; force on i: (stiffness (l / rest_length - 1) + dashpot (v_j - v_i) . d) d,
 its negative on j. An index of N or more is controller index - N. Its velocity is 0; if controller_velocity is true, that of its
-path.
+path. A spring with `pushes` has no force while l > rest_length.
 
 3. A controller whose `holds` is false in this frame or in the next has springs without force in it.
 

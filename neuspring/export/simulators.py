@@ -7,12 +7,15 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
+import numpy as np
+
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from neuspring.export import cable, plain
 from neuspring.export.cable import AXES, text
 from neuspring.export.source import Source
 from neuspring.physics.rod_nodes import radius_of
+from neuspring.twin.rollout import FAR
 
 SCRIPT = Path(__file__).with_name("newton_twin.py")
 MODEL = "twin.xml"
@@ -24,6 +27,9 @@ def write_newton(source: Source, frames: Sequence[int], output: Path) -> list[Pa
     if source.twin.rod is not None:
         rule = "Newton's model is of nodes and springs"
         raise InputError("--to newton", rule, f"{source.name}, whose twin is a rod", "Take --to mujoco, or a run with a lattice.")
+    if source.twin.topology.pushes.any():
+        rule = "Newton's springs pull as well as push"
+        raise InputError("--to newton", rule, f"{source.name}, whose hands only push", "Take --to mujoco or npz.")
     write_text(output / SCRIPT.name, SCRIPT.read_text(encoding="utf-8"))
     return [*plain.write(source, frames, output), output / SCRIPT.name]
 
@@ -45,8 +51,9 @@ def require_start(frames: Sequence[int]) -> None:
 def mjcf(source: Source) -> str:
     """Nodes as bodies on three slides, springs as spatial tendons, controllers as mocap bodies, with our time step.
 
-    A tendon's force is stiffness (l - springlength) + damping dl/dt, so it is our spring with stiffness / rest length. Slides damp
-    as our drag does. MuJoCo's ground is soft. Bodies and sites are node0, node1, ..., hand0, ..., tendons spring0, ...
+    A tendon's force is stiffness (l - springlength) + damping dl/dt, so it is our spring with stiffness / rest length. One that only
+    pushes has no stiffness beyond its rest length; its damping stays. Slides damp as our drag does. MuJoCo's ground is soft. Bodies
+    and sites are node0, node1, ..., hand0, ..., tendons spring0, ...
 
     Of a rod, nodes are sites of a cable (cable.py), and the time step is `cable.STEP` at most.
     """
@@ -82,10 +89,13 @@ def mjcf(source: Source) -> str:
         ET.SubElement(body, "site", name=f"hand{index}", size=text(radius), rgba="1 0.6 0.1 1")
     tendons = ET.SubElement(root, "tendon") if len(topology.springs) else root
     names = [f"node{index}" for index in range(len(topology.nodes))] + [f"hand{c}" for c in range(len(topology.controllers))]
-    columns = (topology.springs, material.stiffness, topology.rest_lengths, material.dashpot)
-    for index, (ends, stiffness, length, dashpot) in enumerate(zip(*columns, strict=True)):
+    pushes = topology.pushes if topology.pushes.size else np.zeros(len(topology.springs), bool)
+    columns = (topology.springs, material.stiffness, topology.rest_lengths, material.dashpot, pushes)
+    for index, (ends, stiffness, length, dashpot, push) in enumerate(zip(*columns, strict=True)):
         force = text(float(stiffness) / float(length))
-        law: dict[str, Any] = {"stiffness": force, "damping": text(dashpot), "springlength": text(length)}
+        # Between two lengths a tendon has no force.
+        free = text(length, FAR) if push else text(length)
+        law: dict[str, Any] = {"stiffness": force, "damping": text(dashpot), "springlength": free}
         tendon = ET.SubElement(tendons, "spatial", name=f"spring{index}", width=text(radius / 5), **law)
         for end in ends:
             ET.SubElement(tendon, "site", site=names[end])

@@ -6,7 +6,7 @@ At the frame in which a controller at x_c begins to hold, spring (c, n) with sti
 
 with x_n where the simulated node is then. So the springs have no force at that moment, and Y' / l0' = Y / l0: force per length, and
 with it the substep that was found stable, stay. Both are functions of the state of that frame, and of the parameters: gradients go
-through them, exactly.
+through them, exactly. Springs that only push keep their lengths.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Grips:
         if lengths is None:
             return packed
         stiffness, inverse, dashpot = packed[..., self.springs, :].unbind(dim=-1)
-        new = lengths > 0
+        new = (lengths > 0) & (inverse > 0)
         safe = torch.where(new, lengths, 1.0)
         own = [torch.where(new, stiffness * inverse * safe, stiffness), torch.where(new, 1.0 / safe, inverse), dashpot]
         return packed.index_copy(-2, self.springs, torch.stack(own, dim=-1))

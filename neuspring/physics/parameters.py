@@ -15,7 +15,7 @@ import torch
 from neuspring.core.artifacts import Twin
 
 Values = Mapping[str, torch.Tensor]
-"""Fields of `Material` by name, and rest_lengths [S], m."""
+"""Fields of `Material` by name, rest_lengths [S], m, and pushes [S]."""
 Parameters = dict[str, torch.Tensor]
 """What `pack` makes: a tensor per name of `PARAMETERS`. Several twins have a leading axis [B]."""
 LIMITS = {
@@ -38,8 +38,11 @@ class Parameter(NamedTuple):
 
 
 def _springs(values: Values, substep: float | torch.Tensor) -> torch.Tensor:
-    stiffness = values["stiffness"]
-    return torch.stack([stiffness, 1.0 / values["rest_lengths"], values["dashpot"].expand_as(stiffness)], dim=-1)
+    stiffness, inverse = values["stiffness"], 1.0 / values["rest_lengths"]
+    pushes = values.get("pushes")
+    if pushes is not None and len(pushes):
+        inverse = torch.where(pushes.bool(), -inverse, inverse)
+    return torch.stack([stiffness, inverse, values["dashpot"].expand_as(stiffness)], dim=-1)
 
 
 def _inverse_mass(values: Values, substep: float | torch.Tensor) -> torch.Tensor:
@@ -47,16 +50,13 @@ def _inverse_mass(values: Values, substep: float | torch.Tensor) -> torch.Tensor
     return values["drag"].detach().new_ones(1) if mass is None or not len(mass) else 1.0 / mass
 
 
-def _hold(values: Values, substep: float | torch.Tensor) -> torch.Tensor:
-    return values.get("hold", torch.ones_like(values["drag"]))
-
-
 def _clamped(name: str) -> Callable[[Values, float | torch.Tensor], torch.Tensor]:
     return lambda values, substep: values[name].clamp(*LIMITS[name])
 
 
 PARAMETERS = {
-    # Stiffness Y [N], 1 / rest length [1/m], dashpot [N s/m]. A spring with neither stiffness nor dashpot is absent.
+    # Stiffness Y [N], 1 / rest length [1/m], dashpot [N s/m]. A spring with neither stiffness nor dashpot is absent; one whose
+    # 1 / rest length is negative only pushes.
     "springs": Parameter("spring", _springs),
     # The factor of velocities that drag leaves in a substep.
     "decay": Parameter("twin", lambda values, substep: torch.exp(-substep * values["drag"])),
@@ -66,8 +66,6 @@ PARAMETERS = {
     "contact_mu": Parameter("twin", _clamped("contact_friction")),
     # m. It only selects pairs.
     "distance": Parameter("twin", lambda values, substep: values["contact_distance"], trained=False),
-    # The part of its force that a controller's spring keeps where it is stretched.
-    "hold": Parameter("twin", _hold, trained=False),
     # 1/kg; [1] where all nodes have 1 kg. Masses are not trained.
     "inverse_mass": Parameter("node", _inverse_mass, trained=False),
 }
@@ -76,8 +74,8 @@ PARAMETERS = {
 def pack(*, substep: float | torch.Tensor, **values: torch.Tensor) -> Parameters:
     """Pack physical parameters, differentiably, for a substep in s.
 
-    `values` are the fields of `Material`, of which those with a default may be left out, and rest_lengths [S], m; dashpot may be
-    one number for all springs.
+    `values` are the fields of `Material`, of which those with a default may be left out, rest_lengths [S], m, and pushes [S] where
+    some only push; dashpot may be one number for all springs.
     """
     return {name: parameter.pack(values, substep) for name, parameter in PARAMETERS.items()}
 
@@ -89,5 +87,6 @@ def packed(twin: Twin, device: str = "cpu", dtype: torch.dtype = torch.float32) 
 
 def twin_tensors(twin: Twin, device: str, dtype: torch.dtype = torch.float32) -> dict[str, torch.Tensor]:
     """A twin's physical parameters as tensors, with the keyword names of `pack`."""
-    values = {f.name: getattr(twin.material, f.name) for f in fields(twin.material)} | {"rest_lengths": twin.topology.rest_lengths}
+    values = {f.name: getattr(twin.material, f.name) for f in fields(twin.material)}
+    values |= {"rest_lengths": twin.topology.rest_lengths, "pushes": twin.topology.pushes}
     return {name: torch.tensor(value, dtype=dtype, device=device) for name, value in values.items()}

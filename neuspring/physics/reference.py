@@ -32,8 +32,8 @@ class Scene:
     simulation: Simulation
     mass: np.ndarray | float = 1.0
     """Of each node [N], or of all, kg."""
-    hold: float = 1.0
-    """Part of its force that a controller's spring keeps where it is stretched."""
+    pushes: np.ndarray | bool = False
+    """Whether each spring [S], or every one, acts only while it is shorter than at rest."""
 
     @classmethod
     def of(cls, twin: Twin) -> Scene:
@@ -51,7 +51,7 @@ class Scene:
             contact_distance=m.contact_distance,
             simulation=twin.simulation,
             mass=m.mass.astype(np.float64) if len(m.mass) else 1.0,
-            hold=m.hold,
+            pushes=t.pushes if len(t.pushes) else False,
         )
 
 
@@ -84,7 +84,7 @@ def holding(scene: Scene, holds: np.ndarray) -> Scene:
 
 def gripped(scene: Scene, x: np.ndarray, hands: np.ndarray, begin: np.ndarray) -> Scene:
     """The scene after controllers with `begin` [C] took hold: l0' = |x_c - x_n|, and Y' / l0' = Y / l0."""
-    taken = np.concatenate([np.zeros(scene.nodes, bool), begin])[scene.springs].any(axis=1)
+    taken = np.concatenate([np.zeros(scene.nodes, bool), begin])[scene.springs].any(axis=1) & ~np.asarray(scene.pushes)
     points = np.concatenate([x, hands])
     apart = np.linalg.norm(points[scene.springs[:, 1]] - points[scene.springs[:, 0]], axis=1)
     lengths = np.where(taken, np.maximum(apart, MIN_LENGTH), scene.rest_lengths)
@@ -138,16 +138,15 @@ def substep(
 
 
 def spring_forces(scene: Scene, x: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Force [S, 3] on the first end of each spring: (Y (l / l0 - 1) + gamma (v_j - v_i) . d) d, of stretched controllers' springs
-    the part `hold`."""
+    """Force [S, 3] on the first end of each spring: (Y (l / l0 - 1) + gamma (v_j - v_i) . d) d; none where one that only pushes is
+    longer than at rest."""
     i, j = scene.springs[:, 0], scene.springs[:, 1]
     offset = x[j] - x[i]
     length = np.linalg.norm(offset, axis=1)
     d = offset / np.maximum(length, MIN_LENGTH)[:, None]
     closing = np.einsum("ek,ek->e", v[j] - v[i], d)
     magnitude = scene.stiffness * (length / scene.rest_lengths - 1.0) + scene.dashpot * closing
-    led = (scene.springs >= scene.nodes).any(axis=1)
-    magnitude = np.where(led & (length > scene.rest_lengths), scene.hold * magnitude, magnitude)
+    magnitude = np.where(scene.pushes & (length > scene.rest_lengths), 0.0, magnitude)
     forces: np.ndarray = magnitude[:, None] * d
     return forces
 

@@ -4,7 +4,7 @@ With d = (x_j - x_i) / l, l = |x_j - x_i|, strain s = l / l0 - 1 and closing spe
 
     f_e = (Y s + gamma w) d        to node i, and -f_e to node j.
 
-A controller's spring that is stretched (s > 0) keeps the part `hold` of its force: 1 where hands hold, 0 where they only push.
+A controller's spring that only pushes has no force while it is longer than at rest. The sign of its 1 / l0 is negative.
 
 `allocate` lists the springs twice: as rows, each spring once at its lower end, for one thread that goes through all nodes in turn;
 and as links, each spring at both ends, for a thread per node that shares nothing with others. A node's sum goes through its
@@ -82,17 +82,26 @@ def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
         return adj_offset, scaled(offset, drift), scaled(wp.matrix_from_rows(strain, length, wd), cd)
 
     @wp.func
-    def kept(offset: Vector, p: Vector, hold: Number) -> Number:
-        """The part of its force that a controller's spring keeps."""
-        ratio = wp.cw_mul(root(dot(offset, offset)), p[1])
-        part = Number()
+    def sides(p: Vector) -> Number:
+        """-1 for a spring that only pushes, 1 for others."""
+        side = Number()
         for q in range(width):
-            part[q] = wp.where(ratio[q] > real(1.0), hold[q], real(1.0))
-        return part
+            side[q] = wp.where(p[1, q] < real(0.0), real(-1.0), real(1.0))
+        return side
 
     @wp.func
-    def weakened(p: Vector, part: Number) -> Vector:
-        return wp.matrix_from_rows(wp.cw_mul(p[0], part), p[1], wp.cw_mul(p[2], part))
+    def acts(offset: Vector, p: Vector) -> Number:
+        """0 for a spring that only pushes and is longer than at rest, 1 for others."""
+        ratio = wp.cw_mul(root(dot(offset, offset)), p[1])
+        act = Number()
+        for q in range(width):
+            act[q] = wp.where(ratio[q] < real(-1.0), real(0.0), real(1.0))
+        return act
+
+    @wp.func
+    def acting(p: Vector, act: Number, side: Number) -> Vector:
+        """The parameters with what does not act taken out."""
+        return wp.matrix_from_rows(wp.cw_mul(p[0], act), wp.cw_mul(p[1], side), wp.cw_mul(p[2], act))
 
     @wp.func
     def pull(model: Model, state: State, slot: int, e: int, j: int, g: int, x: Vector, v: Vector) -> Vector:
@@ -100,7 +109,7 @@ def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
         offset = state.x[slot, j, g] - x
         p = model.springs[e, g]
         if j >= model.nodes:
-            p = weakened(p, kept(offset, p, model.hold[g]))
+            p = acting(p, acts(offset, p), sides(p))
         return force(offset, state.v[slot, j, g] - v, p)
 
     @wp.func
@@ -109,9 +118,10 @@ def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
         relative = state.v[slot, j, g] - v
         p = model.springs[e, g]
         if j >= model.nodes:
-            part = kept(offset, p, model.hold[g])
-            adj_offset, adj_relative, adj_p = force_adjoint(offset, relative, weakened(p, part), c)
-            return adj_offset, adj_relative, scaled(adj_p, part)
+            act = acts(offset, p)
+            side = sides(p)
+            adj_offset, adj_relative, adj_p = force_adjoint(offset, relative, acting(p, act, side), c)
+            return adj_offset, adj_relative, acting(adj_p, act, wp.cw_mul(act, side))
         return force_adjoint(offset, relative, p, c)
 
     @wp.func

@@ -82,7 +82,7 @@ def search(
     write_history(costs.index, {"cost": costs, "best_cost": best}, files["history"])
     facts: dict[str, Any] = {
         **result.values,
-        "hands": "hold" if result.twin.material.hold else "push",
+        "hands": "push" if result.twin.topology.pushes.any() else "hold",
         "cost": result.cost,
         "cost_before_polish": float(costs[result.trace["stage"] == CMAES].min()),
         "spacing": problem.spacing,

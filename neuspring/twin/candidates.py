@@ -38,8 +38,8 @@ UNSTABLE = "unstable"
 """How the reasons of candidates begin that a fixed number of substeps cannot integrate."""
 CMAES, OTHER_WAY = "cmaes", "hands"
 """Stages of candidates that CMA-ES proposes, and of its first generation in the other way of hands (`search.hands`)."""
-WAYS = {"hold": (1.0,), "push": (0.0,), "auto": (1.0, 0.0)}
-"""What `hold` of the material may be, by `search.hands`."""
+WAYS = {"hold": (False,), "push": (True,), "auto": (False, True)}
+"""Whether hands only push, in the ways that are judged, by `search.hands`."""
 Map = Callable[..., Iterable[Any]]
 """As the builtin `map`."""
 RELEASED_SUBSTEPS = 667
@@ -101,8 +101,8 @@ class SearchProblem:
     """
     leave_out: bool = False
     """Judge candidates by the pool alone: nothing after frame 0 of `observations` counts, neither for costs nor for slopes."""
-    hold: float = 1.0
-    """Of the material: 1 where hands hold, 0 where they only push. The search chooses it."""
+    push: bool = False
+    """Whether hands only push. The search chooses it."""
     labels: np.ndarray = field(init=False)
     """Region of each node [N]."""
     velocity: np.ndarray = field(init=False)
@@ -215,13 +215,12 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
     count = len(topology.springs)
     if count == 0:
         raise NumericalFailure("no node has a spring")
-    if not problem.hold:
+    if problem.push:
         # A hand that pushes acts from where it touches on, not from where it was in frame 0.
-        lengths = topology.rest_lengths.copy()
-        led = slice(topology.object_spring_count, None)
-        lengths[led] = np.minimum(lengths[led], values["contact_distance"])
-        topology = replace(topology, rest_lengths=lengths)
-    material = homogeneous(values | {"hold": problem.hold}, count)
+        led = np.arange(count) >= topology.object_spring_count
+        lengths = np.where(led, np.minimum(topology.rest_lengths, values["contact_distance"]), topology.rest_lengths)
+        topology = replace(topology, rest_lengths=lengths.astype(np.float32), pushes=led)
+    material = homogeneous(values, count)
     simulation = Simulation(
         frame_time=RELEASED_FRAME_TIME if problem.quirks.frame_time_667 else 1.0 / scenario.frame_rate,
         substeps=1,
@@ -314,7 +313,7 @@ def made(problem: SearchProblem, normalized: np.ndarray) -> tuple[dict[str, Any]
     """
     start = time.perf_counter()
     values = problem.decode(normalized)
-    row: dict[str, Any] = {"rollout": 0, "generation": 0, "stage": CMAES, "hold": problem.hold, "cost": PENALTY, "reason": ""}
+    row: dict[str, Any] = {"rollout": 0, "generation": 0, "stage": CMAES, "push": problem.push, "cost": PENALTY, "reason": ""}
     row |= {"springs": 0, "substeps": 0, "collision_overflow": 0, "seconds": 0.0}
     row |= values | {f"normalized.{name}": float(u) for name, u in zip(problem.variables, normalized, strict=True)}
     family: tuple[Twin, ...] = ()

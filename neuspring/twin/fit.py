@@ -225,7 +225,7 @@ class TwinFit:
         springs = packed["springs"].detach().double().cpu().numpy()
         if not np.isfinite(springs).all():
             raise NonFinite("a spring's stiffness, rest length or dashpot is not finite")
-        count = self._needed_substeps(springs[:, 0] * springs[:, 1], springs[:, 2])
+        count = self._needed_substeps(springs[:, 0] * np.abs(springs[:, 1]), springs[:, 2])
         if count <= self.twin.simulation.substeps:
             return packed
         self.use_substeps(count)

@@ -119,7 +119,7 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
     trace, other = ([row for row in rows if row["stage"] == stage] for stage in (CMAES, OTHER_WAY))
     saved = len(trace)
     ways = WAYS[problem.search.hands]
-    problem = replace(problem, hold=ways[0])
+    problem = replace(problem, push=ways[0])
     proposals = Proposals(problem, seed)
     loss = FrameLoss.of(problem.observations, problem.losses, problem.device, frozen_counts=problem.quirks.frozen_loss_denominators)
     budget = problem.search.cma_rollouts_of(len(problem.polished))
@@ -146,7 +146,7 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
                 if len(trace) < stop or len(other) < len(population):
                     trace, other = _ways(problem, population, loss, ways, each)
                 budget -= len(other)
-                problem = replace(problem, hold=trace[0]["hold"])
+                problem = replace(problem, push=bool(trace[0]["push"]))
             fresh = population[max(len(trace) - start, 0) :]
             if fresh:
                 trace += evaluate(problem, fresh, loss, len(other) + len(trace), proposals.generation, each)
@@ -176,10 +176,10 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
 
 
 def _ways(
-    problem: SearchProblem, population: Sequence[np.ndarray], loss: FrameLoss, ways: Sequence[float], each: Map
+    problem: SearchProblem, population: Sequence[np.ndarray], loss: FrameLoss, ways: Sequence[bool], each: Map
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """The rows of the first generation in the way of its best candidate, and those in the other ways, which were judged first."""
-    judged = [evaluate(replace(problem, hold=hold), population, loss, 0, 0, each) for hold in ways]
+    judged = [evaluate(replace(problem, push=push), population, loss, 0, 0, each) for push in ways]
     best = min(judged, key=lambda rows: min(row["cost"] for row in rows))
     other = [row | {"stage": OTHER_WAY} for rows in judged if rows is not best for row in rows]
     numbered = [row | {"rollout": number} for number, row in enumerate(other + best)]

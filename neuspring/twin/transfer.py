@@ -242,7 +242,10 @@ def _carried(twin: Twin, new: Topology, material: Material, laid: np.ndarray) ->
             found[name][there] *= before / after if after > 0 else 1.0
     found["strain"][found["strain"] == 0] = 1.0
     material = replace(material, stiffness=found["stiffness"], dashpot=found["dashpot"])
-    return replace(twin, topology=replace(new, rest_lengths=_without_force(new) * found["strain"]), material=material)
+    # Hands hold or push with all of their springs.
+    pushes = np.arange(len(new.springs)) >= new.object_spring_count if old.pushes.any() else old.pushes
+    lengths_of_rest = _without_force(new) * found["strain"]
+    return replace(twin, topology=replace(new, rest_lengths=lengths_of_rest, pushes=pushes), material=material)
 
 
 def _without_force(topology: Topology) -> np.ndarray:

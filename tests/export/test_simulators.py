@@ -69,6 +69,19 @@ def test_without_drag_and_ground_mujoco_swings_as_we_do(tmp_path):
     assert np.abs(source.positions - by_mujoco(source, tmp_path / "out")).max() < SWING
 
 
+def test_hands_that_only_push(tmp_path):
+    """The rope of frame 0 is stretched, and its hand moves away: MuJoCo lets it go as we do. Newton has no such springs."""
+    twin = exported.stretched(exported.rope(ground=False), 1.1)
+    led = np.arange(len(twin.topology.springs)) >= twin.topology.object_spring_count
+    dashpot = np.where(led, 0.0, twin.material.dashpot)
+    twin = replace(twin, topology=replace(twin.topology, pushes=led), material=replace(twin.material, drag=0.0, dashpot=dashpot))
+    source = read_source(exported.run_folder(tmp_path, twin, with_splats=False))
+    assert np.abs(source.positions - swinging(tmp_path / "held", {"drag": 0.0}, ground=False).positions).max() > 0.01
+    assert np.abs(source.positions - by_mujoco(source, tmp_path / "out")).max() < SWING
+    with pytest.raises(InputError, match="whose hands only push"):
+        simulators.write_newton(source, range(exported.FRAMES), tmp_path / "newton")
+
+
 def test_drag_in_mujoco_differs_by_the_time_step(tmp_path):
     each = [swinging(tmp_path / str(substeps), ground=False, substeps=substeps) for substeps in (60, 240)]
     coarse, fine = (np.abs(one.positions - by_mujoco(one, tmp_path / f"out{k}")).max() for k, one in enumerate(each))

@@ -106,16 +106,17 @@ def test_a_caught_body_falls_as_deep_as_its_energy_says():
 @pytest.mark.parametrize(("device", "threads"), WAYS)
 def test_a_hand_that_only_pushes_gives_its_momentum_once(device, threads):
     """A hand runs into a free node at 0.3 m/s: as with an elastic wall the node leaves at twice that, and nothing pulls it back."""
-    body = scene(1, [(0, 1)], [0.03], stiffness=[30.0], hold=0.0, frame_time=2e-3, substeps=20)
+    body = scene(1, [(0, 1)], [0.03], stiffness=[30.0], pushes=True, frame_time=2e-3, substeps=20)
     hands = np.array([-0.05, 0.0, 0.0]) + np.arange(160)[:, None, None] * np.array([6e-4, 0.0, 0.0])
     hands[120:] = hands[119] - np.arange(1, 41)[:, None, None] * np.array([6e-4, 0.0, 0.0])
-    xs, vs = run(body, np.zeros((1, 3)), np.zeros((1, 3)), waypoints(torch.tensor(hands)), device, threads)
+    _, vs = run(body, np.zeros((1, 3)), np.zeros((1, 3)), waypoints(torch.tensor(hands)), device, threads)
     first = int(np.argmax(vs[:, 0, 0] != 0))
     assert hands[first, 0, 0] == pytest.approx(-0.03, abs=6e-4)  # where the spring has its length
     assert not vs[:first].any()
     np.testing.assert_allclose(vs[-60:, 0, 0], 0.6, rtol=2e-3)
     # A hand that holds takes it back.
-    held = run(replace(body, hold=1.0), np.zeros((1, 3)), np.zeros((1, 3)), waypoints(torch.tensor(hands)), device, threads)
+    body = replace(body, pushes=~body.pushes)
+    held = run(body, np.zeros((1, 3)), np.zeros((1, 3)), waypoints(torch.tensor(hands)), device, threads)
     assert held[1][-60:, 0, 0].min() < 0
 
 

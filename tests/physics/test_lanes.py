@@ -141,7 +141,7 @@ def test_twins_have_graphs_of_their_own(dtype: torch.dtype, variant: str) -> Non
     ]
     got = together(union, dtype)
     for number, (one, own) in enumerate(zip(members, present, strict=True)):
-        names = ("springs", "stiffness", "rest_lengths", "dashpot")
+        names = ("springs", "stiffness", "rest_lengths", "dashpot", "pushes")
         body = replace(one.body, **{name: getattr(one.body, name)[own] for name in names})
         in_union = of(got, number)
         in_union["adjoint springs"] = in_union["adjoint springs"][own]
@@ -206,7 +206,8 @@ def test_order_and_direction_of_springs_do_not_matter(data: st.DataObject) -> No
     turned = np.array(data.draw(st.lists(st.booleans(), min_size=count, max_size=count)))
     springs = one.body.springs[order]
     springs = np.where(turned[:, None], springs[:, ::-1], springs)
-    other = replace(one.body, springs=springs, **{n: getattr(one.body, n)[order] for n in ("stiffness", "rest_lengths", "dashpot")})
+    names = ("stiffness", "rest_lengths", "dashpot", "pushes")
+    other = replace(one.body, springs=springs, **{name: getattr(one.body, name)[order] for name in names})
     wanted, got = alone(one, SINGLE), alone(one._replace(body=other), SINGLE)
     wanted["adjoint springs"] = wanted["adjoint springs"][order]
     assert_same(got, wanted)

@@ -34,7 +34,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "self-collision": {"self_collision": True},
     "all": {"self_collision": True, "up": "-z", "controller_velocity": True},
     "masses": {"self_collision": True, "mass": MASSES},
-    "pushes": {"hold": 0.3},
+    "pushes": {"pushes": True},
 }
 """Options of `random_scene` that together reach every term."""
 SCALARS = ("drag", "ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction", "contact_distance")
@@ -54,7 +54,7 @@ def scene(
     contact: tuple[float, float] = (0.7, 0.3),
     contact_distance: float = 0.02,
     mass: Any = 1.0,
-    hold: float = 1.0,
+    pushes: bool = False,
     on_ground: bool = False,
     **simulation: Any,
 ) -> Scene:
@@ -73,7 +73,7 @@ def scene(
         contact_distance=contact_distance,
         simulation=Simulation(**options),
         mass=mass,
-        hold=hold,
+        pushes=(pairs >= nodes).any(axis=1) & pushes,
     )
 
 
@@ -90,7 +90,7 @@ def tensors(scene: Scene, device: str = "cpu", dtype: torch.dtype = torch.float6
         "contact_friction": scene.contact[1],
         "contact_distance": scene.contact_distance,
         "mass": np.atleast_1d(scene.mass),
-        "hold": scene.hold,
+        "pushes": np.asarray(scene.pushes),
     }
     return {name: torch.tensor(np.array(value), dtype=dtype, device=device) for name, value in values.items()}
 
@@ -199,7 +199,9 @@ def twin_of(scene: Scene, x: np.ndarray, controllers: np.ndarray) -> Twin:
     topology = Topology(
         nodes=x, controllers=controllers, springs=scene.springs, rest_lengths=scene.rest_lengths, labels=np.zeros(len(x), np.int32)
     )
+    if np.any(scene.pushes):
+        topology = replace(topology, pushes=np.asarray(scene.pushes))
     scalars = dict(zip(SCALARS, (scene.drag, *scene.ground, *scene.contact, scene.contact_distance), strict=True))
     mass = scene.mass if np.ndim(scene.mass) else ()
-    material = Material(stiffness=scene.stiffness, dashpot=scene.dashpot, mass=np.array(mass, float), hold=scene.hold, **scalars)
+    material = Material(stiffness=scene.stiffness, dashpot=scene.dashpot, mass=np.array(mass, float), **scalars)
     return Twin(topology=topology, material=material, simulation=scene.simulation)

@@ -320,6 +320,46 @@ def test_a_larger_budget_continues_as_if_it_had_been_there_from_the_start(tmp_pa
     assert_same_trace(first.trace, whole.trace[:15])
 
 
+def pushed(hands: str = "auto", rollouts: int = 26) -> SearchProblem:
+    """A lump on the table that two points push along and leave where it is, and which then go back."""
+    frames, corners = 8, np.array([[x, y, z] for x in (0.0, 0.03) for y in (0.0, 0.03) for z in (0.0, 0.03)])
+    way = np.concatenate([np.linspace(0, 0.06, 5), [0.03, 0.0, -0.03]])
+    lump = np.tile(corners, (frames, 1, 1))
+    lump[:, :, 0] += np.maximum.accumulate(np.maximum(way - 0.01, 0.0))[:, None]
+    points = np.array([[-0.03, 0.005, 0.015], [-0.03, 0.025, 0.015]]) + way[:, None, None] * [1.0, 0.0, 0.0]
+    seen = scenarios.observations(frames=frames, train_end=frames, object_points=lump, controller_points=points)
+    return small.search_problem(seen, search=config.Search(hands=hands, rollouts=rollouts, lengths="spacing"))
+
+
+def test_the_first_generation_says_whether_hands_hold_or_push():
+    result = search(pushed(), seed=0)
+    trace = result.trace
+    assert trace["rollout"].tolist() == list(range(26))
+    assert trace["stage"].tolist()[:22] == ["hands"] * 11 + ["cmaes"] * 11
+    variables = [name for name in trace.columns if name.startswith("normalized.")]
+    np.testing.assert_array_equal(trace.loc[:10, variables], trace.loc[11:21, variables])
+    assert (trace["stage"] == "hands").to_numpy().tolist() == (~trace["push"]).tolist()
+    assert trace["cost"][11:22].min() < trace["cost"][:11].min()
+    # From the first touch on, and nothing pulls the lump back.
+    topology = result.twin.topology
+    led = np.arange(len(topology.springs)) >= topology.object_spring_count
+    np.testing.assert_array_equal(topology.pushes, led)
+    assert topology.rest_lengths[led].max() <= result.values["contact_distance"] + 1e-9
+    assert search(pushed("hold"), seed=0).cost > 2 * result.cost
+
+
+def test_hands_that_hold_are_kept(tmp_path, monkeypatch):
+    problem = small.search_problem()
+    problem = replace(problem, search=replace(problem.search, hands="auto", rollouts=33))
+    whole, record = search(problem, seed=1), tmp_path / "trace.parquet"
+    assert not whole.twin.topology.pushes.any()
+    assert whole.trace["push"].tolist() == [True] * 11 + [False] * 22
+    die_after(27, problem, 1, record, monkeypatch)
+    continued = search(problem, seed=1, record=record, key="k")
+    assert_same_trace(continued.trace, whole.trace)
+    assert continued.trace["seconds"].tolist()[:22] == pd.read_parquet(record)["seconds"].tolist()[:22]
+
+
 def tied(rollouts: int, clusters: int = 3, tied_rollouts: int = 15) -> SearchProblem:
     """A search whose regions share their values in its first rollouts; 15 end in the middle of a generation of 11."""
     problem = small.search_problem(clusters=clusters)
