@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+from neuspring.data.capture import OBJECT, Writer
+from neuspring.perception.findings import look_at_masks, mask_facts
+from tests.support.captures import describe, entry
 from tests.support.real import FOOTAGE
-from workflow.scripts.footage import Errors, Points, carried, clicked, film, overlaps, stepwise, truths
+from workflow.scripts.footage import Errors, Points, carried, clicked, film, newly_covered, overlaps, stepwise, truths
 
 pytestmark = pytest.mark.skipif(not FOOTAGE.is_dir(), reason="the footage is not part of the repository")
 MASKS = {
@@ -46,6 +49,30 @@ def test_what_is_counted():
     assert (found.median, found.most) == pytest.approx((5.0, 5.0))
     assert found.lost == pytest.approx(own.sure[0, 1:].sum() / own.sure[:, 1:].sum())
     assert found.hidden == "2 of 2"
+
+
+def test_drawn_masks_keep_what_is_newly_covered_and_masks_of_frame_0_do_not(tmp_path):
+    """The check needs no truth; here it is known. Eight times the last frame, because a check of one frame says nothing."""
+    case = "single_lift_rope"
+    colors, drawn = film(FOOTAGE, case), truths(FOOTAGE, case)
+    last, count = max(drawn), 9
+    height, width = drawn[0].shape
+    writer = Writer(tmp_path, describe(frame_count=count, cameras=(entry(width=width, height=height),), depth="none"))
+    for frame in range(count):
+        writer.frame("0", frame, colors[last if frame else 0], None)
+    capture, labels = writer.finish(), np.stack([drawn[0], *[drawn[last]] * (count - 1)])
+    assert mask_facts(capture, "0", labels)["newly_kept"] > 0.8
+    lost = np.where((labels == OBJECT) & (labels[0] != OBJECT), 0, labels)
+    facts = mask_facts(capture, "0", lost)
+    assert facts["newly_kept"] < 0.1
+    assert "newly covered parts lost" in {one.name for one in look_at_masks(capture, "0", lost, facts)}
+
+
+def test_newly_covered_pixels_are_those_beyond_frame_0():
+    truth = {0: np.zeros((4, 6), np.uint8), 5: np.zeros((4, 6), np.uint8)}
+    truth[0][:, :2], truth[5][:, 1:5] = OBJECT, OBJECT
+    labels = np.stack([truth[0]] * 5 + [np.where(np.arange(6) < 4, truth[5], 0)])
+    assert newly_covered(labels, truth) == [pytest.approx(2 / 3)]
 
 
 @pytest.mark.slow

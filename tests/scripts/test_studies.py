@@ -19,11 +19,25 @@ from tests.support import small
 from tests.support.colored import paint
 from tests.support.findings import of_level
 from tests.support.real import FOOTAGE
-from workflow.scripts.beside_data import PHYSTWIN, Published, Run, fitted_shift, iou_without_hands, shifted
+from workflow.scripts.beside_data import PHYSTWIN, Published, Run, corrected, fitted_shift, iou_without_hands, shifted
+from workflow.scripts.beside_hands import COLUMNS as HAND_COLUMNS
+from workflow.scripts.beside_hands import grips, hand_lines
+from workflow.scripts.beside_hands import hand_errors as given_errors
 from workflow.scripts.beside_phystwin import Scores, labeled_rows
-from workflow.scripts.beside_tables import COLUMNS, GROUPS, cell, costs, differences, mean_and_spread, minutes_by_job
+from workflow.scripts.beside_tables import (
+    COLUMNS,
+    GROUPS,
+    before_after,
+    cell,
+    costs,
+    differences,
+    mean_and_spread,
+    minutes_by_job,
+    shared,
+    tables,
+)
 from workflow.scripts.footage import film
-from workflow.scripts.footage_captures import write_capture
+from workflow.scripts.footage_captures import CARRYING, write_capture
 from workflow.scripts.one_color_camera import hand_errors, one_camera
 
 
@@ -163,12 +177,75 @@ def test_cost_is_of_the_last_good_attempt_and_follows_the_inputs_of_records(tmp_
     assert minutes_by_job(tmp_path)["search/s/uniform/0"] == 3
     assert "fit/s/n/0" not in minutes_by_job(tmp_path)
     found = costs(tmp_path, [Run(tmp_path / "s" / "m" / "0")]).set_index("group")["minutes"].to_dict()
-    assert found == dict(zip(GROUPS, (1.0, 3.0, 5.0, 5.5, 0.5), strict=True))
-    # Of a launch of several fits, the fit's record has its share.
-    fit = record("o/0/fit", {"seconds": 480.0, "facts": {"epochs_together": 20}}, search=search)
-    record("o/0/rollout", fit=fit)
-    job("fit/s/o/0", ("ok", 0.1))
-    assert costs(tmp_path, [Run(tmp_path / "s" / "o" / "0")]).set_index("group")["minutes"]["fit"] == 8
+    assert np.isnan(found.pop("masks"))
+    assert found == dict(zip(list(GROUPS)[1:], (1.0, 3.0, 5.0, 5.5, 0.5), strict=True))
+    run = Run(tmp_path / "s" / "m" / "0")
+    assert costs(tmp_path, [run], {run.scenario: 90.0}).set_index("group")["minutes"]["masks"] == 1.5
+
+
+@pytest.mark.parametrize(("more", "minutes"), [({"earlier_processor_seconds": 120.0}, 2.1), ({}, np.nan)])
+def test_a_fit_that_ran_together_costs_its_share_of_processor_time(tmp_path, more, minutes):
+    """Never wall time: a machine on which other work runs would count that work."""
+    facts = {"epochs_together": 20, **more}
+    write(tmp_path / "s" / "o" / "0" / "fit.json", {"stage": "fit", "status": "ok", "seconds": 480.0, "facts": facts})
+    attempt = {"started": "2026-01-01T00:00:00+00:00", "outcome": "ok", "cpu_seconds": 6.0}
+    write(tmp_path / "jobs" / "fit" / "s" / "o" / "0.json", {"rule": "fit", "name": "fit/s/o/0", "log": "x", "attempts": [attempt]})
+    found = costs(tmp_path, [Run(tmp_path / "s" / "o" / "0")]).set_index("group")["minutes"]["fit"]
+    assert found == pytest.approx(minutes, nan_ok=True)
+
+
+def test_means_compare_the_same_films_only():
+    rows = [(case, "m", 0, "future", "iou", value) for case, value in zip("abc", (0.5, 0.6, 0.1), strict=True)]
+    rows += [(case, PHYSTWIN, 0, "future", "iou", value) for case, value in zip("ab", (0.7, 0.9), strict=True)]
+    assert sorted(set(shared(table(*rows))["case"])) == ["a", "b"]
+    lines = tables(table(*rows), [])
+    assert "Means leave out c: not every method has them." in lines
+    cells = {line.split("|")[1].strip(): line.split("|")[2:] for line in lines if line.startswith(("| m  ", "| PhysTwin"))}
+    assert [cells["m"][k].strip() for k in (0, 4)] == ["2", "0.550"]
+    assert [cells[PHYSTWIN][k].strip() for k in (0, 4)] == ["2", "0.800"]
+
+
+def test_before_and_after_compare_the_films_and_seeds_of_both():
+    def scores(values: dict[tuple[str, int], float]) -> pd.DataFrame:
+        return table(*((case, "m", seed, "future", "iou", value) for (case, seed), value in values.items()))
+
+    before = scores({("a", 0): 0.5, ("b", 0): 0.6, ("b", 1): 0.9, ("c", 0): 0.1})
+    after = scores({("a", 0): 0.6, ("b", 0): 0.8, ("d", 0): 0.9})
+    (line,) = [line for line in before_after(before, after) if "Future IoU" in line]
+    cells = [cell.strip() for cell in line.split("|")[1:-1]]
+    assert cells[1:5] == ["m", "0.550", "0.700", "+0.150"]
+    assert cells[-1] == "2"
+    assert before_after(before, scores({("d", 0): 0.9})) == []
+
+
+def test_the_committed_marks_lie_in_frame_0_alone():
+    """Else a film stands in a table of its own."""
+    assert corrected() == []
+
+
+def test_a_given_grip_is_the_mean_of_its_points_near_the_object():
+    nodes, centers = np.zeros((1, 3)), np.array([[0.0, 0.0, 0.01], [1.0, 0.0, 0.0]])
+    far = [[0.0, 0.0, 0.2], [0.0, 0.0, 0.3]]
+    near = [[0.0, 0.0, 0.0], [0.0, 0.02, 0.0], [0.02, 0.0, 0.0], [0.02, 0.02, 0.0]]
+    other = [[1.0, 0.0, 0.0], [1.0, 0.0, 0.3], [1.0, 0.3, 0.0], [1.0, 0.6, 0.0]]
+    points = np.array([*far, *near, *other])
+    found = grips(centers, np.stack([points, points + np.array([0.0, 0.0, 0.1])]), nodes)
+    np.testing.assert_allclose(found[0], [[0.01, 0.01, 0.0], [1.0, 0.1, 0.1]])
+    np.testing.assert_allclose(found[1] - found[0], [[0.0, 0.0, 0.1]] * 2)
+    with pytest.raises(ValueError, match="hand 1: no given point"):
+        grips(np.array([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]]), points[None], nodes)
+
+
+def test_hands_that_are_shifted_are_off_and_their_way_is_not():
+    owner, given = np.array([0, 0, 0]), np.zeros((4, 3, 3)) + 0.01 * np.arange(4)[:, None, None]
+    image = SimpleNamespace(hand_of=owner, hands=1)
+    seen = SimpleNamespace(image=image, controller_points=given + np.array([0.0, 0.0, 0.005]))
+    found = list(given_errors(seen, given, np.zeros((1, 3))))
+    assert [frame for _, frame, *_ in found] == [0, 1, 2, 3]
+    np.testing.assert_allclose([row[2:] for row in found], [[5.0, 0.0]] * 4, atol=1e-9)
+    rows = [("s", "outlines", 0, hand, frame, "future" if frame > 2 else "training", *e) for hand, frame, *e in found]
+    (line,) = [line for line in hand_lines(pd.DataFrame(rows, columns=list(HAND_COLUMNS))) if "outlines" in line]
+    assert [cell.strip() for cell in line.split("|")[5:-1]] == ["5", "5", "5", "5", "0", "0", "0"]
 
 
 def test_hands_count_by_their_motion_alone():
@@ -198,6 +275,7 @@ def test_a_film_becomes_a_capture_of_color_alone(tmp_path):
     capture = write_capture(FOOTAGE, tmp_path, case, 5)
     about = capture.description
     assert (about.depth, about.up, about.category, about.name, about.masks) == ("none", "-z", "rope", case, True)
+    assert float(about.provenance[CARRYING]) > 0
     np.testing.assert_array_equal(capture.color("0", 4), film(FOOTAGE, case, 5)[4])
     assert (capture.mask("0", 4) == 1).sum() > 3000
     Marks.load(capture.folder / MARKS).require(capture)

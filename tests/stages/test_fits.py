@@ -123,6 +123,7 @@ def test_what_ran_together_is_continued_to_the_same_end(started: Path, alone: Pa
             facts, attempts = StageRecord.load(Path(output)).facts, StageRecord.load(Path(output)).attempts
             assert (facts["epochs_together"], attempts) == ((3, 1) if output in together else (0, 1))
             assert (facts["spring_updates"] == 0) == (output in together)
+            assert (facts["earlier_processor_seconds"] > 0) == (output in together)
             assert not Path(output).with_name("fit.partial.npz").exists()
 
 

@@ -18,10 +18,12 @@ from neuspring.core.records import StageRecord, digest_file
 from neuspring.core.run_folder import RunFolder
 from neuspring.core.run_record import RUN_RECORD, RunRecord
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
+from neuspring.perception.marks.marks import Marks
 from neuspring.scores.pictures import Scored, iou
 from neuspring.splats.draw import picture
 from neuspring.stages.render import posed
 from workflow.scripts.footage import Points, truths
+from workflow.scripts.masks import MARKS
 
 PHYSTWIN = "PhysTwin (published)"
 STILL = "frame 0 repeated"
@@ -218,6 +220,12 @@ class Run:
                     yield frame, rgba, rgba[..., 3] >= scored.covered
         except NumericalFailure:
             return
+
+
+def corrected() -> list[str]:
+    """Cases whose committed marks are not of frame 0 alone."""
+    paths = sorted((MARKS / "phystwin_camera0").glob("*.json"))
+    return [path.stem for path in paths if any(mark.frame for mark in Marks.load(path).of("0"))]
 
 
 def runs_of(results: Path, case: str, methods: Collection[str] | None = None) -> list[Run]:

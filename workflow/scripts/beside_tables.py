@@ -33,12 +33,35 @@ COMPARED = {
     ("last", "iou_drawn"): "IoU with the drawn mask of the last frame",
 }
 """What differences are taken of."""
+CHANGED = {
+    ("reconstruction", "iou"): ("Recon. IoU", 3),
+    ("future", "iou"): ("Future IoU", 3),
+    ("last", "iou_drawn"): ("IoU with the drawn mask of the last frame", 3),
+    ("last", "points_median"): ("marked points, last frame, median, px", 1),
+    ("later", "points_table"): ("marked points on the table, mm", 1),
+}
+"""What is compared before and after a change."""
 
 
 def select(table: pd.DataFrame, metric: str, part: str, *, all_cases: bool = False) -> pd.DataFrame:
     """Rows of one quantity: case, method, seed, value; without the cases that take no part in means unless asked for."""
     rows = table[(table["metric"] == metric) & (table["part"].astype(str) == part)]
     return rows if all_cases else rows[~rows["case"].isin(LEFT_OUT)]
+
+
+def shared(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows of the cases that every method in them has: means compare the same films only."""
+    counts = rows.groupby("case")["method"].nunique()
+    return rows[rows["case"].isin(counts.index[counts == rows["method"].nunique()])]
+
+
+def _in_means(rows: pd.DataFrame, metric: str, parts: Iterable[str]) -> tuple[dict[str, pd.DataFrame], list[str]]:
+    """What `select` finds of each part, of the cases shared by all methods; and a line that names the cases left out for that."""
+    found = {part: select(rows, metric, part) for part in parts}
+    kept = {part: shared(own) for part, own in found.items()}
+    lost = {part: sorted(set(own["case"]) - set(kept[part]["case"])) for part, own in found.items()}
+    missing = sorted({case for cases in lost.values() for case in cases})
+    return kept, [f"Means leave out {', '.join(missing)}: not every method has them.", ""] if missing else []
 
 
 def mean_and_spread(rows: pd.DataFrame) -> tuple[float, float, int]:
@@ -75,14 +98,18 @@ def cell(rows: pd.DataFrame, digits: int) -> str:
     return _text(mean, digits) + ("" if np.isnan(spread) else f" ± {spread:.{digits}f}")
 
 
-def tables(table: pd.DataFrame, notes: Sequence[str]) -> list[str]:
+TITLE = "Twins of color footage beside PhysTwin's published prediction"
+
+
+def tables(table: pd.DataFrame, notes: Sequence[str], title: str = TITLE) -> list[str]:
     """All tables of the scores; columns as in COLUMNS."""
-    lines = ["# Twins of color footage beside PhysTwin's published prediction", ""]
+    lines = [f"# {title}", ""]
     lines += [
         f"{PHYSTWIN} was made from three RGBD cameras and read back from compressed video. It is moved by one shift per case,",
-        f'fitted in frame 0. "{STILL}" is the object as seen in frame 0. Pixels of hands count nowhere. Means are over cases,',
-        f"without {', '.join(LEFT_OUT)}; ±: standard deviation over seeds of the mean over cases. PSNR and SSIM are those of the",
-        "render stage. PhysTwin's colors are of Gaussians seen by three cameras, in a video: its PSNR says less than its IoU.",
+        f'fitted in frame 0. "{STILL}" is the object as seen in frame 0. Pixels of hands count nowhere. Means are over cases that',
+        f"every method has, without {', '.join(LEFT_OUT)}; ±: standard deviation over seeds of the mean over cases. PSNR and",
+        "SSIM are those of the render stage. PhysTwin's colors are of Gaussians seen by three cameras, in a video: its PSNR says",
+        "less than its IoU.",
         "",
         *(line for metric in LABELED for line in _labeled(table, metric)),
         *_means(table),
@@ -106,12 +133,12 @@ def _labeled(table: pd.DataFrame, metric: str) -> list[str]:
     own_rows = table[table["metric"] == metric]
     if not len(own_rows):
         return []
+    means, said = _in_means(own_rows, metric, PARTS)
     rows = []
     for method in in_order(own_rows["method"]):
-        own = own_rows[own_rows["method"] == method]
-        cells = [cell(select(own, metric, part), DIGITS[metric]) for part in PARTS]
-        rows.append([method, str(mean_and_spread(select(own, metric, PARTS[-1]))[2]), *cells])
-    lines = [f"## {LABELED[metric]}", "", *Table.of_texts(["method", "cases", *PARTS], rows).markdown(), ""]
+        own = [part[part["method"] == method] for part in means.values()]
+        rows.append([method, str(own[-1]["case"].nunique()), *(cell(part, DIGITS[metric]) for part in own)])
+    lines = [f"## {LABELED[metric]}", "", *said, *Table.of_texts(["method", "cases", *PARTS], rows).markdown(), ""]
     rows = []
     for (case, method), own in _by_case(own_rows):
         rows.append([case, method, *(cell(select(own, metric, part, all_cases=True), DIGITS[metric]) for part in PARTS[1:])])
@@ -124,11 +151,15 @@ def _means(table: pd.DataFrame) -> list[str]:
     if not len(own_rows):
         return []
     header, rows = [f"{SHORT[part]} {HEADINGS[metric]}" for part, metric in keys], []
+    found = {metric: _in_means(own_rows, metric, SHORT) for metric in HEADINGS}
+    said = next((lines for _, lines in found.values() if lines), [])
     for method in in_order(own_rows["method"]):
-        own = own_rows[own_rows["method"] == method]
-        cells = [cell(select(own, metric, part), DIGITS[metric]) for part, metric in keys]
-        rows.append([method, str(mean_and_spread(select(own, "iou", "future"))[2]), *cells])
-    lines = ["## Means over frames, against carried masks", "", *Table.of_texts(["method", "cases", *header], rows).markdown(), ""]
+        own = {(part, metric): found[metric][0][part] for part, metric in keys}
+        own = {key: values[values["method"] == method] for key, values in own.items()}
+        cells = [cell(values, DIGITS[metric]) for (_, metric), values in own.items()]
+        rows.append([method, str(own["future", "iou"]["case"].nunique()), *cells])
+    title = "## Means over frames, against carried masks"
+    lines = [title, "", *said, *Table.of_texts(["method", "cases", *header], rows).markdown(), ""]
     keys = [key for key in keys if key[1] != "ssim"]
     rows = []
     for (case, method), own in _by_case(own_rows):
@@ -147,10 +178,10 @@ def _points(table: pd.DataFrame) -> list[str]:
     keys = [(part, name) for part in ("last", "later") for name in ("median", "mean")]
     titles = {"last": "last frame", "later": "all later frames"}
     header, rows = [*(f"{name}, {titles[part]}" for part, name in keys), "on the table, mm"], []
+    found = {(part, name): shared(select(points, f"points_{name}", part)) for part, name in keys}
     for method in in_order(points["method"]):
-        own = points[points["method"] == method]
-        cells = [cell(select(own, f"points_{name}", part), 1) for part, name in keys]
-        rows.append([f"mean of {own['case'].nunique()}", method, "", *cells, ""])
+        own = [values[values["method"] == method] for values in found.values()]
+        rows.append([f"mean of {own[0]['case'].nunique()}", method, "", *(cell(values, 1) for values in own), ""])
     for (case, method), own in _by_case(points):
         counts = [f"{select(own, 'points_count', part, all_cases=True)['value'].max():.0f}" for part in ("last", "later")]
         cells = [cell(select(own, f"points_{name}", part, all_cases=True), 1) for part, name in keys]
@@ -193,14 +224,39 @@ def _text(value: float, digits: int) -> str:
     return DASH if np.isnan(value) else f"{value:.{digits}f}"
 
 
+def before_after(before: pd.DataFrame, after: pd.DataFrame) -> list[str]:
+    """What changed between two tables of scores: films, methods and seeds that both have; after less before, paired by film."""
+    names = ["case", "method", "seed"]
+    rows = []
+    for (part, metric), (title, digits) in CHANGED.items():
+        both = select(before, metric, part).merge(select(after, metric, part), on=names, suffixes=("_before", "_after"))
+        for method in in_order(both["method"]):
+            own = both[both["method"] == method]
+            stacked = pd.concat(
+                [own[names].assign(method=when, value=own[f"value_{when}"]) for when in ("before", "after")], ignore_index=True
+            )
+            found = differences(stacked, "after", "before")
+            if found is not None:
+                mean, low, high, count = found
+                sides = [cell(stacked[stacked["method"] == when], digits) for when in ("before", "after")]
+                span = DASH if np.isnan(low) else f"[{low:+.{digits}f}, {high:+.{digits}f}]"
+                rows.append([title, method, *sides, f"{mean:+.{digits}f}", span, str(count)])
+    if not rows:
+        return []
+    about = "The same films, methods and seeds, before and after; after less before, with 95 % t intervals over films."
+    header = ["quantity", "method", "before", "after", "difference", "95 % interval", "films"]
+    return ["", "## Before and after", "", about, "", *Table.of_texts(header, rows).markdown()]
+
+
 GROUPS = {
+    "masks": (),
     "perception": ("capture", "segment", "track", "lift", "judge", "observe"),
     "search": ("search",),
     "fit": ("fits", "fit", "train"),
     "pictures": ("appearance", "render"),
     "rest": ("rollout", "predict", "score", "transfer"),
 }
-"""Rules of the workflow by what they are for."""
+"""Rules of the workflow by what they are for; masks are carried before it."""
 COSTED = "neuspring"
 """Whose cost is shown by scenario."""
 UPSTREAM = ("search", "fit", "train", "appearance")
@@ -249,13 +305,17 @@ def jobs_of_run(run: Run, known: Mapping[str, Path]) -> set[str]:
 
 
 def together(path: Path) -> float:
-    """Minutes of a fit that ran together with others, its share of the launch; 0 of one that ran alone."""
-    record = StageRecord.load(path) if path.is_file() else None
-    return record.seconds / 60 if record and record.facts.get("epochs_together") else 0.0
+    """Processor minutes of a fit before its own job: its share of what ran together with others; NaN: not recorded."""
+    facts = StageRecord.load(path).facts if path.is_file() else {}
+    known = "earlier_processor_seconds" in facts or not facts.get("epochs_together")
+    return float(facts.get("earlier_processor_seconds", 0.0)) / 60 if known else np.nan
 
 
-def costs(results: Path, runs: Sequence[Run]) -> pd.DataFrame:
-    """Processor minutes of every run: columns scenario, method, seed, group, minutes. What runs share counts in each of them."""
+def costs(results: Path, runs: Sequence[Run], carrying: Mapping[Path, float] | None = None) -> pd.DataFrame:
+    """Processor minutes of every run: columns scenario, method, seed, group, minutes. What runs share counts in each of them.
+
+    `carrying`: processor seconds that the masks of a scenario's folder took to be carried, NaN where that is not known.
+    """
     minutes, rows = minutes_by_job(results), []
     for scenario in dict.fromkeys(run.scenario for run in runs):
         known = records_of(scenario)
@@ -264,11 +324,12 @@ def costs(results: Path, runs: Sequence[Run]) -> pd.DataFrame:
         for run in (run for run in runs if run.scenario == scenario):
             own = jobs_of_run(run, known)
             identity = {"scenario": scenario.name, "method": run.method, "seed": run.seed}
+            rows.append(identity | {"group": "masks", "minutes": (carrying or {}).get(scenario, np.nan) / 60})
             rows.append(identity | {"group": "perception", "minutes": perception})
-            for group in (group for group in GROUPS if group != "perception"):
+            for group in (group for group in GROUPS if group not in ("masks", "perception")):
                 total = sum(value for name, value in seen.items() if name in own and group_of(_rule(name)) == group)
-                shared = together(run.folder / "fit.json") if group == "fit" else 0.0
-                rows.append(identity | {"group": group, "minutes": max(total, shared)})
+                earlier = together(run.folder / "fit.json") if group == "fit" else 0.0
+                rows.append(identity | {"group": group, "minutes": total + earlier})
     return pd.DataFrame(rows, columns=["scenario", "method", "seed", "group", "minutes"])
 
 
@@ -287,7 +348,10 @@ def cost_lines(table: pd.DataFrame) -> list[str]:
     if not len(table):
         return []
     lines = ["", "## Cost: processor minutes of one run", ""]
-    lines += ["Mean over runs. What runs share (perception, a search, splats) counts in each of them.", ""]
+    lines += [
+        "Mean over runs. What runs share (masks, perception, a search, splats) counts in each of them. Fits that ran together have"
+    ]
+    lines += ["their shares of the processor time; – is not recorded, and is missing in the sum.", ""]
     lines += Table.of_texts(["method", "runs", *GROUPS, "sum"], _minutes(table, "method")).markdown()
     shown = COSTED if (table["method"] == COSTED).any() else table["method"].iloc[-1]
     lines += ["", f"The same of `{shown}`, by scenario:", ""]

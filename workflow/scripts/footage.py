@@ -112,6 +112,12 @@ def overlaps(labels: np.ndarray, truth: dict[int, np.ndarray]) -> np.ndarray:
     return np.array([[overlap(labels[k] == label, mask == label) for label in (OBJECT, HANDS)] for k, mask in truth.items()])
 
 
+def newly_covered(labels: np.ndarray, truth: dict[int, np.ndarray]) -> list[float]:
+    """IoU of the object in the drawn frames but the first, over pixels that it does not cover there; NaN where it moves to none."""
+    first = truth[min(truth)] != OBJECT
+    return [overlap((labels[k] == OBJECT) & first, (truth[k] == OBJECT) & first) for k in sorted(truth)[1:]]
+
+
 def stepwise(colors: list[np.ndarray], labels: np.ndarray, start: np.ndarray, **settings: Any) -> tuple[np.ndarray, np.ndarray]:
     """The tracker of the workflow: places [T, K, 2] and whether they are visible [T, K], among its own random points."""
     chosen = replace(OpenCvTracking(rim=RIM), **settings)
@@ -180,7 +186,11 @@ def main() -> None:
                 np.savez_compressed(kept, labels=labels)
         rows = overlaps(labels, truths(a.folder, case))
         cells = [f"{' '.join(f'{value:.3f}' for value in rows[:, k])}: {rows[:, k].mean():.3f}" for k in range(2)]
-        print(f"{case}: {len(colors)} frames, object {cells[0]}, hands {cells[1]}, {_spent(*began)}", flush=True)
+        cells.append(" ".join(f"{value:.3f}" for value in newly_covered(labels, truths(a.folder, case))))
+        print(
+            f"{case}: {len(colors)} frames, object {cells[0]}, newly covered {cells[2]}, hands {cells[1]}, {_spent(*began)}",
+            flush=True,
+        )
         if (a.folder / "tracks" / f"{case}.json").exists():
             points = Points.load(a.folder / "tracks" / f"{case}.json")
             for name in a.trackers:
