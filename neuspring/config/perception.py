@@ -140,7 +140,7 @@ class ColorSettings(Section):
     """Categories of ropes: as thick as they are wide."""
     sheet_thickness: Positive = 0.004
     """Thickness of a sheet, m."""
-    body_thickness: Positive = 1.0
+    body_thickness: Positive = 0.9
     """Thickness of a body, of all categories that are neither flat nor round, in local widths of its silhouette; 1: as thick as it
     is wide."""
     footprint: Positive = 1.2

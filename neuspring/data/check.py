@@ -174,8 +174,8 @@ def _color_alone_findings(capture: Capture, name: str, samples: dict[int, plausi
     findings += _at(path, plausible.size_findings(camera, mask))
     findings += _at(path, plausible.outline_findings(f"camera {name}, object", mask, category))
     if capture.description.pose is None and category not in ("cloth", "rope"):
-        text = 'pose is not given: write "pose": "lying" or "standing", because one picture cannot say which'
-        findings.append(note(path, f"{text}. Without it, what would lie farther behind than the object is wide rises"))
+        rule = 'one picture cannot say how the object is in frame 0: write "lying" or "standing"'
+        findings.append(unusual(path, "pose", f"{rule}. Without it, what would lie farther behind than it is wide rises", "none"))
     # Hands are about as far as the object on the table.
     depth = np.nanmedian(camera.project(plausible.object_on_table(camera, mask))[1]) if (mask == OBJECT).any() else np.nan
     if np.isfinite(depth):

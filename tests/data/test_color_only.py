@@ -33,6 +33,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 def intake(root, **changes):
     """Color alone of the folders of `write_folders`, with the true pose."""
     plain = {"folder": root / "capture", "name": "desk", "category": "ball", "rate": 30.0, "views": pairs([root / "color_0"], [])}
+    plain["pose"] = "lying"
     poses = write_poses(root / "poses.json", 1) if "poses" not in changes else None
     return Intake(**(plain | {"intrinsics": root / "intrinsics.json", "poses": poses} | changes))
 
@@ -244,17 +245,17 @@ def test_the_outline_is_checked_before_a_run_and_in_it(capture):
 
 
 def test_the_pose_of_a_body_is_asked_for_and_kept(tmp_path):
-    made, _ = make_capture(intake(write_folders(tmp_path)))
+    made, _ = make_capture(intake(write_folders(tmp_path), pose=None))
     assert '"pose"' not in (made.folder / CAPTURE).read_text()
     save_masks(made, "0", np.stack([disk()] * FRAMES))
-    asked = 'write "pose": "lying" or "standing"'
-    assert holds(check_layout(made.folder), "note", CAPTURE, asked)
+    asked = 'pose: one picture cannot say how the object is in frame 0: write "lying" or "standing"'
+    assert holds(check_layout(made.folder), "warning", CAPTURE, asked)
     edit(made, lambda values: values.update(category="cloth"))
-    assert not holds(check_layout(made.folder), "note", CAPTURE, asked)
+    assert not holds(check_layout(made.folder), "warning", CAPTURE, asked)
     known, _ = make_capture(intake(tmp_path, folder=tmp_path / "known", pose="standing"))
     assert Capture.load(known.folder).description.pose == "standing"
     save_masks(known, "0", np.stack([disk()] * FRAMES))
-    assert not holds(check_layout(known.folder), "note", CAPTURE, asked)
+    assert not holds(check_layout(known.folder), "warning", CAPTURE, asked)
 
 
 def test_a_pose_is_refused_where_depth_is_measured(tmp_path):

@@ -4,8 +4,8 @@
 
 FOLDER is that of `workflow.scripts.footage`, with cameras.json. Of each case with a video and with marks (tests/data/marks) a
 capture OUTPUT/CASE is written: the film, masks carried from the marks of frame 0, the marks, and as points.json the points that
-were marked by hand and are sure. Its provenance has the processor seconds of the carrying, for the table of costs.
-A capture that is there is left alone without --force.
+were marked by hand and are sure. Its provenance has the processor seconds of the carrying, for the table of costs. All objects lie
+in frame 0, as one sees there: `pose: lying`. A capture that is there is left alone without --force.
 """
 
 from __future__ import annotations
@@ -80,6 +80,7 @@ def write_capture(folder: Path, output: Path, case: str, most: int | None = None
         frame_rate=RATE,
         cameras=(camera_of(folder).entry(),),
         depth="none",
+        pose="lying",
         up="-z",
         train_end=int(row["train_end"]) if row is not None and whole else None,
         masks=True,

@@ -82,8 +82,8 @@ def box(x: float, y: float, z: float) -> np.ndarray:
 
 
 def sides(labels: np.ndarray, pose: str | None) -> tuple[np.ndarray, np.ndarray]:
-    """Upper and lower points [n, 3], m, of a body in a pose."""
-    first = FirstFrame.of(capture_of("toy", pose=pose), labels, ColorSettings())
+    """Upper and lower points [n, 3], m, of a body in a pose that is as thick as it is wide."""
+    first = FirstFrame.of(capture_of("toy", pose=pose), labels, ColorSettings(body_thickness=1.0))
     y, x = np.nonzero(labels == OBJECT)
     pixels = np.stack([x, y], axis=1)
     upper, lower = first.points(pixels), first.camera.lift(pixels.astype(float), first.depths(0.0)[y, x])
