@@ -119,12 +119,11 @@ class FirstFrame:
             bounds = {None: settings.footprint, "lying": np.inf, "standing": settings.standing_footprint}
             depth, thick, facts = medial(camera, up, filled, settings.body_thickness, bounds[capture.description.pose])
         y, x = np.nonzero(filled)
-        pixels, sides = np.stack([x, y], axis=1).astype(float), []
-        for side in inflated(filled, depth, thick):
-            sides.append(np.zeros(filled.shape))
+        pixels, heights, lower = np.stack([x, y], axis=1).astype(float), np.zeros(filled.shape), np.zeros(filled.shape)
+        for side, found in zip((heights, lower), inflated(filled, depth, thick), strict=True):
             # The table cuts off what would be below it.
-            sides[-1][y, x] = np.maximum(up * camera.lift(pixels, side[y, x])[:, 2], 0.0)
-        return cls(camera, up, kind, filled, *sides, size, facts)
+            side[y, x] = np.maximum(up * camera.lift(pixels, found[y, x])[:, 2], 0.0)
+        return cls(camera, up, kind, filled, heights, lower, size, facts)
 
     def points(self, pixels: np.ndarray) -> np.ndarray:
         """World points [n, 3], m, of pixels (x, y) [n, 2]: of a sheet its middle, of others their upper side.
@@ -153,7 +152,7 @@ class FirstFrame:
         return np.asarray(self.up * height_of[labels[rows, columns]])
 
     def _between(self, share: float) -> np.ndarray:
-        return self.lower + share * (self.heights - self.lower)
+        return np.asarray(self.lower + share * (self.heights - self.lower))
 
     def depths(self, share: float) -> np.ndarray:
         """Depth [H, W], m, of the upper side (share 1) or of the lower one (0); 0 outside."""
@@ -262,7 +261,7 @@ def lift_color(
     y, x = np.nonzero(first.filled)
     cloud_pixels = np.stack([x, y], axis=1)
     colors = capture.color(name, 0) / 255.0
-    place_rows = np.round(places).astype(int)
+    place_rows, pose = np.round(places).astype(int), capture.description.pose
     facts |= {
         "object_tracks": float(own.sum()),
         "hidden_points": float(len(hidden)),
@@ -281,7 +280,7 @@ def lift_color(
         controller_valid=ALWAYS if space.hands is None else space.hands.holds,
         cloud=first.points(cloud_pixels),
         cloud_colors=colors[y, x],
-        backend=", ".join(filter(None, ("color alone", first.kind, first.kind == "body" and capture.description.pose))),
+        backend=", ".join(["color alone", first.kind, *([pose] if pose and first.kind == "body" else [])]),
         facts=facts,
     )
     return lifted, image
