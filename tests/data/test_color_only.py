@@ -229,7 +229,7 @@ def strip(length, width):
         ("toy", 0 * disk(), None),
     ],
 )
-def test_an_outline_of_another_category(capture, category, mask, words):
+def test_an_outline_of_another_category(category, mask, words):
     found = outline_findings("object", mask, category)
     assert [one.name for one in found] == (["outline and category"] if words else [])
     if words:
