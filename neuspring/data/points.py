@@ -11,7 +11,7 @@ Meters, in the capture's world. Files of another form, in other units or axes ar
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -82,34 +82,32 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
     """
     folder, description = capture.folder, capture.description
     findings: list[Finding] = []
-    hands, nodes, tracks = None, np.zeros((0, 3)), np.zeros((capture.frame_count, 0, 3))
-    files: dict[str, Path | None] = {}
-    for what, names in (("controllers", CONTROLLERS), ("nodes", NODES)):
+
+    def attempt(reader: Callable[..., Any], *values: Any) -> Any:
         try:
-            files[what] = file = given(folder, names) if brought is None else brought.get(what)
-            if file is None:
-                if not description.cameras:
-                    rule = f"a capture without cameras needs {' or '.join(names)}"
-                    findings.append(broken(folder / names[0], "", rule, "no such file"))
-            elif what == "nodes":
-                nodes = read_nodes(file)
-            else:
-                hands = read_hands(file, capture.frame_count)
+            return reader(*values)
         except InputError as error:
             findings.append(refusal(error))
-    marked = (brought or {}).get("tracks", folder / TRACKS)
-    try:
-        annotated = capture.tracks(marked)
-    except InputError as error:
-        findings.append(refusal(error))
-        annotated = tracks
+
+    files: dict[str, Path | None] = dict(brought or {})
+    for what, names in (("controllers", CONTROLLERS), ("nodes", NODES)):
+        if brought is None:
+            files[what] = attempt(given, folder, names)
+        if not files.get(what) and not findings and not description.cameras:
+            rule = f"a capture without cameras needs {' or '.join(names)}"
+            findings.append(broken(folder / names[0], "", rule, "no such file"))
+    marked, none = files.get("tracks") or folder / TRACKS, np.zeros((0, 3))
+    hands = attempt(read_hands, files["controllers"], capture.frame_count) if files.get("controllers") else None
+    nodes: Any = attempt(read_nodes, files["nodes"]) if files.get("nodes") else None
+    annotated, tracks = attempt(capture.tracks, marked), np.zeros((capture.frame_count, 0, 3))
+    nodes, annotated = none if nodes is None else nodes, tracks if annotated is None else annotated
     first = annotated[0][np.isfinite(annotated[0]).all(axis=1)]
     if description.tracks == "train":
         tracks = annotated
         if len(first) < LEAST:
             rule = f"with tracks: train at least {LEAST} points must be annotated in frame 0, where the twin starts"
             findings.append(broken(marked, "", rule, f"{len(first)} of {tracks.shape[1]}"))
-    ground, held_at = description.up_sign if description.ground else None, np.zeros((0, 3)) if hands is None else hands.points
+    ground, held_at = description.up_sign if description.ground else None, none if hands is None else hands.points
     for what, file, points in (("nodes", files.get("nodes"), nodes), ("", marked, first), ("", files.get("controllers"), held_at)):
         if file is not None and points.size:
             findings += plausible.space_findings(file, points.reshape(-1, 3), ground, is_body=what == "nodes")
@@ -117,7 +115,7 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
         return InSpace(hands, nodes, tracks), findings
     if len(nodes):
         findings += plausible.annotated_findings(marked, first, nodes)
-        if (file := files["controllers"]) is not None:
+        if (file := files.get("controllers")) is not None:
             findings += plausible.contact_findings(file, held_at[: capture.train_end], nodes)
     return InSpace(hands, nodes, tracks), findings
 
@@ -277,21 +275,8 @@ def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Obser
     if row.ground:
         points, nodes = (on_table(places, description.up_sign) for places in (points, nodes))
     nodes = nodes[cKDTree(points[0]).query(nodes)[0] > SAME]
-    names = (CAPTURE, *CONTROLLERS, *NODES, TRACKS)
     return Observations(
-        scenario=Scenario(
-            name=row.scenario,
-            source=row.source,
-            category=row.category,
-            frame_count=capture.frame_count,
-            train_end=capture.train_end,
-            frame_rate=description.frame_rate,
-            up=description.up,
-            self_collision=row.self_collision,
-            ground=row.ground,
-            obstacles=description.obstacles,
-            provenance=description.provenance | {n: f"sha256:{digest_file(path / n)}" for n in names if (path / n).exists()},
-        ),
+        scenario=scenario_of(row, capture, {}),
         object_points=points,
         object_visibility=visible,
         object_motion_valid=in_both(visible),
@@ -301,6 +286,26 @@ def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Obser
         surface_points=nodes,
         interior_points=np.zeros((0, 3)),
         tracks=space.tracks,
+    )
+
+
+def scenario_of(row: ScenarioRow, capture: Capture, origin: dict[str, str]) -> Scenario:
+    """The scenario of a capture. Its provenance is the capture's, digests of the files that are there, and `origin`."""
+    described, folder = capture.description, capture.folder
+    files = [name for name in (CAPTURE, *CONTROLLERS, *NODES) if (folder / name).exists()]
+    files += [TRACKS] if described.tracks == "train" else []
+    return Scenario(
+        name=row.scenario,
+        source=row.source,
+        category=row.category,
+        frame_count=capture.frame_count,
+        train_end=capture.train_end,
+        frame_rate=described.frame_rate,
+        up=described.up,
+        self_collision=row.self_collision,
+        ground=row.ground,
+        obstacles=described.obstacles,
+        provenance=described.provenance | {name: f"sha256:{digest_file(folder / name)}" for name in files} | origin,
     )
 
 

@@ -15,11 +15,10 @@ from scipy.spatial import cKDTree
 
 from neuspring.config import ScenarioRow
 from neuspring.config.perception import Perception, Sampling
-from neuspring.core.artifacts import ImageObservations, Observations, Scenario
+from neuspring.core.artifacts import ImageObservations, Observations
 from neuspring.core.geometry import on_table
-from neuspring.core.records import digest_file
-from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, Capture
-from neuspring.data.points import SAME, in_both, read, taught_by
+from neuspring.data.capture import Capture
+from neuspring.data.points import SAME, in_both, read, scenario_of, taught_by
 from neuspring.perception.results import LiftedTracks, ShapePrior
 
 SURFACE, INTERIOR = 1024, 10000
@@ -69,28 +68,11 @@ def assemble(
                 pixels=np.concatenate([nowhere, image.pixels[:, apart]], axis=1),
                 visible=np.concatenate([nowhere[..., 0] > 0, image.visible[:, apart]], axis=1),
             )
-    files = [name for name in (*CONTROLLERS, *NODES) if (capture.folder / name).exists()]
-    origin = {name: f"sha256:{digest_file(capture.folder / name)}" for name in files} | {
-        CAPTURE: f"sha256:{digest_file(capture.folder / CAPTURE)}",
-        "lift": lifted.backend,
-        "shape prior": files[-1] if given else prior.backend,
-    }
+    origin = {"lift": lifted.backend, "shape prior": "given nodes" if given else prior.backend}
     if given or settings.sample.nodes is not None:
         origin["node spacing"] = f"{voxel:.6g} m"
     return Observations(
-        scenario=Scenario(
-            name=row.scenario,
-            source=row.source,
-            category=row.category,
-            frame_count=capture.frame_count,
-            train_end=capture.train_end,
-            frame_rate=capture.description.frame_rate,
-            up=capture.description.up,
-            self_collision=row.self_collision,
-            ground=row.ground,
-            obstacles=capture.description.obstacles,
-            provenance=capture.description.provenance | origin,
-        ),
+        scenario=scenario_of(row, capture, origin),
         object_points=points,
         object_visibility=visible,
         object_motion_valid=valid,

@@ -107,7 +107,7 @@ def test_given_nodes_and_annotated_points_are_those_of_the_twin(tmp_path):
     # Annotated points rise by half of what the hand rises, and nodes are frozen: the nearest is no farther than their own.
     assert 0 < float(terms["chamfer"]) <= 0.004**2
     assert "given nodes" in lifted.backend
-    assert seen.scenario.provenance["shape prior"] == "nodes.npz"
+    assert seen.scenario.provenance["shape prior"] == "given nodes"
 
 
 def test_hands_and_nodes_beside_depth_take_the_place_of_what_is_chosen_and_supposed(tmp_path):

@@ -22,19 +22,7 @@ from neuspring.core.findings import Finding, finding, refuse, refuse_errors
 from neuspring.core.records import digest_file
 from neuspring.core.text import Progress
 from neuspring.data import capture, points
-from neuspring.data.capture import (
-    CAPTURE,
-    CONTROLLERS,
-    NODES,
-    POINTS,
-    TRACKS,
-    Camera,
-    CameraEntry,
-    Capture,
-    Description,
-    Writer,
-    description_findings,
-)
+from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Camera, CameraEntry, Capture, Description, Writer, description_findings
 from neuspring.data.intake.depth import Unit, find_rate
 from neuspring.data.intake.feeds import CameraFeed, Paired, Raw, VideoFile
 from neuspring.data.intake.lenses import Board, Straightener, read_lenses, read_poses
@@ -386,20 +374,10 @@ def _of_points(intake: Intake) -> tuple[Capture, list[str]]:
         raise InputError("make-capture", rule, f"no {' '.join(missing)}")
     if intake.rate is None:
         raise InputError("--rate", "frames per second are required where there is no video", "none")
-    entries = {
-        "format": 1,
-        "name": intake.name,
-        "category": intake.category,
-        "frame_count": len(points.read_hands(intake.brought["controllers"]).points),
-        "frame_rate": intake.rate,
-        "cameras": (),
-        "depth": "none",
-        "tracks": "train",
-        "up": intake.up,
-        "train_end": intake.train_end,
-        "provenance": digests(intake),
-    }
-    made = parse(Description, entries, "make-capture")
+    frames = len(points.read_hands(intake.brought["controllers"]).points)
+    named = {"format": 1, "name": intake.name, "category": intake.category, "frame_count": frames, "frame_rate": intake.rate}
+    alone = {"cameras": (), "depth": "none", "tracks": "train", "up": intake.up, "train_end": intake.train_end}
+    made = parse(Description, named | alone | {"provenance": digests(intake)}, "make-capture")
     refuse(description_findings(Path("make-capture"), made))
     space = brought_by(intake, made)
     prepare(intake.folder, TypeAdapter(Description).dump_python(made, mode="json"), intake.force)
@@ -430,7 +408,7 @@ def digests(intake: Intake) -> dict[str, str]:
     return {f"{name} file": f"sha256:{digest_file(path)}" for name, path in intake.brought.items()}
 
 
-PRECIOUS = ("mask", "marks.json", "annotations.json", TRACKS, POINTS, *CONTROLLERS, *NODES)
+PRECIOUS = ("mask", "marks.json", "annotations.json", TRACKS, POINTS, *capture.CONTROLLERS, *capture.NODES)
 """Work of people and of hours, which --force does not remove."""
 
 
