@@ -20,7 +20,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
 from neuspring.core.findings import Finding, broken, note, refusal, unusual
 from neuspring.data import mocap, phystwin, plausible
-from neuspring.data.capture import CAPTURE, OBJECT, POINTS, Capture, Description, description_findings, read_description
+from neuspring.data.capture import CAPTURE, NODES, OBJECT, POINTS, Capture, Description, description_findings, read_description
 from neuspring.data.intake.depth import FAR, FASTEST, NEAR, SLOWEST, cloud, planes
 from neuspring.data.points import look
 from neuspring.data.released import Released, parameter_findings, prediction_findings, read_checkpoint
@@ -173,7 +173,9 @@ def _color_alone_findings(capture: Capture, name: str, samples: dict[int, plausi
     category = capture.description.category
     findings += _at(path, plausible.size_findings(camera, mask))
     findings += _at(path, plausible.outline_findings(f"camera {name}, object", mask, category))
-    if capture.description.pose is None and category not in ("cloth", "rope"):
+    # Nodes that are given say how it is.
+    given = any((capture.folder / file).exists() for file in NODES)
+    if not given and capture.description.pose is None and category not in ("cloth", "rope"):
         rule = 'one picture cannot say how the object is in frame 0: write "lying" or "standing"'
         findings.append(unusual(path, "pose", f"{rule}. Without it, what would lie farther behind than it is wide rises", "none"))
     # Hands are about as far as the object on the table.

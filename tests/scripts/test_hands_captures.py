@@ -62,7 +62,7 @@ def test_lines_without_their_frames_number_are_refused(folder):
 
 def test_rows_of_film_differ_in_what_teaches_and_share_the_hands(tmp_path):
     folder = published(tmp_path / "upright", up=1)
-    film = paint(tmp_path / "captures" / "thing_film", frames=10).folder
+    film = paint(tmp_path / "captures" / "thing_film", category="toy", frames=10).folder
     both = shutil.copytree(film, tmp_path / "captures" / "thing_both")
     made = {name: add_hands(path, folder, both=name == "both") for name, path in (("film", film), ("both", both))}
     spaces = {name: read(capture) for name, capture in made.items()}
@@ -71,6 +71,8 @@ def test_rows_of_film_differ_in_what_teaches_and_share_the_hands(tmp_path):
     assert [len(space.nodes) for space in spaces.values()] == [0, len(scene.NODES)]
     # In both rows the points are there to be scored.
     assert all(capture.tracks().shape == (10, 4, 3) for capture in made.values())
+    # How the object lies need not be supposed where nodes say it.
+    assert ["lying" in " ".join(serious(check_layout(capture.folder))) for capture in made.values()] == [True, False]
     names = [json.loads((capture.folder / CAPTURE).read_text())["name"] for capture in made.values()]
     assert names == ["thing_film", "thing_both"]
 
