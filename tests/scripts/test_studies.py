@@ -39,6 +39,9 @@ from workflow.scripts.beside_tables import (
 from workflow.scripts.footage import film
 from workflow.scripts.footage_captures import CARRYING, write_capture
 from workflow.scripts.one_color_camera import hand_errors, one_camera
+from workflow.scripts.paper_scenes import PHYSTWIN as RELEASED
+from workflow.scripts.paper_scenes import point_errors
+from workflow.scripts.paper_scenes import tables as scene_tables
 
 
 def block(rows: slice, columns: slice, shape: tuple[int, int] = (40, 60)) -> np.ndarray:
@@ -285,3 +288,22 @@ def test_a_film_becomes_a_capture_of_color_alone(tmp_path):
     # ruler). The mask ends within three pixels of 2 mm at both ends, and the size is told in whole centimeters.
     (length,) = (int(size[1]) for text in of_level(found, "note") if (size := re.search(r"object size on the table (\d+) x", text)))
     assert length == pytest.approx(38.7, abs=1.2 + 0.5)
+
+
+def test_a_scene_stands_beside_the_released_errors_of_its_frames():
+    rows = [("single_lift_sloth", "points", "neuspring", seed, "future", "track_error", 20.0 + seed) for seed in (0, 1, 2)]
+    rows += [("single_lift_sloth", "film", "neuspring", 0, "future", "iou", 0.7)]
+    known = {"future": 24.9, "reconstruction": 4.9}
+    rows += [("single_lift_sloth", "", RELEASED, -1, task, "track_error", value) for task, value in known.items()]
+    names = ["case", "saw", "method", "seed", "task", "metric", "value"]
+    points, films = scene_tables(pd.DataFrame(rows, columns=names), ["static", "neuspring"])
+    assert re.search(r"neuspring +\| +\| 21\.0 ± 1\.0 +\| 3 +\|", points) and re.search(r"4\.9 +\| 24\.9 +\| +\|", points)
+    assert "static" not in points and "one color camera" in films and "0.700" in films
+
+
+def test_a_point_follows_its_nearest_node_and_is_nowhere_after_a_divergence():
+    positions = np.zeros((2, 2, 3), np.float32)
+    positions[:, 1, 0] = [1.0, 1.5]
+    tracks = np.array([[[0.9, 0, 0], [0.1, 0, 0]], [[0.9, 0, 0], [np.nan] * 3], [[0.9, 0, 0], [0.1, 0, 0]]])
+    errors = point_errors(SimpleNamespace(positions=positions), tracks)
+    np.testing.assert_allclose(errors, [[0.1, 0.1], [0.6, np.nan], [np.nan, np.nan]], atol=1e-7)
