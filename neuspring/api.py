@@ -52,13 +52,11 @@ def roll_out(twin: Twin, hands: Observations | np.ndarray, device: str = "auto")
     """
     from neuspring.core.device import resolve_device
     from neuspring.twin import rollout
-    from neuspring.twin.hand_paths import with_hands
 
     device = resolve_device(device)
     if isinstance(hands, Observations):
-        seen = with_hands(hands, twin)
-        velocity = rollout.initial_velocity(seen, twin.simulation.initial_velocity)
-        return rollout.roll_out(twin, seen.controller_points, device, velocity=velocity, valid=seen.controller_valid)
+        velocity = rollout.initial_velocity(hands, twin.simulation.initial_velocity)
+        return rollout.roll_out(twin, hands.controller_points, device, velocity=velocity, valid=hands.controller_valid)
     paths, controllers = np.asarray(hands), len(twin.topology.controllers)
     if paths.ndim != 3 or paths.shape[1:] != (controllers, 3) or not len(paths):
         raise InputError("hands", f"must be observations, or positions [T, {controllers}, 3] in meters", paths.shape)
@@ -120,12 +118,11 @@ def fit(
     from neuspring.core.device import resolve_device
     from neuspring.twin.fit import FitProblem
     from neuspring.twin.fit import fit as fit_twin
-    from neuspring.twin.hand_paths import with_hands
     from neuspring.twin.rod_fit import fit_rod
 
     read = read_settings(settings)
     shared = (read.fit, read.simulation, read.losses, read.released_quirks, resolve_device(device))
-    problem = FitProblem(with_hands(observations, twin), twin, *shared, kind=kind, seed=seed)
+    problem = FitProblem(observations, twin, *shared, kind=kind, seed=seed)
     if kind == "rod":
         return fit_rod(problem.observations, (), twin, read.fit.rod, device=problem.device)
     return fit_twin(problem, partial=checkpoint)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -50,6 +50,9 @@ _LEFT = {
     """,
     "removed, on coordinates and feature always; commit a72d24c is the last that has it": "field.fourier",
     LEFT: "plane_smoothness",
+    "removed, hands of color alone move in an upright plane; commit 152a3d9 is the last that searches how far they are": """
+        hand_tilt hand_size hand_depth hand_knots
+    """,
     "removed: splats follow the nodes that are nearest in each frame": "frozen_skinning",
     "now losses of the whole configuration": "losses",
     "now color_rate": "colour_rate",
@@ -62,7 +65,7 @@ _LEFT = {
     "a third of the scenarios now": "warmup_scenarios",
     "by the scenario's category now": "gs_dynamics.preset",
     "a constant in neuspring/config/search.py now": "polish.share",
-    "a constant beside its user in neuspring/twin now": "betas freed_sigma hand_knots polish.step polish.tolerance",
+    "a constant beside its user in neuspring/twin now": "betas freed_sigma polish.step polish.tolerance",
     "a constant beside its user in neuspring/data now": "toy.frame_rate",
     "a constant beside its user in neuspring/splats now": """
         l1 densify_from densify_until densify_every densify_gradient split_size prune_opacity most_splats images.opacity
@@ -76,11 +79,17 @@ _LEFT = {
         opencv.window opencv.levels opencv.forward_backward opencv.reacquire likeness lift.least_neighbors agreement release_after
         shape.margin shape.tolerance shape.smoothing shape.bend_reach shape.thin shape.bend back_fraction
         sample.surface sample.interior color.beneath color.hands_apart color.hand_radius color.samples color.band color.cell
-        color.grip_reach grip_length color.hand_tilt
+        color.grip_reach grip_length
     """,
 }
 RENAMED = {key: sentence for sentence, keys in _LEFT.items() for key in keys.split()}
 """Keys of older versions -> a sentence that says where they went. An entry is a key, or the end of its dotted path."""
+
+
+def told(names: Iterable[str]) -> str:
+    """What became of names in a list that are keys of older versions; empty where none is."""
+    sentences = dict.fromkeys(RENAMED[name] for name in names if name in RENAMED)
+    return f" ({'; '.join(sentences)})" if sentences else ""
 
 
 def parse(kind: type[T], values: Mapping[str, Any], where: str) -> T:

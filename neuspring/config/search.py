@@ -9,12 +9,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from neuspring.config.parse import STRICT, Count, Finite, Positive, Section
+from neuspring.config.parse import STRICT, Count, Finite, Positive, Section, told
 
 LENGTHS = ("object_radius", "controller_radius", "contact_distance")
 """Variables in units of `search.lengths`."""
-HANDS = ("hand_tilt", "hand_size", "hand_depth")
-"""Variables of how far hands are from a camera without depth; of captures with depth there are none."""
 TOPOLOGY = ("object_radius", "object_neighbors", "controller_radius", "controller_neighbors")
 """Variables that decide which springs there are, so that a twin changes in jumps with them."""
 
@@ -76,12 +74,6 @@ class SearchVariables(Section):
     """Velocity decay, 1/s."""
     dashpot: Variable = _default(0.1, 500.0, 20.0, "log")
     """Damping along springs, N s/m."""
-    hand_tilt: Variable = _default(-15.0, 60.0, 0.0)
-    """Color alone: tilt of the plane through its grip in which a hand moves, degrees. 0: upright, facing the camera. 90: level."""
-    hand_size: Variable = _default(0.0, 1.0, 0.0)
-    """Color alone: how much of a hand's distance follows from its apparent size, the rest from that plane."""
-    hand_depth: Variable = _default(0.97, 1.03, 1.0, "log")
-    """Color alone: factors on a hand's distance from the camera at its knots."""
 
     @model_validator(mode="before")
     @classmethod
@@ -95,7 +87,7 @@ class SearchVariables(Section):
     def __post_init__(self) -> None:
         for name in (spec.name for spec in dataclasses.fields(self)):
             low, high = getattr(self, name).low, getattr(self, name).high
-            if not (0 <= low < high or (name == "hand_tilt" and -90 < low < high)):
+            if not 0 <= low < high:
                 raise ValueError(f"{name}: 0 <= low < high is required, received [{low}, {high}]")
         # An object node counts itself among its neighbors.
         for name, least in (("object_neighbors", 2), ("controller_neighbors", 1)):
@@ -121,7 +113,8 @@ class Polish(Section):
         allowed = [name for name in VARIABLES if name not in (*TOPOLOGY, "contact_distance")]
         unknown = [name for name in self.variables if name not in allowed]
         if unknown or len(set(self.variables)) != len(self.variables) or not self.variables:
-            raise ValueError(f"variables: different ones of {', '.join(allowed)} are required, received {list(self.variables)}")
+            rule = f"different ones of {', '.join(allowed)} are required"
+            raise ValueError(f"variables: {rule}, received {list(self.variables)}{told(unknown)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +150,7 @@ class Search(Section):
         unknown = [name for name in self.fixed if name not in VARIABLES]
         if unknown or len(set(self.fixed)) != len(self.fixed) or len(VARIABLES) - len(self.fixed) < 2:
             rule = f"different ones of {', '.join(VARIABLES)} are required, two of which stay free"
-            raise ValueError(f"fixed: {rule}, received {list(self.fixed)}")
+            raise ValueError(f"fixed: {rule}, received {list(self.fixed)}{told(unknown)}")
         for name in VARIABLES:
             if name in self.fixed:
                 continue
@@ -172,34 +165,25 @@ class Search(Section):
 
     @property
     def polished(self) -> tuple[str, ...]:
-        """Variables of the polish; those of hands count only where there are any."""
-        left_out = (*self.fixed, *HANDS)
-        return tuple(name for name in self.polish.variables if name not in left_out)
+        """What is polished, in the order of the settings."""
+        return tuple(name for name in self.polish.variables if name not in self.fixed)
 
     @property
     def polish_rounds(self) -> int:
         """Most rounds of the polish that its share of the budget holds."""
-        return self.rounds_of(len(self.polished))
-
-    def rounds_of(self, polished: int) -> int:
-        """As `polish_rounds`, for a number of polished variables."""
-        if not polished:
+        if not self.polished:
             return 0
-        return min(self.polish.rounds, int(POLISH_SHARE * self.rollouts) // round_rollouts(polished))
+        return min(self.polish.rounds, int(POLISH_SHARE * self.rollouts) // self.round_rollouts)
+
+    @property
+    def round_rollouts(self) -> int:
+        """Rollouts of a round of the polish."""
+        return 1 + len(self.polished) + TRIALS
 
     @property
     def cma_rollouts(self) -> int:
         """Rollouts of CMA-ES: the budget without what the polish may take."""
-        return self.cma_rollouts_of(len(self.polished))
-
-    def cma_rollouts_of(self, polished: int) -> int:
-        """As `cma_rollouts`, for a number of polished variables."""
-        return self.rollouts - self.rounds_of(polished) * round_rollouts(polished)
-
-
-def round_rollouts(polished: int) -> int:
-    """Rollouts of a round of the polish of so many variables."""
-    return 1 + polished + TRIALS
+        return self.rollouts - self.polish_rounds * self.round_rollouts
 
 
 TRIALS = 4

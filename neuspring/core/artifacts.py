@@ -319,8 +319,8 @@ class Observations(Artifact):
         omitted=True,
     )
     image: ImageObservations | None = field(default=None, metadata=OMITTED)
-    """What a camera without depth saw. Then object points are known in frame 0 alone, and controllers move as a guess says, which
-    a twin's `hands` replace (twin/hand_paths.py)."""
+    """What a camera without depth saw. Then object points are known in frame 0 alone, and hands that were seen move in a plane
+    (perception/color_hands.py)."""
 
     def check(self) -> None:
         name = f"observations of {self.scenario.name}"
@@ -595,8 +595,6 @@ class Twin(Artifact):
     topology: Topology
     material: Material
     simulation: Simulation
-    hands: dict[str, float] = field(default_factory=dict, metadata=OMITTED)
-    """How far the hands are from a camera without depth: searched variables of twin/hand_paths.py. Empty: hands were measured."""
     rod: Rod | None = field(default=None, metadata=OMITTED)
     """The body where it is a rod. Then springs are those of controllers alone, and the nodes follow the center line."""
     residual: Residual | None = field(default=None, metadata=OMITTED)

@@ -16,7 +16,6 @@ from neuspring.core.records import digest_file
 from neuspring.core.run_folder import RunFolder
 from neuspring.splats.draw import prune_by_opacity, skinned_frames
 from neuspring.splats.model import Splats
-from neuspring.twin.hand_paths import with_hands
 from neuspring.twin.rollout import initial_velocity
 
 NAMED = "Name results/<scenario>/<method>/<seed> of a run with a twin, or a twin.npz."
@@ -97,7 +96,7 @@ def read_source(path: Path) -> Source:
     made_from = {twin_name: digest}
     if run.trajectory is None:
         return _at_rest(name, twin, made_from)
-    trajectory, observations = run.trajectory, with_hands(run.observations, twin)
+    trajectory, observations = run.trajectory, run.observations
     if trajectory.diverged_frame is not None:
         raise InputError(
             path,

@@ -38,11 +38,10 @@ from neuspring.core.errors import InputError
 from neuspring.core.geometry import farthest
 from neuspring.data.capture import CAPTURE, CONTROLLERS, HANDS, NOTHING, OBJECT, Camera, Capture
 from neuspring.data.points import InSpace, held, read
-from neuspring.perception.color_hands import follow_hands, grips
+from neuspring.perception.color_hands import follow_hands, grips, place
 from neuspring.perception.controllers import ALWAYS
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
 from neuspring.perception.shape import discs, inflated, no_prior, shape_prior
-from neuspring.twin.hand_paths import depths_of, place
 
 BAND = 30.0
 """How far from the object points beside it were drawn, pixels."""
@@ -254,8 +253,7 @@ def lift_color(
         marked=capture.points(name),
     )
     if space.hands is None:
-        guess = depths_of(image, {"hand_tilt": 0.0, "hand_size": 0.0}, capture.train_end, first.up)
-        hands = place(image, np.concatenate([first.fingers(grip) for grip in chosen]), guess)
+        hands = place(image, np.concatenate([first.fingers(grip) for grip in chosen]))
     else:
         hands = held(space.hands, space.tracks, capture.train_end)
     y, x = np.nonzero(first.filled)

@@ -1,9 +1,18 @@
-"""Hands in the image: where the grip of each is, how it is turned and how large it appears, in all frames.
+"""Hands in front of one camera without depth: where the grip of each is in the image, how it is turned and how large it appears,
+in all frames, and where its controllers are in space.
 
 Corners of the hand near its grip are followed from frame to frame (pyramidal Lucas-Kanade, forward and backward) in images in
 which all but the hand's mask is gray: nothing else is read. Between a key frame and the present frame, a similarity is fitted to
 the corners that are left (RANSAC). Where too few are left, the present frame becomes the key frame. Sizes and turns are smoothed
 over time.
+
+Nothing says how far a hand is. It is supposed to move in the upright plane that faces the camera, through its grip of frame 0, and
+not to go below the level of that grip. With the grip in the image at u(t), the depth z(t) along the optical axis is
+
+    z(t) / z(0) = min(p(t), l(t))
+
+p and l are the depths at which the ray through u(t) meets the upright plane and the level one, over that of frame 0. The hand is a
+rigid patch: it keeps its shape, is turned by its angle in the image about the ray, and follows z(t) and u(t).
 """
 
 from __future__ import annotations
@@ -15,7 +24,9 @@ import numpy as np
 from scipy.signal import savgol_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
+from scipy.spatial.transform import Rotation
 
+from neuspring.core.artifacts import ImageObservations
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.perception.frames import gray
 
@@ -31,6 +42,8 @@ SMOOTH = 9
 """Frames over which size and turn are smoothed (Savitzky-Golay, second order)."""
 LARGEST_STEP = 1.15
 """Change of size from frame to frame beyond which a fit is not believed."""
+NEAREST, FARTHEST = 0.5, 2.0
+"""Depth of a hand over that of frame 0: beyond, the plane is seen edge on and says nothing."""
 
 
 @dataclass(frozen=True)
@@ -184,3 +197,48 @@ def _similarity(key: np.ndarray, start: np.ndarray, points: np.ndarray) -> np.nd
         return None
     angle, size = float(np.arctan2(matrix[1, 0], matrix[0, 0])), float(np.hypot(matrix[0, 0], matrix[1, 0]))
     return np.array([*(matrix[:, :2] @ key[:2] + matrix[:, 2]), key[2] + angle, key[3] * size])
+
+
+def place(image: ImageObservations, first: np.ndarray) -> np.ndarray:
+    """Controllers [T, C, 3], m, from those of frame 0 [C, 3].
+
+    In camera axes, with the grip's point g(t) at depth z(t) on the ray through u(t): x(t) = g(t) + R(a(t)) (x(0) - g(0)), R a turn
+    by the hand's angle a about that ray.
+    """
+    pose = image.camera_to_world
+    local = (first - pose[:3, 3]) @ pose[:3, :3]
+    axis = pose[:3, 2] * [1.0, 1.0, 0.0]
+    if np.linalg.norm(axis) < 1e-3:
+        # Straight down: up in the image is the horizontal direction away from the camera.
+        axis = -pose[:3, 1] * [1.0, 1.0, 0.0]
+    depths = np.minimum(*(plane_depths(image, normal) for normal in (axis / np.linalg.norm(axis), np.array([0.0, 0.0, 1.0]))))
+    result = np.empty((len(depths), *local.shape))
+    directions = rays(image)
+    for hand in range(image.hands):
+        own = np.flatnonzero(image.hand_of == hand)
+        center = directions[0, hand] * local[own, 2].mean()
+        at = directions[:, hand] * (depths[:, hand] * center[2])[:, None]
+        axes = directions[:, hand] / np.linalg.norm(directions[:, hand], axis=1, keepdims=True)
+        turns = Rotation.from_rotvec(axes * image.hand_angles[:, hand, None].astype(np.float64))
+        for frame in range(len(depths)):
+            result[frame, own] = at[frame] + turns[frame].apply(local[own] - center)
+    result[0] = local
+    return np.asarray(result @ pose[:3, :3].T + pose[:3, 3])
+
+
+def plane_depths(image: ImageObservations, normal: np.ndarray) -> np.ndarray:
+    """Depths [T, H], over those of frame 0, at which grips meet the plane with a normal [3] in the world.
+
+    With rays r(t) and the normal n in camera axes they are (n . r(0)) / (n . r(t)).
+    """
+    along = rays(image) @ (normal @ image.camera_to_world[:3, :3])
+    facing = along[0] * along > 0
+    ratio = np.divide(np.broadcast_to(along[0], along.shape), along, out=np.full(along.shape, FARTHEST), where=facing)
+    return np.clip(ratio, NEAREST, FARTHEST)  # type: ignore[no-any-return]
+
+
+def rays(image: ImageObservations) -> np.ndarray:
+    """Rays K^-1 [x, y, 1] through the grips [T, H, 3]: points at depth 1 in camera axes."""
+    pixels = image.hand_centers.astype(np.float64)
+    ones = np.ones((*pixels.shape[:-1], 1))
+    return np.asarray(np.concatenate([pixels, ones], axis=-1) @ np.linalg.inv(image.intrinsics).T)

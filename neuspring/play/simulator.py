@@ -21,7 +21,6 @@ from neuspring.physics import stability
 from neuspring.physics.controllers import BEGINS, begins, waypoints
 from neuspring.physics.rod_nodes import RodFrames
 from neuspring.physics.solver import solver_for
-from neuspring.twin.hand_paths import with_hands
 from neuspring.twin.rollout import FAR, Diverged, initial_velocity
 
 if TYPE_CHECKING:
@@ -79,7 +78,6 @@ def start_state(run: Run, seen: Observations, frame: int, repeat: bool) -> Start
     twin = run.twin
     if twin is None:
         raise InputError(run.folder, "a run with a twin is required", "none", "Choose a method that makes a twin.")
-    seen = with_hands(seen, twin)
     count, hands = len(twin.topology.controllers), seen.controller_points
     if frame == 0 and not repeat:
         return StartState()

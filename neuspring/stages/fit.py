@@ -106,11 +106,10 @@ def prepared(
     from neuspring.core.artifacts import Twin
     from neuspring.core.checkpoint import checkpoint_key
     from neuspring.twin.fit import FitProblem
-    from neuspring.twin.hand_paths import with_hands
 
     twin, seed = Twin.load(search.file("twin")), int(search.record.settings["seed"])
     problem = FitProblem(
-        with_hands(observations, twin),
+        observations,
         twin,
         settings.fit,
         settings.simulation,

@@ -14,15 +14,13 @@ def rollout(observations: Observations, learned: Before, run: Recorder, device: 
     `learned` is the search.json or fit.json that names the twin. A twin that saw the future is called `oracle`.
     """
     from neuspring.core.artifacts import Twin
-    from neuspring.twin.hand_paths import with_hands
     from neuspring.twin.rollout import initial_velocity, roll_out
 
     if learned.record.settings.get("oracle"):
         run.settings["oracle"] = True
     twin = Twin.load(learned.file("twin"))
-    seen = with_hands(observations, twin)
-    velocity = initial_velocity(seen, twin.simulation.initial_velocity)
-    trajectory = roll_out(twin, seen.controller_points, device, velocity=velocity, valid=seen.controller_valid)
+    velocity = initial_velocity(observations, twin.simulation.initial_velocity)
+    trajectory = roll_out(twin, observations.controller_points, device, velocity=velocity, valid=observations.controller_valid)
     if trajectory.collision_overflow:
         print("warning: collision candidates did not fit the list; raise simulation.collision_capacity")
     files = run.beside(trajectory="trajectory.npz")

@@ -50,13 +50,10 @@ def score(
     from neuspring.report.draw import run as figures
     from neuspring.report.draw.twin import Lines
     from neuspring.scores import metrics
-    from neuspring.twin.hand_paths import with_hands
 
     began, folder = time.perf_counter(), output.parent
     given = {"search": search, "fit": fit, "train": train, "rollout": rollout, "appearance": appearance, "render": render}
     stages = RunFolder(folder, {name: before for name, before in given.items() if before})
-    if stages.twin:
-        observations = with_hands(observations, stages.twin)
     scenario, trajectory, frames_file = observations.scenario, stages.trajectory, stages.file("render", "frames")
     pictures = pd.read_parquet(frames_file) if frames_file else None
     errors = metrics.errors_per_frame(trajectory.positions, observations) if trajectory else None

@@ -6,7 +6,7 @@ search      CMA-ES over topology and a homogeneous material: candidates (variabl
 field       the neural spring field
 fit         Adam through the simulation, on one recording or several: parameters (what is trained), batch (fits that share launches)
 losses      every term of the training loss, for search, fit and polish
-rollout     prediction; hand_paths: hands in front of one camera without depth
+rollout     prediction
 transfer    a twin on another recording, with register where its nodes are others
 residual    what rollouts of a cable leave, learned by ridge regression: no physics
 """

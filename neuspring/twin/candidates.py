@@ -16,13 +16,12 @@ import numpy as np
 import torch
 
 from neuspring import config
-from neuspring.config.search import HANDS, LENGTHS, VARIABLES
+from neuspring.config.search import LENGTHS, VARIABLES
 from neuspring.core.artifacts import Material, Observations, Simulation, Twin
-from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.errors import NumericalFailure
 from neuspring.physics import stability
 from neuspring.physics.controllers import waypoints
 from neuspring.physics.lanes import COST, WIDTHS, width_for
-from neuspring.twin import hand_paths
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.rollout import initial_velocity
 from neuspring.twin.topology import controller_reach, node_spacing, piecewise_topology, regions
@@ -67,14 +66,15 @@ class Recording:
         device: str = "cpu",
     ) -> Recording:
         """A recording, judged with the settings of a search."""
+        loss = FrameLoss.of(observations, losses, device, frozen_counts=quirks.frozen_loss_denominators)
+        return cls.judged(observations, initial_velocity(observations, simulation.initial_velocity), loss, device)
+
+    @classmethod
+    def judged(cls, observations: Observations, velocity: np.ndarray, loss: FrameLoss, device: str) -> Recording:
+        """A recording whose start velocities [N, 3], m/s, and losses are known."""
         hands = torch.tensor(observations.controller_points, device=device)[: observations.scenario.train_end]
-        velocity = initial_velocity(observations, simulation.initial_velocity)
-        return cls(
-            observations,
-            waypoints(hands, observations.controller_valid),
-            torch.tensor(velocity, dtype=torch.float32, device=device),
-            FrameLoss.of(observations, losses, device, frozen_counts=quirks.frozen_loss_denominators),
-        )
+        start = torch.tensor(velocity, dtype=torch.float32, device=device)
+        return cls(observations, waypoints(hands, observations.controller_valid), start, loss)
 
 
 @dataclass(frozen=True)
@@ -114,9 +114,6 @@ class SearchProblem:
 
     def __post_init__(self) -> None:
         require_pool(self.observations, [recording.observations for recording in self.pool], self.leave_out)
-        if self.pool and self.observations.image is not None:
-            where = f"pool of {self.observations.scenario.name}"
-            raise InputError(where, "recordings of color alone are searched one by one", f"a pool of {len(self.pool) + 1}")
         canonical, count = self.observations.canonical, len(self.observations.nodes)
         nodes, hands = canonical[:count], canonical[count:]
         object.__setattr__(self, "labels", regions(nodes, self.clusters))
@@ -135,23 +132,14 @@ class SearchProblem:
         """All that makes a candidate: the variables of the settings, regional ones as name.0, name.1, ... (bare for one)."""
         names: list[str] = []
         for name in VARIABLES:
-            if name in HANDS:
-                continue
             regional = name in REGIONAL and self.clusters > 1
             names += [f"{name}.{region}" for region in range(self.clusters)] if regional else [name]
-        image = self.observations.image
-        return (*names, *(hand_paths.names(image) if image else ()))
+        return tuple(names)
 
     @property
     def variables(self) -> tuple[str, ...]:
         """Names of what is searched: `names` without `search.fixed`."""
         return tuple(name for name in self.names if name.partition(".")[0] not in self.search.fixed)
-
-    @property
-    def polished(self) -> tuple[str, ...]:
-        """Names of what is polished, in the order of the settings."""
-        bases = self.search.polish.variables
-        return tuple(name for base in bases for name in self.variables if name.partition(".")[0] == base)
 
     def decode(self, normalized: np.ndarray) -> dict[str, float]:
         """Physical values (lengths in m) of all `names`, from normalized `variables`; neighbor counts are truncated to integers."""
@@ -233,8 +221,7 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
         controller_velocity=settings.controller_velocity,
         initial_velocity=settings.initial_velocity,
     )
-    hands = {name: value for name, value in values.items() if name.partition(".")[0] in HANDS}
-    return with_substeps(problem, Twin(topology=topology, material=material, simulation=simulation, hands=hands))
+    return with_substeps(problem, Twin(topology=topology, material=material, simulation=simulation))
 
 
 def homogeneous(values: dict[str, float], springs: int) -> Material:
@@ -245,27 +232,9 @@ def homogeneous(values: dict[str, float], springs: int) -> Material:
     return Material(**(numbers | arrays))
 
 
-def _motion(problem: SearchProblem, twins: Sequence[Twin]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Waypoints of the hands (controllers.py), m, in the training frames, and the velocity of the nodes in frame 0 [N, 3], m/s.
-
-    Waypoints have an axis [B] of twins where each has hands of its own.
-    """
-    observations, end = problem.observations, problem.observations.scenario.train_end
-
-    def path(points: np.ndarray) -> torch.Tensor:
-        hands = torch.tensor(points, dtype=torch.float32, device=problem.device)[:end]
-        return waypoints(hands, observations.controller_valid)
-
-    if observations.image is None or not observations.image.hands:
-        hands = path(observations.controller_points)
-    else:
-        hands = torch.stack([path(hand_paths.hand_points(observations, twin.hands)) for twin in twins], dim=1)
-    return hands, torch.tensor(problem.velocity, dtype=torch.float32, device=problem.device)
-
-
-def recordings(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> dict[int, Recording]:
-    """The recordings that count, by the place of their twin in a candidate's family; 0 is the scenario's own, with its `twins`."""
-    own = {} if problem.leave_out else {0: Recording(problem.observations, *_motion(problem, twins), loss)}
+def recordings(problem: SearchProblem, loss: FrameLoss) -> dict[int, Recording]:
+    """The recordings that count, by the place of their twin in a candidate's family; 0 is the scenario's own."""
+    own = {} if problem.leave_out else {0: Recording.judged(problem.observations, problem.velocity, loss, problem.device)}
     return own | dict(enumerate(problem.pool, start=1))
 
 
@@ -339,11 +308,10 @@ def evaluate(
     for number, (row, _) in enumerate(candidates):
         row |= {"rollout": index + number, "generation": generation}
     rows, families = [row for row, family in candidates if family], [family for _, family in candidates if family]
-    twins = [family[0] for family in families]
+    twins, counted = [family[0] for family in families], recordings(problem, loss)
 
     def simulate(members: list[int]) -> None:
         start = time.perf_counter()
-        counted = recordings(problem, [twins[k] for k in members], loss)
         results = [
             outcomes([families[k][place] for k in members], one.hands, one.velocity, one.loss, problem.device)
             for place, one in counted.items()

@@ -64,7 +64,7 @@ class Polish:
     @property
     def done(self) -> bool:
         """Whether nothing more is asked for."""
-        return self.finished or self.rounds >= self.search.rounds_of(len(self.columns))
+        return self.finished or self.rounds >= self.search.polish_rounds
 
     def steps(self) -> np.ndarray:
         """Signed steps of the finite differences: downwards, where a twin needs no more substeps, but at a lower bound."""
@@ -195,7 +195,7 @@ def slope_rows(
     families = [family or base for _, family in candidates]
     most = [max(twin.simulation.substeps for twin in twins) for twins in zip(*families, strict=True)]
     fine, seen = [bool(family) for _, family in candidates], []
-    for place, recording in recordings(problem, [family[0] for family in families], loss).items():
+    for place, recording in recordings(problem, loss).items():
         twins = [family[place] for family in families]
         twins = [replace(twin, simulation=replace(twin.simulation, substeps=most[place])) for twin in twins]
         positions, velocities = motions(twins, recording.hands, recording.velocity, problem.device)
@@ -211,6 +211,6 @@ def slope_rows(
         row["cost"] = min(float(costs[k]), PENALTY)
         own = (0.0, np.zeros(len(steps))) if k == 0 else (gradient[k - 1], squares[k - 1])
         row |= {RESIDUAL: float(own[0])}
-        row |= {f"{PRODUCT}{name}": float(value) for name, value in zip(problem.polished, own[1], strict=True)}
+        row |= {f"{PRODUCT}{name}": float(value) for name, value in zip(problem.search.polished, own[1], strict=True)}
         rows.append(row)
     return rows

@@ -53,8 +53,7 @@ class Proposals:
         searched = problem
         if self._tied:
             searched = replace(problem, clusters=1)
-            # Those of regions share a value; those of hands are of no region.
-            shared = [name if name in searched.variables else name.partition(".")[0] for name in problem.variables]
+            shared = [name.partition(".")[0] for name in problem.variables]
             self._columns = np.array([searched.variables.index(name) for name in shared])
         self._strategy = _strategy(searched.encode(), problem.search.sigma, seed)
         self._population: list[np.ndarray] = []
@@ -122,7 +121,7 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
     problem = replace(problem, push=ways[0])
     proposals = Proposals(problem, seed)
     loss = FrameLoss.of(problem.observations, problem.losses, problem.device, frozen_counts=problem.quirks.frozen_loss_denominators)
-    budget = problem.search.cma_rollouts_of(len(problem.polished))
+    budget = problem.search.cma_rollouts
     progress = Progress(
         f"search {problem.observations.scenario.name}, regions: {problem.clusters}, seed {seed}", problem.search.rollouts
     )
@@ -196,10 +195,10 @@ def _polished(
 ) -> Iterator[list[dict[str, Any]]]:
     """The rows of the polish after each of its generations; those that are recorded are taken as they are, if they replay."""
     best = min(trace, key=lambda row: row["cost"])
-    if not problem.search.rounds_of(len(problem.polished)) or best["cost"] >= PENALTY:
+    if not problem.search.polish_rounds or best["cost"] >= PENALTY:
         return
     start = np.array([best[f"normalized.{name}"] for name in problem.variables])
-    columns = [problem.variables.index(name) for name in problem.polished]
+    columns = [problem.variables.index(name) for name in problem.search.polished]
     polish, rows = Polish(problem.search, columns, start, best["cost"]), list[dict[str, Any]]()
     while not polish.done:
         generation += 1

@@ -42,7 +42,7 @@ class Outcome:
 def outcomes(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor, loss: FrameLoss, device: str) -> list[Outcome]:
     """Roll twins of the same nodes out from velocity [N, 3], m/s, and judge the frames that the loss holds.
 
-    hands are the controllers' positions [T, C, 3], or `controllers.waypoints` of them; or those of each twin, [T, B, C, 3].
+    hands are the controllers' positions [T, C, 3], or `controllers.waypoints` of them.
     """
     solver = solver_for(twins, device, differentiable=False)
     sums = LossSums(solver, loss, velocity)
@@ -57,8 +57,7 @@ def outcomes(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor,
 
 
 def motions(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor, device: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Positions, m, and velocities, m/s, [T - 1, B, N, 3] at the end of each frame of rollouts over hands [T, C, 3], or
-    [T, B, C, 3] of each twin, on the CPU."""
+    """Positions, m, and velocities, m/s, [T - 1, B, N, 3] at the end of each frame of rollouts over hands [T, C, 3], on the CPU."""
     solver = solver_for(twins, device, differentiable=False)
     kept: dict[str, list[torch.Tensor]] = {"x": [], "v": []}
     for _ in _frames(solver, twins, hands, velocity):
@@ -72,7 +71,7 @@ def _frames(solver: FrameSolver, twins: Sequence[Twin], hands: torch.Tensor, vel
     count = len(twins)
     nodes = torch.tensor(twins[0].topology.nodes, device=solver.device)
     solver.start(nodes.expand(count, -1, -1), velocity.expand(count, -1, -1))
-    every = hands if hands.dim() == 4 else hands[:, None].expand(-1, count, -1, -1)
+    every = hands[:, None].expand(-1, count, -1, -1)
     for frame in range(1, len(hands)):
         solver.advance(every[frame - 1], every[frame])
         yield frame

@@ -119,6 +119,12 @@ MISTAKES = {
         "perception.segment.opencv.sleeves: unknown key (removed, marks serve such scenes",
     ),
     "a fixed stranger": ("search: {fixed: [mass]}", "fixed: different ones of stiffness, object_radius", "received ['mass']"),
+    "a searched hand": ("search: {variables: {hand_tilt: {start: 5.0}}}", "hand_tilt: unknown key (removed, hands of color alone"),
+    "a fixed hand": ("search: {fixed: [hand_size]}", "received ['hand_size'] (removed, hands of color alone"),
+    "polish of hands": (
+        "search: {polish: {variables: [drag, hand_tilt, hand_depth]}}",
+        "received ['drag', 'hand_tilt', 'hand_depth'] (removed, hands of color alone move in an upright plane; commit 152a3d9",
+    ),
     "polish of springs": (
         "search: {polish: {variables: [object_radius]}}",
         "variables: different ones of stiffness",

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from neuspring.core.artifacts import Observations, Twin
+from neuspring.core.artifacts import Observations
 from neuspring.data.capture import POINTS
 from tests.support.colored import paint
 from tests.support.project import add_scenario, copy_workflow, run
@@ -15,7 +15,7 @@ CHANGES = {
     "scenarios": ["painted"],
     "methods": ["static", "controller_lbs", "search_only", "baseline", "neuspring"],
     "compare_with": "baseline",
-    "search": {"rollouts": 14, "polish": {"variables": ["stiffness", "hand_tilt"]}},
+    "search": {"rollouts": 14, "polish": {"variables": ["stiffness"]}},
     "fit": {"epochs": 1},
     "perception": {"segment": {"backend": "given"}, "sample": {"voxel": 0.02, "nodes": 60}},
     "images": {"appearance": {"iterations": 20, "spacing": 2.0}, "video": False},
@@ -37,8 +37,6 @@ def test_color_alone_becomes_scores_of_pictures_and_marked_points(tmp_path):
     folder = folder if folder.is_dir() else project / "results" / "painted"
     observations = Observations.load(folder / "observations.npz")
     assert observations.image is not None
-    twin = Twin.load(folder / "baseline" / "0" / "twin.npz")
-    assert set(twin.hands) >= {"hand_tilt", "hand_size", "hand_depth.0"}
     scores = pd.read_parquet(folder / "neuspring" / "0" / "scores.parquet")
     # Without depth there is nothing in space to compare with.
     assert set(scores["metric"]) >= {"iou", "psnr", "ssim", "image_error"}

@@ -18,8 +18,7 @@ from neuspring.perception.sample import among, assemble, spacing
 from neuspring.perception.shape import no_prior
 from neuspring.perception.track_opencv import choose
 from neuspring.scores import metrics
-from neuspring.twin.candidates import candidate, recordings
-from neuspring.twin.hand_paths import with_hands
+from neuspring.twin.candidates import recordings
 from neuspring.twin.losses import FrameLoss
 from tests.support import small
 from tests.support.colored import UP, camera, paint
@@ -56,7 +55,7 @@ def seen_of(capture):
     return assemble(ROW, capture, lifted, prior, SETTINGS, image), lifted
 
 
-def test_given_hands_are_the_controllers_and_nothing_of_them_is_searched(tmp_path):
+def test_given_hands_are_the_controllers(tmp_path):
     capture, hands, tracks = brought(paint(tmp_path / "painted"))
     seen, lifted = seen_of(capture)
     np.testing.assert_allclose(seen.controller_points, hands, atol=1e-6)
@@ -69,12 +68,8 @@ def test_given_hands_are_the_controllers_and_nothing_of_them_is_searched(tmp_pat
     np.testing.assert_allclose(seen.tracks, tracks, atol=1e-6)
     assert np.isfinite(metrics.errors_per_frame(np.repeat(seen.nodes[None], 8, axis=0), seen)["track_error"]).all()
     searched = small.search_problem(seen)
-    assert not [name for name in searched.names if name.startswith("hand_")]
-    twin = candidate(searched, searched.decode(searched.encode()))
-    assert not twin.hands
-    assert with_hands(seen, twin) is seen
     loss = FrameLoss.of(seen, Config().losses, "cpu")
-    begun = recordings(searched, [twin], loss)[0].hands
+    begun = recordings(searched, loss)[0].hands
     np.testing.assert_allclose(begun[:, :, :3], hands[: seen.scenario.train_end], atol=1e-6)
     strip = hands_strip(capture, seen.image, lifted.controller_points, tmp_path / "hands.png")
     assert (cv2.imread(str(strip)) == (60, 60, 255)).all(axis=2).any()

@@ -246,9 +246,9 @@ def test_hands_that_are_shifted_are_off_and_their_way_is_not():
     found = list(given_errors(seen, given, np.zeros((1, 3))))
     assert [frame for _, frame, *_ in found] == [0, 1, 2, 3]
     np.testing.assert_allclose([row[2:] for row in found], [[5.0, 0.0]] * 4, atol=1e-9)
-    rows = [("s", "outlines", 0, hand, frame, "future" if frame > 2 else "training", *e) for hand, frame, *e in found]
-    (line,) = [line for line in hand_lines(pd.DataFrame(rows, columns=list(HAND_COLUMNS))) if "outlines" in line]
-    assert [cell.strip() for cell in line.split("|")[5:-1]] == ["5", "5", "5", "5", "0", "0", "0"]
+    rows = [("shifted", hand, frame, "future" if frame > 2 else "training", *e) for hand, frame, *e in found]
+    (line,) = [line for line in hand_lines(pd.DataFrame(rows, columns=list(HAND_COLUMNS))) if "shifted" in line]
+    assert [cell.strip() for cell in line.split("|")[3:-1]] == ["5", "5", "5", "5", "0", "0", "0"]
 
 
 def test_hands_count_by_their_motion_alone():

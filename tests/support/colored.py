@@ -32,7 +32,7 @@ def camera(target: np.ndarray, distance: float = 0.8, elevation: float = 40.0) -
 
 @functools.cache
 def observed(path: str = "rope/lift/smooth") -> Observations:
-    """A toy scene without depth: exact tracks and sizes of hands, silhouettes of discs around the nodes."""
+    """A toy scene without depth: exact tracks and hands, silhouettes of discs around the nodes."""
     scene = small.scene(path)
     seen, truth = scene.observations, scene.motion
     view = camera(seen.nodes.mean(axis=0).astype(float))
@@ -64,15 +64,7 @@ def observed(path: str = "rope/lift/smooth") -> Observations:
         marked=np.zeros((frames, 0, 2)),
     )
     points = np.where(known[..., None], seen.object_points, 0.0)
-    still = np.repeat(seen.controller_points[:1], frames, axis=0)
-    return replace(
-        seen,
-        object_points=points,
-        object_visibility=known,
-        object_motion_valid=np.zeros_like(known),
-        controller_points=still,
-        image=image,
-    )
+    return replace(seen, object_points=points, object_visibility=known, object_motion_valid=np.zeros_like(known), image=image)
 
 
 def paint(folder: Path, category: str = "cloth", frames: int = 8, spoiled: bool = False) -> Capture:

@@ -90,7 +90,7 @@ def search_problem(seen: Observations | None = None, **changes: object) -> Searc
 
 def judge(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> list[Outcome]:
     """What becomes of candidates that are rolled out together over the training frames."""
-    own = recordings(problem, twins, loss)[0]
+    own = recordings(problem, loss)[0]
     return outcomes(twins, own.hands, own.velocity, own.loss, problem.device)
 
 

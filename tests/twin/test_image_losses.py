@@ -8,15 +8,15 @@ import torch
 
 from neuspring import config
 from neuspring.config import Losses
-from neuspring.core.errors import InputError
-from neuspring.twin import hand_paths
-from neuspring.twin.candidates import Recording, SearchProblem, _motion, candidate
+from neuspring.twin.candidates import Recording, SearchProblem, candidate, evaluate, recordings
 from neuspring.twin.fit import FitProblem, TwinFit
 from neuspring.twin.losses import BETA, FrameLoss
-from neuspring.twin.polish import products
+from neuspring.twin.polish import POLISH, products
 from neuspring.twin.search import search
+from neuspring.twin.transfer import on_recording
 from neuspring.twin.trials import motions
 from tests.support import colored, small
+from tests.support.searches import assert_same_trace
 
 ALL = Losses(image_track=1.0, silhouette=1.0)
 
@@ -99,13 +99,14 @@ def test_a_candidates_cost_is_that_of_its_rollout_and_of_its_residuals():
     problem = problem_of(losses=replace(ALL, acceleration=0.01))
     loss = FrameLoss.of(problem.observations, problem.losses, "cpu")
     values = problem.decode(problem.encode())
-    others = values | {"hand_tilt": 20.0, "stiffness": 2e4}
+    others = values | {"stiffness": 2e4}
     twins = [candidate(problem, one) for one in (values, others)]
     together, alone = small.judge(problem, twins, loss), [small.judge(problem, [twin], loss)[0] for twin in twins]
     assert together == alone
     assert together[0].cost != together[1].cost
-    hands, start = _motion(problem, twins)
-    x, v = motions(twins, hands, start, "cpu")
+    own = recordings(problem, loss)[0]
+    start = own.velocity
+    x, v = motions(twins, own.hands, start, "cpu")
     for k, outcome in enumerate(together):
         states = [(frame, x[frame - 1, k], v[frame - 1, k]) for frame in range(1, len(x) + 1)]
         assert small.rollout_loss(loss, states, start) == pytest.approx(outcome.cost, rel=1e-5)
@@ -120,11 +121,11 @@ def test_gradients_of_stiffness_through_projection_and_simulator(name):
     problem = problem_of()
     twin = candidate(problem, problem.decode(problem.encode()))
     twin = replace(twin, simulation=replace(twin.simulation, substeps=100))
-    seen = hand_paths.with_hands(problem.observations, twin)
     settings = config.Fit(horizon=0, learning_rate=1e-12, epochs=1, global_stiffness=True)
+    rules = config.Simulation(substeps=100), weights, config.ReleasedQuirks()
 
     def loss_at(shift: float) -> tuple[float, float]:
-        run = TwinFit(FitProblem(seen, twin, settings, config.Simulation(substeps=100), weights, config.ReleasedQuirks()))
+        run = TwinFit(FitProblem(problem.observations, twin, settings, *rules))
         with torch.no_grad():
             run.parameters.factors["stiffness"] += shift
         packed = run.stable_parameters()
@@ -137,42 +138,27 @@ def test_gradients_of_stiffness_through_projection_and_simulator(name):
     assert loss_at(0.0)[1] == pytest.approx(central, rel=0.05)
 
 
-def test_a_search_moves_the_hands_and_reads_training_frames_alone():
-    polish = {"variables": ["stiffness", "hand_tilt", "hand_size", "hand_depth"]}
-    # The hand rises upright.
-    settings = config.parse(config.Search, {"rollouts": 60, "variables": {"hand_tilt": {"start": 50.0}}, "polish": polish}, "test")
-    problem = problem_of(search=settings)
+def test_a_search_reads_training_frames_alone():
+    # 25 candidates of CMA-ES and a round of the polish.
+    problem = problem_of(search=config.Search(rollouts=33))
     found = search(problem, 0)
-    true = small.observations().controller_points
-    end = problem.observations.scenario.train_end
-
-    def error(values: dict[str, float]) -> float:
-        moved = hand_paths.hand_points(problem.observations, values)
-        return float(np.linalg.norm(moved - true, axis=2)[end - 1].mean())
-
-    assert found.cost < 0.5 * found.trace["cost"].iloc[0]
-    assert error(found.twin.hands) < error(problem.decode(problem.encode()))
-    image = problem.observations.image
-    later = slice(end, None)
+    assert found.trace["stage"].iloc[-1] == POLISH
+    assert found.cost < 0.8 * found.trace["cost"].iloc[0]
+    later = slice(problem.observations.scenario.train_end, None)
+    image, hands = problem.observations.image, problem.observations.controller_points.copy()
     pixels, visible = image.pixels.copy(), image.visible.copy()
-    pixels[later], visible[later] = 7.0, True
-    spoiled = replace(problem.observations, image=replace(image, pixels=pixels, visible=visible))
-    again = search(replace(problem, observations=spoiled), 0)
-    assert again.cost == found.cost
-    assert again.twin.hands == found.twin.hands
+    pixels[later], visible[later], hands[later] = 7.0, True, 0.5
+    spoiled = replace(problem.observations, controller_points=hands, image=replace(image, pixels=pixels, visible=visible))
+    assert_same_trace(search(replace(problem, observations=spoiled), 0).trace, found.trace)
 
 
-def test_regions_and_hands_are_searched_together():
-    settings = config.parse(config.Search, {"rollouts": 40, "tied_rollouts": 20, "polish": {"rounds": 0}}, "test")
-    found = search(problem_of(search=settings, clusters=2), 0)
-    assert {"object_radius.0", "object_radius.1", "hand_tilt", "hand_depth.2"} <= set(found.values)
-    fixed = config.parse(config.Search, {"fixed": ["hand_tilt", "hand_size", "hand_depth"]}, "test")
-    assert not [name for name in problem_of(search=fixed).variables if name.startswith("hand")]
-    assert problem_of(search=fixed).decode(problem_of(search=fixed).encode())["hand_depth.0"] == 1.0
-
-
-def test_a_pool_of_color_alone_is_refused():
-    seen = colored.observed()
-    pool = (Recording.of(seen, config.Simulation(), ALL, config.ReleasedQuirks()),)
-    with pytest.raises(InputError, match="one by one"):
-        problem_of(pool=pool)
+def test_recordings_of_color_alone_form_a_pool():
+    alone, other = problem_of(losses=ALL), colored.observed("rope/shake/smooth")
+    loss = FrameLoss.of(alone.observations, ALL, "cpu")
+    both = replace(alone, pool=(Recording.of(other, alone.simulation, ALL, alone.quirks),))
+    each = (alone, replace(both, leave_out=True), both)
+    one, moved, mean = (evaluate(problem, [alone.encode()], loss, 0, 0, map)[0]["cost"] for problem in each)
+    assert mean == pytest.approx((one + moved) / 2, rel=1e-12)
+    # What the other recording costs is its own error in the image.
+    twin = on_recording(candidate(alone, alone.decode(alone.encode())), other, alone.quirks)
+    assert moved == small.judge(small.search_problem(other), [twin], FrameLoss.of(other, ALL, "cpu"))[0].cost != one

@@ -12,7 +12,7 @@ import torch
 from neuspring import config
 from neuspring.config import Losses
 from neuspring.twin import losses
-from neuspring.twin.candidates import _motion, candidate
+from neuspring.twin.candidates import candidate, recordings
 from neuspring.twin.fit import TwinFit
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.polish import products
@@ -176,11 +176,12 @@ def test_a_new_term_is_a_weight_and_a_function(monkeypatch: pytest.MonkeyPatch) 
     twin = candidate(problem, small.start_values())
     loss = FrameLoss.of(problem.observations, weights, "cpu")
     (searched,) = small.judge(problem, [twin], loss)
-    hands, start = _motion(problem, [twin])
-    x, v = motions([twin], hands, start, "cpu")
+    own = recordings(problem, loss)[0]
+    start = own.velocity
+    x, v = motions([twin], own.hands, start, "cpu")
     expected = float((x[:, 0, :, 2].double() - 0.1).square().mean())
     assert searched.cost == pytest.approx(expected, rel=1e-5)
-    assert small.rollout_loss(loss, zip(range(1, len(hands)), x[:, 0], v[:, 0], strict=True), start) == pytest.approx(expected)
+    assert small.rollout_loss(loss, zip(range(1, len(own.hands)), x[:, 0], v[:, 0], strict=True), start) == pytest.approx(expected)
     polished, _, _ = products(loss, start, x, v, [True], np.zeros(0))
     assert polished.tolist() == pytest.approx([expected])
     fitted = TwinFit(small.fit_problem(losses=weights, twin=twin, fit=config.Fit(horizon=0))).epoch()["loss"]

@@ -11,7 +11,7 @@ from neuspring import config
 from neuspring.config.search import TRIALS
 from neuspring.core.errors import NumericalFailure
 from neuspring.twin import search as module
-from neuspring.twin.candidates import CMAES, SearchProblem, _motion, candidate, evaluate
+from neuspring.twin.candidates import CMAES, SearchProblem, candidate, evaluate, recordings
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.polish import POLISH, REACH, SLOPES, Polish, damped_step, products, residuals
 from neuspring.twin.search import search
@@ -41,8 +41,8 @@ def polished(rollouts: int = 50, *, start: dict | None = None, rounds: int = 6, 
 
 def rollouts_of(problem: SearchProblem, twins: list) -> tuple[torch.Tensor, torch.Tensor, FrameLoss, torch.Tensor]:
     loss = FrameLoss.of(problem.observations, problem.losses, "cpu", frozen_counts=problem.quirks.frozen_loss_denominators)
-    hands, start = _motion(problem, twins)
-    return *motions(twins, hands, start, "cpu"), loss, start
+    own = recordings(problem, loss)[0]
+    return *motions(twins, own.hands, own.velocity, "cpu"), loss, own.velocity
 
 
 def squares(loss: FrameLoss, start: torch.Tensor, x: torch.Tensor, v: torch.Tensor) -> float:
@@ -71,7 +71,7 @@ def test_slopes_are_those_of_the_cost():
     """2 J'r against central differences of the cost, without the acceleration term, which bends most."""
     problem = polished(losses=config.Losses(acceleration=0.0))
     base = problem.encode()
-    columns = [problem.variables.index(name) for name in problem.polished]
+    columns = [problem.variables.index(name) for name in problem.search.polished]
 
     def twins(step: float) -> list:
         moved = [base + step * np.eye(len(base))[column] for column in columns]

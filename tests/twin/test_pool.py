@@ -111,7 +111,7 @@ def test_costs_and_products_of_a_polish_are_means_over_the_recordings():
 def test_a_neighbor_that_leaves_one_recording_has_no_slope(monkeypatch):
     problem = on_pool(polished(seen(LIFTED)), SHAKEN)
     loss, calls = FrameLoss.of(problem.observations, problem.losses, "cpu"), []
-    polish = Polish(problem.search, [problem.variables.index(name) for name in problem.polished], problem.encode(), 1.0)
+    polish = Polish(problem.search, [problem.variables.index(name) for name in problem.search.polished], problem.encode(), 1.0)
     motions = module.motions
 
     def leaving(*arguments):

@@ -1,7 +1,7 @@
-"""How far off the hands of a twin of color footage were, where the hands are given in space: part of `beside_phystwin`.
+"""How far off hands are that were seen in color alone, where they are given in space too: part of `beside_phystwin`.
 
-A hand's grip is the mean of its controllers; the given one is the mean of its points that are near the object in frame 0. The
-hands that the outlines have are those of the observations, without depth; the search found a depth.
+A hand's grip is the mean of its controllers; the given one is the mean of its points that are near the object in frame 0. Seen
+hands move in a plane (neuspring/perception/color_hands.py).
 """
 
 from __future__ import annotations
@@ -13,19 +13,17 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
-from neuspring.core.artifacts import Observations, Twin
-from neuspring.core.records import StageRecord
+from neuspring.core.artifacts import Observations
 from neuspring.core.table import Table
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.data.points import read
 from neuspring.perception.findings import GRIP
-from neuspring.twin.hand_paths import with_hands
 from workflow.scripts.beside_data import PREFIX
 
 FEWEST = 3
 """Given points of a grip, where fewer are within GRIP of the object."""
 MM = 1e3
-COLUMNS = ("scenario", "hands", "seed", "hand", "frame", "task", "off", "way")
+COLUMNS = ("scenario", "hand", "frame", "task", "off", "way")
 
 
 def grips(centers: np.ndarray, given: np.ndarray, nodes: np.ndarray) -> np.ndarray:
@@ -66,36 +64,27 @@ def hand_rows(captures: Path, scenarios: Iterable[Path]) -> pd.DataFrame:
             continue
         space = read(Capture.load(points))
         assert space.hands is not None
-        found = [("outlines", 0, seen)]
-        for record in sorted(scenario.glob("search-*/*/search.json")):
-            loaded = StageRecord.load(record)
-            if "twin" in loaded.files:
-                name = record.parts[-3]
-                found.append((name, int(record.parent.name), with_hands(seen, Twin.load(loaded.file("twin", record)))))
-        for name, seed, own in found:
-            for hand, frame, off, way in hand_errors(own, space.hands.points, space.nodes):
-                task = "future" if frame >= seen.scenario.train_end else "training"
-                rows.append((scenario.name, name, seed, hand, frame, task, off, way))
+        for hand, frame, off, way in hand_errors(seen, space.hands.points, space.nodes):
+            task = "future" if frame >= seen.scenario.train_end else "training"
+            rows.append((scenario.name, hand, frame, task, off, way))
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
 def hand_lines(rows: pd.DataFrame) -> list[str]:
-    """The table: means over seeds, by scenario, source and hand."""
+    """The table, by scenario and hand."""
     if not len(rows):
         return []
     lines = []
-    for (scenario, name, hand), own in rows.groupby(["scenario", "hands", "hand"], sort=False):
+    for (scenario, hand), own in rows.groupby(["scenario", "hand"], sort=False):
         last = own["frame"] == own["frame"].max()
         parts = [own["task"].eq("training") & (own["frame"] > 0), own["task"].eq("future"), last]
         cells = [own.loc[part, column].mean() for column in ("off", "way") for part in parts]
         first = own.loc[own["frame"] == 0, "off"].mean()
         texts = ("–" if np.isnan(value) else f"{value:.0f}" for value in (first, *cells))
-        lines.append([str(scenario), str(name), str(own["seed"].nunique()), str(hand), *texts])
+        lines.append([str(scenario), str(hand), *texts])
     names = ["training", "future", "last frame"]
     header = [
         "scenario",
-        "hands from",
-        "seeds",
         "hand",
         "off, frame 0",
         *(f"off, {n}" for n in names),

@@ -25,13 +25,11 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
-from neuspring.core.artifacts import Observations, Twin
-from neuspring.core.records import StageRecord
+from neuspring.core.artifacts import Observations
 from neuspring.core.table import Table
 from neuspring.data.capture import Capture, Writer
 from neuspring.data.sources import read_scenarios
 from neuspring.data.synthetic.truth import Truth, truth_of
-from neuspring.twin.hand_paths import with_hands
 
 ARMS = ("three", "one", "color")
 """Three RGBD cameras, the first of them alone, and its color alone."""
@@ -106,22 +104,13 @@ def collect(captures: Path, results: Path) -> pd.DataFrame:
             away, covered = shape_errors(truth, seen)
             rows += [(scene, arm, "", 0, "surface nodes from the true surface", MM * away)]
             rows += [(scene, arm, "", 0, "true surface from nodes", MM * covered)]
-            if arm != "color":
-                rows += [(scene, arm, "", 0, "hands, mean", MM * hand_errors(truth, seen)[0])]
+            for name, error in zip(("mean", "last"), hand_errors(truth, seen), strict=True):
+                rows += [(scene, arm, "", 0, f"hands, {name}", MM * error)]
             for file in sorted(folder.glob("*/*/scores.parquet")):
                 method, seed = file.parts[-3], int(file.parts[-2])
                 for score in pd.read_parquet(file).itertuples():
                     if score.metric in ("track_error", "chamfer"):
                         rows.append((scene, arm, method, seed, f"{score.metric}, {score.task}", MM * float(score.value)))
-            for record in sorted(folder.glob("search-uniform/*/search.json")) if arm == "color" else []:
-                twin = Twin.load(StageRecord.load(record).file("twin", record))
-                for method, hands in (("fixed", seen), ("searched", with_hands(seen, twin))):
-                    mean, last = hand_errors(truth, hands)
-                    seed = int(record.parent.name)
-                    rows += [
-                        (scene, arm, method, seed, "hands, mean", MM * mean),
-                        (scene, arm, method, seed, "hands, last", MM * last),
-                    ]
     return pd.DataFrame(rows, columns=["scene", "arm", "method", "seed", "metric", "value_mm"])
 
 

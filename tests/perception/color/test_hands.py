@@ -1,4 +1,6 @@
-"""Hands in the image, and what is read of future frames."""
+"""Hands in the image and in space, and what is read of future frames."""
+
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -6,17 +8,21 @@ import pytest
 
 from neuspring.config import Config
 from neuspring.config.perception import ColorSettings
+from neuspring.core.artifacts import ImageObservations
 from neuspring.data.capture import HANDS, OBJECT
 from neuspring.data.points import read
 from neuspring.perception.color import FirstFrame, lift_color, silhouettes
-from neuspring.perception.color_hands import along_arms, follow_hands, grips
+from neuspring.perception.color_hands import along_arms, follow_hands, grips, place
 from neuspring.perception.results import PixelTracks
 from neuspring.stages.lift import lift
 from neuspring.stages.segment import segment
 from neuspring.stages.track import track
-from tests.support.colored import paint
+from tests.support import colored
+from tests.support.colored import camera, paint
 
 SIZE = 240
+PIXEL32 = 1e-4
+"""Pixels are stored in single precision: 1e-5 px at 1 m are far less than this, m."""
 
 
 class Film:
@@ -138,6 +144,75 @@ def test_sheets_alone_are_held_by_fingers_alone(tmp_path, monkeypatch, category,
     assert (len(image.hand_of) < 30) == fingers
 
 
+def seen_on(path: np.ndarray) -> ImageObservations:
+    """What a camera sees of one hand of four points that goes along `path` [T, 3], m, without turning."""
+    view, frames = camera(path[0]), len(path)
+    return replace(
+        colored.observed().image,
+        intrinsics=view.intrinsics,
+        camera_to_world=view.camera_to_world,
+        hand_centers=view.project(path[:, None])[0],
+        hand_angles=np.zeros((frames, 1)),
+        hand_sizes=np.ones((frames, 1)),
+        pixels=np.zeros((frames, 1, 2)),
+        visible=np.zeros((frames, 1), bool),
+        marked=np.zeros((frames, 0, 2)),
+        hand_of=np.zeros(4, int),
+    )
+
+
+def way(direction: tuple[float, float, float]) -> np.ndarray:
+    """A wavy way of 20 cm in a direction."""
+    share = np.linspace(0, 1, 12)[:, None]
+    return np.array([0.05, 0.1, 0.02]) + 0.2 * share * direction + 0.02 * np.sin(3 * share) * [1.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("direction", [(0, 0, 1), (0, -1, 0)])
+def test_hands_move_upright_and_do_not_go_below_their_grip(direction):
+    """The camera looks along y. A hand that rises is where it is, and so is one that is pulled towards the camera on the table."""
+    path = way(direction)
+    grip = path[0] + 0.01 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
+    placed = place(seen_on(path), grip)
+    np.testing.assert_allclose(placed[0], grip, atol=1e-12)
+    np.testing.assert_allclose(placed.mean(axis=1), path, atol=PIXEL32)
+
+
+def test_a_hand_that_goes_away_counts_as_one_that_rises():
+    path = way((0, 1, 0))
+    placed = place(seen_on(path), np.repeat(path[:1], 4, axis=0)).mean(axis=1)
+    np.testing.assert_allclose(placed[:, 1], path[0, 1], atol=PIXEL32)
+    assert placed[-1, 2] - placed[0, 2] > 0.1
+
+
+def test_seen_from_above_up_in_the_image_is_the_plane_s_normal():
+    path = way((1, 0, 0))
+    view = camera(path[0], elevation=90.0)
+    image = replace(seen_on(path), camera_to_world=view.camera_to_world, hand_centers=view.project(path[:, None])[0])
+    np.testing.assert_allclose(place(image, np.repeat(path[:1], 4, axis=0)).mean(axis=1), path, atol=PIXEL32)
+
+
+def test_a_patch_is_rigid_and_turns_about_the_ray():
+    path = np.repeat(way((0, 0, 1))[:1], 12, axis=0)
+    image = replace(seen_on(path), hand_angles=np.linspace(0, 1.0, 12)[:, None])
+    grip = path[0] + 0.02 * np.random.default_rng(0).normal(size=(4, 3))
+    placed = place(image, grip - grip.mean(axis=0) + path[0])
+    apart = np.linalg.norm(placed[:, :, None] - placed[:, None], axis=-1)
+    np.testing.assert_allclose(apart, np.broadcast_to(apart[0], apart.shape), atol=1e-12)
+    view = camera(path[0])
+    start, end = (view.project(placed[frame])[0] - image.hand_centers[0, 0] for frame in (0, -1))
+    turned = np.arctan2(end[:, 1], end[:, 0]) - np.arctan2(start[:, 1], start[:, 0])
+    # Perspective bends angles by less than a tenth of a radian over 2 cm.
+    np.testing.assert_allclose(np.angle(np.exp(1j * (turned - 1.0))), 0.0, atol=0.1)
+
+
+def test_observations_of_color_alone_are_kept(tmp_path):
+    seen = colored.observed()
+    seen.save(tmp_path / "seen.npz")
+    kept = type(seen).load(tmp_path / "seen.npz")
+    np.testing.assert_array_equal(kept.image.pixels, seen.image.pixels)
+    assert kept.image.cell == seen.image.cell
+
+
 def test_silhouettes_of_frames():
     labels = np.zeros((2, 64, 62), np.uint8)
     labels[0, 20:40, 20:40], labels[0, 10:20, 20:40] = OBJECT, HANDS
@@ -177,6 +252,9 @@ def test_nothing_of_the_object_is_read_in_future_frames(tmp_path):
             output=out / "lifted.json",
         )
         made.append({file: np.load(out / file) for file in ("image.npz", "lifted.npz")})
+    # The painted hand rises by 4 mm per frame; its middle is painted at a whole pixel, 4 mm wide.
+    hands = made[0]["lifted.npz"]["controller_points"].mean(axis=1)
+    np.testing.assert_allclose(hands - hands[0], 0.004 * np.arange(len(hands))[:, None] * colored.UP, atol=0.004)
     for file, arrays in made[0].items():
         for name in arrays.files:
             if name != "meta":
