@@ -173,10 +173,19 @@ def _required_capture(folder: Path) -> None:
     if not (folder / capture.CAPTURE).exists():
         remedy = "Correct the path in the scenario table, or data_root, or make a capture: `neuspring make-capture --help`."
         raise InputError(folder, "a capture is a folder with capture.json", "a folder without", remedy)
-    if any((folder / name).exists() for name in IN_SPACE) or not capture.read_description(folder / capture.CAPTURE).cameras:
-        from neuspring.data.points import read
+    if any((folder / name).exists() for name in IN_SPACE):
+        _required_in_space(folder)
 
-        read(capture.Capture.load(folder))
+
+def _required_points(folder: Path) -> None:
+    _required_capture(folder)
+    _required_in_space(folder)
+
+
+def _required_in_space(folder: Path) -> None:
+    from neuspring.data.points import read
+
+    read(capture.Capture.load(folder))
 
 
 def _require_rings(config: Config) -> None:
@@ -214,7 +223,7 @@ SOURCES = {
         module="neuspring.data.points",
         reads=("data_root",),
         own=True,
-        required=_required_capture,
+        required=_required_points,
         files=(capture.CAPTURE, capture.TRACKS, *IN_SPACE),
     ),
     "phystwin_raw": Source(
