@@ -51,7 +51,7 @@ class Scene:
             contact_distance=m.contact_distance,
             simulation=twin.simulation,
             mass=m.mass.astype(np.float64) if len(m.mass) else 1.0,
-            pushes=t.pushes if len(t.pushes) else False,
+            pushes=t.pushes if len(t.pushes) else np.zeros(len(t.springs), bool),
         )
 
 

@@ -320,7 +320,7 @@ def test_a_board_of_another_size_contradicts_depth(tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([], "one of --color with --depth, --bag, --phystwin-raw is required; received none"),
+        ([], "--bag, --phystwin-raw is required, or --controllers with --nodes and --tracks; received none"),
         (["--color", "{root}/color_0"], "color alone needs the intrinsics of the camera; received none"),
         (
             ["--color", "{root}/color_0", "--depth", "{root}/depth_0", "{root}/depth_0"],
