@@ -41,6 +41,8 @@ NOTE = """\
 Track errors in mm, as PhysTwin's evaluation measures them (the nearest node in frame 0), and bound to the nodes around (0 for every
 rigid motion). ±: standard deviation over seeds. PhysTwin had three RGBD cameras and dense tracks. Its numbers are those of its
 released evaluation of these frames. Nobody has compared our nine annotated points with the released file."""
+UNLEARNED = ("static", "controller_lbs")
+"""They learn nothing; their errors would flatten the pictures."""
 COLUMNS = ["case", "saw", "method", "seed", "task", "metric", "value"]
 
 
@@ -96,7 +98,8 @@ def _spread(values: pd.Series, shown: tuple[str, str]) -> str:
 
 
 def curves(results: Path, case: str, saw: str, methods: Sequence[str]) -> Figure:
-    """Errors of the annotated points, mm: their mean by frame, and each in the future; means over seeds."""
+    """Errors of the annotated points, mm: their mean by frame, and each in the future; means over seeds of methods that learn."""
+    methods = [method for method in methods if method not in UNLEARNED]
     observed = Observations.load(results / f"{case}_{saw}" / "observations.npz")
     tracks, end = observed.tracks.astype(float), observed.scenario.train_end
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.0), layout="constrained", width_ratios=(1.5, 1))
@@ -117,6 +120,11 @@ def curves(results: Path, case: str, saw: str, methods: Sequence[str]) -> Figure
         known = np.isfinite(later).any(axis=0)
         places = np.flatnonzero(known) + (number - len(methods) / 2) * 0.8 / len(methods)
         right.bar(places, np.nanmean(later[:, known], axis=0), width=0.8 / len(methods), color=color)
+    known_errors = released()
+    for row in known_errors[(known_errors["scenario"] == case) & (known_errors["metric"] == "track_error")].itertuples():
+        span = (0, end) if row.task == "reconstruction" else (end, len(tracks) - 1)
+        label = f"{PHYSTWIN}, mean" if row.task == "future" else None
+        left.plot(span, [MM * row.value] * 2, color="k", ls="--", lw=1.0, label=label)
     left.axvspan(end, len(tracks) - 1, color="tab:orange", alpha=0.12, lw=0, label="future")
     left.set(xlabel="frame", ylabel="track error [mm]", xlim=(0, len(tracks) - 1), ylim=(0, None))
     right.set(xlabel="annotated point, mean over the future", xticks=range(tracks.shape[1]), ylim=(0, None))
