@@ -181,6 +181,12 @@ def compared_with_records(stage):
     return found
 
 
+def unfinished(stage, wildcards):
+    """Whether what a job makes is not there, or departs from what it would make now."""
+    there = Path(GRAPH.output_of(stage, wildcards)).exists()
+    return not there or bool(FRESH.look(stage, wildcards))
+
+
 def compared_with_stamp(log, output, stamp):
     """An input function without files, of jobs of no stage. It compares the stamp in the record of the last such job."""
 

@@ -11,9 +11,11 @@ for STAGE in STAGES.values():
             unpack(compared_with_records(STAGE)),
             **(
                 {
-                    # Their checkpoints, from which a fit goes on, are those that it would have left alone.
+                    # Their checkpoints, from which a fit goes on, are those that it would have left alone. But behind a job that
+                    # is made again Snakemake overlooks what is missing, if all that it reads is ancient.
                     "shared": lambda wildcards: [
-                        ancient(path) for path in GRAPH.shared_launches(wildcards)
+                        path if unfinished(STAGES["fit"], wildcards) else ancient(path)
+                        for path in GRAPH.shared_launches(wildcards)
                     ]
                 }
                 if STAGE.name == "fit"
