@@ -75,8 +75,9 @@ class FrameSolver:
         springs.allocate(self.buffers, spring_pairs)
         collision.allocate(self.buffers)
         obstacles.allocate(self.buffers)
-        self._kernels = frame.kernels(self.buffers.real, self.buffers.width, bool(self.simulation.obstacles))
-        self._graphs = Graphs(device)
+        self._pushes = False
+        """Whether some spring only pushes."""
+        self._choose_kernels()
         self.grips = Grips(spring_pairs, nodes, device)
         self._held: torch.Tensor | None = None
         """Rest lengths of grips that began since the parameters were set [B, L] (controllers.py)."""
@@ -88,9 +89,17 @@ class FrameSolver:
         self.frame_token = 0
         """Number of frames simulated: tells whether the buffers still hold a given one."""
 
+    def _choose_kernels(self) -> None:
+        among = bool(self.simulation.obstacles)
+        self._kernels = frame.kernels(self.buffers.real, self.buffers.width, among, self._pushes)
+        self._graphs = Graphs(self.device)
+
     def set_parameters(self, parameters: Parameters) -> None:
         """Copy packed parameters into the solver's buffers."""
         values = {name: self._stacked(parameters[name]) for name in PARAMETERS}
+        if (pushes := bool((values["springs"][..., 1] < 0).any())) != self._pushes:
+            self._pushes = pushes
+            self._choose_kernels()
         for name, value in values.items():
             self.buffers.set_parameter(name, value)
         self._plain, self._factor, self._held = values["springs"].detach(), None, None
