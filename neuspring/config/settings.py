@@ -151,7 +151,7 @@ class Config(Section):
     """auto: CUDA where there are GPUs. Which ones: [gpus](#gpus)."""
     twins_per_launch: Count | Literal["auto"] = "auto"
     """How many candidates of a search, or fits of a scenario, are simulated in one launch at most. auto: on a CPU as many as save
-    time, on CUDA a whole generation, and each fit alone. 1: one by one. On a CPU no result depends on it, bit for bit."""
+    time, on CUDA all. 1: one by one. On a CPU no result depends on it, bit for bit."""
     gpus: Gpus = field(default_factory=Gpus)
     simulation: Simulation = field(default_factory=Simulation)
     losses: Losses = field(default_factory=Losses)

@@ -101,7 +101,17 @@ def _declares(module: str) -> bool:
 
 @functools.cache
 def _module_code(module: str) -> bytes:
-    return hashlib.sha256(ast.dump(_tree(module)).encode()).digest()
+    return hashlib.sha256(_written(_tree(module)).encode()).digest()
+
+
+def _written(value: object) -> str:
+    """A syntax tree as text without its empty fields: each version of Python has other ones."""
+    if isinstance(value, list):
+        return f"[{', '.join(map(_written, value))}]"
+    if not isinstance(value, ast.AST):
+        return repr(value)
+    fields = ", ".join(f"{name}={_written(held)}" for name, held in ast.iter_fields(value) if held is not None and held != [])
+    return f"{type(value).__name__}({fields})"
 
 
 @functools.cache

@@ -203,7 +203,7 @@ class Benchmark:
         self.pooled = frozenset(name for name in whole.methods if methods[name].pool)
         """Methods of the whole configuration that are judged on a pool, so that scenarios without any are left out."""
         self.on_gpu = False
-        """Whether jobs take GPUs. There `twins_per_launch: auto` lets no fits share launches: nobody has measured if it pays."""
+        """Whether jobs take GPUs."""
         for name in [*self.scenarios, *self.methods]:
             if name in (*RESERVED, config.tables) or name.startswith("search-"):
                 rule = f"{', '.join(sorted({*RESERVED, config.tables}))} and search-... are folders of the results"
@@ -249,10 +249,9 @@ class Benchmark:
     def fits_together(self, scenario: str) -> tuple[tuple[str, int], ...]:
         """The fits (method, seed) of a scenario that share launches: those in step (horizon, frames), if not too few.
 
-        None where `twins_per_launch` is 1, or auto on a GPU.
+        None where `twins_per_launch` is 1.
         """
-        most = self.config.twins_per_launch
-        if most == 1 or (most == "auto" and self.on_gpu) or scenario not in self.config.scenarios:
+        if self.config.twins_per_launch == 1 or scenario not in self.config.scenarios:
             return ()
         # A fit on several recordings takes turns between them, and shares launches with nobody; a rod has lanes of its own.
         alone = [name for name, method in self.fits.items() if method.pool or method.fit == "rod"]

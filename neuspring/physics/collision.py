@@ -16,7 +16,7 @@ import torch
 import warp as wp
 
 from neuspring.core.device import load
-from neuspring.physics.arrays import Buffers, structs
+from neuspring.physics.arrays import UNFUSED, Buffers, structs
 from neuspring.physics.lanes import lanes
 from neuspring.physics.motion import APPROACH, MIN_TANGENT
 
@@ -134,7 +134,7 @@ def kernels(real: Any, width: int) -> tuple[Any, Any]:
                         count = inserted(model, i, g, j, q, count)
         model.near_count[i, g] = count
 
-    unique = wp.kernel(module="unique", enable_backward=False)
+    unique = wp.kernel(**UNFUSED)
     return unique(place), unique(find)
 
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from neuspring.physics import collision, motion, obstacles, springs
-from neuspring.physics.arrays import structs
+from neuspring.physics.arrays import UNFUSED, structs
 from neuspring.physics.lanes import lanes
 
 
@@ -208,5 +208,5 @@ def kernels(real: Any, width: int, among: bool = False, pushes: bool = False) ->
             advance_adjoint(model, state, adjoint, step - 1, i, g)
             update_adjoint(model, state, adjoint, step - 1, i, g)
 
-    made = wp.kernel(module="unique", enable_backward=False)
+    made = wp.kernel(**UNFUSED)
     return Kernels(*map(made, (forward, backward, begin, substep, collide, settle, pull, hit, slow)))

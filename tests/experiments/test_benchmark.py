@@ -698,10 +698,6 @@ def test_fits_of_equal_horizon_share_launches_where_they_are_not_too_few():
     assert pairs(seeds=[0, 1]) == ()
     assert pairs(seeds=[0, 1, 2]) == (*(("baseline", k) for k in range(3)), *(("neuspring", k) for k in range(3)))
     assert pairs(seeds=[0, 1, 2], twins_per_launch=1) == ()
-    both = (Benchmark(shipped("toy") | {"seeds": [0, 1, 2], "twins_per_launch": most}, ROOT) for most in ("auto", 8))
-    for one, shared in zip(both, (0, 6), strict=True):
-        one.on_gpu = True
-        assert len(one.fits_together("toy_rope_lift_smooth")) == shared
     assert pairs(seeds=[0, 1, 2], only="method=search_only") == ()
     three = ["baseline", "neuspring", "no_triplane", "fixed_resolution"]
     assert pairs(seeds=[4], methods=three) == (("neuspring", 4), ("no_triplane", 4), ("fixed_resolution", 4))
