@@ -21,8 +21,8 @@ from neuspring.physics.lanes import lanes, width_for
 from neuspring.physics.parameters import PARAMETERS, Parameters
 
 UNFUSED: dict[str, Any] = {"module": "unique", "enable_backward": False, "module_options": {"fuse_fp": False}}
-"""Options of the kernels of a frame. A fused product and sum rounds once, and a GPU fuses where a CPU does not: contacts then flip on
-one of them alone."""
+"""Options of the kernels of a frame. A fused product and sum rounds once, and a GPU fuses where a CPU does not: contacts then flip
+on one of them alone."""
 
 
 @functools.cache
