@@ -115,6 +115,7 @@ def make_capture(
     tracks: Annotated[Path | None, arg(help="annotated points in space: JSON, m")] = None,
     teach: Annotated[bool, arg(help="annotated points of training frames teach the twin; without color they always do")] = False,
     up: Annotated[Literal["+z", "-z"], arg(help="up of points in space alone")] = "+z",
+    no_table: Annotated[bool, arg(help="points in space alone: no table is below the object")] = False,
     force: Annotated[bool, arg(help="replace the images of a capture that is there")] = False,
 ) -> None:
     """Color and depth of a camera, or points in space -> a capture folder. What was found is printed, and the next command."""
@@ -159,6 +160,7 @@ def make_capture(
         tracks=tracks,
         teach=teach,
         up=up,
+        no_table=no_table,
         raw=raw,
         force=force,
     )
@@ -168,6 +170,10 @@ def make_capture(
     print(f"  neuspring check-data {capture.folder}")
     if capture.cameras and not capture.description.masks:
         print(f"  neuspring annotate {capture.folder}")
+    if not capture.cameras:
+        run = "snakemake --profile workflow/profiles/default --cores 2 --configfile config/data/points.yaml"
+        where = capture.folder.resolve()
+        print(f"  {run} --config data_root={where.parent} 'scenarios=[{where.name}]'")
 
 
 def cut_capture(

@@ -274,6 +274,10 @@ def _read_tracks(path: Path, listed: object, frames: int, size: int) -> np.ndarr
         raise InputError(path, f"a list of tracks of {form} or null is required", str(error)) from error
     if tracks.shape[1] != frames:
         raise InputError(path, f"every track needs {frames} entries", tracks.shape[1])
+    unseen = np.array([[point is None for point in track] for track in listed], dtype=bool)
+    if (odd := np.argwhere(~np.isfinite(tracks).all(axis=2) & ~unseen)).size:
+        rule = "coordinates must be finite; where a point is not seen, its entry is null"
+        raise InputError(path, rule, f"point {odd[0, 0]}, frame {odd[0, 1]}: {tracks[tuple(odd[0])].tolist()}")
     return np.swapaxes(tracks, 0, 1)
 
 

@@ -315,11 +315,33 @@ def space_findings(file: Path, points: np.ndarray, up: float | None, *, is_body:
         text = f"{where}. It rests at y = 0: if y is up, write {words} in place of (x, y, z)"
         return [*found, (unusual if low > FAR_OFF else broken)(file, "points", rule, text)]
     if high <= SUNK:
-        return [*found, broken(file, "points", rule, f"{where}. Is up {sign[1]}z? Then write so in {CAPTURE} (make-capture: --up)")]
+        remedy = f"Is up {sign[1]}z? Then write so in {CAPTURE} (make-capture: --up). Without a table: ground: false (--no-table)"
+        return [*found, broken(file, "points", rule, f"{where}. {remedy}")]
     if low > FAR_OFF and high <= HIGH:
-        return found
-    remedy = f"Move the world so that the table is z = 0, or write ground: false in {CAPTURE}"
+        remedy = "If it stands on a table, the table must be z = 0; or is another axis up? If it hangs, this is right"
+        return [*found, unusual(file, "points", rule, f"{where}: {100 * low:.0f} cm above the table. {remedy}")]
+    remedy = f"Move the world so that the table is z = 0, or write ground: false in {CAPTURE} (make-capture: --no-table)"
     return [*found, (broken if low < -FAR_OFF else unusual)(file, "points", rule, f"{where}. {remedy}")]
+
+
+MOST_NODES = 5000
+"""Nodes beyond which a twin takes hours."""
+
+
+def node_findings(file: Path, count: int) -> list[Finding]:
+    """Nodes of a body that are too many."""
+    if count <= MOST_NODES:
+        return []
+    value = f"{count}. Each of them costs time in every substep"
+    return [unusual(file, "points", f"some hundred nodes are enough, more than {MOST_NODES} are slow", value)]
+
+
+def holding_findings(file: Path, hand: np.ndarray) -> list[Finding]:
+    """Hands of one point, from the hand [C] of each controller."""
+    if np.unique(hand, return_counts=True)[1].min() > 1:
+        return []
+    rule = "three points of a hand, or of a jaw, turn what it holds"
+    return [unusual(file, "points", rule, "one of some hand. It holds like a string: is that so?")]
 
 
 def annotated_findings(file: Path, points: np.ndarray, nodes: np.ndarray) -> list[Finding]:

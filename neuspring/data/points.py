@@ -108,11 +108,16 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
             rule = f"with tracks: train at least {LEAST} points must be annotated in frame 0, where the twin starts"
             findings.append(broken(marked, "", rule, f"{len(first)} of {tracks.shape[1]}"))
     ground, held_at = description.up_sign if description.ground else None, none if hands is None else hands.points
-    for what, file, points in (("nodes", files.get("nodes"), nodes), ("", marked, first), ("", files.get("controllers"), held_at)):
+    seen = annotated[np.isfinite(annotated).all(axis=2)]
+    for what, file, points in (("nodes", files.get("nodes"), nodes), ("", marked, seen), ("", files.get("controllers"), held_at)):
         if file is not None and points.size:
             findings += plausible.space_findings(file, points.reshape(-1, 3), ground, is_body=what == "nodes")
     if any(one.level == "error" for one in findings):
         return InSpace(hands, nodes, tracks), findings
+    if (body := files.get("nodes")) is not None:
+        findings += plausible.node_findings(body, len(nodes))
+    if (file := files.get("controllers")) is not None and hands is not None:
+        findings += plausible.holding_findings(file, hands.hand if hands.hand.size else np.zeros(hands.points.shape[1], int))
     if len(nodes):
         findings += plausible.annotated_findings(marked, first, nodes)
         if (file := files.get("controllers")) is not None:

@@ -161,6 +161,17 @@ def tracks(change):
     return lambda folder: write_tracks(folder, change(Capture.load(folder).tracks()))
 
 
+def coordinate(text):
+    """One coordinate of point 1 in frame 1 in place of its number; Python's JSON reads and writes such words."""
+
+    def damage(folder):
+        listed = json.loads((folder / TRACKS).read_text())
+        listed[1][1][0] = float(text)
+        (folder / TRACKS).write_text(json.dumps(listed))
+
+    return damage
+
+
 def everything(change):
     return lambda folder: [each(change)(folder) for each in (controllers, nodes, tracks)]
 
@@ -192,7 +203,10 @@ FAULTS = [
     (nodes(lambda p: p * np.array([1, 1, -8.0])), NODES[0], ("z from -0.16 to 0 m", "Is up -z?")),
     (nodes(lambda p: p + np.array([1.0, 0, 0])), TRACKS, ("on the body", "3 of 3", "one recording")),
     (tracks(lambda p: 1000 * p), TRACKS, ("must be meters", "millimeters")),
+    (tracks(lambda p: np.concatenate([p[:1], 1000 * p[1:]])), TRACKS, ("must be meters", "millimeters")),
     (tracks(lambda p: p[:, :2]), TRACKS, ("at least 3 points", "2 of 2")),
+    (coordinate("NaN"), TRACKS, ("coordinates must be finite", "point 1, frame 1", "null")),
+    (coordinate("Infinity"), TRACKS, ("coordinates must be finite", "inf")),
     (lambda f: (f / TRACKS).unlink(), TRACKS, ("at least 3 points", "0 of 0")),
     (everything(lambda p: p @ np.array([[1.0, 0, 0], [0, 0, 1], [0, 1, 0]]) - [0, 0, 0.03]), NODES[0], ("It rests at y = 0",)),
 ]
@@ -228,6 +242,23 @@ def test_rows_of_another_form_are_refused(capture, change, header, words):
     csv(capture, change, *([header] if header else []))
     with pytest.raises(InputError, match=rf"controllers\.csv.*{words}"):
         read(capture)
+
+
+@pytest.mark.parametrize(
+    ("damage", "file", "words"),
+    [
+        (everything(lambda p: p + np.array([0, 0.3, 0.75])), NODES[0], ("75 cm above the table", "must be z = 0", "If it hangs")),
+        (controllers(lambda p: p[:, :1]), CONTROLLERS[0], ("turn what it holds", "one of some hand")),
+        (nodes(lambda p: np.random.default_rng(0).uniform(p.min(0), p.max(0), (5001, 3))), NODES[0], ("some hundred", "5001")),
+    ],
+)
+def test_what_is_unlikely_is_said(capture, damage, file, words):
+    if words[1] == "one of some hand":
+        arrays(capture.folder / CONTROLLERS[0], holds=lambda _: np.zeros((0, 0), bool), hand=lambda _: np.zeros(0, int))
+    damage(capture.folder)
+    found = check_layout(capture.folder)
+    assert holds(found, "warning", file, *words), found
+    assert not [one for one in found if one.level == "error"]
 
 
 def test_two_files_of_hands_are_refused(capture):

@@ -79,7 +79,7 @@ def find_rate(given: float | None, known: Sequence[float | None], step: int) -> 
     """
     told = [rate for rate in known if rate is not None]
     if given is None and not told:
-        raise InputError("--rate", "the frames per second of the camera are required: folders do not have them", "none")
+        raise InputError("--rate", "frames per second are required: folders, and points in space, do not have them", "none")
     if given is None and max(told) > 1.02 * min(told):
         raise InputError("--rate", "all cameras must film at one rate", " and ".join(f"{rate:.3g}" for rate in told))
     rate = given if given is not None else round(told[0], 2)

@@ -93,6 +93,8 @@ class Intake:
     """Tracks teach the twin; without cameras they always do."""
     up: Up = "+z"
     """Of a capture without cameras; with them it is found."""
+    no_table: bool = False
+    """Nothing is below the object, of a capture without cameras."""
     raw: Raw | None = None
     """PhysTwin's case of which the views are: its masks, tracks and split come along."""
     force: bool = False
@@ -106,6 +108,8 @@ class Intake:
 
 BROUGHT = ("controllers", "nodes", "tracks")
 """Options of files of points in space."""
+OF_FILM = ("frames", "depth_unit", "intrinsics", "poses", "board", "board_images", "level", "top_down", "table_at", "pose")
+"""Options that say nothing of points in space alone."""
 
 
 def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
@@ -116,6 +120,9 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     """
     if not intake.views:
         return _of_points(intake)
+    if intake.no_table:
+        rule = "is for points in space alone: cameras are placed by the table"
+        raise InputError("--no-table", rule, "a film", "Leave it out, and write ground: false in capture.json.")
     for option, name in (("--name", intake.name), *(("--cameras", view.name) for view in intake.views)):
         if not NAMES.fullmatch(name):
             raise InputError(option, "letters, digits, '.', '_' and '-' are required, a letter or digit first", repr(name))
@@ -372,11 +379,21 @@ def _of_points(intake: Intake) -> tuple[Capture, list[str]]:
     if missing := [f"--{name}" for name in BROUGHT if name not in intake.brought]:
         rule = "without --color, --bag and --phystwin-raw, --controllers, --nodes and --tracks are required"
         raise InputError("make-capture", rule, f"no {' '.join(missing)}")
-    if intake.rate is None:
-        raise InputError("--rate", "frames per second are required where there is no video", "none")
+    for option in OF_FILM:
+        if value := getattr(intake, option):
+            rule = "is for film, and there is none"
+            remedy = "Leave it out. Cut or resample the files themselves: a row is a frame."
+            raise InputError(f"--{option.replace('_', '-')}", rule, str(value), remedy)
+    rate, _ = find_rate(intake.rate, [], 1)
     frames = len(points.read_hands(intake.brought["controllers"]).points)
-    named = {"format": 1, "name": intake.name, "category": intake.category, "frame_count": frames, "frame_rate": intake.rate}
+    marked = load_json(intake.brought["tracks"])
+    rows = {len(track) for track in marked if isinstance(track, list)} if isinstance(marked, list) else set()
+    if rows and rows != {frames}:
+        value = f"{frames} rows of --controllers, {', '.join(map(str, sorted(rows)))} of --tracks"
+        raise InputError("make-capture", "a row per frame is required in both files", value, "Cut or resample one of them.")
+    named = {"format": 1, "name": intake.name, "category": intake.category, "frame_count": frames, "frame_rate": rate}
     alone = {"cameras": (), "depth": "none", "tracks": "train", "up": intake.up, "train_end": intake.train_end}
+    alone["ground"] = not intake.no_table
     made = parse(Description, named | alone | {"provenance": digests(intake)}, "make-capture")
     refuse(description_findings(Path("make-capture"), made))
     space = brought_by(intake, made)

@@ -102,7 +102,7 @@ def test_poses_of_a_world_that_is_elsewhere_need_level(tmp_path):
     ("changes", "message"),
     [
         ({"intrinsics": None}, "intrinsics of camera 0 are required"),
-        ({"rate": None}, "the frames per second of the camera are required"),
+        ({"rate": None}, "frames per second are required"),
         ({"rate": 3000.0}, "lie between 1 and 240; received 3000"),
         ({"depth_unit": 1.0}, "Plausible would be 0.001 (millimeters)"),
         ({"frames": "0-2"}, "a capture needs at least 5 frames"),

@@ -1,6 +1,7 @@
 """make-capture brings hands, nodes and annotated points into a capture, with film or alone."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -69,6 +70,10 @@ def test_points_alone_become_a_capture(tmp_path, capsys):
         ({"rate": None}, r"--rate: frames per second are required"),
         ({"up": "-z"}, r"tracks\.json.*Is up \+z.*--up"),
         ({"train_end": 90}, r"train_end: must be at most frame_count = 8"),
+        ({"rate": 0.03}, r"--rate: frames per second of a camera lie between 1 and 240; received 0\.03"),
+        ({"frames": "0-5"}, r"--frames: is for film, and there is none; received 0-5\. .*a row is a frame"),
+        ({"pose": "standing"}, r"--pose: is for film"),
+        ({"poses": Path("poses.json")}, r"--poses: is for film"),
     ],
 )
 def test_points_alone_are_refused_before_anything_is_written(tmp_path, changes, words):
@@ -77,6 +82,35 @@ def test_points_alone_are_refused_before_anything_is_written(tmp_path, changes, 
     with pytest.raises(InputError, match=words):
         make_capture(Intake(**(plain | files | changes)))
     assert not (tmp_path / "made").exists()
+
+
+def test_both_counts_of_rows_are_named(tmp_path):
+    files = brought(tmp_path / "files", 8)
+    hands = np.load(files["controllers"])["points"]
+    np.savez(files["controllers"], points=hands[:6])
+    with pytest.raises(InputError, match=r"a row per frame.*received 6 rows of --controllers, 8 of --tracks"):
+        make_capture(Intake(folder=tmp_path / "made", name="m", category="toy", views=(), rate=30.0, **files))
+
+
+def test_what_hangs_has_no_table(tmp_path):
+    """A body that begins 40 cm below z = 0 is refused with the option that says that there is no table."""
+    files = brought(tmp_path / "files", 8)
+    for name in ("controllers", "nodes"):
+        np.savez(files[name], points=np.load(files[name])["points"] + [0, 0.3, -0.4])
+    listed = json.loads(files["tracks"].read_text())
+    files["tracks"].write_text(json.dumps([[p and [p[0], p[1] + 0.3, p[2] - 0.4] for p in track] for track in listed]))
+    plain = {"folder": tmp_path / "made", "name": "m", "category": "toy", "views": (), "rate": 30.0}
+    with pytest.raises(InputError, match="--no-table"):
+        make_capture(Intake(**plain, **files))
+    made, _ = make_capture(Intake(**plain, **files, no_table=True))
+    assert made.description.ground is False
+    assert serious(check_layout(made.folder)) == []
+
+
+def test_with_film_the_table_stands_in_the_capture(tmp_path):
+    root = write_folders(tmp_path)
+    with pytest.raises(InputError, match=r"--no-table: is for points in space alone.*ground: false"):
+        make_capture(filmed(root, no_table=True, **brought(root / "files")))
 
 
 @pytest.mark.parametrize("teach", [False, True])

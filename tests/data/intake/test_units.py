@@ -55,7 +55,7 @@ def test_the_rate_is_given_or_of_the_video_and_falls_with_the_stride():
 @pytest.mark.parametrize(
     ("given", "known", "message"),
     [
-        (None, [None], "the frames per second of the camera are required: folders do not have them"),
+        (None, [None], "frames per second are required: folders, and points in space, do not have them"),
         (3000.0, [None], "lie between 1 and 240; received 3000"),
         (0.033, [None], "Give the rate at which it was filmed, not a time step"),
         (None, [30.0, 60.0], "all cameras must film at one rate; received 30 and 60"),
