@@ -144,8 +144,8 @@ class ColorSettings(Section):
     """Thickness of a body, of all categories that are neither flat nor round, in local widths of its silhouette; 1: as thick as it
     is wide."""
     footprint: Positive = 1.2
-    """How far from the camera a body extends at most, measured along the table from its nearest point, in widths across the view:
-    what would lie farther off rises. It holds where `pose` of the capture is not given; with `pose: lying` nothing rises."""
+    """How far from the camera a body extends at most, measured along the table from its nearest point, in widths of its middle line
+    across the view: what would lie farther off rises. It holds where `pose` of the capture is not given; with `pose: lying` nothing rises."""
     standing_footprint: Positive = 0.3
     """The same with `pose: standing`."""
 

@@ -72,6 +72,11 @@ META = "meta"
 """Name of the array that holds the JSON text."""
 
 
+DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError, TypeError, RuntimeError)
+"""What reading a damaged .npz file raises: zipfile RuntimeError for damaged flags, np.load a bare array (TypeError) for an .npy
+file."""
+
+
 class DamagedFile(ValueError):
     """A file that is no whole `.npz` file with a JSON mapping; says what is wrong."""
 
@@ -95,8 +100,7 @@ def read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         meta = json.loads(arrays.pop(META).tobytes().decode())
         if not isinstance(meta, dict):
             raise ValueError("`meta` holds no mapping")
-    # zipfile raises RuntimeError for damaged flags, and np.load returns a bare array (TypeError) for an .npy file.
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+    except DAMAGED as error:
         raise DamagedFile(f"{type(error).__name__}: {error}") from error
     return arrays, meta
 

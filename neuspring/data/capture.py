@@ -348,6 +348,7 @@ def cut(capture: Capture, first: int, last: int, folder: Path) -> Capture:
     cameras = tuple(replace(c, missing=tuple(k - first for k in c.missing if k in kept)) for c in description.cameras)
     if late := [c.name for c in cameras if 0 in c.missing]:
         raise InputError("--frames", f"camera {late[0]} must have the first frame", f"{first}, which it missed", "Begin later.")
+    in_space.require_first(capture, first)
     for path in [path for name in ("color", "depth", "mask") for path in (capture.folder / name).glob("*/*")]:
         if path.stem.isdigit() and int(path.stem) in kept:
             there = folder / path.relative_to(capture.folder).with_name(f"{int(path.stem) - first:05d}{path.suffix}")

@@ -345,24 +345,38 @@ def holding_findings(file: Path, hand: np.ndarray) -> list[Finding]:
 
 
 def annotated_findings(file: Path, points: np.ndarray, nodes: np.ndarray) -> list[Finding]:
-    """Annotated points of frame 0 [K, 3], m, that are far from the nodes [N, 3] of the body that they are on."""
-    away = KDTree(nodes).query(points)[0] if len(points) else np.zeros(0)
+    """Annotated points of frame 0 [K, 3], m, NaN where unseen, that are far from the nodes [N, 3] of the body that they are on."""
+    known = np.flatnonzero(np.isfinite(points).all(axis=1))
+    away = KDTree(nodes).query(points[known])[0] if len(known) else np.zeros(0)
     if not (away > REACH).any():
         return []
     rule = f"annotated points must lie on the body: within {100 * REACH:g} cm of a node in frame 0"
-    value = f"point {away.argmax()} is {100 * away.max():.1f} cm away, {(away > REACH).sum()} of {len(away)} are farther"
+    value = f"point {known[away.argmax()]} is {100 * away.max():.1f} cm away, {(away > REACH).sum()} of {len(away)} are farther"
     level = broken if np.median(away) > REACH else unusual
     return [level(file, "", rule, f"{value}. Are points and nodes of one recording, in one world?")]
 
 
 def contact_findings(file: Path, hands: np.ndarray, nodes: np.ndarray) -> list[Finding]:
-    """Controllers [T, C, 3], m, that come near to none of the nodes [N, 3] of frame 0."""
+    """Places [n, 3], m, of controllers that hold in training frames, near to none of the nodes [N, 3] of frame 0."""
+    if not len(hands):
+        rule = "some controller must hold in some training frame"
+        return [broken(file, "holds", rule, "none. A twin learns from training frames: see train_end")]
     gap = float(KDTree(nodes).query(hands)[0].min())
     if gap <= REACH:
         return []
     rule = f"in some training frame a controller must come within {100 * REACH:g} cm of a node of frame 0 to move it"
     value = f"{100 * gap:.1f} cm at the nearest. Are hands and nodes of one recording, in one world?"
     return [(broken if gap > AWAY else unusual)(file, "points", rule, value)]
+
+
+def doubled_findings(file: Path, controllers: np.ndarray, body: np.ndarray, same: float) -> list[Finding]:
+    """Controllers [C, 3], m, of frame 0 that lie on a node or annotated point [n, 3], nearer than `same`."""
+    near = KDTree(body).query(controllers)[0]
+    if not (near < same).any():
+        return []
+    rule = f"controllers must lie {1e3 * same:g} mm from nodes and annotated points in frame 0: a spring needs a length"
+    value = f"controller {near.argmin()}, {(near < same).sum()} in all. Move them off the body, or leave out the nodes below them"
+    return [broken(file, "points", rule, value)]
 
 
 BESIDE = 0.04

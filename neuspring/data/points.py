@@ -10,7 +10,6 @@ Meters, in the capture's world. Files of another form, in other units or axes ar
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +21,7 @@ from scipy.spatial import cKDTree
 from neuspring.config import Config, ScenarioRow
 from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.errors import InputError
-from neuspring.core.files import write_atomically
+from neuspring.core.files import DAMAGED, write_atomically
 from neuspring.core.findings import Finding, broken, refusal, refuse
 from neuspring.core.geometry import on_table
 from neuspring.core.records import digest_file
@@ -47,6 +46,12 @@ class Hands:
     """[T, C] bool: when each holds the object; empty: all do in all frames."""
     hand: np.ndarray
     """[C] int: the hand of each; empty: not grouped."""
+
+    def held(self, end: int | None = None) -> np.ndarray:
+        """Places [n, 3], m, of controllers while they hold, before frame `end`."""
+        points = self.points[:end]
+        places: np.ndarray = points[self.holds[:end]] if self.holds.size else points.reshape(-1, 3)
+        return places
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +112,9 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
         if len(first) < LEAST:
             rule = f"with tracks: train at least {LEAST} points must be annotated in frame 0, where the twin starts"
             findings.append(broken(marked, "", rule, f"{len(first)} of {tracks.shape[1]}"))
-    ground, held_at = description.up_sign if description.ground else None, none if hands is None else hands.points
+    ground = description.up_sign if description.ground else None
+    # A hand may be anywhere while it holds nothing.
+    held_at = none if hands is None else hands.held()
     seen = annotated[np.isfinite(annotated).all(axis=2)]
     for what, file, points in (("nodes", files.get("nodes"), nodes), ("", marked, seen), ("", files.get("controllers"), held_at)):
         if file is not None and points.size:
@@ -116,12 +123,16 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
         return InSpace(hands, nodes, tracks), findings
     if (body := files.get("nodes")) is not None:
         findings += plausible.node_findings(body, len(nodes))
+    if len(nodes):
+        findings += plausible.annotated_findings(marked, annotated[0], nodes)
     if (file := files.get("controllers")) is not None and hands is not None:
         findings += plausible.holding_findings(file, hands.hand if hands.hand.size else np.zeros(hands.points.shape[1], int))
-    if len(nodes):
-        findings += plausible.annotated_findings(marked, first, nodes)
-        if (file := files.get("controllers")) is not None:
-            findings += plausible.contact_findings(file, held_at[: capture.train_end], nodes)
+        body_points = np.concatenate([nodes, first])
+        if len(nodes):
+            findings += plausible.contact_findings(file, hands.held(capture.train_end), nodes)
+        if len(body_points):
+            start = held(hands, annotated, capture.train_end)[0]
+            findings += plausible.doubled_findings(file, start, body_points, SAME)
     return InSpace(hands, nodes, tracks), findings
 
 
@@ -172,7 +183,7 @@ def _arrays(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, EOFError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+    except (*DAMAGED, AttributeError) as error:
         raise InputError(path, "an .npz file without pickle is required", f"{type(error).__name__}: {error}") from error
     if "points" not in arrays or not arrays.keys() <= set(keys):
         optional = f", optional {' and '.join(keys[1:])}" if keys[1:] else ""
@@ -230,12 +241,16 @@ def write(folder: Path, hands: Hands | None, nodes: np.ndarray) -> None:
         write_atomically(folder / NODES[0], lambda path: _save(path, {"points": nodes}))
 
 
-def cut(capture: Capture, kept: range, folder: Path) -> None:
-    """Write hands and nodes of some frames of a capture to another folder. Raises InputError where nodes are of another frame."""
-    file, body = (given(capture.folder, names) for names in (CONTROLLERS, NODES))
-    if body is not None and kept[0]:
+def require_first(capture: Capture, first: int) -> None:
+    """Raise InputError where a cut that begins with frame `first` would have nodes of another frame."""
+    if first and (body := given(capture.folder, NODES)) is not None:
         rule = "the nodes are those of frame 0, with which a cut must begin"
-        raise InputError(body, rule, f"frame {kept[0]}", "Write nodes of that frame, or remove the file.")
+        raise InputError(body, rule, f"frame {first}", "Write nodes of that frame, or remove the file.")
+
+
+def cut(capture: Capture, kept: range, folder: Path) -> None:
+    """Write hands and nodes of some frames of a capture to another folder."""
+    file, body = (given(capture.folder, names) for names in (CONTROLLERS, NODES))
     hands = read_hands(file, capture.frame_count) if file else None
     if hands is not None:
         hands = replace(hands, points=hands.points[kept], holds=hands.holds[kept] if hands.holds.size else hands.holds)
@@ -266,6 +281,13 @@ def held(hands: Hands, tracks: np.ndarray, train_end: int) -> np.ndarray:
     return points
 
 
+def standing(nodes: np.ndarray, up: float) -> np.ndarray:
+    """Nodes [n, 3], m, with those below the table moved up to it; of those that meet there one stays."""
+    lifted = on_table(nodes, up)
+    pairs = cKDTree(lifted).query_pairs(SAME, output_type="ndarray")
+    return np.delete(lifted, np.unique(pairs.max(axis=1)), axis=0) if len(pairs) else lifted
+
+
 def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Observations:
     """Observations of a capture of points alone, see `neuspring.data.sources`.
 
@@ -278,7 +300,7 @@ def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Obser
     points, visible = taught_by(space.tracks)
     nodes = space.nodes
     if row.ground:
-        points, nodes = (on_table(places, description.up_sign) for places in (points, nodes))
+        points, nodes = on_table(points, description.up_sign), standing(nodes, description.up_sign)
     nodes = nodes[cKDTree(points[0]).query(nodes)[0] > SAME]
     return Observations(
         scenario=scenario_of(row, capture, {}),

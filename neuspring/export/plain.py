@@ -123,7 +123,8 @@ def write(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
         values |= {name: float(getattr(rod, name)) for name in ROD_SETTINGS}
     text = {
         "format": FORMAT if rod is None else ROD_FORMAT,
-        "version": VERSION,
+        # Who does not know springs that only push would let them pull.
+        "version": 2 if source.twin.topology.pushes.any() else VERSION,
         "made_by": f"neuspring {__version__}",
         "name": source.name,
         "made_from_sha256": source.made_from,

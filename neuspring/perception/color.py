@@ -179,8 +179,12 @@ def medial(
     level = max(float(np.hypot(x, y)), 1e-9)
     away, aside = depth * (rays[:, :2] @ (x, y)) / level, depth * (rays[:, :2] @ (-y, x)) / level
     nearest = away.min()
-    across = max(float(np.ptp(aside * nearest / away)), 1e-6)
-    shorter = np.minimum((nearest + footprint * across) / away, 1.0) if level > STEEP else np.ones(len(away))
+    across, shorter = float(np.ptp(aside)), np.ones(len(away))
+    # A camera that looks down sees all of the footprint, and bodies may lie on both sides of it. A body that reaches no farther
+    # than it is thick lies in any case.
+    if level > STEEP and nearest > 0 and np.ptp(away) > (depth * thick).max() / factor:
+        across = max(float(np.ptp(aside * nearest / away)), 1e-6)
+        shorter = np.minimum((nearest + footprint * across) / away, 1.0)
     facts = {"longest": float(away.max() - nearest), "across": across, "raised": float((shorter < 1).mean())}
     return shorter * depth, shorter * depth * thick, facts
 

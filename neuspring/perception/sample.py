@@ -18,7 +18,7 @@ from neuspring.config.perception import Perception, Sampling
 from neuspring.core.artifacts import ImageObservations, Observations
 from neuspring.core.geometry import on_table
 from neuspring.data.capture import Capture
-from neuspring.data.points import SAME, in_both, read, scenario_of, taught_by
+from neuspring.data.points import SAME, in_both, read, scenario_of, standing, taught_by
 from neuspring.perception.results import LiftedTracks, ShapePrior
 
 SURFACE, INTERIOR = 1024, 10000
@@ -42,10 +42,10 @@ def assemble(
     """
     up, space = capture.description.up_sign, read(capture)
     # In the image every node should have a track that is followed for long.
-    followed = None if image is None else image.visible.sum(axis=0)
+    followed = None if image is None else image.visible[: capture.train_end].sum(axis=0)
     if given := len(space.nodes):
-        nodes = on_table(space.nodes, up)
-        rank = lifted.object_visibility.sum(axis=0) if followed is None else followed
+        nodes = standing(space.nodes, up) if row.ground else space.nodes
+        rank = lifted.object_visibility[: capture.train_end].sum(axis=0) if followed is None else followed
         indices, kept = among(on_table(lifted.object_points[0], up), rank, nodes)
         surface, interior, voxel = nodes[kept], nodes[:0], spacing(nodes)
     else:
@@ -57,7 +57,8 @@ def assemble(
     marked, seen = taught_by(space.tracks, capture.train_end)
     if marked.shape[1]:
         apart = np.flatnonzero(cKDTree(marked[0]).query(points[0])[0] > SAME)
-        points = np.concatenate([np.where(seen[..., None], on_table(marked, up), 0.0), points[:, apart]], axis=1)
+        marked = on_table(marked, up) if row.ground else marked
+        points = np.concatenate([np.where(seen[..., None], marked, 0.0), points[:, apart]], axis=1)
         visible = np.concatenate([seen, visible[:, apart]], axis=1)
         valid = np.concatenate([in_both(seen), valid[:, apart]], axis=1)
         surface = surface[cKDTree(marked[0]).query(surface)[0] > SAME] if len(surface) else surface

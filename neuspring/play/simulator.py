@@ -209,6 +209,7 @@ class Simulator:
             springs=np.concatenate([topology.springs, np.array([[own, node]], np.int32)]),
             rest_lengths=np.append(topology.rest_lengths, np.float32(REST)),
             rest_shape=np.concatenate([rest, place]) if len(rest) else rest,
+            pushes=np.append(topology.pushes, False) if topology.pushes.size else topology.pushes,
         )
         stiffness = np.append(material.stiffness, np.float32(k * REST))
         stronger = replace(material, stiffness=stiffness, dashpot=np.append(material.dashpot, np.float32(c)))
@@ -223,5 +224,5 @@ def _with_row(rows: np.ndarray, place: np.ndarray) -> np.ndarray:
 def hands_of(controllers: np.ndarray, given: np.ndarray = UNKNOWN) -> np.ndarray:
     """The hand [C] of each controller [C, 3], m: those that move together. `given` is what observations know of it."""
     if len(given) == len(controllers):
-        return given
+        return np.unique(given, return_inverse=True)[1]
     return np.asarray(connected_components(cdist(controllers, controllers) < HAND_GAP)[1])

@@ -141,6 +141,9 @@ class TwinParameters(nn.Module):
         topology = twin.topology
         count = len(topology.springs)
         self.on_controller = torch.arange(count, device=device) >= topology.object_spring_count
+        pushes = topology.pushes if topology.pushes.size else np.zeros(count, bool)
+        self.pushes = torch.from_numpy(pushes).to(device)
+        """Springs [S] whose rest length is where a hand touches, which no unloaded shape changes."""
         self.offsets, self.field = None, None
         if kind == "springs":
             self.offsets = nn.Parameter(torch.zeros(count, 1))
@@ -204,7 +207,7 @@ class TwinParameters(nn.Module):
             if name in self.factors:
                 values[name] = self.start[name] * self._common(name)
         if self.unloaded is not None:
-            values["rest_lengths"] = self.start["rest_lengths"] * self.unloaded()
+            values["rest_lengths"] = self.start["rest_lengths"] * torch.where(self.pushes, 1.0, self.unloaded())
         return values | dict(self.scalars.items())
 
     def pack(self, substep: float) -> Parameters:

@@ -117,7 +117,8 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
     rows, attempts, earlier = recorded_trace(record, key)
     trace, other = ([row for row in rows if row["stage"] == stage] for stage in (CMAES, OTHER_WAY))
     saved = len(trace)
-    ways = WAYS[problem.search.hands]
+    # One candidate cannot be judged both ways.
+    ways = WAYS[problem.search.hands][: problem.search.cma_rollouts]
     problem = replace(problem, push=ways[0])
     proposals = Proposals(problem, seed)
     loss = FrameLoss.of(problem.observations, problem.losses, problem.device, frozen_counts=problem.quirks.frozen_loss_denominators)
@@ -135,6 +136,8 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
         # The last generation may be cut short, so that searches of any population size use exactly the same budget.
         while start < budget:
             population = proposals.ask()[: budget - start]
+            if not start:
+                population = population[: budget // len(ways)]
             stop = start + len(population)
             if not replays(trace[start:stop], population, problem.variables):
                 print(f"{record}: does not replay on this machine; the search continues afresh from rollout {start}")

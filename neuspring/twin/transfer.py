@@ -98,12 +98,15 @@ def _same_nodes(topology: Topology, observations: Observations, keep_lengths: bo
     """The topology with the nodes of a recording, node i on node i."""
     nodes, hands = observations.nodes, observations.controller_points[0]
     rest, springs = topology.controller_rest, topology.springs
-    ratio = unloaded(nodes, hands, springs, observations.rest_shape, rest)
-    ratio /= unloaded(topology.nodes, topology.controllers, springs, topology.rest_shape, rest)
+    now = unloaded(nodes, hands, springs, observations.rest_shape, rest)
+    ratio = now / unloaded(topology.nodes, topology.controllers, springs, topology.rest_shape, rest)
     if keep_lengths:
         calibrated = rest == "first_frame"
         ratio[: topology.object_spring_count if calibrated else None] = 1.0
     lengths = topology.rest_lengths.astype(np.float64) * ratio
+    if topology.pushes.size:
+        # A hand that pushes touches at one distance wherever it begins.
+        lengths = np.where(topology.pushes, np.minimum(topology.rest_lengths, now), lengths)
     if not (lengths > 0).all():
         pair = topology.springs[int(np.argmin(lengths))].tolist()
         rule = "the ends of a spring may not coincide in the rest shape"
@@ -245,6 +248,9 @@ def _carried(twin: Twin, new: Topology, material: Material, laid: np.ndarray) ->
     # Hands hold or push with all of their springs.
     pushes = np.arange(len(new.springs)) >= new.object_spring_count if old.pushes.any() else old.pushes
     lengths_of_rest = _without_force(new) * found["strain"]
+    if old.pushes.any():
+        touching = float(old.rest_lengths[old.pushes].max())
+        lengths_of_rest = np.where(pushes, np.minimum(touching, _without_force(new)), lengths_of_rest)
     return replace(twin, topology=replace(new, rest_lengths=lengths_of_rest, pushes=pushes), material=material)
 
 

@@ -27,6 +27,7 @@ def test_points_alone_become_scores_and_changed_hands_are_noticed(project, tmp_p
     mine = scores[scores["metric"] == "track_error"].set_index("task")["value"]
     frozen = pd.read_parquet(folder / "static" / "0" / "scores.parquet")
     still = frozen[frozen["metric"] == "track_error"].set_index("task")["value"]
+    assert set(mine.index) == set(still.index) == {"reconstruction", "future"}
     assert (mine < still).all()
     assert not set(scores["metric"]) & {"psnr", "iou", "image_error"}
     assert plan(project, changes) == {}

@@ -12,9 +12,10 @@ from neuspring.config import Config
 from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, TRACKS, Capture, cut, write_tracks
 from neuspring.data.check import check_layout
-from neuspring.data.points import Hands, held, observe, read, write
+from neuspring.data.points import Hands, held, observe, read, standing, write
 from neuspring.data.sources import SOURCES, scenario_rows
 from tests.support import spaced as scene
+from tests.support.filmed import film
 from tests.support.findings import holds, serious
 from tests.support.spaced import spaced
 
@@ -161,6 +162,43 @@ def tracks(change):
     return lambda folder: write_tracks(folder, change(Capture.load(folder).tracks()))
 
 
+def flipped(folder):
+    """A byte in the middle of a compressed array is another one."""
+    path = folder / CONTROLLERS[0]
+    with np.load(path) as stored:
+        np.savez_compressed(path, **{name: stored[name] for name in stored.files})
+    data = bytearray(path.read_bytes())
+    data[len(data) // 4] ^= 255
+    path.write_bytes(bytes(data))
+
+
+def onto_a_node(folder):
+    arrays(
+        folder / CONTROLLERS[0],
+        points=lambda p: np.concatenate([p[:, :1], np.tile(read_nodes(folder)[7], (len(p), 1, 1)), p[:, 2:]], axis=1),
+    )
+
+
+def read_nodes(folder):
+    with np.load(folder / NODES[0]) as stored:
+        return stored["points"]
+
+
+def parked(holds):
+    """Controller 2 waits 100 m below, where it holds or not."""
+
+    def damage(folder):
+        def moved(points):
+            points[0, 2] = (0, 0, -100.0)
+            return points
+
+        held = np.ones((8, 4), bool)
+        held[0, 2] = holds
+        arrays(folder / CONTROLLERS[0], points=moved, holds=lambda _: held)
+
+    return damage
+
+
 def coordinate(text):
     """One coordinate of point 1 in frame 1 in place of its number; Python's JSON reads and writes such words."""
 
@@ -191,6 +229,9 @@ FAULTS = [
     (lambda f: arrays(f / CONTROLLERS[0], holds=lambda _: np.zeros((8, 4), bool)), CONTROLLERS[0], ("holds", "some controller")),
     (lambda f: arrays(f / CONTROLLERS[0], grip=lambda _: np.zeros(3)), CONTROLLERS[0], ("optional holds and hand", "grip")),
     (lambda f: (f / CONTROLLERS[0]).write_bytes(b"nothing"), CONTROLLERS[0], (".npz file",)),
+    (flipped, CONTROLLERS[0], (".npz file",)),
+    (onto_a_node, CONTROLLERS[0], ("0.1 mm from nodes", "controller 1, 1 in all", "Move them off the body")),
+    (parked(True), CONTROLLERS[0], ("must be meters", "divide by 1000")),
     (
         lambda f: (f / CONTROLLERS[0]).unlink(),
         CONTROLLERS[0],
@@ -259,6 +300,31 @@ def test_what_is_unlikely_is_said(capture, damage, file, words):
     found = check_layout(capture.folder)
     assert holds(found, "warning", file, *words), found
     assert not [one for one in found if one.level == "error"]
+
+
+def test_a_hand_may_be_anywhere_while_it_holds_nothing(capture):
+    parked(False)(capture.folder)
+    assert serious(check_layout(capture.folder)) == []
+
+
+def test_a_hand_must_hold_in_some_training_frame(capture):
+    late = np.zeros((8, 4), bool)
+    late[6:] = True
+    arrays(capture.folder / CONTROLLERS[0], holds=lambda _: late)
+    assert holds(check_layout(capture.folder), "error", CONTROLLERS[0], "hold in some training frame")
+
+
+def test_nodes_that_meet_on_the_table_are_one():
+    nodes = np.array([[0.0, 0, -0.02], [0, 0, -0.01], [0, 0, 0.01], [0.02, 0, -0.01]])
+    np.testing.assert_allclose(standing(nodes, 1.0), [[0, 0, 0], [0, 0, 0.01], [0.02, 0, 0]])
+
+
+def test_a_film_and_points_alone_are_not_taken_for_each_other(capture, tmp_path):
+    with pytest.raises(InputError, match=r"the source capture is for film.*Write points"):
+        SOURCES["capture"].required(capture.folder)
+    filmed = film(tmp_path / "film", cameras=1)
+    with pytest.raises(InputError, match=r"the source points is for captures without cameras.*Write capture"):
+        SOURCES["points"].required(filmed.folder)
 
 
 def test_two_files_of_hands_are_refused(capture):

@@ -101,6 +101,13 @@ def test_controls_of_another_twin_and_names_that_are_paths_are_refused(twin):
         replace(controls, method="../../etc")
 
 
+def test_a_twin_whose_hands_only_push_can_be_grabbed(twin):
+    topology = twin.topology
+    led = np.arange(len(topology.springs)) >= topology.object_spring_count
+    grabbed = Simulator(replace(twin, topology=replace(topology, pushes=led)))._with_grab(NODE).topology
+    assert grabbed.pushes.tolist() == [*led.tolist(), False], "the mouse pulls"
+
+
 def grab() -> Grab:
     return Grab(5, np.zeros((3, 3), np.float32), np.array([0, 0, 1]))
 
@@ -123,7 +130,7 @@ def test_one_browser_holds_at_a_time_and_a_closed_tab_lets_go():
 def test_hands_are_those_that_the_capture_groups_and_else_those_that_are_near():
     places = np.array([[0.0, 0, 0], [0.01, 0, 0], [1.0, 0, 0]])
     assert hands_of(places).tolist() == [0, 0, 1]
-    assert hands_of(places, np.array([3, 1, 3])).tolist() == [3, 1, 3]
+    assert hands_of(places, np.array([3, -1, 3])).tolist() == [1, 0, 1], "numbered from 0"
     # What is known of another number of controllers says nothing.
     assert hands_of(places, np.array([1, 1])).tolist() == [0, 0, 1]
 

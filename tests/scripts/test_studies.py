@@ -19,6 +19,7 @@ from tests.support import small
 from tests.support.colored import paint
 from tests.support.findings import of_level
 from tests.support.real import FOOTAGE
+from workflow.scripts import masks
 from workflow.scripts.beside_data import PHYSTWIN, Published, Run, corrected, fitted_shift, iou_without_hands, shifted
 from workflow.scripts.beside_hands import COLUMNS as HAND_COLUMNS
 from workflow.scripts.beside_hands import grips, hand_lines
@@ -223,6 +224,7 @@ def test_before_and_after_compare_the_films_and_seeds_of_both():
 
 def test_the_committed_marks_lie_in_frame_0_alone():
     """Else a film stands in a table of its own."""
+    assert len(list((masks.MARKS / "phystwin_camera0").glob("*.json"))) == 12
     assert corrected() == []
 
 

@@ -338,6 +338,16 @@ def test_a_texel_has_moved_by_a_tenth_of_the_scale_at_the_start():
     assert "at_bound" not in movement(trained), "no bound"
 
 
+def test_an_unloaded_shape_changes_no_distance_at_which_hands_touch():
+    twin = small.fit_problem().twin
+    led = np.arange(len(twin.topology.springs)) >= twin.topology.object_spring_count
+    pushing = replace(twin, topology=replace(twin.topology, pushes=led))
+    trained = disturb(TwinParameters(pushing, config.Fit(rest_shape=config.RestShape(handles=3)), "springs", "cpu"))
+    lengths = trained.physical()["rest_lengths"].detach().numpy()
+    np.testing.assert_array_equal(lengths[led], twin.topology.rest_lengths[led])
+    assert np.abs(lengths[~led] / twin.topology.rest_lengths[~led] - 1).max() > 1e-3
+
+
 def test_common_factors_and_strains_are_reported():
     trained = disturb(of_scene("springs", global_stiffness=True, rest_shape=config.RestShape(handles=3)))
     with torch.no_grad():

@@ -355,6 +355,18 @@ def test_the_first_generation_says_whether_hands_hold_or_push():
     assert search(pushed("hold"), seed=0).cost > 1.3 * result.cost
 
 
+@pytest.mark.parametrize("rollouts", [2, 9, 14])
+def test_of_fewer_candidates_than_two_generations_half_are_judged_each_way(rollouts):
+    """Else the best may be of one way, and the twin of the other."""
+    result = search(pushed(rollouts=rollouts), seed=0)
+    trace = result.trace
+    assert len(trace) == rollouts
+    assert (trace["stage"] == "hands").sum() == rollouts // 2
+    best = trace.iloc[int(trace["cost"].to_numpy().argmin())]
+    assert bool(best["push"]) == bool(result.twin.topology.pushes.any())
+    assert result.cost == best["cost"]
+
+
 def test_hands_that_hold_are_kept(tmp_path, monkeypatch):
     problem = small.search_problem()
     problem = replace(problem, search=replace(problem.search, hands="auto", rollouts=33))

@@ -11,6 +11,7 @@ from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
 from neuspring.data import mocap
 from neuspring.twin.candidates import candidate
+from neuspring.twin.fit import FitProblem
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.topology import piecewise_topology
 from neuspring.twin.transfer import corresponds, move, require_pool, roll_between
@@ -97,6 +98,38 @@ def test_calibrated_grips_pull_at_nothing_in_frame_0():
 
     assert moved("first_frame") < STILL
     assert moved("rest_shape") > 1000 * STILL
+
+
+def pushing() -> tuple[FitProblem, float]:
+    """A twin whose hands push from 6 mm on; they begin 2 cm away."""
+    problem, touch = small.fit_problem(), 0.006
+    topology = problem.twin.topology
+    led = np.arange(len(topology.springs)) >= topology.object_spring_count
+    lengths = np.where(led, touch, topology.rest_lengths).astype(np.float32)
+    twin = replace(problem.twin, topology=replace(topology, rest_lengths=lengths, pushes=led))
+    return replace(problem, twin=twin), touch
+
+
+def test_hands_that_push_touch_at_one_distance_wherever_they_begin():
+    problem, touch = pushing()
+    seen = problem.observations
+    farther = replace(seen, controller_points=seen.controller_points + np.float32([0, 0, 0.05]))
+    topology = move(problem.twin, farther)[0].topology
+    np.testing.assert_allclose(topology.rest_lengths[topology.pushes], touch, rtol=SINGLE)
+    # The body itself is the same.
+    own = slice(0, topology.object_spring_count)
+    np.testing.assert_allclose(topology.rest_lengths[own], problem.twin.topology.rest_lengths[own], rtol=SINGLE)
+
+
+def test_a_twin_on_other_nodes_keeps_where_its_hands_touch():
+    problem, touch = pushing()
+    seen = problem.observations
+    order = np.random.default_rng(0).permutation(seen.object_points.shape[1])[1:]
+    fewer = replace(seen, **{name: getattr(seen, name)[:, order] for name in TRACKED})
+    topology = move(problem.twin, fewer)[0].topology
+    assert len(topology.nodes) < len(problem.twin.topology.nodes)
+    assert topology.pushes.any()
+    assert topology.rest_lengths[topology.pushes].max() <= touch * (1 + SINGLE)
 
 
 def test_a_twin_remembers_where_its_grips_rest(tmp_path):

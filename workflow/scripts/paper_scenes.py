@@ -113,8 +113,8 @@ def curves(results: Path, case: str, saw: str, methods: Sequence[str]) -> Figure
         if not errors:
             continue
         mean, color = np.mean(errors, axis=0), f"C{number}"
-        with np.errstate(invalid="ignore"):
-            by_frame = np.nansum(mean, axis=1) / np.maximum(np.isfinite(mean).sum(axis=1), 1)
+        seen = np.isfinite(mean).sum(axis=1)
+        by_frame = np.where(seen > 0, np.nansum(mean, axis=1) / np.maximum(seen, 1), np.nan)
         left.plot(by_frame, color=color, lw=1.3, label=method)
         later = mean[end:]
         known = np.isfinite(later).any(axis=0)

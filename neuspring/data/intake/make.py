@@ -130,6 +130,10 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
         _require_for_color_alone(intake)
     elif intake.pose:
         raise InputError("--pose", "is for color alone: depth shows how the object is", intake.pose, "Leave it out.")
+    if intake.raw is not None and intake.raw.tracks is not None and (intake.tracks or intake.teach):
+        option = "--tracks" if intake.tracks else "--teach"
+        remedy = "Leave it out. To learn from the case's own, write tracks: train in capture.json then."
+        raise InputError(option, "a case in PhysTwin's raw layout brings annotated points of its own", "both", remedy)
     choice = choose(intake.views, intake.frames)
     findings = [one for check in CHECKS for one in check(intake.views, choice)]
     refuse_errors(findings)

@@ -62,10 +62,10 @@ def test_a_rope_is_as_thick_as_it_is_wide():
     assert upper.min() > 0
 
 
-def filled_outline(points: np.ndarray) -> np.ndarray:
+def filled_outline(points: np.ndarray, elevation: float = 40.0) -> np.ndarray:
     """Labels of a convex body of these points [n, 3], m."""
     labels = np.zeros((HEIGHT, WIDTH), np.uint8)
-    pixels = camera(np.zeros(3)).project(points)[0]
+    pixels = camera(np.zeros(3), elevation=elevation).project(points)[0]
     cv2.fillConvexPoly(labels, cv2.convexHull(np.round(pixels).astype(np.int32)), OBJECT)
     return labels
 
@@ -138,7 +138,30 @@ def test_a_long_body_that_points_away_lies_only_if_the_capture_says_so():
     assert known[0]["longest"] == pytest.approx(0.3, abs=0.05)
 
 
-def test_nothing_rises_below_a_camera_that_looks_straight_down():
+@pytest.mark.parametrize(("size", "elevation"), [((0.15, 0.18, 0.10), 50.0), ((0.20, 0.24, 0.06), 60.0)])
+def test_a_compact_box_does_not_rise(size, elevation):
+    """Its outline is one disc, which is as wide as it is."""
+    capture = capture_of("toy")
+    capture.cameras = {"0": camera(np.zeros(3), elevation=elevation)}
+    assert FirstFrame.of(capture, filled_outline(box(*size), elevation), ColorSettings()).facts["raised"] == 0
+
+
+@pytest.mark.parametrize("category", ["toy", "rope"])
+def test_a_camera_above_the_table_that_looks_straight_down_sees_a_shape(category):
+    """It has no direction in which a body could reach away from it."""
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[2, 3] = 0.6
+    capture = capture_of(category)
+    capture.cameras = {"0": replace(camera(np.zeros(3)), camera_to_world=pose)}
+    labels = np.zeros((HEIGHT, WIDTH), np.uint8)
+    labels[20:70, 78:98] = OBJECT
+    frame = FirstFrame.of(capture, labels, ColorSettings())
+    assert all(np.isfinite(value) for value in frame.facts.values())
+    assert np.isfinite(frame.heights).all()
+    assert frame.heights.max() < 0.2
+
+
+def test_nothing_rises_below_a_steep_camera():
     view = camera(np.zeros(3), elevation=80.0)
     labels = np.zeros((HEIGHT, WIDTH), np.uint8)
     labels[20:70, 78:84] = OBJECT
