@@ -145,7 +145,8 @@ class ColorSettings(Section):
     is wide."""
     footprint: Positive = 1.2
     """How far from the camera a body extends at most, measured along the table from its nearest point, in widths of its middle line
-    across the view: what would lie farther off rises. It holds where `pose` of the capture is not given; with `pose: lying` nothing rises."""
+    across the view: what would lie farther off rises. It holds where `pose` of the capture is not given; with `pose: lying` nothing
+    rises."""
     standing_footprint: Positive = 0.3
     """The same with `pose: standing`."""
 
