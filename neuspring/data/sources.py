@@ -173,15 +173,22 @@ def _required_capture(folder: Path) -> None:
     if not (folder / capture.CAPTURE).exists():
         remedy = "Correct the path in the scenario table, or data_root, or make a capture: `neuspring make-capture --help`."
         raise InputError(folder, "a capture is a folder with capture.json", "a folder without", remedy)
-    if not capture.read_description(folder / capture.CAPTURE).cameras:
+    if _filmed(folder) is False:
         raise InputError(folder, "the source capture is for film", "a capture without cameras", "Write points as its source.")
     if any((folder / name).exists() for name in IN_SPACE):
         _required_in_space(folder)
 
 
+def _filmed(folder: Path) -> bool | None:
+    """Whether a capture has cameras; None where its description cannot be read, which the jobs of its scenario say."""
+    try:
+        return bool(capture.read_description(folder / capture.CAPTURE).cameras)
+    except InputError:
+        return None
+
+
 def _required_points(folder: Path) -> None:
-    capture.require_finished(folder)
-    if (folder / capture.CAPTURE).exists() and capture.read_description(folder / capture.CAPTURE).cameras:
+    if _filmed(folder):
         raise InputError(folder, "the source points is for captures without cameras", "a film", "Write capture as its source.")
     _required_in_space(folder)
 
