@@ -325,7 +325,7 @@ def space_findings(file: Path, points: np.ndarray, up: float | None, *, is_body:
 
 
 MOST_NODES = 5000
-"""Nodes beyond which a twin takes hours."""
+"""Nodes beyond which a warning says that a twin is slow."""
 
 
 def node_findings(file: Path, count: int) -> list[Finding]:
