@@ -139,7 +139,8 @@ class Search(Section):
     hands: Literal["hold", "push", "auto"] = "hold"
     """What hands do. hold, as released: their springs pull and push. push: they act only while they are shorter than at rest, and
     rest at `contact_distance` or, where a node was nearer in frame 0, there. auto: the first generation is judged in both ways,
-    out of the budget, and the way of its best candidate is kept."""
+    out of the budget, and the way of its best candidate is kept; hands push only if that also costs less than 0.9 of a body that
+    stays."""
     controller_rest: Literal["rest_shape", "first_frame"] = "rest_shape"
     """Where springs of controllers have no force, if the rest shape is not frame 0. rest_shape: where the body's have none.
     first_frame: in frame 0, as a hand takes hold of a body that is bent already."""

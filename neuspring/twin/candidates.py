@@ -238,6 +238,15 @@ def recordings(problem: SearchProblem, loss: FrameLoss) -> dict[int, Recording]:
     return own | dict(enumerate(problem.pool, start=1))
 
 
+def still_cost(problem: SearchProblem, loss: FrameLoss) -> float:
+    """What a twin costs that stays where it is in frame 0, m^2."""
+    costs = []
+    for one in recordings(problem, loss).values():
+        nodes = torch.tensor(one.observations.nodes, dtype=torch.float32, device=problem.device)
+        costs.append(np.mean([float(one.loss(frame, nodes)) for frame in range(1, len(one.hands))]))
+    return float(np.mean(costs))
+
+
 def groups(problem: SearchProblem, twins: Sequence[Twin]) -> list[list[int]]:
     """Which candidates are simulated together, the slowest group first.
 

@@ -1,10 +1,11 @@
 """Zero-order stage: CMA-ES over topology and homogeneous material (as in the released PhysTwin code), then a polish (polish.py).
 
 The best candidate wins. With `search.hands: auto` the first generation is judged with hands that hold and with hands that push, and
-the way of its best candidate is kept. With `search.tied_rollouts` the first part of the budget searches the 12 variables of the
-uniform topology; then the regions are freed around the best candidate. A trace records every candidate. A killed search continues
-from it, and so does a finished one with a larger budget: CMA-ES is replayed with the recorded costs, the polish with the recorded
-products.
+the way of its best candidate is kept. Hands that push an object that is held leave it where it is, and first candidates that hold
+may be worse than that: so pushing must also cost less than a body that stays. With `search.tied_rollouts` the first part of the
+budget searches the 12 variables of the uniform topology; then the regions are freed around the best candidate. A trace records
+every candidate. A killed search continues from it, and so does a finished one with a larger budget: CMA-ES is replayed with the
+recorded costs, the polish with the recorded products.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_atomically
 from neuspring.core.text import Progress
-from neuspring.twin.candidates import CMAES, OTHER_WAY, PENALTY, UNSTABLE, WAYS, Map, SearchProblem, candidate, evaluate
+from neuspring.twin.candidates import CMAES, OTHER_WAY, PENALTY, UNSTABLE, WAYS, Map, SearchProblem, candidate, evaluate, still_cost
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.polish import POLISH, SLOPES, Polish, slope_rows
 
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 
 FREED_SIGMA = 0.06
 """Step of CMA-ES in normalized variables when each region becomes free."""
+MOVES = 0.9
+"""Hands push if that costs less than this fraction of a body that stays as it is in frame 0."""
 
 
 class Proposals:
@@ -180,11 +183,14 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
 def _ways(
     problem: SearchProblem, population: Sequence[np.ndarray], loss: FrameLoss, ways: Sequence[bool], each: Map
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """The rows of the first generation in the way of its best candidate, and those in the other ways, which were judged first."""
-    judged = [evaluate(replace(problem, push=push), population, loss, 0, 0, each) for push in ways]
-    best = min(judged, key=lambda rows: min(row["cost"] for row in rows))
-    other = [row | {"stage": OTHER_WAY} for rows in judged if rows is not best for row in rows]
-    numbered = [row | {"rollout": number} for number, row in enumerate(other + best)]
+    """The rows of the first generation in the way that is chosen, and those in the other ways, which were judged first."""
+    judged = {push: evaluate(replace(problem, push=push), population, loss, 0, 0, each) for push in ways}
+    costs = {push: min(row["cost"] for row in rows) for push, rows in judged.items()}
+    if costs[True] >= MOVES * still_cost(problem, loss):
+        costs[True] = np.inf
+    chosen = min(ways, key=lambda push: costs[push])
+    other = [row | {"stage": OTHER_WAY} for push, rows in judged.items() if push != chosen for row in rows]
+    numbered = [row | {"rollout": number} for number, row in enumerate(other + judged[chosen])]
     return numbered[len(other) :], numbered[: len(other)]
 
 

@@ -22,7 +22,7 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.physics import stability
 from neuspring.physics.lanes import COST, WIDTHS, width_for
 from neuspring.twin import candidates
-from neuspring.twin.candidates import PENALTY, SearchProblem, candidate, groups
+from neuspring.twin.candidates import PENALTY, SearchProblem, candidate, groups, made, still_cost
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.search import FREED_SIGMA, search
 from neuspring.twin.topology import distances, isolated, regions, uniform_topology
@@ -365,6 +365,23 @@ def test_of_fewer_candidates_than_two_generations_half_are_judged_each_way(rollo
     best = trace.iloc[int(trace["cost"].to_numpy().argmin())]
     assert bool(best["push"]) == bool(result.twin.topology.pushes.any())
     assert result.cost == best["cost"]
+
+
+@pytest.mark.parametrize(("part", "pushes"), [(0.5, True), (0.98, False)])
+def test_hands_that_push_must_move_the_object(part, pushes, monkeypatch):
+    """First candidates that hold may be worse than an object that stays, and hands that push what is held leave it there."""
+    problem = replace(pushed(rollouts=22), losses=config.Losses(chamfer=0.0, acceleration=0.0))
+    still = still_cost(problem, FrameLoss.of(problem.observations, problem.losses, problem.device))
+    way = problem.observations.object_points - problem.observations.object_points[0]
+    # Half a square, and the mean over three axes.
+    assert still == pytest.approx((way[1:] ** 2).sum(axis=2).mean() / 6, rel=1e-5)
+
+    def evaluated(judged: SearchProblem, population: list[np.ndarray], *_: Any) -> list[dict[str, Any]]:
+        rows = [made(judged, normalized)[0] for normalized in population]
+        return [row | {"cost": still * (part if judged.push else 3.0)} for row in rows]
+
+    monkeypatch.setattr("neuspring.twin.search.evaluate", evaluated)
+    assert search(problem, seed=0).trace["push"].tolist() == [not pushes] * 11 + [pushes] * 11
 
 
 def test_hands_that_hold_are_kept(tmp_path, monkeypatch):
