@@ -52,7 +52,7 @@ export class Edits {
       const answer = await post(this.path, { revision: this.revision, [this.key]: value });
       this.revision = answer.revision;
       this.stored = value;
-      saved(`${this.name} saved`);
+      if (!this.waiting) saved(`${this.name} saved`);
       this.changed(true);
     } catch (error) {
       saved(`${this.name} NOT saved`);
