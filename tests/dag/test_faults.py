@@ -68,13 +68,13 @@ def wait_for(condition, process):
         time.sleep(0.02)
 
 
-def wrapper_of(*words):
-    """The wrapper process of a job, by words of its command line."""
-    for process in psutil.process_iter(["cmdline"]):
-        line = process.info["cmdline"] or []
-        if line[1:3] == ["-m", "neuspring.experiments.jobs.wrapper"] and all(word in " ".join(line) for word in words):
+def wrapper_of(project, rule):
+    """The wrapper process of the project's job of a rule; other tests run jobs of that rule at the same time."""
+    for process in psutil.process_iter(["cmdline", "cwd"]):
+        line = " ".join(process.info["cmdline"] or [])
+        if f"neuspring.experiments.jobs.wrapper --log results/logs/{rule}/" in line and process.info["cwd"] == str(project):
             return process
-    raise AssertionError(f"no wrapper with {words}")
+    raise AssertionError(f"no wrapper of {rule} in {project}")
 
 
 def record(results, name):
@@ -95,7 +95,7 @@ def test_each_fault_costs_one_job_and_the_same_command_continues(project, tmp_pa
         "scenarios": [SCENE, RELEASED],
         "methods": ["baseline"],
         "data_root": str(data),
-        "fit": {"epochs": 20},
+        "fit": {"epochs": 50},  # still at work when its wrapper is killed
         "tracking": {"uri": "http://127.0.0.1:9"},
     }
     faults = {
@@ -106,7 +106,7 @@ def test_each_fault_costs_one_job_and_the_same_command_continues(project, tmp_pa
     process = start(arguments(project, changes), project, **sabotage.variables(**faults))
     partial = results / SCENE / "baseline" / "0" / "fit.partial.npz"
     wait_for(partial.exists, process)
-    wrapper = wrapper_of("fit", f"/{SCENE}/")
+    wrapper = wrapper_of(project, "fit")
     (command,) = wrapper.children()
     wrapper.send_signal(signal.SIGKILL)
     output = output_of(process, fails=True)
