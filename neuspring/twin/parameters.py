@@ -37,6 +37,7 @@ from neuspring.core.artifacts import Topology, Twin
 from neuspring.core.geometry import farthest
 from neuspring.physics.parameters import LIMITS, Parameters, pack, twin_tensors
 from neuspring.twin.field import SpringField, midpoints
+from neuspring.twin.roughness import roughness
 from neuspring.twin.topology import node_spacing
 
 CONTACT_SCALARS = tuple(LIMITS)
@@ -144,11 +145,12 @@ class TwinParameters(nn.Module):
         pushes = topology.pushes if topology.pushes.size else np.zeros(count, bool)
         self.pushes = torch.from_numpy(pushes).to(device)
         """Springs [S] whose rest length is where a hand touches, which no unloaded shape changes."""
+        self.midpoints = midpoints(topology.canonical, topology.springs)
         self.offsets, self.field = None, None
         if kind == "springs":
             self.offsets = nn.Parameter(torch.zeros(count, 1))
         else:
-            self.field = SpringField(midpoints(topology.canonical, topology.springs), settings.field, 1, seed)
+            self.field = SpringField(self.midpoints, settings.field, 1, seed)
         self.scalars = nn.ParameterDict({name: nn.Parameter(self.start[name].clone()) for name in CONTACT_SCALARS})
         self.factors = nn.ParameterDict({name: nn.Parameter(torch.zeros(())) for name in self._factor_names()})
         self.unloaded = UnloadedShape(topology, settings.rest_shape.handles) if settings.rest_shape.handles else None
@@ -269,7 +271,8 @@ def movement(parameters: TwinParameters) -> dict[str, Any]:
 
     texels_moved: share of texels that moved by more than a tenth of their scale at the start. at_bound: share of springs whose
     stiffness lies within 5 % of the bound of its deviation (logarithm). at_stiffness_range: share at or beyond an end of the
-    stiffness range. factors: common factors. rest_strain: root mean square relative change of rest lengths.
+    stiffness range. roughness: of the body's log stiffness (roughness.py). factors: common factors. rest_strain: root mean square
+    relative change of rest lengths.
     """
     s, figures = parameters.settings, dict[str, Any]()
     with torch.no_grad():
@@ -284,6 +287,10 @@ def movement(parameters: TwinParameters) -> dict[str, Any]:
         low, high = s.stiffness_range
         stiffness = physical["stiffness"]
         figures["at_stiffness_range"] = _share((stiffness >= high) | (stiffness <= low))
+        body = ~parameters.on_controller.cpu().numpy()
+        rough = roughness(parameters.midpoints[body], stiffness.double().log().cpu().numpy()[body])
+        if np.isfinite(rough):
+            figures["roughness"] = rough
         if parameters.factors:
             figures["factors"] = {name: float(value.exp()) for name, value in parameters.factors.items()}
         if parameters.unloaded is not None:

@@ -18,7 +18,7 @@ from neuspring.report.draw.painter import DrawingStyle, Painter
 from neuspring.report.draw.scene import Prediction, Scene, chosen_frames
 from neuspring.report.draw.sheet import place, save
 from neuspring.report.draw.strip import strip_figure
-from neuspring.report.draw.twin import BAR, Lines, TwinPicture, histogram, twin_figure
+from neuspring.report.draw.twin import BAR, Lines, TwinPicture, histogram, rough_or_smooth, twin_figure
 from neuspring.scores.metrics import PICTURES, errors_per_frame
 
 NAMES = ("errors.png", "motion.png", "losses.png", "topology.png", "stiffness.png")
@@ -162,7 +162,8 @@ def _from_two_sides(observations: Observations, take: Prediction, label: str, *q
 
 
 def stiffness_figure(observations: Observations, take: Prediction, searched: float | None) -> Figure:
-    """The body's lines in frame 0 colored by stiffness in two views, and their histogram with the searched stiffness [N] marked.
+    """The body's lines in frame 0 colored by stiffness in two views, their histogram with the searched stiffness [N] marked, and the
+    variogram of a lattice's springs.
 
     The twin must have an object spring, or be a rod.
     """
@@ -171,9 +172,13 @@ def stiffness_figure(observations: Observations, take: Prediction, searched: flo
     stiffness = lines.stiffness[: lines.inner].astype(float)
     kind = "object springs" if take.twin.rod is None else "edges, EI / l²"
     body = _from_two_sides(observations, take, f"{take.label}: {len(stiffness)} {kind}", "stiffness")
-    figure = twin_figure(body, WIDTH + HISTOGRAM, BAR + HISTOGRAM)
+    columns = 2 if take.twin.rod is None and stiffness.std() > 0 else 1
+    figure = twin_figure(body, WIDTH + columns * HISTOGRAM, BAR + columns * HISTOGRAM)
     high = figure.get_figheight()
     axis = place(figure, WIDTH + 0.6, FOOT, HISTOGRAM - 0.9, max(high - FOOT - 0.1, 0.5))
     histogram(axis, stiffness, body.norm, searched)
     axis.set_ylabel("springs" if take.twin.rod is None else "edges")
+    if columns == 2:
+        axis = place(figure, WIDTH + HISTOGRAM + 0.6, FOOT, HISTOGRAM - 0.9, max(high - FOOT - 0.1, 0.5))
+        rough_or_smooth(axis, take.twin)
     return figure
