@@ -11,6 +11,7 @@ at a distance h.
 from __future__ import annotations
 
 import numpy as np
+
 NEAREST = 8
 """Springs that a spring is compared with."""
 PAIRS = 200_000

@@ -162,8 +162,8 @@ def _from_two_sides(observations: Observations, take: Prediction, label: str, *q
 
 
 def stiffness_figure(observations: Observations, take: Prediction, searched: float | None) -> Figure:
-    """The body's lines in frame 0 colored by stiffness in two views, their histogram with the searched stiffness [N] marked, and the
-    variogram of a lattice's springs.
+    """The body's lines in frame 0 colored by stiffness in two views, their histogram with the searched stiffness [N] marked, and
+    the variogram of a lattice's springs.
 
     The twin must have an object spring, or be a rod.
     """

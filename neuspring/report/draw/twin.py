@@ -326,7 +326,8 @@ def rough_or_smooth(axis: Axes, twin: Twin) -> None:
     """The variogram of a lattice's log stiffness over distance in node spacings, and its roughness (twin/roughness.py)."""
     topology, inner = twin.topology, twin.topology.object_spring_count
     middles = midpoints(topology.canonical, topology.springs[:inner])
-    values, spacing = np.log(np.maximum(twin.material.stiffness[:inner].astype(float), 1e-12)), node_spacing(topology.canonical[: len(topology.nodes)])
+    values = np.log(np.maximum(twin.material.stiffness[:inner].astype(float), 1e-12))
+    spacing = node_spacing(topology.canonical[: len(topology.nodes)])
     far = 0.5 * float(np.linalg.norm(np.ptp(middles, axis=0)))
     edges = np.linspace(0, max(far, spacing), BINS + 1)
     axis.plot((edges[1:] + edges[:-1]) / (2 * spacing), variogram(middles, values, edges), ".-", color="0.2", lw=1)
