@@ -33,6 +33,7 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
     numbers: Any = wp.array2d(dtype=lane.Number)
     vectors: Any = wp.array2d(dtype=lane.Vector)
     slots: Any = wp.array3d(dtype=lane.Vector)
+    counts: Any = wp.array3d(dtype=lane.Number)
     integers: Any = wp.array(dtype=int)
     lists: Any = wp.array3d(dtype=int)
     table: Any = wp.array2d(dtype=int)
@@ -70,6 +71,7 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
         v: slots
         after: slots
         moving: slots
+        met: counts
         force: vectors
 
     class Adjoint:
@@ -144,11 +146,12 @@ class Buffers:
                 tensor = self._zeros(shape, (3, self.width))
                 self.tensors[name], self.views[name] = tensor, wp.from_torch(tensor, dtype=self.lanes.Vector)
 
-    def add_numbers(self, **sizes: int | None) -> None:
+    def add_numbers(self, **sizes: int | tuple[int, int] | None) -> None:
         """Add arrays of Numbers: [size, G], or [G] for a number of a twin (None). Adjoints (adj_...) as for Vectors."""
         for name, size in sizes.items():
             if self.differentiable or not name.startswith("adj_"):
-                tensor = self._zeros(() if size is None else (size,), (self.width,))
+                shape = () if size is None else (size,) if isinstance(size, int) else size
+                tensor = self._zeros(shape, (self.width,))
                 self.tensors[name], self.views[name] = tensor, wp.from_torch(tensor, dtype=self.lanes.Number)
 
     def _zeros(self, shape: tuple[int, ...], entry: tuple[int, ...]) -> torch.Tensor:

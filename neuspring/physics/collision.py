@@ -10,7 +10,7 @@ The twins of a group share a list: a bit per lane says whose partner a node is.
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import warp as wp
@@ -38,6 +38,7 @@ def allocate(b: Buffers) -> None:
     b.indices |= tables
     b.views |= {name: wp.from_torch(tensor, dtype=wp.int32) for name, tensor in tables.items()}
     b.add_vectors(moving=(b.history, b.nodes), adj_moving=(b.nodes,))
+    b.add_numbers(met=(b.history, b.nodes))
     groups = torch.arange(twins, **device).repeat_interleave(b.nodes)
     b.indices["grid_groups"] = groups
     b.views["grid_groups"] = wp.from_torch(groups, dtype=wp.int32)
@@ -138,136 +139,177 @@ def kernels(real: Any, width: int) -> tuple[Any, Any]:
     return unique(place), unique(find)
 
 
+class Contacts(NamedTuple):
+    """What a frame calls. A thread per node gathers (`collided`); one thread for all adds each pair to both of its nodes."""
+
+    collided: Any
+    add_pairs: Any
+    after_pairs: Any
+    adjoint: Any
+
+
 @functools.cache
-def functions(real: Any, width: int) -> tuple[Any, Any]:
-    """(collided, its adjoint) for a scalar type, wp.float32 or wp.float64, and a number of lanes."""
+def functions(real: Any, width: int) -> Contacts:
+    """The functions for a scalar type, wp.float32 or wp.float64, and a number of lanes."""
     lane = lanes(real, width)
     Number, Vector = lane.Number, lane.Vector
     Model, State, Adjoint = structs(real, width)
-    dot, root, column, put = lane.dot, lane.root, lane.column, lane.put
-    vec3 = wp.types.vector(3, real)
+    dot, root, scaled, divided = lane.dot, lane.root, lane.scaled, lane.divided
+    nearly = wp.constant(real(1.0 + 1e-5))
     zero, one = wp.constant(real(0.0)), wp.constant(real(1.0))
     approach, floor = wp.constant(real(APPROACH)), wp.constant(real(MIN_TANGENT))
 
     @wp.func
-    def hits(mask: int, q: int, length: real, closing: real, distance: real) -> bool:
-        return (mask >> q) & 1 == 1 and length < distance and closing < -approach
+    def whole(value: real) -> Number:
+        """The same in every lane."""
+        result = Number()
+        for q in range(width):
+            result[q] = value
+        return result
 
     @wp.func
-    def part(model: Model, i: int, j: int, g: int, q: int) -> real:
-        """m_j / (m_i + m_j)."""
-        own = model.inverse_mass[i, g][q]
-        return own / (own + model.inverse_mass[j, g][q])
-
-    @wp.func
-    def impulse(dx: vec3, u: vec3, length: real, e: real, mu: real, share: real) -> vec3:
-        n = dx / wp.max(length, floor)
-        s = wp.dot(u, n)
-        ut = u - n * s
-        a = wp.max(zero, one - mu * (one + e) * wp.abs(s) / wp.max(wp.length(ut), floor))
-        return (ut * (a - one) - n * ((one + e) * s)) * share
-
-    @wp.func
-    def meeting(state: State, slot: int, inner: int, j: int, g: int, x: Vector, v: Vector):
-        """Node j seen from a node at x with velocity v: offset, relative velocity, distance, distance times closing speed."""
+    def meeting(model: Model, state: State, slot: int, inner: int, j: int, g: int, mask: int, x: Vector, v: Vector):
+        """Node j seen from a node at x with velocity v: whether they meet in any lane, 1 where they do, offset, relative velocity."""
         offset = state.x[slot, j, g] - x
         relative = state.after[inner, j, g] - v
-        return offset, relative, root(dot(offset, offset)), dot(offset, relative)
+        square = dot(offset, offset)
+        distance = model.distance[g]
+        # Almost no pair meets: one look at all lanes first, at squares that rounding cannot make too large.
+        apart = wp.cw_mul(distance, distance) * nearly
+        meets = Number()
+        some = bool(wp.min(wp.max(square - apart, dot(offset, relative) + whole(approach))) < zero)
+        if some:
+            length = root(square)
+            closing = dot(offset, relative)
+            for q in range(width):
+                meets[q] = wp.where((mask >> q) & 1 == 1 and length[q] < distance[q] and closing[q] < -approach, one, zero)
+            some = bool(wp.max(meets) > zero)
+        return some, meets, offset, relative
+
+    @wp.func
+    def part(model: Model, i: int, j: int, g: int) -> Number:
+        """m_j / (m_i + m_j)."""
+        own = model.inverse_mass[i, g]
+        return wp.cw_div(own, own + model.inverse_mass[j, g])
+
+    @wp.func
+    def impulse(dx: Vector, u: Vector, e: Number, mu: Number) -> Vector:
+        """What a node gains from a partner at dx that moves at u, before its share."""
+        n = divided(dx, wp.max(root(dot(dx, dx)), whole(floor)))
+        s = dot(u, n)
+        ut = u - scaled(n, s)
+        more = whole(one) + e
+        lost = wp.cw_div(wp.cw_mul(wp.cw_mul(mu, more), wp.abs(s)), wp.max(root(dot(ut, ut)), whole(floor)))
+        a = wp.max(Number(), whole(one) - lost)
+        return scaled(ut, a - whole(one)) - scaled(n, wp.cw_mul(more, s))
 
     @wp.func
     def collided(model: Model, state: State, slot: int, inner: int, i: int, g: int) -> Vector:
-        """Velocities of node i after the impulses."""
+        """Velocities of node i after the impulses of all its partners."""
         x = state.x[slot, i, g]
         v = state.after[inner, i, g]
         total = Vector()
         count = Number()
         for k in range(model.near_count[i, g]):
             j = model.near[i, k, g]
-            mask = model.near_lanes[i, k, g]
-            offset, relative, length, closing = meeting(state, slot, inner, j, g, x, v)
-            for q in range(width):
-                if hits(mask, q, length[q], closing[q], model.distance[g][q]):
-                    push = impulse(
-                        column(offset, q),
-                        column(relative, q),
-                        length[q],
-                        model.contact_e[g][q],
-                        model.contact_mu[g][q],
-                        part(model, i, j, g, q),
-                    )
-                    total = put(total, q, column(total, q) + push)
-                    count[q] = count[q] + one
-        for q in range(width):
-            if count[q] > zero:
-                v = put(v, q, column(v, q) - column(total, q) / count[q])
-        return v
+            some, meets, offset, relative = meeting(model, state, slot, inner, j, g, model.near_lanes[i, k, g], x, v)
+            if some:
+                push = scaled(impulse(offset, relative, model.contact_e[g], model.contact_mu[g]), part(model, i, j, g))
+                total = total + scaled(push, meets)
+                count = count + meets
+        state.met[inner, i, g] = count
+        return v - divided(total, wp.max(count, whole(one)))
 
     @wp.func
-    def pair_adjoint(dx: vec3, u: vec3, length: real, e: real, mu: real, h: vec3):
+    def add_pairs(model: Model, state: State, slot: int, inner: int, i: int, g: int):
+        """Add the impulses of node i and its later partners to `moving` and `met` of both: each pair once, the same sums."""
+        x = state.x[slot, i, g]
+        v = state.after[inner, i, g]
+        total = state.moving[inner, i, g]
+        count = state.met[inner, i, g]
+        for k in range(model.near_count[i, g]):
+            j = model.near[i, k, g]
+            if j > i:
+                some, meets, offset, relative = meeting(model, state, slot, inner, j, g, model.near_lanes[i, k, g], x, v)
+                if some:
+                    push = impulse(offset, relative, model.contact_e[g], model.contact_mu[g])
+                    total = total + scaled(scaled(push, part(model, i, j, g)), meets)
+                    count = count + meets
+                    back = scaled(scaled(push, part(model, j, i, g)), meets)
+                    state.moving[inner, j, g] = state.moving[inner, j, g] - back
+                    state.met[inner, j, g] = state.met[inner, j, g] + meets
+        state.moving[inner, i, g] = total
+        state.met[inner, i, g] = count
+
+    @wp.func
+    def after_pairs(state: State, inner: int, i: int, g: int) -> Vector:
+        """Velocities of node i after the impulses that `add_pairs` has added."""
+        return state.after[inner, i, g] - divided(state.moving[inner, i, g], wp.max(state.met[inner, i, g], whole(one)))
+
+    @wp.func
+    def pair_adjoint(dx: Vector, u: Vector, e: Number, mu: Number, h: Vector):
         """Adjoints of dx, u, e and mu for h, that of the impulse; the node's share is in h."""
-        inverse = one / wp.max(length, floor)
-        n = dx * inverse
-        s = wp.dot(u, n)
-        ut = u - n * s
-        t = wp.length(ut)
-        tf = wp.max(t, floor)
-        a = wp.max(zero, one - mu * (one + e) * wp.abs(s) / tf)
-        hn_along = wp.dot(h, n)
-        ha = wp.dot(h, ut)
-        hs = -(a + e) * hn_along
-        hn = h * (-(a + e) * s)
-        hu = h * (a - one)
-        he = -s * hn_along
-        hmu = zero
-        if a > zero:
-            hmu = -ha * (one + e) * wp.abs(s) / tf
-            he = he - ha * mu * wp.abs(s) / tf
-            hs = hs - wp.sign(s) * ha * mu * (one + e) / tf
-            if t > floor:
-                ht = ut * (ha * mu * (one + e) * wp.abs(s) / (tf * tf * t))
-                hu = hu + ht
-                hs = hs - wp.dot(ht, n)
-                hn = hn - ht * s
-        hu = hu + n * hs
-        hn = hn + u * hs
-        return (hn - n * wp.dot(hn, n)) * inverse, hu, he, hmu
+        ones = whole(one)
+        inverse = wp.cw_div(ones, wp.max(root(dot(dx, dx)), whole(floor)))
+        n = scaled(dx, inverse)
+        s = dot(u, n)
+        ut = u - scaled(n, s)
+        t = root(dot(ut, ut))
+        tf = wp.max(t, whole(floor))
+        more = ones + e
+        size = wp.abs(s)
+        a = wp.max(Number(), ones - wp.cw_div(wp.cw_mul(wp.cw_mul(mu, more), size), tf))
+        along = dot(h, n)
+        ha = dot(h, ut)
+        hs = -wp.cw_mul(a + e, along)
+        hn = scaled(h, -wp.cw_mul(a + e, s))
+        hu = scaled(h, a - ones)
+        he = -wp.cw_mul(s, along)
+        # Where friction does not stop the pair, and where it has a direction.
+        slides = Number()
+        turns = Number()
+        for q in range(width):
+            slides[q] = wp.where(a[q] > zero, one, zero)
+            turns[q] = wp.where(a[q] > zero and t[q] > floor, one, zero)
+        slope = wp.cw_div(wp.cw_mul(ha, slides), tf)
+        hmu = -wp.cw_mul(wp.cw_mul(slope, more), size)
+        he = he - wp.cw_mul(wp.cw_mul(slope, mu), size)
+        force = wp.cw_mul(wp.cw_mul(slope, mu), more)
+        hs = hs - wp.cw_mul(wp.sign(s), force)
+        ht = scaled(ut, wp.cw_div(wp.cw_mul(wp.cw_mul(force, turns), size), wp.cw_mul(tf, wp.max(t, whole(floor)))))
+        hu = hu + ht + scaled(n, hs - dot(ht, n))
+        hs = hs - dot(ht, n)
+        hn = hn - scaled(ht, s) + scaled(u, hs)
+        return scaled(hn - scaled(n, dot(hn, n)), inverse), hu, he, hmu
 
     @wp.func
     def collided_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
-        """From dL/d(velocities after the impulses) to those before, and to dL/d(x, e, mu)."""
-        x = state.x[step, i, g]
-        v = state.after[step, i, g]
+        """From dL/d(velocities after the impulses) to those before, and to dL/d(x, e, mu): of node i, and its pairs with later ones."""
         h = adjoint.moving[i, g]
         wp.atomic_add(adjoint.after, i, g, h)
-        count = Number()
+        count = state.met[step, i, g]
+        if wp.max(count) == zero:
+            return
+        x = state.x[step, i, g]
+        v = state.after[step, i, g]
+        own = divided(h, wp.max(count, whole(one)))
+        e = adjoint.contact_e[i, g]
+        mu = adjoint.contact_mu[i, g]
         for k in range(model.near_count[i, g]):
             j = model.near[i, k, g]
-            mask = model.near_lanes[i, k, g]
-            offset, relative, length, closing = meeting(state, step, step, j, g, x, v)
-            for q in range(width):
-                if hits(mask, q, length[q], closing[q], model.distance[g][q]):
-                    count[q] = count[q] + one
-        for k in range(model.near_count[i, g]):
-            j = model.near[i, k, g]
-            mask = model.near_lanes[i, k, g]
-            offset, relative, length, closing = meeting(state, step, step, j, g, x, v)
-            for q in range(width):
-                if hits(mask, q, length[q], closing[q], model.distance[g][q]):
-                    share = column(h, q) * (-part(model, i, j, g, q) / count[q])
-                    hx, hu, he, hmu = pair_adjoint(
-                        column(offset, q), column(relative, q), length[q], model.contact_e[g][q], model.contact_mu[g][q], share
-                    )
-                    change_x = put(Vector(), q, hx)
-                    change_v = put(Vector(), q, hu)
-                    wp.atomic_add(adjoint.x, j, g, change_x)
-                    wp.atomic_sub(adjoint.x, i, g, change_x)
-                    wp.atomic_add(adjoint.after, j, g, change_v)
-                    wp.atomic_sub(adjoint.after, i, g, change_v)
-                    e = adjoint.contact_e[i, g]
-                    e[q] = e[q] + he
-                    adjoint.contact_e[i, g] = e
-                    mu = adjoint.contact_mu[i, g]
-                    mu[q] = mu[q] + hmu
-                    adjoint.contact_mu[i, g] = mu
+            if j > i:
+                some, meets, offset, relative = meeting(model, state, step, step, j, g, model.near_lanes[i, k, g], x, v)
+                if some:
+                    other = divided(adjoint.moving[j, g], wp.max(state.met[step, j, g], whole(one)))
+                    share = scaled(scaled(other, part(model, j, i, g)) - scaled(own, part(model, i, j, g)), meets)
+                    hx, hu, he, hmu = pair_adjoint(offset, relative, model.contact_e[g], model.contact_mu[g], share)
+                    wp.atomic_add(adjoint.x, j, g, hx)
+                    wp.atomic_sub(adjoint.x, i, g, hx)
+                    wp.atomic_add(adjoint.after, j, g, hu)
+                    wp.atomic_sub(adjoint.after, i, g, hu)
+                    e = e + he
+                    mu = mu + hmu
+        adjoint.contact_e[i, g] = e
+        adjoint.contact_mu[i, g] = mu
 
-    return collided, collided_adjoint
+    return Contacts(collided, add_pairs, after_pairs, collided_adjoint)

@@ -47,7 +47,7 @@ def kernels(real: Any, width: int, among: bool = False, pushes: bool = False) ->
     Model, State, Adjoint = structs(real, width)
     move_controller, updated, updated_adjoint = motion.velocity(real, width)
     moved, moved_adjoint = (obstacles if among else motion).position(real, width)
-    collided, collided_adjoint = collision.functions(real, width)
+    collided, add_pairs, after_pairs, collided_adjoint = collision.functions(real, width)
     add_row, add_row_adjoint, gathered, gathered_adjoint = springs.functions(real, width, pushes)
 
     @wp.func
@@ -138,10 +138,15 @@ def kernels(real: Any, width: int, among: bool = False, pushes: bool = False) ->
                 if model.collide == 0:  #      (4)  x' = x + dt v', reflected at the ground
                     advance(model, state, step, i, g, after)
             if model.collide != 0:
-                for i in range(model.nodes):  #     v' += mean impulse from the partners that are hit
-                    state.moving[inner, i, g] = collided(model, state, slot, inner, i, g)
                 for i in range(model.nodes):
-                    advance(model, state, step, i, g, state.moving[inner, i, g])
+                    state.moving[inner, i, g] = Vector()
+                    state.met[inner, i, g] = Number()
+                for i in range(model.nodes):  #     v' += mean impulse from the partners that are hit
+                    add_pairs(model, state, slot, inner, i, g)
+                for i in range(model.nodes):
+                    moving = after_pairs(state, inner, i, g)
+                    state.moving[inner, i, g] = moving
+                    advance(model, state, step, i, g, moving)
 
     def backward(model: Model, state: State, adjoint: Adjoint):
         """The adjoints of `forward`, last line first."""
