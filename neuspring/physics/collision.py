@@ -155,7 +155,6 @@ def functions(real: Any, width: int) -> Contacts:
     Number, Vector = lane.Number, lane.Vector
     Model, State, Adjoint = structs(real, width)
     dot, root, scaled, divided = lane.dot, lane.root, lane.scaled, lane.divided
-    nearly = wp.constant(real(1.0 + 1e-5))
     zero, one = wp.constant(real(0.0)), wp.constant(real(1.0))
     approach, floor = wp.constant(real(APPROACH)), wp.constant(real(MIN_TANGENT))
 
@@ -168,23 +167,19 @@ def functions(real: Any, width: int) -> Contacts:
         return result
 
     @wp.func
-    def meeting(model: Model, state: State, slot: int, inner: int, j: int, g: int, mask: int, x: Vector, v: Vector):
-        """Node j seen from a node at x with velocity v: whether they meet in any lane, 1 where they do, offset, relative velocity."""
-        offset = state.x[slot, j, g] - x
-        relative = state.after[inner, j, g] - v
-        square = dot(offset, offset)
-        distance = model.distance[g]
-        # Almost no pair meets: one look at all lanes first, at squares that rounding cannot make too large.
-        apart = wp.cw_mul(distance, distance) * nearly
+    def closes(offset: Vector, relative: Vector) -> bool:
+        """Whether a pair comes closer in any lane. Almost half do not, and need no more than this."""
+        return wp.min(dot(offset, relative)) < -approach
+
+    @wp.func
+    def meeting(offset: Vector, relative: Vector, mask: int, distance: Number) -> Number:
+        """1 in the lanes in which a pair meets."""
+        length = root(dot(offset, offset))
+        closing = dot(offset, relative)
         meets = Number()
-        some = bool(wp.min(wp.max(square - apart, dot(offset, relative) + whole(approach))) < zero)
-        if some:
-            length = root(square)
-            closing = dot(offset, relative)
-            for q in range(width):
-                meets[q] = wp.where((mask >> q) & 1 == 1 and length[q] < distance[q] and closing[q] < -approach, one, zero)
-            some = bool(wp.max(meets) > zero)
-        return some, meets, offset, relative
+        for q in range(width):
+            meets[q] = wp.where((mask >> q) & 1 == 1 and length[q] < distance[q] and closing[q] < -approach, one, zero)
+        return meets
 
     @wp.func
     def part(model: Model, i: int, j: int, g: int) -> Number:
@@ -210,10 +205,13 @@ def functions(real: Any, width: int) -> Contacts:
         v = state.after[inner, i, g]
         total = Vector()
         count = Number()
+        distance = model.distance[g]
         for k in range(model.near_count[i, g]):
             j = model.near[i, k, g]
-            some, meets, offset, relative = meeting(model, state, slot, inner, j, g, model.near_lanes[i, k, g], x, v)
-            if some:
+            offset = state.x[slot, j, g] - x
+            relative = state.after[inner, j, g] - v
+            if closes(offset, relative):
+                meets = meeting(offset, relative, model.near_lanes[i, k, g], distance)
                 push = scaled(impulse(offset, relative, model.contact_e[g], model.contact_mu[g]), part(model, i, j, g))
                 total = total + scaled(push, meets)
                 count = count + meets
@@ -227,11 +225,14 @@ def functions(real: Any, width: int) -> Contacts:
         v = state.after[inner, i, g]
         total = state.moving[inner, i, g]
         count = state.met[inner, i, g]
+        distance = model.distance[g]
         for k in range(model.near_count[i, g]):
             j = model.near[i, k, g]
             if j > i:
-                some, meets, offset, relative = meeting(model, state, slot, inner, j, g, model.near_lanes[i, k, g], x, v)
-                if some:
+                offset = state.x[slot, j, g] - x
+                relative = state.after[inner, j, g] - v
+                if closes(offset, relative):
+                    meets = meeting(offset, relative, model.near_lanes[i, k, g], distance)
                     push = impulse(offset, relative, model.contact_e[g], model.contact_mu[g])
                     total = total + scaled(scaled(push, part(model, i, j, g)), meets)
                     count = count + meets
@@ -295,11 +296,14 @@ def functions(real: Any, width: int) -> Contacts:
         own = divided(h, wp.max(count, whole(one)))
         e = adjoint.contact_e[i, g]
         mu = adjoint.contact_mu[i, g]
+        distance = model.distance[g]
         for k in range(model.near_count[i, g]):
             j = model.near[i, k, g]
             if j > i:
-                some, meets, offset, relative = meeting(model, state, step, step, j, g, model.near_lanes[i, k, g], x, v)
-                if some:
+                offset = state.x[step, j, g] - x
+                relative = state.after[step, j, g] - v
+                if closes(offset, relative):
+                    meets = meeting(offset, relative, model.near_lanes[i, k, g], distance)
                     other = divided(adjoint.moving[j, g], wp.max(state.met[step, j, g], whole(one)))
                     share = scaled(scaled(other, part(model, j, i, g)) - scaled(own, part(model, i, j, g)), meets)
                     hx, hu, he, hmu = pair_adjoint(offset, relative, model.contact_e[g], model.contact_mu[g], share)
