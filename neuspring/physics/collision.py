@@ -4,7 +4,8 @@ Node i takes the mean impulse over its listed partners j that are closer than th
 motion.py, of which m_j / (m_i + m_j) is its share: a pair that meets nobody else keeps its momentum.
 
 Partners are listed once per frame, from a hash grid with cells as wide as the contact distance, so that the cost grows with the
-nodes. A list is in node order; where a twin has more than `collision_capacity`, those with the lowest indices stay.
+nodes. A list is in node order; where a node has more than `collision_capacity`, those with the lowest indices stay, and the others
+do not meet it.
 The twins of a group share a list: a bit per lane says whose partner a node is.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
@@ -56,17 +57,18 @@ def overflow(b: Buffers) -> torch.Tensor:
 
 def find_candidates(b: Buffers, reach: float) -> None:
     """List the partners of every node at the start of the frame; `reach` is the largest contact distance, m."""
-    place, find = (load(kernel, b.device) for kernel in kernels(b.real, b.width))
+    place, find, agree = (load(kernel, b.device) for kernel in kernels(b.real, b.width))
     views, size = b.views, (b.nodes, b.groups)
     model, state, _ = b.arguments
     b.launch(place, size, model, state, views["grid_points"])
     views["grid"].build(views["grid_points"], reach, groups=views["grid_groups"])
     b.launch(find, size, model, state, views["grid"].id, views["overflow"])
+    b.launch(agree, size, model, views["overflow"])
 
 
 @functools.cache
-def kernels(real: Any, width: int) -> tuple[Any, Any]:
-    """(place, find): kernels for a scalar type, wp.float32 or wp.float64, and a number of lanes."""
+def kernels(real: Any, width: int) -> tuple[Any, Any, Any]:
+    """(place, find, agree): kernels for a scalar type, wp.float32 or wp.float64, and a number of lanes."""
     lane = lanes(real, width)
     Model, State, _ = structs(real, width)
     column = lane.column
@@ -135,8 +137,27 @@ def kernels(real: Any, width: int) -> tuple[Any, Any]:
                         count = inserted(model, i, g, j, q, count)
         model.near_count[i, g] = count
 
+    @wp.func
+    def listed(model: Model, i: int, g: int, j: int) -> int:
+        """The lanes in which j is a partner of node i."""
+        for k in range(model.near_count[i, g]):
+            if model.near[i, k, g] == j:
+                return model.near_lanes[i, k, g]
+        return 0
+
+    def agree(model: Model, overflow: counts):
+        """A node that was dropped by a partner drops it too: a pair is one for both. The order of threads makes no difference."""
+        i, g = wp.tid()
+        for k in range(model.near_count[i, g]):
+            j = model.near[i, k, g]
+            full = wp.int32(0)
+            for q in range(width):
+                full = full + overflow[j, g, q]
+            if full > 0:
+                model.near_lanes[i, k, g] = model.near_lanes[i, k, g] & listed(model, j, g, i)
+
     unique = wp.kernel(**UNFUSED)
-    return unique(place), unique(find)
+    return unique(place), unique(find), unique(agree)
 
 
 class Contacts(NamedTuple):

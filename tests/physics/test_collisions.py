@@ -52,8 +52,11 @@ def lists(x: np.ndarray, capacity: int, frames: int, device: str) -> tuple[list[
     # Slots behind a list stay untouched, also the first slot of the empty list behind a full one.
     beyond = np.arange(partners.shape[1]) >= count[:, None]
     assert (partners[beyond] == -1).all()
-    assert (lanes[~beyond] == 1).all()
-    return [row[:n].tolist() for row, n in zip(partners, count, strict=True)], solver.collision_overflow
+    found = [row[:n].tolist() for row, n in zip(partners, count, strict=True)]
+    # A pair is one for both nodes.
+    both = [[int(i in found[j]) for j in own] for i, own in enumerate(found)]
+    assert [row[:n].tolist() for row, n in zip(lanes, count, strict=True)] == both
+    return found, solver.collision_overflow
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -125,6 +128,11 @@ def expected(cloud: np.ndarray, dtype: torch.dtype, distance: float) -> list[lis
     return [pairs[pairs[:, 0] == i, 1].tolist() for i in range(len(cloud))]
 
 
+def mutual(rows: list[list[int]]) -> list[list[int]]:
+    """The partners of each node that list it as well."""
+    return [[j for j in row if i in rows[j]] for i, row in enumerate(rows)]
+
+
 def cloud(kind: str) -> np.ndarray:
     """[N, 3] around the origin, far from it, on the borders of the grid's cells, or wider than the grid."""
     rng, steps = np.random.default_rng(3), np.arange(-3, 4) * DISTANCE / 2
@@ -184,7 +192,7 @@ def test_a_crowded_twin_takes_no_room_from_others(dtype: torch.dtype, capacity: 
     clouds[2][:20] = np.random.default_rng(2).uniform(-0.004, 0.004, (20, 3))
     lists, overflow = partners(clouds, dtype, capacity, DISTANCE)
     wanted = [expected(x, dtype, DISTANCE) for x in clouds]
-    assert lists == [[row[:capacity] for row in rows] for rows in wanted]
+    assert lists == [mutual([row[:capacity] for row in rows]) for rows in wanted]
     assert overflow == [sum(max(len(row) - capacity, 0) for row in rows) for rows in wanted]
     assert (overflow[2] > 100) == (capacity < 50)
 

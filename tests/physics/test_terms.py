@@ -232,13 +232,19 @@ def fill_crowd(values: Arrays) -> Buffers:
 
 
 def collided(values: Arrays) -> np.ndarray:
+    """Velocities after the impulses, which a thread per node and one thread for all pairs give alike, bit for bit."""
     b = fill_crowd(values)
     launch(terms.kernels(b.width).collide, (6, 1), *b.arguments[:2])
-    return b.get_vectors("moving", slot=0).numpy()
+    gathered = b.get_vectors("moving", slot=0).numpy()
+    launch(terms.kernels(b.width).collide_pairs, 1, *b.arguments[:2])
+    np.testing.assert_array_equal(b.get_vectors("moving", slot=0).numpy(), gathered)
+    return gathered
 
 
 def collided_adjoints(values: Arrays, weight: np.ndarray) -> Arrays:
     b = fill_crowd(values)
+    # The adjoint reads how many partners were met.
+    launch(terms.kernels(b.width).collide, (6, 1), *b.arguments[:2])
     for name, tensor in b.tensors.items():
         if name.startswith("adj_"):
             tensor.zero_()
@@ -262,13 +268,13 @@ def crowd(friction: float, seed: int = 11) -> Arrays:
 def test_collision(friction: float, width: int) -> None:
     """x, v, elasticity and friction for Jacobi impulses of nodes with several partners each.
 
-    All nodes are listed in the first lane; in every other, each node misses another partner.
+    All nodes are listed in the first lane; in every other, some pair is none.
     """
     crowds = [crowd((friction + lane) % 2.0 if lane else friction, 11 + lane) for lane in range(width)]
     at = {name: np.stack([one[name] for one in crowds]) for name in crowds[0]}
     listed = np.broadcast_to(~np.eye(6, dtype=bool), (width, 6, 6)).astype(np.int64)
     for lane in range(1, width):
-        listed[lane, np.arange(6), (np.arange(6) + lane) % 6] = 0
+        listed[lane, lane - 1, lane % 5] = listed[lane, lane % 5, lane - 1] = 0
     weight = np.random.default_rng(12).standard_normal((width, 6, 3))
     got = collided_adjoints(at | {"listed": listed}, weight)
     # Lengths here are 0.01 m, so third derivatives in x are 1e4 times those of the other kernels: a smaller step.

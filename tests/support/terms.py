@@ -15,7 +15,7 @@ from neuspring.physics.motion import position, velocity
 
 
 class Kernels(NamedTuple):
-    """Terms for one width, each followed by its adjoint."""
+    """Terms for one width, each followed by its adjoint; impulses by a thread per node and by one thread for all pairs."""
 
     rows: Any
     rows_adjoint: Any
@@ -26,6 +26,7 @@ class Kernels(NamedTuple):
     motion: Any
     motion_adjoint: Any
     collide: Any
+    collide_pairs: Any
     collide_adjoint: Any
 
 
@@ -42,7 +43,7 @@ def kernels(width: int) -> Kernels:
     add_row, add_row_adjoint, gathered, gathered_adjoint = springs.functions(real, width)
     _, updated, updated_adjoint = velocity(real, width)
     moved, moved_adjoint = position(real, width)
-    collided, collided_adjoint = collision.functions(real, width)
+    collided, add_pairs, after_pairs, collided_adjoint = collision.functions(real, width)
 
     def rows(model: Model, state: State):
         g = wp.tid()
@@ -130,12 +131,22 @@ def kernels(width: int) -> Kernels:
         i, g = wp.tid()
         state.moving[0, i, g] = collided(model, state, 0, 0, i, g)
 
+    def collide_pairs(model: Model, state: State):
+        g = wp.tid()
+        for i in range(model.nodes):
+            state.moving[0, i, g] = lane.Vector()
+            state.met[0, i, g] = lane.Number()
+        for i in range(model.nodes):
+            add_pairs(model, state, 0, 0, i, g)
+        for i in range(model.nodes):
+            state.moving[0, i, g] = after_pairs(state, 0, i, g)
+
     def collide_adjoint(model: Model, state: State, adjoint: Adjoint):
         i, g = wp.tid()
         collided_adjoint(model, state, adjoint, 0, i, g)
 
     made = wp.kernel(module=f"tests.support.terms.{width}", enable_backward=False)
-    terms = rows, rows_adjoint, links, links_adjoint, speed, speed_adjoint, motion, motion_adjoint, collide, collide_adjoint
+    terms = rows, rows_adjoint, links, links_adjoint, speed, speed_adjoint, motion, motion_adjoint, collide, collide_pairs, collide_adjoint
     return Kernels(*map(made, terms))
 
 
