@@ -203,10 +203,9 @@ def functions(real: Any, width: int) -> Contacts:
         return meets
 
     @wp.func
-    def part(model: Model, i: int, j: int, g: int) -> Number:
-        """m_j / (m_i + m_j)."""
-        own = model.inverse_mass[i, g]
-        return wp.cw_div(own, own + model.inverse_mass[j, g])
+    def part(own: Number, other: Number) -> Number:
+        """m_j / (m_i + m_j) of the inverse masses of i and j."""
+        return wp.cw_div(own, own + other)
 
     @wp.func
     def impulse(dx: Vector, u: Vector, e: Number, mu: Number) -> Vector:
@@ -227,13 +226,14 @@ def functions(real: Any, width: int) -> Contacts:
         total = Vector()
         count = Number()
         distance = model.distance[g]
+        light = model.inverse_mass[i, g]
         for k in range(model.near_count[i, g]):
             j = model.near[i, k, g]
             offset = state.x[slot, j, g] - x
             relative = state.after[inner, j, g] - v
             if closes(offset, relative):
                 meets = meeting(offset, relative, model.near_lanes[i, k, g], distance)
-                push = scaled(impulse(offset, relative, model.contact_e[g], model.contact_mu[g]), part(model, i, j, g))
+                push = scaled(impulse(offset, relative, model.contact_e[g], model.contact_mu[g]), part(light, model.inverse_mass[j, g]))
                 total = total + scaled(push, meets)
                 count = count + meets
         state.met[inner, i, g] = count
@@ -247,6 +247,7 @@ def functions(real: Any, width: int) -> Contacts:
         total = state.moving[inner, i, g]
         count = state.met[inner, i, g]
         distance = model.distance[g]
+        light = model.inverse_mass[i, g]
         for k in range(model.near_count[i, g]):
             j = model.near[i, k, g]
             if j > i:
@@ -255,9 +256,9 @@ def functions(real: Any, width: int) -> Contacts:
                 if closes(offset, relative):
                     meets = meeting(offset, relative, model.near_lanes[i, k, g], distance)
                     push = impulse(offset, relative, model.contact_e[g], model.contact_mu[g])
-                    total = total + scaled(scaled(push, part(model, i, j, g)), meets)
+                    total = total + scaled(scaled(push, part(light, model.inverse_mass[j, g])), meets)
                     count = count + meets
-                    back = scaled(scaled(push, part(model, j, i, g)), meets)
+                    back = scaled(scaled(push, part(model.inverse_mass[j, g], light)), meets)
                     state.moving[inner, j, g] = state.moving[inner, j, g] - back
                     state.met[inner, j, g] = state.met[inner, j, g] + meets
         state.moving[inner, i, g] = total
@@ -318,6 +319,7 @@ def functions(real: Any, width: int) -> Contacts:
         e = adjoint.contact_e[i, g]
         mu = adjoint.contact_mu[i, g]
         distance = model.distance[g]
+        light = model.inverse_mass[i, g]
         for k in range(model.near_count[i, g]):
             j = model.near[i, k, g]
             if j > i:
@@ -326,7 +328,7 @@ def functions(real: Any, width: int) -> Contacts:
                 if closes(offset, relative):
                     meets = meeting(offset, relative, model.near_lanes[i, k, g], distance)
                     other = divided(adjoint.moving[j, g], wp.max(state.met[step, j, g], whole(one)))
-                    share = scaled(scaled(other, part(model, j, i, g)) - scaled(own, part(model, i, j, g)), meets)
+                    share = scaled(scaled(other, part(model.inverse_mass[j, g], light)) - scaled(own, part(light, model.inverse_mass[j, g])), meets)
                     hx, hu, he, hmu = pair_adjoint(offset, relative, model.contact_e[g], model.contact_mu[g], share)
                     wp.atomic_add(adjoint.x, j, g, hx)
                     wp.atomic_sub(adjoint.x, i, g, hx)
