@@ -18,7 +18,7 @@ from neuspring.config.rows import Body, Kind, Method, ScenarioRow, SearchRow
 from neuspring.config.search import Polish, Search, SearchVariables, Variable
 from neuspring.config.settings import Config, Tracking
 from neuspring.config.simulation import ReleasedQuirks, Simulation
-from neuspring.config.twin import Fit, Losses, RestShape, SpringField
+from neuspring.config.twin import Fit, Losses, SpringField
 
 __all__ = [
     "Body",
@@ -30,7 +30,6 @@ __all__ = [
     "Mocap",
     "Polish",
     "ReleasedQuirks",
-    "RestShape",
     "Rod",
     "ScenarioRow",
     "Search",

@@ -50,6 +50,7 @@ _LEFT = {
     """,
     "removed, on coordinates and feature always; commit a72d24c is the last that has it": "field.fourier",
     LEFT: "plane_smoothness",
+    "removed; commit f43b356 is the last that has it": "fit.rest_shape",
     "removed, hands of color alone move in an upright plane; commit 152a3d9 is the last that searches how far they are": """
         hand_tilt hand_size hand_depth hand_knots
     """,

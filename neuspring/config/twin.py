@@ -49,22 +49,14 @@ class SpringField(Section):
     """Standard deviation of the texels at the start, which are white noise."""
     plane_learning_rate: Positive | None = None
     """Learning rate of the texels; null: that of the MLP."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RestShape(Section):
-    """Unloaded shape X + u(X): a smooth displacement u of the recorded rest shape X, interpolated from a few nodes, the handles."""
-
-    handles: Annotated[int, Field(ge=0)] = 0
-    """Number of handles, farthest-point samples of nodes and controllers; 0: the rest shape is the recorded one."""
-    prior: NonNegative = 0.1
-    """Weight of the mean squared change of rest lengths (as strain) in the loss unit."""
-    learning_rate: Positive = 0.01
-    """Learning rate of the handles: displacements in node spacings, and gradients as displacements at the next handle."""
-
-    def __post_init__(self) -> None:
-        if self.handles == 1:
-            raise ValueError("handles: at least 2 are required, or 0 for none, received 1")
+    smoothness: NonNegative = 0.0
+    """Weight of the mean squared difference of F between each spring and the 8 nearest, in the loss unit."""
+    offsets: bool = False
+    """Each spring also has a number of its own, which is added to F."""
+    offset_prior: NonNegative = 0.0
+    """Weight of the mean square of these numbers, in the loss unit."""
+    offset_learning_rate: Positive = 0.03
+    """Learning rate of these numbers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +90,6 @@ class Fit(Section):
     """Clamp of the stiffness inside the simulation, N."""
     damping: Literal["fixed", "homogeneous"] = "fixed"
     """What is trained of the damping. homogeneous: drag and one factor of all dashpots."""
-    rest_shape: RestShape = dataclasses.field(default_factory=RestShape)
     selection: Literal["training_loss", "tail"] = "training_loss"
     """How the best epoch is chosen. training_loss: by the loss seen while training, as in the paper. tail: by the loss on the last
     training frames, on which nothing is fitted then; the start of the fit is a candidate too."""

@@ -233,7 +233,9 @@ def functions(real: Any, width: int) -> Contacts:
             relative = state.after[inner, j, g] - v
             if closes(offset, relative):
                 meets = meeting(offset, relative, model.near_lanes[i, k, g], distance)
-                push = scaled(impulse(offset, relative, model.contact_e[g], model.contact_mu[g]), part(light, model.inverse_mass[j, g]))
+                push = scaled(
+                    impulse(offset, relative, model.contact_e[g], model.contact_mu[g]), part(light, model.inverse_mass[j, g])
+                )
                 total = total + scaled(push, meets)
                 count = count + meets
         state.met[inner, i, g] = count
@@ -307,7 +309,7 @@ def functions(real: Any, width: int) -> Contacts:
 
     @wp.func
     def collided_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
-        """From dL/d(velocities after the impulses) to those before, and to dL/d(x, e, mu): of node i, and its pairs with later ones."""
+        """From dL/d(velocities after the impulses) to those before, and dL/d(x, e, mu): of node i and its pairs with later ones."""
         h = adjoint.moving[i, g]
         wp.atomic_add(adjoint.after, i, g, h)
         count = state.met[step, i, g]
@@ -328,7 +330,10 @@ def functions(real: Any, width: int) -> Contacts:
                 if closes(offset, relative):
                     meets = meeting(offset, relative, model.near_lanes[i, k, g], distance)
                     other = divided(adjoint.moving[j, g], wp.max(state.met[step, j, g], whole(one)))
-                    share = scaled(scaled(other, part(model.inverse_mass[j, g], light)) - scaled(own, part(light, model.inverse_mass[j, g])), meets)
+                    share = scaled(
+                        scaled(other, part(model.inverse_mass[j, g], light)) - scaled(own, part(light, model.inverse_mass[j, g])),
+                        meets,
+                    )
                     hx, hu, he, hmu = pair_adjoint(offset, relative, model.contact_e[g], model.contact_mu[g], share)
                     wp.atomic_add(adjoint.x, j, g, hx)
                     wp.atomic_sub(adjoint.x, i, g, hx)

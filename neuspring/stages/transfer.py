@@ -59,7 +59,6 @@ def transfer(
                 twin,
                 observations,
                 safety=settings.simulation.safety,
-                keep_lengths=bool(record.settings.get("fit", {}).get("rest_shape", {}).get("handles")),
                 keep_frame_time=record.settings["released_quirks"]["frame_time_667"],
             )
             velocity = initial_velocity(observations, moved.simulation.initial_velocity)

@@ -1,24 +1,12 @@
 """What a first-order stage trains, and the physical quantities that follow from it.
 
-Every spring has an offset o on a log scale: its own number (`springs`), or the neural spring field at its midpoint (`field`). With
-b(o) = bound tanh(o / bound), or o without a bound, its stiffness is
+Every spring has an offset o on a log scale: its own number (`springs`), or the neural spring field at its midpoint (`field`), to
+which its own number may be added (`field.offsets`). With b(o) = bound tanh(o / bound), or o without a bound, its stiffness is
 
     Y = Y0 exp(b(o)), clamped to the stiffness range.
 
 Beside them: four contact scalars, and common factors exp(.), without a bound, of stiffness (`global_stiffness`), drag and
 dashpots (`damping`). With `controller_factors` the springs of controllers, which are of another material, have their own.
-
-With `rest_shape.handles` an unloaded shape X + u(X) is estimated, X the canonical shape of nodes and controllers, u a smooth
-displacement. A few points p_k are handles. Each has a displacement t_k and a displacement gradient A_k; weights w_k blend them:
-
-    u(x) = h sum_k w_k(x) (t_k + A_k (x - p_k) / s),      w_k(x) ~ exp(-|x - p_k|^2 / 2 s^2),   sum_k w_k = 1
-
-with h the node spacing and s the median distance of a handle to the nearest other one. So t and A have no unit, every affine map of
-the body can be met exactly, and a cable can curve without shear. Rest lengths follow:
-
-    l = l0 |(x + u)_i - (x + u)_j| / |x_i - x_j|
-
-Controllers move with u as the nodes around them do: a grip holds material points, and a rigid part of u must change no length.
 """
 
 from __future__ import annotations
@@ -34,10 +22,9 @@ from torch import nn
 from neuspring import config
 from neuspring.config import Kind
 from neuspring.core.artifacts import Topology, Twin
-from neuspring.core.geometry import farthest
 from neuspring.physics.parameters import LIMITS, Parameters, pack, twin_tensors
 from neuspring.twin.field import SpringField, midpoints
-from neuspring.twin.roughness import roughness
+from neuspring.twin.roughness import NEAREST, neighbors, roughness
 from neuspring.twin.topology import node_spacing
 
 CONTACT_SCALARS = tuple(LIMITS)
@@ -84,53 +71,6 @@ def topology_spacing(topology: Topology) -> float:
     return node_spacing(nodes) if len(nodes) > 1 else float(np.median(topology.rest_lengths.astype(np.float64)))
 
 
-def blending(points: np.ndarray, count: int) -> np.ndarray:
-    """Matrix [P, 4 H] that takes (t_k, columns of A_k) of H = min(count, P) handles to u / h at points [P, 3], m."""
-    from scipy.spatial import cKDTree
-
-    centers = points[farthest(points, count)]
-    away = points[:, None] - centers  # [P, H, 3]
-    gaps = cKDTree(centers).query(centers, k=2)[0][:, 1]
-    scale = float(np.median(gaps))
-    exponent = -(away**2).sum(axis=2) / (2 * scale**2)
-    # The largest exponent is taken out first, so that a point far from all handles has weights too.
-    weights = np.exp(exponent - exponent.max(axis=1, keepdims=True))
-    weights /= weights.sum(axis=1, keepdims=True)
-    parts = np.concatenate([np.ones_like(away[..., :1]), away / scale], axis=2) * weights[..., None]
-    matrix: np.ndarray = parts.reshape(len(points), -1)
-    return matrix
-
-
-class UnloadedShape(nn.Module):
-    """u of a topology, zero at the start: forward() gives the factors l0' / l0 [S] of the rest lengths."""
-
-    matrix: torch.Tensor
-    apart: torch.Tensor
-    change: torch.Tensor
-
-    def __init__(self, topology: Topology, handles: int) -> None:
-        super().__init__()
-        points = topology.canonical.astype(np.float64)
-        matrix = topology_spacing(topology) * blending(points, handles)
-        first, second = topology.springs.T
-        for name, values in (
-            ("matrix", matrix),
-            ("apart", points[first] - points[second]),
-            ("change", matrix[first] - matrix[second]),
-        ):
-            self.register_buffer(name, torch.from_numpy(values.astype(np.float32)), persistent=False)
-        self.handles = nn.Parameter(torch.zeros(matrix.shape[1], 3))
-
-    def forward(self) -> torch.Tensor:
-        """l0' / l0 [S], 1 where u changes no length."""
-        ratio: torch.Tensor = (self.apart + self.change @ self.handles).norm(dim=1) / self.apart.norm(dim=1)
-        return ratio
-
-    def displacement(self) -> torch.Tensor:
-        """u [N + C, 3], m, of nodes, then controllers."""
-        return self.matrix @ self.handles
-
-
 class TwinParameters(nn.Module):
     """The trained tensors of a twin, as a module: `named_parameters` is the checkpoint's content."""
 
@@ -142,18 +82,14 @@ class TwinParameters(nn.Module):
         topology = twin.topology
         count = len(topology.springs)
         self.on_controller = torch.arange(count, device=device) >= topology.object_spring_count
-        pushes = topology.pushes if topology.pushes.size else np.zeros(count, bool)
-        self.pushes = torch.from_numpy(pushes).to(device)
-        """Springs [S] whose rest length is where a hand touches, which no unloaded shape changes."""
         self.midpoints = midpoints(topology.canonical, topology.springs)
-        self.offsets, self.field = None, None
-        if kind == "springs":
-            self.offsets = nn.Parameter(torch.zeros(count, 1))
-        else:
-            self.field = SpringField(self.midpoints, settings.field, 1, seed)
+        self.field = SpringField(self.midpoints, settings.field, 1, seed) if kind == "field" else None
+        own = kind == "springs" or settings.field.offsets
+        self.offsets = nn.Parameter(torch.zeros(count, 1)) if own else None
+        smooth = kind == "field" and settings.field.smoothness > 0
+        self._near = torch.from_numpy(neighbors(self.midpoints, NEAREST)).to(device) if smooth else None
         self.scalars = nn.ParameterDict({name: nn.Parameter(self.start[name].clone()) for name in CONTACT_SCALARS})
         self.factors = nn.ParameterDict({name: nn.Parameter(torch.zeros(())) for name in self._factor_names()})
-        self.unloaded = UnloadedShape(topology, settings.rest_shape.handles) if settings.rest_shape.handles else None
         self.to(device)
         self.first = self.copy()
         """The trained values before the first step."""
@@ -171,7 +107,7 @@ class TwinParameters(nn.Module):
         rate = s.learning_rate
         groups: list[tuple[Iterable[nn.Parameter], float]] = []
         if self.offsets is not None:
-            groups.append(([self.offsets], rate))
+            groups.append(([self.offsets], rate if self.field is None else s.field.offset_learning_rate))
         if self.field is not None:
             groups.append((self.field.layers.parameters(), rate))
             if self.field.planes is not None:
@@ -179,15 +115,12 @@ class TwinParameters(nn.Module):
         groups.append((self.scalars.values(), s.scalar_learning_rate or rate))
         if self.factors:
             groups.append((self.factors.values(), s.factor_learning_rate or s.scalar_learning_rate or rate))
-        if self.unloaded is not None:
-            groups.append((self.unloaded.parameters(), s.rest_shape.learning_rate))
         return [{"params": list(each), "lr": rate, "base_rate": rate} for each, rate in groups]
 
     def deviation(self) -> torch.Tensor:
         """Factor of each spring's stiffness [S], apart from common factors."""
-        offsets = self.offsets if self.field is None else self.field()
-        assert offsets is not None
-        return bounded(offsets[:, 0], self.settings.output_bound).exp()
+        parts = [*([] if self.field is None else [self.field()]), *([] if self.offsets is None else [self.offsets])]
+        return bounded(sum(parts)[:, 0], self.settings.output_bound).exp()
 
     def _common(self, name: str) -> torch.Tensor | float:
         """The common factor of a physical value: one number, or a number per spring."""
@@ -208,8 +141,6 @@ class TwinParameters(nn.Module):
         for name in DAMPING_FACTORS:
             if name in self.factors:
                 values[name] = self.start[name] * self._common(name)
-        if self.unloaded is not None:
-            values["rest_lengths"] = self.start["rest_lengths"] * torch.where(self.pushes, 1.0, self.unloaded())
         return values | dict(self.scalars.items())
 
     def pack(self, substep: float) -> Parameters:
@@ -217,9 +148,16 @@ class TwinParameters(nn.Module):
         return pack(**self.physical(), substep=substep)
 
     def penalty(self) -> torch.Tensor:
-        """The regularizer of a step, in the loss unit: changes of rest lengths, with their weight."""
-        prior = self.settings.rest_shape.prior
-        return prior * (self.unloaded() - 1).square().mean() if self.unloaded is not None and prior else torch.zeros(())
+        """The regularizer of a step, in the loss unit, with its weights: mean squares of the field's differences between springs
+        side by side, and of the offsets beside it."""
+        s, total = self.settings.field, torch.zeros(())
+        if self._near is not None:
+            assert self.field is not None
+            values = self.field()[:, 0]
+            total = s.smoothness * (values[:, None] - values[self._near]).square().mean()
+        if self.field is not None and self.offsets is not None:
+            total = total + s.offset_prior * self.offsets.square().mean()
+        return total
 
     def copy(self) -> dict[str, np.ndarray]:
         """The trained values as arrays."""
@@ -239,11 +177,7 @@ class TwinParameters(nn.Module):
         for name in (f.name for f in fields(twin.material) if f.name not in UNTRAINED):
             value = np.clip(values[name], *LIMITS.get(name, (-np.inf, np.inf)))
             material[name] = value if value.ndim else float(value)
-        topology = twin.topology
-        if self.unloaded is not None:
-            shape = topology.canonical + self.unloaded.displacement().detach().cpu().numpy()
-            topology = replace(topology, rest_lengths=values["rest_lengths"], rest_shape=shape.astype(np.float32))
-        return replace(twin, material=replace(twin.material, **material), topology=topology)
+        return replace(twin, material=replace(twin.material, **material))
 
 
 MOVED = 0.1
@@ -254,10 +188,10 @@ AT_BOUND = 0.95
 
 def watched(parameters: TwinParameters) -> torch.Tensor:
     """The values whose gradients are compared with Adam's epsilon: offsets of springs, texels, or the field's first layer."""
-    if parameters.offsets is not None:
-        return parameters.offsets
     field = parameters.field
-    assert field is not None
+    if field is None:
+        assert parameters.offsets is not None
+        return parameters.offsets
     return field.planes.texels if field.planes is not None else next(iter(field.layers[0].parameters()))
 
 
@@ -271,8 +205,7 @@ def movement(parameters: TwinParameters) -> dict[str, Any]:
 
     texels_moved: share of texels that moved by more than a tenth of their scale at the start. at_bound: share of springs whose
     stiffness lies within 5 % of the bound of its deviation (logarithm). at_stiffness_range: share at or beyond an end of the
-    stiffness range. roughness: of the body's log stiffness (roughness.py). factors: common factors. rest_strain: root mean square
-    relative change of rest lengths.
+    stiffness range. roughness: of the body's log stiffness (roughness.py). factors: common factors.
     """
     s, figures = parameters.settings, dict[str, Any]()
     with torch.no_grad():
@@ -293,9 +226,6 @@ def movement(parameters: TwinParameters) -> dict[str, Any]:
             figures["roughness"] = rough
         if parameters.factors:
             figures["factors"] = {name: float(value.exp()) for name, value in parameters.factors.items()}
-        if parameters.unloaded is not None:
-            strain = physical["rest_lengths"] / parameters.start["rest_lengths"] - 1
-            figures["rest_strain"] = float(strain.square().mean().sqrt())
     return figures
 
 

@@ -20,19 +20,25 @@ PAIRS = 200_000
 
 def roughness(midpoints: np.ndarray, values: np.ndarray) -> float:
     """Of values [S] at points [S, 3]. NaN where there are too few springs, or no variance."""
-    from scipy.spatial import cKDTree
-
-    count = min(NEAREST, len(values) - 1)
-    variance = float(np.var(values)) if count > 0 else 0.0
+    variance = float(np.var(values)) if len(values) > 1 else 0.0
     if variance <= 0:
         return float("nan")
-    points = midpoints.astype(np.float64)
-    near = cKDTree(points).query(points, k=count + 1)[1]
-    # Midpoints may coincide: a spring is not always the first of its own list.
-    own = near == np.arange(len(values))[:, None]
-    own[:, -1] |= ~own.any(axis=1)
-    others = near[~own].reshape(len(values), count)
+    others = neighbors(midpoints, NEAREST)
     return float(np.square(values[:, None] - values[others]).mean() / (2 * variance))
+
+
+def neighbors(points: np.ndarray, most: int) -> np.ndarray:
+    """For each of the points [S, 3] its nearest others [S, K], K = min(most, S - 1)."""
+    from scipy.spatial import cKDTree
+
+    points = points.astype(np.float64)
+    count = min(most, len(points) - 1)
+    near = cKDTree(points).query(points, k=[*range(1, count + 2)])[1]
+    # Points may coincide: one is not always the first of its own list.
+    own = near == np.arange(len(points))[:, None]
+    own[:, -1] |= ~own.any(axis=1)
+    others: np.ndarray = near[~own].reshape(len(points), count)
+    return others
 
 
 def variogram(midpoints: np.ndarray, values: np.ndarray, edges: np.ndarray, seed: int = 0) -> np.ndarray:

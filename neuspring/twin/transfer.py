@@ -41,7 +41,7 @@ SHORTEST = 1e-9
 
 
 def move(
-    twin: Twin, observations: Observations, *, keep_lengths: bool = False, keep_frame_time: bool = False, safety: float = 0.8
+    twin: Twin, observations: Observations, *, keep_frame_time: bool = False, safety: float = 0.8
 ) -> tuple[Twin, Registration | None]:
     """The twin on the nodes and hands of another recording, and how the shapes fitted where the nodes are others.
 
@@ -49,11 +49,9 @@ def move(
 
     Where both recordings have the same nodes in the same order (`corresponds`), a spring keeps its ends, stiffness, dashpot, and
     the ratio of its rest length to the distance of its ends where it has no force: in the rest shape, or in frame 0 where the
-    twin's controllers rest there. With `keep_lengths` it keeps the rest length itself: trained lengths belong to the body. Those of
-    controllers that rest in frame 0 belong to the grip, and follow the new one. Nodes keep their masses. Other nodes, as of filmed
-    objects, take springs and masses of their own (`resample`), and always keep the ratio. Up, ground and, unless
-    `keep_frame_time`, the frame time are the recording's. Substeps are added if the new distances need more. Raises InputError if
-    the shapes do not fit, or a spring would have no length. A rod: `rod.on_recording`.
+    twin's controllers rest there. Nodes keep their masses. Other nodes, as of filmed objects, take springs and masses of their own
+    (`resample`). Up, ground and, unless `keep_frame_time`, the frame time are the recording's. Substeps are added if the new
+    distances need more. Raises InputError if the shapes do not fit, or a spring would have no length. A rod: `rod.on_recording`.
     """
     from neuspring.twin.rod import on_recording as rod_on_recording
 
@@ -61,7 +59,7 @@ def move(
     if twin.rod is not None:
         moved = rod_on_recording(twin, observations)
     elif corresponds(twin.topology, observations):
-        moved = replace(twin, topology=_same_nodes(twin.topology, observations, keep_lengths))
+        moved = replace(twin, topology=_same_nodes(twin.topology, observations))
     else:
         moved, registration = resampled(twin, observations)
     simulation = replace(
@@ -94,15 +92,12 @@ def corresponds(topology: Topology, observations: Observations) -> bool:
     return bool(np.median(np.abs(ratio - np.median(ratio))) < SPREAD)
 
 
-def _same_nodes(topology: Topology, observations: Observations, keep_lengths: bool) -> Topology:
+def _same_nodes(topology: Topology, observations: Observations) -> Topology:
     """The topology with the nodes of a recording, node i on node i."""
     nodes, hands = observations.nodes, observations.controller_points[0]
     rest, springs = topology.controller_rest, topology.springs
     now = unloaded(nodes, hands, springs, observations.rest_shape, rest)
     ratio = now / unloaded(topology.nodes, topology.controllers, springs, topology.rest_shape, rest)
-    if keep_lengths:
-        calibrated = rest == "first_frame"
-        ratio[: topology.object_spring_count if calibrated else None] = 1.0
     lengths = topology.rest_lengths.astype(np.float64) * ratio
     if topology.pushes.size:
         # A hand that pushes touches at one distance wherever it begins.

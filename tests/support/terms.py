@@ -146,7 +146,19 @@ def kernels(width: int) -> Kernels:
         collided_adjoint(model, state, adjoint, 0, i, g)
 
     made = wp.kernel(module=f"tests.support.terms.{width}", enable_backward=False)
-    terms = rows, rows_adjoint, links, links_adjoint, speed, speed_adjoint, motion, motion_adjoint, collide, collide_pairs, collide_adjoint
+    terms = (
+        rows,
+        rows_adjoint,
+        links,
+        links_adjoint,
+        speed,
+        speed_adjoint,
+        motion,
+        motion_adjoint,
+        collide,
+        collide_pairs,
+        collide_adjoint,
+    )
     return Kernels(*map(made, terms))
 
 

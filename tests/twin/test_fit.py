@@ -78,10 +78,9 @@ EVERYTHING = {
         global_stiffness=True,
         controller_factors=True,
         damping="homogeneous",
-        rest_shape=config.RestShape(handles=3, prior=10.0),
         output_bound=1.5,
         selection="tail",
-        field=FIELD,
+        field=replace(FIELD, offsets=True, offset_prior=0.1, smoothness=0.1),
     ),
 }
 LIMITED = {

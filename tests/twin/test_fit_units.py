@@ -13,9 +13,9 @@ from tests.support import small
 
 SINGLE = 1e-5
 """Relative: sums of gradients in float32."""
-FIELD = config.SpringField(channels=4, hidden=16, bands=2)
+FIELD = config.SpringField(channels=4, hidden=16, bands=2, offsets=True, offset_prior=0.1, smoothness=0.1)
 SETTINGS = {
-    "springs": {"rest_shape": config.RestShape(handles=4)},
+    "springs": {},
     "field": {"output_bound": 1.5, "horizon": 2},
 }
 
@@ -73,7 +73,7 @@ def test_another_unit_of_length_gives_the_same_fit(kind, factor, losses):
 
 def test_the_released_unit_depends_on_the_unit():
     """With the released epsilon and the loss in m^2, the same scene in kilometers does not train."""
-    released = {"epsilon": 1e-8, "loss_unit": "meter", "rest_shape": config.RestShape()}
+    released = {"epsilon": 1e-8, "loss_unit": "meter"}
     moved = []
     for factor in (1.0, 2.0**-10):
         run = TwinFit(in_unit(factor, "springs", config.Losses(), **released))

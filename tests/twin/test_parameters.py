@@ -1,4 +1,4 @@
-"""What is trained becomes physics: gradients through field and simulator, bounds, clamps, warm start, an unloaded shape."""
+"""What is trained becomes physics: gradients through field and simulator, bounds, clamps, warm start, numbers beside the field."""
 
 import math
 from dataclasses import replace
@@ -13,9 +13,7 @@ from neuspring.physics.parameters import pack, twin_tensors
 from neuspring.physics.solver import FrameSolver, simulate_frame
 from neuspring.twin.field import in_cube, midpoints
 from neuspring.twin.fit import TwinFit, fit
-from neuspring.twin.parameters import TwinParameters, UnloadedShape, blending, bounded, inward_clamp, movement, topology_spacing
-from neuspring.twin.rollout import roll_out
-from neuspring.twin.topology import distances
+from neuspring.twin.parameters import TwinParameters, bounded, inward_clamp, movement, topology_spacing
 from tests.support import small
 from tests.support.scenes import random_scene, twin_of
 
@@ -68,7 +66,8 @@ def offsets(trained: TwinParameters, values: torch.Tensor | float) -> TwinParame
 TRAINED = {
     "field": ("field", {}, ALL | {"global_stiffness": True, "controller_factors": True}),
     "field of coordinates": ("field", {"triplane": False}, ALL),
-    "springs, unloaded shape": ("springs", {}, ALL | {"global_stiffness": True, "rest_shape": config.RestShape(handles=3)}),
+    "springs": ("springs", {}, ALL | {"global_stiffness": True}),
+    "field and offsets": ("field", {"offsets": True}, ALL),
 }
 
 
@@ -257,10 +256,10 @@ def test_stiffness_of_zero_can_grow():
 
 
 def test_learning_rates_of_each_group():
-    shape = config.RestShape(handles=2, learning_rate=0.5)
     rates = {"learning_rate": 0.1, "scalar_learning_rate": 0.2, "factor_learning_rate": 0.4}
-    trained = parameters(field={"plane_learning_rate": 0.3}, damping="homogeneous", rest_shape=shape, **rates)
-    expected = {"field.layers": 0.1, "field.planes": 0.3, "factors": 0.4, "unloaded": 0.5}
+    beside = {"offsets": True, "offset_learning_rate": 0.5}
+    trained = parameters(field={"plane_learning_rate": 0.3} | beside, damping="homogeneous", **rates)
+    expected = {"field.layers": 0.1, "field.planes": 0.3, "factors": 0.4, "offsets": 0.5}
     names = {tensor: name for name, tensor in trained.named_parameters()}
     for group in trained.groups():
         assert group["lr"] == group["base_rate"]
@@ -271,11 +270,23 @@ def test_learning_rates_of_each_group():
     assert not names, "every trained value belongs to one group"
 
 
-def test_the_prior_of_the_unloaded_shape_is_its_mean_squared_strain():
-    trained = disturb(parameters("springs", rest_shape=config.RestShape(handles=3, prior=2.0)))
-    strain = trained.physical()["rest_lengths"].detach() / trained.start["rest_lengths"] - 1
-    assert trained.penalty().item() == pytest.approx(2.0 * float(strain.square().mean()), rel=1e-4)
-    assert trained.penalty() > 0
+def test_offsets_beside_a_field_are_added_to_it():
+    values = torch.linspace(-1, 1, len(twin().topology.springs))
+    both, alone = (disturb(parameters(field={"offsets": own}), seed=4) for own in (True, False))
+    alone.restore({name: value for name, value in both.copy().items() if name != "offsets"})
+    torch.testing.assert_close(offsets(both, values[:, None]).deviation(), alone.deviation() * values.exp(), rtol=SINGLE, atol=0)
+
+
+def test_penalties_are_mean_squares_of_differences_of_neighbors_and_of_offsets():
+    trained = disturb(parameters(field={"offsets": True, "smoothness": 3.0, "offset_prior": 2.0}))
+    values = trained.field().detach().numpy()[:, 0].astype(float)
+    apart = np.linalg.norm(trained.midpoints[:, None] - trained.midpoints, axis=2)
+    nearest = np.argsort(apart + np.diag(np.full(len(apart), np.inf)), axis=1)[:, :8]
+    smooth = np.square(values[:, None] - values[nearest]).mean()
+    expected = 3.0 * smooth + 2.0 * float(trained.offsets.detach().square().mean())
+    assert trained.penalty().item() == pytest.approx(expected, rel=1e-4)
+    assert smooth > 0
+    assert parameters(field={"offsets": True}).penalty() == 0 == parameters("springs").penalty()
 
 
 @pytest.mark.parametrize("kind", ["springs", "field"])
@@ -340,24 +351,11 @@ def test_a_texel_has_moved_by_a_tenth_of_the_scale_at_the_start():
     assert "at_bound" not in movement(trained), "no bound"
 
 
-def test_an_unloaded_shape_changes_no_distance_at_which_hands_touch():
-    twin = small.fit_problem().twin
-    led = np.arange(len(twin.topology.springs)) >= twin.topology.object_spring_count
-    pushing = replace(twin, topology=replace(twin.topology, pushes=led))
-    trained = disturb(TwinParameters(pushing, config.Fit(rest_shape=config.RestShape(handles=3)), "springs", "cpu"))
-    lengths = trained.physical()["rest_lengths"].detach().numpy()
-    np.testing.assert_array_equal(lengths[led], twin.topology.rest_lengths[led])
-    assert np.abs(lengths[~led] / twin.topology.rest_lengths[~led] - 1).max() > 1e-3
-
-
-def test_common_factors_and_strains_are_reported():
-    trained = disturb(of_scene("springs", global_stiffness=True, rest_shape=config.RestShape(handles=3)))
+def test_common_factors_are_reported():
+    trained = disturb(of_scene("springs", global_stiffness=True))
     with torch.no_grad():
         trained.factors["stiffness"].fill_(math.log(3.0))
-        strain = trained.unloaded() - 1
-    figures = movement(trained)
-    assert figures["factors"] == pytest.approx({"stiffness": 3.0})
-    assert figures["rest_strain"] == pytest.approx(float(strain.square().mean().sqrt()), rel=1e-5)
+    assert movement(trained)["factors"] == pytest.approx({"stiffness": 3.0})
 
 
 def test_gradients_are_compared_with_epsilon():
@@ -370,83 +368,6 @@ def test_gradients_are_compared_with_epsilon():
     run.gradients = []
     run.epoch()
     assert run.gradients == [float(run.parameters.offsets.grad.abs().median())]
-
-
-# The unloaded shape -----------------------------------------------------------------------------------------------------
-
-
-def rope() -> Topology:
-    return small.fit_problem().twin.topology
-
-
-@pytest.mark.parametrize("handles", [2, 5, 1000])
-def test_every_affine_map_is_met_exactly(handles):
-    """The blend of one affine map at all handles is that map, wherever the handles are."""
-    points = np.random.default_rng(0).normal(size=(40, 3)) * (1.0, 0.3, 0.01)
-    matrix = blending(points, handles)
-    assert matrix.shape == (40, 4 * min(handles, 40))
-    wanted = points @ np.array([[0.1, 2.0, 0.0], [-0.4, 0.0, 1.0], [3.0, 0.0, 0.2]]) + [1.0, -2.0, 0.5]
-    solution = np.linalg.lstsq(matrix, wanted, rcond=None)[0]
-    np.testing.assert_allclose(matrix @ solution, wanted, atol=SOLVED * np.abs(wanted).max())
-    same = np.zeros((matrix.shape[1], 3))
-    same[::4] = (1.0, 2.0, 3.0)
-    np.testing.assert_allclose(matrix @ same, np.broadcast_to((1.0, 2.0, 3.0), (40, 3)), rtol=SOLVED, err_msg="partition of unity")
-
-
-def test_a_point_far_from_every_handle_still_belongs_to_some():
-    points = np.concatenate([np.random.default_rng(0).normal(size=(30, 3)) * 0.01, [[100.0, 0.0, 0.0]]])
-    assert np.isfinite(blending(points, 3)).all()
-    np.testing.assert_allclose(blending(points, 3)[:, ::4].sum(axis=1), 1.0, rtol=SOLVED)
-
-
-def test_the_start_changes_no_length_and_a_rotation_none_either():
-    shape = UnloadedShape(rope(), 6)
-    assert torch.equal(shape(), torch.ones(len(rope().springs)))
-    points = rope().canonical.astype(np.float64)
-    quarter = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    turned = points @ quarter + 0.1 - points
-    handles = np.linalg.lstsq(shape.matrix.double().numpy(), turned, rcond=None)[0]
-    with torch.no_grad():
-        shape.handles.copy_(torch.from_numpy(handles))
-    torch.testing.assert_close(shape(), torch.ones_like(shape()), rtol=0, atol=1e-4)
-    np.testing.assert_allclose(shape.displacement().detach().numpy(), turned, atol=1e-4 * np.abs(turned).max())
-
-
-def test_lengths_are_those_of_the_displaced_shape():
-    start = small.fit_problem().twin
-    run = TwinFit(small.fit_problem(fit=config.Fit(epochs=1, rest_shape=config.RestShape(handles=5))))
-    with torch.no_grad():
-        run.parameters.unloaded.handles.normal_(0.0, 0.3, generator=torch.Generator().manual_seed(0))
-    twin = run.parameters.as_twin(start)
-    assert not np.allclose(twin.topology.rest_lengths, start.topology.rest_lengths, rtol=1e-2)
-    expected = distances(twin.topology.canonical, start.topology.springs)
-    np.testing.assert_allclose(twin.topology.rest_lengths, expected, rtol=1e-5)
-    # Springs that were strained in the rest shape keep their ratio.
-    strained = replace(start, topology=replace(start.topology, rest_lengths=start.topology.rest_lengths * np.float32(0.9)))
-    other = TwinFit(small.fit_problem(twin=strained, fit=run.problem.fit))
-    other.parameters.restore(run.parameters.copy())
-    np.testing.assert_allclose(other.parameters.as_twin(strained).topology.rest_lengths, 0.9 * expected, rtol=1e-5)
-
-
-def test_a_bent_unloaded_shape_is_found():
-    """What is filmed is a body that is unloaded in another shape; the stiffness is the true one."""
-    start = small.fit_problem().twin
-    still = {"learning_rate": 1e-9, "scalar_learning_rate": 1e-9}
-    shape = config.RestShape(handles=4, prior=0.0, learning_rate=0.02)
-    settings = config.Fit(epochs=15, horizon=2, rest_shape=shape, **still)
-    bent = TwinFit(small.fit_problem(fit=settings))
-    with torch.no_grad():
-        bent.parameters.unloaded.handles.normal_(0.0, 0.2, generator=torch.Generator().manual_seed(1))
-    truth = bent.parameters.as_twin(start)
-    seen = small.observations()
-    filmed = replace(seen, object_points=roll_out(truth, seen.controller_points).positions[:, : seen.object_points.shape[1]])
-    free = fit(small.fit_problem(filmed, fit=settings))
-    fixed = fit(small.fit_problem(filmed, fit=replace(settings, rest_shape=config.RestShape())))
-    assert free.best_loss < 0.3 * fixed.best_loss
-    # The prior holds it back.
-    held = fit(small.fit_problem(filmed, fit=replace(settings, rest_shape=replace(shape, prior=1e4))))
-    assert held.figures["rest_strain"] < 0.2 * free.figures["rest_strain"]
-    assert held.best_loss > 2 * free.best_loss
 
 
 def test_the_topology_spacing_is_that_of_a_lattice_and_follows_the_unit():
@@ -462,5 +383,3 @@ def test_the_topology_spacing_is_that_of_a_lattice_and_follows_the_unit():
     assert topology_spacing(made) == pytest.approx(0.02, rel=DIFFERENCES)
     alone = replace(made, nodes=made.nodes[:1], labels=made.labels[:1], springs=np.array([[0, 1]], np.int32))
     assert topology_spacing(alone) == pytest.approx(0.05, rel=DIFFERENCES), "one node: its springs"
-    with pytest.raises(ValueError, match="at least 2"):
-        config.RestShape(handles=1)

@@ -185,10 +185,9 @@ def require_equal_twins(one: Twin, other: Twin) -> None:
     assert one.material.ground_friction == other.material.ground_friction
 
 
-SHAPE = config.RestShape(handles=4, prior=1e-3, learning_rate=0.02)
 SETTINGS = {
     "one step and tail": ("springs", {"selection": "tail", "horizon": 0}),
-    "shape, meters": ("springs", {"rest_shape": SHAPE, "selection": "tail", "epochs": 2, "loss_unit": "meter"}),
+    "meters": ("springs", {"selection": "tail", "epochs": 2, "loss_unit": "meter"}),
     "field": ("field", {"field": config.SpringField(channels=4, hidden=16, bands=2), "learning_rate": 1e-2, "horizon": 0}),
 }
 
@@ -213,20 +212,20 @@ def test_an_oracle_on_a_pool_reads_the_future_of_what_counts():
     require_equal(pooled(plain, late), pooled(plain, plain.observations))
 
 
-def test_recordings_share_one_unloaded_shape_and_one_unit():
-    problem = problem_of(LIFTED, epochs=1, rest_shape=SHAPE)
+def test_recordings_share_one_material_and_one_unit():
+    problem = problem_of(LIFTED, epochs=1)
     larger = replace(seen(SHAKEN), **{name: 2 * getattr(seen(SHAKEN), name) for name in PLACES})
     run = PooledFit(replace(problem, pool=[larger]))
     with torch.no_grad():
-        run.parameters.unloaded.handles.normal_(0.0, 0.2, generator=torch.Generator().manual_seed(0))
-    here, there = (member.parameters.physical()["rest_lengths"] for member in run._members)
-    torch.testing.assert_close(there, 2 * here)
-    assert not torch.allclose(here, run.parameters.start["rest_lengths"], rtol=1e-2)
+        run.parameters.offsets.normal_(0.0, 0.2, generator=torch.Generator().manual_seed(0))
+    here, there = (member.parameters.physical() for member in run._members)
+    torch.testing.assert_close(there["rest_lengths"], 2 * here["rest_lengths"])
+    assert torch.equal(there["stiffness"], here["stiffness"])
     assert {member.loss_scale for member in run._members} == {run.loss_scale}
     before = run.parameters.copy()
     run.set_rate(1.0)
     run.epoch()
-    assert not np.array_equal(before["unloaded.handles"], run.parameters.copy()["unloaded.handles"])
+    assert not np.array_equal(before["offsets"], run.parameters.copy()["offsets"])
 
 
 def test_left_out_recordings_lend_their_nodes_alone():
@@ -263,7 +262,7 @@ def test_one_material_comes_nearer_to_two_recordings():
 
 
 def test_a_killed_fit_continues_exactly(tmp_path):
-    problem = problem_of(LIFTED, rest_shape=SHAPE, epochs=3)
+    problem = problem_of(LIFTED, epochs=3)
     whole = pooled(problem, seen(SHAKEN))
 
     class Killed(Exception):

@@ -43,8 +43,6 @@ def test_rest_lengths_follow_the_new_first_frame_and_keep_what_was_learned():
     moved = move(replace(problem.twin, topology=learned), larger)[0]
     np.testing.assert_allclose(moved.topology.rest_lengths, problem.twin.topology.rest_lengths * 2.06, rtol=SINGLE)
     assert np.array_equal(moved.topology.nodes, larger.nodes)
-    moved = move(replace(problem.twin, topology=learned), larger, keep_lengths=True)[0]
-    np.testing.assert_array_equal(moved.topology.rest_lengths, learned.rest_lengths)
 
 
 def test_rest_lengths_follow_the_rest_shape_where_there_is_one():
@@ -75,12 +73,11 @@ def test_calibrated_grips_take_hold_of_the_body_as_it_is_in_the_new_recording():
     seen, twin, body = calibrated()
     learned = replace(twin, topology=replace(twin.topology, rest_lengths=twin.topology.rest_lengths * 1.03))
     other = replace(seen, **{name: getattr(seen, name) * 2 for name in ("object_points", "surface_points", "controller_points")})
-    for keep in (False, True):
-        moved = move(learned, other, keep_lengths=keep)[0].topology
-        assert moved.controller_rest == "first_frame"
-        # The body rests as before, for its rest shape is the same; the grips follow frame 0.
-        np.testing.assert_allclose(moved.rest_lengths[:body], learned.topology.rest_lengths[:body], rtol=SINGLE)
-        np.testing.assert_allclose(moved.rest_lengths[body:], twin.topology.rest_lengths[body:] * 2.06, rtol=SINGLE)
+    moved = move(learned, other)[0].topology
+    assert moved.controller_rest == "first_frame"
+    # The body rests as before, for its rest shape is the same; the grips follow frame 0.
+    np.testing.assert_allclose(moved.rest_lengths[:body], learned.topology.rest_lengths[:body], rtol=SINGLE)
+    np.testing.assert_allclose(moved.rest_lengths[body:], twin.topology.rest_lengths[body:] * 2.06, rtol=SINGLE)
 
 
 def test_calibrated_grips_pull_at_nothing_in_frame_0():
