@@ -49,6 +49,8 @@ class SpringField(Section):
     """Standard deviation of the texels at the start, which are white noise."""
     plane_learning_rate: Positive | None = None
     """Learning rate of the texels; null: that of the MLP."""
+    shuffled: bool = False
+    """Deal the midpoints out among the springs at random, so that F knows nothing of which springs lie side by side."""
     smoothness: NonNegative = 0.0
     """Weight of the mean squared difference of F between each spring and the 8 nearest, in the loss unit."""
     offsets: bool = False

@@ -99,6 +99,8 @@ class SpringField(nn.Module):
         super().__init__()
         self.settings = settings
         mapped = in_cube(points)
+        if settings.shuffled:
+            mapped = mapped[np.random.default_rng(seed).permutation(len(mapped))]
         self.register_buffer("coordinates", torch.from_numpy(mapped.astype(np.float32)), persistent=False)
         self.resolution = (
             adaptive_resolution(len(points), settings.adaptive_factor) if settings.resolution == "adaptive" else settings.resolution

@@ -116,11 +116,12 @@ class Starts:
 
 
 def _strategy(start: np.ndarray, sigma: float, seed: int) -> cma.CMAEvolutionStrategy:
-    # cma takes 0 to mean "seed from the clock", so seeds are shifted by one.
     import cma
 
     no_end = {"maxiter": np.inf, "tolfun": 0, "tolx": 0, "tolstagnation": np.inf}
-    options = {"bounds": [0, 1], "seed": seed + 1, "verbose": -9, **no_end}
+    # Its own generator: cma's is that of the process, which all starts would draw from. Shifted by one, as cma reads 0 as "any".
+    drawn = {"randn": np.random.RandomState(seed + 1).randn, "seed": np.nan}
+    options = {"bounds": [0, 1], "verbose": -9, **drawn, **no_end}
     return cma.CMAEvolutionStrategy(start, sigma, options)
 
 

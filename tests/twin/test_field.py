@@ -127,6 +127,16 @@ def test_permuting_springs_permutes_the_field_and_changes_nothing_else():
         torch.testing.assert_close(b, a, rtol=0, atol=STEPS, msg=name)
 
 
+def test_a_shuffled_field_is_the_field_of_midpoints_that_are_dealt_out_anew():
+    shuffled, other, plain = (
+        field_of(seed=seed, shuffled=shuffled).coordinates.numpy() for seed, shuffled in ((2, True), (3, True), (2, False))
+    )
+    assert not np.array_equal(shuffled, plain)
+    assert not np.array_equal(shuffled, other)
+    rows = {tuple(row) for row in plain}
+    assert {tuple(row) for row in shuffled} == rows == {tuple(row) for row in other}
+
+
 def test_without_planes_only_coordinates_count():
     field = field_of(triplane=False)
     assert field.planes is None

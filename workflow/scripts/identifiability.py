@@ -11,9 +11,10 @@ epochs; mm^2 of a rollout): springs 1.65 at 1e-2, 1.17 at 2e-2, 1.05 at 3e-2; fi
 The truth has 0.89, the start 50. With output_bound 1.5 the best were 1.13 and 1.38; with a cosine schedule too 1.44 and 1.34.
 
 Compared on object springs: Pearson correlation with the truth and RMS error of log10 stiffness (decades), per spring and for
-the mean of log10 stiffness around each node, which needs no single spring to be identifiable; training loss (m^2) of a
-rollout; track error (m) of the frames after the split against the true motion. For scale: the kinds `truth`, `start` and
-`constant`, the truth's geometric mean everywhere.
+the mean of log10 stiffness around each node, which needs no single spring to be identifiable; the same error split into a smooth
+part, the mean over a spring's two ends of the error around a node, and the rough rest; training loss (m^2) of a rollout; track
+error (m) of the frames after the split against the true motion. For scale: the kinds `truth`, `start` and `constant`, the truth's
+geometric mean everywhere. `shuffled` is a field that does not know which springs lie side by side.
 
 Writes identifiability.csv, .md and .png. Finished runs lie in runs/ and are not repeated while the settings are the same
 (remove them when the code changes).
@@ -66,13 +67,16 @@ SHOWN = (0.0005, 0)
 """Noise [m] and seed of the picture."""
 CONSTANTS = {"start": 0.6, "constant": 1.0}
 """Homogeneous stiffness as a fraction of the truth's geometric mean."""
-RATES = {"springs": 3e-2, "field": 2e-3}
+RATES = {"springs": 3e-2, "field": 2e-3, "shuffled": 2e-3}
+"""What is fitted -> its learning rate. shuffled: a field that does not know which springs lie side by side."""
 KINDS = ("truth", *CONSTANTS, *RATES)
 METRICS = {
     "correlation": ("r, springs", 1.0, 2),
     "rms": ("RMS, springs [dec]", 1.0, 3),
     "node_correlation": ("r, nodes", 1.0, 2),
     "node_rms": ("RMS, nodes [dec]", 1.0, 3),
+    "smooth_rms": ("RMS, smooth part [dec]", 1.0, 3),
+    "rough_rms": ("RMS, rough part [dec]", 1.0, 3),
     "training_loss": ("training loss [mm²]", 1e6, 3),
     "future_track_error": ("future track error [mm]", 1e3, 2),
 }
@@ -97,7 +101,8 @@ class Run:
     def fit(self) -> config.Fit:
         """Contact scalars practically stand still; the gradient goes through ten frames."""
         rate = RATES.get(self.kind, 1.0)
-        return config.Fit(epochs=self.epochs, learning_rate=rate, scalar_learning_rate=1e-12, horizon=10, output_bound=0.0)
+        field = config.SpringField(shuffled=self.kind == "shuffled")
+        return config.Fit(epochs=self.epochs, learning_rate=rate, scalar_learning_rate=1e-12, horizon=10, field=field)
 
     def settings(self) -> dict[str, Any]:
         """Everything that the result depends on, plainly."""
@@ -133,11 +138,15 @@ def compare(twin: Twin, scene: toy.ToyScene) -> dict[str, float]:
     incidence = np.zeros((len(topology.nodes), count))
     incidence[topology.springs[:count].T, np.arange(count)] = 1.0
     incidence = incidence[incidence.any(axis=1)]
-    around = log @ (incidence / incidence.sum(axis=1, keepdims=True)).T
+    average = incidence / incidence.sum(axis=1, keepdims=True)
+    around = log @ average.T
     for prefix, (recovered, true) in {"": log, "node_": around}.items():
         values[f"{prefix}rms"] = float(np.sqrt(np.mean((recovered - true) ** 2)))
         if recovered.std() > 1e-9:
             values[f"{prefix}correlation"] = float(np.corrcoef(recovered, true)[0, 1])
+    error = log[0] - log[1]
+    smooth = incidence.T @ (average @ error) / 2
+    values |= {"smooth_rms": float(np.sqrt(np.mean(smooth**2))), "rough_rms": float(np.sqrt(np.mean((error - smooth) ** 2)))}
     trajectory = roll_out(twin, seen.controller_points)
     loss, end = FrameLoss.of(seen, config.Losses(), "cpu"), seen.scenario.train_end
     if len(trajectory.positions) >= end:
@@ -157,7 +166,8 @@ def execute(run: Run, folder: Path) -> dict[str, Any]:
         if run.kind in RATES:
             settings = (run.fit, config.Simulation(), config.Losses(), config.ReleasedQuirks())
             with redirect_stderr(io.StringIO()):
-                result = fit(FitProblem(scene.observations, twin, *settings, kind=run.kind, seed=run.seed))  # type: ignore[arg-type]
+                kind = "springs" if run.kind == "springs" else "field"
+                result = fit(FitProblem(scene.observations, twin, *settings, kind=kind, seed=run.seed))
             twin = result.twin
             record |= {"best_epoch": result.best_epoch, "rollbacks": result.rollbacks, "losses": list(result.history["loss"])}
         record |= {"values": compare(twin, scene), "substeps": twin.simulation.substeps}
@@ -184,7 +194,7 @@ def execute_all(runs: list[Run], folder: Path, jobs: int) -> list[dict[str, Any]
 
 
 def report(table: pd.DataFrame) -> list[str]:
-    """The tables in Markdown: every kind and the paired difference per scene and noise; the differences over all scenes."""
+    """The tables in Markdown: every kind and the paired differences per scene and noise; the differences over all scenes."""
 
     def cell(metric: str, values: pd.Series, sign: str) -> str:
         _, factor, digits = METRICS[metric]
@@ -194,7 +204,8 @@ def report(table: pd.DataFrame) -> list[str]:
     rows = []
     for (scene, noise), part in table.groupby(["scene", "noise"], sort=False):
         wide = part.pivot(index=["metric", "seed"], columns="kind", values="value").reindex(columns=KINDS)
-        wide["field − springs"] = wide["field"] - wide["springs"]
+        for kind in list(RATES)[1:]:
+            wide[f"{kind} − springs"] = wide[kind] - wide["springs"]
         for kind, values in wide.items():
             sign, of = "+" if "−" in str(kind) else "", wide.index.get_level_values(0)
             cells = [cell(metric, values[of == metric].dropna(), sign) for metric in METRICS]
@@ -204,22 +215,22 @@ def report(table: pd.DataFrame) -> list[str]:
     fits = table[table["kind"].isin(list(RATES))].rename(columns={"scene": "scenario", "kind": "method"})
     both = pd.concat([fits.assign(task=[f"{1e3 * noise:g}" for noise in fits["noise"]]), fits.assign(task="all")])
     differences, rows = paired_differences(both, "springs"), []
-    for task, part in differences.groupby("task", sort=False) if len(differences) else []:
-        by, cells = part.set_index("metric"), [str(task)]
+    for (kind, task), part in differences.groupby(["method", "task"], sort=False) if len(differences) else []:
+        by, cells = part.set_index("metric"), [str(kind), str(task)]
         for metric, (_, factor, digits) in METRICS.items():
             of = by.reindex([metric]).iloc[0]
             cells.append("{:+.{d}f} [{:+.{d}f}, {:+.{d}f}]".format(*(factor * of[["difference", "low", "high"]]), d=digits))
         rows.append(cells)
-    lines += ["", "Field − springs, same scene, noise and seed [95 % bootstrap interval over scenes and seeds]:", ""]
-    return lines + Table.of_texts(["noise [mm]", *headings], rows).markdown()
+    lines += ["", "Less springs, same scene, noise and seed [95 % bootstrap interval over scenes and seeds]:", ""]
+    return lines + Table.of_texts(["kind", "noise [mm]", *headings], rows).markdown()
 
 
 def picture(scenes: dict[str, dict[str, np.ndarray]]) -> Figure:
-    """Per scene: truth, springs and field at rest, colored by stiffness, and recovered against true stiffness.
+    """Per scene: the truth and every fit at rest, colored by stiffness, and recovered against true stiffness.
 
     `scenes` is scene -> kind -> stiffness [N] of the object springs; shown relative to the truth's geometric mean.
     """
-    figure, axes = plt.subplots(len(scenes), 4, figsize=(14, 2.9 * len(scenes) + 1), squeeze=False, layout="constrained")
+    figure, axes = plt.subplots(len(scenes), 5, figsize=(17, 2.9 * len(scenes) + 1), squeeze=False, layout="constrained")
     for row, (scene, kinds) in zip(axes, scenes.items(), strict=True):
         truth, unit = scene_of(scene, *SHOWN).truth, np.exp(np.log(kinds["truth"]).mean())
         seen = Scene.from_side(scene_of(scene, *SHOWN).observations, [], [0])
@@ -231,14 +242,14 @@ def picture(scenes: dict[str, dict[str, np.ndarray]]) -> Figure:
             TwinPicture([(seen, take)], 0, ("stiffness",), limits=LIMITS).paint(axis, seen, take, "stiffness")
             axis.set_aspect("equal")
             axis.set_title(f"{scene}: {kind}", fontsize=10)
-        for kind, color, shift in (("springs", "tab:orange", -0.012), ("field", "tab:blue", 0.012)):
+        for kind, color, shift in zip(RATES, ("tab:orange", "tab:blue", "tab:green"), (-0.014, 0.0, 0.014), strict=True):
             true, recovered = np.log10(kinds["truth"] / unit), np.log10(kinds[kind] / unit)
             label = f"{kind}, r = {np.corrcoef(true, recovered)[0, 1]:.2f}"
-            row[3].scatter(true + shift, recovered, s=5, color=color, alpha=0.35, lw=0, label=label)
-        row[3].plot([-0.35, 0.35], [-0.35, 0.35], color="black", lw=0.8, label="equal")
-        row[3].axhline(np.log10(kinds["start"][0] / unit), color="0.4", ls=":", lw=1, label="start")
-        row[3].set(xlabel="log$_{10}$ true / mean (kinds side by side)", ylabel="log$_{10}$ recovered / mean", ylim=(-1.1, 1.1))
-        for handle in row[3].legend(fontsize=7, markerscale=3, ncols=2, loc="lower right").legend_handles:
+            row[-1].scatter(true + shift, recovered, s=5, color=color, alpha=0.35, lw=0, label=label)
+        row[-1].plot([-0.35, 0.35], [-0.35, 0.35], color="black", lw=0.8, label="equal")
+        row[-1].axhline(np.log10(kinds["start"][0] / unit), color="0.4", ls=":", lw=1, label="start")
+        row[-1].set(xlabel="log$_{10}$ true / mean (kinds side by side)", ylabel="log$_{10}$ recovered / mean", ylim=(-1.1, 1.1))
+        for handle in row[-1].legend(fontsize=7, markerscale=3, ncols=2, loc="lower right").legend_handles:
             handle.set_alpha(1.0)
     label = "stiffness / geometric mean of the truth"
     ticks: dict[str, Any] = {"ticks": [0.3, 0.5, 1, 2, 3], "format": "{x:g}", "extend": "both"}
