@@ -130,7 +130,8 @@ class Search(Section):
     """Rollouts, out of the budget, in which all regions share their values; afterwards each region is free around the best
     candidate."""
     isolated_nodes: Literal["repair", "allow"] = "repair"
-    """Nodes without any spring. repair: join them to their 3 nearest nodes. allow: leave them, as released."""
+    """Nodes and parts of the body that no spring joins to the rest. repair: join them, a part along its seam. allow: leave them, as
+    released."""
     lengths: Literal["spacing", "meter"] = "spacing"
     """Unit of object_radius, controller_radius and contact_distance in `variables`. spacing: the distance between
     neighboring nodes in the rest shape, measured on each object (neuspring/twin/README.md). meter: as released."""

@@ -3,6 +3,7 @@
 Every object node asks for its nearest nodes within a radius; every controller asks for its nearest object nodes. A spring is made
 if either end asks for it. In a piecewise topology each region of nodes has
 its own radius and number of neighbors; a node asks among all nodes, with its own region's values, so regions stay joined.
+A body is one piece: what no spring joins to the rest, a node or a part behind a gap in what was seen, is joined along its seam.
 Radii of a search are in units of the spacing of the nodes.
 """
 
@@ -60,7 +61,7 @@ def controller_reach(nodes: np.ndarray, controllers: np.ndarray) -> float:
 MIN_LENGTH = 1e-4
 """Shorter object springs are not made, m."""
 REPAIR_SPRINGS = 3
-"""Springs given to a node that has none: the fewest that can hold a point in space."""
+"""Springs given to a node of a seam: the fewest that can hold a point in space."""
 
 
 def regions(nodes: np.ndarray, count: int) -> np.ndarray:
@@ -90,26 +91,39 @@ def regions(nodes: np.ndarray, count: int) -> np.ndarray:
     return labels
 
 
-def join(nodes: np.ndarray, springs: np.ndarray, lonely: np.ndarray) -> np.ndarray:
-    """The springs [S, 2], followed by springs from each of the nodes `lonely` to its nearest nodes."""
+def joined(nodes: np.ndarray, springs: np.ndarray) -> np.ndarray:
+    """The springs [S, 2] between nodes [N, 3], m, followed by those that make the body one piece.
+
+    Each piece asks for springs, but the one that is larger than all others: its nodes from which the rest is at most a node spacing
+    farther than from the nearest of them, each from its 3 nearest nodes of the rest. So a single node has 3 springs, and a part
+    behind a gap a seam.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
-    if not len(lonely):
-        return springs
-    tree = cKDTree(nodes)
-    # Nodes at the same place, the lonely node among them, are no partners.
-    same = max(tree.query_ball_point(nodes[lonely], MIN_LENGTH, return_length=True))
-    k = min(REPAIR_SPRINGS + same, len(nodes))
-    distance, partner = tree.query(nodes[lonely], k=k)
-    usable = distance.reshape(len(lonely), k) > MIN_LENGTH
-    row, column = np.nonzero(usable & (usable.cumsum(axis=1) <= REPAIR_SPRINGS))
-    added = np.stack([lonely[row], partner.reshape(len(lonely), k)[row, column]], axis=1)
-    return _first_of_each(np.concatenate([springs, added]), len(nodes))
-
-
-def isolated(count: int, springs: np.ndarray) -> np.ndarray:
-    """Indices of nodes below `count` that no spring holds."""
-    return np.flatnonzero(np.bincount(springs.ravel(), minlength=count)[:count] == 0)
+    count, spacing = len(nodes), 0.0
+    while True:
+        graph = coo_array((np.ones(len(springs)), springs.T), shape=(count, count))
+        pieces, piece = connected_components(graph, directed=False)
+        if pieces <= 1:
+            return springs
+        spacing, sizes, added = spacing or node_spacing(nodes), np.bincount(piece), [springs]
+        largest = np.flatnonzero(sizes == sizes.max())
+        for label in np.setdiff1d(np.arange(pieces), largest if len(largest) == 1 else []):
+            own, rest = np.flatnonzero(piece == label), np.flatnonzero(piece != label)
+            tree = cKDTree(nodes[rest])
+            # Nodes at the same place are no partners.
+            same = max(tree.query_ball_point(nodes[own], MIN_LENGTH, return_length=True))
+            k = min(REPAIR_SPRINGS + same, len(rest))
+            distance, partner = (found.reshape(len(own), k) for found in tree.query(nodes[own], k=k))
+            usable = distance > MIN_LENGTH
+            away = np.where(usable, distance, np.inf).min(axis=1)
+            row, column = np.nonzero(usable & (usable.cumsum(axis=1) <= REPAIR_SPRINGS) & (away <= away.min() + spacing)[:, None])
+            added.append(np.stack([own[row], rest[partner[row, column]]], axis=1))
+        if len(more := _first_of_each(np.concatenate(added), count)) == len(springs):
+            return springs
+        springs = more
 
 
 def object_springs(nodes: np.ndarray, radius: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
@@ -210,16 +224,15 @@ def piecewise_topology(
 ) -> Topology:
     """A radius [m] and a neighbor count (self included) per region; `labels` [N] says which region a node belongs to.
 
-    Neighbors are looked for in the rest shape [N + C, 3], m, where one is given, else in frame 0. `repair` joins nodes without
-    any spring, controllers' included, to their nearest nodes. Rest lengths: `unloaded`. Raises InputError if a controller
-    coincides with a node.
+    Neighbors are looked for in the rest shape [N + C, 3], m, where one is given, else in frame 0. `repair` makes the body one
+    piece (`joined`). Rest lengths: `unloaded`. Raises InputError if a controller coincides with a node.
     """
     canonical = np.asarray(canonical_shape(nodes, controllers, rest_shape), np.float64)
     points, hands = canonical[: len(nodes)], canonical[len(nodes) :]
     inner = object_springs(points, np.asarray(object_radius, np.float64)[labels], np.asarray(object_neighbors)[labels])
     outer = controller_springs(points, hands, controller_radius, controller_neighbors)
     if repair:
-        inner = join(points, inner, isolated(len(points), np.concatenate([inner, outer])))
+        inner = joined(points, inner)
     springs = np.concatenate([inner, outer])
     return build(np.asarray(nodes), np.asarray(controllers), springs, labels, rest_shape, controller_rest)
 

@@ -15,6 +15,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from neuspring import config
 from neuspring.config.search import LENGTHS
@@ -25,7 +27,7 @@ from neuspring.twin import candidates
 from neuspring.twin.candidates import PENALTY, SearchProblem, candidate, groups, made, still_cost
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.search import FREED_SIGMA, SEEDS, search
-from neuspring.twin.topology import distances, isolated, regions, uniform_topology
+from neuspring.twin.topology import distances, regions, uniform_topology
 from neuspring.twin.trials import Outcome
 from tests.support import scenarios, small
 from tests.support.searches import assert_same_trace, budget
@@ -209,7 +211,7 @@ def test_the_released_row_is_the_search_as_it_was(clusters):
 def test_a_region_s_values_reach_its_own_nodes():
     values = small.start_values()
     regional = {"object_radius.0": 0.03, "object_radius.1": 0.045, "object_neighbors.0": 5.0, "object_neighbors.1": 18.0}
-    problem = small.search_problem(clusters=2)
+    problem = small.search_problem(clusters=2, search=small.released(isolated_nodes="allow"))
     topology = candidate(problem, values | regional).topology
     inner = topology.springs[: topology.object_spring_count]
     longest = [topology.rest_lengths[: len(inner)][(problem.labels[inner] == r).all(axis=1)].max() for r in (0, 1)]
@@ -241,14 +243,15 @@ def test_isolated_nodes_are_repaired_or_left():
     values = small.start_values() | {"object_radius": 0.005}
     count = len(small.observations().nodes)
     left = candidate(loosely(isolated_nodes="allow"), values)
-    alone = isolated(count, left.topology.springs)
+    alone = np.setdiff1d(np.arange(count), left.topology.springs)
     assert 0 < len(alone) < count
     assert left.topology.object_spring_count == 0
     seen = small.observations()
     released = uniform_topology(seen.nodes, seen.controller_points[0], 0.005, 18, values["controller_radius"], 50)
     np.testing.assert_array_equal(left.topology.springs, released.springs)
     mended = candidate(loosely(isolated_nodes="repair"), values)
-    assert len(isolated(count, mended.topology.springs)) == 0
+    body = mended.topology.springs[: mended.topology.object_spring_count]
+    assert connected_components(coo_array((np.ones(len(body)), body.T), shape=(count, count)), directed=False)[0] == 1
     # Nothing is isolated: both are the same.
     whole = [candidate(loosely(isolated_nodes=rule), small.start_values()) for rule in ("repair", "allow")]
     np.testing.assert_array_equal(whole[0].topology.springs, whole[1].topology.springs)

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from neuspring.core.errors import InputError
 from neuspring.twin.topology import (
@@ -16,8 +18,7 @@ from neuspring.twin.topology import (
     controller_reach,
     controller_springs,
     distances,
-    isolated,
-    join,
+    joined,
     node_spacing,
     object_springs,
     piecewise_topology,
@@ -264,42 +265,75 @@ def test_another_place_of_rest_is_refused() -> None:
         replace(piecewise_topology(cloud(3), cloud(4, 3), np.zeros(25, np.int32), [0.5], [6], 0.6, 4), controller_rest="hands")
 
 
-# Isolated nodes -------------------------------------------------------------------------------------------------------
+# One piece ------------------------------------------------------------------------------------------------------------
+
+TWO = np.array([[0, 1], [2, 1]])
+"""Springs of the first three nodes of a row."""
 
 
-def test_isolated_nodes_are_those_without_any_spring() -> None:
-    assert isolated(5, np.array([[0, 1], [6, 3]])).tolist() == [2, 4]
-    assert isolated(3, np.zeros((0, 2), np.int32)).tolist() == [0, 1, 2]
+def pieces(count: int, springs: np.ndarray) -> int:
+    return connected_components(coo_array((np.ones(len(springs)), springs.T), shape=(count, count)), directed=False)[0]
 
 
-def test_join_gives_lonely_nodes_their_nearest_nodes_behind_the_springs_that_are_there() -> None:
-    nodes = np.array([[0.0, 0, 0], [1, 0, 0], [2.1, 0, 0], [3.3, 0, 0], [4.6, 0, 0], [0, 0, MIN_LENGTH / 2]])
-    springs = np.array([[0, 1], [2, 1]])
-    joined = join(nodes, springs, np.array([4]))
-    assert joined.tolist() == [[0, 1], [2, 1], [4, 3], [4, 2], [4, 1]]
-    assert len(joined) - len(springs) == REPAIR_SPRINGS
-    # Two lonely nodes that ask for each other get one spring, and a node at the same place is no partner.
-    undirected(join(nodes, springs, np.array([3, 4])))
-    assert (0, 5) not in undirected(join(nodes, springs, np.array([5])))
-    np.testing.assert_array_equal(join(nodes, springs, np.zeros(0, int)), springs)
+def test_a_node_without_a_spring_asks_for_its_nearest_nodes_behind_the_springs_that_are_there() -> None:
+    nodes = np.array([[0.0, 0, 0], [1, 0, 0], [2.1, 0, 0], [4.6, 0, 0]])
+    mended = joined(nodes, TWO)
+    assert mended.tolist() == [[0, 1], [2, 1], [3, 2], [3, 1], [3, 0]]
+    assert len(mended) - len(TWO) == REPAIR_SPRINGS
+    np.testing.assert_array_equal(joined(nodes[:3], TWO), TWO, err_msg="it is one piece")
 
 
-def test_repair_joins_only_nodes_that_nothing_holds() -> None:
+def test_a_part_behind_a_gap_is_joined_along_its_seam() -> None:
+    """Two sheets of 8 x 3 and 8 x 2 nodes, 1 apart, with a gap of 2.5: two rows are within a spacing of the gap."""
+    large, small = (
+        np.stack(np.meshgrid(np.arange(8.0), row, [0.0], indexing="ij"), -1).reshape(-1, 3) for row in ([0, 1, 2], [4.5, 5.5])
+    )
+    nodes = np.concatenate([large, small])
+    torn = same(nodes, 1.2, 9)
+    assert pieces(len(nodes), torn) == 2
+    mended = joined(nodes, torn)
+    np.testing.assert_array_equal(mended[: len(torn)], torn)
+    seam = mended[len(torn) :]
+    assert pieces(len(nodes), mended) == 1
+    assert set(seam[:, 0].tolist()) == set(range(len(large), len(nodes))), "the smaller part asks, all along"
+    assert set(nodes[seam[:, 1], 1]) == {2.0}, "for the row that is nearest"
+    assert len(seam) == REPAIR_SPRINGS * len(small)
+
+
+def test_a_seam_is_no_longer_than_the_part_that_is_near() -> None:
+    """A row that leads away from the body is joined by its end alone."""
+    body = np.stack(np.meshgrid(np.arange(4.0), np.arange(4.0), [0.0], indexing="ij"), -1).reshape(-1, 3)
+    row = np.array([[6.0 + k, 0, 0] for k in range(5)])
+    nodes = np.concatenate([body, row])
+    mended = joined(nodes, same(nodes, 1.2, 5))
+    assert pieces(len(nodes), mended) == 1
+    long = mended[distances(nodes, mended) > 1.2]
+    assert set(long.ravel().tolist()) & set(range(16, 21)) == {16, 17}
+
+
+def test_many_parts_become_one_whatever_is_near_to_what() -> None:
+    """Pairs that are nearer to each other than to the body join first, and then the body."""
+    nodes = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [20, 0, 0], [21, 0, 0], [23, 0, 0], [24, 0, 0]])
+    mended = joined(nodes, np.array([[0, 1], [1, 2], [2, 3], [4, 5], [6, 7]]))
+    assert pieces(8, mended) == 1
+    assert pieces(6, joined(nodes[:6], np.zeros((0, 2), int))) == 1, "from no spring at all"
+
+
+def test_repair_joins_what_hangs_on_a_hand_alone() -> None:
     nodes, hands = np.array([[0.0, 0, 0], [0.1, 0, 0], [1, 0, 0], [2, 0, 0]]), np.array([[2.0, 0.05, 0]])
     one, values = np.zeros(4, np.int32), ([0.2], [5], 0.1, 5)
-    broken = piecewise_topology(nodes, hands, one, *values)
-    assert undirected(broken.springs) == {(0, 1), (3, 4)}
+    assert undirected(piecewise_topology(nodes, hands, one, *values).springs) == {(0, 1), (3, 4)}
     mended = piecewise_topology(nodes, hands, one, *values, repair=True)
-    # Node 3 hangs on the controller, so it is left as it is; node 2 asks for its three nearest.
-    assert undirected(mended.springs) == {(0, 1), (3, 4), (1, 2), (2, 3), (0, 2)}
-    assert mended.object_spring_count == 4
-    assert len(isolated(4, mended.springs)) == 0
+    assert undirected(mended.springs) == {(0, 1), (3, 4), (1, 2), (2, 3), (0, 2), (0, 3), (1, 3)}
+    assert mended.object_spring_count == 6
 
 
-@pytest.mark.parametrize("copies", [1, 2, 5])
-def test_join_looks_past_nodes_at_the_same_place(copies: int) -> None:
-    nodes = np.concatenate([np.zeros((copies, 3)), np.eye(3)])
-    assert undirected(join(nodes, np.zeros((0, 2), int), np.array([0]))) == {(0, copies + i) for i in range(REPAIR_SPRINGS)}
+@pytest.mark.parametrize("copies", [2, 5])
+def test_nodes_at_the_same_place_are_no_partners(copies: int) -> None:
+    nodes = np.concatenate([np.zeros((copies, 3)), np.eye(3), 2 * np.eye(3)])
+    chain = np.array([[copies + i, copies + j] for i in range(6) for j in range(i)])
+    mended = joined(nodes, chain)
+    assert undirected(mended) == undirected(chain) | {(i, copies + j) for i in range(copies) for j in range(3)}
 
 
 # The spacing of nodes -------------------------------------------------------------------------------------------------
