@@ -156,8 +156,8 @@ class Segmentation(Section):
     """Which pixels show the object and the hands."""
 
     backend: Literal["given", "opencv", "marks", "grounded_sam2"] = "given"
-    """given: the capture's masks. opencv: height and color. marks: the capture's marks.json, carried through the video.
-    grounded_sam2: GroundingDINO and SAM 2 (extra `perception`)."""
+    """given: the capture's masks. opencv: height and color; of a capture with marks.json, marks. marks: the capture's marks.json,
+    carried through the video. grounded_sam2: GroundingDINO and SAM 2 (extra `perception`)."""
     marks: MarksSegmentation = field(default_factory=MarksSegmentation)
     opencv: OpenCvSegmentation = field(default_factory=OpenCvSegmentation)
     grounded_sam2: GroundedSam2 = field(default_factory=GroundedSam2)

@@ -135,8 +135,6 @@ class Search(Section):
     lengths: Literal["spacing", "meter"] = "spacing"
     """Unit of object_radius, controller_radius and contact_distance in `variables`. spacing: the distance between
     neighboring nodes in the rest shape, measured on each object (neuspring/twin/README.md). meter: as released."""
-    starts: Count = 1
-    """Runs of CMA-ES from seeds of their own, which share the rollouts; the best candidate of all wins."""
     fixed: tuple[str, ...] = ()
     """Variables that keep their start and are not searched; the start may then lie outside the range."""
     hands: Literal["hold", "push", "auto"] = "hold"

@@ -82,7 +82,27 @@ BACKENDS = {
 }
 
 
+def segmentation(name: str, capture: Capture) -> str:
+    """The backend of a capture's segmentation where `name` is configured: marks, where it has some, in place of `opencv`.
+
+    Whoever has drawn marks knows that height and color do not tell the object from the table.
+    """
+    from neuspring.perception.marks.marks import MARKS
+
+    return "marks" if name == "opencv" and (capture.folder / MARKS).exists() else name
+
+
+def _possible(step: str, name: str) -> list[Backend]:
+    """What may run where `name` is configured."""
+    return [BACKENDS[step][one] for one in ((name, "marks") if (step, name) == ("segment", "opencv") else (name,))]
+
+
 def backend_keys(step: str, name: str) -> tuple[str, ...]:
     """Keys of the configuration that a backend reads."""
-    section = BACKENDS[step][name].section
-    return (f"perception.{step}.backend", *((f"perception.{step}.{section}",) if section else ()))
+    sections = [one.section for one in _possible(step, name) if one.section]
+    return (f"perception.{step}.backend", *(f"perception.{step}.{section}" for section in sections))
+
+
+def backend_modules(step: str, name: str) -> tuple[str, ...]:
+    """Modules that a backend is made of."""
+    return tuple(one.module for one in _possible(step, name))

@@ -6,14 +6,14 @@ from neuspring.config import Config
 from neuspring.core.errors import InputError
 from neuspring.core.records import Recorder
 from neuspring.data.capture import Capture
-from neuspring.perception.backends import BACKENDS, backend_keys
+from neuspring.perception.backends import BACKENDS, backend_keys, backend_modules, segmentation
 from neuspring.stages.stage import Written, stage
 
 
 @stage(
     output="{scenario}/perception/{camera}/masks.json",
     reads=lambda settings, given: (*backend_keys("segment", settings.perception.segment.backend), "perception.segment.verdict"),
-    code=lambda settings, given: (BACKENDS["segment"][settings.perception.segment.backend].module,),
+    code=lambda settings, given: backend_modules("segment", settings.perception.segment.backend),
     gpu="backend",
     memory_mb=8000,
     minutes=120,
@@ -27,14 +27,15 @@ def segment(capture: Capture, camera: str, settings: Config, run: Recorder, devi
 
     section = settings.perception.segment
     capture.require_camera(camera)
-    labels = BACKENDS["segment"][section.backend].segment(capture, camera, settings.perception, device)
+    backend = segmentation(section.backend, capture)
+    labels = BACKENDS["segment"][backend].segment(capture, camera, settings.perception, device)
     facts = mask_facts(capture, camera, labels)
     findings = look_at_masks(capture, camera, labels, facts)
     wrong = [one for one in findings if one.name in WRONG]
     if wrong and section.verdict == "error":
         rule = "perception.segment.verdict: error asks for masks that can be right"
         raise InputError(f"{capture.folder}, camera {camera}", rule, "; ".join(one.text for one in wrong))
-    masks = Masks(labels=labels, backend=section.backend, facts=facts)
+    masks = Masks(labels=labels, backend=backend, facts=facts)
     files = run.beside(masks="masks.npz", picture="masks.png")
     masks.save(files["masks"])
     figures.masks_strip(capture, camera, masks, files["picture"])

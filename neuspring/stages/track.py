@@ -5,14 +5,14 @@ from __future__ import annotations
 from neuspring.config import Config
 from neuspring.core.records import Before, Recorder
 from neuspring.data.capture import Capture
-from neuspring.perception.backends import BACKENDS, backend_keys
+from neuspring.perception.backends import BACKENDS, backend_keys, backend_modules
 from neuspring.stages.stage import Written, stage
 
 
 @stage(
     output="{scenario}/perception/{camera}/tracks.json",
     reads=lambda settings, given: (*backend_keys("track", settings.perception.track.backend), "perception.seed"),
-    code=lambda settings, given: (BACKENDS["track"][settings.perception.track.backend].module,),
+    code=lambda settings, given: backend_modules("track", settings.perception.track.backend),
     gpu="backend",
     memory_mb=8000,
     minutes=120,

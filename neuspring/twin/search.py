@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 
 FREED_SIGMA = 0.06
 """Step of CMA-ES in normalized variables when each region becomes free."""
-SEEDS = 1000
-"""Distance of the seeds of a search's starts."""
 MOVES = 0.9
 """Hands push if that costs less than this fraction of a body that stays as it is in frame 0."""
 
@@ -52,7 +50,7 @@ class Proposals:
 
     def __init__(self, problem: SearchProblem, seed: int) -> None:
         self._problem, self._seed = problem, seed
-        self._tied = problem.search.tied_rollouts // problem.search.starts if problem.clusters > 1 else 0
+        self._tied = problem.search.tied_rollouts if problem.clusters > 1 else 0
         self._columns = np.arange(len(problem.variables))
         """Which of the searched variables each variable takes its value from."""
         searched = problem
@@ -87,39 +85,11 @@ class Proposals:
             self._strategy.tell(self._population, costs)
 
 
-class Starts:
-    """CMA-ES from several seeds side by side: a generation is one of each, so that many candidates share launches."""
-
-    def __init__(self, problem: SearchProblem, seed: int) -> None:
-        starts = problem.search.starts
-        # Seed s of a search with one start stays what it was.
-        self._each = [Proposals(problem, seed + SEEDS * start) for start in range(starts)]
-        self._sizes: list[int] = []
-
-    @property
-    def generation(self) -> int:
-        """The number of the present generation."""
-        return self._each[0].generation
-
-    def ask(self) -> list[np.ndarray]:
-        """The next generation of every start."""
-        populations = [one.ask() for one in self._each]
-        self._sizes = [len(population) for population in populations]
-        return [candidate for population in populations for candidate in population]
-
-    def tell(self, costs: list[float]) -> None:
-        """Take the costs of the first candidates of the last generation."""
-        for one, size in zip(self._each, self._sizes, strict=True):
-            own, costs = costs[:size], costs[size:]
-            if own:
-                one.tell(own)
-
-
 def _strategy(start: np.ndarray, sigma: float, seed: int) -> cma.CMAEvolutionStrategy:
     import cma
 
     no_end = {"maxiter": np.inf, "tolfun": 0, "tolx": 0, "tolstagnation": np.inf}
-    # Its own generator: cma's is that of the process, which all starts would draw from. Shifted by one, as cma reads 0 as "any".
+    # A generator of its own: cma's is that of the process. Seeds are shifted by one, since cma once took 0 for "any".
     drawn = {"randn": np.random.RandomState(seed + 1).randn, "seed": np.nan}
     options = {"bounds": [0, 1], "verbose": -9, **drawn, **no_end}
     return cma.CMAEvolutionStrategy(start, sigma, options)
@@ -154,7 +124,7 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
     # One candidate cannot be judged both ways.
     ways = WAYS[problem.search.hands][: problem.search.cma_rollouts]
     problem = replace(problem, push=ways[0])
-    proposals = Starts(problem, seed)
+    proposals = Proposals(problem, seed)
     loss = FrameLoss.of(problem.observations, problem.losses, problem.device, frozen_counts=problem.quirks.frozen_loss_denominators)
     budget = problem.search.cma_rollouts
     progress = Progress(

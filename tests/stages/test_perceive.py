@@ -14,6 +14,8 @@ from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
 from neuspring.data import phystwin
 from neuspring.data.capture import Capture
+from neuspring.data.synthetic.make import outlines
+from neuspring.perception.results import Masks
 from neuspring.stages.capture import capture
 from neuspring.stages.lift import lift
 from neuspring.stages.observe import observe
@@ -84,6 +86,19 @@ def test_opencv_finds_what_the_given_masks_show(tmp_path, whole):
     observations = perceived(whole[0], tmp_path, settings=settings)
     assert np.median(motion_error(observations)) < 0.003
     assert StageRecord.load(tmp_path / "0" / "masks.json").settings["perception"]["segment"]["backend"] == "opencv"
+
+
+def test_marks_of_a_capture_take_the_place_of_opencv(tmp_path):
+    settings = replace(SETTINGS, perception=replace(SETTINGS.perception, segment=Segmentation(backend="opencv")))
+    capture = film(tmp_path / "capture", cameras=1)
+    (capture.folder / "marks.json").write_text(json.dumps({"format": 1, "cameras": outlines(capture)}))
+    observations = perceived(capture, tmp_path, settings=settings)
+    assert Masks.load(tmp_path / "0" / "masks.npz").backend == "marks"
+    assert np.median(motion_error(observations)) < 0.003
+    seen = Masks.load(tmp_path / "0" / "masks.npz").labels[0]
+    truth = capture.mask("0", 0)
+    for label in (1, 2):
+        assert ((seen == label) & (truth == label)).sum() > 0.8 * ((seen == label) | (truth == label)).sum()
 
 
 def test_phystwin_s_raw_layout_gives_the_same_observations(tmp_path):

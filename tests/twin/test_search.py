@@ -26,7 +26,7 @@ from neuspring.physics.lanes import COST, WIDTHS, width_for
 from neuspring.twin import candidates
 from neuspring.twin.candidates import PENALTY, SearchProblem, candidate, groups, made, still_cost
 from neuspring.twin.losses import FrameLoss
-from neuspring.twin.search import FREED_SIGMA, SEEDS, search
+from neuspring.twin.search import FREED_SIGMA, search
 from neuspring.twin.topology import distances, regions, uniform_topology
 from neuspring.twin.trials import Outcome
 from tests.support import scenarios, small
@@ -321,34 +321,6 @@ def test_a_larger_budget_continues_as_if_it_had_been_there_from_the_start(tmp_pa
     # What was recorded was not computed again, and a smaller budget is a prefix.
     assert evaluated.trace["seconds"].tolist()[:15] == first.trace["seconds"].tolist()
     assert_same_trace(first.trace, whole.trace[:15])
-
-
-def started(rollouts: int, starts: int, clusters: int = 1, tied: int = 0) -> SearchProblem:
-    """The small search from several starts."""
-    problem = budget(rollouts, clusters)
-    return replace(problem, search=replace(problem.search, starts=starts, tied_rollouts=tied))
-
-
-@pytest.mark.parametrize(("clusters", "generations", "tied"), [(1, (11, 11), 0), (3, (8, 12), 8)])
-def test_starts_are_the_searches_of_their_seeds_side_by_side(clusters, generations, tied):
-    """Each has its own proposals, which only its own costs move; the best candidate of all wins."""
-    first, second = generations
-    together = search(started(2 * (first + second), 2, clusters, 2 * tied), seed=3)
-    compared = ["cost", *(name for name in together.trace if name.startswith("normalized."))]
-    rows = together.trace[compared].to_numpy()
-    for start in range(2):
-        alone = search(started(first + second, 1, clusters, tied), seed=3 + SEEDS * start).trace[compared].to_numpy()
-        np.testing.assert_array_equal(rows[start * first :][:first], alone[:first])
-        np.testing.assert_array_equal(rows[2 * first + start * second :][:second], alone[first:])
-    assert together.cost == rows[:, 0].min()
-
-
-def test_a_killed_search_of_several_starts_continues_exactly(tmp_path, monkeypatch):
-    problem, record = started(60, 2), tmp_path / "trace.parquet"
-    whole = search(problem, seed=5)
-    die_after(30, problem, 5, record, monkeypatch)
-    assert len(pd.read_parquet(record)) == 22
-    assert_same_trace(search(problem, seed=5, record=record, key="k").trace, whole.trace)
 
 
 def pushed(hands: str = "auto", rollouts: int = 26) -> SearchProblem:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from neuspring.config import Config, ScenarioRow
 from neuspring.config.data import Synthetic
 from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.files import write_text
 from neuspring.core.geometry import farthest
 from neuspring.core.records import digest_file
 from neuspring.core.text import Progress
@@ -134,6 +137,8 @@ def make(row: ScenarioRow, settings: Synthetic, folder: Path) -> tuple[Capture, 
     )
     writer = Writer(folder, description)
     _film(writer, body, clip, hands, cameras, row, settings, size)
+    if scene.marked:
+        write_text(folder / "marks.json", json.dumps({"format": 1, "cameras": outlines(writer.capture)}) + "\n")
     path = truth_path(folder)
     truth.save(path)
     return writer.finish(_annotate(truth, cameras[0], writer.capture), truth=f"sha256:{digest_file(path)}"), truth
@@ -212,6 +217,27 @@ def _film(
                 depth = measured(view.depth, view.slope, DEPTH_UNIT, rng)
             writer.frame(camera.name, frame, view.color, depth, view.label)
         report.update(frame + 1)
+
+
+MARK_LABELS = {OBJECT: "object", HAND: "hand"}
+OFF = 1.0
+"""Pixels by which the border of a mark may be off, and by which its corners are rounded."""
+
+
+def outlines(capture: Capture) -> dict[str, list[dict[str, Any]]]:
+    """Polygons around object and hands in frame 0 of each camera, as perception.marks reads them."""
+    import cv2
+
+    cameras: dict[str, list[dict[str, Any]]] = {name: [] for name in capture.cameras}
+    for name, marks in cameras.items():
+        mask = capture.mask(name, 0)
+        for label, word in MARK_LABELS.items():
+            for contour in cv2.findContours((mask == label).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]:
+                points = cv2.approxPolyDP(contour, OFF, closed=True)[:, 0].tolist()
+                # What is thinner than the rounding has no polygon.
+                kind = "polygon" if len(points) > 2 else "scribble"
+                marks.append({"frame": 0, "label": word, "kind": kind, "points": points, "radius": OFF})
+    return cameras
 
 
 def _annotate(truth: Truth, camera: Camera, capture: Capture) -> np.ndarray:

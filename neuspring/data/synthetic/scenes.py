@@ -94,6 +94,8 @@ class SyntheticScene:
     frames: int
     hands: Callable[[np.ndarray, float], tuple[Hand, ...]]
     """Settled nodes [N, 3], m, and duration, s -> hands."""
+    marked: bool = False
+    """Whether its capture has marks of frame 0, as a careful user draws them: its colors are the table's."""
 
 
 def wander(start: np.ndarray, offsets: Offsets, duration: float) -> tuple[KeyFrame, ...]:
@@ -203,7 +205,7 @@ SCENES: dict[str, SyntheticScene] = {
         body=bodies.dinosaur, frames=86, hands=lift((0.0, 0.5, 0.1), reach=0.03, offsets=LOW_LIFT)
     ),
     "rope_double_hand": SyntheticScene(
-        body=_rope("twine"), frames=264, hands=lift((0.02, 0.5, 0.5), (0.98, 0.5, 0.5), reach=0.016)
+        body=_rope("twine"), frames=264, hands=lift((0.02, 0.5, 0.5), (0.98, 0.5, 0.5), reach=0.016), marked=True
     ),
     "single_lift_rope": SyntheticScene(body=_rope("cord"), frames=50, hands=lift((0.03, 0.5, 0.5), reach=0.016)),
     "single_push_rope": SyntheticScene(body=_rope("twine"), frames=58, hands=push((0.5, 0.0, 0.5), (0, 1, 0), 0.1)),
