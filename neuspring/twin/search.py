@@ -86,12 +86,11 @@ class Proposals:
 
 
 def _strategy(start: np.ndarray, sigma: float, seed: int) -> cma.CMAEvolutionStrategy:
+    # cma takes 0 to mean "seed from the clock", so seeds are shifted by one.
     import cma
 
     no_end = {"maxiter": np.inf, "tolfun": 0, "tolx": 0, "tolstagnation": np.inf}
-    # A generator of its own: cma's is that of the process. Seeds are shifted by one, since cma once took 0 for "any".
-    drawn = {"randn": np.random.RandomState(seed + 1).randn, "seed": np.nan}
-    options = {"bounds": [0, 1], "verbose": -9, **drawn, **no_end}
+    options = {"bounds": [0, 1], "seed": seed + 1, "verbose": -9, **no_end}
     return cma.CMAEvolutionStrategy(start, sigma, options)
 
 
