@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from neuspring.api import Observations, Topology, Trajectory, Twin, fit, load_run, roll_out, score, search
 
-__version__ = "0.5.0"
+__version__ = "0.6.0"
 __all__ = ["Observations", "Topology", "Trajectory", "Twin", "fit", "load_run", "roll_out", "score", "search"]
 
 
