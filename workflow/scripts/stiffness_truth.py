@@ -1,0 +1,115 @@
+"""Twins of synthetic scenes beside the material that their bodies were made of.
+
+    python -m workflow.scripts.stiffness_truth RESULTS OUT [--methods ...] [--pictures SCENARIO ...]
+
+A body of finite elements has a modulus per element (Young's modulus of a solid, membrane stiffness of a sheet), a twin a stiffness
+per spring. Around a node the twin has the geometric mean of its springs (`node_stiffness`), the truth the modulus of the nearest
+element in frame 0. OUT/stiffness.md has their correlation (Pearson, of logarithms) per method, mean over seeds and then over scenes,
+for scenes whose modulus is not the same everywhere; OUT/stiffness.csv a row per run, OUT/SCENARIO.png a picture of each, relative to
+the geometric mean over nodes.
+"""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib import pyplot as plt
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from scipy.spatial import cKDTree
+
+from neuspring.core.artifacts import Twin
+from neuspring.core.files import write_text
+from neuspring.core.run_folder import RunFolder
+from neuspring.core.table import Table
+from neuspring.data.synthetic.truth import Truth, truth_path
+from neuspring.report.draw.scene import Prediction, Scene
+from neuspring.report.draw.sheet import save
+from neuspring.report.draw.twin import COLORS, TwinPicture, node_stiffness
+
+METHODS = ["search_only", "baseline_ten_frames", "model_b", "shuffled", "neuspring", "neuspring_plus", "baseline_plus"]
+NOTE = "Correlation of log stiffness around each node with the log modulus that the body was made of, mean over seeds."
+LEAST_SPREAD = 1e-6
+"""Standard deviation of logarithms below which everything is equal."""
+LIMITS = (0.1, 10.0)
+"""Range of colors: stiffness over its geometric mean."""
+
+
+def modulus_at(truth: Truth, nodes: np.ndarray) -> np.ndarray:
+    """Modulus of the element whose center in frame 0 is nearest to each node [N], Pa; of a sheet N/m."""
+    solid = len(truth.tetrahedra) > 0
+    elements, values = (truth.tetrahedra, truth.youngs_modulus) if solid else (truth.triangles, truth.membrane)
+    return np.asarray(values[cKDTree(truth.nodes[0][elements].mean(axis=1)).query(nodes)[1]], dtype=float)
+
+
+def made_of(twin: Twin, modulus: np.ndarray) -> Twin:
+    """The twin's springs with the geometric mean of the modulus [N] at their two ends."""
+    springs, inner = twin.topology.springs, twin.topology.object_spring_count
+    stiffness = twin.material.stiffness.astype(float)
+    stiffness[:inner] = np.sqrt(modulus[springs[:inner, 0]] * modulus[springs[:inner, 1]])
+    return replace(twin, material=replace(twin.material, stiffness=stiffness.astype(np.float32)))
+
+
+def relative(twin: Twin) -> Twin:
+    """The twin with stiffness over the geometric mean of its nodes'."""
+    stiffness = twin.material.stiffness / np.exp(np.log(node_stiffness(twin)).mean())
+    return replace(twin, material=replace(twin.material, stiffness=stiffness.astype(np.float32)))
+
+
+def picture(scenario: str, takes: Sequence[Prediction], scene: Scene) -> Figure:
+    """The truth and twins side by side."""
+    shape = scene.view.width / scene.view.height
+    figure, axes = plt.subplots(1, len(takes), figsize=(2.4 * shape * len(takes), 3.4), layout="constrained")
+    for axis, take in zip(axes, takes, strict=True):
+        TwinPicture([(scene, take)], 0, ("stiffness",), limits=LIMITS).paint(axis, scene, take, "stiffness")
+        axis.set_title(take.label, fontsize=9)
+    label = "stiffness / its geometric mean"
+    bar = figure.colorbar(ScalarMappable(LogNorm(*LIMITS), COLORS), ax=axes, label=label, location="bottom", aspect=60, shrink=0.5)
+    bar.ax.tick_params(labelsize=8)
+    figure.suptitle(scenario, fontsize=10)
+    return figure
+
+
+def main() -> None:
+    """Write the table, and a picture of each scene that is named."""
+    parser = ArgumentParser(description=__doc__)
+    parser.add_argument("results", type=Path)
+    parser.add_argument("output", type=Path)
+    parser.add_argument("--methods", nargs="+", default=METHODS)
+    parser.add_argument("--pictures", nargs="*", default=[], metavar="SCENARIO")
+    options = parser.parse_args()
+    rows = []
+    for folder in sorted(options.results.glob("*/capture")):
+        home, truth = folder.parent, Truth.load(truth_path(folder))
+        scenario, takes = home.name.removeprefix("synthetic_"), dict[str, Prediction]()
+        runs = [RunFolder.of(path.parent) for method in options.methods for path in sorted(home.glob(f"{method}/*/rollout.json"))]
+        for run in runs:
+            if (twin := run.twin) is None:
+                continue
+            method, seed = run.folder.parts[-2:]
+            modulus, here = modulus_at(truth, twin.topology.nodes), twin.topology.nodes[None]
+            logs = np.log([modulus, node_stiffness(twin)])
+            rows.append((scenario, method, int(seed), np.corrcoef(logs)[0, 1] if (logs.std(axis=1) > LEAST_SPREAD).all() else np.nan))
+            takes.setdefault("truth", Prediction("truth", here, relative(made_of(twin, modulus))))
+            takes.setdefault(method, Prediction(method, here, relative(twin)))
+        if home.name in options.pictures and takes:
+            scene = Scene.from_side(runs[0].observations, list(takes.values()), [0])
+            save(picture(scenario, list(takes.values()), scene), options.output / f"{scenario}.png")
+    table = pd.DataFrame(rows, columns=["scenario", "method", "seed", "correlation"]).dropna()
+    write_text(options.output / "stiffness.csv", table.to_csv(index=False, float_format="%.4f"))
+    wide = table.pivot_table(index="scenario", columns="method", values="correlation")[
+        [method for method in options.methods if method in set(table["method"])]
+    ]
+    wide.loc["mean over scenes"] = wide.mean()
+    lines = Table.of_texts(["scene", *wide.columns], [[name, *(f"{r:.2f}" for r in row)] for name, row in wide.iterrows()]).markdown()
+    write_text(options.output / "stiffness.md", "\n".join(["# Stiffness beside the truth", "", NOTE, "", *lines, ""]))
+
+
+if __name__ == "__main__":
+    main()
