@@ -2,7 +2,8 @@
 
 `FrameSolver` is a frame forward and backward: a launch on a CPU, a captured graph on CUDA. Its memory is substeps x nodes x twins.
 `simulate_frame` is the same for autograd. Chained frames give gradients over any horizon: only the states between frames are kept,
-and a frame whose substeps are no longer in the solver's buffers is simulated again from its start before its backward pass.
+and a frame whose substeps are no longer in a solver's buffers is simulated again from its start before its backward pass. A
+`FrameWindow` has buffers for the last frames, as many as its memory takes.
 
 Several twins of the same nodes and controllers may have topologies of their own (`union`). A twin's spring that another one lacks
 is there for both, and has no stiffness and no dashpot in the other: it adds nothing. The springs of a node are summed in the order
@@ -27,6 +28,8 @@ from neuspring.physics.controllers import Grips, begins, begun
 from neuspring.physics.parameters import PARAMETERS, Parameters, packed
 from neuspring.physics.rod_nodes import RodFrames
 
+KEPT = 1 << 30
+"""Bytes that a `FrameWindow` may take."""
 PER_TWIN = ("frame_time", "substeps", "initial_velocity")
 """What may differ between the simulations of one solver; it does not read the last."""
 
@@ -88,6 +91,15 @@ class FrameSolver:
         self._reach = 0.0
         self.frame_token = 0
         """Number of frames simulated: tells whether the buffers still hold a given one."""
+
+    def holding(self, token: int) -> FrameSolver | None:
+        """The solver whose buffers hold the frame that ended with this `frame_token`; None if it is no longer held."""
+        return self if token == self.frame_token else None
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the buffers, bytes."""
+        return sum(tensor.nbytes for tensor in (*self.buffers.tensors.values(), *self.buffers.indices.values()))
 
     def _choose_kernels(self) -> None:
         among = bool(self.simulation.obstacles)
@@ -268,11 +280,45 @@ class FrameSolver:
             b.launch(k.pull, size, *arguments, step)
 
 
+class FrameWindow:
+    """The last frames of a spring graph, as a solver of their own each, so that a gradient through them simulates none again.
+
+    `make` makes a solver of the graph; there will be `frames` of them, or as many as fit into `KEPT` bytes, one at least.
+    """
+
+    def __init__(self, make: Callable[[], FrameSolver], frames: int, frame_token: int = 0) -> None:
+        self._make, self._solvers = make, [make()]
+        self._room = max(1, min(frames, KEPT // self._solvers[0].nbytes))
+        self._first = self.frame_token = frame_token
+
+    def turn(self) -> FrameSolver:
+        """The solver that takes the next frame: that of the oldest."""
+        place = (self.frame_token - self._first) % self._room
+        if place == len(self._solvers):
+            self._solvers.append(self._make())
+        self.frame_token += 1
+        return self._solvers[place]
+
+    def run(self, *inputs: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        """As `FrameSolver.run`."""
+        return self.turn().run(*inputs)
+
+    def holding(self, token: int) -> FrameSolver | None:
+        """As `FrameSolver.holding`."""
+        held = max(self._first, self.frame_token - self._room) < token <= self.frame_token
+        return self._solvers[(token - 1 - self._first) % self._room] if held else None
+
+    @property
+    def collision_overflow(self) -> int:
+        """As `FrameSolver.collision_overflow`."""
+        return sum(solver.collision_overflow for solver in self._solvers)
+
+
 class Frame(torch.autograd.Function):
     """A frame of any solver that has the three members used here.
 
-    `run(begin, end, x, v, parameters)` simulates a frame and returns (x, v). `backward(adj_x, adj_v)` returns the adjoints of x
-    and v in the last frame, and those of parameters by name. `frame_token` counts the frames.
+    `run(begin, end, x, v, parameters)` simulates a frame and returns (x, v); `frame_token` counts the frames. `holding(token)` has
+    that frame still, or is None: its `backward(adj_x, adj_v)` returns the adjoints of x and v, and those of parameters by name.
     """
 
     @staticmethod
@@ -287,9 +333,11 @@ class Frame(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, adj_x: torch.Tensor, adj_v: torch.Tensor) -> tuple[torch.Tensor | None, ...]:  # type: ignore[override]
         """Adjoints of the inputs; none of the controllers' path."""
-        if ctx.solver.frame_token != ctx.token:
+        held = ctx.solver.holding(ctx.token)
+        if held is None:
             Frame._run(ctx, ctx.saved_tensors)
-        x, v, gradients = ctx.solver.backward(adj_x, adj_v)
+            held = ctx.solver.holding(ctx.solver.frame_token)
+        x, v, gradients = held.backward(adj_x, adj_v)
         return None, None, None, None, x, v, *(gradients.get(name) for name in ctx.names)
 
     @staticmethod

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from neuspring.core.artifacts import Twin
-from neuspring.physics.solver import FrameSolver, stacked, union, unstacked
+from neuspring.physics.solver import FrameSolver, FrameWindow, stacked, union, unstacked
 
 T = TypeVar("T")
 Results = tuple[Any, ...]
@@ -29,26 +29,41 @@ class Lane:
     def __init__(self, batch: BatchedFits, twin: Twin) -> None:
         self.batch = batch
         self.twin = twin
-        self.frame_token = 0
-        """Changes with every frame that the shared solver simulates: tells whether it still holds a given one."""
+        self.frames = 1
+        """How many frames a gradient goes through."""
+        self._asked = 0
+        """The frame whose adjoint is asked for next."""
         self.collision_overflow = 0
         """Collision pairs of this twin that were dropped so far because the list was full."""
         self.waiting: tuple[str, Sequence[Any]] | None = None
         """What is requested, "run" or "backward", and its inputs."""
         self.answer: Results | BaseException | None = None
 
-    def of_twin(self, twin: Twin) -> Lane:
-        """This lane, which simulates `twin` from now on."""
+    @property
+    def frame_token(self) -> int:
+        """Number of frames simulated for the batch."""
+        return self.batch.frame_token
+
+    def of_twin(self, twin: Twin, frames: int = 1) -> Lane:
+        """This lane, which simulates `twin` from now on, with gradients through so many frames."""
+        self.frames = frames
         self.batch.set_twin(self, twin)
         return self
 
     def run(self, *inputs: Any) -> Results:
         """As `FrameSolver.run`."""
-        return self.batch.request(self, "run", inputs)
+        state = self.batch.request(self, "run", inputs)
+        self._asked = self.frame_token
+        return state
+
+    def holding(self, token: int) -> Lane | None:
+        """As `FrameSolver.holding`; `backward` is then that of this frame."""
+        self._asked = token
+        return self if self.batch.holding(token) else None
 
     def backward(self, adj_x: torch.Tensor, adj_v: torch.Tensor) -> Results:
         """As `FrameSolver.backward`."""
-        return self.batch.request(self, "backward", (adj_x, adj_v))
+        return self.batch.request(self, "backward", (adj_x, adj_v, self._asked))
 
 
 class BatchedFits:
@@ -60,11 +75,12 @@ class BatchedFits:
         self._active = list(self.lanes)
         self._turn = threading.Condition()
         self._end: BaseException | None = None
-        self._solver: FrameSolver | None = None
+        self.frame_token = 0
+        self._window: FrameWindow | None = None
         self._stale = True
-        """Whether the next frame needs another solver. The old one holds frames whose adjoints may be requested."""
+        """Whether the next frame needs another window. The old one holds frames whose adjoints may be requested."""
         self._members: list[Lane] = []
-        """Lanes of the present solver, in its order."""
+        """Lanes of the present window, in the order of its solvers."""
         self._places: list[np.ndarray] = []
         self._springs = 0
 
@@ -86,6 +102,10 @@ class BatchedFits:
         with self._turn:
             self._end = reason
             self._turn.notify_all()
+
+    def holding(self, token: int) -> FrameSolver | None:
+        """The solver that holds a frame; None if it is no longer held."""
+        return self._window.holding(token) if self._window else None
 
     def request(self, lane: Lane, what: str, inputs: Sequence[Any]) -> Results:
         """Wait for the launch that serves a request."""
@@ -111,33 +131,38 @@ class BatchedFits:
 
     def _serve(self) -> None:
         # Adjoints first: the frames that they belong to are in the buffers until the next frame is simulated.
-        for what, serve in (("backward", self._backward), ("run", self._run)):
-            requests = {lane: lane.waiting[1] for lane in self._active if lane.waiting is not None and lane.waiting[0] == what}
-            if requests:
-                for lane, answer in zip(requests, serve(list(requests), list(requests.values())), strict=True):
-                    lane.waiting, lane.answer = None, answer
+        waiting = {lane: lane.waiting for lane in self._active if lane.waiting is not None}
+        runs = {lane: inputs for lane, (what, inputs) in waiting.items() if what == "run"}
+        adjoints = {lane: inputs for lane, (what, inputs) in waiting.items() if what == "backward"}
+        for token in sorted({inputs[2] for inputs in adjoints.values()}):
+            self._answer(self._backward, {lane: inputs for lane, inputs in adjoints.items() if inputs[2] == token})
+        if runs:
+            self._answer(self._run, runs)
+
+    @staticmethod
+    def _answer(serve: Callable[..., list[Results]], requests: dict[Lane, Sequence[Any]]) -> None:
+        for lane, answer in zip(requests, serve(list(requests), list(requests.values())), strict=True):
+            lane.waiting, lane.answer = None, answer
 
     def _run(self, waiting: list[Lane], inputs: Sequence[Sequence[Any]]) -> list[Results]:
-        if self._stale or self._solver is None:
-            self._solver = self._made()
-        solver, numbers = self._solver, [self._members.index(lane) for lane in waiting]
+        if self._stale or self._window is None:
+            self._window = self._made()
+        solver, numbers = self._window.turn(), [self._members.index(lane) for lane in waiting]
         # A lane without a request repeats the first that has one.
         source = [numbers.index(number) if number in numbers else 0 for number in range(len(self._members))]
         begin, end, x, v = (torch.stack([inputs[k][place] for k in source]) for place in range(4))
         places = [self._places[numbers[k]] for k in source]
         parameters = stacked([inputs[k][4] for k in source], places, self._springs)
         before = solver.overflows if solver.simulation.self_collision else None
-        solver.set_parameters(parameters)
-        after = solver.forward(x, v, begin, end)
-        for lane in self._active:
-            lane.frame_token += 1
+        after = solver.run(begin, end, x, v, parameters)
+        self.frame_token += 1
         if before is not None:
             for lane, number in zip(waiting, numbers, strict=True):
                 lane.collision_overflow += solver.overflows[number] - before[number]
         return [(after[0][number].clone(), after[1][number].clone()) for number in numbers]
 
     def _backward(self, waiting: list[Lane], inputs: Sequence[Sequence[Any]]) -> list[Results]:
-        solver = self._solver
+        solver = self.holding(inputs[0][2])
         assert solver is not None
         zero = torch.zeros_like(inputs[0][0])
         given = {self._members.index(lane): adjoints for lane, adjoints in zip(waiting, inputs, strict=True)}
@@ -148,15 +173,19 @@ class BatchedFits:
         x, v, gradients = solver.backward(adj_x, adj_v)
         return [(x[number], v[number], unstacked(gradients, number, self._places[number])) for number in given]
 
-    def _made(self) -> FrameSolver:
-        """A solver of all active lanes."""
+    def _made(self) -> FrameWindow:
+        """A window of all active lanes."""
         self._members, self._stale = list(self._active), False
         twins = [lane.twin for lane in self._members]
         pairs, self._places = union([twin.topology for twin in twins])
         self._springs = len(pairs)
-        first = twins[0].topology
+        size = len(twins[0].topology.nodes), len(twins[0].topology.controllers)
         simulations = [twin.simulation for twin in twins]
-        return FrameSolver(pairs, len(first.nodes), len(first.controllers), simulations, device=self._device)
+
+        def make() -> FrameSolver:
+            return FrameSolver(pairs, *size, simulations, device=self._device)
+
+        return FrameWindow(make, max(lane.frames for lane in self._members), self.frame_token)
 
 
 def run_batch(twins: Sequence[Twin], device: str, works: Sequence[Callable[[Lane], T]]) -> list[T | Exception]:

@@ -31,7 +31,7 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.physics import stability
 from neuspring.physics.controllers import Grips, waypoints
 from neuspring.physics.parameters import Parameters
-from neuspring.physics.solver import FrameSolver, simulate_frame, solver_for
+from neuspring.physics.solver import FrameWindow, simulate_frame, solver_for
 from neuspring.twin.batch import Lane
 from neuspring.twin.losses import FrameLoss, frames_seen
 from neuspring.twin.parameters import TwinParameters, median_gradient, movement, topology_spacing, watched
@@ -186,7 +186,7 @@ class TwinFit:
         self.gradients: list[float] | None = None
         """Where to put the median |gradient| of each step, if it is wanted."""
         self.twin = problem.twin
-        self._solver: FrameSolver | Lane | None = None
+        self._solver: FrameWindow | Lane | None = None
         self._overflow = 0
         self._known: tuple[stability.Spectrum, np.ndarray, np.ndarray] | None = None
         """The last spectrum that was computed, and for which stiffness and dashpots."""
@@ -196,10 +196,15 @@ class TwinFit:
         """Whether an epoch is a single optimizer step, so that its losses belong to the values before it."""
         return self.horizon >= self.fitted_end - 1
 
-    def solver(self) -> FrameSolver | Lane:
+    def solver(self) -> FrameWindow | Lane:
         """The solver for the current number of substeps, or the lane in a shared one."""
         if self._solver is None:
-            self._solver = self._lane.of_twin(self.twin) if self._lane else solver_for(self.twin, self.problem.device)
+            twin, device = self.twin, self.problem.device
+            self._solver = (
+                self._lane.of_twin(twin, self.horizon)
+                if self._lane
+                else FrameWindow(lambda: solver_for(twin, device), self.horizon)
+            )
         return self._solver
 
     @property

@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from neuspring.physics import reference
+from neuspring.physics import solver as solver_module
 from neuspring.physics.controllers import waypoints
 from neuspring.physics.parameters import PARAMETERS, pack
-from neuspring.physics.solver import FrameSolver, simulate_frame
+from neuspring.physics.solver import FrameSolver, FrameWindow, simulate_frame
 from tests.support.differences import EXACT, Arrays, assert_gradients, differences
 from tests.support.scenes import VARIANTS, packed, random_scene, solver_for, tensors, with_values
 
@@ -107,6 +108,42 @@ def test_recomputed_frames_equal_the_chain_of_single_frames() -> None:
         adj_x, adj_v, springs_ = adj[0], adj[1], springs_ + adj[2]["springs"]
     chain = {"x": adj_x.numpy(), "v": adj_v.numpy(), "stiffness": springs_[:, 0].numpy(), "dashpot": springs_[:, 2].numpy()}
     assert_gradients(got, chain, EXACT)
+
+
+@pytest.mark.parametrize(("frames", "again"), [(1, 4), (3, 2), (9, 0)])
+def test_a_window_gives_what_its_solver_gives_and_simulates_less(frames: int, again: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Five frames of which the last ones are held: the same numbers bit for bit; only what is no longer held is simulated again."""
+    body, x, v, hands = random_scene(26, self_collision=True, frames=5)
+    motion, simulated = torch.tensor(hands), []
+    forward = FrameSolver.forward
+    monkeypatch.setattr(FrameSolver, "forward", lambda self, *inputs: simulated.append(1) or forward(self, *inputs))
+
+    def gradient(solver: FrameSolver | FrameWindow) -> list[torch.Tensor]:
+        values = tensors(body)["stiffness"].requires_grad_(), torch.tensor(x).requires_grad_()
+        state = values[1], torch.tensor(v)
+        # Parameters differ from frame to frame: each has its own at its adjoint.
+        for k in range(5):
+            parameters = pack(**tensors(body) | {"stiffness": (1 + 0.1 * k) * values[0]}, substep=body.simulation.substep)
+            state = simulate_frame(solver, parameters, *state, motion[k], motion[k + 1])
+        return list(torch.autograd.grad(state[0].square().sum(), values))
+
+    expected = gradient(solver_for(body, hands.shape[1]))
+    simulated.clear()
+    got = gradient(FrameWindow(lambda: solver_for(body, hands.shape[1]), frames))
+    assert len(simulated) == 5 + again
+    assert all(torch.equal(one, other) for one, other in zip(got, expected, strict=True))
+
+
+def test_a_window_is_as_long_as_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    body, x, v, hands = random_scene(27, frames=4)
+    size = solver_for(body, hands.shape[1]).nbytes
+    monkeypatch.setattr(solver_module, "KEPT", 2 * size + size // 2)
+    window, motion = FrameWindow(lambda: solver_for(body, hands.shape[1]), 4, 7), torch.tensor(hands)
+    for k in range(4):
+        window.run(motion[k], motion[k + 1], torch.tensor(x), torch.tensor(v), packed(body))
+    assert [window.holding(token) is not None for token in range(7, 13)] == [False, False, False, True, True, False]
+    monkeypatch.setattr(solver_module, "KEPT", 1)
+    assert FrameWindow(lambda: solver_for(body, hands.shape[1]), 4).holding(0) is None
 
 
 def test_a_second_backward_gives_the_same() -> None:

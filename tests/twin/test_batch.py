@@ -13,8 +13,7 @@ import torch
 from neuspring import config
 from neuspring.core.errors import NumericalFailure
 from neuspring.physics.parameters import packed
-from neuspring.physics.solver import solver_for
-from neuspring.twin import fit as module
+from neuspring.physics.solver import FrameSolver, solver_for
 from neuspring.twin.batch import Lane, run_batch
 from neuspring.twin.fit import FitProblem, FitResult, fit
 from tests.support import small
@@ -60,8 +59,8 @@ def test_fits_in_a_batch_equal_those_alone() -> None:
 def test_fits_in_step_share_their_launches(monkeypatch: pytest.MonkeyPatch) -> None:
     """Three alike make as many frames as one, and each keeps what it computed: no frame is simulated again."""
     frames = []
-    original = module.FrameSolver.forward
-    monkeypatch.setattr(module.FrameSolver, "forward", lambda self, *a: frames.append(len(a[0])) or original(self, *a))
+    original = FrameSolver.forward
+    monkeypatch.setattr(FrameSolver, "forward", lambda self, *a: frames.append(len(a[0])) or original(self, *a))
     fit(small.fit_problem())
     alone = len(frames)
     frames.clear()
@@ -83,7 +82,7 @@ def test_an_error_in_the_shared_launch_reaches_everyone(monkeypatch: pytest.Monk
     def fail(*_: object) -> None:
         raise RuntimeError("no memory")
 
-    monkeypatch.setattr(module.FrameSolver, "forward", fail)
+    monkeypatch.setattr(FrameSolver, "forward", fail)
     results = in_a_batch(several()[:3])
     assert [str(result) for result in results] == ["no memory"] * 3
 

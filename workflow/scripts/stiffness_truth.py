@@ -3,15 +3,14 @@
     python -m workflow.scripts.stiffness_truth RESULTS OUT [--methods ...] [--pictures SCENARIO ...]
 
 A body of finite elements has a modulus per element (Young's modulus of a solid, membrane stiffness of a sheet), a twin a stiffness
-per spring. Around a node the twin has the geometric mean of its springs (`node_stiffness`), the truth the modulus of the nearest
-element in frame 0. OUT/stiffness.md has their correlation (Pearson, of logarithms) per method, mean over seeds and then over scenes,
-for scenes whose modulus is not the same everywhere; OUT/stiffness.csv a row per run, OUT/SCENARIO.png a picture of each, relative to
-the geometric mean over nodes.
+per spring. Around a node the twin has the geometric mean of its springs, the truth the modulus of the nearest element in frame 0.
+OUT/stiffness.md has the correlation of their logarithms, mean over seeds; OUT/stiffness.csv has a row per run, and OUT/SCENARIO.png
+shows both, relative to the geometric mean over nodes.
 """
 
 from __future__ import annotations
 
-from argparse import ArgumentParser
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -76,38 +75,46 @@ def picture(scenario: str, takes: Sequence[Prediction], scene: Scene) -> Figure:
     return figure
 
 
+def judged(home: Path, methods: Sequence[str]) -> tuple[list[tuple[str, int, float]], list[Prediction], Scene | None]:
+    """Of the runs of a scenario: (method, seed, correlation); the truth and a twin of each method at rest, and what shows them."""
+    truth, rows, takes, scene = Truth.load(truth_path(home / "capture")), [], dict[str, Prediction](), None
+    for path in (path for method in methods for path in sorted(home.glob(f"{method}/*/rollout.json"))):
+        run = RunFolder.of(path.parent)
+        if (twin := run.twin) is None:
+            continue
+        method, seed = run.folder.parts[-2:]
+        modulus, here = modulus_at(truth, twin.topology.nodes), twin.topology.nodes[None]
+        logs = np.log([modulus, node_stiffness(twin)])
+        known = (logs.std(axis=1) > LEAST_SPREAD).all()
+        rows.append((method, int(seed), float(np.corrcoef(logs)[0, 1]) if known else np.nan))
+        takes.setdefault("truth", Prediction("truth", here, relative(made_of(twin, modulus))))
+        takes.setdefault(method, Prediction(method, here, relative(twin)))
+        scene = scene or Scene.from_side(run.observations, list(takes.values()), [0])
+    return rows, list(takes.values()), scene
+
+
 def main() -> None:
     """Write the table, and a picture of each scene that is named."""
-    parser = ArgumentParser(description=__doc__)
+    parser = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
     parser.add_argument("results", type=Path)
     parser.add_argument("output", type=Path)
     parser.add_argument("--methods", nargs="+", default=METHODS)
     parser.add_argument("--pictures", nargs="*", default=[], metavar="SCENARIO")
     options = parser.parse_args()
     rows = []
-    for folder in sorted(options.results.glob("*/capture")):
-        home, truth = folder.parent, Truth.load(truth_path(folder))
-        scenario, takes = home.name.removeprefix("synthetic_"), dict[str, Prediction]()
-        runs = [RunFolder.of(path.parent) for method in options.methods for path in sorted(home.glob(f"{method}/*/rollout.json"))]
-        for run in runs:
-            if (twin := run.twin) is None:
-                continue
-            method, seed = run.folder.parts[-2:]
-            modulus, here = modulus_at(truth, twin.topology.nodes), twin.topology.nodes[None]
-            logs = np.log([modulus, node_stiffness(twin)])
-            rows.append((scenario, method, int(seed), np.corrcoef(logs)[0, 1] if (logs.std(axis=1) > LEAST_SPREAD).all() else np.nan))
-            takes.setdefault("truth", Prediction("truth", here, relative(made_of(twin, modulus))))
-            takes.setdefault(method, Prediction(method, here, relative(twin)))
-        if home.name in options.pictures and takes:
-            scene = Scene.from_side(runs[0].observations, list(takes.values()), [0])
-            save(picture(scenario, list(takes.values()), scene), options.output / f"{scenario}.png")
+    for folder in sorted(options.results.glob("*/capture_truth.npz")):
+        name = folder.parent.name.removeprefix("synthetic_")
+        found, takes, scene = judged(folder.parent, options.methods)
+        rows += [(name, *row) for row in found]
+        if scene and folder.parent.name in options.pictures:
+            save(picture(name, takes, scene), options.output / f"{name}.png")
     table = pd.DataFrame(rows, columns=["scenario", "method", "seed", "correlation"]).dropna()
     write_text(options.output / "stiffness.csv", table.to_csv(index=False, float_format="%.4f"))
-    wide = table.pivot_table(index="scenario", columns="method", values="correlation")[
-        [method for method in options.methods if method in set(table["method"])]
-    ]
+    wide = table.pivot_table(index="scenario", columns="method", values="correlation")
+    wide = wide[[method for method in options.methods if method in wide]]
     wide.loc["mean over scenes"] = wide.mean()
-    lines = Table.of_texts(["scene", *wide.columns], [[name, *(f"{r:.2f}" for r in row)] for name, row in wide.iterrows()]).markdown()
+    cells = [[str(name), *(f"{r:.2f}" for r in row)] for name, row in wide.iterrows()]
+    lines = Table.of_texts(["scene", *wide.columns], cells).markdown()
     write_text(options.output / "stiffness.md", "\n".join(["# Stiffness beside the truth", "", NOTE, "", *lines, ""]))
 
 

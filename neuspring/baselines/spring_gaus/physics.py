@@ -288,6 +288,10 @@ class AnchorSolver:
         self.frame_token = 0
         """Number of the frame whose substeps are in the buffers."""
 
+    def holding(self, token: int) -> Any:
+        """This solver, if the substeps of that frame are in the buffers."""
+        return self if token == self.frame_token else None
+
     def _allocate(self, name: str, shape: tuple[int, ...], kind: Any) -> Any:
         self._buffers[name] = torch.zeros(shape, dtype=self.dtype, device=self.device)
         return wp.from_torch(self._buffers[name], dtype=kind)
