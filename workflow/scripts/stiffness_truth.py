@@ -36,7 +36,7 @@ METHODS = ["search_only", "baseline_ten_frames", "model_b", "shuffled", "neuspri
 NOTE = "Correlation of log stiffness around each node with the log modulus that the body was made of, mean over seeds."
 LEAST_SPREAD = 1e-6
 """Standard deviation of logarithms below which everything is equal."""
-LIMITS = (0.1, 10.0)
+LIMITS = (0.2, 5.0)
 """Range of colors: stiffness over its geometric mean."""
 
 
@@ -69,7 +69,16 @@ def picture(scenario: str, takes: Sequence[Prediction], scene: Scene) -> Figure:
         TwinPicture([(scene, take)], 0, ("stiffness",), limits=LIMITS).paint(axis, scene, take, "stiffness")
         axis.set_title(take.label, fontsize=9)
     label = "stiffness / its geometric mean"
-    bar = figure.colorbar(ScalarMappable(LogNorm(*LIMITS), COLORS), ax=axes, label=label, location="bottom", aspect=60, shrink=0.5)
+    bar = figure.colorbar(
+        ScalarMappable(LogNorm(*LIMITS), COLORS),
+        ax=axes,
+        label=label,
+        location="bottom",
+        aspect=60,
+        shrink=0.5,
+        ticks=[0.2, 0.5, 1, 2, 5],
+        format="{x:g}",
+    )
     bar.ax.tick_params(labelsize=8)
     figure.suptitle(scenario, fontsize=10)
     return figure
