@@ -67,6 +67,7 @@ def fit(
         "earlier_processor_seconds": round(result.earlier_processor_seconds, 3),
         "rollbacks": result.rollbacks,
         "collision_overflow": result.collision_overflow,
+        "frames_left_out": result.frames_left_out,
         **result.figures,
         "spring_updates": frames * counts["springs"] * counts["substeps"],
         **counts,

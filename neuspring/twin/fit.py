@@ -31,7 +31,7 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.physics import stability
 from neuspring.physics.controllers import Grips, waypoints
 from neuspring.physics.parameters import Parameters
-from neuspring.physics.solver import FrameWindow, simulate_frame, solver_for
+from neuspring.physics.solver import AdjointLimit, FrameWindow, simulate_frame, solver_for
 from neuspring.twin.batch import Lane
 from neuspring.twin.losses import FrameLoss, frames_seen
 from neuspring.twin.parameters import TwinParameters, median_gradient, movement, topology_spacing, watched
@@ -112,6 +112,8 @@ class FitResult:
     earlier_processor_seconds: float
     """Processor time of the same; of what ran together with other fits, this one's share."""
     collision_overflow: int
+    frames_left_out: int
+    """Frames that were left out of gradients (`AdjointLimit`), over all epochs."""
     epochs_together: int
     """Epochs that ran together with those of other fits."""
     figures: dict[str, Any]
@@ -177,6 +179,9 @@ class TwinFit:
             raise InputError("fit.selection", "a held-back tail needs at least two training frames after frame 0", end - 1)
         self.fitted_end = tail_start(end, settings.tail_fraction) if settings.selection == "tail" else end
         self.horizon = settings.horizon or self.fitted_end - 1
+        self.limit = None
+        if settings.adjoint_limit is not None and self.horizon > 1:
+            self.limit = AdjointLimit(settings.adjoint_limit, problem.twin.simulation.frame_time)
         self.rest = torch.tensor(problem.twin.topology.nodes, device=problem.device)
         velocity = initial_velocity(observations, problem.twin.simulation.initial_velocity)
         self.velocity = torch.tensor(velocity, dtype=torch.float32, device=problem.device)
@@ -213,6 +218,13 @@ class TwinFit:
         if self._lane:
             return self._lane.collision_overflow
         return self._overflow + (self._solver.collision_overflow if self._solver is not None else 0)
+
+    def take_left_out(self) -> int:
+        """Frames that were left out of gradients since the last call."""
+        if self.limit is None:
+            return 0
+        count, self.limit.left_out = self.limit.left_out, 0
+        return count
 
     def use_substeps(self, count: int) -> None:
         """Integrate with `count` substeps per frame from now on."""
@@ -311,7 +323,8 @@ class TwinFit:
         lengths = self.grips.taken(lengths, x, self.hands[frame - 1])
         if lengths is not None:
             packed = packed | {"springs": self.grips.applied(packed["springs"], lengths)}
-        return *simulate_frame(self.solver(), packed, x, v, self.hands[frame - 1], self.hands[frame]), lengths
+        x, v = simulate_frame(self.solver(), packed, x, v, self.hands[frame - 1], self.hands[frame], self.limit)
+        return x, v, lengths
 
     def _simulate(self, state: _Motion, window: range, packed: Parameters) -> tuple[_Motion, torch.Tensor]:
         """State after the frames of `window`, and their mean loss."""
@@ -382,6 +395,10 @@ class PooledFit(TwinFit):
     def collision_overflow(self) -> int:
         """The sum over all recordings."""
         return sum(member.collision_overflow for member in self._members)
+
+    def take_left_out(self) -> int:
+        """The sum over all recordings."""
+        return sum(member.take_left_out() for member in self._members)
 
     def use_substeps(self, count: int) -> None:
         """Integrate all recordings with `count` substeps per frame from now on."""
@@ -459,6 +476,7 @@ def fit(
         loop.earlier_seconds,
         loop.earlier_processor_seconds,
         state.overflow,
+        sum(row["frames_left_out"] for row in loop.history),
         loop.epochs_together,
         run.figures(state),
     )
@@ -515,6 +533,7 @@ def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> di
         run.use_substeps(state.substeps)
         run.restore(state.values, state.moments)
         row["rolled_back"] = True
+    row["frames_left_out"] = run.take_left_out()
     return row
 
 

@@ -10,9 +10,9 @@ from neuspring.physics import reference
 from neuspring.physics import solver as solver_module
 from neuspring.physics.controllers import waypoints
 from neuspring.physics.parameters import PARAMETERS, pack
-from neuspring.physics.solver import FrameSolver, FrameWindow, simulate_frame
+from neuspring.physics.solver import AdjointLimit, FrameSolver, FrameWindow, simulate_frame
 from tests.support.differences import EXACT, Arrays, assert_gradients, differences
-from tests.support.scenes import VARIANTS, packed, random_scene, solver_for, tensors, with_values
+from tests.support.scenes import VARIANTS, packed, random_scene, scene, solver_for, tensors, with_values
 
 FRAMES = 1e-5
 """Relative to the largest entry of the gradient compared, over one to three frames of 10 substeps."""
@@ -144,6 +144,64 @@ def test_a_window_is_as_long_as_its_memory(monkeypatch: pytest.MonkeyPatch) -> N
     assert [window.holding(token) is not None for token in range(7, 13)] == [False, False, False, True, True, False]
     monkeypatch.setattr(solver_module, "KEPT", 1)
     assert FrameWindow(lambda: solver_for(body, hands.shape[1]), 4).holding(0) is None
+
+
+def resting_block(substeps: int) -> tuple[reference.Scene, np.ndarray]:
+    """(scene, x): a block of 6 x 2 x 2 nodes, 2 cm apart, a tenth of a millimeter above an elastic ground."""
+    x = 0.02 * np.stack(np.meshgrid(np.arange(6), np.arange(2), np.arange(2), indexing="ij"), axis=-1).reshape(-1, 3)
+    x[:, 2] += 1e-4
+    apart = np.linalg.norm(x[:, None] - x, axis=2)
+    pairs = np.argwhere(np.triu((apart > 0) & (apart < 0.036)))
+    body = scene(
+        len(x), pairs, apart[tuple(pairs.T)], stiffness=np.full(len(pairs), 5e4), dashpot=np.full(len(pairs), 1.0), drag=5.0,
+        ground=(0.8, 0.4), frame_time=1 / 30, substeps=substeps, gravity=9.8, on_ground=True,
+    )  # fmt: skip
+    return body, x
+
+
+def resting_gradient(substeps: int, frames: int, limit: AdjointLimit | None) -> tuple[float, float]:
+    """(largest entry of dL/dx0, largest way of a node, m) with L = sum |x - 1|^2 at the end of each frame."""
+    body, x = resting_block(substeps)
+    start, none = torch.tensor(x).requires_grad_(), torch.zeros((0, 3), dtype=torch.float64)
+    state, total = (start, torch.zeros_like(start)), start.sum() * 0
+    window = FrameWindow(lambda: solver_for(body, 0), frames)
+    for _ in range(frames):
+        state = simulate_frame(window, packed(body), *state, none, none, limit)
+        total = total + (state[0] - 1).square().sum()
+    (gradient,) = torch.autograd.grad(total, start)
+    return float(gradient.abs().max()), float((state[0] - start).detach().abs().max())
+
+
+def test_adjoints_grow_without_bound_through_a_resting_body_and_the_limit_leaves_such_frames_out() -> None:
+    """The exact gradient at the stability bound's margin of 0.8 is useless; smaller steps or the limit are a remedy."""
+    exact, way = resting_gradient(80, 4, None)
+    assert exact > 1e8
+    assert way < 2e-4, "the motion itself is calm: it falls by a tenth of a millimeter and rests"
+    limit = AdjointLimit(10.0, 1 / 30)
+    assert resting_gradient(80, 4, limit) == (0.0, way)
+    assert limit.left_out == 4
+    limit = AdjointLimit(1e3, 1 / 30)
+    calm, _ = resting_gradient(160, 4, limit)
+    assert (calm, 0) == (resting_gradient(160, 4, None)[0], limit.left_out)
+    assert calm < 1e5
+
+
+def test_a_frame_that_is_left_out_ends_the_gradient_and_earlier_frames_keep_theirs() -> None:
+    """Frame 2 is left out: what remains is the gradient of frame 1's own loss."""
+    body, x, v, hands = random_scene(26, frames=2)
+    solver, motion = solver_for(body, hands.shape[1]), torch.tensor(hands)
+
+    def gradient(factor: float, *weights: float) -> tuple[torch.Tensor, int]:
+        start, limit = torch.tensor(x).requires_grad_(), AdjointLimit(factor, body.simulation.frame_time)
+        first = simulate_frame(solver, packed(body), start, torch.tensor(v), motion[0], motion[1], AdjointLimit(1e30, 1.0))
+        second = simulate_frame(solver, packed(body), *first, motion[1], motion[2], limit)
+        loss = sum(weight * state[0].square().sum() for weight, state in zip(weights, (first, second), strict=True))
+        return torch.autograd.grad(loss, start)[0], limit.left_out
+
+    (cut, count), (alone, _), (whole, none) = gradient(1e-9, 1.0, 1.0), gradient(1e30, 1.0, 0.0), gradient(1e30, 1.0, 1.0)
+    assert (count, none) == (1, 0)
+    torch.testing.assert_close(cut, alone, rtol=EXACT, atol=0)
+    assert not torch.allclose(whole, alone)
 
 
 def test_a_second_backward_gives_the_same() -> None:

@@ -154,9 +154,20 @@ def test_a_non_finite_gradient_rolls_back_and_is_reported(monkeypatch):
 
 @pytest.mark.parametrize("settings", [{}, {"selection": "tail"}, {"selection": "tail", "horizon": 0}], ids=str)
 def test_a_fit_that_never_completes_an_epoch_is_a_named_failure(monkeypatch, settings):
-    monkeypatch.setattr(module, "simulate_frame", lambda s, p, x, v, b, e: (x * float("nan"), v))
+    monkeypatch.setattr(module, "simulate_frame", lambda solver, values, x, v, *_: (x * float("nan"), v))
     with pytest.raises(NumericalFailure, match=r"no epoch could be completed: epoch 0: the loss is not finite"):
         fit(small.fit_problem(fit=config.Fit(epochs=10, **settings)))
+
+
+@pytest.mark.parametrize(("limit", "horizon", "left_out"), [(1e-9, 0, 12), (1e-9, 1, 0), (1e9, 0, 0), (None, 0, 0)])
+def test_frames_beyond_the_limit_of_adjoints_are_left_out_and_counted(limit, horizon, left_out):
+    """Three epochs of four frames. A single frame per step is the released method, which has no limit."""
+    settings = {"epochs": 3, "learning_rate": 0.05, "horizon": horizon}
+    problem = small.fit_problem(fit=config.Fit(**settings, adjoint_limit=limit))
+    result = fit(problem)
+    assert result.frames_left_out == left_out
+    moved = np.any(result.twin.material.stiffness != problem.twin.material.stiffness)
+    assert moved == (left_out == 0)
 
 
 def test_a_dashpot_beyond_all_numbers_is_rolled_back_not_a_crash():
