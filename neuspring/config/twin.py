@@ -81,9 +81,9 @@ class Fit(Section):
     a fit does not depend on the unit of length. meter: m^2, as released. Losses are recorded in m^2 always."""
     horizon: Annotated[int, Field(ge=0)] = 1
     """Frames per optimizer step, with the gradient through all of them; 0: all training frames."""
-    adjoint_limit: Positive | None = 10.0
-    """Of several frames per step: one through which the adjoint of the state grows by more than this factor is left out of the
-    gradient, and counted in the record. null: none is."""
+    adjoint_limit: Positive | None = 100.0
+    """Of several frames per step: the gradient ends at a frame through which the adjoint of the state grows beyond this many times
+    what the losses behind it have added. The record counts such frames. null: none."""
     output_bound: NonNegative = 0.0
     """Bound b of the change per spring: stiffness stays within exp(+-b) of the searched value, by b tanh(x / b).
     Common factors come on top. 0: no bound."""

@@ -316,27 +316,36 @@ class FrameWindow:
 
 
 class AdjointLimit:
-    """Leaves a frame out of a gradient if adjoints grow through it by more than `factor`, and counts such frames.
+    """For one backward pass through chained frames: leaves out those through which adjoints outgrow the losses, and counts them.
 
-    The size of an adjoint is sqrt(|dL/dx|^2 + |dL/dv|^2 / T^2), where T is the frame's time, s. A body that rests on the ground
-    bounces on it by micrometers. Each reflection turns a disturbance of one node around and not that of its neighbors, and springs
-    answer to the difference: a disturbance grows a millionfold in a frame, though the motion is smooth. Such a gradient says
-    nothing about parameters, and Adam hardly moves for hundreds of steps after it.
+    The size of an adjoint is sqrt(|dL/dx|^2 + |dL/dv|^2 / T^2), where T is the frame's time, s. A frame is left out if that at its
+    begin is more than `factor` times the sum of |dL/dx| that the losses behind it have added. What lies before it then has the
+    gradient of its own losses.
+
+    A body that rests on the ground bounces on it by micrometers. Each reflection turns a disturbance of one node around and not
+    that of its neighbors, and springs answer to the difference: a disturbance grows a millionfold in a frame, though the motion is
+    smooth. Such a gradient says nothing about parameters, and Adam hardly moves for hundreds of steps after it.
     """
 
     def __init__(self, factor: float, frame_time: float) -> None:
         self.factor, self.frame_time = factor, frame_time
         self.left_out = 0
+        self._added = 0.0
+        self._carried: torch.Tensor | None = None
+        """dL/dx at the begin of the frame that came last."""
 
     def passes(self, after: Sequence[torch.Tensor], before: Sequence[torch.Tensor]) -> bool:
-        """Whether (dL/dx, dL/dv) at a frame's begin, `before`, are small enough for those at its end, `after`."""
-        held = self._size(before) <= self.factor * self._size(after)
-        self.left_out += not held
-        return held
+        """Whether a frame stays, given (dL/dx, dL/dv) at its end, `after`, and at its begin, `before`; frames come last first."""
+        (end, _), (x, v) = after, before
+        self._added += _norm(end if self._carried is None else end - self._carried)
+        stays = math.hypot(_norm(x), _norm(v) / self.frame_time) <= self.factor * self._added
+        self._carried = x if stays else None
+        self.left_out += not stays
+        return stays
 
-    def _size(self, adjoint: Sequence[torch.Tensor]) -> float:
-        x, v = (float(torch.linalg.vector_norm(each, dtype=torch.float64)) for each in adjoint)
-        return math.hypot(x, v / self.frame_time)
+
+def _norm(values: torch.Tensor) -> float:
+    return float(torch.linalg.vector_norm(values, dtype=torch.float64))
 
 
 class Frame(torch.autograd.Function):

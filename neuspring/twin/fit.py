@@ -179,9 +179,8 @@ class TwinFit:
             raise InputError("fit.selection", "a held-back tail needs at least two training frames after frame 0", end - 1)
         self.fitted_end = tail_start(end, settings.tail_fraction) if settings.selection == "tail" else end
         self.horizon = settings.horizon or self.fitted_end - 1
-        self.limit = None
-        if settings.adjoint_limit is not None and self.horizon > 1:
-            self.limit = AdjointLimit(settings.adjoint_limit, problem.twin.simulation.frame_time)
+        self.left_out = 0
+        """Frames that were left out of gradients since `take_left_out`."""
         self.rest = torch.tensor(problem.twin.topology.nodes, device=problem.device)
         velocity = initial_velocity(observations, problem.twin.simulation.initial_velocity)
         self.velocity = torch.tensor(velocity, dtype=torch.float32, device=problem.device)
@@ -221,9 +220,7 @@ class TwinFit:
 
     def take_left_out(self) -> int:
         """Frames that were left out of gradients since the last call."""
-        if self.limit is None:
-            return 0
-        count, self.limit.left_out = self.limit.left_out, 0
+        count, self.left_out = self.left_out, 0
         return count
 
     def use_substeps(self, count: int) -> None:
@@ -290,12 +287,15 @@ class TwinFit:
             window = range(start, min(start + self.horizon, self.fitted_end))
             self.optimizer.zero_grad(set_to_none=True)
             packed = self.stable_parameters()
-            state, mean = self._simulate(state, window, packed)
+            limit = self._limit()
+            state, mean = self._simulate(state, window, packed, limit)
             if not bool(torch.isfinite(mean)):
                 raise NonFinite(f"the loss is not finite in frames {window.start} to {window.stop - 1}")
             objective = self.loss_scale * mean + self.parameters.penalty()
             if objective.requires_grad:
                 objective.backward()  # type: ignore[no-untyped-call]
+            if limit is not None:
+                self.left_out += limit.left_out
             total += float(mean.detach()) * len(window)
             x, v, lengths = state
             state = (x.detach(), v.detach(), None if lengths is None else lengths.detach())
@@ -317,20 +317,27 @@ class TwinFit:
             raise NonFinite("the loss of the held-back frames is not finite")
         return loss
 
-    def _frame(self, state: _Motion, frame: int, packed: Parameters) -> _Motion:
+    def _limit(self) -> AdjointLimit | None:
+        """The limit of a window's gradient; none where a window is one frame, as released."""
+        factor = self.problem.fit.adjoint_limit
+        return AdjointLimit(factor, self.twin.simulation.frame_time) if factor is not None and self.horizon > 1 else None
+
+    def _frame(self, state: _Motion, frame: int, packed: Parameters, limit: AdjointLimit | None = None) -> _Motion:
         """State at the end of a frame."""
         x, v, lengths = state
         lengths = self.grips.taken(lengths, x, self.hands[frame - 1])
         if lengths is not None:
             packed = packed | {"springs": self.grips.applied(packed["springs"], lengths)}
-        x, v = simulate_frame(self.solver(), packed, x, v, self.hands[frame - 1], self.hands[frame], self.limit)
+        x, v = simulate_frame(self.solver(), packed, x, v, self.hands[frame - 1], self.hands[frame], limit)
         return x, v, lengths
 
-    def _simulate(self, state: _Motion, window: range, packed: Parameters) -> tuple[_Motion, torch.Tensor]:
+    def _simulate(
+        self, state: _Motion, window: range, packed: Parameters, limit: AdjointLimit | None = None
+    ) -> tuple[_Motion, torch.Tensor]:
         """State after the frames of `window`, and their mean loss."""
         losses = []
         for frame in window:
-            state = self._frame(state, frame, packed)
+            state = self._frame(state, frame, packed, limit)
             losses.append(self.loss(frame, state[0]))
         return state, torch.stack(losses).mean()
 

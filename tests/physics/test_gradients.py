@@ -177,7 +177,7 @@ def test_adjoints_grow_without_bound_through_a_resting_body_and_the_limit_leaves
     exact, way = resting_gradient(80, 4, None)
     assert exact > 1e8
     assert way < 2e-4, "the motion itself is calm: it falls by a tenth of a millimeter and rests"
-    limit = AdjointLimit(10.0, 1 / 30)
+    limit = AdjointLimit(100.0, 1 / 30)
     assert resting_gradient(80, 4, limit) == (0.0, way)
     assert limit.left_out == 4
     limit = AdjointLimit(1e3, 1 / 30)
