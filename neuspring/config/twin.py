@@ -83,7 +83,7 @@ class Fit(Section):
     """Frames per optimizer step, with the gradient through all of them; 0: all training frames."""
     adjoint_limit: Positive | None = 100.0
     """Of several frames per step: the gradient ends at a frame through which the adjoint of the state grows beyond this many times
-    what the losses behind it have added. The record counts such frames. null: none."""
+    what the losses behind it have added. The record has the share of such frames. null: none."""
     output_bound: NonNegative = 0.0
     """Bound b of the change per spring: stiffness stays within exp(+-b) of the searched value, by b tanh(x / b).
     Common factors come on top. 0: no bound."""

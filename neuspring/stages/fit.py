@@ -67,7 +67,7 @@ def fit(
         "earlier_processor_seconds": round(result.earlier_processor_seconds, 3),
         "rollbacks": result.rollbacks,
         "collision_overflow": result.collision_overflow,
-        "frames_left_out": result.frames_left_out,
+        "frames_left_out": round(result.frames_left_out / (len(result.history) * per_epoch), 4),
         **result.figures,
         "spring_updates": frames * counts["springs"] * counts["substeps"],
         **counts,

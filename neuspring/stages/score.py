@@ -20,6 +20,8 @@ PICTURE_ROLES = ("strip", "video", "turntable")
 PICTURE_FACTS = ("backend", "masks", "views", "lpips", "quirks", "unseen_surface")
 """What a reader of image scores must know."""
 
+MANY_LEFT_OUT = 0.05
+"""Of the frames of all epochs; with a larger share left out, gradients say little about long motions."""
 FEW_TEXELS = 0.05
 """A share of texels that moved below this says that the settings were in training's way."""
 
@@ -162,6 +164,8 @@ def _notes(records: Mapping[str, StageRecord]) -> list[str]:
             notes.append(
                 f"{name}: {record.facts['at_bound']:.0%} of the springs lie at the bound of their stiffness (fit.output_bound)"
             )
+        if record.facts.get("frames_left_out", 0.0) > MANY_LEFT_OUT:
+            notes.append(f"{name}: {record.facts['frames_left_out']:.0%} of the frames left out of gradients (fit.adjoint_limit)")
         if record.facts.get("texels_moved", 1.0) < FEW_TEXELS:
             notes.append(f"{name}: only {record.facts['texels_moved']:.1%} of the texels moved by a tenth of their first scale")
     return notes

@@ -177,15 +177,16 @@ def test_regions_and_a_field_pass_through_every_stage(tmp_path):
 
 
 def test_a_fit_that_its_settings_held_says_so_in_the_notes():
-    facts = {"at_bound": 0.25, "texels_moved": 0.0125}
+    facts = {"at_bound": 0.25, "texels_moved": 0.0125, "frames_left_out": 0.2}
     settings = {"fit": {"epochs": 2}}
     held = StageRecord(stage="fit", status="ok", facts=facts, settings=settings)
     notes = _notes({"rollout": StageRecord(stage="rollout", status="ok"), "fit": held})
     assert notes == [
         "fit: 25% of the springs lie at the bound of their stiffness (fit.output_bound)",
+        "fit: 20% of the frames left out of gradients (fit.adjoint_limit)",
         "fit: only 1.2% of the texels moved by a tenth of their first scale",
     ]
-    free = StageRecord(stage="fit", status="ok", facts={"at_bound": 0.05, "texels_moved": 0.05}, settings=settings)
+    free = StageRecord(stage="fit", status="ok", facts={"at_bound": 0.05, "texels_moved": 0.05, "frames_left_out": 0.05}, settings=settings)
     assert _notes({"rollout": StageRecord(stage="rollout", status="ok"), "fit": free}) == []
 
 
