@@ -1,9 +1,9 @@
 """First-order stage: springs, or a neural spring field, by Adam with gradients through the simulation.
 
 An epoch is one pass over the training frames from rest. Every `horizon` frames (1 as released, 0 for the whole training span) one
-optimizer step is made with the gradient through those frames; the state is detached there and goes on while parameters change. The
-best epoch is the one with the lowest training loss, or the lowest loss of a held-back tail of the training frames, to which the
-start counts too. Test frames are never read, but by an oracle (`FitProblem.oracle`). A non-finite loss or gradient restores the
+optimizer step is made with the gradient through those frames, as far back as `solver.AdjointLimit` lets it; the state is detached
+there and goes on while parameters change. The best epoch is the one with the lowest training loss, or the lowest loss of a
+held-back tail of the training frames, to which the start counts too. Test frames are never read, but by an oracle (`FitProblem.oracle`). A non-finite loss or gradient restores the
 parameters of the epoch's start, halves the learning rates and is reported.
 
 What is differentiated is the loss in squared node spacings (`loss_unit`), so a fit does not depend on the unit of length; what
@@ -113,7 +113,7 @@ class FitResult:
     """Processor time of the same; of what ran together with other fits, this one's share."""
     collision_overflow: int
     frames_left_out: int
-    """Frames that were left out of gradients (`AdjointLimit`), over all epochs."""
+    """Frames that were left out of gradients (`AdjointLimit`), over all epochs that were not rolled back."""
     epochs_together: int
     """Epochs that ran together with those of other fits."""
     figures: dict[str, Any]
@@ -179,8 +179,6 @@ class TwinFit:
             raise InputError("fit.selection", "a held-back tail needs at least two training frames after frame 0", end - 1)
         self.fitted_end = tail_start(end, settings.tail_fraction) if settings.selection == "tail" else end
         self.horizon = settings.horizon or self.fitted_end - 1
-        self.left_out = 0
-        """Frames that were left out of gradients since `take_left_out`."""
         self.rest = torch.tensor(problem.twin.topology.nodes, device=problem.device)
         velocity = initial_velocity(observations, problem.twin.simulation.initial_velocity)
         self.velocity = torch.tensor(velocity, dtype=torch.float32, device=problem.device)
@@ -217,11 +215,6 @@ class TwinFit:
         if self._lane:
             return self._lane.collision_overflow
         return self._overflow + (self._solver.collision_overflow if self._solver is not None else 0)
-
-    def take_left_out(self) -> int:
-        """Frames that were left out of gradients since the last call."""
-        count, self.left_out = self.left_out, 0
-        return count
 
     def use_substeps(self, count: int) -> None:
         """Integrate with `count` substeps per frame from now on."""
@@ -278,11 +271,11 @@ class TwinFit:
     def epoch(self) -> dict[str, float]:
         """One pass over the frames that are trained on; raises NonFinite.
 
-        Returns `loss`, the mean frame loss while parameters change, m^2; `gradient_norm`, the largest of any step; and, if
-        frames are held back and the epoch is one step, their `tail_loss` before it.
+        Returns `loss`, the mean frame loss while parameters change, m^2; `gradient_norm`, the largest of any step;
+        `frames_left_out` of gradients; and, if frames are held back and the epoch is one step, their `tail_loss` before it.
         """
         state: _Motion = (self.rest, self.velocity, None)
-        total, largest, row = 0.0, 0.0, {}
+        total, largest, left_out, row = 0.0, 0.0, 0, {}
         for start in range(1, self.fitted_end, self.horizon):
             window = range(start, min(start + self.horizon, self.fitted_end))
             self.optimizer.zero_grad(set_to_none=True)
@@ -295,7 +288,7 @@ class TwinFit:
             if objective.requires_grad:
                 objective.backward()  # type: ignore[no-untyped-call]
             if limit is not None:
-                self.left_out += limit.left_out
+                left_out += limit.left_out
             total += float(mean.detach()) * len(window)
             x, v, lengths = state
             state = (x.detach(), v.detach(), None if lengths is None else lengths.detach())
@@ -303,7 +296,7 @@ class TwinFit:
                 with torch.no_grad():
                     row["tail_loss"] = float(self._simulate(state, range(self.fitted_end, len(self.hands)), packed)[1])
             largest = max(largest, self._step(window))
-        return row | {"loss": total / (self.fitted_end - 1), "gradient_norm": largest}
+        return row | {"loss": total / (self.fitted_end - 1), "gradient_norm": largest, "frames_left_out": left_out}
 
     def tail_loss(self) -> float:
         """Mean loss of the held-back frames, m^2, in a rollout from rest with the present values. Raises NonFinite."""
@@ -403,10 +396,6 @@ class PooledFit(TwinFit):
         """The sum over all recordings."""
         return sum(member.collision_overflow for member in self._members)
 
-    def take_left_out(self) -> int:
-        """The sum over all recordings."""
-        return sum(member.take_left_out() for member in self._members)
-
     def use_substeps(self, count: int) -> None:
         """Integrate all recordings with `count` substeps per frame from now on."""
         super().use_substeps(count)
@@ -423,13 +412,17 @@ class PooledFit(TwinFit):
         return self.parameters.pack(self.twin.simulation.substep)
 
     def epoch(self) -> dict[str, float]:
-        """One pass over each recording; raises NonFinite. Means over the recordings, and the largest gradient of any step."""
+        """As for one recording, each in turn: the mean loss, the largest gradient of any step, all frames left out."""
         for member in self._members:
             member.gradients = self.gradients
         rows = [member.epoch() for member in self._members]
         if len(rows) == 1:
             return rows[0]
-        return {"loss": sum(row["loss"] for row in rows) / len(rows), "gradient_norm": max(row["gradient_norm"] for row in rows)}
+        return {
+            "loss": sum(row["loss"] for row in rows) / len(rows),
+            "gradient_norm": max(row["gradient_norm"] for row in rows),
+            "frames_left_out": sum(row["frames_left_out"] for row in rows),
+        }
 
     def tail_loss(self) -> float:
         """Mean loss of the held-back frames of all recordings, m^2. Raises NonFinite."""
@@ -512,6 +505,7 @@ def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> di
     Accepted values can always be integrated with `state.substeps`.
     """
     row: dict[str, Any] = {"epoch": epoch, "rolled_back": False, "loss": None, "tail_loss": None, "gradient_norm": None}
+    row["frames_left_out"] = 0
     run.set_rate(state.rate)
     row["learning_rate"] = run.optimizer.param_groups[0]["lr"]
     try:
@@ -540,7 +534,6 @@ def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> di
         run.use_substeps(state.substeps)
         run.restore(state.values, state.moments)
         row["rolled_back"] = True
-    row["frames_left_out"] = run.take_left_out()
     return row
 
 

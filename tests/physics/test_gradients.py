@@ -163,6 +163,7 @@ def resting_gradient(substeps: int, frames: int, limit: AdjointLimit | None) -> 
     """(largest entry of dL/dx0, largest way of a node, m) with L = sum |x - 1|^2 at the end of each frame."""
     body, x = resting_block(substeps)
     start, none = torch.tensor(x).requires_grad_(), torch.zeros((0, 3), dtype=torch.float64)
+    # The sum has a gradient, which is zero, even where all frames are left out.
     state, total = (start, torch.zeros_like(start)), start.sum() * 0
     window = FrameWindow(lambda: solver_for(body, 0), frames)
     for _ in range(frames):
