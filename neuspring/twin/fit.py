@@ -3,8 +3,9 @@
 An epoch is one pass over the training frames from rest. Every `horizon` frames (1 as released, 0 for the whole training span) one
 optimizer step is made with the gradient through those frames, as far back as `solver.AdjointLimit` lets it; the state is detached
 there and goes on while parameters change. The best epoch is the one with the lowest training loss, or the lowest loss of a
-held-back tail of the training frames, to which the start counts too. Test frames are never read, but by an oracle (`FitProblem.oracle`). A non-finite loss or gradient restores the
-parameters of the epoch's start, halves the learning rates and is reported.
+held-back tail of the training frames, to which the start counts too. Test frames are never read, but by an oracle
+(`FitProblem.oracle`). A non-finite loss or gradient restores the parameters of the epoch's start, halves the learning rates and is
+reported.
 
 What is differentiated is the loss in squared node spacings (`loss_unit`), so a fit does not depend on the unit of length; what
 is recorded is in m^2.
