@@ -45,15 +45,16 @@ def load_run(folder: Path | str) -> RunFolder:
 
 
 def roll_out(twin: Twin, hands: Observations | np.ndarray, device: str = "auto") -> Trajectory:
-    """Simulate a twin from frame 0 under hands that move: positions [T, N, 3], m.
+    """Simulate a twin from frame 0 under hands that move, as the workflow does: positions [T, N, 3], m.
 
     `hands` are observations, or the position of every controller in every frame [T, C, 3], m, the first as in the twin. A
     rollout that diverges is a result: its `diverged_frame` and `reason` say so. Raises InputError for another shape.
     """
     from neuspring.core.device import resolve_device
+    from neuspring.physics.stability import for_prediction
     from neuspring.twin import rollout
 
-    device = resolve_device(device)
+    device, twin = resolve_device(device), for_prediction(twin)
     if isinstance(hands, Observations):
         velocity = rollout.initial_velocity(hands, twin.simulation.initial_velocity)
         return rollout.roll_out(twin, hands.controller_points, device, velocity=velocity, valid=hands.controller_valid)

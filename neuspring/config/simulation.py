@@ -17,7 +17,7 @@ class Simulation(Section):
     substeps: Count | Literal["auto"] = "auto"
     """Integration steps per frame; `auto` takes the smallest count that the stability bound allows."""
     safety: Annotated[float, Field(gt=0, le=0.95)] = 0.8
-    """Fraction of the stability bound that `auto` uses."""
+    """Fraction of the stability bound that `auto` uses. Predictions of a body that can meet itself use at most 0.4."""
     max_substeps: Count = 2000
     """Upper limit of `auto`; the search penalizes a candidate that would need more."""
     gravity: Finite = 9.8

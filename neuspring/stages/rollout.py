@@ -11,14 +11,18 @@ from neuspring.stages.stage import Written, stage
 def rollout(observations: Observations, learned: Before, run: Recorder, device: str = "auto") -> Written:
     """Twin -> trajectory over all frames, trajectory.npz. A rollout that diverges is recorded as a failure.
 
-    `learned` is the search.json or fit.json that names the twin. A twin that saw the future is called `oracle`.
+    `learned` is the search.json or fit.json that names the twin. A twin that saw the future is called `oracle`. A body that can
+    meet itself takes more substeps (`stability.for_prediction`), except with the released frame time.
     """
     from neuspring.core.artifacts import Twin
+    from neuspring.physics.stability import for_prediction
     from neuspring.twin.rollout import initial_velocity, roll_out
 
     if learned.record.settings.get("oracle"):
         run.settings["oracle"] = True
     twin = Twin.load(learned.file("twin"))
+    if not learned.record.settings["released_quirks"]["frame_time_667"]:
+        twin = for_prediction(twin)
     velocity = initial_velocity(observations, twin.simulation.initial_velocity)
     trajectory = roll_out(twin, observations.controller_points, device, velocity=velocity, valid=observations.controller_valid)
     if trajectory.collision_overflow:
@@ -28,6 +32,7 @@ def rollout(observations: Observations, learned: Before, run: Recorder, device: 
     facts = {
         "frames": len(trajectory.positions),
         "spring_updates": (len(trajectory.positions) - 1) * twin.counts["springs"] * twin.counts["substeps"],
+        "substeps": twin.simulation.substeps,
         "collision_overflow": trajectory.collision_overflow,
     }
     failure = f"rollout: {trajectory.reason}" if trajectory.diverged_frame is not None else ""

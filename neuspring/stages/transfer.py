@@ -43,6 +43,7 @@ def transfer(
     import pandas as pd
 
     from neuspring.core.files import write_npz, write_table
+    from neuspring.physics.stability import for_prediction
     from neuspring.scores import metrics
     from neuspring.twin.rollout import initial_velocity, roll_out
     from neuspring.twin.transfer import move
@@ -55,12 +56,9 @@ def transfer(
         if twin is None:
             trajectory = BASELINES[record.settings["model"]].predict(observations, learned.file("model"), None, device).trajectory
         else:
-            moved, registration = move(
-                twin,
-                observations,
-                safety=settings.simulation.safety,
-                keep_frame_time=record.settings["released_quirks"]["frame_time_667"],
-            )
+            released = record.settings["released_quirks"]["frame_time_667"]
+            moved, registration = move(twin, observations, safety=settings.simulation.safety, keep_frame_time=released)
+            moved = moved if released else for_prediction(moved)
             velocity = initial_velocity(observations, moved.simulation.initial_velocity)
             controllers, valid = observations.controller_points, observations.controller_valid
             trajectory = roll_out(moved, controllers, device, velocity=velocity, valid=valid)

@@ -135,6 +135,31 @@ def test_smallest_safe_substeps_is_smallest(safety: float) -> None:
     assert stability.smallest_safe_substeps(Spectrum(1.0, 0.0, 0), 1e-3, safety) == 1
 
 
+@pytest.mark.parametrize("load", [2.4, 3.6])
+def test_a_prediction_keeps_the_sign_of_a_damped_mode(load: float) -> None:
+    """Two nodes on a dashpot: c = 2 gamma, so their relative velocity is 1 - load / 2 times itself after a substep."""
+    gamma, frame_time = 300.0, 1 / 30
+    substeps = int(np.ceil(frame_time * 4 * gamma / load))
+    body = scene(2, [(1, 0)], [0.1], stiffness=1e-6, dashpot=gamma, frame_time=frame_time, substeps=substeps, self_collision=True)
+    x = np.array([[0.1, 0.0, 0.0], [0.0, 0.0, 0.0]])
+
+    def relative_velocity(twin: Twin) -> np.ndarray:
+        one = replace(body, simulation=replace(body.simulation, frame_time=twin.simulation.substep, substeps=1))
+        _, v = reference.rollout(one, x, np.array([[0.01, 0.0, 0.0], [-0.01, 0.0, 0.0]]), np.zeros((5, 0, 3)))
+        return v[:, 0, 0] - v[:, 1, 0]
+
+    twin = twin_of(body, x, np.zeros((0, 3)))
+    assert (relative_velocity(twin) < 0).any()
+    predicted = stability.for_prediction(twin)
+    assert (relative_velocity(predicted) > 0).all()
+    assert stability.for_prediction(predicted) == predicted
+
+
+def test_a_prediction_leaves_bodies_that_cannot_meet_themselves() -> None:
+    twin = random_twin(0, substeps=3, frame_time=1e-3)
+    assert stability.for_prediction(twin) is twin
+
+
 def test_masses_change_the_spectrum() -> None:
     """Two nodes on a spring: lambda = k (1/m_1 + 1/m_2), and Gershgorin's bound 2 k / least mass is above it."""
     points, pairs = np.array([[0.0, 0, 0], [0.1, 0.1, 0]]), np.array([[0, 1]])

@@ -11,8 +11,9 @@ from neuspring import config
 from neuspring.core.artifacts import Observations, Trajectory, Twin
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import read_npz
-from neuspring.core.records import StageRecord
+from neuspring.core.records import StageRecord, digest_file
 from neuspring.experiments.tracking import log as tracking
+from neuspring.physics import stability
 from neuspring.report import benchmark as tables
 from neuspring.scores import metrics
 from neuspring.scores.runs import collect
@@ -272,6 +273,33 @@ def test_a_numerical_failure_is_a_result_that_the_table_shows(tmp_path, monkeypa
     assert "bad / phystwin / seed 0: failed: fit: search: every candidate diverged" in text
     assert "nan" not in text.lower()
     assert tracking.RunRecord.load(tmp_path / "bad" / "phystwin" / "0" / "run.json").status == "failed"
+
+
+def test_only_a_body_that_can_meet_itself_is_predicted_with_more_substeps(tmp_path, finished):
+    folder, _, _ = finished
+    found = folder / "small" / "search-uniform" / "0" / "search.json"
+    twin, kept = Twin.load(found.with_name("twin.npz")), found.read_text()
+    counts = {}
+    for meets in (False, True):
+        one = replace(twin, simulation=replace(twin.simulation, self_collision=meets))
+        for released in (False, True):
+            learned = tmp_path / f"{meets}{released}" / "search.json"
+            one.save(learned.parent / "twin.npz")
+            values = json.loads(kept)
+            values["files"]["twin"][1] = digest_file(learned.parent / "twin.npz")
+            values["settings"]["released_quirks"]["frame_time_667"] = released
+            learned.write_text(json.dumps(values))
+            output = learned.with_name("rollout.json")
+            rollout(observations=folder / "small" / "observations.npz", learned=learned, device="cpu", output=output)
+            counts[meets, released] = StageRecord.load(output).facts["substeps"]
+    searched = twin.simulation.substeps
+    assert counts == {
+        (False, False): searched,
+        (False, True): searched,
+        (True, False): stability.for_prediction(one).simulation.substeps,
+        (True, True): searched,
+    }
+    assert counts[True, False] > searched
 
 
 def test_a_diverging_rollout_is_a_result(tmp_path, finished, monkeypatch):
