@@ -14,6 +14,7 @@ from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
 from neuspring.core.run_folder import RunFolder
+from neuspring.physics.stability import for_prediction
 from neuspring.splats.draw import prune_by_opacity, skinned_frames
 from neuspring.splats.model import Splats
 from neuspring.twin.rollout import initial_velocity
@@ -112,7 +113,7 @@ def read_source(path: Path) -> Source:
     splats = run.file("appearance", "splats")
     return Source(
         name=name,
-        twin=twin,
+        twin=for_prediction(twin),
         positions=trajectory.positions,
         hands=hands,
         holds=valid[:count] if valid.size else np.ones(hands.shape[:2], bool),

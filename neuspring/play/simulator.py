@@ -110,7 +110,7 @@ class Simulator:
 
     def __init__(self, twin: Twin, start: Start | None = None) -> None:
         stability.check(twin)
-        self.twin = twin
+        self.twin = twin = stability.for_prediction(twin)
         self._start = start or Start()
         self._load = 0.0 if twin.rod is not None else stability.twin_spectrum(twin).load(twin.simulation.substep)
         self._free = solver_for(twin, "cpu", differentiable=False)

@@ -21,7 +21,7 @@ def rollout(observations: Observations, learned: Before, run: Recorder, device: 
     if learned.record.settings.get("oracle"):
         run.settings["oracle"] = True
     twin = Twin.load(learned.file("twin"))
-    if not learned.record.settings["released_quirks"]["frame_time_667"]:
+    if not learned.record.settings.get("released_quirks", {}).get("frame_time_667"):
         twin = for_prediction(twin)
     velocity = initial_velocity(observations, twin.simulation.initial_velocity)
     trajectory = roll_out(twin, observations.controller_points, device, velocity=velocity, valid=observations.controller_valid)
