@@ -22,6 +22,9 @@ from neuspring.core.errors import InputError
 LIMIT = 4.0
 PREDICTION = 0.4
 """Fraction of the bound for predictions. A substep multiplies a damped mode by 1 - dt c; with dt c <= 0.8 it keeps its sign."""
+RELEASED_SUBSTEPS = 667
+RELEASED_FRAME_TIME = RELEASED_SUBSTEPS * 5e-5
+"""s, whatever the frame rate (released_quirks.frame_time_667)."""
 UNIT = np.zeros(0)
 """The masses that stand for: 1 kg each."""
 
@@ -135,10 +138,11 @@ def for_prediction(twin: Twin) -> Twin:
     """The twin as predictions are made with it: where the body can meet itself, with substeps for `PREDICTION`.
 
     Above half of the bound a damped mode turns around in every substep, and a contact that meets it on its way back kicks it again:
-    springs of a cloth that lay on itself were stretched to four times their length. Other twins stay as they are.
+    springs of a cloth that lay on itself were stretched to four times their length. Other twins stay as they are, and so does one
+    with the released frame time, which stands for the released simulator.
     """
     simulation = twin.simulation
-    if twin.rod is not None or not simulation.self_collision:
+    if twin.rod is not None or not simulation.self_collision or simulation.frame_time == RELEASED_FRAME_TIME:
         return twin
     count = smallest_safe_substeps(twin_spectrum(twin), simulation.frame_time, PREDICTION)
     return replace(twin, simulation=replace(simulation, substeps=max(count, simulation.substeps)))

@@ -12,7 +12,7 @@ def rollout(observations: Observations, learned: Before, run: Recorder, device: 
     """Twin -> trajectory over all frames, trajectory.npz. A rollout that diverges is recorded as a failure.
 
     `learned` is the search.json or fit.json that names the twin. A twin that saw the future is called `oracle`. A body that can
-    meet itself takes more substeps (`stability.for_prediction`), except with the released frame time.
+    meet itself takes more substeps (`stability.for_prediction`).
     """
     from neuspring.core.artifacts import Twin
     from neuspring.physics.stability import for_prediction
@@ -20,9 +20,7 @@ def rollout(observations: Observations, learned: Before, run: Recorder, device: 
 
     if learned.record.settings.get("oracle"):
         run.settings["oracle"] = True
-    twin = Twin.load(learned.file("twin"))
-    if not learned.record.settings.get("released_quirks", {}).get("frame_time_667"):
-        twin = for_prediction(twin)
+    twin = for_prediction(Twin.load(learned.file("twin")))
     velocity = initial_velocity(observations, twin.simulation.initial_velocity)
     trajectory = roll_out(twin, observations.controller_points, device, velocity=velocity, valid=observations.controller_valid)
     if trajectory.collision_overflow:

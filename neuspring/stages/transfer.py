@@ -56,9 +56,13 @@ def transfer(
         if twin is None:
             trajectory = BASELINES[record.settings["model"]].predict(observations, learned.file("model"), None, device).trajectory
         else:
-            released = record.settings["released_quirks"]["frame_time_667"]
-            moved, registration = move(twin, observations, safety=settings.simulation.safety, keep_frame_time=released)
-            moved = moved if released else for_prediction(moved)
+            moved, registration = move(
+                twin,
+                observations,
+                safety=settings.simulation.safety,
+                keep_frame_time=record.settings["released_quirks"]["frame_time_667"],
+            )
+            moved = for_prediction(moved)
             velocity = initial_velocity(observations, moved.simulation.initial_velocity)
             controllers, valid = observations.controller_points, observations.controller_valid
             trajectory = roll_out(moved, controllers, device, velocity=velocity, valid=valid)

@@ -41,8 +41,6 @@ WAYS = {"hold": (False,), "push": (True,), "auto": (False, True)}
 """Whether hands only push, in the ways that are judged, by `search.hands`."""
 Map = Callable[..., Iterable[Any]]
 """As the builtin `map`."""
-RELEASED_SUBSTEPS = 667
-RELEASED_FRAME_TIME = RELEASED_SUBSTEPS * 5e-5
 
 
 @dataclass(frozen=True)
@@ -175,7 +173,7 @@ def with_substeps(problem: SearchProblem, twin: Twin) -> Twin:
     """
     settings = problem.simulation
     if problem.quirks.frame_time_667 or settings.substeps != "auto":
-        count = RELEASED_SUBSTEPS if problem.quirks.frame_time_667 else int(settings.substeps)
+        count = stability.RELEASED_SUBSTEPS if problem.quirks.frame_time_667 else int(settings.substeps)
         twin = replace(twin, simulation=replace(twin.simulation, substeps=count))
         stability.check(twin)
         return twin
@@ -210,7 +208,7 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
         topology = replace(topology, rest_lengths=lengths.astype(np.float32), pushes=led)
     material = homogeneous(values, count)
     simulation = Simulation(
-        frame_time=RELEASED_FRAME_TIME if problem.quirks.frame_time_667 else 1.0 / scenario.frame_rate,
+        frame_time=stability.RELEASED_FRAME_TIME if problem.quirks.frame_time_667 else 1.0 / scenario.frame_rate,
         substeps=1,
         up=scenario.up,
         gravity=settings.gravity,

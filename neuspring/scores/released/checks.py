@@ -35,13 +35,13 @@ from neuspring.data.released import (
     read_prediction,
     visible_pixels,
 )
+from neuspring.physics.stability import RELEASED_FRAME_TIME, RELEASED_SUBSTEPS
 from neuspring.scores import metrics
 from neuspring.scores.lpips import Lpips
 from neuspring.scores.metrics import METRICS, TASKS, UNITS, averages
 from neuspring.scores.pictures import Pair, picture_scores
 from neuspring.splats.draw import COVERED, picture, prune_by_opacity, skinned_frames, view_of
 from neuspring.splats.model import Splats
-from neuspring.twin.candidates import RELEASED_FRAME_TIME, RELEASED_SUBSTEPS
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.topology import uniform_topology
 
