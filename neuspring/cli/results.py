@@ -55,7 +55,7 @@ def tables(
     wanted = tuple(parse(Aim, row, "--aims") for row in json_value("--aims", aims, list))
     without = _read_left_out(left_out)
     if scores:
-        found = read_scores(scores)
+        found = read_scores(scores).named(scenario=scenarios, method=methods, seed=seeds)
         against = baseline or str(found.runs["method"].iloc[0])
         found = replace(found, left_out=without)
         print(write(Benchmark(everything=found, baseline=against, objects=objects, aims=wanted), output))
@@ -129,7 +129,8 @@ def study(
     definition, without = studies[study], _read_left_out(left_out)
     beside = studies[definition.beside] if definition.beside else None
     if scores:
-        print(write_collected(study, definition, replace(read_scores(scores), left_out=without), output, beside))
+        found = replace(read_scores(scores).named(scenario=scenarios, method=methods, seed=seeds), left_out=without)
+        print(write_collected(study, definition, found, output, beside))
     elif scenarios and methods and seeds:
         print(write_study(study, definition, results, scenarios, seeds, methods, output, without, beside))
     else:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ import pandas as pd
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
 from neuspring.core.run_record import RUN_RECORD, RunRecord
+from neuspring.core.text import listed
 from neuspring.scores.failures import NOTHING, LeftOut, applying
 from neuspring.scores.metrics import COLUMNS
 
@@ -71,6 +72,17 @@ class Collected:
         runs, scores, frozen = (table[table["method"].isin(list(methods))] for table in (self.runs, self.scores, self.frozen))
         left_out = {name: where for name, where in self.left_out.items() if name in methods}
         return Collected(scores, runs, frozen, left_out, {key: record for key, record in self.records.items() if key[1] in methods})
+
+    def named(self, **wanted: Collection[str | int]) -> Collected:
+        """The runs of these `scenario`s, `method`s and `seed`s, all where none is named. A name without runs is an InputError."""
+        runs, scores = self.runs, self.scores
+        for column, names in wanted.items():
+            known = dict.fromkeys(self.runs[column])
+            if absent := [name for name in names if name not in known]:
+                raise InputError(f"--{column}s", "must be in the file of --scores", listed(absent), f"There: {listed(known, 40)}.")
+            if names:
+                runs, scores = (table[table[column].isin(list(names))] for table in (runs, scores))
+        return replace(self, scores=scores, runs=runs)
 
 
 def collect(

@@ -382,6 +382,14 @@ def test_a_table_can_be_made_from_scores_alone(tmp_path, capsys):
         runs = read_scores(tmp_path / "tables" / "scores.csv").runs.set_index(["scenario", "method"])["status"]
         assert (runs["cable_6", "neuspring_one_frame"], runs["cable_6", "baseline"]) == ("failed", "ok")
         (tmp_path / "tables" / "runs.csv").unlink(missing_ok=True)
+    alone = ["tables", "--scores", str(tmp_path / "tables" / "scores.csv"), "--output", str(tmp_path / "some"), "--scenarios"]
+    assert main([*alone, *names[:3], "--methods", "baseline"]) == 0
+    kept = pd.read_csv(tmp_path / "some" / "scores.csv")
+    assert (set(kept["scenario"]), set(kept["method"])) == (set(names[:3]), {"baseline"}), (
+        "a scores.csv is read in part as runs are"
+    )
+    assert main([*alone, "cable_9"]) == 2
+    assert "--scenarios: must be in the file of --scores" in capsys.readouterr().err
     assert main(command) == 2
     assert "--scores, or --scenarios, --methods and --seeds" in capsys.readouterr().err
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")

@@ -62,10 +62,12 @@ def relative(twin: Twin) -> Twin:
 
 
 def picture(scenario: str, takes: Sequence[Prediction], scene: Scene) -> Figure:
-    """The truth and twins side by side."""
-    shape = scene.view.width / scene.view.height
-    figure, axes = plt.subplots(1, len(takes), figsize=(2.4 * shape * len(takes), 3.4), layout="constrained")
-    for axis, take in zip(axes, takes, strict=True):
+    """The truth and twins side by side, four in a row."""
+    rows, height = -(-len(takes) // 4), 4 * scene.view.height / scene.view.width
+    figure, axes = plt.subplots(rows, 4, figsize=(16, rows * (height + 0.3) + 0.9), layout="constrained", squeeze=False)
+    for axis in axes.flat:
+        axis.set_axis_off()
+    for axis, take in zip(axes.flat, takes, strict=False):
         TwinPicture([(scene, take)], 0, ("stiffness",), limits=LIMITS).paint(axis, scene, take, "stiffness")
         axis.set_title(take.label, fontsize=9)
     label = "stiffness / its geometric mean"
@@ -80,6 +82,7 @@ def picture(scenario: str, takes: Sequence[Prediction], scene: Scene) -> Figure:
         format="{x:g}",
     )
     bar.ax.tick_params(labelsize=8)
+    bar.ax.minorticks_off()
     figure.suptitle(scenario, fontsize=10)
     return figure
 
