@@ -323,14 +323,13 @@ def silhouettes(labels: np.ndarray, samples: int = SAMPLES) -> dict[str, np.ndar
     inside = np.full((frames, count, 2), np.nan, np.float32)
     outside = np.zeros((frames, -(-height // cell), -(-width // cell)), np.float32)
     for frame, label in enumerate(labels):
+        if not (label == OBJECT).any():
+            # Out of view: nothing says where it is.
+            continue
         away = cv2.distanceTransform((label == NOTHING).astype(np.uint8), cv2.DIST_L2, 5)
         padded = np.pad(away, ((0, -height % cell), (0, -width % cell)), mode="edge")
         outside[frame] = padded.reshape(outside.shape[1], cell, outside.shape[2], cell).mean(axis=(1, 3))
         from_object = cv2.distanceTransform((label != OBJECT).astype(np.uint8), cv2.DIST_L2, 5)
-        if not (label == OBJECT).any():
-            # Out of view: nothing says where it is.
-            outside[frame] = 0.0
-            continue
         y, x = np.nonzero(label == OBJECT)
         rows = rng.choice(len(x), min(count, len(x)), replace=False)
         inside[frame, : len(rows)] = np.stack([x[rows], y[rows]], axis=1)
