@@ -168,7 +168,8 @@ def growth_figure(growth: pd.DataFrame, labels: Sequence[str]) -> Figure:
     A row of the table has its color by its place in `labels`, whichever of them are there.
     """
     cables, shown = list(dict.fromkeys(growth["cable"])), [label for label in labels if label in set(growth["label"])]
-    size = (2.6 * len(cables) + 0.6, 3.0)
+    # A column of the legend is as wide as a panel.
+    size = (2.6 * len(cables) + 0.6, 2.8 + 0.2 * -(-len(shown) // len(cables)))
     figure, axes = plt.subplots(1, len(cables), figsize=size, layout="constrained", squeeze=False, sharex=True, sharey=True)
     colors = plt.get_cmap("tab10" if len(labels) <= 10 else "tab20")
     handles = [Line2D([], [], color=colors(labels.index(label)), label=label) for label in shown]
@@ -180,5 +181,5 @@ def growth_figure(growth: pd.DataFrame, labels: Sequence[str]) -> Figure:
         axis.grid(color="0.92")
     figure.supxlabel("time [s]", fontsize=9)
     figure.supylabel("error of free markers [mm]", fontsize=9)
-    figure.legend(handles=handles, loc="outside upper center", ncols=min(len(shown), 2 * len(cables)), frameon=False, fontsize=8)
+    figure.legend(handles=handles, loc="outside upper center", ncols=min(len(shown), len(cables)), frameon=False, fontsize=8)
     return figure
