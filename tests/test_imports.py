@@ -9,7 +9,7 @@ from neuspring.core import provenance
 
 PACKAGE = Path(provenance.__file__).parents[1]
 FLOORS = (
-    "cli > export experiments play > stages > report > scores baselines > splats perception > data > twin > physics config > core"
+    "extensions > cli > experiments > stages > report > scores baselines > splats perception > data > twin > physics config > core"
 )
 LIGHT = (
     "",

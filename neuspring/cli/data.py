@@ -36,7 +36,7 @@ def fetch(
 ) -> int:
     """Released archives -> the folders that the readers expect; exit status 2 if a fetched file is damaged."""
     from neuspring.data import fetch
-    from neuspring.scores.released.run import check
+    from neuspring.extensions.released.run import check
 
     findings = fetch.fetch(data_root, scenarios, parts, revision=revision, dry_run=dry_run, check=check)
     return 0 if dry_run else _tell(findings)
@@ -44,7 +44,7 @@ def fetch(
 
 def check_data(folder: Positional[Path]) -> int:
     """Report how a data folder departs from the expected layout; exit status 2 where it cannot be used."""
-    from neuspring.scores.released.run import check
+    from neuspring.extensions.released.run import check
 
     return _tell(check(folder))
 
@@ -68,7 +68,7 @@ def verify_released(
     device: Device = "auto",
 ) -> int:
     """PhysTwin's released results, checked against ours."""
-    from neuspring.scores.released import run
+    from neuspring.extensions.released import run
 
     lpips = read_settings(settings).images.lpips
     chosen = checks or tuple(run.CHECKS)
@@ -294,8 +294,8 @@ def annotate(
 ) -> None:
     """Mark masks and tracks of a capture in the browser; serves until Ctrl-C."""
     from neuspring.data.capture import Capture
-    from neuspring.perception.annotate.guard import is_loopback
-    from neuspring.perception.annotate.server import Server
+    from neuspring.core.web import is_loopback
+    from neuspring.extensions.annotate.server import Server
 
     server = Server(Capture.load(capture), read_settings(settings).perception.segment.marks, host, port)
     print(f"Annotate {capture} at {server.url} (stop with Ctrl-C)", flush=True)

@@ -11,7 +11,7 @@ from neuspring.cli.options import Positional, arg
 from neuspring.core.errors import InputError
 
 if TYPE_CHECKING:
-    from neuspring.play.page import Page
+    from neuspring.extensions.play.page import Page
 
 FORMATS = {
     "npz": ("plain.write", "", "{name}_npz"),
@@ -20,7 +20,7 @@ FORMATS = {
     "mujoco": ("simulators.write_mujoco", "", "{name}_mujoco"),
     "usd": ("usd.write", "", "{name}.usdc"),
 }
-"""Format -> module and function of neuspring.export, frames by default (all where empty), what is written by default."""
+"""Format -> module and function of neuspring.extensions.exports, frames by default (all where empty), what is written by default."""
 
 
 def export(
@@ -31,7 +31,7 @@ def export(
     rate: Annotated[float | None, arg(help="time codes per second (usd); the capture's frames per second by default")] = None,
 ) -> None:
     """A twin -> USD, PLY, Newton, MuJoCo, or npz with a JSON description."""
-    from neuspring.export.source import chosen_frames, read_source
+    from neuspring.extensions.exports.source import chosen_frames, read_source
 
     writer, default, name = FORMATS[to]
     module, _, function = writer.partition(".")
@@ -41,7 +41,7 @@ def export(
     chosen = chosen_frames(frames, source, default)
     target = output or Path("export") / name.format(name=source.name)
     own = {"rate": rate} if to == "usd" else {}
-    for path in getattr(importlib.import_module(f"neuspring.export.{module}"), function)(source, chosen, target, **own):
+    for path in getattr(importlib.import_module(f"neuspring.extensions.exports.{module}"), function)(source, chosen, target, **own):
         print(f"Wrote {path}")
 
 
@@ -57,8 +57,8 @@ def play(
     compare: Annotated[bool, arg(help="with --replay: print how the other twins move under it, and end")] = False,
 ) -> None:
     """Runs of a results folder in the browser, until Ctrl-C; twins that can be pulled by hand."""
-    from neuspring.play.controls import comparison, load_controls, pulled_run
-    from neuspring.play.results import find
+    from neuspring.extensions.play.controls import comparison, load_controls, pulled_run
+    from neuspring.extensions.play.results import find
 
     found = find(results)
     frames = found.observations.scenario.frame_count
@@ -72,9 +72,9 @@ def play(
         for line in comparison(found, controls, own):
             print(line, flush=True)
         return
-    from neuspring.perception.annotate.guard import is_loopback
-    from neuspring.play.page import Page
-    from neuspring.play.serve import address, start
+    from neuspring.core.web import is_loopback
+    from neuspring.extensions.play.page import Page
+    from neuspring.extensions.play.serve import address, start
 
     pages: list[Page] = []
 

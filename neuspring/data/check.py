@@ -2,7 +2,7 @@
 Nothing here raises for bad content.
 
 What cannot work is an error, what is only unusual a warning with the next move; see `plausible`. `neuspring check-data` adds
-the comparison with the released results: `neuspring.scores.released.run`.
+the comparison with the released results: `neuspring.extensions.released.run`.
 """
 
 from __future__ import annotations

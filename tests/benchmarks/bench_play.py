@@ -23,13 +23,13 @@ import numpy as np
 
 from neuspring.core.artifacts import Trajectory, Twin
 from neuspring.core.records import Recorder
-from neuspring.play.controls import MOST_FRAMES
-from neuspring.play.live import Live
-from neuspring.play.page import Page
-from neuspring.play.player import Player
-from neuspring.play.results import find
-from neuspring.play.serve import address, start
-from neuspring.play.simulator import Simulator, StartState
+from neuspring.extensions.play.controls import MOST_FRAMES
+from neuspring.extensions.play.live import Live
+from neuspring.extensions.play.page import Page
+from neuspring.extensions.play.player import Player
+from neuspring.extensions.play.results import find
+from neuspring.extensions.play.serve import address, start
+from neuspring.extensions.play.simulator import Simulator, StartState
 from tests.benchmarks.memory import resident_mib
 from tests.benchmarks.scenes import box
 from tests.support import scenarios

@@ -29,7 +29,7 @@ from neuspring.core.errors import InputError
 from neuspring.data import fetch as fetching
 from neuspring.data import phystwin
 from neuspring.data.fetch import LOCK, RECORD, fetch
-from neuspring.scores.released.run import check
+from neuspring.extensions.released.run import check
 from tests.support.phystwin_case import write_case
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"

@@ -20,7 +20,7 @@ PLACES = {
 """Of drag, with `decay`, what the kernels take of it: files of the package that a force with one trained parameter needs."""
 VALUES = {
     "data/synthetic/toy.py": "the drag of the toy's truth",
-    "scores/released/checks.py": "the released files' drag",
+    "extensions/released/checks.py": "the released files' drag",
     "twin/search.py": "the released rounding of drag",
     "export/simulators.py": "drag in MuJoCo",
     "export/newton_twin.py": "drag in Newton",

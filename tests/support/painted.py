@@ -10,7 +10,7 @@ import pytest
 
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
-from neuspring.perception.annotate import masks
+from neuspring.extensions.annotate import masks
 from neuspring.perception.marks.carry import Carried
 from neuspring.perception.marks.marks import Mark
 

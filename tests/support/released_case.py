@@ -19,7 +19,7 @@ from neuspring.data.released import Released
 from neuspring.data.unpickle import load_pickle
 from neuspring.physics import reference as simulation
 from neuspring.physics.reference import Scene
-from neuspring.scores.released.checks import Published
+from neuspring.extensions.released.checks import Published
 from neuspring.splats.model import Splats
 from neuspring.splats.rasterize import reference
 from neuspring.splats.skinning import Skin

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from neuspring.data.capture import Capture
-from neuspring.perception.annotate.server import TOKEN_HEADER, Server
+from neuspring.extensions.annotate.server import TOKEN_HEADER, Server
 
 TOKEN = "the-token"
 

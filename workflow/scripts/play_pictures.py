@@ -13,9 +13,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from neuspring.play.page import Page
-from neuspring.play.results import find
-from neuspring.play.serve import address, start
+from neuspring.extensions.play.page import Page
+from neuspring.extensions.play.results import find
+from neuspring.extensions.play.serve import address, start
 from tests.support.browser import Browser
 from tests.support.pointing import WINDOW, choose_tab, pixel, pull, until
 

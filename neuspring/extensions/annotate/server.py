@@ -1,0 +1,268 @@
+"""The server of `neuspring annotate`: the page, and what it asks for, as JSON and images.
+
+Requests must name this machine (guard.py), and all beyond the page itself needs the token, which is in the printed address alone.
+Every camera and frame is looked up in the capture, so no address leads to another file.
+"""
+
+from __future__ import annotations
+
+import errno
+import hmac
+import json
+import logging
+import secrets
+import socket
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import uvicorn
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.middleware.base import BaseHTTPMiddleware
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from neuspring.config.perception import MarksSegmentation
+from neuspring.core.errors import InputError
+from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.extensions.annotate.clicks import Annotations
+from neuspring.core.web import Refused, check_host, check_origin
+from neuspring.extensions.annotate.masks import MasksMode
+from neuspring.extensions.annotate.shared import Busy, Stale
+from neuspring.extensions.annotate.tracks import Foreign, TracksMode
+
+STATIC = Path(__file__).parent / "static"
+"""The only files that are given out."""
+TOKEN_HEADER = "X-NeuSpring-Token"
+MOST_BYTES = 2_000_000
+"""Largest body of a request."""
+HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+"""Headers of every answer."""
+COLORS = {OBJECT: (0, 200, 160), HANDS: (255, 140, 0)}
+"""RGB of a label; the legend of the page has the same."""
+INSIDE, BORDER = 90, 255
+"""Opacity inside a mask and on its border, of 255."""
+JPEG_QUALITY = 95
+ANSWERS: dict[type[Exception], int] = {Stale: 409, Busy: 409, Foreign: 428, InputError: 422}
+"""HTTP status of what a request can raise."""
+
+
+class Server:
+    """`Server(capture)`; then `serve_forever()`, from another thread `shutdown()`, and `close()`."""
+
+    def __init__(
+        self,
+        capture: Capture,
+        settings: MarksSegmentation | None = None,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        token: str | None = None,
+    ) -> None:
+        """Listen; port 0: any that is free. Raises InputError for an address that cannot be had, or a damaged file."""
+        self.capture, self.host, self.token = capture, host, token or secrets.token_urlsafe(16)
+        self.masks = MasksMode(capture, settings or MarksSegmentation())
+        self.masks.document.read()
+        Annotations.load(capture)
+        self._socket = _listen(host, port)
+        self.port: int = self._socket.getsockname()[1]
+        self.tracks = TracksMode(capture)
+        app = Starlette(
+            routes=[
+                Route("/api/state", self._state),
+                Route("/api/masks", lambda _: JSONResponse(self.masks.plain())),
+                Route("/api/clicks", lambda _: JSONResponse(self.tracks.plain())),
+                Route("/api/job", lambda _: JSONResponse(self.masks.job.plain())),
+                Route("/api/tracks/{since:int}", lambda asked: JSONResponse(self.tracks.results(asked.path_params["since"]))),
+                Route("/api/color/{camera}/{frame:int}", self._color),
+                Route("/api/overlay/{source}/{camera}/{frame:int}", self._overlay),
+                Route("/api/marks", lambda asked: self._write(asked, self.masks, "marks"), methods=["POST"]),
+                Route("/api/preview", self._preview, methods=["POST"]),
+                Route("/api/carry", self._carry, methods=["POST"]),
+                Route("/api/stop", self._stop, methods=["POST"]),
+                Route("/api/masks/save", lambda _: JSONResponse({"cameras": self.masks.save()}), methods=["POST"]),
+                Route("/api/clicks", lambda asked: self._write(asked, self.tracks, "annotations"), methods=["POST"]),
+                Route("/api/tracks/save", self._save_tracks, methods=["POST"]),
+                Mount("/", StaticFiles(directory=STATIC, html=True)),
+            ],
+            middleware=[Middleware(BaseHTTPMiddleware, dispatch=self._answer)],
+            exception_handlers={HTTPException: lambda _, error: _problem(error.status_code, "There is nothing at this address.")},  # type: ignore[attr-defined]
+        )
+        options: dict[str, Any] = {"lifespan": "off", "ws": "none", "access_log": False, "log_config": None, "server_header": False}
+        self._uvicorn = uvicorn.Server(uvicorn.Config(app, **options, proxy_headers=False, timeout_graceful_shutdown=5))
+
+    @property
+    def url(self) -> str:
+        """The address to open, with the token where no server logs it."""
+        name = f"[{self.host}]" if ":" in self.host else self.host
+        if self.host in ("0.0.0.0", "::", ""):
+            name = socket.gethostname()
+        return f"http://{name}:{self.port}/#{self.token}"
+
+    def serve_forever(self) -> None:
+        """Answer requests until `shutdown`, or Ctrl-C, which raises KeyboardInterrupt."""
+        self._uvicorn.run(sockets=[self._socket])
+
+    def shutdown(self) -> None:
+        """End `serve_forever`."""
+        self._uvicorn.should_exit = True
+
+    def close(self) -> None:
+        """Free the port, stop the work, and wait for its end."""
+        self._socket.close()
+        self.masks.job.stop()
+        self.masks.job.join()
+        self.tracks.close()
+
+    async def _answer(self, request: Request, go_on: Callable[[Request], Awaitable[Response]]) -> Response:
+        """Check who asks, read the body, and answer; what is refused or fails becomes a status and a sentence."""
+        try:
+            check_host(request.headers.get("Host"), self.host)
+            if request.scope["path"].startswith("/api/"):
+                check_origin(request.headers)
+                if not hmac.compare_digest(request.headers.get(TOKEN_HEADER, "").encode(), self.token.encode()):
+                    text = "The token is missing or of an earlier start. Open the address that neuspring annotate printed."
+                    raise Refused(401, text)
+                if request.method == "POST":
+                    request.state.values = await _body(request)
+            answer = await go_on(request)
+        except Refused as refused:
+            answer = _problem(refused.status, refused.text)
+        except tuple(ANSWERS) as error:
+            text = "The file changed in another tab or program since this page read it." if isinstance(error, Stale) else str(error)
+            answer = _problem(next(status for kind, status in ANSWERS.items() if isinstance(error, kind)), text)
+        except Exception as error:  # the page must say so, and the terminal where
+            logging.getLogger(__name__).exception("a request failed")
+            answer = _problem(500, f"{type(error).__name__}: {error}. The terminal shows where.")
+        answer.headers.update(HEADERS)
+        return answer
+
+    def _frame(self, camera: object, frame: object) -> tuple[str, int]:
+        """A camera and a frame that it has. Refuses others."""
+        if not isinstance(camera, str) or camera not in self.capture.cameras:
+            raise Refused(404, "There is no such camera.")
+        if not isinstance(frame, int) or not 0 <= frame < self.capture.frame_count or not self.capture.has(camera, frame):
+            raise Refused(404, "This camera has no such frame.")
+        return camera, frame
+
+    def _state(self, _: Request) -> Response:
+        """The capture, the marks and the clicks."""
+        description = self.capture.description
+        cameras = [
+            {"name": entry.name, "width": entry.width, "height": entry.height, "missing": list(entry.missing)}
+            for entry in description.cameras
+        ]
+        values = {
+            "name": description.name,
+            "folder": str(self.capture.folder),
+            "frames": description.frame_count,
+            "frame_rate": description.frame_rate,
+            "cameras": cameras,
+            "masks": self.masks.plain(),
+            "tracks": self.tracks.plain(),
+        }
+        return JSONResponse(values)
+
+    def _color(self, request: Request) -> Response:
+        """A frame as JPEG."""
+        color = self.capture.color(*self._frame(request.path_params["camera"], request.path_params["frame"]))
+        bgr = np.ascontiguousarray(color[..., ::-1])
+        return Response(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes(), media_type="image/jpeg")
+
+    def _overlay(self, request: Request) -> Response:
+        """Masks of a frame as colors; `source` is carried or saved."""
+        camera, frame = self._frame(request.path_params["camera"], request.path_params["frame"])
+        labels = self.masks.labels(camera, frame, request.path_params["source"])
+        if labels is None:
+            raise Refused(404, "This frame has no mask.")
+        return Response(overlay_png(labels), media_type="image/png")
+
+    def _preview(self, request: Request) -> Response:
+        """The mask of one marked frame from its marks alone, as colors."""
+        values = request.state.values
+        labels = self.masks.preview(*self._frame(values.get("camera"), values.get("frame")))
+        return Response(overlay_png(labels), media_type="image/png")
+
+    def _write(self, request: Request, mode: MasksMode | TracksMode, key: str) -> Response:
+        values = request.state.values
+        return JSONResponse({"revision": mode.write(values.get("revision"), values.get(key))})
+
+    def _carry(self, request: Request) -> Response:
+        """Begin to carry the marks of the named cameras."""
+        cameras = request.state.values.get("cameras")
+        if not isinstance(cameras, list) or not all(isinstance(name, str) and name in self.capture.cameras for name in cameras):
+            raise Refused(404, "There is no such camera.")
+        self.masks.carry(cameras)
+        return JSONResponse(self.masks.job.plain())
+
+    def _stop(self, _: Request) -> Response:
+        self.masks.job.stop()
+        return JSONResponse(self.masks.job.plain())
+
+    def _save_tracks(self, request: Request) -> Response:
+        return JSONResponse({"points": self.tracks.save(replace=request.state.values.get("replace") is True)})
+
+
+def overlay_png(labels: np.ndarray) -> bytes:
+    """Labels [H, W] as colors with opacity, PNG: strong on borders, weak inside."""
+    picture = np.zeros((*labels.shape, 4), np.uint8)
+    for label, (red, green, blue) in COLORS.items():
+        mask = (labels == label).astype(np.uint8)
+        core = cv2.erode(mask, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=1)
+        picture[mask > 0] = (blue, green, red, BORDER)
+        picture[core > 0] = (blue, green, red, INSIDE)
+    return cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+
+
+async def _body(request: Request) -> dict[str, Any]:
+    """The JSON object of a request. Refuses other kinds, unknown lengths and large ones before they are read."""
+    headers = request.headers
+    if headers.get("Content-Type", "").split(";")[0].strip().lower() != "application/json":
+        raise Refused(415, "JSON is required.")
+    length = headers.get("Content-Length", "")
+    if "Transfer-Encoding" in headers or not length.isdecimal():
+        raise Refused(411, "A Content-Length is required.")
+    if int(length) > MOST_BYTES:
+        raise Refused(413, f"At most {MOST_BYTES} bytes are taken.")
+    try:
+        values = json.loads(await request.body())
+    except (ValueError, RecursionError) as error:
+        raise Refused(400, f"The body must be JSON: {error}.") from error
+    if not isinstance(values, dict):
+        raise Refused(400, "A JSON object is required.")
+    return values
+
+
+def _problem(status: int, text: str) -> Response:
+    return JSONResponse({"error": text}, status)
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    """A socket at an address. Raises InputError with the next move."""
+    try:
+        if ":" in host:
+            return socket.create_server((host, port), family=socket.AF_INET6, dualstack_ipv6=socket.has_dualstack_ipv6())
+        return socket.create_server((host, port))
+    except (OSError, OverflowError) as error:
+        number = getattr(error, "errno", None)
+        if number == errno.EADDRINUSE:
+            remedy = "Another program listens there. Stop it, or choose another port; --port 0 takes any free one."
+            raise InputError("--port", "must be a free port", port, remedy) from error
+        if isinstance(error, OverflowError):
+            raise InputError("--port", "must be 0 to 65535", port) from error
+        if number in (errno.EACCES, errno.EPERM):
+            raise InputError("--port", "must be one that you may use", port, "Choose one above 1023.") from error
+        remedy = "127.0.0.1 is for this machine alone, 0.0.0.0 for all networks."
+        raise InputError("--host", "must be an address of this machine", host, remedy) from error

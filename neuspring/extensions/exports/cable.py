@@ -1,0 +1,100 @@
+"""A rod as a chain of MuJoCo's bodies, one per edge. Its plugin for cables has left MuJoCo, and knew one stiffness of the whole.
+
+The rest pose of the bodies is the unloaded shape (unloaded curvatures, no twist), the keyframe `start` is frame 0. A body's axes
+are t, m1, m2. Between two edges are three hinges, about t with stiffness GJ / l, about m1 and m2 with EI / l, each with the rod's
+damping times that. Edges keep their lengths, and their mass lies along them. A clamp is a mocap body that the end is welded to.
+Drag is left out.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from neuspring.extensions.exports.source import Source
+from neuspring.physics.rod_nodes import frame_zero, radius_of
+
+STEP = 2e-4
+"""s, at most: springs of joints are explicit there."""
+THICKNESS = 0.002
+"""Least radius, m: nodes on the line show none."""
+WELD: dict[str, Any] = {"solref": f"{2 * STEP} 1", "solimp": "0.999 0.9999 1e-4"}
+"""A clamp is as stiff as the time step allows."""
+
+
+AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
+
+
+def text(*values: float | np.floating) -> str:
+    """Numbers as MJCF has them; float32 to the last bit."""
+    return " ".join(f"{float(value):.9g}" for value in values)
+
+
+def add(source: Source, root: ET.Element, world: ET.Element, meets: dict[str, Any]) -> None:
+    """Add the chain edge0, edge1, ..., a site per node, clamps clamp0 and clamp1, and the keyframe `start` of frame 0."""
+    rod = source.twin.rod
+    assert rod is not None
+    edges, radius = len(rod.lengths), max(radius_of(rod), THICKNESS)
+    spans = (rod.lengths[:-1] + rod.lengths[1:]) / 2
+    bend, twist = rod.bending[1:-1] / spans, rod.twisting[1:-1] / spans
+    frames, rest = _frames(source), _rest(rod.curvature)
+    share = rod.mass / np.where(np.isin(np.arange(edges + 1), (0, edges)), 1, 2)
+    pose = [*rod.vertices[0], *frames[0].as_quat(scalar_first=True)]
+    parent = world
+    at: dict[str, Any] = {"pos": text(*rod.vertices[0]), "quat": text(*pose[3:])}
+    for j in range(edges):
+        parent = ET.SubElement(parent, "body", name=f"edge{j}", **at)
+        if j:
+            for axis, k in zip(AXES, (twist[j - 1], bend[j - 1], bend[j - 1]), strict=True):
+                law: dict[str, Any] = {"stiffness": text(k), "damping": text(rod.damping * k)}
+                ET.SubElement(parent, "joint", name=f"joint{j}{axis}", type="hinge", axis=AXES[axis], **law)
+            pose += (rest[j - 1].inv() * frames[j - 1].inv() * frames[j]).as_euler("XYZ").tolist()
+        else:
+            ET.SubElement(parent, "freejoint", name="joint0")
+        along: dict[str, Any] = {
+            "type": "capsule",
+            "fromto": text(0, 0, 0, rod.lengths[j], 0, 0),
+            "mass": text(share[j] + share[j + 1]),
+        }
+        ET.SubElement(parent, "geom", size=text(radius), **along, **meets)
+        for n in np.flatnonzero(rod.edge == j):
+            f, a, b = rod.place[n]
+            ET.SubElement(parent, "site", name=f"node{n}", pos=text(f * rod.lengths[j], a, b), size=text(radius / 4))
+        if j + 1 < edges:
+            at = {"pos": text(rod.lengths[j], 0, 0), "quat": text(*rest[j].as_quat(scalar_first=True))}
+    _clamps(source, root, world, frames)
+    ET.SubElement(ET.SubElement(root, "keyframe"), "key", name="start", qpos=text(*pose))
+
+
+def _frames(source: Source) -> Rotation:
+    """The axes t, m1, m2 of each edge in frame 0."""
+    rod = source.twin.rod
+    assert rod is not None
+    m1, along = frame_zero(rod)[0], np.diff(rod.vertices, axis=0)
+    t = along / np.linalg.norm(along, axis=1, keepdims=True)
+    return Rotation.from_matrix(np.stack([t, m1, np.cross(t, m1)], axis=2))
+
+
+def _rest(curvature: np.ndarray) -> Rotation:
+    """The turn from each edge to the next without moments, in the axes of either: about (0, -k2, k1) by 2 atan(|k| / 2)."""
+    k = np.stack([np.zeros(len(curvature) - 2), -curvature[1:-1, 1], curvature[1:-1, 0]], axis=1)
+    size = np.linalg.norm(k, axis=1, keepdims=True)
+    return Rotation.from_rotvec(2 * np.arctan(size / 2) * k / np.maximum(size, 1e-12))
+
+
+def _clamps(source: Source, root: ET.Element, world: ET.Element, frames: Rotation) -> None:
+    """A mocap body at each end that is held: with the place of the end's first vertex and the axes of its edge."""
+    rod = source.twin.rod
+    assert rod is not None
+    last = len(rod.lengths) - 1
+    ends = {0: (rod.held[:2] >= 0).all(), last: (rod.held[-2:] >= 0).all()}
+    equality = ET.SubElement(root, "equality") if any(ends.values()) else root
+    for number, (edge, held) in enumerate(ends.items()):
+        if held:
+            quat = text(*frames[edge].as_quat(scalar_first=True))
+            ET.SubElement(world, "body", name=f"clamp{number}", pos=text(*rod.vertices[edge]), quat=quat, mocap="true")
+            pose = "0 0 0 1 0 0 0"
+            ET.SubElement(equality, "weld", body1=f"clamp{number}", body2=f"edge{edge}", relpose=pose, **WELD)

@@ -1,0 +1,106 @@
+"""A twin for other simulators, beside the plain export: the script that makes Newton's model of it, and MuJoCo's MJCF file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from neuspring.core.errors import InputError
+from neuspring.core.files import write_text
+from neuspring.extensions.exports import cable, plain
+from neuspring.extensions.exports.cable import AXES, text
+from neuspring.extensions.exports.source import Source
+from neuspring.physics.rod_nodes import radius_of
+from neuspring.twin.rollout import FAR
+
+SCRIPT = Path(__file__).with_name("newton_twin.py")
+MODEL = "twin.xml"
+
+
+def write_newton(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
+    """Write arrays.npz, description.json and newton_twin.py to the folder `output`."""
+    require_start(frames)
+    if source.twin.rod is not None:
+        rule = "Newton's model is of nodes and springs"
+        raise InputError("--to newton", rule, f"{source.name}, whose twin is a rod", "Take --to mujoco, or a run with a lattice.")
+    if source.twin.topology.pushes.any():
+        rule = "Newton's springs pull as well as push"
+        raise InputError("--to newton", rule, f"{source.name}, whose hands only push", "Take --to mujoco or npz.")
+    write_text(output / SCRIPT.name, SCRIPT.read_text(encoding="utf-8"))
+    return [*plain.write(source, frames, output), output / SCRIPT.name]
+
+
+def write_mujoco(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
+    """Write twin.xml, and arrays.npz and description.json for the hands' motion, to the folder `output`."""
+    require_start(frames)
+    write_text(output / MODEL, mjcf(source))
+    return [output / MODEL, *plain.write(source, frames, output)]
+
+
+def require_start(frames: Sequence[int]) -> None:
+    """Raise InputError unless the frames are 0, 1, 2, ...: a simulator needs the hands from the start on."""
+    if list(frames) != list(range(len(frames))):
+        rule = "a simulator needs the hands of all frames from 0 on"
+        raise InputError("--frames", rule, f"{frames[0]} to {frames[-1]}, {len(frames)} frames", "Take 0:STOP, or leave it out.")
+
+
+def mjcf(source: Source) -> str:
+    """Nodes as bodies on three slides, springs as spatial tendons, controllers as mocap bodies, with our time step.
+
+    A tendon's force is stiffness (l - springlength) + damping dl/dt, so it is our spring with stiffness / rest length. One that
+    only pushes has no stiffness beyond its rest length; its damping stays. Slides damp as our drag does. MuJoCo's ground is soft.
+    Bodies and sites are node0, node1, ..., hand0, ..., tendons spring0, ...
+
+    Of a rod, nodes are sites of a cable (cable.py), and the time step is `cable.STEP` at most.
+    """
+    twin = source.twin
+    simulation, material, topology = twin.simulation, twin.material, twin.topology
+    radius = material.contact_distance / 2
+    root = ET.Element("mujoco", model=source.name)
+    gravity = (0, 0, -simulation.gravity * simulation.up_sign)
+    rod = twin.rod
+    radius = radius if rod is None else max(radius_of(rod), cable.THICKNESS)
+    step, integrator = (simulation.substep, "Euler") if rod is None else (min(simulation.substep, cable.STEP), "implicitfast")
+    ET.SubElement(root, "option", timestep=text(step), integrator=integrator, gravity=text(*gravity))
+    world = ET.SubElement(root, "worldbody")
+    if simulation.ground:
+        # Nodes are points for us and balls here, which touch a plane that is lower by their radius.
+        height, turn = -radius * simulation.up_sign, "0 0 0" if simulation.up == "+z" else "180 0 0"
+        friction = text(material.ground_friction, 0.005, 0.0001)
+        kind: dict[str, Any] = {"type": "plane", "size": "5 5 0.1", "contype": "1", "conaffinity": "0", "friction": friction}
+        ET.SubElement(world, "geom", name="ground", pos=text(0, 0, height), euler=turn, **kind)
+    # The plane meets nodes; nodes meet each other only with self-collision.
+    meets: dict[str, Any] = {"contype": "1" if simulation.self_collision else "0", "conaffinity": "1"}
+    if rod is not None:
+        cable.add(source, root, world, meets)
+    for index, (place, mass) in enumerate(zip(topology.nodes, source.masses, strict=True) if rod is None else ()):
+        body = ET.SubElement(world, "body", name=f"node{index}", pos=text(*place))
+        for axis, direction in AXES.items():
+            damping = text(material.drag * float(mass))
+            ET.SubElement(body, "joint", name=f"node{index}{axis}", type="slide", axis=direction, damping=damping)
+        ET.SubElement(body, "geom", type="sphere", size=text(radius), mass=text(mass), **meets)
+        ET.SubElement(body, "site", name=f"node{index}", size=text(radius))
+    for index, place in enumerate(topology.controllers):
+        body = ET.SubElement(world, "body", name=f"hand{index}", pos=text(*place), mocap="true")
+        ET.SubElement(body, "site", name=f"hand{index}", size=text(radius), rgba="1 0.6 0.1 1")
+    tendons = ET.SubElement(root, "tendon") if len(topology.springs) else root
+    names = [f"node{index}" for index in range(len(topology.nodes))] + [f"hand{c}" for c in range(len(topology.controllers))]
+    pushes = topology.pushes if topology.pushes.size else np.zeros(len(topology.springs), bool)
+    columns = (topology.springs, material.stiffness, topology.rest_lengths, material.dashpot, pushes)
+    for index, (ends, stiffness, length, dashpot, push) in enumerate(zip(*columns, strict=True)):
+        force = text(float(stiffness) / float(length))
+        # Between two lengths a tendon has no force.
+        free = text(length, FAR) if push else text(length)
+        law: dict[str, Any] = {"stiffness": force, "damping": text(dashpot), "springlength": free}
+        tendon = ET.SubElement(tendons, "spatial", name=f"spring{index}", width=text(radius / 5), **law)
+        for end in ends:
+            ET.SubElement(tendon, "site", site=names[end])
+    if rod is None and source.velocity.any():
+        keys = ET.SubElement(root, "keyframe")
+        ET.SubElement(keys, "key", name="start", qvel=text(*source.velocity.ravel()))
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode") + "\n"

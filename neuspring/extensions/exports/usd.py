@@ -1,0 +1,167 @@
+"""USD: animated nodes, springs as curves, and splats as Gaussian particle fields with points as their stand-in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuspring.core.artifacts import Rod
+from neuspring.core.errors import InputError
+from neuspring.core.extras import needed
+from neuspring.core.files import write_atomically
+from neuspring.extensions.exports import ply
+from neuspring.extensions.exports.source import Source
+from neuspring.physics.rod_nodes import radius_of
+from neuspring.splats.view import C0
+
+SUFFIXES = (".usdc", ".usda", ".usd")
+ROOT = "/Twin"
+THIN, THICK = 0.1, 0.3
+"""Width of springs and of nodes, in median rest lengths."""
+
+
+def write(source: Source, frames: Sequence[int], output: Path, rate: float | None = None) -> list[Path]:
+    """Write one file. Its time codes per second are `rate`, or one per frame of the twin; seconds stay what they are."""
+    Gf, Usd, UsdGeom, Vt = (needed(f"pxr.{name}") for name in ("Gf", "Usd", "UsdGeom", "Vt"))
+    if output.suffix not in SUFFIXES:
+        raise InputError("--output", f"must end with {', '.join(SUFFIXES)}", output.name)
+    if rate is not None and not (np.isfinite(rate) and rate > 0):
+        raise InputError("--rate", "must be a positive number of time codes per second", rate)
+    rate = rate or 1 / source.twin.simulation.frame_time
+    codes = {frame: round(float(source.times[frame]) * rate, 6) for frame in frames}
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetTimeCodesPerSecond(rate)
+    stage.SetFramesPerSecond(rate)
+    stage.SetStartTimeCode(min(codes.values()))
+    stage.SetEndTimeCode(max(codes.values()))
+    root = UsdGeom.Xform.Define(stage, ROOT)
+    stage.SetDefaultPrim(root.GetPrim())
+    if source.twin.simulation.up == "-z":
+        root.AddRotateXOp().Set(180.0)  # USD has no axis that points down.
+    shapes = _Shapes(stage, UsdGeom, Vt, Gf)
+    shapes.graph(source, codes)
+    if source.splats is not None:
+        shapes.splats(source, codes)
+
+    def save(temporary: Path) -> None:
+        whole = temporary.with_suffix(output.suffix)  # The suffix chooses the encoding.
+        try:
+            stage.GetRootLayer().Export(str(whole))
+            whole.replace(temporary)
+        finally:
+            whole.unlink(missing_ok=True)
+
+    write_atomically(output, save)
+    return [output]
+
+
+def colors(stiffness: np.ndarray) -> np.ndarray:
+    """RGB [S, 3]: blue where a spring is soft, red where it is stiff, by the logarithm of its stiffness."""
+    logs = np.log(np.maximum(stiffness, 1e-9))
+    span = np.ptp(logs) if len(logs) else 0.0
+    share = (logs - logs.min()) / span if span else np.full(len(logs), 0.5)
+    return np.stack([share, np.full(len(logs), 0.2), 1 - share], axis=1)
+
+
+class _Shapes:
+    """Prims of a stage. pxr's modules are given, because they are optional."""
+
+    def __init__(self, stage: Any, geom: Any, vt: Any, gf: Any) -> None:
+        self._stage, self._geom, self._vt, self._gf = stage, geom, vt, gf
+
+    def graph(self, source: Source, codes: dict[int, float]) -> None:
+        """Nodes, controllers and springs; of a rod, its center line."""
+        topology, material, token = source.twin.topology, source.twin.material, self._geom.Tokens
+        unit = float(np.median(topology.rest_lengths)) if len(topology.rest_lengths) else 0.01
+        nodes = self._points("Nodes", THICK * unit, (0.8, 0.8, 0.8))
+        hands = self._points("Controllers", 2 * THICK * unit, (1.0, 0.6, 0.1))
+        springs = self._geom.BasisCurves.Define(self._stage, f"{ROOT}/Springs")
+        springs.CreateTypeAttr(token.linear)
+        springs.CreateCurveVertexCountsAttr([2] * len(topology.springs))
+        springs.CreateWidthsAttr([THIN * unit])
+        springs.SetWidthsInterpolation(token.constant)
+        self._primvar(springs, "displayColor", "color3f[]", self._vectors(colors(material.stiffness)), token.uniform)
+        values = {"stiffness": material.stiffness, "dashpot": material.dashpot, "restLength": topology.rest_lengths}
+        for name, value in values.items():
+            self._primvar(springs, name, "float[]", self._vt.FloatArray.FromNumpy(value), token.uniform)
+        rod = source.twin.rod
+        if rod is None:
+            self._primvar(nodes, "mass", "float[]", self._vt.FloatArray.FromNumpy(source.masses), token.vertex)
+        else:
+            line = self._line(rod)
+        for frame, code in codes.items():
+            both = ply.points(source, frame)
+            shown = {nodes: source.positions[frame], hands: source.hands[frame], springs: both[topology.springs].reshape(-1, 3)}
+            if rod is not None:
+                shown[line] = both[-len(rod.vertices) :]
+            for prim, points in shown.items():
+                self._place(prim, prim.CreatePointsAttr(), points, code)
+
+    def _line(self, rod: Rod) -> Any:
+        """A curve through the vertices, as thick as the nodes are far, with what the rod is made of."""
+        token = self._geom.Tokens
+        curve = self._geom.BasisCurves.Define(self._stage, f"{ROOT}/CenterLine")
+        curve.CreateTypeAttr(token.linear)
+        curve.CreateCurveVertexCountsAttr([len(rod.vertices)])
+        curve.CreateWidthsAttr([2 * max(radius_of(rod), 0.5 * THIN * float(rod.lengths.mean()))])
+        curve.SetWidthsInterpolation(token.constant)
+        for name, value in {"mass": rod.mass, "bending": rod.bending, "twisting": rod.twisting}.items():
+            self._primvar(curve, name, "float[]", self._vt.FloatArray.FromNumpy(value.astype(np.float32)), token.vertex)
+        return curve
+
+    def splats(self, source: Source, codes: dict[int, float]) -> None:
+        """Splats for renderers that know Gaussians, and points (purpose proxy) for those that do not."""
+        from pxr import UsdVol
+
+        token, fields = self._geom.Tokens, None
+        field = UsdVol.ParticleField3DGaussianSplat.Define(self._stage, f"{ROOT}/Splats")
+        stand_in = self._geom.Points.Define(self._stage, f"{ROOT}/SplatPoints")
+        image, proxy = self._geom.Imageable(field.GetPrim()), self._geom.Imageable(stand_in.GetPrim())
+        image.CreatePurposeAttr(token.render)
+        proxy.CreatePurposeAttr(token.proxy)
+        image.SetProxyPrim(stand_in.GetPrim())
+        for frame, splats in source.moved_splats(list(codes)):
+            if fields is None:
+                fields = splats
+                scales = np.exp(np.broadcast_to(splats.log_scales, (len(splats.means), 3)))
+                opacities = self._vt.FloatArray.FromNumpy(1 / (1 + np.exp(-splats.opacity_logits)))
+                field.CreateScalesAttr(self._vectors(scales))
+                field.CreateOpacitiesAttr(opacities)
+                degree = round(splats.harmonics.shape[1] ** 0.5) - 1
+                field.CreateRadianceSphericalHarmonicsDegreeAttr(degree)
+                field.CreateRadianceSphericalHarmonicsCoefficientsAttr(self._vectors(splats.harmonics.reshape(-1, 3)))
+                stand_in.CreateWidthsAttr(self._vt.FloatArray.FromNumpy((2 * scales.mean(axis=1)).astype(np.float32)))
+                shade = np.clip(0.5 + C0 * splats.harmonics[:, 0], 0, 1)
+                self._primvar(stand_in, "displayColor", "color3f[]", self._vectors(shade), token.vertex)
+                self._primvar(stand_in, "displayOpacity", "float[]", opacities, token.vertex)
+            turns = splats.quaternions / np.linalg.norm(splats.quaternions, axis=1, keepdims=True)
+            quaternions = [self._gf.Quatf(*map(float, turn)) for turn in turns]
+            field.CreateOrientationsAttr().Set(self._vt.QuatfArray(quaternions), codes[frame])
+            field.CreatePositionsAttr().Set(self._vectors(splats.means), codes[frame])
+            self._place(stand_in, stand_in.CreatePointsAttr(), splats.means, codes[frame])
+
+    def _points(self, name: str, width: float, color: tuple[float, float, float]) -> Any:
+        prim = self._geom.Points.Define(self._stage, f"{ROOT}/{name}")
+        prim.CreateWidthsAttr([width])
+        prim.SetWidthsInterpolation(self._geom.Tokens.constant)
+        self._primvar(prim, "displayColor", "color3f[]", [color], self._geom.Tokens.constant)
+        return prim
+
+    def _place(self, prim: Any, attribute: Any, points: np.ndarray, code: float) -> None:
+        attribute.Set(self._vectors(points), code)
+        if len(points):
+            prim.CreateExtentAttr().Set(self._vectors(np.stack([points.min(axis=0), points.max(axis=0)])), code)
+
+    def _vectors(self, values: np.ndarray) -> Any:
+        return self._vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, np.float32))
+
+    def _primvar(self, prim: Any, name: str, kind: str, value: Any, interpolation: str) -> None:
+        from pxr import Sdf
+
+        made = self._geom.PrimvarsAPI(prim).CreatePrimvar(name, Sdf.ValueTypeNames.Find(kind), interpolation)
+        made.Set(value)

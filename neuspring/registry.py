@@ -1,0 +1,112 @@
+"""The door of each kind of thing: our own members, and those that installed packages bring.
+
+A kind is a `Registry` beside the code that uses it (`METRICS`, `BASELINES`, `STAGES`, ...). A package adds to it by an entry point of
+the group `neuspring.<kind>`, in its pyproject.toml, and nothing here changes:
+
+    [project.entry-points."neuspring.metrics"]
+    my_error = "my_package.errors:MY_ERROR"
+
+A member is an object, or text "module:name" that is imported when it is first asked for, so that listing names imports nothing.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
+from pkgutil import iter_modules, resolve_name
+from typing import Any, Generic, TypeVar
+
+from neuspring.core.errors import InputError
+
+T = TypeVar("T")
+OURS = "neuspring"
+
+
+class Registry(Mapping[str, T], Generic[T]):
+    """Members of one kind, name -> member; ours come first, in their order.
+
+    Raises InputError where two packages bring one name, a package's member cannot be imported or is of another type, or there is no
+    such name (a KeyError too, so that it is a mapping).
+    """
+
+    def __init__(self, kind: str, own: Mapping[str, T | str], type: type | tuple[type, ...] = object) -> None:
+        self.kind, self._own, self._type = kind, dict(own), type
+        self._loaded: dict[str, T] = {}
+
+    @functools.cached_property
+    def _foreign(self) -> dict[str, EntryPoint]:
+        found: dict[str, EntryPoint] = {}
+        for point in entry_points(group=f"{OURS}.{self.kind}"):
+            if _left_out(point):
+                continue
+            if point.name in self._own or (other := found.get(point.name)) and other.value != point.value:
+                rule = f"two packages bring the {self.kind} member {point.name}"
+                raise InputError(f"package {_package(point)}", rule, point.value, "Uninstall one of them.")
+            found[point.name] = point
+        return dict(sorted(found.items()))
+
+    def __getitem__(self, name: str) -> T:
+        if name not in self._loaded:
+            if name in self._own:
+                own = self._own[name]
+                member: Any = resolve_name(own) if isinstance(own, str) else own
+            elif name in self._foreign:
+                member = self._imported(self._foreign[name])
+            else:
+                raise Unknown(self.kind, name, list(self))
+            self._loaded[name] = member
+        return self._loaded[name]
+
+    def _imported(self, point: EntryPoint) -> Any:
+        where, remedy = f"package {_package(point)}, {self.kind} {point.name}", "Repair or uninstall the package."
+        try:
+            member = point.load()
+        except Exception as error:
+            raise InputError(where, "must be importable", f"{type(error).__name__}: {error}", remedy) from error
+        if not isinstance(member, self._type):
+            raise InputError(where, f"must be a {getattr(self._type, '__name__', self._type)}", type(member).__name__, remedy)
+        return member
+
+    def __iter__(self) -> Iterator[str]:
+        return iter([*self._own, *self._foreign])
+
+    def __len__(self) -> int:
+        return len(self._own) + len(self._foreign)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._own or name in self._foreign
+
+    def module_of(self, name: str) -> str:
+        """The module that a member is declared in, for digests of code; that of the registry's user for one given as an object."""
+        own = self._own.get(name)
+        text = own if isinstance(own, str) else self._foreign[name].value if name in self._foreign else ""
+        return text.partition(":")[0]
+
+
+class Unknown(InputError, KeyError):
+    """No member has this name."""
+
+    def __init__(self, kind: str, name: str, known: list[str]) -> None:
+        super().__init__(kind, "must be a registered name", name, f"Known: {', '.join(known)}.")
+
+
+def modules(package: str, member: str = "{}") -> dict[str, str]:
+    """Each module of a package -> "module:name" of the member it declares; `member` has {} for the module's name."""
+    names = sorted(found.name for found in iter_modules(import_module(package).__path__) if not found.name.startswith("_"))
+    return {name: f"{package}.{name}:{member.format(name)}" for name in names}
+
+
+def _package(point: EntryPoint) -> str:
+    return point.dist.name if point.dist else "unknown"
+
+
+def _left_out(point: EntryPoint) -> bool:
+    """One of our own extensions whose folder was removed: that is how a user leaves it out."""
+    module = point.value.partition(":")[0]
+    try:
+        return module.split(".")[0] == OURS and find_spec(module) is None
+    except ModuleNotFoundError:
+        return True

@@ -1,0 +1,257 @@
+"""What the page asks of the server: marks, masks and clicks that are never lost, and never written over by a stale tab."""
+
+import json
+
+import numpy as np
+import pytest
+
+from neuspring.core.errors import InputError
+from neuspring.data.capture import TRACKS, Capture, write_tracks
+from neuspring.extensions.annotate.clicks import ANNOTATIONS
+from neuspring.extensions.annotate.server import COLORS, Server, overlay_png
+from neuspring.perception.marks.store import MasksFile
+from tests.support.moving import FRAMES, moving, truth
+from tests.support.painted import Painted
+from tests.support.served import decoded, served
+
+BOX = {"frame": 1, "label": "object", "kind": "box", "points": [[40, 50], [60, 70]], "radius": 3.0}
+HAND = BOX | {"label": "hand", "points": [[80, 50], [100, 70]]}
+POINT = (46.0, 62.0)
+
+
+@pytest.fixture
+def capture(tmp_path) -> Capture:
+    return moving(tmp_path / "capture", missing=(4,))
+
+
+@pytest.fixture
+def painted(monkeypatch) -> Painted:
+    return Painted(monkeypatch)
+
+
+@pytest.fixture
+def client(capture, painted):
+    with served(capture) as client:
+        yield client
+
+
+def marks(*marks, camera="0") -> dict:
+    return {"format": 1, "cameras": {camera: list(marks)}}
+
+
+def revision(client, what: str = "masks") -> str:
+    return client.get(f"/api/{what}")["revision"]
+
+
+def write_marks(client, *own, camera="0"):
+    status, answer = client.post("/api/marks", revision=revision(client), marks=marks(*own, camera=camera))
+    assert status == 200
+    return answer["revision"]
+
+
+def test_the_state_describes_the_capture_and_frames_come_as_they_are(client, capture):
+    state = client.get("/api/state")
+    assert (state["name"], state["frames"], state["frame_rate"]) == ("thing", FRAMES, 30.0)
+    assert state["cameras"][0] == {"name": "0", "width": 128, "height": 96, "missing": [4]}
+    assert state["masks"]["marks"] == {"format": 1, "cameras": {}}
+    assert state["tracks"]["annotations"] == {"format": 1, "points": []}
+    assert state["masks"]["saved"] == {}
+    shown = client.image("/api/color/0/3")[..., ::-1].astype(int)
+    assert np.abs(shown - capture.color("0", 3)).mean() < 2.0  # JPEG
+    assert client.raw("GET", "/api/color/0/4")[0] == 404
+
+
+def test_marks_are_saved_at_each_change_and_a_stale_tab_is_refused(client, capture):
+    first = write_marks(client, BOX)
+    assert json.loads((capture.folder / "marks.json").read_text()) == marks(BOX)
+    status, answer = client.post("/api/marks", revision="none", marks=marks())
+    assert (status, answer["error"]) == (409, "The file changed in another tab or program since this page read it.")
+    assert client.get("/api/masks")["marks"] == marks(BOX)
+    assert client.post("/api/marks", revision=first, marks=marks(BOX, HAND))[0] == 200
+
+
+def test_marks_that_break_a_rule_are_refused_and_change_nothing(client, capture):
+    status, answer = client.post("/api/marks", revision="none", marks={"format": 2})
+    assert (status, "format" in answer["error"]) == (422, True)
+    status, answer = client.post("/api/marks", revision="none", marks=marks(*[BOX] * 2001))
+    assert (status, "at most 2000 marks a camera; received 2001" in answer["error"]) == (422, True)
+    assert not (capture.folder / "marks.json").exists()
+
+
+def test_work_goes_on_after_a_new_start(capture):
+    with served(capture) as client:
+        write_marks(client, BOX)
+        client.post("/api/clicks", revision="none", annotations={"format": 1, "points": [{"name": "ear"}]})
+    with served(capture) as client:
+        state = client.get("/api/state")
+    assert state["masks"]["marks"] == marks(BOX)
+    assert state["tracks"]["annotations"]["points"] == [{"name": "ear", "clicks": {}}]
+
+
+@pytest.mark.parametrize("name", ["marks.json", ANNOTATIONS])
+def test_a_damaged_file_is_refused_at_the_start(capture, name):
+    (capture.folder / name).write_text("{")
+    with pytest.raises(InputError, match=name):
+        Server(capture)
+
+
+def test_the_preview_shows_the_marks_of_the_frame(client):
+    write_marks(client, BOX, HAND)
+    status, headers, content = client.raw("POST", "/api/preview", json.dumps({"camera": "0", "frame": 1}).encode())
+    assert (status, headers["content-type"]) == (200, "image/png")
+    picture = decoded(content)
+    assert tuple(picture[60, 50, 2::-1]) == COLORS[1]
+    assert tuple(picture[60, 90, 2::-1]) == COLORS[2]
+    assert picture[10, 10, 3] == 0
+    status, answer = client.post("/api/preview", camera="0", frame=0)
+    assert (status, "must be marked on it" in answer["error"]) == (422, True)
+
+
+@pytest.mark.parametrize(
+    ("camera", "frame"), [("0", 4), ("0", 12), ("0", -1), ("0", None), ("7", 0), (None, 0), ([], 0), ("0", [])]
+)
+def test_previews_of_frames_that_are_not_there_are_refused(client, camera, frame):
+    assert client.post("/api/preview", camera=camera, frame=frame)[0] == 404
+
+
+def test_marks_are_carried_looked_at_and_saved(client, capture):
+    write_marks(client, BOX)
+    assert client.post("/api/masks/save")[0] == 422
+    assert client.raw("GET", "/api/overlay/carried/0/2")[0] == 404
+    assert client.post("/api/carry", cameras=["0"])[0] == 200
+    client.wait(lambda: client.get("/api/job")["state"] == "done")
+    masks = client.get("/api/masks")
+    assert masks["carried"]["0"]["doubt"] == pytest.approx(np.linspace(0, 1, FRAMES), abs=1e-3)
+    assert (masks["carried"]["0"]["stale"], masks["carried"]["0"]["saved"]) == (False, False)
+    assert masks["job"]["message"] == "Carried camera 0; 6 very doubtful frames. Look at the frames that are listed, then save."
+    overlay = client.image("/api/overlay/carried/0/2")
+    assert (overlay[..., 3] > 0).sum() == 21 * 21
+    assert client.raw("GET", "/api/overlay/carried/0/4")[0] == 404
+    status, answer = client.post("/api/masks/save")
+    assert (status, answer) == (200, {"cameras": ["0"]})
+    assert [capture.mask("0", frame).sum() for frame in (0, FRAMES - 1)] == [21 * 21] * 2
+    assert MasksFile.of(capture).cameras["0"].backend == "marks"
+    assert client.get("/api/masks")["carried"]["0"]["saved"]
+    write_marks(client, HAND)
+    assert client.get("/api/masks")["carried"]["0"]["stale"]
+
+
+def test_one_thing_is_carried_at_a_time_and_can_be_stopped(client, painted):
+    write_marks(client, BOX)
+    painted.gate.clear()
+    assert client.post("/api/carry", cameras=["0"])[0] == 200
+    job = client.wait(lambda: (job := client.get("/api/job"))["done"] == 1 and job)
+    assert (job["state"], job["what"], job["total"]) == ("running", "camera 0", FRAMES)
+    status, answer = client.post("/api/carry", cameras=["0"])
+    assert (status, "Wait for the end, or stop it" in answer["error"]) == (409, True)
+    assert client.post("/api/stop")[0] == 200
+    painted.gate.set()
+    client.wait(lambda: client.get("/api/job")["state"] == "stopped")
+    assert client.get("/api/masks")["carried"] == {}
+    assert client.post("/api/carry", cameras=["0"])[0] == 200
+    client.wait(lambda: client.get("/api/job")["state"] == "done")
+
+
+def test_an_error_in_the_work_is_told(client, painted):
+    write_marks(client, BOX)
+    painted.fill = lambda *_: (_ for _ in ()).throw(InputError("camera 0", "the object must be found", "none"))
+    client.post("/api/carry", cameras=["0"])
+    job = client.wait(lambda: (job := client.get("/api/job"))["state"] == "failed" and job)
+    assert job["message"] == "camera 0: the object must be found; received none."
+    painted.fill = lambda *_: 1 / 0
+    client.post("/api/carry", cameras=["0"])
+    client.wait(lambda: "ZeroDivisionError" in client.get("/api/job")["message"])
+
+
+@pytest.mark.parametrize(("cameras", "status"), [(["covered"], 422), ([], 422), (["7"], 404), ("0", 404), (None, 404), ([[]], 404)])
+def test_only_marked_cameras_are_carried(client, cameras, status):
+    write_marks(client, BOX)
+    assert client.post("/api/carry", cameras=cameras)[0] == status
+    assert client.get("/api/job")["state"] == "idle"
+
+
+def clicks(*frames, name="ear", camera="0") -> dict:
+    places = truth(POINT)
+    own = [{"frame": frame, "x": float(places[frame, 0]), "y": float(places[frame, 1])} for frame in frames]
+    return {"format": 1, "points": [{"name": name, "clicks": {camera: own}}]}
+
+
+def followed(client) -> dict:
+    return client.wait(lambda: (answer := client.get("/api/tracks/0"))["busy"] is False and answer)
+
+
+def test_clicks_become_tracks(client, capture):
+    status, answer = client.post("/api/clicks", revision="none", annotations=clicks(0))
+    assert status == 200
+    assert revision(client, "clicks") == answer["revision"]
+    assert client.post("/api/clicks", revision="none", annotations=clicks(1))[0] == 409
+    point = followed(client)["points"][0]
+    trail = np.array([[np.nan] * 2 if place is None else place for place in point["trails"]["0"]])
+    assert np.flatnonzero(np.isnan(trail).any(axis=1)).tolist() == [4]
+    assert np.nanmax(np.linalg.norm(trail - truth(POINT), axis=1)) < 0.3
+    assert client.post("/api/tracks/save") == (200, {"points": 1})
+    saved = capture.tracks()
+    assert saved.shape == (FRAMES, 1, 3)
+    assert np.isnan(saved[4]).all()
+    pixels, _ = capture.cameras["0"].project(saved[:, 0])
+    assert np.nanmax(np.linalg.norm(pixels - truth(POINT), axis=1)) < 0.3
+    version = client.get("/api/tracks/0")["version"]
+    assert "points" not in client.get(f"/api/tracks/{version}")
+
+
+def test_a_correction_follows_only_what_changed(client):
+    client.post("/api/clicks", revision="none", annotations=clicks(0, 8))
+    followed(client)
+    runs = client.server.tracks._run.cache_info().misses
+    client.post("/api/clicks", revision=revision(client, "clicks"), annotations=clicks(0, 8, 11))
+    followed(client)
+    # From 8 to 11, from 11 to 8, and from 11 to the end.
+    assert client.server.tracks._run.cache_info().misses == runs + 3
+
+
+def test_bad_clicks_are_refused_and_tracks_need_a_point(client, capture):
+    for annotations in (clicks(4), None, {"format": 1, "points": [{"name": ""}]}):
+        assert client.post("/api/clicks", revision="none", annotations=annotations)[0] == 422
+    assert not (capture.folder / ANNOTATIONS).exists()
+    assert client.post("/api/tracks/save")[0] == 422
+
+
+def test_tracks_that_were_there_before_are_not_replaced_without_a_word(client, capture):
+    write_tracks(capture.folder, np.zeros((FRAMES, 3, 3)))
+    client.post("/api/clicks", revision="none", annotations=clicks(0))
+    followed(client)
+    status, answer = client.post("/api/tracks/save")
+    assert (status, answer["error"]) == (428, f"The capture already has {TRACKS}, with 3 tracks. Saving replaces them.")
+    assert capture.tracks().shape[1] == 3
+    assert client.post("/api/tracks/save", replace="yes")[0] == 428
+    assert client.post("/api/tracks/save", replace=True) == (200, {"points": 1})
+    assert client.post("/api/tracks/save") == (200, {"points": 1})
+    write_tracks(capture.folder, np.ones((FRAMES, 2, 3)))
+    assert client.post("/api/tracks/save")[0] == 428, "another program wrote them since"
+    assert capture.tracks().shape[1] == 2
+
+
+def test_an_image_that_cannot_be_read_or_an_error_of_the_program_is_told_and_work_goes_on(client, capture, monkeypatch):
+    path = capture.path("color", "0", 2)
+    image = path.read_bytes()
+    path.write_bytes(b"no image")
+    client.post("/api/clicks", revision="none", annotations=clicks(0))
+    assert "00002.png" in followed(client)["failure"]
+    status, answer = client.post("/api/tracks/save")
+    assert (status, "00002.png" in answer["error"]) == (409, True)
+    path.write_bytes(image)
+    with monkeypatch.context() as patch:
+        patch.setattr(client.server.tracks, "_run", lambda *_: 1 / 0)
+        client.post("/api/clicks", revision=revision(client, "clicks"), annotations=clicks(1))
+        assert "ZeroDivisionError" in followed(client)["failure"]
+    client.post("/api/clicks", revision=revision(client, "clicks"), annotations=clicks(0, 1))
+    assert followed(client)["failure"] == ""
+
+
+def test_borders_of_an_overlay_are_strong_and_its_inside_is_clear():
+    labels = np.zeros((20, 30), np.uint8)
+    labels[5:15, 5:25] = 1
+    opacity = decoded(overlay_png(labels))[..., 3]
+    assert opacity[5, 5] == opacity[14, 24] == 255
+    assert 0 < opacity[10, 15] < 128
+    assert opacity[0, 0] == 0

@@ -1,0 +1,131 @@
+"""A rod in other tools: it hangs in MuJoCo as here, viewers show the center line, and no reader takes it for springs alone."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from neuspring.core.artifacts import Rod
+from neuspring.core.errors import InputError
+from neuspring.extensions.exports import ply, simulators, usd
+from neuspring.extensions.exports.cable import _rest
+from neuspring.extensions.exports.source import read_source
+from neuspring.twin.rollout import roll_out
+from tests.support import ropes
+from tests.support.played import rod_results
+
+HANGING = 0.03
+"""Of the sag: MuJoCo's edges are rigid bodies with a mass along them, ours have it at their ends, and clamps are soft there.
+Measured: 0.021."""
+
+
+def source_of(tmp_path, **options):
+    return read_source(rod_results(tmp_path, **options) / "rod" / "0")
+
+
+def hanging(tmp_path, **rod):
+    """A cable that swings from a level plane down between its clamps, as a source, and its nodes once it hangs still."""
+    seen = ropes.cable(frames=200, sag=2.0)
+    level = {name: getattr(seen, name)[..., [0, 2, 1]] + [0, 0, 1] for name in ("object_points", "controller_points")}
+    seen = replace(seen, **level)
+    settings = replace(ropes.SETTINGS, rod=replace(ropes.ROD, bending=0.002, twisting=0.002, drag=8.0, stretching=1e5, **rod))
+    ropes.twin(seen, settings).save(tmp_path / "twin.npz")
+    source = read_source(tmp_path / "twin.npz")
+    return source, roll_out(source.twin, seen.controller_points).positions[-1]
+
+
+@pytest.mark.parametrize("rest", ["straight", "first_frame"])
+def test_a_cable_hangs_between_its_clamps_in_mujoco_as_here(tmp_path, rest):
+    mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (extra `export`)")
+    source, ours = hanging(tmp_path, rest=rest)
+    model = mujoco.MjModel.from_xml_string(simulators.mjcf(source))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_kinematics(model, data)
+    sites = [model.site(f"node{n}").id for n in range(len(ours))]
+    # Bodies have the unloaded lengths, which are those of frame 0 here.
+    np.testing.assert_allclose(data.site_xpos[sites], source.twin.topology.nodes, atol=1e-6)
+    model.dof_damping[6:] = np.maximum(model.dof_damping[6:], 3e-3)
+    mujoco.mj_step(model, data, 12_000)
+    assert np.abs(data.qvel).max() < 1e-2, "it hangs still"
+    sag = 1.0 - ours[:, 2].min()
+    assert sag > 0.01
+    assert np.abs(data.site_xpos[sites] - ours).max() < HANGING * sag
+
+
+def test_a_joint_without_moments_has_the_unloaded_curvatures():
+    k = np.array([[0, 0], [0.3, -0.2], [0, 0.5], [0, 0]])
+    turns = _rest(k)
+    for (k1, k2), turn in zip(k[1:-1], turns, strict=True):
+        before, after = np.eye(3), turn.as_matrix()
+        binormal = 2 * np.cross(before[:, 0], after[:, 0]) / (1 + before[:, 0] @ after[:, 0])
+        m1, m2 = before[:, 1] + after[:, 1], before[:, 2] + after[:, 2]
+        np.testing.assert_allclose([binormal @ m2 / 2, -binormal @ m1 / 2], [k1, k2], atol=1e-12)
+
+
+def test_a_rope_with_hands_loads_in_mujoco(tmp_path):
+    mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (extra `export`)")
+    source = source_of(tmp_path)
+    made = simulators.write_mujoco(source, range(3), tmp_path / "out")
+    model = mujoco.MjModel.from_xml_path(str(made[0]))
+    assert (model.ntendon, model.nmocap) == (len(source.twin.topology.springs), 3)
+    assert model.body_mass.sum() == pytest.approx(source.twin.rod.mass.sum())
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_step(model, data, 20)
+    assert np.isfinite(data.qpos).all()
+    assert data.warning.number.sum() == 0
+
+
+def test_arrays_are_described_and_the_format_says_that_it_is_a_rod(tmp_path):
+    source = source_of(tmp_path)
+    simulators.plain.write(source, [0, 1], tmp_path / "out")
+    said = json.loads((tmp_path / "out" / "description.json").read_text())
+    assert (said["format"], said["version"]) == ("neuspring-rod", 1)
+    assert {"stretching", "damping", "roll", "drag", "gravity"} <= said["settings"].keys()
+    with np.load(tmp_path / "out" / "arrays.npz") as arrays:
+        assert "mass" not in arrays
+        sizes: dict[str, int] = {}
+        for name, entry in said["arrays"].items():
+            assert list(arrays[name].shape) == entry["shape"]
+            for symbol, size in zip(entry["dimensions"], entry["shape"], strict=True):
+                assert size == (int(symbol) if symbol.isdigit() else sizes.setdefault(symbol, size)), name
+                assert symbol.isdigit() or symbol in said["sizes"]
+        for name in Rod.__dataclass_fields__:
+            if f"rod_{name}" in arrays:
+                assert np.array_equal(arrays[f"rod_{name}"], getattr(source.twin.rod, name))
+        assert sizes["V"] == 10 == sizes["E"] + 1
+
+
+def test_newton_is_refused_with_the_next_move(tmp_path):
+    with pytest.raises(InputError, match=r"nodes and springs.*rod.*mujoco"):
+        simulators.write_newton(source_of(tmp_path), range(2), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_viewer_sees_the_center_line_as_a_moving_curve(tmp_path):
+    pytest.importorskip("pxr", reason="usd-core is not installed (extra `export`)")
+    from pxr import Usd, UsdGeom
+
+    source = source_of(tmp_path, clamped=True)
+    (path,) = usd.write(source, [0, 3, 5], tmp_path / "rod.usdc")
+    stage = Usd.Stage.Open(str(path))
+    line = UsdGeom.BasisCurves.Get(stage, "/Twin/CenterLine")
+    assert line.GetCurveVertexCountsAttr().Get() == [7]
+    assert line.GetPointsAttr().GetTimeSamples() == [0, 3, 5]
+    for frame in (0, 5):
+        points = np.array(line.GetPointsAttr().Get(frame))
+        np.testing.assert_allclose(points[2:5], source.positions[frame], atol=1e-6)
+        np.testing.assert_allclose(points[[0, 1, 5, 6]], source.hands[frame], atol=1e-6)
+    bending = UsdGeom.PrimvarsAPI(line).GetPrimvar("bending")
+    np.testing.assert_allclose(bending.Get(), source.twin.rod.bending, rtol=1e-6)
+
+
+def test_a_graph_file_has_the_line_and_its_mass(tmp_path):
+    source = source_of(tmp_path)
+    rod, edges, vertices = source.twin.rod, ply.edges(source, 2), ply.vertices(source, 2)
+    assert len(edges) == len(rod.lengths) + len(source.twin.topology.springs)
+    np.testing.assert_allclose(vertices["mass"][-10:], rod.mass, rtol=1e-6)
+    assert vertices["mass"].sum() == pytest.approx(rod.mass.sum(), rel=1e-6)
+    assert np.abs(edges["strain"][: len(rod.lengths)]).max() < 0.05

@@ -1,0 +1,83 @@
+"""npz + JSON: read and simulated without us, by the script on the page."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import neuspring.extensions.exports
+from neuspring.cli.main import main
+from neuspring.core.artifacts import Twin
+from neuspring.extensions.exports import plain
+from neuspring.extensions.exports.source import read_source
+from tests.support import exported
+
+PAGE = Path(neuspring.extensions.exports.__file__).with_name("README.md")
+ERROR = 2e-7
+"""m, of the script on the page to our rollout in float32. Measured: 2.4e-8."""
+
+
+def script() -> str:
+    """The Python script on the page."""
+    (found,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    assert "neuspring." not in found and "import neuspring" not in found
+    return found
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"up": "-z", "ground": False}, {"controller_velocity": True}, {"gravity": 200.0}],
+    ids=["plain", "-z up", "hand velocity", "bounces"],
+)
+def test_the_script_on_the_page_simulates_the_first_frame(tmp_path, options):
+    twin = exported.stretched(exported.rope(**options), 1.1)
+    folder = exported.run_folder(tmp_path, twin)
+    assert main(["export", str(folder), "--to", "npz", "--output", str(tmp_path / "out")]) == 0
+    path = tmp_path / "first_frame.py"
+    path.write_text(script())
+    run = subprocess.run([sys.executable, "-I", str(path), str(tmp_path / "out")], capture_output=True, text=True, check=True)
+    error = float(run.stdout.split()[-1])
+    assert error < ERROR
+    arrays = np.load(tmp_path / "out" / plain.ARRAYS)
+    assert np.abs(arrays["positions"][1] - arrays["positions"][0]).max() > 100 * ERROR, "the body moves"
+    if "gravity" in options:
+        heights = arrays["positions"][:2, :, 2]
+        assert (heights >= 0).all() and heights[0].max() < 0.4 * options["gravity"] / 900, "it hits the ground in the first frame"
+
+
+def test_every_array_is_described_as_it_is(tmp_path):
+    folder = exported.run_folder(tmp_path)
+    plain.write(read_source(folder), [0, 2, 4], tmp_path / "out")
+    said = json.loads((tmp_path / "out" / plain.DESCRIPTION).read_text())
+    with np.load(tmp_path / "out" / plain.ARRAYS, allow_pickle=False) as arrays:
+        assert set(arrays.files) == set(said["arrays"])
+        sizes: dict[str, int] = {}
+        for name, entry in said["arrays"].items():
+            assert list(arrays[name].shape) == entry["shape"] and arrays[name].dtype.name == entry["dtype"]
+            assert entry["unit"] and entry["about"]
+            for symbol, size in zip(entry["dimensions"], entry["shape"], strict=True):
+                assert size == (int(symbol) if symbol.isdigit() else sizes.setdefault(symbol, size)), name
+                assert symbol.isdigit() or symbol in said["sizes"]
+        assert sizes["F"] == 3 and arrays["time"].tolist() == pytest.approx([0, 2 / 30, 4 / 30])
+        twin = Twin.load(folder / "twin.npz")
+        for name in ("springs", "rest_lengths", "nodes"):
+            assert np.array_equal(arrays[name], getattr(twin.topology, name))
+        for name in ("stiffness", "dashpot", "mass"):
+            assert np.array_equal(arrays[name], getattr(twin.material, name))
+    assert all({"value", "unit", "about"} == set(entry) for entry in said["settings"].values())
+
+
+def test_masses_of_one_kilogram_are_written_out(tmp_path):
+    twin = exported.rope()
+    Twin(
+        topology=twin.topology,
+        simulation=twin.simulation,
+        material=type(twin.material)(**{**vars(twin.material), "mass": np.zeros(0)}),
+    ).save(tmp_path / "twin.npz")
+    assert main(["export", str(tmp_path / "twin.npz"), "--to", "npz", "--output", str(tmp_path / "out")]) == 0
+    arrays = np.load(tmp_path / "out" / plain.ARRAYS)
+    assert arrays["mass"].tolist() == [1.0] * exported.NODES and arrays["positions"].shape[0] == 1

@@ -1,0 +1,141 @@
+"""What can be exported, and what is said about what cannot."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from neuspring.cli.main import main
+from neuspring.core.artifacts import Trajectory
+from neuspring.core.errors import InputError
+from neuspring.core.records import Recorder, StageRecord
+from neuspring.extensions.exports.source import chosen_frames, read_source
+from tests.support import exported
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return exported.run_folder(tmp_path / "results")
+
+
+def test_a_run_has_its_motion_hands_and_splats(folder):
+    source = read_source(folder)
+    assert source.name == "scene_neuspring_0"
+    assert source.positions.shape == (exported.FRAMES, exported.NODES, 3)
+    assert np.array_equal(source.positions, Trajectory.load(folder / "trajectory.npz").positions)
+    assert source.hands.shape == (exported.FRAMES, 1, 3) and source.holds.all()
+    moved = dict(source.moved_splats([0, 3]))
+    assert sorted(moved) == [0, 3] and source.splats is not None
+    shift = np.linalg.norm(moved[3].means.mean(0) - moved[0].means.mean(0))
+    assert shift == pytest.approx(np.linalg.norm((source.positions[3] - source.positions[0]).mean(0)), rel=0.5)
+
+
+def test_the_twin_may_be_of_another_folder_of_the_scenario(folder):
+    """Methods with the same fit share it; the run's record names it by digest."""
+    shared = folder.parents[1] / "owner" / "0"
+    shared.mkdir(parents=True)
+    for name in ("fit.json", "twin.npz"):
+        (folder / name).rename(shared / name)
+    assert len(read_source(folder).positions) == exported.FRAMES
+
+
+def test_a_twin_alone_is_known_in_frame_0(folder, tmp_path):
+    (folder / "rollout.json").unlink()
+    for path in (folder, folder / "twin.npz"):
+        source = read_source(path)
+        assert source.positions.shape[0] == 1 and source.splats is None
+        with pytest.raises(InputError, match=r"splats are required.*appearance/<seed>/splats.ply"):
+            source.require_splats()
+
+
+@pytest.mark.parametrize(
+    ("words", "frames"), [(None, list(range(7))), ("2", [2]), ("1:4", [1, 2, 3]), ("0:7:3", [0, 3, 6])], ids=str
+)
+def test_frames(folder, words, frames):
+    assert chosen_frames(words, read_source(folder), "") == frames
+
+
+@pytest.mark.parametrize("words", ["7", "0:8", "3:3", "4:2", "0:5:0", "-1", "a", "", "1:2:3:4"])
+def test_frames_that_are_not_there(folder, words):
+    with pytest.raises(InputError, match="frames of 0 to 6"):
+        chosen_frames(words, read_source(folder), "")
+
+
+def diverged(folder):
+    rollout = folder / "rollout.json"
+    trajectory = Trajectory.load(folder / "trajectory.npz")
+    short = replace(trajectory, positions=trajectory.positions[:3], diverged_frame=3, reason="node 1 left the scene in frame 3")
+    short.save(folder / "trajectory.npz")
+    old = StageRecord.load(rollout)
+    record = Recorder("rollout", rollout)
+    record.inputs = old.inputs
+    record.save({"trajectory": folder / "trajectory.npz"}, failure="rollout: diverged")
+
+
+def failed_fit(folder):
+    Recorder("fit", folder / "fit.json").save(failure="all candidates diverged")
+    (folder / "rollout.json").unlink()
+
+
+def baseline(folder):
+    Recorder("train", folder / "train.json").save()
+    for name in ("fit.json", "rollout.json"):
+        (folder / name).unlink()
+
+
+def older(folder):
+    values = json.loads((folder / "rollout.json").read_text())
+    (folder / "rollout.json").write_text(json.dumps(values | {"format": 0}))
+
+
+def other_observations(folder):
+    with (folder.parents[1] / "observations.npz").open("ab") as stream:
+        stream.write(b"more")
+
+
+BROKEN = {
+    "no folder": (shutil.rmtree, "no such file or folder"),
+    "empty folder": (
+        lambda folder: [path.unlink() for path in folder.iterdir()],
+        "must be the run of a method that makes a twin; received none",
+    ),
+    "no twin": (lambda folder: (folder / "twin.npz").unlink(), "Delete .*fit.json and run again"),
+    "no record of the twin": (lambda folder: (folder / "fit.json").unlink(), "the record of its model must lie in"),
+    "no trajectory": (lambda folder: (folder / "trajectory.npz").unlink(), "Delete .*rollout.json and run again"),
+    "no observations": (
+        lambda folder: (folder.parents[1] / "observations.npz").unlink(),
+        "the observations of the run must be there",
+    ),
+    "other observations": (other_observations, "Run the workflow again"),
+    "diverged": (diverged, "diverged: node 1 left.*name .*twin.npz"),
+    "failed": (failed_fit, "a failure: all candidates diverged"),
+    "baseline": (baseline, "a baseline's model"),
+    "older": (older, "this version reads records of format"),
+    "not a twin": (lambda folder: shutil.copy(folder / "trajectory.npz", folder / "twin.npz"), "Delete .*fit.json and run again"),
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_what_cannot_be_exported(folder, kind):
+    spoil, message = BROKEN[kind]
+    spoil(folder)
+    with pytest.raises(InputError, match=message):
+        read_source(folder)
+
+
+def test_the_command_says_what_is_wrong_and_writes_nothing(folder, tmp_path, capsys):
+    assert main(["export", str(folder), "--to", "npz", "--rate", "60"]) == 2
+    assert "--rate: is for usd" in capsys.readouterr().err
+    (folder / "trajectory.npz").unlink()
+    assert main(["export", str(folder), "--to", "npz", "--output", str(tmp_path / "out")]) == 2
+    assert "run again" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_without_output_no_format_writes_over_another(folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for to, frames in (("npz", "2"), ("newton", "0:3"), ("mujoco", "0:4")):
+        assert main(["export", str(folder), "--to", to, "--frames", frames]) == 0
+    counts = {path.parent.name: len(np.load(path)["frame"]) for path in (tmp_path / "export").rglob("arrays.npz")}
+    assert counts == {"scene_neuspring_0_npz": 1, "scene_neuspring_0_newton": 3, "scene_neuspring_0_mujoco": 4}

@@ -1,0 +1,94 @@
+"""Files of viewers, read back: PLY by plyfile and USD by pxr, bit for bit."""
+
+import numpy as np
+import pytest
+
+from neuspring.cli.main import main
+from neuspring.core.artifacts import Twin
+from neuspring.core.errors import InputError
+from neuspring.extensions.exports import usd
+from neuspring.extensions.exports.source import read_source
+from neuspring.splats.model import Splats
+from tests.support import exported
+
+
+def test_plyfile_reads_the_graph_as_it_is_and_splats_are_those_that_pictures_show(tmp_path):
+    plyfile = pytest.importorskip("plyfile", reason="plyfile is not installed (extra `dev`)")
+    folder, written = exported.run_folder(tmp_path), tmp_path / "out"
+    assert main(["export", str(folder), "--to", "ply", "--frames", "0:4:3", "--output", str(written)]) == 0
+    assert sorted(path.name for path in written.iterdir()) == [
+        *("splats_00000.ply", "splats_00003.ply", "springs_00000.ply", "springs_00003.ply")
+    ]
+    source, twin = read_source(folder), Twin.load(folder / "twin.npz")
+    read = plyfile.PlyData.read(written / "springs_00003.ply")
+    vertex, edge = read["vertex"].data, read["edge"].data
+    nodes = exported.NODES
+    placed = np.stack([vertex[axis] for axis in "xyz"], axis=-1).reshape(-1, 3)
+    assert np.array_equal(placed, np.concatenate([source.positions[3], source.hands[3]]))
+    assert np.array_equal(np.ravel(vertex["mass"]), [*twin.material.mass, 0]) and np.ravel(vertex["controller"])[nodes] == 1
+    assert np.ravel(vertex["region"]).tolist() == [0, 0, 0, 1, 1, 1, -1]
+    assert np.array_equal(np.stack([np.ravel(edge["vertex1"]), np.ravel(edge["vertex2"])], axis=1), twin.topology.springs)
+    for name, value in {"stiffness": twin.material.stiffness, "rest_length": twin.topology.rest_lengths}.items():
+        assert np.array_equal(np.ravel(edge[name]), value)
+    ends = placed[twin.topology.springs]
+    strain = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) / twin.topology.rest_lengths - 1
+    assert np.abs(np.ravel(edge["strain"]) - strain).max() < 1e-6 and np.abs(strain).max() > 0.01
+    splats, expected = Splats.load(written / "splats_00003.ply"), dict(source.moved_splats([3]))[3]
+    for name in ("means", "quaternions", "log_scales", "opacity_logits", "harmonics"):
+        assert np.array_equal(getattr(splats, name), getattr(expected, name))
+
+
+def opened(path):
+    from pxr import Usd
+
+    return Usd.Stage.Open(str(path))
+
+
+@pytest.mark.parametrize("suffix", usd.SUFFIXES)
+def test_pxr_reads_positions_as_they_are(tmp_path, suffix):
+    pytest.importorskip("pxr", reason="usd-core is not installed (extra `export`)")
+    from pxr import UsdGeom, UsdVol
+
+    folder = exported.run_folder(tmp_path)
+    path = tmp_path / f"twin{suffix}"
+    assert main(["export", str(folder), "--to", "usd", "--output", str(path)]) == 0
+    stage, source, twin = opened(path), read_source(folder), Twin.load(folder / "twin.npz")
+    assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Z", 1.0)
+    assert stage.GetTimeCodesPerSecond() == pytest.approx(30) and stage.GetEndTimeCode() == exported.FRAMES - 1
+    assert stage.GetDefaultPrim().GetPath() == usd.ROOT
+    nodes, springs = UsdGeom.Points.Get(stage, "/Twin/Nodes"), UsdGeom.BasisCurves.Get(stage, "/Twin/Springs")
+    splats = UsdVol.ParticleField3DGaussianSplat.Get(stage, "/Twin/Splats")
+    stand_in = UsdGeom.Points.Get(stage, "/Twin/SplatPoints")
+    moved = dict(source.moved_splats(range(exported.FRAMES)))
+    for frame in range(exported.FRAMES):
+        assert np.array_equal(nodes.GetPointsAttr().Get(frame), source.positions[frame])
+        both = np.concatenate([source.positions[frame], source.hands[frame]])
+        assert np.array_equal(np.array(springs.GetPointsAttr().Get(frame)).reshape(-1, 2, 3), both[twin.topology.springs])
+        assert np.array_equal(splats.GetPositionsAttr().Get(frame), moved[frame].means)
+        assert np.array_equal(stand_in.GetPointsAttr().Get(frame), moved[frame].means)
+    ours = moved[3].quaternions / np.linalg.norm(moved[3].quaternions, axis=1, keepdims=True)
+    theirs = np.array([[turn.GetReal(), *turn.GetImaginary()] for turn in splats.GetOrientationsAttr().Get(3)])
+    assert np.abs(ours - theirs).max() < 1e-6
+    assert np.allclose(splats.GetScalesAttr().Get(), np.exp(moved[0].log_scales), rtol=1e-6)
+    coefficients = np.array(splats.GetRadianceSphericalHarmonicsCoefficientsAttr().Get()).reshape(moved[0].harmonics.shape)
+    assert np.array_equal(coefficients, moved[0].harmonics) and splats.GetRadianceSphericalHarmonicsDegreeAttr().Get() == 1
+    primvars = UsdGeom.PrimvarsAPI(springs)
+    assert np.array_equal(primvars.GetPrimvar("stiffness").Get(), twin.material.stiffness)
+    assert primvars.GetPrimvar("stiffness").GetInterpolation() == "uniform"
+    assert UsdGeom.Imageable(splats).GetPurposeAttr().Get() == "render" and len(splats.GetOpacitiesAttr().Get()) == len(ours)
+
+
+def test_a_rate_changes_codes_and_no_seconds_up_is_up_and_bad_names_and_rates_are_refused(tmp_path):
+    pytest.importorskip("pxr", reason="usd-core is not installed (extra `export`)")
+    from pxr import Gf, UsdGeom
+
+    source = read_source(exported.run_folder(tmp_path, exported.rope(up="-z", ground=False), with_splats=False))
+    usd.write(source, [0, 2], tmp_path / "twin.usda", rate=24.0)
+    stage = opened(tmp_path / "twin.usda")
+    assert stage.GetTimeCodesPerSecond() == 24 and stage.GetEndTimeCode() == pytest.approx(2 / 30 * 24)
+    assert not stage.GetPrimAtPath("/Twin/Splats")
+    matrix = UsdGeom.Xformable(stage.GetDefaultPrim()).ComputeLocalToWorldTransform(0)
+    assert Gf.IsClose(matrix.TransformDir(Gf.Vec3d(0, 0, -1)), Gf.Vec3d(0, 0, 1), 1e-6)
+    for name, rate in (("twin.fbx", None), ("twin.usda", 0.0), ("twin.usda", float("nan"))):
+        with pytest.raises(InputError, match=r"--output: must end|--rate: must be a positive"):
+            usd.write(source, [0], tmp_path / name, rate)
