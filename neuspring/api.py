@@ -75,17 +75,18 @@ def search(
     observations: Observations,
     settings: Settings = None,
     *,
-    clusters: int = 1,
+    clusters: int | None = None,
     body: Body = "lattice",
     seed: int = 0,
     device: str = "auto",
     threads: int = 1,
     record: Path | None = None,
 ) -> SearchResult | RodResult:
-    """CMA-ES over material and topology, with `clusters` regions of the topology: the best `twin`, its `cost`, the `trace`.
+    """CMA-ES over material and topology: the best `twin`, its `cost`, the `trace`.
 
-    The trace is kept in the file `record`, and a search that was stopped goes on from it. With `body="rod"` the constants of an
-    elastic rod are found, for a long thin object. Raises InputError, NumericalFailure.
+    The topology has `clusters` regions, by default as many as the settings say; 1 is uniform. The trace is kept in the file
+    `record`, and a search that was stopped goes on from it. With `body="rod"` the constants of an elastic rod are found, for a
+    long thin object. Raises InputError, NumericalFailure.
     """
     from neuspring.core.device import resolve_device
     from neuspring.twin.candidates import SearchProblem
@@ -96,7 +97,9 @@ def search(
     if body == "rod":
         return search_rod(observations, (), read, device=resolve_device(device), threads=threads)
     shared = (read.search, read.simulation, read.losses, read.released_quirks, resolve_device(device))
-    return search_twin(SearchProblem(observations, *shared, clusters=clusters, threads=threads), seed, record=record)
+    return search_twin(
+        SearchProblem(observations, *shared, clusters=clusters or read.clusters, threads=threads), seed, record=record
+    )
 
 
 def fit(

@@ -9,15 +9,14 @@ import json
 import math
 import types
 import typing
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_type_hints
 
 import yaml
 from pydantic.fields import FieldInfo
 
 from neuspring.config import rows, settings
-from neuspring.config.parse import Section
+from neuspring.config.parse import Section, parts
 
 PAGE = Path(__file__).parents[2] / "config" / "README.md"
 HEADING = "## Keys\n"
@@ -32,7 +31,7 @@ def sections(kind: type = settings.Config, path: str = "") -> dict[str, type]:
     found = {path or "(top level)": kind}
     hints = get_type_hints(kind)
     for spec in dataclasses.fields(kind):
-        for part in (hints[spec.name], *_parts(hints[spec.name])):
+        for part in (hints[spec.name], *parts(hints[spec.name])):
             if is_section(part):
                 found |= sections(part, f"{path}.{spec.name}" if path else spec.name)
     return found
@@ -41,13 +40,6 @@ def sections(kind: type = settings.Config, path: str = "") -> dict[str, type]:
 def is_section(kind: Any) -> bool:
     """Whether a type has a table of its own on the page; a dataclass that is no section is one value."""
     return isinstance(kind, type) and issubclass(kind, Section)
-
-
-def _parts(hint: Any) -> Iterator[Any]:
-    """All types inside a type: the members of a union, the values of a mapping."""
-    for part in get_args(hint):
-        yield part
-        yield from _parts(part)
 
 
 def text() -> str:

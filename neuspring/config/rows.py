@@ -5,34 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from neuspring.config.parse import LEFT, REMOVED, Count, Name, Section
+from neuspring.config.parse import Count, Name, Section
 
 Kind = Literal["springs", "field", "rod"]
 """What a first-order stage trains: each spring by itself, the neural spring field, or what is unknown of a rod."""
 Body = Literal["lattice", "rod"]
 """What a twin is made of: springs between nodes, or an elastic rod."""
 
-_LEFT = """
-    spring_gaus_alpha spring_gaus_ignore_hands spring_gaus_shared_splats gs_dynamics_all_tracks gs_dynamics_centroids
-    gs_dynamics_nearest baseline_long neuspring_long baseline_plus_long neuspring_plus_long plus_tail plus_rest_shape
-    plus_rest_lengths no_factors plus_average neuspring_plus_average slow_planes oracle_plus search_only_from_last_frame
-    baseline_from_last_frame neuspring_from_last_frame neuspring_plus_from_last_frame search_only_carry_over
-    baseline_carry_over model_b_carry_over plus_carry_over neuspring_plus_carry_over baseline_pooled search_only_others
-    baseline_others neuspring_others color_hands_fixed color_hands_in_plane color_hands_by_size color_tracks
-    color_silhouettes color_alpha color_with_alpha hands_fixed hands_in_plane hands_by_size tracks_alone silhouettes_alone
-    alpha_alone with_alpha
-"""
-RENAMED_ROWS = {"phystwin": "baseline", "clusters_1": "model_b", "clusters_5": "neuspring"} | dict.fromkeys(_LEFT.split(), REMOVED)
-RENAMED_ROWS |= dict.fromkeys(("fourier_feature", "fourier_coordinates", "fourier_none"), LEFT)
-"""Methods and searches of older tables -> their name now, or a sentence that says where they went."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class SearchRow(Section):
     """A row of the search table: into how many regions the topology is divided, and settings of its own."""
 
-    clusters: Count
-    """Number K of regions, each with its own radius and neighbors: 2K + 10 variables. 1 is the uniform topology."""
+    clusters: Count | None = None
+    """Number K of regions, each with its own radius and neighbors: 2K + 10 variables; 1 is the uniform topology; null: the key
+    `clusters`."""
     body: Body = "lattice"
     """lattice: springs between nodes. rod: a discrete elastic rod, for long thin bodies; it has no regions."""
     description: str

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from neuspring.config.parse import STRICT, Count, Finite, Positive, Section, told
+from neuspring.config.parse import STRICT, Count, Finite, Positive, Section
 
 LENGTHS = ("object_radius", "controller_radius", "contact_distance")
 """Variables in units of `search.lengths`."""
@@ -114,7 +114,7 @@ class Polish(Section):
         unknown = [name for name in self.variables if name not in allowed]
         if unknown or len(set(self.variables)) != len(self.variables) or not self.variables:
             rule = f"different ones of {', '.join(allowed)} are required"
-            raise ValueError(f"variables: {rule}, received {list(self.variables)}{told(unknown)}")
+            raise ValueError(f"variables: {rule}, received {list(self.variables)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,7 +152,7 @@ class Search(Section):
         unknown = [name for name in self.fixed if name not in VARIABLES]
         if unknown or len(set(self.fixed)) != len(self.fixed) or len(VARIABLES) - len(self.fixed) < 2:
             rule = f"different ones of {', '.join(VARIABLES)} are required, two of which stay free"
-            raise ValueError(f"fixed: {rule}, received {list(self.fixed)}{told(unknown)}")
+            raise ValueError(f"fixed: {rule}, received {list(self.fixed)}")
         for name in VARIABLES:
             if name in self.fixed:
                 continue

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
@@ -11,8 +11,9 @@ from pydantic import AfterValidator, BeforeValidator, Field, StringConstraints
 
 from neuspring.config.baselines import Baselines
 from neuspring.config.data import Deform, Mocap, Synthetic, Toy
+from neuspring.config.effort import EFFORTS, Effort, sizes
 from neuspring.config.images import Images
-from neuspring.config.parse import Count, Name, Section, plain
+from neuspring.config.parse import Count, Name, Section, merge, plain
 from neuspring.config.perception import Perception
 from neuspring.config.rod import Rod
 from neuspring.config.search import Search
@@ -122,6 +123,11 @@ class Config(Section):
     seeds: Seeds = (0,)
     """Seeds of the search and of a field's first weights; every method runs with the same seeds. On the command line:
     `--config seeds=0,1,2`."""
+    effort: Effort | None = None
+    """Sizes that are set together, see [effort](#effort): quick, normal or paper; a key that is given wins over them; null: none is
+    set."""
+    clusters: Count = 5
+    """Number K of regions of the piecewise topology, as in the paper, for the rows of the search table that name none."""
     only: str = ""
     """Part of the scenarios, methods and seeds that is run now, as in
     `--config only="category=rope,cloth method=clusters_* seed=0"`. Terms are scenario, category, method and seed, each with names
@@ -169,6 +175,13 @@ class Config(Section):
     tracking: Tracking = field(default_factory=Tracking)
     tune: Tune | None = None
     """A sweep over settings, for the target `sweep`, see [tune](#tune); null: none."""
+
+    @classmethod
+    def completed(cls, given: Mapping[str, Any]) -> Mapping[str, Any]:
+        """What is given, on top of the sizes of its effort."""
+        values = sizes(given["effort"]) if given.get("effort") in EFFORTS else {}
+        merge(values, given)
+        return values
 
     def __post_init__(self) -> None:
         for name in ("scenarios", "methods", "seeds", "studies"):

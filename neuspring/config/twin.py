@@ -42,7 +42,9 @@ class SpringField(Section):
     channels: Count = 32
     """Features per texel, C."""
     hidden: Count = 128
-    """Units per hidden layer of the MLP, which has three layers."""
+    """Units per hidden layer of the MLP."""
+    layers: Annotated[int, Field(ge=2)] = 3
+    """Layers of the MLP, the linear one at its end included."""
     bands: Count = 4
     """Number of frequencies 1, 2, 4, ... (times pi) of the Fourier transform."""
     texel_scale: Positive = 0.1

@@ -32,7 +32,15 @@ from neuspring.stages.stage import Stage
 TEMPLATES = Path(__file__).parents[1] / "report" / "templates"
 SPLATS = "appearance"
 """Folder of the splats that all methods share; those of one method have its name behind a hyphen."""
-NEUTRAL: dict[str, Any] = {"only": "", "gpus": {}, "tracking": {}, "twins_per_launch": "auto", "device": "auto", "tune": None}
+NEUTRAL: dict[str, Any] = {
+    "only": "",
+    "effort": None,
+    "gpus": {},
+    "tracking": {},
+    "twins_per_launch": "auto",
+    "device": "auto",
+    "tune": None,
+}
 """Keys that no result depends on, with what stands for them where settings are compared."""
 Files = str | list[str]
 _stamps = functools.cache(image_stamps)
@@ -476,7 +484,7 @@ class Graph:
         """The rows of the method that is varied, so that changed ones are tuned again."""
         assert self.config.tune
         method = read_methods(self.root / self.config.method_table)[self.config.tune.method]
-        search = read_searches(self.root / self.config.search_table)[method.search or ""]
+        search = read_searches(self.root / self.config.search_table, self.config.clusters)[method.search or ""]
         return _json([plain(method), plain(search)])
 
 

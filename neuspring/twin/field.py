@@ -109,7 +109,7 @@ class SpringField(nn.Module):
         self.planes = None
         if settings.triplane:
             self.planes = TriPlane(mapped, self.resolution, settings.channels, settings.texel_scale, generator)
-        widths = [self.encoded().shape[1], settings.hidden, settings.hidden, outputs]
+        widths = [self.encoded().shape[1], *[settings.hidden] * (settings.layers - 1), outputs]
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(widths))
         with torch.no_grad():
             for layer in self.layers:

@@ -56,7 +56,7 @@ def spoiled_future() -> Observations:
 @functools.cache
 def _released() -> dict[str, object]:
     rows = config.read_yaml(Path(__file__).parents[2] / "config" / "searches.yaml")
-    return dict(rows["released_uniform"]["settings"])
+    return {key: value for key, value in rows["released_quirks"]["settings"].items() if key != "isolated_nodes"}
 
 
 def variables(ranges: Mapping[str, Any] = {}, scales: Mapping[str, str] = {}, start: Mapping[str, float] = {}) -> dict[str, Any]:

@@ -49,7 +49,8 @@ class Plan:
     @classmethod
     def of(cls, settings: Config, tune: Tune, root: Path = Path()) -> Plan:
         """Check a sweep as far as that needs no data. Tables are read relative to `root`. Raises InputError."""
-        methods, searches = read_methods(root / settings.method_table), read_searches(root / settings.search_table)
+        methods = read_methods(root / settings.method_table)
+        searches = read_searches(root / settings.search_table, settings.clusters)
         method = _row("tune.method", tune.method, methods, settings.method_table)
         if method.oracle:
             raise InputError("tune.method", "an oracle sees the future, and chooses nothing", tune.method, "Name another method.")
