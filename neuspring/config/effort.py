@@ -30,8 +30,8 @@ SIZES: dict[str, tuple[Any, Any, Any]] = {
     "baselines.gs_dynamics.epochs": (25, 25, 50),
     "baselines.gs_dynamics.updates_per_epoch": (40, 40, 100),
 }
-"""Key -> its value at each effort. quick: `make demo`. normal: the published synthetic benchmark. paper: sizes of the paper and of the
-released code, the defaults of all keys but `synthetic.size`. Pictures of the first camera are scored, as in the paper."""
+"""Key -> its value at each effort. quick: `make demo`. normal: the published synthetic benchmark. paper: sizes of the paper and of
+the released code, the defaults of all keys but `synthetic.size`. Pictures of the first camera are scored, as in the paper."""
 
 
 def sizes(effort: str) -> dict[str, Any]:

@@ -23,7 +23,7 @@ class SearchRow(Section):
     body: Body = "lattice"
     """lattice: springs between nodes. rod: a discrete elastic rod, for long thin bodies; it has no regions."""
     description: str
-    """What the row is, for people."""
+    """A line for people."""
     settings: dict[str, Any] = field(default_factory=dict)
     """Search settings of this row alone (keys of `search`), on top of the configuration's."""
     released_quirks: dict[str, Any] = field(default_factory=dict)
@@ -35,23 +35,24 @@ class Method(Section):
     """A row of the method table: a twin (which search it starts from, what follows) or a baseline's model; how it predicts."""
 
     description: str
-    """What the row is, for people."""
+    """A line for people."""
     search: Name | None = None
     """A row of the search table; methods that name the same row share the search."""
     fit: Kind | None = None
-    """What the first-order stage trains: each spring by itself, the neural spring field, or a rod (of a search with `body: rod`);
-    null: there is no such stage."""
+    """Unknowns that the first-order stage trains: each spring by itself, the neural spring field, or a rod (of a search with
+    `body: rod`); null: there is no such stage."""
     model: Name | None = None
     """A baseline, which has neither search nor fit: spring_gaus, gs_dynamics, static or controller_lbs."""
     settings: dict[str, Any] = field(default_factory=dict)
     """Settings of this method alone, on top of the configuration's: keys of `fit` (for example `horizon: 0`), or of its model's
     section of `baselines`."""
     appearance: dict[str, Any] | None = None
-    """Makes splats for this method alone: keys of `images.appearance`, on top of the configuration's; null: the splats that all
+    """Splats of this method alone: keys of `images.appearance`, on top of the configuration's; null: the splats that all
     methods share."""
     oracle: bool = False
-    """Fit all frames, the future included, from the same search. Such a row predicts nothing: it says how much of an error fitting
-    could remove at all, and stands outside every comparison. Its records say so, and it shares its fit with other oracles only."""
+    """Fit of all frames, the future included, from the same search. Such a row predicts nothing: it says how much of an error
+    fitting could remove at all, and stands outside every comparison. Its records say so, and it shares its fit with other oracles
+    only."""
     pool: Literal["all", "others"] | None = None
     """Several recordings of the object (`pools`) on which search and fit judge one twin. all: the scenario's own and the others of
     its pool. others: those alone, so that nothing of the scenario but frame 0 is fitted; null: the scenario's own."""
@@ -81,10 +82,10 @@ class ScenarioRow(Section):
     source: Name
     """The kind of its data: phystwin, mocap, toy, synthetic, capture or phystwin_raw."""
     category: Name
-    """Kind of object: rope, cloth, package, sloth, ..."""
+    """Kind of object, for example rope, cloth, package or sloth."""
     path: str
     """Folder or file under data_root; for toy and synthetic scenes, the scene's name."""
     self_collision: bool
-    """Whether the object may touch itself."""
+    """True where the object may touch itself."""
     ground: bool
-    """Whether there is a ground."""
+    """True where there is a ground."""

@@ -216,7 +216,6 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
         obstacles=scenario.obstacles,
         self_collision=scenario.self_collision,
         collision_capacity=settings.collision_capacity,
-        controller_velocity=settings.controller_velocity,
         initial_velocity=settings.initial_velocity,
     )
     return with_substeps(problem, Twin(topology=topology, material=material, simulation=simulation))

@@ -112,9 +112,9 @@ class TwinParameters(nn.Module):
             groups.append((self.field.layers.parameters(), rate))
             if self.field.planes is not None:
                 groups.append((self.field.planes.parameters(), s.field.plane_learning_rate or rate))
-        groups.append((self.scalars.values(), s.scalar_learning_rate or rate))
+        groups.append((self.scalars.values(), rate))
         if self.factors:
-            groups.append((self.factors.values(), s.factor_learning_rate or s.scalar_learning_rate or rate))
+            groups.append((self.factors.values(), s.factor_learning_rate or rate))
         return [{"params": list(each), "lr": rate, "base_rate": rate} for each, rate in groups]
 
     def deviation(self) -> torch.Tensor:

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+FIRST_STEP = 1 / 6
+"""Initial step of CMA-ES in normalized variables."""
 FREED_SIGMA = 0.06
 """Step of CMA-ES in normalized variables when each region becomes free."""
 MOVES = 0.9
@@ -58,7 +60,7 @@ class Proposals:
             searched = replace(problem, clusters=1)
             shared = [name.partition(".")[0] for name in problem.variables]
             self._columns = np.array([searched.variables.index(name) for name in shared])
-        self._strategy = _strategy(searched.encode(), problem.search.sigma, seed)
+        self._strategy = _strategy(searched.encode(), FIRST_STEP, seed)
         self._population: list[np.ndarray] = []
         self._best = (np.inf, problem.encode())
         self._evaluated = 0

@@ -116,11 +116,6 @@ MISTAKES = {
     "unknown scale": ("search: {variables: {drag: {scale: cubic}}}", "search.variables.drag.scale", "received 'cubic'"),
     "unit of lengths": ("search: {lengths: inch}", "search.lengths", "received 'inch'"),
     "a fixed stranger": ("search: {fixed: [mass]}", "fixed: different ones of stiffness, object_radius", "received ['mass']"),
-    "polish of springs": (
-        "search: {polish: {variables: [object_radius]}}",
-        "variables: different ones of stiffness",
-        "object_radius",
-    ),
     "negative rounds": ("search: {polish: {rounds: -1}}", "search.polish.rounds", "received -1"),
     "isolated nodes": ("search: {isolated_nodes: ignore}", "search.isolated_nodes", "received 'ignore'"),
     "resolution word": ("fit: {field: {resolution: fine}}", "fit.field.resolution", "'adaptive'"),
@@ -133,7 +128,7 @@ MISTAKES = {
     "unknown effort": ("effort: fast", "effort", "'quick', 'normal' or 'paper', received 'fast'"),
     "tail fraction": ("fit: {tail_fraction: 0}", "fit.tail_fraction", "greater than 0"),
     "null for a rate": ("fit: {learning_rate: null}", "fit.learning_rate", "received None"),
-    "zero for an optional rate": ("fit: {scalar_learning_rate: 0}", "fit.scalar_learning_rate", "greater than 0"),
+    "zero for an optional rate": ("fit: {factor_learning_rate: 0}", "fit.factor_learning_rate", "greater than 0"),
     "a password on command lines": (
         "tracking: {uri: 'http://me:secret@host:5000'}",
         "tracking: uri: a password would be shown by ps and in logs; set PGPASSWORD, ~/.pgpass or MLFLOW_TRACKING_PASSWORD instead",

@@ -69,7 +69,7 @@ def write(path: Path, text: str) -> Path:
 def test_rows_lie_on_top_of_the_configuration(tmp_path: Path) -> None:
     found = tables.read_methods(write(tmp_path / "methods.yaml", METHODS))
     assert [found[name].fit for name in ("full", "coarse", "long", "ours")] == ["springs", None, "springs", "field"]
-    made = load("fit: {epochs: 3, learning_rate: 0.5, field: {hidden: 8}}\nsearch: {rollouts: 44, sigma: 0.25}")
+    made = load("fit: {epochs: 3, learning_rate: 0.5, field: {hidden: 8}}\nsearch: {rollouts: 44, tied_rollouts: 5}")
     merged = tables.with_method(made, found["long"], "long").fit
     assert (merged.horizon, merged.epochs, merged.learning_rate) == (0, 7, 0.5)
     assert tables.with_method(made, found["full"], "full") == made
@@ -78,7 +78,7 @@ def test_rows_lie_on_top_of_the_configuration(tmp_path: Path) -> None:
     rows = read_searches(write(tmp_path / "searches.yaml", SEARCHES))
     assert {name: row.clusters for name, row in rows.items()} == {"uniform": 1, "pieces": 5}
     searched = tables.with_search(made, rows["pieces"], "pieces").search
-    assert (searched.rollouts, searched.sigma, searched.polish.rounds) == (33, 0.25, 1)
+    assert (searched.rollouts, searched.tied_rollouts, searched.polish.rounds) == (33, 5, 1)
     assert tables.with_search(made, rows["uniform"], "uniform") == made
 
 
@@ -361,10 +361,7 @@ def test_springs_may_not_start_beyond_their_clamp(tmp_path: Path) -> None:
         ("{model: static, settings: {epochs: 1}, description: x}", r"model static has none; received \['epochs'\]"),
         ("{model: spring_gauss, description: x}", "model: must be one of spring_gaus"),
         ("{model: spring_gaus, settings: {anchor: 9}, description: x}", "method bad, settings: .*anchor: unknown key"),
-        (
-            "{model: spring_gaus, settings: {full_neighbors: 30}, description: x}",
-            "method bad, settings: .*full_neighbors: at most",
-        ),
+        ("{model: spring_gaus, settings: {anchors: 0}, description: x}", "method bad, settings: .*anchors: .*received 0"),
         ("{model: spring_gaus, appearance: {degrees: 0}, description: x}", "method bad, appearance: .*degrees: unknown key"),
         ("{model: spring_gaus, description: x}", "at least one method must apply to a scenario"),
     ],

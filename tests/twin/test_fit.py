@@ -330,9 +330,9 @@ def test_the_loss_of_a_one_step_epoch_belongs_to_the_values_before_the_step():
 
 def test_rollbacks_scale_every_rate_and_the_rate_is_the_step_that_is_taken():
     """The first step of Adam is the learning rate itself, but for its epsilon, 1e-3 of the largest gradient here."""
-    run = TwinFit(small.fit_problem(fit=config.Fit(learning_rate=0.1, scalar_learning_rate=0.3, horizon=0)))
+    run = TwinFit(small.fit_problem(fit=config.Fit(learning_rate=0.1, horizon=0)))
     run.set_rate(0.25)
-    assert [group["lr"] for group in run.optimizer.param_groups] == [0.25 * 0.1, 0.25 * 0.3]
+    assert [group["lr"] for group in run.optimizer.param_groups] == 2 * [0.25 * 0.1]
     run.epoch()
     assert run.parameters.offsets.abs().max().item() == pytest.approx(0.1 / 4, rel=1e-2)
 

@@ -14,19 +14,18 @@ import json
 import time
 from argparse import ArgumentParser
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import cv2
 import numpy as np
 
 from neuspring.config.perception import MarksSegmentation, OpenCvTracking
 from neuspring.data.capture import HANDS, OBJECT
-from neuspring.perception import track_opencv
 from neuspring.extensions.annotate.clicks import Click, GrayImages
 from neuspring.extensions.annotate.clicks import follow as follow_click
+from neuspring.perception import track_opencv
 from neuspring.perception.frames import overlap
 from neuspring.perception.marks.carry import carry
 from neuspring.perception.marks.marks import Marks
@@ -118,9 +117,9 @@ def newly_covered(labels: np.ndarray, truth: dict[int, np.ndarray]) -> list[floa
     return [overlap((labels[k] == OBJECT) & first, (truth[k] == OBJECT) & first) for k in sorted(truth)[1:]]
 
 
-def stepwise(colors: list[np.ndarray], labels: np.ndarray, start: np.ndarray, **settings: Any) -> tuple[np.ndarray, np.ndarray]:
+def stepwise(colors: list[np.ndarray], labels: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The tracker of the workflow: places [T, K, 2] and whether they are visible [T, K], among its own random points."""
-    chosen = replace(OpenCvTracking(rim=RIM), **settings)
+    chosen = OpenCvTracking(rim=RIM)
     points = np.concatenate([start, track_opencv.choose(labels[0], chosen.points, 0)]).astype(np.float32)
     found = track_opencv.follow(Film(colors), "0", labels, points, chosen)  # type: ignore[arg-type]
     return found.pixels[:, : len(start)], found.visible[:, : len(start)]
@@ -135,7 +134,6 @@ def clicked(colors: list[np.ndarray], labels: np.ndarray, start: np.ndarray) -> 
 
 TRACKERS: dict[str, Callable[..., tuple[np.ndarray, np.ndarray]]] = {
     "lucas_kanade": stepwise,
-    "dis": lambda colors, labels, start: stepwise(colors, labels, start, method="dis"),
     "click": clicked,
 }
 

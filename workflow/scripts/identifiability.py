@@ -102,7 +102,7 @@ class Run:
         """Contact scalars practically stand still; the gradient goes through ten frames."""
         rate = RATES.get(self.kind, 1.0)
         field = config.SpringField(shuffled=self.kind == "shuffled")
-        return config.Fit(epochs=self.epochs, learning_rate=rate, scalar_learning_rate=1e-12, horizon=10, field=field)
+        return config.Fit(epochs=self.epochs, learning_rate=rate, horizon=10, field=field)
 
     def settings(self) -> dict[str, Any]:
         """Everything that the result depends on, plainly."""

@@ -25,6 +25,7 @@ from neuspring.baselines.gs_dynamics.model import (
     Dynamics,
     Graph,
     GsDynamicsModel,
+    GsDynamicsTraining,
     Recipe,
     Rules,
     connect,
@@ -36,7 +37,6 @@ from neuspring.baselines.gs_dynamics.model import (
     upright,
 )
 from neuspring.baselines.results import Trained, TrainingStopped, run_epochs
-from neuspring.config.baselines import GsDynamics
 from neuspring.core.artifacts import Observations
 from neuspring.core.checkpoint import Checkpoint, adam_arrays, restore_adam
 from neuspring.core.geometry import farthest
@@ -67,7 +67,7 @@ class Tracks:
     """How many tracks were outliers."""
 
     @classmethod
-    def of(cls, observations: Observations, settings: GsDynamics) -> Tracks:
+    def of(cls, observations: Observations, settings: GsDynamicsTraining) -> Tracks:
         """From the training frames of a capture; nothing else of it is read."""
         train, up = slice(observations.scenario.train_end), observations.scenario.up
         points, visible = upright(observations.object_points[train], up), observations.object_visibility[train]
@@ -125,7 +125,7 @@ def ahead(tools: np.ndarray, frame: int, step: float, count: int) -> list[int]:
     return frames + frames[-1:] * (count - len(frames))
 
 
-def window_frames(tools: np.ndarray, settings: GsDynamics) -> np.ndarray:
+def window_frames(tools: np.ndarray, settings: GsDynamicsTraining) -> np.ndarray:
     """Frames [W, H + F] of each window. A frame without a step ahead has none, as nothing moves there in a rollout."""
     rows = []
     for frame in range(len(tools)):
@@ -154,7 +154,7 @@ class Windows:
         return len(self.frames)
 
     @classmethod
-    def of(cls, tracks: Tracks, settings: GsDynamics, device: str) -> Windows:
+    def of(cls, tracks: Tracks, settings: GsDynamicsTraining, device: str) -> Windows:
         """All windows in which at least one track may become a particle.
 
         These are tracks visible in all frames of the window. Fallback if fewer than MIN_VISIBLE: visible in the history only.
@@ -274,7 +274,7 @@ class Training:
     """Runs epochs on the training frames of a capture."""
 
     def __init__(self, request: TrainingRequest) -> None:
-        self.settings, self.seed = request.settings.baselines.gs_dynamics, request.seed
+        self.settings, self.seed = GsDynamicsTraining.of(request.settings.baselines.gs_dynamics), request.seed
         self.category = request.observations.scenario.category
         self.rules, self.recipe = resolve(self.settings, self.category)
         self.tracks = Tracks.of(request.observations, self.settings)
