@@ -15,7 +15,7 @@ from neuspring.core.device import resolve_device
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
 from neuspring.data.capture import Camera, Capture
-from neuspring.extensions.figures.commands import ComparedOptions, FilmOptions, RunOptions, StripOptions, TwinOptions
+from neuspring.extensions.figures.options import ComparedOptions, FilmOptions, RunOptions, StripOptions, TwinOptions
 from neuspring.perception.results import Masks
 from neuspring.report.draw import sheet
 from neuspring.report.draw.film import write_film
