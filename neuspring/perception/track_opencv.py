@@ -121,9 +121,7 @@ def lucas_kanade(
     return np.asarray(moved), there.ravel().astype(bool) & back.ravel().astype(bool) & near
 
 
-def _reacquire(
-    first: np.ndarray, now: np.ndarray, start: np.ndarray, place: np.ndarray, alive: np.ndarray
-) -> np.ndarray:
+def _reacquire(first: np.ndarray, now: np.ndarray, start: np.ndarray, place: np.ndarray, alive: np.ndarray) -> np.ndarray:
     """Which lost points are seen again [Q] bool; their places are written into `place`."""
     lost, guides = np.flatnonzero(~alive), np.flatnonzero(alive)
     again = np.zeros(len(start), dtype=bool)
