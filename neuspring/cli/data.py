@@ -293,8 +293,8 @@ def annotate(
     settings: Settings = "{}",
 ) -> None:
     """Mark masks and tracks of a capture in the browser; serves until Ctrl-C."""
-    from neuspring.data.capture import Capture
     from neuspring.core.web import is_loopback
+    from neuspring.data.capture import Capture
     from neuspring.extensions.annotate.server import Server
 
     server = Server(Capture.load(capture), read_settings(settings).perception.segment.marks, host, port)

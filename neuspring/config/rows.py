@@ -7,11 +7,6 @@ from typing import Any, Literal
 
 from neuspring.config.parse import LEFT, REMOVED, Count, Name, Section
 
-Kind = Literal["springs", "field", "rod"]
-"""What a first-order stage trains: each spring by itself, the neural spring field, or what is unknown of a rod."""
-Body = Literal["lattice", "rod"]
-"""What a twin is made of: springs between nodes, or an elastic rod."""
-
 _LEFT = """
     spring_gaus_alpha spring_gaus_ignore_hands spring_gaus_shared_splats gs_dynamics_all_tracks gs_dynamics_centroids
     gs_dynamics_nearest baseline_long neuspring_long baseline_plus_long neuspring_plus_long plus_tail plus_rest_shape
@@ -33,7 +28,7 @@ class SearchRow(Section):
 
     clusters: Count
     """Number K of regions, each with its own radius and neighbors: 2K + 10 variables. 1 is the uniform topology."""
-    body: Body = "lattice"
+    body: Name = "lattice"
     """lattice: springs between nodes. rod: a discrete elastic rod, for long thin bodies; it has no regions."""
     description: str
     """What the row is, for people."""
@@ -51,7 +46,7 @@ class Method(Section):
     """What the row is, for people."""
     search: Name | None = None
     """A row of the search table; methods that name the same row share the search."""
-    fit: Kind | None = None
+    fit: Name | None = None
     """What the first-order stage trains: each spring by itself, the neural spring field, or a rod (of a search with `body: rod`);
     null: there is no such stage."""
     model: Name | None = None
@@ -65,9 +60,9 @@ class Method(Section):
     oracle: bool = False
     """Fit all frames, the future included, from the same search. Such a row predicts nothing: it says how much of an error fitting
     could remove at all, and stands outside every comparison. Its records say so, and it shares its fit with other oracles only."""
-    pool: Literal["all", "others"] | None = None
-    """Several recordings of the object (`pools`) on which search and fit judge one twin. all: the scenario's own and the others of
-    its pool. others: those alone, so that nothing of the scenario but frame 0 is fitted; null: the scenario's own."""
+    pool: Literal["all"] | None = None
+    """Recordings of the object (`pools`) that one twin is judged on. all: the scenario's own and the others of its pool; null: the
+    scenario's own."""
 
     @property
     def searched(self) -> str:

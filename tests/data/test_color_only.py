@@ -15,9 +15,9 @@ from neuspring.data.intake.feeds import pairs
 from neuspring.data.intake.lenses import Board, rigid_inverse
 from neuspring.data.intake.make import Intake, make_capture
 from neuspring.data.plausible import on_table, outline_findings
-from neuspring.perception import segment_opencv
 from neuspring.extensions.annotate.clicks import Annotations, Click, ClickedPoint
 from neuspring.extensions.annotate.tracks import TracksMode, tracks_of
+from neuspring.perception import segment_opencv
 from neuspring.perception.backends import BACKENDS
 from neuspring.perception.findings import look_at_masks, mask_facts
 from neuspring.perception.marks.carry import CameraFilm

@@ -23,10 +23,10 @@ from neuspring.data.released import (
     read_parameters,
     visible_pixels,
 )
-from neuspring.scores.lpips import CHANNELS, WINDOWS, Lpips
-from neuspring.scores.metrics import METRICS
 from neuspring.extensions.released.checks import MEAN, RELEASED, Comparison, Published, frame_scores, of_means
 from neuspring.extensions.released.run import CHECKS, Report, read_observations, verify_released
+from neuspring.scores.lpips import CHANNELS, WINDOWS, Lpips
+from neuspring.scores.metrics import METRICS
 from tests.support.phystwin_case import dump, edit, stored
 from tests.support.released_case import (
     DASHPOT,
