@@ -1,7 +1,7 @@
 """The door of each kind of thing: our own members, and those that installed packages bring.
 
-A kind is a `Registry` beside the code that uses it (`METRICS`, `BASELINES`, `STAGES`, ...). A package adds to it by an entry point of
-the group `neuspring.<kind>`, in its pyproject.toml, and nothing here changes:
+A kind is a `Registry` beside the code that uses it (`METRICS`, `BASELINES`, `STAGES`, ...). A package adds to it by an entry point
+of the group `neuspring.<kind>`, in its pyproject.toml, and nothing here changes:
 
     [project.entry-points."neuspring.metrics"]
     my_error = "my_package.errors:MY_ERROR"

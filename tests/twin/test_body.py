@@ -86,5 +86,5 @@ def test_a_further_body_is_one_entry_point(twins, monkeypatch):
 
 
 def test_an_unknown_body_is_refused_with_the_known_ones():
-    with pytest.raises(InputError, match="must be a registered name; received jelly.*lattice, rod"):
+    with pytest.raises(InputError, match=r"must be a registered name; received jelly.*lattice, rod"):
         BODIES["jelly"]
