@@ -64,8 +64,6 @@ class RodFit(Section):
     """Stride of the frames that count."""
     robust: Positive = 0.02
     """Robustness b, m: errors e count as sqrt(e^2 + b^2), so that recordings that flip do not decide."""
-    residual: bool = False
-    """Add what a ridge regression learns of errors on training recordings (twin/residual.py): no physics, so a row of its own."""
 
     def __post_init__(self) -> None:
         if not self.horizons:

@@ -7,11 +7,6 @@ from typing import Any, Literal
 
 from neuspring.config.parse import Count, Name, Section
 
-Kind = Literal["springs", "field", "rod"]
-"""What a first-order stage trains: each spring by itself, the neural spring field, or what is unknown of a rod."""
-Body = Literal["lattice", "rod"]
-"""What a twin is made of: springs between nodes, or an elastic rod."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class SearchRow(Section):
@@ -20,7 +15,7 @@ class SearchRow(Section):
     clusters: Count | None = None
     """Number K of regions, each with its own radius and neighbors: 2K + 10 variables; 1 is the uniform topology; null: the key
     `clusters`."""
-    body: Body = "lattice"
+    body: Name = "lattice"
     """lattice: springs between nodes. rod: a discrete elastic rod, for long thin bodies; it has no regions."""
     description: str
     """A line for people."""
@@ -38,7 +33,7 @@ class Method(Section):
     """A line for people."""
     search: Name | None = None
     """A row of the search table; methods that name the same row share the search."""
-    fit: Kind | None = None
+    fit: Name | None = None
     """Unknowns that the first-order stage trains: each spring by itself, the neural spring field, or a rod (of a search with
     `body: rod`); null: there is no such stage."""
     model: Name | None = None
@@ -53,9 +48,9 @@ class Method(Section):
     """Fit of all frames, the future included, from the same search. Such a row predicts nothing: it says how much of an error
     fitting could remove at all, and stands outside every comparison. Its records say so, and it shares its fit with other oracles
     only."""
-    pool: Literal["all", "others"] | None = None
-    """Several recordings of the object (`pools`) on which search and fit judge one twin. all: the scenario's own and the others of
-    its pool. others: those alone, so that nothing of the scenario but frame 0 is fitted; null: the scenario's own."""
+    pool: Literal["all"] | None = None
+    """Recordings of the object (`pools`) that one twin is judged on: the scenario's own and the others of its pool (all); null: the
+    scenario's own."""
 
     @property
     def searched(self) -> str:

@@ -21,6 +21,7 @@ from neuspring.data.sources import SOURCES, Source, location, scenario_rows, wit
 from neuspring.perception.backends import BACKENDS
 from neuspring.scores.lpips import configured_weights
 from neuspring.scores.paper import Study, read_studies
+from neuspring.twin.body import BODIES
 
 T = TypeVar("T")
 RESERVED = ("tables", "logs", "benchmarks", "jobs", "tune", "mlartifacts", "published", "appearance", "perception", "capture")
@@ -237,8 +238,8 @@ class Benchmark:
         wanted = with_search(self.config, row, method.search).search.variables.stiffness
         if not method.fit:
             return
-        if (method.fit == "rod") != (row.body == "rod"):
-            rule = f"search {method.search} makes a {row.body}; a rod is fitted as rod, a lattice as springs or field"
+        if method.fit not in (fits := BODIES[row.body].fits):
+            rule = f"search {method.search} makes a {row.body}, which is fitted as {' or '.join(fits)}"
             raise InputError(f"method {name}, fit", rule, method.fit)
         if method.oracle and config.fit.selection == "tail":
             rule = "an oracle is fitted on all frames and holds none back"
@@ -249,7 +250,7 @@ class Benchmark:
             raise InputError(f"method {name}, fit.stiffness_range", rule, [low, high])
 
     def pool_kind(self, job: Any) -> str | None:
-        """Of the search that a job makes, or of its method: whether it is judged on all of the pool, the others, or no pool."""
+        """The pool on which the search that a job makes, or its method, is judged; None: the scenario's own recording."""
         rows = self.fits | self.methods
         if hasattr(job, "method"):
             return rows[job.method].pool
@@ -262,8 +263,9 @@ class Benchmark:
         """
         if self.config.twins_per_launch == 1 or scenario not in self.config.scenarios:
             return ()
-        # A fit on several recordings takes turns between them, and shares launches with nobody; a rod has lanes of its own.
-        alone = [name for name, method in self.fits.items() if method.pool or method.fit == "rod"]
+        # A fit on several recordings takes turns between them, and shares launches with nobody.
+        bodies = {name: BODIES[self.searches[method.searched].body] for name, method in self.fits.items()}
+        alone = [name for name, method in self.fits.items() if method.pool or not bodies[name].by_gradients]
         rows = [name for name in self.fits if self.applies(name, scenario) and name not in alone]
         seeds = self.config.seeds
         alike = Counter(self._steps[name] for name in rows)

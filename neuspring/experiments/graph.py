@@ -283,8 +283,6 @@ class Graph:
                 return rows.searches[job.search].clusters
             case "body":
                 return rows.searches[job.search].body
-            case "leave_out":
-                return rows.pool_kind(job) == "others"
             case "kind":
                 return rows.fits[job.method].fit
             case "oracle":

@@ -20,7 +20,6 @@ import torch
 from torch import nn
 
 from neuspring import config
-from neuspring.config import Kind
 from neuspring.core.artifacts import Topology, Twin
 from neuspring.physics.parameters import LIMITS, Parameters, pack, twin_tensors
 from neuspring.twin.field import SpringField, midpoints
@@ -74,7 +73,7 @@ def topology_spacing(topology: Topology) -> float:
 class TwinParameters(nn.Module):
     """The trained tensors of a twin, as a module: `named_parameters` is the checkpoint's content."""
 
-    def __init__(self, twin: Twin, settings: config.Fit, kind: Kind, device: str, seed: int = 0) -> None:
+    def __init__(self, twin: Twin, settings: config.Fit, kind: str, device: str, seed: int = 0) -> None:
         super().__init__()
         self.settings, self.kind = settings, kind
         self.start = twin_tensors(twin, device)

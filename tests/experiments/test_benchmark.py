@@ -408,7 +408,7 @@ def test_twins_of_cables_move_only_where_all_have_as_many_nodes(tmp_path: Path) 
 def pooled(folder: Path, **changes: object) -> Benchmark:
     """Two methods on the pool of a rope, and the same two alone."""
     row = "{name}: {{search: uniform, fit: springs, pool: {pool}, description: x}}\n"
-    write(folder / "pooled.yaml", METHODS + row.format(name="one", pool="all") + row.format(name="two", pool="others"))
+    write(folder / "pooled.yaml", METHODS + row.format(name="one", pool="all") + row.format(name="two", pool="all"))
     toys = "".join(f"{name}\ttoy\trope\trope/lift/smooth\tfalse\ttrue\n" for name in ("a", "b", "c"))
     write(folder / "toys.tsv", HEADER + toys + "cloth\ttoy\tcloth\tcloth/lift/smooth\tfalse\ttrue\n")
     chosen: dict[str, object] = {"scenario_table": "toys.tsv", "method_table": "pooled.yaml", "pools": {"rope": ["a", "b", "c"]}}
@@ -419,21 +419,19 @@ def test_methods_on_a_pool_have_searches_and_fits_of_their_own(tmp_path: Path) -
     made = pooled(tmp_path)
     assert made.pools["a"] == ("b", "c")
     assert list(made.scenarios) == ["a", "b", "c"], "the others are observed too"
-    assert list(made.searches) == ["uniform", "uniform-all", "uniform-others"]
-    assert made.fit_of_method == {"full": "full", "one": "one", "two": "two"}
+    assert list(made.searches) == ["uniform", "uniform-all"]
+    assert made.fit_of_method == {"full": "full", "one": "one", "two": "one"}
     graph = Graph(made)
     jobs = {name: SimpleNamespace(scenario="a", method=name, seed=0) for name in made.methods}
     found = [graph.inputs(STAGES["fit"])(job) for job in jobs.values()]
     assert [files["search"] for files in found] == [
-        f"results/a/{name}/0/search.json" for name in ("search-uniform", "search-uniform-all", "search-uniform-others")
+        f"results/a/{name}/0/search.json" for name in ("search-uniform", "search-uniform-all", "search-uniform-all")
     ]
     others = ["results/b/observations.npz", "results/c/observations.npz"]
     assert [files.get("pool", []) for files in found] == [[], others, others]
     searches = [SimpleNamespace(scenario="a", search=name, seed=0) for name in made.searches]
-    assert [graph.inputs(STAGES["search"])(job).get("pool", []) for job in searches] == [[], others, others]
-    assert [graph.options(STAGES["search"], job)["leave_out"] for job in searches] == [False, False, True]
-    assert [graph.options(STAGES["fit"], job)["leave_out"] for job in jobs.values()] == [False, False, True]
-    assert [graph.variant(job).get("pool") for job in jobs.values()] == [None, "all", "others"]
+    assert [graph.inputs(STAGES["search"])(job).get("pool", []) for job in searches] == [[], others]
+    assert [graph.variant(job).get("pool") for job in jobs.values()] == [None, "all", "all"]
     assert graph.variant(jobs["one"])["clusters"] == 1
 
 

@@ -1,6 +1,7 @@
 """Levenberg-Marquardt after CMA-ES: residuals, steps, and what it makes of a toy twin."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -11,9 +12,10 @@ from neuspring import config
 from neuspring.config.search import TRIALS
 from neuspring.core.errors import NumericalFailure
 from neuspring.twin import search as module
-from neuspring.twin.candidates import CMAES, SearchProblem, candidate, evaluate, recordings
+from neuspring.twin.candidates import CMAES, SearchProblem, candidate, evaluate
+from neuspring.twin.levenberg import damped_step
 from neuspring.twin.losses import FrameLoss
-from neuspring.twin.polish import POLISH, REACH, SLOPES, Polish, damped_step, products, residuals
+from neuspring.twin.polish import POLISH, REACH, SLOPES, Polish, products, residuals, slope_rows
 from neuspring.twin.search import search
 from neuspring.twin.trials import motions
 from tests.support import small
@@ -41,7 +43,7 @@ def polished(rollouts: int = 50, *, start: dict | None = None, rounds: int = 6, 
 
 def rollouts_of(problem: SearchProblem, twins: list) -> tuple[torch.Tensor, torch.Tensor, FrameLoss, torch.Tensor]:
     loss = FrameLoss.of(problem.observations, problem.losses, "cpu", frozen_counts=problem.quirks.frozen_loss_denominators)
-    own = recordings(problem, loss)[0]
+    own = problem.recordings[0]
     return *motions(twins, own.hands, own.velocity, "cpu"), loss, own.velocity
 
 
@@ -174,9 +176,9 @@ def test_stiffness_and_drag_of_a_toy_twin_are_recovered():
     points[1:] = x[:, 0, : points.shape[1]]
     problem = replace(problem, observations=replace(seen, object_points=points))
     # The polish alone, from the start of the search.
-    loss = FrameLoss.of(problem.observations, problem.losses, "cpu")
-    rows = evaluate(problem, [problem.encode()], loss, 0, 0, map)
-    ends = list(module._polished(problem, rows, [], loss, 0, map))[-1]
+    judge, slopes = partial(evaluate, problem), partial(slope_rows, problem)
+    rows = judge([problem.encode()], False, 0, 0)
+    ends = list(module._polished(problem.search, problem.variables, rows, [], 0, judge, slopes, False))[-1]
     tried = [row for row in ends if row["stage"] == POLISH]
     best = min(tried, key=lambda row: row["cost"])
     assert best["cost"] < 1e-3 * rows[0]["cost"]

@@ -164,10 +164,18 @@ def execute(run: Run, folder: Path) -> dict[str, Any]:
     record: dict[str, Any] = {"settings": run.settings(), "values": {}, "stiffness": []}
     try:
         if run.kind in RATES:
-            settings = (run.fit, config.Simulation(), config.Losses(), config.ReleasedQuirks())
+            problem = FitProblem(
+                observations=scene.observations,
+                twin=twin,
+                fit=run.fit,
+                simulation=config.Simulation(),
+                losses=config.Losses(),
+                quirks=config.ReleasedQuirks(),
+                kind="springs" if run.kind == "springs" else "field",
+                seed=run.seed,
+            )
             with redirect_stderr(io.StringIO()):
-                kind = "springs" if run.kind == "springs" else "field"
-                result = fit(FitProblem(scene.observations, twin, *settings, kind=kind, seed=run.seed))
+                result = fit(problem)
             twin = result.twin
             record |= {"best_epoch": result.best_epoch, "rollbacks": result.rollbacks, "losses": list(result.history["loss"])}
         record |= {"values": compare(twin, scene), "substeps": twin.simulation.substeps}

@@ -30,7 +30,8 @@ from neuspring.core.table import Table
 from neuspring.data.synthetic.truth import Truth, truth_path
 from neuspring.report.draw.scene import Prediction, Scene
 from neuspring.report.draw.sheet import save
-from neuspring.report.draw.twin import COLORS, TwinPicture, node_stiffness
+from neuspring.report.draw.twin import COLORS, TwinPicture
+from neuspring.twin.body import body_of
 
 METHODS = ["search_only", "baseline_ten_frames", "model_b", "shuffled", "neuspring", "neuspring_plus", "baseline_plus"]
 NOTE = "Correlation of log stiffness around each node with the log modulus that the body was made of, mean over seeds."
@@ -57,7 +58,7 @@ def made_of(twin: Twin, modulus: np.ndarray) -> Twin:
 
 def relative(twin: Twin) -> Twin:
     """The twin with stiffness over the geometric mean of its nodes'."""
-    stiffness = twin.material.stiffness / np.exp(np.log(node_stiffness(twin)).mean())
+    stiffness = twin.material.stiffness / np.exp(np.log(body_of(twin).node_stiffness(twin)).mean())
     return replace(twin, material=replace(twin.material, stiffness=stiffness.astype(np.float32)))
 
 
@@ -96,7 +97,7 @@ def judged(home: Path, methods: Sequence[str]) -> tuple[list[tuple[str, int, flo
             continue
         method, seed = run.folder.parts[-2:]
         modulus, here = modulus_at(truth, twin.topology.nodes), twin.topology.nodes[None]
-        logs = np.log([modulus, node_stiffness(twin)])
+        logs = np.log([modulus, body_of(twin).node_stiffness(twin)])
         known = (logs.std(axis=1) > LEAST_SPREAD).all()
         rows.append((method, int(seed), float(np.corrcoef(logs)[0, 1]) if known else np.nan))
         takes.setdefault("truth", Prediction("truth", here, relative(made_of(twin, modulus))))
