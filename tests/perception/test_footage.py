@@ -5,9 +5,10 @@ import pytest
 
 from neuspring.data.capture import OBJECT, Writer
 from neuspring.perception.findings import look_at_masks, mask_facts
+from results.published.footage.film import Points, carried, film, truths
 from tests.support.captures import describe, entry
+from tests.support.films import Errors, clicked, newly_covered, overlaps, stepwise
 from tests.support.real import FOOTAGE
-from workflow.scripts.footage import Errors, Points, carried, clicked, film, newly_covered, overlaps, stepwise, truths
 
 pytestmark = pytest.mark.skipif(not FOOTAGE.is_dir(), reason="the footage is not part of the repository")
 MASKS = {

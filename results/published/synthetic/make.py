@@ -1,6 +1,6 @@
 """First, middle and last frame of every capture in a results folder, and what each took: time, disk, numerics.
 
-python workflow/scripts/contact_sheet.py results/synthetic results/published/synthetic
+python -m results.published.synthetic.make results/synthetic results/published/synthetic
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Does a fit recover a known stiffness, and a neural spring field better than free springs? Toy scenes, whose truth is known.
 
-    python workflow/scripts/identifiability.py OUTPUT_FOLDER [--epochs N] [--seeds 0 1 2] [--scenes ...] [--jobs 2]
+    python -m results.published.identifiability.make OUTPUT_FOLDER [--epochs N] [--seeds 0 1 2] [--scenes ...] [--jobs 2]
 
 A fit starts from the truth in everything (topology, dashpots, drag, contact, substeps) but the stiffness, which is the same
 everywhere and too low: 0.6 of the truth's geometric mean. Only the stiffness is trained, without bounds, by both kinds with
@@ -119,7 +119,7 @@ class Run:
 @functools.cache
 def scene_of(path: str, noise: float, seed: int) -> toy.ToyScene:
     """The toy scene as seen with `noise` [m]."""
-    rows = read_scenarios(Path(__file__).parents[2] / "config/scenarios.tsv")
+    rows = read_scenarios(Path(__file__).parents[3] / "config/scenarios.tsv")
     return toy.make(rows[f"toy_{path.replace('/', '_')}"], config.Toy(noise=noise, seed=seed))
 
 

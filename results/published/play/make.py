@@ -1,4 +1,4 @@
-"""Pictures of the playground for its page: `python -m workflow.scripts.play_pictures RESULTS/SCENARIO OUTPUT`.
+"""Pictures of the playground for its page: `python -m results.published.play.make RESULTS/SCENARIO OUTPUT`.
 
 A headless Chromium opens the page as a user does. The scenario should be synthetic, with splats, and have runs of `neuspring` and
 `baseline`; pictures of real footage are not for this repository.
