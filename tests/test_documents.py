@@ -1,4 +1,4 @@
-"""Pages name files, folders, headings and configurations that there are."""
+"""Pages name files, folders, headings and configurations that there are, are short, and have plain sentences."""
 
 import re
 from pathlib import Path
@@ -6,8 +6,11 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PLACES = ("", ".github", "config", "results", "tests/benchmarks", "workflow")
+PLACES = ("", ".github", "config", "results", "tests/benchmarks", "tests/golden", "workflow")
 PAGES = [*(path for place in PLACES for path in sorted((ROOT / place).glob("*.md"))), *sorted((ROOT / "neuspring").rglob("*.md"))]
+WRITTEN = [page for page in PAGES if page != ROOT / "config" / "README.md"]
+MOST_WORDS, ALL_WORDS = 5_000, 42_000
+"""Of a hand-written page, and of all of them."""
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 PATH = re.compile(
     r"(?<![\w/.])((?:neuspring|workflow|config|tests|results/published)/[\w/.-]*\w\.(?:py|yaml|tsv|smk|csv|md|txt))\b"
@@ -59,3 +62,18 @@ def test_the_table_of_what_to_add_names_files_and_names_that_there_are():
         if (ROOT / path).exists() and not re.search(rf"^(?:def |class )?{name}\b", (ROOT / path).read_text(), re.MULTILINE):
             absent.append(f"{name} in {path}")
     assert not absent
+
+
+def test_pages_are_short():
+    """Hand-written pages, without the page of settings, which is generated."""
+    words = {page.relative_to(ROOT).as_posix(): len(page.read_text().split()) for page in WRITTEN}
+    assert max(words.values()) <= MOST_WORDS, words
+    assert sum(words.values()) <= ALL_WORDS, words
+
+
+@pytest.mark.parametrize("page", WRITTEN, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_sentences_begin_with_their_subject(page):
+    text = re.sub(r"```.*?```|`[^`\n]*`", "x", page.read_text(), flags=re.DOTALL)
+    prose = re.sub(r"^(?:#|\|).*$", "\n", text, flags=re.MULTILINE)
+    sentences = re.split(r"(?<=[.!?:])\s+|\n\s*(?:[-*]|\d+\.)\s+|\n\s*\n", prose)
+    assert [one[:60] for one in sentences if re.match(r"\W*(?:Of|What|Whether)\b", one)] == []

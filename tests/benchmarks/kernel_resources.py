@@ -1,4 +1,4 @@
-"""Registers and memory of every kernel on GPUs, from its machine code: `python -m tests.benchmarks.kernel_resources`, without a GPU."""
+"""Registers and memory of every kernel on GPUs, from machine code, without a GPU: `python -m tests.benchmarks.kernel_resources`."""
 
 from __future__ import annotations
 
