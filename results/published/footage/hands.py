@@ -1,4 +1,4 @@
-"""How far off hands are that were seen in color alone, where they are given in space too: part of `make`.
+"""Errors of hands that were seen in color alone, where they are given in space too: part of `make`.
 
 A hand's grip is the mean of its controllers; the given one is the mean of its points that are near the object in frame 0. Seen
 hands move in a plane (neuspring/perception/color_hands.py).

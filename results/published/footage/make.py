@@ -110,7 +110,7 @@ def published_rows(case: Case) -> list[Row]:
 
 
 def still_rows(case: Case) -> list[Row]:
-    """Of a prediction that nothing moves: the object as it is seen in frame 0, cut out by the capture's mask."""
+    """Rows of a prediction that nothing moves: the object as it is seen in frame 0, cut out by the capture's mask."""
     covered = case.labels(0) == OBJECT
     rgba = np.dstack([np.where(covered[..., None], case.color(0), 0), np.where(covered, 255, 0)]).astype(np.uint8)
     own = labeled_rows(case, ((frame, covered) for frame in case.labeled))
@@ -119,7 +119,7 @@ def still_rows(case: Case) -> list[Row]:
 
 
 def run_rows(case: Case, run: Run) -> list[Row]:
-    """Of a run; empty where it has no trajectory."""
+    """Rows of a run; empty where it has no trajectory."""
     positions = run.positions()
     if positions is None:
         return []
@@ -170,11 +170,11 @@ class Scores:
 SHOWN = 6
 """Frames of a strip."""
 WHITE = 0.3
-"""How much white PhysTwin's video has laid over its frames."""
+"""Share of white that PhysTwin's video has laid over its frames."""
 MARGIN = 24
 """px around object and hands."""
 WIDTH = 360
-"""Of a picture of the strip, px."""
+"""Width of a picture of the strip, px."""
 BAR, GAP = 24, 3
 """Height of the bar of time and width of gaps, px."""
 INK = (40, 40, 40)

@@ -1,4 +1,4 @@
-"""What is compared in `make`: footage with drawn masks, PhysTwin's published prediction, and runs of the workflow."""
+"""The sides of the comparison in `make`: footage with drawn masks, PhysTwin's published prediction, and runs of the workflow."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class Case:
 
     name: str
     folder: Path
-    """Of the footage."""
+    """A case of the footage."""
     capture: Capture
 
     @property

@@ -32,7 +32,7 @@ COMPARED = {
     ("future", "psnr"): "Future PSNR [dB]",
     ("last", "iou_drawn"): "IoU with the drawn mask of the last frame",
 }
-"""What differences are taken of."""
+"""Quantities of which differences are taken."""
 
 
 def select(table: pd.DataFrame, metric: str, part: str, *, all_cases: bool = False) -> pd.DataFrame:
@@ -48,7 +48,7 @@ def shared(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _in_means(rows: pd.DataFrame, metric: str, parts: Iterable[str]) -> tuple[dict[str, pd.DataFrame], list[str]]:
-    """What `select` finds of each part, of the cases shared by all methods; and a line that names the cases left out for that."""
+    """Rows that `select` finds of each part, of the cases shared by all methods; and a line that names the cases left out for that."""
     found = {part: select(rows, metric, part) for part in parts}
     kept = {part: shared(own) for part, own in found.items()}
     lost = {part: sorted(set(own["case"]) - set(kept[part]["case"])) for part, own in found.items()}

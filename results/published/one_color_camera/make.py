@@ -1,4 +1,4 @@
-r"""What one color camera costs, where the truth is known: synthetic scenes seen by three RGBD cameras, by one, by color alone.
+r"""The cost of one color camera, where the truth is known: synthetic scenes seen by three RGBD cameras, by one, by color alone.
 
     python -m results.published.one_color_camera.make make CAPTURES OUT       # captures of one camera, with and without depth
     python -m results.published.one_color_camera.make table OUT RESULTS --output TABLES

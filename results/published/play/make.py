@@ -20,10 +20,10 @@ from tests.support.browser import Browser
 from tests.support.pointing import WINDOW, choose_tab, pixel, pull, until
 
 QUALITY = 82
-"""Of JPEG."""
+"""JPEG's quality."""
 PATIENCE = 900.0
 SECONDS = 20
-"""That a picture is given."""
+"""Seconds that a picture is given."""
 CLOSE_NOTES = "document.querySelectorAll('.mantine-Notification-closeButton').forEach((one) => one.click())"
 
 

@@ -60,7 +60,7 @@ def read_case(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def described(case: str, name: str, frames: int) -> Description:
-    """What capture.json says of the points alone."""
+    """Description of a capture of the points alone."""
     row = released_cases().get(case)
     split = int(row["train_end"]) if row is not None and int(row["frames"]) == frames else None
     return Description(

@@ -34,7 +34,7 @@ SEEN = {
     "film": "one color camera and the hands; annotated points are for scoring alone",
     "both": "one color camera, the hands, 320 nodes and the annotated points of training frames",
 }
-"""What methods saw, by the ending of the scenario's name."""
+"""The input of methods, by the ending of the scenario's name."""
 METRICS = {"track_error": "track error", "track_error_bound": "bound track error", "iou": "IoU"}
 TASKS = {"reconstruction": "training", "future": "future"}
 NOTE = """\

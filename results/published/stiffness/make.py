@@ -88,7 +88,7 @@ def picture(scenario: str, takes: Sequence[Prediction], scene: Scene) -> Figure:
 
 
 def judged(home: Path, methods: Sequence[str]) -> tuple[list[tuple[str, int, float]], list[Prediction], Scene | None]:
-    """Of the runs of a scenario: (method, seed, correlation); the truth and a twin of each method at rest, and what shows them."""
+    """Judged runs of a scenario: (method, seed, correlation); the truth and a twin of each method at rest, and what shows them."""
     truth, rows, takes, scene = Truth.load(truth_path(home / "capture")), [], dict[str, Prediction](), None
     for path in (path for method in methods for path in sorted(home.glob(f"{method}/*/rollout.json"))):
         run = RunFolder.of(path.parent)

@@ -33,7 +33,7 @@ def strip(capture: Capture) -> np.ndarray:
 
 
 def facts(capture: Capture, results: Path) -> dict[str, object]:
-    """What a capture took, from its files and the record of its job."""
+    """The cost of a capture, from its files and the record of its job."""
     folder = capture.folder.parent
     truth = Truth.load(truth_path(capture.folder))
     record = JobRecord.load(results / FOLDER / "capture" / f"{folder.name}.json")
