@@ -1,8 +1,8 @@
 """Real color film of one camera and what was drawn in it by hand: videos, masks, points.
 
 A folder of it has videos/combine_tracking__CASE.mp4 or combine_rendering__CASE.mp4 (the left half is the film),
-masks/CASE/FRAME.png (0 nothing, 1 object, 2 hands) and tracks/CASE.json (points marked by hand, null where hidden). Marks of frame 0 alone
-(tests/data/marks) are carried through the film.
+masks/CASE/FRAME.png (0 nothing, 1 object, 2 hands) and tracks/CASE.json (points marked by hand, null where hidden). Marks of
+frame 0 alone (tests/data/marks) are carried through the film.
 """
 
 from __future__ import annotations

@@ -110,7 +110,7 @@ class Case:
 
     name: str
     folder: Path
-    """A case of the footage."""
+    """The folder of the footage."""
     capture: Capture
 
     @property

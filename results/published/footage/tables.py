@@ -48,7 +48,7 @@ def shared(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _in_means(rows: pd.DataFrame, metric: str, parts: Iterable[str]) -> tuple[dict[str, pd.DataFrame], list[str]]:
-    """Rows that `select` finds of each part, of the cases shared by all methods; and a line that names the cases left out for that."""
+    """Rows that `select` finds of each part, of the cases shared by all methods; and a line that names the cases left out."""
     found = {part: select(rows, metric, part) for part in parts}
     kept = {part: shared(own) for part, own in found.items()}
     lost = {part: sorted(set(own["case"]) - set(kept[part]["case"])) for part, own in found.items()}
