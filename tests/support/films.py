@@ -10,8 +10,6 @@ import numpy as np
 
 from neuspring.config.perception import OpenCvTracking
 from neuspring.data.capture import HANDS, OBJECT
-from neuspring.extensions.annotate.clicks import Click, GrayImages
-from neuspring.extensions.annotate.clicks import follow as follow_click
 from neuspring.perception import track_opencv
 from neuspring.perception.frames import overlap
 from results.published.footage.film import Points
@@ -59,13 +57,6 @@ def stepwise(colors: list[np.ndarray], labels: np.ndarray, start: np.ndarray, **
     points = np.concatenate([start, track_opencv.choose(labels[0], chosen.points, 0)]).astype(np.float32)
     found = track_opencv.follow(Film(colors), "0", labels, points, chosen)  # type: ignore[arg-type]
     return found.pixels[:, : len(start)], found.visible[:, : len(start)]
-
-
-def clicked(colors: list[np.ndarray], labels: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The tracker of `neuspring annotate`, from one click in frame 0, without masks."""
-    images = GrayImages(Film(colors))  # type: ignore[arg-type]
-    places = [follow_click(images, "0", [Click(frame=0, x=float(x), y=float(y))]).places for x, y in start]
-    return np.stack(places, axis=1), np.isfinite(np.stack(places, axis=1)[..., 0])
 
 
 @dataclass(frozen=True)

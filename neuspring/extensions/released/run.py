@@ -22,9 +22,9 @@ from neuspring.data import phystwin
 from neuspring.data.check import check_layout, find_cases
 from neuspring.data.phystwin import released_cases
 from neuspring.data.released import Released
-from neuspring.scores.lpips import Lpips
 from neuspring.extensions.released import checks
 from neuspring.extensions.released.checks import MEAN, Absent, Comparison, Outcome, Published, Tools, of_means, require
+from neuspring.scores.lpips import Lpips
 
 CHECKS = {
     1: "sizes of the case, and frame 0 of the released prediction",

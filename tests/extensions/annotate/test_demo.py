@@ -14,9 +14,9 @@ from neuspring.data.sources import read_scenarios
 from neuspring.data.synthetic.make import make
 from neuspring.perception.frames import overlap
 from neuspring.perception.marks.marks import Mark
+from tests.extensions.annotate.served import TOKEN, Client, served
 from tests.support.browser import Browser, chromium
 from tests.support.project import ROOT
-from tests.support.served import TOKEN, Client, served
 
 DEMO = config.read_yaml(ROOT / "config" / "data" / "demo.yaml")
 KEYS = {"object": "1", "hand": "2"}

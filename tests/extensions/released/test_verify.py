@@ -23,12 +23,11 @@ from neuspring.data.released import (
     read_parameters,
     visible_pixels,
 )
-from neuspring.scores.lpips import CHANNELS, WINDOWS, Lpips
-from neuspring.scores.metrics import METRICS
 from neuspring.extensions.released.checks import MEAN, RELEASED, Comparison, Published, frame_scores, of_means
 from neuspring.extensions.released.run import CHECKS, Report, read_observations, verify_released
-from tests.support.phystwin_case import dump, edit, stored
-from tests.support.released_case import (
+from neuspring.scores.lpips import CHANNELS, WINDOWS, Lpips
+from neuspring.scores.metrics import METRICS
+from tests.extensions.released.released_case import (
     DASHPOT,
     DRAG,
     FRAMES,
@@ -45,6 +44,7 @@ from tests.support.released_case import (
     write_prediction,
     write_released,
 )
+from tests.support.phystwin_case import dump, edit, stored
 
 NAME = "single_lift_thing"
 

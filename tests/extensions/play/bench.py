@@ -1,4 +1,4 @@
-"""The playground's live mode: `python -m tests.benchmarks.bench_play [--nodes N ...] [--seconds S] [--frames N] [--runs RUN ...]`.
+"""The playground's live mode: `python -m tests.extensions.play.bench [--nodes N ...] [--seconds S] [--frames N] [--runs RUN ...]`.
 
 For each size a box of random points (`scenes.py`, 100 substeps per frame of 1/30 s) is pulled by a mouse that moves 60 times per
 second. Columns: one frame of the simulation alone, and one with its drawing, in ms of processor time (medians), so that other work
@@ -27,9 +27,9 @@ from neuspring.extensions.play.controls import MOST_FRAMES
 from neuspring.extensions.play.live import Live
 from neuspring.extensions.play.page import Page
 from neuspring.extensions.play.player import Player
-from neuspring.extensions.play.results import find
 from neuspring.extensions.play.serve import address, start
 from neuspring.extensions.play.simulator import Simulator, StartState
+from neuspring.report.shown import find
 from tests.benchmarks.memory import resident_mib
 from tests.benchmarks.scenes import box
 from tests.support import scenarios

@@ -10,10 +10,15 @@ import pytest
 from neuspring.core.errors import InputError
 from neuspring.core.records import CAPTURE_FOLDER, Recorder, digest_file
 from neuspring.data.capture import CAPTURE
-from neuspring.extensions.play.results import find
+from neuspring.report.shown import find
 from tests.support import small
 from tests.support.colored import paint
 from tests.support.played import record, results, spoil
+
+
+@pytest.fixture
+def scenario(tmp_path):
+    return results(tmp_path)
 
 
 def test_a_scenarios_folder_shows_one_run_of_each_of_two_methods(scenario):
