@@ -9,7 +9,7 @@ from neuspring.config.parse import merge
 
 Effort = Literal["quick", "normal", "paper"]
 EFFORTS = get_args(Effort)
-SIZES: dict[str, tuple[Any, Any, Any]] = {
+EFFORT_SIZES: dict[str, tuple[Any, Any, Any]] = {
     # Key: quick, normal, paper.
     "search.rollouts": (88, 110, 220),
     "search.tied_rollouts": (0, 44, 0),
@@ -37,7 +37,7 @@ the released code, the defaults of all keys but `synthetic.size`. Pictures of th
 def sizes(effort: str) -> dict[str, Any]:
     """The values of an effort, nested as in a configuration file."""
     values: dict[str, Any] = {}
-    for path, choices in SIZES.items():
+    for path, choices in EFFORT_SIZES.items():
         merge(
             values, functools.reduce(lambda inner, name: {name: inner}, reversed(path.split(".")), choices[EFFORTS.index(effort)])
         )

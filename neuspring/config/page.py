@@ -18,15 +18,15 @@ import yaml
 from pydantic.fields import FieldInfo
 
 from neuspring.config import rows, settings
-from neuspring.config.effort import EFFORTS, SIZES
+from neuspring.config.effort import EFFORT_SIZES, EFFORTS
 from neuspring.config.parse import Section, parts
 
 PAGE = Path(__file__).parents[2] / "config" / "README.md"
 HEADING = "## Keys\n"
-"""What stands above it is written by hand, what stands below from the declarations."""
+"""Above it the page is written by hand, below it from the declarations."""
 ROWS = {"rows of scenarios.tsv": rows.ScenarioRow, "rows of methods.yaml": rows.Method, "rows of searches.yaml": rows.SearchRow}
 BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
-PLAIN = {int: "integer", float: "number", str: "text", bool: "`true`, `false`", types.NoneType: "`null`", Any: "any"}
+WORDS = {int: "integer", float: "number", str: "text", bool: "`true`, `false`", types.NoneType: "`null`", Any: "any"}
 
 
 def sections(kind: type = settings.Config, path: str = "") -> dict[str, type]:
@@ -47,7 +47,7 @@ def is_section(kind: Any) -> bool:
 def text() -> str:
     """The page: its introduction as it is, its tables anew."""
     written = PAGE.read_text(encoding="utf-8").partition(HEADING)[0] + HEADING
-    sizes = ((f"`{key}`", *(f"`{yaml_text(value)}`" for value in values)) for key, values in SIZES.items())
+    sizes = ((f"`{key}`", *(f"`{yaml_text(value)}`" for value in values)) for key, values in EFFORT_SIZES.items())
     efforts = ["### effort", "", "The sizes that `effort` sets.", "", *table(("key", *EFFORTS), sizes), ""]
     described = [section(title, kind) for title, kind in (sections() | ROWS).items()]
     return "\n".join([written, described[0], *efforts, *described[1:]])
@@ -116,7 +116,7 @@ def allowed(hint: Any) -> str:
         return "section"
     if dataclasses.is_dataclass(hint):
         return "range"
-    return "mapping" if origin is dict else PLAIN[hint]
+    return "mapping" if origin is dict else WORDS[hint]
 
 
 def bounds(hint: Any) -> list[Any]:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from neuspring import config
 from neuspring.config import Config, parse, plain
-from neuspring.config.effort import EFFORTS, SIZES, sizes
+from neuspring.config.effort import EFFORT_SIZES, EFFORTS, sizes
 from neuspring.core import artifacts
 from neuspring.core.errors import InputError
 from neuspring.core.text import listed
@@ -232,5 +232,7 @@ def test_the_demo_is_quick_and_the_synthetic_benchmark_normal():
         values = config.read_yaml(ROOT / "config" / "data" / f"{name}.yaml")
         assert values["effort"] == effort
         # Whatever the dial sets, these files leave to it.
-        given = [path for path in SIZES if functools.reduce(lambda part, key: part.get(key, {}), path.split("."), values) != {}]
+        given = [
+            path for path in EFFORT_SIZES if functools.reduce(lambda part, key: part.get(key, {}), path.split("."), values) != {}
+        ]
         assert given == []
