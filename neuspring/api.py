@@ -86,10 +86,11 @@ def search(
     elastic rod are found, for a long thin object. Raises InputError, NumericalFailure.
     """
     from neuspring.core.device import resolve_device
-    from neuspring.twin.body import BODIES
+    from neuspring.twin.body import BODIES, SearchOptions
 
-    options: dict[str, Any] = {"clusters": clusters, "seed": seed, "device": resolve_device(device), "threads": threads}
-    return BODIES[body].search(observations, (), read_settings(settings), record=record, **options)
+    device = resolve_device(device)
+    options = SearchOptions(clusters=clusters, seed=seed, device=device, threads=threads, record=record)
+    return BODIES[body].search(observations, (), read_settings(settings), options)
 
 
 def fit(

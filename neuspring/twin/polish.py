@@ -35,7 +35,7 @@ TOLERANCE = 1e-3
 REACH = 0.25
 """Longest step of a round in a normalized variable."""
 FACTORS = tuple(10.0 ** (k - TRIALS + 2) for k in range(TRIALS))
-"""What the damping is multiplied with, for each step that is tried: from 0.01 to 10."""
+"""Factors on the damping, for each step that is tried: from 0.01 to 10."""
 
 
 class Polish(LevenbergMarquardt):

@@ -33,15 +33,15 @@ BESIDE, MOST_BESIDE = 3.0, 0.1
 NEIGHBORS = 12
 """Nearest nodes along which distances on the body are measured."""
 MOST_NODES = 3000
-"""Of more nodes, evenly chosen ones decide on the line."""
+"""Nodes that decide on the line, at most; of more, evenly chosen ones."""
 ROUNDS = 4
 """Fits of the line, each with the arc of the one before."""
 SAMPLES = 400
 """Points of the smooth line, to which nodes are projected."""
 PIECES = 0.15
-"""Of the spline per radius of length: one in about seven radii, so that it does not follow the surface."""
+"""Pieces of the spline per radius of length: one in about seven radii, so that it does not follow the surface."""
 PENALTY = 1e-3
-"""Of the spline's second differences, where the mean weight of a piece's points is 1."""
+"""Weight of the spline's second differences, where the mean weight of a piece's points is 1."""
 
 
 def rod_twin(observations: Observations, settings: config.Config, axis: Sequence[float] = (0.0, 1.0, 0.0)) -> Twin:
