@@ -53,11 +53,6 @@ class Recording:
     """Velocity of the nodes in frame 0 [N, 3], m/s."""
     loss: FrameLoss
 
-    @property
-    def frames(self) -> int:
-        """Frames that a candidate is simulated over."""
-        return len(self.hands) - 1
-
 
 @dataclass(frozen=True, kw_only=True)
 class SearchProblem:

@@ -27,12 +27,12 @@ from neuspring.config.rod import RodFit
 from neuspring.core.artifacts import Observations, Rod, Twin
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_table
+from neuspring.core.levenberg import LevenbergMarquardt
 from neuspring.core.text import Progress
 from neuspring.physics.controllers import waypoints
 from neuspring.physics.rod_nodes import RodFrames, settled, turn_of
 from neuspring.twin import rod as rods
 from neuspring.twin.body import Learned
-from neuspring.twin.levenberg import LevenbergMarquardt
 from neuspring.twin.losses import frames_seen
 from neuspring.twin.rollout import initial_velocity
 

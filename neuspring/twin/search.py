@@ -199,7 +199,7 @@ def _best(problem: SearchProblem, rows: Sequence[dict[str, Any]], push: bool, at
         "rollouts": len(table),
         "failed_rollouts": int((table["reason"] != "").sum()),
         "collision_overflow": int(table["collision_overflow"].max()),
-        "spring_updates": int((table["springs"] * table["substeps"]).sum()) * sum(one.frames for one in problem.recordings),
+        "spring_updates": int((table["springs"] * table["substeps"]).sum()) * sum(len(one.hands) - 1 for one in problem.recordings),
         **twin.counts,
     }
     if held := at_ends(table, problem.variables):
