@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Annotated, Literal
 
 from neuspring.config import Config
 from neuspring.core.artifacts import Observations
@@ -29,7 +29,7 @@ def search(
     run: Recorder,
     pool: Sequence[Observations] = (),
     clusters: int = 1,
-    body: str = "lattice",
+    body: Annotated[str, "lattice or rod, or a package's own"] = "lattice",
     seed: int = 0,
     device: str = "auto",
     threads: int = 1,
