@@ -161,7 +161,7 @@ def kernels(real: Any, width: int) -> tuple[Any, Any, Any]:
 
 
 class Contacts(NamedTuple):
-    """What a frame calls. A thread per node gathers (`collided`); one thread for all adds each pair to both of its nodes."""
+    """Calls of a frame. A thread per node gathers (`collided`); one thread for all adds each pair to both of its nodes."""
 
     collided: Any
     add_pairs: Any
@@ -189,7 +189,7 @@ def functions(real: Any, width: int) -> Contacts:
 
     @wp.func
     def closes(offset: Vector, relative: Vector) -> bool:
-        """Whether a pair comes closer in any lane. Almost half do not, and need no more than this."""
+        """True where a pair comes closer in any lane. Almost half do not, and need no more than this."""
         return wp.min(dot(offset, relative)) < -approach
 
     @wp.func
@@ -209,7 +209,7 @@ def functions(real: Any, width: int) -> Contacts:
 
     @wp.func
     def impulse(dx: Vector, u: Vector, e: Number, mu: Number) -> Vector:
-        """What a node gains from a partner at dx that moves at u, before its share."""
+        """Velocity that a node gains from a partner at dx that moves at u, before its share."""
         n = divided(dx, wp.max(root(dot(dx, dx)), whole(floor)))
         s = dot(u, n)
         ut = u - scaled(n, s)

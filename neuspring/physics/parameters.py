@@ -18,7 +18,7 @@ from neuspring.core.artifacts import Material, Twin
 Values = Mapping[str, torch.Tensor]
 """Fields of `Material` by name, rest_lengths [S], m, and pushes [S]."""
 Parameters = dict[str, torch.Tensor]
-"""What `pack` makes: a tensor per name of `PARAMETERS`. Several twins have a leading axis [B]."""
+"""Result of `pack`: a tensor per name of `PARAMETERS`. Several twins have a leading axis [B]."""
 LIMITS = {
     f"{kind}_{name}": limits
     for kind in ("ground", "contact")
@@ -35,7 +35,7 @@ class Parameter(NamedTuple):
     pack: Callable[[Values, float | torch.Tensor], torch.Tensor]
     """(values of the material, substep, s) -> [S, 3], [N] or []."""
     trained: bool = True
-    """Whether gradients reach it."""
+    """True where gradients reach it."""
 
 
 def _springs(values: Values, substep: float | torch.Tensor) -> torch.Tensor:

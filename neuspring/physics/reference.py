@@ -31,9 +31,9 @@ class Scene:
     contact_distance: float
     simulation: Simulation
     mass: np.ndarray | float = 1.0
-    """Of each node [N], or of all, kg."""
+    """Mass of each node [N], or of all, kg."""
     pushes: np.ndarray | bool = False
-    """Whether each spring [S], or every one, acts only while it is shorter than at rest."""
+    """True where each spring [S], or every one, acts only while it is shorter than at rest."""
 
     @classmethod
     def of(cls, twin: Twin) -> Scene:

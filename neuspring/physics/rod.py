@@ -34,14 +34,14 @@ TWIST_STEPS = wp.constant(60)
 MAX_TURN = wp.constant(wp.float64(0.5))
 """Largest change of an angle in a step of Newton, rad."""
 LEAST_PIVOT = wp.constant(wp.float64(1e-3))
-"""Of the matrix of the steps in frame 0, over the entry of the diagonal."""
+"""Least pivot of the matrix of the steps in frame 0, over the entry of the diagonal."""
 TINY = wp.constant(wp.float64(1e-12))
 BAND = wp.constant(11)
 """Entries of a row of the banded matrix, from the diagonal to the left. Row 4 i + r is of x_i, row 4 j + 3 of theta_j."""
 JOINT = wp.constant(11)
-"""What a joint depends on: x_(i-1), theta_(i-1), x_i, theta_i, x_(i+1), in this order."""
+"""Variables that a joint depends on: x_(i-1), theta_(i-1), x_i, theta_i, x_(i+1), in this order."""
 REST = wp.constant(wp.float64(1e-9))
-"""Of GJ / l: stiffness against turning of a rod that nothing else turns."""
+"""Fraction of GJ / l: stiffness against turning of a rod that nothing else turns."""
 
 real = wp.float64
 vec3 = wp.vec3d
@@ -101,7 +101,7 @@ class Lanes:
     diagonal: Scalars
     rest: Scalars
     spring_edge: Indices
-    """Of the springs of hands [B, S]: the edge that each acts on,"""
+    """Springs of hands [B, S]: the edge that each acts on,"""
     spring_place: Vectors
     """fraction along it, distances along m1 and m2,"""
     leader: Indices
@@ -109,7 +109,7 @@ class Lanes:
     law: Vectors
     """stiffness, N/m, rest length, m, dashpot, N s/m."""
     hands: Vectors
-    """Where controllers are at the end of the substep."""
+    """Controllers at the end of the substep."""
     clearance: Scalars
     """Height over the ground at which each vertex touches it, m; below -1: there is no ground."""
     elasticity: Numbers
@@ -633,7 +633,7 @@ class RodLanes:
 
 @dataclass(frozen=True)
 class RodHands:
-    """What pulls and carries B rods besides clamps: S springs of controllers, and the ground."""
+    """Forces on B rods besides clamps: S springs of controllers, and the ground."""
 
     controllers: int
     leader: np.ndarray
@@ -661,7 +661,7 @@ STATE = (
     "k_before",
     "history",
 )
-"""What `RodSolver.follow` takes over."""
+"""State that `RodSolver.follow` takes over."""
 
 
 class RodSolver:
@@ -713,12 +713,12 @@ class RodSolver:
         self._ends: Any = (self._state.hands, self._state.hands)
 
     def bind(self, edge: torch.Tensor, place: torch.Tensor) -> None:
-        """Where the springs of hands act: on edges [B, S], at places [B, S, 3] as in `Rod.place`."""
+        """Set where the springs of hands act: on edges [B, S], at places [B, S, 3] as in `Rod.place`."""
         self._put(self._state.spring_edge, edge)
         self._put(self._state.spring_place, place)
 
     def pull(self, law: torch.Tensor, begin: torch.Tensor, end: torch.Tensor) -> None:
-        """How they act in the next frame: stiffness, N/m, rest length, m, and dashpot, N s/m [B, S, 3]; none where both are 0.
+        """Set how they act in the next frame: stiffness, N/m, rest length, m, and dashpot, N s/m [B, S, 3]; none where both are 0.
 
         Controllers move linearly from begin to end [B, C, 3], m.
         """

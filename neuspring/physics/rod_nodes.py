@@ -98,7 +98,7 @@ def settled(rods: Sequence[Rod], lines: np.ndarray) -> np.ndarray:
 
 
 def _ends(rod: Rod) -> tuple[bool, bool]:
-    """Whether either end is clamped."""
+    """True for each end that is clamped."""
     held = rod.held >= 0
     return bool(held[:2].all()), bool(held[-2:].all())
 
@@ -160,7 +160,7 @@ def at_vertices(rod: Rod, values: np.ndarray, held: np.ndarray | None = None) ->
 
 
 def radius_of(rod: Rod) -> float:
-    """How thick a rod is, m: the 0.9 quantile of the nodes' distances from the center line."""
+    """Radius of a rod, m: the 0.9 quantile of the nodes' distances from the center line."""
     return float(np.quantile(np.linalg.norm(rod.place[:, 1:], axis=1), 0.9))
 
 
