@@ -34,8 +34,11 @@ REMEDY = "Name what to run on, for example --configfile config/data/demo.yaml."
 def read_methods(path: Path) -> dict[str, Method]:
     """The method table: name -> Method. Raises InputError."""
     methods = {name: parse(Method, row, f"{path}, method {name}") for name, row in read_yaml(path).items()}
+    fits = [kind for body in BODIES.values() for kind in body.fits]
     for name, method in methods.items():
         where = f"{path}, method {name}"
+        if method.fit and method.fit not in fits:
+            raise InputError(f"{where}, fit", f"must be one of {', '.join(fits)}", repr(method.fit))
         if method.model and method.model not in BASELINES:
             raise InputError(f"{where}, model", f"must be one of {', '.join(BASELINES)}", method.model)
         if method.settings and method.model and not BASELINES[method.model].trained:
@@ -47,8 +50,12 @@ def read_methods(path: Path) -> dict[str, Method]:
 
 
 def read_searches(path: Path) -> dict[str, SearchRow]:
-    """The search table: name -> SearchRow."""
-    return {name: parse(SearchRow, row, f"{path}, search {name}") for name, row in read_yaml(path).items()}
+    """The search table: name -> SearchRow. Raises InputError."""
+    searches = {name: parse(SearchRow, row, f"{path}, search {name}") for name, row in read_yaml(path).items()}
+    for name, row in searches.items():
+        if row.body not in BODIES:
+            raise InputError(f"{path}, search {name}, body", f"must be one of {', '.join(BODIES)}", repr(row.body))
+    return searches
 
 
 def chosen_part(config: Config, scenarios: Mapping[str, ScenarioRow]) -> Config:

@@ -86,6 +86,11 @@ BAD_ROWS = {
     "key": (tables.read_searches, "a: {clusters: 1, description: x, linkage: ward}", "search a.*linkage: unknown key"),
     "search": (tables.read_methods, "a: {search: ../up, description: x}", r"method a.*search.*received '\.\./up'"),
     "fit": (tables.read_methods, "a: {search: uniform, fit: network, description: x}", "method a.*fit.*received 'network'"),
+    "body": (
+        tables.read_searches,
+        "a: {clusters: 1, body: jelly, description: x}",
+        "search a, body: must be one of lattice, rod",
+    ),
     "missing": (tables.read_methods, "a: {search: uniform, fit: null}", "method a.*description: required, but missing"),
     "unknown": (tables.read_methods, "a: {search: uniform, description: x, lr: 1}", "method a.*lr: unknown key"),
     "not a mapping": (tables.read_methods, "a: 3", "method a"),
