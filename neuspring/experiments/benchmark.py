@@ -34,8 +34,11 @@ REMEDY = "Name what to run on, for example --configfile config/data/demo.yaml."
 def read_methods(path: Path) -> dict[str, Method]:
     """The method table: name -> Method. Raises InputError."""
     methods = read_rows(Method, path, "method")
+    fits = [kind for body in BODIES.values() for kind in body.fits]
     for name, method in methods.items():
         where = f"{path}, method {name}"
+        if method.fit and method.fit not in fits:
+            raise InputError(f"{where}, fit", f"must be one of {', '.join(fits)}", repr(method.fit))
         if method.model and method.model not in BASELINES:
             raise InputError(f"{where}, model", f"must be one of {', '.join(BASELINES)}", method.model)
         if method.settings and method.model and not BASELINES[method.model].trained:
@@ -47,8 +50,11 @@ def read_methods(path: Path) -> dict[str, Method]:
 
 
 def read_searches(path: Path, clusters: int) -> dict[str, SearchRow]:
-    """The search table: name -> SearchRow; rows that name no number of regions have `clusters`."""
+    """The search table: name -> SearchRow; rows that name no number of regions have `clusters`. Raises InputError."""
     rows = read_rows(SearchRow, path, "search")
+    for name, row in rows.items():
+        if row.body not in BODIES:
+            raise InputError(f"{path}, search {name}, body", f"must be one of {', '.join(BODIES)}", repr(row.body))
     return {name: dataclasses.replace(row, clusters=row.clusters or clusters) for name, row in rows.items()}
 
 

@@ -34,9 +34,9 @@ def clear():
         function.cache_clear()
 
 
-def digest(module: str) -> str:
+def digest(*modules: str) -> str:
     clear()
-    return provenance.code_digest(module)
+    return provenance.code_digest(*modules)
 
 
 def edit(path: Path, old: str, new: str) -> None:
@@ -99,10 +99,12 @@ def test_modules_that_are_imported_by_name_count(copy):
 
 
 def test_transitive_imports_count(copy):
-    before = digest("neuspring.stages.search")
+    search, lattice = "neuspring.stages.search", *STAGES["search"].code(config.Config(), {"body": "lattice"})
+    before = digest(search, lattice)
     edit(copy / "physics" / "lanes.py", "MIN_LENGTH = 1e-6", "MIN_LENGTH = 1e-7")
-    assert digest("neuspring.stages.search") != before
+    assert digest(search, lattice) != before
     assert "neuspring.physics.springs" in provenance.used_modules("neuspring.stages.fit")
+    assert "neuspring.physics.rod" not in provenance.used_modules(lattice), "a change of the rod searches no lattice again"
 
 
 def test_declarations_and_reporting_do_not_count(copy):

@@ -89,6 +89,11 @@ BAD_ROWS = {
     "rows that extend each other": (read_searches, "a: {extends: b}\nb: {extends: a}", "search b: extends: .*; received a"),
     "search": (tables.read_methods, "a: {search: ../up, description: x}", r"method a.*search.*received '\.\./up'"),
     "fit": (tables.read_methods, "a: {search: uniform, fit: network, description: x}", "method a.*fit.*received 'network'"),
+    "body": (
+        tables.read_searches,
+        "a: {clusters: 1, body: jelly, description: x}",
+        "search a, body: must be one of lattice, rod",
+    ),
     "missing": (tables.read_methods, "a: {search: uniform, fit: null}", "method a.*description: required, but missing"),
     "unknown": (tables.read_methods, "a: {search: uniform, description: x, lr: 1}", "method a.*lr: unknown key"),
     "not a mapping": (tables.read_methods, "a: 3", "method a"),
