@@ -90,7 +90,7 @@ BAD_ROWS = {
     "search": (tables.read_methods, "a: {search: ../up, description: x}", r"method a.*search.*received '\.\./up'"),
     "fit": (tables.read_methods, "a: {search: uniform, fit: network, description: x}", "method a.*fit.*received 'network'"),
     "body": (
-        tables.read_searches,
+        read_searches,
         "a: {clusters: 1, body: jelly, description: x}",
         "search a, body: must be one of lattice, rod",
     ),
