@@ -82,7 +82,7 @@ def tables(
 def _made_otherwise(settings: str, results: Path) -> tuple[str, ...]:
     """Lines on runs that are there but are not what these settings would make."""
     from neuspring.config import plain
-    from neuspring.core.provenance import ROOT
+    from neuspring.core.provenance import PACKAGE_FOLDER
     from neuspring.experiments.benchmark import Benchmark
     from neuspring.experiments.freshness import Freshness
     from neuspring.experiments.graph import Graph
@@ -91,7 +91,7 @@ def _made_otherwise(settings: str, results: Path) -> tuple[str, ...]:
         return ()
     values = plain(read_settings(settings)) | {"results": str(results)}
     try:
-        return tuple(Freshness(Graph(Benchmark(values, ROOT.parent))).of_runs())
+        return tuple(Freshness(Graph(Benchmark(values, PACKAGE_FOLDER.parent))).of_runs())
     except InputError as error:
         # Of a part of the scenarios, for example, whose others have no data here.
         return (f"  Not compared with the configuration: {error}",)

@@ -1,4 +1,4 @@
-"""What everything stands on.
+"""Artifacts, records, files and errors, on which all other rooms stand.
 
 - `artifacts`: the nouns (`Observations`, `Topology`, `Material`, `Twin`, `Trajectory`, ...); `geometry`: obstacles.
 - `records`, `run_record`, `job_records`: what a stage, a run, a job did; `Recorder` measures a stage and writes its record.

@@ -23,7 +23,7 @@ class Refused(Exception):
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address or name means this machine alone."""
+    """True where an address or name means this machine alone."""
     address = _address(host)
     return host == "localhost" if address is None else address.is_loopback
 

@@ -22,7 +22,7 @@ def copy(tmp_path, monkeypatch):
     """A copy of the package that digests read from."""
     target = tmp_path / "neuspring"
     shutil.copytree(PACKAGE, target, ignore=shutil.ignore_patterns("__pycache__"))
-    monkeypatch.setattr(provenance, "ROOT", target)
+    monkeypatch.setattr(provenance, "PACKAGE_FOLDER", target)
     clear()
     yield target
     clear()
