@@ -20,9 +20,9 @@ import torch
 
 from neuspring.core.errors import InputError
 
-MARGIN = 0.3
+PICTURE_MARGIN = 0.3
 """Slopes in the Jacobian may leave the picture by this part of its half width or height."""
-SAFETY = 1e-3
+BOX_MARGIN = 1e-3
 """Bounding boxes are wider by this part, so that rounding cuts off no pixel."""
 C0 = 0.5 / math.sqrt(math.pi)
 """Y_0."""
@@ -54,7 +54,7 @@ class Limits:
     """A pixel is done before the splat that would leave no more than this transmittance."""
 
 
-LIMITS = Limits()
+DEFAULT_LIMITS = Limits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +148,7 @@ def project(means: torch.Tensor, quaternions: torch.Tensor, scales: torch.Tensor
 
 
 def _limited(slope: torch.Tensor, focal: torch.Tensor, center: torch.Tensor, size: int) -> torch.Tensor:
-    margin = MARGIN * 0.5 * size / focal
+    margin = PICTURE_MARGIN * 0.5 * size / focal
     return slope.clamp(-center / focal - margin, (size - center) / focal + margin)
 
 
@@ -159,7 +159,7 @@ def boxes(projected: Projected, opacities: torch.Tensor, view: View, limits: Lim
     alpha >= alpha_min needs a Mahalanobis square of at most 2 ln(opacity / alpha_min), an ellipse with these half widths.
     """
     reach = 2 * torch.log(opacities / limits.alpha_min)
-    half = torch.sqrt(reach.clamp_min(0.0)[:, None] * projected.covariances[:, [0, 2]]) * (1 + SAFETY)
+    half = torch.sqrt(reach.clamp_min(0.0)[:, None] * projected.covariances[:, [0, 2]]) * (1 + BOX_MARGIN)
     size = torch.tensor([view.width, view.height], device=half.device, dtype=half.dtype)
     low = torch.ceil(projected.means - half - 0.5).clamp_min(0.0).minimum(size)
     high = (torch.floor(projected.means + half - 0.5) + 1).clamp_min(0.0).minimum(size)
