@@ -25,7 +25,7 @@ LeftOut = Annotated[str, arg(help="JSON: methods and the scenarios to which they
 StudyTable = Annotated[Path, arg(help="the study table")]
 Folder = Annotated[Path, arg(help="folder to write to")]
 Transfers = Annotated[tuple[str, ...], arg(help="scenarios whose twins were rolled out on other recordings")]
-WHAT = "--scores, or --scenarios, --methods and --seeds of a results folder, are required"
+STUDY_RULE = "--scores, or --scenarios, --methods and --seeds of a results folder, are required"
 
 
 def tables(
@@ -134,7 +134,7 @@ def study(
     elif scenarios and methods and seeds:
         print(write_study(study, definition, results, scenarios, seeds, methods, output, without, beside))
     else:
-        raise InputError("study", WHAT)
+        raise InputError("study", STUDY_RULE)
 
 
 def explain(

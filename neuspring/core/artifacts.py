@@ -31,7 +31,7 @@ SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 OMITTED = {"empty": "omitted"}
 """Metadata of a field that files do not have where it is empty."""
 NO_REST_SHAPE = np.zeros((0, 3))
-"""The rest shape that stands for: as in frame 0."""
+"""No rest shape of its own: frame 0 is the rest shape."""
 
 
 def up_sign(up: str) -> float:

@@ -21,7 +21,7 @@ from neuspring.physics.arrays import UNFUSED, Buffers, structs
 from neuspring.physics.lanes import lanes
 from neuspring.physics.motion import APPROACH, MIN_TANGENT
 
-CELLS = 64
+GRID_CELLS = 64
 """Cells of the hash grid along each axis; farther cells share them."""
 
 
@@ -45,7 +45,7 @@ def allocate(b: Buffers) -> None:
     b.views["grid_groups"] = wp.from_torch(groups, dtype=wp.int32)
     b.tensors["grid_points"] = torch.zeros((twins * b.nodes, 3), dtype=b.dtype, device=b.device)
     b.views["grid_points"] = wp.from_torch(b.tensors["grid_points"], dtype=wp.types.vector(3, b.real))
-    b.views["grid"] = wp.HashGrid(CELLS, CELLS, CELLS, device=b.device, dtype=b.real)
+    b.views["grid"] = wp.HashGrid(GRID_CELLS, GRID_CELLS, GRID_CELLS, device=b.device, dtype=b.real)
 
 
 def overflow(b: Buffers) -> torch.Tensor:
@@ -161,7 +161,7 @@ def kernels(real: Any, width: int) -> tuple[Any, Any, Any]:
 
 
 class Contacts(NamedTuple):
-    """What a frame calls. A thread per node gathers (`collided`); one thread for all adds each pair to both of its nodes."""
+    """Functions of a frame. A thread per node gathers (`collided`); one thread for all adds a pair to both of its nodes."""
 
     collided: Any
     add_pairs: Any
@@ -189,7 +189,7 @@ def functions(real: Any, width: int) -> Contacts:
 
     @wp.func
     def closes(offset: Vector, relative: Vector) -> bool:
-        """Whether a pair comes closer in any lane. Almost half do not, and need no more than this."""
+        """True where a pair comes closer in any lane. Almost half do not, and need no more than this."""
         return wp.min(dot(offset, relative)) < -approach
 
     @wp.func
@@ -209,7 +209,7 @@ def functions(real: Any, width: int) -> Contacts:
 
     @wp.func
     def impulse(dx: Vector, u: Vector, e: Number, mu: Number) -> Vector:
-        """What a node gains from a partner at dx that moves at u, before its share."""
+        """Change of a node's velocity, before its share, by a partner at dx that moves at u."""
         n = divided(dx, wp.max(root(dot(dx, dx)), whole(floor)))
         s = dot(u, n)
         ut = u - scaled(n, s)

@@ -16,14 +16,14 @@ from collections.abc import Iterable
 import numpy as np
 import torch
 
-from neuspring.physics.lanes import MIN_LENGTH
+from neuspring.physics.lanes import MIN_SPRING_LENGTH
 
 BEGINS = 2.0
 """In the last column of a row of waypoints: the controller begins to hold in this frame."""
 
 
 def waypoints(hands: torch.Tensor, valid: np.ndarray | None = None) -> torch.Tensor:
-    """What a solver takes for `begin` and `end` of frames, one row per frame: hands [T, C, 3], m.
+    """Controllers as a solver takes them for `begin` and `end` of frames, one row per frame, from hands [T, C, 3], m.
 
     Where some controller does not hold in some frame (`valid` [T', C], T' >= T; empty or none: all hold), a last column has 1 or 0,
     and 2 where it begins to hold, but in frame 0. The springs of a controller act in a frame if it holds at both ends of the frame.
@@ -46,7 +46,7 @@ def begun(row: torch.Tensor) -> torch.Tensor:
     return torch.cat([row[..., :3], row[..., 3:].clamp(max=1.0)], dim=-1) if row.shape[-1] == 4 else row
 
 
-class Grips:
+class ControllerSprings:
     """The springs of controllers among spring_pairs [S, 2]; i >= nodes means controller i - nodes."""
 
     def __init__(self, spring_pairs: np.ndarray, nodes: int, device: str) -> None:
@@ -65,7 +65,7 @@ class Grips:
         now = begins(row)
         if not bool(now.any()):
             return lengths
-        apart = (row[..., self.leaders, :3] - x[..., self.nodes, :]).norm(dim=-1).clamp(min=MIN_LENGTH)
+        apart = (row[..., self.leaders, :3] - x[..., self.nodes, :]).norm(dim=-1).clamp(min=MIN_SPRING_LENGTH)
         before = torch.zeros_like(apart) if lengths is None else lengths
         return torch.where(now[..., self.leaders], apart, before)
 

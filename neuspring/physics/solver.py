@@ -25,14 +25,14 @@ from neuspring.core.device import load
 from neuspring.core.errors import InputError
 from neuspring.physics import collision, frame, obstacles, springs
 from neuspring.physics.arrays import Buffers, Graphs
-from neuspring.physics.controllers import Grips, begins, begun
+from neuspring.physics.controllers import ControllerSprings, begins, begun
 from neuspring.physics.parameters import PARAMETERS, Parameters, packed
 from neuspring.physics.rod_nodes import RodFrames
 
-KEPT = 1 << 30
+FRAME_WINDOW_BYTES = 1 << 30
 """Bytes that a `FrameWindow` may take."""
 PER_TWIN = ("frame_time", "substeps", "initial_velocity")
-"""What may differ between the simulations of one solver; it does not read the last."""
+"""Fields that may differ between the simulations of one solver; it does not read the last."""
 
 
 def _check(simulations: Sequence[Simulation]) -> None:
@@ -80,15 +80,15 @@ class FrameSolver:
         collision.allocate(self.buffers)
         obstacles.allocate(self.buffers)
         self._pushes = False
-        """Whether some spring only pushes."""
+        """True where some spring only pushes."""
         self._choose_kernels()
-        self.grips = Grips(spring_pairs, nodes, device)
+        self.grips = ControllerSprings(spring_pairs, nodes, device)
         self._held: torch.Tensor | None = None
         """Rest lengths of grips that began since the parameters were set [B, L] (controllers.py)."""
         self._plain: torch.Tensor | None = None
         """Springs as they were set [B, S, 3]."""
         self._factor: torch.Tensor | None = None
-        """What springs are multiplied with in this frame [B, S, 3], where some controller does not hold."""
+        """Factors of springs in this frame [B, S, 3], where some controller does not hold."""
         self._reach = 0.0
         self.frame_token = 0
         """Number of frames simulated: tells whether the buffers still hold a given one."""
@@ -284,12 +284,12 @@ class FrameSolver:
 class FrameWindow:
     """The last frames of a spring graph, as a solver of their own each, so that a gradient through them simulates none again.
 
-    `make` makes a solver of the graph; there will be `frames` of them, or as many as fit into `KEPT` bytes, one at least.
+    `make` makes a solver of the graph; there will be `frames` of them, or as many as fit into `FRAME_WINDOW_BYTES`, one at least.
     """
 
     def __init__(self, make: Callable[[], FrameSolver], frames: int, frame_token: int = 0) -> None:
         self._make, self._solvers = make, [make()]
-        self._room = max(1, min(frames, KEPT // self._solvers[0].nbytes))
+        self._room = max(1, min(frames, FRAME_WINDOW_BYTES // self._solvers[0].nbytes))
         self._first = self.frame_token = frame_token
 
     def turn(self) -> FrameSolver:
@@ -335,7 +335,7 @@ class AdjointLimit:
         """dL/dx at the begin of the frame that came last."""
 
     def passes(self, after: Sequence[torch.Tensor], before: Sequence[torch.Tensor]) -> bool:
-        """Whether a frame stays, given (dL/dx, dL/dv) at its end, `after`, and at its begin, `before`; frames come last first."""
+        """True where a frame stays, from (dL/dx, dL/dv) at its end, `after`, and its begin, `before`; frames come last first."""
         (end, _), (x, v) = after, before
         self._added += _norm(end if self._carried is None else end - self._carried)
         stays = math.hypot(_norm(x), _norm(v) / self.frame_time) <= self.factor * self._added

@@ -21,7 +21,7 @@ from neuspring.core.artifacts import Material, Observations, Simulation, Twin
 from neuspring.core.errors import NumericalFailure
 from neuspring.physics import stability
 from neuspring.physics.controllers import waypoints
-from neuspring.physics.lanes import COST, WIDTHS, width_for
+from neuspring.physics.lanes import COST, LANE_WIDTHS, width_for
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.rollout import initial_velocity
 from neuspring.twin.topology import controller_reach, node_spacing, piecewise_topology, regions
@@ -257,7 +257,7 @@ def groups(problem: SearchProblem, twins: Sequence[Twin]) -> list[list[int]]:
     substeps = [twin.simulation.substeps for twin in twins]
     springs = [len(twin.topology.springs) for twin in twins]
     order = sorted(range(len(twins)), key=lambda k: -substeps[k])
-    most = min(problem.together or WIDTHS[-1], WIDTHS[-1])
+    most = min(problem.together or LANE_WIDTHS[-1], LANE_WIDTHS[-1])
 
     def time_of(members: Sequence[int]) -> float:
         return COST[width_for(len(members))] * substeps[members[0]] * max(springs[k] for k in members)

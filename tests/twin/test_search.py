@@ -22,7 +22,7 @@ from neuspring import config
 from neuspring.config.search import LENGTHS
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.physics import stability
-from neuspring.physics.lanes import COST, WIDTHS, width_for
+from neuspring.physics.lanes import COST, LANE_WIDTHS, width_for
 from neuspring.twin import candidates
 from neuspring.twin.candidates import PENALTY, SearchProblem, candidate, groups, made, still_cost
 from neuspring.twin.losses import FrameLoss
@@ -670,7 +670,7 @@ def test_groups_are_a_partition_that_never_takes_longer_than_one_by_one(sizes, t
     twins = [stand_in(*size) for size in sizes]
     made = groups(problem, twins)
     assert sorted(k for members in made for k in members) == list(range(len(twins)))
-    assert all(1 <= len(members) <= min(together or WIDTHS[-1], WIDTHS[-1]) for members in made)
+    assert all(1 <= len(members) <= min(together or LANE_WIDTHS[-1], LANE_WIDTHS[-1]) for members in made)
     assert made == groups(problem, twins)
     # Those with the most substeps begin.
     slowest = [max(sizes[k][0] for k in members) for members in made]

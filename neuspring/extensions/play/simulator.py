@@ -191,8 +191,8 @@ class Simulator:
             edge = self.twin.rod.edge[node]
             mass = float(self.twin.rod.mass[edge : edge + 2].sum())
         wanted = float((material.stiffness[own] / topology.rest_lengths[own]).sum())
-        # Half of what is left is for k, half for c: dt^2 k / m + 2 dt c / m < MARGIN LIMIT - load.
-        room = max(MARGIN * stability.LIMIT - self._load, 0.05) / 2
+        # Half of what is left is for k, half for c: dt^2 k / m + 2 dt c / m < STABILITY_MARGIN STABILITY_LIMIT - load.
+        room = max(MARGIN * stability.STABILITY_LIMIT - self._load, 0.05) / 2
         k = min(wanted or room * mass / dt**2, room * mass / dt**2)
         return k, min(2 * np.sqrt(k * mass), room * mass / (2 * dt))
 
