@@ -14,18 +14,18 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neuspring.extensions.exports.source import Source
+from neuspring.extensions.exports.source import ExportSource
 from neuspring.physics.rod_nodes import frame_zero, radius_of
 
-STEP = 2e-4
+CABLE_STEP = 2e-4
 """s, at most: springs of joints are explicit there."""
 THICKNESS = 0.002
 """Least radius, m: nodes on the line show none."""
-WELD: dict[str, Any] = {"solref": f"{2 * STEP} 1", "solimp": "0.999 0.9999 1e-4"}
+WELD: dict[str, Any] = {"solref": f"{2 * CABLE_STEP} 1", "solimp": "0.999 0.9999 1e-4"}
 """A clamp is as stiff as the time step allows."""
 
 
-AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
+HINGE_AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
 
 
 def text(*values: float | np.floating) -> str:
@@ -33,7 +33,7 @@ def text(*values: float | np.floating) -> str:
     return " ".join(f"{float(value):.9g}" for value in values)
 
 
-def add(source: Source, root: ET.Element, world: ET.Element, meets: dict[str, Any]) -> None:
+def add(source: ExportSource, root: ET.Element, world: ET.Element, meets: dict[str, Any]) -> None:
     """Add the chain edge0, edge1, ..., a site per node, clamps clamp0 and clamp1, and the keyframe `start` of frame 0."""
     rod = source.twin.rod
     assert rod is not None
@@ -48,9 +48,9 @@ def add(source: Source, root: ET.Element, world: ET.Element, meets: dict[str, An
     for j in range(edges):
         parent = ET.SubElement(parent, "body", name=f"edge{j}", **at)
         if j:
-            for axis, k in zip(AXES, (twist[j - 1], bend[j - 1], bend[j - 1]), strict=True):
+            for axis, k in zip(HINGE_AXES, (twist[j - 1], bend[j - 1], bend[j - 1]), strict=True):
                 law: dict[str, Any] = {"stiffness": text(k), "damping": text(rod.damping * k)}
-                ET.SubElement(parent, "joint", name=f"joint{j}{axis}", type="hinge", axis=AXES[axis], **law)
+                ET.SubElement(parent, "joint", name=f"joint{j}{axis}", type="hinge", axis=HINGE_AXES[axis], **law)
             pose += (rest[j - 1].inv() * frames[j - 1].inv() * frames[j]).as_euler("XYZ").tolist()
         else:
             ET.SubElement(parent, "freejoint", name="joint0")
@@ -69,7 +69,7 @@ def add(source: Source, root: ET.Element, world: ET.Element, meets: dict[str, An
     ET.SubElement(ET.SubElement(root, "keyframe"), "key", name="start", qpos=text(*pose))
 
 
-def _frames(source: Source) -> Rotation:
+def _frames(source: ExportSource) -> Rotation:
     """The axes t, m1, m2 of each edge in frame 0."""
     rod = source.twin.rod
     assert rod is not None
@@ -85,7 +85,7 @@ def _rest(curvature: np.ndarray) -> Rotation:
     return Rotation.from_rotvec(2 * np.arctan(size / 2) * k / np.maximum(size, 1e-12))
 
 
-def _clamps(source: Source, root: ET.Element, world: ET.Element, frames: Rotation) -> None:
+def _clamps(source: ExportSource, root: ET.Element, world: ET.Element, frames: Rotation) -> None:
     """A mocap body at each end that is held: with the place of the end's first vertex and the axes of its edge."""
     rod = source.twin.rod
     assert rod is not None

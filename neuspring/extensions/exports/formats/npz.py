@@ -14,15 +14,15 @@ from neuspring import __version__
 from neuspring.core.artifacts import SCALARS, Artifact, Material, Rod, Topology
 from neuspring.core.files import write_atomically, write_text
 from neuspring.extensions.exports import Export
-from neuspring.extensions.exports.source import Source
+from neuspring.extensions.exports.source import ExportSource
 from neuspring.splats.model import Splats
 
 FORMAT, VERSION = "neuspring-plain", 1
-"""Of the description. A reader should refuse a version that it does not know."""
+"""Format and version of the description. A reader should refuse a version that it does not know."""
 ROD_FORMAT = "neuspring-rod"
-"""Of a twin that is a rod: a reader of the other would simulate its springs alone."""
-ARRAYS, DESCRIPTION = "arrays.npz", "description.json"
-SIZES = {
+"""Format of a twin that is a rod: a reader of the other would simulate its springs alone."""
+ARRAYS_FILE, DESCRIPTION_FILE = "arrays.npz", "description.json"
+SIZE_MEANINGS = {
     "N": "nodes",
     "C": "controllers: points that are moved from outside, as hands or grippers",
     "S": "springs",
@@ -112,7 +112,7 @@ v_x, c v_y, -ground_elasticity v_z), c = max(0, 1 - ground_friction (1 + ground_
 """The same of a rod."""
 
 
-def write(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
+def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Path]:
     """Write arrays.npz and description.json of these frames to the folder `output`."""
     arrays, described = arrays_of(source, frames)
     simulation, rod = source.twin.simulation, source.twin.rod
@@ -131,7 +131,7 @@ def write(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
         "made_from_sha256": source.made_from,
         "about": f"{about}, and moved by controllers.",
         "units": "SI: m, kg, s, N. Coordinates are right-handed; z is vertical.",
-        "sizes": SIZES,
+        "sizes": SIZE_MEANINGS,
         "arrays": described,
         "settings": {name: {"value": values[name], "unit": unit, "about": about} for name, (unit, about) in settings.items()},
         "equations": [" ".join(paragraph.split()) for paragraph in equations.strip().split("\n\n")],
@@ -141,12 +141,12 @@ def write(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
         with path.open("wb") as stream:
             np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
 
-    write_atomically(output / ARRAYS, save)
-    write_text(output / DESCRIPTION, json.dumps(text, indent=1, allow_nan=False) + "\n")
-    return [output / DESCRIPTION, output / ARRAYS]
+    write_atomically(output / ARRAYS_FILE, save)
+    write_text(output / DESCRIPTION_FILE, json.dumps(text, indent=1, allow_nan=False) + "\n")
+    return [output / DESCRIPTION_FILE, output / ARRAYS_FILE]
 
 
-def arrays_of(source: Source, frames: Sequence[int]) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
+def arrays_of(source: ExportSource, frames: Sequence[int]) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
     """Arrays, and what is said of each: dimensions, shape, dtype, unit, meaning."""
     arrays: dict[str, np.ndarray] = {}
     described: dict[str, dict[str, Any]] = {}
