@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neuspring.config import Body, Config, Kind, parse
+from neuspring.config import Config, parse
 from neuspring.core.artifacts import Observations, Topology, Trajectory, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.run_folder import RunFolder
@@ -23,9 +23,7 @@ from neuspring.core.run_folder import RunFolder
 if TYPE_CHECKING:
     import pandas as pd
 
-    from neuspring.twin.fit import FitResult
-    from neuspring.twin.rod_fit import RodResult
-    from neuspring.twin.search import SearchResult
+    from neuspring.twin.body import Learned
 
 __all__ = ["Observations", "Topology", "Trajectory", "Twin", "fit", "load_run", "roll_out", "score", "search"]
 Settings = Config | Mapping[str, Any] | Path | str | None
@@ -51,10 +49,10 @@ def roll_out(twin: Twin, hands: Observations | np.ndarray, device: str = "auto")
     rollout that diverges is a result: its `diverged_frame` and `reason` say so. Raises InputError for another shape.
     """
     from neuspring.core.device import resolve_device
-    from neuspring.physics.stability import for_prediction
     from neuspring.twin import rollout
+    from neuspring.twin.body import body_of
 
-    device, twin = resolve_device(device), for_prediction(twin)
+    device, twin = resolve_device(device), body_of(twin).for_prediction(twin)
     if isinstance(hands, Observations):
         velocity = rollout.initial_velocity(hands, twin.simulation.initial_velocity)
         return rollout.roll_out(twin, hands.controller_points, device, velocity=velocity, valid=hands.controller_valid)
@@ -75,28 +73,26 @@ def search(
     observations: Observations,
     settings: Settings = None,
     *,
-    clusters: int = 1,
-    body: Body = "lattice",
+    clusters: int | None = None,
+    body: str = "lattice",
     seed: int = 0,
     device: str = "auto",
     threads: int = 1,
     record: Path | None = None,
-) -> SearchResult | RodResult:
-    """CMA-ES over material and topology, with `clusters` regions of the topology: the best `twin`, its `cost`, the `trace`.
+) -> Learned:
+    """CMA-ES over material and topology: the best `twin`, its `cost`, the `trace`.
 
-    The trace is kept in the file `record`, and a search that was stopped goes on from it. With `body="rod"` the constants of an
-    elastic rod are found, for a long thin object. Raises InputError, NumericalFailure.
+    The topology has `clusters` regions, by default as many as the settings say; 1 is uniform. The trace is kept in the file
+    `record`, and a search that was stopped goes on from it. With `body="rod"` the constants of an elastic rod are found, for a
+    long thin object. Raises InputError, NumericalFailure.
     """
     from neuspring.core.device import resolve_device
-    from neuspring.twin.candidates import SearchProblem
-    from neuspring.twin.rod_fit import search_rod
-    from neuspring.twin.search import search as search_twin
+    from neuspring.twin.body import BODIES
 
     read = read_settings(settings)
-    if body == "rod":
-        return search_rod(observations, (), read, device=resolve_device(device), threads=threads)
-    shared = (read.search, read.simulation, read.losses, read.released_quirks, resolve_device(device))
-    return search_twin(SearchProblem(observations, *shared, clusters=clusters, threads=threads), seed, record=record)
+    options: dict[str, Any] = {"clusters": clusters or read.clusters, "seed": seed}
+    options |= {"device": resolve_device(device), "threads": threads, "record": record}
+    return BODIES[body].search(observations, (), read, **options)
 
 
 def fit(
@@ -104,11 +100,11 @@ def fit(
     twin: Twin,
     settings: Settings = None,
     *,
-    kind: Kind = "field",
+    kind: str = "field",
     seed: int = 0,
     device: str = "auto",
     checkpoint: Path | None = None,
-) -> FitResult | RodResult:
+) -> Learned:
     """Train a twin's stiffness by gradients through the simulation, as a neural spring `field` or each of the `springs` apart.
 
     A rod is fitted as `kind="rod"`, in everything that is unknown of it.
@@ -117,16 +113,22 @@ def fit(
     InputError, NumericalFailure.
     """
     from neuspring.core.device import resolve_device
+    from neuspring.twin.body import body_of
     from neuspring.twin.fit import FitProblem
-    from neuspring.twin.fit import fit as fit_twin
-    from neuspring.twin.rod_fit import fit_rod
 
     read = read_settings(settings)
-    shared = (read.fit, read.simulation, read.losses, read.released_quirks, resolve_device(device))
-    problem = FitProblem(observations, twin, *shared, kind=kind, seed=seed)
-    if kind == "rod":
-        return fit_rod(problem.observations, (), twin, read.fit.rod, device=problem.device)
-    return fit_twin(problem, partial=checkpoint)
+    problem = FitProblem(
+        observations=observations,
+        twin=twin,
+        fit=read.fit,
+        simulation=read.simulation,
+        losses=read.losses,
+        quirks=read.released_quirks,
+        device=resolve_device(device),
+        kind=kind,
+        seed=seed,
+    )
+    return body_of(twin).fit(problem, partial=checkpoint)
 
 
 def read_settings(settings: Settings) -> Config:

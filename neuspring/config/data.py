@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.parse import Count, Name, NonNegative, Positive, Section
+from neuspring.config.parse import Count, Name, NonNegative, Section
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,7 @@ class Mocap(Section):
     """Motion capture of cables: end markers control, inner markers are observed, the body is sampled as rings."""
 
     stride: Count = 2
-    """Use every n-th sample of the 100 Hz record."""
+    """Stride of samples of the 100 Hz record."""
     start: Annotated[int, Field(ge=0)] = 0
     """Samples left out at the beginning of the record. With at least one, the velocity in frame 0 is known from the sample before
     it (`simulation.initial_velocity: before`)."""
@@ -37,21 +37,17 @@ class Mocap(Section):
     """Number of frames that are kept, the first ones, counted after the stride; shorter recordings are refused. null keeps all."""
     train_fraction: Annotated[float, Field(gt=0, le=1)] = 0.7
     """Part of the frames that are for training, the first ones. 1: all, where future frames are those of other recordings."""
-    spacing: Positive = 0.012
-    """Distance of rings along the center line, m."""
     rings: Annotated[int, Field(ge=2)] | None = None
-    """Number of rings, whatever their spacing, so that a twin can move to another recording of the cable; null: by `spacing`."""
-    radius: Positive = 0.006
-    """Radius of the rings, m."""
+    """Number of rings, whatever their spacing, so that a twin can move to another recording of the cable; null: one every 12 mm."""
     ring: Annotated[int, Field(ge=3)] = 4
     """Nodes per ring."""
     roll_axis: Literal["x", "y", "z"] = "y"
     """Direction of the world from which the roll of rings and clamps starts at both ends in frame 0, so that node i is the same
     node in all recordings of a cable. Neither end may lie along it. y: DEFORM's cables hang about in the plane of x and z."""
     rest_shape: Literal["first_frame", "straight"] = "first_frame"
-    """Shape without forces. first_frame: frame 0, as in the paper. straight: a straight cable with the arc lengths of frame 0."""
+    """Shape without forces: frame 0, as in the paper, or a straight cable with the arc lengths of frame 0."""
     grip: Literal["markers", "clamp"] = "markers"
-    """What holds an end. markers: its two markers, which leave its roll free. clamp: and a ring of `ring` points around each, which
+    """Hold of an end: its two markers, which leave its roll free, or a clamp. clamp: and a ring of `ring` points around each, which
     turns with the direction of the two without spinning, so that direction and roll are held. With a straight rest shape set
     `search.controller_rest: first_frame` too."""
 
@@ -80,6 +76,4 @@ class Synthetic(Section):
     cameras: Annotated[int, Field(ge=1, le=3)] = 3
     """Number of cameras that film the scene."""
     sensor: Literal["model", "clean"] = "model"
-    """model: depth with noise, dropouts and holes. clean: depth that is only quantized."""
-    seed: Annotated[int, Field(ge=0)] = 0
-    """Seed of the sensor's noise; the scenario's name enters too."""
+    """Depth sensor: with noise, dropouts and holes (model), or only quantized (clean)."""

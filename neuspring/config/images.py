@@ -19,13 +19,14 @@ class Appearance(Section):
     iterations: Count = 10_000
     """Optimizer steps. Each takes one view, drawn without replacement."""
     isotropic: bool = True
-    """Each splat has one scale; false: one scale per axis."""
+    """One scale per splat; false: one per axis."""
     fixed_radius: Positive | None = None
     """Standard deviation of every splat, m, which is then not trained; null: it is trained, and starts from the distance to the
     nearest splats."""
     start: Literal["seen", "shape_prior"] = "seen"
-    """Where the first splats are. seen: points that were seen, and the shape prior's points where nothing was seen. shape_prior:
-    the surface of the prior alone; without a prior, as for seen, and the run's notes say so."""
+    """Places of the first splats: points that were seen, or the shape prior's surface. seen: points that were seen, and the shape
+    prior's points where nothing was seen. shape_prior: the surface of the prior alone; without a prior, as for seen, and the run's
+    notes say so."""
     degree: Annotated[int, Field(ge=0, le=3)] = 3
     """Degree of the spherical harmonics at the end."""
     spacing: NonNegative = 0.0
@@ -68,13 +69,13 @@ class Images(Section):
     """Appearance and the scores of pictures, for scenarios that have images."""
 
     enabled: bool = True
-    """Train splats, draw every method's prediction and score it."""
+    """Training of splats, drawing and scoring of every method's prediction."""
     backend: Literal["auto", "warp", "gsplat"] = "auto"
-    """Rasterizer. auto: gsplat on CUDA where it works (extra `gpu`), otherwise the platform's own (warp)."""
+    """Rasterizer; auto: gsplat on CUDA where it works (extra `gpu`), otherwise the platform's own (warp)."""
     views: Literal["first", "all"] = "first"
     """Cameras whose pictures are scored; the released evaluation takes the first."""
     video: bool = True
-    """Write videos: observed, predicted and error side by side, and a turntable of the twin."""
+    """Videos: observed, predicted and error side by side, and a turntable of the twin."""
     appearance: Appearance = field(default_factory=Appearance)
     lpips: LpipsWeights = field(default_factory=LpipsWeights)
     released_quirks: tuple[ImageQuirk, ...] = ()
@@ -83,4 +84,4 @@ class Images(Section):
     unit_lpips: the inputs of LPIPS stay in [0, 1]; its networks were trained with [-1, 1]. degenerate_skinning: one node on a line
     of neighbors turns all nodes as it turns; several such nodes turn none."""
     corner_pixels: bool = False
-    """One more of these errors, of training too: calibrated intrinsics are used unchanged, half a pixel off."""
+    """Shift of pictures, as released, in training too: calibrated intrinsics are used unchanged, half a pixel off."""

@@ -5,26 +5,28 @@ from __future__ import annotations
 import ast
 import dataclasses
 import inspect
+import itertools
 import json
 import math
 import types
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_type_hints
 
 import yaml
 from pydantic.fields import FieldInfo
 
 from neuspring.config import rows, settings
-from neuspring.config.parse import Section
+from neuspring.config.effort import EFFORT_SIZES, EFFORTS
+from neuspring.config.parse import Section, parts
 
 PAGE = Path(__file__).parents[2] / "config" / "README.md"
 HEADING = "## Keys\n"
-"""What stands above it is written by hand, what stands below from the declarations."""
+"""Heading of the tables: the page above it is written by hand, the page below it from the declarations."""
 ROWS = {"rows of scenarios.tsv": rows.ScenarioRow, "rows of methods.yaml": rows.Method, "rows of searches.yaml": rows.SearchRow}
 BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
-PLAIN = {int: "integer", float: "number", str: "text", bool: "`true`, `false`", types.NoneType: "`null`", Any: "any"}
+TYPE_NAMES = {int: "integer", float: "number", str: "text", bool: "`true`, `false`", types.NoneType: "`null`", Any: "any"}
 
 
 def sections(kind: type = settings.Config, path: str = "") -> dict[str, type]:
@@ -32,80 +34,68 @@ def sections(kind: type = settings.Config, path: str = "") -> dict[str, type]:
     found = {path or "(top level)": kind}
     hints = get_type_hints(kind)
     for spec in dataclasses.fields(kind):
-        for part in (hints[spec.name], *_parts(hints[spec.name])):
-            if is_section(part):
-                found |= sections(part, f"{path}.{spec.name}" if path else spec.name)
+        for part in filter(is_section, (hints[spec.name], *parts(hints[spec.name]))):
+            found |= sections(part, f"{path}.{spec.name}" if path else spec.name)
     return found
 
 
 def is_section(kind: Any) -> bool:
-    """Whether a type has a table of its own on the page; a dataclass that is no section is one value."""
+    """True for a type that has a table of its own on the page; a dataclass that is no section is one value."""
     return isinstance(kind, type) and issubclass(kind, Section)
-
-
-def _parts(hint: Any) -> Iterator[Any]:
-    """All types inside a type: the members of a union, the values of a mapping."""
-    for part in get_args(hint):
-        yield part
-        yield from _parts(part)
 
 
 def text() -> str:
     """The page: its introduction as it is, its tables anew."""
-    parts = [PAGE.read_text(encoding="utf-8").partition(HEADING)[0] + HEADING]
-    parts += [section(title, kind) for title, kind in sections().items()]
-    parts += ["## Rows of the tables\n"]
-    parts += [section(title, kind) for title, kind in ROWS.items()]
-    return "\n".join(parts)
+    written = PAGE.read_text(encoding="utf-8").partition(HEADING)[0] + HEADING
+    sizes = ((f"`{key}`", *(f"`{yaml_text(value)}`" for value in values)) for key, values in EFFORT_SIZES.items())
+    efforts = ["### effort", "", "The sizes that `effort` sets.", "", *table(("key", *EFFORTS), sizes), ""]
+    described = [section(title, kind) for title, kind in (sections() | ROWS).items()]
+    return "\n".join([written, described[0], *efforts, *described[1:]])
 
 
 def section(title: str, kind: type) -> str:
     """A heading, what the section is, and a table of its keys."""
     summary = (kind.__doc__ or "").partition("\n")[0]
-    lines = ["| key | allowed | default | meaning |", "|---|---|---|---|"]
-    for key, words, default, meaning in fields(kind):
-        nested = key if kind is settings.Config else f"{title}.{key}"
-        link = f"See [{nested}](#{nested.replace('.', '')})."
-        shown = link if words == "section" else meaning.replace("|", r"\|")
-        lines.append(f"| `{key}` | {words} | {default} | {shown} |")
-    return "\n".join([f"### {title}", "", summary, "", *lines, ""])
+    return "\n".join([f"### {title}", "", summary, "", *table(("key", "default", "values", "meaning"), fields(kind)), ""])
+
+
+def table(head: Iterable[str], body: Iterable[Iterable[str]]) -> list[str]:
+    """The lines of a Markdown table."""
+    lines = ["| " + " | ".join(cells) + " |" for cells in (head, *body)]
+    return [lines[0], "|" + "---|" * lines[0].count(" | ") + "---|", *lines[1:]]
 
 
 def fields(kind: type) -> list[tuple[str, str, str, str]]:
-    """(key, allowed, default, meaning) of every field; the meaning is the text below its declaration."""
-    hints, meanings = typing.get_type_hints(kind, include_extras=True), declared_meanings(kind)
-    entries = []
-    for spec in dataclasses.fields(kind):
-        words, default = ("section", "") if is_section(hints[spec.name]) else (allowed(hints[spec.name]), shown_default(spec))
-        entries.append((spec.name, words, default, meanings.get(spec.name, "")))
-    return entries
+    """(key, default, values, meaning) of every key; the meaning is the first sentence below its declaration."""
+    hints, meanings = get_type_hints(kind, include_extras=True), declared_meanings(kind)
+    keys = (spec for spec in dataclasses.fields(kind) if not is_section(hints[spec.name]))
+    return [(f"`{key.name}`", shown_default(key), allowed(hints[key.name]), meanings.get(key.name, "")) for key in keys]
 
 
 def declared_meanings(kind: type) -> dict[str, str]:
-    """Key -> the text below its declaration in the class's module."""
+    """Key -> the first sentence below its declaration in the class's module."""
     module = ast.parse(Path(inspect.getfile(kind)).read_text(encoding="utf-8"))
     body = next(node.body for node in module.body if isinstance(node, ast.ClassDef) and node.name == kind.__name__)
     meanings = {}
-    for statement, following in zip(body, [*body[1:], None], strict=True):
-        if not isinstance(statement, ast.AnnAssign) or not isinstance(following, ast.Expr):
-            continue
-        if isinstance(following.value, ast.Constant):
-            meanings[ast.unparse(statement.target)] = " ".join(str(following.value.value).split())
+    for statement, following in itertools.pairwise(body):
+        if isinstance(statement, ast.AnnAssign) and isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant):
+            words = " ".join(str(following.value.value).split())
+            meanings[ast.unparse(statement.target)] = words.partition(". ")[0].rstrip(".").replace("|", r"\|") + "."
     return meanings
 
 
 def shown_default(spec: dataclasses.Field[Any]) -> str:
-    """As one would write it in YAML."""
+    """A default as one would write it in YAML."""
     if spec.default_factory is not dataclasses.MISSING:
         return f"`{yaml_text(spec.default_factory())}`"
     return "required" if spec.default is dataclasses.MISSING else f"`{yaml_text(spec.default)}`"
 
 
 def yaml_text(value: Any) -> str:
-    """A default in YAML's flow style; floats with a point, as the strict reader wants them."""
-    # Six digits: 1/6 is meant, not its last bit.
-    rounded = json.loads(json.dumps(value, default=vars), parse_float=lambda text: float(f"{float(text):.6g}"))
-    listed: str = yaml.safe_dump([rounded], default_flow_style=True, sort_keys=False, width=math.inf)
+    """A value in YAML's flow style; floats with a point, as the strict reader wants them."""
+    listed: str = yaml.safe_dump(
+        [json.loads(json.dumps(value, default=vars))], default_flow_style=True, sort_keys=False, width=math.inf
+    )
     return listed.strip()[1:-1]
 
 
@@ -120,22 +110,18 @@ def allowed(hint: Any) -> str:
     if origin is typing.Literal:
         return ", ".join(f"`{word}`" for word in arguments)
     if origin is tuple:
-        if arguments[-1] is Ellipsis:
-            return f"list of {allowed(arguments[0])}"
-        return f"[{', '.join(map(allowed, arguments))}]"
+        several = arguments[-1] is Ellipsis
+        return f"list of {allowed(arguments[0])}" if several else f"[{', '.join(map(allowed, arguments))}]"
     if is_section(hint):
         return "section"
     if dataclasses.is_dataclass(hint):
-        return f"mapping of {', '.join(f'`{spec.name}`' for spec in dataclasses.fields(hint))}"
-    return "mapping" if origin is dict else PLAIN[hint]
+        return "range"
+    return "mapping" if origin is dict else TYPE_NAMES[hint]
 
 
 def bounds(hint: Any) -> list[Any]:
     """Single constraints of an annotated type."""
-    constraints: list[Any] = []
-    for item in hint.__metadata__:
-        constraints += item.metadata if isinstance(item, FieldInfo) else [item]
-    return constraints
+    return [each for item in hint.__metadata__ for each in (item.metadata if isinstance(item, FieldInfo) else [item])]
 
 
 def limit(constraint: Any) -> str:

@@ -6,12 +6,14 @@ Unknown keys raise, values are never cast, every problem is listed with its path
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import difflib
 import functools
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import yaml
 from pydantic import ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
@@ -34,74 +36,25 @@ class Section:
 
     __pydantic_config__ = STRICT
 
+    @classmethod
+    def completed(cls, given: Mapping[str, Any]) -> Mapping[str, Any]:
+        """The given values, with those that follow from them."""
+        return given
+
 
 T = TypeVar("T")
-REMOVED = "removed; commit 7308a7b is the last that has it"
-LEFT = "removed; commit a72d24c is the last that has it"
-"""The sentences for what lost its trial."""
-_LEFT = {
-    REMOVED: """
-        controller_path drag_quadratic carry_over average_seeds last_frame losses.alpha simulation.mass search.clusters extra
-        bending_reach homogeneous_epochs fit.warmup_epochs schedule fit.clip_gradient_norm weight_decay rest_lengths_by field.scale
-        field.controllers rest_length_bound rest_prior rest_learning_rate
-    """,
-    "removed, marks serve such scenes (segment.backend: marks); commit a72d24c is the last that has it": """
-        opencv.boxes opencv.table opencv.sleeves opencv.clutter opencv.object opencv.thin
-    """,
-    "removed, on coordinates and feature always; commit a72d24c is the last that has it": "field.fourier",
-    LEFT: "plane_smoothness",
-    "removed; commit f43b356 is the last that has it": "fit.rest_shape",
-    "removed, hands of color alone move in an upright plane; commit 152a3d9 is the last that searches how far they are": """
-        hand_tilt hand_size hand_depth hand_knots
-    """,
-    "removed: splats follow the nodes that are nearest in each frame": "frozen_skinning",
-    "now losses of the whole configuration": "losses",
-    "now color_rate": "colour_rate",
-    "now neighborhood": "neighbourhood",
-    "now outlier_neighbors": "outlier_neighbours",
-    "now variables.NAME: {low: ..., high: ...}": "ranges",
-    "now variables.NAME: {scale: ...}": "scales",
-    "of a search now variables.NAME: {start: ...}": "start",
-    "now lift.released": "sequential_motion_filter coordinate_outliers whole_pixels depth_window",
-    "a third of the scenarios now": "warmup_scenarios",
-    "by the scenario's category now": "gs_dynamics.preset",
-    "a constant in neuspring/config/search.py now": "polish.share",
-    "a constant beside its user in neuspring/twin now": "betas freed_sigma polish.step polish.tolerance",
-    "a constant beside its user in neuspring/data now": "toy.frame_rate",
-    "a constant beside its user in neuspring/splats now": """
-        l1 densify_from densify_until densify_every densify_gradient split_size prune_opacity most_splats images.opacity
-    """,
-    "a constant beside its user in neuspring/baselines now": """
-        coverage min_visible bound_anchors link_stiffness substeps_added substeps_raised spring_gaus.checkpoint_every
-        dense_points smoothing_passes gs_dynamics.checkpoint_every
-    """,
-    "a constant beside its user in neuspring/perception now": """
-        marks.smoothness marks.reach opencv.smoothing opencv.smallest hand_prompt box_threshold text_threshold
-        opencv.window opencv.levels opencv.forward_backward opencv.reacquire likeness lift.least_neighbors agreement release_after
-        shape.margin shape.tolerance shape.smoothing shape.bend_reach shape.thin shape.bend back_fraction
-        sample.surface sample.interior color.beneath color.hands_apart color.hand_radius color.samples color.band color.cell
-        color.grip_reach grip_length
-    """,
-}
-RENAMED = {key: sentence for sentence, keys in _LEFT.items() for key in keys.split()}
-"""Keys of older versions -> a sentence that says where they went. An entry is a key, or the end of its dotted path."""
-
-
-def told(names: Iterable[str]) -> str:
-    """What became of names in a list that are keys of older versions; empty where none is."""
-    sentences = dict.fromkeys(RENAMED[name] for name in names if name in RENAMED)
-    return f" ({'; '.join(sentences)})" if sentences else ""
 
 
 def parse(kind: type[T], values: Mapping[str, Any], where: str) -> T:
     """Build the dataclass `kind` from plain values, strictly. Raises InputError listing every problem with its path."""
+    values = kind.completed(values) if issubclass(kind, Section) and isinstance(values, Mapping) else values
     try:
         result: T = _adapter(kind).validate_json(json.dumps(values), strict=True)  # type: ignore[arg-type]
         return result
     except TypeError as error:
         raise InputError(where, "values must be plain YAML", str(error)) from error
     except ValidationError as error:
-        problems = [_describe(problem) for problem in error.errors()]
+        problems = [_describe(problem, kind) for problem in error.errors()]
         raise InputError(where, "\n  " + "\n  ".join(problems), remedy="\nSee config/README.md for every key.") from error
 
 
@@ -111,24 +64,33 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
 
 
-def _describe(problem: Any) -> str:
-    path = ".".join(str(part) for part in problem["loc"] if not str(part).startswith("constrained")) or "(top level)"
-    value = problem["input"]
+def _describe(problem: Any, kind: type) -> str:
+    place = [part for part in problem["loc"] if not str(part).startswith("constrained")]
+    path, value = ".".join(map(str, place)) or "(top level)", problem["input"]
     if problem["type"] == "unexpected_keyword_argument":
-        parts = path.split(".")
-        now = next((RENAMED[end] for n in range(len(parts)) if (end := ".".join(parts[n:])) in RENAMED), "")
-        return f"{path}: unknown key" + (f" ({now})" if now else "")
+        near = difflib.get_close_matches(str(place[-1]), _keys(kind, place[:-1]), n=1)
+        return f"{path}: unknown key" + (f" (did you mean {near[0]}?)" if near else "")
     if problem["type"] == "missing":
         return f"{path}: required, but missing"
-    hint = ""
-    if isinstance(value, str) and problem["type"] in ("float_type", "int_type"):
-        hint = " (YAML reads a number such as 5e-5 as text: write 5.0e-5)"
-    if path.endswith("images.released_quirks") and isinstance(value, dict):
-        hint = " (a list of names now; the key corner_pixels is images.corner_pixels now)"
-    if "released_quirks" in path and value == "corner_pixels":
-        hint = " (now images.corner_pixels: true)"
+    number = isinstance(value, str) and problem["type"] in ("float_type", "int_type")
+    hint = " (YAML reads a number such as 5e-5 as text: write 5.0e-5)" if number else ""
     message = problem["msg"].removeprefix("Value error, ")
     return f"{path}: {message[:1].lower()}{message[1:]}, received {masked(repr(value))}{hint}"
+
+
+def _keys(kind: Any, path: Iterable[Any]) -> list[str]:
+    """The keys of the section at a path of a dataclass."""
+    for name in path:
+        hint = get_type_hints(kind).get(name)
+        kind = next((part for part in (hint, *parts(hint)) if dataclasses.is_dataclass(part)), kind)
+    return [spec.name for spec in dataclasses.fields(kind)]
+
+
+def parts(hint: Any) -> Iterator[Any]:
+    """All types inside a type: the members of a union, the values of a mapping."""
+    for part in get_args(hint):
+        yield part
+        yield from parts(part)
 
 
 def plain(settings: Any) -> dict[str, Any]:
@@ -154,6 +116,38 @@ def read_yaml(path: Path) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise InputError(path, "this file must hold a YAML mapping", type(values).__name__)
     return values
+
+
+def read_rows(kind: type[T], path: Path, what: str) -> dict[str, T]:
+    """A table of a YAML file: name -> row. Raises InputError.
+
+    A row that `extends` another one has that row's values, its own on top. A row with `each: [2, 3]` stands for one row per value,
+    which takes the place of {each} in its name and its texts.
+    """
+    table: dict[str, Any] = {}
+    for name, row in read_yaml(path).items():
+        values = row.pop("each", None) if isinstance(row, dict) else None
+        for value in [None] if values is None else values:
+            table[str(name).replace("{each}", str(value))] = row if value is None else _filled(row, str(value))
+    return {name: parse(kind, _extended(table, name, path, what, ()), f"{path}, {what} {name}") for name in table}
+
+
+def _extended(table: Mapping[str, Any], name: str, path: Path, what: str, below: tuple[str, ...]) -> Any:
+    if name not in table or name in below:
+        rule = "extends: a row of this table is required, which does not extend this one"
+        raise InputError(f"{path}, {what} {below[-1]}", rule, name, f"Known: {', '.join(table)}.")
+    row = table[name]
+    if not isinstance(row, dict) or "extends" not in row:
+        return row
+    whole = copy.deepcopy(_extended(table, row["extends"], path, what, (*below, name)))
+    merge(whole, {key: value for key, value in row.items() if key != "extends"})
+    return whole
+
+
+def _filled(row: Any, value: str) -> Any:
+    if isinstance(row, dict):
+        return {key: _filled(inner, value) for key, inner in row.items()}
+    return typed(row.replace("{each}", value)) if isinstance(row, str) and "{each}" in row else row
 
 
 def typed(value: Any) -> Any:

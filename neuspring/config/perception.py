@@ -27,21 +27,19 @@ class MarksSegmentation(Section):
     """Segmentation from the marks of a user (`marks.json` of the capture), carried through the video."""
 
     background: bool = True
-    """Learn the color of every pixel of the background; for a camera that stands still."""
+    """Learning of the color of every pixel of the background; for a camera that stands still."""
     scale: Annotated[float, Field(gt=0, le=4)] = 1.0
     """Size of the images that are worked on, as a multiple of the camera's; 2 helps ropes of a few pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class OpenCvTracking(Section):
-    """Lucas-Kanade or DIS flow with a forward-backward check."""
+    """Lucas-Kanade with a forward-backward check."""
 
-    method: Literal["lucas_kanade", "dis"] = "lucas_kanade"
-    """Pyramidal Lucas-Kanade per point, or dense DIS flow."""
     points: Count = 5000
     """Largest number of pixels that are followed per camera, drawn at random from the masks of frame 0."""
     rim: NonNegative = 0.0
-    """How far outside of its mask a point may lie, pixels, before it is lost: masks are off by pixels at tips and corners."""
+    """Distance outside of its mask at which a point is lost, pixels: masks are off by pixels at tips and corners."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +53,7 @@ class GroundedSam2(Section):
     prompt: str | None = None
     """Words for the object; null: the capture's category."""
     download: bool = False
-    """Fetch weights that are not in the cache."""
+    """Download of weights that are not in the cache."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +63,7 @@ class CoTracker3(Section):
     points: Count = 5000
     """Largest number of pixels that are followed per camera, drawn at random from the masks of frame 0."""
     download: bool = False
-    """Fetch code and weights that are not in the cache. Mind their license."""
+    """Download of code and weights that are not in the cache. Mind their license."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,38 +81,39 @@ class Lift(Section):
     least_controllers: Count = 30
     """Smallest number of controller points; fewer are an error."""
     controller_gaps: Literal["none", "rigid"] = "none"
-    """none, as released: controllers are visible throughout. rigid: gaps are filled by the rigid motion of the hand."""
+    """Gaps of controllers: none, as released, or filled by the rigid motion of the hand."""
     controller_share: Annotated[float, Field(gt=0, le=1)] = 0.6
     """Part of the frames in which a controller must be seen, with `controller_gaps: rigid`."""
     grip: Literal["points", "patch"] = "points"
-    """Where controllers are. points, as released: spread over hand and forearm, each where its track is. patch: spread over the
-    part of each hand that is near the object in frame 0, and moving rigidly with the hand: a grip keeps direction and roll."""
+    """Places of controllers: spread over hand and forearm, as released, or a rigid patch near the object. points, as released:
+    spread over hand and forearm, each where its track is. patch: spread over the part of each hand that is near the object in
+    frame 0, and moving rigidly with the hand: a grip keeps direction and roll."""
     grip_reach: Positive = 0.03
-    """With `grip: patch`: how much farther from the object than a hand's nearest point its controllers may be in frame 0, m."""
+    """Distance by which controllers of `grip: patch` may lie farther from the object than a hand's nearest point in frame 0, m."""
     release: Positive | None = None
     """Distance, m, between hand and object beyond which a hand has let go: its springs do not act. If it comes near the same part
     of the object again, it takes hold again. null: hands hold to the end, as released."""
     released: bool = False
-    """As the released processing: a track is lifted at its nearest whole pixel with its own depth, motions are judged in the order
-    of the points, and a masked pixel that shares any one coordinate with an outlier is dropped."""
+    """Lifting as in the released processing. A track is lifted at its nearest whole pixel with its own depth, motions are judged in
+    the order of the points, and a masked pixel that shares any one coordinate with an outlier is dropped."""
     mirrored_principal_point: bool = False
-    """Measure x from W - cx, as the released processing did before July 2025."""
+    """Measurement of x from W - cx, as the released processing did before July 2025."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ShapePriorSettings(Section):
-    """What the cameras do not see of the object in frame 0."""
+    """The part of the object that no camera sees in frame 0."""
 
     backend: Literal["auto", "none", "visual_hull", "mesh", "truth"] = "auto"
-    """auto: none for cloth and packages, else visual_hull. none: only what was seen. visual_hull: voxels carved by masks and depth.
-    mesh: a file, aligned to what was seen. truth: the surface of a synthetic capture, to measure what perception costs."""
+    """Shape of what was not seen; auto: none for cloth and packages, else visual_hull. none: only what was seen. visual_hull:
+    voxels carved by masks and depth. mesh: a file, aligned to what was seen. truth: the surface of a synthetic capture, to measure
+    what perception costs."""
     voxel: Positive = 0.003
     """Side of a voxel of the visual hull, m."""
     back: Literal["none", "symmetry", "fraction"] = "symmetry"
-    """Where the hull ends if one camera alone shows the object in frame 0, so that its back is invented (with several cameras it is
-    carved, and this is not used). fraction: behind the seen surface by 1.2 of the silhouette's local width, rounded to
-    its edge. symmetry: where the seen surface is mirrored about the surface that the silhouette's rim spans. none: at the table, or
-    a margin behind what was seen."""
+    """End of the hull where one camera alone shows the object in frame 0, so that its back is invented. fraction: behind the seen
+    surface by 1.2 of the silhouette's local width, rounded to its edge. symmetry: where the seen surface is mirrored about the
+    surface that the silhouette's rim spans. none: at the table, or a margin behind what was seen."""
     mesh: str | None = None
     """File of the mesh for `backend: mesh`."""
 
@@ -126,8 +125,8 @@ class Sampling(Section):
     voxel: Positive = 0.005
     """Side of a voxel, m; one structure point is kept in each."""
     nodes: Count | None = None
-    """Most structure points: the voxel grows from `voxel` until no more are left, so that a rope is sampled finer than a plush
-    animal at the same cost. null: `voxel` as it is."""
+    """Most structure points, for which the voxel grows from `voxel` on; null: `voxel` as it is. So a rope is sampled finer than a
+    plush animal at the same cost."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,17 +137,6 @@ class ColorSettings(Section):
     """Categories of sheets: every pixel lies on the table."""
     round: tuple[str, ...] = ("rope",)
     """Categories of ropes: as thick as they are wide."""
-    sheet_thickness: Positive = 0.004
-    """Thickness of a sheet, m."""
-    body_thickness: Positive = 0.9
-    """Thickness of a body, of all categories that are neither flat nor round, in local widths of its silhouette; 1: as thick as it
-    is wide."""
-    footprint: Positive = 1.2
-    """How far from the camera a body extends at most, measured along the table from its nearest point, in widths of its middle line
-    across the view: what would lie farther off rises. It holds where `pose` of the capture is not given; with `pose: lying` nothing
-    rises."""
-    standing_footprint: Positive = 0.3
-    """The same with `pose: standing`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,22 +144,23 @@ class Segmentation(Section):
     """Which pixels show the object and the hands."""
 
     backend: Literal["given", "opencv", "marks", "grounded_sam2"] = "given"
-    """given: the capture's masks. opencv: height and color; of a capture with marks.json, marks. marks: the capture's marks.json,
-    carried through the video. grounded_sam2: GroundingDINO and SAM 2 (extra `perception`)."""
+    """Source of masks: the capture's, height and color, marks of a user, or networks. opencv: height and color; of a capture with
+    marks.json, marks. marks: the capture's marks.json, carried through the video. grounded_sam2: GroundingDINO and SAM 2 (extra
+    `perception`)."""
     marks: MarksSegmentation = field(default_factory=MarksSegmentation)
     opencv: OpenCvSegmentation = field(default_factory=OpenCvSegmentation)
     grounded_sam2: GroundedSam2 = field(default_factory=GroundedSam2)
     verdict: Literal["warn", "error"] = "warn"
-    """What happens where masks made here cannot be right: it is printed and recorded (warn), or the step fails (error)."""
+    """Consequence of masks that cannot be right: printed and recorded (warn), or a failure of the step (error)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PointTracking(Section):
-    """Where the pixels of frame 0 go."""
+    """Following the pixels of frame 0 through the video."""
 
     backend: Literal["opencv", "cotracker3", "truth"] = "opencv"
-    """opencv: Lucas-Kanade or DIS flow. cotracker3: the online CoTracker3 of torch.hub. truth: exact tracks of a synthetic capture,
-    as many as opencv follows, to measure what perception costs."""
+    """Tracker: Lucas-Kanade, a network, or the truth of a synthetic capture. cotracker3: the online CoTracker3 of torch.hub.
+    truth: exact tracks of a synthetic capture, as many as opencv follows, to measure what perception costs."""
     opencv: OpenCvTracking = field(default_factory=OpenCvTracking)
     cotracker3: CoTracker3 = field(default_factory=CoTracker3)
 

@@ -11,7 +11,7 @@ from neuspring.config.parse import Finite, Positive, Section
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rod(Section):
+class RodSettings(Section):
     """A long thin body as a rod (twin/rod.py): its vertices, and the values that its fit starts from.
 
     Motion depends on stiffness over mass alone. So stiffness, and the mass of markers, are given for a body of 1 kg/m; a body of
@@ -55,17 +55,15 @@ class RodFit(Section):
     knots: Annotated[int, Field(ge=4)] = 5
     """Knots of a field along the arc."""
     markers: bool = True
-    """Also fit how far markers lie beside the center line, and the lengths between them."""
+    """Fit of how far markers lie beside the center line, and the lengths between them."""
     horizons: tuple[Annotated[int, Field(ge=0)], ...] = (60, 150, 0)
     """Training frames that count, one stage of the fit after the other; 0: all."""
     rounds: Annotated[int, Field(ge=1)] = 8
     """Steps per stage, at most; a stage ends where a step gains less than 0.2 %."""
     every: Annotated[int, Field(ge=1)] = 4
-    """Of the frames every n-th counts."""
+    """Stride of the frames that count."""
     robust: Positive = 0.02
-    """Errors e count as sqrt(e^2 + robust^2), so that recordings that flip do not decide, m."""
-    residual: bool = False
-    """Add what a ridge regression learns of errors on training recordings (twin/residual.py): no physics, so a row of its own."""
+    """Robustness b, m: errors e count as sqrt(e^2 + b^2), so that recordings that flip do not decide."""
 
     def __post_init__(self) -> None:
         if not self.horizons:

@@ -5,38 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from neuspring.config.parse import LEFT, REMOVED, Count, Name, Section
-
-Kind = Literal["springs", "field", "rod"]
-"""What a first-order stage trains: each spring by itself, the neural spring field, or what is unknown of a rod."""
-Body = Literal["lattice", "rod"]
-"""What a twin is made of: springs between nodes, or an elastic rod."""
-
-_LEFT = """
-    spring_gaus_alpha spring_gaus_ignore_hands spring_gaus_shared_splats gs_dynamics_all_tracks gs_dynamics_centroids
-    gs_dynamics_nearest baseline_long neuspring_long baseline_plus_long neuspring_plus_long plus_tail plus_rest_shape
-    plus_rest_lengths no_factors plus_average neuspring_plus_average slow_planes oracle_plus search_only_from_last_frame
-    baseline_from_last_frame neuspring_from_last_frame neuspring_plus_from_last_frame search_only_carry_over
-    baseline_carry_over model_b_carry_over plus_carry_over neuspring_plus_carry_over baseline_pooled search_only_others
-    baseline_others neuspring_others color_hands_fixed color_hands_in_plane color_hands_by_size color_tracks
-    color_silhouettes color_alpha color_with_alpha hands_fixed hands_in_plane hands_by_size tracks_alone silhouettes_alone
-    alpha_alone with_alpha
-"""
-RENAMED_ROWS = {"phystwin": "baseline", "clusters_1": "model_b", "clusters_5": "neuspring"} | dict.fromkeys(_LEFT.split(), REMOVED)
-RENAMED_ROWS |= dict.fromkeys(("fourier_feature", "fourier_coordinates", "fourier_none"), LEFT)
-"""Methods and searches of older tables -> their name now, or a sentence that says where they went."""
+from neuspring.config.parse import Count, Name, Section
 
 
 @dataclass(frozen=True, kw_only=True)
 class SearchRow(Section):
     """A row of the search table: into how many regions the topology is divided, and settings of its own."""
 
-    clusters: Count
-    """Number K of regions, each with its own radius and neighbors: 2K + 10 variables. 1 is the uniform topology."""
-    body: Body = "lattice"
+    clusters: Count | None = None
+    """Number K of regions, each with its own radius and neighbors: 2K + 10 variables; 1 is the uniform topology; null: the key
+    `clusters`."""
+    body: Name = "lattice"
     """lattice: springs between nodes. rod: a discrete elastic rod, for long thin bodies; it has no regions."""
     description: str
-    """What the row is, for people."""
+    """A line for people."""
     settings: dict[str, Any] = field(default_factory=dict)
     """Search settings of this row alone (keys of `search`), on top of the configuration's."""
     released_quirks: dict[str, Any] = field(default_factory=dict)
@@ -48,26 +30,27 @@ class Method(Section):
     """A row of the method table: a twin (which search it starts from, what follows) or a baseline's model; how it predicts."""
 
     description: str
-    """What the row is, for people."""
+    """A line for people."""
     search: Name | None = None
     """A row of the search table; methods that name the same row share the search."""
-    fit: Kind | None = None
-    """What the first-order stage trains: each spring by itself, the neural spring field, or a rod (of a search with `body: rod`);
-    null: there is no such stage."""
+    fit: Name | None = None
+    """Unknowns that the first-order stage trains: each spring by itself, the neural spring field, or a rod (of a search with
+    `body: rod`); null: there is no such stage."""
     model: Name | None = None
     """A baseline, which has neither search nor fit: spring_gaus, gs_dynamics, static or controller_lbs."""
     settings: dict[str, Any] = field(default_factory=dict)
     """Settings of this method alone, on top of the configuration's: keys of `fit` (for example `horizon: 0`), or of its model's
     section of `baselines`."""
     appearance: dict[str, Any] | None = None
-    """Makes splats for this method alone: keys of `images.appearance`, on top of the configuration's; null: the splats that all
+    """Splats of this method alone: keys of `images.appearance`, on top of the configuration's; null: the splats that all
     methods share."""
     oracle: bool = False
-    """Fit all frames, the future included, from the same search. Such a row predicts nothing: it says how much of an error fitting
-    could remove at all, and stands outside every comparison. Its records say so, and it shares its fit with other oracles only."""
-    pool: Literal["all", "others"] | None = None
-    """Several recordings of the object (`pools`) on which search and fit judge one twin. all: the scenario's own and the others of
-    its pool. others: those alone, so that nothing of the scenario but frame 0 is fitted; null: the scenario's own."""
+    """Fit of all frames, the future included, from the same search. Such a row predicts nothing: it says how much of an error
+    fitting could remove at all, and stands outside every comparison. Its records say so, and it shares its fit with other oracles
+    only."""
+    pool: Literal["all"] | None = None
+    """Recordings of the object (`pools`) that one twin is judged on: the scenario's own and the others of its pool (all); null: the
+    scenario's own."""
 
     @property
     def searched(self) -> str:
@@ -94,10 +77,10 @@ class ScenarioRow(Section):
     source: Name
     """The kind of its data: phystwin, mocap, toy, synthetic, capture or phystwin_raw."""
     category: Name
-    """Kind of object: rope, cloth, package, sloth, ..."""
+    """Kind of object, for example rope, cloth, package or sloth."""
     path: str
     """Folder or file under data_root; for toy and synthetic scenes, the scene's name."""
     self_collision: bool
-    """Whether the object may touch itself."""
+    """True where the object may touch itself."""
     ground: bool
-    """Whether there is a ground."""
+    """True where there is a ground."""

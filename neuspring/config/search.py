@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from neuspring.config.parse import STRICT, Count, Finite, Positive, Section, told
+from neuspring.config.parse import STRICT, Count, Finite, Section
 
 LENGTHS = ("object_radius", "controller_radius", "contact_distance")
 """Variables in units of `search.lengths`."""
@@ -25,7 +25,7 @@ class Variable:
     low: Finite
     high: Finite
     start: Finite
-    """Where the search begins, and where a fixed variable stays."""
+    """Value at which the search begins, and at which a fixed variable stays."""
     scale: Literal["linear", "log"] = "linear"
 
     def normalized(self, value: float) -> float:
@@ -47,7 +47,7 @@ def _default(*values: Any) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class SearchVariables(Section):
-    """What the search varies: lowest and highest value, start, and scale (linear or log). A setting names those that differ."""
+    """Variables of the search: lowest and highest value, start, and scale (linear or log). A setting names what differs."""
 
     stiffness: Variable = _default(10.0, 1e5, 3e3, "log")
     """Stiffness Y of the springs, N."""
@@ -78,7 +78,7 @@ class SearchVariables(Section):
     @model_validator(mode="before")
     @classmethod
     def _over_defaults(cls, given: Any) -> Any:
-        """What a variable does not name stays as it is."""
+        """Given values over the defaults: what a variable does not name stays as it is."""
         if not isinstance(given, dict):
             return given
         defaults = dataclasses.asdict(cls())
@@ -101,20 +101,11 @@ VARIABLES = tuple(spec.name for spec in dataclasses.fields(SearchVariables))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Polish(Section):
+class PolishSettings(Section):
     """Levenberg-Marquardt after CMA-ES: from its best candidate, in few variables, on the residuals of all training frames."""
 
     rounds: Annotated[int, Field(ge=0)] = 6
     """Most rounds; 0: no polish. A round takes a rollout, one more per variable for the slopes, and four for the damped steps."""
-    variables: tuple[str, ...] = ("stiffness", "dashpot", "drag")
-    """What is polished: variables that decide nothing of which springs and pairs there are; fixed ones are left out."""
-
-    def __post_init__(self) -> None:
-        allowed = [name for name in VARIABLES if name not in (*TOPOLOGY, "contact_distance")]
-        unknown = [name for name in self.variables if name not in allowed]
-        if unknown or len(set(self.variables)) != len(self.variables) or not self.variables:
-            rule = f"different ones of {', '.join(allowed)} are required"
-            raise ValueError(f"variables: {rule}, received {list(self.variables)}{told(unknown)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,35 +115,33 @@ class Search(Section):
     rollouts: Count = 220
     """Budget in candidate rollouts, those of the polish included, the same for every method that is compared. The last generation
     of CMA-ES may be cut short."""
-    sigma: Positive = 1 / 6
-    """Initial step in normalized variables."""
     tied_rollouts: Annotated[int, Field(ge=0)] = 0
     """Rollouts, out of the budget, in which all regions share their values; afterwards each region is free around the best
     candidate."""
     isolated_nodes: Literal["repair", "allow"] = "repair"
-    """Nodes and parts of the body that no spring joins to the rest. repair: join them, a part along its seam. allow: leave them, as
-    released."""
+    """Treatment of nodes and parts that no spring joins to the rest: join them, a part along its seam (repair), or leave them, as
+    released (allow)."""
     lengths: Literal["spacing", "meter"] = "spacing"
-    """Unit of object_radius, controller_radius and contact_distance in `variables`. spacing: the distance between
-    neighboring nodes in the rest shape, measured on each object (neuspring/twin/README.md). meter: as released."""
+    """Unit of radii and of contact_distance in `variables`: the distance between neighboring nodes in the rest shape,
+    or meters, as released."""
     fixed: tuple[str, ...] = ()
     """Variables that keep their start and are not searched; the start may then lie outside the range."""
     hands: Literal["hold", "push", "auto"] = "hold"
-    """What hands do. hold, as released: their springs pull and push. push: they act only while they are shorter than at rest, and
-    rest at `contact_distance` or, where a node was nearer in frame 0, there. auto: the first generation is judged in both ways,
-    out of the budget, and the way of its best candidate is kept; hands push only if that also costs less than 0.9 of a body that
-    stays."""
+    """Action of hands: their springs pull and push (hold, as released), only push, or what costs less (auto). push: they act only
+    while they are shorter than at rest, and rest at `contact_distance` or, where a node was nearer in frame 0, there. auto: the
+    first generation is judged in both ways, out of the budget, and the way of its best candidate is kept; hands push only if that
+    also costs less than 0.9 of a body that stays."""
     controller_rest: Literal["rest_shape", "first_frame"] = "rest_shape"
-    """Where springs of controllers have no force, if the rest shape is not frame 0. rest_shape: where the body's have none.
-    first_frame: in frame 0, as a hand takes hold of a body that is bent already."""
+    """Shape in which springs of controllers have no force: the body's rest shape, or frame 0, as a hand takes hold of a body that
+    is bent already."""
     variables: SearchVariables = field(default_factory=SearchVariables)
-    polish: Polish = field(default_factory=Polish)
+    polish: PolishSettings = field(default_factory=PolishSettings)
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.fixed if name not in VARIABLES]
         if unknown or len(set(self.fixed)) != len(self.fixed) or len(VARIABLES) - len(self.fixed) < 2:
             rule = f"different ones of {', '.join(VARIABLES)} are required, two of which stay free"
-            raise ValueError(f"fixed: {rule}, received {list(self.fixed)}{told(unknown)}")
+            raise ValueError(f"fixed: {rule}, received {list(self.fixed)}")
         for name in VARIABLES:
             if name in self.fixed:
                 continue
@@ -167,8 +156,8 @@ class Search(Section):
 
     @property
     def polished(self) -> tuple[str, ...]:
-        """What is polished, in the order of the settings."""
-        return tuple(name for name in self.polish.variables if name not in self.fixed)
+        """Variables that are polished."""
+        return tuple(name for name in POLISHED if name not in self.fixed)
 
     @property
     def polish_rounds(self) -> int:
@@ -188,6 +177,8 @@ class Search(Section):
         return self.rollouts - self.polish_rounds * self.round_rollouts
 
 
+POLISHED = ("stiffness", "dashpot", "drag")
+"""Variables of the polish, which decide nothing of which springs and pairs there are; fixed ones are left out."""
 TRIALS = 4
 """Damped steps that a round of the polish tries."""
 POLISH_SHARE = 0.25

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
@@ -11,12 +11,13 @@ from pydantic import AfterValidator, BeforeValidator, Field, StringConstraints
 
 from neuspring.config.baselines import Baselines
 from neuspring.config.data import Deform, Mocap, Synthetic, Toy
+from neuspring.config.effort import EFFORTS, Effort, sizes
 from neuspring.config.images import Images
-from neuspring.config.parse import Count, Name, Section, plain
+from neuspring.config.parse import Count, Name, Section, merge, plain
 from neuspring.config.perception import Perception
-from neuspring.config.rod import Rod
+from neuspring.config.rod import RodSettings
 from neuspring.config.search import Search
-from neuspring.config.simulation import ReleasedQuirks, Simulation
+from neuspring.config.simulation import ReleasedQuirks, SimulationSettings
 from neuspring.config.tuning import Tune
 from neuspring.config.twin import Fit, Losses
 from neuspring.core.text import refuse_password
@@ -92,13 +93,13 @@ class Aim(Section):
     baseline: Name
     """The method whose error is below the line."""
     task: Literal["reconstruction", "future", "transfer"] = "future"
-    """Training frames, future frames, or twins on other recordings."""
+    """Frames that count: training frames, future frames, or those of other recordings."""
     metric: Literal["chamfer", "track_error", "track_error_bound", "deform_l1"] = "track_error"
     """The error."""
     ratio: Annotated[float, Field(gt=0.0)]
     """Largest geometric mean."""
     below: Annotated[float, Field(gt=0.0)] = 1.0
-    """The 95 % interval must lie below this; 1.05 stands for "not worse by 5 %"."""
+    """Bound of the 95 % interval, which must lie below it; 1.05 stands for "not worse by 5 %"."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,22 +107,25 @@ class Config(Section):
     """One benchmark: which scenarios, methods and seeds, and how."""
 
     scenarios: tuple[Name, ...] = ()
-    """What is run: rows of the scenario table, captures in `data_root` by the names of their folders, and recordings of cables
-    there: `DLO3_train_15` is `DLO3/train/15.pkl`."""
+    """Scenarios that are run: rows of the scenario table, captures in `data_root` by the names of their folders, and recordings of
+    cables there: `DLO3_train_15` is `DLO3/train/15.pkl`."""
     methods: tuple[Name, ...] = ()
     """Rows of the method table that are run, beside the methods in the rows of `studies`. If studies add any, all methods stand in
     the order of the method table."""
     compare_with: Name | None = None
     """The method that tables compare the others with; the first method where this is null or is not run."""
     objects: Literal["scenario", "category"] = "scenario"
-    """What counts as one object in ratios to another method, whose intervals are over objects: every scenario, or all of a
-    category together (the recordings of one cable)."""
+    """Objects that intervals of ratios are over: every scenario, or all of a category together (the recordings of one cable)."""
     aims: tuple[Aim, ...] = ()
-    """What methods are to reach against others, declared before the run; tables say of each whether it is reached, see
-    [aims](#aims)."""
+    """Ratios that methods are to reach against others, declared before the run, see [aims](#aims)."""
     seeds: Seeds = (0,)
     """Seeds of the search and of a field's first weights; every method runs with the same seeds. On the command line:
     `--config seeds=0,1,2`."""
+    effort: Effort | None = None
+    """Sizes that are set together, see [effort](#effort): quick, normal or paper; a key that is given wins over them; null: none is
+    set."""
+    clusters: Count = 5
+    """Number K of regions of the piecewise topology, as in the paper, for the rows of the search table that name none."""
     only: str = ""
     """Part of the scenarios, methods and seeds that is run now, as in
     `--config only="category=rope,cloth method=clusters_* seed=0"`. Terms are scenario, category, method and seed, each with names
@@ -148,16 +152,16 @@ class Config(Section):
     study_table: str = "config/studies.yaml"
     """The study table; its path is relative to the Snakefile."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """auto: CUDA where there are GPUs. Which ones: [gpus](#gpus)."""
+    """Device of the simulations; auto: CUDA where there are GPUs, see [gpus](#gpus)."""
     twins_per_launch: Count | Literal["auto"] = "auto"
-    """How many candidates of a search, or fits of a scenario, are simulated in one launch at most. auto: on a CPU as many as save
-    time, on CUDA all. 1: one by one. On a CPU no result depends on it, bit for bit."""
+    """Most candidates of a search, or fits of a scenario, in one launch; auto: on a CPU as many as save time, on CUDA all. On a CPU
+    no result depends on it, bit for bit."""
     gpus: Gpus = field(default_factory=Gpus)
-    simulation: Simulation = field(default_factory=Simulation)
+    simulation: SimulationSettings = field(default_factory=SimulationSettings)
     losses: Losses = field(default_factory=Losses)
     search: Search = field(default_factory=Search)
     fit: Fit = field(default_factory=Fit)
-    rod: Rod = field(default_factory=Rod)
+    rod: RodSettings = field(default_factory=RodSettings)
     released_quirks: ReleasedQuirks = field(default_factory=ReleasedQuirks)
     toy: Toy = field(default_factory=Toy)
     mocap: Mocap = field(default_factory=Mocap)
@@ -169,6 +173,13 @@ class Config(Section):
     tracking: Tracking = field(default_factory=Tracking)
     tune: Tune | None = None
     """A sweep over settings, for the target `sweep`, see [tune](#tune); null: none."""
+
+    @classmethod
+    def completed(cls, given: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Given settings on top of the sizes of their effort."""
+        values = sizes(given["effort"]) if given.get("effort") in EFFORTS else {}
+        merge(values, given)
+        return values
 
     def __post_init__(self) -> None:
         for name in ("scenarios", "methods", "seeds", "studies"):

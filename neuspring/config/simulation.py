@@ -11,7 +11,7 @@ from neuspring.config.parse import Count, Finite, Section
 
 
 @dataclass(frozen=True, kw_only=True)
-class Simulation(Section):
+class SimulationSettings(Section):
     """Integration. Which way is up, the ground and self-collision come with the scenario."""
 
     substeps: Count | Literal["auto"] = "auto"
@@ -24,11 +24,9 @@ class Simulation(Section):
     """Acceleration downwards, m/s^2."""
     collision_capacity: Count = 500
     """Candidate partners for self-collision, per node and frame; overflow is reported."""
-    controller_velocity: bool = False
-    """Dashpots use the controllers' velocity (finite differences); false: zero velocity, as in the released simulator."""
     initial_velocity: Literal["rest", "observed", "before"] = "rest"
-    """Velocity in frame 0. rest: zero, as released. observed: from the first three frames, for captures that begin in motion.
-    before: from the sample before frame 0, where a recording has one (`mocap.start` of at least 1); no later frame is used."""
+    """Velocity in frame 0: zero (rest), from the first three frames (observed), or from the sample before it (before). rest is as
+    released; before needs `mocap.start` of at least 1, and uses no later frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +37,7 @@ class ReleasedQuirks(Section):
     """
 
     integer_damping: bool = False
-    """Truncate drag and dashpot to integers after the search."""
+    """Truncation of drag and dashpot to integers after the search."""
     frozen_loss_denominators: bool = False
     """Divide the losses of every frame by the valid counts of frame 1."""
     frame_time_667: bool = False

@@ -16,14 +16,14 @@ Number = int | Annotated[float, Field(allow_inf_nan=False)]
 
 @dataclass(frozen=True, kw_only=True)
 class Dimension(Section):
-    """What a sweep may choose for one setting: a number between `low` and `high`, or one of `choices`."""
+    """Values of one setting: numbers between `low` and `high`, or `choices`."""
 
     low: Number | None = None
     """Smallest value, in the setting's unit; a whole number where the setting is one."""
     high: Number | None = None
     """Largest value."""
     log: bool = False
-    """Draw on a logarithmic scale."""
+    """Logarithmic scale of the draws."""
     step: Number | None = None
     """Distance between two values, from `low` on; null: 1 for whole numbers, otherwise continuous."""
     choices: tuple[Any, ...] = ()
@@ -69,7 +69,7 @@ class Tune(Section):
     """PostgreSQL URI, for workers on several machines. It must hold no password: libpq reads PGPASSWORD or ~/.pgpass. null: SQLite
     in the sweep's folder, for workers of one machine."""
     pruner: Literal["median", "none"] = "median"
-    """Which trials end early. median: those above the median of finished ones at the same epoch."""
+    """Rule by which trials end early: above the median of finished ones at the same epoch, or none."""
     startup_trials: Whole = 10
     """Number of random trials, before the sampler (TPE) learns from earlier ones and before the median prunes any."""
     warmup_epochs: Whole = 5

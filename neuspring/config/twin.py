@@ -23,18 +23,17 @@ class Losses(Section):
     acceleration: NonNegative = 0.01
     """Weight of the acceleration loss, which the search alone uses, as in the released method."""
     image_track: NonNegative = 1.0
-    """Color alone: weight of the error of tracked points in the image, as a distance at the object."""
+    """Weight, for color alone, of the error of tracked points in the image, as a distance at the object."""
     silhouette: NonNegative = 1.0
-    """Color alone: weight of the squared distance, in the image, between mask and nodes: of points of the mask from the
-    nearest node, and of nodes that leave object and hands from these."""
+    """Weight, for color alone, of the squared distance in the image between mask and nodes, both ways."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class SpringField(Section):
+class SpringFieldSettings(Section):
     """Neural spring field: S(e) = S0 + F(x_mid(e)), F a tri-plane and a small MLP over spring midpoints in the rest shape."""
 
     triplane: bool = True
-    """Use three feature planes (xy, yz, xz), bilinear, summed. false: F is an MLP on Fourier features of the coordinates."""
+    """Three feature planes (xy, yz, xz), bilinear, summed; false: F is an MLP on Fourier features of the coordinates."""
     resolution: Annotated[int, Field(ge=2)] | Literal["adaptive"] = "adaptive"
     """Texels N per side of a plane; adaptive: round(adaptive_factor sqrt(springs)), at least 2."""
     adaptive_factor: Positive = 0.85
@@ -42,19 +41,21 @@ class SpringField(Section):
     channels: Count = 32
     """Features per texel, C."""
     hidden: Count = 128
-    """Units per hidden layer of the MLP, which has three layers."""
+    """Units per hidden layer of the MLP."""
+    layers: Annotated[int, Field(ge=2)] = 3
+    """Layers of the MLP, the linear one at its end included."""
     bands: Count = 4
-    """Number of frequencies 1, 2, 4, ... (times pi) of the Fourier transform."""
+    """Number of frequencies (powers of two, times pi) of the Fourier transform."""
     texel_scale: Positive = 0.1
     """Standard deviation of the texels at the start, which are white noise."""
     plane_learning_rate: Positive | None = None
     """Learning rate of the texels; null: that of the MLP."""
     shuffled: bool = False
-    """Deal the midpoints out among the springs at random, so that F knows nothing of which springs lie side by side."""
+    """Midpoints dealt out among the springs at random, so that F does not know which springs lie side by side."""
     smoothness: NonNegative = 0.0
     """Weight of the mean squared difference of F between each spring and the 8 nearest, in the loss unit."""
     offsets: bool = False
-    """Each spring also has a number of its own, which is added to F."""
+    """A number of its own for each spring, which is added to F."""
     offset_prior: NonNegative = 0.0
     """Weight of the mean square of these numbers, in the loss unit."""
     offset_learning_rate: Positive = 0.03
@@ -69,38 +70,35 @@ class Fit(Section):
     """Passes over the training frames."""
     learning_rate: Positive = 1e-3
     """Adam's learning rate of log stiffness per spring, or of the field's weights."""
-    scalar_learning_rate: Positive | None = None
-    """Learning rate of contact scalars, drag and common factors; null: `learning_rate`."""
     factor_learning_rate: Positive | None = None
-    """Learning rate of drag and common factors; null: `scalar_learning_rate`."""
+    """Learning rate of drag and common factors; null: `learning_rate`."""
     epsilon: Positive = 1e-15
-    """Adam's epsilon, in the loss unit. Gradients far below it are not followed. The released code has 1e-8, with
-    `loss_unit: meter`."""
+    """Adam's epsilon, in the loss unit; released: 1e-8 m^2. Gradients far below it are not followed."""
     loss_unit: Literal["spacing", "meter"] = "spacing"
-    """Unit of the loss that is differentiated, and of its penalties. spacing: squared node spacings (twin/topology.py), so that
-    a fit does not depend on the unit of length. meter: m^2, as released. Losses are recorded in m^2 always."""
+    """Unit of the loss that is differentiated, and of its penalties: squared node spacings, or m^2, as released. Losses are
+    recorded in m^2 always."""
     horizon: Annotated[int, Field(ge=0)] = 1
     """Frames per optimizer step, with the gradient through all of them; 0: all training frames."""
     adjoint_limit: Positive | None = 100.0
-    """Of several frames per step: the gradient ends at a frame through which the adjoint of the state grows beyond this many times
-    what the losses behind it have added. The record has the share of such frames. null: none."""
+    """Growth of the adjoint of the state, as a multiple of what losses have added to it, at which the gradient through several
+    frames ends; null: none. The record has the share of such frames."""
     output_bound: NonNegative = 0.0
     """Bound b of the change per spring: stiffness stays within exp(+-b) of the searched value, by b tanh(x / b).
     Common factors come on top. 0: no bound."""
     global_stiffness: bool = False
-    """Train one common factor of all stiffnesses beside springs or field, without a bound, in every epoch."""
+    """Training of one common factor of all stiffnesses beside springs or field, without a bound."""
     controller_factors: bool = False
-    """Common factors of stiffness and dashpots are two each: one of object springs, one of controllers' springs."""
+    """Two common factors each of stiffness and dashpots: of object springs, and of controllers' springs."""
     stiffness_range: Range = (0.0, 1e5)
     """Clamp of the stiffness inside the simulation, N."""
     damping: Literal["fixed", "homogeneous"] = "fixed"
-    """What is trained of the damping. homogeneous: drag and one factor of all dashpots."""
+    """Training of the damping: none (fixed), or drag and one factor of all dashpots (homogeneous)."""
     selection: Literal["training_loss", "tail"] = "training_loss"
-    """How the best epoch is chosen. training_loss: by the loss seen while training, as in the paper. tail: by the loss on the last
-    training frames, on which nothing is fitted then; the start of the fit is a candidate too."""
+    """Loss that chooses the best epoch: that seen while training, as in the paper, or that on a tail of training frames. On a tail
+    nothing is fitted; the start of the fit is a candidate too."""
     tail_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.2
     """Fraction of the training frames on which nothing is fitted with `selection: tail`."""
-    field: SpringField = dataclasses.field(default_factory=SpringField)
+    field: SpringFieldSettings = dataclasses.field(default_factory=SpringFieldSettings)
     checkpoint_every: Count = 5
     """Epochs between checkpoints from which a killed job continues."""
     rod: RodFit = dataclasses.field(default_factory=RodFit)

@@ -578,16 +578,6 @@ class Rod(Artifact):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Residual(Artifact):
-    """A learned correction."""
-
-    kind: ClassVar[str] = "residual"
-    weights: np.ndarray = array("F,3", np.float64, "m", "of each feature, in the frame of gravity and clamps; 0: no correction")
-    ridge: float = number("1", "the ridge weight that was chosen")
-    left_out: float = number("1", "with it, squared error of clips that were left out, over that without a correction")
-
-
-@dataclass(frozen=True, kw_only=True)
 class Twin(Artifact):
     """Topology + Material + Simulation: enough to roll out anywhere."""
 
@@ -597,8 +587,6 @@ class Twin(Artifact):
     simulation: Simulation
     rod: Rod | None = field(default=None, metadata=OMITTED)
     """The body where it is a rod. Then springs are those of controllers alone, and the nodes follow the center line."""
-    residual: Residual | None = field(default=None, metadata=OMITTED)
-    """Regression of the errors of a rod (twin/residual.py), added to its rollouts."""
 
     def check(self) -> None:
         springs, values = len(self.topology.springs), len(self.material.stiffness)
@@ -607,7 +595,7 @@ class Twin(Artifact):
         nodes, masses = len(self.topology.nodes), len(self.material.mass)
         if masses not in (0, nodes):
             raise InputError("twin", f"the material must have one mass per node ({nodes}), or none", masses)
-        if self.rod is not None:
+        if self.rod:
             self._check_rod(self.rod)
 
     def _check_rod(self, rod: Rod) -> None:

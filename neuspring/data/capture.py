@@ -136,7 +136,7 @@ class Description:
     depth_format: Literal["png", "npy"] = "png"
     pose: Literal["lying", "standing"] | None = None
     """How the object is in frame 0, where `depth` is none and it is neither a sheet nor a rope. null: not known; what would lie too
-    far behind rises (perception.color.footprint)."""
+    far behind rises."""
     up: Literal["+z", "-z"] = "+z"
     """Direction of up along the world's z axis."""
     train_end: Annotated[int, Field(ge=2)] | None = None

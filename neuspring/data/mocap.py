@@ -90,6 +90,10 @@ MIN_MARKERS = 6
 MIN_FRAMES = 4
 LARGEST_ALONG = 0.99
 """Cosine of the angle between an end of the cable and the roll axis: nearer to 1 a small turn of the end is a large roll."""
+RING_SPACING = 0.012
+"""Distance of rings along the center line where `mocap.rings` gives no number of them, m."""
+RING_RADIUS = 0.006
+"""m."""
 MIN_DISTANCE = 1e-4
 """Nodes must be farther apart than this, m; otherwise their spring would have no length."""
 RELEASED_SAMPLES = 500
@@ -126,21 +130,21 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
 
     held = [0, 1, count - 2, count - 1]
     observed = markers[:, 2:-2]
-    centers, tangents = centerline(markers[0], settings.spacing, settings.rings)
+    centers, tangents = centerline(markers[0], RING_SPACING, settings.rings)
     if (along := np.abs(tangents[[0, -1]] @ axis).max()) > LARGEST_ALONG:
         rule = "in frame 0 neither end of the cable may lie along mocap.roll_axis, from which the roll of its rings starts"
         value = f"{np.degrees(np.arccos(min(along, 1.0))):.1f} degrees between an end and {settings.roll_axis}"
         raise InputError(file, rule, value, "Name the axis that is farthest from the ends in all recordings of the cable.")
     normals = rolled(tangents, axis)
-    body = rings(centers, tangents, normals, settings.radius, settings.ring)
+    body = rings(centers, tangents, normals, RING_RADIUS, settings.ring)
     points = np.concatenate([markers[0], body])
     nearest = float(cKDTree(points).query(points, k=2)[0][:, 1].min())
     if nearest < MIN_DISTANCE:
-        rule = f"markers and ring nodes of frame 0 must be {MIN_DISTANCE} m apart (mocap.spacing, mocap.radius)"
-        raise InputError(file, rule, f"{nearest:.2g} m", "Choose a larger radius or spacing.")
+        rule = f"markers and ring nodes of frame 0 must be {MIN_DISTANCE} m apart"
+        raise InputError(file, rule, f"{nearest:.2g} m", "Lower mocap.rings or mocap.ring.")
     rest_shape = NO_REST_SHAPE
     if settings.rest_shape == "straight":
-        line, rest_body = straightened(markers[0], len(body) // settings.ring, settings.radius, settings.ring)
+        line, rest_body = straightened(markers[0], len(body) // settings.ring, RING_RADIUS, settings.ring)
         rest_shape = np.concatenate([line[2:-2], rest_body, line[held]])
     controllers = markers[:, held]
     before = np.asarray(raw)[max(settings.start - 1, 0)].T
@@ -148,11 +152,11 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
     if settings.grip == "clamp":
         # Rings turn at the full rate of the record: the fewer samples, the less of a turn is seen.
         recorded = np.asarray(raw)[settings.start :].transpose(0, 2, 1)[: (frames - 1) * settings.stride + 1, held]
-        grips = normals[[0, -1]], settings.radius, settings.ring, MIN_DISTANCE, str(file)
+        grips = normals[[0, -1]], RING_RADIUS, settings.ring, MIN_DISTANCE, str(file)
         controllers = np.concatenate([controllers, clamps(recorded, *grips)[:: settings.stride]], axis=1)
         back = np.concatenate([back, clamps(back, *grips)], axis=1)
         if len(rest_shape):
-            around = circle(Y, Z, settings.radius, settings.ring, 0.5)
+            around = circle(Y, Z, RING_RADIUS, settings.ring, 0.5)
             rest_shape = np.concatenate([rest_shape, (line[held][:, None] + around).reshape(-1, 3)])
     visible = np.ones(observed.shape[:2], dtype=bool)
     motion_valid = visible.copy()

@@ -13,14 +13,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from neuspring.baselines import BASELINES, REFERENCES
-from neuspring.config import Config, Method, ScenarioRow, SearchRow, merge, parse, plain, read_yaml
-from neuspring.config.rows import RENAMED_ROWS
+from neuspring.config import Config, Method, ScenarioRow, SearchRow, merge, parse, plain
+from neuspring.config.parse import read_rows
 from neuspring.core.errors import InputError
 from neuspring.core.text import listed
 from neuspring.data.sources import SOURCES, Source, location, scenario_rows, with_deform
 from neuspring.perception.backends import BACKENDS
 from neuspring.scores.lpips import configured_weights
 from neuspring.scores.paper import Study, read_studies
+from neuspring.twin.body import BODIES
 
 T = TypeVar("T")
 RESERVED = ("tables", "logs", "benchmarks", "jobs", "tune", "mlartifacts", "published", "appearance", "perception", "capture")
@@ -32,7 +33,7 @@ REMEDY = "Name what to run on, for example --configfile config/data/demo.yaml."
 
 def read_methods(path: Path) -> dict[str, Method]:
     """The method table: name -> Method. Raises InputError."""
-    methods = {name: parse(Method, row, f"{path}, method {name}") for name, row in read_yaml(path).items()}
+    methods = read_rows(Method, path, "method")
     for name, method in methods.items():
         where = f"{path}, method {name}"
         if method.model and method.model not in BASELINES:
@@ -45,9 +46,17 @@ def read_methods(path: Path) -> dict[str, Method]:
     return methods
 
 
-def read_searches(path: Path) -> dict[str, SearchRow]:
-    """The search table: name -> SearchRow."""
-    return {name: parse(SearchRow, row, f"{path}, search {name}") for name, row in read_yaml(path).items()}
+def read_searches(path: Path, clusters: int) -> dict[str, SearchRow]:
+    """The search table: name -> SearchRow; rows that name no number of regions have `clusters`."""
+    rows = read_rows(SearchRow, path, "search")
+    return {name: dataclasses.replace(row, clusters=row.clusters or clusters) for name, row in rows.items()}
+
+
+def shared_searches(methods: Mapping[str, Method], searches: Mapping[str, SearchRow]) -> dict[str, Method]:
+    """The methods; those whose searches do the same name the first of these, and so share it."""
+    first: dict[Any, str] = {}
+    same = {name: first.setdefault(repr(dataclasses.replace(row, description="")), name) for name, row in searches.items()}
+    return {n: dataclasses.replace(m, search=same.get(m.search, m.search)) if m.search else m for n, m in methods.items()}
 
 
 def chosen_part(config: Config, scenarios: Mapping[str, ScenarioRow]) -> Config:
@@ -164,7 +173,8 @@ class Benchmark:
         """The configuration as it was given: what tables are laid out for, whatever part of it is run now."""
         self.config = config = chosen_part(whole, scenarios)
         """With what `only` leaves of scenarios, methods and seeds."""
-        searches = read_searches(root / config.search_table)
+        searches = read_searches(root / config.search_table, config.clusters)
+        methods = shared_searches(methods, searches)
         wanted = tuple(dict.fromkeys(search for n in config.methods if (search := methods[n].search)))
         _require_known("methods' search", wanted, searches, config.search_table)
         _require_known("compare_with", (config.compare_with,) if config.compare_with else (), methods, config.method_table)
@@ -228,8 +238,8 @@ class Benchmark:
         wanted = with_search(self.config, row, method.search).search.variables.stiffness
         if not method.fit:
             return
-        if (method.fit == "rod") != (row.body == "rod"):
-            rule = f"search {method.search} makes a {row.body}; a rod is fitted as rod, a lattice as springs or field"
+        if method.fit not in (fits := BODIES[row.body].fits):
+            rule = f"search {method.search} makes a {row.body}, which is fitted as {' or '.join(fits)}"
             raise InputError(f"method {name}, fit", rule, method.fit)
         if method.oracle and config.fit.selection == "tail":
             rule = "an oracle is fitted on all frames and holds none back"
@@ -240,7 +250,7 @@ class Benchmark:
             raise InputError(f"method {name}, fit.stiffness_range", rule, [low, high])
 
     def pool_kind(self, job: Any) -> str | None:
-        """Of the search that a job makes, or of its method: whether it is judged on all of the pool, the others, or no pool."""
+        """The pool on which the search that a job makes, or its method, is judged; None: the scenario's own recording."""
         rows = self.fits | self.methods
         if hasattr(job, "method"):
             return rows[job.method].pool
@@ -253,8 +263,9 @@ class Benchmark:
         """
         if self.config.twins_per_launch == 1 or scenario not in self.config.scenarios:
             return ()
-        # A fit on several recordings takes turns between them, and shares launches with nobody; a rod has lanes of its own.
-        alone = [name for name, method in self.fits.items() if method.pool or method.fit == "rod"]
+        # A fit on several recordings takes turns between them, and shares launches with nobody.
+        bodies = {name: BODIES[self.searches[method.searched].body] for name, method in self.fits.items()}
+        alone = [name for name, method in self.fits.items() if method.pool or not bodies[name].by_gradients]
         rows = [name for name in self.fits if self.applies(name, scenario) and name not in alone]
         seeds = self.config.seeds
         alike = Counter(self._steps[name] for name in rows)
@@ -387,16 +398,11 @@ def _require_alike(
 
 
 def _require_known(key: str, names: tuple[str, ...], known: Mapping[str, Any], table: str) -> None:
-    """Raise InputError for unknown rows, with what to name in their place: their name now, or one that is spelled alike."""
+    """Raise InputError for unknown rows, with a name that is spelled alike."""
     hints = []
-    for name in names:
-        if name in known:
-            continue
-        if now := RENAMED_ROWS.get(name):
-            hints.append(f"{name!r} ({now if ' ' in now else f'now {now!r}'})")
-        else:
-            alike = difflib.get_close_matches(name, known, n=1)
-            hints.append(f"{name!r} (did you mean {alike[0]!r}?)" if alike else f"{name!r}")
+    for name in (name for name in names if name not in known):
+        alike = difflib.get_close_matches(name, known, n=1)
+        hints.append(f"{name!r} (did you mean {alike[0]!r}?)" if alike else f"{name!r}")
     if hints:
         raise InputError(
             f"configuration, {key}", f"every entry must be a row of {table}", ", ".join(hints), f"Known: {listed(known)}"

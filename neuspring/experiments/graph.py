@@ -18,7 +18,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from neuspring.baselines import BASELINES
-from neuspring.config import Config, Search, SpringField, plain
+from neuspring.config import Config, Search, SpringFieldSettings, plain
 from neuspring.config.settings import select
 from neuspring.core.errors import InputError
 from neuspring.core.provenance import image_stamps
@@ -32,7 +32,15 @@ from neuspring.stages.stage import Stage
 TEMPLATES = Path(__file__).parents[1] / "report" / "templates"
 SPLATS = "appearance"
 """Folder of the splats that all methods share; those of one method have its name behind a hyphen."""
-NEUTRAL: dict[str, Any] = {"only": "", "gpus": {}, "tracking": {}, "twins_per_launch": "auto", "device": "auto", "tune": None}
+NEUTRAL: dict[str, Any] = {
+    "only": "",
+    "effort": None,
+    "gpus": {},
+    "tracking": {},
+    "twins_per_launch": "auto",
+    "device": "auto",
+    "tune": None,
+}
 """Keys that no result depends on, with what stands for them where settings are compared."""
 Files = str | list[str]
 _stamps = functools.cache(image_stamps)
@@ -275,8 +283,6 @@ class Graph:
                 return rows.searches[job.search].clusters
             case "body":
                 return rows.searches[job.search].body
-            case "leave_out":
-                return rows.pool_kind(job) == "others"
             case "kind":
                 return rows.fits[job.method].fit
             case "oracle":
@@ -353,7 +359,7 @@ class Graph:
         if stage.name == "fit":
             method = rows.fits[job.method]
             config = with_search(with_method(config, method, job.method), rows.searches[method.searched], method.searched)
-            unread: dict[str, Any] = {"field": SpringField()} if method.fit == "springs" else {}
+            unread: dict[str, Any] = {"field": SpringFieldSettings()} if method.fit == "springs" else {}
             return dataclasses.replace(config, fit=dataclasses.replace(config.fit, **unread))
         if stage.name == "train":
             return with_method(config, rows.methods[job.method], job.method)
@@ -476,7 +482,7 @@ class Graph:
         """The rows of the method that is varied, so that changed ones are tuned again."""
         assert self.config.tune
         method = read_methods(self.root / self.config.method_table)[self.config.tune.method]
-        search = read_searches(self.root / self.config.search_table)[method.search or ""]
+        search = read_searches(self.root / self.config.search_table, self.config.clusters)[method.search or ""]
         return _json([plain(method), plain(search)])
 
 

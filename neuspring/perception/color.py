@@ -3,11 +3,11 @@ the table; hands and silhouettes of later frames are evidence in the image.
 
 With up as +z, the pixel p shows the object's upper side at height t(p), where its ray meets the plane z = t(p):
 
-    sheets   (`flat`, such as cloth)         t = `sheet_thickness`; nodes lie at t / 2
+    sheets   (`flat`, such as cloth)         t = SHEET_THICKNESS; nodes lie at t / 2
     ropes    (`round`), bodies (all others)  t of the nearest of the ellipsoids below, and their lower side is that of the farthest
 
 Each of the largest discs inside the silhouette (shape.discs), with center q and radius r, pixels, is an ellipsoid that is
-w = 2 k r z / f thick, k = 1 for ropes and `body_thickness` for bodies: thickness follows the outline's width, symmetric about the
+w = 2 k r z / f thick, k = 1 for ropes and BODY_THICKNESS for bodies: thickness follows the outline's width, symmetric about the
 medial surface on which the centers lie. f is the focal length, z the depth of the center. Where it lies on the table its center is
 at half its thickness above it:
 
@@ -16,11 +16,11 @@ at half its thickness above it:
 h is the height of the camera and d(q) how far the ray of q sinks per meter of depth. What stands would be laid far behind itself
 so. Therefore no center is farther from the camera than the upright plane
 
-    a(q) <= min a + `footprint` (max s - min s)
+    a(q) <= min a + FOOTPRINT (max s - min s)
 
 a is the distance along the table in the direction in which the camera looks, s that across, on the plane through the nearest
 center. What would be beyond the plane rises in it, above what touches the table. `pose` of the capture says lying (no such plane)
-or standing (`standing_footprint`): one picture cannot say which.
+or standing (STANDING_FOOTPRINT): one picture cannot say which.
 """
 
 from __future__ import annotations
@@ -59,6 +59,13 @@ SAMPLES = 300
 """Points of the object's silhouette per frame."""
 CELL = 4
 """Side of the cells of the distance from object and hands, pixels."""
+SHEET_THICKNESS = 0.004
+"""m."""
+BODY_THICKNESS = 0.9
+"""Thickness of a body, which is neither sheet nor rope, in local widths of its silhouette; 1: as thick as it is wide."""
+FOOTPRINT, STANDING_FOOTPRINT = 1.2, 0.3
+"""Farthest that a body reaches away from the camera, measured along the table from its nearest point, in widths of its middle line
+across the view; what would lie farther off rises. For a pose that is not given, and a standing one; a lying body rises nowhere."""
 ROPE_WIDEST = 1.5
 """Largest thickness of a rope over its median."""
 STEEP = 0.35
@@ -109,14 +116,14 @@ class FirstFrame:
         filled = beneath_hands(labels, BENEATH / size)
         up = capture.description.up_sign
         if kind == "flat":
-            heights = np.where(filled, settings.sheet_thickness, 0.0)
+            heights = np.where(filled, SHEET_THICKNESS, 0.0)
             return cls(camera, up, kind, filled, heights, np.zeros_like(heights), size, {})
         if kind == "round":
             # Where the silhouette is wider than a rope it shows two turns, or a shadow.
             depth, thick, facts = medial(camera, up, filled, 1.0, np.inf, ROPE_WIDEST)
         else:
-            bounds = {None: settings.footprint, "lying": np.inf, "standing": settings.standing_footprint}
-            depth, thick, facts = medial(camera, up, filled, settings.body_thickness, bounds[capture.description.pose])
+            bounds = {None: FOOTPRINT, "lying": np.inf, "standing": STANDING_FOOTPRINT}
+            depth, thick, facts = medial(camera, up, filled, BODY_THICKNESS, bounds[capture.description.pose])
         y, x = np.nonzero(filled)
         pixels, heights, lower = np.stack([x, y], axis=1).astype(float), np.zeros(filled.shape), np.zeros(filled.shape)
         for side, found in zip((heights, lower), inflated(filled, depth, thick), strict=True):
@@ -166,7 +173,7 @@ def medial(
 ) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
     """Depth [n] and thickness [n], m, of the ellipsoids of the `discs` of a silhouette `filled` [H, W], and `FirstFrame.facts`.
 
-    `factor` is k and `footprint` that of the head of this file; up is +1 or -1. No ellipsoid is thicker than `widest` times the
+    `factor` is k and FOOTPRINT that of the head of this file; up is +1 or -1. No ellipsoid is thicker than `widest` times the
     median one.
     """
     centers, radii, _ = discs(filled)

@@ -1,4 +1,4 @@
-"""Dense tracking without a network: pyramidal Lucas-Kanade, or DIS optical flow, both with a forward-backward check.
+"""Dense tracking without a network: pyramidal Lucas-Kanade with a forward-backward check.
 
 Points start in frame 0 on random pixels inside the masks. A point is lost if it fails the check, leaves the image or its mask, or
 moves otherwise than its neighbors. Lost points are looked for again in every frame: where their neighbors of frame 0 went, by
@@ -78,28 +78,18 @@ def follow(capture: Capture, camera: str, labels: np.ndarray, start: np.ndarray,
         own[beside] = _nearest_label(labels[0], start[beside])
     result = Followed.starting_at(start, capture.frame_count)
     pixels, visible = result.pixels, result.visible
-    flow = None
-    if settings.method == "dis":
-        # Down to whole pixels; the presets stop at every second or fourth.
-        flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        flow.setFinestScale(0)
-
-    def seen(frame: int) -> np.ndarray:
-        image = gray(capture, camera, frame)
-        return image if flow is not None else equalized(image)
-
-    first = before = seen(0)
+    first = before = equalized(gray(capture, camera, 0))
     last = 0
     for frame in range(1, capture.frame_count):
         pixels[frame] = pixels[frame - 1]
         if not capture.has(camera, frame):
             continue
-        now = seen(frame)
+        now = equalized(gray(capture, camera, frame))
         place, alive = pixels[last].copy(), visible[last].copy()
         if alive.any():
-            place[alive], alive[alive] = _follow(before, now, place[alive], settings, flow)
+            place[alive], alive[alive] = lucas_kanade(before, now, place[alive], place[alive], WINDOW)
         alive &= inside(place, now.shape)
-        alive |= _reacquire(first, now, start, place, alive, settings)
+        alive |= _reacquire(first, now, start, place, alive)
         alive &= _held(labels[frame], place, own, settings.rim)
         for label in np.unique(own):
             _outvote(start, place, alive, own == label)
@@ -117,18 +107,6 @@ def choose(labels: np.ndarray, count: int, seed: int) -> np.ndarray:
     return pixels[np.sort(np.random.default_rng(seed).choice(len(pixels), count, replace=False))]
 
 
-def _follow(
-    before: np.ndarray, now: np.ndarray, points: np.ndarray, settings: OpenCvTracking, flow: cv2.DISOpticalFlow | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Places in the next frame [n, 2], and whether going back returns to the start [n]."""
-    if flow is None:
-        return lucas_kanade(before, now, points, points, WINDOW)
-    there, back = flow.calc(before, now, None), flow.calc(now, before, None)  # type: ignore[call-overload]
-    moved = points + _sample(there, points)
-    returned = moved + _sample(back, moved)
-    return moved, np.linalg.norm(returned - points, axis=1) < FORWARD_BACKWARD
-
-
 def lucas_kanade(
     source: np.ndarray, target: np.ndarray, points: np.ndarray, guess: np.ndarray, window: int, levels: int = LEVELS
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -143,9 +121,7 @@ def lucas_kanade(
     return np.asarray(moved), there.ravel().astype(bool) & back.ravel().astype(bool) & near
 
 
-def _reacquire(
-    first: np.ndarray, now: np.ndarray, start: np.ndarray, place: np.ndarray, alive: np.ndarray, settings: OpenCvTracking
-) -> np.ndarray:
+def _reacquire(first: np.ndarray, now: np.ndarray, start: np.ndarray, place: np.ndarray, alive: np.ndarray) -> np.ndarray:
     """Which lost points are seen again [Q] bool; their places are written into `place`."""
     lost, guides = np.flatnonzero(~alive), np.flatnonzero(alive)
     again = np.zeros(len(start), dtype=bool)

@@ -17,10 +17,6 @@ LANE_WIDTHS = (1, 4, 8)
 """Lanes that kernels are made for. 16 were no faster per twin than 8 (tests/benchmarks/NOTES.md)."""
 
 
-COST = {1: 1.0, 4: 1.4, 8: 1.5}
-"""Time of a substep by width, over that of a twin alone, on one thread (tests/benchmarks/NOTES.md)."""
-
-
 def width_for(twins: int) -> int:
     """The smallest width that holds `twins`, or the largest there is."""
     return next((width for width in LANE_WIDTHS if width >= twins), LANE_WIDTHS[-1])

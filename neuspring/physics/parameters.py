@@ -7,12 +7,13 @@ from that by name.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields
-from typing import Literal, NamedTuple
+from dataclasses import MISSING, fields
+from typing import Any, Literal, NamedTuple
 
+import numpy as np
 import torch
 
-from neuspring.core.artifacts import Twin
+from neuspring.core.artifacts import Material, Twin
 
 Values = Mapping[str, torch.Tensor]
 """Fields of `Material` by name, rest_lengths [S], m, and pushes [S]."""
@@ -90,3 +91,11 @@ def twin_tensors(twin: Twin, device: str, dtype: torch.dtype = torch.float32) ->
     values = {f.name: getattr(twin.material, f.name) for f in fields(twin.material)}
     values |= {"rest_lengths": twin.topology.rest_lengths, "pushes": twin.topology.pushes}
     return {name: torch.tensor(value, dtype=dtype, device=device) for name, value in values.items()}
+
+
+def homogeneous(values: dict[str, float], springs: int) -> Material:
+    """A material that is the same everywhere; `values` has a number for every field of `Material` without a default."""
+    every = {f.name: f for f in fields(Material) if f.name in values or (f.default is MISSING and f.default_factory is MISSING)}
+    numbers: dict[str, Any] = {name: values[name] for name in every}
+    arrays = {name: np.full(springs, values[name]) for name, f in every.items() if "shape" in f.metadata}
+    return Material(**(numbers | arrays))

@@ -27,7 +27,6 @@ from neuspring.physics import collision, frame, obstacles, springs
 from neuspring.physics.arrays import Buffers, Graphs
 from neuspring.physics.controllers import ControllerSprings, begins, begun
 from neuspring.physics.parameters import PARAMETERS, Parameters, packed
-from neuspring.physics.rod_nodes import RodFrames
 
 FRAME_WINDOW_BYTES = 1 << 30
 """Bytes that a `FrameWindow` may take."""
@@ -178,6 +177,9 @@ class FrameSolver:
         states = [torch.tensor(positions[number], dtype=self.dtype, device=self.device) for number in known]
         lengths = self.grips.taken_before([rows[number] for number in known], states)
         self._held = None if lengths is None else lengths.expand(self.buffers.twins, -1)
+
+    def follow(self, other: FrameSolver) -> None:
+        """Take the state of another solver: none, since a frame is given it."""
 
     def go_on(self) -> None:
         """Take the end of the last frame for the start of the next."""
@@ -406,15 +408,10 @@ def simulate_frame(
 
 def solver_for(
     twins: Twin | Sequence[Twin], device: str = "cpu", dtype: torch.dtype = torch.float32, *, differentiable: bool = True
-) -> Any:
-    """A solver with parameters set: of a twin, or of several of the same nodes and controllers, whose tensors have an axis [B].
-
-    A `FrameSolver`; of rods, `RodFrames`, which have its calls for rollouts, and no gradients.
-    """
+) -> FrameSolver:
+    """A solver with parameters set: of a lattice, or of several of the same nodes and controllers: tensors have an axis [B]."""
     options: dict[str, Any] = {"device": device, "dtype": dtype, "differentiable": differentiable}
     first = twins.topology if isinstance(twins, Twin) else twins[0].topology
-    if (twins if isinstance(twins, Twin) else twins[0]).rod is not None:
-        return RodFrames(twins, device)
     if isinstance(twins, Twin):
         solver = FrameSolver(first.springs, len(first.nodes), len(first.controllers), twins.simulation, **options)
         solver.set_parameters(packed(twins, device, dtype))

@@ -135,14 +135,14 @@ def smallest_safe_substeps(spectrum: Spectrum, frame_time: float, safety: float)
 
 
 def for_prediction(twin: Twin) -> Twin:
-    """The twin as predictions are made with it: where the body can meet itself, with substeps for `PREDICTION`.
+    """A lattice as predictions are made with it: where the body can meet itself, with substeps for `PREDICTION`.
 
     Above half of the bound a damped mode turns around in every substep, and a contact that meets it on its way back kicks it again:
     springs of a cloth that lay on itself were stretched to four times their length. Other twins stay as they are, and so does one
     with the released frame time, which stands for the released simulator.
     """
     simulation = twin.simulation
-    if twin.rod is not None or not simulation.self_collision or simulation.frame_time == RELEASED_FRAME_TIME:
+    if not simulation.self_collision or simulation.frame_time == RELEASED_FRAME_TIME:
         return twin
     count = smallest_safe_substeps(twin_spectrum(twin), simulation.frame_time, PREDICTION)
     return replace(twin, simulation=replace(simulation, substeps=max(count, simulation.substeps)))
@@ -150,8 +150,6 @@ def for_prediction(twin: Twin) -> Twin:
 
 def check(twin: Twin) -> None:
     """Raise Unstable, naming node, bound and remedy, if the twin's substep is beyond the stability limit."""
-    if twin.rod is not None:
-        return  # implicit (rod.py)
     topology, simulation = twin.topology, twin.simulation
     bound = gershgorin(topology.springs, len(topology.nodes), *_strengths(twin), twin.material.mass)
     if bound.load(simulation.substep) < STABILITY_LIMIT:

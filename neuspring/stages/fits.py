@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from neuspring import config
-from neuspring.config import Kind
 from neuspring.core.artifacts import Observations
 from neuspring.core.records import Recorder, StageRecord
 from neuspring.stages import fit as alone
@@ -32,7 +31,7 @@ class Row:
 
     fits: dict[str, str]
     """Record to write -> search.json to start from."""
-    kind: Kind = "springs"
+    kind: str = "springs"
     settings: str = "{}"
     oracle: bool = False
 

@@ -5,22 +5,23 @@ from __future__ import annotations
 from neuspring.core.artifacts import Observations
 from neuspring.core.records import Before, Recorder
 from neuspring.stages.stage import Written, stage
+from neuspring.twin.body import body_of, code
 
 
-@stage(output="{scenario}/{method}/{seed}/rollout.json", gpu="always", minutes=60)
+@stage(output="{scenario}/{method}/{seed}/rollout.json", code=lambda settings, given: code(), gpu="always", minutes=60)
 def rollout(observations: Observations, learned: Before, run: Recorder, device: str = "auto") -> Written:
     """Twin -> trajectory over all frames, trajectory.npz. A rollout that diverges is recorded as a failure.
 
     `learned` is the search.json or fit.json that names the twin. A twin that saw the future is called `oracle`. A body that can
-    meet itself takes more substeps (`stability.for_prediction`).
+    meet itself takes more substeps (`Body.for_prediction`).
     """
     from neuspring.core.artifacts import Twin
-    from neuspring.physics.stability import for_prediction
     from neuspring.twin.rollout import initial_velocity, roll_out
 
     if learned.record.settings.get("oracle"):
         run.settings["oracle"] = True
-    twin = for_prediction(Twin.load(learned.file("twin")))
+    twin = Twin.load(learned.file("twin"))
+    twin = body_of(twin).for_prediction(twin)
     velocity = initial_velocity(observations, twin.simulation.initial_velocity)
     trajectory = roll_out(twin, observations.controller_points, device, velocity=velocity, valid=observations.controller_valid)
     if trajectory.collision_overflow:

@@ -50,8 +50,8 @@ def score(
 
     from neuspring.core.files import write_table
     from neuspring.report.draw import run as figures
-    from neuspring.report.draw.twin import Lines
     from neuspring.scores import metrics
+    from neuspring.twin.body import lines_of
 
     began, folder = time.perf_counter(), output.parent
     given = {"search": search, "fit": fit, "train": train, "rollout": rollout, "appearance": appearance, "render": render}
@@ -78,7 +78,7 @@ def score(
         errors=errors,
         twin=stages.twin,
         # The search gives every spring the same stiffness.
-        searched=Lines.of(Twin.load(searched)).typical if searched else None,
+        searched=lines_of(Twin.load(searched)).typical if searched else None,
     )
     artifacts = {"records": list(paths.values())} | ({"twin": [stages.twin_file]} if stages.twin_file else {}) | {"plots": plots}
     if pictures is not None:

@@ -10,12 +10,13 @@ from neuspring.config import Config
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.records import Recorder
 from neuspring.stages.stage import MayFail, Written, stage
+from neuspring.twin.body import body_of, code
 
 
 @stage(
     output="{scenario}/{method}/{seed}/transfer.json",
     reads=("simulation",),
-    code=lambda settings, given: BASELINES[given["model"]].modules if given["model"] in BASELINES else (),
+    code=lambda settings, given: BASELINES[given["model"]].modules if given["model"] in BASELINES else code(),
     gpu="always",
     minutes=60,
 )
@@ -43,7 +44,6 @@ def transfer(
     import pandas as pd
 
     from neuspring.core.files import write_npz, write_table
-    from neuspring.physics.stability import for_prediction
     from neuspring.scores import metrics
     from neuspring.twin.rollout import initial_velocity, roll_out
     from neuspring.twin.transfer import move
@@ -62,7 +62,7 @@ def transfer(
                 safety=settings.simulation.safety,
                 keep_frame_time=record.settings["released_quirks"]["frame_time_667"],
             )
-            moved = for_prediction(moved)
+            moved = body_of(moved).for_prediction(moved)
             velocity = initial_velocity(observations, moved.simulation.initial_velocity)
             controllers, valid = observations.controller_points, observations.controller_valid
             trajectory = roll_out(moved, controllers, device, velocity=velocity, valid=valid)

@@ -8,5 +8,4 @@ fit         Adam through the simulation, on one recording or several: parameters
 losses      every term of the training loss, for search, fit and polish
 rollout     prediction
 transfer    a twin on another recording, with register where its nodes are others
-residual    what rollouts of a cable leave, learned by ridge regression: no physics
 """

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,15 +17,16 @@ import torch
 
 from neuspring import config
 from neuspring.config.search import LENGTHS, VARIABLES
-from neuspring.core.artifacts import Material, Observations, Simulation, Twin
+from neuspring.core.artifacts import Observations, Simulation, Twin
 from neuspring.core.errors import NumericalFailure
 from neuspring.physics import stability
 from neuspring.physics.controllers import waypoints
-from neuspring.physics.lanes import COST, LANE_WIDTHS, width_for
+from neuspring.physics.lanes import LANE_WIDTHS
+from neuspring.physics.parameters import homogeneous
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.rollout import initial_velocity
 from neuspring.twin.topology import controller_reach, node_spacing, piecewise_topology, regions
-from neuspring.twin.transfer import on_recording, require_pool
+from neuspring.twin.transfer import in_pool, require_pool
 from neuspring.twin.trials import Outcome, outcomes
 
 INTEGERS = ("object_neighbors", "controller_neighbors")
@@ -37,13 +38,11 @@ UNSTABLE = "unstable"
 """How the reasons of candidates begin that a fixed number of substeps cannot integrate."""
 CMAES, OTHER_WAY = "cmaes", "hands"
 """Stages of candidates that CMA-ES proposes, and of its first generation in the other way of hands (`search.hands`)."""
-WAYS = {"hold": (False,), "push": (True,), "auto": (False, True)}
-"""Whether hands only push, in the ways that are judged, by `search.hands`."""
 Map = Callable[..., Iterable[Any]]
 """As the builtin `map`."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Recording:
     """The training frames of a recording: hands and start velocities of its own, and the losses of its frames."""
 
@@ -54,76 +53,62 @@ class Recording:
     """Velocity of the nodes in frame 0 [N, 3], m/s."""
     loss: FrameLoss
 
-    @classmethod
-    def of(
-        cls,
-        observations: Observations,
-        simulation: config.Simulation,
-        losses: config.Losses,
-        quirks: config.ReleasedQuirks,
-        device: str = "cpu",
-    ) -> Recording:
-        """A recording, judged with the settings of a search."""
-        loss = FrameLoss.of(observations, losses, device, frozen_counts=quirks.frozen_loss_denominators)
-        return cls.judged(observations, initial_velocity(observations, simulation.initial_velocity), loss, device)
-
-    @classmethod
-    def judged(cls, observations: Observations, velocity: np.ndarray, loss: FrameLoss, device: str) -> Recording:
-        """A recording whose start velocities [N, 3], m/s, and losses are known."""
-        hands = torch.tensor(observations.controller_points, device=device)[: observations.scenario.train_end]
-        start = torch.tensor(velocity, dtype=torch.float32, device=device)
-        return cls(observations, waypoints(hands, observations.controller_valid), start, loss)
+    @property
+    def frames(self) -> int:
+        """Frames that a candidate is simulated over."""
+        return len(self.hands) - 1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SearchProblem:
     """Everything that a candidate is judged with."""
 
     observations: Observations
     search: config.Search
-    simulation: config.Simulation
+    simulation: config.SimulationSettings
     losses: config.Losses
     quirks: config.ReleasedQuirks
     device: str = "cpu"
     clusters: int = 1
     together: int = 0
-    """Candidates in one launch at most; 0: as many as pay (`together`). Costs do not depend on it, bit for bit on a CPU."""
+    """Candidates in one launch at most; 0: as many as the widest kernel has lanes on a CPU (8: more are no faster), a whole
+    generation on a GPU. Costs do not depend on it, bit for bit on a CPU."""
     threads: int = 1
     """Threads that simulate at the same time, on a CPU."""
-    pool: tuple[Recording, ...] = ()
+    pool: tuple[Observations, ...] = ()
     """Other recordings of the object; a candidate's cost is the mean over all.
 
     Its springs are made once, on the nodes of `observations` in frame 0 (or their rest shape), with that body's `spacing` and
     `reach`, and are moved to each recording, node i on node i. Radii measured in each recording's own lengths would join other
     nodes there, and the material of one topology would be judged on another.
     """
-    leave_out: bool = False
-    """Judge candidates by the pool alone: nothing after frame 0 of `observations` counts, neither for costs nor for slopes."""
-    push: bool = False
-    """Whether hands only push. The search chooses it."""
+    recordings: tuple[Recording, ...] = field(init=False)
+    """The scenario's own and those of the pool; a candidate has a twin on each."""
     labels: np.ndarray = field(init=False)
     """Region of each node [N]."""
-    velocity: np.ndarray = field(init=False)
-    """Velocity of each node in frame 0 [N, 3], m/s."""
     spacing: float = field(init=False)
     """Distance between neighboring nodes in the rest shape, m (topology.py)."""
     reach: float = field(init=False)
     """Smallest distance between a controller and a node in the rest shape, m."""
 
     def __post_init__(self) -> None:
-        require_pool(self.observations, [recording.observations for recording in self.pool], self.leave_out)
+        require_pool(self.observations, self.pool)
         canonical, count = self.observations.canonical, len(self.observations.nodes)
         nodes, hands = canonical[:count], canonical[count:]
         object.__setattr__(self, "labels", regions(nodes, self.clusters))
-        object.__setattr__(self, "velocity", initial_velocity(self.observations, self.simulation.initial_velocity))
+        object.__setattr__(self, "recordings", tuple(self._recording(each) for each in (self.observations, *self.pool)))
         object.__setattr__(self, "spacing", node_spacing(nodes))
         object.__setattr__(self, "reach", controller_reach(nodes, hands))
 
-    @property
-    def simulated_frames(self) -> int:
-        """Frames that a candidate is simulated over, on all recordings that count."""
-        counted = [*([] if self.leave_out else [self.observations]), *(recording.observations for recording in self.pool)]
-        return sum(observations.scenario.train_end - 1 for observations in counted)
+    def _recording(self, observations: Observations) -> Recording:
+        hands = torch.tensor(observations.controller_points, device=self.device)[: observations.scenario.train_end]
+        start = initial_velocity(observations, self.simulation.initial_velocity)
+        return Recording(
+            observations=observations,
+            hands=waypoints(hands, observations.controller_valid),
+            velocity=torch.tensor(start, dtype=torch.float32, device=self.device),
+            loss=FrameLoss.of(observations, self.losses, self.device, frozen_counts=self.quirks.frozen_loss_denominators),
+        )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -166,14 +151,13 @@ class SearchProblem:
         return [values[name]] if self.clusters == 1 else [values[f"{name}.{region}"] for region in range(self.clusters)]
 
 
-def with_substeps(problem: SearchProblem, twin: Twin) -> Twin:
+def with_substeps(twin: Twin, settings: config.SimulationSettings, frame_time_667: bool) -> Twin:
     """The twin with its number of substeps: 667 with the quirk, else as configured: a fixed count or the smallest safe one.
 
     Raises InputError if a fixed count is too small, NumericalFailure if `auto` would need more than `max_substeps`.
     """
-    settings = problem.simulation
-    if problem.quirks.frame_time_667 or settings.substeps != "auto":
-        count = stability.RELEASED_SUBSTEPS if problem.quirks.frame_time_667 else int(settings.substeps)
+    if frame_time_667 or settings.substeps != "auto":
+        count = stability.RELEASED_SUBSTEPS if frame_time_667 else int(settings.substeps)
         twin = replace(twin, simulation=replace(twin.simulation, substeps=count))
         stability.check(twin)
         return twin
@@ -183,8 +167,11 @@ def with_substeps(problem: SearchProblem, twin: Twin) -> Twin:
     return replace(twin, simulation=replace(twin.simulation, substeps=count))
 
 
-def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
-    """The twin of one set of physical values. Raises InputError or NumericalFailure if it cannot be integrated."""
+def candidate(problem: SearchProblem, values: dict[str, float], push: bool = False) -> Twin:
+    """The twin of one set of physical values, whose hands hold, or only `push`.
+
+    Raises InputError or NumericalFailure if it cannot be integrated.
+    """
     observations, settings, scenario = problem.observations, problem.simulation, problem.observations.scenario
     topology = piecewise_topology(
         observations.nodes,
@@ -201,7 +188,7 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
     count = len(topology.springs)
     if count == 0:
         raise NumericalFailure("no node has a spring")
-    if problem.push:
+    if push:
         # A hand that pushes acts from where it touches on, not from where it was in frame 0.
         led = np.arange(count) >= topology.object_spring_count
         lengths = np.where(led, np.minimum(topology.rest_lengths, values["contact_distance"]), topology.rest_lengths)
@@ -216,88 +203,48 @@ def candidate(problem: SearchProblem, values: dict[str, float]) -> Twin:
         obstacles=scenario.obstacles,
         self_collision=scenario.self_collision,
         collision_capacity=settings.collision_capacity,
-        controller_velocity=settings.controller_velocity,
         initial_velocity=settings.initial_velocity,
     )
-    return with_substeps(problem, Twin(topology=topology, material=material, simulation=simulation))
+    return with_substeps(Twin(topology=topology, material=material, simulation=simulation), settings, problem.quirks.frame_time_667)
 
 
-def homogeneous(values: dict[str, float], springs: int) -> Material:
-    """A material that is the same everywhere; `values` has a number for every field of `Material` without a default."""
-    every = {f.name: f for f in fields(Material) if f.name in values or (f.default is MISSING and f.default_factory is MISSING)}
-    numbers: dict[str, Any] = {name: values[name] for name in every}
-    arrays = {name: np.full(springs, values[name]) for name, f in every.items() if "shape" in f.metadata}
-    return Material(**(numbers | arrays))
-
-
-def recordings(problem: SearchProblem, loss: FrameLoss) -> dict[int, Recording]:
-    """The recordings that count, by the place of their twin in a candidate's family; 0 is the scenario's own."""
-    own = {} if problem.leave_out else {0: Recording.judged(problem.observations, problem.velocity, loss, problem.device)}
-    return own | dict(enumerate(problem.pool, start=1))
-
-
-def still_cost(problem: SearchProblem, loss: FrameLoss) -> float:
-    """What a twin costs that stays where it is in frame 0, m^2."""
+def still_cost(recordings: Sequence[Recording]) -> float:
+    """Cost of a twin that stays where it is in frame 0, m^2."""
     costs = []
-    for one in recordings(problem, loss).values():
-        nodes = torch.tensor(one.observations.nodes, dtype=torch.float32, device=problem.device)
+    for one in recordings:
+        nodes = torch.tensor(one.observations.nodes, dtype=torch.float32, device=one.hands.device)
         costs.append(np.mean([float(one.loss(frame, nodes)) for frame in range(1, len(one.hands))]))
     return float(np.mean(costs))
 
 
-def groups(problem: SearchProblem, twins: Sequence[Twin]) -> list[list[int]]:
-    """Which candidates are simulated together, the slowest group first.
+def groups(twins: Sequence[Twin], device: str, together: int, threads: int) -> list[list[int]]:
+    """Candidates that are simulated together, the slowest group first; see `SearchProblem.together`.
 
-    On CUDA all. On a CPU lanes wait for their group's largest number of substeps, and work on all springs of their group: alike
-    ones are put together, such that the expected time of `threads` is least.
+    On a CPU lanes wait for their group's largest number of substeps, so alike ones are put together, and every thread has a group.
     """
-    if problem.device != "cpu":
-        size = problem.together or len(twins)
-        return [list(range(first, min(first + size, len(twins)))) for first in range(0, len(twins), size)]
-    substeps = [twin.simulation.substeps for twin in twins]
-    springs = [len(twin.topology.springs) for twin in twins]
-    order = sorted(range(len(twins)), key=lambda k: -substeps[k])
-    most = min(problem.together or LANE_WIDTHS[-1], LANE_WIDTHS[-1])
-
-    def time_of(members: Sequence[int]) -> float:
-        return COST[width_for(len(members))] * substeps[members[0]] * max(springs[k] for k in members)
-
-    parts = [order[first:last] for first in range(len(order)) for last in range(first + 1, min(first + most, len(order)) + 1)]
-    times = {(part[0], len(part)): time_of(part) for part in parts}
-
-    def split(limit: float) -> tuple[float, float, list[list[int]]]:
-        """(time of all threads, sum, groups) of the split with the least sum, in which no group of several takes longer."""
-        best: list[tuple[float, float, list[list[int]]]] = [(0.0, 0.0, [])]
-        for first in reversed(range(len(order))):
-            choices = []
-            for size in range(1, min(most, len(order) - first) + 1):
-                own = times[order[first], size]
-                total, longest, rest = best[len(order) - first - size]
-                if size == 1 or own <= limit:
-                    choices.append((total + own, max(longest, own), [order[first : first + size], *rest]))
-            best.append(min(choices, key=lambda choice: choice[0]))
-        total, longest, split_parts = best[-1]
-        return max(total / problem.threads, longest), total, split_parts
-
-    return min(map(split, set(times.values())), key=lambda choice: choice[:2])[2]
+    if device != "cpu":
+        order, size = list(range(len(twins))), together or len(twins)
+    else:
+        order = sorted(range(len(twins)), key=lambda k: -twins[k].simulation.substeps)
+        size = min(together or LANE_WIDTHS[-1], LANE_WIDTHS[-1], -(-len(twins) // threads))
+    return [order[first : first + size] for first in range(0, len(twins), size)]
 
 
-def made(problem: SearchProblem, normalized: np.ndarray) -> tuple[dict[str, Any], tuple[Twin, ...]]:
-    """A candidate's row, its cost the penalty, and its twin, here and on each recording of the pool.
+def made(problem: SearchProblem, normalized: np.ndarray, push: bool = False) -> tuple[dict[str, Any], tuple[Twin, ...]]:
+    """A candidate's row, its cost the penalty, and its twin on each recording.
 
     None, with the reason in the row, if one cannot be integrated.
     """
     start = time.perf_counter()
-    values = problem.decode(normalized)
-    row: dict[str, Any] = {"rollout": 0, "generation": 0, "stage": CMAES, "push": problem.push, "cost": PENALTY, "reason": ""}
+    values, settings, released = problem.decode(normalized), problem.simulation, problem.quirks.frame_time_667
+    row: dict[str, Any] = {"rollout": 0, "generation": 0, "stage": CMAES, "push": push, "cost": PENALTY, "reason": ""}
     row |= {"springs": 0, "substeps": 0, "collision_overflow": 0, "seconds": 0.0}
     row |= values | {f"normalized.{name}": float(u) for name, u in zip(problem.variables, normalized, strict=True)}
     family: tuple[Twin, ...] = ()
     try:
-        twin = candidate(problem, values)
+        twin = candidate(problem, values, push)
         row |= {"springs": len(twin.topology.springs), "substeps": twin.simulation.substeps}
-        moved = (on_recording(twin, recording.observations, problem.quirks) for recording in problem.pool)
-        family = (twin, *(with_substeps(problem, one) for one in moved))
+        family = (twin, *(with_substeps(in_pool(twin, seen, released), settings, released) for seen in problem.pool))
     except NumericalFailure as failure:
         row["reason"] = str(failure)
     except stability.Unstable as failure:
@@ -308,20 +255,20 @@ def made(problem: SearchProblem, normalized: np.ndarray) -> tuple[dict[str, Any]
 
 
 def evaluate(
-    problem: SearchProblem, population: Sequence[np.ndarray], loss: FrameLoss, index: int, generation: int, each: Map
+    problem: SearchProblem, population: Sequence[np.ndarray], push: bool, index: int, generation: int, each: Map = map
 ) -> list[dict[str, Any]]:
-    """Rows of the trace for the candidates of a generation, numbered from `index` on."""
-    candidates = list(each(lambda normalized: made(problem, normalized), population))
+    """Rows of the trace for the candidates of a generation, numbered from `index` on; `each` may work in several threads."""
+    candidates = list(each(lambda normalized: made(problem, normalized, push), population))
     for number, (row, _) in enumerate(candidates):
         row |= {"rollout": index + number, "generation": generation}
     rows, families = [row for row, family in candidates if family], [family for _, family in candidates if family]
-    twins, counted = [family[0] for family in families], recordings(problem, loss)
+    device, recordings = problem.device, problem.recordings
 
     def simulate(members: list[int]) -> None:
         start = time.perf_counter()
         results = [
-            outcomes([families[k][place] for k in members], one.hands, one.velocity, one.loss, problem.device)
-            for place, one in counted.items()
+            outcomes([families[k][place] for k in members], one.hands, one.velocity, one.loss, device)
+            for place, one in enumerate(recordings)
         ]
         share = (time.perf_counter() - start) / len(members)
         for k, result in zip(members, map(mean_outcome, zip(*results, strict=True)), strict=True):
@@ -332,9 +279,10 @@ def evaluate(
             else:
                 rows[k]["cost"] = min(result.cost, PENALTY)
 
+    twins = [family[0] for family in families]
     # Threads would meet in the one stream of a GPU.
-    simulated = each if problem.device == "cpu" else map
-    list(simulated(simulate, groups(problem, twins) if twins else []))
+    simulated = each if device == "cpu" else map
+    list(simulated(simulate, groups(twins, device, problem.together, problem.threads) if twins else []))
     return [row for row, _ in candidates]
 
 

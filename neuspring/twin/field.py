@@ -15,7 +15,7 @@ import torch
 from torch import nn
 from torch.nn.functional import embedding_bag
 
-from neuspring.config import SpringField as Settings
+from neuspring.config import SpringFieldSettings as Settings
 
 AXES = ((0, 1), (1, 2), (0, 2))
 """Coordinates that span the planes xy, yz, xz."""
@@ -109,7 +109,7 @@ class SpringField(nn.Module):
         self.planes = None
         if settings.triplane:
             self.planes = TriPlane(mapped, self.resolution, settings.channels, settings.texel_scale, generator)
-        widths = [self.encoded().shape[1], settings.hidden, settings.hidden, outputs]
+        widths = [self.encoded().shape[1], *[settings.hidden] * (settings.layers - 1), outputs]
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(widths))
         with torch.no_grad():
             for layer in self.layers:

@@ -25,7 +25,6 @@ import numpy as np
 import torch
 
 from neuspring import config
-from neuspring.config import Kind
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.checkpoint import Checkpoint, TrainingLoop, adam_arrays, restore_adam
 from neuspring.core.errors import InputError, NumericalFailure
@@ -34,10 +33,11 @@ from neuspring.physics.controllers import ControllerSprings, waypoints
 from neuspring.physics.parameters import Parameters
 from neuspring.physics.solver import AdjointLimit, FrameWindow, simulate_frame, solver_for
 from neuspring.twin.batch import Lane
+from neuspring.twin.body import Learned, body_of
 from neuspring.twin.losses import FrameLoss, frames_seen
 from neuspring.twin.parameters import TwinParameters, median_gradient, movement, topology_spacing, watched
 from neuspring.twin.rollout import initial_velocity
-from neuspring.twin.transfer import on_recording, require_pool
+from neuspring.twin.transfer import in_pool
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,32 +57,31 @@ class NonFinite(ArithmeticError):
     """A loss or gradient is not finite; says where."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FitProblem:
     """Everything that a fit is made from."""
 
     observations: Observations
     twin: Twin
     fit: config.Fit
-    simulation: config.Simulation
+    simulation: config.SimulationSettings
     losses: config.Losses
     quirks: config.ReleasedQuirks
     device: str = "cpu"
-    kind: Kind = "springs"
+    kind: str = "springs"
+    """Of the body's `fits`."""
     seed: int = 0
     """Seed of the field's first weights."""
     oracle: bool = False
     """Fit all frames, the future included: no prediction, but what fitting could reach at best."""
     pool: Sequence[Observations] = ()
     """Other recordings of the object, that one material is fitted on together with `observations`."""
-    leave_out: bool = False
-    """Fit the pool alone: only frame 0 of `observations` is used."""
 
     def __post_init__(self) -> None:
-        require_pool(self.observations, self.pool, self.leave_out)
-        if (self.kind == "rod") != (self.twin.rod is not None):
-            body = "a rod" if self.twin.rod is not None else "a lattice"
-            raise InputError("fit, kind", "rods are fitted as rod, lattices as springs or field", f"{self.kind} of {body}")
+        body = body_of(self.twin)
+        body.require_pool(self.observations, self.pool)
+        if self.kind not in body.fits:
+            raise InputError("fit, kind", f"a {body.name} is fitted as {' or '.join(body.fits)}", self.kind)
         if self.oracle and self.fit.selection == "tail":
             raise InputError("fit.selection", "an oracle is fitted on all frames and holds none back", "tail", "Use training_loss.")
 
@@ -91,34 +90,34 @@ class FitProblem:
         """Frames that the fit reads, from frame 0 on: those before the split; all of them for an oracle."""
         return frames_seen(self.observations, oracle=self.oracle)
 
+    @property
+    def epoch_frames(self) -> int:
+        """Frames that an epoch simulates, on all recordings."""
+        return sum(frames_seen(one, oracle=self.oracle) - 1 for one in (self.observations, *self.pool))
 
-@dataclass(frozen=True)
-class FitResult:
+
+@dataclass(frozen=True, kw_only=True)
+class FitResult(Learned):
     """The best twin, and the history: one row per epoch (epoch, loss, tail_loss, gradient_norm, rolled_back, learning_rate).
 
     Gradients are those of the loss in its unit (`fit.loss_unit`).
     """
 
-    twin: Twin
     history: pd.DataFrame
     best_epoch: int
     """The epoch whose end is the result; -1 is the start."""
     best_loss: float
-    """What selected it: training loss or tail loss, m^2."""
+    """Training loss or tail loss that selected it, m^2."""
     rollbacks: list[str]
-    attempts: int
-    """1, plus one for every time the fit continued from a checkpoint."""
-    earlier_seconds: float
-    """Wall time of the attempts that this one continued, up to their last checkpoint."""
     earlier_processor_seconds: float
-    """Processor time of the same; of what ran together with other fits, this one's share."""
+    """Processor time of earlier attempts; of epochs that ran together with other fits, this one's share."""
     collision_overflow: int
     frames_left_out: int
     """Frames that were left out of gradients (`AdjointLimit`), over all epochs that were not rolled back."""
     epochs_together: int
     """Epochs that ran together with those of other fits."""
     figures: dict[str, Any]
-    """What moved and what was in the way (`movement`), and gradient_over_epsilon."""
+    """Numbers on what moved and what was in the way (`movement`), and gradient_over_epsilon."""
 
 
 @dataclass
@@ -368,12 +367,11 @@ class PooledFit(TwinFit):
     """
 
     def __init__(self, problem: FitProblem) -> None:
-        alone = replace(problem, pool=(), leave_out=False)
+        alone = replace(problem, pool=())
         super().__init__(alone)
-        moved = [(on_recording(problem.twin, observations, problem.quirks), observations) for observations in problem.pool]
-        self._leave_out = problem.leave_out
-        self._members = [] if problem.leave_out else [self._member(alone)]
-        self._members += [self._member(replace(alone, twin=twin, observations=seen)) for twin, seen in moved]
+        moved = [(in_pool(problem.twin, seen, problem.quirks.frame_time_667), seen) for seen in problem.pool]
+        own = (problem.twin, problem.observations)
+        self._members = [self._member(replace(alone, twin=twin, observations=seen)) for twin, seen in [own, *moved]]
 
     def _member(self, problem: FitProblem) -> TwinFit:
         """The fit of one recording, which trains this one's parameters with this one's optimizer."""
@@ -387,10 +385,8 @@ class PooledFit(TwinFit):
         member.loss_scale = self.loss_scale
         return member
 
-    @property
-    def one_step(self) -> bool:
-        """Whether an epoch is a single optimizer step: never of several recordings."""
-        return len(self._members) == 1 and self._members[0].one_step
+    one_step = False
+    """An epoch makes a step per recording at least."""
 
     @property
     def collision_overflow(self) -> int:
@@ -407,8 +403,6 @@ class PooledFit(TwinFit):
         """The present parameters, packed, after seeing that they can be integrated on every recording. Raises NonFinite."""
         for member in self._members:
             member.stable_parameters()
-        if self._leave_out:
-            super().stable_parameters()
         self.use_substeps(max(run.twin.simulation.substeps for run in [self, *self._members]))
         return self.parameters.pack(self.twin.simulation.substep)
 
@@ -417,8 +411,6 @@ class PooledFit(TwinFit):
         for member in self._members:
             member.gradients = self.gradients
         rows = [member.epoch() for member in self._members]
-        if len(rows) == 1:
-            return rows[0]
         return {
             "loss": sum(row["loss"] for row in rows) / len(rows),
             "gradient_norm": max(row["gradient_norm"] for row in rows),
@@ -467,19 +459,39 @@ def fit(
     run.parameters.restore(state.best_values)
     run.use_substeps(state.best_substeps)
     best = run.parameters.as_twin(run.twin)
+    history, figures = pd.DataFrame(loop.history), run.figures(state)
+    left_out = sum(row["frames_left_out"] for row in loop.history)
+    frames, counts = problem.epoch_frames, best.counts
+    facts = {
+        "best_epoch": state.best_epoch,
+        "best_loss": state.best_loss,
+        "epochs": len(history),
+        "epochs_asked": problem.fit.epochs,
+        "epochs_together": loop.epochs_together,
+        "earlier_processor_seconds": round(loop.earlier_processor_seconds, 3),
+        "rollbacks": state.rollbacks,
+        "collision_overflow": state.overflow,
+        "frames_left_out": round(left_out / (len(history) * frames), 4),
+        **figures,
+        # Those that ran together count in the record of `fits`.
+        "spring_updates": (len(history) - loop.epochs_together) * frames * counts["springs"] * counts["substeps"],
+        **counts,
+    }
     return FitResult(
-        best,
-        pd.DataFrame(loop.history),
-        state.best_epoch,
-        state.best_loss,
-        state.rollbacks,
-        loop.attempts,
-        loop.earlier_seconds,
-        loop.earlier_processor_seconds,
-        state.overflow,
-        sum(row["frames_left_out"] for row in loop.history),
-        loop.epochs_together,
-        run.figures(state),
+        twin=best,
+        history=history,
+        course=history.set_index("epoch")[["loss", "tail_loss", "gradient_norm", "learning_rate"]],
+        facts=facts,
+        attempts=loop.attempts,
+        earlier_seconds=loop.earlier_seconds,
+        best_epoch=state.best_epoch,
+        best_loss=state.best_loss,
+        rollbacks=state.rollbacks,
+        earlier_processor_seconds=loop.earlier_processor_seconds,
+        collision_overflow=state.overflow,
+        frames_left_out=left_out,
+        epochs_together=loop.epochs_together,
+        figures=figures,
     )
 
 

@@ -20,7 +20,6 @@ import torch
 from torch import nn
 
 from neuspring import config
-from neuspring.config import Kind
 from neuspring.core.artifacts import Topology, Twin
 from neuspring.physics.parameters import CONTACT_LIMITS, Parameters, pack, twin_tensors
 from neuspring.twin.field import SpringField, midpoints
@@ -74,7 +73,7 @@ def topology_spacing(topology: Topology) -> float:
 class TwinParameters(nn.Module):
     """The trained tensors of a twin, as a module: `named_parameters` is the checkpoint's content."""
 
-    def __init__(self, twin: Twin, settings: config.Fit, kind: Kind, device: str, seed: int = 0) -> None:
+    def __init__(self, twin: Twin, settings: config.Fit, kind: str, device: str, seed: int = 0) -> None:
         super().__init__()
         self.settings, self.kind = settings, kind
         self.start = twin_tensors(twin, device)
@@ -112,9 +111,9 @@ class TwinParameters(nn.Module):
             groups.append((self.field.layers.parameters(), rate))
             if self.field.planes is not None:
                 groups.append((self.field.planes.parameters(), s.field.plane_learning_rate or rate))
-        groups.append((self.scalars.values(), s.scalar_learning_rate or rate))
+        groups.append((self.scalars.values(), rate))
         if self.factors:
-            groups.append((self.factors.values(), s.factor_learning_rate or s.scalar_learning_rate or rate))
+            groups.append((self.factors.values(), s.factor_learning_rate or rate))
         return [{"params": list(each), "lr": rate, "base_rate": rate} for each, rate in groups]
 
     def deviation(self) -> torch.Tensor:

@@ -2,26 +2,24 @@
 
 A round first asks for slopes: the base and one neighbor per variable. Their residuals r (losses.py, |r|^2 is the cost; points stay
 assigned as in the base, so that r is smooth) give the products J'J and J'r of finite differences. Then it asks for four damped
-steps d of the normalized variables,
-
-    (J'J + damping diag J'J) d = -J'r        within the ranges, and at most `REACH` per variable,
-
-and takes the best of them if it costs less than the base. Nothing but the costs and products that it is told decides what it asks
-for next, so a polish is replayed from its record.
+steps (levenberg.py) of the normalized variables, within the ranges and at most `REACH` per variable, and takes the best of them if
+it costs less than the base. Nothing but the costs and products that it is told decides what it asks for next, so a polish is
+replayed from its record.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 
 from neuspring.config.search import TRIALS, Search
-from neuspring.twin.candidates import PENALTY, Map, SearchProblem, made, recordings
+from neuspring.twin.candidates import PENALTY, Map, SearchProblem, made
+from neuspring.twin.levenberg import LevenbergMarquardt
 from neuspring.twin.losses import OF_IMAGES, TERMS, FrameLoss
 from neuspring.twin.rollout import FAR
 from neuspring.twin.trials import motions
@@ -36,39 +34,33 @@ TOLERANCE = 1e-3
 """A round whose step lowers the cost by less than this fraction of it is the last."""
 REACH = 0.25
 """Longest step of a round in a normalized variable."""
-FIRST_DAMPING, MOST_DAMPING = 0.1, 1e4
 FACTORS = tuple(10.0 ** (k - TRIALS + 2) for k in range(TRIALS))
 """What the damping is multiplied with, for each step that is tried: from 0.01 to 10."""
 
 
-@dataclass
-class Polish:
+class Polish(LevenbergMarquardt):
     """The state of a polish: its base, and what is asked for next."""
 
-    search: Search
-    columns: Sequence[int]
-    """Places of the polished variables among the searched ones."""
-    base: np.ndarray
-    """Normalized variables of the best candidate so far."""
-    cost: float
-    damping: float = FIRST_DAMPING
-    stage: str = SLOPES
-    """Stage of the candidates that are asked for now."""
-    rounds: int = 0
-    """Rounds that are done."""
-    finished: bool = False
-    _products: np.ndarray = field(init=False)
-    _gradient: np.ndarray = field(init=False)
-    _asked: list[np.ndarray] = field(init=False, default_factory=list)
+    def __init__(self, search: Search, columns: Sequence[int], base: np.ndarray, cost: float) -> None:
+        """`base`: normalized variables, of which those at `columns` are polished."""
+        raised = 10 * FACTORS[-1] / FACTORS[0]
+        options: dict[str, Any] = {"damping": 0.1, "most": 1e4, "tolerance": TOLERANCE}
+        super().__init__(base=base, cost=cost, factors=FACTORS, raised=raised, **options)
+        self._most_rounds, self.columns = search.polish_rounds, list(columns)
+        self.stage = SLOPES
+        """Stage of the candidates that are asked for now."""
+        self.rounds = 0
+        """Rounds that are done."""
+        self._asked: list[np.ndarray] = []
 
     @property
     def done(self) -> bool:
-        """Whether nothing more is asked for."""
-        return self.finished or self.rounds >= self.search.polish_rounds
+        """True where nothing more is asked for."""
+        return self.finished or self.rounds >= self._most_rounds
 
     def steps(self) -> np.ndarray:
         """Signed steps of the finite differences: downwards, where a twin needs no more substeps, but at a lower bound."""
-        here, step = self.base[list(self.columns)], STEP
+        here, step = self.base[self.columns], STEP
         return np.where(here - step < 0, step, -step)
 
     def ask(self) -> list[np.ndarray]:
@@ -76,12 +68,12 @@ class Polish:
         if self.stage == SLOPES:
             moves = [np.zeros(len(self.columns)), *np.diag(self.steps())]
         else:
-            here = self.base[list(self.columns)]
+            here = self.base[self.columns]
             low, high = np.maximum(-here, -REACH), np.minimum(1 - here, REACH)
-            moves = [damped_step(self._products, self._gradient, self.damping * factor, low, high) for factor in FACTORS]
+            moves = self.moves(self._products, self._gradient, low, high)
         self._asked = [self.base.copy() for _ in moves]
         for candidate, move in zip(self._asked, moves, strict=True):
-            candidate[list(self.columns)] = np.clip(candidate[list(self.columns)] + move, 0, 1)
+            candidate[self.columns] = np.clip(candidate[self.columns] + move, 0, 1)
         return self._asked
 
     def tell(self, rows: Sequence[dict[str, Any]]) -> None:
@@ -94,36 +86,9 @@ class Polish:
             self.stage = POLISH
             return
         self.rounds += 1
-        costs = [row["cost"] for row in rows]
-        best = int(np.argmin(costs))
-        if costs[best] < self.cost:
-            self.finished = self.cost - costs[best] < TOLERANCE * self.cost
-            self.base, self.cost = np.asarray(self._asked[best]), costs[best]
-            self.damping *= FACTORS[best]
+        # Where none was taken, the slopes are still those of the base.
+        if self.take(self._asked, [row["cost"] for row in rows]) is not None:
             self.stage = SLOPES
-        else:
-            # The slopes are still those of the base; shorter steps are tried.
-            self.damping *= 10 * FACTORS[-1] / FACTORS[0]
-            self.finished = self.damping > MOST_DAMPING
-
-
-def damped_step(products: np.ndarray, gradient: np.ndarray, damping: float, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """d that solves (A + damping diag A) d = -g for A [V, V], g [V], and low <= d <= high; what leaves is held at its bound."""
-    scale = np.diag(products)
-    # A variable without effect stays where it is.
-    matrix = products + damping * np.diag(np.maximum(scale, 1e-12 * scale.max()))
-    step, free = np.zeros(len(gradient)), scale > 1e-12 * scale.max()
-    while free.any():
-        rest = -(gradient + matrix[:, ~free] @ step[~free])
-        step[free] = np.linalg.solve(matrix[np.ix_(free, free)], rest[free])
-        beyond = np.where(free, np.maximum(low - step, step - high), 0.0)
-        if beyond.max() <= 0:
-            break
-        # One at a time: where it is held, others may not leave any more.
-        worst = int(np.argmax(beyond))
-        step[worst] = np.clip(step[worst], low[worst], high[worst])
-        free[worst] = False
-    return step
 
 
 def residuals(
@@ -175,11 +140,11 @@ def products(
 def slope_rows(
     problem: SearchProblem,
     population: Sequence[np.ndarray],
+    push: bool,
     steps: np.ndarray,
-    loss: FrameLoss,
     index: int,
     generation: int,
-    each: Map,
+    each: Map = map,
 ) -> list[dict[str, Any]]:
     """Rows of a base and its neighbors, with the products of their slopes.
 
@@ -189,13 +154,13 @@ def slope_rows(
     variable does.
     """
     clock = time.perf_counter()
-    candidates = list(each(lambda normalized: made(problem, normalized), population))
+    candidates = list(each(lambda normalized: made(problem, normalized, push), population))
     base = candidates[0][1]
     assert base, "the base was simulated before"
     families = [family or base for _, family in candidates]
     most = [max(twin.simulation.substeps for twin in twins) for twins in zip(*families, strict=True)]
     fine, seen = [bool(family) for _, family in candidates], []
-    for place, recording in recordings(problem, loss).items():
+    for place, recording in enumerate(problem.recordings):
         twins = [family[place] for family in families]
         twins = [replace(twin, simulation=replace(twin.simulation, substeps=most[place])) for twin in twins]
         positions, velocities = motions(twins, recording.hands, recording.velocity, problem.device)

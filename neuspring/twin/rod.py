@@ -19,9 +19,9 @@ from neuspring import config
 from neuspring.config.search import VARIABLES
 from neuspring.core.artifacts import Observations, Rod, Simulation, Twin
 from neuspring.core.errors import InputError
+from neuspring.physics.parameters import homogeneous
 from neuspring.physics.rod_nodes import bind, bound, frame_zero, place_on, radius_of, settled
-from neuspring.twin.candidates import homogeneous
-from neuspring.twin.topology import build, controller_reach, controller_springs, node_spacing
+from neuspring.twin.topology import build, controller_reach, controller_springs, infer_controller_radius, node_spacing
 
 MOST_STRETCH = 0.1
 """Relative difference in length of the center lines of two recordings of one body, at most."""
@@ -118,8 +118,6 @@ def on_recording(twin: Twin, observations: Observations) -> Twin:
     that comes first in x, and the rod is turned about itself as the unloaded curvatures ask. Raises InputError if the
     bodies have other vertices, or another length.
     """
-    from neuspring.twin.transfer import infer_controller_radius
-
     rod, where = twin.rod, f"transfer to {observations.scenario.name}"
     assert rod is not None
     nodes, hands, held = observations.nodes, observations.controller_points[0], _line(observations)

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,15 +24,16 @@ import torch
 
 from neuspring import config
 from neuspring.config.rod import RodFit
-from neuspring.core.artifacts import Observations, Residual, Rod, Twin
+from neuspring.core.artifacts import Observations, Rod, Twin
 from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.files import write_table
 from neuspring.core.text import Progress
 from neuspring.physics.controllers import waypoints
 from neuspring.physics.rod_nodes import RodFrames, settled, turn_of
-from neuspring.twin import residual
 from neuspring.twin import rod as rods
+from neuspring.twin.body import Learned
+from neuspring.twin.levenberg import LevenbergMarquardt
 from neuspring.twin.losses import frames_seen
-from neuspring.twin.polish import damped_step
 from neuspring.twin.rollout import initial_velocity
 
 if TYPE_CHECKING:
@@ -47,7 +49,6 @@ LEAST_GAIN = 2e-3
 """A step that lowers the objective by less than this part of it is a stage's last."""
 DAMPINGS = (0.1, 1.0, 10.0, 100.0)
 """What the damping is multiplied with, for each step that is tried."""
-FIRST_DAMPING, MOST_DAMPING = 1e-2, 1e6
 LANES = 512
 """Rollouts that run in one solver at most."""
 SCALES = {
@@ -212,24 +213,6 @@ class Recordings:
         found = torch.stack(kept, dim=1).reshape(len(twins), count, len(kept), tracked, 3).numpy()
         return np.asarray(np.nan_to_num(found, nan=FARTHEST * 10, posinf=FARTHEST * 10, neginf=-FARTHEST * 10))
 
-    def residual(self, twin: Twin, device: str) -> Residual:
-        """What a regression learns of the errors of a twin. Raises InputError for less than two recordings."""
-        found = self.predicted([twin], len(self.hands), 1, device)[0]
-        lines = []
-        for each, later, seen in zip(self.observations, found, self.counts, strict=True):
-            last = int(seen.any(axis=1).sum())
-            points = each.object_points[:last].astype(np.float64)
-            predicted = np.concatenate([points[:1], later[: last - 1]])
-            hands = each.controller_points[:last]
-            lines.append([np.concatenate([nodes, hands], axis=1) for nodes in (predicted, points)])
-            count = len(each.nodes) - points.shape[1]
-            # Tracked points are the first nodes; controllers come behind all nodes.
-            index = np.where(each.line >= len(each.nodes), each.line - count, each.line)
-            lines[-1] = [line[:, index] for line in lines[-1]]
-        names = [each.scenario.name for each in self.observations]
-        rollouts, targets = zip(*lines, strict=True)
-        return residual.fit(rollouts, targets, names, twin.simulation.frame_time, _rod(twin).held < 0)
-
 
 def _paths(pairs: Sequence[tuple[Observations, np.ndarray]]) -> torch.Tensor:
     """Way points of the hands of recordings, in these frames of each [T, C, hands, 3 or 4]: 4 where some do not always hold."""
@@ -290,50 +273,41 @@ class Levenberg:
         every = self.settings.every
         if frames <= 30 * every:
             every = max(every // 2, 1)
-        scale, b, damping = variables.scale, self.settings.robust, FIRST_DAMPING
+        scale, b = variables.scale, self.settings.robust
         errors = self.errors(variables, [q], frames, every)[0]
         value = float(self.objective(errors, q, scale))
+        descent = LevenbergMarquardt(
+            base=q, cost=value, damping=1e-2, factors=DAMPINGS, raised=DAMPINGS[-1] * 10, least=1e-6, most=1e6, tolerance=LEAST_GAIN
+        )
         for _ in range(self.settings.rounds):
-            steps = np.diag(STEP * scale)
+            q, steps, bound = descent.base, np.diag(STEP * scale), np.ones(len(scale))
             # In the units of their scales, so that bounds and damping mean the same for all.
             slopes = (self.errors(variables, list(q + steps), frames, every) - errors) / STEP
             weights = 1 / np.sqrt(errors**2 + b**2) / len(errors)
             products = (slopes * weights) @ slopes.T + 2 * PRIOR * np.eye(len(q))
             gradient = slopes @ (weights * errors) + 2 * PRIOR * q / scale
-            bound = np.ones(len(q))
-            while damping <= MOST_DAMPING:
-                tried = [q + scale * damped_step(products, gradient, damping * factor, -bound, bound) for factor in DAMPINGS]
+            best = None
+            while best is None and descent.damping <= descent.most:
+                tried = [q + scale * move for move in descent.moves(products, gradient, -bound, bound)]
                 found = self.errors(variables, tried, frames, every)
-                values = self.objective(found, np.array(tried), scale)
-                best = int(np.argmin(values))
-                if values[best] < value:
-                    break
-                damping *= DAMPINGS[-1] * 10
-            else:
-                return q
-            gain = (value - float(values[best])) / value
-            q, errors, value = tried[best], found[best], float(values[best])
-            damping = max(damping * DAMPINGS[best], 1e-6)
-            report(
-                {"loss": float(3 * np.mean(errors**2)), "gradient_norm": float(np.linalg.norm(gradient)), "learning_rate": damping}
-            )
-            if gain < LEAST_GAIN:
+                best = descent.take(tried, list(self.objective(found, np.array(tried), scale)))
+            if best is None:
                 break
-        return q
+            errors, norm = found[best], float(np.linalg.norm(gradient))
+            report({"loss": float(3 * np.mean(errors**2)), "gradient_norm": norm, "learning_rate": descent.damping})
+            if descent.finished:
+                break
+        return descent.base
 
 
-@dataclass(frozen=True)
-class RodResult:
+@dataclass(frozen=True, kw_only=True)
+class RodResult(Learned):
     """The best rod, and how it was found."""
 
-    twin: Twin
     value: float
     """The objective at the end, m."""
     history: pd.DataFrame
     """A row per step: stage, loss (mean squared error of the horizon's frames, m^2), gradient_norm, learning_rate (the damping)."""
-    rollouts: int
-    facts: dict[str, Any]
-    """What a reader of the record wants to know of the rod."""
 
 
 def search_rod(
@@ -341,24 +315,31 @@ def search_rod(
     pool: Sequence[Observations],
     settings: config.Config,
     *,
-    leave_out: bool = False,
     device: str = "cpu",
     threads: int = 1,
+    record: Path | None = None,
 ) -> RodResult:
-    """The constants of a rod, on the frames of the first horizon.
+    """The constants of a rod, on the frames of the first horizon; a row per step goes to the file `record`.
 
     A turn of the last clamp against the first is known but for whole turns. Of `rod.axes` that axis is taken for which turns in
     frame 0 of the recordings lie farthest from half a turn, where recordings of one body would be told apart by a whole one.
     """
+    import pandas as pd
+
+    require_pool(observations, pool)
     first = replace(settings.fit.rod, stiffness="constant", curvature="constant", markers=False)
     first = replace(first, horizons=first.horizons[:1])
-    seen = [] if leave_out else [observations]
-    lines = [rods.line_of(each) for each in [*seen, *pool] if each.line.size]
+    lines = [rods.line_of(each) for each in [observations, *pool] if each.line.size]
     axis = max(settings.rod.axes, key=lambda axis: sum(np.cos(turn_of(line, np.array(axis))) for line in lines))
     start = rods.rod_twin(observations, settings, axis)
-    solver = Levenberg(_recordings(observations, pool, leave_out, start), first, device, threads)
+    solver = Levenberg(Recordings.of([observations, *pool], start), first, device, threads)
     twin, value, history = solver.lowered(start, Progress(f"search {observations.scenario.name}, rod", first.rounds))
-    return _result(twin, value, history, solver.rollouts)
+    found = _result(twin, value, history)
+    if record is not None:
+        write_table(found.history, record)
+    costs = found.history["loss"]
+    facts = {"cost": value, "rollouts": solver.rollouts, "collision_overflow": 0, **found.facts, **twin.counts}
+    return replace(found, course=pd.DataFrame({"cost": costs, "best_cost": costs.cummin()}), facts=facts)
 
 
 def fit_rod(
@@ -367,40 +348,36 @@ def fit_rod(
     twin: Twin,
     settings: RodFit,
     *,
-    leave_out: bool = False,
     oracle: bool = False,
     device: str = "cpu",
     threads: int = 1,
 ) -> RodResult:
     """All variables of a rod, stage by stage, from the twin of its search. Raises InputError, NumericalFailure."""
-    recordings = _recordings(observations, pool, leave_out, twin, oracle)
-    if settings.residual and not (len(recordings.observations) > 1 and _rod(twin).line.size):
-        rule = "a residual is learned on two or more recordings of a cable with markers"
-        raise InputError("fit.rod.residual", rule, len(recordings.observations), "Name a pool (`pools`), or choose row rod_single.")
+    recordings = Recordings.of([observations, *pool], twin, oracle)
     solver = Levenberg(recordings, settings, device, threads)
     progress = Progress(f"fit {observations.scenario.name}, rod", settings.rounds * len(settings.horizons))
     twin, value, history = solver.lowered(twin, progress)
     # Where markers lie beside the line, frame 0 has another line now.
     twin = rods.on_recording(twin, observations)
-    result = _result(twin, value, history, solver.rollouts)
-    if not settings.residual:
-        return result
-    learned = recordings.residual(twin, device)
-    facts = result.facts | {"ridge": learned.ridge, "left_out": learned.left_out}
-    return replace(result, twin=replace(twin, residual=learned), facts=facts)
+    found = _result(twin, value, history)
+    counted = {"best_loss": value, "steps": len(history), "rollouts": solver.rollouts, "collision_overflow": 0}
+    return replace(found, facts=counted | found.facts | twin.counts)
 
 
-def _recordings(
-    observations: Observations, pool: Sequence[Observations], leave_out: bool, twin: Twin, oracle: bool = False
-) -> Recordings:
-    seen = [*([] if leave_out else [observations]), *pool]
-    if len(seen) > 1 and not observations.line.size:
+def require_pool(here: Observations, pool: Sequence[Observations]) -> None:
+    """Raise InputError unless recordings have one center line: as many tracked points, hands and vertices."""
+    name, counts = f"pool of {here.scenario.name}", (here.object_points.shape[1], here.controller_points.shape[1])
+    if pool and not here.line.size:
         rule = "recordings of a pool must have markers along the line, for a rod"
-        raise InputError(f"pool of {observations.scenario.name}", rule, "none", "Choose row rod_single.")
-    return Recordings.of(seen, twin, oracle)
+        raise InputError(name, rule, "none", "Choose row rod_single.")
+    for there in pool:
+        received = there.object_points.shape[1], there.controller_points.shape[1]
+        if received != counts or len(there.line) != len(here.line):
+            rule = f"recordings of a pool must have as many tracked points, controllers and vertices: {counts}, {len(here.line)}"
+            raise InputError(name, rule, f"{received}, {len(there.line)} in {there.scenario.name}", "Leave this recording out.")
 
 
-def _result(twin: Twin, value: float, history: list[dict[str, Any]], rollouts: int) -> RodResult:
+def _result(twin: Twin, value: float, history: list[dict[str, Any]]) -> RodResult:
     import pandas as pd
 
     if not history or not np.isfinite(value):
@@ -409,4 +386,7 @@ def _result(twin: Twin, value: float, history: list[dict[str, Any]], rollouts: i
     inner = slice(1, -1)
     facts = {name: float(np.median(getattr(rod, name)[inner])) for name in ("bending", "twisting", "mass")}
     facts |= {name: float(getattr(rod, name)) for name in ("damping", "drag_quadratic", "roll")}
-    return RodResult(twin, value, pd.DataFrame(history), rollouts, facts | {"drag": twin.material.drag, "axis": rod.axis.tolist()})
+    facts |= {"drag": twin.material.drag, "axis": rod.axis.tolist()}
+    table = pd.DataFrame(history)
+    course = table[["loss", "gradient_norm", "learning_rate"]]
+    return RodResult(twin=twin, value=value, history=table, course=course, facts=facts)

@@ -9,10 +9,9 @@ import torch
 
 from neuspring.core.artifacts import InitialVelocity, Observations, Trajectory, Twin
 from neuspring.core.errors import InputError
-from neuspring.physics import stability
 from neuspring.physics.controllers import waypoints
-from neuspring.physics.solver import FrameSolver, solver_for
-from neuspring.twin.residual import corrected
+from neuspring.physics.solver import FrameSolver
+from neuspring.twin.body import body_of
 
 FAR = 1e3
 """A node this far from the origin has left any plausible scene, m."""
@@ -63,9 +62,10 @@ def roll_out(
     `valid` [T, C]: when each controller holds; empty or none: always. Raises Unstable if the substep is beyond the stability bound,
     unless `check` is false: the released simulator does not look.
     """
+    body = body_of(twin)
     if check:
-        stability.check(twin)
-    solver = solver_for(twin, device, differentiable=False)
+        body.check(twin)
+    solver = body.solver(twin, device)
     hands = torch.tensor(np.asarray(controller_points), dtype=torch.float32, device=device)
     positions = [torch.tensor(twin.topology.nodes)]
     diverged, reason = None, ""
@@ -76,11 +76,8 @@ def roll_out(
                 progress(frame)
     except Diverged as end:
         diverged, reason = end.frame, end.reason
-    predicted = torch.stack(positions).numpy()
-    if twin.residual is not None and diverged is None:
-        predicted = corrected(twin, predicted, np.asarray(controller_points)[: len(predicted)]).astype(np.float32)
     return Trajectory(
-        positions=predicted,
+        positions=torch.stack(positions).numpy(),
         frame_count=len(hands),
         diverged_frame=diverged,
         reason=reason,

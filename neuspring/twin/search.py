@@ -11,22 +11,23 @@ recorded costs, the polish with the recorded products.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
-from neuspring.core.artifacts import Twin
+from neuspring.config.search import Search
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_atomically
 from neuspring.core.text import Progress
-from neuspring.twin.candidates import CMAES, OTHER_WAY, PENALTY, UNSTABLE, WAYS, Map, SearchProblem, candidate, evaluate, still_cost
-from neuspring.twin.losses import FrameLoss
+from neuspring.twin.body import Learned
+from neuspring.twin.candidates import CMAES, OTHER_WAY, PENALTY, UNSTABLE, Map, SearchProblem, candidate, evaluate, still_cost
 from neuspring.twin.polish import POLISH, SLOPES, Polish, slope_rows
 
 if TYPE_CHECKING:
@@ -34,6 +35,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+FIRST_STEP = 1 / 6
+"""Initial step of CMA-ES in normalized variables."""
+WAYS = {"hold": (False,), "push": (True,), "auto": (False, True)}
+"""Ways of hands that are judged, by `search.hands`: True where they only push."""
 FREED_SIGMA = 0.06
 """Step of CMA-ES in normalized variables when each region becomes free."""
 MOVES = 0.9
@@ -48,19 +53,20 @@ class Proposals:
     search of cables ended above the uniform one on training frames, although its space contains the other's.
     """
 
-    def __init__(self, problem: SearchProblem, seed: int) -> None:
-        self._problem, self._seed = problem, seed
-        self._tied = problem.search.tied_rollouts if problem.clusters > 1 else 0
-        self._columns = np.arange(len(problem.variables))
+    def __init__(self, start: np.ndarray, variables: Sequence[str], tied: int, seed: int) -> None:
+        """From normalized `variables` at `start` [V]; the first `tied` candidates have regions alike."""
+        self._seed, self._tied = seed, tied
+        self._columns = np.arange(len(variables))
         """Which of the searched variables each variable takes its value from."""
-        searched = problem
-        if self._tied:
-            searched = replace(problem, clusters=1)
-            shared = [name.partition(".")[0] for name in problem.variables]
-            self._columns = np.array([searched.variables.index(name) for name in shared])
-        self._strategy = _strategy(searched.encode(), problem.search.sigma, seed)
+        searched = start
+        if tied:
+            shared = [name.partition(".")[0] for name in variables]
+            names = list(dict.fromkeys(shared))
+            self._columns = np.array([names.index(name) for name in shared])
+            searched = start[[shared.index(name) for name in names]]
+        self._strategy = _strategy(searched, FIRST_STEP, seed)
         self._population: list[np.ndarray] = []
-        self._best = (np.inf, problem.encode())
+        self._best = (np.inf, start)
         self._evaluated = 0
         self.generation = -1
 
@@ -68,7 +74,7 @@ class Proposals:
         """The next generation; the last one with tied regions may be cut short."""
         if self._tied and self._evaluated == self._tied:
             self._strategy = _strategy(self._best[1], FREED_SIGMA, self._seed)
-            self._columns = np.arange(len(self._problem.variables))
+            self._columns = np.arange(len(self._best[1]))
         self._population = self._strategy.ask()
         if self._evaluated < self._tied:
             self._population = self._population[: self._tied - self._evaluated]
@@ -94,18 +100,17 @@ def _strategy(start: np.ndarray, sigma: float, seed: int) -> cma.CMAEvolutionStr
     return cma.CMAEvolutionStrategy(start, sigma, options)
 
 
-@dataclass(frozen=True)
-class SearchResult:
+@dataclass(frozen=True, kw_only=True)
+class SearchResult(Learned):
     """The best twin found, its variables and cost, and the trace: one row per candidate."""
 
-    twin: Twin
     values: dict[str, float]
     cost: float
     trace: pd.DataFrame
-    attempts: int
-    """1, plus one for every time the search continued from its record."""
-    earlier_seconds: float
-    """Wall time of the attempts that this one continued, up to their last complete generation."""
+
+
+Judge = Callable[[Sequence[np.ndarray], bool, int, int], list[dict[str, Any]]]
+"""Rows of candidates [V], given also True where hands only push, the number of the first candidate, and the generation."""
 
 
 def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key: str = "") -> SearchResult:
@@ -114,21 +119,17 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
     The trace is written to `record` after every generation. A trace with the same `key` that is there already is continued,
     whatever its budget was. Raises NumericalFailure if no candidate could be simulated.
     """
-    import pandas as pd
-
-    clock = time.perf_counter()
+    clock, settings, variables = time.perf_counter(), problem.search, problem.variables
     rows, attempts, earlier = recorded_trace(record, key)
     trace, other = ([row for row in rows if row["stage"] == stage] for stage in (CMAES, OTHER_WAY))
     saved = len(trace)
     # One candidate cannot be judged both ways.
-    ways = WAYS[problem.search.hands][: problem.search.cma_rollouts]
-    problem = replace(problem, push=ways[0])
-    proposals = Proposals(problem, seed)
-    loss = FrameLoss.of(problem.observations, problem.losses, problem.device, frozen_counts=problem.quirks.frozen_loss_denominators)
-    budget = problem.search.cma_rollouts
-    progress = Progress(
-        f"search {problem.observations.scenario.name}, regions: {problem.clusters}, seed {seed}", problem.search.rollouts
-    )
+    ways = WAYS[settings.hands][: settings.cma_rollouts]
+    push = ways[0]
+    tied = settings.tied_rollouts if problem.clusters > 1 else 0
+    proposals = Proposals(problem.encode(), variables, tied, seed)
+    budget, name = settings.cma_rollouts, problem.observations.scenario.name
+    progress = Progress(f"search {name}, regions: {problem.clusters}, seed {seed}", settings.rollouts)
 
     def save(kept: list[dict[str, Any]]) -> None:
         if record is not None:
@@ -136,25 +137,26 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
 
     start = 0
     with _threads(problem.threads) as each:
+        judge = partial(evaluate, problem, each=each)
         # The last generation may be cut short, so that searches of any population size use exactly the same budget.
         while start < budget:
             population = proposals.ask()[: budget - start]
             if not start:
                 population = population[: budget // len(ways)]
             stop = start + len(population)
-            if not replays(trace[start:stop], population, problem.variables):
+            if not replays(trace[start:stop], population, variables):
                 print(f"{record}: does not replay on this machine; the search continues afresh from rollout {start}")
                 trace, saved = trace[:start], start
                 if not start:
                     other, attempts, earlier = [], 1, 0.0
             if not start and len(ways) > 1:
                 if len(trace) < stop or len(other) < len(population):
-                    trace, other = _ways(problem, population, loss, ways, each)
+                    trace, other = _ways(judge, population, ways, MOVES * still_cost(problem.recordings))
                 budget -= len(other)
-                problem = replace(problem, push=bool(trace[0]["push"]))
+                push = bool(trace[0]["push"])
             fresh = population[max(len(trace) - start, 0) :]
             if fresh:
-                trace += evaluate(problem, fresh, loss, len(other) + len(trace), proposals.generation, each)
+                trace += judge(fresh, push, len(other) + len(trace), proposals.generation)
             progress.update(len(other) + len(trace), f"best cost {min(row['cost'] for row in trace):.3e}")
             proposals.tell([row["cost"] for row in trace[start:stop]])
             start = stop
@@ -162,31 +164,84 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
                 save(other + trace)
         done, polished = other + trace[:budget], list[dict[str, Any]]()
         recorded = [row for row in rows if row["stage"] not in (CMAES, OTHER_WAY)]
-        for polished in _polished(problem, done, recorded, loss, proposals.generation, each):
+        slopes = partial(slope_rows, problem, each=each)
+        for polished in _polished(settings, variables, done, recorded, proposals.generation, judge, slopes, push):
             if len(polished) > len(recorded) or polished[-1] is not recorded[len(polished) - 1]:
                 save(other + trace + polished)
             progress.update(len(done) + len(polished), "polish")
-    table = pd.DataFrame(done + polished)
+    return _best(problem, done + polished, push, attempts, earlier)
+
+
+def _best(problem: SearchProblem, rows: Sequence[dict[str, Any]], push: bool, attempts: int, earlier: float) -> SearchResult:
+    """The result of a search with these rows. Raises InputError, NumericalFailure if none could be simulated."""
+    import pandas as pd
+
+    table = pd.DataFrame(rows)
+    costs = table["cost"]
+    # Candidates for slopes are never the result.
     judged = table[table["stage"] != SLOPES]
     best = judged.iloc[int(judged["cost"].to_numpy().argmin())]
     if best["cost"] >= PENALTY:
-        if problem.simulation.substeps != "auto" and table["reason"].str.startswith(UNSTABLE).all():
+        substeps = problem.simulation.substeps
+        if substeps != "auto" and table["reason"].str.startswith(UNSTABLE).all():
             rule = f"at least one of {len(table)} candidates must be stable with this count"
-            raise InputError("simulation.substeps", rule, problem.simulation.substeps, str(table.iloc[0]["reason"]))
+            raise InputError("simulation.substeps", rule, substeps, str(table.iloc[0]["reason"]))
         raise NumericalFailure(f"none of {len(table)} candidates could be simulated; the first: {table.iloc[0]['reason']}")
     values = {name: float(best[name]) for name in problem.names}
     if problem.quirks.integer_damping:
         values |= {name: float(int(values[name])) for name in ("drag", "dashpot")}
-    return SearchResult(candidate(problem, values), values, float(best["cost"]), table, attempts, earlier)
+    twin = candidate(problem, values, push)
+    facts: dict[str, Any] = {
+        **values,
+        "hands": "push" if twin.topology.pushes.any() else "hold",
+        "cost": float(best["cost"]),
+        "cost_before_polish": float(costs[table["stage"] == CMAES].min()),
+        "spacing": problem.spacing,
+        "controller_reach": problem.reach,
+        "rollouts": len(table),
+        "failed_rollouts": int((table["reason"] != "").sum()),
+        "collision_overflow": int(table["collision_overflow"].max()),
+        "spring_updates": int((table["springs"] * table["substeps"]).sum()) * sum(one.frames for one in problem.recordings),
+        **twin.counts,
+    }
+    if held := at_ends(table, problem.variables):
+        facts["at_ends"] = ", ".join(held)
+    return SearchResult(
+        twin=twin,
+        values=values,
+        cost=float(best["cost"]),
+        trace=table,
+        course=pd.DataFrame({"cost": costs, "best_cost": costs.where(table["stage"] != SLOPES).cummin().ffill()}),
+        facts=facts,
+        attempts=attempts,
+        earlier_seconds=earlier,
+    )
+
+
+SURFACES = ("ground_", "contact_")
+"""How the names of variables begin that have no effect where nothing touches."""
+END = 0.01
+"""Distance from an end of its range, in normalized units, within which a variable counts as held by it."""
+
+
+def at_ends(trace: pd.DataFrame, variables: Sequence[str]) -> list[str]:
+    """Variables of the best candidate that lie within `END` of an end of their range; contact is left out."""
+    judged = trace[trace["stage"] != SLOPES]
+    best = judged.iloc[int(judged["cost"].to_numpy().argmin())]
+    decisive = [name for name in variables if not name.startswith(SURFACES)]
+    return [name for name in decisive if not END <= best[f"normalized.{name}"] <= 1 - END]
 
 
 def _ways(
-    problem: SearchProblem, population: Sequence[np.ndarray], loss: FrameLoss, ways: Sequence[bool], each: Map
+    judge: Judge, population: Sequence[np.ndarray], ways: Sequence[bool], most: float
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """The rows of the first generation in the way that is chosen, and those in the other ways, which were judged first."""
-    judged = {push: evaluate(replace(problem, push=push), population, loss, 0, 0, each) for push in ways}
+    """Rows of the first generation in the way that is chosen, and those in the other ways, which were judged first.
+
+    Hands push only if that costs less than `most`.
+    """
+    judged = {push: judge(population, push, 0, 0) for push in ways}
     costs = {push: min(row["cost"] for row in rows) for push, rows in judged.items()}
-    if costs[True] >= MOVES * still_cost(problem, loss):
+    if costs[True] >= most:
         costs[True] = np.inf
     chosen = min(ways, key=lambda push: costs[push])
     other = [row | {"stage": OTHER_WAY} for push, rows in judged.items() if push != chosen for row in rows]
@@ -195,31 +250,33 @@ def _ways(
 
 
 def _polished(
-    problem: SearchProblem,
+    settings: Search,
+    variables: tuple[str, ...],
     trace: Sequence[dict[str, Any]],
     recorded: Sequence[dict[str, Any]],
-    loss: FrameLoss,
     generation: int,
-    each: Map,
+    judge: Judge,
+    slopes: Callable[..., list[dict[str, Any]]],
+    push: bool,
 ) -> Iterator[list[dict[str, Any]]]:
     """The rows of the polish after each of its generations; those that are recorded are taken as they are, if they replay."""
     best = min(trace, key=lambda row: row["cost"])
-    if not problem.search.polish_rounds or best["cost"] >= PENALTY:
+    if not settings.polish_rounds or best["cost"] >= PENALTY:
         return
-    start = np.array([best[f"normalized.{name}"] for name in problem.variables])
-    columns = [problem.variables.index(name) for name in problem.search.polished]
-    polish, rows = Polish(problem.search, columns, start, best["cost"]), list[dict[str, Any]]()
+    start = np.array([best[f"normalized.{name}"] for name in variables])
+    columns = [variables.index(name) for name in settings.polished]
+    polish, rows = Polish(settings, columns, start, best["cost"]), list[dict[str, Any]]()
     while not polish.done:
         generation += 1
         population, first = polish.ask(), len(trace) + len(rows)
         made = list(recorded[len(rows) : len(rows) + len(population)])
         same = len(made) == len(population) and all(row["rollout"] == first + k for k, row in enumerate(made))
-        if not same or not replays(made, population, problem.variables):
+        if not same or not replays(made, population, variables):
             made, recorded = [], []
             if polish.stage == SLOPES:
-                made = slope_rows(problem, population, polish.steps(), loss, first, generation, each)
+                made = slopes(population, push, polish.steps(), first, generation)
             else:
-                made = [row | {"stage": POLISH} for row in evaluate(problem, population, loss, first, generation, each)]
+                made = [row | {"stage": POLISH} for row in judge(population, push, first, generation)]
         rows = rows + made
         polish.tell(made)
         yield rows
@@ -273,7 +330,7 @@ def recorded_trace(path: Path | None, key: str) -> tuple[list[dict[str, Any]], i
 
 
 def replays(rows: list[dict[str, Any]], population: list[np.ndarray], variables: tuple[str, ...]) -> bool:
-    """Whether recorded candidates are those that CMA-ES proposes now."""
+    """True where recorded candidates are those that CMA-ES proposes now."""
     return all(
         np.array_equal(np.array([row.get(f"normalized.{name}", np.nan) for name in variables]), normalized)
         for row, normalized in zip(rows, population, strict=False)

@@ -251,3 +251,16 @@ def uniform_topology(
     """
     one = np.zeros(len(nodes), np.int32)
     return piecewise_topology(nodes, controllers, one, [object_radius], [object_neighbors], controller_radius, controller_neighbors)
+
+
+MARGIN = 1 + 1e-6
+"""Factor on radii, so that the longest spring is made again."""
+
+
+def infer_controller_radius(topology: Topology) -> tuple[float, int]:
+    """Radius, m, and number of nodes that make the controller springs of a topology again."""
+    springs = topology.springs[topology.object_spring_count :]
+    if not len(springs):
+        return 1e-9, 1
+    hands = springs.max(axis=1) - len(topology.nodes)
+    return float(distances(topology.canonical, springs).max()) * MARGIN, int(np.bincount(hands).max())

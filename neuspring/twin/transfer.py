@@ -24,12 +24,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neuspring import config
 from neuspring.core.artifacts import Material, Observations, Topology, Twin
 from neuspring.core.errors import InputError
-from neuspring.physics import stability
+from neuspring.twin.body import body_of
 from neuspring.twin.field import midpoints
-from neuspring.twin.topology import REPAIR_SPRINGS, distances, piecewise_topology, unloaded
+from neuspring.twin.topology import MARGIN, REPAIR_SPRINGS, distances, infer_controller_radius, piecewise_topology, unloaded
 
 if TYPE_CHECKING:
     from neuspring.twin.register import Registration
@@ -43,25 +42,13 @@ SHORTEST = 1e-9
 def move(
     twin: Twin, observations: Observations, *, keep_frame_time: bool = False, safety: float = 0.8
 ) -> tuple[Twin, Registration | None]:
-    """The twin on the nodes and hands of another recording, and how the shapes fitted where the nodes are others.
+    """The twin in frame 0 of another recording of its object, and how the shapes were registered where nodes are others.
 
-    The rest shape is frame 0 unless recorded.
-
-    Where both recordings have the same nodes in the same order (`corresponds`), a spring keeps its ends, stiffness, dashpot, and
-    the ratio of its rest length to the distance of its ends where it has no force: in the rest shape, or in frame 0 where the
-    twin's controllers rest there. Nodes keep their masses. Other nodes, as of filmed objects, take springs and masses of their own
-    (`resample`). Up, ground and, unless `keep_frame_time`, the frame time are the recording's. Substeps are added if the new
-    distances need more. Raises InputError if the shapes do not fit, or a spring would have no length. A rod: `rod.on_recording`.
+    Its body says what of it stays (`Body.on_recording`). Up, ground and, unless `keep_frame_time`, the frame time are the
+    recording's. Substeps are added if the new distances need more. Raises InputError if the recording is of another body.
     """
-    from neuspring.twin.rod import on_recording as rod_on_recording
-
-    scenario, registration = observations.scenario, None
-    if twin.rod is not None:
-        moved = rod_on_recording(twin, observations)
-    elif corresponds(twin.topology, observations):
-        moved = replace(twin, topology=_same_nodes(twin.topology, observations))
-    else:
-        moved, registration = resampled(twin, observations)
+    scenario, body = observations.scenario, body_of(twin)
+    moved, registration = body.on_recording(twin, observations)
     simulation = replace(
         twin.simulation,
         frame_time=twin.simulation.frame_time if keep_frame_time else 1.0 / scenario.frame_rate,
@@ -70,11 +57,28 @@ def move(
         obstacles=scenario.obstacles,
         self_collision=scenario.self_collision,
     )
-    moved = replace(moved, simulation=simulation)
-    if moved.rod is not None:
-        return moved, None  # implicit: no bound on the substep
-    count = stability.smallest_safe_substeps(stability.twin_spectrum(moved), simulation.frame_time, safety)
-    return replace(moved, simulation=replace(simulation, substeps=max(count, simulation.substeps))), registration
+    return body.stable(replace(moved, simulation=simulation), safety), registration
+
+
+def in_pool(twin: Twin, observations: Observations, keep_frame_time: bool) -> Twin:
+    """A lattice on the nodes of a recording of its pool, node i on node i. Raises InputError if those are others."""
+    if not corresponds(twin.topology, observations):
+        name = f"pool, {observations.scenario.name}"
+        raise InputError(name, "recordings of a pool must have the same nodes", "others", "Sample all alike (mocap.rings).")
+    return move(twin, observations, keep_frame_time=keep_frame_time)[0]
+
+
+def on_nodes(twin: Twin, observations: Observations) -> tuple[Twin, Registration | None]:
+    """A lattice on the nodes and hands of another recording, and how the shapes fitted where the nodes are others.
+
+    The rest shape is frame 0 unless recorded. Where both recordings have the same nodes in the same order (`corresponds`), a spring
+    keeps its ends, stiffness, dashpot, and the ratio of its rest length to the distance of its ends where it has no force: in the
+    rest shape, or in frame 0 where the twin's controllers rest there. Nodes keep their masses. Other nodes, as of filmed objects,
+    take springs and masses of their own (`resampled`). Raises InputError if the shapes do not fit, or a spring has no length.
+    """
+    if corresponds(twin.topology, observations):
+        return replace(twin, topology=_same_nodes(twin.topology, observations)), None
+    return resampled(twin, observations)
 
 
 def corresponds(topology: Topology, observations: Observations) -> bool:
@@ -114,8 +118,6 @@ NEAREST_SPRINGS = 8
 LARGEST_RESIDUAL, LARGEST_STRETCH = 0.12, 0.15
 """Beyond these shapes do not fit: the residual of the rigid motion, as a fraction of the extent, and the stretch of the bending,
 which could lay any shape onto any other. Filmed recordings of one plush have at most 0.06; another animal of its size has 0.16."""
-MARGIN = 1 + 1e-6
-"""Factor on radii, so that the longest spring is made again."""
 
 
 def resampled(twin: Twin, observations: Observations) -> tuple[Twin, Registration]:
@@ -203,15 +205,6 @@ def infer_radii(topology: Topology) -> tuple[list[float], list[int]]:
         radii.append(float(length[within].max()) * MARGIN)
         neighbors.append(max(int(rank[within].max()), 2))
     return radii, neighbors
-
-
-def infer_controller_radius(topology: Topology) -> tuple[float, int]:
-    """Radius, m, and number of nodes that make the controller springs of a topology again."""
-    springs = topology.springs[topology.object_spring_count :]
-    if not len(springs):
-        return 1e-9, 1
-    hands = springs.max(axis=1) - len(topology.nodes)
-    return float(distances(topology.canonical, springs).max()) * MARGIN, int(np.bincount(hands).max())
 
 
 def _carried(twin: Twin, new: Topology, material: Material, laid: np.ndarray) -> Twin:
@@ -309,14 +302,12 @@ def roll_between(here: Observations, there: Observations) -> float:
     return float(max(rolls))
 
 
-def require_pool(here: Observations, pool: Sequence[Observations], leave_out: bool) -> None:
+def require_pool(here: Observations, pool: Sequence[Observations]) -> None:
     """Raise InputError unless a twin can be judged on the pool: other recordings, with as many nodes and hands, node i on node i.
 
     Along a line neighbors tell nothing of a turn about it, so that is measured (`roll_between`).
     """
     name = f"pool of {here.scenario.name}"
-    if leave_out and not pool:
-        raise InputError(name, "at least one other recording is required where this one is left out", "none")
     counts = len(here.nodes), here.controller_points.shape[1]
     for there in pool:
         received = len(there.nodes), there.controller_points.shape[1]
@@ -330,11 +321,3 @@ def require_pool(here: Observations, pool: Sequence[Observations], leave_out: bo
             )
             remedy = "Name another mocap.roll_axis, or leave this recording out."
             raise InputError(name, rule, f"{roll:.0f} degrees in {there.scenario.name}", remedy)
-
-
-def on_recording(twin: Twin, observations: Observations, quirks: config.ReleasedQuirks) -> Twin:
-    """The twin on the nodes of a recording of its pool, node i on node i. Raises InputError if those are others."""
-    if not corresponds(twin.topology, observations):
-        name = f"pool, {observations.scenario.name}"
-        raise InputError(name, "recordings of a pool must have the same nodes", "others", "Sample all alike (mocap.rings).")
-    return move(twin, observations, keep_frame_time=quirks.frame_time_667)[0]

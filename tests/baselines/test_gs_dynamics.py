@@ -15,6 +15,7 @@ from neuspring.baselines.gs_dynamics import train as training
 from neuspring.baselines.gs_dynamics.model import (
     Dynamics,
     GsDynamicsModel,
+    GsDynamicsTraining,
     ParticleGraph,
     Rules,
     carry,
@@ -48,7 +49,7 @@ from neuspring.config.baselines import Baselines, GsDynamics
 from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.errors import InputError
 
-RULES, RECIPE = resolve(GsDynamics(width=16), "sloth")
+RULES, RECIPE = resolve(GsDynamicsTraining(width=16), "sloth")
 
 
 def cloud(count: int = 12, seed: int = 0) -> torch.Tensor:
@@ -118,7 +119,7 @@ def test_input_sizes_are_those_of_the_public_code():
     assert edge_inputs(graph, history).shape[1] == 14 == RULES.edge_size
     of_node = node_inputs(RULES, graph, history, tools)[12]
     assert of_node.tolist() == pytest.approx([0, 1, *[float(tools[0, 2])] * 3, *[0] * 6, *tools[0].tolist()])
-    full = resolve(GsDynamics(), "sloth")[0]
+    full = resolve(GsDynamicsTraining(), "sloth")[0]
     assert weight_count(full) == len(Dynamics.initial(full, 0).weights) == 2_904_579
 
 
@@ -156,7 +157,7 @@ def test_shifts_along_the_ground_change_nothing_and_heights_do():
 def test_yaw_is_learned_and_not_built_in():
     points, tools, quarter = cloud(), cloud(3, 1), torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
     assert float((moves(points @ quarter.T, tools @ quarter.T) - moves(points, tools) @ quarter.T).abs().max()) > 1e-4
-    settings = GsDynamics(width=8, noise=0.0, batch=4)
+    settings = GsDynamicsTraining(width=8, noise=0.0, batch=4)
     rules, recipe = resolve(settings, "sloth")
     windows = Windows.of(walk(10), settings, "cpu")
     turned, plain = (draw(windows, rules, replace(recipe, yaw=yaw), torch.Generator().manual_seed(0)) for yaw in (True, False))
@@ -189,9 +190,9 @@ def test_steps_of_a_window_are_of_tool_motion():
     assert past(tools, 2, 0.01) == [0, 0, 2] and past(tools, 1, 0.01) == [1, 1, 1]
     assert ahead(tools, 0, 0.01, 5) == [2, 4, 5, 5, 5], "the last frame needs three quarters of a step"
     assert ahead(tools, 0, 0.01, 1) == [2] and ahead(tools, 5, 0.01, 5) == []
-    frames = window_frames(tools, GsDynamics())
+    frames = window_frames(tools, GsDynamicsTraining())
     assert frames[:, 2].tolist() == [0, 1, 2, 3, 4] and frames.shape == (5, 8)
-    assert window_frames(tools[:, :1], GsDynamics()).shape == (0, 8)
+    assert window_frames(tools[:, :1], GsDynamicsTraining()).shape == (0, 8)
 
 
 def test_unseen_tracks_are_no_particles_and_no_targets(monkeypatch):
@@ -200,7 +201,7 @@ def test_unseen_tracks_are_no_particles_and_no_targets(monkeypatch):
     visible[6, :5] = False
     points = np.where(visible[..., None], tracks.points, 100.0).astype(np.float32)
     hidden = replace(tracks, points=points, visible=visible)
-    settings = GsDynamics(width=8, batch=16, noise=0.0)
+    settings = GsDynamicsTraining(width=8, batch=16, noise=0.0)
     rules, recipe = resolve(settings, "sloth")
     windows = Windows.of(hidden, settings, "cpu")
     touched = (windows.frames == 6).any(dim=1)
@@ -256,9 +257,9 @@ def test_the_losses_by_hand():
 def test_presets_and_what_replaces_them():
     named = [preset_name(name) for name in ("rope", "DLO1", "cloth", "package", "sloth", "blob")]
     assert named == ["rope", "rope", "cloth", "cloth", "animals", "animals"]
-    rules, recipe = resolve(GsDynamics(noise=0.0, neighbors=9), "cloth")
+    rules, recipe = resolve(GsDynamicsTraining(noise=0.0, neighbors=9), "cloth")
     assert (rules.neighbors, rules.particles, recipe.noise, recipe.length_weight, recipe.batch) == (9, 150, 0.0, 0.1, 64)
-    assert not resolve(GsDynamics(), "rope")[0].heights and rules.heights
+    assert not resolve(GsDynamicsTraining(), "rope")[0].heights and rules.heights
 
 
 def test_wrong_settings_and_weights_are_refused():
@@ -270,7 +271,7 @@ def test_wrong_settings_and_weights_are_refused():
 
 # Training and rollouts ---------------------------------------------------------------------------------------------------
 
-PLAIN = GsDynamics(
+PLAIN = GsDynamicsTraining(
     width=24, batch=4, epochs=4, updates_per_epoch=3, noise=0.0, yaw=False, outlier_deviations=0.0,
     length_weight=0.0, future=1, learning_rate=3e-3,
 )  # fmt: skip
@@ -309,7 +310,7 @@ def hands(frames: int, motion: float = 0.012) -> np.ndarray:
     return (corners(3, 1)[None] + np.cumsum(steps, axis=0)[:, None] - steps[0]).astype(np.float32)
 
 
-def train(seen: Observations, settings: GsDynamics, seed: int = 0, partial: Path | None = None) -> Trained:
+def train(seen: Observations, settings: GsDynamicsTraining, seed: int = 0, partial: Path | None = None) -> Trained:
     facts = {"seed": seed, "device": "cpu", "partial": partial, "key": lambda: "key"}
     chosen = Config(baselines=Baselines(gs_dynamics=settings))
     return training.train(TrainingRequest(observations=seen, settings=chosen, **facts))

@@ -15,19 +15,19 @@ from neuspring.baselines.spring_gaus.model import (
     AnchorPhysics,
     Follower,
     SpringGausModel,
+    SpringGausTraining,
     choose_anchors,
     contraction,
     roll_out,
     soft_vector,
 )
 from neuspring.baselines.spring_gaus.physics import AnchorSolver, reference_substep
-from neuspring.baselines.spring_gaus.train import FEATURE_WEIGHT, Problem, SpringGausTraining, load_features, run, silhouette_loss
-from neuspring.config.baselines import SpringGaus
+from neuspring.baselines.spring_gaus.train import FEATURE_WEIGHT, Problem, SpringGausTrainer, load_features, run, silhouette_loss
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.records import digest_file
 
 FRAME = 1 / 30
-SMALL = SpringGaus(anchors=72, neighbors=12, full_neighbors=8, substeps=150, damping=1.0)
+SMALL = SpringGausTraining(anchors=72, neighbors=12, full_neighbors=8, substeps=150, damping=1.0)
 
 
 def bar(height: float = 0.3, seed: int = 0) -> np.ndarray:
@@ -37,7 +37,7 @@ def bar(height: float = 0.3, seed: int = 0) -> np.ndarray:
     return lattice * 0.02 + jitter + [0, 0, height]
 
 
-def model_of(anchors: np.ndarray, controllers: np.ndarray, settings: SpringGaus = SMALL, **changed) -> SpringGausModel:
+def model_of(anchors: np.ndarray, controllers: np.ndarray, settings: SpringGausTraining = SMALL, **changed) -> SpringGausModel:
     graph = AnchorGraph.between(anchors, controllers, settings.neighbors)
     world = {"frame_time": FRAME, "up_sign": 1.0, "gravity": 9.8, "ground": True} | changed
     return replace(SpringGausModel.start(graph, settings, **world), link_stiffness=3e3)
@@ -229,7 +229,7 @@ def test_damping_that_is_clamped_can_come_back():
         return sign[0] * (anchors - torch.tensor(start.anchors)).square().sum()
 
     settings = replace(SMALL, iterations=1, damping_rate=0.01)
-    training = SpringGausTraining(Problem(start, hands, objective, settings))
+    training = SpringGausTrainer(Problem(start, hands, objective, settings))
     training.epoch(0)
     first = training.values["theta"].item()
     sign[0] = -sign[0]

@@ -11,9 +11,8 @@ import time
 import numpy as np
 import torch
 
-from neuspring.baselines.spring_gaus.model import SpringGausModel
+from neuspring.baselines.spring_gaus.model import SpringGausModel, SpringGausTraining
 from neuspring.baselines.spring_gaus.physics import AnchorGraph, AnchorSolver, reference_substep
-from neuspring.config.baselines import SpringGaus
 from neuspring.core.device import resolve_device
 
 ANCHORS, SUBSTEPS, REPEATS = 1024, 100, 5
@@ -41,7 +40,7 @@ def bar() -> tuple[SpringGausModel, np.ndarray]:
     cells = np.stack(np.meshgrid(range(16), range(8), range(8), indexing="ij"), axis=-1).reshape(-1, 3)
     anchors = 0.01 * cells + rng.uniform(-1e-3, 1e-3, cells.shape) + [0, 0, 0.3]
     hands = np.stack([anchors[:30] + 0.005, anchors[:30] + 0.01]).astype(np.float32)
-    settings = SpringGaus()
+    settings = SpringGausTraining()
     graph = AnchorGraph.between(anchors, hands[0], settings.neighbors)
     model = SpringGausModel.start(graph, settings, frame_time=1 / 30, up_sign=1.0, gravity=9.8, ground=True)
     return model, hands

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 
 from neuspring import config
 from neuspring.config import Config, parse, plain
+from neuspring.config.effort import EFFORT_SIZES, EFFORTS, sizes
 from neuspring.core import artifacts
 from neuspring.core.errors import InputError
 from neuspring.core.text import listed
@@ -69,8 +71,8 @@ def test_no_transfers_may_be_asked_for_on_the_command_line() -> None:
 # Mistakes -------------------------------------------------------------------------------------------------------------
 
 MISTAKES = {
-    "unknown key": ("fit: {learning_rat: 0.1}", "fit.learning_rat: unknown key"),
-    "unknown top key": ("sede: 1", "sede: unknown key"),
+    "unknown key": ("fit: {learning_rat: 0.1}", "fit.learning_rat: unknown key (did you mean learning_rate?)"),
+    "unknown top key": ("sede: 1", "sede: unknown key (did you mean seeds?)"),
     "number as text": (
         "fit: {learning_rate: 5e-5}",
         "fit.learning_rate",
@@ -99,7 +101,7 @@ MISTAKES = {
     ),
     "negative range": ("search: {variables: {drag: {low: -5}}}", "drag: 0 <= low < high is required"),
     "infinite range": ("search: {variables: {drag: {high: .inf}}}", "search.variables.drag.high", "finite"),
-    "a variable in the old way": ("search: {ranges: {drag: [0, 5]}}", "search.ranges: unknown key (now variables.NAME"),
+    "a variable in the old way": ("search: {ranges: {drag: [0, 5]}}", "search.ranges: unknown key"),
     "an unknown variable": ("search: {variables: {bending: {low: 1}}}", "search.variables.bending: unknown key"),
     "always tied": (
         "search: {rollouts: 9, tied_rollouts: 9}",
@@ -113,35 +115,20 @@ MISTAKES = {
     ),
     "unknown scale": ("search: {variables: {drag: {scale: cubic}}}", "search.variables.drag.scale", "received 'cubic'"),
     "unit of lengths": ("search: {lengths: inch}", "search.lengths", "received 'inch'"),
-    "what lost its trial": ("search: {bending_reach: [1.6, 2.6]}", "search.bending_reach: unknown key (removed; commit 7308a7b"),
-    "masks of scenes that need marks": (
-        "perception: {segment: {opencv: {sleeves: true}}}",
-        "perception.segment.opencv.sleeves: unknown key (removed, marks serve such scenes",
-    ),
     "a fixed stranger": ("search: {fixed: [mass]}", "fixed: different ones of stiffness, object_radius", "received ['mass']"),
-    "a searched hand": ("search: {variables: {hand_tilt: {start: 5.0}}}", "hand_tilt: unknown key (removed, hands of color alone"),
-    "a fixed hand": ("search: {fixed: [hand_size]}", "received ['hand_size'] (removed, hands of color alone"),
-    "polish of hands": (
-        "search: {polish: {variables: [drag, hand_tilt, hand_depth]}}",
-        "received ['drag', 'hand_tilt', 'hand_depth'] (removed, hands of color alone move in an upright plane; commit 152a3d9",
-    ),
-    "polish of springs": (
-        "search: {polish: {variables: [object_radius]}}",
-        "variables: different ones of stiffness",
-        "object_radius",
-    ),
     "negative rounds": ("search: {polish: {rounds: -1}}", "search.polish.rounds", "received -1"),
     "isolated nodes": ("search: {isolated_nodes: ignore}", "search.isolated_nodes", "received 'ignore'"),
     "resolution word": ("fit: {field: {resolution: fine}}", "fit.field.resolution", "'adaptive'"),
     "no texels": ("fit: {field: {resolution: 0}}", "fit.field.resolution", "received 0"),
-    "unknown field key": ("fit: {field: {layers: 3}}", "fit.field.layers: unknown key"),
-    "where the Fourier transform goes": (
-        "fit: {field: {fourier: feature}}",
-        "fit.field.fourier: unknown key (removed, on coordinates and feature always; commit a72d24c",
+    "unknown field key": ("fit: {field: {chanels: 3}}", "fit.field.chanels: unknown key (did you mean channels?)"),
+    "unknown key in a list": (
+        "aims: [{method: a, baseline: b, ratio: 1.0, bellow: 1}]",
+        "aims.0.bellow: unknown key (did you mean below?)",
     ),
+    "unknown effort": ("effort: fast", "effort", "'quick', 'normal' or 'paper', received 'fast'"),
     "tail fraction": ("fit: {tail_fraction: 0}", "fit.tail_fraction", "greater than 0"),
     "null for a rate": ("fit: {learning_rate: null}", "fit.learning_rate", "received None"),
-    "zero for an optional rate": ("fit: {scalar_learning_rate: 0}", "fit.scalar_learning_rate", "greater than 0"),
+    "zero for an optional rate": ("fit: {factor_learning_rate: 0}", "fit.factor_learning_rate", "greater than 0"),
     "a password on command lines": (
         "tracking: {uri: 'http://me:secret@host:5000'}",
         "tracking: uri: a password would be shown by ps and in logs; set PGPASSWORD, ~/.pgpass or MLFLOW_TRACKING_PASSWORD instead",
@@ -215,3 +202,37 @@ def test_the_home_folder_may_be_written_as_a_tilde(monkeypatch):
 def test_many_names_are_shortened():
     assert listed(["a", "b"]) == "a, b"
     assert listed(range(100)) == "0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11 and 88 more"
+
+
+# The dial ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("effort", EFFORTS)
+def test_an_effort_sets_its_sizes_and_nothing_else(effort):
+    made, plainly = load(f"effort: {effort}\n"), plain(load(""))
+    config.merge(plainly, sizes(effort) | {"effort": effort})
+    assert plain(made) == plainly
+    # What a record holds is read back as it is.
+    assert parse(Config, plain(made), "again") == made
+
+
+def test_the_sizes_of_the_paper_are_the_defaults_but_for_synthetic_pictures():
+    assert plain(load("effort: paper\nsynthetic: {size: demo}\n")) == plain(load("")) | {"effort": "paper"}
+    field = Config().fit.field
+    assert (Config().clusters, field.adaptive_factor, field.channels, field.hidden, field.layers) == (5, 0.85, 32, 128, 3)
+
+
+def test_a_key_that_is_given_wins_over_the_effort():
+    made = load("effort: quick\nfit: {epochs: 7}\nperception: {sample: {nodes: null}}\n")
+    assert (made.fit.epochs, made.perception.sample.nodes, made.search.rollouts) == (7, None, 88)
+
+
+def test_the_demo_is_quick_and_the_synthetic_benchmark_normal():
+    for name, effort in (("demo", "quick"), ("synthetic", "normal")):
+        values = config.read_yaml(ROOT / "config" / "data" / f"{name}.yaml")
+        assert values["effort"] == effort
+        # Whatever the dial sets, these files leave to it.
+        given = [
+            path for path in EFFORT_SIZES if functools.reduce(lambda part, key: part.get(key, {}), path.split("."), values) != {}
+        ]
+        assert given == []

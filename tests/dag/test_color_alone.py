@@ -15,7 +15,7 @@ CHANGES = {
     "scenarios": ["painted"],
     "methods": ["static", "controller_lbs", "search_only", "baseline", "neuspring"],
     "compare_with": "baseline",
-    "search": {"rollouts": 14, "polish": {"variables": ["stiffness"]}},
+    "search": {"rollouts": 14},
     "fit": {"epochs": 1},
     "perception": {"segment": {"backend": "given"}, "sample": {"voxel": 0.02, "nodes": 60}},
     "images": {"appearance": {"iterations": 20, "spacing": 2.0}, "video": False},

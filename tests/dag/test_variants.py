@@ -49,7 +49,7 @@ def test_baselines_pass_through_the_same_workflow_and_say_where_they_do_not_appl
     changes = {
         "methods": ["search_only", "static", "controller_lbs", "spring_gaus", "spring_gaus_points", "gs_dynamics"],
         "baselines": {
-            "spring_gaus": {"anchors": 60, "neighbors": 8, "full_neighbors": 6, "iterations": 1},
+            "spring_gaus": {"anchors": 60, "iterations": 1},
             "gs_dynamics": {"width": 8, "batch": 2, "epochs": 1, "updates_per_epoch": 2, "step": 0.002},
         },
         "studies": ["table1"],

@@ -226,12 +226,17 @@ def test_bad_recordings_are_refused(tmp_path: Path, value: Any, message: str) ->
     [
         (Mocap(stride=20), "stride = 20"),
         (Mocap(start=37), "mocap.start = 37"),
-        (Mocap(radius=1e-5), "mocap.radius"),
     ],
 )
 def test_settings_that_do_not_fit_are_refused(tmp_path: Path, settings: Mocap, message: str) -> None:
     with pytest.raises(InputError, match=rf"7\.pkl: .*{message}"):
         mocap.read(ROW, write(tmp_path, recording()), settings)
+
+
+def test_rings_that_would_touch_markers_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mocap, "RING_RADIUS", 1e-5)
+    with pytest.raises(InputError, match=r"7\.pkl: .*must be 0\.0001 m apart"):
+        mocap.read(ROW, write(tmp_path, recording()), Mocap())
 
 
 def test_check_of_files_and_folders(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 from collections import Counter
@@ -50,6 +51,7 @@ long:
   settings: {horizon: 0, epochs: 7}
 ours: {search: pieces, fit: field, description: x, settings: {output_bound: 1.5, field: {triplane: false}}}
 """
+read_searches = functools.partial(tables.read_searches, clusters=5)
 SEARCHES = """
 uniform: {clusters: 1, description: one region}
 pieces:
@@ -67,23 +69,24 @@ def write(path: Path, text: str) -> Path:
 def test_rows_lie_on_top_of_the_configuration(tmp_path: Path) -> None:
     found = tables.read_methods(write(tmp_path / "methods.yaml", METHODS))
     assert [found[name].fit for name in ("full", "coarse", "long", "ours")] == ["springs", None, "springs", "field"]
-    made = load("fit: {epochs: 3, learning_rate: 0.5, field: {hidden: 8}}\nsearch: {rollouts: 44, sigma: 0.25}")
+    made = load("fit: {epochs: 3, learning_rate: 0.5, field: {hidden: 8}}\nsearch: {rollouts: 44, tied_rollouts: 5}")
     merged = tables.with_method(made, found["long"], "long").fit
     assert (merged.horizon, merged.epochs, merged.learning_rate) == (0, 7, 0.5)
     assert tables.with_method(made, found["full"], "full") == made
     ours = tables.with_method(made, found["ours"], "ours").fit
     assert (ours.epochs, ours.output_bound, ours.field.triplane, ours.field.hidden) == (3, 1.5, False, 8)
-    rows = tables.read_searches(write(tmp_path / "searches.yaml", SEARCHES))
+    rows = read_searches(write(tmp_path / "searches.yaml", SEARCHES))
     assert {name: row.clusters for name, row in rows.items()} == {"uniform": 1, "pieces": 5}
     searched = tables.with_search(made, rows["pieces"], "pieces").search
-    assert (searched.rollouts, searched.sigma, searched.polish.rounds) == (33, 0.25, 1)
+    assert (searched.rollouts, searched.tied_rollouts, searched.polish.rounds) == (33, 5, 1)
     assert tables.with_search(made, rows["uniform"], "uniform") == made
 
 
 BAD_ROWS = {
-    "no regions": (tables.read_searches, "a: {clusters: 0, description: x}", "search a.*clusters.*received 0"),
-    "no clusters": (tables.read_searches, "a: {description: x}", "search a.*clusters: required, but missing"),
-    "key": (tables.read_searches, "a: {clusters: 1, description: x, linkage: ward}", "search a.*linkage: unknown key"),
+    "no regions": (read_searches, "a: {clusters: 0, description: x}", "search a.*clusters.*received 0"),
+    "key": (read_searches, "a: {clusters: 1, description: x, linkage: ward}", "search a.*linkage: unknown key"),
+    "nothing to extend": (read_searches, "a: {extends: b, description: x}", "search a: extends: a row of this table.*received b"),
+    "rows that extend each other": (read_searches, "a: {extends: b}\nb: {extends: a}", "search b: extends: .*; received a"),
     "search": (tables.read_methods, "a: {search: ../up, description: x}", r"method a.*search.*received '\.\./up'"),
     "fit": (tables.read_methods, "a: {search: uniform, fit: network, description: x}", "method a.*fit.*received 'network'"),
     "missing": (tables.read_methods, "a: {search: uniform, fit: null}", "method a.*description: required, but missing"),
@@ -108,7 +111,7 @@ def test_unreadable_files(tmp_path: Path) -> None:
     """Missing, a folder, and not UTF-8."""
     latin = tmp_path / "latin"
     latin.write_bytes("# Größe\n".encode("latin-1"))
-    for read in (tables.read_methods, tables.read_searches, read_scenarios):
+    for read in (tables.read_methods, read_searches, read_scenarios):
         for path in (tmp_path / "missing", tmp_path, latin):
             with pytest.raises(InputError, match="must be readable") as caught:
                 read(path)
@@ -345,7 +348,6 @@ def test_springs_may_not_start_beyond_their_clamp(tmp_path: Path) -> None:
     [
         ("{description: x}", "either search or model is required, received search None and model None"),
         ("{search: uniform, oracle: true, description: x}", "an oracle has a fit"),
-        ("{search: uniform, carry_over: state, description: x}", "removed"),
         (
             "{search: uniform, fit: field, oracle: true, description: x, settings: {selection: tail}}",
             "an oracle is fitted on all frames and holds none back",
@@ -359,10 +361,7 @@ def test_springs_may_not_start_beyond_their_clamp(tmp_path: Path) -> None:
         ("{model: static, settings: {epochs: 1}, description: x}", r"model static has none; received \['epochs'\]"),
         ("{model: spring_gauss, description: x}", "model: must be one of spring_gaus"),
         ("{model: spring_gaus, settings: {anchor: 9}, description: x}", "method bad, settings: .*anchor: unknown key"),
-        (
-            "{model: spring_gaus, settings: {full_neighbors: 30}, description: x}",
-            "method bad, settings: .*full_neighbors: at most",
-        ),
+        ("{model: spring_gaus, settings: {anchors: 0}, description: x}", "method bad, settings: .*anchors: .*received 0"),
         ("{model: spring_gaus, appearance: {degrees: 0}, description: x}", "method bad, appearance: .*degrees: unknown key"),
         ("{model: spring_gaus, description: x}", "at least one method must apply to a scenario"),
     ],
@@ -409,7 +408,7 @@ def test_twins_of_cables_move_only_where_all_have_as_many_nodes(tmp_path: Path) 
 def pooled(folder: Path, **changes: object) -> Benchmark:
     """Two methods on the pool of a rope, and the same two alone."""
     row = "{name}: {{search: uniform, fit: springs, pool: {pool}, description: x}}\n"
-    write(folder / "pooled.yaml", METHODS + row.format(name="one", pool="all") + row.format(name="two", pool="others"))
+    write(folder / "pooled.yaml", METHODS + row.format(name="one", pool="all") + row.format(name="two", pool="all"))
     toys = "".join(f"{name}\ttoy\trope\trope/lift/smooth\tfalse\ttrue\n" for name in ("a", "b", "c"))
     write(folder / "toys.tsv", HEADER + toys + "cloth\ttoy\tcloth\tcloth/lift/smooth\tfalse\ttrue\n")
     chosen: dict[str, object] = {"scenario_table": "toys.tsv", "method_table": "pooled.yaml", "pools": {"rope": ["a", "b", "c"]}}
@@ -420,21 +419,19 @@ def test_methods_on_a_pool_have_searches_and_fits_of_their_own(tmp_path: Path) -
     made = pooled(tmp_path)
     assert made.pools["a"] == ("b", "c")
     assert list(made.scenarios) == ["a", "b", "c"], "the others are observed too"
-    assert list(made.searches) == ["uniform", "uniform-all", "uniform-others"]
-    assert made.fit_of_method == {"full": "full", "one": "one", "two": "two"}
+    assert list(made.searches) == ["uniform", "uniform-all"]
+    assert made.fit_of_method == {"full": "full", "one": "one", "two": "one"}
     graph = Graph(made)
     jobs = {name: SimpleNamespace(scenario="a", method=name, seed=0) for name in made.methods}
     found = [graph.inputs(STAGES["fit"])(job) for job in jobs.values()]
     assert [files["search"] for files in found] == [
-        f"results/a/{name}/0/search.json" for name in ("search-uniform", "search-uniform-all", "search-uniform-others")
+        f"results/a/{name}/0/search.json" for name in ("search-uniform", "search-uniform-all", "search-uniform-all")
     ]
     others = ["results/b/observations.npz", "results/c/observations.npz"]
     assert [files.get("pool", []) for files in found] == [[], others, others]
     searches = [SimpleNamespace(scenario="a", search=name, seed=0) for name in made.searches]
-    assert [graph.inputs(STAGES["search"])(job).get("pool", []) for job in searches] == [[], others, others]
-    assert [graph.options(STAGES["search"], job)["leave_out"] for job in searches] == [False, False, True]
-    assert [graph.options(STAGES["fit"], job)["leave_out"] for job in jobs.values()] == [False, False, True]
-    assert [graph.variant(job).get("pool") for job in jobs.values()] == [None, "all", "others"]
+    assert [graph.inputs(STAGES["search"])(job).get("pool", []) for job in searches] == [[], others]
+    assert [graph.variant(job).get("pool") for job in jobs.values()] == [None, "all", "all"]
     assert graph.variant(jobs["one"])["clusters"] == 1
 
 
@@ -557,12 +554,12 @@ def test_the_default_configuration_names_the_tables_alone():
 
 
 def test_the_synthetic_benchmark_sees_what_studies_of_the_demo_see():
-    synthetic = shipped("synthetic")
+    synthetic = parse(Config, shipped("synthetic"), "synthetic.yaml")
     for study in ("heldout", "perception"):
-        studied = shipped("demo", study)
+        studied = parse(Config, shipped("demo", study), study)
         for section in ("perception", "images", "baselines"):
-            assert synthetic[section] == studied[section]
-        assert studied["synthetic"]["size"] == synthetic["synthetic"].get("size", "demo")
+            assert getattr(synthetic, section) == getattr(studied, section)
+        assert studied.synthetic.size == synthetic.synthetic.size
 
 
 def test_the_whole_benchmark_has_every_method_and_study_of_the_paper(tmp_path):
@@ -578,7 +575,7 @@ def test_the_whole_benchmark_has_every_method_and_study_of_the_paper(tmp_path):
 
 
 def test_studies_bring_the_methods_of_their_rows_in_the_order_of_the_table():
-    studies, methods = (config.read_yaml(ROOT / "config" / f"{name}.yaml") for name in ("studies", "methods"))
+    studies, methods = config.read_yaml(ROOT / "config" / "studies.yaml"), tables.read_methods(ROOT / "config" / "methods.yaml")
     made = Benchmark(shipped("toy", "paper"), ROOT).whole.methods
     named = {method for name in shipped("toy", "paper")["studies"] for method in studies[name]["rows"].values()}
     listed = set(shipped("toy", "paper")["methods"])
@@ -662,8 +659,8 @@ def test_every_method_that_is_shipped_is_valid():
     methods = tables.read_methods(ROOT / "config" / "methods.yaml")
     values = config.read_yaml(ROOT / "config" / "data" / "demo.yaml") | {"methods": list(methods)}
     made = Benchmark(values, ROOT)
-    # No two rows are the same: each has a fit of its own, the oracle too.
-    assert {name for name, owner in made.fit_of_method.items() if name != owner} == set()
+    # No two rows are the same: each has a fit of its own, the oracle too. But one has as many regions as `clusters` says.
+    assert {name: owner for name, owner in made.fit_of_method.items() if name != owner} == {"clusters_5": "neuspring"}
     regions = {name: made.searches[row.searched].clusters for name, row in made.methods.items() if name.startswith("clusters_")}
     assert regions == {name: int(name.removeprefix("clusters_")) for name in regions}
 
@@ -679,15 +676,41 @@ def test_every_row_that_is_shipped_is_named_somewhere():
     words = set(re.findall(r"\w+", "\n".join(path.read_text() for path in files)))
     methods = tables.read_methods(ROOT / "config" / "methods.yaml")
     assert set(methods) <= words
-    assert set(tables.read_searches(ROOT / "config" / "searches.yaml")) == {row.search for row in methods.values() if row.search}
+    assert set(read_searches(ROOT / "config" / "searches.yaml")) == {row.search for row in methods.values() if row.search}
 
 
-@pytest.mark.parametrize(
-    ("name", "hint"), [("phystwin", "now 'baseline'"), ("plus_average", "removed; "), ("baselin", "did you mean")]
-)
-def test_rows_of_older_tables_are_refused_with_what_became_of_them(name, hint):
-    with pytest.raises(InputError, match=hint):
-        Benchmark(shipped("toy") | {"methods": [name]}, ROOT)
+def test_a_row_extends_another_and_each_stands_for_one_per_value(tmp_path):
+    text = """
+uniform: {clusters: 1, description: one, settings: {rollouts: 40, polish: {rounds: 2}}}
+more: {extends: uniform, description: more, settings: {rollouts: 80}}
+most: {extends: more, settings: {polish: {rounds: 0}}}
+k{each}: {each: [2, 3], extends: uniform, clusters: "{each}", description: "{each} regions"}
+key: {extends: k2, clusters: null}
+"""
+    rows = tables.read_searches(write(tmp_path / "searches.yaml", text), clusters=7)
+    assert rows["most"] == config.SearchRow(clusters=1, description="more", settings={"rollouts": 80, "polish": {"rounds": 0}})
+    assert rows["uniform"].settings == {"rollouts": 40, "polish": {"rounds": 2}}
+    assert {name: (row.clusters, row.description) for name, row in rows.items() if name[0] == "k"} == {
+        "k2": (2, "2 regions"),
+        "k3": (3, "3 regions"),
+        "key": (7, "2 regions"),
+    }
+
+
+@pytest.mark.parametrize(("values", "regions"), [({}, 5), ({"clusters": 3}, 3), ({"clusters": 7}, 7)])
+def test_rows_that_name_no_number_of_regions_have_that_of_the_key(values, regions):
+    names = ["model_b", "clusters_3", "neuspring"]
+    made = Benchmark(shipped("toy") | {"methods": names} | values, ROOT)
+    assert [made.searches[made.methods[name].searched].clusters for name in names] == [1, 3, regions]
+    # Rows that do the same share search and fit.
+    shared = {name: made.fit_of_method[name] for name in names}
+    assert shared == {name: "neuspring" if regions == 3 and name == "clusters_3" else name for name in names}
+    assert len(made.searches) == (2 if regions == 3 else 3)
+
+
+def test_unknown_rows_are_refused_with_one_that_is_spelled_alike():
+    with pytest.raises(InputError, match="'baselin' \\(did you mean 'baseline'"):
+        Benchmark(shipped("toy") | {"methods": ["baselin"]}, ROOT)
 
 
 def test_fits_of_equal_horizon_share_launches_where_they_are_not_too_few():
@@ -704,7 +727,7 @@ def test_fits_of_equal_horizon_share_launches_where_they_are_not_too_few():
 
 
 def test_quirks_of_a_search_row_reach_its_search_and_its_fits_alone() -> None:
-    values = {"scenarios": ["toy_rope_lift_smooth"], "methods": ["baseline", "released_search", "phystwin_released"], "seeds": [0]}
+    values = {"scenarios": ["toy_rope_lift_smooth"], "methods": ["baseline", "phystwin_released"], "seeds": [0]}
     graph = Graph(Benchmark(values, ROOT))
 
     def settings(stage: str, **job: str) -> dict[str, Any]:
@@ -715,7 +738,6 @@ def test_quirks_of_a_search_row_reach_its_search_and_its_fits_alone() -> None:
     for row, method, on in (("uniform", "baseline", False), ("released_quirks", "phystwin_released", True)):
         for found in (settings("search", search=row), settings("fit", method=method)):
             assert found["released_quirks"] == dict.fromkeys(config.plain(config.ReleasedQuirks()), on)
-    assert not any(settings("search", search="released_uniform")["released_quirks"].values())
     fitted = settings("fit", method="phystwin_released")["fit"]
     assert (fitted["horizon"], fitted["learning_rate"]) == (1, 1e-3)
     variant = graph.variant(SimpleNamespace(method="phystwin_released"))
@@ -724,7 +746,7 @@ def test_quirks_of_a_search_row_reach_its_search_and_its_fits_alone() -> None:
 
 
 def test_the_released_rows_have_the_released_search() -> None:
-    made = Benchmark({"scenarios": ["toy_rope_lift_smooth"], "methods": ["released_search", "phystwin_released"]}, ROOT)
+    made = Benchmark({"scenarios": ["toy_rope_lift_smooth"], "methods": ["phystwin_released"]}, ROOT)
     for name, row in made.searches.items():
         search = tables.with_search(made.config, row, name).search
         variables = config.plain(search.variables)

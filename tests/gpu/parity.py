@@ -22,10 +22,9 @@ import numpy as np
 import torch
 
 from neuspring import config
-from neuspring.baselines.spring_gaus.model import SpringGausModel
+from neuspring.baselines.spring_gaus.model import SpringGausModel, SpringGausTraining
 from neuspring.baselines.spring_gaus.model import roll_out as roll_out_anchors
 from neuspring.baselines.spring_gaus.physics import AnchorGraph, AnchorSolver
-from neuspring.config.baselines import SpringGaus
 from neuspring.core.device import resolve_device
 from neuspring.physics.parameters import pack, twin_tensors
 from neuspring.physics.solver import simulate_frame, solver_for
@@ -154,7 +153,7 @@ def spring_gaus(device: str) -> dict[str, Any]:
     lattice = np.stack(np.meshgrid(np.arange(8), np.arange(3), np.arange(3), indexing="ij"), axis=-1).reshape(-1, 3)
     anchors = lattice * 0.02 + np.random.default_rng(0).uniform(-0.002, 0.002, lattice.shape) + [0, 0, 0.05]
     hands = (anchors[:3] + 0.004)[None] + 0.01 * np.arange(12)[:, None, None] * np.array([0.3, 0.2, 1.0])
-    settings = SpringGaus(anchors=72, neighbors=12, full_neighbors=8, substeps=150, damping=1.0)
+    settings = SpringGausTraining(anchors=72, neighbors=12, full_neighbors=8, substeps=150, damping=1.0)
     graph = AnchorGraph.between(anchors, hands[0], settings.neighbors)
     model = SpringGausModel.start(graph, settings, frame_time=1 / 30, up_sign=1.0, gravity=9.8, ground=True)
     model = replace(model, link_stiffness=3e3)

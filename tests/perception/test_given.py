@@ -18,7 +18,6 @@ from neuspring.perception.sample import among, assemble, spacing
 from neuspring.perception.shape import no_prior
 from neuspring.perception.track_opencv import choose
 from neuspring.scores import metrics
-from neuspring.twin.candidates import recordings
 from neuspring.twin.losses import FrameLoss
 from tests.support import small
 from tests.support.colored import UP, camera, paint
@@ -68,8 +67,7 @@ def test_given_hands_are_the_controllers(tmp_path):
     np.testing.assert_allclose(seen.tracks, tracks, atol=1e-6)
     assert np.isfinite(metrics.errors_per_frame(np.repeat(seen.nodes[None], 8, axis=0), seen)["track_error"]).all()
     searched = small.search_problem(seen)
-    loss = FrameLoss.of(seen, Config().losses, "cpu")
-    begun = recordings(searched, loss)[0].hands
+    begun = searched.recordings[0].hands
     np.testing.assert_allclose(begun[:, :, :3], hands[: seen.scenario.train_end], atol=1e-6)
     strip = hands_strip(capture, seen.image, lifted.controller_points, tmp_path / "hands.png")
     assert (cv2.imread(str(strip)) == (60, 60, 255)).all(axis=2).any()

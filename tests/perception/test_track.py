@@ -53,10 +53,9 @@ def error(tracks: track_opencv.Followed, frame: int) -> np.ndarray:
     return np.linalg.norm(tracks.pixels[frame] - tracks.pixels[0] - SHIFT * frame, axis=1)
 
 
-@pytest.mark.parametrize("method", ["lucas_kanade", "dis"])
-def test_points_move_with_the_texture(video, method):
+def test_points_move_with_the_texture(video):
     capture, labels = video
-    tracks = track_opencv.track(capture, "0", labels, OpenCvTracking(method=method, points=200), 0)
+    tracks = track_opencv.track(capture, "0", labels, OpenCvTracking(points=200), 0)
     seen = tracks.visible[2]
     assert seen.mean() > 0.8
     assert np.median(error(tracks, 2)[seen]) < 0.25

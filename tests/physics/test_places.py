@@ -15,7 +15,7 @@ PLACES = {
     "physics/reference.py": "the specification",
     "config/search.py": "range, scale and start",
     "twin/parameters.py": "how it is trained",
-    "extensions/exports/formats/npz.py": "the equation in words",
+    "twin/bodies/lattice.py": "the equation in words",
 }
 """Of drag, with `decay`, what the kernels take of it: files of the package that a force with one trained parameter needs."""
 VALUES = {
@@ -28,7 +28,15 @@ VALUES = {
 """Files that give or translate the value that drag, which has no default, has in their case. A new parameter has a default."""
 OTHERS = {"data/synthetic/fem.py", "data/synthetic/kernels.py", "extensions/play/page.py"}
 """Drag of another simulator; dragging with a mouse."""
-RODS = {"config/rod.py", "physics/rod.py", "physics/rod_nodes.py", "physics/rod_reference.py", "twin/rod.py", "twin/rod_fit.py"}
+RODS = {
+    "config/rod.py",
+    "physics/rod.py",
+    "physics/rod_nodes.py",
+    "physics/rod_reference.py",
+    "twin/bodies/rod.py",
+    "twin/rod.py",
+    "twin/rod_fit.py",
+}
 """Rods are a simulator of their own."""
 
 

@@ -11,7 +11,7 @@ from neuspring import config
 from neuspring.baselines import BASELINES
 from neuspring.baselines.gs_dynamics.model import GsDynamicsModel
 from neuspring.baselines.gs_dynamics.model import predict as predicted
-from neuspring.baselines.spring_gaus.model import SpringGausModel
+from neuspring.baselines.spring_gaus.model import SpringGausModel, SpringGausTraining
 from neuspring.config.baselines import Baselines, GsDynamics, SpringGaus
 from neuspring.config.images import Appearance, Images
 from neuspring.core.artifacts import Observations, SplatCenters, Trajectory
@@ -27,9 +27,9 @@ from tests.support import small
 from tests.support.filmed import FRAMES, film
 from tests.support.pictured import Scene, pictured
 
-POINTS = SpringGaus(supervision="points", anchors=60, iterations=2, neighbors=8, full_neighbors=6)
+POINTS = SpringGaus(supervision="points", anchors=60, iterations=2)
 MASKS = replace(POINTS, supervision="masks", anchors=150)
-NETWORK = GsDynamics(width=8, batch=2, epochs=1, updates_per_epoch=2, step=0.002, particles=20)
+NETWORK = GsDynamics(width=8, batch=2, epochs=1, updates_per_epoch=2, step=0.002)
 
 
 def settings(**models: object) -> config.Config:
@@ -105,9 +105,10 @@ def test_a_network_moves_to_another_recording(seen, tmp_path):
     pd.testing.assert_frame_equal(scores, wanted)
 
 
-def test_a_training_that_breaks_is_a_failure_whose_run_is_held_and_counted(seen):
-    stiff = replace(POINTS, stiffness=1e12, substeps=1, max_substeps=2)
-    run = run_all(seen, "spring_gaus", settings(spring_gaus=stiff))
+def test_a_training_that_breaks_is_a_failure_whose_run_is_held_and_counted(seen, monkeypatch):
+    stiff = SpringGausTraining(supervision="points", anchors=60, iterations=2, stiffness=1e12, substeps=1, max_substeps=2)
+    monkeypatch.setattr(SpringGausTraining, "of", lambda settings: stiff)
+    run = run_all(seen, "spring_gaus", settings())
     record = json.loads(run.read_text())
     trained = StageRecord.load(run.with_name("train.json"))
     assert trained.status == "failed" and "the anchors left the scene" in trained.reason
@@ -123,7 +124,7 @@ def test_a_training_that_breaks_is_a_failure_whose_run_is_held_and_counted(seen)
     np.testing.assert_allclose(held["value"], static["value"])
 
 
-def test_splats_that_failed_and_too_few_anchors_are_failures_that_are_counted(seen, tmp_path):
+def test_splats_that_failed_and_too_few_anchors_are_failures_that_are_counted(seen, tmp_path, monkeypatch):
     learned = tmp_path / "appearance.json"
     Recorder("appearance", learned).save(failure="appearance: step 3 removed the last splat")
     pictures = {"appearance": learned}
@@ -139,8 +140,9 @@ def test_splats_that_failed_and_too_few_anchors_are_failures_that_are_counted(se
     )
     found = StageRecord.load(out)
     assert (found.status, found.files) == ("failed", {}) and "removed the last splat" in found.reason
-    lonely = settings(spring_gaus=replace(POINTS, neighbors=500))
-    run = run_all(seen, "spring_gaus", lonely)
+    lonely = SpringGausTraining(supervision="points", anchors=60, iterations=2, neighbors=500)
+    monkeypatch.setattr(SpringGausTraining, "of", lambda settings: lonely)
+    run = run_all(seen, "spring_gaus", settings())
     record = json.loads(run.read_text())
     assert record["status"] == "failed" and "more anchors than neighbors (500) are required" in record["reason"]
     assert set(pd.read_parquet(run.with_name(record["held_file"]))["task"]) == {"reconstruction", "future"}

@@ -40,20 +40,17 @@ def run(seen: dict[str, Path], folder: Path, **pool) -> tuple[StageRecord, Stage
 def test_records_name_the_pool_and_count_its_frames(seen, tmp_path):
     alone = run(seen, tmp_path / "alone")
     pooled = run(seen, tmp_path / "pooled", pool=[seen["shake"]])
-    left_out = run(seen, tmp_path / "left_out", pool=[seen["shake"]], leave_out=True)
-    for one, both, other in zip(alone, pooled, left_out, strict=True):
+    for one, both in zip(alone, pooled, strict=True):
         assert "pool0" not in one.inputs
-        assert both.inputs["pool0"] == other.inputs["pool0"] == digest_file(seen["shake"])
-        assert [record.settings["leave_out"] for record in (one, both, other)] == [False, False, True]
-        assert one.status == both.status == other.status == "ok"
+        assert both.inputs["pool0"] == digest_file(seen["shake"])
+        assert one.status == both.status == "ok"
     ratio = [both.facts["spring_updates"] / (both.facts["springs"] * both.facts["substeps"]) for both in (alone[1], pooled[1])]
     assert ratio[1] == 2 * ratio[0]
     stiffness = [
         Twin.load(record.file("twin", tmp_path / name / "fit" / "fit.json")).material.stiffness
-        for name, (_, record) in (("alone", alone), ("pooled", pooled), ("left_out", left_out))
+        for name, (_, record) in (("alone", alone), ("pooled", pooled))
     ]
     assert not np.array_equal(stiffness[0], stiffness[1])
-    assert not np.array_equal(stiffness[1], stiffness[2])
 
 
 def test_a_search_on_another_pool_starts_afresh(seen, tmp_path, capsys):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pandas as pd
 
-from neuspring.stages.search import at_ends
 from neuspring.twin.candidates import CMAES
 from neuspring.twin.polish import SLOPES
+from neuspring.twin.search import at_ends
 
 VARIABLES = ("stiffness", "dashpot", "drag", "contact_friction")
 

@@ -14,7 +14,7 @@ import torch
 from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.data.synthetic import toy
-from neuspring.twin.candidates import SearchProblem, candidate, recordings
+from neuspring.twin.candidates import SearchProblem, candidate
 from neuspring.twin.fit import FitProblem
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.trials import Outcome, outcomes
@@ -56,7 +56,7 @@ def spoiled_future() -> Observations:
 @functools.cache
 def _released() -> dict[str, object]:
     rows = config.read_yaml(Path(__file__).parents[2] / "config" / "searches.yaml")
-    return dict(rows["released_uniform"]["settings"])
+    return {key: value for key, value in rows["released_quirks"]["settings"].items() if key != "isolated_nodes"}
 
 
 def variables(ranges: Mapping[str, Any] = {}, scales: Mapping[str, str] = {}, start: Mapping[str, float] = {}) -> dict[str, Any]:
@@ -81,7 +81,7 @@ def search_problem(seen: Observations | None = None, **changes: object) -> Searc
     settings: dict[str, object] = {
         "observations": seen or observations(),
         "search": released(rollouts=22, start={"object_radius": 0.045, "stiffness": 1e4}),
-        "simulation": config.Simulation(),
+        "simulation": config.SimulationSettings(),
         "losses": config.Losses(),
         "quirks": config.ReleasedQuirks(),
     }
@@ -90,8 +90,8 @@ def search_problem(seen: Observations | None = None, **changes: object) -> Searc
 
 def judge(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> list[Outcome]:
     """What becomes of candidates that are rolled out together over the training frames."""
-    own = recordings(problem, loss)[0]
-    return outcomes(twins, own.hands, own.velocity, own.loss, problem.device)
+    own = problem.recordings[0]
+    return outcomes(twins, own.hands, own.velocity, loss, problem.device)
 
 
 def rollout_loss(loss: FrameLoss, states: Iterable[tuple[int, torch.Tensor, torch.Tensor]], velocity: torch.Tensor) -> float:

@@ -8,12 +8,12 @@ import torch
 
 from neuspring import config
 from neuspring.config import Losses
-from neuspring.twin.candidates import Recording, SearchProblem, candidate, evaluate, recordings
+from neuspring.twin.candidates import SearchProblem, candidate, evaluate
 from neuspring.twin.fit import FitProblem, TwinFit
 from neuspring.twin.losses import BETA, FrameLoss
 from neuspring.twin.polish import POLISH, products
 from neuspring.twin.search import search
-from neuspring.twin.transfer import on_recording
+from neuspring.twin.transfer import in_pool
 from neuspring.twin.trials import motions
 from tests.support import colored, small
 from tests.support.searches import assert_same_trace
@@ -104,7 +104,7 @@ def test_a_candidates_cost_is_that_of_its_rollout_and_of_its_residuals():
     together, alone = small.judge(problem, twins, loss), [small.judge(problem, [twin], loss)[0] for twin in twins]
     assert together == alone
     assert together[0].cost != together[1].cost
-    own = recordings(problem, loss)[0]
+    own = problem.recordings[0]
     start = own.velocity
     x, v = motions(twins, own.hands, start, "cpu")
     for k, outcome in enumerate(together):
@@ -122,10 +122,18 @@ def test_gradients_of_stiffness_through_projection_and_simulator(name):
     twin = candidate(problem, problem.decode(problem.encode()))
     twin = replace(twin, simulation=replace(twin.simulation, substeps=100))
     settings = config.Fit(horizon=0, learning_rate=1e-12, epochs=1, global_stiffness=True)
-    rules = config.Simulation(substeps=100), weights, config.ReleasedQuirks()
 
     def loss_at(shift: float) -> tuple[float, float]:
-        run = TwinFit(FitProblem(problem.observations, twin, settings, *rules))
+        run = TwinFit(
+            FitProblem(
+                observations=problem.observations,
+                twin=twin,
+                fit=settings,
+                simulation=config.SimulationSettings(substeps=100),
+                losses=weights,
+                quirks=config.ReleasedQuirks(),
+            )
+        )
         with torch.no_grad():
             run.parameters.factors["stiffness"] += shift
         packed = run.stable_parameters()
@@ -154,11 +162,10 @@ def test_a_search_reads_training_frames_alone():
 
 def test_recordings_of_color_alone_form_a_pool():
     alone, other = problem_of(losses=ALL), colored.observed("rope/shake/smooth")
-    loss = FrameLoss.of(alone.observations, ALL, "cpu")
-    both = replace(alone, pool=(Recording.of(other, alone.simulation, ALL, alone.quirks),))
-    each = (alone, replace(both, leave_out=True), both)
-    one, moved, mean = (evaluate(problem, [alone.encode()], loss, 0, 0, map)[0]["cost"] for problem in each)
+    each = (alone, replace(alone, pool=(other,)))
+    one, mean = (evaluate(problem, [alone.encode()], False, 0, 0)[0]["cost"] for problem in each)
+    # The cost of the other recording is its own error in the image.
+    twin = in_pool(candidate(alone, alone.decode(alone.encode())), other, keep_frame_time=False)
+    moved = small.judge(small.search_problem(other), [twin], FrameLoss.of(other, ALL, "cpu"))[0].cost
     assert mean == pytest.approx((one + moved) / 2, rel=1e-12)
-    # What the other recording costs is its own error in the image.
-    twin = on_recording(candidate(alone, alone.decode(alone.encode())), other, alone.quirks)
-    assert moved == small.judge(small.search_problem(other), [twin], FrameLoss.of(other, ALL, "cpu"))[0].cost != one
+    assert moved != one

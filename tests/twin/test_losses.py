@@ -12,7 +12,7 @@ import torch
 from neuspring import config
 from neuspring.config import Losses
 from neuspring.twin import losses
-from neuspring.twin.candidates import candidate, recordings
+from neuspring.twin.candidates import candidate
 from neuspring.twin.fit import TwinFit
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.polish import products
@@ -176,7 +176,7 @@ def test_a_new_term_is_a_weight_and_a_function(monkeypatch: pytest.MonkeyPatch) 
     twin = candidate(problem, small.start_values())
     loss = FrameLoss.of(problem.observations, weights, "cpu")
     (searched,) = small.judge(problem, [twin], loss)
-    own = recordings(problem, loss)[0]
+    own = problem.recordings[0]
     start = own.velocity
     x, v = motions([twin], own.hands, start, "cpu")
     expected = float((x[:, 0, :, 2].double() - 0.1).square().mean())

@@ -40,7 +40,7 @@ def twin() -> Twin:
 
 def parameters(kind: str = "field", start: Twin | None = None, field: dict | None = None, **settings) -> TwinParameters:
     """Trained values of the small twin."""
-    fit = config.Fit(field=config.SpringField(**(SMALL | (field or {}))), **settings)
+    fit = config.Fit(field=config.SpringFieldSettings(**(SMALL | (field or {}))), **settings)
     return TwinParameters(start or twin(), fit, kind, "cpu")
 
 
@@ -256,7 +256,7 @@ def test_stiffness_of_zero_can_grow():
 
 
 def test_learning_rates_of_each_group():
-    rates = {"learning_rate": 0.1, "scalar_learning_rate": 0.2, "factor_learning_rate": 0.4}
+    rates = {"learning_rate": 0.1, "factor_learning_rate": 0.4}
     beside = {"offsets": True, "offset_learning_rate": 0.5}
     trained = parameters(field={"plane_learning_rate": 0.3} | beside, damping="homogeneous", **rates)
     expected = {"field.layers": 0.1, "field.planes": 0.3, "factors": 0.4, "offsets": 0.5}
@@ -265,7 +265,7 @@ def test_learning_rates_of_each_group():
         assert group["lr"] == group["base_rate"]
         for tensor in group["params"]:
             name = names.pop(tensor)
-            wanted = next((values for start, values in expected.items() if name.startswith(start)), 0.2)
+            wanted = next((values for start, values in expected.items() if name.startswith(start)), 0.1)
             assert group["lr"] == wanted, name
     assert not names, "every trained value belongs to one group"
 
@@ -319,7 +319,7 @@ def test_the_twin_is_what_is_simulated(kind):
 
 # What moved -----------------------------------------------------------------------------------------------------------
 
-OF_TEXELS = config.SpringField(channels=4, hidden=8, bands=2, texel_scale=0.02)
+OF_TEXELS = config.SpringFieldSettings(channels=4, hidden=8, bands=2, texel_scale=0.02)
 
 
 def of_scene(kind: str, **settings: object) -> TwinParameters:
@@ -359,7 +359,7 @@ def test_common_factors_are_reported():
 
 
 def test_gradients_are_compared_with_epsilon():
-    still = {"epochs": 1, "learning_rate": 1e-12, "scalar_learning_rate": 1e-12}
+    still = {"epochs": 1, "learning_rate": 1e-12}
     runs = [fit(small.fit_problem(fit=config.Fit(epsilon=epsilon, **still))) for epsilon in (1e-15, 1e-3)]
     coarse, fine = (run.figures["gradient_over_epsilon"] for run in runs)
     assert coarse == pytest.approx(1e12 * fine, rel=1e-2)

@@ -1,6 +1,7 @@
 """Levenberg-Marquardt after CMA-ES: residuals, steps, and what it makes of a toy twin."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -11,9 +12,10 @@ from neuspring import config
 from neuspring.config.search import TRIALS
 from neuspring.core.errors import NumericalFailure
 from neuspring.twin import search as module
-from neuspring.twin.candidates import CMAES, SearchProblem, candidate, evaluate, recordings
+from neuspring.twin.candidates import CMAES, SearchProblem, candidate, evaluate
+from neuspring.twin.levenberg import damped_step
 from neuspring.twin.losses import FrameLoss
-from neuspring.twin.polish import POLISH, REACH, SLOPES, Polish, damped_step, products, residuals
+from neuspring.twin.polish import POLISH, REACH, SLOPES, Polish, products, residuals, slope_rows
 from neuspring.twin.search import search
 from neuspring.twin.trials import motions
 from tests.support import small
@@ -41,7 +43,7 @@ def polished(rollouts: int = 50, *, start: dict | None = None, rounds: int = 6, 
 
 def rollouts_of(problem: SearchProblem, twins: list) -> tuple[torch.Tensor, torch.Tensor, FrameLoss, torch.Tensor]:
     loss = FrameLoss.of(problem.observations, problem.losses, "cpu", frozen_counts=problem.quirks.frozen_loss_denominators)
-    own = recordings(problem, loss)[0]
+    own = problem.recordings[0]
     return *motions(twins, own.hands, own.velocity, "cpu"), loss, own.velocity
 
 
@@ -174,9 +176,9 @@ def test_stiffness_and_drag_of_a_toy_twin_are_recovered():
     points[1:] = x[:, 0, : points.shape[1]]
     problem = replace(problem, observations=replace(seen, object_points=points))
     # The polish alone, from the start of the search.
-    loss = FrameLoss.of(problem.observations, problem.losses, "cpu")
-    rows = evaluate(problem, [problem.encode()], loss, 0, 0, map)
-    ends = list(module._polished(problem, rows, [], loss, 0, map))[-1]
+    judge, slopes = partial(evaluate, problem), partial(slope_rows, problem)
+    rows = judge([problem.encode()], False, 0, 0)
+    ends = list(module._polished(problem.search, problem.variables, rows, [], 0, judge, slopes, False))[-1]
     tried = [row for row in ends if row["stage"] == POLISH]
     best = min(tried, key=lambda row: row["cost"])
     assert best["cost"] < 1e-3 * rows[0]["cost"]
@@ -189,7 +191,7 @@ def test_a_polish_never_raises_the_cost_and_keeps_the_topology():
     problem = polished(22 + 3 * ROUND, rounds=3)
     result = search(problem, seed=0)
     trace = result.trace
-    plain = search(replace(problem, search=replace(problem.search, rollouts=22, polish=config.Polish(rounds=0))), seed=0)
+    plain = search(replace(problem, search=replace(problem.search, rollouts=22, polish=config.PolishSettings(rounds=0))), seed=0)
     assert_same_trace(trace[:22].drop(columns=[c for c in trace if c.startswith("product.")]), plain.trace)
     assert result.cost < plain.cost
     assert set(trace["stage"][22:]) == {SLOPES, POLISH}
@@ -211,7 +213,7 @@ def test_the_polish_is_part_of_the_budget(monkeypatch, rollouts, rounds):
     settings = config.Search(rollouts=rollouts)
     assert settings.polish_rounds == rounds
     assert settings.cma_rollouts == rollouts - rounds * ROUND
-    assert config.Search(rollouts=rollouts, polish=config.Polish(rounds=0)).cma_rollouts == rollouts
+    assert config.Search(rollouts=rollouts, polish=config.PolishSettings(rounds=0)).cma_rollouts == rollouts
 
 
 def test_the_polish_is_the_same_however_candidates_are_simulated():
@@ -259,4 +261,4 @@ def test_a_larger_budget_begins_its_polish_anew(tmp_path):
 
 def test_nothing_is_polished_where_no_candidate_could_be_simulated():
     with pytest.raises(NumericalFailure, match="none of 22 candidates"):
-        search(polished(30, rounds=1, simulation=config.Simulation(max_substeps=1)), seed=0)
+        search(polished(30, rounds=1, simulation=config.SimulationSettings(max_substeps=1)), seed=0)

@@ -11,12 +11,11 @@ from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError
 from neuspring.twin import polish as module
-from neuspring.twin.candidates import PENALTY, Recording, SearchProblem, evaluate, made, mean_outcome
+from neuspring.twin.candidates import PENALTY, SearchProblem, evaluate, made, mean_outcome
 from neuspring.twin.fit import FitProblem, FitResult, PooledFit, fit
-from neuspring.twin.losses import FrameLoss
 from neuspring.twin.polish import POLISH, SLOPES, Polish
 from neuspring.twin.search import search
-from neuspring.twin.trials import Outcome
+from neuspring.twin.trials import Outcome, outcomes
 from tests.support import small
 
 POLISHED = {
@@ -52,10 +51,9 @@ def polished(own: Observations, **changes) -> SearchProblem:
     return small.search_problem(own, search=small.released(rollouts=ROLLOUTS, start=start, polish=polish, **POLISHED), **changes)
 
 
-def on_pool(alone: SearchProblem, *others: str, leave_out: bool = False, **changes) -> SearchProblem:
+def on_pool(alone: SearchProblem, *others: str, **changes) -> SearchProblem:
     """The search on other recordings too."""
-    pool = tuple(Recording.of(seen(path), alone.simulation, alone.losses, alone.quirks) for path in others)
-    return replace(alone, pool=pool, leave_out=leave_out, **changes)
+    return replace(alone, pool=tuple(map(seen, others)), **changes)
 
 
 def traced(problem: SearchProblem) -> pd.DataFrame:
@@ -68,17 +66,6 @@ def searched(here: str, *others: str, **options) -> pd.DataFrame:
     return traced(on_pool(small.search_problem(seen(here)), *others, **options))
 
 
-def spoiled(observations: Observations) -> Observations:
-    """Everything after frame 0 is another motion, and hidden."""
-    later = (np.arange(small.FRAMES) > 0)[:, None]
-    return replace(
-        observations,
-        object_points=observations.object_points + later[..., None].astype(np.float32),
-        controller_points=observations.controller_points - 0.5 * later[..., None].astype(np.float32),
-        object_visibility=observations.object_visibility & ~later,
-    )
-
-
 # Search ---------------------------------------------------------------------------------------------------------------
 
 
@@ -86,33 +73,35 @@ def test_a_recording_beside_itself_changes_nothing():
     alone = polished(seen(LIFTED))
     expected = traced(alone)
     assert expected["stage"].tolist()[11:] == [SLOPES] * 4 + [POLISH] * 4
-    for leave_out in (False, True):
-        found = traced(on_pool(alone, LIFTED, leave_out=leave_out))
-        pd.testing.assert_frame_equal(found, expected, check_exact=True)
+    pd.testing.assert_frame_equal(traced(on_pool(alone, LIFTED)), expected, check_exact=True)
 
 
 def test_costs_and_products_of_a_polish_are_means_over_the_recordings():
-    """The same candidates, judged on both recordings, on one, and on the other: as CMA-ES does, and for slopes."""
-    both = on_pool(polished(seen(LIFTED)), SHAKEN)
-    alone, moved = replace(both, pool=()), replace(both, leave_out=True)
-    loss = FrameLoss.of(both.observations, both.losses, "cpu")
+    """The same candidates, judged on one recording, on two, and with the second one twice: as CMA-ES does, and for slopes."""
+    alone = polished(seen(LIFTED))
+    both = on_pool(alone, SHAKEN)
+    problems = (alone, both, on_pool(alone, SHAKEN, SHAKEN))
     settings = both.search
     columns = [both.variables.index(name) for name in settings.polished]
     polish = Polish(settings, columns, both.encode(), 1.0)
     population, steps = polish.ask(), polish.steps()
-    costs = [[row["cost"] for row in evaluate(each, population, loss, 0, 0, map)] for each in (both, alone, moved)]
-    np.testing.assert_allclose(costs[0], np.mean(costs[1:], axis=0), rtol=1e-12)
-    tables = [pd.DataFrame(module.slope_rows(each, population, steps, loss, 0, 0, map)) for each in (both, alone, moved)]
+    costs = [np.array([row["cost"] for row in evaluate(each, population, False, 0, 0)]) for each in problems]
+    families = [made(both, normalized)[1] for normalized in population]
+    there = both.recordings[1]
+    moved = [judged.cost for judged in outcomes([pair[1] for pair in families], there.hands, there.velocity, there.loss, "cpu")]
+    np.testing.assert_allclose(costs[1], (costs[0] + moved) / 2, rtol=1e-12)
+    np.testing.assert_allclose(costs[2], (costs[0] + moved + moved) / 3, rtol=1e-12)
+    tables = [pd.DataFrame(module.slope_rows(each, population, False, steps, 0, 0)) for each in problems]
     judged = ["cost", *(name for name in tables[0] if name.startswith("product."))]
     assert len(judged) == 5
-    mean, one, other = (table[judged].to_numpy() for table in tables)
-    np.testing.assert_allclose(mean, (one + other) / 2, rtol=1e-12, atol=0)
+    one, mean, twice = (table[judged].to_numpy() for table in tables)
+    other = 2 * mean - one
+    np.testing.assert_allclose(twice, (one + 2 * other) / 3, rtol=1e-9, atol=0)
     assert (np.abs(one[1:] / other[1:] - 1) > 0.1).any(), "two recordings say something else"
 
 
 def test_a_neighbor_that_leaves_one_recording_has_no_slope(monkeypatch):
-    problem = on_pool(polished(seen(LIFTED)), SHAKEN)
-    loss, calls = FrameLoss.of(problem.observations, problem.losses, "cpu"), []
+    problem, calls = on_pool(polished(seen(LIFTED)), SHAKEN), []
     polish = Polish(problem.search, [problem.variables.index(name) for name in problem.search.polished], problem.encode(), 1.0)
     motions = module.motions
 
@@ -124,7 +113,7 @@ def test_a_neighbor_that_leaves_one_recording_has_no_slope(monkeypatch):
         return x, v
 
     monkeypatch.setattr(module, "motions", leaving)
-    rows = module.slope_rows(problem, polish.ask(), polish.steps(), loss, 0, 0, map)
+    rows = module.slope_rows(problem, polish.ask(), False, polish.steps(), 0, 0)
     assert len(calls) == 2
     assert [row["cost"] < PENALTY for row in rows] == [True, True, False, True]
     assert [row["product.residual"] != 0 for row in rows] == [False, True, False, True]
@@ -135,8 +124,7 @@ def test_springs_and_radii_are_the_same_on_all_recordings():
     search_settings = replace(polished(seen(LIFTED)).search, lengths="spacing")
     alone = replace(polished(seen(LIFTED)), search=search_settings)
     stretched = replace(seen(SHAKEN), **{name: 1.1 * getattr(seen(SHAKEN), name) for name in PLACES})
-    recording = Recording.of(stretched, alone.simulation, alone.losses, alone.quirks)
-    _, (here, there) = made(replace(alone, pool=(recording,)), alone.encode())
+    _, (here, there) = made(replace(alone, pool=(stretched,)), alone.encode())
     np.testing.assert_array_equal(here.topology.springs, there.topology.springs)
     np.testing.assert_allclose(there.topology.rest_lengths, 1.1 * here.topology.rest_lengths, rtol=SINGLE_POSITIONS)
 
@@ -164,9 +152,9 @@ def problem_of(path: str, *, oracle: bool = False, **settings) -> FitProblem:
     return small.fit_problem(seen(path), twin=start, fit=config.Fit(**changes), oracle=oracle)
 
 
-def pooled(problem: FitProblem, *pool: Observations, leave_out: bool = False, **options) -> FitResult:
+def pooled(problem: FitProblem, *pool: Observations, **options) -> FitResult:
     """A fit on a pool."""
-    return fit(replace(problem, pool=pool, leave_out=leave_out), **options)
+    return fit(replace(problem, pool=pool), **options)
 
 
 def require_equal(one: FitResult, other: FitResult) -> None:
@@ -187,26 +175,8 @@ def require_equal_twins(one: Twin, other: Twin) -> None:
     assert one.material.ground_friction == other.material.ground_friction
 
 
-SETTINGS = {
-    "one step and tail": ("springs", {"selection": "tail", "horizon": 0}),
-    "meters": ("springs", {"selection": "tail", "epochs": 2, "loss_unit": "meter"}),
-    "field": ("field", {"field": config.SpringField(channels=4, hidden=16, bands=2), "learning_rate": 1e-2, "horizon": 0}),
-}
-
-
-@pytest.mark.parametrize("name", SETTINGS)
-def test_a_pool_of_itself_alone_is_the_plain_fit(name):
-    kind, settings = SETTINGS[name]
-    problem = replace(problem_of(LIFTED, **settings), kind=kind)
-    require_equal(pooled(problem, problem.observations, leave_out=True), fit(problem))
-
-
 def test_an_oracle_on_a_pool_reads_the_future_of_what_counts():
-    problem, other, late = problem_of(LIFTED, oracle=True, epochs=1), seen(SHAKEN), small.spoiled_future()
-    found = pooled(problem, other, leave_out=True)
-    require_equal(found, pooled(replace(problem, observations=late), other, leave_out=True))
-    own = fit(replace(problem, observations=other))
-    np.testing.assert_array_equal(found.twin.material.stiffness, own.twin.material.stiffness)
+    problem, late = problem_of(LIFTED, oracle=True, epochs=1), small.spoiled_future()
     assert not np.array_equal(
         pooled(problem, late).twin.material.stiffness, pooled(problem, problem.observations).twin.material.stiffness
     )
@@ -228,26 +198,6 @@ def test_recordings_share_one_material_and_one_unit():
     run.set_rate(1.0)
     run.epoch()
     assert not np.array_equal(before["offsets"], run.parameters.copy()["offsets"])
-
-
-def test_left_out_recordings_lend_their_nodes_alone():
-    problem, other = problem_of(LIFTED, selection="tail"), seen(SHAKEN)
-    found = pooled(problem, other, leave_out=True)
-    require_equal(pooled(replace(problem, observations=spoiled(problem.observations)), other, leave_out=True), found)
-    # What is fitted is the other recording: on the same nodes, its own fit.
-    own = fit(replace(problem, observations=other))
-    np.testing.assert_array_equal(found.twin.material.stiffness, own.twin.material.stiffness)
-    assert not np.array_equal(found.twin.material.stiffness, fit(problem).twin.material.stiffness)
-
-
-def test_search_and_polish_read_nothing_of_what_is_left_out():
-    here, simulation = seen(LIFTED), config.Simulation(initial_velocity="observed")
-    alone = on_pool(polished(here, simulation=simulation), SHAKEN, leave_out=True)
-    first, second = (traced(replace(alone, observations=o)) for o in (here, spoiled(here)))
-    assert first["stage"].iloc[-1] == POLISH
-    pd.testing.assert_frame_equal(first, second, check_exact=True)
-    # What counts is read.
-    assert not traced(replace(alone, leave_out=False))["cost"].equals(first["cost"])
 
 
 def test_one_material_comes_nearer_to_two_recordings():
@@ -293,5 +243,3 @@ def test_recordings_with_other_nodes_are_refused():
     shuffled = replace(other, surface_points=other.surface_points[::-1], object_points=other.object_points[:, order])
     with pytest.raises(InputError, match=r"must have the same nodes"):
         PooledFit(replace(problem, pool=[shuffled]))
-    with pytest.raises(InputError, match=r"at least one other recording is required where this one is left out"):
-        replace(problem, leave_out=True)

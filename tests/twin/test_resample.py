@@ -10,8 +10,8 @@ from neuspring.core.artifacts import Material, Observations, Scenario, Simulatio
 from neuspring.core.errors import InputError
 from neuspring.physics import stability
 from neuspring.twin.rollout import roll_out
-from neuspring.twin.topology import distances, piecewise_topology, uniform_topology
-from neuspring.twin.transfer import infer_controller_radius, infer_radii, move, resampled, scale_between
+from neuspring.twin.topology import distances, infer_controller_radius, piecewise_topology, uniform_topology
+from neuspring.twin.transfer import infer_radii, move, resampled, scale_between
 
 FRAMES, RATE = 20, 30.0
 SUMS = 1e-4

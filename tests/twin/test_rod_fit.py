@@ -120,9 +120,16 @@ def test_what_a_rod_cannot_be_fitted_to_is_refused():
     with pytest.raises(InputError, match=r"markers along the line.*rod_single"):
         search_rod(rope, [rope], ropes.SETTINGS)
     twin = rod_twin(cable("one", 0), SETTINGS, AXIS)
-    sections = SETTINGS.fit, SETTINGS.simulation, SETTINGS.losses, SETTINGS.released_quirks
-    with pytest.raises(InputError, match="rods are fitted as rod"):
-        FitProblem(cable("one", 0), twin, *sections, kind="field")
+    with pytest.raises(InputError, match="a rod is fitted as rod; received field"):
+        FitProblem(
+            observations=cable("one", 0),
+            twin=twin,
+            fit=SETTINGS.fit,
+            simulation=SETTINGS.simulation,
+            losses=SETTINGS.losses,
+            quirks=SETTINGS.released_quirks,
+            kind="field",
+        )
 
 
 def test_slopes_are_derivatives_of_rollouts():
@@ -157,15 +164,3 @@ def test_fields_along_the_arc():
         made = variables.made(np.zeros(len(variables.scale)))
         np.testing.assert_array_equal(made.rod.bending, twin.rod.bending)
     assert sizes == {"constant": (0, 2), "knots": (4, 8), "free": (6, 12)}
-
-
-def test_the_residual_row_adds_a_correction_that_saves_and_loads(tmp_path):
-    _, seen, _, _ = planted(WITHOUT_MARKERS, 2, 0.5)
-    start = rod_twin(seen[0], SETTINGS, AXIS)
-    result = fitted(start, seen, markers=False, horizons=(3,), rounds=1, residual=True)
-    result.twin.save(tmp_path / "twin.npz")
-    again = Twin.load(tmp_path / "twin.npz")
-    np.testing.assert_array_equal(again.residual.weights, result.twin.residual.weights)
-    assert error(again, seen) < error(replace(again, residual=None), seen)
-    with pytest.raises(InputError, match="two or more recordings"):
-        fitted(start, seen[:1], markers=False, horizons=(3,), rounds=1, residual=True)

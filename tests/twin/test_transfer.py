@@ -12,6 +12,7 @@ from neuspring.core.errors import InputError
 from neuspring.data import mocap
 from neuspring.twin.candidates import candidate
 from neuspring.twin.fit import FitProblem
+from neuspring.twin.rod import rod_twin
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.topology import piecewise_topology
 from neuspring.twin.transfer import corresponds, move, require_pool, roll_between
@@ -192,7 +193,7 @@ def cable(folder, sag, **settings):
 
 def test_a_pool_whose_rings_are_turned_about_the_cable_is_refused(tmp_path):
     here, there = cable(tmp_path, 0.3), cable(tmp_path, 0.45)
-    require_pool(here, [there], leave_out=False)
+    require_pool(here, [there])
     assert 0.0 < roll_between(here, there) < 10.0
     # As when the roll starts from the axis that is least along the first tangent: y here, x in a steeper recording.
     turned = cable(tmp_path, 0.45, roll_axis="x")
@@ -203,7 +204,14 @@ def test_a_pool_whose_rings_are_turned_about_the_cable_is_refused(tmp_path):
     with pytest.raises(
         InputError, match=r"pool of cable_0\.3: node i of a cable.*; received \d+ degrees in cable_0\.45.*mocap\.roll"
     ):
-        require_pool(here, [turned], leave_out=False)
+        require_pool(here, [turned])
+    # Nodes around the line are the lattice's affair: a rod follows the markers alone.
+    settings = config.Config()
+    fit = {"fit": settings.fit, "simulation": settings.simulation, "losses": settings.losses, "quirks": settings.released_quirks}
+    twin = rod_twin(here, settings, (0.0, 1.0, 0.0))
+    assert FitProblem(observations=here, pool=[turned], twin=twin, kind="rod", **fit).epoch_frames > 0
+    with pytest.raises(InputError, match="as many tracked points, controllers and vertices"):
+        FitProblem(observations=here, pool=[replace(turned, line=turned.line[1:])], twin=twin, kind="rod", **fit)
     # One end alone, by as much as its ring has room.
     nodes = there.surface_points.reshape(12, 4, 3).copy()
     nodes[-3:] = np.roll(nodes[-3:], 1, axis=1)

@@ -43,7 +43,7 @@ CANDIDATES = (
 def colliding(seen: Observations, **simulation: object) -> SearchProblem:
     """The problem with self-collision."""
     crowded = replace(seen, scenario=replace(seen.scenario, self_collision=True))
-    return small.search_problem(crowded, simulation=config.Simulation(**simulation))  # type: ignore[arg-type]
+    return small.search_problem(crowded, simulation=config.SimulationSettings(**simulation))  # type: ignore[arg-type]
 
 
 def candidates(problem: SearchProblem, count: int = len(CANDIDATES)) -> list[Twin]:
@@ -71,8 +71,8 @@ def alone(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> lis
 
 def by_torch(problem: SearchProblem, twin: Twin, loss: FrameLoss) -> float:
     """The cost by the losses of the fit, over the rollout of a solver of the twin's own."""
-    states = frames(twin, solver_for(twin, differentiable=False), hands_of(problem), problem.velocity)
-    return small.rollout_loss(loss, states, torch.tensor(problem.velocity, dtype=torch.float32))
+    states = frames(twin, solver_for(twin, differentiable=False), hands_of(problem), problem.recordings[0].velocity.numpy())
+    return small.rollout_loss(loss, states, problem.recordings[0].velocity)
 
 
 # Batches --------------------------------------------------------------------------------------------------------------
@@ -210,7 +210,8 @@ def test_the_velocity_at_the_start_counts():
     """It moves the nodes, and the first change of velocity begins with it."""
     rest = small.search_problem()
     thrown = small.search_problem()
-    object.__setattr__(thrown, "velocity", np.random.default_rng(0).normal(0, 2.0, rest.velocity.shape).astype(np.float32))
+    start = torch.tensor(np.random.default_rng(0).normal(0, 2.0, rest.observations.nodes.shape).astype(np.float32))
+    object.__setattr__(thrown, "recordings", (replace(thrown.recordings[0], velocity=start),))
     twins, loss = candidates(rest, 3), loss_of(rest)
     costs = [outcome.cost for outcome in small.judge(thrown, twins, loss)]
     assert costs == pytest.approx([by_torch(thrown, twin, loss) for twin in twins], rel=FLOAT32_SUMS)
@@ -237,7 +238,7 @@ def test_a_node_that_comes_back_has_left():
     problem = small.search_problem()
     twins = candidates(problem, 3)
     solver = solver_for(twins, differentiable=False)
-    sums = LossSums(solver, loss_of(problem), torch.tensor(problem.velocity))
+    sums = LossSums(solver, loss_of(problem), problem.recordings[0].velocity)
     near = torch.tensor(twins[0].topology.nodes).expand(len(twins), -1, -1)
     for frame, gone in enumerate([(), (1,), (0, 1), ()], start=1):
         places = near.clone()

@@ -48,7 +48,7 @@ PRESETS: dict[PresetName, tuple[Any, ...]] = {
     "animals": (0.08, 6, 100, 0.003, 0.05, 64, True),
     "cloth": (0.075, 6, 150, 0.002, 0.1, 64, True),
 }
-"""The public configurations. Meanings as in `Rules` and `config.GsDynamics`."""
+"""The public configurations. Meanings as in `GsDynamicsTraining`."""
 CLOTHS = ("cloth", "package")
 COVERAGE = 0.03
 """m: no more particles are added once every point lies within it of a particle."""
@@ -61,8 +61,35 @@ Linear = partial(skip_init, torch.nn.Linear)
 
 
 @dataclass(frozen=True, kw_only=True)
+class GsDynamicsTraining(GsDynamics):
+    """The settings with what the public code fixes; what is None has the value of a public configuration, by the category."""
+
+    radius: float | None = None
+    """Distance below which nodes feel each other, m."""
+    neighbors: int | None = None
+    """Number k of nearest particles that a particle feels, itself included."""
+    particles: int | None = None
+    """Largest number of particles of a graph."""
+    noise: float | None = None
+    """Half width of the uniform noise that training adds to positions in the history, m."""
+    length_weight: float | None = None
+    """Weight lambda of the length loss."""
+    future: int = 5
+    """Steps that training predicts in a row."""
+    yaw: bool = True
+    """Turn each training window by a random angle about the vertical."""
+    learning_rate: float = 1e-3
+    """Adam's learning rate."""
+
+    @classmethod
+    def of(cls, settings: GsDynamics) -> GsDynamicsTraining:
+        """The training that the settings ask for."""
+        return cls(**vars(settings))
+
+
+@dataclass(frozen=True, kw_only=True)
 class Rules:
-    """Settings of graphs and of the network's inputs. A rollout needs these and the weights. Meanings as in GsDynamics."""
+    """Settings of graphs and of the network's inputs. A rollout needs these and the weights. Meanings as in GsDynamicsTraining."""
 
     radius: float
     neighbors: int
@@ -86,7 +113,7 @@ class Rules:
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """Settings of the training alone. Meanings as in GsDynamics."""
+    """Settings of the training alone. Meanings as in GsDynamicsTraining."""
 
     noise: float
     yaw: bool
@@ -102,8 +129,8 @@ def preset_name(category: str) -> PresetName:
     return "cloth" if category in CLOTHS else "animals"
 
 
-def resolve(settings: GsDynamics, category: str) -> tuple[Rules, Recipe]:
-    """The settings of a model and of its training, with every null replaced by the value of the preset."""
+def resolve(settings: GsDynamicsTraining, category: str) -> tuple[Rules, Recipe]:
+    """The settings of a model and of its training, with every None replaced by the value of the preset."""
     values = dict(zip(PRESET_COLUMNS, PRESETS[preset_name(category)], strict=True))
     values |= {"coverage": COVERAGE} | {name: value for name, value in vars(settings).items() if value is not None}
     rules, recipe = ({field.name: values[field.name] for field in fields(kind)} for kind in (Rules, Recipe))

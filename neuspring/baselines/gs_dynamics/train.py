@@ -24,6 +24,7 @@ from neuspring.baselines.gs_dynamics.model import (
     HISTORY,
     Dynamics,
     GsDynamicsModel,
+    GsDynamicsTraining,
     ParticleGraph,
     Recipe,
     Rules,
@@ -36,7 +37,6 @@ from neuspring.baselines.gs_dynamics.model import (
     upright,
 )
 from neuspring.baselines.results import Trained, TrainingStopped, run_epochs
-from neuspring.config.baselines import GsDynamics
 from neuspring.core.artifacts import Observations
 from neuspring.core.checkpoint import Checkpoint, adam_arrays, restore_adam
 from neuspring.core.geometry import farthest
@@ -67,7 +67,7 @@ class Tracks:
     """Number of tracks that were outliers."""
 
     @classmethod
-    def of(cls, observations: Observations, settings: GsDynamics) -> Tracks:
+    def of(cls, observations: Observations, settings: GsDynamicsTraining) -> Tracks:
         """From the training frames of a capture; nothing else of it is read."""
         train, up = slice(observations.scenario.train_end), observations.scenario.up
         points, visible = upright(observations.object_points[train], up), observations.object_visibility[train]
@@ -125,7 +125,7 @@ def ahead(tools: np.ndarray, frame: int, step: float, count: int) -> list[int]:
     return frames + frames[-1:] * (count - len(frames))
 
 
-def window_frames(tools: np.ndarray, settings: GsDynamics) -> np.ndarray:
+def window_frames(tools: np.ndarray, settings: GsDynamicsTraining) -> np.ndarray:
     """Frames [W, H + F] of each window. A frame without a step ahead has none, as nothing moves there in a rollout."""
     rows = []
     for frame in range(len(tools)):
@@ -154,7 +154,7 @@ class Windows:
         return len(self.frames)
 
     @classmethod
-    def of(cls, tracks: Tracks, settings: GsDynamics, device: str) -> Windows:
+    def of(cls, tracks: Tracks, settings: GsDynamicsTraining, device: str) -> Windows:
         """All windows in which at least one track may become a particle.
 
         These are tracks visible in all frames of the window. Fallback if fewer than MIN_VISIBLE: visible in the history only.
@@ -270,11 +270,11 @@ def length_loss(graph: ParticleGraph, after: torch.Tensor, before: torch.Tensor)
     return squares.mean()
 
 
-class GsDynamicsTraining:
+class GsDynamicsTrainer:
     """Runs epochs on the training frames of a capture."""
 
     def __init__(self, request: TrainingRequest) -> None:
-        self.settings, self.seed = request.settings.baselines.gs_dynamics, request.seed
+        self.settings, self.seed = GsDynamicsTraining.of(request.settings.baselines.gs_dynamics), request.seed
         self.category = request.observations.scenario.category
         self.rules, self.recipe = resolve(self.settings, self.category)
         self.tracks = Tracks.of(request.observations, self.settings)
@@ -343,7 +343,7 @@ class GsDynamicsTraining:
 
 def train(request: TrainingRequest) -> Trained[GsDynamicsModel]:
     """Train on the tracks of the training frames; continue a checkpoint with the same key."""
-    training, settings = GsDynamicsTraining(request), request.settings.baselines.gs_dynamics
+    training, settings = GsDynamicsTrainer(request), request.settings.baselines.gs_dynamics
     if len(training.windows):
         return run_epochs(training, GS_DYNAMICS_METRICS, settings.epochs, request.partial, request.key())
     # A network that learned nothing must not move the object at random.

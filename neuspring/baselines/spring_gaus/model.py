@@ -26,6 +26,35 @@ GROUND_LOGIT = -1.0
 
 
 @dataclass(frozen=True, kw_only=True)
+class SpringGausTraining(SpringGaus):
+    """The settings with what the public code fixes."""
+
+    neighbors: int = 20
+    """Number K of nearest anchors that an anchor feels."""
+    full_neighbors: int = 16
+    """Number n_c of nearest anchors that are felt with full weight; the others are felt softly."""
+    stiffness: float = 2000.0
+    """Stiffness 10^kappa at the start, N at 1 kg."""
+    damping: float = 0.2
+    """Damping zeta at the start, N s at 1 kg."""
+    substeps: int = 50
+    """Substeps per frame at the start."""
+    max_substeps: int = 1000
+    """Largest number of substeps; if a frame fails with so many, training ends as a failure of the run."""
+    stiffness_rate: float = 1e-3
+    """Adam's learning rate of kappa."""
+    damping_rate: float = 1e-4
+    """Adam's learning rate of exp(zeta)."""
+    velocity_rate: float = 2.5e-4
+    """Adam's learning rate of the initial velocity, which all anchors share, m/s."""
+
+    @classmethod
+    def of(cls, settings: SpringGaus) -> SpringGausTraining:
+        """The training that the settings ask for."""
+        return cls(**vars(settings))
+
+
+@dataclass(frozen=True, kw_only=True)
 class SpringGausModel(AnchorGraph, AnchorPhysics):
     """Anchors of frame 0 and the parameters of their motion, at 1 kg per anchor."""
 
@@ -42,7 +71,7 @@ class SpringGausModel(AnchorGraph, AnchorPhysics):
 
     @classmethod
     def start(
-        cls, graph: AnchorGraph, settings: SpringGaus, *, frame_time: float, up_sign: float, gravity: float, ground: bool
+        cls, graph: AnchorGraph, settings: SpringGausTraining, *, frame_time: float, up_sign: float, gravity: float, ground: bool
     ) -> SpringGausModel:
         """Before training: a homogeneous body at rest."""
         return cls(

@@ -25,10 +25,9 @@ import torch
 from neuspring.baselines import Pictures, TrainingRequest
 from neuspring.baselines.results import DIVERGENCE_RADIUS, Trained, TrainingStopped, run_epochs
 from neuspring.baselines.spring_gaus import find_vgg16
-from neuspring.baselines.spring_gaus.model import Follower, SpringGausModel, choose_anchors
+from neuspring.baselines.spring_gaus.model import Follower, SpringGausModel, SpringGausTraining, choose_anchors
 from neuspring.baselines.spring_gaus.physics import AnchorGraph, AnchorSolver
 from neuspring.config import Config
-from neuspring.config.baselines import SpringGaus
 from neuspring.core.checkpoint import Checkpoint, adam_arrays, restore_adam
 from neuspring.core.errors import InputError
 from neuspring.core.weights import read_tensors
@@ -72,14 +71,14 @@ class Problem:
     hands: np.ndarray
     """[T, C, 3] m, of the training frames."""
     objective: Objective
-    settings: SpringGaus
+    settings: SpringGausTraining
     device: str = "cpu"
 
 
 def train(request: TrainingRequest) -> Trained[SpringGausModel]:
     """Train on silhouettes, or on points. Raises InputError for `supervision: masks` without pictures."""
     observations, settings, device = request.observations, request.settings, request.device
-    chosen, scenario = settings.baselines.spring_gaus, observations.scenario
+    chosen, scenario = SpringGausTraining.of(settings.baselines.spring_gaus), observations.scenario
     pictures = request.pictures if chosen.supervision == "masks" else None
     if chosen.supervision == "masks" and pictures is None:
         rule = "supervision: masks needs --capture, --masks and --appearance"
@@ -145,10 +144,10 @@ def silhouettes(
 
 def run(problem: Problem, partial: Path | None = None, key: str = "") -> Trained[SpringGausModel]:
     """Train; continue from `partial` if it holds a checkpoint with the same key."""
-    return run_epochs(SpringGausTraining(problem), SPRING_GAUS_METRICS, problem.settings.iterations, partial, key)
+    return run_epochs(SpringGausTrainer(problem), SPRING_GAUS_METRICS, problem.settings.iterations, partial, key)
 
 
-class SpringGausTraining:
+class SpringGausTrainer:
     """Runs epochs, a frame at a time."""
 
     def __init__(self, problem: Problem) -> None:

@@ -127,7 +127,7 @@ def write_best(findings: Findings, settings: Config, folder: Path, root: Path) -
         *above, key = path.split(".")
         functools.reduce(lambda inside, part: inside.setdefault(part, {}), above, sections)[key] = value
     methods = {key: config.plain(row) for key, row in read_methods(root / settings.method_table).items()}
-    searches = {key: config.plain(row) for key, row in read_searches(root / settings.search_table).items()}
+    searches = {key: config.plain(row) for key, row in read_searches(root / settings.search_table, settings.clusters).items()}
     tuned = config.plain(plan.method) | {"description": description}
     config.merge(tuned["settings"], sections.get("fit", {}))
     if "search" in sections or clusters is not None:

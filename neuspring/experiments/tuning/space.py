@@ -23,6 +23,7 @@ from neuspring.config.tuning import Dimension, Tune
 from neuspring.core.errors import InputError
 from neuspring.core.records import canonical
 from neuspring.experiments.benchmark import read_methods, read_searches, with_method, with_search
+from neuspring.twin.body import BODIES
 
 SECTIONS = ("simulation", "losses", "search", "fit", "released_quirks")
 """What a trial reads; observations are made before."""
@@ -49,13 +50,15 @@ class Plan:
     @classmethod
     def of(cls, settings: Config, tune: Tune, root: Path = Path()) -> Plan:
         """Check a sweep as far as that needs no data. Tables are read relative to `root`. Raises InputError."""
-        methods, searches = read_methods(root / settings.method_table), read_searches(root / settings.search_table)
+        methods = read_methods(root / settings.method_table)
+        searches = read_searches(root / settings.search_table, settings.clusters)
         method = _row("tune.method", tune.method, methods, settings.method_table)
         if method.oracle:
             raise InputError("tune.method", "an oracle sees the future, and chooses nothing", tune.method, "Name another method.")
         row = _row(f"method {tune.method}, search", method.search, searches, settings.search_table)
-        if row.body == "rod":
-            raise InputError("tune.method", "a sweep tunes lattices", f"{tune.method}, a rod", "Name another method.")
+        if not BODIES[row.body].by_gradients:
+            rule = "a sweep watches fits that go epoch by epoch"
+            raise InputError("tune.method", rule, f"{tune.method}, a {row.body}", "Name another method.")
         own = with_search(with_method(settings, method, tune.method), row, method.search)
         base = {name: config.plain(getattr(own, name)) for name in SECTIONS} | {CLUSTERS: row.clusters}
         plan = cls(tune, method, row, base)

@@ -122,8 +122,17 @@ def run(
         if record.status == "failed":
             raise NumericalFailure(f"{scene.name}, search: {record.reason}")
         twin = Twin.load(record.file("twin", path))
-        sections = (tailed.fit, tailed.simulation, tailed.losses, tailed.released_quirks)
-        problem = FitProblem(scene.training, twin, *sections, device, plan.method.fit or "springs", plan.tune.seed)
+        problem = FitProblem(
+            observations=scene.training,
+            twin=twin,
+            fit=tailed.fit,
+            simulation=tailed.simulation,
+            losses=tailed.losses,
+            quirks=tailed.released_quirks,
+            device=device,
+            kind=plan.method.fit or "springs",
+            seed=plan.tune.seed,
+        )
 
         def report_epoch(epoch: int, loss: float, name: str = scene.name, first: int = index * plan.epochs) -> None:
             mean = (sum(outcome.losses.values()) + loss) / (len(outcome.losses) + 1)

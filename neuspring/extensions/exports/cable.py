@@ -14,7 +14,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neuspring.extensions.exports.source import ExportSource
+from neuspring.core.artifacts import Rod
 from neuspring.physics.rod_nodes import frame_zero, radius_of
 
 CABLE_STEP = 2e-4
@@ -33,14 +33,12 @@ def text(*values: float | np.floating) -> str:
     return " ".join(f"{float(value):.9g}" for value in values)
 
 
-def add(source: ExportSource, root: ET.Element, world: ET.Element, meets: dict[str, Any]) -> None:
+def add(rod: Rod, root: ET.Element, world: ET.Element, meets: dict[str, Any]) -> None:
     """Add the chain edge0, edge1, ..., a site per node, clamps clamp0 and clamp1, and the keyframe `start` of frame 0."""
-    rod = source.twin.rod
-    assert rod is not None
     edges, radius = len(rod.lengths), max(radius_of(rod), THICKNESS)
     spans = (rod.lengths[:-1] + rod.lengths[1:]) / 2
     bend, twist = rod.bending[1:-1] / spans, rod.twisting[1:-1] / spans
-    frames, rest = _frames(source), _rest(rod.curvature)
+    frames, rest = _frames(rod), _rest(rod.curvature)
     share = rod.mass / np.where(np.isin(np.arange(edges + 1), (0, edges)), 1, 2)
     pose = [*rod.vertices[0], *frames[0].as_quat(scalar_first=True)]
     parent = world
@@ -65,14 +63,12 @@ def add(source: ExportSource, root: ET.Element, world: ET.Element, meets: dict[s
             ET.SubElement(parent, "site", name=f"node{n}", pos=text(f * rod.lengths[j], a, b), size=text(radius / 4))
         if j + 1 < edges:
             at = {"pos": text(rod.lengths[j], 0, 0), "quat": text(*rest[j].as_quat(scalar_first=True))}
-    _clamps(source, root, world, frames)
+    _clamps(rod, root, world, frames)
     ET.SubElement(ET.SubElement(root, "keyframe"), "key", name="start", qpos=text(*pose))
 
 
-def _frames(source: ExportSource) -> Rotation:
+def _frames(rod: Rod) -> Rotation:
     """The axes t, m1, m2 of each edge in frame 0."""
-    rod = source.twin.rod
-    assert rod is not None
     m1, along = frame_zero(rod)[0], np.diff(rod.vertices, axis=0)
     t = along / np.linalg.norm(along, axis=1, keepdims=True)
     return Rotation.from_matrix(np.stack([t, m1, np.cross(t, m1)], axis=2))
@@ -85,10 +81,8 @@ def _rest(curvature: np.ndarray) -> Rotation:
     return Rotation.from_rotvec(2 * np.arctan(size / 2) * k / np.maximum(size, 1e-12))
 
 
-def _clamps(source: ExportSource, root: ET.Element, world: ET.Element, frames: Rotation) -> None:
+def _clamps(rod: Rod, root: ET.Element, world: ET.Element, frames: Rotation) -> None:
     """A mocap body at each end that is held: with the place of the end's first vertex and the axes of its edge."""
-    rod = source.twin.rod
-    assert rod is not None
     last = len(rod.lengths) - 1
     ends = {0: (rod.held[:2] >= 0).all(), last: (rod.held[-2:] >= 0).all()}
     equality = ET.SubElement(root, "equality") if any(ends.values()) else root

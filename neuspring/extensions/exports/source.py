@@ -14,9 +14,9 @@ from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
 from neuspring.core.run_folder import RunFolder
-from neuspring.physics.stability import for_prediction
 from neuspring.splats.draw import prune_by_opacity, skinned_frames
 from neuspring.splats.model import Splats
+from neuspring.twin.body import body_of, lines_of
 from neuspring.twin.rollout import initial_velocity
 
 SOURCE_REMEDY = "Name results/<scenario>/<method>/<seed> of a run with a twin, or a twin.npz."
@@ -51,9 +51,8 @@ class ExportSource:
 
     @property
     def masses(self) -> np.ndarray:
-        """Masses of the nodes [N], kg."""
-        mass = self.twin.material.mass
-        return mass if len(mass) else np.ones(len(self.twin.topology.nodes), np.float32)
+        """Masses of the nodes [N], kg; 0 where others of the body's points have the mass."""
+        return lines_of(self.twin).masses[: len(self.twin.topology.nodes)]
 
     def only(self, frames: Sequence[int]) -> ExportSource:
         """The same with these of its frames alone."""
@@ -113,7 +112,7 @@ def read_source(path: Path) -> ExportSource:
     splats = run.file("appearance", "splats")
     return ExportSource(
         name=name,
-        twin=for_prediction(twin),
+        twin=body_of(twin).for_prediction(twin),
         positions=trajectory.positions,
         hands=hands,
         holds=valid[:count] if valid.size else np.ones(hands.shape[:2], bool),

@@ -11,7 +11,8 @@ from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
 from neuspring.core.artifacts import Twin
-from neuspring.report.draw.twin import COLORS, Lines, region_colors, stiffness_limits
+from neuspring.report.draw.twin import COLORS, region_colors, stiffness_limits
+from neuspring.twin.body import Lines, lines_of
 
 QUANTITIES = ("stiffness", "strain", "force", "region")
 DIVERGING = "coolwarm"
@@ -72,7 +73,7 @@ class Springs:
     @classmethod
     def of(cls, twin: Twin, chosen: np.ndarray | None = None) -> Springs:
         """The chosen springs of a twin, or all."""
-        lines = Lines.of(twin)
+        lines = lines_of(twin)
         part = np.arange(len(lines.pairs)) if chosen is None else chosen
         return cls(lines, lines.pairs[part], lines.rest_lengths[part], lines.stiffness[part], _regions(lines)[part])
 

@@ -19,10 +19,10 @@ from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
 from neuspring.extensions.play.colors import OVER_COLOR, Scale, Springs, linear, node_colors
 from neuspring.report.draw.sheet import sample
-from neuspring.report.draw.twin import Lines
 from neuspring.splats.model import Splats
 from neuspring.splats.skinning import Skin
 from neuspring.splats.view import C0
+from neuspring.twin.body import lines_of
 
 if TYPE_CHECKING:
     import viser
@@ -72,7 +72,7 @@ class BodyLayer:
 
     def __init__(self, scene: viser.SceneApi, name: str, twin: Twin | None, nodes: np.ndarray, hands: np.ndarray) -> None:
         self.twin, self.name, self._scene = twin, name, scene
-        count = len(Lines.of(twin).pairs) if twin else 0
+        count = len(lines_of(twin).pairs) if twin else 0
         self.parts = Springs.of(twin, sample(count)) if twin and count else None
         self.root = scene.add_frame(f"/{name}", show_axes=False)
         size = float(np.linalg.norm(np.ptp(nodes, axis=0)))

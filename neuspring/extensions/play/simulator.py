@@ -19,8 +19,7 @@ from neuspring.core.artifacts import Artifact, Observations, Twin, array
 from neuspring.core.errors import InputError
 from neuspring.physics import stability
 from neuspring.physics.controllers import BEGINS, begins, waypoints
-from neuspring.physics.rod_nodes import RodFrames
-from neuspring.physics.solver import solver_for
+from neuspring.twin.body import body_of
 from neuspring.twin.rollout import FAR, Diverged, initial_velocity
 
 if TYPE_CHECKING:
@@ -81,8 +80,8 @@ def start_state(run: Run, seen: Observations, frame: int, repeat: bool) -> Start
     count, hands = len(twin.topology.controllers), seen.controller_points
     if frame == 0 and not repeat:
         return StartState()
-    if frame and twin.rod is not None:
-        rule = "a rod begins in frame 0: a later frame does not say how it is twisted"
+    if frame and not body_of(twin).starts_anywhere:
+        rule = "begins in frame 0: nodes of a later frame do not say how it is twisted"
         raise InputError(f"{run.name}, frame {frame}", rule, frame, "Begin at frame 0.")
     if hands.shape[1] != count:
         raise InputError(run.folder, f"its twin has {count} controllers, the observations must too", hands.shape[1])
@@ -109,11 +108,12 @@ class Simulator:
     """A twin's state, frame by frame. Equal controls give equal states, bit for bit: it runs on the CPU."""
 
     def __init__(self, twin: Twin, start: Start | None = None) -> None:
-        stability.check(twin)
-        self.twin = twin = stability.for_prediction(twin)
+        body = self._body = body_of(twin)
+        body.check(twin)
+        self.twin = twin = body.for_prediction(twin)
         self._start = start or Start()
-        self._load = 0.0 if twin.rod is not None else stability.twin_spectrum(twin).load(twin.simulation.substep)
-        self._free = solver_for(twin, "cpu", differentiable=False)
+        self._load = body.load(twin)
+        self._free = body.solver(twin)
         self._held: dict[int, Any] = {}
         self.reset()
 
@@ -162,13 +162,13 @@ class Simulator:
             if grabbed not in self._held:
                 if len(self._held) >= MOST_SOLVERS:
                     self._held.pop(next(iter(self._held)))
-                self._held[grabbed] = solver_for(self._with_grab(grabbed), "cpu", differentiable=False)
+                self._held[grabbed] = self._body.solver(self._with_grab(grabbed))
             solver = self._held[grabbed]
         if begin.shape[1] == 4:
             # Each solver knows the grips of its own frames alone.
             rows = [_with_row(row, aim) if grabbed >= 0 else row for row, _ in grips]
             solver.resume(torch.tensor(np.array(rows).reshape(len(rows), *begin.shape)), [nodes for _, nodes in grips])
-        if isinstance(solver, RodFrames) and self._last not in (None, solver):
+        if self._last not in (None, solver):
             solver.follow(self._last)
         ends = (torch.tensor(np.asarray(values, np.float32)) for values in (begin, end))
         x, v = solver.forward(self._x, self._v, *ends)
@@ -186,10 +186,7 @@ class Simulator:
         """k [N/m] and c [N s/m] of the spring that pulls a node."""
         topology, material, dt = self.twin.topology, self.twin.material, self.twin.simulation.substep
         own = (topology.springs == node).any(axis=1)
-        mass = float(material.mass[node]) if len(material.mass) else 1.0
-        if self.twin.rod is not None:
-            edge = self.twin.rod.edge[node]
-            mass = float(self.twin.rod.mass[edge : edge + 2].sum())
+        mass = self._body.mass_at(self.twin, node)
         wanted = float((material.stiffness[own] / topology.rest_lengths[own]).sum())
         # Half of what is left is for k, half for c: dt^2 k / m + 2 dt c / m < STABILITY_MARGIN STABILITY_LIMIT - load.
         room = max(STABILITY_MARGIN * stability.STABILITY_LIMIT - self._load, 0.05) / 2

@@ -96,12 +96,12 @@ MM = 1e3
 MOST_PANELS = 4
 """For more scenarios than this, one panel shows their mean."""
 TASK_STYLES = {"reconstruction": ("tab:blue", "o"), "future": ("tab:orange", "s")}
-NAMED = {"model_b": 1, "neuspring": 5}
+NAMED = {"model_b": 1}
 """Rows of this study that have names of their own."""
 
 
 def cluster_methods(methods: Iterable[str]) -> dict[str, int]:
-    """The methods named clusters_<K> and, beside such, model_b and neuspring, each once, with K; sorted by K."""
+    """The methods named clusters_<K> and, beside such, model_b, with K; sorted by K."""
     names = set(methods)
     counts = {method: int(match[1]) for method in names if (match := re.fullmatch(r"clusters_(\d+)", method))}
     counts |= {method: count for method, count in NAMED.items() if counts and method in names}

@@ -18,8 +18,9 @@ from neuspring.report.draw.painter import DrawingStyle, Painter
 from neuspring.report.draw.scene import Prediction, Scene, chosen_frames
 from neuspring.report.draw.sheet import place, save
 from neuspring.report.draw.strip import strip_figure
-from neuspring.report.draw.twin import BAR, Lines, TwinPicture, histogram, rough_or_smooth, twin_figure
+from neuspring.report.draw.twin import BAR, TwinPicture, histogram, rough_or_smooth, twin_figure
 from neuspring.scores.metrics import PICTURES, errors_per_frame
+from neuspring.twin.body import lines_of
 
 NAMES = ("errors.png", "motion.png", "losses.png", "topology.png", "stiffness.png")
 IMAGE_SCORES = "image_scores.png"
@@ -69,9 +70,8 @@ def run_figures(
     if histories:
         paths.append(save(losses_figure(histories, title), folder / "losses.png"))
     if twin is not None:
-        take, lines = Prediction(title, twin.topology.nodes[None], twin), Lines.of(twin)
-        what = "springs" if twin.rod is None else "edges and springs"
-        label = f"{title}: {len(twin.topology.nodes)} nodes, {len(lines.pairs)} {what}"
+        take, lines = Prediction(title, twin.topology.nodes[None], twin), lines_of(twin)
+        label = f"{title}: {len(twin.topology.nodes)} nodes, {len(lines.pairs)} {lines.kinds}"
         paths.append(
             save(twin_figure(_from_two_sides(observations, take, label, "region"), WIDTH, COUNTS), folder / "topology.png")
         )
@@ -163,21 +163,20 @@ def _from_two_sides(observations: Observations, take: Prediction, label: str, *q
 
 def stiffness_figure(observations: Observations, take: Prediction, searched: float | None) -> Figure:
     """The body's lines in frame 0 colored by stiffness in two views, their histogram with the searched stiffness [N] marked, and
-    the variogram of a lattice's springs.
+    the variogram of springs between nodes.
 
-    The twin must have an object spring, or be a rod.
+    The body must have a line.
     """
     assert take.twin is not None
-    lines = Lines.of(take.twin)
+    lines = lines_of(take.twin)
     stiffness = lines.stiffness[: lines.inner].astype(float)
-    kind = "object springs" if take.twin.rod is None else "edges, EI / l²"
-    body = _from_two_sides(observations, take, f"{take.label}: {len(stiffness)} {kind}", "stiffness")
-    columns = 2 if take.twin.rod is None and stiffness.std() > 0 else 1
+    body = _from_two_sides(observations, take, f"{take.label}: {len(stiffness)} {lines.about}", "stiffness")
+    columns = 2 if take.twin.topology.object_spring_count and stiffness.std() > 0 else 1
     figure = twin_figure(body, WIDTH + columns * HISTOGRAM, BAR + columns * HISTOGRAM)
     high = figure.get_figheight()
     axis = place(figure, WIDTH + 0.6, FOOT, HISTOGRAM - 0.9, max(high - FOOT - 0.1, 0.5))
     histogram(axis, stiffness, body.norm, searched)
-    axis.set_ylabel("springs" if take.twin.rod is None else "edges")
+    axis.set_ylabel(lines.kind)
     if columns == 2:
         axis = place(figure, WIDTH + HISTOGRAM + 0.6, FOOT, HISTOGRAM - 0.9, max(high - FOOT - 0.1, 0.5))
         rough_or_smooth(axis, take.twin)

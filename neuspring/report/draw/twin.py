@@ -22,7 +22,6 @@ from scipy.spatial import cKDTree
 
 from neuspring.config.images import Images
 from neuspring.core.artifacts import Twin
-from neuspring.physics.rod_nodes import at_vertices
 from neuspring.report.draw.painter import empty, hands
 from neuspring.report.draw.scene import Prediction, Scene, faded, finer, over_white
 from neuspring.report.draw.sheet import CONTROLLER, TEXT, color_bar, place, points_across, sample
@@ -30,6 +29,7 @@ from neuspring.splats.draw import picture, view_of
 from neuspring.splats.model import Gaussians
 from neuspring.splats.rasterize import choose_backend
 from neuspring.splats.view import C0
+from neuspring.twin.body import Lines, body_of, lines_of
 from neuspring.twin.field import midpoints
 from neuspring.twin.roughness import roughness, variogram
 from neuspring.twin.topology import node_spacing
@@ -79,71 +79,6 @@ def _widened(low: float, high: float) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, eq=False)
-class Lines:
-    """Lines that a twin is drawn with: its springs, or, of a rod, the edges of the center line and then the springs of hands.
-
-    A point is a node, then a controller, then a vertex of the line.
-    """
-
-    twin: Twin
-    pairs: np.ndarray
-    """Ends [L, 2]."""
-    rest_lengths: np.ndarray
-    stiffness: np.ndarray
-    """N; of an edge of a rod EI / l^2."""
-    inner: int
-    """How many are the body's; the others are those of hands."""
-
-    @classmethod
-    def of(cls, twin: Twin) -> Lines:
-        """All lines of a twin."""
-        topology, rod, strength = twin.topology, twin.rod, twin.material.stiffness
-        if rod is None:
-            return cls(twin, topology.springs, topology.rest_lengths, strength, topology.object_spring_count)
-        edges = len(topology.nodes) + len(topology.controllers) + np.arange(len(rod.lengths))
-        of_edges = (rod.bending[:-1] + rod.bending[1:]) / 2 / rod.lengths**2
-        return cls(
-            twin,
-            np.concatenate([np.stack([edges, edges + 1], axis=1), topology.springs]),
-            np.concatenate([rod.lengths, topology.rest_lengths]),
-            np.concatenate([of_edges, strength]),
-            len(edges),
-        )
-
-    def points(self, nodes: np.ndarray, hands: np.ndarray) -> np.ndarray:
-        """All points [P, 3], m, with the nodes at [N, 3] and the controllers at [C, 3]."""
-        line = [] if self.twin.rod is None else [at_vertices(self.twin.rod, nodes, hands)]
-        return np.concatenate([nodes, hands, *line])
-
-    @property
-    def typical(self) -> float:
-        """Median stiffness of the body's lines, N; of all where it has none."""
-        return float(np.median(self.stiffness[: self.inner or None]))
-
-    @property
-    def labels(self) -> np.ndarray:
-        """The region of each point; all of a rod is one."""
-        labels = self.twin.topology.labels
-        return np.pad(labels, (0, int(self.pairs.max(initial=0)) + 1), constant_values=labels.min())
-
-
-def node_stiffness(twin: Twin) -> np.ndarray:
-    """Geometric mean of the stiffness of each node's object springs [N], N; the median of all for a node without any.
-
-    Of a rod, that of the node's edge.
-    """
-    if twin.rod is not None:
-        return np.asarray(Lines.of(twin).stiffness[twin.rod.edge])
-    count = twin.topology.object_spring_count
-    pairs, values = twin.topology.springs[:count], np.maximum(twin.material.stiffness[:count].astype(float), 1e-30)
-    nodes = len(twin.topology.nodes)
-    degree = np.bincount(pairs.ravel(), minlength=nodes)
-    total = np.bincount(pairs.ravel(), np.repeat(np.log(values), 2), minlength=nodes)
-    typical = float(np.median(np.log(values))) if count else 0.0
-    return np.asarray(np.exp(np.where(degree > 0, total / np.maximum(degree, 1), typical)))
-
-
-@dataclass(frozen=True, eq=False)
 class TwinPicture:
     """Twins in one frame, and what their colors say: a column for each of `takes`, seen in the scene beside it."""
 
@@ -163,19 +98,19 @@ class TwinPicture:
         if self.limits:
             return LogNorm(*self.limits)
         twins = [_twin(take) for _, take in self.columns]
-        return LogNorm(*stiffness_limits(np.concatenate([lines.stiffness[: lines.inner] for lines in map(Lines.of, twins)])))
+        return LogNorm(*stiffness_limits(np.concatenate([lines.stiffness[: lines.inner] for lines in map(lines_of, twins)])))
 
     def node_colors(self, take: Prediction, quantity: Quantity) -> np.ndarray:
         """RGBA [N, 4]."""
         twin = _twin(take)
         if quantity == "stiffness":
-            return self._of_stiffness(node_stiffness(twin))
+            return self._of_stiffness(body_of(twin).node_stiffness(twin))
         names, region = np.unique(twin.topology.labels, return_inverse=True)
         return np.asarray(region_colors(len(names))[region])
 
     def spring_colors(self, take: Prediction, quantity: Quantity) -> np.ndarray:
         """RGBA [S, 4] of object springs."""
-        lines = Lines.of(_twin(take))
+        lines = lines_of(_twin(take))
         if quantity == "stiffness":
             return self._of_stiffness(lines.stiffness[: lines.inner])
         names, region = np.unique(lines.labels, return_inverse=True)
@@ -205,7 +140,7 @@ class TwinPicture:
 
     def _lines(self, axis: Axes, scene: Scene, take: Prediction, quantity: Quantity) -> None:
         """Springs and nodes, the farthest first, so that the nearest are on top; by region also the springs of hands in frame 0."""
-        lines, nodes = Lines.of(_twin(take)), take.positions[self.frame].astype(float)
+        lines, nodes = lines_of(_twin(take)), take.positions[self.frame].astype(float)
         seen = scene.observations.controller_points
         everything = lines.points(nodes, seen[min(self.frame, len(seen) - 1)].astype(float))
         flat, depth = scene.view.project(everything)
@@ -272,11 +207,9 @@ def twin_figure(body: TwinPicture, width: float, room: float = BAR) -> Figure:
 def _regions(figure: Figure, body: TwinPicture, left: float, middle: float, *, counted: bool) -> None:
     """Names of the regions; twins of one scene are divided alike, and the one with most regions names them all."""
     twin = max((_twin(take) for _, take in body.columns), key=lambda found: len(np.unique(found.topology.labels)))
-    topology, lines = twin.topology, Lines.of(twin)
+    topology, lines = twin.topology, lines_of(twin)
     labels, sizes = np.unique(topology.labels, return_counts=True)
     count, between, joined = len(labels), _between(lines), len(lines.pairs) - lines.inner
-    lonely = len(topology.nodes) - len(np.unique(topology.springs[topology.springs < len(topology.nodes)]))
-    lonely, what_lines = (lonely, "springs") if twin.rod is None else (0, "edges")
     names = [f"region {k}" for k in range(count)] if count > 1 else ["one region"]
     dots = [Line2D([], [], ls="", marker="o", ms=4, color=color) for color in region_colors(count)]
     extra: list[tuple[Any, str, int, str]] = []
@@ -285,8 +218,10 @@ def _regions(figure: Figure, body: TwinPicture, left: float, middle: float, *, c
     if counted:
         ends = lines.labels[lines.pairs[: lines.inner]]
         springs = [int(((ends == label).all(axis=1)).sum()) for label in labels]
-        names = [f"{name}: {n} nodes, {s} {what_lines}" for name, n, s in zip(names, sizes, springs, strict=True)]
-        extra += [(CONTROLLER, "of hands", joined, "springs")] + ([("white", "without spring", lonely, "nodes")] if lonely else [])
+        names = [f"{name}: {n} nodes, {s} {lines.kind}" for name, n, s in zip(names, sizes, springs, strict=True)]
+        extra += [(CONTROLLER, "of hands", joined, "springs")] + (
+            [("white", "without spring", lines.loose, "nodes")] if lines.loose else []
+        )
     for color, name, number, what in extra:
         dots.append(Line2D([], [], color=color, linewidth=1.0))
         names.append(f"{name}: {number} {what}" if counted else name)

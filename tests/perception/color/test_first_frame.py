@@ -12,7 +12,8 @@ from neuspring.config.perception import ColorSettings, Perception, Sampling, Sha
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT
-from neuspring.perception.color import FirstFrame, beneath_hands, camera_depth, from_color
+from neuspring.perception import color
+from neuspring.perception.color import SHEET_THICKNESS, FirstFrame, beneath_hands, camera_depth, from_color
 from neuspring.perception.results import Masks, PixelTracks
 from neuspring.perception.sample import structure
 from neuspring.perception.track_opencv import choose
@@ -45,9 +46,9 @@ def object_points(first: FirstFrame) -> np.ndarray:
 
 
 def test_a_sheet_has_its_size_on_the_table():
-    first = FirstFrame.of(capture_of("cloth"), shown(SQUARE), ColorSettings(sheet_thickness=0.002))
+    first = FirstFrame.of(capture_of("cloth"), shown(SQUARE), ColorSettings())
     points = object_points(first)
-    np.testing.assert_allclose(points[:, 2], 0.001, atol=1e-9)
+    np.testing.assert_allclose(points[:, 2], SHEET_THICKNESS / 2, atol=1e-9)
     # Rows of pixels are 1.6 times as far apart on the table, seen at 40 degrees.
     np.testing.assert_allclose(points[:, :2].max(axis=0), 0.1, atol=1.6 * PIXEL)
     np.testing.assert_allclose(points[:, :2].min(axis=0), -0.1, atol=1.6 * PIXEL)
@@ -83,7 +84,9 @@ def box(x: float, y: float, z: float) -> np.ndarray:
 
 def sides(labels: np.ndarray, pose: str | None) -> tuple[np.ndarray, np.ndarray]:
     """Upper and lower points [n, 3], m, of a body in a pose that is as thick as it is wide."""
-    first = FirstFrame.of(capture_of("toy", pose=pose), labels, ColorSettings(body_thickness=1.0))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(color, "BODY_THICKNESS", 1.0)
+        first = FirstFrame.of(capture_of("toy", pose=pose), labels, ColorSettings())
     y, x = np.nonzero(labels == OBJECT)
     pixels = np.stack([x, y], axis=1)
     upper, lower = first.points(pixels), first.camera.lift(pixels.astype(float), first.depths(0.0)[y, x])

@@ -9,8 +9,9 @@ from matplotlib.collections import LineCollection, PathCollection
 
 from neuspring.report.draw.scene import Prediction, Scene
 from neuspring.report.draw.sheet import CONTROLLER
-from neuspring.report.draw.twin import CROSSING, Lines, TwinPicture, node_stiffness, region_colors, twin_figure
+from neuspring.report.draw.twin import CROSSING, TwinPicture, region_colors, twin_figure
 from neuspring.report.shown import find
+from neuspring.twin.body import body_of, lines_of
 from tests.support.played import results, rod_results
 from tests.support.shown import METHODS, filmed, painter
 
@@ -70,7 +71,7 @@ def test_a_node_has_the_mean_of_its_springs(plain):
     count = twin.topology.object_spring_count
     own = (twin.topology.springs[:count] == 3).any(axis=1)
     expected = np.exp(np.log(twin.material.stiffness[:count][own].astype(float)).mean())
-    assert node_stiffness(twin)[3] == pytest.approx(expected)
+    assert body_of(twin).node_stiffness(twin)[3] == pytest.approx(expected)
 
 
 def test_regions_have_a_color_each_and_springs_between_them_are_dark(plain):
@@ -121,7 +122,7 @@ def test_a_rod_is_drawn_as_its_center_line_colored_by_its_bending_stiffness(tmp_
     scene = Scene.from_side(found.observations, [take], [0])
     uneven = replace(run.twin, rod=replace(rod, bending=np.linspace(1, 2, len(rod.bending)) * rod.bending))
     take = replace(take, twin=uneven)
-    lines = Lines.of(uneven)
+    lines = lines_of(uneven)
     assert lines.inner == len(rod.lengths) == len(lines.pairs) - len(uneven.topology.springs)
     points = lines.points(take.positions[0], found.observations.controller_points[0])
     # A tube's nodes are not even at its ends.

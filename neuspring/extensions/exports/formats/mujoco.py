@@ -15,6 +15,7 @@ from neuspring.extensions.exports.cable import HINGE_AXES, text
 from neuspring.extensions.exports.formats import npz
 from neuspring.extensions.exports.source import ExportSource, require_start
 from neuspring.physics.rod_nodes import radius_of
+from neuspring.twin.body import body_of
 from neuspring.twin.rollout import FAR
 
 MODEL = "twin.xml"
@@ -41,9 +42,9 @@ def mjcf(source: ExportSource) -> str:
     radius = material.contact_distance / 2
     root = ET.Element("mujoco", model=source.name)
     gravity = (0, 0, -simulation.gravity * simulation.up_sign)
-    rod = twin.rod
-    radius = radius if rod is None else max(radius_of(rod), cable.THICKNESS)
-    step, integrator = (simulation.substep, "Euler") if rod is None else (min(simulation.substep, cable.CABLE_STEP), "implicitfast")
+    rod = body_of(twin).center_line(twin)
+    radius = max(radius_of(rod), cable.THICKNESS) if rod else radius
+    step, integrator = (min(simulation.substep, cable.CABLE_STEP), "implicitfast") if rod else (simulation.substep, "Euler")
     ET.SubElement(root, "option", timestep=text(step), integrator=integrator, gravity=text(*gravity))
     world = ET.SubElement(root, "worldbody")
     if simulation.ground:
@@ -54,9 +55,9 @@ def mjcf(source: ExportSource) -> str:
         ET.SubElement(world, "geom", name="ground", pos=text(0, 0, height), euler=turn, **kind)
     # The plane meets nodes; nodes meet each other only with self-collision.
     meets: dict[str, Any] = {"contype": "1" if simulation.self_collision else "0", "conaffinity": "1"}
-    if rod is not None:
-        cable.add(source, root, world, meets)
-    for index, (place, mass) in enumerate(zip(topology.nodes, source.masses, strict=True) if rod is None else ()):
+    if rod:
+        cable.add(rod, root, world, meets)
+    for index, (place, mass) in enumerate(zip(topology.nodes, source.masses, strict=True) if not rod else ()):
         body = ET.SubElement(world, "body", name=f"node{index}", pos=text(*place))
         for axis, direction in HINGE_AXES.items():
             damping = text(material.drag * float(mass))
@@ -78,7 +79,7 @@ def mjcf(source: ExportSource) -> str:
         tendon = ET.SubElement(tendons, "spatial", name=f"spring{index}", width=text(radius / 5), **law)
         for end in ends:
             ET.SubElement(tendon, "site", site=names[end])
-    if rod is None and source.velocity.any():
+    if not rod and source.velocity.any():
         keys = ET.SubElement(root, "keyframe")
         ET.SubElement(keys, "key", name="start", qvel=text(*source.velocity.ravel()))
     ET.indent(root)

@@ -10,6 +10,7 @@ from neuspring.core.files import write_text
 from neuspring.extensions.exports import Export
 from neuspring.extensions.exports.formats import npz
 from neuspring.extensions.exports.source import ExportSource, require_start
+from neuspring.twin.body import body_of
 
 SCRIPT = Path(__file__).parents[1] / "newton_twin.py"
 
@@ -17,7 +18,7 @@ SCRIPT = Path(__file__).parents[1] / "newton_twin.py"
 def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Path]:
     """Write arrays.npz, description.json and newton_twin.py to the folder `output`."""
     require_start(frames)
-    if source.twin.rod is not None:
+    if body_of(source.twin).center_line(source.twin):
         rule = "Newton's model is of nodes and springs"
         raise InputError("--to newton", rule, f"{source.name}, whose twin is a rod", "Take --to mujoco, or a run with a lattice.")
     if source.twin.topology.pushes.any():

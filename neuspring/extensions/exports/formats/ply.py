@@ -10,7 +10,7 @@ import numpy as np
 from neuspring.core.files import write_atomically
 from neuspring.extensions.exports import Export
 from neuspring.extensions.exports.source import ExportSource
-from neuspring.report.draw.twin import Lines
+from neuspring.twin.body import lines_of
 
 VERTEX = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("mass", "<f4"), ("region", "<i4"), ("controller", "u1"), ("stiffness", "<f4")]
 EDGE_DTYPE = [
@@ -36,22 +36,16 @@ def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Pat
 
 def points(source: ExportSource, frame: int) -> np.ndarray:
     """Nodes, then controllers, then, of a rod, the vertices of its center line [P, 3], m."""
-    return Lines.of(source.twin).points(source.positions[frame], source.hands[frame])
+    return lines_of(source.twin).points(source.positions[frame], source.hands[frame])
 
 
 def vertices(source: ExportSource, frame: int) -> np.ndarray:
-    """A row per point; a controller has no mass and region -1. Stiffness is 0 where there are no springs.
-
-    Of a rod, vertices of the line have the mass, and nodes none.
-    """
-    nodes, placed, lines = len(source.positions[frame]), points(source, frame), Lines.of(source.twin)
-    moved, rod = nodes + len(source.hands[frame]), source.twin.rod
+    """A row per point, as in `Lines`; a controller has no mass and region -1. Stiffness is 0 where there are no springs."""
+    nodes, placed, lines = len(source.positions[frame]), points(source, frame), lines_of(source.twin)
+    moved = nodes + len(source.hands[frame])
     table = np.zeros(len(placed), VERTEX)
     table["x"], table["y"], table["z"] = placed.T
-    if rod is None:
-        table["mass"][:nodes] = source.masses
-    else:
-        table["mass"][moved:] = rod.mass
+    table["mass"] = lines.masses
     table["region"] = -1
     table["region"][:nodes] = source.twin.topology.labels
     table["controller"][nodes:moved] = 1
@@ -63,7 +57,7 @@ def vertices(source: ExportSource, frame: int) -> np.ndarray:
 
 def edges(source: ExportSource, frame: int) -> np.ndarray:
     """A row per spring; of a rod, per edge of the line, whose stiffness is EI / l^2, and then per spring."""
-    lines, dashpot = Lines.of(source.twin), source.twin.material.dashpot
+    lines, dashpot = lines_of(source.twin), source.twin.material.dashpot
     table = np.zeros(len(lines.pairs), EDGE_DTYPE)
     table["vertex1"], table["vertex2"] = lines.pairs.T
     table["stiffness"], table["rest_length"] = lines.stiffness, lines.rest_lengths

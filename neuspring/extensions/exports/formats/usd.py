@@ -17,6 +17,7 @@ from neuspring.extensions.exports.formats import ply
 from neuspring.extensions.exports.source import ExportSource
 from neuspring.physics.rod_nodes import radius_of
 from neuspring.splats.view import C0
+from neuspring.twin.body import body_of
 
 SUFFIXES = (".usdc", ".usda", ".usd")
 ROOT_PRIM = "/Twin"
@@ -90,15 +91,14 @@ class _Shapes:
         values = {"stiffness": material.stiffness, "dashpot": material.dashpot, "restLength": topology.rest_lengths}
         for name, value in values.items():
             self._primvar(springs, name, "float[]", self._vt.FloatArray.FromNumpy(value), token.uniform)
-        rod = source.twin.rod
-        if rod is None:
+        rod = body_of(source.twin).center_line(source.twin)
+        line = self._line(rod) if rod else None
+        if source.masses.any():
             self._primvar(nodes, "mass", "float[]", self._vt.FloatArray.FromNumpy(source.masses), token.vertex)
-        else:
-            line = self._line(rod)
         for frame, code in codes.items():
             both = ply.points(source, frame)
             shown = {nodes: source.positions[frame], hands: source.hands[frame], springs: both[topology.springs].reshape(-1, 3)}
-            if rod is not None:
+            if rod:
                 shown[line] = both[-len(rod.vertices) :]
             for prim, points in shown.items():
                 self._place(prim, prim.CreatePointsAttr(), points, code)

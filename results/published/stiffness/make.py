@@ -1,11 +1,11 @@
 """Twins of synthetic scenes beside the material that their bodies were made of.
 
-    python -m workflow.scripts.stiffness_truth RESULTS OUT [--methods ...] [--pictures SCENARIO ...]
+    python -m results.published.stiffness.make RESULTS OUT [--methods ...] [--pictures SCENARIO ...]
 
 A body of finite elements has a modulus per element (Young's modulus of a solid, membrane stiffness of a sheet), a twin a stiffness
 per spring. Around a node the twin has the geometric mean of its springs, the truth the modulus of the nearest element in frame 0.
-OUT/stiffness.md has the correlation of their logarithms, mean over seeds; OUT/stiffness.csv has a row per run, and OUT/SCENARIO.png
-shows both, relative to the geometric mean over nodes.
+OUT/beside_truth.md has the correlation of their logarithms, mean over seeds; OUT/beside_truth.csv has a row per run, and
+OUT/SCENARIO.png shows both, relative to the geometric mean over nodes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ from neuspring.core.table import Table
 from neuspring.data.synthetic.truth import Truth, truth_path
 from neuspring.report.draw.scene import Prediction, Scene
 from neuspring.report.draw.sheet import save
-from neuspring.report.draw.twin import COLORS, TwinPicture, node_stiffness
+from neuspring.report.draw.twin import COLORS, TwinPicture
+from neuspring.twin.body import body_of
 
 METHODS = ["search_only", "baseline_ten_frames", "model_b", "shuffled", "neuspring", "neuspring_plus", "baseline_plus"]
 NOTE = "Correlation of log stiffness around each node with the log modulus that the body was made of, mean over seeds."
@@ -57,7 +58,7 @@ def made_of(twin: Twin, modulus: np.ndarray) -> Twin:
 
 def relative(twin: Twin) -> Twin:
     """The twin with stiffness over the geometric mean of its nodes'."""
-    stiffness = twin.material.stiffness / np.exp(np.log(node_stiffness(twin)).mean())
+    stiffness = twin.material.stiffness / np.exp(np.log(body_of(twin).node_stiffness(twin)).mean())
     return replace(twin, material=replace(twin.material, stiffness=stiffness.astype(np.float32)))
 
 
@@ -88,7 +89,7 @@ def picture(scenario: str, takes: Sequence[Prediction], scene: Scene) -> Figure:
 
 
 def judged(home: Path, methods: Sequence[str]) -> tuple[list[tuple[str, int, float]], list[Prediction], Scene | None]:
-    """Of the runs of a scenario: (method, seed, correlation); the truth and a twin of each method at rest, and what shows them."""
+    """Judged runs of a scenario: (method, seed, correlation); the truth and a twin of each method at rest, and what shows them."""
     truth, rows, takes, scene = Truth.load(truth_path(home / "capture")), [], dict[str, Prediction](), None
     for path in (path for method in methods for path in sorted(home.glob(f"{method}/*/rollout.json"))):
         run = RunFolder.of(path.parent)
@@ -96,7 +97,7 @@ def judged(home: Path, methods: Sequence[str]) -> tuple[list[tuple[str, int, flo
             continue
         method, seed = run.folder.parts[-2:]
         modulus, here = modulus_at(truth, twin.topology.nodes), twin.topology.nodes[None]
-        logs = np.log([modulus, node_stiffness(twin)])
+        logs = np.log([modulus, body_of(twin).node_stiffness(twin)])
         known = (logs.std(axis=1) > LEAST_SPREAD).all()
         rows.append((method, int(seed), float(np.corrcoef(logs)[0, 1]) if known else np.nan))
         takes.setdefault("truth", Prediction("truth", here, relative(made_of(twin, modulus))))
@@ -121,13 +122,13 @@ def main() -> None:
         if scene and folder.parent.name in options.pictures:
             save(picture(name, takes, scene), options.output / f"{name}.png")
     table = pd.DataFrame(rows, columns=["scenario", "method", "seed", "correlation"]).dropna()
-    write_text(options.output / "stiffness.csv", table.to_csv(index=False, float_format="%.4f"))
+    write_text(options.output / "beside_truth.csv", table.to_csv(index=False, float_format="%.4f"))
     wide = table.pivot_table(index="scenario", columns="method", values="correlation")
     wide = wide[[method for method in options.methods if method in wide]]
     wide.loc["mean over scenes"] = wide.mean()
     cells = [[str(name), *(f"{r:.2f}" for r in row)] for name, row in wide.iterrows()]
     lines = Table.of_texts(["scene", *wide.columns], cells).markdown()
-    write_text(options.output / "stiffness.md", "\n".join(["# Stiffness beside the truth", "", NOTE, "", *lines, ""]))
+    write_text(options.output / "beside_truth.md", "\n".join(["# Stiffness beside the truth", "", NOTE, "", *lines, ""]))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,44 @@
+"""The dial `effort`: the sizes that decide how long a benchmark takes, all turned together."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, Literal, get_args
+
+from neuspring.config.parse import merge
+
+Effort = Literal["quick", "normal", "paper"]
+EFFORTS = get_args(Effort)
+EFFORT_SIZES: dict[str, tuple[Any, Any, Any]] = {
+    # Key: quick, normal, paper.
+    "search.rollouts": (88, 110, 220),
+    "search.tied_rollouts": (0, 44, 0),
+    "fit.epochs": (20, 40, 200),
+    "synthetic.size": ("small", "demo", "full"),
+    "synthetic.frames": (45, 60, None),
+    "synthetic.certified_frames": (5, 5, 20),
+    "perception.sample.voxel": (0.006, 0.006, 0.005),
+    "perception.sample.nodes": (300, 400, None),
+    "images.views": ("first", "first", "first"),
+    "images.appearance.iterations": (300, 400, 10_000),
+    "images.appearance.spacing": (2.0, 2.0, 0.0),
+    "images.appearance.degree": (0, 0, 3),
+    "baselines.spring_gaus.anchors": (400, 400, 1024),
+    "baselines.spring_gaus.iterations": (40, 40, 100),
+    "baselines.gs_dynamics.width": (64, 64, 512),
+    "baselines.gs_dynamics.batch": (4, 4, None),
+    "baselines.gs_dynamics.epochs": (25, 25, 50),
+    "baselines.gs_dynamics.updates_per_epoch": (40, 40, 100),
+}
+"""Key -> its value at each effort. quick: `make demo`. normal: the published synthetic benchmark. paper: sizes of the paper and of
+the released code, the defaults of all keys but `synthetic.size`. Pictures of the first camera are scored, as in the paper."""
+
+
+def sizes(effort: str) -> dict[str, Any]:
+    """The values of an effort, nested as in a configuration file."""
+    values: dict[str, Any] = {}
+    for path, choices in EFFORT_SIZES.items():
+        merge(
+            values, functools.reduce(lambda inner, name: {name: inner}, reversed(path.split(".")), choices[EFFORTS.index(effort)])
+        )
+    return values

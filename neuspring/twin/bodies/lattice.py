@@ -1,0 +1,172 @@
+"""The lattice: nodes that are joined by springs with dashpots, as in PhysTwin and the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from neuspring.config import Config
+from neuspring.core.artifacts import Observations, Twin
+from neuspring.twin.body import Body, Lines
+
+if TYPE_CHECKING:
+    from neuspring.physics.solver import FrameSolver
+    from neuspring.twin.fit import FitProblem, FitResult
+    from neuspring.twin.register import Registration
+    from neuspring.twin.search import SearchResult
+
+
+class Lattice(Body):
+    """Springs between nodes, in the topology and the material of a twin."""
+
+    name = "lattice"
+    fits = ("springs", "field")
+    by_gradients = True
+    starts_anywhere = True
+    format = "neuspring-plain"
+    about = "A spring-mass twin: nodes that are joined by springs with dashpots"
+    equations = """
+Per frame there are `substeps` steps of dt = frame_time / substeps. Step k = 0, 1, ... of a frame does, in this order:
+
+1. Controllers are at begin + (end - begin) u, u = (k + 1) / substeps, with begin and end the rows of `hands` of this frame and of
+the next. Nodes are where the step before left them.
+
+2. Spring (i, j): d = (x_j - x_i) / l, l = |x_j - x_i|; force on i: (stiffness (l / rest_length - 1) + dashpot (v_j - v_i) . d) d,
+its negative on j. An index of N or more is controller index - N. Its velocity is 0; if controller_velocity is true, that of its
+path. A spring with `pushes` has no force while l > rest_length.
+
+3. A controller whose `holds` is false in this frame or in the next has springs without force in it.
+
+4. w = v + dt (force / mass + (0, 0, -gravity up_sign)).
+
+5. Drag: v' = w exp(-dt drag).
+
+6. If self_collision: pairs of nodes that were closer than contact_distance at the begin of the frame, are so now, and approach
+(dx . dv < 0) change their velocity. With n = dx / |dx|, u = v_j - v_i = u_n + u_t, u_n along n, a = max(0, 1 - contact_friction
+(1 + contact_elasticity) |u_n| / |u_t|), node i loses the mean over its partners of mass_j / (mass_i + mass_j) (-(1 +
+contact_elasticity) u_n + (a - 1) u_t).
+
+7. x' = x + dt v'. If ground, and the step would take a node that moves down below z = 0 (z up_sign < 0): it moves to z = 0, its
+velocity becomes (a v_x, a v_y, -ground_elasticity v_z), a = max(0, 1 - ground_friction (1 + ground_elasticity) |v_z| / |v_xy|),
+and it goes on for the rest of dt.
+"""
+
+    def describes(self, twin: Twin) -> bool:
+        return twin.rod is None
+
+    def search(
+        self,
+        observations: Observations,
+        pool: Sequence[Observations],
+        settings: Config,
+        *,
+        clusters: int = 1,
+        seed: int = 0,
+        device: str = "cpu",
+        threads: int = 1,
+        together: int = 0,
+        record: Path | None = None,
+        key: str = "",
+    ) -> SearchResult:
+        """CMA-ES over topology and a homogeneous material, and a polish; see `search.search`."""
+        from neuspring.twin.candidates import SearchProblem
+        from neuspring.twin.search import search
+
+        problem = SearchProblem(
+            observations=observations,
+            pool=tuple(pool),
+            search=settings.search,
+            simulation=settings.simulation,
+            losses=settings.losses,
+            quirks=settings.released_quirks,
+            clusters=clusters,
+            device=device,
+            threads=threads,
+            together=together,
+        )
+        return search(problem, seed, record=record, key=key)
+
+    def fit(self, problem: FitProblem, *, partial: Path | None = None, key: str = "", threads: int = 1) -> FitResult:
+        """Adam, with gradients through the simulation; see `fit.fit`. It has one thread."""
+        from neuspring.twin.fit import fit
+
+        return fit(problem, partial=partial, key=key)
+
+    def require_pool(self, here: Observations, pool: Sequence[Observations]) -> None:
+        """Other recordings with as many nodes and hands, node i on node i; see `transfer.require_pool`."""
+        from neuspring.twin.transfer import require_pool
+
+        require_pool(here, pool)
+
+    def on_recording(self, twin: Twin, observations: Observations) -> tuple[Twin, Registration | None]:
+        """Springs with their ends on the same nodes, or springs of their own on others; see `transfer.on_nodes`."""
+        from neuspring.twin.transfer import on_nodes
+
+        return on_nodes(twin, observations)
+
+    def solver(self, twin: Twin, device: str = "cpu") -> FrameSolver:
+        from neuspring.physics.solver import solver_for
+
+        solver: FrameSolver = solver_for(twin, device, differentiable=False)
+        return solver
+
+    def check(self, twin: Twin) -> None:
+        from neuspring.physics import stability
+
+        stability.check(twin)
+
+    def stable(self, twin: Twin, safety: float) -> Twin:
+        from neuspring.physics import stability
+
+        simulation = twin.simulation
+        count = stability.smallest_safe_substeps(stability.twin_spectrum(twin), simulation.frame_time, safety)
+        return replace(twin, simulation=replace(simulation, substeps=max(count, simulation.substeps)))
+
+    def for_prediction(self, twin: Twin) -> Twin:
+        from neuspring.physics import stability
+
+        return stability.for_prediction(twin)
+
+    def load(self, twin: Twin) -> float:
+        from neuspring.physics import stability
+
+        return stability.twin_spectrum(twin).load(twin.simulation.substep)
+
+    def lines(self, twin: Twin) -> Lines:
+        """All springs, those between nodes first."""
+        topology, mass = twin.topology, twin.material.mass
+        nodes, hands = len(topology.nodes), len(topology.controllers)
+        own = mass if len(mass) else np.ones(nodes, np.float32)
+        carried = np.unique(topology.springs[topology.springs < nodes])
+        return Lines(
+            pairs=topology.springs,
+            rest_lengths=topology.rest_lengths,
+            stiffness=twin.material.stiffness,
+            inner=topology.object_spring_count,
+            kind="springs",
+            about="object springs",
+            labels=np.pad(topology.labels, (0, hands), constant_values=topology.labels.min()),
+            masses=np.concatenate([own, np.zeros(hands, np.float32)]),
+            loose=nodes - len(carried),
+            points=lambda x, held: np.concatenate([x, held]),
+        )
+
+    def node_stiffness(self, twin: Twin) -> np.ndarray:
+        """Geometric mean of the stiffness of each node's object springs [N], N; the median of all for a node without any."""
+        count = twin.topology.object_spring_count
+        pairs, values = twin.topology.springs[:count], np.maximum(twin.material.stiffness[:count].astype(float), 1e-30)
+        nodes = len(twin.topology.nodes)
+        degree = np.bincount(pairs.ravel(), minlength=nodes)
+        total = np.bincount(pairs.ravel(), np.repeat(np.log(values), 2), minlength=nodes)
+        typical = float(np.median(np.log(values))) if count else 0.0
+        return np.asarray(np.exp(np.where(degree > 0, total / np.maximum(degree, 1), typical)))
+
+    def mass_at(self, twin: Twin, node: int) -> float:
+        return float(twin.material.mass[node]) if len(twin.material.mass) else 1.0
+
+
+BODY: Any = Lattice()

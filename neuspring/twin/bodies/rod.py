@@ -1,0 +1,146 @@
+"""The rod: a long thin body whose nodes follow an elastic center line (Bergou et al. 2008, 2010)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from neuspring.config import Config
+from neuspring.core.artifacts import Artifact, Observations, Rod, Twin
+from neuspring.twin.body import Body, Lines
+
+if TYPE_CHECKING:
+    from neuspring.physics.rod_nodes import RodFrames
+    from neuspring.twin.fit import FitProblem
+    from neuspring.twin.rod_fit import RodResult
+
+
+class RodBody(Body):
+    """A discrete elastic rod, in `Twin.rod`; its springs are those of hands alone."""
+
+    name = "rod"
+    fits = ("rod",)
+    reads = ("rod", "fit.rod")
+    format = "neuspring-rod"
+    about = "A rod: nodes that follow an elastic center line"
+    equations = """
+A discrete elastic rod (Bergou et al. 2008, 2010). Vertices x_0 .. x_E, edges e_j = x_(j+1) - x_j with tangents t_j and unit
+directors m1_j, m2_j = t_j x m1_j. The curvature binormal of inner vertex i is kb = 2 t_(i-1) x t_i / (1 + t_(i-1) . t_i), its
+curvatures are k1 = kb . (m2_(i-1) + m2_i) / 2 and k2 = -kb . (m1_(i-1) + m1_i) / 2, and l_i is half of the unloaded lengths of
+its edges.
+
+Energy: sum_i bending_i |k_i - curvature_i|^2 / (2 l_i) + sum_i twisting_i m_i^2 / (2 l_i) + sum_j stretching (|e_j| / length_j
+- 1)^2 length_j / 2. The twist m_i is the angle from m1_(i-1), parallel-transported to t_i, to m1_i. Inner damping: k_i +
+damping dk_i/dt takes the place of k_i in the moments of bending.
+
+Directors of an end are held where its two outer vertices are: m1 of the first edge is rod_axis projected, that of the last the
+same turned by roll about its tangent. All others are where moments about the tangents, inner damping among them, are in
+balance.
+
+mass_i dv_i/dt = force - mass_i (gravity up_sign (0, 0, 1) + (drag + drag_quadratic |v_i|) v_i). A vertex with rod_held >= 0 is
+where that controller is. With rod_clamps, the inner held vertex of an end is beside its controller by these distances along t,
+m1 (without roll) and m2, with t along the two controllers, and the outer one follows at the controllers' distance along -t or
+t. The implicit integration is BDF2 with `substeps` steps per frame.
+
+A node n is at x_j + f e_j + a m1_j + b m2_j with j = rod_edge and (f, a, b) = rod_place. A spring (controller, node) pulls
+there with stiffness (l / rest_length - 1) + dashpot dl/dt; it acts where `holds` is true in this frame and the next. A vertex
+that passes the ground (the nodes' 0.9 quantile of (a^2 + b^2)^(1/2), or its height in frame 0, above z = 0) is reflected: (c
+v_x, c v_y, -ground_elasticity v_z), c = max(0, 1 - ground_friction (1 + ground_elasticity) |v_z| / |v_xy|).
+"""
+
+    def describes(self, twin: Twin) -> bool:
+        return twin.rod is not None
+
+    def search(
+        self,
+        observations: Observations,
+        pool: Sequence[Observations],
+        settings: Config,
+        *,
+        clusters: int = 1,
+        seed: int = 0,
+        device: str = "cpu",
+        threads: int = 1,
+        together: int = 0,
+        record: Path | None = None,
+        key: str = "",
+    ) -> RodResult:
+        """The constants of a rod; see `rod_fit.search_rod`. It has no regions and no chance, and begins anew."""
+        from neuspring.twin.rod_fit import search_rod
+
+        return search_rod(observations, pool, settings, device=device, threads=threads, record=record)
+
+    def fit(self, problem: FitProblem, *, partial: Path | None = None, key: str = "", threads: int = 1) -> RodResult:
+        """All that is unknown of a rod; see `rod_fit.fit_rod`. It begins anew."""
+        from neuspring.twin.rod_fit import fit_rod
+
+        settings, read = problem.fit.rod, (problem.observations, problem.pool, problem.twin)
+        return fit_rod(*read, settings, oracle=problem.oracle, device=problem.device, threads=threads)
+
+    def require_pool(self, here: Observations, pool: Sequence[Observations]) -> None:
+        """Recordings of one center line; see `rod_fit.require_pool`. Nodes around the line are free."""
+        from neuspring.twin.rod_fit import require_pool
+
+        require_pool(here, pool)
+
+    def on_recording(self, twin: Twin, observations: Observations) -> tuple[Twin, None]:
+        """The rod on the line of frame 0; see `rod.on_recording`."""
+        from neuspring.twin.rod import on_recording
+
+        return on_recording(twin, observations), None
+
+    def solver(self, twin: Twin, device: str = "cpu") -> RodFrames:
+        from neuspring.physics.rod_nodes import RodFrames
+
+        return RodFrames(twin, device)
+
+    def lines(self, twin: Twin) -> Lines:
+        """The edges of the center line, then the springs of hands."""
+        from neuspring.physics.rod_nodes import at_vertices
+
+        topology, rod = twin.topology, _rod(twin)
+        points = len(topology.nodes) + len(topology.controllers)
+        edges = points + np.arange(len(rod.lengths))
+        return Lines(
+            pairs=np.concatenate([np.stack([edges, edges + 1], axis=1), topology.springs]),
+            rest_lengths=np.concatenate([rod.lengths, topology.rest_lengths]),
+            stiffness=np.concatenate([_edge_stiffness(rod), twin.material.stiffness]),
+            inner=len(edges),
+            kind="edges",
+            about="edges, EI / l²",
+            labels=np.full(points + len(rod.mass), topology.labels.min()),
+            masses=np.concatenate([np.zeros(points), rod.mass]),
+            loose=0,
+            points=lambda x, held: np.concatenate([x, held, at_vertices(rod, x, held)]),
+        )
+
+    def node_stiffness(self, twin: Twin) -> np.ndarray:
+        """EI / l^2 of each node's edge [N], N."""
+        return np.asarray(_edge_stiffness(_rod(twin))[_rod(twin).edge])
+
+    def mass_at(self, twin: Twin, node: int) -> float:
+        """The two vertices of the node's edge."""
+        edge = _rod(twin).edge[node]
+        return float(_rod(twin).mass[edge : edge + 2].sum())
+
+    def parts(self, twin: Twin) -> tuple[Artifact, ...]:
+        return (_rod(twin),)
+
+    def center_line(self, twin: Twin) -> Rod:
+        return _rod(twin)
+
+
+def _rod(twin: Twin) -> Rod:
+    assert twin.rod is not None
+    return twin.rod
+
+
+def _edge_stiffness(rod: Rod) -> np.ndarray:
+    """EI / l^2 of each edge [E], N."""
+    return np.asarray((rod.bending[:-1] + rod.bending[1:]) / 2 / rod.lengths**2)
+
+
+BODY: Any = RodBody()

@@ -1,0 +1,201 @@
+"""The body: what a twin is made of. A lattice of springs and a rod answer the same questions, and so does a package's own body.
+
+A body is a module of `neuspring.twin.bodies` with a `BODY`, or an entry point of the group `neuspring.bodies`. It imports what it
+computes with in its methods: the workflow asks for names and settings before any job exists.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from neuspring.config import Config
+from neuspring.core.artifacts import Artifact, Observations, Rod, Twin
+from neuspring.registry import Registry, modules
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True, kw_only=True)
+class Learned:
+    """A twin that a search or a fit has found, and how."""
+
+    twin: Twin
+    course: pd.DataFrame
+    """Losses by step, for history.parquet."""
+    facts: dict[str, Any] = field(default_factory=dict)
+    """Numbers and text for the record."""
+    attempts: int = 1
+    """1, plus one for every time it continued from its record."""
+    earlier_seconds: float = 0.0
+    """Wall time of the attempts that this one continued, up to what was recorded last."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Lines:
+    """Lines that a twin is drawn with: those of its body, then the springs of hands.
+
+    A point is a node, then a controller, then what else the body has: the vertices of a rod's center line.
+    """
+
+    pairs: np.ndarray
+    """Ends [L, 2]."""
+    rest_lengths: np.ndarray
+    """[L], m."""
+    stiffness: np.ndarray
+    """[L], N; of an edge of a rod EI / l^2."""
+    inner: int
+    """Number of lines that are the body's; the others are those of hands."""
+    kind: str
+    """Name of the body's lines: springs, edges."""
+    about: str
+    """Their name where stiffness is shown."""
+    labels: np.ndarray
+    """Region of each point [P]."""
+    masses: np.ndarray
+    """Of each point [P], kg; 0 where it has none."""
+    loose: int
+    """Number of nodes that no line carries."""
+    points: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    """From nodes [N, 3] and controllers [C, 3] to all points [P, 3], m."""
+
+    @property
+    def kinds(self) -> str:
+        """Names of all lines, those of hands included."""
+        return " and ".join(dict.fromkeys([self.kind, "springs"]))
+
+    @property
+    def typical(self) -> float:
+        """Median stiffness of the body's lines, N; of all where it has none."""
+        return float(np.median(self.stiffness[: self.inner or None]))
+
+
+class Body(ABC):
+    """A kind of body. What has a default holds for bodies that are integrated implicitly: any substep is stable."""
+
+    name: str
+    """Its name in the registry."""
+    fits: tuple[str, ...]
+    """Kinds of fits that it has; the first is the default."""
+    reads: tuple[str, ...] = ()
+    """Settings that its search reads beside those of every search."""
+    by_gradients = False
+    """Fits go epoch by epoch, with gradients: they share launches, and sweeps watch them."""
+    starts_anywhere = False
+    """Positions and velocities of the nodes are its whole state, so that it may start in any frame."""
+    format: str
+    """Name of the plain export's format."""
+    about: str
+    """The body, in the plain export."""
+    equations: str
+    """A step of its simulation, in the plain export; a paragraph each."""
+
+    @abstractmethod
+    def describes(self, twin: Twin) -> bool:
+        """True for a twin that has this body; a lattice has springs, as every twin."""
+
+    # --- from recordings to twins
+
+    @abstractmethod
+    def search(
+        self,
+        observations: Observations,
+        pool: Sequence[Observations],
+        settings: Config,
+        *,
+        clusters: int = 1,
+        seed: int = 0,
+        device: str = "cpu",
+        threads: int = 1,
+        together: int = 0,
+        record: Path | None = None,
+        key: str = "",
+    ) -> Learned:
+        """A coarse twin, on a recording and a pool of others.
+
+        Its trace goes to the file `record`; one with the same `key` that is there already may be continued. At most `together`
+        candidates share a launch (0: as many as are fast).
+        """
+
+    @abstractmethod
+    def fit(self, problem: Any, *, partial: Path | None = None, key: str = "", threads: int = 1) -> Learned:
+        """The fitted twin of a `fit.FitProblem`; checkpoints go to the file `partial`."""
+
+    @abstractmethod
+    def require_pool(self, here: Observations, pool: Sequence[Observations]) -> None:
+        """Raise InputError unless one twin can be judged on all recordings."""
+
+    @abstractmethod
+    def on_recording(self, twin: Twin, observations: Observations) -> tuple[Twin, Any]:
+        """The twin in frame 0 of another recording of its object, and how its shape was registered, where it was.
+
+        Its simulation is still the twin's. Raises InputError if the recording is of another body.
+        """
+
+    # --- simulation
+
+    @abstractmethod
+    def solver(self, twin: Twin, device: str = "cpu") -> Any:
+        """A solver with the calls of `physics.solver.FrameSolver` that rollouts make, without gradients."""
+
+    def check(self, twin: Twin) -> None:
+        """Raise Unstable if the twin's substep is beyond the stability bound."""
+        return
+
+    def stable(self, twin: Twin, safety: float) -> Twin:
+        """The twin with at least as many substeps as a part `safety` of the stability bound asks for."""
+        return twin
+
+    def for_prediction(self, twin: Twin) -> Twin:
+        """The twin as predictions are made with it."""
+        return twin
+
+    def load(self, twin: Twin) -> float:
+        """Stability criterion at the twin's substep, below `stability.LIMIT`."""
+        return 0.0
+
+    # --- pictures and files
+
+    @abstractmethod
+    def lines(self, twin: Twin) -> Lines:
+        """All lines of a twin."""
+
+    @abstractmethod
+    def node_stiffness(self, twin: Twin) -> np.ndarray:
+        """Stiffness that each node shows [N], N."""
+
+    @abstractmethod
+    def mass_at(self, twin: Twin, node: int) -> float:
+        """Mass that a force on a node moves first, kg."""
+
+    def parts(self, twin: Twin) -> tuple[Artifact, ...]:
+        """Parts of a twin beside topology and material, whose arrays are exported with their kind as prefix."""
+        return ()
+
+    def center_line(self, twin: Twin) -> Rod | None:
+        """The elastic line that carries the nodes; None where springs between nodes are all there is."""
+        return None
+
+
+BODIES: Registry[Body] = Registry("bodies", modules("neuspring.twin.bodies", "BODY"), type=Body)
+
+
+def code() -> tuple[str, ...]:
+    """Modules of all bodies, for digests of what treats any twin."""
+    return tuple(BODIES.module_of(name) for name in BODIES)
+
+
+def body_of(twin: Twin) -> Body:
+    """The body of a twin: the last registered one that describes it, so that a package's body goes before ours."""
+    return next(body for body in reversed(list(BODIES.values())) if body.describes(twin))
+
+
+def lines_of(twin: Twin) -> Lines:
+    """All lines of a twin."""
+    return body_of(twin).lines(twin)

@@ -1,0 +1,90 @@
+"""The body of a twin is asked, never told apart: lattice, rod, and what a package brings."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import neuspring
+from neuspring.core.artifacts import Twin
+from neuspring.core.errors import InputError
+from neuspring.core.provenance import imported_modules
+from neuspring.physics.rod_nodes import RodFrames
+from neuspring.physics.solver import FrameSolver
+from neuspring.twin import body as module
+from neuspring.twin.bodies.lattice import Lattice
+from neuspring.twin.body import BODIES, body_of, lines_of
+from neuspring.twin.rod import rod_twin
+from tests.support import ropes, small
+
+PACKAGE = Path(neuspring.__file__).parent
+TOLD_APART = re.compile(r"\.rod is (not )?None|\b(body|kind|fit)\b *[!=]= *\"(rod|lattice)\"|isinstance\([^)]*Rod")
+
+
+@pytest.fixture(scope="module")
+def twins() -> dict[str, Twin]:
+    """A twin of each body."""
+    return {"lattice": small.fit_problem().twin, "rod": rod_twin(ropes.rope(), ropes.SETTINGS)}
+
+
+def test_no_room_above_tells_a_rod_from_a_lattice():
+    """Outside physics and twin; the pattern finds what it looks for."""
+    assert all(TOLD_APART.search(text) for text in ("if twin.rod is None", 'if body == "rod":', "isinstance(solver, RodFrames)"))
+    places = [path for path in PACKAGE.rglob("*.py") if path.relative_to(PACKAGE).parts[0] not in ("physics", "twin")]
+    lines = [(path.relative_to(PACKAGE), line) for path in places for line in path.read_text().splitlines()]
+    found = [f"{path}: {line.strip()}" for path, line in lines if TOLD_APART.search(line)]
+    assert not found, "\n".join(found)
+
+
+def test_files_of_the_twin_and_the_simulator_import_in_one_direction():
+    """Lazy and type-only imports included."""
+    paths = [path for room in ("physics", "twin") for path in (PACKAGE / room).rglob("*.py") if path.name != "__init__.py"]
+    names = {".".join(["neuspring", *path.relative_to(PACKAGE).with_suffix("").parts]) for path in paths}
+    left = {name: imported_modules(name) & names - {name} for name in names}
+    while free := [name for name, below in left.items() if not below & left.keys()]:
+        for name in free:
+            del left[name]
+    assert not left, sorted(left)
+
+
+def test_every_body_answers_for_its_twin(twins):
+    assert list(BODIES) == list(twins)
+    for name, twin in twins.items():
+        body = body_of(twin)
+        assert body is BODIES[name] and body.name == name
+        lines, nodes, hands = lines_of(twin), twin.topology.nodes, twin.topology.controllers
+        points = lines.points(nodes, hands)
+        assert len(points) == len(lines.labels) == len(lines.masses) > lines.pairs.max()
+        assert len(lines.pairs) == len(lines.stiffness) == len(lines.rest_lengths) >= lines.inner > 0
+        assert body.node_stiffness(twin).shape == (len(nodes),)
+        assert lines.masses.sum() > 0 and body.mass_at(twin, 0) > 0
+        body.check(body.stable(twin, 0.8))
+        seen = {"lattice": small.observations(), "rod": ropes.rope()}[name]
+        np.testing.assert_array_equal(body.on_recording(twin, seen)[0].topology.nodes, nodes)
+    assert isinstance(body_of(twins["lattice"]).solver(twins["lattice"]), FrameSolver)
+    assert isinstance(body_of(twins["rod"]).solver(twins["rod"]), RodFrames)
+    assert body_of(twins["rod"]).load(twins["rod"]) == 0.0 < body_of(twins["lattice"]).load(twins["lattice"])
+
+
+class Marked(Lattice):
+    """A body of another package: a lattice whose nodes have masses."""
+
+    name = "marked"
+
+    def describes(self, twin: Twin) -> bool:
+        return len(twin.material.mass) > 0
+
+
+def test_a_further_body_is_one_entry_point(twins, monkeypatch):
+    twin, body = twins["lattice"], Marked()
+    monkeypatch.setattr(module, "BODIES", {**BODIES, "marked": body})
+    heavy = replace(twin, material=replace(twin.material, mass=np.ones(len(twin.topology.nodes), np.float32)))
+    assert body_of(heavy) is body
+    assert [body_of(each).name for each in twins.values()] == list(twins)
+
+
+def test_an_unknown_body_is_refused_with_the_known_ones():
+    with pytest.raises(InputError, match=r"must be a registered name; received jelly.*lattice, rod"):
+        BODIES["jelly"]
