@@ -23,10 +23,10 @@ from neuspring.config.parse import Section, parts
 
 PAGE = Path(__file__).parents[2] / "config" / "README.md"
 HEADING = "## Keys\n"
-"""Heading of the tables: the page above it is written by hand, the page below it from the declarations."""
+"""Above it the page is written by hand, below it from the declarations."""
 ROWS = {"rows of scenarios.tsv": rows.ScenarioRow, "rows of methods.yaml": rows.Method, "rows of searches.yaml": rows.SearchRow}
 BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
-TYPE_NAMES = {int: "integer", float: "number", str: "text", bool: "`true`, `false`", types.NoneType: "`null`", Any: "any"}
+WORDS = {int: "integer", float: "number", str: "text", bool: "`true`, `false`", types.NoneType: "`null`", Any: "any"}
 
 
 def sections(kind: type = settings.Config, path: str = "") -> dict[str, type]:
@@ -116,7 +116,7 @@ def allowed(hint: Any) -> str:
         return "section"
     if dataclasses.is_dataclass(hint):
         return "range"
-    return "mapping" if origin is dict else TYPE_NAMES[hint]
+    return "mapping" if origin is dict else WORDS[hint]
 
 
 def bounds(hint: Any) -> list[Any]:

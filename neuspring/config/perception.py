@@ -102,7 +102,7 @@ class Lift(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class ShapePriorSettings(Section):
-    """The part of the object that no camera sees in frame 0."""
+    """The parts of the object in frame 0 that no camera sees."""
 
     backend: Literal["auto", "none", "visual_hull", "mesh", "truth"] = "auto"
     """Shape of what was not seen; auto: none for cloth and packages, else visual_hull. none: only what was seen. visual_hull:
@@ -141,7 +141,7 @@ class ColorSettings(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class Segmentation(Section):
-    """Which pixels show the object and the hands."""
+    """Pixels that show the object and the hands."""
 
     backend: Literal["given", "opencv", "marks", "grounded_sam2"] = "given"
     """Source of masks: the capture's, height and color, marks of a user, or networks. opencv: height and color; of a capture with
@@ -156,7 +156,7 @@ class Segmentation(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class PointTracking(Section):
-    """Following the pixels of frame 0 through the video."""
+    """The way of the pixels of frame 0."""
 
     backend: Literal["opencv", "cotracker3", "truth"] = "opencv"
     """Tracker: Lucas-Kanade, a network, or the truth of a synthetic capture. cotracker3: the online CoTracker3 of torch.hub.

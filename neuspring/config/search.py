@@ -25,7 +25,7 @@ class Variable:
     low: Finite
     high: Finite
     start: Finite
-    """Value at which the search begins, and at which a fixed variable stays."""
+    """Start of the search, where a fixed variable stays."""
     scale: Literal["linear", "log"] = "linear"
 
     def normalized(self, value: float) -> float:
@@ -78,7 +78,7 @@ class SearchVariables(Section):
     @model_validator(mode="before")
     @classmethod
     def _over_defaults(cls, given: Any) -> Any:
-        """Given values over the defaults: what a variable does not name stays as it is."""
+        """The given values on top of the defaults of each variable."""
         if not isinstance(given, dict):
             return given
         defaults = dataclasses.asdict(cls())

@@ -176,7 +176,7 @@ class Config(Section):
 
     @classmethod
     def completed(cls, given: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Given settings on top of the sizes of their effort."""
+        """The given values, on top of the sizes of their effort."""
         values = sizes(given["effort"]) if given.get("effort") in EFFORTS else {}
         merge(values, given)
         return values

@@ -17,7 +17,7 @@ EDGE_DTYPE = [
     *(("vertex1", "<i4"), ("vertex2", "<i4"), ("stiffness", "<f4"), ("dashpot", "<f4"), ("rest_length", "<f4")),
     ("strain", "<f4"),
 ]
-WORDS = {"<f4": "float", "<i4": "int", "u1": "uchar"}
+PLY_TYPE_NAMES = {"<f4": "float", "<i4": "int", "u1": "uchar"}
 COMMENT = "units m, N, N s/m, kg; stiffness of a vertex: mean of its springs"
 
 
@@ -71,7 +71,7 @@ def _write_elements(path: Path, elements: dict[str, np.ndarray]) -> None:
     lines = ["ply", "format binary_little_endian 1.0", f"comment {COMMENT}"]
     for name, table in elements.items():
         lines.append(f"element {name} {len(table)}")
-        lines += [f"property {WORDS[table.dtype[field].str.lstrip('|')]} {field}" for field in table.dtype.names or ()]
+        lines += [f"property {PLY_TYPE_NAMES[table.dtype[field].str.lstrip('|')]} {field}" for field in table.dtype.names or ()]
     head = "\n".join([*lines, "end_header", ""]).encode()
     content = head + b"".join(table.tobytes() for table in elements.values())
     write_atomically(path, lambda temporary: temporary.write_bytes(content))
