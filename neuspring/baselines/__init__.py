@@ -43,7 +43,7 @@ class TrainingRequest:
 
     observations: Observations
     settings: Config
-    """With the method's own settings in the model's section."""
+    """The configuration, with the method's own settings in the model's section."""
     seed: int
     device: str
     partial: Path | None
@@ -68,7 +68,7 @@ class Baseline:
     takes_pictures: Callable[[Any], bool] = lambda section: False
     """True, from its settings, where it is trained on silhouettes."""
     reads: Callable[[Any], tuple[str, ...]] = lambda section: ()
-    """From its settings: keys of the configuration that training reads beside its own section."""
+    """Keys of the configuration, from its settings, that training reads beside its own section."""
     own_splats: bool = False
     """True where a method row may give it splats of its own to move (`appearance`)."""
     transfers: bool = False

@@ -31,7 +31,7 @@ class Trained(Generic[Model]):
     facts: dict[str, Any] = field(default_factory=dict)
     """Plain values for the record."""
     failure: str = ""
-    """Why training ended early; the model is then the last that was usable. Empty: it did not."""
+    """Reason why training ended early; the model is then the last usable one. Empty: it did not end early."""
     attempts: int = 1
     """1, plus one for every time that training continued from a checkpoint."""
     earlier_seconds: float = 0.0

@@ -214,7 +214,7 @@ class Scenario(Artifact):
     frame_rate: float
     """Frames per second."""
     up: Up
-    """Which way is up along the world's z axis; the ground is the plane z = 0."""
+    """Direction up along the world's z axis; the ground is the plane z = 0."""
     self_collision: bool = False
     ground: bool = True
     obstacles: tuple[Obstacle, ...] = field(default=(), metadata=OMITTED)

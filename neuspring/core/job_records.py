@@ -42,7 +42,7 @@ class Attempt:
     """s waited for a GPU."""
     outcome: Outcome = "running"
     cause: str = ""
-    """Why it failed, in words; empty if it did not."""
+    """Cause of the failure, in words; empty where it did not fail."""
     message: str = ""
     """The line of the output that names the error; empty if it did not fail."""
     exit: int | None = None

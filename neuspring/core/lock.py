@@ -38,7 +38,7 @@ def try_lock(path: Path) -> IO[str] | None:
 
 
 def wait_for_lock(path: Path) -> IO[str]:
-    """As `try_lock`, but waits until the lock is free."""
+    """The file of `try_lock`, after waiting until the lock is free."""
     while (file := try_lock(path)) is None:
         time.sleep(LOCK_POLL)
     return file

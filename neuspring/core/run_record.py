@@ -55,7 +55,7 @@ class RunRecord:
     seed: int
     status: Literal["ok", "failed"]
     reason: str
-    """Why the run failed; empty otherwise."""
+    """Reason why the run failed; empty otherwise."""
     notes: list[str] = field(default_factory=list)
     """Notes that a reader of the scores needs although the run did not fail."""
     images: dict[str, Any] | None = None

@@ -1,4 +1,4 @@
-"""Which requests are answered: those of the page that this server gave out.
+"""Requests that a local server answers: those of the page that it gave out.
 
 A page of another site can make a browser send requests here, and can point a name of its own at this address (DNS rebinding). So
 the Host header must name this machine, and what a browser says about a request's origin must agree with it.

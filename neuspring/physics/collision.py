@@ -26,7 +26,7 @@ GRID_CELLS = 64
 
 
 def allocate(b: Buffers) -> None:
-    """With self-collision, the lists of partners and the velocities after collisions."""
+    """Allocate the lists of partners and the velocities after collisions, with self-collision alone."""
     if not b.simulation.self_collision:
         return
     capacity, twins = b.simulation.collision_capacity, b.groups * b.width
@@ -309,7 +309,7 @@ def functions(real: Any, width: int) -> Contacts:
 
     @wp.func
     def collided_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
-        """From dL/d(velocities after the impulses) to those before, and dL/d(x, e, mu): of node i and its pairs with later ones."""
+        """Adjoint of `collided`, of node i and its later pairs: dL/d(velocities after impulses) -> dL/d(those before, x, e, mu)."""
         h = adjoint.moving[i, g]
         wp.atomic_add(adjoint.after, i, g, h)
         count = state.met[step, i, g]

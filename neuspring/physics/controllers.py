@@ -19,7 +19,7 @@ import torch
 from neuspring.physics.lanes import MIN_SPRING_LENGTH
 
 BEGINS = 2.0
-"""In the last column of a row of waypoints: the controller begins to hold in this frame."""
+"""Value in the last column of a row of waypoints: the controller begins to hold in this frame."""
 
 
 def waypoints(hands: torch.Tensor, valid: np.ndarray | None = None) -> torch.Tensor:
@@ -37,7 +37,7 @@ def waypoints(hands: torch.Tensor, valid: np.ndarray | None = None) -> torch.Ten
 
 
 def begins(row: torch.Tensor) -> torch.Tensor:
-    """Which controllers [..., C] begin to hold, of a row of waypoints; none where it has no such column."""
+    """True for the controllers [..., C] of a row of waypoints that begin to hold; none where it has no such column."""
     return row[..., 3] == BEGINS if row.shape[-1] == 4 else torch.zeros(row.shape[:-1], dtype=torch.bool, device=row.device)
 
 

@@ -230,7 +230,7 @@ class FrameSolver:
         return sum(self.overflows)
 
     def _stacked(self, values: torch.Tensor) -> torch.Tensor:
-        """With a leading axis [B]."""
+        """The values of all twins with a leading axis [B]."""
         return values if self.together else values[None]
 
     def _one(self, values: torch.Tensor) -> torch.Tensor:
@@ -318,7 +318,7 @@ class FrameWindow:
 
 
 class AdjointLimit:
-    """For one backward pass through chained frames: leaves out those through which adjoints outgrow the losses, and counts them.
+    """Limit of one backward pass through chained frames: leaves out frames whose adjoints outgrow the losses, and counts them.
 
     The size of an adjoint is sqrt(|dL/dx|^2 + |dL/dv|^2 / T^2), where T is the frame's time, s. A frame is left out if that at its
     begin is more than `factor` times the sum of |dL/dx| that the losses behind it have added. What lies before it then has the

@@ -102,7 +102,7 @@ class Shot:
     def of(
         cls, name: str, view: View, color: np.ndarray, mask: np.ndarray, hands: np.ndarray, depth: np.ndarray, margin: float
     ) -> Shot | None:
-        """From an image [H, W, 3] uint8, bool masks [H, W] and depth [H, W] m; hands are dilated by a square of `margin` pixels.
+        """Shot of an image [H, W, 3] uint8, bool masks [H, W], depth [H, W] m; hands are dilated by a square of `margin` pixels.
 
         None where nothing of the object is seen. Raises InputError for sizes that differ from the view's.
         """

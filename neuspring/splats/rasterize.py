@@ -175,7 +175,7 @@ def choose_backend(wanted: Literal["auto", "warp", "gsplat"], device: str) -> Ba
 
 @functools.cache
 def _gsplat_fault(device: str) -> str:
-    """Why gsplat cannot draw on `device`; empty if it can: one splat is drawn to find out, since gsplat compiles at first use."""
+    """Reason why gsplat cannot draw on `device`; empty if it can. One splat is drawn to find out: gsplat compiles at first use."""
     if not device.startswith("cuda"):
         return f"it needs CUDA, the device is {device}"
     if importlib.util.find_spec("gsplat") is None:

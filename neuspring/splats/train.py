@@ -233,7 +233,7 @@ class Statistics:
 
     @classmethod
     def empty(cls, like: torch.Tensor) -> Statistics:
-        """For splats with means `like` [N, 3]."""
+        """Statistics of no pictures, for splats with means `like` [N, 3]."""
         return cls(like.new_zeros(len(like)), like.new_zeros(len(like)), like.new_zeros(len(like)))
 
     @torch.no_grad()
@@ -259,7 +259,7 @@ def densify(
     after_reset: bool,
     generator: torch.Generator,
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """Which splats stay [N] bool, and the new ones, with the keys of `splats` (those of `Gaussians`).
+    """The splats that stay [N] bool, and the new ones, with the keys of `splats` (those of `Gaussians`).
 
     `extent`, m, is the size of the scene; `after_reset` also removes splats that are huge.
     """

@@ -1,4 +1,4 @@
-"""From splats in the world to ellipses in the picture: pinhole views, the rasterizer's thresholds, the projection, and colors.
+"""Projection of splats in the world to ellipses in the picture: pinhole views, the rasterizer's thresholds, and colors.
 
 With p = R x + t the camera point and Sigma = Rq diag(s^2) Rq^T the covariance of a splat, its mean in the picture is
 (fx px/pz + cx, fy py/pz + cy) and its covariance there J R Sigma R^T J^T + blur 1, J the Jacobian of the projection, taken at
@@ -72,7 +72,7 @@ class View:
     def of(
         cls, camera_to_world: np.ndarray, intrinsics: np.ndarray, width: int, height: int, device: str = "cpu", shift: float = 0.5
     ) -> View:
-        """From a calibrated camera whose pixel centers lie at whole coordinates, `shift` pixels away from those here.
+        """View of a calibrated camera whose pixel centers lie at whole coordinates, `shift` pixels away from those here.
 
         shift = 0 takes the intrinsics as they are, as the released rendering does: a picture half a pixel off.
         """
@@ -154,7 +154,7 @@ def _limited(slope: torch.Tensor, focal: torch.Tensor, center: torch.Tensor, siz
 
 @torch.no_grad()
 def boxes(projected: Projected, opacities: torch.Tensor, view: View, limits: Limits) -> tuple[torch.Tensor, torch.Tensor]:
-    """Which projected splats touch the picture [M] bool, and the pixels they touch [M, 4] int: x0, y0, x1, y1, ends excluded.
+    """True for projected splats that touch the picture [M], and the pixels they touch [M, 4] int: x0, y0, x1, y1, ends excluded.
 
     alpha >= alpha_min needs a Mahalanobis square of at most 2 ln(opacity / alpha_min), an ellipse with these half widths.
     """

@@ -68,7 +68,7 @@ class Tracks:
 
     @classmethod
     def of(cls, observations: Observations, settings: GsDynamicsTraining) -> Tracks:
-        """From the training frames of a capture; nothing else of it is read."""
+        """Tracks and tools of the training frames of a capture; nothing else of it is read."""
         train, up = slice(observations.scenario.train_end), observations.scenario.up
         points, visible = upright(observations.object_points[train], up), observations.object_visibility[train]
         inliers = np.flatnonzero(ordinary(points, visible, settings.outlier_deviations))
@@ -315,7 +315,7 @@ class GsDynamicsTrainer:
         raise TrainingStopped(reason)
 
     def model(self) -> GsDynamicsModel:
-        """With the present weights."""
+        """The model with the present weights."""
         return GsDynamicsModel(weights=self.network.weights.cpu().numpy(), rules=self.rules)
 
     def checkpoint(self) -> Checkpoint:

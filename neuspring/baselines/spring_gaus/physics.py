@@ -42,7 +42,7 @@ PACKED = ("stiffness", "soft", "scalars")
 
 @dataclass(frozen=True, kw_only=True)
 class AnchorGraph(Artifact):
-    """Which anchors and controllers each anchor feels. Springs are directed: row i is what anchor i feels."""
+    """Graph of the anchors and controllers that each anchor feels. Springs are directed: row i has those that anchor i feels."""
 
     kind: ClassVar[str] = "anchor_graph"
     anchors: np.ndarray = array("N,3", np.float32, "m", "positions in frame 0")

@@ -240,7 +240,7 @@ class SpringGausTrainer:
         self.complete = {name: tensor.detach().clone() for name, tensor in self.values.items()}
 
     def model(self) -> SpringGausModel:
-        """With the values of the last complete epoch."""
+        """The model with the values of the last complete epoch."""
         values: dict[str, Any] = {name: tensor.cpu().numpy() for name, tensor in self.complete.items()}
         return replace(self.problem.start, **values, substeps=self.substeps)
 

@@ -95,7 +95,7 @@ class Annotations:
 
     @classmethod
     def read(cls, values: Any, capture: Capture, where: str) -> Annotations:
-        """From plain values; clicks are sorted by frame. Raises InputError that names the point, the camera and the rule."""
+        """Annotations of plain values, clicks sorted by frame. Raises InputError that names the point, the camera and the rule."""
         if not isinstance(values, dict):
             raise InputError(where, "a JSON object is required", type(values).__name__)
         parsed = parse(cls, values, where)
@@ -123,7 +123,7 @@ class Annotations:
         write_text(folder / ANNOTATIONS, json.dumps(self.plain(), indent=1) + "\n")
 
     def plain(self) -> dict[str, Any]:
-        """As plain JSON values; what a click does not say is left out."""
+        """The annotations as plain JSON values; fields that a click does not set are left out."""
         values = plain(self)
         for point in values["points"]:
             for clicks in point["clicks"].values():

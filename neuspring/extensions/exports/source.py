@@ -38,7 +38,7 @@ class ExportSource:
     velocity: np.ndarray
     """Velocity of the nodes in frame 0 [N, 3], m/s."""
     splats: Splats | None = None
-    """In the shape of frame 0."""
+    """Splats in the shape of frame 0."""
     made_from: dict[str, str] = field(default_factory=dict)
     """File name -> SHA-256."""
     frames: np.ndarray = field(default_factory=lambda: np.zeros(1, np.int64))

@@ -14,7 +14,7 @@ README_FILM_MEGABYTES = 2.0
 
 @dataclass(kw_only=True)
 class RunOptions:
-    """Which runs, seen from where, as which file."""
+    """Runs to draw, the view, and the file."""
 
     results: Annotated[
         Positional[tuple[Path, ...]], arg(help="results/<scenario>, or runs <scenario>/<method>/<seed> of one scenario")

@@ -166,7 +166,7 @@ class Difference:
     worst: float
     """Largest distance of a node, m."""
     diverged: str = ""
-    """Why one of them ended earlier."""
+    """Reason why one of them ended earlier."""
 
 
 def compare(controls: Controls, own: Twin, other: Twin, seen: Trajectory | None = None) -> Difference:

@@ -228,7 +228,7 @@ class Live:
 
 
 class Grab:
-    """Who holds what of a twin with `nodes` nodes, and where its hands are wanted [C, 3], m. Safe for threads.
+    """Grab of a twin with `nodes` nodes: its holder, the node or hand, and the wanted hands [C, 3], m. Safe for threads.
 
     One grab at a time, of a node or a hand, by one browser. What browsers send is checked here.
     """
@@ -238,7 +238,7 @@ class Grab:
         self.following = False
         """Hands follow a recording, so that nobody can take them."""
         self.asked = 0.0
-        """When a mouse was last moved, s (time.monotonic); 0 once that was drawn."""
+        """Time when a mouse was last moved, s (time.monotonic); 0 once that was drawn."""
         self.reset(hands)
 
     def reset(self, hands: np.ndarray) -> None:

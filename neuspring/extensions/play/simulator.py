@@ -132,7 +132,7 @@ class Simulator:
 
     @property
     def holds(self) -> np.ndarray:
-        """Which hands hold [C]."""
+        """True for controllers that hold [C]."""
         return self._holds > 0
 
     @property
