@@ -69,7 +69,7 @@ def test_the_code_of_a_stage_itself_counts(copy):
 @pytest.mark.parametrize(
     ("file", "old", "new"),
     [
-        ("splats/draw.py", "COVERED = 128", "COVERED = 200"),
+        ("splats/draw.py", "OBJECT_COVERAGE = 128", "OBJECT_COVERAGE = 200"),
         ("scores/lpips.py", "SHIFT = (-0.030", "SHIFT = (-0.031"),
         ("report/video.py", "quality: int = 20", "quality: int = 21"),
         ("stages/render.py", 'VIDEOS = ("video", "turntable")', 'VIDEOS = ("turntable", "video")'),
@@ -100,7 +100,7 @@ def test_modules_that_are_imported_by_name_count(copy):
 
 def test_transitive_imports_count(copy):
     before = digest("neuspring.stages.search")
-    edit(copy / "physics" / "lanes.py", "MIN_LENGTH = 1e-6", "MIN_LENGTH = 1e-7")
+    edit(copy / "physics" / "lanes.py", "MIN_SPRING_LENGTH = 1e-6", "MIN_SPRING_LENGTH = 1e-7")
     assert digest("neuspring.stages.search") != before
     assert "neuspring.physics.springs" in provenance.used_modules("neuspring.stages.fit")
 

@@ -274,7 +274,7 @@ def test_frames_are_shown_in_any_order_hidden_splats_cost_nothing_and_many_are_s
     again.move(x[5])
     assert np.array_equal(layer.handle.centers, again.handle.centers)
     assert (layer.handle.centers != before).any()
-    monkeypatch.setattr("neuspring.extensions.play.layers.MOST_SPLATS", 100)
+    monkeypatch.setattr("neuspring.extensions.play.layers.MOST_DRAWN_SPLATS", 100)
     assert len(SplatLayer(server.scene, "many", splats, x[0]).handle.centers) == 100
 
 
