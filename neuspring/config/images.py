@@ -38,15 +38,8 @@ class Appearance(Section):
     """Weight of the mean absolute difference of coverage and mask."""
     depth: NonNegative = 0.001
     """Weight of the mean absolute difference of depth, per m, where depth was measured on the object."""
-    position_rate: Positive = 1.6e-4
-    """Learning rate of means at the start, per extent of the scene. The extent is 1.1 times the largest distance of a camera from
-    the cameras' center."""
-    color_rate: Positive = 2.5e-3
-    """Learning rate of the first harmonic; that of the others is a twentieth."""
     opacity_rate: Positive = 0.025
     """Learning rate of opacity logits."""
-    scale_rate: Positive = 5e-3
-    """Learning rate of log scales."""
 
     def __post_init__(self) -> None:
         if self.fixed_radius is not None and not self.isotropic:

@@ -144,10 +144,29 @@ def _shuffled(shots: Sequence[Shot], generator: torch.Generator) -> Iterator[Sho
             yield shots[index]
 
 
+@dataclass(frozen=True, kw_only=True)
+class SplatRates(Appearance):
+    """The settings with the learning rates of the released training."""
+
+    position_rate: float = 1.6e-4
+    """Learning rate of means at the start, per extent of the scene: 1.1 times the largest distance of a camera from the center of
+    all."""
+    color_rate: float = 2.5e-3
+    """Learning rate of the first harmonic; that of the others is a twentieth."""
+    scale_rate: float = 5e-3
+    """Learning rate of log scales."""
+
+    @classmethod
+    def of(cls, settings: Appearance) -> SplatRates:
+        """The training that the settings ask for."""
+        return cls(**vars(settings))
+
+
 class _Optimizer:
     """Adam over the tensors of `Gaussians`, whose number may change."""
 
     def __init__(self, gaussians: Gaussians, settings: Appearance, extent: float) -> None:
+        settings = SplatRates.of(settings)
         self.settings, self.extent = settings, extent
         values = _parameters(vars(gaussians))
         rates = {

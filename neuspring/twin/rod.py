@@ -11,7 +11,7 @@ One that springs pull has 1 kg per node, as a lattice has, so that the searched 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,13 +44,36 @@ PENALTY = 1e-3
 """Of the spline's second differences, where the mean weight of a piece's points is 1."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class RodStart(config.RodSettings):
+    """The settings with the other values that a fit starts from, for a body of 1 kg/m."""
+
+    stretching: float = 2e4
+    """EA, N."""
+    damping: float = 0.05
+    """Time of inner damping, s."""
+    marker_mass: float = 0.03
+    """Mass of a marker at each vertex of a center line that the observations give, kg."""
+    drag: float = 0.1
+    """Linear drag, 1/s."""
+    drag_quadratic: float = 0.05
+    """Quadratic drag, 1/m."""
+    substep: float = 0.005
+    """Longest integration step with `simulation.substeps: auto`, s."""
+
+    @classmethod
+    def of(cls, settings: config.RodSettings) -> RodStart:
+        """The start that the settings ask for."""
+        return cls(**vars(settings))
+
+
 def rod_twin(observations: Observations, settings: config.Config, axis: Sequence[float] = (0.0, 1.0, 0.0)) -> Twin:
     """The rod that a fit starts from (`settings.rod`), on the body of a recording in frame 0; `axis` [3]: see `Rod`.
 
     Springs of controllers and all scalars have the starts of `search.variables`, as a lattice's search does, but the linear drag of
     `rod`. Raises InputError if the body is not long and thin, nothing holds it, or only a camera without depth saw it.
     """
-    start, variables, scenario = settings.rod, settings.search.variables, observations.scenario
+    start, variables, scenario = RodStart.of(settings.rod), settings.search.variables, observations.scenario
     where = f"observations of {scenario.name}"
     if observations.image is not None:
         rule = "a rod is fitted to points that are tracked in space"
@@ -84,7 +107,7 @@ def rod_twin(observations: Observations, settings: config.Config, axis: Sequence
         stretching=density * start.stretching,
         damping=start.damping,
         drag_quadratic=start.drag_quadratic,
-        roll=start.roll,
+        roll=0.0,
         line=observations.line,
         axis=direction,
         edge=np.zeros(0, np.int32),

@@ -60,6 +60,27 @@ SCALES = {
 LOGARITHMIC = ("bending", "twisting", "damping", "drag", "drag_quadratic", "marker_mass", "hands", "dashpots")
 
 
+@dataclass(frozen=True, kw_only=True)
+class RodSteps(RodFit):
+    """The settings with the course of the fit."""
+
+    markers: bool = True
+    """Fit of how far markers lie beside the center line, and the lengths between them."""
+    horizons: tuple[int, ...] = (60, 150, 0)
+    """Training frames that count, one stage of the fit after the other; 0: all."""
+    rounds: int = 8
+    """Steps per stage, at most; a stage ends where a step gains less than 0.2 %."""
+    every: int = 4
+    """Stride of the frames that count."""
+    robust: float = 0.02
+    """Robustness b, m: errors e count as sqrt(e^2 + b^2), so that recordings that flip do not decide."""
+
+    @classmethod
+    def of(cls, settings: RodFit) -> RodSteps:
+        """The fit that the settings ask for."""
+        return cls(**vars(settings))
+
+
 @dataclass(frozen=True)
 class Variables:
     """What is varied of a twin, as one vector q [Q], 0 at the start."""
@@ -72,7 +93,7 @@ class Variables:
     """Basis [V, n] of k1 and k2 over the joint's length, along the arc."""
 
     @classmethod
-    def of(cls, twin: Twin, settings: RodFit) -> Variables:
+    def of(cls, twin: Twin, settings: RodSteps) -> Variables:
         """The variables of a fit."""
         rod, held = _rod(twin), _rod(twin).held >= 0
         joints = len(held) - 2
@@ -227,7 +248,7 @@ def _paths(pairs: Sequence[tuple[Observations, np.ndarray]]) -> torch.Tensor:
 class Levenberg:
     """Lowers the objective of some variables on some recordings."""
 
-    def __init__(self, recordings: Recordings, settings: RodFit, device: str = "cpu", threads: int = 1) -> None:
+    def __init__(self, recordings: Recordings, settings: RodSteps, device: str = "cpu", threads: int = 1) -> None:
         self.recordings, self.settings, self.device = recordings, settings, device
         self.threads = threads if device == "cpu" else 1
         self.rollouts = 0
@@ -321,16 +342,16 @@ def search_rod(
 ) -> RodResult:
     """The constants of a rod, on the frames of the first horizon; a row per step goes to the file `record`.
 
-    A turn of the last clamp against the first is known but for whole turns. Of `rod.axes` that axis is taken for which turns in
-    frame 0 of the recordings lie farthest from half a turn, where recordings of one body would be told apart by a whole one.
+    A turn of the last clamp against the first is known but for whole turns. Of the axes x and y that one is taken for which turns
+    in frame 0 of the recordings lie farthest from half a turn, where recordings of one body would be told apart by a whole one.
     """
     import pandas as pd
 
     require_pool(observations, pool)
-    first = replace(settings.fit.rod, stiffness="constant", curvature="constant", markers=False)
+    first = replace(RodSteps.of(settings.fit.rod), stiffness="constant", curvature="constant", markers=False)
     first = replace(first, horizons=first.horizons[:1])
     lines = [rods.line_of(each) for each in [observations, *pool] if each.line.size]
-    axis = max(settings.rod.axes, key=lambda axis: sum(np.cos(turn_of(line, np.array(axis))) for line in lines))
+    axis = max(np.eye(3)[:2].tolist(), key=lambda axis: sum(np.cos(turn_of(line, np.array(axis))) for line in lines))
     start = rods.rod_twin(observations, settings, axis)
     solver = Levenberg(Recordings.of([observations, *pool], start), first, device, threads)
     twin, value, history = solver.lowered(start, Progress(f"search {observations.scenario.name}, rod", first.rounds))
@@ -353,7 +374,7 @@ def fit_rod(
     threads: int = 1,
 ) -> RodResult:
     """All variables of a rod, stage by stage, from the twin of its search. Raises InputError, NumericalFailure."""
-    recordings = Recordings.of([observations, *pool], twin, oracle)
+    recordings, settings = Recordings.of([observations, *pool], twin, oracle), RodSteps.of(settings)
     solver = Levenberg(recordings, settings, device, threads)
     progress = Progress(f"fit {observations.scenario.name}, rod", settings.rounds * len(settings.horizons))
     twin, value, history = solver.lowered(twin, progress)

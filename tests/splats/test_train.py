@@ -13,13 +13,13 @@ from neuspring.scores.pictures import psnr
 from neuspring.splats.draw import prune_by_opacity
 from neuspring.splats.losses import Shot, loss
 from neuspring.splats.model import Gaussians, Splats
-from neuspring.splats.train import Statistics, densify, extent_of, first_splats, train
+from neuspring.splats.train import SplatRates, Statistics, densify, extent_of, first_splats, train
 from neuspring.splats.view import C0, View, harmonic_colors
 from tests.support.filmed import EYES, intrinsics
 
 SIZE = (96, 64)
 HELD_OUT = (0.1, -0.55, 0.35)
-FAST = Appearance(iterations=300, degree=0)
+FAST = SplatRates(iterations=300, degree=0)
 
 
 @pytest.fixture

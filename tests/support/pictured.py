@@ -6,16 +6,17 @@ import numpy as np
 import pandas as pd
 
 from neuspring.config import Config
-from neuspring.config.images import Appearance, Images
+from neuspring.config.images import Images
 from neuspring.core.artifacts import Trajectory
 from neuspring.core.records import Recorder, StageRecord
 from neuspring.data.capture import Capture
+from neuspring.splats.train import SplatRates
 from neuspring.stages.appearance import appearance
 from neuspring.stages.render import render
 from tests.support.filmed import FRAMES
 from tests.support.perceived import SETTINGS, perceived
 
-IMAGES = Images(appearance=Appearance(iterations=90, degree=0, spacing=2.0, color_rate=0.02, opacity_rate=0.05))
+IMAGES = Images(appearance=SplatRates(iterations=90, degree=0, spacing=2.0, color_rate=0.02, opacity_rate=0.05))
 
 
 def pictured(**changes: object) -> Config:

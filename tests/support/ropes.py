@@ -8,11 +8,11 @@ import numpy as np
 
 from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
-from neuspring.twin.rod import rod_twin
+from neuspring.twin.rod import RodStart, rod_twin
 from tests.support import scenarios
 
 RADIUS, LENGTH, HEIGHT = 0.01, 0.4, 0.1
-ROD = config.RodSettings(
+ROD = RodStart(
     vertices=10, bending=0.03, twisting=0.03, damping=0.01, marker_mass=0.01, drag=0.3, drag_quadratic=0.1, substep=0.002
 )
 SETTINGS = config.Config(rod=ROD)

@@ -6,20 +6,17 @@ import numpy as np
 import pytest
 
 from neuspring import config
-from neuspring.config.rod import RodFit
 from neuspring.core.artifacts import Observations, Scenario, Twin
 from neuspring.core.errors import InputError
 from neuspring.twin.fit import FitProblem
 from neuspring.twin.rod import rod_twin
-from neuspring.twin.rod_fit import Levenberg, Recordings, RodResult, Variables, fit_rod, search_rod
+from neuspring.twin.rod_fit import Levenberg, Recordings, RodResult, RodSteps, Variables, fit_rod, search_rod
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.transfer import move
 from tests.support import ropes
 
-SETTINGS = config.parse(
-    config.Config,
-    {"rod": {"bending": 0.02, "twisting": 0.02}, "fit": {"rod": {"horizons": [0], "rounds": 5, "every": 1, "robust": 1e-3}}},
-    "test",
+SETTINGS = config.Config(
+    rod=config.RodSettings(bending=0.02, twisting=0.02), fit=config.Fit(rod=RodSteps(horizons=(0,), rounds=5, every=1, robust=1e-3))
 )
 VERTICES = 8
 AXIS = (0.0, 1.0, 0.0)
@@ -56,7 +53,7 @@ def recorded(twin: Twin, observations: Observations) -> Observations:
     return replace(observations, object_points=points, tracks=points)
 
 
-def planted(settings: RodFit, seed: int, size: float) -> tuple[Twin, list[Observations], Variables, np.ndarray]:
+def planted(settings: RodSteps, seed: int, size: float) -> tuple[Twin, list[Observations], Variables, np.ndarray]:
     """A twin with random variables, and two recordings of it; the start, and the variables."""
     shapes = [cable("one", 0), cable("two", 1, frames=16)]
     variables = Variables.of(rod_twin(shapes[0], SETTINGS, AXIS), settings)
