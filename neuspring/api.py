@@ -87,12 +87,11 @@ def search(
     long thin object. Raises InputError, NumericalFailure.
     """
     from neuspring.core.device import resolve_device
-    from neuspring.twin.body import BODIES
+    from neuspring.twin.body import BODIES, SearchOptions
 
-    read = read_settings(settings)
-    options: dict[str, Any] = {"clusters": clusters or read.clusters, "seed": seed}
-    options |= {"device": resolve_device(device), "threads": threads, "record": record}
-    return BODIES[body].search(observations, (), read, **options)
+    read, device = read_settings(settings), resolve_device(device)
+    options = SearchOptions(clusters=clusters or read.clusters, seed=seed, device=device, threads=threads, record=record)
+    return BODIES[body].search(observations, (), read, options)
 
 
 def fit(

@@ -161,7 +161,7 @@ def kernels(real: Any, width: int) -> tuple[Any, Any, Any]:
 
 
 class Contacts(NamedTuple):
-    """Functions of a frame. A thread per node gathers (`collided`); one thread for all adds a pair to both of its nodes."""
+    """Calls of a frame. A thread per node gathers (`collided`); one thread for all adds each pair to both of its nodes."""
 
     collided: Any
     add_pairs: Any
@@ -209,7 +209,7 @@ def functions(real: Any, width: int) -> Contacts:
 
     @wp.func
     def impulse(dx: Vector, u: Vector, e: Number, mu: Number) -> Vector:
-        """Change of a node's velocity, before its share, by a partner at dx that moves at u."""
+        """Velocity that a node gains from a partner at dx that moves at u, before its share."""
         n = divided(dx, wp.max(root(dot(dx, dx)), whole(floor)))
         s = dot(u, n)
         ut = u - scaled(n, s)

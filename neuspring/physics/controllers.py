@@ -23,7 +23,7 @@ BEGINS = 2.0
 
 
 def waypoints(hands: torch.Tensor, valid: np.ndarray | None = None) -> torch.Tensor:
-    """Controllers as a solver takes them for `begin` and `end` of frames, one row per frame, from hands [T, C, 3], m.
+    """Rows that a solver takes for `begin` and `end` of frames, one row per frame: hands [T, C, 3], m.
 
     Where some controller does not hold in some frame (`valid` [T', C], T' >= T; empty or none: all hold), a last column has 1 or 0,
     and 2 where it begins to hold, but in frame 0. The springs of a controller act in a frame if it holds at both ends of the frame.

@@ -85,7 +85,7 @@ def position(real: Any, width: int) -> tuple[Any, Any]:
 
     @wp.func
     def falls(z: real, speed: real, dt: real, up: real) -> bool:
-        """True where a node moves down and would be below at the end of the substep; never without ground (up = 0)."""
+        """True for a node that would be below at the end of the substep and moves down; never without ground (up = 0)."""
         return (z + speed * dt) * up < zero and speed * up < -approach
 
     @wp.func

@@ -33,7 +33,7 @@ class ReferenceTwin:
     mass: np.ndarray | float = 1.0
     """Mass of each node [N], or of all, kg."""
     pushes: np.ndarray | bool = False
-    """True for springs [S], or for all, that act only while they are shorter than at rest."""
+    """True where each spring [S], or every one, acts only while it is shorter than at rest."""
 
     @classmethod
     def of(cls, twin: Twin) -> ReferenceTwin:

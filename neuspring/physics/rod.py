@@ -39,9 +39,9 @@ TINY = wp.constant(wp.float64(1e-12))
 BAND_WIDTH = wp.constant(11)
 """Entries of a row of the banded matrix, from the diagonal to the left. Row 4 i + r is of x_i, row 4 j + 3 of theta_j."""
 JOINT = wp.constant(11)
-"""Unknowns that a joint depends on: x_(i-1), theta_(i-1), x_i, theta_i, x_(i+1), in this order."""
+"""Variables that a joint depends on: x_(i-1), theta_(i-1), x_i, theta_i, x_(i+1), in this order."""
 FREE_TURN_STIFFNESS = wp.constant(wp.float64(1e-9))
-"""Stiffness against turning of a rod that nothing else turns, as a part of GJ / l."""
+"""Fraction of GJ / l: stiffness against turning of a rod that nothing else turns."""
 
 real = wp.float64
 vec3 = wp.vec3d
@@ -101,7 +101,7 @@ class RodState:
     diagonal: Scalars
     rest: Scalars
     spring_edge: Indices
-    """Edge that each spring of the hands acts on [B, S]."""
+    """Springs of hands [B, S]: the edge that each acts on,"""
     spring_place: Vectors
     """Place that each spring acts at [B, S]: fraction along the edge, distances along m1 and m2, m."""
     leader: Indices
@@ -109,7 +109,7 @@ class RodState:
     law: Vectors
     """Law of each spring [B, S]: stiffness, N/m, rest length, m, dashpot, N s/m."""
     hands: Vectors
-    """Controllers at the end of the substep, m."""
+    """Controllers at the end of the substep."""
     clearance: Scalars
     """Height over the ground at which each vertex touches it, m; below -1: there is no ground."""
     elasticity: Numbers
@@ -661,7 +661,7 @@ STATE = (
     "k_before",
     "history",
 )
-"""Fields that `RodSolver.follow` takes over."""
+"""State that `RodSolver.follow` takes over."""
 
 
 class RodSolver:
@@ -713,14 +713,14 @@ class RodSolver:
         self._ends: Any = (self._state.hands, self._state.hands)
 
     def bind(self, edge: torch.Tensor, place: torch.Tensor) -> None:
-        """Set the edges [B, S] that the springs of hands act on, and their places [B, S, 3] as in `Rod.place`."""
+        """Set where the springs of hands act: on edges [B, S], at places [B, S, 3] as in `Rod.place`."""
         self._put(self._state.spring_edge, edge)
         self._put(self._state.spring_place, place)
 
     def pull(self, law: torch.Tensor, begin: torch.Tensor, end: torch.Tensor) -> None:
-        """Set the law of these springs in the next frame [B, S, 3]: stiffness, N/m, rest length, m, and dashpot, N s/m.
+        """Set how they act in the next frame: stiffness, N/m, rest length, m, and dashpot, N s/m [B, S, 3]; none where both are 0.
 
-        A spring without stiffness and dashpot is none. Controllers move linearly from begin to end [B, C, 3], m.
+        Controllers move linearly from begin to end [B, C, 3], m.
         """
         self._put(self._state.law, law)
         self._ends = self._vectors(begin), self._vectors(end)

@@ -31,7 +31,7 @@ NO_STIFFNESS = 1e-10
 
 @dataclass(frozen=True, kw_only=True)
 class Parameters:
-    """Values of a `Rod` (which declares shapes and units) as float64 tensors, and the drag of its material."""
+    """The arrays of a `Rod` (there are shapes and units), as float64 tensors, and the drag of its material."""
 
     vertices: Tensor
     held: Tensor
@@ -99,7 +99,7 @@ def angle(a: Tensor, b: Tensor, t: Tensor) -> Tensor:
 
 
 def tangents(x: Tensor) -> Tensor:
-    """Unit tangents [V - 1, 3] of the edges between vertices x [V, 3]."""
+    """Tangents of the edges between vertices x [V, 3]."""
     edges = x[1:] - x[:-1]
     return edges / edges.norm(dim=1, keepdim=True)  # type: ignore[no-any-return]
 
@@ -164,7 +164,7 @@ def energy(parameters: Parameters, x: Tensor, frames: Frames, theta: Tensor) -> 
 
 
 class Rate(NamedTuple):
-    """Rate of change of curvatures, from those of earlier times: dk/dt = factor k - past [J, 2], 1/s."""
+    """Rate at which curvatures change, from those of earlier times: dk/dt = factor k - past [J, 2], 1/s."""
 
     factor: float
     past: Tensor

@@ -87,7 +87,7 @@ class FrameSolver:
         self._plain: torch.Tensor | None = None
         """Springs as they were set [B, S, 3]."""
         self._factor: torch.Tensor | None = None
-        """Factors of springs in this frame [B, S, 3], where some controller does not hold."""
+        """Factors on the springs in this frame [B, S, 3], where some controller does not hold."""
         self._reach = 0.0
         self.frame_token = 0
         """Number of frames simulated: tells whether the buffers still hold a given one."""
@@ -337,7 +337,7 @@ class AdjointLimit:
         """dL/dx at the begin of the frame that came last."""
 
     def passes(self, after: Sequence[torch.Tensor], before: Sequence[torch.Tensor]) -> bool:
-        """True where a frame stays, from (dL/dx, dL/dv) at its end, `after`, and its begin, `before`; frames come last first."""
+        """True for a frame that stays, from (dL/dx, dL/dv) at its end, `after`, and begin, `before`; frames come last first."""
         (end, _), (x, v) = after, before
         self._added += _norm(end if self._carried is None else end - self._carried)
         stays = math.hypot(_norm(x), _norm(v) / self.frame_time) <= self.factor * self._added

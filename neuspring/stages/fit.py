@@ -30,7 +30,7 @@ def fit(
     settings: Config,
     run: Recorder,
     pool: Sequence[Observations] = (),
-    kind: Annotated[str, "train each spring, the neural spring field, or a rod"] = "springs",
+    kind: Annotated[str, "springs: train each spring; field: the neural spring field; rod: all of a rod"] = "springs",
     oracle: Annotated[bool, "fit all frames, the future included: what fitting could reach at best"] = False,
     device: str = "auto",
     threads: int = 1,

@@ -80,7 +80,7 @@ def fits(
         for job, result in zip(batch, results, strict=True):
             if isinstance(result, FitResult):
                 counts, frames = result.twin.counts, job.problem.frame_end - 1
-                facts["spring_updates"] += result.epochs_together * frames * counts["springs"] * counts["substeps"]
+                facts["spring_updates"] += result.facts["epochs_together"] * frames * counts["springs"] * counts["substeps"]
             else:
                 facts["errors"][job.output] = f"{type(result).__name__}: {result}"
                 print(f"{job.output}: {facts['errors'][job.output]}; its own job goes on from its last checkpoint")

@@ -14,6 +14,7 @@ from neuspring.core.records import StageRecord, digest_file, now
 from neuspring.core.run_folder import RunFolder
 from neuspring.core.run_record import RunRecord, flat, key_of
 from neuspring.stages.stage import MayFail, stage
+from neuspring.twin.body import code, lines_of
 
 PICTURE_ROLES = ("strip", "video", "turntable")
 """Files of the render stage to look at."""
@@ -26,7 +27,7 @@ FEW_TEXELS = 0.05
 """A share of texels that moved below this says that the settings were in training's way."""
 
 
-@stage(output="{scenario}/{method}/{seed}/run.json")
+@stage(output="{scenario}/{method}/{seed}/run.json", code=lambda settings, given: code())
 def score(
     observations: Observations,
     rollout: MayFail,
@@ -51,7 +52,6 @@ def score(
     from neuspring.core.files import write_table
     from neuspring.report.draw import run as figures
     from neuspring.scores import metrics
-    from neuspring.twin.body import lines_of
 
     began, folder = time.perf_counter(), output.parent
     given = {"search": search, "fit": fit, "train": train, "rollout": rollout, "appearance": appearance, "render": render}

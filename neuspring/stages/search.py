@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Annotated, Literal
 
 from neuspring.config import Config
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.core.records import Recorder
 from neuspring.stages.stage import Written, stage
-from neuspring.twin.body import BODIES
+from neuspring.twin.body import BODIES, SearchOptions
 
 READS = ("search", "simulation", "losses", "released_quirks")
 
@@ -29,7 +29,7 @@ def search(
     run: Recorder,
     pool: Sequence[Observations] = (),
     clusters: int = 1,
-    body: str = "lattice",
+    body: Annotated[str, "lattice or rod, or a package's own"] = "lattice",
     seed: int = 0,
     device: str = "auto",
     threads: int = 1,
@@ -52,10 +52,7 @@ def search(
     without_budget = {name: value for name, value in run.settings["search"].items() if name != "rollouts"}
     key = checkpoint_key(run.inputs, run.settings | {"search": without_budget}, device, "neuspring.twin.search")
     files = run.beside(twin="twin.npz", trace="trace.parquet", history="history.parquet")
-    result = BODIES[body].search(
-        observations,
-        pool,
-        settings,
+    options = SearchOptions(
         clusters=clusters,
         seed=seed,
         device=device,
@@ -64,6 +61,7 @@ def search(
         record=files["trace"],
         key=key,
     )
+    result = BODIES[body].search(observations, pool, settings, options)
     result.twin.save(files["twin"])
     write_history(result.course.index, dict(result.course), files["history"])
     return Written(files=files, facts=result.facts, attempts=result.attempts, earlier_seconds=result.earlier_seconds)

@@ -30,13 +30,13 @@ class Lane:
         self.batch = batch
         self.twin = twin
         self.frames = 1
-        """How many frames a gradient goes through."""
+        """Number of frames that a gradient goes through."""
         self._asked = 0
         """The frame whose adjoint is asked for next."""
         self.collision_overflow = 0
         """Collision pairs of this twin that were dropped so far because the list was full."""
         self.waiting: tuple[str, Sequence[Any]] | None = None
-        """What is requested, "run" or "backward", and its inputs."""
+        """The request, "run" or "backward", and its inputs."""
         self.answer: Results | BaseException | None = None
 
     @property
@@ -78,7 +78,7 @@ class BatchedFits:
         self.frame_token = 0
         self._window: FrameWindow | None = None
         self._stale = True
-        """Whether the next frame needs another window. The old one holds frames whose adjoints may be requested."""
+        """True where the next frame needs another window. The old one holds frames whose adjoints may be requested."""
         self._members: list[Lane] = []
         """Lanes of the present window, in the order of its solvers."""
         self._places: list[np.ndarray] = []
@@ -189,7 +189,7 @@ class BatchedFits:
 
 
 def run_batch(twins: Sequence[Twin], device: str, works: Sequence[Callable[[Lane], T]]) -> list[T | Exception]:
-    """What each work returns, or the error that ended it, with the lanes of one batch; work k begins with twin k."""
+    """The results of each work, or the error that ended it, with the lanes of one batch; work k begins with twin k."""
     batch = BatchedFits(twins, device)
 
     def run(lane: Lane, work: Callable[[Lane], T]) -> T | Exception:

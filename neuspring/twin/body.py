@@ -1,6 +1,6 @@
 """The body: what a twin is made of. A lattice of springs and a rod answer the same questions, and so does a package's own body.
 
-A body is a module of `neuspring.twin.bodies` with a `BODY`, or an entry point of the group `neuspring.bodies`. It imports what it
+A body is a module of `neuspring.twin.bodies` with a `body`, or an entry point of the group `neuspring.bodies`. It imports what it
 computes with in its methods: the workflow asks for names and settings before any job exists.
 """
 
@@ -37,6 +37,22 @@ class Learned:
     """Wall time of the attempts that this one continued, up to what was recorded last."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class SearchOptions:
+    """The way a search runs; a body leaves alone what it has no use for."""
+
+    clusters: int = 1
+    """Regions of a topology, each with values of its own."""
+    seed: int = 0
+    device: str = "cpu"
+    threads: int = 1
+    together: int = 0
+    """Candidates in one launch at most; 0: as many as are fast on the device."""
+    record: Path | None = None
+    """File of the trace; one with the same `key` that is there already may be continued."""
+    key: str = ""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Lines:
     """Lines that a twin is drawn with: those of its body, then the springs of hands.
@@ -59,7 +75,7 @@ class Lines:
     labels: np.ndarray
     """Region of each point [P]."""
     masses: np.ndarray
-    """Of each point [P], kg; 0 where it has none."""
+    """Mass of each point [P], kg; 0 where it has none."""
     loose: int
     """Number of nodes that no line carries."""
     points: Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -103,25 +119,8 @@ class Body(ABC):
     # --- from recordings to twins
 
     @abstractmethod
-    def search(
-        self,
-        observations: Observations,
-        pool: Sequence[Observations],
-        settings: Config,
-        *,
-        clusters: int = 1,
-        seed: int = 0,
-        device: str = "cpu",
-        threads: int = 1,
-        together: int = 0,
-        record: Path | None = None,
-        key: str = "",
-    ) -> Learned:
-        """A coarse twin, on a recording and a pool of others.
-
-        Its trace goes to the file `record`; one with the same `key` that is there already may be continued. At most `together`
-        candidates share a launch (0: as many as are fast).
-        """
+    def search(self, observations: Observations, pool: Sequence[Observations], settings: Config, options: SearchOptions) -> Learned:
+        """A coarse twin, on a recording and a pool of others."""
 
     @abstractmethod
     def fit(self, problem: Any, *, partial: Path | None = None, key: str = "", threads: int = 1) -> Learned:
@@ -183,7 +182,7 @@ class Body(ABC):
         return None
 
 
-BODIES: Registry[Body] = Registry("bodies", modules("neuspring.twin.bodies", "BODY"), type=Body)
+BODIES: Registry[Body] = Registry("bodies", modules("neuspring.twin.bodies", "body"), type=Body)
 
 
 def code() -> tuple[str, ...]:

@@ -35,7 +35,7 @@ REGIONAL = ("object_radius", "object_neighbors")
 PENALTY = 1e6
 """Cost of a candidate that diverges or cannot be integrated; far above any loss in square meters."""
 UNSTABLE = "unstable"
-"""How the reasons of candidates begin that a fixed number of substeps cannot integrate."""
+"""Beginning of the reasons of candidates that a fixed number of substeps cannot integrate."""
 CMAES, OTHER_WAY = "cmaes", "hands"
 """Stages of candidates that CMA-ES proposes, and of its first generation in the other way of hands (`search.hands`)."""
 Map = Callable[..., Iterable[Any]]
@@ -52,11 +52,6 @@ class Recording:
     velocity: torch.Tensor
     """Velocity of the nodes in frame 0 [N, 3], m/s."""
     loss: FrameLoss
-
-    @property
-    def frames(self) -> int:
-        """Frames that a candidate is simulated over."""
-        return len(self.hands) - 1
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -69,7 +69,7 @@ class FitProblem:
     quirks: config.ReleasedQuirks
     device: str = "cpu"
     kind: str = "springs"
-    """Of the body's `fits`."""
+    """One of the body's `fits`."""
     seed: int = 0
     """Seed of the field's first weights."""
     oracle: bool = False
@@ -109,13 +109,6 @@ class FitResult(Learned):
     best_loss: float
     """Training loss or tail loss that selected it, m^2."""
     rollbacks: list[str]
-    earlier_processor_seconds: float
-    """Processor time of earlier attempts; of epochs that ran together with other fits, this one's share."""
-    collision_overflow: int
-    frames_left_out: int
-    """Frames that were left out of gradients (`AdjointLimit`), over all epochs that were not rolled back."""
-    epochs_together: int
-    """Epochs that ran together with those of other fits."""
     figures: dict[str, Any]
     """Numbers on what moved and what was in the way (`movement`), and gradient_over_epsilon."""
 
@@ -186,7 +179,7 @@ class TwinFit:
         self.loss_scale = 1.0 if settings.loss_unit == "meter" else topology_spacing(problem.twin.topology) ** -2
         """Loss units per m^2."""
         self.gradients: list[float] | None = None
-        """Where to put the median |gradient| of each step, if it is wanted."""
+        """The median |gradient| of each step is put here, if it is wanted."""
         self.twin = problem.twin
         self._solver: FrameWindow | Lane | None = None
         self._overflow = 0
@@ -195,7 +188,7 @@ class TwinFit:
 
     @property
     def one_step(self) -> bool:
-        """Whether an epoch is a single optimizer step, so that its losses belong to the values before it."""
+        """True where an epoch is a single optimizer step, so that its losses belong to the values before it."""
         return self.horizon >= self.fitted_end - 1
 
     def solver(self) -> FrameWindow | Lane:
@@ -350,7 +343,7 @@ class TwinFit:
         restore_adam(self.optimizer, moments)
 
     def figures(self, state: _State) -> dict[str, Any]:
-        """What the fit's record says of the selected values, which are the present ones."""
+        """Figures for the fit's record of the selected values, which are the present ones."""
         figures = movement(self.parameters)
         if state.gradient_over_epsilon is not None:
             figures["gradient_over_epsilon"] = state.gradient_over_epsilon
@@ -460,7 +453,6 @@ def fit(
     run.use_substeps(state.best_substeps)
     best = run.parameters.as_twin(run.twin)
     history, figures = pd.DataFrame(loop.history), run.figures(state)
-    left_out = sum(row["frames_left_out"] for row in loop.history)
     frames, counts = problem.epoch_frames, best.counts
     facts = {
         "best_epoch": state.best_epoch,
@@ -471,9 +463,9 @@ def fit(
         "earlier_processor_seconds": round(loop.earlier_processor_seconds, 3),
         "rollbacks": state.rollbacks,
         "collision_overflow": state.overflow,
-        "frames_left_out": round(left_out / (len(history) * frames), 4),
+        "frames_left_out": round(int(history["frames_left_out"].sum()) / (len(history) * frames), 4),
         **figures,
-        # Those that ran together count in the record of `fits`.
+        # Epochs that ran together with those of other fits count in the record of `fits`.
         "spring_updates": (len(history) - loop.epochs_together) * frames * counts["springs"] * counts["substeps"],
         **counts,
     }
@@ -487,10 +479,6 @@ def fit(
         best_epoch=state.best_epoch,
         best_loss=state.best_loss,
         rollbacks=state.rollbacks,
-        earlier_processor_seconds=loop.earlier_processor_seconds,
-        collision_overflow=state.overflow,
-        frames_left_out=left_out,
-        epochs_together=loop.epochs_together,
         figures=figures,
     )
 
@@ -551,6 +539,6 @@ def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> di
 
 
 def _eligible(epoch: int, problem: FitProblem) -> bool:
-    """Whether an epoch may become the best: all of them, or with the released quirk every 20th and the last."""
+    """True for an epoch that may become the best: all of them, or with the released quirk every 20th and the last."""
     last = problem.fit.epochs - 1
     return not problem.quirks.sparse_checkpoints or epoch % RELEASED_CHECKPOINT_EPOCHS == 0 or epoch == last

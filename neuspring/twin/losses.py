@@ -74,7 +74,7 @@ class Errors(NamedTuple):
     """At least 1."""
     penalty: Penalty
     rows: torch.Tensor | None = None
-    """Where the values stand among all points of the term, bool [P]; none: they are all."""
+    """Places of the values among all points of the term, bool [P]; none: they are all."""
     single: bool = False
     """Residuals are scaled in single precision, as earlier polishes did."""
 
@@ -106,7 +106,7 @@ def _root(value: float | torch.Tensor) -> float | torch.Tensor:
 
 
 class FrameState(NamedTuple):
-    """What the terms of a frame read."""
+    """The state that the terms of a frame read."""
 
     frame: int
     x: torch.Tensor
@@ -209,12 +209,12 @@ TERMS: dict[str, Term] = {
 OF_IMAGES = ("image_track", "silhouette")
 """Terms of one camera without depth."""
 ASSIGNED = {"chamfer": _nearest_visible, "silhouette": _nearest_in_image}
-"""How terms that compare with a nearest node find it."""
+"""Functions by which terms that compare with a nearest node find it."""
 
 
 @dataclass(frozen=True)
 class ImageEvidence:
-    """What a camera without depth saw in the frames that a loss may read, as tensors."""
+    """Measurements of a camera without depth in the frames that a loss may read, as tensors."""
 
     world_to_camera: torch.Tensor
     intrinsics: torch.Tensor

@@ -1,4 +1,4 @@
-"""What a first-order stage trains, and the physical quantities that follow from it.
+"""Parameters that a first-order stage trains, and the physical quantities that follow from it.
 
 Every spring has an offset o on a log scale: its own number (`springs`), or the neural spring field at its midpoint (`field`), to
 which its own number may be added (`field.offsets`). With b(o) = bound tanh(o / bound), or o without a bound, its stiffness is

@@ -2,9 +2,9 @@
 
 A round first asks for slopes: the base and one neighbor per variable. Their residuals r (losses.py, |r|^2 is the cost; points stay
 assigned as in the base, so that r is smooth) give the products J'J and J'r of finite differences. Then it asks for four damped
-steps (levenberg.py) of the normalized variables, within the ranges and at most `REACH` per variable, and takes the best of them if
-it costs less than the base. Nothing but the costs and products that it is told decides what it asks for next, so a polish is
-replayed from its record.
+steps (core/levenberg.py) of the normalized variables, within the ranges and at most `REACH` per variable, and takes the best of
+them if it costs less than the base. Nothing but the costs and products that it is told decides what it asks for next, so a polish
+is replayed from its record.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import numpy as np
 import torch
 
 from neuspring.config.search import TRIALS, Search
+from neuspring.core.levenberg import LevenbergMarquardt
 from neuspring.twin.candidates import PENALTY, Map, SearchProblem, made
-from neuspring.twin.levenberg import LevenbergMarquardt
 from neuspring.twin.losses import OF_IMAGES, TERMS, FrameLoss
 from neuspring.twin.rollout import FAR
 from neuspring.twin.trials import motions
@@ -35,7 +35,7 @@ TOLERANCE = 1e-3
 REACH = 0.25
 """Longest step of a round in a normalized variable."""
 FACTORS = tuple(10.0 ** (k - TRIALS + 2) for k in range(TRIALS))
-"""What the damping is multiplied with, for each step that is tried: from 0.01 to 10."""
+"""Factors on the damping, for each step that is tried: from 0.01 to 10."""
 
 
 class Polish(LevenbergMarquardt):

@@ -30,7 +30,7 @@ BEND_STEPS = 8
 
 @dataclass(frozen=True)
 class Registration:
-    """Where the points of a shape lie in another sampling's frame."""
+    """Points of a shape in another sampling's frame."""
 
     points: np.ndarray
     """Mapped points [M, 3], m."""
@@ -41,7 +41,7 @@ class Registration:
     residual: float
     """After bending, m; the same where nothing was bent."""
     stretch: float
-    """How much bending changed distances between neighbors: mean of |log ratio|; 0 where nothing was bent."""
+    """Change that bending made in distances between neighbors: mean of |log ratio|; 0 where nothing was bent."""
     extent: float
     """Diagonal of the source's bounding box along its principal axes, m."""
 

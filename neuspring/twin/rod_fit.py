@@ -27,12 +27,12 @@ from neuspring.config.rod import RodFit
 from neuspring.core.artifacts import Observations, Rod, Twin
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_table
+from neuspring.core.levenberg import LevenbergMarquardt
 from neuspring.core.text import Progress
 from neuspring.physics.controllers import waypoints
 from neuspring.physics.rod_nodes import RodFrames, settled, turn_of
 from neuspring.twin import rod as rods
 from neuspring.twin.body import Learned
-from neuspring.twin.levenberg import LevenbergMarquardt
 from neuspring.twin.losses import frames_seen
 from neuspring.twin.rollout import initial_velocity
 
@@ -48,7 +48,7 @@ FARTHEST = 2.0
 LEAST_GAIN = 2e-3
 """A step that lowers the objective by less than this part of it is a stage's last."""
 DAMPINGS = (0.1, 1.0, 10.0, 100.0)
-"""What the damping is multiplied with, for each step that is tried."""
+"""Factors on the damping, for each step that is tried."""
 LANES = 512
 """Rollouts that run in one solver at most."""
 SCALES = {
@@ -83,7 +83,7 @@ class RodSteps(RodFit):
 
 @dataclass(frozen=True)
 class Variables:
-    """What is varied of a twin, as one vector q [Q], 0 at the start."""
+    """Variables of a twin, as one vector q [Q], 0 at the start."""
 
     twin: Twin
     sizes: dict[str, int]
@@ -188,9 +188,9 @@ class Recordings:
     points: np.ndarray
     """Tracked points [C, T, No, 3], m."""
     counts: np.ndarray
-    """Whether a point is seen in a training frame [C, T, No]."""
+    """True where a point is seen in a training frame [C, T, No]."""
     velocities: tuple[np.ndarray, ...]
-    """Of tracked points or of all nodes in frame 0, m/s."""
+    """Velocities of tracked points or of all nodes in frame 0, m/s."""
 
     @classmethod
     def of(cls, observations: Sequence[Observations], twin: Twin, oracle: bool = False) -> Recordings:
@@ -269,7 +269,7 @@ class Levenberg:
             return np.concatenate(list((pool.map if self.threads > 1 else map)(one, parts)))
 
     def objective(self, errors: np.ndarray, q: np.ndarray, scale: np.ndarray) -> np.ndarray:
-        """Of candidates: errors [K, R] and variables [K, Q]; m."""
+        """The objective of candidates, m, from errors [K, R] and variables [K, Q]."""
         b = self.settings.robust
         value: np.ndarray = np.mean(np.sqrt(errors**2 + b**2) - b, axis=-1) + PRIOR * ((q / scale) ** 2).sum(axis=-1)
         return value

@@ -1,4 +1,4 @@
-"""How rough the stiffness of a twin is: does it differ between springs side by side, or between parts of the body?
+"""Roughness of a twin's stiffness: does it differ between springs side by side, or between parts of the body?
 
 With z_e = ln Y_e and E_k(e) the k springs whose canonical midpoints are nearest to that of spring e,
 
@@ -19,7 +19,7 @@ PAIRS = 200_000
 
 
 def roughness(midpoints: np.ndarray, values: np.ndarray) -> float:
-    """Of values [S] at points [S, 3]. NaN where there are too few springs, or no variance."""
+    """Roughness of values [S] at points [S, 3]. NaN where there are too few springs, or no variance."""
     variance = float(np.var(values)) if len(values) > 1 else 0.0
     if variance <= 0:
         return float("nan")

@@ -201,7 +201,7 @@ def _best(problem: SearchProblem, rows: Sequence[dict[str, Any]], push: bool, at
         "rollouts": len(table),
         "failed_rollouts": int((table["reason"] != "").sum()),
         "collision_overflow": int(table["collision_overflow"].max()),
-        "spring_updates": int((table["springs"] * table["substeps"]).sum()) * sum(one.frames for one in problem.recordings),
+        "spring_updates": int((table["springs"] * table["substeps"]).sum()) * sum(len(one.hands) - 1 for one in problem.recordings),
         **twin.counts,
     }
     if held := at_ends(table, problem.variables):
@@ -219,7 +219,7 @@ def _best(problem: SearchProblem, rows: Sequence[dict[str, Any]], push: bool, at
 
 
 SURFACES = ("ground_", "contact_")
-"""How the names of variables begin that have no effect where nothing touches."""
+"""Beginnings of the names of variables that have no effect where nothing touches."""
 END = 0.01
 """Distance from an end of its range, in normalized units, within which a variable counts as held by it."""
 
@@ -284,7 +284,7 @@ def _polished(
 
 @contextmanager
 def _threads(count: int) -> Iterator[Map]:
-    """How candidates are made and simulated: by `count` threads, or by this one, which an interrupt ends at once.
+    """A map that makes and simulates candidates: by `count` threads, or by this one, which an interrupt ends at once.
 
     Torch has no threads of its own meanwhile, so that `count` cores are busy and no more.
     """

@@ -82,7 +82,7 @@ def on_nodes(twin: Twin, observations: Observations) -> tuple[Twin, Registration
 
 
 def corresponds(topology: Topology, observations: Observations) -> bool:
-    """Whether node i of a recording is node i of a twin: as many nodes and hands, and springs that keep their length or its scale.
+    """True where node i of a recording is that of a twin: as many nodes and hands, and springs that keep their length or its scale.
 
     The springs' lengths change by one factor, up to `SPREAD` (median deviation of its logarithm): points in another order make
     distances across the whole body of neighbors.
@@ -260,7 +260,7 @@ def _sum(topology: Topology, part: slice, values: np.ndarray, lengths: np.ndarra
 
 
 def _means(places: np.ndarray, at: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """How numbers [S] >= 0 at places [S, 3] are carried to [P, 3]: geometric means of the nearest, by inverse distance."""
+    """Carrier of numbers [S] >= 0 from places [S, 3] to [P, 3]: geometric means of the nearest, by inverse distance."""
     from scipy.spatial import cKDTree
 
     k = min(NEAREST_SPRINGS, len(places))
@@ -284,7 +284,7 @@ END_NODES = 8
 
 
 def roll_between(here: Observations, there: Observations) -> float:
-    """How far the nodes at either end of the line are turned about it from one recording to the other, degrees, the larger.
+    """Turn of the nodes at either end of the line about it, from one recording to the other, degrees, the larger.
 
     The rotation of the nearest nodes about the end is the smallest one that turns its direction, after a turn about it: the roll.
     It says nothing, and counts as 0, where the direction turns by more than 60 degrees.

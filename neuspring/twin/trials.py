@@ -23,14 +23,14 @@ from neuspring.twin.losses import FrameLoss
 from neuspring.twin.rollout import FAR
 
 CHECK_EVERY = {"cpu": 1, "cuda": 16}
-"""Whether all twins diverged is checked every so many frames; on CUDA each check synchronizes."""
+"""Frames from one look for twins that all diverged to the next; on CUDA each check synchronizes."""
 ON_LANES = ("chamfer", "track", "acceleration")
 """Terms that have a kernel."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a candidate's rollout."""
+    """The end of a candidate's rollout."""
 
     cost: float
     """Mean training loss over frames 1 .. train_end - 1, m^2, acceleration included; infinite if it left the scene."""
@@ -133,7 +133,7 @@ class LossSums:
 
     @property
     def any_alive(self) -> bool:
-        """Whether any twin is in the scene."""
+        """True where any twin is in the scene."""
         return not bool(self._buffers.tensors["diverged"].all())
 
 

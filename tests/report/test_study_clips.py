@@ -27,7 +27,7 @@ VALUES = {
     "clips": True,
     "baseline": "Rod",
     "training": "Choices were made on training clips",
-    "rows": {"Field": "model_b_pooled", "Rod": "rod", "Residual": "rod_residual"},
+    "rows": {"Field": "model_b_pooled", "Rod": "rod", "Residual": "rod_free"},
 }
 STUDY = parse(Study, VALUES, "here")
 CLIPS = {"DLO3_eval_a": 0.002, "DLO3_eval_b": 0.006, "DLO3_eval_c": 0.004}
@@ -91,7 +91,7 @@ def test_minutes_are_those_of_search_and_fit(tmp_path):
 def test_a_mean_of_fewer_clips_is_marked_and_never_the_best(tmp_path):
     write_transfer(tmp_path, "DLO3", "rod", 0, CLIPS)
     fewer = dict.fromkeys(list(CLIPS)[:2], 0.001)
-    write_transfer(tmp_path, "DLO3", "rod_residual", 0, fewer, diverged=("DLO3_eval_c",))
+    write_transfer(tmp_path, "DLO3", "rod_free", 0, fewer, diverged=("DLO3_eval_c",))
     blocks = clip_blocks(found(tmp_path))
     overview = rows_of(tables_in(blocks)["L1 per cable"])
     assert overview["Residual"]["DLO3"].text == "1.00 *" and overview["Residual"]["DLO3"].mark == ""

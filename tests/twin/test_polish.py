@@ -11,9 +11,9 @@ import torch
 from neuspring import config
 from neuspring.config.search import TRIALS
 from neuspring.core.errors import NumericalFailure
+from neuspring.core.levenberg import damped_step
 from neuspring.twin import search as module
 from neuspring.twin.candidates import CMAES, SearchProblem, candidate, evaluate
-from neuspring.twin.levenberg import damped_step
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.polish import POLISH, REACH, SLOPES, Polish, products, residuals, slope_rows
 from neuspring.twin.search import search

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from neuspring.config import Config
 from neuspring.core.artifacts import Observations, Twin
-from neuspring.twin.body import Body, Lines
+from neuspring.physics import stability
+from neuspring.twin.body import Body, Lines, SearchOptions
 
 if TYPE_CHECKING:
     from neuspring.physics.solver import FrameSolver
@@ -59,18 +60,7 @@ and it goes on for the rest of dt.
         return twin.rod is None
 
     def search(
-        self,
-        observations: Observations,
-        pool: Sequence[Observations],
-        settings: Config,
-        *,
-        clusters: int = 1,
-        seed: int = 0,
-        device: str = "cpu",
-        threads: int = 1,
-        together: int = 0,
-        record: Path | None = None,
-        key: str = "",
+        self, observations: Observations, pool: Sequence[Observations], settings: Config, options: SearchOptions
     ) -> SearchResult:
         """CMA-ES over topology and a homogeneous material, and a polish; see `search.search`."""
         from neuspring.twin.candidates import SearchProblem
@@ -83,12 +73,12 @@ and it goes on for the rest of dt.
             simulation=settings.simulation,
             losses=settings.losses,
             quirks=settings.released_quirks,
-            clusters=clusters,
-            device=device,
-            threads=threads,
-            together=together,
+            clusters=options.clusters,
+            device=options.device,
+            threads=options.threads,
+            together=options.together,
         )
-        return search(problem, seed, record=record, key=key)
+        return search(problem, options.seed, record=options.record, key=options.key)
 
     def fit(self, problem: FitProblem, *, partial: Path | None = None, key: str = "", threads: int = 1) -> FitResult:
         """Adam, with gradients through the simulation; see `fit.fit`. It has one thread."""
@@ -115,25 +105,17 @@ and it goes on for the rest of dt.
         return solver
 
     def check(self, twin: Twin) -> None:
-        from neuspring.physics import stability
-
         stability.check(twin)
 
     def stable(self, twin: Twin, safety: float) -> Twin:
-        from neuspring.physics import stability
-
         simulation = twin.simulation
         count = stability.smallest_safe_substeps(stability.twin_spectrum(twin), simulation.frame_time, safety)
         return replace(twin, simulation=replace(simulation, substeps=max(count, simulation.substeps)))
 
     def for_prediction(self, twin: Twin) -> Twin:
-        from neuspring.physics import stability
-
         return stability.for_prediction(twin)
 
     def load(self, twin: Twin) -> float:
-        from neuspring.physics import stability
-
         return stability.twin_spectrum(twin).load(twin.simulation.substep)
 
     def lines(self, twin: Twin) -> Lines:
@@ -169,4 +151,4 @@ and it goes on for the rest of dt.
         return float(twin.material.mass[node]) if len(twin.material.mass) else 1.0
 
 
-BODY: Any = Lattice()
+body = Lattice()

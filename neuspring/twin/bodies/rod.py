@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from neuspring.config import Config
 from neuspring.core.artifacts import Artifact, Observations, Rod, Twin
-from neuspring.twin.body import Body, Lines
+from neuspring.twin.body import Body, Lines, SearchOptions
 
 if TYPE_CHECKING:
     from neuspring.physics.rod_nodes import RodFrames
@@ -55,23 +55,13 @@ v_x, c v_y, -ground_elasticity v_z), c = max(0, 1 - ground_friction (1 + ground_
         return twin.rod is not None
 
     def search(
-        self,
-        observations: Observations,
-        pool: Sequence[Observations],
-        settings: Config,
-        *,
-        clusters: int = 1,
-        seed: int = 0,
-        device: str = "cpu",
-        threads: int = 1,
-        together: int = 0,
-        record: Path | None = None,
-        key: str = "",
+        self, observations: Observations, pool: Sequence[Observations], settings: Config, options: SearchOptions
     ) -> RodResult:
         """The constants of a rod; see `rod_fit.search_rod`. It has no regions and no chance, and begins anew."""
         from neuspring.twin.rod_fit import search_rod
 
-        return search_rod(observations, pool, settings, device=device, threads=threads, record=record)
+        device, threads = options.device, options.threads
+        return search_rod(observations, pool, settings, device=device, threads=threads, record=options.record)
 
     def fit(self, problem: FitProblem, *, partial: Path | None = None, key: str = "", threads: int = 1) -> RodResult:
         """All that is unknown of a rod; see `rod_fit.fit_rod`. It begins anew."""
@@ -143,4 +133,4 @@ def _edge_stiffness(rod: Rod) -> np.ndarray:
     return np.asarray((rod.bending[:-1] + rod.bending[1:]) / 2 / rod.lengths**2)
 
 
-BODY: Any = RodBody()
+body = RodBody()
