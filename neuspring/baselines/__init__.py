@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Pictures:
-    """What a model that is trained on silhouettes reads."""
+    """Files that a model reads that is trained on silhouettes."""
 
     folder: Path
     """The capture's."""
@@ -43,7 +43,7 @@ class TrainingRequest:
 
     observations: Observations
     settings: Config
-    """With the method's own settings in the model's section."""
+    """The configuration, with the method's own settings in the model's section."""
     seed: int
     device: str
     partial: Path | None
@@ -55,7 +55,7 @@ class TrainingRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class Baseline:
-    """What is known of a baseline before it runs. Its functions are named as `module:name` and imported when they are called."""
+    """Declaration of a baseline. Its functions are named as `module:name` and imported when they are called."""
 
     prediction: str
     """(model or None, observations, centers of splats or None, device) -> Prediction."""
@@ -66,19 +66,19 @@ class Baseline:
     section: str = ""
     """Its settings: a field of `config.Baselines`."""
     takes_pictures: Callable[[Any], bool] = lambda section: False
-    """From its settings: whether it is trained on silhouettes."""
+    """True, from its settings, where it is trained on silhouettes."""
     reads: Callable[[Any], tuple[str, ...]] = lambda section: ()
-    """From its settings: keys of the configuration that training reads beside its own section."""
+    """Keys of the configuration, from its settings, that training reads beside its own section."""
     own_splats: bool = False
-    """Whether a method row may give it splats of its own to move (`appearance`)."""
+    """True where a method row may give it splats of its own to move (`appearance`)."""
     transfers: bool = False
-    """Whether what it learned can be moved to another recording."""
+    """True where a trained model can be moved to another recording."""
     features: Callable[[Any], str] = lambda section: "none"
-    """Whether optional weights are there, so that training runs again when they come. Raises InputError for wrong ones."""
+    """State of its optional weights in a word, so that training runs again when they come. Raises InputError for wrong ones."""
 
     @property
     def trained(self) -> bool:
-        """Whether it is trained."""
+        """True where it is trained."""
         return bool(self.training)
 
     @property

@@ -1,4 +1,4 @@
-"""What training and prediction of a baseline return, and the training loop that they share."""
+"""Results of a baseline's training and prediction, and the training loop that baselines share."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from neuspring.core.checkpoint import Checkpoint, TrainingLoop
 
 CHECKPOINT_EVERY = 5
 """Epochs between checkpoints from which a killed training continues."""
-LIMIT = 10.0
+DIVERGENCE_RADIUS = 10.0
 """m from the origin. A state with a point beyond it counts as diverged: scenes are a meter or two wide."""
 Model = TypeVar("Model", bound=Artifact)
 TrainedModel = TypeVar("TrainedModel", bound=Artifact, covariant=True)
@@ -31,7 +31,7 @@ class Trained(Generic[Model]):
     facts: dict[str, Any] = field(default_factory=dict)
     """Plain values for the record."""
     failure: str = ""
-    """Why training ended early; the model is then the last that was usable. Empty: it did not."""
+    """Reason why training ended early; the model is then the last usable one. Empty: it did not end early."""
     attempts: int = 1
     """1, plus one for every time that training continued from a checkpoint."""
     earlier_seconds: float = 0.0
@@ -43,7 +43,7 @@ class Prediction:
     """An open-loop rollout over all frames."""
 
     trajectory: Trajectory
-    """Of the structure points, in the order of `Observations.nodes`."""
+    """Motion of the structure points, in the order of `Observations.nodes`."""
     facts: dict[str, Any] = field(default_factory=dict)
     """Plain values for the record."""
     centers: np.ndarray | None = None
@@ -56,7 +56,7 @@ class TrainingStopped(ArithmeticError):
 
 
 class Training(Protocol[TrainedModel]):
-    """What `run_epochs` asks of a training. `epoch` returns metrics; `facts` is given the number of complete epochs."""
+    """Methods that `run_epochs` asks of a training. `epoch` returns metrics; `facts` is given the number of complete epochs."""
 
     def epoch(self, number: int) -> dict[str, float]: ...
     def model(self) -> TrainedModel: ...

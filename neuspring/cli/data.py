@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
     from neuspring.core.findings import Finding
 
-SHOWN = 5
-"""How many doubtful frames are named per camera."""
+DOUBTFUL_FRAMES_SHOWN = 5
+"""Number of doubtful frames that are named per camera."""
 BOARD = "SQUARES_XxSQUARES_Y:SQUARE_M:MARKER_M:DICTIONARY"
 
 
@@ -251,7 +251,7 @@ def mask(
                 print(finding)
             told = f"masks are in {capture / 'mask' / name}"
         print(f"camera {name}: {told}; look at {store.sheet_of(read, name)}")
-        worst = sorted(range(len(doubts)), key=lambda frame: -doubts[frame])[:SHOWN]
+        worst = sorted(range(len(doubts)), key=lambda frame: -doubts[frame])[:DOUBTFUL_FRAMES_SHOWN]
         print(f"camera {name}: most doubtful frames: " + ", ".join(f"{frame} ({doubts[frame]:.2f})" for frame in worst))
     without = [name for name in read.cameras if not store.has_masks(read, [name])]
     if without:

@@ -31,7 +31,7 @@ COMMANDS: Registry[Callable[..., int | None]] = Registry(
     {name: f"neuspring.cli.{module}:{name.replace('-', '_')}" for module, names in _OURS.items() for name in names.split()},
 )
 """Tools beside the stages. A dot in a member's name is a space of the command: `draw.film` is `neuspring draw film`."""
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 OWN_THREADS = ("search",)
 """Commands that share their work among --threads threads of their own: numerical libraries have one in each of them."""
 
@@ -39,7 +39,7 @@ OWN_THREADS = ("search",)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    for name in THREADS:
+    for name in THREAD_VARIABLES:
         os.environ.setdefault(name, _threads(words))
     try:
         return _run(words)
@@ -59,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def full_disk(path: Path) -> InputError:
-    """What is said where a file does not fit on its disk."""
+    """The error of a file that does not fit on its disk."""
     disk = next(folder for folder in [path.absolute(), *path.absolute().parents] if folder.is_mount())
     free, whole = (size / 1e9 for size in (shutil.disk_usage(disk).free, shutil.disk_usage(disk).total))
     rule = f"no space left on device: the disk at {disk} has {free:.1f} of {whole:.1f} GB free"

@@ -25,7 +25,7 @@ LeftOut = Annotated[str, arg(help="JSON: methods and the scenarios to which they
 StudyTable = Annotated[Path, arg(help="the study table")]
 Folder = Annotated[Path, arg(help="folder to write to")]
 Transfers = Annotated[tuple[str, ...], arg(help="scenarios whose twins were rolled out on other recordings")]
-WHAT = "--scores, or --scenarios, --methods and --seeds of a results folder, are required"
+STUDY_RULE = "--scores, or --scenarios, --methods and --seeds of a results folder, are required"
 
 
 def tables(
@@ -82,7 +82,7 @@ def tables(
 def _made_otherwise(settings: str, results: Path) -> tuple[str, ...]:
     """Lines on runs that are there but are not what these settings would make."""
     from neuspring.config import plain
-    from neuspring.core.provenance import ROOT
+    from neuspring.core.provenance import PACKAGE_FOLDER
     from neuspring.experiments.benchmark import Benchmark
     from neuspring.experiments.freshness import Freshness
     from neuspring.experiments.graph import Graph
@@ -91,7 +91,7 @@ def _made_otherwise(settings: str, results: Path) -> tuple[str, ...]:
         return ()
     values = plain(read_settings(settings)) | {"results": str(results)}
     try:
-        return tuple(Freshness(Graph(Benchmark(values, ROOT.parent))).of_runs())
+        return tuple(Freshness(Graph(Benchmark(values, PACKAGE_FOLDER.parent))).of_runs())
     except InputError as error:
         # Of a part of the scenarios, for example, whose others have no data here.
         return (f"  Not compared with the configuration: {error}",)
@@ -134,7 +134,7 @@ def study(
     elif scenarios and methods and seeds:
         print(write_study(study, definition, results, scenarios, seeds, methods, output, without, beside))
     else:
-        raise InputError("study", WHAT)
+        raise InputError("study", STUDY_RULE)
 
 
 def explain(

@@ -13,12 +13,12 @@ Nothing here imports torch, Warp or MLflow, because the workflow reads the confi
 
 from neuspring.config.data import Mocap, Synthetic, Toy
 from neuspring.config.parse import merge, parse, plain, read_text, read_yaml, typed
-from neuspring.config.rod import Rod
+from neuspring.config.rod import RodSettings
 from neuspring.config.rows import Method, ScenarioRow, SearchRow
-from neuspring.config.search import Polish, Search, SearchVariables, Variable
+from neuspring.config.search import PolishSettings, Search, SearchVariables, Variable
 from neuspring.config.settings import Config, Tracking
-from neuspring.config.simulation import ReleasedQuirks, Simulation
-from neuspring.config.twin import Fit, Losses, SpringField
+from neuspring.config.simulation import ReleasedQuirks, SimulationSettings
+from neuspring.config.twin import Fit, Losses, SpringFieldSettings
 
 __all__ = [
     "Config",
@@ -26,15 +26,15 @@ __all__ = [
     "Losses",
     "Method",
     "Mocap",
-    "Polish",
+    "PolishSettings",
     "ReleasedQuirks",
-    "Rod",
+    "RodSettings",
     "ScenarioRow",
     "Search",
     "SearchRow",
     "SearchVariables",
-    "Simulation",
-    "SpringField",
+    "SimulationSettings",
+    "SpringFieldSettings",
     "Synthetic",
     "Toy",
     "Tracking",

@@ -11,7 +11,7 @@ from neuspring.config.parse import Positive, Section
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rod(Section):
+class RodSettings(Section):
     """A long thin body as a rod (twin/rod.py): its vertices, and the stiffness that its fit starts from.
 
     Motion depends on stiffness over mass alone. So stiffness is given for a body of 1 kg/m; a body of another mass per length has

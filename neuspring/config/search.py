@@ -101,7 +101,7 @@ VARIABLES = tuple(spec.name for spec in dataclasses.fields(SearchVariables))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Polish(Section):
+class PolishSettings(Section):
     """Levenberg-Marquardt after CMA-ES: from its best candidate, in few variables, on the residuals of all training frames."""
 
     rounds: Annotated[int, Field(ge=0)] = 6
@@ -135,7 +135,7 @@ class Search(Section):
     """Shape in which springs of controllers have no force: the body's rest shape, or frame 0, as a hand takes hold of a body that
     is bent already."""
     variables: SearchVariables = field(default_factory=SearchVariables)
-    polish: Polish = field(default_factory=Polish)
+    polish: PolishSettings = field(default_factory=PolishSettings)
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.fixed if name not in VARIABLES]

@@ -15,9 +15,9 @@ from neuspring.config.effort import EFFORTS, Effort, sizes
 from neuspring.config.images import Images
 from neuspring.config.parse import Count, Name, Section, merge, plain
 from neuspring.config.perception import Perception
-from neuspring.config.rod import Rod
+from neuspring.config.rod import RodSettings
 from neuspring.config.search import Search
-from neuspring.config.simulation import ReleasedQuirks, Simulation
+from neuspring.config.simulation import ReleasedQuirks, SimulationSettings
 from neuspring.config.tuning import Tune
 from neuspring.config.twin import Fit, Losses
 from neuspring.core.text import refuse_password
@@ -157,11 +157,11 @@ class Config(Section):
     """Most candidates of a search, or fits of a scenario, in one launch; auto: on a CPU as many as save time, on CUDA all. On a CPU
     no result depends on it, bit for bit."""
     gpus: Gpus = field(default_factory=Gpus)
-    simulation: Simulation = field(default_factory=Simulation)
+    simulation: SimulationSettings = field(default_factory=SimulationSettings)
     losses: Losses = field(default_factory=Losses)
     search: Search = field(default_factory=Search)
     fit: Fit = field(default_factory=Fit)
-    rod: Rod = field(default_factory=Rod)
+    rod: RodSettings = field(default_factory=RodSettings)
     released_quirks: ReleasedQuirks = field(default_factory=ReleasedQuirks)
     toy: Toy = field(default_factory=Toy)
     mocap: Mocap = field(default_factory=Mocap)

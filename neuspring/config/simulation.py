@@ -11,7 +11,7 @@ from neuspring.config.parse import Count, Finite, Section
 
 
 @dataclass(frozen=True, kw_only=True)
-class Simulation(Section):
+class SimulationSettings(Section):
     """Integration. Which way is up, the ground and self-collision come with the scenario."""
 
     substeps: Count | Literal["auto"] = "auto"

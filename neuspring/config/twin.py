@@ -29,7 +29,7 @@ class Losses(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SpringField(Section):
+class SpringFieldSettings(Section):
     """Neural spring field: S(e) = S0 + F(x_mid(e)), F a tri-plane and a small MLP over spring midpoints in the rest shape."""
 
     triplane: bool = True
@@ -98,7 +98,7 @@ class Fit(Section):
     nothing is fitted; the start of the fit is a candidate too."""
     tail_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.2
     """Fraction of the training frames on which nothing is fitted with `selection: tail`."""
-    field: SpringField = dataclasses.field(default_factory=SpringField)
+    field: SpringFieldSettings = dataclasses.field(default_factory=SpringFieldSettings)
     checkpoint_every: Count = 5
     """Epochs between checkpoints from which a killed job continues."""
     rod: RodFit = dataclasses.field(default_factory=RodFit)

@@ -23,7 +23,7 @@ from neuspring.core.files import DamagedFile, read_npz, write_npz
 from neuspring.core.geometry import Obstacle, obstacles_of
 
 FORMAT_VERSION = 2
-"""Of the files of all artifacts; files of another version are refused."""
+"""Version of the files of all artifacts; files of another version are refused."""
 Up = Literal["+z", "-z"]
 InitialVelocity = Literal["rest", "observed", "before"]
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
@@ -31,7 +31,7 @@ SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 OMITTED = {"empty": "omitted"}
 """Metadata of a field that files do not have where it is empty."""
 NO_REST_SHAPE = np.zeros((0, 3))
-"""The rest shape that stands for: as in frame 0."""
+"""No rest shape of its own: frame 0 is the rest shape."""
 
 
 def up_sign(up: str) -> float:
@@ -182,7 +182,7 @@ class Artifact:
 
 
 def _kept(spec: dataclasses.Field[Any], value: object) -> bool:
-    """Whether a file has a field: an empty one may be left out."""
+    """True where a file has the field; an empty one may be left out."""
     return bool(value) or spec.metadata != OMITTED
 
 
@@ -199,7 +199,7 @@ def _tuples(value: Any) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario(Artifact):
-    """Where a capture comes from and how it is split.
+    """Source of a capture, its frames and their split, and the world around it.
 
     Training frames are [0, train_end), future frames [train_end, frame_count).
     """
@@ -214,13 +214,13 @@ class Scenario(Artifact):
     frame_rate: float
     """Frames per second."""
     up: Up
-    """Which way is up along the world's z axis; the ground is the plane z = 0."""
+    """Direction up along the world's z axis; the ground is the plane z = 0."""
     self_collision: bool = False
     ground: bool = True
     obstacles: tuple[Obstacle, ...] = field(default=(), metadata=OMITTED)
-    """What stands in the scene and does not move."""
+    """Boxes and spheres that stand in the scene and do not move."""
     provenance: dict[str, str] = field(default_factory=dict)
-    """What the reader used, as text: files with digests, options."""
+    """Files with digests, and options, that the reader used, as text."""
 
     @property
     def up_sign(self) -> float:
@@ -248,9 +248,9 @@ class Scenario(Artifact):
 
 @dataclass(frozen=True, kw_only=True)
 class ImageObservations(Artifact):
-    """What one calibrated camera without depth saw: the object in training frames, the hands in all frames.
+    """Observations of one calibrated camera without depth: the object in training frames, the hands in all frames.
 
-    Where the capture brings hands in space (data/points.py) there are none here: H = 0, and `hand_of` is empty.
+    A capture that brings hands in space (data/points.py) has none here: H = 0, and `hand_of` is empty.
 
     Pixel centers lie at whole coordinates, x right, y down (data/capture.py).
     """
@@ -276,13 +276,13 @@ class ImageObservations(Artifact):
 
     @property
     def hands(self) -> int:
-        """How many hands there are."""
+        """Number of hands, H."""
         return self.hand_centers.shape[1]  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Observations(Artifact):
-    """What was seen: tracked object points, the hands, and the structure of the object at frame 0.
+    """Observations of a capture: tracked object points, the hands, and the structure of the object in frame 0.
 
     The canonical node order is [object_points[0] | surface_points | interior_points]; the first No + Ns nodes are "surface".
     """
@@ -319,8 +319,8 @@ class Observations(Artifact):
         omitted=True,
     )
     image: ImageObservations | None = field(default=None, metadata=OMITTED)
-    """What a camera without depth saw. Then object points are known in frame 0 alone, and hands that were seen move in a plane
-    (perception/color_hands.py)."""
+    """Observations of a camera without depth. Then object points are known in frame 0 alone, and hands that were seen move in a
+    plane (perception/color_hands.py)."""
 
     def check(self) -> None:
         name = f"observations of {self.scenario.name}"
@@ -370,7 +370,7 @@ class Observations(Artifact):
 
     @property
     def surface_count(self) -> int:
-        """How many of the first nodes count as surface: No + Ns."""
+        """Number of surface nodes, which come first: No + Ns."""
         return len(self.object_points[0]) + len(self.surface_points)
 
 
@@ -401,7 +401,7 @@ class Topology(Artifact):
         "S", np.bool_, "1", "springs of controllers that act only while they are shorter than at rest; empty: none", omitted=True
     )
     controller_rest: str = "rest_shape"
-    """Where the springs of controllers have no force: in the rest shape, or in the first_frame, whatever the rest shape is."""
+    """Shape in which the springs of controllers have no force: rest_shape, or first_frame, whatever the rest shape is."""
 
     def check(self) -> None:
         nodes, total = len(self.nodes), len(self.nodes) + len(self.controllers)
@@ -435,7 +435,7 @@ class Topology(Artifact):
 
     @property
     def object_spring_count(self) -> int:
-        """How many springs join two object nodes; they come first."""
+        """Number of springs that join two object nodes; they come first."""
         return int(np.count_nonzero((self.springs < len(self.nodes)).all(axis=1)))
 
 
@@ -475,7 +475,7 @@ SCALARS = tuple(spec.name for spec in dataclasses.fields(Material) if "shape" no
 
 @dataclass(frozen=True, kw_only=True)
 class Simulation:
-    """How a twin is integrated: everything a rollout needs besides topology, material and controller motion."""
+    """Integration of a twin: everything that a rollout needs besides topology, material and the motion of controllers."""
 
     frame_time: float
     """Simulated time per frame, s. The substep is frame_time / substeps."""
@@ -490,7 +490,7 @@ class Simulation:
     controller_velocity: bool = False
     """Give controllers their finite-difference velocity in the dashpots. The released simulator uses zero."""
     initial_velocity: InitialVelocity = "rest"
-    """How a rollout starts: at rest, as in the released simulator, or with the velocity observed in the first frames."""
+    """Velocity at the start of a rollout: rest (none), as in the released simulator, or the one observed in the first frames."""
     obstacles: tuple[Obstacle, ...] = field(default=(), metadata=OMITTED)
     """Nodes collide with them as with the ground, with its elasticity and friction."""
 
@@ -639,7 +639,7 @@ class Trajectory(Artifact):
 
 @dataclass(frozen=True, kw_only=True)
 class SplatCenters(Artifact):
-    """Where a method's own model puts its splats; their other properties are those of frame 0."""
+    """Centers of the splats that a method's own model moves; their other properties are those of frame 0."""
 
     kind: ClassVar[str] = "splat_centers"
     positions: np.ndarray = array("F,G,3", np.float32, "m", "center of each splat at the end of each frame")

@@ -33,7 +33,7 @@ CHECKPOINT_FORMAT = 2
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What a stage needs to go on."""
+    """State from which a stage continues after a kill."""
 
     arrays: Mapping[str, Mapping[str, np.ndarray]]
     """Arrays by group and name. A group's name has no dot. Of a loaded checkpoint, a group without arrays is empty."""
@@ -69,7 +69,7 @@ class Checkpoint:
 
 
 def checkpoint_key(inputs: Mapping[str, str], settings: Mapping[str, Any], device: str, module: str) -> str:
-    """What a checkpoint must match to be continued from: inputs, settings, device kind and the code of a module."""
+    """SHA-256 of inputs, settings, kind of device and the code of a module: a checkpoint with another key is not continued from."""
     values = [dict(inputs), dict(settings), device.partition(":")[0], provenance.code_digest(module)]
     return hashlib.sha256(canonical(values).encode()).hexdigest()
 
@@ -100,7 +100,7 @@ class TrainingLoop:
         self.earlier_processor_seconds = 0.0
         """Processor time of the same, of all threads."""
         self.epochs_together = 0
-        """How many epochs ran together with those of other trainings."""
+        """Number of epochs that ran together with those of other trainings."""
         self.restored = Checkpoint.load(partial, key, what)
         """The checkpoint to continue from."""
         if self.restored:

@@ -1,4 +1,4 @@
-"""Where things are computed: Warp's start, the device that a setting means, kernels compiled once however many processes start.
+"""Devices: Warp's start, the device that a setting means, kernels compiled once however many processes start.
 
 The only module of this package that imports torch and Warp.
 """

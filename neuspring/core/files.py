@@ -72,9 +72,9 @@ META = "meta"
 """Name of the array that holds the JSON text."""
 
 
-DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError, TypeError, RuntimeError)
-"""What reading a damaged .npz file raises: zipfile RuntimeError for damaged flags, np.load a bare array (TypeError) for an .npy
-file."""
+NPZ_FAULTS = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError, TypeError, RuntimeError)
+"""Exceptions of reading a damaged .npz file: zipfile raises RuntimeError for damaged flags, and np.load returns a bare array
+(TypeError) for an .npy file."""
 
 
 class DamagedFile(ValueError):
@@ -100,7 +100,7 @@ def read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         meta = json.loads(arrays.pop(META).tobytes().decode())
         if not isinstance(meta, dict):
             raise ValueError("`meta` holds no mapping")
-    except DAMAGED as error:
+    except NPZ_FAULTS as error:
         raise DamagedFile(f"{type(error).__name__}: {error}") from error
     return arrays, meta
 

@@ -1,6 +1,6 @@
-"""What was noticed: about a data set, or by a step about its own result.
+"""Findings: faults and oddities of a data set, or those that a step notices in its own result.
 
-The latter is implausible, but no reason to stop: it is kept in the record, printed, and reported.
+A step's own finding is implausible, but no reason to stop: it is kept in the record, printed, and reported.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Finding:
     """
 
     name: str
-    """What it is about, in a few words, the same for every occurrence; of a file of data, the key, or empty."""
+    """Subject in a few words, the same for every occurrence; for a file of data, the key, or empty."""
     level: Level
     where: str
     """The file, the camera, or what else was looked at."""

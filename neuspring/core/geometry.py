@@ -12,7 +12,7 @@ from neuspring.core.errors import InputError
 
 UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 NOT_TURNED = 1e-4
-"""How far the entries of R R' may be from those of the unit matrix."""
+"""Largest difference between an entry of R R' and that of the unit matrix."""
 Triple = tuple[float, float, float]
 
 
@@ -25,11 +25,11 @@ class Obstacle:
     center: Triple
     """m."""
     half_sizes: Triple = (0.0, 0.0, 0.0)
-    """Of a box along its own axes, m."""
+    """Half sizes of a box along its own axes, m."""
     rotation: tuple[Triple, Triple, Triple] = UPRIGHT
-    """Of a box, own axes to world: x_world = center + rotation x_own."""
+    """Rotation of a box from its own axes to the world: x_world = center + rotation x_own."""
     radius: float = 0.0
-    """Of a sphere, m."""
+    """Radius of a sphere, m."""
 
     def __post_init__(self) -> None:
         for name in ("center", "half_sizes"):
@@ -54,7 +54,7 @@ class Obstacle:
         return None
 
     def depth(self, points: np.ndarray) -> np.ndarray:
-        """How deep points [P, 3], m, are inside [P], m; negative outside."""
+        """Depth [P], m, of points [P, 3], m, inside; negative outside."""
         away = np.asarray(points, np.float64) - np.array(self.center)
         if self.shape == "sphere":
             return np.asarray(self.radius - np.linalg.norm(away, axis=1))

@@ -19,21 +19,21 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from neuspring.core.records import RECORD_FORMAT, read_json
 
-STRICT = ConfigDict(extra="forbid", strict=True)
+JOB_CONFIG = ConfigDict(extra="forbid", strict=True)
 FOLDER, LOGS = "jobs", "logs"
-RUN = ".run"
+RUN_FILE = ".run"
 """File in FOLDER that names the current run of the workflow, or the last one."""
 GPU_NOTES = ".gpus"
 """File in FOLDER in which the jobs of that run note which GPUs failed."""
 Outcome = Literal["ok", "transient", "permanent", "killed", "running"]
-"""How an attempt ended. transient: trying again may help. running: it runs, or its wrapper was killed."""
+"""End of an attempt. transient: trying again may help. running: it runs, or its wrapper was killed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Attempt:
     """One run of a job's command."""
 
-    __pydantic_config__ = STRICT
+    __pydantic_config__ = JOB_CONFIG
     started: str
     """UTC, ISO 8601."""
     seconds: float = 0.0
@@ -42,7 +42,7 @@ class Attempt:
     """s waited for a GPU."""
     outcome: Outcome = "running"
     cause: str = ""
-    """Why it failed, in words; empty if it did not."""
+    """Cause of the failure, in words; empty where it did not fail."""
     message: str = ""
     """The line of the output that names the error; empty if it did not fail."""
     exit: int | None = None
@@ -65,7 +65,7 @@ class Attempt:
 
     @property
     def kind(self) -> Literal["cpu", "gpu"]:
-        """Where it ran."""
+        """Kind of device that it ran on."""
         return "gpu" if self.devices else "cpu"
 
 
@@ -73,7 +73,7 @@ class Attempt:
 class JobRecord:
     """All attempts of a job."""
 
-    __pydantic_config__ = STRICT
+    __pydantic_config__ = JOB_CONFIG
     rule: str
     name: str
     """<rule>/<wildcards joined by />."""
@@ -82,7 +82,7 @@ class JobRecord:
     attempts: list[Attempt]
     scenario: str = ""
     stamp: str = ""
-    """Of a job of no stage that succeeded: a digest of what it was told and of its code. Stages have records of their own."""
+    """Digest of the options and the code of a job that is no stage, once it succeeded. Stages have records of their own."""
 
     @property
     def last(self) -> Attempt:
@@ -91,7 +91,7 @@ class JobRecord:
 
     @property
     def failed(self) -> bool:
-        """Whether the newest attempt ended without success."""
+        """True where the newest attempt ended without success."""
         return self.last.outcome not in ("ok", "running")
 
     @property
@@ -110,7 +110,7 @@ class JobRecord:
         return cls(rule=rule, name=name, log=place, attempts=[], scenario=scenario)
 
     def path(self, results: Path) -> Path:
-        """Where the record lies."""
+        """Path of the record."""
         return Path(results) / FOLDER / f"{self.name}.json"
 
     def save(self, results: Path) -> None:
@@ -133,13 +133,13 @@ def begin_run(results: Path) -> None:
     """
     folder = Path(results) / FOLDER
     (folder / GPU_NOTES).unlink(missing_ok=True)
-    write_text(folder / RUN, uuid.uuid4().hex)
+    write_text(folder / RUN_FILE, uuid.uuid4().hex)
 
 
 def this_run(results: Path) -> str:
     """The name of the current run, or of the last one; empty where there was none."""
     try:
-        return (Path(results) / FOLDER / RUN).read_text().strip()
+        return (Path(results) / FOLDER / RUN_FILE).read_text().strip()
     except OSError:
         return ""
 

@@ -14,7 +14,7 @@ from typing import IO
 
 from filelock import lock_descriptor
 
-POLL = 0.01
+LOCK_POLL = 0.01
 """s between two attempts to lock."""
 
 
@@ -38,9 +38,9 @@ def try_lock(path: Path) -> IO[str] | None:
 
 
 def wait_for_lock(path: Path) -> IO[str]:
-    """As `try_lock`, but waits until the lock is free."""
+    """The file of `try_lock`, after waiting until the lock is free."""
     while (file := try_lock(path)) is None:
-        time.sleep(POLL)
+        time.sleep(LOCK_POLL)
     return file
 
 
@@ -53,7 +53,7 @@ def _open(path: Path) -> IO[str]:
 
 
 def _is_at(file: IO[str], path: Path) -> bool:
-    """Whether the file is still the one at `path`: its last holder may have removed it before we locked it."""
+    """True where the file is still the one at `path`: its last holder may have removed it before we locked it."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), path.stat())
     except FileNotFoundError:

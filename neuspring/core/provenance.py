@@ -1,4 +1,4 @@
-"""What code made a result: a digest of the package modules a stage uses, and the commit.
+"""Code behind a result: a digest of the package modules that a stage uses, and the commit.
 
 Snakemake does not notice changes in imported code. Each record of a stage therefore holds `code_digest(module)`, which the workflow
 compares: the syntax trees, docstrings and comments stripped, of the module and of every package module it imports, directly or not.
@@ -16,10 +16,11 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-PACKAGE = "neuspring"
-ROOT = Path(__file__).parents[1]
+PACKAGE_NAME = "neuspring"
+PACKAGE_FOLDER = Path(__file__).parents[1]
 NOT_NUMERICS = tuple(
-    f"{PACKAGE}.{name}" for name in ("config", "core.text", "core.records", "core.run_record", "core.run_folder", "stages.stage")
+    f"{PACKAGE_NAME}.{name}"
+    for name in ("config", "core.text", "core.records", "core.run_record", "core.run_folder", "stages.stage")
 )
 """Declarations, records and progress: they change no number. Configured values reach a rule as parameters of their own."""
 
@@ -27,7 +28,7 @@ NOT_NUMERICS = tuple(
 @functools.cache
 def _source(module: str) -> Path | None:
     parts = module.split(".")[1:]
-    path = ROOT.joinpath(*parts)
+    path = PACKAGE_FOLDER.joinpath(*parts)
     for file in (path.with_suffix(".py"), path / "__init__.py"):
         if file.is_file():
             return file
@@ -75,7 +76,9 @@ def imported_modules(module: str) -> frozenset[str]:
             names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
         else:
             continue
-        found |= {name for name in names if name.split(".")[0] == PACKAGE and name != PACKAGE and _source(name) is not None}
+        found |= {
+            name for name in names if name.split(".")[0] == PACKAGE_NAME and name != PACKAGE_NAME and _source(name) is not None
+        }
     return frozenset(found)
 
 
@@ -146,7 +149,7 @@ def image_stamps(folder: Path) -> str:
 def commit() -> str:
     """The commit of the working copy this package runs from, with `-dirty` if it has changes; empty if unknown."""
     try:
-        run = functools.partial(subprocess.run, cwd=ROOT.parent, capture_output=True, text=True, timeout=10, check=True)
+        run = functools.partial(subprocess.run, cwd=PACKAGE_FOLDER.parent, capture_output=True, text=True, timeout=10, check=True)
         name = run(["git", "rev-parse", "HEAD"]).stdout.strip()
         changed = run(["git", "status", "--porcelain", "--untracked-files=no", "--", "."]).stdout.strip()
     except (OSError, subprocess.SubprocessError):

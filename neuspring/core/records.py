@@ -23,9 +23,9 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 
 RECORD_FORMAT = 2
-REMEDY = "The commit that made older results reads them. Delete this folder, or use another: --config results=..."
-MOST_BYTES = 50_000_000
-"""What a record may have: it is read whole."""
+OTHER_FORMAT_REMEDY = "The commit that made older results reads them. Delete this folder, or use another: --config results=..."
+MOST_RECORD_BYTES = 50_000_000
+"""Bytes of a record, at most: it is read whole."""
 COMPUTING = ("numpy", "scipy", "torch", "warp-lang")
 """Packages on whose versions results depend."""
 CAPTURE_FOLDER = "capture_folder"
@@ -51,7 +51,7 @@ def now() -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class StageRecord:
-    """What one stage did. `files` maps a role (for example "twin") to [file name beside the record, SHA-256]."""
+    """Record of one run of a stage. `files` maps a role (for example "twin") to [file name beside the record, SHA-256]."""
 
     stage: str
     status: Status
@@ -71,7 +71,7 @@ class StageRecord:
     device: str = "cpu"
     machine: str = ""
     versions: dict[str, str] = field(default_factory=dict)
-    """Of the packages that compute."""
+    """Versions of the packages that compute."""
     code: str = ""
     """Digest of the code that made it (`neuspring.core.provenance`); empty in records of older versions."""
 
@@ -120,7 +120,7 @@ class Before:
         return cls(Path(path), StageRecord.load(path))
 
     def has(self, role: str) -> bool:
-        """Whether the stage wrote such a file."""
+        """True where the stage wrote a file of this role."""
         return role in self.record.files
 
     def file(self, role: str) -> Path:
@@ -131,15 +131,15 @@ class Before:
 def read_json(path: Path, version: int) -> dict[str, Any]:
     """A JSON record of the given format version, without its `format` key. Raises InputError."""
     try:
-        if (size := Path(path).stat().st_size) > MOST_BYTES:
-            raise InputError(path, f"a record has at most {MOST_BYTES} bytes", size, "Delete it and run again.")
+        if (size := Path(path).stat().st_size) > MOST_RECORD_BYTES:
+            raise InputError(path, f"a record has at most {MOST_RECORD_BYTES} bytes", size, "Delete it and run again.")
         values = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(path, "this record must be readable", error.strerror, "Run the step that makes it first.") from error
     except ValueError as error:
         raise InputError(path, "this record must be JSON", str(error), "Delete it and run again.") from error
     if not isinstance(values, dict) or values.pop("format", None) != version:
-        raise InputError(path, f"this version reads records of format {version}", "another format", REMEDY)
+        raise InputError(path, f"this version reads records of format {version}", "another format", OTHER_FORMAT_REMEDY)
     return values
 
 

@@ -19,11 +19,11 @@ from neuspring.core.records import Before, StageRecord, digest_file
 if TYPE_CHECKING:
     import pandas as pd
 
-LEARNING = ("search", "fit", "train")
+LEARNING_STAGES = ("search", "fit", "train")
 """Stages that produce a model, in order. A run's model is from the last of these that it has."""
 RESULTS = ("twin", "model", "trajectory", "centers")
 """Roles of a stage's files that are results; its other files say how it got there."""
-OBSERVATIONS = "observations.npz"
+OBSERVATIONS_FILE = "observations.npz"
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,11 @@ class RunFolder:
                 damaged.append(str(error))
 
         add(lambda: _own(folder, "rollout"))
-        add(lambda: _behind(folder, found["rollout"].record) if "rollout" in found else _own(folder, *LEARNING))
+        add(lambda: _behind(folder, found["rollout"].record) if "rollout" in found else _own(folder, *LEARNING_STAGES))
         add(lambda: _behind(folder, found["fit"].record) if "fit" in found else {})
         add(lambda: _own(folder, "render"))
         add(lambda: _splats(folder, found.get("render")))
-        return cls(folder, {name: found[name] for name in (*LEARNING, "rollout", "appearance", "render") if name in found})
+        return cls(folder, {name: found[name] for name in (*LEARNING_STAGES, "rollout", "appearance", "render") if name in found})
 
     @property
     def scenario_folder(self) -> Path:
@@ -74,7 +74,7 @@ class RunFolder:
     @property
     def learning(self) -> list[str]:
         """The stages that learned the run's model, in order."""
-        return [name for name in LEARNING if name in self.stages]
+        return [name for name in LEARNING_STAGES if name in self.stages]
 
     @property
     def maker(self) -> StageRecord:
@@ -114,8 +114,8 @@ class RunFolder:
 
     @cached_property
     def observations(self) -> Observations:
-        """What was observed. Raises InputError if it is missing, or other than what the run was made from."""
-        path = self.scenario_folder / OBSERVATIONS
+        """Observations of the scenario. Raises InputError where they are missing, or others than the run was made from."""
+        path = self.scenario_folder / OBSERVATIONS_FILE
         if not path.is_file():
             raise InputError(
                 path, "the observations of the run must be there", "no such file", "Use the results folder it was made in."
@@ -133,9 +133,9 @@ def _own(folder: Path, *names: str) -> dict[str, Before]:
 
 def _behind(folder: Path, record: StageRecord) -> dict[str, Before]:
     """The learning stages that a record names as inputs, wherever in the scenario's folder they lie."""
-    wanted = {record.inputs[role] for role in ("learned", *LEARNING) if role in record.inputs}
+    wanted = {record.inputs[role] for role in ("learned", *LEARNING_STAGES) if role in record.inputs}
     found: dict[str, Before] = {}
-    for name in LEARNING:
+    for name in LEARNING_STAGES:
         for path in (folder / f"{name}.json", *sorted(folder.parents[1].glob(f"*/*/{name}.json"))):
             if name not in found and path.is_file() and digest_file(path) in wanted:
                 found[name] = Before.load(path)

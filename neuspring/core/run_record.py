@@ -55,11 +55,11 @@ class RunRecord:
     seed: int
     status: Literal["ok", "failed"]
     reason: str
-    """Why the run failed; empty otherwise."""
+    """Reason why the run failed; empty otherwise."""
     notes: list[str] = field(default_factory=list)
-    """What a reader of the scores must know although the run did not fail."""
+    """Notes that a reader of the scores needs although the run did not fail."""
     images: dict[str, Any] | None = None
-    """How pictures were scored, or why they were not; None for scenarios without images."""
+    """Way in which pictures were scored, or why they were not; None for scenarios without images."""
     floors: dict[str, float] = field(default_factory=dict)
     """Metric -> its value in frame 0, which is given: how far points are from nodes without any motion, m."""
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -70,10 +70,10 @@ class RunRecord:
     """The most attempts of any stage: 1, plus one for every time it continued from a checkpoint."""
     commit: Annotated[str, StringConstraints(pattern=r"^[\w.-]{0,100}$")]
     device: str
-    """Where the model was made."""
+    """Device that the model was made on."""
     machine: str = ""
     versions: dict[str, str] = field(default_factory=dict)
-    """Of the packages that compute."""
+    """Versions of the packages that compute."""
     started: Moment
     ended: Moment
     params: dict[str, Any]
@@ -85,7 +85,7 @@ class RunRecord:
     scores_file: str | None = None
     """None or empty where a failed run has no scores."""
     held_file: str | None = None
-    """Of a failed run: the file of its scores with its last finite frame repeated to the end."""
+    """File of a failed run's scores, with its last finite frame repeated to the end."""
     histories: dict[str, str] = field(default_factory=dict)
     """Stage -> Parquet file of values per step."""
     artifacts: dict[str, list[str]] = field(default_factory=dict)
@@ -98,7 +98,7 @@ class RunRecord:
 
     @property
     def ok(self) -> bool:
-        """Whether the run has a result."""
+        """True where the run has a result."""
         return self.status == "ok"
 
     @property
@@ -108,7 +108,7 @@ class RunRecord:
 
     @property
     def oracle(self) -> bool:
-        """Whether the method has seen all frames, so that it takes no part in comparisons."""
+        """True where the method has seen all frames, so that it takes no part in comparisons."""
         return bool(self.variant.get("oracle"))
 
     @property

@@ -60,7 +60,7 @@ class Table:
     rows: Sequence[Sequence[Cell]]
     caption: str = ""
     groups: Sequence[str] = ()
-    """What each column behind the stub belongs to, for example a task; empty: columns are not grouped."""
+    """Group of each column behind the stub, for example a task; empty: columns are not grouped."""
     stub: int = 1
     sortable: bool = False
     note: str = ""

@@ -1,4 +1,4 @@
-"""What is printed: addresses of stores without their passwords, the line of progress of long work."""
+"""Text for the terminal: addresses of stores without their passwords, the line of progress of long work."""
 
 from __future__ import annotations
 

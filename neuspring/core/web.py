@@ -1,4 +1,4 @@
-"""Which requests are answered: those of the page that this server gave out.
+"""Requests that a local server answers: those of the page that it gave out.
 
 A page of another site can make a browser send requests here, and can point a name of its own at this address (DNS rebinding). So
 the Host header must name this machine, and what a browser says about a request's origin must agree with it.
@@ -23,7 +23,7 @@ class Refused(Exception):
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address or name means this machine alone."""
+    """True where an address or name means this machine alone."""
     address = _address(host)
     return host == "localhost" if address is None else address.is_loopback
 

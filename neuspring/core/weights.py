@@ -20,7 +20,7 @@ SHOWN_DIGITS = 8
 
 
 def hub_folder() -> Path:
-    """Where torch hub keeps checkpoints; asked of the environment, since torch itself takes seconds to import."""
+    """Folder in which torch hub keeps checkpoints; read from the environment, since torch itself takes seconds to import."""
     cache = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser()
     return Path(os.environ.get("TORCH_HOME", cache / "torch")).expanduser() / "hub" / "checkpoints"
 
@@ -50,7 +50,7 @@ def _short(path: Path) -> str:
 
 
 def _fault(path: Path, digest: str, trusted: bool) -> str:
-    """What is wrong with a weight file; empty if nothing is."""
+    """Fault of a weight file in words; empty where it has none."""
     try:
         if not path.is_file():
             return "is not there"

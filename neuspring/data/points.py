@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from neuspring.config import Config, ScenarioRow
 from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.errors import InputError
-from neuspring.core.files import DAMAGED, write_atomically
+from neuspring.core.files import NPZ_FAULTS, write_atomically
 from neuspring.core.findings import Finding, broken, refusal, refuse
 from neuspring.core.geometry import on_table
 from neuspring.core.records import digest_file
@@ -183,7 +183,7 @@ def _arrays(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
-    except (*DAMAGED, AttributeError) as error:
+    except (*NPZ_FAULTS, AttributeError) as error:
         raise InputError(path, "an .npz file without pickle is required", f"{type(error).__name__}: {error}") from error
     if "points" not in arrays or not arrays.keys() <= set(keys):
         optional = f", optional {' and '.join(keys[1:])}" if keys[1:] else ""

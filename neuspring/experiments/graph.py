@@ -18,7 +18,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from neuspring.baselines import BASELINES
-from neuspring.config import Config, Search, SpringField, plain
+from neuspring.config import Config, Search, SpringFieldSettings, plain
 from neuspring.config.settings import select
 from neuspring.core.errors import InputError
 from neuspring.core.provenance import image_stamps
@@ -359,7 +359,7 @@ class Graph:
         if stage.name == "fit":
             method = rows.fits[job.method]
             config = with_search(with_method(config, method, job.method), rows.searches[method.searched], method.searched)
-            unread: dict[str, Any] = {"field": SpringField()} if method.fit == "springs" else {}
+            unread: dict[str, Any] = {"field": SpringFieldSettings()} if method.fit == "springs" else {}
             return dataclasses.replace(config, fit=dataclasses.replace(config.fit, **unread))
         if stage.name == "train":
             return with_method(config, rows.methods[job.method], job.method)

@@ -17,7 +17,7 @@ from typing import IO, Any
 from neuspring.config import plain
 from neuspring.core.errors import InputError
 from neuspring.core.findings import warnings_of
-from neuspring.core.job_records import FOLDER, RUN, JobRecord, failure_lines, read_jobs, this_run
+from neuspring.core.job_records import FOLDER, RUN_FILE, JobRecord, failure_lines, read_jobs, this_run
 from neuspring.core.table import Table
 from neuspring.core.text import listed
 from neuspring.experiments.freshness import told
@@ -169,7 +169,7 @@ def finished(graph: Graph, seconds: float) -> None:
     from neuspring.report.verdict import headline
 
     config, folder, neuspring = graph.config, graph.folder, Path(sys.executable).parent / "neuspring"
-    begun = (Path(config.results) / FOLDER / RUN).stat().st_mtime
+    begun = (Path(config.results) / FOLDER / RUN_FILE).stat().st_mtime
     summary = Path(folder) / "summary.md"
     if summary.exists():
         print(f"\n{headline(summary.read_text())}\n")

@@ -9,16 +9,16 @@ from neuspring.physics.rod_nodes import bind
 
 LEAST_SLENDERNESS = 8.0
 """Length over radius below which a body is no rod: bending would shear it as much."""
-BESIDE, MOST_BESIDE = 3.0, 0.1
+BESIDE_LINE, MOST_BESIDE = 3.0, 0.1
 """Nodes farther from the line than this times the median lie beside it, and the largest part of them. A cylinder has none: at most
 1.4 times the median."""
-NEIGHBORS = 12
+LINE_NEIGHBORS = 12
 """Nearest nodes along which distances on the body are measured."""
-MOST_NODES = 3000
+MOST_LINE_NODES = 3000
 """Nodes that decide on the line, at most; of more, evenly chosen ones."""
-ROUNDS = 4
+LINE_ROUNDS = 4
 """Fits of the line, each with the arc of the one before."""
-SAMPLES = 400
+LINE_SAMPLES = 400
 """Points of the smooth line, to which nodes are projected."""
 PIECES = 0.15
 """Pieces of the spline per radius of length: one in about seven radii, so that it does not follow the surface."""
@@ -35,23 +35,23 @@ def center_line(nodes: np.ndarray, count: int, where: str = "observations") -> n
     """
     points = np.asarray(nodes, np.float64)
     points = points[np.lexsort(points.T)]
-    points = points[:: -(-len(points) // MOST_NODES)]
+    points = points[:: -(-len(points) // MOST_LINE_NODES)]
     arc = _from_an_end(points)
     weights, slenderness = np.ones(len(points)), LEAST_SLENDERNESS
-    for _ in range(ROUNDS):
+    for _ in range(LINE_ROUNDS):
         line = _spline(arc, points, weights, int(np.clip(PIECES * slenderness, 2, count // 2)))
         arc, apart = _projected(points, line)
         # What lies far beside the line, as points of a hand, hardly pulls it.
         typical = max(float(np.median(apart)), 1e-9)
-        weights = 1 / (1 + (apart / (0.67 * BESIDE * typical)) ** 8)
+        weights = 1 / (1 + (apart / (0.67 * BESIDE_LINE * typical)) ** 8)
         length = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
         slenderness = min(length / max(float(np.quantile(apart, 0.9)), 1e-9), 1e3)
-    beside = float((apart > BESIDE * typical + 1e-3 * length).mean())
+    beside = float((apart > BESIDE_LINE * typical + 1e-3 * length).mean())
     if slenderness < LEAST_SLENDERNESS or beside > MOST_BESIDE:
         rule = f"a rod is long and thin: its nodes lie around one line without branches, at least {LEAST_SLENDERNESS:g} radii long"
         found = f"{slenderness:.1f} radii" if slenderness < LEAST_SLENDERNESS else f"{beside:.0%} of the nodes far beside the line"
         raise InputError(f"{where}, nodes of frame 0", rule, found, "Choose a method whose twin is a lattice.")
-    return _equally_spaced(line, arc[apart < BESIDE * typical + 1e-3 * length], count)
+    return _equally_spaced(line, arc[apart < BESIDE_LINE * typical + 1e-3 * length], count)
 
 
 def _from_an_end(points: np.ndarray) -> np.ndarray:
@@ -61,7 +61,7 @@ def _from_an_end(points: np.ndarray) -> np.ndarray:
     from scipy.spatial import cKDTree
     from scipy.spatial.distance import cdist
 
-    near, partner = cKDTree(points).query(points, k=min(NEIGHBORS, len(points)))
+    near, partner = cKDTree(points).query(points, k=min(LINE_NEIGHBORS, len(points)))
     rows = np.repeat(np.arange(len(points)), near.shape[1])
     # The tree joins parts that no near neighbor does.
     tree = minimum_spanning_tree(cdist(points, points)).tocoo()
@@ -80,7 +80,7 @@ def _from_an_end(points: np.ndarray) -> np.ndarray:
 
 
 def _spline(arc: np.ndarray, points: np.ndarray, weights: np.ndarray, pieces: int) -> np.ndarray:
-    """Points [SAMPLES, 3] of the cubic spline of equal pieces that is nearest to points [N, 3] with weights [N] at arcs [N].
+    """Points [LINE_SAMPLES, 3] of the cubic spline of equal pieces that is nearest to points [N, 3] with weights [N] at arcs [N].
 
     Its second differences are penalized a little (a P-spline), which decides where there are no points.
     """
@@ -92,7 +92,7 @@ def _spline(arc: np.ndarray, points: np.ndarray, weights: np.ndarray, pieces: in
     bends = np.diff(np.eye(design.shape[1]), n=2, axis=0)
     normal = design.T @ (weights[:, None] * design) + SPLINE_PENALTY * weights.sum() / pieces * bends.T @ bends
     coefficients = np.linalg.solve(normal, design.T @ (weights[:, None] * points))
-    return np.asarray(BSpline(knots, coefficients, 3)(np.linspace(low, high, SAMPLES)))
+    return np.asarray(BSpline(knots, coefficients, 3)(np.linspace(low, high, LINE_SAMPLES)))
 
 
 def _projected(points: np.ndarray, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

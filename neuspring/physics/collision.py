@@ -21,12 +21,12 @@ from neuspring.physics.arrays import UNFUSED, Buffers, structs
 from neuspring.physics.lanes import lanes
 from neuspring.physics.motion import APPROACH, MIN_TANGENT
 
-CELLS = 64
+GRID_CELLS = 64
 """Cells of the hash grid along each axis; farther cells share them."""
 
 
 def allocate(b: Buffers) -> None:
-    """With self-collision, the lists of partners and the velocities after collisions."""
+    """Allocate the lists of partners and the velocities after collisions, with self-collision alone."""
     if not b.simulation.self_collision:
         return
     capacity, twins = b.simulation.collision_capacity, b.groups * b.width
@@ -45,7 +45,7 @@ def allocate(b: Buffers) -> None:
     b.views["grid_groups"] = wp.from_torch(groups, dtype=wp.int32)
     b.tensors["grid_points"] = torch.zeros((twins * b.nodes, 3), dtype=b.dtype, device=b.device)
     b.views["grid_points"] = wp.from_torch(b.tensors["grid_points"], dtype=wp.types.vector(3, b.real))
-    b.views["grid"] = wp.HashGrid(CELLS, CELLS, CELLS, device=b.device, dtype=b.real)
+    b.views["grid"] = wp.HashGrid(GRID_CELLS, GRID_CELLS, GRID_CELLS, device=b.device, dtype=b.real)
 
 
 def overflow(b: Buffers) -> torch.Tensor:
@@ -309,7 +309,7 @@ def functions(real: Any, width: int) -> Contacts:
 
     @wp.func
     def collided_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
-        """From dL/d(velocities after the impulses) to those before, and dL/d(x, e, mu): of node i and its pairs with later ones."""
+        """Adjoint of `collided`, of node i and its later pairs: dL/d(velocities after impulses) -> dL/d(those before, x, e, mu)."""
         h = adjoint.moving[i, g]
         wp.atomic_add(adjoint.after, i, g, h)
         count = state.met[step, i, g]

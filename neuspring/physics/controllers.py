@@ -16,10 +16,10 @@ from collections.abc import Iterable
 import numpy as np
 import torch
 
-from neuspring.physics.lanes import MIN_LENGTH
+from neuspring.physics.lanes import MIN_SPRING_LENGTH
 
 BEGINS = 2.0
-"""In the last column of a row of waypoints: the controller begins to hold in this frame."""
+"""Value in the last column of a row of waypoints: the controller begins to hold in this frame."""
 
 
 def waypoints(hands: torch.Tensor, valid: np.ndarray | None = None) -> torch.Tensor:
@@ -37,7 +37,7 @@ def waypoints(hands: torch.Tensor, valid: np.ndarray | None = None) -> torch.Ten
 
 
 def begins(row: torch.Tensor) -> torch.Tensor:
-    """Which controllers [..., C] begin to hold, of a row of waypoints; none where it has no such column."""
+    """True for the controllers [..., C] of a row of waypoints that begin to hold; none where it has no such column."""
     return row[..., 3] == BEGINS if row.shape[-1] == 4 else torch.zeros(row.shape[:-1], dtype=torch.bool, device=row.device)
 
 
@@ -46,7 +46,7 @@ def begun(row: torch.Tensor) -> torch.Tensor:
     return torch.cat([row[..., :3], row[..., 3:].clamp(max=1.0)], dim=-1) if row.shape[-1] == 4 else row
 
 
-class Grips:
+class ControllerSprings:
     """The springs of controllers among spring_pairs [S, 2]; i >= nodes means controller i - nodes."""
 
     def __init__(self, spring_pairs: np.ndarray, nodes: int, device: str) -> None:
@@ -65,7 +65,7 @@ class Grips:
         now = begins(row)
         if not bool(now.any()):
             return lengths
-        apart = (row[..., self.leaders, :3] - x[..., self.nodes, :]).norm(dim=-1).clamp(min=MIN_LENGTH)
+        apart = (row[..., self.leaders, :3] - x[..., self.nodes, :]).norm(dim=-1).clamp(min=MIN_SPRING_LENGTH)
         before = torch.zeros_like(apart) if lengths is None else lengths
         return torch.where(now[..., self.leaders], apart, before)
 

@@ -72,7 +72,7 @@ def kernels(real: Any, width: int, among: bool = False, pushes: bool = False) ->
 
     @wp.func
     def advance_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
-        """From dL/d(x', v') to dL/d(x) and dL/d(velocity that the node moves with)."""
+        """Adjoint of `advance`: dL/d(x', v') -> dL/d(x) and dL/d(velocity that the node moves with)."""
         adj_x, adj_v, adj_e, adj_mu = moved_adjoint(
             state.x[step, i, g],
             state.moving[step, i, g],
@@ -108,7 +108,7 @@ def kernels(real: Any, width: int, among: bool = False, pushes: bool = False) ->
 
     @wp.func
     def update_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
-        """From dL/d(velocity after the forces) to dL/d(v, force, drag's factor)."""
+        """Adjoint of `update`: dL/d(velocity after the forces) -> dL/d(v, force, drag's factor)."""
         adj_v, adj_force, adj_decay = updated_adjoint(
             state.after[step, i, g],
             adjoint.after[i, g],

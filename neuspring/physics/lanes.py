@@ -11,15 +11,15 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-MIN_LENGTH = 1e-6
+MIN_SPRING_LENGTH = 1e-6
 """Lengths are floored here when a direction is formed, m."""
-WIDTHS = (1, 4, 8)
+LANE_WIDTHS = (1, 4, 8)
 """Lanes that kernels are made for. 16 were no faster per twin than 8 (tests/benchmarks/NOTES.md)."""
 
 
 def width_for(twins: int) -> int:
     """The smallest width that holds `twins`, or the largest there is."""
-    return next((width for width in WIDTHS if width >= twins), WIDTHS[-1])
+    return next((width for width in LANE_WIDTHS if width >= twins), LANE_WIDTHS[-1])
 
 
 class Lanes(NamedTuple):
@@ -40,7 +40,7 @@ class Lanes(NamedTuple):
     divided: Any
     """(Vector, Number) -> the Vector over it."""
     floored: Any
-    """Number -> max(number, MIN_LENGTH)."""
+    """Number -> max(number, MIN_SPRING_LENGTH)."""
     column: Any
     """(Vector, lane) -> the vec3 of one lane."""
     put: Any
@@ -57,7 +57,7 @@ def lanes(real: Any, width: int) -> Lanes:
     Number = wp.types.vector(width, real)
     Vector = wp.types.matrix((3, width), real)
     vec3 = wp.types.vector(3, real)
-    floor = wp.constant(real(MIN_LENGTH))
+    floor = wp.constant(real(MIN_SPRING_LENGTH))
 
     @wp.func
     def dot(a: Vector, b: Vector) -> Number:

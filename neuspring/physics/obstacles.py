@@ -21,7 +21,7 @@ from neuspring.physics.arrays import Buffers
 from neuspring.physics.lanes import lanes
 from neuspring.physics.motion import APPROACH, MIN_TANGENT
 
-NEVER = 1e30
+NO_IMPACT_TIME = 1e30
 """s; the time of an impact that does not come."""
 
 
@@ -39,7 +39,7 @@ def position(real: Any, width: int) -> tuple[Any, Any]:
     Number, Vector, scaled, column, put = lane.Number, lane.Vector, lane.scaled, lane.column, lane.put
     vec3 = wp.types.vector(3, real)
     Table: Any = wp.array2d(dtype=real)
-    zero, one, never = wp.constant(real(0.0)), wp.constant(real(1.0)), wp.constant(real(NEVER))
+    zero, one, never = wp.constant(real(0.0)), wp.constant(real(1.0)), wp.constant(real(NO_IMPACT_TIME))
     approach, floor = wp.constant(real(APPROACH)), wp.constant(real(MIN_TANGENT))
 
     @wp.func
@@ -53,8 +53,8 @@ def position(real: Any, width: int) -> tuple[Any, Any]:
         away = p - vec3(table[o, 1], table[o, 2], table[o, 3])
         inside = wp.int32(1)
         axis = wp.int32(-1)
-        nearest = -real(NEVER)
-        latest = -real(NEVER)
+        nearest = -real(NO_IMPACT_TIME)
+        latest = -real(NO_IMPACT_TIME)
         entry = wp.int32(-1)
         for k in range(3):
             a = vec3(table[o, 4 + 3 * k], table[o, 5 + 3 * k], table[o, 6 + 3 * k])
@@ -85,7 +85,7 @@ def position(real: Any, width: int) -> tuple[Any, Any]:
     def first(p: vec3, w: vec3, dt: real, up: real, table: Table):
         """The contact that is first: obstacle (-1 the ground, -2 none), distance, normal, distance from a sphere's center."""
         hit = wp.int32(-2)
-        soonest = real(NEVER)
+        soonest = real(NO_IMPACT_TIME)
         d = real(0.0)
         n = vec3()
         length = real(0.0)

@@ -19,7 +19,7 @@ Values = Mapping[str, torch.Tensor]
 """Fields of `Material` by name, rest_lengths [S], m, and pushes [S]."""
 Parameters = dict[str, torch.Tensor]
 """Result of `pack`: a tensor per name of `PARAMETERS`. Several twins have a leading axis [B]."""
-LIMITS = {
+CONTACT_LIMITS = {
     f"{kind}_{name}": limits
     for kind in ("ground", "contact")
     for name, limits in {"elasticity": (0.0, 1.0), "friction": (0.0, 2.0)}.items()
@@ -27,7 +27,7 @@ LIMITS = {
 """Fields of `Material` that are clamped on use, as in the released simulator."""
 
 
-class Parameter(NamedTuple):
+class KernelParameter(NamedTuple):
     """One argument of the kernels."""
 
     per: Literal["spring", "node", "twin"]
@@ -52,23 +52,23 @@ def _inverse_mass(values: Values, substep: float | torch.Tensor) -> torch.Tensor
 
 
 def _clamped(name: str) -> Callable[[Values, float | torch.Tensor], torch.Tensor]:
-    return lambda values, substep: values[name].clamp(*LIMITS[name])
+    return lambda values, substep: values[name].clamp(*CONTACT_LIMITS[name])
 
 
 PARAMETERS = {
     # Stiffness Y [N], 1 / rest length [1/m], dashpot [N s/m]. A spring with neither stiffness nor dashpot is absent; one whose
     # 1 / rest length is negative only pushes.
-    "springs": Parameter("spring", _springs),
+    "springs": KernelParameter("spring", _springs),
     # The factor of velocities that drag leaves in a substep.
-    "decay": Parameter("twin", lambda values, substep: torch.exp(-substep * values["drag"])),
-    "ground_e": Parameter("twin", _clamped("ground_elasticity")),
-    "ground_mu": Parameter("twin", _clamped("ground_friction")),
-    "contact_e": Parameter("twin", _clamped("contact_elasticity")),
-    "contact_mu": Parameter("twin", _clamped("contact_friction")),
+    "decay": KernelParameter("twin", lambda values, substep: torch.exp(-substep * values["drag"])),
+    "ground_e": KernelParameter("twin", _clamped("ground_elasticity")),
+    "ground_mu": KernelParameter("twin", _clamped("ground_friction")),
+    "contact_e": KernelParameter("twin", _clamped("contact_elasticity")),
+    "contact_mu": KernelParameter("twin", _clamped("contact_friction")),
     # m. It only selects pairs.
-    "distance": Parameter("twin", lambda values, substep: values["contact_distance"], trained=False),
+    "distance": KernelParameter("twin", lambda values, substep: values["contact_distance"], trained=False),
     # 1/kg; [1] where all nodes have 1 kg. Masses are not trained.
-    "inverse_mass": Parameter("node", _inverse_mass, trained=False),
+    "inverse_mass": KernelParameter("node", _inverse_mass, trained=False),
 }
 
 

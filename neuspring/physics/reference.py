@@ -12,12 +12,12 @@ from scipy.sparse import csr_matrix
 
 from neuspring.core.artifacts import Simulation, Twin
 from neuspring.core.geometry import Obstacle
-from neuspring.physics.lanes import MIN_LENGTH
+from neuspring.physics.lanes import MIN_SPRING_LENGTH
 from neuspring.physics.motion import APPROACH, MIN_TANGENT
 
 
 @dataclass(frozen=True)
-class Scene:
+class ReferenceTwin:
     """The numbers of a twin in float64, without the rounding of the stored float32 arrays unless they come from there."""
 
     nodes: int
@@ -36,7 +36,7 @@ class Scene:
     """True where each spring [S], or every one, acts only while it is shorter than at rest."""
 
     @classmethod
-    def of(cls, twin: Twin) -> Scene:
+    def of(cls, twin: Twin) -> ReferenceTwin:
         """A twin's numbers."""
         t, m = twin.topology, twin.material
         return cls(
@@ -56,7 +56,7 @@ class Scene:
 
 
 def rollout(
-    scene: Scene, x: np.ndarray, v: np.ndarray, controllers: np.ndarray, valid: np.ndarray | None = None
+    scene: ReferenceTwin, x: np.ndarray, v: np.ndarray, controllers: np.ndarray, valid: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """States at frame ends, x and v, each [F, N, 3]; frame 0 is the given state. controllers [F, C, 3].
 
@@ -75,23 +75,23 @@ def rollout(
     return np.stack(xs), np.stack(vs)
 
 
-def holding(scene: Scene, holds: np.ndarray) -> Scene:
+def holding(scene: ReferenceTwin, holds: np.ndarray) -> ReferenceTwin:
     """The scene in which only controllers with `holds` [C] pull."""
     led = np.concatenate([np.ones(scene.nodes, bool), holds])
     acts = led[scene.springs].all(axis=1)
     return replace(scene, stiffness=scene.stiffness * acts, dashpot=scene.dashpot * acts)
 
 
-def gripped(scene: Scene, x: np.ndarray, hands: np.ndarray, begin: np.ndarray) -> Scene:
+def gripped(scene: ReferenceTwin, x: np.ndarray, hands: np.ndarray, begin: np.ndarray) -> ReferenceTwin:
     """The scene after controllers with `begin` [C] took hold: l0' = |x_c - x_n|, and Y' / l0' = Y / l0."""
     taken = np.concatenate([np.zeros(scene.nodes, bool), begin])[scene.springs].any(axis=1) & ~np.asarray(scene.pushes)
     points = np.concatenate([x, hands])
     apart = np.linalg.norm(points[scene.springs[:, 1]] - points[scene.springs[:, 0]], axis=1)
-    lengths = np.where(taken, np.maximum(apart, MIN_LENGTH), scene.rest_lengths)
+    lengths = np.where(taken, np.maximum(apart, MIN_SPRING_LENGTH), scene.rest_lengths)
     return replace(scene, rest_lengths=lengths, stiffness=scene.stiffness * (lengths / scene.rest_lengths))
 
 
-def frame(scene: Scene, x: np.ndarray, v: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def frame(scene: ReferenceTwin, x: np.ndarray, v: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """One frame: `substeps` substeps with controllers moving in a line from begin to end [C, 3]."""
     sim = scene.simulation
     spread = incidence(scene)
@@ -103,7 +103,7 @@ def frame(scene: Scene, x: np.ndarray, v: np.ndarray, begin: np.ndarray, end: np
     return x, v
 
 
-def incidence(scene: Scene) -> csr_matrix:
+def incidence(scene: ReferenceTwin) -> csr_matrix:
     """[N, S]: +1 where a node is the first end of a spring, -1 where it is the second; controllers are left out."""
     count = len(scene.springs)
     total = int(max(scene.nodes, scene.springs.max(initial=0) + 1))
@@ -113,7 +113,7 @@ def incidence(scene: Scene) -> csr_matrix:
 
 
 def substep(
-    scene: Scene,
+    scene: ReferenceTwin,
     x: np.ndarray,
     v: np.ndarray,
     hands: np.ndarray,
@@ -137,13 +137,13 @@ def substep(
     return x + dt * v, v
 
 
-def spring_forces(scene: Scene, x: np.ndarray, v: np.ndarray) -> np.ndarray:
+def spring_forces(scene: ReferenceTwin, x: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Force [S, 3] on the first end of each spring: (Y (l / l0 - 1) + gamma (v_j - v_i) . d) d; none where one that only pushes is
     longer than at rest."""
     i, j = scene.springs[:, 0], scene.springs[:, 1]
     offset = x[j] - x[i]
     length = np.linalg.norm(offset, axis=1)
-    d = offset / np.maximum(length, MIN_LENGTH)[:, None]
+    d = offset / np.maximum(length, MIN_SPRING_LENGTH)[:, None]
     closing = np.einsum("ek,ek->e", v[j] - v[i], d)
     magnitude = scene.stiffness * (length / scene.rest_lengths - 1.0) + scene.dashpot * closing
     magnitude = np.where(scene.pushes & (length > scene.rest_lengths), 0.0, magnitude)

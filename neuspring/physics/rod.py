@@ -36,11 +36,11 @@ MAX_TURN = wp.constant(wp.float64(0.5))
 LEAST_PIVOT = wp.constant(wp.float64(1e-3))
 """Least pivot of the matrix of the steps in frame 0, over the entry of the diagonal."""
 TINY = wp.constant(wp.float64(1e-12))
-BAND = wp.constant(11)
+BAND_WIDTH = wp.constant(11)
 """Entries of a row of the banded matrix, from the diagonal to the left. Row 4 i + r is of x_i, row 4 j + 3 of theta_j."""
 JOINT = wp.constant(11)
 """Variables that a joint depends on: x_(i-1), theta_(i-1), x_i, theta_i, x_(i+1), in this order."""
-REST = wp.constant(wp.float64(1e-9))
+FREE_TURN_STIFFNESS = wp.constant(wp.float64(1e-9))
 """Fraction of GJ / l: stiffness against turning of a rod that nothing else turns."""
 
 real = wp.float64
@@ -56,7 +56,7 @@ Indices: Any = wp.array2d(dtype=wp.int32)
 
 
 @wp.struct
-class Lanes:
+class RodState:
     """Parameters and state of B rods."""
 
     lengths: Scalars
@@ -103,11 +103,11 @@ class Lanes:
     spring_edge: Indices
     """Springs of hands [B, S]: the edge that each acts on,"""
     spring_place: Vectors
-    """fraction along it, distances along m1 and m2,"""
+    """Place that each spring acts at [B, S]: fraction along the edge, distances along m1 and m2, m."""
     leader: Indices
-    """the controller that pulls,"""
+    """Controller that pulls each spring [B, S]."""
     law: Vectors
-    """stiffness, N/m, rest length, m, dashpot, N s/m."""
+    """Law of each spring [B, S]: stiffness, N/m, rest length, m, dashpot, N s/m."""
     hands: Vectors
     """Controllers at the end of the substep."""
     clearance: Scalars
@@ -145,7 +145,7 @@ def near(angle: real, before: real):
 
 
 @wp.func
-def set_directors(s: Lanes, lane: int, edges: int):
+def set_directors(s: RodState, lane: int, edges: int):
     """Material directors from reference directors and angles."""
     for j in range(edges):
         c = wp.cos(s.theta[lane, j])
@@ -156,7 +156,7 @@ def set_directors(s: Lanes, lane: int, edges: int):
 
 
 @wp.func
-def curvature(s: Lanes, lane: int, i: int):
+def curvature(s: RodState, lane: int, i: int):
     """k1 and k2 of joint i, see `Rod`."""
     kb = s.kb[lane, i]
     k1 = real(0.5) * wp.dot(kb, s.m2[lane, i - 1] + s.m2[lane, i])
@@ -165,13 +165,13 @@ def curvature(s: Lanes, lane: int, i: int):
 
 
 @wp.func
-def joint_length(s: Lanes, lane: int, i: int):
+def joint_length(s: RodState, lane: int, i: int):
     """Half of the two edges of joint i, m."""
     return real(0.5) * (s.lengths[lane, i - 1] + s.lengths[lane, i])
 
 
 @wp.func
-def solve_twist(s: Lanes, lane: int, edges: int, first_held: bool, last_held: bool):
+def solve_twist(s: RodState, lane: int, edges: int, first_held: bool, last_held: bool):
     """Angles of edges that no clamp holds, from `theta` to a minimum of the energy, by tridiagonal Newton steps."""
     low = wp.where(first_held, 1, 0)
     high = wp.where(last_held, edges - 2, edges - 1)
@@ -224,7 +224,7 @@ def solve_twist(s: Lanes, lane: int, edges: int, first_held: bool, last_held: bo
 
 
 @wp.func
-def set_geometry(s: Lanes, lane: int, edges: int):
+def set_geometry(s: RodState, lane: int, edges: int):
     """Tangents, reference directors, their twist, and curvature binormals at the positions p."""
     for j in range(edges):
         t = wp.normalize(s.p[lane, j + 1] - s.p[lane, j])
@@ -239,7 +239,7 @@ def set_geometry(s: Lanes, lane: int, edges: int):
 
 
 @wp.kernel(enable_backward=False)
-def begin(s: Lanes):
+def begin(s: RodState):
     """Directors and twist of frame 0 at the positions x."""
     lane = wp.tid()
     edges = s.x.shape[1] - 1
@@ -275,7 +275,7 @@ def begin(s: Lanes):
 
 
 @wp.func
-def add_block(s: Lanes, lane: int, i: int, j: int, block: mat33):
+def add_block(s: RodState, lane: int, i: int, j: int, block: mat33):
     """Add to the rows of vertex i and the columns of vertex j <= i."""
     for r in range(3):
         for c in range(3):
@@ -285,21 +285,21 @@ def add_block(s: Lanes, lane: int, i: int, j: int, block: mat33):
 
 
 @wp.func
-def add_force(s: Lanes, lane: int, i: int, force: vec3):
+def add_force(s: RodState, lane: int, i: int, force: vec3):
     """Add to the right-hand side of vertex i."""
     for r in range(3):
         s.b[lane, 4 * i + r] = s.b[lane, 4 * i + r] + force[r]
 
 
 @wp.func
-def put(s: Lanes, lane: int, row: int, column: int, value: vec3):
+def put(s: RodState, lane: int, row: int, column: int, value: vec3):
     """A derivative by a position."""
     for r in range(3):
         s.w[lane, row, column + r] = value[r]
 
 
 @wp.func
-def slopes(s: Lanes, lane: int, i: int, k: vec2):
+def slopes(s: RodState, lane: int, i: int, k: vec2):
     """Derivatives of k1, k2 and the twist of joint i with the curvatures k, by what it depends on."""
     before = s.t[lane, i - 1]
     after = s.t[lane, i]
@@ -336,7 +336,7 @@ def slopes(s: Lanes, lane: int, i: int, k: vec2):
 
 
 @wp.func
-def assemble_bending(s: Lanes, lane: int, edges: int, rate: real, older: real, oldest: real):
+def assemble_bending(s: RodState, lane: int, edges: int, rate: real, older: real, oldest: real):
     """Forces and moments of bending and twist, and their Gauss-Newton matrix. dk/dt = rate k - older k_ + oldest k__."""
     for i in range(1, edges):
         joint = joint_length(s, lane, i)
@@ -361,11 +361,11 @@ def assemble_bending(s: Lanes, lane: int, edges: int, rate: real, older: real, o
             c = 3 + 4 * side
             # The second derivative of k1 by an angle is the first of k2, and that of k2 less that of k1.
             second = moment[0] * s.w[lane, 1, c] - moment[1] * s.w[lane, 0, c]
-            s.a[lane, first + c, 0] = s.a[lane, first + c, 0] + wp.max(second, real(0.0)) + REST * z
+            s.a[lane, first + c, 0] = s.a[lane, first + c, 0] + wp.max(second, real(0.0)) + FREE_TURN_STIFFNESS * z
 
 
 @wp.func
-def assemble_stretching(s: Lanes, lane: int, edges: int):
+def assemble_stretching(s: RodState, lane: int, edges: int):
     """Forces and matrix of stretching, with the tension of the substep before across edges."""
     unit = wp.identity(n=3, dtype=real)
     for j in range(edges):
@@ -383,7 +383,7 @@ def assemble_stretching(s: Lanes, lane: int, edges: int):
 
 
 @wp.func
-def assemble_hands(s: Lanes, lane: int, rate: real, more: real):
+def assemble_hands(s: RodState, lane: int, rate: real, more: real):
     """Forces, moments and Gauss-Newton matrix of springs from controllers to places on edges; only tension is stiff across.
 
     With the offset o of the place, which turns with its edge e, and the fraction f along it, the place moves by
@@ -428,13 +428,13 @@ def assemble_hands(s: Lanes, lane: int, rate: real, more: real):
 
 
 @wp.func
-def velocity_at(s: Lanes, lane: int, i: int, rate: real, more: real):
+def velocity_at(s: RodState, lane: int, i: int, rate: real, more: real):
     """The velocity at the end of the substep of a vertex that is at p then."""
     return rate * (s.p[lane, i] - (real(1.0) + more) * s.x[lane, i] + more * s.x_before[lane, i])
 
 
 @wp.func
-def touch_ground(s: Lanes, lane: int, i: int, up: real):
+def touch_ground(s: RodState, lane: int, i: int, up: real):
     """A vertex that went below its clearance is put on it, and reflected as a node is (motion.py); then backward Euler follows."""
     x = s.x[lane, i]
     v = s.v[lane, i]
@@ -448,9 +448,9 @@ def touch_ground(s: Lanes, lane: int, i: int, up: real):
 
 
 @wp.func
-def set_known(s: Lanes, lane: int, row: int, rows: int):
+def set_known(s: RodState, lane: int, row: int, rows: int):
     """An unknown that does not change: its equation is 1 d = 0."""
-    for q in range(BAND):
+    for q in range(BAND_WIDTH):
         s.a[lane, row, q] = real(0.0)
         if row + q < rows:
             s.a[lane, row + q, q] = real(0.0)
@@ -459,7 +459,7 @@ def set_known(s: Lanes, lane: int, row: int, rows: int):
 
 
 @wp.func
-def solve(s: Lanes, lane: int, rows: int):
+def solve(s: RodState, lane: int, rows: int):
     """Banded Cholesky in place, with inverse diagonals; the solution is in b. A row is in registers, and its loops are unrolled."""
     for i in range(rows):
         row = Row()
@@ -494,7 +494,7 @@ def solve(s: Lanes, lane: int, rows: int):
 
 @wp.kernel(enable_backward=False)
 def advance(
-    s: Lanes,
+    s: RodState,
     held_from: Vectors,
     held_to: Vectors,
     hands_from: Vectors,
@@ -546,7 +546,7 @@ def advance(
         set_directors(s, lane, edges)
         for i in range(4 * vertices):
             s.b[lane, i] = real(0.0)
-            for q in range(BAND):
+            for q in range(BAND_WIDTH):
                 s.a[lane, i, q] = real(0.0)
         assemble_bending(s, lane, edges, rate, older, oldest)
         assemble_stretching(s, lane, edges)
@@ -602,7 +602,7 @@ def advance(
                     touch_ground(s, lane, i, up)
 
 
-PARAMETERS = ("lengths", "mass", "bending", "twisting", "curvature", "axis", "stretching", "damping", "drag_quadratic", "roll")
+ROD_LANE_FIELDS = ("lengths", "mass", "bending", "twisting", "curvature", "axis", "stretching", "damping", "drag_quadratic", "roll")
 """Fields of a `Rod` that lanes have one value of each."""
 
 
@@ -627,7 +627,7 @@ class RodLanes:
     @classmethod
     def of(cls, rods: Sequence[Rod], drags: Sequence[float]) -> "RodLanes":
         """Lanes of rods and their linear drags, 1/s."""
-        values = {name: np.array([getattr(rod, name) for rod in rods], dtype=np.float64) for name in PARAMETERS}
+        values = {name: np.array([getattr(rod, name) for rod in rods], dtype=np.float64) for name in ROD_LANE_FIELDS}
         return cls(**values, drag=np.array(drags, dtype=np.float64), held=np.array([rod.held for rod in rods], dtype=np.int32))
 
 
@@ -684,7 +684,7 @@ class RodSolver:
         }
         kinds |= {"kb": vec3, "theta": real, "theta_before": real, "reference": real, "tension": real, "k": vec2, "k_before": vec2}
         kinds |= {"lower": real, "diagonal": real, "rest": real}
-        self._state = Lanes()
+        self._state = RodState()
         for name, dtype in kinds.items():
             setattr(self._state, name, wp.zeros((count, vertices), dtype=dtype, device=device))
         self._state.history = wp.zeros(count, dtype=wp.int32, device=device)

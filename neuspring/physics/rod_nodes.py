@@ -19,15 +19,15 @@ import torch
 
 from neuspring.core.artifacts import Rod, Simulation, Twin
 from neuspring.core.errors import InputError
-from neuspring.physics.controllers import Grips, begins
-from neuspring.physics.parameters import LIMITS
+from neuspring.physics.controllers import ControllerSprings, begins
+from neuspring.physics.parameters import CONTACT_LIMITS
 from neuspring.physics.rod import RodHands, RodLanes, RodSolver
 
-SMOOTHING = 1e-6
+SMOOTHING_WEIGHT = 1e-6
 """Weight of second differences along the vertices against nodes: decides where no node is."""
 SETTLING = 4
 """Rounds in which vertices and directors of frame 0 are made to agree."""
-SURFACE = ("ground_elasticity", "ground_friction")
+GROUND_FIELDS = ("ground_elasticity", "ground_friction")
 PARALLEL = 0.99
 """Cosine to an end's tangent from which `Rod.axis` has no projection worth the name."""
 
@@ -149,7 +149,7 @@ def at_vertices(rod: Rod, values: np.ndarray, held: np.ndarray | None = None) ->
     weights[nodes, rod.edge], weights[nodes, rod.edge + 1] = 1 - rod.place[:, 0], rod.place[:, 0]
     known = rod.held >= 0 if held is not None else np.zeros(count, bool)
     # Where no node is, neighbors decide: of positions, their second differences.
-    rows = np.concatenate([weights, SMOOTHING * np.diff(np.eye(count), n=2, axis=0)])
+    rows = np.concatenate([weights, SMOOTHING_WEIGHT * np.diff(np.eye(count), n=2, axis=0)])
     given = np.asarray(values, np.float64)
     result = np.zeros((*given.shape[:-2], count, 3))
     if held is not None:
@@ -178,7 +178,7 @@ class RodFrames:
         every = [twins] if isinstance(twins, Twin) else list(twins)
         self.rods, self.device = [_rod(twin) for twin in every], device
         first, simulation = every[0].topology, every[0].simulation
-        self.grips = Grips(first.springs, len(first.nodes), device)
+        self.grips = ControllerSprings(first.springs, len(first.nodes), device)
         self._nodes = np.stack([twin.topology.nodes for twin in every])
         self._packed = self._tensor([_packed(twin) for twin in every])
         hands = self._hands(every)
@@ -230,7 +230,7 @@ class RodFrames:
         up = twins[0].simulation.up_sign
         heights = [np.minimum(radius_of(rod), np.maximum(up * rod.vertices[:, 2], 0.0)) for rod in self.rods]
         leaders = np.tile(self.grips.leaders.cpu().numpy(), (len(twins), 1))
-        surface = [[np.clip(getattr(twin.material, name), *LIMITS[name]) for twin in twins] for name in SURFACE]
+        surface = [[np.clip(getattr(twin.material, name), *CONTACT_LIMITS[name]) for twin in twins] for name in GROUND_FIELDS]
         return RodHands(
             len(twins[0].topology.controllers), leaders, np.stack(heights), *(np.array(values, np.float64) for values in surface)
         )
@@ -280,7 +280,7 @@ class RodFrames:
 
 
 def _packed(twin: Twin) -> np.ndarray:
-    """Y, 1 / l0 and dashpot of the springs of hands [S, 3], as `Grips.applied` takes them."""
+    """Y, 1 / l0 and dashpot of the springs of hands [S, 3], as `ControllerSprings.applied` takes them."""
     lengths = twin.topology.rest_lengths.astype(np.float64)
     return np.stack([twin.material.stiffness.astype(np.float64), 1 / lengths, twin.material.dashpot], axis=1)
 

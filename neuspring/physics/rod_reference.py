@@ -94,7 +94,7 @@ def transport(u: Tensor, a: Tensor, b: Tensor) -> Tensor:
 
 
 def angle(a: Tensor, b: Tensor, t: Tensor) -> Tensor:
-    """From a to b about t, rad, in (-pi, pi]."""
+    """Angle from a to b about t, rad, in (-pi, pi]."""
     return torch.atan2(dot(torch.linalg.cross(a, b), t), dot(a, b))
 
 

@@ -25,10 +25,10 @@ from neuspring.core.device import load
 from neuspring.core.errors import InputError
 from neuspring.physics import collision, frame, obstacles, springs
 from neuspring.physics.arrays import Buffers, Graphs
-from neuspring.physics.controllers import Grips, begins, begun
+from neuspring.physics.controllers import ControllerSprings, begins, begun
 from neuspring.physics.parameters import PARAMETERS, Parameters, packed
 
-KEPT = 1 << 30
+FRAME_WINDOW_BYTES = 1 << 30
 """Bytes that a `FrameWindow` may take."""
 PER_TWIN = ("frame_time", "substeps", "initial_velocity")
 """Fields that may differ between the simulations of one solver; it does not read the last."""
@@ -81,7 +81,7 @@ class FrameSolver:
         self._pushes = False
         """True where some spring only pushes."""
         self._choose_kernels()
-        self.grips = Grips(spring_pairs, nodes, device)
+        self.grips = ControllerSprings(spring_pairs, nodes, device)
         self._held: torch.Tensor | None = None
         """Rest lengths of grips that began since the parameters were set [B, L] (controllers.py)."""
         self._plain: torch.Tensor | None = None
@@ -230,7 +230,7 @@ class FrameSolver:
         return sum(self.overflows)
 
     def _stacked(self, values: torch.Tensor) -> torch.Tensor:
-        """With a leading axis [B]."""
+        """The values of all twins with a leading axis [B]."""
         return values if self.together else values[None]
 
     def _one(self, values: torch.Tensor) -> torch.Tensor:
@@ -286,12 +286,12 @@ class FrameSolver:
 class FrameWindow:
     """The last frames of a spring graph, as a solver of their own each, so that a gradient through them simulates none again.
 
-    `make` makes a solver of the graph; there will be `frames` of them, or as many as fit into `KEPT` bytes, one at least.
+    `make` makes a solver of the graph; there will be `frames` of them, or as many as fit into `FRAME_WINDOW_BYTES`, one at least.
     """
 
     def __init__(self, make: Callable[[], FrameSolver], frames: int, frame_token: int = 0) -> None:
         self._make, self._solvers = make, [make()]
-        self._room = max(1, min(frames, KEPT // self._solvers[0].nbytes))
+        self._room = max(1, min(frames, FRAME_WINDOW_BYTES // self._solvers[0].nbytes))
         self._first = self.frame_token = frame_token
 
     def turn(self) -> FrameSolver:
@@ -318,7 +318,7 @@ class FrameWindow:
 
 
 class AdjointLimit:
-    """For one backward pass through chained frames: leaves out those through which adjoints outgrow the losses, and counts them.
+    """Limit of one backward pass through chained frames: leaves out frames whose adjoints outgrow the losses, and counts them.
 
     The size of an adjoint is sqrt(|dL/dx|^2 + |dL/dv|^2 / T^2), where T is the frame's time, s. A frame is left out if that at its
     begin is more than `factor` times the sum of |dL/dx| that the losses behind it have added. What lies before it then has the

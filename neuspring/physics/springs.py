@@ -153,7 +153,7 @@ def functions(real: Any, width: int, pushes: bool = False) -> tuple[Any, Any, An
 
     @wp.func
     def add_row_adjoint(model: Model, state: State, adjoint: Adjoint, slot: int, turn: int, i: int, g: int):
-        """From dL/d(force) of node i's row to dL/d(x, v) of both ends and dL/d(parameters)."""
+        """Adjoint of `add_row`: dL/d(force) of node i's row -> dL/d(x, v) of both ends and dL/d(parameters)."""
         x = state.x[slot, i, g]
         v = state.v[slot, i, g]
         adj_force = adjoint.force[turn, i, g]
@@ -187,7 +187,7 @@ def functions(real: Any, width: int, pushes: bool = False) -> tuple[Any, Any, An
 
     @wp.func
     def gathered_adjoint(model: Model, state: State, adjoint: Adjoint, slot: int, turn: int, i: int, g: int):
-        """From dL/d(force) of node i and its partners to dL/d(x, v) of node i, and to dL/d(parameters) at a spring's lower end."""
+        """Adjoint of `gathered`: dL/d(force) of node i and its partners -> dL/d(x, v) of node i, dL/d(parameters) at lower ends."""
         x = state.x[slot, i, g]
         v = state.v[slot, i, g]
         adj_force = adjoint.force[turn, i, g]

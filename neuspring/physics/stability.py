@@ -19,14 +19,14 @@ import numpy as np
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
 
-LIMIT = 4.0
+STABILITY_LIMIT = 4.0
 PREDICTION = 0.4
 """Fraction of the bound for predictions. A substep multiplies a damped mode by 1 - dt c; with dt c <= 0.8 it keeps its sign."""
 RELEASED_SUBSTEPS = 667
 RELEASED_FRAME_TIME = RELEASED_SUBSTEPS * 5e-5
 """s, whatever the frame rate (released_quirks.frame_time_667)."""
-UNIT = np.zeros(0)
-"""The masses that stand for: 1 kg each."""
+ONE_KG = np.zeros(0)
+"""Masses of no nodes, which stand for 1 kg each."""
 
 
 class Unstable(InputError):
@@ -49,11 +49,11 @@ class Spectrum:
         """The largest dt [s] with load(dt) <= 4 * safety."""
         a, b = self.stiffness, 2 * self.damping
         if a <= 0:
-            return np.inf if b <= 0 else LIMIT * safety / b
-        return float((-b + np.sqrt(b * b + 4 * a * LIMIT * safety)) / (2 * a))
+            return np.inf if b <= 0 else STABILITY_LIMIT * safety / b
+        return float((-b + np.sqrt(b * b + 4 * a * STABILITY_LIMIT * safety)) / (2 * a))
 
 
-def gershgorin(springs: np.ndarray, nodes: int, stiffness: np.ndarray, damping: np.ndarray, mass: np.ndarray = UNIT) -> Spectrum:
+def gershgorin(springs: np.ndarray, nodes: int, stiffness: np.ndarray, damping: np.ndarray, mass: np.ndarray = ONE_KG) -> Spectrum:
     """Per-node bound: twice the sum over springs to nodes, once over springs to controllers, over the mass [N].
 
     stiffness is Y / l0 [S]. These are the rows of M^-1 K, which has the eigenvalues of M^-1/2 K M^-1/2.
@@ -78,7 +78,7 @@ def rest_spectrum(
     controllers: np.ndarray,
     stiffness: np.ndarray,
     damping: np.ndarray,
-    mass: np.ndarray = UNIT,
+    mass: np.ndarray = ONE_KG,
 ) -> Spectrum:
     """Largest eigenvalues in the rest configuration. stiffness is Y / l0 [S], damping gamma [S], mass [N], kg, or empty: 1 each."""
     from scipy.sparse import coo_matrix
@@ -152,10 +152,10 @@ def check(twin: Twin) -> None:
     """Raise Unstable, naming node, bound and remedy, if the twin's substep is beyond the stability limit."""
     topology, simulation = twin.topology, twin.simulation
     bound = gershgorin(topology.springs, len(topology.nodes), *_strengths(twin), twin.material.mass)
-    if bound.load(simulation.substep) < LIMIT:
+    if bound.load(simulation.substep) < STABILITY_LIMIT:
         return
     spectrum = twin_spectrum(twin)
-    if spectrum.load(simulation.substep) >= LIMIT:
+    if spectrum.load(simulation.substep) >= STABILITY_LIMIT:
         largest = spectrum.largest_substep(1.0)
         needed = smallest_safe_substeps(spectrum, simulation.frame_time, 1.0)
         raise Unstable(

@@ -13,8 +13,8 @@ from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
 from neuspring.perception.results import Masks
 from neuspring.scores.lpips import Lpips
-from neuspring.splats.draw import COVERED, picture, view_of
-from neuspring.splats.losses import RADIUS, check_pair, ssim_map
+from neuspring.splats.draw import OBJECT_COVERAGE, picture, view_of
+from neuspring.splats.losses import WINDOW_RADIUS, check_pair, ssim_map
 from neuspring.splats.model import Gaussians
 from neuspring.splats.rasterize import Backend, choose_backend
 from neuspring.splats.view import View
@@ -122,7 +122,7 @@ def _ssim_on_black(a: torch.Tensor, b: torch.Tensor) -> float:
     if not len(rows):
         return 1.0
     # Windows reach this far beyond it.
-    box = [slice(max(int(where[0]) - RADIUS, 0), int(where[-1]) + RADIUS + 1) for where in (rows, columns)]
+    box = [slice(max(int(where[0]) - WINDOW_RADIUS, 0), int(where[-1]) + WINDOW_RADIUS + 1) for where in (rows, columns)]
     compared = ssim_map(a[:, box[0], box[1]], b[:, box[0], box[1]])
     return 1.0 + float((compared - 1.0).sum(dtype=torch.float64)) / a.numel()
 
@@ -154,7 +154,7 @@ class Scored:
         own = capture.description.masks
         labels = {} if own else {name: perceived[name].labels for name in views}
         source = "given" if own else next(iter(perceived.values())).backend
-        covered = 1 if "any_alpha" in quirks else COVERED
+        covered = 1 if "any_alpha" in quirks else OBJECT_COVERAGE
         return cls(capture, labels, source, views, choose_backend(images.backend, device), covered)
 
     def pair(self, name: str, frame: int, gaussians: Gaussians) -> Pair:

@@ -20,7 +20,7 @@ from neuspring.splats.rasterize import Backend
 from neuspring.splats.skinning import Skin
 from neuspring.splats.view import View
 
-COVERED = 128
+OBJECT_COVERAGE = 128
 """Coverage, of 255, from which a pixel counts as object: a half."""
 LEAST_OPACITY = 0.1
 """A splat must exceed it to be drawn when the twin moves, as released."""

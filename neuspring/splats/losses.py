@@ -26,17 +26,17 @@ from neuspring.core.errors import InputError
 from neuspring.splats.rasterize import Rendered
 from neuspring.splats.view import View
 
-RADIUS = 5
-"""px: the window is 2 RADIUS + 1 wide."""
+WINDOW_RADIUS = 5
+"""px: the window is 2 WINDOW_RADIUS + 1 wide."""
 SIGMA = 1.5
 """px."""
 C1 = 0.01**2
 C2 = 0.03**2
-L1 = 0.8
+COLOR_WEIGHT = 0.8
 """Weight of the mean absolute difference of colors, as released."""
 HAND_MARGIN, REFERENCE_WIDTH = 8.0, 848
 """Hands are dilated by a square of so many pixels in an image of this width; pixels within are not compared."""
-WINDOW = 12
+SSIM_MARGIN = 12
 """Pixels around the object's mask in which SSIM is taken; its window is 11 wide. Splats farther out cost color and mask alone."""
 
 
@@ -50,14 +50,14 @@ def check_pair(where: str, a: torch.Tensor, b: torch.Tensor) -> None:
 
 def _blur(pictures: torch.Tensor) -> torch.Tensor:
     """Mean of every [H, W] plane under the Gaussian window, zeros outside: rows, then columns."""
-    offsets = torch.arange(-RADIUS, RADIUS + 1, device=pictures.device, dtype=torch.float64)
+    offsets = torch.arange(-WINDOW_RADIUS, WINDOW_RADIUS + 1, device=pictures.device, dtype=torch.float64)
     window = torch.exp(-0.5 * (offsets / SIGMA) ** 2)
     window = (window / window.sum()).to(pictures.dtype)
     # One call with a group per plane: much faster on CPU than a batch of one-channel pictures.
     planes = pictures.reshape(1, -1, *pictures.shape[-2:])
     groups = planes.shape[1]
-    planes = conv2d(planes, window.expand(groups, 1, 1, -1), padding=(0, RADIUS), groups=groups)
-    planes = conv2d(planes, window[:, None].expand(groups, 1, -1, 1), padding=(RADIUS, 0), groups=groups)
+    planes = conv2d(planes, window.expand(groups, 1, 1, -1), padding=(0, WINDOW_RADIUS), groups=groups)
+    planes = conv2d(planes, window[:, None].expand(groups, 1, -1, 1), padding=(WINDOW_RADIUS, 0), groups=groups)
     return planes.reshape(pictures.shape)
 
 
@@ -102,7 +102,7 @@ class Shot:
     def of(
         cls, name: str, view: View, color: np.ndarray, mask: np.ndarray, hands: np.ndarray, depth: np.ndarray, margin: float
     ) -> Shot | None:
-        """From an image [H, W, 3] uint8, bool masks [H, W] and depth [H, W] m; hands are dilated by a square of `margin` pixels.
+        """Shot of an image [H, W, 3] uint8, bool masks [H, W], depth [H, W] m; hands are dilated by a square of `margin` pixels.
 
         None where nothing of the object is seen. Raises InputError for sizes that differ from the view's.
         """
@@ -117,10 +117,10 @@ class Shot:
             return None
         (top, bottom), (left, right) = (np.flatnonzero(seen.any(axis=axis))[[0, -1]].tolist() for axis in (1, 0))
         box = (
-            max(top - WINDOW, 0),
-            min(bottom + WINDOW + 1, view.height),
-            max(left - WINDOW, 0),
-            min(right + WINDOW + 1, view.width),
+            max(top - SSIM_MARGIN, 0),
+            min(bottom + SSIM_MARGIN + 1, view.height),
+            max(left - SSIM_MARGIN, 0),
+            min(right + SSIM_MARGIN + 1, view.width),
         )
 
         def on_device(values: np.ndarray) -> torch.Tensor:
@@ -140,7 +140,7 @@ class Shot:
 def loss(rendered: Rendered, shot: Shot, settings: Appearance) -> torch.Tensor:
     """The training loss of one picture."""
     color = rendered.rgb * shot.known[..., None]
-    total = L1 * (color - shot.color).abs().mean()
+    total = COLOR_WEIGHT * (color - shot.color).abs().mean()
     if settings.dssim:
         top, bottom, left, right = shot.box
         pair = [image[top:bottom, left:right].permute(2, 0, 1) for image in (color, shot.color)]

@@ -146,11 +146,11 @@ class Gaussians:
 
     @classmethod
     def of(cls, splats: Splats, device: str = "cpu") -> Gaussians:
-        """From stored splats."""
+        """Gaussians from stored splats."""
         return cls(**{field.name: torch.tensor(getattr(splats, field.name), device=device) for field in dataclasses.fields(cls)})
 
     def stored(self) -> Splats:
-        """As an artifact."""
+        """The same as an artifact."""
         return Splats(**{name: tensor.detach().cpu().numpy() for name, tensor in vars(self).items()})
 
     @property

@@ -15,7 +15,7 @@ import torch
 
 from neuspring.core.errors import InputError
 from neuspring.splats.blend import blend, tiles
-from neuspring.splats.view import LIMITS, Limits, View, boxes, harmonic_colors, project, radii
+from neuspring.splats.view import DEFAULT_LIMITS, Limits, View, boxes, harmonic_colors, project, radii
 
 Backend = Literal["warp", "gsplat"]
 LEAST_ALPHA = 1e-10
@@ -52,7 +52,7 @@ def rasterize(
     *,
     degree: int | None = None,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    limits: Limits = LIMITS,
+    limits: Limits = DEFAULT_LIMITS,
     backend: Backend = "warp",
 ) -> Rendered:
     """Draw splats with means [N, 3] m, quaternions [N, 4] (w first, any length), standard deviations [N, 3] m, opacities [N].
@@ -91,7 +91,7 @@ def _by_gsplat(
     from gsplat import rasterization
 
     own = (limits.alpha_min, limits.alpha_max, limits.transmittance_min)
-    if own != (LIMITS.alpha_min, LIMITS.alpha_max, LIMITS.transmittance_min):
+    if own != (DEFAULT_LIMITS.alpha_min, DEFAULT_LIMITS.alpha_max, DEFAULT_LIMITS.transmittance_min):
         raise InputError("splats, limits", "gsplat keeps its own thresholds of coverage", own, "Take backend: warp.")
     picture, alpha, facts = rasterization(
         splats["means"],
@@ -129,7 +129,7 @@ def reference(
     *,
     degree: int | None = None,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    limits: Limits = LIMITS,
+    limits: Limits = DEFAULT_LIMITS,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """The specification: rgb [H, W, 3], alpha [H, W] and depth [H, W], arguments as in `rasterize`.
 
@@ -175,7 +175,7 @@ def choose_backend(wanted: Literal["auto", "warp", "gsplat"], device: str) -> Ba
 
 @functools.cache
 def _gsplat_fault(device: str) -> str:
-    """Why gsplat cannot draw on `device`; empty if it can: one splat is drawn to find out, since gsplat compiles at first use."""
+    """Reason why gsplat cannot draw on `device`; empty if it can. One splat is drawn to find out: gsplat compiles at first use."""
     if not device.startswith("cuda"):
         return f"it needs CUDA, the device is {device}"
     if importlib.util.find_spec("gsplat") is None:

@@ -22,16 +22,16 @@ from scipy.spatial import cKDTree
 from neuspring.core.device import load, start_warp
 from neuspring.core.errors import InputError
 
-NEIGHBORS = 16
+SKIN_NEIGHBORS = 16
 MOST_CELLS = 64
 """Most cells of the hash grid along one axis."""
 SMALLEST_RADIUS = 1e-4
 """m: least radius of a search for nodes."""
 DEGENERATE = 1e-5
 """A neighborhood whose second singular value is below this part of the first is a line: thinner than 0.3 % of its length."""
-TINY = 1e-30
+POINT_SPREAD = 1e-30
 """m^2: a neighborhood smaller than this is a point."""
-CLOSE = 1e-6
+DISTANCE_OFFSET = 1e-6
 """m, added to distances in weights."""
 DOUBLINGS = 60
 
@@ -49,7 +49,7 @@ class Skin:
             raise InputError("skinning, nodes", "at least one node, all finite, is required", np.shape(nodes))
         self._device, self._frozen, self._released = device, frozen, released_degeneracy
         self._bound: Any = None
-        self._count = min(NEIGHBORS, len(nodes))
+        self._count = min(SKIN_NEIGHBORS, len(nodes))
         # Where this radius holds too few nodes, the search doubles it. A larger start would make every search slower.
         usual = np.median(cKDTree(nodes).query(nodes, k=[self._count])[0])
         self._radius = float(max(1.2 * usual, SMALLEST_RADIUS))
@@ -59,7 +59,7 @@ class Skin:
         self._grid = wp.HashGrid(wide, deep, high, device=device)
         with _on_torch_stream(device):
             start = self._vectors(nodes)
-            self._relations = self._nearest(start, start, own=True, wanted=min(NEIGHBORS, len(nodes) - 1))
+            self._relations = self._nearest(start, start, own=True, wanted=min(SKIN_NEIGHBORS, len(nodes) - 1))
 
     def step(
         self, before: np.ndarray, after: np.ndarray, means: torch.Tensor, quaternions: torch.Tensor
@@ -199,7 +199,7 @@ def turn_nodes(
     u, s, v = wp.svd3(moment)
     turn = wp.identity(n=3, dtype=wp.float64)
     rank = wp.int32(0)
-    if s[0] > wp.float64(TINY):
+    if s[0] > wp.float64(POINT_SPREAD):
         if s[1] > wp.float64(DEGENERATE) * s[0]:
             rank = 2
             turn = u * wp.transpose(v)
@@ -231,7 +231,7 @@ def move_splats(
     for k in range(bound.shape[1]):
         i = bound[t, k]
         arm = place - before[i]
-        weight = 1.0 / (wp.length(arm) + CLOSE)
+        weight = 1.0 / (wp.length(arm) + DISTANCE_OFFSET)
         total += weight
         shift += weight * (after[i] - before[i] + (rotations[i] * arm - arm))
         q = wp.quat_from_matrix(rotations[i])

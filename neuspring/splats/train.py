@@ -22,7 +22,7 @@ from neuspring.splats.model import Gaussians, Splats
 from neuspring.splats.rasterize import Backend, Rendered
 from neuspring.splats.view import C0, rotations
 
-NEAREST = 3
+SCALE_NEIGHBORS = 3
 """The first scale of a splat is its mean distance to this many neighbors."""
 FIRST_OPACITY = 0.1
 RESET_OPACITY, RESET_EVERY = 0.01, 3000
@@ -45,7 +45,7 @@ PRUNE_RADIUS, PRUNE_SIZE = 20.0, 0.1
 """After the first reset of opacities, splats are removed whose radius ever exceeded so many pixels, or this part of the extent."""
 RECORD_EVERY = 10
 """Steps between entries of the history."""
-SMALLEST = 1e-6
+LEAST_FIRST_SCALE = 1e-6
 """m: least first scale."""
 ADAM_EPSILON = 1e-15
 MOMENTS = ("exp_avg", "exp_avg_sq")
@@ -55,14 +55,14 @@ SHRINK = 1.6
 
 
 @dataclass(frozen=True)
-class Trained:
+class TrainedSplats:
     """Splats and the history of their training."""
 
     splats: Splats
     history: dict[str, list[float]]
     """Columns step, loss, splats."""
     first: int
-    """How many splats there were at the start."""
+    """Number of splats at the start."""
 
 
 def first_splats(points: np.ndarray, colors: np.ndarray, settings: Appearance, width: float) -> Splats:
@@ -73,9 +73,11 @@ def first_splats(points: np.ndarray, colors: np.ndarray, settings: Appearance, w
         owner = owner.reshape(-1)
         sums = [np.bincount(owner, weights=values) / members for values in (*points.T, *colors.T)]
         points, colors = np.stack(sums[:3], axis=1), np.stack(sums[3:], axis=1)
-    if len(points) <= NEAREST:
-        raise InputError("appearance, points of frame 0", f"more than {NEAREST} points are needed to begin with", len(points))
-    scale = np.maximum(cKDTree(points).query(points, k=NEAREST + 1)[0][:, 1:].mean(axis=1), SMALLEST)
+    if len(points) <= SCALE_NEIGHBORS:
+        raise InputError(
+            "appearance, points of frame 0", f"more than {SCALE_NEIGHBORS} points are needed to begin with", len(points)
+        )
+    scale = np.maximum(cKDTree(points).query(points, k=SCALE_NEIGHBORS + 1)[0][:, 1:].mean(axis=1), LEAST_FIRST_SCALE)
     if settings.fixed_radius is not None:
         scale = np.full(len(points), settings.fixed_radius)
     count = len(points)
@@ -99,7 +101,7 @@ def extent_of(shots: Sequence[Shot]) -> float:
     return 1.1 * float((centers - centers.mean(0)).norm(dim=1).max())
 
 
-def train(start: Splats, shots: Sequence[Shot], settings: Appearance, seed: int, backend: Backend) -> Trained:
+def train(start: Splats, shots: Sequence[Shot], settings: Appearance, seed: int, backend: Backend) -> TrainedSplats:
     """Fit splats to the shots. Deterministic on the CPU for a seed.
 
     Raises NumericalFailure if splats become infinite or all of them are removed.
@@ -133,7 +135,7 @@ def train(start: Splats, shots: Sequence[Shot], settings: Appearance, seed: int,
         if step % RESET_EVERY == 0 and step < last_change:
             optimizer.reset_opacities()
         progress.update(step, f"loss {number:.4f}, {len(optimizer)} splats")
-    return Trained(optimizer.gaussians.stored(), history, len(start.means))
+    return TrainedSplats(optimizer.gaussians.stored(), history, len(start.means))
 
 
 def _shuffled(shots: Sequence[Shot], generator: torch.Generator) -> Iterator[Shot]:
@@ -180,7 +182,7 @@ class _Optimizer:
         self._adam = torch.optim.Adam(groups, eps=ADAM_EPSILON)
 
     def __len__(self) -> int:
-        """How many splats there are."""
+        """Number of splats."""
         return len(self._values["means"])
 
     @property
@@ -239,7 +241,7 @@ def _parameters(splats: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
 
 @dataclass
 class Statistics:
-    """What pictures showed of each splat since their number last changed."""
+    """Statistics of each splat in the pictures since their number last changed."""
 
     pull: torch.Tensor
     """[N] sum of gradients of the place in the picture, per half picture."""
@@ -250,7 +252,7 @@ class Statistics:
 
     @classmethod
     def empty(cls, like: torch.Tensor) -> Statistics:
-        """For splats with means `like` [N, 3]."""
+        """Statistics of no pictures, for splats with means `like` [N, 3]."""
         return cls(like.new_zeros(len(like)), like.new_zeros(len(like)), like.new_zeros(len(like)))
 
     @torch.no_grad()
@@ -276,7 +278,7 @@ def densify(
     after_reset: bool,
     generator: torch.Generator,
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """Which splats stay [N] bool, and the new ones, with the keys of `splats` (those of `Gaussians`).
+    """The splats that stay [N] bool, and the new ones, with the keys of `splats` (those of `Gaussians`).
 
     `extent`, m, is the size of the scene; `after_reset` also removes splats that are huge.
     """

@@ -1,4 +1,4 @@
-"""From splats in the world to ellipses in the picture: pinhole views, the rasterizer's thresholds, the projection, and colors.
+"""Projection of splats in the world to ellipses in the picture: pinhole views, the rasterizer's thresholds, and colors.
 
 With p = R x + t the camera point and Sigma = Rq diag(s^2) Rq^T the covariance of a splat, its mean in the picture is
 (fx px/pz + cx, fy py/pz + cy) and its covariance there J R Sigma R^T J^T + blur 1, J the Jacobian of the projection, taken at
@@ -20,9 +20,9 @@ import torch
 
 from neuspring.core.errors import InputError
 
-MARGIN = 0.3
+PICTURE_MARGIN = 0.3
 """Slopes in the Jacobian may leave the picture by this part of its half width or height."""
-SAFETY = 1e-3
+BOX_MARGIN = 1e-3
 """Bounding boxes are wider by this part, so that rounding cuts off no pixel."""
 C0 = 0.5 / math.sqrt(math.pi)
 """Y_0."""
@@ -54,7 +54,7 @@ class Limits:
     """A pixel is done before the splat that would leave no more than this transmittance."""
 
 
-LIMITS = Limits()
+DEFAULT_LIMITS = Limits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ class View:
     def of(
         cls, camera_to_world: np.ndarray, intrinsics: np.ndarray, width: int, height: int, device: str = "cpu", shift: float = 0.5
     ) -> View:
-        """From a calibrated camera whose pixel centers lie at whole coordinates, `shift` pixels away from those here.
+        """View of a calibrated camera whose pixel centers lie at whole coordinates, `shift` pixels away from those here.
 
         shift = 0 takes the intrinsics as they are, as the released rendering does: a picture half a pixel off.
         """
@@ -148,18 +148,18 @@ def project(means: torch.Tensor, quaternions: torch.Tensor, scales: torch.Tensor
 
 
 def _limited(slope: torch.Tensor, focal: torch.Tensor, center: torch.Tensor, size: int) -> torch.Tensor:
-    margin = MARGIN * 0.5 * size / focal
+    margin = PICTURE_MARGIN * 0.5 * size / focal
     return slope.clamp(-center / focal - margin, (size - center) / focal + margin)
 
 
 @torch.no_grad()
 def boxes(projected: Projected, opacities: torch.Tensor, view: View, limits: Limits) -> tuple[torch.Tensor, torch.Tensor]:
-    """Which projected splats touch the picture [M] bool, and the pixels they touch [M, 4] int: x0, y0, x1, y1, ends excluded.
+    """True for projected splats that touch the picture [M], and the pixels they touch [M, 4] int: x0, y0, x1, y1, ends excluded.
 
     alpha >= alpha_min needs a Mahalanobis square of at most 2 ln(opacity / alpha_min), an ellipse with these half widths.
     """
     reach = 2 * torch.log(opacities / limits.alpha_min)
-    half = torch.sqrt(reach.clamp_min(0.0)[:, None] * projected.covariances[:, [0, 2]]) * (1 + SAFETY)
+    half = torch.sqrt(reach.clamp_min(0.0)[:, None] * projected.covariances[:, [0, 2]]) * (1 + BOX_MARGIN)
     size = torch.tensor([view.width, view.height], device=half.device, dtype=half.dtype)
     low = torch.ceil(projected.means - half - 0.5).clamp_min(0.0).minimum(size)
     high = (torch.floor(projected.means + half - 0.5) + 1).clamp_min(0.0).minimum(size)

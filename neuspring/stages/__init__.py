@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 
-from neuspring.core.run_folder import LEARNING
+from neuspring.core.run_folder import LEARNING_STAGES
 from neuspring.stages.stage import Stage
 
 
@@ -19,7 +19,7 @@ def _found() -> dict[str, Stage]:
     waiting: dict[str, Stage] = {name: getattr(importlib.import_module(f"{__name__}.{name}"), name) for name in names}
     found: dict[str, Stage] = {}
     while waiting:
-        to_come = {one.product for one in waiting.values()} | {LEARNED for name in LEARNING if name in waiting}
+        to_come = {one.product for one in waiting.values()} | {LEARNED for name in LEARNING_STAGES if name in waiting}
         ready = [name for name, one in waiting.items() if not to_come & (set(one.inputs) - {one.product})]
         assert ready, f"stages read from each other: {', '.join(waiting)}"
         found |= {name: waiting.pop(name) for name in ready}

@@ -166,9 +166,9 @@ class _Surface:
     @property
     def has_prior(self) -> bool:
         """Whether there are points enough of a prior for splats to begin with."""
-        from neuspring.splats.train import NEAREST
+        from neuspring.splats.train import SCALE_NEIGHBORS
 
-        return len(self.prior) > NEAREST
+        return len(self.prior) > SCALE_NEIGHBORS
 
     @property
     def hidden(self) -> float | None:
@@ -227,9 +227,9 @@ def _surface_points(prior: ShapePrior, apart: float, seed: int) -> np.ndarray:
 
 def _behind_hands(shot: Shot, drawn: np.ndarray) -> float:
     """Part of the splats' picture that hands cover."""
-    from neuspring.splats.draw import COVERED
+    from neuspring.splats.draw import OBJECT_COVERAGE
 
-    cover = drawn[..., 3] >= COVERED
+    cover = drawn[..., 3] >= OBJECT_COVERAGE
     return float((cover & (shot.known.cpu().numpy() == 0)).sum() / max(cover.sum(), 1))
 
 

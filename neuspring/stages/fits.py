@@ -66,14 +66,14 @@ def fits(
     and settings, are left alone, and so are those whose search failed. An error in one fit holds nobody up: it is named here, and
     its own `fit` meets it again.
     """
-    from neuspring.physics.lanes import WIDTHS
+    from neuspring.physics.lanes import LANE_WIDTHS
     from neuspring.twin.batch import run_batch
     from neuspring.twin.fit import FitResult
 
     asked = [config.parse(Row, row, f"--rows, entry {place}") for place, row in enumerate(json_value("--rows", rows, list))]
     jobs = [job for row in asked for job in _jobs(run.input_paths["observations"], row, device)]
     facts: dict[str, Any] = {"fits": sum(len(row.fits) for row in asked), "errors": {}, "spring_updates": 0}
-    batches = batched(jobs, launch_size(twins_per_launch) or (WIDTHS[-1] if device == "cpu" else len(jobs)))
+    batches = batched(jobs, launch_size(twins_per_launch) or (LANE_WIDTHS[-1] if device == "cpu" else len(jobs)))
     facts["batches"] = [[job.output for job in batch] for batch in batches]
     for batch in batches:
         results = run_batch([job.problem.twin for job in batch], device, [partial(_fit, job) for job in batch])

@@ -21,7 +21,7 @@ from neuspring.core.artifacts import Observations, Simulation, Twin
 from neuspring.core.errors import NumericalFailure
 from neuspring.physics import stability
 from neuspring.physics.controllers import waypoints
-from neuspring.physics.lanes import WIDTHS
+from neuspring.physics.lanes import LANE_WIDTHS
 from neuspring.physics.parameters import homogeneous
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.rollout import initial_velocity
@@ -60,7 +60,7 @@ class SearchProblem:
 
     observations: Observations
     search: config.Search
-    simulation: config.Simulation
+    simulation: config.SimulationSettings
     losses: config.Losses
     quirks: config.ReleasedQuirks
     device: str = "cpu"
@@ -146,7 +146,7 @@ class SearchProblem:
         return [values[name]] if self.clusters == 1 else [values[f"{name}.{region}"] for region in range(self.clusters)]
 
 
-def with_substeps(twin: Twin, settings: config.Simulation, frame_time_667: bool) -> Twin:
+def with_substeps(twin: Twin, settings: config.SimulationSettings, frame_time_667: bool) -> Twin:
     """The twin with its number of substeps: 667 with the quirk, else as configured: a fixed count or the smallest safe one.
 
     Raises InputError if a fixed count is too small, NumericalFailure if `auto` would need more than `max_substeps`.
@@ -221,7 +221,7 @@ def groups(twins: Sequence[Twin], device: str, together: int, threads: int) -> l
         order, size = list(range(len(twins))), together or len(twins)
     else:
         order = sorted(range(len(twins)), key=lambda k: -twins[k].simulation.substeps)
-        size = min(together or WIDTHS[-1], WIDTHS[-1], -(-len(twins) // threads))
+        size = min(together or LANE_WIDTHS[-1], LANE_WIDTHS[-1], -(-len(twins) // threads))
     return [order[first : first + size] for first in range(0, len(twins), size)]
 
 

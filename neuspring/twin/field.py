@@ -15,7 +15,7 @@ import torch
 from torch import nn
 from torch.nn.functional import embedding_bag
 
-from neuspring.config import SpringField as Settings
+from neuspring.config import SpringFieldSettings as Settings
 
 AXES = ((0, 1), (1, 2), (0, 2))
 """Coordinates that span the planes xy, yz, xz."""

@@ -29,7 +29,7 @@ from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.checkpoint import Checkpoint, TrainingLoop, adam_arrays, restore_adam
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.physics import stability
-from neuspring.physics.controllers import Grips, waypoints
+from neuspring.physics.controllers import ControllerSprings, waypoints
 from neuspring.physics.parameters import Parameters
 from neuspring.physics.solver import AdjointLimit, FrameWindow, simulate_frame, solver_for
 from neuspring.twin.batch import Lane
@@ -64,7 +64,7 @@ class FitProblem:
     observations: Observations
     twin: Twin
     fit: config.Fit
-    simulation: config.Simulation
+    simulation: config.SimulationSettings
     losses: config.Losses
     quirks: config.ReleasedQuirks
     device: str = "cpu"
@@ -167,7 +167,7 @@ class TwinFit:
         hands = torch.tensor(observations.controller_points[:end], device=problem.device)
         self.hands = waypoints(hands, observations.controller_valid)
         graph = problem.twin.topology
-        self.grips = Grips(graph.springs, len(graph.nodes), problem.device)
+        self.grips = ControllerSprings(graph.springs, len(graph.nodes), problem.device)
         if settings.selection == "tail" and end < 3:
             raise InputError("fit.selection", "a held-back tail needs at least two training frames after frame 0", end - 1)
         self.fitted_end = tail_start(end, settings.tail_fraction) if settings.selection == "tail" else end
@@ -235,7 +235,7 @@ class TwinFit:
         """Substeps per frame for stiffness Y / l0 [S] and dashpots [S]. Raises NonFinite."""
         chosen, simulation = self.problem.simulation, self.twin.simulation
         # Half of the safety margin is kept for the parameters' way to the next look.
-        enough = stability.LIMIT * (1 + chosen.safety) / 2
+        enough = stability.STABILITY_LIMIT * (1 + chosen.safety) / 2
         if self._known is not None:
             # K and C grow at most as much as their fastest growing spring (sums of positive semidefinite terms).
             known, k, c = self._known
@@ -252,7 +252,7 @@ class TwinFit:
         may_grow = chosen.substeps == "auto" and not self.problem.quirks.frame_time_667
         if may_grow and count <= chosen.max_substeps:
             return count
-        if spectrum.load(simulation.substep) >= stability.LIMIT:
+        if spectrum.load(simulation.substep) >= stability.STABILITY_LIMIT:
             raise NonFinite(f"stiffness grew beyond what {simulation.substeps} substeps per frame can integrate")
         return simulation.substeps
 

@@ -21,12 +21,12 @@ from torch import nn
 
 from neuspring import config
 from neuspring.core.artifacts import Topology, Twin
-from neuspring.physics.parameters import LIMITS, Parameters, pack, twin_tensors
+from neuspring.physics.parameters import CONTACT_LIMITS, Parameters, pack, twin_tensors
 from neuspring.twin.field import SpringField, midpoints
 from neuspring.twin.roughness import NEAREST, neighbors, roughness
 from neuspring.twin.topology import node_spacing
 
-CONTACT_SCALARS = tuple(LIMITS)
+CONTACT_SCALARS = tuple(CONTACT_LIMITS)
 DAMPING_FACTORS = ("drag", "dashpot")
 """Fields of the material with a common factor where damping is trained. One that is zero cannot be scaled and has none."""
 SPRING_FACTORS = ("stiffness", "dashpot")
@@ -174,7 +174,7 @@ class TwinParameters(nn.Module):
             values = {name: tensor.double().cpu().numpy() for name, tensor in self.physical().items()}
         material: dict[str, Any] = {}
         for name in (f.name for f in fields(twin.material) if f.name not in UNTRAINED):
-            value = np.clip(values[name], *LIMITS.get(name, (-np.inf, np.inf)))
+            value = np.clip(values[name], *CONTACT_LIMITS.get(name, (-np.inf, np.inf)))
             material[name] = value if value.ndim else float(value)
         return replace(twin, material=replace(twin.material, **material))
 

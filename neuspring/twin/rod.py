@@ -29,7 +29,7 @@ MOST_STRETCH = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
-class RodStart(config.Rod):
+class RodStart(config.RodSettings):
     """The settings with the other values that a fit starts from, for a body of 1 kg/m."""
 
     stretching: float = 2e4
@@ -46,7 +46,7 @@ class RodStart(config.Rod):
     """Longest integration step with `simulation.substeps: auto`, s."""
 
     @classmethod
-    def of(cls, settings: config.Rod) -> RodStart:
+    def of(cls, settings: config.RodSettings) -> RodStart:
         """The start that the settings ask for."""
         return cls(**vars(settings))
 

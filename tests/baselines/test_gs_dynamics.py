@@ -14,9 +14,9 @@ from neuspring.baselines import TrainingRequest
 from neuspring.baselines.gs_dynamics import train as training
 from neuspring.baselines.gs_dynamics.model import (
     Dynamics,
-    Graph,
     GsDynamicsModel,
     GsDynamicsTraining,
+    ParticleGraph,
     Rules,
     carry,
     connect,
@@ -57,11 +57,11 @@ def cloud(count: int = 12, seed: int = 0) -> torch.Tensor:
     return torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * 0.1
 
 
-def graph_of(points: torch.Tensor, tools: torch.Tensor, rules: Rules = RULES) -> Graph:
+def graph_of(points: torch.Tensor, tools: torch.Tensor, rules: Rules = RULES) -> ParticleGraph:
     return connect(points[None], torch.ones(1, len(points), dtype=torch.bool), tools[None], rules)
 
 
-def pairs(graph: Graph) -> set[tuple[int, int]]:
+def pairs(graph: ParticleGraph) -> set[tuple[int, int]]:
     return set(zip(graph.receivers.tolist(), graph.senders.tolist(), strict=True))
 
 
@@ -239,7 +239,7 @@ def test_smoothing_stays_within_what_is_seen():
 
 def test_the_losses_by_hand():
     # Two particles that feel themselves, each other, and one of them a tool, node 2.
-    graph = Graph(torch.tensor([0, 1, 0, 1, 0, 2]), torch.tensor([0, 1, 1, 0, 2, 0]), 2)
+    graph = ParticleGraph(torch.tensor([0, 1, 0, 1, 0, 2]), torch.tensor([0, 1, 1, 0, 2, 0]), 2)
     before = torch.tensor([[3.0, 0, 0], [3, 4, 0]])
     assert float(length_loss(graph, before + torch.tensor([3.0, 0, 0]), before)) == 0
     stretched = torch.tensor([[3.0, 0, 0], [3, 6, 0]], requires_grad=True)

@@ -22,7 +22,7 @@ from neuspring.baselines.spring_gaus.model import (
     soft_vector,
 )
 from neuspring.baselines.spring_gaus.physics import AnchorSolver, reference_substep
-from neuspring.baselines.spring_gaus.train import FEATURES, Problem, Training, load_features, run, silhouette_loss
+from neuspring.baselines.spring_gaus.train import FEATURE_WEIGHT, Problem, SpringGausTrainer, load_features, run, silhouette_loss
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.records import digest_file
 
@@ -229,7 +229,7 @@ def test_damping_that_is_clamped_can_come_back():
         return sign[0] * (anchors - torch.tensor(start.anchors)).square().sum()
 
     settings = replace(SMALL, iterations=1, damping_rate=0.01)
-    training = Training(Problem(start, hands, objective, settings))
+    training = SpringGausTrainer(Problem(start, hands, objective, settings))
     training.epoch(0)
     first = training.values["theta"].item()
     sign[0] = -sign[0]
@@ -326,7 +326,7 @@ def test_the_term_of_the_loss_is_weighted_and_differentiable(network, tmp_path):
     mask = (drawn.detach() > 0.5).float()
     term = silhouette_loss(drawn, mask, features) - silhouette_loss(drawn, mask, None)
     found = features(torch.stack([drawn, mask])[:, None].expand(-1, 3, -1, -1))
-    torch.testing.assert_close(term, FEATURES * (found[0] - found[1]).square().mean(), rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(term, FEATURE_WEIGHT * (found[0] - found[1]).square().mean(), rtol=1e-4, atol=1e-6)
     term.backward()
     assert drawn.grad.abs().sum() > 0
 

@@ -116,7 +116,7 @@ def of_log_stiffness(gradient: torch.Tensor, springs: torch.Tensor) -> np.ndarra
 
 def reference_frame(twin: Twin, hands: np.ndarray) -> Frame:
     """One frame by the specification in NumPy, float64."""
-    scene, nodes = reference.Scene.of(twin), twin.topology.nodes.astype(np.float64)
+    scene, nodes = reference.ReferenceTwin.of(twin), twin.topology.nodes.astype(np.float64)
     last: list[np.ndarray] = []
 
     def run() -> None:

@@ -27,7 +27,7 @@ def problem(rollouts: int, device: str) -> SearchProblem:
     return SearchProblem(
         observations=observations(),
         search=config.Search(rollouts=rollouts),
-        simulation=config.Simulation(),
+        simulation=config.SimulationSettings(),
         losses=config.Losses(),
         quirks=config.ReleasedQuirks(),
         device=device,

@@ -153,7 +153,7 @@ def test_our_frame_is_that_of_the_reference_and_its_gradient_is_that_of_the_loss
 
     def after(scale: float = 1.0) -> np.ndarray:
         body = replace(twin, material=replace(twin.material, stiffness=scale * twin.material.stiffness))
-        return reference.frame(reference.Scene.of(body), nodes, np.zeros_like(nodes), *hands)[0]
+        return reference.frame(reference.ReferenceTwin.of(body), nodes, np.zeros_like(nodes), *hands)[0]
 
     # A few roundings of positions of 0.1 m.
     assert np.abs(ahead.positions() - after()).max() < 1e-7

@@ -22,7 +22,7 @@ def copy(tmp_path, monkeypatch):
     """A copy of the package that digests read from."""
     target = tmp_path / "neuspring"
     shutil.copytree(PACKAGE, target, ignore=shutil.ignore_patterns("__pycache__"))
-    monkeypatch.setattr(provenance, "ROOT", target)
+    monkeypatch.setattr(provenance, "PACKAGE_FOLDER", target)
     clear()
     yield target
     clear()
@@ -69,7 +69,7 @@ def test_the_code_of_a_stage_itself_counts(copy):
 @pytest.mark.parametrize(
     ("file", "old", "new"),
     [
-        ("splats/draw.py", "COVERED = 128", "COVERED = 200"),
+        ("splats/draw.py", "OBJECT_COVERAGE = 128", "OBJECT_COVERAGE = 200"),
         ("scores/lpips.py", "SHIFT = (-0.030", "SHIFT = (-0.031"),
         ("report/video.py", "quality: int = 20", "quality: int = 21"),
         ("stages/render.py", 'VIDEOS = ("video", "turntable")', 'VIDEOS = ("turntable", "video")'),
@@ -101,7 +101,7 @@ def test_modules_that_are_imported_by_name_count(copy):
 def test_transitive_imports_count(copy):
     search, lattice = "neuspring.stages.search", *STAGES["search"].code(config.Config(), {"body": "lattice"})
     before = digest(search, lattice)
-    edit(copy / "physics" / "lanes.py", "MIN_LENGTH = 1e-6", "MIN_LENGTH = 1e-7")
+    edit(copy / "physics" / "lanes.py", "MIN_SPRING_LENGTH = 1e-6", "MIN_SPRING_LENGTH = 1e-7")
     assert digest(search, lattice) != before
     assert "neuspring.physics.springs" in provenance.used_modules("neuspring.stages.fit")
     assert "neuspring.physics.rod" not in provenance.used_modules(lattice), "a change of the rod searches no lattice again"

@@ -109,7 +109,7 @@ def test_a_plan_is_made_without_heavy_imports():
 def test_a_factor_varies_the_adaptive_resolution():
     points = np.random.default_rng(0).random((400, 3))
     chosen = [{}, {"adaptive_factor": 1.7}, {"adaptive_factor": 1.7, "resolution": 9}]
-    assert [SpringField(points, config.SpringField(**one), 1, 0).resolution for one in chosen] == [17, 34, 9]
+    assert [SpringField(points, config.SpringFieldSettings(**one), 1, 0).resolution for one in chosen] == [17, 34, 9]
 
 
 def test_what_a_sweep_cannot_be_begun_with_is_refused(folder):

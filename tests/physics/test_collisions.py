@@ -262,7 +262,7 @@ def test_a_rollout_starts_at_rest_and_reports_progress() -> None:
     np.testing.assert_array_equal(result.positions[0], twin.topology.nodes)
     assert seen == [1, 2, 3]
     assert result.diverged_frame is None
-    expected, _ = reference.rollout(reference.Scene.of(twin), twin.topology.nodes, 0 * twin.topology.nodes, hands)
+    expected, _ = reference.rollout(reference.ReferenceTwin.of(twin), twin.topology.nodes, 0 * twin.topology.nodes, hands)
     # float32 against float64 over 60 substeps, as in test_reference.
     np.testing.assert_allclose(result.positions, expected, atol=2e-5)
 

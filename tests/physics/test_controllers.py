@@ -12,7 +12,7 @@ import torch
 from neuspring.core.errors import InputError
 from neuspring.physics import reference
 from neuspring.physics import solver as frame_solver
-from neuspring.physics.controllers import Grips, waypoints
+from neuspring.physics.controllers import ControllerSprings, waypoints
 from neuspring.physics.parameters import pack
 from neuspring.physics.solver import simulate_frame
 from neuspring.twin.rollout import frames, roll_out
@@ -145,7 +145,7 @@ def test_the_solver_agrees_with_the_reference(device, threads):
 
 def simulated(body, rows, x, v, values):
     """The last positions, differentiable in values, x and v: as a fit simulates."""
-    solver, grips = solver_for(body, rows.shape[1]), Grips(body.springs, body.nodes, "cpu")
+    solver, grips = solver_for(body, rows.shape[1]), ControllerSprings(body.springs, body.nodes, "cpu")
     parameters, lengths = pack(**values, substep=body.simulation.substep), None
     for begin, end in pairwise(rows):
         lengths = grips.taken(lengths, x, begin)
@@ -210,7 +210,7 @@ def test_all_ways_to_roll_out_take_the_same_grips():
 def test_stiffness_per_length_stays_however_near_the_hand():
     """So the substep that was checked for the lengths of frame 0 stays safe."""
     body, x, _, _, _ = late_scene()
-    grips, springs = Grips(body.springs, body.nodes, "cpu"), pack(**tensors(body), substep=1e-3)["springs"]
+    grips, springs = ControllerSprings(body.springs, body.nodes, "cpu"), pack(**tensors(body), substep=1e-3)["springs"]
     controllers = int(body.springs.max()) + 1 - body.nodes
     row = torch.zeros(controllers, 4, dtype=torch.float64)
     row[:, :3] = torch.tensor(x[int(grips.nodes[0])])

@@ -11,7 +11,7 @@ import torch
 
 from neuspring.physics import reference, stability
 from neuspring.physics.parameters import pack, twin_tensors
-from neuspring.physics.reference import Scene
+from neuspring.physics.reference import ReferenceTwin
 from neuspring.physics.solver import FrameSolver, simulate_frame, solver_for
 from tests.support import scenes
 from tests.support.clips import CONTACT_SCALARS, NAMES, Clip, clip
@@ -58,7 +58,7 @@ def clip_solver(name: str, device: str, dtype: torch.dtype, differentiable: bool
     if threads == (device != "cpu"):
         return solver_for(twin, device, dtype, differentiable=differentiable)
     options: dict[str, Any] = {"device": device, "dtype": dtype, "differentiable": differentiable, "threads": threads}
-    return scenes.solver_for(Scene.of(twin), len(twin.topology.controllers), **options)
+    return scenes.solver_for(ReferenceTwin.of(twin), len(twin.topology.controllers), **options)
 
 
 @cache
@@ -131,7 +131,7 @@ def test_positions_follow_the_record_over_the_whole_clip(name: str, dtype: torch
 @pytest.mark.parametrize("name", DRAWN)
 def test_the_reference_follows_the_record(name: str) -> None:
     c = clip(name)
-    x, _ = reference.rollout(Scene.of(c.twin), c.x[0], c.v[0], c.controllers)
+    x, _ = reference.rollout(ReferenceTwin.of(c.twin), c.x[0], c.v[0], c.controllers)
     assert node_error(x, c.x).max() < POSITION
 
 

@@ -22,7 +22,7 @@ LEARNED = (
 )  # fmt: skip
 
 
-def lively(variant: str) -> tuple[reference.Scene, np.ndarray, np.ndarray, np.ndarray]:
+def lively(variant: str) -> tuple[reference.ReferenceTwin, np.ndarray, np.ndarray, np.ndarray]:
     """(scene, x0, v0, hands) of three frames; the first already touches the ground and, where on, itself (tested below).
 
     The seed is one for which no contact decision lies so near its threshold that a step of the differences flips it.
@@ -62,7 +62,7 @@ def weights(frames: int, nodes: int) -> np.ndarray:
     return np.random.default_rng(7).standard_normal((2, frames, nodes, 3))
 
 
-def loss_gradient(body: reference.Scene, x: np.ndarray, v: np.ndarray, hands: np.ndarray, weight: np.ndarray) -> Arrays:
+def loss_gradient(body: reference.ReferenceTwin, x: np.ndarray, v: np.ndarray, hands: np.ndarray, weight: np.ndarray) -> Arrays:
     """Gradient of sum(weight * (x, v) at frame ends) through all frames, by simulate_frame; frame 0 has no weight."""
     solver, motion = solver_for(body, hands.shape[1]), waypoints(torch.tensor(hands))
     values = {name: value.requires_grad_() for name, value in tensors(body).items()}
@@ -137,16 +137,16 @@ def test_a_window_gives_what_its_solver_gives_and_simulates_less(frames: int, ag
 def test_a_window_is_as_long_as_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     body, x, v, hands = random_scene(27, frames=4)
     size = solver_for(body, hands.shape[1]).nbytes
-    monkeypatch.setattr(solver_module, "KEPT", 2 * size + size // 2)
+    monkeypatch.setattr(solver_module, "FRAME_WINDOW_BYTES", 2 * size + size // 2)
     window, motion = FrameWindow(lambda: solver_for(body, hands.shape[1]), 4, 7), torch.tensor(hands)
     for k in range(4):
         window.run(motion[k], motion[k + 1], torch.tensor(x), torch.tensor(v), packed(body))
     assert [window.holding(token) is not None for token in range(7, 13)] == [False, False, False, True, True, False]
-    monkeypatch.setattr(solver_module, "KEPT", 1)
+    monkeypatch.setattr(solver_module, "FRAME_WINDOW_BYTES", 1)
     assert FrameWindow(lambda: solver_for(body, hands.shape[1]), 4).holding(0) is None
 
 
-def resting_block(substeps: int) -> tuple[reference.Scene, np.ndarray]:
+def resting_block(substeps: int) -> tuple[reference.ReferenceTwin, np.ndarray]:
     """(scene, x): a block of 6 x 2 x 2 nodes, 2 cm apart, a tenth of a millimeter above an elastic ground."""
     x = 0.02 * np.stack(np.meshgrid(np.arange(6), np.arange(2), np.arange(2), indexing="ij"), axis=-1).reshape(-1, 3)
     x[:, 2] += 1e-4

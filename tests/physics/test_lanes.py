@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from neuspring.core.errors import InputError
 from neuspring.physics.controllers import waypoints
 from neuspring.physics.parameters import pack
-from neuspring.physics.reference import Scene
+from neuspring.physics.reference import ReferenceTwin
 from neuspring.physics.solver import FrameSolver, simulate_frame
 from tests.support.scenes import VARIANTS, WAYS, random_scene, solver_for, tensors
 
@@ -33,7 +33,7 @@ SIZES = [(SINGLE, count) for count in (1, 3, 4, 8, 16, 17)] + [(DOUBLE, count) f
 class Member(NamedTuple):
     """A twin of a population: its scene, start and hands."""
 
-    body: Scene
+    body: ReferenceTwin
     x: np.ndarray
     v: np.ndarray
     hands: np.ndarray

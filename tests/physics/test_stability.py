@@ -11,8 +11,8 @@ import pytest
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
 from neuspring.physics import reference, stability
-from neuspring.physics.reference import Scene
-from neuspring.physics.stability import LIMIT, Spectrum
+from neuspring.physics.reference import ReferenceTwin
+from neuspring.physics.stability import STABILITY_LIMIT, Spectrum
 from tests.support.scenes import random_scene, scene, twin_of
 
 MARGIN = 0.01
@@ -25,7 +25,7 @@ LANCZOS = 2e-3
 LENGTH = 0.5
 
 
-def held_node(substep: float, stiffness: float, dashpot: float) -> Scene:
+def held_node(substep: float, stiffness: float, dashpot: float) -> ReferenceTwin:
     """One node on a spring to a controller: lambda = Y / l0, c = gamma."""
     return scene(1, [(1, 0)], [LENGTH], stiffness=stiffness, dashpot=dashpot, frame_time=substep)
 
@@ -128,10 +128,10 @@ def with_substeps(twin: Twin, count: int) -> Twin:
 def test_smallest_safe_substeps_is_smallest(safety: float) -> None:
     spectrum, frame_time = Spectrum(3.7e5, 130.0, 0), 1 / 30
     for one in (spectrum, Spectrum(0.0, 40.0, 0), Spectrum(1e6, 0.0, 0)):
-        assert one.load(one.largest_substep(safety)) == pytest.approx(LIMIT * safety)
+        assert one.load(one.largest_substep(safety)) == pytest.approx(STABILITY_LIMIT * safety)
     assert Spectrum(0.0, 0.0, 0).largest_substep(safety) == np.inf
     count = stability.smallest_safe_substeps(spectrum, frame_time, safety)
-    assert spectrum.load(frame_time / count) < LIMIT * safety <= spectrum.load(frame_time / (count - 1))
+    assert spectrum.load(frame_time / count) < STABILITY_LIMIT * safety <= spectrum.load(frame_time / (count - 1))
     assert stability.smallest_safe_substeps(Spectrum(1.0, 0.0, 0), 1e-3, safety) == 1
 
 

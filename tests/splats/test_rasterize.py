@@ -19,7 +19,7 @@ from neuspring.core.errors import InputError
 from neuspring.splats.blend import blend, tiles
 from neuspring.splats.rasterize import _gsplat_fault, choose_backend, rasterize, reference
 from neuspring.splats.train import Statistics, densify
-from neuspring.splats.view import LIMITS, Limits, View, boxes, harmonic_colors, project, radii
+from neuspring.splats.view import DEFAULT_LIMITS, Limits, View, boxes, harmonic_colors, project, radii
 from tests.support.devices import DEVICES
 from tests.support.golden_splats import CASES, Golden, random_splats, small_view
 
@@ -106,7 +106,7 @@ def test_gradients_are_those_of_central_differences():
     splats = random_splats(3, 12, torch.float64)
     view = small_view()
     # No threshold nearby: where one lies, the picture jumps.
-    limits = dataclasses.replace(LIMITS, alpha_min=1e-12, transmittance_min=1e-12)
+    limits = dataclasses.replace(DEFAULT_LIMITS, alpha_min=1e-12, transmittance_min=1e-12)
     weights = torch.rand(view.height, view.width, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 
     def loss(*tensors):
@@ -243,6 +243,6 @@ def test_gsplat_draws_what_we_draw():
     view = View(view.world_to_camera.float().cuda(), view.intrinsics.float().cuda(), view.width, view.height)
     # gsplat's clamp of coverage is 0.99.
     splats[3] = splats[3].clamp(max=0.95)
-    ours, theirs = (rasterize(*splats, view, limits=LIMITS, backend=name) for name in ("warp", "gsplat"))
+    ours, theirs = (rasterize(*splats, view, limits=DEFAULT_LIMITS, backend=name) for name in ("warp", "gsplat"))
     assert (ours.rgb - theirs.rgb).abs().mean() < 1e-4
     assert (ours.alpha - theirs.alpha).abs().mean() < 1e-4

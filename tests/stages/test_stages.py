@@ -158,7 +158,7 @@ def test_a_method_without_second_stage_shares_the_search(finished):
 
 
 def test_regions_and_a_field_pass_through_every_stage(tmp_path):
-    fit = config.Fit(epochs=2, selection="tail", field=config.SpringField(channels=4, hidden=16, bands=2))
+    fit = config.Fit(epochs=2, selection="tail", field=config.SpringFieldSettings(channels=4, hidden=16, bands=2))
     run = run_all(tmp_path, method="neuspring", settings=replace(SETTINGS, fit=fit))
     record = tracking.RunRecord.load(run)
     assert record.status == "ok"

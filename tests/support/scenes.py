@@ -15,7 +15,7 @@ from neuspring.core.artifacts import Material, Simulation, Topology, Twin
 from neuspring.physics import reference
 from neuspring.physics.controllers import waypoints
 from neuspring.physics.parameters import Parameters, pack
-from neuspring.physics.reference import Scene
+from neuspring.physics.reference import ReferenceTwin
 from neuspring.physics.solver import FrameSolver
 from tests.support.devices import CUDA
 from tests.support.devices import DEVICES as DEVICES
@@ -39,7 +39,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 """Options of `random_scene` that together reach every term."""
 SCALARS = ("drag", "ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction", "contact_distance")
 """Of the arguments of `Material`, those that have no default."""
-Engine = Callable[[Scene, np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+Engine = Callable[[ReferenceTwin, np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 def scene(
@@ -57,11 +57,11 @@ def scene(
     pushes: bool = False,
     on_ground: bool = False,
     **simulation: Any,
-) -> Scene:
-    """A Scene in float64; `ground` and `contact` are (e, mu). Defaults: no gravity, no ground, one substep per frame of 1 ms."""
+) -> ReferenceTwin:
+    """A twin in float64; `ground` and `contact` are (e, mu). Defaults: no gravity, no ground, one substep per frame of 1 ms."""
     pairs = np.array(springs, np.int32).reshape(-1, 2)
     options: dict[str, Any] = {"frame_time": 1e-3, "substeps": 1, "gravity": 0.0, "ground": on_ground} | simulation
-    return Scene(
+    return ReferenceTwin(
         nodes=nodes,
         springs=pairs,
         rest_lengths=np.broadcast_to(np.asarray(rest_lengths, np.float64), len(pairs)),
@@ -77,7 +77,7 @@ def scene(
     )
 
 
-def tensors(scene: Scene, device: str = "cpu", dtype: torch.dtype = torch.float64) -> dict[str, torch.Tensor]:
+def tensors(scene: ReferenceTwin, device: str = "cpu", dtype: torch.dtype = torch.float64) -> dict[str, torch.Tensor]:
     """A scene's physical parameters with the keyword names of `pack`."""
     values = {
         "stiffness": scene.stiffness,
@@ -95,7 +95,7 @@ def tensors(scene: Scene, device: str = "cpu", dtype: torch.dtype = torch.float6
     return {name: torch.tensor(np.array(value), dtype=dtype, device=device) for name, value in values.items()}
 
 
-def with_values(scene: Scene, values: dict[str, Any]) -> Scene:
+def with_values(scene: ReferenceTwin, values: dict[str, Any]) -> ReferenceTwin:
     """A scene with parameters replaced by name (those of `pack`)."""
     arrays = {k: np.asarray(v, np.float64) for k, v in values.items() if k in ("stiffness", "rest_lengths", "dashpot")}
     ground = (values.get("ground_elasticity", scene.ground[0]), values.get("ground_friction", scene.ground[1]))
@@ -104,13 +104,13 @@ def with_values(scene: Scene, values: dict[str, Any]) -> Scene:
     return replace(scene, **arrays, drag=drag, ground=tuple(map(float, ground)), contact=tuple(map(float, contact)))
 
 
-def packed(scene: Scene, device: str = "cpu", dtype: torch.dtype = torch.float64) -> Parameters:
+def packed(scene: ReferenceTwin, device: str = "cpu", dtype: torch.dtype = torch.float64) -> Parameters:
     """A scene's parameters, packed."""
     return pack(**tensors(scene, device, dtype), substep=scene.simulation.substep)
 
 
 def solver_for(
-    scene: Scene | Sequence[Scene],
+    scene: ReferenceTwin | Sequence[ReferenceTwin],
     controllers: int,
     device: str = "cpu",
     dtype: torch.dtype = torch.float64,
@@ -120,7 +120,7 @@ def solver_for(
 ) -> FrameSolver:
     """A FrameSolver with the scene's parameters set, or one of several scenes on the graph of the first."""
     options: dict[str, Any] = {"device": device, "dtype": dtype, "differentiable": differentiable, "threads": threads}
-    if isinstance(scene, Scene):
+    if isinstance(scene, ReferenceTwin):
         solver = FrameSolver(scene.springs, scene.nodes, controllers, scene.simulation, **options)
         solver.set_parameters(packed(scene, device, dtype))
         return solver
@@ -131,7 +131,7 @@ def solver_for(
 
 
 def warp(
-    scene: Scene,
+    scene: ReferenceTwin,
     x: np.ndarray,
     v: np.ndarray,
     controllers: np.ndarray,
@@ -163,7 +163,7 @@ def no_hands(frames: int) -> np.ndarray:
     return np.zeros((frames + 1, 0, 3))
 
 
-def random_scene(seed: int, nodes: int = 10, controllers: int = 2, frames: int = 3, **simulation: Any) -> tuple[Scene, ...]:
+def random_scene(seed: int, nodes: int = 10, controllers: int = 2, frames: int = 3, **simulation: Any) -> tuple[ReferenceTwin, ...]:
     """(scene, x0, v0, hands): a random net above and just in the ground, held and dragged, away from its rest lengths."""
     rng = np.random.default_rng(seed)
     up = -1.0 if simulation.get("up") == "-z" else 1.0
@@ -194,7 +194,7 @@ def random_scene(seed: int, nodes: int = 10, controllers: int = 2, frames: int =
     return body, x, v, hands
 
 
-def twin_of(scene: Scene, x: np.ndarray, controllers: np.ndarray) -> Twin:
+def twin_of(scene: ReferenceTwin, x: np.ndarray, controllers: np.ndarray) -> Twin:
     """The scene as a Twin (rounded to float32), at rest positions x [N, 3] and controllers [C, 3]."""
     topology = Topology(
         nodes=x, controllers=controllers, springs=scene.springs, rest_lengths=scene.rest_lengths, labels=np.zeros(len(x), np.int32)

@@ -13,7 +13,7 @@ from neuspring.data.capture import HANDS, OBJECT, CameraEntry, Capture, Descript
 from neuspring.report.draw.painter import DrawingStyle, Painter
 from neuspring.report.draw.scene import Prediction, Scene, broad_side, seen_from, shown_points
 from neuspring.report.shown import find
-from neuspring.splats.draw import COVERED, picture, view_of
+from neuspring.splats.draw import OBJECT_COVERAGE, picture, view_of
 from tests.support.filmed import rows
 from tests.support.played import dressed, results
 
@@ -55,7 +55,7 @@ def filmed(folder: Path, missing: tuple[int, ...] = ()) -> Path:
         if frame in missing:
             continue
         rgba = picture(gaussians, view, "warp")
-        labels = np.where(rgba[..., 3] >= COVERED, OBJECT, 0).astype(np.uint8)
+        labels = np.where(rgba[..., 3] >= OBJECT_COVERAGE, OBJECT, 0).astype(np.uint8)
         labels[:CORNER, :CORNER] = HANDS
         # What is at the border, where a pixel is partly object, counts as object and keeps its color.
         writer.frame("0", frame, rgba[..., :3], np.ones((SIZE, SIZE), np.uint16), labels)

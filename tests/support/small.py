@@ -81,7 +81,7 @@ def search_problem(seen: Observations | None = None, **changes: object) -> Searc
     settings: dict[str, object] = {
         "observations": seen or observations(),
         "search": released(rollouts=22, start={"object_radius": 0.045, "stiffness": 1e4}),
-        "simulation": config.Simulation(),
+        "simulation": config.SimulationSettings(),
         "losses": config.Losses(),
         "quirks": config.ReleasedQuirks(),
     }

@@ -18,7 +18,7 @@ from neuspring.twin.batch import Lane, run_batch
 from neuspring.twin.fit import FitProblem, FitResult, fit
 from tests.support import small
 
-FIELD = config.SpringField(channels=4, hidden=16, bands=2)
+FIELD = config.SpringFieldSettings(channels=4, hidden=16, bands=2)
 
 
 def several() -> list[FitProblem]:

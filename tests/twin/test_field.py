@@ -24,7 +24,7 @@ def points(count: int = 30, seed: int = 0) -> np.ndarray:
 
 def field_of(at: np.ndarray | None = None, outputs: int = 2, seed: int = 0, **settings) -> SpringField:
     """A small field in float64."""
-    return SpringField(points() if at is None else at, config.SpringField(**(SMALL | settings)), outputs, seed).double()
+    return SpringField(points() if at is None else at, config.SpringFieldSettings(**(SMALL | settings)), outputs, seed).double()
 
 
 def train(field: SpringField, target: torch.Tensor, steps: int = 5) -> None:
@@ -76,7 +76,7 @@ def test_the_resolution_is_adaptive_or_fixed():
 
 
 def test_the_network_has_three_layers_of_the_paper_s_width():
-    field = SpringField(points(), config.SpringField(), 1, 0)
+    field = SpringField(points(), config.SpringFieldSettings(), 1, 0)
     # 32 channels and 3 coordinates, each as sine and cosine of 4 bands.
     assert [tuple(layer.weight.shape) for layer in field.layers] == [(128, (32 + 3) * 8), (128, 128), (1, 128)]
     assert field.planes is not None

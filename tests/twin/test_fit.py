@@ -23,7 +23,7 @@ RATE = 1e-12
 """Relative: learning rates are a few operations in float64."""
 MEAN = 1e-6
 """Relative: a mean of losses in float32, summed in another order."""
-FIELD = config.SpringField(channels=4, hidden=16, bands=2)
+FIELD = config.SpringFieldSettings(channels=4, hidden=16, bands=2)
 """Small enough for tests."""
 
 
@@ -85,7 +85,7 @@ EVERYTHING = {
 }
 LIMITED = {
     "fit": config.Fit(epochs=4, learning_rate=0.3, checkpoint_every=1),
-    "simulation": config.Simulation(max_substeps=70),
+    "simulation": config.SimulationSettings(max_substeps=70),
 }
 """Substeps grow within the second epoch, until it is rolled back because they may not grow further."""
 
@@ -192,7 +192,11 @@ def test_substeps_grow_within_an_epoch(kind):
     assert np.isfinite(run.epoch()["loss"])
     assert run.twin.simulation.substeps > problem.twin.simulation.substeps, "before the epoch's end"
     fixed = fit(
-        replace(problem, simulation=config.Simulation(substeps=problem.twin.simulation.substeps), fit=replace(settings, epochs=6))
+        replace(
+            problem,
+            simulation=config.SimulationSettings(substeps=problem.twin.simulation.substeps),
+            fit=replace(settings, epochs=6),
+        )
     )
     assert "stiffness grew beyond" in fixed.rollbacks[0]
 
@@ -228,8 +232,8 @@ def limited(kind: str) -> dict[str, object]:
     start = small.fit_problem(**GROWING).twin
     count = start.simulation.substeps
     if kind == "fixed":
-        return GROWING | {"simulation": config.Simulation(substeps=count)}
-    return GROWING | {"simulation": config.Simulation(max_substeps=count)}
+        return GROWING | {"simulation": config.SimulationSettings(substeps=count)}
+    return GROWING | {"simulation": config.SimulationSettings(max_substeps=count)}
 
 
 @pytest.mark.parametrize("kind", ["fixed", "max_substeps"])
@@ -254,7 +258,7 @@ def test_the_best_epoch_by_training_loss_wins_and_the_quirk_looks_every_20_epoch
 
 
 def test_the_future_is_never_read():
-    changes = EVERYTHING | {"simulation": config.Simulation(initial_velocity="observed")}
+    changes = EVERYTHING | {"simulation": config.SimulationSettings(initial_velocity="observed")}
     first, second = (fit(small.fit_problem(seen, **changes)) for seen in (small.observations(), small.spoiled_future()))
     assert_same_twin(first.twin, second.twin)
     pd.testing.assert_frame_equal(first.history, second.history, check_exact=True)

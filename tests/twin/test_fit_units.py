@@ -13,7 +13,7 @@ from tests.support import small
 
 SINGLE = 1e-5
 """Relative: sums of gradients in float32."""
-FIELD = config.SpringField(channels=4, hidden=16, bands=2, offsets=True, offset_prior=0.1, smoothness=0.1)
+FIELD = config.SpringFieldSettings(channels=4, hidden=16, bands=2, offsets=True, offset_prior=0.1, smoothness=0.1)
 SETTINGS = {
     "springs": {},
     "field": {"output_bound": 1.5, "horizon": 2},

@@ -129,7 +129,7 @@ def test_gradients_of_stiffness_through_projection_and_simulator(name):
                 observations=problem.observations,
                 twin=twin,
                 fit=settings,
-                simulation=config.Simulation(substeps=100),
+                simulation=config.SimulationSettings(substeps=100),
                 losses=weights,
                 quirks=config.ReleasedQuirks(),
             )

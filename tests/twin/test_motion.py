@@ -97,7 +97,7 @@ def test_search_and_fit_start_with_the_observed_velocity(kind):
     """Everything flies along at 0.3 m/s without gravity or drag: with the right start, nothing is left to explain."""
     seen = moving([0, 0, 0], [0.3, 0, 0.1])
     seen = replace(seen, scenario=replace(seen.scenario, ground=False))
-    simulation = config.Simulation(gravity=0.0, initial_velocity=kind)
+    simulation = config.SimulationSettings(gravity=0.0, initial_velocity=kind)
     problem = small.search_problem(seen, simulation=simulation)
     twin = candidate(problem, small.start_values() | {"drag": 0.0})
     loss = FrameLoss.of(seen, config.Losses(acceleration=0.0), "cpu")

@@ -40,7 +40,7 @@ def twin() -> Twin:
 
 def parameters(kind: str = "field", start: Twin | None = None, field: dict | None = None, **settings) -> TwinParameters:
     """Trained values of the small twin."""
-    fit = config.Fit(field=config.SpringField(**(SMALL | (field or {}))), **settings)
+    fit = config.Fit(field=config.SpringFieldSettings(**(SMALL | (field or {}))), **settings)
     return TwinParameters(start or twin(), fit, kind, "cpu")
 
 
@@ -319,7 +319,7 @@ def test_the_twin_is_what_is_simulated(kind):
 
 # What moved -----------------------------------------------------------------------------------------------------------
 
-OF_TEXELS = config.SpringField(channels=4, hidden=8, bands=2, texel_scale=0.02)
+OF_TEXELS = config.SpringFieldSettings(channels=4, hidden=8, bands=2, texel_scale=0.02)
 
 
 def of_scene(kind: str, **settings: object) -> TwinParameters:

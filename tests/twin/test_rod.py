@@ -86,7 +86,9 @@ def test_a_start_velocity_moves_the_vertices():
 
 def test_the_shape_of_frame_0_may_be_without_moments():
     seen = ropes.cable(frames=8)
-    settings = replace(ropes.SETTINGS, rod=replace(ropes.ROD, rest="first_frame"), simulation=config.Simulation(gravity=0.0))
+    settings = replace(
+        ropes.SETTINGS, rod=replace(ropes.ROD, rest="first_frame"), simulation=config.SimulationSettings(gravity=0.0)
+    )
     twin = ropes.twin(seen, settings)
     at_rest = roll_out(twin, seen.controller_points).positions
     assert np.abs(at_rest - at_rest[0]).max() < SINGLE

@@ -16,7 +16,7 @@ from neuspring.twin.transfer import move
 from tests.support import ropes
 
 SETTINGS = config.Config(
-    rod=config.Rod(bending=0.02, twisting=0.02), fit=config.Fit(rod=RodSteps(horizons=(0,), rounds=5, every=1, robust=1e-3))
+    rod=config.RodSettings(bending=0.02, twisting=0.02), fit=config.Fit(rod=RodSteps(horizons=(0,), rounds=5, every=1, robust=1e-3))
 )
 VERTICES = 8
 AXIS = (0.0, 1.0, 0.0)

@@ -21,7 +21,7 @@ from neuspring import config
 from neuspring.config.search import LENGTHS
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.physics import stability
-from neuspring.physics.lanes import WIDTHS
+from neuspring.physics.lanes import LANE_WIDTHS
 from neuspring.twin import candidates
 from neuspring.twin.candidates import PENALTY, SearchProblem, candidate, groups, made, still_cost
 from neuspring.twin.losses import FrameLoss
@@ -466,7 +466,7 @@ def test_a_record_that_replays_in_part_is_continued_from_there(tmp_path, capsys)
 
 
 def test_a_fixed_count_that_no_candidate_can_use_is_an_error_with_the_remedy():
-    problem = small.search_problem(simulation=config.Simulation(substeps=1))
+    problem = small.search_problem(simulation=config.SimulationSettings(substeps=1))
     with pytest.raises(
         InputError, match=r"simulation.substeps: at least one of 22 candidates must be stable.*; received 1"
     ) as caught:
@@ -475,7 +475,7 @@ def test_a_fixed_count_that_no_candidate_can_use_is_an_error_with_the_remedy():
 
 
 def test_a_search_whose_candidates_all_fail_is_a_named_failure():
-    problem = small.search_problem(simulation=config.Simulation(max_substeps=1))
+    problem = small.search_problem(simulation=config.SimulationSettings(max_substeps=1))
     with pytest.raises(
         NumericalFailure, match=r"none of 22 candidates could be simulated; the first: needs \d+ substeps per frame"
     ):
@@ -491,7 +491,11 @@ def test_bad_input_is_not_mistaken_for_a_bad_candidate():
 
 
 def test_the_future_is_never_read():
-    changes = {"clusters": 3, "search": config.Search(rollouts=40), "simulation": config.Simulation(initial_velocity="observed")}
+    changes = {
+        "clusters": 3,
+        "search": config.Search(rollouts=40),
+        "simulation": config.SimulationSettings(initial_velocity="observed"),
+    }
     first, second = (search(small.search_problem(o, **changes), seed=0) for o in (small.observations(), small.spoiled_future()))
     assert first.trace["stage"].nunique() == 3, "the polish too"
     assert first.trace["cost"].tolist() == second.trace["cost"].tolist()
@@ -519,9 +523,9 @@ def test_released_quirks_of_the_search():
 
 
 def test_an_unstable_candidate_is_penalized_not_fatal():
-    needed = search(small.search_problem(simulation=config.Simulation(safety=1.0)), seed=0).trace["substeps"]
+    needed = search(small.search_problem(simulation=config.SimulationSettings(safety=1.0)), seed=0).trace["substeps"]
     # Enough substeps for the softer half of the first candidates only.
-    problem = small.search_problem(simulation=config.Simulation(substeps=int(needed.median())))
+    problem = small.search_problem(simulation=config.SimulationSettings(substeps=int(needed.median())))
     result = search(problem, seed=0)
     penalized = result.trace[result.trace["cost"] == PENALTY]
     assert 0 < len(penalized) < len(result.trace)
@@ -551,7 +555,7 @@ def test_the_search_is_the_same_bit_for_bit_however_candidates_are_simulated(mak
 
 def test_the_search_is_the_same_where_lists_of_partners_are_full():
     """Then a candidate is judged by what it finds alone."""
-    settings = config.Simulation(collision_capacity=6)
+    settings = config.SimulationSettings(collision_capacity=6)
     slow, fast = (search(crowded(simulation=settings, together=together), seed=3).trace for together in (1, 16))
     assert_same_trace(fast, slow)
     assert 0 < (slow["collision_overflow"] > 0).sum() < len(slow)
@@ -628,7 +632,7 @@ def test_candidates_of_every_fate_in_one_generation(monkeypatch):
     """Some diverge, some are unstable, and the others are judged as if they were alone."""
     # About the spacing of the nodes.
     settings = small.released(rollouts=22, start={"object_radius": 0.0145, "stiffness": 3e4})
-    chosen = small.search_problem(search=settings, simulation=config.Simulation(substeps=60))
+    chosen = small.search_problem(search=settings, simulation=config.SimulationSettings(substeps=60))
     check = stability.check
 
     def lenient(twin):
@@ -658,7 +662,7 @@ def test_groups_are_a_partition_by_substeps_with_one_for_each_thread(substeps, t
     made = groups([stand_in(count) for count in substeps], "cpu", together, threads)
     order = [k for members in made for k in members]
     assert sorted(order) == list(range(len(substeps)))
-    assert all(1 <= len(members) <= min(together or WIDTHS[-1], WIDTHS[-1]) for members in made)
+    assert all(1 <= len(members) <= min(together or LANE_WIDTHS[-1], LANE_WIDTHS[-1]) for members in made)
     # Those with the most substeps begin.
     assert [substeps[k] for k in order] == sorted(substeps, reverse=True)
     assert len(made) >= len(substeps) // -(-len(substeps) // threads)

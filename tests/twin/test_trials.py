@@ -43,7 +43,7 @@ CANDIDATES = (
 def colliding(seen: Observations, **simulation: object) -> SearchProblem:
     """The problem with self-collision."""
     crowded = replace(seen, scenario=replace(seen.scenario, self_collision=True))
-    return small.search_problem(crowded, simulation=config.Simulation(**simulation))  # type: ignore[arg-type]
+    return small.search_problem(crowded, simulation=config.SimulationSettings(**simulation))  # type: ignore[arg-type]
 
 
 def candidates(problem: SearchProblem, count: int = len(CANDIDATES)) -> list[Twin]:

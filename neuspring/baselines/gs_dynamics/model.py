@@ -28,7 +28,7 @@ import warp as wp
 from torch.nn.functional import linear, relu
 from torch.nn.utils import parameters_to_vector, skip_init, vector_to_parameters
 
-from neuspring.baselines.results import LIMIT, Prediction
+from neuspring.baselines.results import DIVERGENCE_RADIUS, Prediction
 from neuspring.config.baselines import GsDynamics
 from neuspring.core.artifacts import Artifact, Observations, Trajectory, Up, array
 from neuspring.core.device import load, start_warp
@@ -37,7 +37,7 @@ from neuspring.splats.skinning import turn_nodes
 
 HISTORY = 3
 """Steps H that the network sees, the present one included."""
-ROUNDS = 3
+MESSAGE_ROUNDS = 3
 """Rounds of message passing, which share their weights."""
 UP_AXIS = 2
 """Positions here have +z up."""
@@ -52,7 +52,7 @@ PRESETS: dict[PresetName, tuple[Any, ...]] = {
 CLOTHS = ("cloth", "package")
 COVERAGE = 0.03
 """m: no more particles are added once every point lies within it of a particle."""
-CLOSE = 1e-4
+MIN_PARTICLE_DISTANCE = 1e-4
 """Distances are floored here before a weight is computed from them, m."""
 HALF_TURN = np.array([1, -1, -1], dtype=np.float32)
 """Half a turn about the x axis: from a world with -z up to one with +z up, and back. It makes no mirror image."""
@@ -89,7 +89,7 @@ class GsDynamicsTraining(GsDynamics):
 
 @dataclass(frozen=True, kw_only=True)
 class Rules:
-    """How graphs are made and what the network sees. A rollout needs these and the weights. Meanings as in GsDynamicsTraining."""
+    """Settings of graphs and of the network's inputs. A rollout needs these and the weights. Meanings as in GsDynamicsTraining."""
 
     radius: float
     neighbors: int
@@ -113,7 +113,7 @@ class Rules:
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """How the network is trained. Meanings as in GsDynamicsTraining."""
+    """Settings of the training alone. Meanings as in GsDynamicsTraining."""
 
     noise: float
     yaw: bool
@@ -138,7 +138,7 @@ def resolve(settings: GsDynamicsTraining, category: str) -> tuple[Rules, Recipe]
 
 
 @dataclass(frozen=True, eq=False)
-class Graph:
+class ParticleGraph:
     """Directed edges among nodes 0..N-1. The first nodes are particles, the others tools."""
 
     receivers: torch.Tensor
@@ -153,7 +153,7 @@ class Graph:
         return (self.receivers < self.particles) & (self.senders < self.particles)
 
 
-def connect(points: torch.Tensor, used: torch.Tensor, tools: torch.Tensor, rules: Rules) -> Graph:
+def connect(points: torch.Tensor, used: torch.Tensor, tools: torch.Tensor, rules: Rules) -> ParticleGraph:
     """The graph of B windows with points [B, K, 3] and tools [B, C, 3], m. Points with used [B, K] are particles.
 
     A particle receives from its k nearest particles, itself included, as far as they are within the radius. Between a particle and
@@ -171,7 +171,7 @@ def connect(points: torch.Tensor, used: torch.Tensor, tools: torch.Tensor, rules
     near_tools = torch.cdist(points, tools, compute_mode="donot_use_mm_for_euclid_dist") < rules.radius
     window, point, tool = (near_tools & used[:, :, None]).nonzero(as_tuple=True)
     particle_ends, tool_ends = number[window, point], count + window * tools.shape[1] + tool
-    return Graph(torch.cat([receivers, particle_ends, tool_ends]), torch.cat([senders, tool_ends, particle_ends]), count)
+    return ParticleGraph(torch.cat([receivers, particle_ends, tool_ends]), torch.cat([senders, tool_ends, particle_ends]), count)
 
 
 def sample(
@@ -230,7 +230,7 @@ class Dynamics(torch.nn.Module):
         """A copy of the weights [W], without gradient."""
         return parameters_to_vector(self.parameters()).detach()
 
-    def forward(self, graph: Graph, history: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+    def forward(self, graph: ParticleGraph, history: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Displacements [P, 3] of particles, m, in the next step.
 
         history [H, N, 3], m, oldest first: positions of the nodes. action [N - P, 3], m: the tools' next displacements.
@@ -241,7 +241,7 @@ class Dynamics(torch.nn.Module):
         by_code, by_sum = self.particle.weight.chunk(2, dim=1)
         edge_part, code_part = linear(edges, by_edge, self.relation.bias), linear(nodes, by_code, self.particle.bias)
         state = nodes
-        for _ in range(ROUNDS):
+        for _ in range(MESSAGE_ROUNDS):
             received = linear(state, by_receiver).index_select(0, graph.receivers)
             messages = relu(edge_part + received + linear(state, by_sender).index_select(0, graph.senders))
             total = torch.zeros_like(state).index_add(0, graph.receivers, messages)
@@ -256,7 +256,7 @@ def _encoder(inputs: int, width: int) -> torch.nn.Sequential:
     return torch.nn.Sequential(*(module for layer in layers for module in (layer, relu_layer)))
 
 
-def node_inputs(rules: Rules, graph: Graph, history: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+def node_inputs(rules: Rules, graph: ParticleGraph, history: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
     """[N, `node_size`]: kind; heights and displacements in the history [H, N, 3], if asked for; action, 0 for particles."""
     nodes = history.shape[1]
     parts = [_kinds(torch.arange(nodes, device=history.device) < graph.particles, history)]
@@ -265,7 +265,7 @@ def node_inputs(rules: Rules, graph: Graph, history: torch.Tensor, action: torch
     return torch.cat([*parts, torch.cat([action.new_zeros(graph.particles, 3), action])], dim=1)
 
 
-def edge_inputs(graph: Graph, history: torch.Tensor) -> torch.Tensor:
+def edge_inputs(graph: ParticleGraph, history: torch.Tensor) -> torch.Tensor:
     """[E, `edge_size`]: kinds of receiver and sender, 1 between particle and tool, receiver - sender in each step H."""
     receives, sends = graph.receivers < graph.particles, graph.senders < graph.particles
     between = history.index_select(1, graph.receivers) - history.index_select(1, graph.senders)
@@ -320,7 +320,7 @@ def predict(model: GsDynamicsModel, observations: Observations, splats: np.ndarr
             counts.append(particles)
             touched.append(contacts)
             # NaN compares false, so this catches it together with infinity and absurd distances.
-            near = (after.abs() < LIMIT).all(dim=1)
+            near = (after.abs() < DIVERGENCE_RADIUS).all(dim=1)
             if not bool(near.all()):
                 reason, diverged = f"node {int((~near).nonzero()[0])} left the scene in frame {frame}", frame
                 break
@@ -372,7 +372,7 @@ def in_every_frame(steps: list[int], positions: np.ndarray, frames: int) -> np.n
     return np.asarray(positions[before] + part * (positions[after] - positions[before]))
 
 
-def turns(graph: Graph, before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
+def turns(graph: ParticleGraph, before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
     """Rotations [P, 3, 3] of particles that moved from `before` to `after` [P, 3], m."""
     start_warp()
     count, among = graph.particles, graph.among_particles
@@ -395,7 +395,7 @@ def turns(graph: Graph, before: torch.Tensor, after: torch.Tensor) -> torch.Tens
 
 def carry(points: torch.Tensor, particles: torch.Tensor, rotations: torch.Tensor, displacements: torch.Tensor) -> torch.Tensor:
     """Points [N, 3] m after particles [P, 3] m with rotations [P, 3, 3] moved by displacements [P, 3], m."""
-    weights = 1 / torch.cdist(points, particles, compute_mode="donot_use_mm_for_euclid_dist").clamp(min=CLOSE)
+    weights = 1 / torch.cdist(points, particles, compute_mode="donot_use_mm_for_euclid_dist").clamp(min=MIN_PARTICLE_DISTANCE)
     weights = weights / weights.sum(dim=1, keepdim=True)
     bend = rotations - torch.eye(3, dtype=points.dtype, device=points.device)
     # sum_b w_b [B_b (x - b) + u_b] = (sum_b w_b B_b) x + sum_b w_b (u_b - B_b b), relative to a center to keep digits.

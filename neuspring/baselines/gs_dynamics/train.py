@@ -23,9 +23,9 @@ from neuspring.baselines import TrainingRequest
 from neuspring.baselines.gs_dynamics.model import (
     HISTORY,
     Dynamics,
-    Graph,
     GsDynamicsModel,
     GsDynamicsTraining,
+    ParticleGraph,
     Recipe,
     Rules,
     connect,
@@ -47,10 +47,10 @@ MIN_VISIBLE = 20
 """Least tracks that must be seen in all frames of a window. Where fewer are, the window takes those seen in its history, and the
 losses leave out what is not seen."""
 SMOOTHING_PASSES = 10
-"""Of a moving average over three frames on the visible part of tracks."""
+"""Passes of a moving average over three frames on the visible part of tracks."""
 LAST_ACCEPTED = 0.75
 """Part of a step that suffices for the last training frame to end a step."""
-METRICS = ("loss", "position_loss", "length_loss")
+GS_DYNAMICS_METRICS = ("loss", "position_loss", "length_loss")
 
 
 @dataclass(frozen=True)
@@ -64,11 +64,11 @@ class Tracks:
     tools: np.ndarray
     """[T, C, 3] m."""
     dropped: int
-    """How many tracks were outliers."""
+    """Number of tracks that were outliers."""
 
     @classmethod
     def of(cls, observations: Observations, settings: GsDynamicsTraining) -> Tracks:
-        """From the training frames of a capture; nothing else of it is read."""
+        """Tracks and tools of the training frames of a capture; nothing else of it is read."""
         train, up = slice(observations.scenario.train_end), observations.scenario.up
         points, visible = upright(observations.object_points[train], up), observations.object_visibility[train]
         inliers = np.flatnonzero(ordinary(points, visible, settings.outlier_deviations))
@@ -173,7 +173,7 @@ class Windows:
 class Batch:
     """A batch of windows. All together have P particles and C tools, N = P + C nodes."""
 
-    graph: Graph
+    graph: ParticleGraph
     history: torch.Tensor
     """[H, N, 3] m, with noise."""
     tools: torch.Tensor
@@ -258,7 +258,7 @@ def position_loss(after: torch.Tensor, target: torch.Tensor, known: torch.Tensor
     return squares.sum() / (3 * known.sum().clamp(min=1))
 
 
-def length_loss(graph: Graph, after: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
+def length_loss(graph: ParticleGraph, after: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
     """Mean squared change of the lengths of edges among particles, `before` to `after` [P, 3], m^2.
 
     An edge of a particle to itself counts, with no change.
@@ -270,7 +270,7 @@ def length_loss(graph: Graph, after: torch.Tensor, before: torch.Tensor) -> torc
     return squares.mean()
 
 
-class Training:
+class GsDynamicsTrainer:
     """Runs epochs on the training frames of a capture."""
 
     def __init__(self, request: TrainingRequest) -> None:
@@ -291,7 +291,7 @@ class Training:
         generator = torch.Generator().manual_seed(int(state >> np.uint64(1)))
         updates = range(self.settings.updates_per_epoch)
         rows = [self.update(generator, f"epoch {number}, update {update}") for update in updates]
-        return dict(zip(METRICS, np.mean(rows, axis=0).tolist(), strict=True))
+        return dict(zip(GS_DYNAMICS_METRICS, np.mean(rows, axis=0).tolist(), strict=True))
 
     def update(self, generator: torch.Generator, where: str) -> list[float]:
         """One optimizer step; returns the loss, the position loss and the length loss before its weight, m^2."""
@@ -315,7 +315,7 @@ class Training:
         raise TrainingStopped(reason)
 
     def model(self) -> GsDynamicsModel:
-        """With the present weights."""
+        """The model with the present weights."""
         return GsDynamicsModel(weights=self.network.weights.cpu().numpy(), rules=self.rules)
 
     def checkpoint(self) -> Checkpoint:
@@ -343,9 +343,9 @@ class Training:
 
 def train(request: TrainingRequest) -> Trained[GsDynamicsModel]:
     """Train on the tracks of the training frames; continue a checkpoint with the same key."""
-    training, settings = Training(request), request.settings.baselines.gs_dynamics
+    training, settings = GsDynamicsTrainer(request), request.settings.baselines.gs_dynamics
     if len(training.windows):
-        return run_epochs(training, METRICS, settings.epochs, request.partial, request.key())
+        return run_epochs(training, GS_DYNAMICS_METRICS, settings.epochs, request.partial, request.key())
     # A network that learned nothing must not move the object at random.
     with torch.no_grad():
         for parameter in training.network.head[-1].parameters():
@@ -354,4 +354,4 @@ def train(request: TrainingRequest) -> Trained[GsDynamicsModel]:
     if executed(request.observations.controller_points, settings.step):
         frames = request.observations.scenario.train_end
         failure = f"training did not start: no window of a tool that moves {settings.step} m in {frames} training frames"
-    return run_epochs(training, METRICS, 0, None, "", failure)
+    return run_epochs(training, GS_DYNAMICS_METRICS, 0, None, "", failure)

@@ -10,16 +10,16 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from neuspring.baselines.results import LIMIT, Prediction
+from neuspring.baselines.results import DIVERGENCE_RADIUS, Prediction
 from neuspring.baselines.spring_gaus.physics import AnchorGraph, AnchorParameters, AnchorPhysics, AnchorSolver
 from neuspring.config.baselines import SpringGaus
 from neuspring.core.artifacts import Observations, Trajectory, array
 
-CELLS = (0.01, 0.001)
+ANCHOR_CELL_SIZES = (0.01, 0.001)
 """Cell sizes of the grids that anchors are drawn from, m."""
 BOUND_ANCHORS = 16
 """Nearest anchors that a splat or a structure point follows."""
-NEAREST = 1e-12
+MIN_ANCHOR_DISTANCE = 1e-12
 """Distances to anchors are floored here before a weight is computed from them, m."""
 GROUND_LOGIT = -1.0
 """rho at the start."""
@@ -116,9 +116,9 @@ def soft_vector(s: torch.Tensor, neighbors: int, full: int) -> torch.Tensor:
 def choose_anchors(points: np.ndarray, count: int, draw: np.random.Generator) -> np.ndarray:
     """`count` random centers [N, 3] of occupied cells of a grid, m.
 
-    The grid has the first of the sizes CELLS with so many occupied cells. If none has, all centers of the last are returned.
+    The grid has the first of ANCHOR_CELL_SIZES with so many occupied cells. If none has, all centers of the last are returned.
     """
-    for size in CELLS:
+    for size in ANCHOR_CELL_SIZES:
         centers = (np.unique(np.floor(points / size).astype(np.int64), axis=0) + 0.5) * size
         if len(centers) >= count:
             return centers[np.sort(draw.choice(len(centers), count, replace=False))]
@@ -130,7 +130,7 @@ class Follower:
 
     def __init__(self, points: np.ndarray, anchors: np.ndarray, count: int, device: str) -> None:
         distance, index = cKDTree(anchors).query(points, k=min(count, len(anchors)))
-        weights = np.maximum(distance.reshape(len(points), -1), NEAREST) ** -0.5
+        weights = np.maximum(distance.reshape(len(points), -1), MIN_ANCHOR_DISTANCE) ** -0.5
         weights /= weights.sum(axis=1, keepdims=True)
         self.indices = torch.tensor(index.reshape(weights.shape).astype(np.int64), device=device)
         self.weights = torch.tensor(weights.astype(np.float32), device=device)
@@ -172,7 +172,7 @@ def roll_out(model: SpringGausModel, controllers: np.ndarray, device: str) -> tu
         # As in training: v0 is added on entering a frame and removed on leaving it.
         x, v = solver.frame(parameters, x, v + start, hands[frame - 1], hands[frame])
         v = v - start
-        near = (x.abs() < LIMIT).all(dim=1)
+        near = (x.abs() < DIVERGENCE_RADIUS).all(dim=1)
         if not bool(near.all()):
             return torch.stack(states), f"anchor {int((~near).nonzero()[0])} left the scene in frame {frame}"
         states.append(x)
@@ -180,7 +180,7 @@ def roll_out(model: SpringGausModel, controllers: np.ndarray, device: str) -> tu
 
 
 def contraction(centers: np.ndarray, bound: np.ndarray) -> dict[str, float]:
-    """How binding by absolute positions changes centers [G, 3], m, in frame 0: mean shift, m, and ratio of sizes.
+    """Change of centers [G, 3], m, in frame 0 by binding with absolute positions: mean shift, m, and ratio of sizes.
 
     The size is the root mean square distance from the mean.
     """

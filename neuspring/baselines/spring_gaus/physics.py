@@ -34,7 +34,7 @@ SHORTEST_LINK = 1e-4
 """Rest lengths of controller links are floored here, m: a controller may lie on an anchor."""
 SLACK = 1e-6
 """Elongations below this exert no force, m."""
-MIN_LENGTH = 1e-6
+MIN_ANCHOR_LENGTH = 1e-6
 """Lengths are floored here when a direction is formed, m."""
 PACKED = ("stiffness", "soft", "scalars")
 """Trained parameters as the kernels take them; scalars are damping and friction."""
@@ -42,7 +42,7 @@ PACKED = ("stiffness", "soft", "scalars")
 
 @dataclass(frozen=True, kw_only=True)
 class AnchorGraph(Artifact):
-    """Which anchors and controllers each anchor feels. Springs are directed: row i is what anchor i feels."""
+    """Graph of the anchors and controllers that each anchor feels. Springs are directed: row i has those that anchor i feels."""
 
     kind: ClassVar[str] = "anchor_graph"
     anchors: np.ndarray = array("N,3", np.float32, "m", "positions in frame 0")
@@ -109,7 +109,7 @@ class AnchorPhysics:
 
 @dataclass(frozen=True)
 class AnchorParameters:
-    """What is trained, in the form that the forces use, at 1 kg per anchor."""
+    """Trained values in the form that the forces use, at 1 kg per anchor."""
 
     stiffness: torch.Tensor
     """[N] s_i, N: 10^kappa."""
@@ -121,7 +121,7 @@ class AnchorParameters:
     """phi: the fraction of the velocity along the ground that remains after each substep on it."""
 
 
-class Kernels(NamedTuple):
+class AnchorKernels(NamedTuple):
     """Kernels and their arguments for one scalar type. Kernels are launched over [N] anchors."""
 
     substep: Any
@@ -131,10 +131,10 @@ class Kernels(NamedTuple):
 
 
 @functools.cache
-def kernels(real: Any) -> Kernels:
+def kernels(real: Any) -> AnchorKernels:
     """Kernels for the scalar type `real`, wp.float32 or wp.float64."""
     vec3 = wp.types.vector(3, real)
-    slack, floor = wp.constant(real(SLACK)), wp.constant(real(MIN_LENGTH))
+    slack, floor = wp.constant(real(SLACK)), wp.constant(real(MIN_ANCHOR_LENGTH))
     zero, one = wp.constant(real(0.0)), wp.constant(real(1.0))
 
     @wp.struct
@@ -251,7 +251,7 @@ def kernels(real: Any) -> Kernels:
         adjoint.stiffness[i] = adjoint.stiffness[i] + hard
 
     unique = wp.kernel(module="unique", enable_backward=False)
-    return Kernels(unique(anchor_substep), unique(anchor_substep_adjoint), State, Model)
+    return AnchorKernels(unique(anchor_substep), unique(anchor_substep_adjoint), State, Model)
 
 
 class AnchorSolver:
@@ -357,7 +357,7 @@ def reference_substep(
     rest = torch.tensor(graph.lengths, dtype=x.dtype, device=x.device)
     offset = x[neighbors] - x[:, None]
     length = offset.norm(dim=2)
-    n = offset / length.clamp(min=MIN_LENGTH)[..., None]
+    n = offset / length.clamp(min=MIN_ANCHOR_LENGTH)[..., None]
     stretch = length - rest
     stiff = parameters.stiffness[:, None] / rest * parameters.soft * stretch
     pull = torch.where(stretch.abs() < SLACK, 0.0, stiff * (1 + stretch.abs() / rest) ** physics.exponent)
@@ -367,7 +367,7 @@ def reference_substep(
     reach = controllers[torch.tensor(graph.links, device=x.device).long()] - x[anchor]
     distance = reach.norm(dim=1, keepdim=True)
     strain = distance / torch.tensor(graph.link_lengths, dtype=x.dtype, device=x.device)[:, None] - 1
-    force = force.index_add(0, anchor, reach / distance.clamp(min=MIN_LENGTH) * strain * physics.link_stiffness)
+    force = force.index_add(0, anchor, reach / distance.clamp(min=MIN_ANCHOR_LENGTH) * strain * physics.link_stiffness)
     force = force + x.new_tensor([0.0, 0.0, -physics.up_sign * physics.gravity])
     v = v + step * force
     x = x + step * v

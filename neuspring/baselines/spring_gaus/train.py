@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 from neuspring.baselines import Pictures, TrainingRequest
-from neuspring.baselines.results import LIMIT, Trained, TrainingStopped, run_epochs
+from neuspring.baselines.results import DIVERGENCE_RADIUS, Trained, TrainingStopped, run_epochs
 from neuspring.baselines.spring_gaus import find_vgg16
 from neuspring.baselines.spring_gaus.model import Follower, SpringGausModel, SpringGausTraining, choose_anchors
 from neuspring.baselines.spring_gaus.physics import AnchorGraph, AnchorSolver
@@ -43,20 +43,20 @@ Objective = Callable[[int, int, torch.Tensor], torch.Tensor | None]
 """(epoch, frame, anchors [N, 3] m at the end of the frame) -> loss; None where there is nothing to compare with."""
 Features = Callable[[torch.Tensor], torch.Tensor]
 """Pictures [B, 3, H, W] in 0..1 -> features."""
-L1, DSSIM, FEATURES, VARIATION = 0.2, 0.8, 0.1, 2.0
+L1_WEIGHT, DSSIM_WEIGHT, FEATURE_WEIGHT, VARIATION_WEIGHT = 0.2, 0.8, 0.1, 2.0
 """Weights of the terms, as published."""
 LEAST_COVER = 1e-6
 """Floor of a silhouette's area, px, where a centroid is divided by it."""
-MEANS, DEVIATIONS = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+IMAGENET_MEANS, IMAGENET_DEVIATIONS = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """ImageNet's, of R, G, B in 0..1."""
 SOFT_RATE = GROUND_RATE = 1e-3
 """Adam's learning rates of s, the parameter of the soft weights, and of rho."""
 CLIP = 1.0
 """Largest norm of the gradient of each tensor by itself."""
-ADAM_EPSILON = 1e-15
+SPRING_GAUS_ADAM_EPSILON = 1e-15
 SUBSTEPS_ADDED, SUBSTEPS_RAISED = 50, (25, 50)
 """Substeps that are added at these iterations, and whenever a frame fails."""
-METRICS = ("loss", "gradient_norm", "substeps")
+SPRING_GAUS_METRICS = ("loss", "gradient_norm", "substeps")
 
 
 class UnusableFrame(ArithmeticError):
@@ -65,7 +65,7 @@ class UnusableFrame(ArithmeticError):
 
 @dataclass(frozen=True)
 class Problem:
-    """What a model is trained on."""
+    """Start, data and loss that a model is trained with."""
 
     start: SpringGausModel
     hands: np.ndarray
@@ -144,10 +144,10 @@ def silhouettes(
 
 def run(problem: Problem, partial: Path | None = None, key: str = "") -> Trained[SpringGausModel]:
     """Train; continue from `partial` if it holds a checkpoint with the same key."""
-    return run_epochs(Training(problem), METRICS, problem.settings.iterations, partial, key)
+    return run_epochs(SpringGausTrainer(problem), SPRING_GAUS_METRICS, problem.settings.iterations, partial, key)
 
 
-class Training:
+class SpringGausTrainer:
     """Runs epochs, a frame at a time."""
 
     def __init__(self, problem: Problem) -> None:
@@ -163,7 +163,7 @@ class Training:
             "velocity": settings.velocity_rate,
         }
         groups = [{"params": [tensor], "lr": rates[name]} for name, tensor in self.values.items()]
-        self.optimizer = torch.optim.Adam(groups, eps=ADAM_EPSILON)
+        self.optimizer = torch.optim.Adam(groups, eps=SPRING_GAUS_ADAM_EPSILON)
         self.rest = torch.tensor(model.anchors, device=device)
         self.hands = torch.tensor(problem.hands, device=device)
         self.keep()
@@ -215,7 +215,7 @@ class Training:
         ends = self.hands[frame - 1], self.hands[frame]
         after, speed = self.solver.frame(parameters, x, v + self.values["velocity"], *ends)
         # NaN compares false, so this catches it together with infinity and absurd distances.
-        if not bool((after.detach().abs() < LIMIT).all() and torch.isfinite(speed.detach()).all()):
+        if not bool((after.detach().abs() < DIVERGENCE_RADIUS).all() and torch.isfinite(speed.detach()).all()):
             raise UnusableFrame("the anchors left the scene")
         state = after.detach(), (speed - self.values["velocity"]).detach()
         loss = self.problem.objective(epoch, frame, after)
@@ -240,7 +240,7 @@ class Training:
         self.complete = {name: tensor.detach().clone() for name, tensor in self.values.items()}
 
     def model(self) -> SpringGausModel:
-        """With the values of the last complete epoch."""
+        """The model with the values of the last complete epoch."""
         values: dict[str, Any] = {name: tensor.cpu().numpy() for name, tensor in self.complete.items()}
         return replace(self.problem.start, **values, substeps=self.substeps)
 
@@ -265,14 +265,14 @@ class Training:
 
 def silhouette_loss(drawn: torch.Tensor, mask: torch.Tensor, features: Features | None) -> torch.Tensor:
     """Loss of a drawn coverage [H, W] against a mask [H, W], both in 0..1; without features their term is left out."""
-    total = L1 * (drawn - mask).abs().mean()
-    total = total + DSSIM * (1 - ssim(drawn[None], mask[None]))
+    total = L1_WEIGHT * (drawn - mask).abs().mean()
+    total = total + DSSIM_WEIGHT * (1 - ssim(drawn[None], mask[None]))
     if bool(mask.any()):
         total = total + (centroid(drawn) - centroid(mask)).norm() / drawn.shape[1]
     if features is not None:
         found, wanted = (features(picture.expand(1, 3, -1, -1)) for picture in (drawn, mask))
-        total = total + FEATURES * (found - wanted.detach()).square().mean()
-    return total + VARIATION * total_variation(drawn)
+        total = total + FEATURE_WEIGHT * (found - wanted.detach()).square().mean()
+    return total + VARIATION_WEIGHT * total_variation(drawn)
 
 
 def centroid(silhouette: torch.Tensor) -> torch.Tensor:
@@ -304,7 +304,7 @@ def load_features(path: Path, device: str) -> Callable[[torch.Tensor], torch.Ten
     layers.load_state_dict(dict(zip(layers.state_dict(), tensors, strict=True)), assign=True)
 
     def features(pictures: torch.Tensor) -> torch.Tensor:
-        mean, deviation = (pictures.new_tensor(values)[:, None, None] for values in (MEANS, DEVIATIONS))
+        mean, deviation = (pictures.new_tensor(values)[:, None, None] for values in (IMAGENET_MEANS, IMAGENET_DEVIATIONS))
         found: torch.Tensor = layers((pictures - mean) / deviation)
         return found
 

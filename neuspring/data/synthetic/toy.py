@@ -141,7 +141,7 @@ def make(row: ScenarioRow, settings: Toy) -> ToyScene:
     times = np.arange(settings.frames) / FRAME_RATE
     hands = hand_motion(parts[1], shape.hands, times)
     rest = truth.topology.nodes.astype(np.float64)
-    motion, _ = reference.rollout(reference.Scene.of(truth), rest, np.zeros_like(rest), hands)
+    motion, _ = reference.rollout(reference.ReferenceTwin.of(truth), rest, np.zeros_like(rest), hands)
     return ToyScene(_observe(row, shape, motion, hands, settings), truth, motion)
 
 

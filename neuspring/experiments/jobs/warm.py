@@ -126,10 +126,10 @@ def main(path: str) -> None:
     for library in LIBRARIES:
         with contextlib.suppress(ImportError):
             importlib.import_module(library)
-    from neuspring.core.provenance import ROOT, code_digest
+    from neuspring.core.provenance import PACKAGE_FOLDER, code_digest
 
     # Every job's record holds the digest of its code: here it is computed once for all.
-    for module in (ROOT / "stages").glob("*.py"):
+    for module in (PACKAGE_FOLDER / "stages").glob("*.py"):
         code_digest(f"neuspring.stages.{module.stem}")
     # Threads of this process beside the first.
     tasks = [task.read_text().strip() for task in Path("/proc/self/task").glob("*/comm") if task.parent.name != str(os.getpid())]

@@ -37,9 +37,9 @@ from neuspring.perception.frames import gray
 from neuspring.perception.track_opencv import LEVELS, equalized, inside, likeness, lucas_kanade
 
 ANNOTATIONS = "annotations.json"
-MOST_POINTS, MOST_CLICKS = 500, 5000
+MOST_CLICKED_POINTS, MOST_CLICKS = 500, 5000
 """Points in a file, and clicks on one point in one camera: limits for what a browser may send."""
-WINDOW = 13
+FLOW_WINDOW = 13
 """Side of the Lucas-Kanade window, pixels: a point alone has no neighbors that vote, so it needs more texture than one of many."""
 CROP = 80
 """Half the side, pixels, of the part of the images around a point that Lucas-Kanade sees."""
@@ -52,14 +52,14 @@ FOUND_AGAIN = 0.85
 SURROUND = 17
 """Side of the part of an image, pixels, from which compared patches are cut."""
 KEPT_BYTES = 400_000_000
-"""Of gray images that are kept."""
+"""Bytes of gray images that are kept."""
 Title = Annotated[str, StringConstraints(min_length=1, max_length=80, pattern=r"^[^\x00-\x1f\x7f]+$")]
 CameraName = Annotated[str, StringConstraints(max_length=80)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Click:
-    """Where a point is in one frame of one camera, or that it is hidden from here on."""
+    """Place of a point in one frame of one camera, or the mark that it is hidden from here on."""
 
     __pydantic_config__ = STRICT
     frame: Annotated[int, Field(ge=0)]
@@ -91,11 +91,11 @@ class Annotations:
 
     __pydantic_config__ = STRICT
     format: Literal[1] = 1
-    points: Annotated[tuple[ClickedPoint, ...], Field(max_length=MOST_POINTS)] = ()
+    points: Annotated[tuple[ClickedPoint, ...], Field(max_length=MOST_CLICKED_POINTS)] = ()
 
     @classmethod
     def read(cls, values: Any, capture: Capture, where: str) -> Annotations:
-        """From plain values; clicks are sorted by frame. Raises InputError that names the point, the camera and the rule."""
+        """Annotations of plain values, clicks sorted by frame. Raises InputError that names the point, the camera and the rule."""
         if not isinstance(values, dict):
             raise InputError(where, "a JSON object is required", type(values).__name__)
         parsed = parse(cls, values, where)
@@ -123,7 +123,7 @@ class Annotations:
         write_text(folder / ANNOTATIONS, json.dumps(self.plain(), indent=1) + "\n")
 
     def plain(self) -> dict[str, Any]:
-        """As plain JSON values; what a click does not say is left out."""
+        """The annotations as plain JSON values; fields that a click does not set are left out."""
         values = plain(self)
         for point in values["points"]:
             for clicks in point["clicks"].values():
@@ -153,19 +153,19 @@ def _check(clicks: tuple[Click, ...], capture: Capture, camera: str, where: str)
 
 @dataclass(frozen=True, eq=False)
 class Trail:
-    """Where a point is in every frame of one camera."""
+    """Place of a point in every frame of one camera."""
 
     places: np.ndarray
     """(x, y) [T, 2], pixels; NaN where hidden, lost, or without an image."""
     apart: np.ndarray
-    """How far the two directions lie apart [T], pixels; NaN where one stands alone."""
+    """Distance between the places of the two directions [T], pixels; NaN where one stands alone."""
     alike: np.ndarray
     """Correlation with the nearer click's patch [T]; NaN where unknown."""
 
 
 @dataclass(frozen=True, eq=False)
 class OneWay:
-    """What following from one click found in other frames, by frame."""
+    """Result of following from one click: places (x, y), pixels, and likeness, by frame."""
 
     places: dict[int, np.ndarray]
     alike: dict[int, float]
@@ -233,7 +233,7 @@ def follow_from(images: GrayImages, camera: str, click: Click, stop: int, aim: C
             guess = last if aim is None or aim.place is None else (1 - share) * start + share * np.array(aim.place)
             place = _look(template, now, start, guess)
             if place is not None and (
-                np.linalg.norm(place - guess) > 2 * WINDOW or _alike(template, now, start, place) < FOUND_AGAIN
+                np.linalg.norm(place - guess) > 2 * FLOW_WINDOW or _alike(template, now, start, place) < FOUND_AGAIN
             ):
                 place = None
         alive = place is not None
@@ -272,7 +272,9 @@ def _look(source: np.ndarray, target: np.ndarray, point: np.ndarray, guess: np.n
     if not inside(guess[None], target.shape)[0]:
         return None
     here, there = _corner(point, source.shape), _corner(guess, target.shape)
-    place, ok = lucas_kanade(_part(source, here), _part(target, there), (point - here)[None], (guess - there)[None], WINDOW, levels)
+    place, ok = lucas_kanade(
+        _part(source, here), _part(target, there), (point - here)[None], (guess - there)[None], FLOW_WINDOW, levels
+    )
     found = place[0].astype(float) + there
     return found if ok[0] and inside(found[None], target.shape)[0] else None
 

@@ -32,7 +32,7 @@ class CarriedMasks:
     doubt: np.ndarray
     """[T], 0 sure, 1 doubtful."""
     marks: Marks
-    """What they came from."""
+    """Marks that the masks were carried from."""
     saved: bool = False
 
 

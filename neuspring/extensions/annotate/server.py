@@ -37,12 +37,12 @@ from neuspring.extensions.annotate.masks import MasksMode
 from neuspring.extensions.annotate.shared import Busy, Stale
 from neuspring.extensions.annotate.tracks import Foreign, TracksMode
 
-STATIC = Path(__file__).parent / "static"
+STATIC_FOLDER = Path(__file__).parent / "static"
 """The only files that are given out."""
 TOKEN_HEADER = "X-NeuSpring-Token"
-MOST_BYTES = 2_000_000
+MOST_REQUEST_BYTES = 2_000_000
 """Largest body of a request."""
-HEADERS = {
+ANNOTATE_HEADERS = {
     "Content-Security-Policy": "default-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
@@ -51,9 +51,9 @@ HEADERS = {
     "Cache-Control": "no-store",
 }
 """Headers of every answer."""
-COLORS = {OBJECT: (0, 200, 160), HANDS: (255, 140, 0)}
+LABEL_COLORS = {OBJECT: (0, 200, 160), HANDS: (255, 140, 0)}
 """RGB of a label; the legend of the page has the same."""
-INSIDE, BORDER = 90, 255
+INSIDE_OPACITY, BORDER_OPACITY = 90, 255
 """Opacity inside a mask and on its border, of 255."""
 JPEG_QUALITY = 95
 ANSWERS: dict[type[Exception], int] = {Stale: 409, Busy: 409, Foreign: 428, InputError: 422}
@@ -95,7 +95,7 @@ class Server:
                 Route("/api/masks/save", lambda _: JSONResponse({"cameras": self.masks.save()}), methods=["POST"]),
                 Route("/api/clicks", lambda asked: self._write(asked, self.tracks, "annotations"), methods=["POST"]),
                 Route("/api/tracks/save", self._save_tracks, methods=["POST"]),
-                Mount("/", StaticFiles(directory=STATIC, html=True)),
+                Mount("/", StaticFiles(directory=STATIC_FOLDER, html=True)),
             ],
             middleware=[Middleware(BaseHTTPMiddleware, dispatch=self._answer)],
             exception_handlers={HTTPException: lambda _, error: _problem(error.status_code, "There is nothing at this address.")},  # type: ignore[attr-defined]
@@ -146,7 +146,7 @@ class Server:
         except Exception as error:  # the page must say so, and the terminal where
             logging.getLogger(__name__).exception("a request failed")
             answer = _problem(500, f"{type(error).__name__}: {error}. The terminal shows where.")
-        answer.headers.update(HEADERS)
+        answer.headers.update(ANNOTATE_HEADERS)
         return answer
 
     def _frame(self, camera: object, frame: object) -> tuple[str, int]:
@@ -218,11 +218,11 @@ class Server:
 def overlay_png(labels: np.ndarray) -> bytes:
     """Labels [H, W] as colors with opacity, PNG: strong on borders, weak inside."""
     picture = np.zeros((*labels.shape, 4), np.uint8)
-    for label, (red, green, blue) in COLORS.items():
+    for label, (red, green, blue) in LABEL_COLORS.items():
         mask = (labels == label).astype(np.uint8)
         core = cv2.erode(mask, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=1)
-        picture[mask > 0] = (blue, green, red, BORDER)
-        picture[core > 0] = (blue, green, red, INSIDE)
+        picture[mask > 0] = (blue, green, red, BORDER_OPACITY)
+        picture[core > 0] = (blue, green, red, INSIDE_OPACITY)
     return cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
 
 
@@ -234,8 +234,8 @@ async def _body(request: Request) -> dict[str, Any]:
     length = headers.get("Content-Length", "")
     if "Transfer-Encoding" in headers or not length.isdecimal():
         raise Refused(411, "A Content-Length is required.")
-    if int(length) > MOST_BYTES:
-        raise Refused(413, f"At most {MOST_BYTES} bytes are taken.")
+    if int(length) > MOST_REQUEST_BYTES:
+        raise Refused(413, f"At most {MOST_REQUEST_BYTES} bytes are taken.")
     try:
         values = json.loads(await request.body())
     except (ValueError, RecursionError) as error:

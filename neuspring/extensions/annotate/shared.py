@@ -1,4 +1,4 @@
-"""What all tabs share: a file that each may edit, and one piece of long work at a time."""
+"""State that all tabs share: a file that each may edit, and one piece of long work at a time."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Document(Generic[T]):
 
 
 Report: TypeAlias = Callable[[str, int, int], None]
-"""What work calls: (what, done, of all). Raises Stopped when the user stopped the work."""
+"""Progress of work, as it calls it: (what, done, of all). Raises Stopped when the user stopped the work."""
 
 
 class Stopped(Exception):

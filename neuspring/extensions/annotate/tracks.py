@@ -34,7 +34,7 @@ from neuspring.extensions.annotate.clicks import (
 from neuspring.extensions.annotate.shared import Busy, Document
 from neuspring.perception.lift import local_depth
 
-WINDOW, LEAST = 5, 4
+MEDIAN_WINDOW, LEAST_MEASURED = 5, 4
 """Side of the window, pixels, whose median depth a point gets, and how many of its pixels must be measured."""
 CAMERAS_APART = 0.02
 """m. Cameras whose points lie farther apart disagree."""
@@ -42,9 +42,9 @@ DIRECTIONS_APART = 3.0
 """Pixels. Where the ways from two clicks lie farther apart, another click is needed."""
 UNALIKE = 0.3
 """Correlation with the nearer click's patch below which a place is doubtful."""
-GAP = 4
+NOTE_GAP = 4
 """Fewer good frames than this between doubtful ones are part of one note."""
-JUMP = 0.06
+TRACK_JUMP = 0.06
 """m. A point that moves farther from one frame to the next has left its surface."""
 KEPT_RUNS, KEPT_LIFTS = 20_000, 500_000
 """Results of following from one click to the next, and lifted places, that are kept."""
@@ -54,11 +54,11 @@ def lift_place(capture: Capture, camera: str, frame: int, x: float, y: float) ->
     """World point [3], m, of a place in a frame, at the median depth of a small window; NaN where there is no depth."""
     if not capture.has_depth or not capture.has(camera, frame) or not capture.path("depth", camera, frame).exists():
         return np.full(3, np.nan)
-    view, depth, reach = capture.cameras[camera], capture.depth(camera, frame), WINDOW // 2
+    view, depth, reach = capture.cameras[camera], capture.depth(camera, frame), MEDIAN_WINDOW // 2
     column, row = np.clip(np.round([x, y]).astype(int), 0, (view.width - 1, view.height - 1))
-    if (depth[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1] > 0).sum() < LEAST:
+    if (depth[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1] > 0).sum() < LEAST_MEASURED:
         return np.full(3, np.nan)
-    here = local_depth(depth, depth > 0, np.array([column]), np.array([row]), WINDOW)[0]
+    here = local_depth(depth, depth > 0, np.array([column]), np.array([row]), MEDIAN_WINDOW)[0]
     return np.asarray(view.lift(np.array([x, y]), here))
 
 
@@ -101,12 +101,12 @@ class Note:
 def notes_of(
     point: ClickedPoint, trails: Mapping[str, Trail], places: np.ndarray, apart: np.ndarray, capture: Capture
 ) -> list[Note]:
-    """What is doubtful about a point at world places [T, 3] whose cameras lie `apart` [T], m: a note for each run of frames."""
+    """A note for each run of frames in which a point is doubtful: it has world places [T, 3], its cameras lie `apart` [T], m."""
     notes: list[Note] = []
 
     def add(camera: str | None, badness: np.ndarray, text: Callable[[int], str]) -> None:
         """A note for each run of frames of positive badness [T]; short gaps do not end a run."""
-        bad = binary_closing(np.pad(badness > 0, GAP + 1), np.ones(GAP + 1))[GAP:-GAP]
+        bad = binary_closing(np.pad(badness > 0, NOTE_GAP + 1), np.ones(NOTE_GAP + 1))[NOTE_GAP:-NOTE_GAP]
         for first, stop in np.flatnonzero(bad[1:] != bad[:-1]).reshape(-1, 2).tolist():
             worst = first + int(np.argmax(badness[first:stop]))
             notes.append(Note(point.name, camera, first, stop - 1, worst, text(worst)))
@@ -128,7 +128,7 @@ def notes_of(
     step = np.concatenate([[0.0], np.nan_to_num(np.linalg.norm(np.diff(places, axis=0), axis=1))])
     add(
         None,
-        np.where(step > JUMP, step, 0),
+        np.where(step > TRACK_JUMP, step, 0),
         lambda frame: f"jumps by {1000 * step[frame]:.0f} mm in one frame: is the point hidden here?",
     )
     flat = np.any([np.isfinite(trail.places).all(axis=1) for trail in trails.values()] or [np.zeros(len(gap), bool)], axis=0)
@@ -231,7 +231,7 @@ class TracksMode:
         return {"revision": revision, "annotations": annotations.plain(), "tracks_exist": (self.capture.folder / TRACKS).exists()}
 
     def results(self, since: int) -> dict[str, Any]:
-        """What was followed, as plain values; without the points if nothing is newer than `since`."""
+        """Followed points as plain values; without the points where nothing is newer than `since`."""
         with self._lock:
             answer: dict[str, Any] = {"version": self._done, "busy": self._done < self._wanted, "failure": self._failure}
             if self._done != since:

@@ -17,15 +17,15 @@ from scipy.spatial.transform import Rotation
 from neuspring.core.artifacts import Rod
 from neuspring.physics.rod_nodes import frame_zero, radius_of
 
-STEP = 2e-4
+CABLE_STEP = 2e-4
 """s, at most: springs of joints are explicit there."""
 THICKNESS = 0.002
 """Least radius, m: nodes on the line show none."""
-WELD: dict[str, Any] = {"solref": f"{2 * STEP} 1", "solimp": "0.999 0.9999 1e-4"}
+WELD: dict[str, Any] = {"solref": f"{2 * CABLE_STEP} 1", "solimp": "0.999 0.9999 1e-4"}
 """A clamp is as stiff as the time step allows."""
 
 
-AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
+HINGE_AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
 
 
 def text(*values: float | np.floating) -> str:
@@ -46,9 +46,9 @@ def add(rod: Rod, root: ET.Element, world: ET.Element, meets: dict[str, Any]) ->
     for j in range(edges):
         parent = ET.SubElement(parent, "body", name=f"edge{j}", **at)
         if j:
-            for axis, k in zip(AXES, (twist[j - 1], bend[j - 1], bend[j - 1]), strict=True):
+            for axis, k in zip(HINGE_AXES, (twist[j - 1], bend[j - 1], bend[j - 1]), strict=True):
                 law: dict[str, Any] = {"stiffness": text(k), "damping": text(rod.damping * k)}
-                ET.SubElement(parent, "joint", name=f"joint{j}{axis}", type="hinge", axis=AXES[axis], **law)
+                ET.SubElement(parent, "joint", name=f"joint{j}{axis}", type="hinge", axis=HINGE_AXES[axis], **law)
             pose += (rest[j - 1].inv() * frames[j - 1].inv() * frames[j]).as_euler("XYZ").tolist()
         else:
             ET.SubElement(parent, "freejoint", name="joint0")

@@ -1,4 +1,4 @@
-"""What is exported: a twin, its predicted motion, the hands that move it and its splats, from a run's folder or a `twin.npz`."""
+"""Source of an export: a twin, its predicted motion, the hands that move it and its splats, from a run's folder or a `twin.npz`."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from neuspring.splats.model import Splats
 from neuspring.twin.body import body_of, lines_of
 from neuspring.twin.rollout import initial_velocity
 
-NAMED = "Name results/<scenario>/<method>/<seed> of a run with a twin, or a twin.npz."
-FRAMES = re.compile(r"(\d{1,9})(?::(\d{1,9})(?::(\d{1,9}))?)?")
+SOURCE_REMEDY = "Name results/<scenario>/<method>/<seed> of a run with a twin, or a twin.npz."
+FRAME_RANGE = re.compile(r"(\d{1,9})(?::(\d{1,9})(?::(\d{1,9}))?)?")
 
 
 @dataclass(frozen=True)
-class Source:
+class ExportSource:
     """A twin and what is known of its motion; F frames, N nodes, C controllers."""
 
     name: str
@@ -34,11 +34,11 @@ class Source:
     hands: np.ndarray
     """Controllers [F, C, 3], m."""
     holds: np.ndarray
-    """Whether each controller holds the object [F, C]."""
+    """True where a controller holds the object [F, C]."""
     velocity: np.ndarray
-    """Of the nodes in frame 0 [N, 3], m/s."""
+    """Velocity of the nodes in frame 0 [N, 3], m/s."""
     splats: Splats | None = None
-    """In the shape of frame 0."""
+    """Splats in the shape of frame 0."""
     made_from: dict[str, str] = field(default_factory=dict)
     """File name -> SHA-256."""
     frames: np.ndarray = field(default_factory=lambda: np.zeros(1, np.int64))
@@ -51,10 +51,10 @@ class Source:
 
     @property
     def masses(self) -> np.ndarray:
-        """Of the nodes [N], kg; 0 where others of the body's points have the mass."""
+        """Masses of the nodes [N], kg; 0 where others of the body's points have the mass."""
         return lines_of(self.twin).masses[: len(self.twin.topology.nodes)]
 
-    def only(self, frames: Sequence[int]) -> Source:
+    def only(self, frames: Sequence[int]) -> ExportSource:
         """The same with these of its frames alone."""
         rows = list(frames)
         changed = {name: getattr(self, name)[rows] for name in ("positions", "hands", "holds", "frames")}
@@ -77,7 +77,7 @@ class Source:
         return self.splats
 
 
-def read_source(path: Path) -> Source:
+def read_source(path: Path) -> ExportSource:
     """A run's folder (results/<scenario>/<method>/<seed>), or a twin.npz, which is known in frame 0 alone.
 
     Raises InputError for a folder without a twin, one that is incomplete, and a run that failed before it had a twin.
@@ -85,13 +85,13 @@ def read_source(path: Path) -> Source:
     if path.is_file():
         return _at_rest(path.parent.name or "twin", Twin.load(path), {path.name: digest_file(path)})
     if not path.is_dir():
-        raise InputError(path, "must be a run's folder or a twin.npz", "no such file or folder", NAMED)
+        raise InputError(path, "must be a run's folder or a twin.npz", "no such file or folder", SOURCE_REMEDY)
     run = RunFolder.of(path)
     name, twin = "_".join(run.folder.parts[-3:]), run.twin
     if twin is None:
         failed = next((record.reason for record in run.records.values() if record.status == "failed"), "")
         found = f"a failure: {failed}" if failed else f"a baseline's model ({run.learning[-1]})" if run.learning else "none"
-        raise InputError(path, "must be the run of a method that makes a twin", found, NAMED)
+        raise InputError(path, "must be the run of a method that makes a twin", found, SOURCE_REMEDY)
     twin_name, digest = run.stages[run.learning[-1]].record.files["twin"]
     made_from = {twin_name: digest}
     if run.trajectory is None:
@@ -110,7 +110,7 @@ def read_source(path: Path) -> Source:
         raise InputError(path / "trajectory.npz", rule, trajectory.positions.shape, "Delete rollout.json and run again.")
     hands, valid = observations.controller_points[:count], observations.controller_valid
     splats = run.file("appearance", "splats")
-    return Source(
+    return ExportSource(
         name=name,
         twin=body_of(twin).for_prediction(twin),
         positions=trajectory.positions,
@@ -123,11 +123,11 @@ def read_source(path: Path) -> Source:
     )
 
 
-def chosen_frames(text: str | None, source: Source, default: str) -> list[int]:
+def chosen_frames(text: str | None, source: ExportSource, default: str) -> list[int]:
     """Frames of FIRST, FIRST:STOP or FIRST:STOP:STEP (STOP is left out); without text `default`, or all where that is empty."""
     count = len(source.positions)
     words = text if text is not None else default or f"0:{count}"
-    found = FRAMES.fullmatch(words)
+    found = FRAME_RANGE.fullmatch(words)
     first, stop, step = (int(word) if word else None for word in found.groups()) if found else (None, None, None)
     frames = [] if first is None else list(range(first, first + 1 if stop is None else stop, 1 if step is None else step or count))
     if not frames or step == 0 or frames[-1] >= count:
@@ -135,9 +135,9 @@ def chosen_frames(text: str | None, source: Source, default: str) -> list[int]:
     return frames
 
 
-def _at_rest(name: str, twin: Twin, digests: dict[str, str]) -> Source:
+def _at_rest(name: str, twin: Twin, digests: dict[str, str]) -> ExportSource:
     topology = twin.topology
-    return Source(
+    return ExportSource(
         name=name,
         twin=twin,
         positions=topology.nodes[None],

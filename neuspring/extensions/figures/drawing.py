@@ -151,7 +151,7 @@ def _require_splats(chosen: Chosen, remedy: str) -> None:
 
 
 def _painter(a: ComparedOptions, chosen: Chosen, frames: list[int], error: Error | None) -> Painter:
-    """What paints a strip or a film; `error` is what is drawn where nothing is asked for, None for the best there is."""
+    """The painter of a strip or a film; `error` is drawn where the options ask for none, None stands for the best there is."""
     if a.style == "splats":
         _require_splats(chosen, "Leave out --as splats to draw nodes.")
     without = _without_splats(chosen)

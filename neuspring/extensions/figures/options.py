@@ -8,13 +8,13 @@ from typing import Annotated, Literal
 
 from neuspring.cli.options import Device, Positional, Settings, arg
 
-FILM_MEGABYTES = 2.0
+README_FILM_MEGABYTES = 2.0
 """Size of a film that a README loads at once."""
 
 
 @dataclass(kw_only=True)
 class RunOptions:
-    """Which runs, seen from where, as which file."""
+    """Runs to draw, the view, and the file."""
 
     results: Annotated[
         Positional[tuple[Path, ...]], arg(help="results/<scenario>, or runs <scenario>/<method>/<seed> of one scenario")
@@ -31,7 +31,7 @@ class RunOptions:
 
 @dataclass(kw_only=True)
 class ComparedOptions(RunOptions):
-    """How predictions and errors are drawn."""
+    """Look of predictions and errors."""
 
     frames: Annotated[tuple[int, ...], arg(help="of a strip: first, last of training, middle of the future, last by default")] = ()
     style: Annotated[Literal["splats", "nodes"] | None, arg(name="as", help="splats where the runs have them by default")] = None
@@ -64,12 +64,12 @@ class FilmOptions(ComparedOptions):
 
     width: Annotated[int, arg(help="pixels")] = 800
     speed: Annotated[float, arg(help="1: as fast as it was; 0.5: half as fast")] = 1.0
-    megabytes: Annotated[float, arg(help="largest file; a film beyond it is made coarser")] = FILM_MEGABYTES
+    megabytes: Annotated[float, arg(help="largest file; a film beyond it is made coarser")] = README_FILM_MEGABYTES
 
 
 @dataclass(kw_only=True)
 class TwinOptions(RunOptions):
-    """What is drawn of twins, and the size on paper."""
+    """Parts of twins that are drawn, and the size on paper."""
 
     by: Annotated[tuple[Literal["stiffness", "region"], ...], arg(help="rows: springs by stiffness, nodes by region")] = (
         "stiffness",

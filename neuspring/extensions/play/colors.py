@@ -1,4 +1,4 @@
-"""What springs show by their color: stiffness, region, strain or force, each with its range and a legend."""
+"""Colors of springs: by stiffness, region, strain or force, each with its range and a legend."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from neuspring.twin.body import Lines, lines_of
 
 QUANTITIES = ("stiffness", "strain", "force", "region")
 DIVERGING = "coolwarm"
-STEPS = 12
+LEGEND_STEPS = 12
 """Colors of a legend's bar."""
-PLAIN = np.array([150, 150, 150], np.uint8)
-CROSSING = np.array([70, 70, 70], np.uint8)
-OVER = np.array([255, 0, 0], np.uint8)
+PLAIN_COLOR = np.array([150, 150, 150], np.uint8)
+CROSSING_COLOR = np.array([70, 70, 70], np.uint8)
+OVER_COLOR = np.array([255, 0, 0], np.uint8)
 """Springs beyond the strain that is given as the most."""
 LEAST_STRAIN, LEAST_FORCE = 0.02, 0.1
 """Half of the narrowest range, 1 and N: noise must not fill the colors."""
@@ -47,7 +47,7 @@ class Scale:
 
     def legend(self) -> str:
         """The legend as HTML: a bar from low to high with values and unit."""
-        stops = ", ".join(to_hex(color) for color in colormaps[self.colors](np.linspace(0, 1, STEPS)))
+        stops = ", ".join(to_hex(color) for color in colormaps[self.colors](np.linspace(0, 1, LEGEND_STEPS)))
         middle = np.sqrt(self.low * self.high) if self.log else 0.5 * (self.low + self.high)
         ticks = "".join(f"<span>{value:.3g}</span>" for value in (self.low, middle, self.high))
         kind = ", logarithmic" if self.log else ""
@@ -134,9 +134,9 @@ def _regions(lines: Lines) -> np.ndarray:
     """A region's color within it; dark between regions; gray for springs of hands."""
     names, region = np.unique(lines.labels, return_inverse=True)
     ends = region[lines.pairs[: lines.inner]]
-    colors = np.tile(PLAIN, (len(lines.pairs), 1))
+    colors = np.tile(PLAIN_COLOR, (len(lines.pairs), 1))
     colors[: lines.inner] = np.asarray(255 * region_colors(len(names))[ends[:, 0]][:, :3] + 0.5, np.uint8)
-    colors[: lines.inner][ends[:, 0] != ends[:, 1]] = CROSSING
+    colors[: lines.inner][ends[:, 0] != ends[:, 1]] = CROSSING_COLOR
     return colors
 
 

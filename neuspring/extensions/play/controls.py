@@ -19,7 +19,7 @@ from neuspring.twin.rollout import Diverged
 
 MOST_FRAMES = 20_000
 """Frames of a recording: eleven minutes at 30 frames/s."""
-MOST_BYTES = 200_000_000
+MOST_CONTROL_BYTES = 200_000_000
 """Largest file of a recording, unpacked."""
 Row = tuple[np.ndarray, int, np.ndarray, np.ndarray]
 """Hands [C, 3], the grabbed node or -1, its target [3], and which hands hold [C]."""
@@ -27,7 +27,7 @@ Row = tuple[np.ndarray, int, np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, kw_only=True)
 class Controls(Artifact):
-    """What was done to a twin in F frames after a start."""
+    """Hands and grabs that moved a twin in F frames after a start."""
 
     kind: ClassVar[str] = "recording"
     hands: np.ndarray = array("F,C,3", np.float32, "m", "where each controller is at the end of each frame")
@@ -58,7 +58,7 @@ class Controls(Artifact):
         return f"{self.method}/{self.seed}"
 
     def row(self, frame: int) -> tuple[np.ndarray, int, np.ndarray, np.ndarray | None]:
-        """What `Simulator.step` takes for a frame, the first one being 0."""
+        """Arguments of `Simulator.step` for a frame, the first one being 0."""
         return self.hands[frame], int(self.grabbed[frame]), self.target[frame], self.holds[frame] if self.holds.size else None
 
     def require_fit(self, twin: Twin) -> None:
@@ -80,7 +80,7 @@ class Controls(Artifact):
             raise InputError("controls.grabbed", f"nodes must lie in [-1, {nodes})", [self.grabbed.min(), self.grabbed.max()])
 
 
-class Recording:
+class ControlRecorder:
     """Controls and nodes of each frame since the start, up to MOST_FRAMES. Safe for threads."""
 
     def __init__(self) -> None:
@@ -111,7 +111,7 @@ class Recording:
             return digest_motion(np.stack(self._seen))
 
     def controls(self, start: Start, frame: int, **names: str) -> Controls:
-        """What was recorded. Raises InputError where that is nothing, or was too long."""
+        """The recorded controls. Raises InputError where there are none, or too many."""
         with self._lock:
             rows, seen = list(self._rows or ()), list(self._seen)
         if not rows:
@@ -131,7 +131,7 @@ class Recording:
 
 def load_controls(path: Path) -> Controls:
     """Read a recording. Raises InputError for a damaged, foreign or oversized file."""
-    require_modest(path, MOST_BYTES)
+    require_modest(path, MOST_CONTROL_BYTES)
     return Controls.load(path)
 
 
@@ -155,7 +155,7 @@ def digest_motion(positions: np.ndarray) -> str:
 
 @dataclass(frozen=True)
 class Difference:
-    """How far two twins are apart under the same controls, node by node."""
+    """Distance between two twins under the same controls, node by node."""
 
     frames: int
     """Frames that both reached."""
@@ -166,7 +166,7 @@ class Difference:
     worst: float
     """Largest distance of a node, m."""
     diverged: str = ""
-    """Why one of them ended earlier."""
+    """Reason why one of them ended earlier."""
 
 
 def compare(controls: Controls, own: Twin, other: Twin, seen: Trajectory | None = None) -> Difference:

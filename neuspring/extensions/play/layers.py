@@ -1,4 +1,4 @@
-"""What is drawn in the scene: a run's body, its splats, its tracks, and what was observed around it."""
+"""Layers of the scene: a run's body, its splats, its tracks, and what was observed around it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from trimesh.visual.material import PBRMaterial
 from neuspring.core.artifacts import Observations, SplatCenters, Twin
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
-from neuspring.extensions.play.colors import OVER, Scale, Springs, linear, node_colors
+from neuspring.extensions.play.colors import OVER_COLOR, Scale, Springs, linear, node_colors
 from neuspring.report.draw.sheet import sample
 from neuspring.splats.model import Splats
 from neuspring.splats.skinning import Skin
@@ -27,20 +27,20 @@ from neuspring.twin.body import lines_of
 if TYPE_CHECKING:
     import viser
 
-NODE, HAND, GRABBED = (70, 90, 120), (214, 39, 40), (255, 200, 0)
-SEEN, TRACK, CAMERA = (0, 150, 90), (150, 0, 200), (60, 60, 60)
-PREDICTED, APART = (230, 120, 0), (90, 90, 90)
-WIDTH = 2.0
+NODE_COLOR, HAND_COLOR, GRABBED_COLOR = (70, 90, 120), (214, 39, 40), (255, 200, 0)
+SEEN_COLOR, TRACK_COLOR, CAMERA_COLOR = (0, 150, 90), (150, 0, 200), (60, 60, 60)
+PREDICTED_COLOR, APART_COLOR = (230, 120, 0), (90, 90, 90)
+LINE_WIDTH = 2.0
 """Pixels of a spring, and of the line from a predicted point to the annotated one."""
 SIZE = 0.3
 """Radius of a node as a part of the median distance to its nearest neighbor."""
-LEAST, REACH = 0.004, 0.03
+LEAST_RADIUS, LEAST_REACH = 0.004, 0.03
 """Least radius of a node, and of what takes the mouse for it, as parts of the body's size."""
-UNIT = 1e-3
+SPLAT_UNIT = 1e-3
 """m. The browser has covariances in 16-bit floats, which are too coarse for squares of meters."""
-WIDEST = 200.0
+WIDEST_SPLAT = 200.0
 """Largest standard deviation of a splat, mm: the largest whose square 16 bits hold, less a margin."""
-MOST_SPLATS = 60_000
+MOST_DRAWN_SPLATS = 60_000
 """Splats that are drawn: 32 bytes each go to the browser in each frame."""
 FRUSTUM = 0.12
 """Length of a camera's pyramid as a part of the scene's size."""
@@ -50,7 +50,7 @@ LARGEST_IMAGE = 480
 
 @dataclass
 class Display:
-    """What is shown, and how."""
+    """Parts that are shown, and their look."""
 
     quantity: str = "stiffness"
     splats: bool = True
@@ -76,24 +76,24 @@ class BodyLayer:
         self.parts = Springs.of(twin, sample(count)) if twin and count else None
         self.root = scene.add_frame(f"/{name}", show_axes=False)
         size = float(np.linalg.norm(np.ptp(nodes, axis=0)))
-        self.radius = radius = max(SIZE * spacing(nodes), LEAST * size)
-        self._reach = max(radius, REACH * size)
+        self.radius = radius = max(SIZE * spacing(nodes), LEAST_RADIUS * size)
+        self._reach = max(radius, LEAST_REACH * size)
         self.splats: SplatLayer | None = None
         self.overlay: TrackOverlay | None = None
         self._handles: Any = None
-        self._colors = node_colors(twin) if twin else np.tile(np.array(NODE, np.uint8), (len(nodes), 1))
+        self._colors = node_colors(twin) if twin else np.tile(np.array(NODE_COLOR, np.uint8), (len(nodes), 1))
         self.nodes = _balls(scene, f"/{name}/nodes", nodes, radius, self._colors)
-        self.hands = _balls(scene, f"/{name}/hands", hands, 1.3 * radius, HAND)
+        self.hands = _balls(scene, f"/{name}/hands", hands, 1.3 * radius, HAND_COLOR)
         self.springs: Any = None
         if self.parts is not None:
             ends = self.parts.ends(nodes, hands)
             colors = np.zeros(ends.shape, np.uint8)
-            self.springs = scene.add_line_segments(f"/{name}/springs", ends, colors, thickness=WIDTH, thickness_units="screen")
+            self.springs = scene.add_line_segments(f"/{name}/springs", ends, colors, thickness=LINE_WIDTH, thickness_units="screen")
         self.label = scene.add_label(f"/{name}/label", name, anchor="bottom-center", font_screen_scale=0.9)
 
     @property
     def left_out(self) -> int:
-        """How many springs are not drawn."""
+        """Number of springs that are not drawn."""
         return len(self.parts.lines.pairs) - len(self.parts.pairs) if self.parts else 0
 
     def show(self, display: Display) -> None:
@@ -120,7 +120,7 @@ class BodyLayer:
         strain = self.parts.strain(ends)
         if self.springs.visible:
             colors = self.parts.paint(quantity, scale, strain)
-            colors[strain > most] = OVER
+            colors[strain > most] = OVER_COLOR
             self.springs.points = ends
             self.springs.colors = np.repeat(linear(colors)[:, None], 2, axis=1)
         return strain
@@ -129,7 +129,7 @@ class BodyLayer:
         """Show a grabbed node in yellow."""
         colors = self._colors.copy()
         if node is not None:
-            colors[node] = GRABBED
+            colors[node] = GRABBED_COLOR
         self.nodes.batched_colors = linear(colors)
 
     def handles(self) -> Any:
@@ -187,28 +187,28 @@ class SplatLayer:
         self, scene: viser.SceneApi, name: str, splats: Splats, nodes: np.ndarray, centers: SplatCenters | None = None
     ) -> None:
         chosen = np.arange(len(splats.means))
-        if len(chosen) > MOST_SPLATS:
-            chosen = np.sort(np.random.default_rng(0).choice(chosen, MOST_SPLATS, replace=False))
+        if len(chosen) > MOST_DRAWN_SPLATS:
+            chosen = np.sort(np.random.default_rng(0).choice(chosen, MOST_DRAWN_SPLATS, replace=False))
         self._nodes, self._centers, self._chosen = np.array(nodes, np.float32), centers, chosen
         self._means, self._turns = torch.tensor(splats.means[chosen]), torch.tensor(splats.quaternions[chosen])
-        scales = np.exp(splats.log_scales[chosen].astype(float)) / UNIT
-        self._scales = np.minimum(np.broadcast_to(scales, (len(chosen), 3)), WIDEST).astype(np.float32)
+        scales = np.exp(splats.log_scales[chosen].astype(float)) / SPLAT_UNIT
+        self._scales = np.minimum(np.broadcast_to(scales, (len(chosen), 3)), WIDEST_SPLAT).astype(np.float32)
         colors = np.clip(0.5 + C0 * splats.harmonics[chosen, 0], 0, 1)
         opacities = 1 / (1 + np.exp(-splats.opacity_logits[chosen, None]))
         self._skin = Skin(self._nodes, frozen=True)
         self.handle: Any = scene.add_gaussian_splats(
             f"/{name}/splats",
-            (self._means.numpy() / UNIT).astype(np.float32),
+            (self._means.numpy() / SPLAT_UNIT).astype(np.float32),
             covariances(self._turns.numpy(), self._scales),
             colors,
             opacities,
-            scale=UNIT,
+            scale=SPLAT_UNIT,
             visible=False,
         )
 
     @property
     def shown(self) -> bool:
-        """Whether they are seen."""
+        """True where they are shown."""
         return bool(self.handle.visible)
 
     def show(self, visible: bool) -> None:
@@ -229,7 +229,7 @@ class SplatLayer:
         if self.shown:
             means, turns = self.carried(nodes, frame)
             old = self.handle
-            old.set_gaussians(means / UNIT, covariances(turns, self._scales), old.rgbs / 255.0, old.opacities / 255.0)
+            old.set_gaussians(means / SPLAT_UNIT, covariances(turns, self._scales), old.rgbs / 255.0, old.opacities / 255.0)
 
 
 def covariances(quaternions: np.ndarray, scales: np.ndarray) -> np.ndarray:
@@ -248,9 +248,9 @@ class TrackOverlay:
         known = np.isfinite(tracks[0]).all(axis=1) if len(tracks) else np.zeros(0, bool)
         self._tracks = tracks[:, known] if len(tracks) else np.zeros((1, 0, 3))
         self._nodes = cKDTree(nodes).query(self._tracks[0])[1].astype(int)
-        self._points = _points(scene, f"/{name}/tracks", nodes[self._nodes], PREDICTED, radius, "diamond")
+        self._points = _points(scene, f"/{name}/tracks", nodes[self._nodes], PREDICTED_COLOR, radius, "diamond")
         lines = np.zeros((len(self._nodes), 2, 3), np.float32)
-        self._lines = scene.add_line_segments(f"/{name}/apart", lines, APART, thickness=WIDTH, thickness_units="screen")
+        self._lines = scene.add_line_segments(f"/{name}/apart", lines, APART_COLOR, thickness=LINE_WIDTH, thickness_units="screen")
         self.error: float | None = None
         """Mean distance in the frame that is shown, m; None where no track is annotated."""
 
@@ -274,13 +274,13 @@ def _points(scene: viser.SceneApi, name: str, points: np.ndarray, color: Any, si
 
 
 class Surroundings:
-    """What was observed of one scenario: points, annotated tracks, and cameras with their images."""
+    """Observations of one scenario: points, annotated tracks, and cameras with their images."""
 
     def __init__(self, scene: viser.SceneApi, observations: Observations, capture: Capture | None, size: float) -> None:
         self._seen, self._capture = observations, capture
         radius = min(0.35 * spacing(observations.object_points[0]), 0.006 * size)
-        self.points = _points(scene, "/observed/points", self._observed(0), SEEN, radius, "circle")
-        self.tracks = _points(scene, "/observed/tracks", self._annotated(0), TRACK, 1.4 * radius, "diamond")
+        self.points = _points(scene, "/observed/points", self._observed(0), SEEN_COLOR, radius, "circle")
+        self.tracks = _points(scene, "/observed/tracks", self._annotated(0), TRACK_COLOR, 1.4 * radius, "diamond")
         self._images = False
         self.cameras: dict[str, Any] = {}
         for name, camera in (capture.cameras if capture else {}).items():
@@ -289,7 +289,7 @@ class Surroundings:
                 fov=float(2 * np.arctan2(camera.height / 2, camera.intrinsics[1, 1])),
                 aspect=camera.width / camera.height,
                 scale=FRUSTUM * size,
-                color=CAMERA,
+                color=CAMERA_COLOR,
                 thickness=1.5,
                 thickness_units="screen",
                 wxyz=Rotation.from_matrix(camera.camera_to_world[:3, :3]).as_quat(scalar_first=True),

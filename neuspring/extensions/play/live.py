@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from neuspring.core.errors import InputError
-from neuspring.extensions.play.controls import MOST_FRAMES, Controls, Recording
+from neuspring.extensions.play.controls import MOST_FRAMES, ControlRecorder, Controls
 from neuspring.extensions.play.layers import BodyLayer
 from neuspring.extensions.play.player import Player
 from neuspring.extensions.play.simulator import Simulator, StartState, hands_of
@@ -22,9 +22,9 @@ from neuspring.twin.rollout import Diverged
 if TYPE_CHECKING:
     import viser
 
-FASTEST = 3.0
+FASTEST_GRAB = 3.0
 """m/s: a grab follows a faster mouse at this speed, as a jump would tear the twin."""
-WINDOW = 30
+AVERAGED_FRAMES = 30
 """Frames that frame rate and latency are averages of."""
 TOO_MUCH = 0.3
 """Strain from which springs are red at the beginning."""
@@ -54,9 +54,9 @@ class Live:
         self.most, self.message = TOO_MUCH, ""
         self.strain, self.over = 0.0, 0
         self.rate = self.factor = self.latency = 0.0
-        self.recording = Recording()
+        self.recording = ControlRecorder()
         self.recording.begin(self.simulator.positions)
-        self._latencies: deque[float] = deque(maxlen=WINDOW)
+        self._latencies: deque[float] = deque(maxlen=AVERAGED_FRAMES)
         self._splat_seconds = 0.0
         self._again, self._stop = threading.Event(), threading.Event()
         self.body = BodyLayer(server.scene, f"live {run.name}", twin, self.simulator.positions, hands)
@@ -76,7 +76,7 @@ class Live:
         self._again.set()
 
     def recorded(self) -> Controls:
-        """What was done since the last reset. Raises InputError where that is nothing, or too long."""
+        """Controls since the last reset. Raises InputError where there are none, or too many."""
         return self.recording.controls(
             self.begin.start,
             self.begin.frame,
@@ -144,7 +144,7 @@ class Live:
 
     def _run(self) -> None:
         frame_time = self.simulator.twin.simulation.frame_time
-        ends: deque[float] = deque(maxlen=WINDOW)
+        ends: deque[float] = deque(maxlen=AVERAGED_FRAMES)
         due = time.monotonic()
         while not self._stop.is_set():
             if not self._player.watched.wait(0.2):
@@ -206,7 +206,7 @@ class Live:
             self.latency = sum(self._latencies) / len(self._latencies)
 
     def _controls(self, frame_time: float) -> tuple[np.ndarray, int, np.ndarray, np.ndarray | None] | None:
-        """What is done in the next frame; None where a recording has ended."""
+        """Arguments of `Simulator.step` for the next frame; None where a recording has ended."""
         simulator, frame = self.simulator, self.simulator.frame
         if self.played is not None:
             return self.played.row(frame) if frame < len(self.played.grabbed) else None
@@ -228,7 +228,7 @@ class Live:
 
 
 class Grab:
-    """Who holds what of a twin with `nodes` nodes, and where its hands are wanted [C, 3], m. Safe for threads.
+    """Grab of a twin with `nodes` nodes: its holder, the node or hand, and the wanted hands [C, 3], m. Safe for threads.
 
     One grab at a time, of a node or a hand, by one browser. What browsers send is checked here.
     """
@@ -238,7 +238,7 @@ class Grab:
         self.following = False
         """Hands follow a recording, so that nobody can take them."""
         self.asked = 0.0
-        """When a mouse was last moved, s (time.monotonic); 0 once that was drawn."""
+        """Time when a mouse was last moved, s (time.monotonic); 0 once that was drawn."""
         self.reset(hands)
 
     def reset(self, hands: np.ndarray) -> None:
@@ -296,7 +296,7 @@ class Grab:
             if recorded is not None:
                 self.wanted = recorded
             wanted, node, target = self.wanted, self.node, self._target
-        reach = FASTEST * seconds
+        reach = FASTEST_GRAB * seconds
         moved = hands + _limited(wanted - hands, reach) if recorded is None else recorded
         return moved, node, at + _limited((target - at)[None], reach)[0] if node >= 0 else target
 

@@ -15,7 +15,7 @@ from neuspring.extensions.play import layers
 from neuspring.extensions.play.colors import QUANTITIES
 from neuspring.extensions.play.controls import Controls
 from neuspring.extensions.play.live import TOO_MUCH, Live
-from neuspring.extensions.play.player import MOST_SHOWN, SPEEDS, Player
+from neuspring.extensions.play.player import MOST_RUNS_SHOWN, SPEEDS, Player
 from neuspring.extensions.play.simulator import StartState, start_state
 from neuspring.report.shown import Found
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 RATE = 30.0
 """Most drawings per second."""
-PARTS = {
+PART_TITLES = {
     "nodes": "Nodes",
     "springs": "Springs",
     "hands": "Hands",
@@ -37,25 +37,25 @@ PARTS = {
 DRAG = "Start, then drag a node or a hand (red) with the left button. Drag beside them to turn the view."
 REPEAT = "Hands move as recorded, while you pull elsewhere. Switching begins again."
 FROM = "Begins in the state of the prediction in this frame"
-KEYS = "Keys: space plays, arrows left and right step, home and end jump, R resets a live twin, Escape leaves it."
+KEY_HINTS = "Keys: space plays, arrows left and right step, home and end jump, R resets a live twin, Escape leaves it."
 BACK = "Back to the recording"
-OPENING = math.radians(45)
+VIEW_ANGLE = math.radians(45)
 """Vertical angle of view."""
-PHONE, COVERED = 576, 0.45
+PHONE, PANEL_SHARE = 576, 0.45
 """A window narrower than this, CSS pixels, has its panel below, over this part of it."""
 FIT = (
     f"<style>@media (max-width: {PHONE}px) {{ [style*='max-height: 60%'] {{ width: 100% !important; "
-    f"max-height: {COVERED:.0%} !important }} [style*='width: 20em'] {{ width: 100% !important }} }}</style>"
+    f"max-height: {PANEL_SHARE:.0%} !important }} [style*='width: 20em'] {{ width: 100% !important }} }}</style>"
 )
 """viser's panel on a phone is as wide as the window."""
-SMALL = "margin:0 .8em;font-size:.8em"
-MARKS = {
-    "observed points": layers.SEEN,
-    "annotated tracks": layers.TRACK,
-    "where the run predicts them": layers.PREDICTED,
-    "hands": layers.HAND,
-    "the node that is held": layers.GRABBED,
-    "cameras": layers.CAMERA,
+SMALL_STYLE = "margin:0 .8em;font-size:.8em"
+OBSERVED_MARKS = {
+    "observed points": layers.SEEN_COLOR,
+    "annotated tracks": layers.TRACK_COLOR,
+    "where the run predicts them": layers.PREDICTED_COLOR,
+    "hands": layers.HAND_COLOR,
+    "the node that is held": layers.GRABBED_COLOR,
+    "cameras": layers.CAMERA_COLOR,
 }
 """Colors of what is not a spring."""
 
@@ -75,8 +75,8 @@ class Page:
         gui.main_panel.dock_right()
         # The first view: all shown runs, across the row in which they stand.
         camera = server.initial_camera
-        camera.fov = OPENING
-        camera.up, camera.look_at, camera.position = self.player.view(OPENING)
+        camera.fov = VIEW_ANGLE
+        camera.up, camera.look_at, camera.position = self.player.view(VIEW_ANGLE)
         server.on_client_connect(self._connected)
         server.on_client_disconnect(lambda client: self._left())
         gui.add_html(FIT)
@@ -137,15 +137,17 @@ class Page:
             absent["tracks"] = "no tracks were annotated"
         if not any("splats" in run.paths for run in found.runs):
             absent["splats"] = "no run here has splats"
-        for name, title in PARTS.items():
+        for name, title in PART_TITLES.items():
             hint, wanted = absent.get(name), getattr(self.player.display, name)
             self.parts[name] = gui.add_checkbox(title, wanted and not hint, disabled=bool(hint), hint=hint)
-        marks = "".join(f"<div><span style='color:rgb{color}'>&#9679;</span> {text}</div>" for text, color in MARKS.items())
-        gui.add_html(f"<div style='{SMALL};margin-top:.6em'>{marks}</div>")
+        marks = "".join(
+            f"<div><span style='color:rgb{color}'>&#9679;</span> {text}</div>" for text, color in OBSERVED_MARKS.items()
+        )
+        gui.add_html(f"<div style='{SMALL_STYLE};margin-top:.6em'>{marks}</div>")
 
     def _add_keys(self) -> None:
         gui, clock = self.server.gui, self.player.clock
-        gui.add_html(f"<div style='{SMALL}'>{KEYS}</div>")
+        gui.add_html(f"<div style='{SMALL_STYLE}'>{KEY_HINTS}</div>")
         for label, key, action in (
             ("Play or pause", "space", self.toggle),
             ("Next frame", "arrowright", lambda: self.show(clock.frame + 1)),
@@ -190,10 +192,10 @@ class Page:
             self.player.apply()
             self.legend.content = self.player.legend()
             notes = [f"{name}: {note}" for name, note in self.player.notes.items() if note and name in display.runs]
-            if len(display.runs) > MOST_SHOWN:
-                notes.append(f"{MOST_SHOWN} runs are shown at once; take some away to see others")
+            if len(display.runs) > MOST_RUNS_SHOWN:
+                notes.append(f"{MOST_RUNS_SHOWN} runs are shown at once; take some away to see others")
             rows = "<br>".join(escape(note[:400]) for note in [*self.found.notes, *notes])
-            self.notes.content = f"<div style='{SMALL}'>{rows}</div>"
+            self.notes.content = f"<div style='{SMALL_STYLE}'>{rows}</div>"
         self._update_error_text()
 
     def _lived(self) -> None:
@@ -230,14 +232,14 @@ class Page:
         """Let a browser see all that is shown, whatever the shape of its window."""
         camera = client.camera
         wide, high = max(camera.image_width, 1), max(camera.image_height, 1)
-        covered, count = (COVERED if wide < PHONE else 0.0), (1 if self._alive else MOST_SHOWN)
+        covered, count = (PANEL_SHARE if wide < PHONE else 0.0), (1 if self._alive else MOST_RUNS_SHOWN)
         # A new place moves what is looked at, so that this comes last.
         _, look_at, camera.position = self.player.view(camera.fov, wide / high, covered, count)
         camera.look_at = look_at
 
     def _update_error_text(self) -> None:
         found = self.player.errors()
-        self.errors.content = f"<div style='{SMALL}'>track error in this frame: {escape(found)}</div>" if found else ""
+        self.errors.content = f"<div style='{SMALL_STYLE}'>track error in this frame: {escape(found)}</div>" if found else ""
 
     def _tick(self) -> None:
         """Let time pass, and draw what has changed."""
@@ -276,7 +278,7 @@ class LivePanel:
         self.twin = gui.add_dropdown("Twin", tuple(names))
         self.frame = gui.add_slider("From frame", 0, player.clock.count - 1, 1, 0, hint=FROM)
         self.repeat = gui.add_checkbox("Hands repeat the recording", False, hint=REPEAT)
-        gui.add_html(f"<div style='{SMALL}'>{DRAG}</div>")
+        gui.add_html(f"<div style='{SMALL_STYLE}'>{DRAG}</div>")
         self.switch = gui.add_button("Start")
         self.again = gui.add_button("Reset", disabled=True)
         self.save = gui.add_button("Save recording", disabled=True, hint="What was done since the last reset")

@@ -22,10 +22,10 @@ SPEEDS = {"0.1 ×": 0.1, "0.25 ×": 0.25, "0.5 ×": 0.5, "1 ×": 1.0, "2 ×": 2.
 ROOM = 1.08
 """The first view shows so much of what the runs fill."""
 WAY = (1.0, -0.35, 0.45)
-"""Where it is seen from: across the row of runs, from above."""
-SAMPLES = 12
+"""Direction of the first view: across the row of runs, from above."""
+RANGE_SAMPLES = 12
 """Frames that the range of strain and force is taken from."""
-MOST_SHOWN = 8
+MOST_RUNS_SHOWN = 8
 """Runs that are shown at once."""
 
 
@@ -127,7 +127,7 @@ class Player:
     def apply(self) -> None:
         """Make the scene agree with the display."""
         with self.lock:
-            wanted = self.display.runs[:MOST_SHOWN]
+            wanted = self.display.runs[:MOST_RUNS_SHOWN]
             for name in [name for name in self._bodies if name not in wanted]:
                 self._bodies.pop(name).remove()
             for name in wanted:
@@ -161,10 +161,12 @@ class Player:
             self.apply()
 
     def offset(self, index: int) -> tuple[float, float, float]:
-        """Where a run stands: beside the others along y, the first one where it was observed."""
+        """Shift of a run, m: it stands beside the others along y, the first one where it was observed."""
         return (0.0, index * self.display.gap * max(float(self.high[1] - self.low[1]), 0.5 * self.size), 0.0)
 
-    def view(self, opening: float, aspect: float = 1.0, covered: float = 0.0, count: int = MOST_SHOWN) -> tuple[np.ndarray, ...]:
+    def view(
+        self, opening: float, aspect: float = 1.0, covered: float = 0.0, count: int = MOST_RUNS_SHOWN
+    ) -> tuple[np.ndarray, ...]:
         """Up [3], where to look [3], m, and from where [3], m, so that the first `count` shown runs fill the window in all frames.
 
         `opening` is the vertical angle of view, rad, `aspect` width over height; a panel hides the lower part `covered` of it.
@@ -245,7 +247,7 @@ class Player:
     def _scale(self) -> Scale | None:
         if self.limit is not None and self.display.quantity == "strain":
             return strain_scale(self.limit)
-        frames = np.unique(np.linspace(0, self.clock.count - 1, SAMPLES).astype(int))
+        frames = np.unique(np.linspace(0, self.clock.count - 1, RANGE_SAMPLES).astype(int))
         hands = self.found.observations.controller_points
         bodies = {name: body.parts for name, body in self._bodies.items() if body.parts is not None}
         strains = [

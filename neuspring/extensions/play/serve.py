@@ -17,17 +17,17 @@ from neuspring.core.web import Refused, check_host, check_origin
 if TYPE_CHECKING:
     import viser
 
-LABEL = "NeuSpring"
+SERVER_LABEL = "NeuSpring"
 VISIT = re.compile(r"/(?:\?frame=([0-9]{1,9})(?:&scenario=([A-Za-z0-9_.-]{1,200}))?)?")
 """The page, and a frame of it, perhaps of a scenario that must be the one that is shown."""
-HEADERS = {
+FILE_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
     "Referrer-Policy": "no-referrer",
 }
-"""Of every file of the page."""
+"""Headers of every file of the page."""
 PAGE_HEADERS = {"Cache-Control": "no-store"}
-"""Of the page itself: a browser that kept it for its button "back" would keep its connection, and with it what is held."""
+"""Headers of the page itself: a browser that kept it for its button "back" would keep its connection, and with it what is held."""
 
 
 def start(
@@ -45,7 +45,7 @@ def start(
     # viser takes another port from this variable, whatever it is told.
     os.environ.pop("_VISER_PORT_OVERRIDE", None)
     with _guarded(host, asked, scenario) as used, contextlib.redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(host=host, port=port, label=LABEL, verbose=False)
+        server = viser.ViserServer(host=host, port=port, label=SERVER_LABEL, verbose=False)
     if not used:
         server.stop()
         raise InputError("viser", "this version cannot be told whom to answer", viser.__version__, "Install viser >=1.1,<2.")
@@ -59,7 +59,7 @@ def start(
 
 
 def address(server: viser.ViserServer) -> str:
-    """What to open."""
+    """Address to open in a browser."""
     host = server.get_host()
     return f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}/"
 
@@ -79,7 +79,7 @@ def asked_frame(path: str, scenario: str | None) -> int | None:
 
 
 def _is_visit(request: Any) -> bool:
-    """Whether a person follows a link to the page, from a report for instance: a window of its own, not a frame of another site.
+    """True where a person follows a link to the page, from a report for instance: a window of its own, no frame of another site.
 
     Other parameters are refused: viser's page takes from them where it connects to, and shows what it gets from there.
     """
@@ -141,7 +141,7 @@ def _guarded(host: str, asked: Callable[[int], object], scenario: str | None) ->
                 asked(frame)
             answer = process_request(connection, request)
             if answer is not None:
-                answer.headers.update(HEADERS)
+                answer.headers.update(FILE_HEADERS)
                 if answer.headers.get("Content-Type", "").startswith("text/html"):
                     answer.headers.update(PAGE_HEADERS)
             return answer

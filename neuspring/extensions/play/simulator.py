@@ -25,15 +25,15 @@ from neuspring.twin.rollout import FAR, Diverged, initial_velocity
 if TYPE_CHECKING:
     from neuspring.report.shown import Run
 
-REST = 1e-6
+GRAB_REST_LENGTH = 1e-6
 """Rest length of the spring of a grab, m: the solver has none of length 0."""
-MARGIN = 0.9
+STABILITY_MARGIN = 0.9
 """Part of the stability bound that twin and grab may use together."""
 MOST_SOLVERS = 8
 """Solvers of grabbed nodes that are kept."""
-UNKNOWN = np.zeros(0, np.int32)
+UNKNOWN_HANDS = np.zeros(0, np.int32)
 """Nothing says which hand a controller belongs to."""
-HAND_GAP = 0.15
+CONTROLLER_GAP = 0.15
 """Controllers nearer than this, m, directly or through others, are one hand."""
 
 
@@ -52,10 +52,10 @@ class Start(Artifact):
 
 @dataclass(frozen=True, eq=False)
 class StartState:
-    """Where a live twin begins, and what recorded hands do from there: E frames, none where they stay."""
+    """State in which a live twin begins, and recorded hands from there in E frames, none where they stay."""
 
     frame: int = 0
-    """Of the recording."""
+    """Frame of the recording."""
     start: Start = field(default_factory=Start)
     hands: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3), np.float32))
     """[E, C, 3], m."""
@@ -132,7 +132,7 @@ class Simulator:
 
     @property
     def holds(self) -> np.ndarray:
-        """Which hands hold [C]."""
+        """True for controllers that hold [C]."""
         return self._holds > 0
 
     @property
@@ -188,8 +188,8 @@ class Simulator:
         own = (topology.springs == node).any(axis=1)
         mass = self._body.mass_at(self.twin, node)
         wanted = float((material.stiffness[own] / topology.rest_lengths[own]).sum())
-        # Half of what is left is for k, half for c: dt^2 k / m + 2 dt c / m < MARGIN LIMIT - load.
-        room = max(MARGIN * stability.LIMIT - self._load, 0.05) / 2
+        # Half of what is left is for k, half for c: dt^2 k / m + 2 dt c / m < STABILITY_MARGIN STABILITY_LIMIT - load.
+        room = max(STABILITY_MARGIN * stability.STABILITY_LIMIT - self._load, 0.05) / 2
         k = min(wanted or room * mass / dt**2, room * mass / dt**2)
         return k, min(2 * np.sqrt(k * mass), room * mass / (2 * dt))
 
@@ -204,11 +204,11 @@ class Simulator:
             topology,
             controllers=np.concatenate([topology.controllers, place]),
             springs=np.concatenate([topology.springs, np.array([[own, node]], np.int32)]),
-            rest_lengths=np.append(topology.rest_lengths, np.float32(REST)),
+            rest_lengths=np.append(topology.rest_lengths, np.float32(GRAB_REST_LENGTH)),
             rest_shape=np.concatenate([rest, place]) if len(rest) else rest,
             pushes=np.append(topology.pushes, False) if topology.pushes.size else topology.pushes,
         )
-        stiffness = np.append(material.stiffness, np.float32(k * REST))
+        stiffness = np.append(material.stiffness, np.float32(k * GRAB_REST_LENGTH))
         stronger = replace(material, stiffness=stiffness, dashpot=np.append(material.dashpot, np.float32(c)))
         return replace(self.twin, topology=more, material=stronger)
 
@@ -218,8 +218,8 @@ def _with_row(rows: np.ndarray, place: np.ndarray) -> np.ndarray:
     return np.concatenate([rows, np.append(place, np.ones(rows.shape[1] - 3))[None]]).astype(np.float32)
 
 
-def hands_of(controllers: np.ndarray, given: np.ndarray = UNKNOWN) -> np.ndarray:
+def hands_of(controllers: np.ndarray, given: np.ndarray = UNKNOWN_HANDS) -> np.ndarray:
     """The hand [C] of each controller [C, 3], m: those that move together. `given` is what observations know of it."""
     if len(given) == len(controllers):
         return np.unique(given, return_inverse=True)[1]
-    return np.asarray(connected_components(cdist(controllers, controllers) < HAND_GAP)[1])
+    return np.asarray(connected_components(cdist(controllers, controllers) < CONTROLLER_GAP)[1])

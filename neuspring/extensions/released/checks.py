@@ -40,7 +40,7 @@ from neuspring.scores import metrics
 from neuspring.scores.lpips import Lpips
 from neuspring.scores.metrics import METRICS, TASKS, UNITS, averages
 from neuspring.scores.pictures import Pair, picture_scores
-from neuspring.splats.draw import COVERED, picture, prune_by_opacity, skinned_frames, view_of
+from neuspring.splats.draw import OBJECT_COVERAGE, picture, prune_by_opacity, skinned_frames, view_of
 from neuspring.splats.model import Splats
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.topology import uniform_topology
@@ -509,5 +509,5 @@ def _scores(
     observed = read_picture(case.colors / name, camera)
     mask = read_picture(case.object_masks / name, camera, gray=True)
     human = read_picture(case.human_masks / name, camera, gray=True)
-    pair = Pair.of(observed, rendered, mask, human, 1 if "any_alpha" in quirks else COVERED)
+    pair = Pair.of(observed, rendered, mask, human, 1 if "any_alpha" in quirks else OBJECT_COVERAGE)
     return picture_scores(pair, lpips, unit_lpips="unit_lpips" in quirks)

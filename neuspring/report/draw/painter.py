@@ -17,7 +17,7 @@ from neuspring.data.capture import Camera
 from neuspring.report.draw.scene import Prediction, Scene, faded, masked, object_and_hands, over_white, shown_points
 from neuspring.report.draw.sheet import CONTROLLER, WORST, points_across
 from neuspring.scores.pictures import Pair, psnr
-from neuspring.splats.draw import COVERED, picture, view_of
+from neuspring.splats.draw import OBJECT_COVERAGE, picture, view_of
 from neuspring.splats.rasterize import choose_backend
 
 Style = Literal["splats", "nodes"]
@@ -101,7 +101,7 @@ class Painter:
         photo, labels = self.scene.photo(frame), self.scene.mask(frame)
         if photo is None or labels is None:
             return Drawn(self.scene.cut(rgba))
-        pair = Pair.of(photo, rgba, *object_and_hands(labels), COVERED)
+        pair = Pair.of(photo, rgba, *object_and_hands(labels), OBJECT_COVERAGE)
         difference = (pair.truth - pair.prediction).abs().mean(0).numpy()
         shows = pair.silhouettes[0] | pair.silhouettes[1]
         cut = self.scene.cut

@@ -29,7 +29,7 @@ from neuspring.data.capture import CAPTURE, HANDS, OBJECT
 from neuspring.report.draw.sheet import FUTURE, TRAINING
 from neuspring.scores.carried import point_errors, points_on_table
 from neuspring.scores.pictures import Pair, picture_scores
-from neuspring.splats.draw import COVERED
+from neuspring.splats.draw import OBJECT_COVERAGE
 from results.published.footage.captures import CARRYING
 from results.published.footage.hands import hand_lines, hand_rows
 from results.published.footage.runs import PHYSTWIN, STILL, Case, Run, cases_of, corrected, iou_without_hands, runs_of
@@ -67,7 +67,7 @@ def picture_rows(case: Case, pictures: Iterable[tuple[int, np.ndarray]]) -> Iter
     for frame, rgba in pictures:
         labels = case.labels(frame)
         mask, hands = (np.where(labels == label, 255, 0).astype(np.uint8) for label in (OBJECT, HANDS))
-        scores = picture_scores(Pair.of(case.color(frame), rgba, mask, hands, COVERED), NO_LPIPS, unit_lpips=False)
+        scores = picture_scores(Pair.of(case.color(frame), rgba, mask, hands, OBJECT_COVERAGE), NO_LPIPS, unit_lpips=False)
         values += [{"frame": frame, "metric": name, "value": value} for name, value in scores.items()]
     yield from task_rows(case, pd.DataFrame(values, columns=["frame", "metric", "value"]))
 

@@ -101,7 +101,7 @@ class Run:
     def fit(self) -> config.Fit:
         """Contact scalars practically stand still; the gradient goes through ten frames."""
         rate = RATES.get(self.kind, 1.0)
-        field = config.SpringField(shuffled=self.kind == "shuffled")
+        field = config.SpringFieldSettings(shuffled=self.kind == "shuffled")
         return config.Fit(epochs=self.epochs, learning_rate=rate, horizon=10, field=field)
 
     def settings(self) -> dict[str, Any]:
@@ -168,7 +168,7 @@ def execute(run: Run, folder: Path) -> dict[str, Any]:
                 observations=scene.observations,
                 twin=twin,
                 fit=run.fit,
-                simulation=config.Simulation(),
+                simulation=config.SimulationSettings(),
                 losses=config.Losses(),
                 quirks=config.ReleasedQuirks(),
                 kind="springs" if run.kind == "springs" else "field",

@@ -9,7 +9,7 @@ import pytest
 
 from neuspring.core import web as guard
 from neuspring.core.errors import InputError
-from neuspring.extensions.annotate.server import MOST_BYTES, STATIC, Server
+from neuspring.extensions.annotate.server import MOST_REQUEST_BYTES, STATIC_FOLDER, Server
 from tests.extensions.annotate.served import TOKEN, served
 from tests.support.moving import moving
 
@@ -72,7 +72,7 @@ def test_a_server_for_a_network_is_reached_by_address_or_by_its_own_name():
         ({"Content_Length": None}, 411),
         ({"Content_Length": "-5"}, 400),
         ({"Transfer_Encoding": "chunked"}, 411),
-        ({"Content_Length": str(MOST_BYTES + 1)}, 413),
+        ({"Content_Length": str(MOST_REQUEST_BYTES + 1)}, 413),
         ({"Content_Length": "9" * 50}, 400),
     ],
 )
@@ -134,7 +134,7 @@ def test_all_under_api_needs_the_token_and_other_methods_are_not_there(client):
 
 def test_the_page_comes_from_the_package_alone(client):
     """Every file of the page is given out, and none of them asks the network for more."""
-    for name in ("", *(path.name for path in STATIC.iterdir())):
+    for name in ("", *(path.name for path in STATIC_FOLDER.iterdir())):
         status, headers, content = client.raw("GET", f"/{name}", X_NeuSpring_Token=None)
         assert status == 200
         assert headers["x-content-type-options"] == "nosniff"

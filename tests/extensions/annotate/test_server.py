@@ -8,7 +8,7 @@ import pytest
 from neuspring.core.errors import InputError
 from neuspring.data.capture import TRACKS, Capture, write_tracks
 from neuspring.extensions.annotate.clicks import ANNOTATIONS
-from neuspring.extensions.annotate.server import COLORS, Server, overlay_png
+from neuspring.extensions.annotate.server import LABEL_COLORS, Server, overlay_png
 from neuspring.perception.marks.store import MasksFile
 from tests.extensions.annotate.painted import Painted
 from tests.extensions.annotate.served import decoded, served
@@ -100,8 +100,8 @@ def test_the_preview_shows_the_marks_of_the_frame(client):
     status, headers, content = client.raw("POST", "/api/preview", json.dumps({"camera": "0", "frame": 1}).encode())
     assert (status, headers["content-type"]) == (200, "image/png")
     picture = decoded(content)
-    assert tuple(picture[60, 50, 2::-1]) == COLORS[1]
-    assert tuple(picture[60, 90, 2::-1]) == COLORS[2]
+    assert tuple(picture[60, 50, 2::-1]) == LABEL_COLORS[1]
+    assert tuple(picture[60, 90, 2::-1]) == LABEL_COLORS[2]
     assert picture[10, 10, 3] == 0
     status, answer = client.post("/api/preview", camera="0", frame=0)
     assert (status, "must be marked on it" in answer["error"]) == (422, True)

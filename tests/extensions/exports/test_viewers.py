@@ -55,7 +55,7 @@ def test_pxr_reads_positions_as_they_are(tmp_path, suffix):
     stage, source, twin = opened(path), read_source(folder), Twin.load(folder / "twin.npz")
     assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Z", 1.0)
     assert stage.GetTimeCodesPerSecond() == pytest.approx(30) and stage.GetEndTimeCode() == exported.FRAMES - 1
-    assert stage.GetDefaultPrim().GetPath() == usd.ROOT
+    assert stage.GetDefaultPrim().GetPath() == usd.ROOT_PRIM
     nodes, springs = UsdGeom.Points.Get(stage, "/Twin/Nodes"), UsdGeom.BasisCurves.Get(stage, "/Twin/Springs")
     splats = UsdVol.ParticleField3DGaussianSplat.Get(stage, "/Twin/Splats")
     stand_in = UsdGeom.Points.Get(stage, "/Twin/SplatPoints")

@@ -8,8 +8,8 @@ import pytest
 
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
-from neuspring.extensions.play.controls import Controls, Recording, compare, digest_motion, load_controls, replay
-from neuspring.extensions.play.live import FASTEST, Grab, nearest_to_ray
+from neuspring.extensions.play.controls import ControlRecorder, Controls, compare, digest_motion, load_controls, replay
+from neuspring.extensions.play.live import FASTEST_GRAB, Grab, nearest_to_ray
 from neuspring.extensions.play.simulator import Simulator, Start, hands_of, start_state
 from neuspring.physics import stability
 from neuspring.report.shown import find
@@ -141,7 +141,7 @@ def test_a_hand_moves_as_one_and_no_faster_than_allowed():
     one.pull(1, (1, 0, 0))
     hands, node, _ = one.next(0.1, np.zeros((3, 3), np.float32), np.zeros(3))
     assert node == -1
-    assert hands == pytest.approx(np.array([[0.1 * FASTEST, 0, 0], [0.1 * FASTEST, 0, 0], [0, 0, 0]]))
+    assert hands == pytest.approx(np.array([[0.1 * FASTEST_GRAB, 0, 0], [0.1 * FASTEST_GRAB, 0, 0], [0, 0, 0]]))
 
 
 def test_places_and_nodes_that_are_none_are_ignored():
@@ -227,7 +227,7 @@ def test_a_recording_from_a_frame_gives_the_same_motion_bit_for_bit(found, tmp_p
     seen = found.observations
     valid = letting_go(len(seen.controller_points), seen.controller_points.shape[1])
     begin = start_state(run, replace(seen, controller_valid=valid), 5, repeat=True)
-    simulator, recording = Simulator(run.twin, start=begin.start), Recording()
+    simulator, recording = Simulator(run.twin, start=begin.start), ControlRecorder()
     recording.begin(simulator.positions)
     for number, (hands, holds) in enumerate(zip(begin.hands, begin.holds, strict=True)):
         node, target = (2, simulator.positions[2] + [0, 0, 0.02]) if number else (-1, np.zeros(3))
@@ -245,7 +245,7 @@ def test_a_frame_without_prediction_and_a_start_of_another_twin_are_refused(foun
     for frame in (-1, 8):
         with pytest.raises(InputError, match="its prediction has 8 frames"):
             start_state(run, found.observations, frame, repeat=False)
-    recording, simulator = Recording(), Simulator(run.twin)
+    recording, simulator = ControlRecorder(), Simulator(run.twin)
     recording.begin(simulator.positions)
     hands = run.twin.topology.controllers
     recording.add((hands, -1, np.zeros(3), np.ones(len(hands), bool)), simulator.step(hands))
@@ -256,7 +256,7 @@ def test_a_frame_without_prediction_and_a_start_of_another_twin_are_refused(foun
 
 def test_a_recording_that_is_too_long_keeps_nothing(monkeypatch):
     monkeypatch.setattr("neuspring.extensions.play.controls.MOST_FRAMES", 2)
-    recording, x, row = Recording(), np.zeros((3, 3)), (np.zeros((1, 3)), -1, np.zeros(3), np.ones(1, bool))
+    recording, x, row = ControlRecorder(), np.zeros((3, 3)), (np.zeros((1, 3)), -1, np.zeros(3), np.ones(1, bool))
     recording.begin(x)
     assert [recording.add(row, x) for _ in range(4)] == [False, False, True, False]
     with pytest.raises(InputError, match="at least one frame"):

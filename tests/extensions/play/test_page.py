@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from neuspring.core.artifacts import SplatCenters, Trajectory
 from neuspring.core.files import read_npz, write_npz
 from neuspring.core.records import digest_file
-from neuspring.extensions.play.layers import UNIT, SplatLayer, covariances
+from neuspring.extensions.play.layers import SPLAT_UNIT, SplatLayer, covariances
 from neuspring.extensions.play.page import Page
 from neuspring.extensions.play.player import Player
 from neuspring.report.shown import find
@@ -250,12 +250,12 @@ def test_what_the_browser_gets_are_their_colors_and_sizes(scenario, server):
     splats, run = dressed(scenario, degree=2), find([scenario]).runs[0]
     layer = SplatLayer(server.scene, "colors", splats, run.trajectory.positions[0])
     handle = layer.handle
-    assert handle.centers * UNIT == pytest.approx(splats.means, abs=1e-6)
+    assert handle.centers * SPLAT_UNIT == pytest.approx(splats.means, abs=1e-6)
     gaussians = Gaussians.of(splats)
     scales = torch.diag_embed(gaussians.scales).numpy()
     turns = Rotation.from_quat(splats.quaternions, scalar_first=True).as_matrix()
     expected = turns @ scales @ scales @ turns.transpose(0, 2, 1)
-    assert handle.covariances * UNIT**2 == pytest.approx(expected, abs=ROUNDING * np.abs(expected).max())
+    assert handle.covariances * SPLAT_UNIT**2 == pytest.approx(expected, abs=ROUNDING * np.abs(expected).max())
     assert handle.rgbs / 255 == pytest.approx(np.clip(0.5 + C0 * splats.harmonics[:, 0], 0, 1), abs=1 / 255)
 
 
@@ -274,7 +274,7 @@ def test_frames_are_shown_in_any_order_hidden_splats_cost_nothing_and_many_are_s
     again.move(x[5])
     assert np.array_equal(layer.handle.centers, again.handle.centers)
     assert (layer.handle.centers != before).any()
-    monkeypatch.setattr("neuspring.extensions.play.layers.MOST_SPLATS", 100)
+    monkeypatch.setattr("neuspring.extensions.play.layers.MOST_DRAWN_SPLATS", 100)
     assert len(SplatLayer(server.scene, "many", splats, x[0]).handle.centers) == 100
 
 

@@ -19,7 +19,7 @@ from neuspring.data.released import Released
 from neuspring.data.unpickle import load_pickle
 from neuspring.extensions.released.checks import Published
 from neuspring.physics import reference as simulation
-from neuspring.physics.reference import Scene
+from neuspring.physics.reference import ReferenceTwin
 from neuspring.splats.model import Splats
 from neuspring.splats.rasterize import reference
 from neuspring.splats.skinning import Skin
@@ -166,7 +166,7 @@ def write_checkpoint(case: Released, nodes: np.ndarray, hands: np.ndarray, self_
 def write_prediction(case: Released, twin: Twin, drag: float, dashpot: float) -> np.ndarray:
     """inference.pkl, by the float64 reference; returns the positions."""
     material = replace(twin.material, drag=drag, dashpot=np.full(len(twin.topology.springs), dashpot))
-    scene, start = Scene.of(replace(twin, material=material)), twin.topology.nodes
+    scene, start = ReferenceTwin.of(replace(twin, material=material)), twin.topology.nodes
     hands = stored(case.folder)["controller_points"].astype(np.float32)
     positions = simulation.rollout(scene, start, np.zeros_like(start), hands)[0].astype(np.float32)
     dump(case.prediction, positions)

@@ -11,9 +11,9 @@ import numpy as np
 
 from neuspring.core.files import write_text
 from neuspring.extensions.exports import Export, cable
-from neuspring.extensions.exports.cable import AXES, text
+from neuspring.extensions.exports.cable import HINGE_AXES, text
 from neuspring.extensions.exports.formats import npz
-from neuspring.extensions.exports.source import Source, require_start
+from neuspring.extensions.exports.source import ExportSource, require_start
 from neuspring.physics.rod_nodes import radius_of
 from neuspring.twin.body import body_of
 from neuspring.twin.rollout import FAR
@@ -21,14 +21,14 @@ from neuspring.twin.rollout import FAR
 MODEL = "twin.xml"
 
 
-def write(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
+def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Path]:
     """Write twin.xml, and arrays.npz and description.json for the hands' motion, to the folder `output`."""
     require_start(frames)
     write_text(output / MODEL, mjcf(source))
     return [output / MODEL, *npz.write(source, frames, output)]
 
 
-def mjcf(source: Source) -> str:
+def mjcf(source: ExportSource) -> str:
     """Nodes as bodies on three slides, springs as spatial tendons, controllers as mocap bodies, with our time step.
 
     A tendon's force is stiffness (l - springlength) + damping dl/dt, so it is our spring with stiffness / rest length. One that
@@ -44,7 +44,7 @@ def mjcf(source: Source) -> str:
     gravity = (0, 0, -simulation.gravity * simulation.up_sign)
     rod = body_of(twin).center_line(twin)
     radius = max(radius_of(rod), cable.THICKNESS) if rod else radius
-    step, integrator = (min(simulation.substep, cable.STEP), "implicitfast") if rod else (simulation.substep, "Euler")
+    step, integrator = (min(simulation.substep, cable.CABLE_STEP), "implicitfast") if rod else (simulation.substep, "Euler")
     ET.SubElement(root, "option", timestep=text(step), integrator=integrator, gravity=text(*gravity))
     world = ET.SubElement(root, "worldbody")
     if simulation.ground:
@@ -59,7 +59,7 @@ def mjcf(source: Source) -> str:
         cable.add(rod, root, world, meets)
     for index, (place, mass) in enumerate(zip(topology.nodes, source.masses, strict=True) if not rod else ()):
         body = ET.SubElement(world, "body", name=f"node{index}", pos=text(*place))
-        for axis, direction in AXES.items():
+        for axis, direction in HINGE_AXES.items():
             damping = text(material.drag * float(mass))
             ET.SubElement(body, "joint", name=f"node{index}{axis}", type="slide", axis=direction, damping=damping)
         ET.SubElement(body, "geom", type="sphere", size=text(radius), mass=text(mass), **meets)

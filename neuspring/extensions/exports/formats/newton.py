@@ -9,13 +9,13 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from neuspring.extensions.exports import Export
 from neuspring.extensions.exports.formats import npz
-from neuspring.extensions.exports.source import Source, require_start
+from neuspring.extensions.exports.source import ExportSource, require_start
 from neuspring.twin.body import body_of
 
 SCRIPT = Path(__file__).parents[1] / "newton_twin.py"
 
 
-def write(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
+def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Path]:
     """Write arrays.npz, description.json and newton_twin.py to the folder `output`."""
     require_start(frames)
     if body_of(source.twin).center_line(source.twin):

@@ -14,14 +14,14 @@ from neuspring import __version__
 from neuspring.core.artifacts import SCALARS, Artifact, Material, Topology
 from neuspring.core.files import write_atomically, write_text
 from neuspring.extensions.exports import Export
-from neuspring.extensions.exports.source import Source
+from neuspring.extensions.exports.source import ExportSource
 from neuspring.splats.model import Splats
 from neuspring.twin.body import body_of
 
 VERSION = 1
-"""Of the description. A reader should refuse a version that it does not know."""
-ARRAYS, DESCRIPTION = "arrays.npz", "description.json"
-SIZES = {
+"""Format and version of the description. A reader should refuse a version that it does not know."""
+ARRAYS_FILE, DESCRIPTION_FILE = "arrays.npz", "description.json"
+SIZE_MEANINGS = {
     "N": "nodes",
     "C": "controllers: points that are moved from outside, as hands or grippers",
     "S": "springs",
@@ -57,7 +57,7 @@ MOTION: dict[str, tuple[str, str, str]] = {
 }
 
 
-def write(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
+def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Path]:
     """Write arrays.npz and description.json of these frames to the folder `output`."""
     arrays, described = arrays_of(source, frames)
     twin, body = source.twin, body_of(source.twin)
@@ -78,7 +78,7 @@ def write(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
         "made_from_sha256": source.made_from,
         "about": f"{body.about}, and moved by controllers.",
         "units": "SI: m, kg, s, N. Coordinates are right-handed; z is vertical.",
-        "sizes": SIZES,
+        "sizes": SIZE_MEANINGS,
         "arrays": described,
         "settings": {name: {"value": values[name], "unit": unit, "about": about} for name, (unit, about) in settings.items()},
         "equations": [" ".join(paragraph.split()) for paragraph in body.equations.strip().split("\n\n")],
@@ -88,12 +88,12 @@ def write(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
         with path.open("wb") as stream:
             np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
 
-    write_atomically(output / ARRAYS, save)
-    write_text(output / DESCRIPTION, json.dumps(text, indent=1, allow_nan=False) + "\n")
-    return [output / DESCRIPTION, output / ARRAYS]
+    write_atomically(output / ARRAYS_FILE, save)
+    write_text(output / DESCRIPTION_FILE, json.dumps(text, indent=1, allow_nan=False) + "\n")
+    return [output / DESCRIPTION_FILE, output / ARRAYS_FILE]
 
 
-def arrays_of(source: Source, frames: Sequence[int]) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
+def arrays_of(source: ExportSource, frames: Sequence[int]) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
     """Arrays, and what is said of each: dimensions, shape, dtype, unit, meaning."""
     arrays: dict[str, np.ndarray] = {}
     described: dict[str, dict[str, Any]] = {}

@@ -9,19 +9,19 @@ import numpy as np
 
 from neuspring.core.files import write_atomically
 from neuspring.extensions.exports import Export
-from neuspring.extensions.exports.source import Source
+from neuspring.extensions.exports.source import ExportSource
 from neuspring.twin.body import lines_of
 
 VERTEX = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("mass", "<f4"), ("region", "<i4"), ("controller", "u1"), ("stiffness", "<f4")]
-EDGE = [
+EDGE_DTYPE = [
     *(("vertex1", "<i4"), ("vertex2", "<i4"), ("stiffness", "<f4"), ("dashpot", "<f4"), ("rest_length", "<f4")),
     ("strain", "<f4"),
 ]
-WORDS = {"<f4": "float", "<i4": "int", "u1": "uchar"}
+PLY_TYPE_NAMES = {"<f4": "float", "<i4": "int", "u1": "uchar"}
 COMMENT = "units m, N, N s/m, kg; stiffness of a vertex: mean of its springs"
 
 
-def write(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
+def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Path]:
     """Write springs_<frame>.ply and, where there are splats, splats_<frame>.ply to the folder `output`."""
     made = []
     for frame in frames:
@@ -34,12 +34,12 @@ def write(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
     return made
 
 
-def points(source: Source, frame: int) -> np.ndarray:
+def points(source: ExportSource, frame: int) -> np.ndarray:
     """Nodes, then controllers, then, of a rod, the vertices of its center line [P, 3], m."""
     return lines_of(source.twin).points(source.positions[frame], source.hands[frame])
 
 
-def vertices(source: Source, frame: int) -> np.ndarray:
+def vertices(source: ExportSource, frame: int) -> np.ndarray:
     """A row per point, as in `Lines`; a controller has no mass and region -1. Stiffness is 0 where there are no springs."""
     nodes, placed, lines = len(source.positions[frame]), points(source, frame), lines_of(source.twin)
     moved = nodes + len(source.hands[frame])
@@ -55,10 +55,10 @@ def vertices(source: Source, frame: int) -> np.ndarray:
     return table
 
 
-def edges(source: Source, frame: int) -> np.ndarray:
+def edges(source: ExportSource, frame: int) -> np.ndarray:
     """A row per spring; of a rod, per edge of the line, whose stiffness is EI / l^2, and then per spring."""
     lines, dashpot = lines_of(source.twin), source.twin.material.dashpot
-    table = np.zeros(len(lines.pairs), EDGE)
+    table = np.zeros(len(lines.pairs), EDGE_DTYPE)
     table["vertex1"], table["vertex2"] = lines.pairs.T
     table["stiffness"], table["rest_length"] = lines.stiffness, lines.rest_lengths
     table["dashpot"][len(table) - len(dashpot) :] = dashpot
@@ -71,7 +71,7 @@ def _write_elements(path: Path, elements: dict[str, np.ndarray]) -> None:
     lines = ["ply", "format binary_little_endian 1.0", f"comment {COMMENT}"]
     for name, table in elements.items():
         lines.append(f"element {name} {len(table)}")
-        lines += [f"property {WORDS[table.dtype[field].str.lstrip('|')]} {field}" for field in table.dtype.names or ()]
+        lines += [f"property {PLY_TYPE_NAMES[table.dtype[field].str.lstrip('|')]} {field}" for field in table.dtype.names or ()]
     head = "\n".join([*lines, "end_header", ""]).encode()
     content = head + b"".join(table.tobytes() for table in elements.values())
     write_atomically(path, lambda temporary: temporary.write_bytes(content))

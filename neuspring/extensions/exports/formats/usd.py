@@ -14,18 +14,18 @@ from neuspring.core.extras import needed
 from neuspring.core.files import write_atomically
 from neuspring.extensions.exports import Export
 from neuspring.extensions.exports.formats import ply
-from neuspring.extensions.exports.source import Source
+from neuspring.extensions.exports.source import ExportSource
 from neuspring.physics.rod_nodes import radius_of
 from neuspring.splats.view import C0
 from neuspring.twin.body import body_of
 
 SUFFIXES = (".usdc", ".usda", ".usd")
-ROOT = "/Twin"
-THIN, THICK = 0.1, 0.3
+ROOT_PRIM = "/Twin"
+SPRING_WIDTH, NODE_WIDTH = 0.1, 0.3
 """Width of springs and of nodes, in median rest lengths."""
 
 
-def write(source: Source, frames: Sequence[int], output: Path, rate: float | None = None) -> list[Path]:
+def write(source: ExportSource, frames: Sequence[int], output: Path, rate: float | None = None) -> list[Path]:
     """Write one file. Its time codes per second are `rate`, or one per frame of the twin; seconds stay what they are."""
     Gf, Usd, UsdGeom, Vt = (needed(f"pxr.{name}") for name in ("Gf", "Usd", "UsdGeom", "Vt"))
     if output.suffix not in SUFFIXES:
@@ -41,7 +41,7 @@ def write(source: Source, frames: Sequence[int], output: Path, rate: float | Non
     stage.SetFramesPerSecond(rate)
     stage.SetStartTimeCode(min(codes.values()))
     stage.SetEndTimeCode(max(codes.values()))
-    root = UsdGeom.Xform.Define(stage, ROOT)
+    root = UsdGeom.Xform.Define(stage, ROOT_PRIM)
     stage.SetDefaultPrim(root.GetPrim())
     if source.twin.simulation.up == "-z":
         root.AddRotateXOp().Set(180.0)  # USD has no axis that points down.
@@ -76,16 +76,16 @@ class _Shapes:
     def __init__(self, stage: Any, geom: Any, vt: Any, gf: Any) -> None:
         self._stage, self._geom, self._vt, self._gf = stage, geom, vt, gf
 
-    def graph(self, source: Source, codes: dict[int, float]) -> None:
+    def graph(self, source: ExportSource, codes: dict[int, float]) -> None:
         """Nodes, controllers and springs; of a rod, its center line."""
         topology, material, token = source.twin.topology, source.twin.material, self._geom.Tokens
         unit = float(np.median(topology.rest_lengths)) if len(topology.rest_lengths) else 0.01
-        nodes = self._points("Nodes", THICK * unit, (0.8, 0.8, 0.8))
-        hands = self._points("Controllers", 2 * THICK * unit, (1.0, 0.6, 0.1))
-        springs = self._geom.BasisCurves.Define(self._stage, f"{ROOT}/Springs")
+        nodes = self._points("Nodes", NODE_WIDTH * unit, (0.8, 0.8, 0.8))
+        hands = self._points("Controllers", 2 * NODE_WIDTH * unit, (1.0, 0.6, 0.1))
+        springs = self._geom.BasisCurves.Define(self._stage, f"{ROOT_PRIM}/Springs")
         springs.CreateTypeAttr(token.linear)
         springs.CreateCurveVertexCountsAttr([2] * len(topology.springs))
-        springs.CreateWidthsAttr([THIN * unit])
+        springs.CreateWidthsAttr([SPRING_WIDTH * unit])
         springs.SetWidthsInterpolation(token.constant)
         self._primvar(springs, "displayColor", "color3f[]", self._vectors(colors(material.stiffness)), token.uniform)
         values = {"stiffness": material.stiffness, "dashpot": material.dashpot, "restLength": topology.rest_lengths}
@@ -106,22 +106,22 @@ class _Shapes:
     def _line(self, rod: Rod) -> Any:
         """A curve through the vertices, as thick as the nodes are far, with what the rod is made of."""
         token = self._geom.Tokens
-        curve = self._geom.BasisCurves.Define(self._stage, f"{ROOT}/CenterLine")
+        curve = self._geom.BasisCurves.Define(self._stage, f"{ROOT_PRIM}/CenterLine")
         curve.CreateTypeAttr(token.linear)
         curve.CreateCurveVertexCountsAttr([len(rod.vertices)])
-        curve.CreateWidthsAttr([2 * max(radius_of(rod), 0.5 * THIN * float(rod.lengths.mean()))])
+        curve.CreateWidthsAttr([2 * max(radius_of(rod), 0.5 * SPRING_WIDTH * float(rod.lengths.mean()))])
         curve.SetWidthsInterpolation(token.constant)
         for name, value in {"mass": rod.mass, "bending": rod.bending, "twisting": rod.twisting}.items():
             self._primvar(curve, name, "float[]", self._vt.FloatArray.FromNumpy(value.astype(np.float32)), token.vertex)
         return curve
 
-    def splats(self, source: Source, codes: dict[int, float]) -> None:
+    def splats(self, source: ExportSource, codes: dict[int, float]) -> None:
         """Splats for renderers that know Gaussians, and points (purpose proxy) for those that do not."""
         from pxr import UsdVol
 
         token, fields = self._geom.Tokens, None
-        field = UsdVol.ParticleField3DGaussianSplat.Define(self._stage, f"{ROOT}/Splats")
-        stand_in = self._geom.Points.Define(self._stage, f"{ROOT}/SplatPoints")
+        field = UsdVol.ParticleField3DGaussianSplat.Define(self._stage, f"{ROOT_PRIM}/Splats")
+        stand_in = self._geom.Points.Define(self._stage, f"{ROOT_PRIM}/SplatPoints")
         image, proxy = self._geom.Imageable(field.GetPrim()), self._geom.Imageable(stand_in.GetPrim())
         image.CreatePurposeAttr(token.render)
         proxy.CreatePurposeAttr(token.proxy)
@@ -147,7 +147,7 @@ class _Shapes:
             self._place(stand_in, stand_in.CreatePointsAttr(), splats.means, codes[frame])
 
     def _points(self, name: str, width: float, color: tuple[float, float, float]) -> Any:
-        prim = self._geom.Points.Define(self._stage, f"{ROOT}/{name}")
+        prim = self._geom.Points.Define(self._stage, f"{ROOT_PRIM}/{name}")
         prim.CreateWidthsAttr([width])
         prim.SetWidthsInterpolation(self._geom.Tokens.constant)
         self._primvar(prim, "displayColor", "color3f[]", [color], self._geom.Tokens.constant)
