@@ -16,16 +16,20 @@ from neuspring.config import parse
 from neuspring.core.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from neuspring.config import Config
     from neuspring.config.tuning import Tune
+    from neuspring.scores.paper import Study
+    from neuspring.scores.runs import Collected
 
 Names = Annotated[tuple[str, ...], arg(help="those of the settings, else all on disk, by default")]
 Scores = Annotated[Path | None, arg(help="instead of run records: a scores.csv that tables wrote, on any machine")]
-LeftOut = Annotated[str, arg(help="JSON: methods and the scenarios to which they do not apply, where they have no runs")]
+LeftOut = Annotated[str, arg(help="JSON: methods and the scenarios to which they do not apply, with reasons")]
 StudyTable = Annotated[Path, arg(help="the study table")]
 Folder = Annotated[Path, arg(help="folder to write to")]
 Transfers = Annotated[tuple[str, ...], arg(help="scenarios whose twins were rolled out on other recordings")]
-STUDY_RULE = "--scores, or --scenarios, --methods and --seeds of a results folder, are required"
+Tables = Annotated[str, arg(help="folder of tables in the results folder")]
 
 
 def tables(
@@ -38,45 +42,76 @@ def tables(
     baseline: Annotated[str | None, arg(help="method that others are compared with; the first by default")] = None,
     objects: Annotated[Literal["scenario", "category"], arg(help="what intervals of ratios are over")] = "scenario",
     aims: Annotated[str, arg(help="JSON: ratios that are aimed at (config/README.md, aims)")] = "[]",
+    studies: Annotated[tuple[str, ...], arg(help="rows of the study table whose numbers are kept too")] = (),
+    table: StudyTable = Path("config/studies.yaml"),
     scores: Scores = None,
     left_out: LeftOut = "{}",
     brief: Annotated[bool, arg(help="print the verdict and the first table alone")] = False,
     settings: Annotated[str, arg(help="of the benchmark: runs that were made with something else are named")] = "",
 ) -> None:
-    """Run records -> tables."""
+    """Run records -> numbers.json, each number computed once, and the benchmark's tables."""
     from neuspring.config.settings import Aim
     from neuspring.core.findings import warnings_of
-    from neuspring.report.benchmark import Benchmark, write
-    from neuspring.report.sections.data import job_records, traces
-    from neuspring.report.sections.pictures import write_gallery
+    from neuspring.report.data import job_records, traces
+    from neuspring.report.gallery import write_gallery
+    from neuspring.report.summary import write
     from neuspring.report.verdict import headline
-    from neuspring.scores.runs import collect, collect_transfers, read_scores
+    from neuspring.scores.metrics import require_metrics
+    from neuspring.scores.numbers import Numbers
+    from neuspring.scores.runs import collect, collect_transfers
 
     wanted = tuple(parse(Aim, row, "--aims") for row in json_value("--aims", aims, list))
-    without = _read_left_out(left_out)
+    require_metrics(wanted)
+    shown = {name: _study(table, name)[1] for name in studies}
+    known = _study(table, studies[0])[0] if studies else {}
     if scores:
-        found = read_scores(scores).named(scenario=scenarios, method=methods, seed=seeds)
+        found = _read_scores(scores, scenarios, methods, seeds, left_out)
         against = baseline or str(found.runs["method"].iloc[0])
-        found = replace(found, left_out=without)
-        print(write(Benchmark(everything=found, baseline=against, objects=objects, aims=wanted), output))
+        made = Numbers(
+            everything=found, baseline=against, objects=objects, aims=wanted, studies=shown, known_studies=known, results=results
+        )
+        print(write(made, output))
         return
     there = traces(results, job_records(results)[0])
     scenarios, methods, seeds = scenarios or tuple(there[0]), methods or tuple(there[1]), seeds or tuple(there[2])
     if not (scenarios and methods and seeds):
         raise InputError(results, "a results folder with runs is required", "none", "Run the workflow first, or name another.")
-    collected = collect(results, scenarios, methods, seeds, without)
-    moved = collect_transfers(results, transfers, methods, seeds)
-    against = baseline or methods[0]
-    noted, old = warnings_of(results, scenarios), _made_otherwise(settings, results)
-    benchmark = Benchmark(
-        everything=collected, baseline=against, objects=objects, aims=wanted, transfers=moved, warnings=noted, made_otherwise=old
+    collected = collect(results, scenarios, methods, seeds, _read_left_out(left_out))
+    numbers = Numbers(
+        everything=collected,
+        baseline=baseline or methods[0],
+        objects=objects,
+        aims=wanted,
+        transfers=collect_transfers(results, transfers, methods, seeds),
+        studies=shown,
+        known_studies=known,
+        results=results,
+        warnings=warnings_of(results, scenarios),
+        made_otherwise=_made_otherwise(settings, results),
     )
-    text = write(benchmark, output)
+    text = write(numbers, output)
     print(headline(text) if brief else text)
     print(f"Tables: {output / 'summary.md'}")
     finished = collected.runs.loc[collected.runs["status"] == "ok", "seed"].to_list()
     seed = next((seed for seed in seeds if seed in finished), seeds[0])
     print(f"Pictures and videos: {write_gallery(results, scenarios, methods, seed, collected, output)}")
+
+
+def _study(table: Path, name: str) -> tuple[dict[str, Study], Study]:
+    """All studies of a table, and one of them. Raises InputError."""
+    from neuspring.scores.paper import read_studies
+
+    studies = read_studies(table)
+    if name not in studies:
+        raise InputError("study", f"must be a row of {table}", name, f"Known: {', '.join(studies)}")
+    return studies, studies[name]
+
+
+def _read_scores(path: Path, scenarios: Sequence[str], methods: Sequence[str], seeds: Sequence[int], left_out: str) -> Collected:
+    from neuspring.scores.runs import read_scores
+
+    found = read_scores(path).named(scenario=scenarios, method=methods, seed=seeds)
+    return replace(found, left_out=_read_left_out(left_out))
 
 
 def _made_otherwise(settings: str, results: Path) -> tuple[str, ...]:
@@ -110,31 +145,37 @@ def perception_table(
 def study(
     study: Annotated[str, arg(help="row of the study table")],
     output: Folder,
-    table: StudyTable = Path("config/studies.yaml"),
     results: Results = Path("results"),
-    scenarios: tuple[str, ...] = (),
+    tables: Tables = "tables",
+    scores: Scores = None,
+    table: Annotated[Path, arg(help="with --scores: the study table")] = Path("config/studies.yaml"),
+    scenarios: Annotated[tuple[str, ...], arg(help="with --scores: a part of it")] = (),
     methods: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (),
-    scores: Scores = None,
     left_out: LeftOut = "{}",
 ) -> None:
-    """Run records -> one of the paper's tables, beside the paper's values."""
-    from neuspring.report.study import write_collected, write_study
-    from neuspring.scores.paper import read_studies
-    from neuspring.scores.runs import read_scores
+    """The numbers that `tables --studies` kept, or a scores.csv -> one of the paper's tables, beside the paper's values."""
+    from neuspring.report.clips import write_clips
+    from neuspring.report.study import write_study
+    from neuspring.scores.clips import ClipNumbers
+    from neuspring.scores.numbers import Numbers
 
-    studies = read_studies(table)
-    if study not in studies:
-        raise InputError("--study", f"must be a row of {table}", study, f"Known: {', '.join(studies)}")
-    definition, without = studies[study], _read_left_out(left_out)
-    beside = studies[definition.beside] if definition.beside else None
     if scores:
-        found = replace(read_scores(scores).named(scenario=scenarios, method=methods, seed=seeds), left_out=without)
-        print(write_collected(study, definition, found, output, beside))
-    elif scenarios and methods and seeds:
-        print(write_study(study, definition, results, scenarios, seeds, methods, output, without, beside))
+        studies, one = _study(table, study)
+        if one.clips:
+            remedy = "Leave out --scores; `neuspring tables --studies` makes its numbers."
+            raise InputError(f"study {study}", "a study of clips needs the transfers of a results folder", "scores alone", remedy)
+        everything = _read_scores(scores, scenarios, methods, seeds, left_out)
+        numbers = Numbers(everything=everything, baseline="", studies={study: one}, known_studies=studies)
     else:
-        raise InputError("study", STUDY_RULE)
+        numbers = Numbers.load(results / tables, results)
+        if study not in numbers.by_study:
+            known = ", ".join(numbers.by_study) or "none"
+            raise InputError(
+                "--study", f"must be in {results / tables}", study, f"There: {known}. Make it: tables --studies {study}."
+            )
+    found = numbers.by_study[study]
+    print(write_clips(found, output) if isinstance(found, ClipNumbers) else write_study(found, output))
 
 
 def explain(
@@ -143,25 +184,24 @@ def explain(
         arg(help="METHOD/TASK/METRIC, STUDY/ROW/TASK/METRIC, SCENARIO/METHOD/SEED, or a folder; lists what there is by default"),
     ] = "",
     results: Results = Path("results"),
-    tables: Annotated[str, arg(help="folder of the tables in the results folder")] = "tables",
-    configfile: Annotated[tuple[str, ...], arg(help="files the benchmark was run with, for the commands")] = (),
+    tables: Tables = "tables",
     json: bool = False,
 ) -> int:
-    """A number or a run -> what is behind it, and how to make it again; 1 if a run has changed since."""
+    """A number or a run -> the runs and records behind it; 1 if one is missing, failed, or newer than the table."""
     from neuspring.report.explain import explain, known, run_text, runs_of, text
 
-    folder = results / tables / "studies"
+    folder = results / tables
     if not what:
         print(known(results, folder))
         return 0
     if runs := runs_of(what, results):
-        found = [run_text(path, configfile) for path in runs]
+        found = [run_text(path) for path in runs]
         print("\n\n".join(lines for lines, _ in found))
-        return 0 if all(same for _, same in found) else 1
+        return 0 if all(good for _, good in found) else 1
     if what.count("/") < 2:
         rule = "must be METHOD/TASK/METRIC, STUDY/ROW/TASK/METRIC, or a run that there is"
         raise InputError(f"explain {what}", rule, remedy="`neuspring explain` lists what there is.")
-    explanation = explain(what, results, folder, configfile)
+    explanation = explain(what, results, folder)
     print(explanation.as_json() if json else text(explanation), end="")
     return 1 if explanation.problems else 0
 
@@ -176,7 +216,7 @@ def report(
     baseline: Annotated[str | None, arg(help="method that others are compared with")] = None,
     shown: Annotated[tuple[str, ...], arg(help="methods to draw; six at most by default")] = (),
     table: StudyTable = Path("config/studies.yaml"),
-    tables: Annotated[str, arg(help="folder of tables in the results folder")] = "tables",
+    tables: Tables = "tables",
     megabytes: Annotated[float, arg(help="size that pictures and videos may fill")] = 25.0,
     video_megabytes: Annotated[float, arg(help="part of it for videos; the others are linked")] = 8.0,
     left_out: LeftOut = "{}",
@@ -203,12 +243,12 @@ def report(
     print(f"Report: {page.write(results, output, options)}")
 
 
-def _read_left_out(text: str) -> dict[str, tuple[str, ...]]:
-    """Method -> scenarios to which it does not apply, from JSON text. Raises InputError."""
-    values = json_value("--left-out", text)
-    if not all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in values.values()):
-        raise InputError("--left-out", "must map methods to lists of scenarios", text)
-    return {method: tuple(names) for method, names in values.items()}
+def _read_left_out(text: str) -> dict[str, dict[str, str]]:
+    """Method -> scenarios to which it does not apply, and why, from JSON text. Raises InputError."""
+    values: dict[str, dict[str, str]] = json_value("--left-out", text)
+    if not all(isinstance(why, dict) and all(isinstance(reason, str) for reason in why.values()) for why in values.values()):
+        raise InputError("--left-out", "must map methods to scenarios with reasons", text)
+    return values
 
 
 def track_init(output: Path, results: Results = Path("results"), settings: Settings = "{}") -> None:

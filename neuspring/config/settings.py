@@ -93,9 +93,9 @@ class Aim(Section):
     baseline: Name
     """The method whose error is below the line."""
     task: Literal["reconstruction", "future", "transfer"] = "future"
-    """Frames that count: training frames, future frames, or those of other recordings."""
-    metric: Literal["chamfer", "track_error", "track_error_bound", "deform_l1"] = "track_error"
-    """The error."""
+    """Training frames, future frames, or twins on other recordings."""
+    metric: Name = "track_error"
+    """The error: a metric of positions, for example chamfer, track_error_bound or deform_l1."""
     ratio: Annotated[float, Field(gt=0.0)]
     """Largest geometric mean."""
     below: Annotated[float, Field(gt=0.0)] = 1.0

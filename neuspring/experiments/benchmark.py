@@ -20,6 +20,7 @@ from neuspring.core.text import listed
 from neuspring.data.sources import SOURCES, Source, location, scenario_rows, with_deform
 from neuspring.perception.backends import BACKENDS
 from neuspring.scores.lpips import configured_weights
+from neuspring.scores.metrics import require_metrics
 from neuspring.scores.paper import Study, read_studies
 from neuspring.twin.body import BODIES
 
@@ -183,6 +184,7 @@ class Benchmark:
         methods = shared_searches(methods, searches)
         wanted = tuple(dict.fromkeys(search for n in config.methods if (search := methods[n].search)))
         _require_known("methods' search", wanted, searches, config.search_table)
+        require_metrics(config.aims)
         _require_known("compare_with", (config.compare_with,) if config.compare_with else (), methods, config.method_table)
         pairs = config.transfers or {}
         everyone = tuple(name for source, names in pairs.items() for name in (source, *names))
@@ -310,16 +312,20 @@ class Benchmark:
         return self.config.images.enabled and (source.films or (path is not None and source.images_beside(path)))
 
     def applies(self, method: str, scenario: str) -> bool:
-        """Whether a method can be run on a scenario: what is trained on silhouettes needs images, what has a pool the others."""
+        """True where a method can be run on a scenario."""
+        return not self.why_not(method, scenario)
+
+    def why_not(self, method: str, scenario: str) -> str:
+        """The reason why a method cannot be run on a scenario; empty where it can."""
         if method in self.pooled and scenario not in self.pools:
-            return False
-        return method not in self.pictured or self.has_images(scenario)
+            return "it learns from a pool of recordings, and this one has none"
+        return "it needs images" if method in self.pictured and not self.has_images(scenario) else ""
 
     @property
-    def whole_left_out(self) -> dict[str, tuple[str, ...]]:
-        """Of the whole configuration: method -> the scenarios to which it does not apply; methods that apply to all are no keys."""
-        some = self.pictured | self.pooled
-        without = {n: tuple(s for s in self.whole_scenarios if not self.applies(n, s)) for n in self.whole.methods if n in some}
+    def whole_left_out(self) -> dict[str, dict[str, str]]:
+        """Of the whole configuration: method -> the scenarios to which it does not apply, and why."""
+        some = [name for name in self.whole.methods if name in self.pictured | self.pooled]
+        without = {name: {s: why for s in self.whole_scenarios if (why := self.why_not(name, s))} for name in some}
         return {name: scenarios for name, scenarios in without.items() if scenarios}
 
     def capture_folder(self, name: str) -> Path:

@@ -23,7 +23,7 @@ from neuspring.config.settings import select
 from neuspring.core.errors import InputError
 from neuspring.core.provenance import image_stamps
 from neuspring.data.sources import SOURCES
-from neuspring.experiments.benchmark import Benchmark, read_methods, read_searches, rows_of, section_of, with_method, with_search
+from neuspring.experiments.benchmark import Benchmark, read_methods, read_searches, section_of, with_method, with_search
 from neuspring.perception.backends import BACKENDS
 from neuspring.scores.lpips import configured_weights
 from neuspring.stages import STAGES
@@ -118,11 +118,6 @@ class Graph:
     def logged_runs(self, methods: Sequence[str] | None = None) -> list[str]:
         """Files that say that a run is in MLflow; none where tracking is off."""
         return [path.replace("run.json", "mlflow.txt") for path in self.runs(methods) if self.config.tracking.enabled]
-
-    def study_runs(self, name: str) -> list[str]:
-        """The records that a study is made of."""
-        moved = self.transfers() if self.benchmark.studies[name].clips else ()
-        return [*self.runs(self.benchmark.methods_of(name)), *moved]
 
     def transfers(self) -> list[str]:
         """Records of transfers: per source, method and seed. Oracles concern their own recording alone, and are not transferred."""
@@ -417,14 +412,16 @@ class Graph:
         aims = ["--aims", _json(plain(self.config)["aims"])] if self.config.aims else []
         compared = ["--baseline", self.benchmark.compared_with]
         settings = ["--settings", _json(plain(self.whole) | NEUTRAL)]
-        return [*self._runs(output or self.folder), *self._transfers(), *compared, *objects, *aims, *settings]
+        studies = ["--studies", *self.whole.studies, *self._study_table()] if self.whole.studies else []
+        return [*self._runs(output or self.folder), *self._transfers(), *compared, *objects, *aims, *studies, *settings]
 
     def study(self, name: str) -> list[str]:
         """Of `neuspring study`."""
-        # Of the methods those that it shows: it is the same table however many others the configuration names.
-        shown = [method for method in rows_of(self.benchmark.studies, name) if method in self.whole.methods]
-        table = str(self.root / self.config.study_table)
-        return ["--study", name, "--table", table, *self._runs(f"{self.folder}/studies", shown)]
+        place = ["--results", self.results, "--tables", self.config.tables]
+        return ["--study", name, *place, "--output", f"{self.folder}/studies"]
+
+    def _study_table(self) -> list[str]:
+        return ["--table", str(self.root / self.config.study_table)]
 
     def perception(self) -> list[str]:
         """Of `neuspring perception-table`."""
@@ -437,22 +434,22 @@ class Graph:
         del values["tracking"]
         return [
             *("--results", self.results, "--output", output or f"{self.folder}/report.html", "--settings", _json(values)),
-            *("--table", str(self.root / self.config.study_table), "--tables", self.config.tables),
+            *(*self._study_table(), "--tables", self.config.tables),
             *("--baseline", self.benchmark.compared_with, *self._transfers(), *self._left_out()),
         ]
 
-    def _runs(self, output: str, methods: Sequence[str] = ()) -> list[str]:
-        whole, names = self.whole, methods or self.whole.methods
-        runs = ["--scenarios", *whole.scenarios, "--methods", *names, "--seeds", *map(str, whole.seeds)]
-        return ["--results", self.results, "--output", output, *runs, *self._left_out(names)]
+    def _runs(self, output: str) -> list[str]:
+        whole = self.whole
+        runs = ["--scenarios", *whole.scenarios, "--methods", *whole.methods, "--seeds", *map(str, whole.seeds)]
+        return ["--results", self.results, "--output", output, *runs, *self._left_out()]
 
     def _transfers(self) -> list[str]:
         sources = [name for name in self.whole.transfers or {} if name in self.whole.scenarios]
         return ["--transfers", *sources] if sources else []
 
-    def _left_out(self, methods: Sequence[str] = ()) -> list[str]:
-        """Which methods (of all or of these) do not apply to which scenarios, so that nothing is missing there."""
-        left_out = {name: where for name, where in self.benchmark.whole_left_out.items() if not methods or name in methods}
+    def _left_out(self) -> list[str]:
+        """The methods that do not apply to some scenarios, so that nothing is missing there."""
+        left_out = self.benchmark.whole_left_out
         return ["--left-out", _json(left_out)] if left_out else []
 
     def report_stamp(self) -> list[str]:

@@ -7,15 +7,13 @@ hold the object at all?
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import pandas as pd
 
 from neuspring.baselines import REFERENCES
-from neuspring.core.run_record import RunRecord, flat
-from neuspring.core.table import Cell, Table
+from neuspring.core.run_record import RunRecord
 from neuspring.data.sources import SOURCES
 from neuspring.scores.metrics import AT_BOUND, METRICS
 from neuspring.scores.runs import Collected, finished_scores
@@ -95,56 +93,3 @@ def _gripping(values: Mapping[str, Any]) -> int | None:
         if springs is not None and inner is not None:
             return int(springs - inner)
     return None
-
-
-NOT_SETTINGS = ("seed", "device", "description", "batch")
-"""Recorded beside the settings, without being one of the method."""
-STAGES = ("search", "fit", "train", "rollout")
-"""Stages whose settings make a prediction. Pictures are drawn the same way for all."""
-ABSENT = "–"
-ABOUT = "Settings that differ between the rows, as the runs recorded them. A stage that a row does not have is not listed for it."
-
-
-def differing(records: Iterable[RunRecord], labels: Mapping[str, str]) -> dict[str, str]:
-    """Settings that differ between methods, as `value: rows; value: rows` by dotted name with the stage in front.
-
-    `labels` maps each method to its name in the table, in order. A setting that differs between scenarios is compared as the set of
-    its values. Of a method without a stage, that alone is said.
-    """
-    found: dict[str, dict[str, set[str]]] = {"stages": {}}
-    stages: dict[str, set[str]] = {}
-    for record in records:
-        if record.method not in labels:
-            continue
-        stages.setdefault(record.method, set()).update(name for name in record.settings if name in STAGES)
-        for name, value in settings_of(record).items():
-            text = value if isinstance(value, str) else json.dumps(value)
-            found.setdefault(name, {}).setdefault(record.method, set()).add(text)
-    methods = [method for method in labels if method in stages]
-    found["stages"] = {method: {" + ".join(name for name in STAGES if name in stages[method])} for method in methods}
-    rows: dict[str, str] = {}
-    for name, by_method in found.items():
-        stage = name.partition(".")[0]
-        values: dict[str, list[str]] = {}
-        for method in methods:
-            if stage in ("stages", "method") or stage in stages[method]:
-                values.setdefault(" or ".join(sorted(by_method.get(method, {ABSENT}))), []).append(labels[method])
-        if len(values) > 1:
-            rows[name] = "; ".join(f"{value}: {', '.join(names)}" for value, names in values.items())
-    return rows
-
-
-def settings_of(record: RunRecord) -> dict[str, Any]:
-    """Every setting that makes a run's prediction, by its dotted name; a section of the name of its stage is not named twice."""
-    named: dict[str, Any] = {}
-    for stage, settings in record.settings.items():
-        if stage in STAGES:
-            values = {name.removeprefix(f"{stage}."): value for name, value in flat(settings).items()}
-            named |= {f"{stage}.{name}": value for name, value in values.items() if name.split(".")[-1] not in NOT_SETTINGS}
-    return named | {f"method.{name}": record.variant[name] for name in ("search",) if name in record.variant}
-
-
-def differing_table(records: Iterable[RunRecord], labels: Mapping[str, str]) -> list[Table]:
-    """The settings that differ between methods as a table; none where none does."""
-    rows = [[Cell(text=name), Cell(text=text, wrap=True)] for name, text in differing(records, labels).items()]
-    return [Table(caption="Settings that differ", header=["Setting", "Value: rows"], rows=rows, note=ABOUT)] if rows else []

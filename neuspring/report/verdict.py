@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from typing import TYPE_CHECKING, Any
+from typing import Any, cast
 
 import pandas as pd
 
@@ -15,15 +15,11 @@ from neuspring.baselines import REFERENCES
 from neuspring.core.text import listed
 from neuspring.report.blocks import Text
 from neuspring.report.notes import causes
-from neuspring.report.study_cells import LEAST_SCENARIOS
 from neuspring.scores import statistics
-from neuspring.scores.metrics import METRICS, averages
+from neuspring.scores.metrics import METRICS
+from neuspring.scores.numbers import Numbers
+from neuspring.scores.study import LEAST_SCENARIOS
 
-if TYPE_CHECKING:
-    from neuspring.report.benchmark import Benchmark
-
-JUDGES = tuple((task, name) for task in ("future", "reconstruction") for name in ("track_error", "chamfer", "image_error"))
-"""Task and metric that decide: the first one that the runs have."""
 FRAMES = {"future": "future", "reconstruction": "training"}
 NOUNS = {"scenario": "scenarios", "category": "categories"}
 """What intervals of ratios are over."""
@@ -34,16 +30,14 @@ GROWS = 2.0
 ONE_SEED = "Seeds 0, 1 and 2 would tell how much is chance in training."
 
 
-def verdict(benchmark: Benchmark) -> list[Text]:
+def verdict(numbers: Numbers) -> list[Text]:
     """Labeled paragraphs on a benchmark."""
-    runs, usable = benchmark.collected.runs, benchmark.usable
-    there = set(zip(usable["task"], usable["metric"], strict=True)) if len(usable) else set()
-    key = next((key for key in JUDGES if key in there), None)
-    if key is None:
+    runs = numbers.collected.runs
+    if not len(numbers.lead):
         ended = int((runs["status"] == "ok").sum())
         said = {"Who wins": [f"Nothing can be compared yet: {ended} of {len(runs)} runs have finished."]}
         return _paragraphs(said | {"What went wrong": _unfinished(runs)})
-    duel = Duel(benchmark, *key)
+    duel = Duel(numbers)
     why = [*duel.drift(), *duel.causes()][:MOST]
     said = {
         "Who wins": duel.winner(),
@@ -78,21 +72,20 @@ def _unfinished(runs: pd.DataFrame) -> list[str]:
 
 
 class Duel:
-    """The best method by one error, and its rival: what it is compared with, or the second best where it is that itself."""
+    """The words on `Numbers.lead`: the best method by the error that decides, and its rival."""
 
-    def __init__(self, benchmark: Benchmark, task: str, name: str) -> None:
-        self.benchmark, self.task, self.metric = benchmark, task, METRICS[name]
-        usable = benchmark.usable
-        part = usable[(usable["task"] == task) & (usable["metric"] == name)]
-        means = averages(part).set_index("method")["equal"].sort_values(kind="stable")
-        self.means = {str(method): float(value) for method, value in means.items()}
-        self.best, *others = self.means
-        self.rival = benchmark.baseline if benchmark.baseline in others else next(iter(others), "")
+    def __init__(self, numbers: Numbers) -> None:
+        self.numbers, self.lead = numbers, cast("Any", next(numbers.lead.itertuples()))
+        self.best, self.rival, self.task, self.metric = (
+            str(self.lead.method), str(self.lead.baseline), str(self.lead.task), METRICS[str(self.lead.metric)]
+        )  # fmt: skip
+        self.means = numbers.means(self.task, self.metric.name)
+        usable, finished = numbers.usable, numbers.finished[numbers.finished["metric"] == self.metric.name]
+        part = usable[(usable["task"] == self.task) & (usable["metric"] == self.metric.name)]
         self.scenarios, self.seeds = part["scenario"].nunique(), part["seed"].nunique()
-        finished = benchmark.finished[benchmark.finished["metric"] == name]
-        each = finished.groupby(["method", "task", "scenario"])["value"].mean()
-        self.each: dict[Any, float] = dict(zip(each.index.tolist(), each.tolist(), strict=True))
-        own = {scenario: value for (method, at, scenario), value in self.each.items() if (method, at) == (self.best, task)}
+        each: Any = finished.groupby(["method", "task", "scenario"])["value"].mean().to_dict()
+        self.each: dict[tuple[str, str, str], float] = each
+        own = {scenario: value for (method, at, scenario), value in self.each.items() if (method, at) == (self.best, self.task)}
         self.by_scenario = dict(sorted(own.items(), key=lambda pair: -pair[1]))
         self.weakest = next(iter(self.by_scenario))
 
@@ -115,29 +108,24 @@ class Duel:
         return [f"{self.best}, by {what}: {first}{over}. That is {' and '.join(beaten)}."]
 
     def resolved(self) -> list[str]:
-        """Whether the lead over the rival is more than chance, and what would show it if not."""
+        """The answer to: is the lead over the rival more than chance, and what would show it if not?"""
         if not self.rival:
             return []
-        found = self.benchmark.finished
-        pair = found[found["method"].isin([self.best, self.rival]) & (found["task"] == self.task)]
-        table = statistics.ratios(pair[pair["metric"] == self.metric.name], self.rival, self.benchmark.objects)
-        more = [ONE_SEED] if self.seeds == 1 else []
-        if not len(table) or table.iloc[0]["verdict"] == statistics.TOO_FEW:
+        row, more = self.lead, [ONE_SEED] if self.seeds == 1 else []
+        if row.verdict == statistics.TOO_FEW:
             count = f"{self.scenarios} scenario{'s' * (self.scenarios > 1)}"
             return [f"No. {count} cannot tell a lead from chance; {statistics.LEAST_OBJECTS} give an interval.", *more]
-        row = table.iloc[0]
-        ends = f"{row['ratio_low']:.3f} to {row['ratio_high']:.3f}"
-        nouns = NOUNS[row["objects"]]
-        what = f"Over {row['n']} {nouns} the ratio of its error to that of {self.rival} is {row['ratio']:.3f}"
-        if row["verdict"] == statistics.BELOW:
-            if row["n"] < LEAST_SCENARIOS:
-                return [f"Not yet. {what}, interval {ends}: below 1, but fewer than {LEAST_SCENARIOS} are too few.", *more]
-            return [f"Yes. {what}, interval {ends}: below 1.", *more]
-        if row["verdict"] == statistics.ABOVE:
-            return [f"No. {what}, interval {ends}: above 1. A few large errors of {self.rival} make its mean.", *more]
-        most = statistics.needed(row["ratio_low"], row["ratio_high"], int(row["n"]))
+        nouns, low, high = NOUNS[row.objects], row.ratio_low, row.ratio_high
+        what = f"Over {row.n} {nouns} the ratio of its error to that of {self.rival} is {row.ratio:.3f}"
+        what += f", interval {low:.3f} to {high:.3f}"
+        if row.verdict == statistics.BELOW:
+            few = f", but fewer than {LEAST_SCENARIOS} are too few" * (row.n < LEAST_SCENARIOS)
+            return [f"{'Not yet' if few else 'Yes'}. {what}: below 1{few}.", *more]
+        if row.verdict == statistics.ABOVE:
+            return [f"No. {what}: above 1. A few large errors of {self.rival} make its mean.", *more]
+        most = statistics.needed(low, high, row.n)
         would = f"{most} {nouns} that scatter alike would resolve it." if most else "The lead is too small to be resolved."
-        return [f"No. {what}, interval {ends}: 1 lies in it. {would}", *more]
+        return [f"No. {what}: 1 lies in it. {would}", *more]
 
     def weak(self) -> list[str]:
         """Where the best method is weakest, where its rival is better, and whether it learned anything at all."""
@@ -151,10 +139,11 @@ class Duel:
 
     def others(self) -> list[str]:
         """Other measures of the same frames by which another method is first."""
-        usable, first = self.benchmark.usable, dict[str, list[str]]()
-        for name, part in usable[usable["task"] == self.task].groupby("metric", sort=False):
-            metric, values = METRICS[str(name)], averages(part).set_index("method")["equal"]
-            leader = str(values.idxmax() if metric.higher_is_better else values.idxmin())
+        first = dict[str, list[str]]()
+        usable = self.numbers.usable
+        for name in dict.fromkeys(usable.loc[usable["task"] == self.task, "metric"]):
+            metric, values = METRICS[str(name)], self.numbers.means(self.task, str(name))
+            leader = (max if metric.higher_is_better else min)(values, key=lambda method: values[method])
             if self.best in values and values[leader] != values[self.best]:
                 against = f"{metric.heading} ({metric.text(values[leader])} against {metric.text(values[self.best])})"
                 first.setdefault(leader, []).append(against)
@@ -162,10 +151,10 @@ class Duel:
 
     def causes(self) -> list[tuple[str, str]]:
         """What records say, with the next move, weakest scenario first: warnings of perception there, then search and fit."""
-        warned = [one for scenario, one in self.benchmark.warnings if scenario == self.weakest]
+        warned = [one for scenario, one in self.numbers.warnings if scenario == self.weakest]
         found = [(f"{self.weakest}: {one.name} ({one.where}).", one.remedy) for one in warned]
         for scenario in self.by_scenario:
-            records = self.benchmark.everything.records.items()
+            records = self.numbers.everything.records.items()
             own = [record for (place, method, _), record in records if (place, method) == (scenario, self.best)]
             found += [(f"{self.best} on {scenario}: {cause}.", move) for cause, move in causes(own)]
         return found

@@ -15,16 +15,14 @@ import pandas as pd
 
 from neuspring.scores.metrics import METRICS, TASKS, averages
 
-LeftOut = Mapping[str, Collection[str]]
-"""Method to the scenarios to which it does not apply."""
+LeftOut = Mapping[str, Mapping[str, str]]
+"""Method to the scenarios to which it does not apply, each with the reason."""
 Labels = Mapping[str, str]
 """Method to its name in a table."""
 NOTHING: Mapping[str, Any] = MappingProxyType({})
-REASON = "it needs images"
-"""Why a method does not apply to a scenario."""
 RUN = ["scenario", "method", "seed"]
 CELL = ["method", "task", "metric"]
-MEANS = ("own", "own_frames", "own_scenarios", "all", "all_frames", "all_scenarios")
+MEANS = ("own", "own_other", "all", "all_other")
 COLUMNS = ("method", "succeeded", "attempted", "unknown", *CELL[1:], *MEANS)
 OWN, ALL = "its successes", "all, failures held"
 """What the two means are over."""
@@ -39,9 +37,9 @@ DASHES = "A dash in a mean over all runs: a failed run has no such score."
 def both_averages(scores: pd.DataFrame, runs: pd.DataFrame, frozen: pd.DataFrame) -> pd.DataFrame:
     """A row per method, task and metric: means over its successful runs and over all of its runs; no row if none has failed.
 
-    `frozen` are the scores of failed runs with the last finite frame frozen. `own` and `all` weigh scenarios equally, `own_frames`
-    and `all_frames` by their frames, in the units of `scores`. `attempted` counts successes and failures, `unknown` the failures
-    without such scores. A mean over all runs is NaN where a score of a failed run is missing.
+    `frozen` are the scores of failed runs with the last finite frame frozen. `own` and `all` are in the average that the paper
+    takes of the metric, `own_other` and `all_other` in the other one, in the units of `scores`. `attempted` counts successes and
+    failures, `unknown` the failures without such scores. A mean over all runs is NaN where a score of a failed run is missing.
     """
     ended = runs[runs["status"].isin(["ok", "failed"])]
     failed = ended.loc[ended["status"] == "failed", RUN]
@@ -58,7 +56,7 @@ def both_averages(scores: pd.DataFrame, runs: pd.DataFrame, frozen: pd.DataFrame
     unknown = _unknown(failed, lost)
     lacking = _lacking(failed, lost, pd.concat([part for part in (scores, lost) if len(part)]) if len(everything) else scores)
     without = table["method"].isin(unknown[unknown > 0].index) | pd.MultiIndex.from_frame(table[CELL]).isin(lacking)
-    table.loc[without, ["all", "all_frames", "all_scenarios"]] = np.nan
+    table.loc[without, ["all", "all_other"]] = np.nan
     counts = ended.groupby("method")["status"].agg(succeeded=lambda status: int((status == "ok").sum()), attempted="size")
     counts["unknown"] = unknown.reindex(counts.index).fillna(0).astype(int)
     table = counts.reset_index().merge(table, on="method", how="left")[list(COLUMNS)]
@@ -72,8 +70,8 @@ def _scores_of(scores: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def _means(scores: pd.DataFrame, name: str) -> pd.DataFrame:
-    names = {"equal": name, "frames": f"{name}_frames", "scenarios": f"{name}_scenarios"}
-    return averages(scores).rename(columns=names)[[*CELL, *names.values()]]
+    names = {"mean": name, "other": f"{name}_other"}
+    return averages(scores)[[*CELL, *names]].rename(columns=names)
 
 
 def _unknown(failed: pd.DataFrame, lost: pd.DataFrame) -> pd.Series:
@@ -147,11 +145,16 @@ def removed_lines(runs: pd.DataFrame, left_out: LeftOut = NOTHING, labels: Label
 
 
 def left_out_lines(left_out: LeftOut, labels: Labels = NOTHING) -> list[str]:
-    """A sentence for every method that does not apply to some scenarios."""
-    return [f"Left out: {labels.get(name, name)} on {', '.join(where)}: {REASON}." for name, where in left_out.items() if where]
+    """A sentence for every method and reason for which it does not apply to some scenarios."""
+    lines = []
+    for name, where in left_out.items():
+        for why in dict.fromkeys(where.values()):
+            places = ", ".join(place for place, reason in where.items() if reason == why)
+            lines.append(f"Left out: {labels.get(name, name)} on {places}: {why}.")
+    return lines
 
 
-def applying(left_out: LeftOut, scenarios: Collection[str], methods: Collection[str]) -> dict[str, tuple[str, ...]]:
+def applying(left_out: LeftOut, scenarios: Collection[str], methods: Collection[str]) -> dict[str, dict[str, str]]:
     """The part of `left_out` that concerns these scenarios and methods, in their order."""
-    absent = {name: tuple(where for where in scenarios if where in left_out.get(name, ())) for name in methods}
+    absent = {name: {where: why for where in scenarios if (why := left_out.get(name, {}).get(where))} for name in methods}
     return {name: where for name, where in absent.items() if where}

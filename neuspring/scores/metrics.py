@@ -1,33 +1,40 @@
-"""The metrics: what they measure, how tables show them, and the functions that compute them.
+"""The metrics: what they measure, the functions that compute them, and how tables show them; averages of scores.
 
 Chamfer distance: each visible observed point to its nearest surface node, one direction, in the L1 norm |dx| + |dy| + |dz|.
 Track error: annotated tracks, matched to the nearest of all nodes at frame 0, Euclidean distance.
 Both follow the released evaluation of PhysTwin. The track error has a floor, its value in frame 0. The bound track error has none:
 its points move with the nodes around them (`carried`). DEFORM's L1 error is that of its evaluation, of markers along a cable.
-Metrics of pictures are in `pictures` and `lpips`.
+Metrics of pictures are computed in `pictures` and `lpips`.
+
+A metric is one member of `METRICS` and carries its function: it is computed wherever runs are scored, and stands in all tables. An
+installed package adds one by an entry point of the group `neuspring.metrics`, whose object is a `Metric`.
 
 pandas and SciPy are imported where they are used, because the workflow reads the declarations at its start.
-
-To add a metric, write its function, add its values in `score_tasks` or `pictures.picture_scores`, and declare it in `METRICS`.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from neuspring.core.artifacts import Observations, Scenario, Trajectory
-from neuspring.scores.carried import NEIGHBORS, bound_positions
+from neuspring.core.errors import InputError
+from neuspring.registry import Registry
+from neuspring.scores.carried import NEIGHBORS, bound_positions, points_in_image, points_on_table
 
 if TYPE_CHECKING:
     import pandas as pd
     from scipy.spatial import cKDTree
 
+    from neuspring.config.settings import Aim
+
 TASKS = ("reconstruction", "future")
-SHORT = {"reconstruction": "Recon.", "future": "Future"}
+SHORT = {"reconstruction": "Recon.", "future": "Future", "transfer": "Transfer"}
 """Tasks in headings of columns."""
 COLUMNS = ("scenario", "category", "method", "seed", "task", "metric", "value", "unit", "frames")
 DASH = "–"
@@ -35,11 +42,12 @@ DASH = "–"
 AT_BOUND = 0.05
 """A share of springs at the bound of their stiffness above this says that the bound was in training's way: in notes of runs and
 below tables alike."""
+Of = Literal["positions", "pictures", "marks"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Metric:
-    """A metric, and how tables show it: in summaries, and beside the paper's values, which stand in mm where they are lengths."""
+    """A metric: the function that computes it, and how tables show it."""
 
     name: str
     title: str
@@ -47,17 +55,26 @@ class Metric:
     heading: str
     unit: str
     """Of stored values; 1 for plain numbers."""
+    shown_unit: str = ""
+    """In tables; empty for plain numbers."""
     factor: float = 1.0
-    """From the stored unit to that of summaries."""
+    """From the stored unit to that of tables."""
     digits: int
-    """After the point, in summaries."""
+    """After the point, in tables."""
     higher_is_better: bool = False
     relative: bool = True
-    """Whether a change in per cent means something. It does not in dB."""
-    of_pictures: bool = False
+    """True where a change in per cent means something. It does not in dB."""
+    of: Of = "positions"
+    """Positions of nodes in space; pictures; points that were marked in images, where there is color alone."""
+    function: Callable[..., Any] | str
+    """Of positions and marks: (positions [F, N, 3] m, observations) -> values per frame [F], NaN where a frame has none, or None
+    where the metric does not apply. Of pictures: (`pictures.Pair`, LPIPS of two pictures or None) -> a value or None. Text
+    "module:name" is imported when it is first called."""
+    in_studies: bool = False
+    """True where tables of studies show it too."""
     average: Literal["equal", "frames"] = "equal"
     """How the paper averages over scenarios: equally, or weighted by their frames."""
-    tolerance: float
+    tolerance: float = 1e-6
     """Largest difference, in the stored unit, from a published value of the same data that conformance checks allow.
 
     Distances: single precision and its order of summation. Pictures: those of the stand-in agree within 1e-6 dB with another
@@ -66,14 +83,11 @@ class Metric:
     explained: str = ""
     """In words, below the heading of summaries; empty: the title."""
     paper_name: str = ""
-    """In paper_tables.csv; empty for metrics that the paper does not have. Those that it has are named in `IN_PAPER` too."""
-    paper_heading: str = ""
-    paper_unit: str = ""
-    """Empty for plain numbers."""
-    paper_factor: float = 1.0
-    """From the stored unit to `paper_unit`."""
-    paper_digits: int = 3
-    """After the point, for our values beside the paper's."""
+    """In paper_tables.csv; empty for metrics that the paper does not have."""
+
+    def measure(self, *given: Any) -> Any:
+        """What the function returns."""
+        return (resolve_name(self.function) if isinstance(self.function, str) else self.function)(*given)
 
     @property
     def other_average(self) -> Literal["equal", "frames"]:
@@ -86,106 +100,22 @@ class Metric:
         return self.heading if self.unit == "1" else f"{self.heading} [{self.unit}]"
 
     @property
-    def shown_unit(self) -> str:
-        """The unit of summaries; empty for plain numbers."""
-        return "mm" if self.unit == "m" else "" if self.unit == "1" else self.unit
-
-    @property
-    def paper_column(self) -> str:
-        """The paper's heading with an arrow that says which direction is better."""
-        return f"{self.paper_heading} {'↑' if self.higher_is_better else '↓'}"
+    def column(self) -> str:
+        """The heading of a column, with the sign of plain per cents."""
+        return f"{self.heading} %" if self.shown_unit == "%" else self.heading
 
     def text(self, value: float, sign: str = "") -> str:
-        """A stored value as summaries print it."""
-        return f"{self.factor * value:{sign}.{self.digits}f}"
+        """A stored value as tables print it."""
+        return self.shown(self.factor * value, sign)
 
-    def paper_text(self, value: float, sign: str = "") -> str:
-        """A value in the paper's unit; a dash for NaN."""
-        return DASH if np.isnan(value) else f"{value:{sign}.{self.paper_digits}f}"
-
-
-_ALL = (
-    Metric(
-        name="chamfer", title="Chamfer distance", heading="CD", unit="m", factor=1e3, digits=2, tolerance=1e-6,
-        explained="single-directional L1 Chamfer",
-        paper_name="cd", paper_heading="CD", paper_unit="mm", paper_factor=1e3, paper_digits=2,
-    ),
-    Metric(
-        name="track_error", title="track error", heading="TE", unit="m", factor=1e3, digits=2, tolerance=1e-6,
-        paper_name="track_error", paper_heading="TE", paper_unit="mm", paper_factor=1e3, paper_digits=2,
-    ),
-    Metric(
-        name="track_error_bound", title="bound track error", heading="TE bound", unit="m", factor=1e3, digits=2, tolerance=1e-6,
-        explained="track error of points bound to the nodes around them, 0 for any rigid motion",
-        paper_heading="TE bound", paper_unit="mm", paper_factor=1e3, paper_digits=2,
-    ),
-    Metric(
-        name="deform_l1", title="L1 error of DEFORM", heading="L1", unit="m", factor=1e3, digits=2, tolerance=1e-6,
-        explained="mean absolute difference of all coordinates of the markers along a cable, held ones (0) included",
-        paper_heading="L1", paper_unit="mm", paper_factor=1e3, paper_digits=2,
-    ),
-    Metric(
-        name="psnr", title="PSNR", heading="PSNR", unit="dB", digits=2, tolerance=0.02, relative=False,
-        higher_is_better=True, of_pictures=True, average="frames",
-        paper_name="psnr", paper_heading="PSNR", paper_unit="dB", paper_digits=3,
-    ),
-    Metric(
-        name="ssim", title="SSIM", heading="SSIM", unit="1", digits=4, tolerance=5e-4,
-        higher_is_better=True, of_pictures=True, average="frames",
-        paper_name="ssim", paper_heading="SSIM", paper_unit="", paper_digits=3,
-    ),
-    Metric(
-        name="lpips", title="LPIPS", heading="LPIPS", unit="1", digits=4, tolerance=5e-4, of_pictures=True, average="frames",
-        paper_name="lpips", paper_heading="LPIPS", paper_unit="", paper_digits=3,
-    ),
-    Metric(
-        name="iou", title="IoU", heading="IoU", unit="1", digits=3, tolerance=2e-3,
-        higher_is_better=True, of_pictures=True, average="frames",
-        paper_name="iou", paper_heading="IoU %", paper_unit="%", paper_factor=100.0, paper_digits=1,
-    ),
-)  # fmt: skip
-MARKED = (
-    Metric(
-        name="image_error", title="error of marked points in the image", heading="Marked", unit="px", digits=1, tolerance=1e-3,
-    ),
-    Metric(
-        name="table_error", title="error of marked points that lie on the table", heading="On the table", unit="m", factor=1e3,
-        digits=1, tolerance=1e-6,
-    ),
-)  # fmt: skip
-"""Of points that were marked in images, where there is color alone (carried.py)."""
-METRICS = {metric.name: metric for metric in (*_ALL, *MARKED)}
-"""By name, in the order of summaries."""
-IN_PAPER = {name: METRICS[name] for name in ("chamfer", "track_error", "iou", "psnr", "ssim", "lpips")}
-"""The metrics of the paper's tables, in its order."""
-IN_STUDIES = IN_PAPER | {"track_error_bound": METRICS["track_error_bound"]}
-"""The metrics of studies, in the order of their columns: the paper's, then ours."""
-DISTANCES = tuple(metric for metric in _ALL if not metric.of_pictures)
-PUBLISHED = tuple(metric for metric in DISTANCES if metric.paper_name)
-PICTURES = tuple(metric for metric in _ALL if metric.of_pictures)
-UNITS = {metric.name: metric.unit for metric in METRICS.values()}
-Headings = Mapping[tuple[str, str], str]
-"""Task and metric to the heading of their column."""
-HEADINGS = {(task, m.name): f"{short} {m.heading}" for task, short in SHORT.items() for m in DISTANCES}
-IMAGE_HEADINGS = {(task, m.name): f"{short} {m.heading}" for task, short in SHORT.items() for m in PICTURES}
-MARKED_HEADINGS = {(task, m.name): f"{short} {m.heading}" for task, short in SHORT.items() for m in MARKED}
-TRANSFER_HEADINGS = {("transfer", m.name): f"Transfer {m.heading}" for m in DISTANCES}
+    def shown(self, value: float, sign: str = "") -> str:
+        """A value in the unit of tables as they print it; a dash for NaN."""
+        return DASH if np.isnan(value) else f"{value:{sign}.{self.digits}f}"
 
 
 def present(table: pd.DataFrame) -> set[tuple[str, str]]:
     """The pairs of task and metric that a table has rows of."""
     return set(zip(table["task"], table["metric"], strict=True))
-
-
-def published(headings: Headings, table: pd.DataFrame) -> Headings:
-    """Those of `headings` that are of the published distances, or of which a table has rows: older tables lack our metrics."""
-    columns = present(table) if len(table) else set()
-    return {key: text for key, text in headings.items() if METRICS[key[1]] in PUBLISHED or key in columns}
-
-
-def headings_of(table: pd.DataFrame) -> Headings:
-    """Headings of the published distances, and of the other metrics that a table has rows of."""
-    return published(HEADINGS | IMAGE_HEADINGS, table)
 
 
 def _tree(points: np.ndarray) -> cKDTree:
@@ -261,36 +191,93 @@ def deform_l1(positions: np.ndarray, observations: Observations) -> np.ndarray:
     return total / (3 * len(observations.line))
 
 
-def errors_per_frame(positions: np.ndarray, observations: Observations) -> dict[str, np.ndarray]:
-    """Every distance per frame [T], m, by the name of its metric; positions [T, N, 3]. DEFORM's with a line of markers alone."""
-    tracks, line = observations.tracks[: len(positions)], observations.line
+def _of_cables(positions: np.ndarray, observations: Observations) -> np.ndarray | None:
+    """DEFORM's error; None but for a line of markers alone."""
+    line = observations.line
     of_markers = not ((line >= observations.object_points.shape[1]) & (line < len(observations.nodes))).any()
     of_markers &= bool(line.size) and observations.scenario.up == "+z" and bool(observations.object_visibility.all())
-    return ({"deform_l1": deform_l1(positions, observations)} if of_markers else {}) | {
-        "chamfer": chamfer_per_frame(positions, observations),
-        "track_error": track_errors(positions, tracks),
-        "track_error_bound": bound_track_errors(positions, tracks),
-    }
+    return deform_l1(positions, observations) if of_markers else None
 
 
-def marked_errors(positions: np.ndarray, observations: Observations) -> dict[str, np.ndarray]:
-    """Errors of points marked in the image per frame [F], px and m, by the name of their metric, for positions [F, N, 3].
-
-    NaN in frames without marks. Empty for captures with depth, and where no point was marked.
-    """
+def _of_marks(positions: np.ndarray, observations: Observations, *, on_table: bool) -> np.ndarray | None:
+    """Errors of marked points, px or m on the table; None for captures with depth, and where no point was marked."""
     image = observations.image
     if image is None or not image.marked.shape[1]:
-        return {}
-    # OpenCV is imported for captures alone.
-    from neuspring.scores.carried import points_in_image, points_on_table
-
+        return None
     view = image.intrinsics, image.camera_to_world, positions, image.marked.astype(np.float64), observations.surface_count
-    up = 1.0 if observations.scenario.up == "+z" else -1.0
-    return {"image_error": points_in_image(*view), "table_error": points_on_table(*view, up)}
+    return points_on_table(*view, 1.0 if observations.scenario.up == "+z" else -1.0) if on_table else points_in_image(*view)
+
+
+_MM: Any = {"unit": "m", "shown_unit": "mm", "factor": 1e3, "digits": 2}
+_DRAWN: Any = {"unit": "1", "of": "pictures", "average": "frames", "in_studies": True}
+_ALL = (
+    Metric(
+        name="deform_l1", title="L1 error of DEFORM", heading="L1", **_MM, function=_of_cables,
+        explained="mean absolute difference of all coordinates of the markers along a cable, held ones (0) included",
+    ),
+    Metric(
+        name="chamfer", title="Chamfer distance", heading="CD", **_MM, function=chamfer_per_frame, paper_name="cd", in_studies=True,
+        explained="single-directional L1 Chamfer",
+    ),
+    Metric(
+        name="track_error", title="track error", heading="TE", **_MM, paper_name="track_error", in_studies=True,
+        function=lambda positions, seen: track_errors(positions, seen.tracks[: len(positions)]),
+    ),
+    Metric(
+        name="track_error_bound", title="bound track error", heading="TE bound", **_MM, in_studies=True,
+        function=lambda positions, seen: bound_track_errors(positions, seen.tracks[: len(positions)]),
+        explained="track error of points bound to the nodes around them, 0 for any rigid motion",
+    ),
+    Metric(
+        name="psnr", title="PSNR", heading="PSNR", paper_name="psnr", **_DRAWN | {"unit": "dB"}, shown_unit="dB", digits=3,
+        relative=False, higher_is_better=True, tolerance=0.02, function="neuspring.scores.pictures:psnr_of",
+    ),
+    Metric(
+        name="ssim", title="SSIM", heading="SSIM", paper_name="ssim", **_DRAWN, digits=4, higher_is_better=True, tolerance=5e-4,
+        function="neuspring.scores.pictures:ssim_of",
+    ),
+    Metric(
+        name="iou", title="IoU", heading="IoU", paper_name="iou", **_DRAWN, shown_unit="%", factor=100.0, digits=1,
+        higher_is_better=True, tolerance=2e-3, function="neuspring.scores.pictures:iou_of",
+    ),
+    Metric(
+        name="lpips", title="LPIPS", heading="LPIPS", paper_name="lpips", **_DRAWN, digits=4, tolerance=5e-4,
+        function="neuspring.scores.pictures:lpips_of",
+    ),
+    Metric(
+        name="image_error", title="error of marked points in the image", heading="Marked", unit="px", shown_unit="px", digits=1,
+        of="marks", tolerance=1e-3, function=functools.partial(_of_marks, on_table=False),
+    ),
+    Metric(
+        name="table_error", title="error of marked points that lie on the table", heading="On the table", **_MM | {"digits": 1},
+        of="marks", function=functools.partial(_of_marks, on_table=True),
+    ),
+)  # fmt: skip
+METRICS: Registry[Metric] = Registry("metrics", {metric.name: metric for metric in _ALL}, type=Metric)
+"""By name, in the order of rows of scores and of columns."""
+
+
+def metrics_of(of: Of) -> tuple[Metric, ...]:
+    """The metrics of positions, of pictures, or of marked points."""
+    return tuple(metric for metric in METRICS.values() if metric.of == of)
+
+
+def require_metrics(aims: Iterable[Aim]) -> None:
+    """Raise InputError where an aim names no metric of positions, of which alone there are ratios."""
+    for aim in aims:
+        known = [metric.name for metric in metrics_of("positions")]
+        if aim.metric not in known:
+            raise InputError("aims, metric", "must be a metric of positions", aim.metric, f"Known: {', '.join(known)}.")
+
+
+def errors_per_frame(positions: np.ndarray, observations: Observations, of: Of = "positions") -> dict[str, np.ndarray]:
+    """Every metric of positions (or marks) that applies, per frame [T], by its name; positions [T, N, 3], m."""
+    found = {metric.name: metric.measure(positions, observations) for metric in metrics_of(of)}
+    return {name: values for name, values in found.items() if values is not None}
 
 
 def floors(observations: Observations) -> dict[str, float]:
-    """Every distance in frame 0, m, where the prediction is given: it measures how far points are from nodes, and no motion.
+    """Metrics of positions in frame 0, m, where the prediction is given: they measure how far points are from nodes, and no motion.
 
     Metrics without a value there are left out.
     """
@@ -339,7 +326,7 @@ def score_tasks(
     scenario = observations.scenario
     rows = []
     known = errors_per_frame(trajectory.positions, observations) if errors is None else errors
-    per_frame = {**known, **marked_errors(trajectory.positions, observations)}
+    per_frame = {**known, **errors_per_frame(trajectory.positions, observations, "marks")}
     for task, frames in tasks.items():
         if not len(frames) or frames[-1] >= len(trajectory.positions):
             continue
@@ -348,7 +335,7 @@ def score_tasks(
             usable = usable[~np.isnan(usable)]
             if len(usable):
                 identity = (scenario.name, scenario.category, method, seed, task, metric)
-                rows.append((*identity, float(usable.mean()), UNITS[metric], len(usable)))
+                rows.append((*identity, float(usable.mean()), METRICS[metric].unit, len(usable)))
     return _table(rows)
 
 
@@ -388,14 +375,15 @@ def score_images(frames: pd.DataFrame, scenario: Scenario, drawn: int, method: s
         for metric, values in part.groupby("metric", sort=False):
             per_frame = values.groupby("frame")["value"].mean()
             identity = (scenario.name, scenario.category, method, seed, task, metric)
-            rows.append((*identity, float(per_frame.mean()), UNITS[str(metric)], len(per_frame)))
+            rows.append((*identity, float(per_frame.mean()), METRICS[str(metric)].unit, len(per_frame)))
     return _table(rows)
 
 
 def averages(scores: pd.DataFrame, by: Iterable[str] = ("method", "task", "metric")) -> pd.DataFrame:
     """Both averages over scenarios: `equal` weighs scenarios equally, `frames` weighs them by their frames.
 
-    The paper uses the first for distances and the second for pictures. Seeds are averaged within each scenario first. `seed_std` is
+    The paper uses the first for distances and the second for pictures: that is `mean`, where metrics are told apart, and the other
+    one is `other`. Seeds are averaged within each scenario first. `seed_std` is
     the standard deviation over seeds of the equal average, of the seeds that have every scenario: 0 for one seed, NaN where there
     are several seeds and fewer than two of them have every scenario.
     """
@@ -413,4 +401,9 @@ def averages(scores: pd.DataFrame, by: Iterable[str] = ("method", "task", "metri
     complete = per_seed[per_seed["scenarios"] == by_seed["scenarios"].transform("max")]
     spread = complete["value"].groupby(level=list(range(len(keys)))).std(ddof=1)
     result["seed_std"] = spread.reindex(result.index).where(by_seed.size().reindex(result.index) > 1, 0.0)
-    return result.reset_index()
+    result = result.reset_index()
+    if "metric" not in keys:
+        return result
+    framed = result["metric"].map(lambda name: METRICS[name].average == "frames")
+    mean, other = np.where(framed, result["frames"], result["equal"]), np.where(framed, result["equal"], result["frames"])
+    return result.assign(mean=mean, other=other)

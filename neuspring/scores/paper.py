@@ -17,7 +17,7 @@ from neuspring.config import parse, read_yaml
 from neuspring.config.parse import STRICT, Name
 from neuspring.core.artifacts import SAFE_NAME
 from neuspring.core.errors import InputError
-from neuspring.scores.metrics import IN_PAPER
+from neuspring.scores.metrics import METRICS, Metric
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -61,6 +61,18 @@ Values = dict[tuple[str, str, str], Printed]
 
 
 @functools.cache
+def metrics() -> dict[str, Metric]:
+    """The metrics of the paper's tables, in its order."""
+    ours = {metric.paper_name: metric for metric in METRICS.values() if metric.paper_name}
+    return {ours[name].name: ours[name] for name in dict.fromkeys(row["metric"] for row in _rows("paper_tables.csv"))}
+
+
+def in_studies() -> dict[str, Metric]:
+    """The metrics of studies, in the order of their columns: the paper's, then ours."""
+    return metrics() | {name: metric for name, metric in METRICS.items() if metric.in_studies}
+
+
+@functools.cache
 def table(name: str) -> Values:
     """One of the paper's tables, or `CLIPS`; empty if there is none of that name."""
     if name == CLIPS:
@@ -69,9 +81,9 @@ def table(name: str) -> Values:
             for row in _rows(f"{CLIPS}.csv")
         }
     tasks = {theirs: ours for ours, theirs in TASKS.items()}
-    metrics = {metric.paper_name: metric for metric in IN_PAPER.values()}
+    ours = {metric.paper_name: metric for metric in metrics().values()}
     return {
-        (row["method"], tasks[row["task"]], metrics[row["metric"]].name): _printed(row["value"], metrics[row["metric"]].unit == "m")
+        (row["method"], tasks[row["task"]], ours[row["metric"]].name): _printed(row["value"], ours[row["metric"]].unit == "m")
         for row in _rows("paper_tables.csv")
         if row["table"] == name
     }
@@ -115,21 +127,7 @@ def _rows(name: str) -> list[dict[str, str]]:
 
 
 Text = Annotated[str, StringConstraints(pattern=r"^[^\n]*\S[^\n]*$")]
-TAKEN = (
-    "summary",
-    "scores",
-    "runs",
-    "averages",
-    "differences",
-    "held",
-    "floors",
-    "ratios",
-    "seeds",
-    "aims",
-    "transfers",
-    "perception",
-    "pictures",
-)
+TAKEN = ("summary", "scores", "runs", "numbers", "transfers", "perception", "pictures", "report")
 """Names of files that other commands write into the folder of tables."""
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
 from neuspring.perception.results import Masks
 from neuspring.scores.lpips import Lpips
+from neuspring.scores.metrics import metrics_of
 from neuspring.splats.draw import OBJECT_COVERAGE, picture, view_of
 from neuspring.splats.losses import WINDOW_RADIUS, check_pair, ssim_map
 from neuspring.splats.model import Gaussians
@@ -98,21 +100,39 @@ class Pair:
         return cls(observed, rendered, truth, prediction, silhouettes(mask, rendered, hands, covered), hands > 0)
 
 
-def picture_scores(pair: Pair, lpips: Lpips | str, *, unit_lpips: bool) -> dict[str, float]:
-    """PSNR [dB], SSIM, IoU and LPIPS of a pair.
+Perceptual = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+"""LPIPS of two pictures [3, H, W]."""
 
-    `lpips` is the metric, or a text that says why there is none; then it is left out. `unit_lpips`: `released_range`
-    of `Lpips`.
+
+def picture_scores(pair: Pair, lpips: Lpips | str, *, unit_lpips: bool) -> dict[str, float]:
+    """Every metric of pictures (`metrics.METRICS`) of a pair.
+
+    `lpips` is the network, or a text that says why there is none; then LPIPS is left out. `unit_lpips`: `released_range` of
+    `Lpips`.
     """
-    truth, prediction = pair.truth, pair.prediction
-    values = {
-        "psnr": float(psnr(prediction, truth)),
-        "ssim": _ssim_on_black(prediction, truth),
-        "iou": iou(*pair.silhouettes),
-    }
-    if not isinstance(lpips, str):
-        values["lpips"] = float(lpips(prediction, truth, released_range=unit_lpips))
-    return values
+    perceptual = None if isinstance(lpips, str) else functools.partial(lpips, released_range=unit_lpips)
+    values = {metric.name: metric.measure(pair, perceptual) for metric in metrics_of("pictures")}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def psnr_of(pair: Pair, _: Perceptual | None) -> float:
+    """PSNR, dB."""
+    return float(psnr(pair.prediction, pair.truth))
+
+
+def ssim_of(pair: Pair, _: Perceptual | None) -> float:
+    """SSIM of the whole picture, of which most is black."""
+    return _ssim_on_black(pair.prediction, pair.truth)
+
+
+def iou_of(pair: Pair, _: Perceptual | None) -> float:
+    """IoU of the silhouettes."""
+    return iou(*pair.silhouettes)
+
+
+def lpips_of(pair: Pair, perceptual: Perceptual | None) -> float | None:
+    """LPIPS; None without the network's weights."""
+    return None if perceptual is None else float(perceptual(pair.prediction, pair.truth))
 
 
 def _ssim_on_black(a: torch.Tensor, b: torch.Tensor) -> float:

@@ -23,7 +23,7 @@ import numpy as np
 import pandas as pd
 
 from neuspring.config.settings import Aim
-from neuspring.scores.metrics import DISTANCES
+from neuspring.scores.metrics import metrics_of
 
 RESAMPLES = 10_000
 
@@ -109,7 +109,7 @@ def ratios(scores: pd.DataFrame, baseline: str, objects: Objects = "scenario") -
     counts objects. Interval and verdict are NaN and "too few objects" below three objects. There is no row where an error is zero.
     """
     rows = []
-    names = [metric.name for metric in DISTANCES]
+    names = [metric.name for metric in metrics_of("positions")]
     for (task, metric), part in scores[scores["metric"].isin(names)].groupby(["task", "metric"], sort=False):
         wide = part.pivot_table(index=["category", "scenario", "seed"], columns="method", values="value")
         if baseline not in wide:
@@ -178,7 +178,7 @@ def seed_spread(scores: pd.DataFrame) -> pd.DataFrame:
 
     0.1 means that another seed typically changes an error by 10 %.
     """
-    rows = scores[scores["metric"].isin([metric.name for metric in DISTANCES]) & (scores["value"] > 0)]
+    rows = scores[scores["metric"].isin([metric.name for metric in metrics_of("positions")]) & (scores["value"] > 0)]
     rows = rows.assign(log=np.log(rows["value"].astype(float)))
     keys = ["method", "task", "metric"]
     each = rows.groupby([*keys, "scenario"], sort=False)["log"].std(ddof=1).dropna()

@@ -43,7 +43,7 @@ def perceived_run(tmp_path_factory):
 @pytest.mark.slow
 def test_a_synthetic_capture_becomes_scores_and_a_table_of_perception(perceived_run):
     results = perceived_run / "results"
-    scores = pd.read_parquet(results / "tables" / "scores.parquet")
+    scores = pd.read_csv(results / "tables" / "scores.csv")
     assert set(scores["scenario"]) == {PACKAGE}
     assert scores["value"].notna().all()
     table = pd.read_csv(results / "tables" / "perception.csv")

@@ -86,7 +86,7 @@ def test_a_run_on_slurm_ends_with_all_runs_tables_and_records(slurm_run):
     assert not {"baseline/0/fit.json", "baseline/0/run.json"} & before
     runs = {f"{method}/0/{name}.json" for method in ("search_only", "baseline") for name in ("rollout", "run")}
     assert records(results) == runs | {"search-uniform/0/search.json", "baseline/0/fit.json"}
-    scores = pd.read_parquet(results / "tables" / "scores.parquet")
+    scores = pd.read_csv(results / "tables" / "scores.csv")
     assert len(scores) == 8
     assert np.isfinite(scores["value"]).all()
     assert {path.read_text().strip() for path in results.glob("*/*/*/mlflow.txt")} == {"logged"}

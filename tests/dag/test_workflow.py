@@ -45,7 +45,7 @@ def test_a_configuration_becomes_a_table_with_every_run_in_mlflow(tiny_run):
     results = project / "results"
     assert "| baseline " in output
     assert "neuspring ui --results results" in output
-    scores = pd.read_parquet(results / "tables" / "scores.parquet")
+    scores = pd.read_csv(results / "tables" / "scores.csv")
     kinds = scores[["method", "task", "metric"]].drop_duplicates()
     assert len(kinds) == len(scores) == 2 * len(TASKS) * 3
     assert set(scores["metric"]) == {"chamfer", "track_error", "track_error_bound"}

@@ -391,13 +391,13 @@ def test_what_is_trained_on_silhouettes_needs_images_and_is_left_out_elsewhere(t
     assert made.applies("spring_gaus", "synthetic_single_lift_rope")
     assert not made.applies("spring_gaus", "toy_rope_lift_smooth")
     assert made.applies("spring_gaus_points", "toy_rope_lift_smooth")
-    left_out = ("toy_rope_lift_smooth",)
+    left_out = {"toy_rope_lift_smooth": "it needs images"}
     assert made.whole_left_out == {"spring_gaus": left_out, "spring_gaus_few": left_out}
     # The same splats are made once; who trains on points draws with those of all methods.
     assert made.splats_of_method == {"spring_gaus": "spring_gaus", "spring_gaus_few": "spring_gaus"}
     assert list(made.splats) == ["spring_gaus"] and not made.fits and not made.searches
     blind = Benchmark(values | {"images": {"enabled": False}}, ROOT)
-    assert blind.whole_left_out["spring_gaus"] == tuple(values["scenarios"])
+    assert blind.whole_left_out["spring_gaus"] == dict.fromkeys(values["scenarios"], "it needs images")
 
 
 def test_twins_of_cables_move_only_where_all_have_as_many_nodes(tmp_path: Path) -> None:
@@ -453,7 +453,8 @@ def test_a_new_stage_s_options_have_their_defaults_and_a_required_one_is_a_wildc
 
 def test_scenarios_without_a_pool_are_left_out_of_its_methods_which_share_no_launches(tmp_path: Path) -> None:
     made = pooled(tmp_path, scenarios=["a", "cloth"], seeds=[0, 1, 2], twins_per_launch=8)
-    assert made.whole_left_out == {"one": ("cloth",), "two": ("cloth",)}
+    why = {"cloth": "it learns from a pool of recordings, and this one has none"}
+    assert made.whole_left_out == {"one": why, "two": why}
     assert [path for path in Graph(made).runs() if "cloth" in path] == [f"results/cloth/full/{seed}/run.json" for seed in range(3)]
     assert made.applies("one", "a")
     assert made.fits_together("a") == (("full", 0), ("full", 1), ("full", 2))
@@ -595,15 +596,22 @@ def test_studies_bring_the_methods_of_their_rows_in_the_order_of_the_table():
     )
 
 
-def test_a_study_of_clips_is_made_of_transfers_of_its_rows():
+def test_a_study_of_clips_is_made_of_transfers_of_its_rows_whose_numbers_are_kept():
     values = shipped("toy") | {"studies": ["deform"], "methods": [], "seeds": [0], "only": ""}
     scene, other = "toy_rope_lift_smooth", "toy_rope_shake_smooth"
     values |= {"scenarios": [scene], "transfers": {scene: [other]}, "pools": {"ropes": [scene, other]}}
     graph = Graph(Benchmark(values, ROOT))
     rows = [name for name in graph.benchmark.studies["deform"].rows.values() if name in graph.benchmark.methods]
-    records = {Path(path).relative_to(values["results"]).as_posix() for path in graph.study_runs("deform")}
-    assert records == {f"{scene}/{name}/0/{record}.json" for name in rows for record in ("run", "transfer")}
-    assert not any(path.endswith("transfer.json") for path in graph.study_runs("table3"))
+    records = {Path(path).relative_to(values["results"]).as_posix() for path in [*graph.runs(), *graph.transfers()]}
+    assert records >= {f"{scene}/{name}/0/{record}.json" for name in rows for record in ("run", "transfer")}
+    words = graph.tables()
+    assert words[words.index("--studies") + 1] == "deform"
+
+
+def test_an_aim_names_a_metric_of_positions():
+    aim = {"method": "neuspring", "baseline": "baseline", "metric": "chanfer", "ratio": 0.9}
+    with pytest.raises(InputError, match=r"aims, metric: must be a metric of positions.*Known: deform_l1, chamfer"):
+        Benchmark(shipped("toy") | {"aims": [aim]}, ROOT)
 
 
 def jobs_of(graph: Graph, files: list[str]) -> Counter[str]:
@@ -647,8 +655,8 @@ def test_a_target_of_a_table_means_its_rows_and_no_others_with_any_data(overlays
     assert (count["score"], count["search"], count["fit"], count["train"]) == (runs, searches, fits, trainings)
     assert count["rollout"] + count["predict"] == runs
     # The table itself is the same whatever else the configuration names.
-    words = graph.study(study)
-    assert set(words[words.index("--methods") + 1 : words.index("--seeds")]) == set(made.methods)
+    words = graph.tables()
+    assert study in words[words.index("--studies") + 1 : words.index("--table")]
 
 
 def test_targets_leave_a_part_that_was_asked_for_and_other_targets_as_they_are():

@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from html.parser import HTMLParser
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
@@ -10,14 +11,17 @@ import pytest
 from neuspring import config
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
+from neuspring.report.blocks import Section, Text
+from neuspring.report.data import ReportSection, duration, hours, rendered
 from neuspring.report.draw.scene import chosen_frames
-from neuspring.report.page import Options, _answer, write
-from neuspring.report.sections.data import duration, hours
-from neuspring.report.sections.pictures import ADDRESS, write_gallery
-from neuspring.report.sections.setup import render
+from neuspring.report.gallery import write_gallery
+from neuspring.report.page import REPORT_SECTIONS, Options, write
+from neuspring.report.sections.pictures import ADDRESS
+from neuspring.report.sections.studies import answer
 from neuspring.scores import paper
+from neuspring.scores.numbers import Numbers
 from neuspring.scores.paper import Study
-from neuspring.scores.runs import collect
+from neuspring.scores.runs import collect, collect_transfers
 from tests.support import report_tree
 from tests.support.browser import Browser, chromium
 from tests.support.report_tree import page_section as section
@@ -60,8 +64,9 @@ def full(tmp_path_factory) -> Path:
     (results / "tables").mkdir()
     (results / "tables" / "perception.md").write_text("# Perception against the truth\n\n|a|b|\n|-|-|\n|1|2|\n")
     (results / "tables" / "scores.csv").write_text("scenario\n")
-    (results / "tables" / "studies").mkdir()
-    (results / "tables" / "studies" / "systems.md").write_text("# Systems\n")
+    found = collect(results, ["cloth", "rope"], ["baseline", "neuspring"], [0, 1])
+    studies = {"systems": SYSTEMS}
+    Numbers(everything=found, baseline="baseline", studies=studies, known_studies=studies, results=results).save(results)
     return results
 
 
@@ -200,6 +205,42 @@ def test_the_answer_comes_first_then_scores_film_and_curves_and_a_study_only_if_
     assert "The data are not the paper's: synthetic (2 scenarios)." in text
 
 
+def test_numbers_that_tables_kept_are_not_computed_again(tmp_path, monkeypatch):
+    scenarios, methods = ["rope", "cloth", "bear"], ["baseline", "neuspring"]
+    results = report_tree.make(tmp_path / "results", scenarios, pictures=False, curves=False)
+    found = collect(results, scenarios, methods, [0, 1])
+    studies = {"pieces": ABLATION, "systems": SYSTEMS}
+    moved = collect_transfers(results, [], [], [])
+    Numbers(everything=found, baseline="baseline", studies=studies, known_studies=studies, transfers=moved).save(results)
+    options = {"scenarios": scenarios, "methods": methods, "seeds": [0, 1], "baseline": "baseline"}
+    page = report(results, **options)
+
+    def never(*_):
+        raise AssertionError("a bootstrap")
+
+    for module in ("statistics", "study"):
+        monkeypatch.setattr(f"neuspring.scores.{module}.resampled_means", never)
+    assert report(results, **options) == page
+    assert "pieces: Pieces" in section(page, "studies")
+    seen = report_tree.observations("rope", "synthetic", 30)
+    report_tree.write_run(results, seen, "baseline", 0, {}, curves=False, run_key="of another run")
+    with pytest.raises(AssertionError, match="a bootstrap"):
+        report(results, **options)
+
+
+def test_a_package_adds_a_section_that_stands_where_it_says(monkeypatch, small):
+    def hello(material):
+        return Section(key="hello", title="Hello", blocks=[Text(text=f"{len(material.runs)} runs")])
+
+    point = EntryPoint("hello", "package:SECTION", "neuspring.report_sections")
+    monkeypatch.setitem(vars(REPORT_SECTIONS), "_foreign", {"hello": point})
+    monkeypatch.setattr(EntryPoint, "load", lambda _: ReportSection(order=15, make=hello))
+    monkeypatch.setitem(vars(REPORT_SECTIONS), "_loaded", {})
+    page = report(small)
+    assert re.findall(r"<h2>(.*?)</h2>", page)[:3] == ["Verdict", "Hello", "Scores"]
+    assert section(page, "hello") == "Hello 8 runs"
+
+
 def test_lengths_on_the_page_are_in_mm(page):
     """Errors of both tables: the benchmark's, and a study's, of which the paper prints m."""
     scores, studies = section(page, "scores"), section(page, "studies")
@@ -242,8 +283,8 @@ def test_a_page_of_one_finished_scenario_says_what_is_not_there_yet(tmp_path):
     ],
 )
 def test_an_answer_claims_no_more_than_its_cells(counts, words, tone):
-    answer, given = _answer(Counter(counts), 24)
-    assert answer.startswith(words)
+    text, given = answer(Counter(counts), 24)
+    assert text.startswith(words)
     assert given == tone
 
 
@@ -407,7 +448,7 @@ def test_tuning_studies_and_judged_perception_are_shown(page):
 
 
 def test_markdown_brings_no_markup_of_its_own():
-    made = str(render("<script>alert(1)</script> [x](javascript:alert(1)) ![p](https://host/p.png)"))
+    made = str(rendered("<script>alert(1)</script> [x](javascript:alert(1)) ![p](https://host/p.png)"))
     assert "<script>" not in made
     assert "href" not in made
     assert "<img" not in made
@@ -454,7 +495,7 @@ def test_the_gallery_links_every_video_with_its_scores(full, tmp_path):
     files = [target for target in parser.targets if not target.startswith("#")]
     assert len([name for name in files if name.endswith(".mp4")]) == 8
     assert all((path.parent / name).is_file() for name in files)
-    assert re.search(r"neuspring: training TE \d+\.\d+ mm, IoU 0\.\d+; future TE", page)
+    assert re.search(r"neuspring: training TE \d+\.\d+ mm, IoU \d+\.\d %; future TE", page)
     assert "No pictures: no images, or no finished run." in section(page, "zebra")
 
 

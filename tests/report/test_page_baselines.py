@@ -117,12 +117,18 @@ def test_what_does_not_apply_is_no_run(results):
         "methods": ["baseline", "spring_gaus"],
         "seeds": [0],
     }
-    page = report(results, **studied, left_out={"spring_gaus": ("cable",)})
+    page = report(results, **studied, left_out={"spring_gaus": {"cable": "it needs images"}})
     assert "1 of 3 runs have not finished." in section(page, "verdict")
     assert "Left out: spring_gaus on cable: it needs images." in section(page, "details")
     assert "empty: does not apply" in section(page, "failures")
     assert "2 of 4 runs have not finished." in section(report(results, **studied), "verdict")
-    choice = Options(scenarios=("a", "b"), methods=("x", "y"), seeds=(0, 1), baseline="x", left_out={"x": ["b", "c"], "z": ["a"]})
+    choice = Options(
+        scenarios=("a", "b"),
+        methods=("x", "y"),
+        seeds=(0, 1),
+        baseline="x",
+        left_out={"x": dict.fromkeys("bc", "why"), "z": {"a": "why"}},
+    )
     assert choice.size == 6
 
 

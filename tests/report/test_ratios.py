@@ -7,18 +7,20 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pytest
 
 from neuspring.config import parse, plain
 from neuspring.config.settings import Aim, Config
 from neuspring.core.run_record import RunRecord
-from neuspring.report import benchmark as summary
 from neuspring.report import study as tables_study
-from neuspring.report.notes import differing
-from neuspring.report.study_cells import ORACLE_LINE, cells, restricted
+from neuspring.report import summary
+from neuspring.scores.numbers import Numbers
 from neuspring.scores.paper import Study, read_studies
 from neuspring.scores.runs import Collected, collect, read_scores
+from neuspring.scores.settings import differing as differing_table
+from neuspring.scores.study import ORACLE_LINE, Verdict, cells, restricted
 from tests.support.runs import run_record
-from tests.support.study_runs import collected, rows_of, write_run
+from tests.support.study_runs import collected, rows_of, study_text, write_run
 from tests.support.study_runs import summary as summary_of
 
 STUDIES = read_studies(Path(__file__).resolve().parents[2] / "config" / "studies.yaml")
@@ -41,9 +43,10 @@ def test_an_oracle_stands_outside_every_comparison(tmp_path):
     place = next(index for index, line in enumerate(lines) if ORACLE_LINE in line)
     assert lines[place + 1].startswith("| oracle") and "2.00" in lines[place + 1]
     assert [line for line in lines if "oracle" not in line] == without.splitlines()
-    summary.write(summary.Benchmark(everything=with_oracle(values | oracle), baseline="x"), tmp_path)
-    for name in ("averages", "differences", "ratios", "seeds"):
-        assert "oracle" not in (tmp_path / f"{name}.csv").read_text()
+    numbers = Numbers(everything=with_oracle(values | oracle), baseline="x")
+    summary.write(numbers, tmp_path)
+    for table in (numbers.differences, numbers.ratios, numbers.seeds):
+        assert "oracle" not in set(table["method"])
     again = read_scores(tmp_path / "scores.csv")
     assert again.oracles == ("oracle",)
 
@@ -54,7 +57,7 @@ def test_an_oracle_in_a_study_is_never_marked():
     runs = with_oracle(values)
     runs = Collected(runs.scores, runs.runs.assign(source="mocap", run_key="", images="null"))
     found = cells(study, restricted(study, runs)).set_index(["label", "metric"])
-    assert found.loc[("O", "track_error"), ["verdict", "direction"]].dropna().iloc[-1] == "oracle"
+    assert found.loc[("O", "track_error"), ["verdict", "direction"]].tolist() == [Verdict.ORACLE] * 2
     table = tables_study.main_table(study, cells(study, restricted(study, runs)))
     assert ORACLE_LINE in rows_of(table)
     marked = [row[0].text for row in table.rows if any(cell.mark for cell in row)]
@@ -72,8 +75,8 @@ def test_records_say_which_method_is_an_oracle_and_what_the_floor_is(tmp_path):
     assert set(found.comparison.runs["method"]) == {"x"}
     text = summary_of(found)
     assert "Floor in frame 0: CD 7.00 mm, TE 3.50 mm; TE bound 0 by construction." in text
-    floors = summary.floors_of(found.runs).set_index("metric")["value"]
-    assert floors.to_dict() == {"chamfer_floor": 0.007, "track_error_floor": 0.0035}
+    floors = Numbers(everything=found, baseline="x").floors.set_index("metric")["value"]
+    assert floors.to_dict() == {"chamfer": 0.007, "track_error": 0.0035}
 
 
 def test_the_new_metric_is_left_out_where_no_run_has_it():
@@ -87,15 +90,17 @@ def test_the_new_metric_is_left_out_where_no_run_has_it():
     assert "4.00" in text
 
 
-def test_a_study_shows_it_below_the_papers_columns(tmp_path):
+def test_a_study_shows_it_beside_the_papers_columns(tmp_path):
     for name in NAMES:
         for method, factor in (("baseline", 1.0), ("model_a", 0.7)):
             write_run(tmp_path, name, method, 0, {key: factor * value for key, value in BOTH.items()}, source="mocap")
     methods = ["baseline", "model_a"]
-    text = tables_study.write_study("table2", STUDIES["table2"], tmp_path, NAMES, [0], methods, tmp_path / "out")
-    first, second = text.split("## Without a floor")
-    assert "TE bound" not in first
-    assert "Future TE bound" in second and "-30.0 % [-30.0, -30.0]" in second and "better" in second
+    text = study_text("table2", STUDIES["table2"], tmp_path, NAMES, [0], methods, tmp_path / "out")
+    found = pd.read_csv(tmp_path / "out" / "table2.csv").set_index(["label", "metric", "task"])
+    row = found.loc[("Model-A (PT)", "track_error_bound", "future")]
+    assert (row["direction"], row["verdict"]) == (Verdict.BETTER, Verdict.NO_VALUE)
+    assert row[["relative", "relative_low", "relative_high"]].astype(float).tolist() == pytest.approx([-0.3] * 3)
+    assert "Future TE bound" in text and "0 for every rigid motion" in text
 
 
 def test_two_trainings_stand_under_one_heading(tmp_path):
@@ -106,7 +111,7 @@ def test_two_trainings_stand_under_one_heading(tmp_path):
     for name in NAMES:
         for method, factor in factors.items():
             write_run(tmp_path, name, method, 0, {key: factor * value for key, value in BOTH.items()}, source="mocap")
-    text = tables_study.write_study("table2_ours", ours, tmp_path, NAMES, [0], factors, tmp_path / "out", beside=beside)
+    text = study_text("table2_ours", ours, tmp_path, NAMES, [0], factors, tmp_path / "out", beside=beside)
     change = text.split("## Both trainings: change")[1].split("##")[0].splitlines()
     rows = [line for line in change if line.startswith("| NeuSpring") or line.startswith("|  ")]
     # Each against the baseline of its own training.
@@ -117,6 +122,10 @@ def test_two_trainings_stand_under_one_heading(tmp_path):
 
 def record(method: str, scenario: str = "a", variant: dict | None = None, **settings: dict) -> RunRecord:
     return run_record(scenario=scenario, method=method, settings=settings, variant=variant or {})
+
+
+def differing(records, labels) -> dict[str, str]:
+    return dict(differing_table(records, labels).itertuples(index=False))
 
 
 def test_settings_that_differ_are_those_of_the_records():
@@ -145,7 +154,7 @@ def test_the_footnote_is_in_markdown_and_latex(tmp_path):
         settings = {"fit": {"horizon": horizon}}
         write_run(tmp_path, "cable_0", method, 0, BOTH, source="mocap", settings=settings)
     out = tmp_path / "out"
-    text = tables_study.write_study("table2", STUDIES["table2"], tmp_path, NAMES[:1], [0], ["baseline", "model_a"], out)
+    text = study_text("table2", STUDIES["table2"], tmp_path, NAMES[:1], [0], ["baseline", "model_a"], out)
     assert "## Settings that differ" in text
     assert "| fit.horizon | 1: Baseline; 10: Model-A (PT) |" in text
     assert "fit.horizon & 1: Baseline; 10: Model-A (PT)" in (out / "table2.tex").read_text()
@@ -156,10 +165,12 @@ def test_aims_reach_the_summary_and_its_file(tmp_path):
     config = parse(Config, {"aims": [{"method": "y", "baseline": "x", "ratio": r} for r in (0.85, 0.5)]}, "here")
     assert json.loads(json.dumps(plain(config)["aims"]))[0]["below"] == 1.0
     aims = tuple(parse(Aim, row, "here") for row in plain(config)["aims"])
-    text = summary.write(summary.Benchmark(everything=collected(values), baseline="x", aims=aims), tmp_path)
-    assert pd.read_csv(tmp_path / "aims.csv")["aim_verdict"].tolist() == ["reached", "missed"]
-    assert [row[-1].plain for row in summary.aim_table(pd.read_csv(tmp_path / "aims.csv"))[0].rows] == ["reached", "missed"]
+    numbers = Numbers(everything=collected(values), baseline="x", aims=aims)
+    text = summary.write(numbers, tmp_path)
+    aimed = Numbers.load(tmp_path).aimed
+    assert aimed["aim_verdict"].tolist() == ["reached", "missed"]
+    assert [row[-1].plain for row in summary.aim_table(aimed)[0].rows] == ["reached", "missed"]
     assert "## Aims" in text
-    table = pd.read_csv(tmp_path / "ratios.csv")
+    table = Numbers.load(tmp_path).ratios
     assert table["verdict"].tolist() == ["below 1"]
     np.testing.assert_allclose(table["ratio"], 0.7 * np.exp(np.log1p(0.02 * np.arange(4)).mean()))

@@ -14,19 +14,22 @@ from neuspring.config import parse
 from neuspring.core.errors import InputError
 from neuspring.core.table import tex
 from neuspring.data.phystwin import released_cases
-from neuspring.report import benchmark as tables
 from neuspring.report import study as tables_paper
-from neuspring.report import study_cells as tables_cells
+from neuspring.report import summary as tables
 from neuspring.scores import paper
+from neuspring.scores import study as tables_cells
 from neuspring.scores.metrics import COLUMNS, averages
+from neuspring.scores.numbers import Numbers
 from neuspring.scores.paper import Study, read_studies
 from neuspring.scores.runs import RUN_COLUMNS, Collected, collect, read_scores
 from neuspring.scores.statistics import paired_differences
-from tests.support.study_runs import all_scores, write_benchmark, write_run
+from neuspring.scores.study import Verdict
+from tests.support.study_runs import all_scores, study_text, write_benchmark, write_run
 
 STUDY_TABLE = Path(__file__).resolve().parents[2] / "config" / "studies.yaml"
 STUDIES = read_studies(STUDY_TABLE)
 RELEASED = sorted(paper.scenarios())
+METHODS = ["neuspring", "search_only", "baseline"]
 CD, TE, IOU, PSNR = (("future", name) for name in ("chamfer", "track_error", "iou", "psnr"))
 Values = Mapping[tuple[str, str, int], Mapping[tuple[str, str], float]]
 
@@ -122,9 +125,12 @@ def test_the_overlap_of_silhouettes_is_compared_in_per_cent():
 
 def test_absolute_values_are_compared_on_the_papers_scenarios_alone():
     some = everywhere("baseline", {CD: 0.012}, RELEASED[:8])
-    assert cells_of("table1", collected(some)).loc[("PhysTwin", *CD), "verdict"] == "partial (8 of 22): within"
+    found = cells_of("table1", collected(some)).loc[("PhysTwin", *CD)]
+    assert (found["verdict"], found["partial"], found["scenarios"]) == (Verdict.WITHIN, True, 8)
+    assert tables_cells.verdict_text(found) == "partial (8 of 22): within"
     one = everywhere("baseline", {CD: 0.1}, RELEASED[:1])
-    assert cells_of("table1", collected(one)).loc[("PhysTwin", *CD), "verdict"] == "partial (1 of 22): no interval"
+    found = cells_of("table1", collected(one)).loc[("PhysTwin", *CD)]
+    assert (found["verdict"], found["partial"]) == (Verdict.NO_INTERVAL, True)
     for others in (collected(some | everywhere("baseline", {CD: 0.012}, ["toy"])), collected(some, source="phystwin_raw")):
         found = cells_of("table1", others).loc[("PhysTwin", *CD)]
         assert found["verdict"] == "other data"
@@ -136,7 +142,8 @@ def test_what_is_not_there_is_said():
     runs = collected(everywhere("baseline", {CD: 0.012}), failed=tuple((s, "neuspring", 0) for s in RELEASED))
     found = cells_of("table1", runs)["verdict"]
     assert found[("Spring-Gaus", *CD)] == "not run"
-    assert found[("NeuSpring", *CD)] == "not run (22 failed)"
+    assert found[("NeuSpring", *CD)] == "not run"
+    assert tables_cells.verdict_text(cells_of("table1", runs).loc[("NeuSpring", *CD)]) == "not run (22 failed)"
     assert found[("PhysTwin", *PSNR)] == "not computed"
     apart = everywhere("baseline", {CD: 0.012}, RELEASED[:2]) | everywhere("neuspring", {CD: 0.012}, RELEASED[2:4])
     assert cells_of("table1", collected(apart)).loc[("NeuSpring", *CD), "verdict"] == "nothing to compare"
@@ -248,7 +255,7 @@ def test_a_score_that_one_method_lacks_is_left_out_for_all():
 
 
 def test_a_table_of_nothing_holds_the_papers_values(tmp_path):
-    text = tables_paper.write_study("table1", STUDIES["table1"], tmp_path, RELEASED, [0], [], tmp_path / "out")
+    text = study_text("table1", STUDIES["table1"], tmp_path, RELEASED, [0], [], tmp_path / "out")
     assert "Nothing has finished." in text
     assert "| **9**" in text
     assert "- Spring-Gaus: spring_gaus is not among the methods of this benchmark" in text
@@ -256,7 +263,7 @@ def test_a_table_of_nothing_holds_the_papers_values(tmp_path):
     assert set(table["verdict"]) == {"not run"}
     assert len(table) == 48
     assert table["ours"].isna().all()
-    missing = tables_paper.write_study("table1", STUDIES["table1"], tmp_path, RELEASED, [0], ["baseline"], tmp_path / "out")
+    missing = study_text("table1", STUDIES["table1"], tmp_path, RELEASED, [0], ["baseline"], tmp_path / "out")
     assert "0/22 (22 missing)" in missing
     assert "and 16 more: missing: no run.json" in missing
 
@@ -270,7 +277,7 @@ def written(tmp_path_factory):
     write_run(folder, names[0], "neuspring", 1, {}, status="failed", reason="rollout: node 3 left | the scene")
     (folder / names[1] / "baseline" / "0" / "scores.parquet").write_bytes(b"half a fi")
     out = folder / "tables" / "studies"
-    text = tables_paper.write_study("table1", STUDIES["table1"], folder, names, [0, 1], ["baseline", "neuspring"], out)
+    text = study_text("table1", STUDIES["table1"], folder, names, [0, 1], ["baseline", "neuspring"], out)
     return folder, out, text
 
 
@@ -282,7 +289,7 @@ def test_every_failure_is_counted_and_named(written):
     assert f"- NeuSpring, {RELEASED[0]} / seed 1: failed: rollout: node 3 left | the scene" in text
     assert f"- PhysTwin, {RELEASED[1]} / seed 0: failed: damaged record: " in text
     assert "Averages take the 14 of 16 pairs of scenario and seed" in text
-    runs = pd.read_csv(out / "table1_runs.csv")
+    runs = Numbers.load(out.parent).by_study["table1"].runs
     assert runs["counted"].sum() == 28
     assert len(runs) == 32
 
@@ -319,11 +326,12 @@ def test_latex_can_be_input(written):
 
 def test_breakdowns_hold_every_finished_run(written):
     _, out, text = written
-    rows = pd.read_csv(out / "table1_scenarios.csv").set_index(["scenario", "label", "task", "metric"])
+    numbers = Numbers.load(out.parent).by_study["table1"]
+    rows = numbers.scenarios.set_index(["scenario", "label", "task", "metric"])
     assert rows.loc[(RELEASED[0], "PhysTwin", *CD), ["seeds", "counted"]].tolist() == [2, 1]
     assert rows.loc[(RELEASED[0], "NeuSpring", *CD), ["seeds", "counted"]].tolist() == [1, 1]
     table = pd.read_csv(out / "table1.csv").set_index(["label", "task", "metric"])
-    category = pd.read_csv(out / "table1_categories.csv").set_index(["label", "task", "metric"])
+    category = numbers.categories.set_index(["label", "task", "metric"])
     assert category.loc[("NeuSpring", *IOU), "value"] == pytest.approx(table.loc[("NeuSpring", *IOU), "ours"])
     assert "## Per category" in text
     assert "## Per scenario" in text
@@ -332,29 +340,29 @@ def test_breakdowns_hold_every_finished_run(written):
 def test_ours_stands_beside_the_released_values(written):
     folder, out, text = written
     name = RELEASED[2]
-    row = pd.read_csv(out / "table1_released_phystwin.csv").set_index(["scenario", "task", "metric"]).loc[(name, *CD)]
+    row = Numbers.load(out.parent).by_study["table1"].released.set_index(["scenario", "task", "metric"]).loc[(name, *CD)]
     known = paper.released().set_index(["scenario", "task", "metric"])["value"]
     scores = [pd.read_parquet(folder / name / "baseline" / str(seed) / "scores.parquet") for seed in (0, 1)]
     ours = np.mean([table.set_index(["task", "metric"]).loc[CD, "value"] for table in scores])
     assert row["released"] == pytest.approx(1e3 * known[(name, *CD)])
     assert row["ours"] == pytest.approx(1e3 * ours)
     assert row["ratio"] == pytest.approx(ours / known[(name, *CD)])
-    assert "[Per scenario](table1_released_phystwin.md): 8 of 22 scenarios have finished." in text
-    assert "mean of 8" in (out / "table1_released_phystwin.md").read_text()
+    assert "## Beside the released PhysTwin" in text
 
 
 def test_other_data_of_the_same_name_does_not_stand_beside_the_released_values():
     runs = collected(everywhere("baseline", {CD: 0.012}), source="phystwin_raw")
     own = tables_cells.restricted(STUDIES["table1"], runs)
-    assert tables_paper.released_comparison(own, "baseline")["ours"].isna().all()
+    assert tables_cells.released_comparison(own, "baseline")["ours"].isna().all()
 
 
-def test_tables_are_the_same_every_time_and_from_runs_read_before(written, tmp_path):
+def test_tables_are_the_same_every_time_and_from_a_file_of_numbers(written, tmp_path):
     folder, out, _ = written
-    everything = collect(folder, RELEASED[:8], ["neuspring", "search_only", "baseline"], [0, 1])
-    tables_paper.write_collected("table1", STUDIES["table1"], everything, tmp_path)
-    for name in ("table1.csv", "table1.tex", "table1_scenarios.csv", "table1_released_phystwin.md"):
-        assert (tmp_path / name).read_bytes() == (out / name).read_bytes()
+    tables_paper.write_study(Numbers.load(out.parent).by_study["table1"], tmp_path / "read")
+    study_text("table1", STUDIES["table1"], folder, RELEASED[:8], [0, 1], METHODS, tmp_path / "new")
+    for name in ("table1.csv", "table1.tex", "table1.md"):
+        assert (tmp_path / "read" / name).read_bytes() == (out / name).read_bytes()
+        assert name == "table1.md" or (tmp_path / "new" / name).read_bytes() == (out / name).read_bytes()
 
 
 def test_a_table_can_be_made_from_scores_alone(tmp_path, capsys):
@@ -362,19 +370,22 @@ def test_a_table_can_be_made_from_scores_alone(tmp_path, capsys):
     for number, (method, factor) in itertools.product(range(7), methods.items()):
         write_run(tmp_path, f"cable_{number}", method, 0, {CD: 0.01 * factor * (1 + number)}, source="mocap")
     names = [f"cable_{number}" for number in range(7)]
-    tables.write(tables.Benchmark(everything=collect(tmp_path, names, methods, [0]), baseline="baseline"), tmp_path / "tables")
-    tables_paper.write_study("table2", STUDIES["table2"], tmp_path, names, [0], methods, tmp_path / "records")
+    kept = ["tables", "--results", str(tmp_path), "--output", str(tmp_path / "tables"), "--seeds", "0", "--studies", "table2"]
+    assert main([*kept, "--table", str(STUDY_TABLE), "--scenarios", *names, "--methods", *methods]) == 0
+    assert main(["study", "--study", "table2", "--results", str(tmp_path), "--output", str(tmp_path / "records")]) == 0
+    assert main(["study", "--study", "table3", "--results", str(tmp_path), "--output", str(tmp_path / "records")]) == 2
+    assert "There: table2. Make it: tables --studies table3." in capsys.readouterr().err
     command = ["study", "--study", "table2", "--table", str(STUDY_TABLE), "--output", str(tmp_path / "scores")]
     assert main([*command, "--scores", str(tmp_path / "tables" / "scores.csv")]) == 0
     assert "same direction, confirmed" in capsys.readouterr().out
-    for name in ("table2.csv", "table2_scenarios.csv", "table2.md"):
+    for name in ("table2.csv", "table2.md"):
         assert (tmp_path / "scores" / name).read_text() == (tmp_path / "records" / name).read_text()
-    assert not (tmp_path / "scores" / "table2_released_phystwin.md").exists(), "none of these is a released scenario"
+    assert "released PhysTwin" not in (tmp_path / "scores" / "table2.md").read_text(), "none of these is a released scenario"
     # Of a run that diverged the errors of one task remain, with or without the file that says so.
     write_run(
         tmp_path, "cable_6", "neuspring_one_frame", 0, {("reconstruction", "chamfer"): 9.0}, status="failed", reason="diverged"
     )
-    tables.write(tables.Benchmark(everything=collect(tmp_path, names, methods, [0]), baseline="baseline"), tmp_path / "tables")
+    tables.write(Numbers(everything=collect(tmp_path, names, methods, [0]), baseline="baseline"), tmp_path / "tables")
     scores = pd.read_csv(tmp_path / "tables" / "scores.csv")
     other = scores[scores["task"] == "future"].assign(task="reconstruction")
     pd.concat([scores, other]).to_csv(tmp_path / "tables" / "scores.csv", index=False)
@@ -390,8 +401,6 @@ def test_a_table_can_be_made_from_scores_alone(tmp_path, capsys):
     )
     assert main([*alone, "cable_9"]) == 2
     assert "--scenarios: must be in the file of --scores" in capsys.readouterr().err
-    assert main(command) == 2
-    assert "--scores, or --scenarios, --methods and --seeds" in capsys.readouterr().err
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")
     assert main([*command, "--scores", str(tmp_path / "other.csv")]) == 2
     assert "other.csv: must be a scores.csv with the columns scenario, category" in capsys.readouterr().err
@@ -400,7 +409,7 @@ def test_a_table_can_be_made_from_scores_alone(tmp_path, capsys):
 def test_how_pictures_were_scored_is_said(tmp_path):
     facts = {"quirks": ["any_alpha"], "lpips": "no weights"}
     write_run(tmp_path, RELEASED[0], "baseline", 0, all_scores(), images=facts)
-    text = tables_paper.write_study("table1", STUDIES["table1"], tmp_path, RELEASED[:1], [0], ["baseline"], tmp_path / "out")
+    text = study_text("table1", STUDIES["table1"], tmp_path, RELEASED[:1], [0], ["baseline"], tmp_path / "out")
     assert "Quirks of the released evaluation of pictures that were on: any_alpha." in text
     assert "LPIPS not computed in some runs: no weights." in text
 
@@ -409,9 +418,11 @@ def test_the_number_of_regions_is_a_curve_without_the_papers_numbers(tmp_path):
     methods = {"model_b": 1.0, "neuspring": 0.7, "clusters_10": 1.2}
     names = [f"rope_{index}" for index in range(6)]
     write_benchmark(tmp_path, names, methods, source="toy")
-    text = tables_paper.write_study("clusters", STUDIES["clusters"], tmp_path, names, [0, 1], methods, tmp_path)
+    text = study_text("clusters", STUDIES["clusters"], tmp_path, names, [0, 1], methods, tmp_path)
     assert "![Chamfer distance against the number of regions K](clusters_curve.png)" in text
     assert (tmp_path / "clusters_curve.png").stat().st_size > 1000
+    drawn = Numbers.load(tmp_path.parent).by_study["clusters"].chamfer["value"]
+    assert 0.001 < drawn.min() < drawn.max() < 0.1, "m, of which the picture makes mm"
     assert paper.CLUSTER_CLAIM in text
     assert "| paper " not in text
     table = pd.read_csv(tmp_path / "clusters.csv", dtype={"label": str}).set_index(["label", "task", "metric"])
@@ -419,5 +430,5 @@ def test_the_number_of_regions_is_a_curve_without_the_papers_numbers(tmp_path):
     assert table.loc[("10", *CD), "direction"] == "worse"
     assert table.loc[("10", *PSNR), "direction"] == "worse"
     assert table.loc[("2", *CD), "direction"] == "not run"
-    tables_paper.write_study("clusters", STUDIES["clusters"], tmp_path, names, [0, 1], [], tmp_path)
+    study_text("clusters", STUDIES["clusters"], tmp_path, names, [0, 1], [], tmp_path)
     assert not (tmp_path / "clusters_curve.png").exists()

@@ -11,12 +11,16 @@ from PIL import Image
 from neuspring.cli.main import main
 from neuspring.config import parse
 from neuspring.core.errors import InputError
-from neuspring.report import page, study_clips
+from neuspring.report import clips as study_clips
+from neuspring.report import page
 from neuspring.report.blocks import markdown
-from neuspring.report.study_clips import clip_blocks, read_clips
+from neuspring.report.clips import clip_blocks, filmed
 from neuspring.scores import paper
+from neuspring.scores.clips import ClipNumbers
 from neuspring.scores.metrics import COLUMNS
+from neuspring.scores.numbers import Numbers
 from neuspring.scores.paper import Study, read_studies
+from neuspring.scores.runs import collect
 from tests.support.clip_runs import FRAMES, RATE, write_transfer
 from tests.support.study_runs import rows_of, tables_in, write_run
 
@@ -34,7 +38,7 @@ CLIPS = {"DLO3_eval_a": 0.002, "DLO3_eval_b": 0.006, "DLO3_eval_c": 0.004}
 
 
 def found(results: Path, sources=("DLO3_train",), seeds=(0, 1)):
-    return read_clips(STUDY, results, sources, seeds, set(STUDY.rows.values()))
+    return ClipNumbers(name="deform", study=STUDY, results=results, sources=sources, methods=list(STUDY.rows.values()), seeds=seeds)
 
 
 def test_published_numbers_keep_their_digits_their_sources_and_what_the_tag_means():
@@ -116,12 +120,14 @@ def test_the_command_writes_tables_growth_and_films(tmp_path, capsys, monkeypatc
     output.mkdir()
     (output / "deform_DLO9.gif").write_bytes(b"of an older run")
     runs = ["--scenarios", "DLO3_train", "--methods", "rod", "model_b_pooled", "--seeds", "0"]
-    command = ["study", "--study", "deform", "--table", str(STUDY_TABLE), "--output", str(output)]
-    main([*command, "--results", str(results), *runs])
+    command, known = ["study", "--study", "deform", "--output", str(output)], ["--table", str(STUDY_TABLE)]
+    kept = ["--output", str(results / "tables"), "--studies", "deform", *known]
+    assert main(["tables", "--results", str(results), *runs, *kept]) == 0
+    assert main([*command, "--results", str(results)]) == 0
     names = ["deform.csv", "deform.md", "deform.tex", "deform_DLO3.gif", "deform_DLO3.mp4"]
-    names += ["deform_clips.csv", "deform_growth.csv", "deform_growth.png"]
+    names += ["deform_clips.csv", "deform_growth.png"]
     assert sorted(path.name for path in output.iterdir()) == names
-    growth = pd.read_csv(output / "deform_growth.csv")
+    growth = Numbers.load(results / "tables", results).by_study["deform"].growth
     rod = growth[growth["label"] == "Rod"]
     np.testing.assert_allclose(rod["seconds"], np.arange(FRAMES) / RATE)
     np.testing.assert_allclose(rod["euclid_mm"], [0.0, *[12.0] * (FRAMES - 1)])
@@ -131,20 +137,20 @@ def test_the_command_writes_tables_growth_and_films(tmp_path, capsys, monkeypatc
     assert "\\begin{tabular}{@{} ll r @{}}" in (output / "deform.tex").read_text(), "numbers, and no paragraphs"
     assert "![DLO3" in (output / "deform.md").read_text() and "7.7†" in capsys.readouterr().out
     pd.DataFrame(columns=list(COLUMNS)).to_csv(tmp_path / "scores.csv")
-    assert main([*command, "--scores", str(tmp_path / "scores.csv")]) != 0
+    assert main([*command, *known, "--scores", str(tmp_path / "scores.csv")]) != 0
     assert "a study of clips needs the transfers of a results folder" in capsys.readouterr().err
 
 
 def test_the_film_shows_the_best_the_median_and_the_worst_clip_of_the_chosen_row(tmp_path):
     write_transfer(tmp_path, "DLO3", "model_b_pooled", 0, CLIPS)
-    titles = [painter.takes[0].label for painter in found(tmp_path).filmed("DLO3")]
+    titles = [painter.takes[0].label for painter in filmed(found(tmp_path), "DLO3")]
     assert titles == [
         "Field, best: DLO3_eval_a, L1 2.0 mm",
         "Field, median: DLO3_eval_c, L1 4.0 mm",
         "Field, worst: DLO3_eval_b, L1 6.0 mm",
     ], "the last row that ran, where the baseline has not"
     write_transfer(tmp_path, "DLO3", "rod", 0, {"DLO3_eval_a": 0.002, "DLO3_eval_b": 0.006})
-    painters = found(tmp_path).filmed("DLO3")
+    painters = filmed(found(tmp_path), "DLO3")
     assert [painter.takes[0].label for painter in painters] == [
         "Rod, best: DLO3_eval_a, L1 2.0 mm",
         "Rod, worst: DLO3_eval_b, L1 6.0 mm",
@@ -160,8 +166,8 @@ def test_the_page_shows_the_same_tables_once_the_study_was_made(tmp_path):
     write_run(tmp_path, "DLO3_train", "rod", 0, {("future", "chamfer"): 0.01}, category="DLO3", source="mocap")
     options = page.Options(studies={"deform": STUDY})
     assert "L1 per clip" not in page.write(tmp_path, tmp_path / "report.html", options).read_text()
-    table = tmp_path / "tables" / "studies" / "deform.md"
-    table.parent.mkdir(parents=True)
-    table.write_text("")
+    runs = collect(tmp_path, ["DLO3_train"], ["rod"], [0])
+    studies = {"deform": STUDY}
+    Numbers(everything=runs, baseline="rod", studies=studies, known_studies=studies, results=tmp_path).save(tmp_path)
     text = page.write(tmp_path, tmp_path / "report.html", options).read_text()
     assert "L1 per clip" in text and "7.7†" in text and "DLO3_eval_b" in text

@@ -7,10 +7,10 @@ import pandas as pd
 import pytest
 
 from neuspring.core.table import Cell, Chip, Table
-from neuspring.report import benchmark as tables
-from neuspring.report.benchmark import Benchmark, detail_blocks, errors_table, not_counted, score_blocks
 from neuspring.report.blocks import Section, html_page
+from neuspring.report.summary import detail_blocks, errors_table, not_counted, score_blocks, write
 from neuspring.scores.metrics import COLUMNS
+from neuspring.scores.numbers import Numbers
 from neuspring.scores.runs import Collected, collect
 from neuspring.scores.statistics import paired_differences, resampled_means
 from tests.support.study_runs import collected, rows_of, summary, tables_in
@@ -100,22 +100,22 @@ def with_images(lpips: str = "computed", quirks: tuple[str, ...] = ()) -> Collec
 
 
 def test_pictures_have_a_table_of_their_own():
-    benchmark = Benchmark(everything=with_images(), baseline="x")
+    benchmark = Numbers(everything=with_images(), baseline="x")
     found = tables_in([*score_blocks(benchmark), *detail_blocks(benchmark)])
     table = found["Scores of pictures"]
     row = rows_of(table)["y"]
-    assert row["Recon. PSNR"].text == "33.00" and row["Recon. LPIPS"].text == "0.0500"
+    assert row["Recon. PSNR"].text == "33.000" and row["Recon. LPIPS"].text == "0.0500"
     assert row["Recon. SSIM"].plain == "0.9500" and row["Recon. SSIM"].mark == "best"
     # Runs are those with images; a percentage of decibels would mean nothing.
     assert row["Runs"].text == "1/1"
-    assert rows_of(found["Pictures: paired difference to x"])["y"]["Recon. PSNR"].plain == "+3.00"
+    assert rows_of(found["Pictures: paired difference to x"])["y"]["Recon. PSNR"].plain == "+3.000"
     assert "Of 2 scenarios 1 have scores of pictures. Cameras scored: 0; masks: given; rasterizer: warp; none of" in table.note
     assert "frame 0: a 25%." in summary(with_images())
 
 
 def test_what_was_not_computed_is_said_and_never_a_number():
     runs = with_images("no AlexNet weights: x is not there", ("any_alpha",))
-    found = tables_in(score_blocks(Benchmark(everything=runs, baseline="x")))
+    found = tables_in(score_blocks(Numbers(everything=runs, baseline="x")))
     table = found["Scores of pictures"]
     assert not any("LPIPS" in heading for heading in table.header)
     assert "released quirks: any_alpha" in table.note
@@ -139,7 +139,7 @@ def test_only_pairs_that_every_method_finished_are_averaged_and_the_others_liste
     """A method that has finished nothing does not empty the table."""
     values = {("a", "x", 0): 0.010, ("a", "y", 0): 0.008, ("b", "x", 0): 0.500}
     found = collected(values, failed=(("b", "y", 0), ("a", "z", 0)))
-    rows = rows_of(errors_table(Benchmark(everything=found, baseline="x")))
+    rows = rows_of(errors_table(Numbers(everything=found, baseline="x")))
     assert [rows[name]["Future TE"].text for name in "xyz"] == ["10.00", "8.00", "–"]
     assert [rows[name]["Runs"].text for name in "xyz"] == ["2/2", "1/2 (1 failed)", "0/1 (1 failed)"]
     assert [rows[name]["Future TE"].mark for name in "xyz"] == ["", "best", ""]
@@ -150,7 +150,7 @@ def test_only_pairs_that_every_method_finished_are_averaged_and_the_others_liste
 def test_missing_runs_are_listed(tmp_path):
     found = collect(tmp_path, ["a"], ["x", "y"], [0, 1])
     assert (found.runs["status"] == "missing").all()
-    text = tables.write(tables.Benchmark(everything=found, baseline="x"), tmp_path / "tables")
+    text = write(Numbers(everything=found, baseline="x"), tmp_path / "tables")
     assert text.count("missing: no run.json") == 4
     assert (tmp_path / "tables" / "summary.md").is_file()
 
@@ -185,7 +185,7 @@ def test_many_notes_are_counted_by_kind_with_the_range_of_their_numbers():
 def test_no_spread_is_shown_where_one_seed_of_several_has_finished():
     found = collected({("a", "x", 0): 0.010})
     rest = pd.DataFrame([{"scenario": "a", "method": "x", "seed": 1, "status": "missing", "reason": "", "notes": ""}])
-    table = errors_table(Benchmark(everything=Collected(found.scores, pd.concat([found.runs, rest])), baseline="x"))
+    table = errors_table(Numbers(everything=Collected(found.scores, pd.concat([found.runs, rest])), baseline="x"))
     assert rows_of(table)["x"]["Future TE"].plain == "10.00"
     assert "standard deviation" not in table.note
 

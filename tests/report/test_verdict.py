@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 
 from neuspring.core.findings import finding
-from neuspring.report.benchmark import Benchmark
 from neuspring.report.verdict import headline, verdict
 from neuspring.scores import statistics
+from neuspring.scores.numbers import Numbers
 from neuspring.scores.runs import Collected
 from tests.support.runs import run_record
 from tests.support.study_runs import collected, summary
@@ -21,7 +21,7 @@ TWO = {("a", "ours", 0): 0.010, ("a", "base", 0): 0.020, ("b", "ours", 0): 0.030
 
 def said(found: Collected, **options) -> dict[str, str]:
     """Label to text."""
-    return {one.label: one.text for one in verdict(Benchmark(**({"everything": found, "baseline": "base"} | options)))}
+    return {one.label: one.text for one in verdict(Numbers(**({"everything": found, "baseline": "base"} | options)))}
 
 
 def test_the_winner_comes_with_its_error_its_lead_and_where_it_is_weakest():

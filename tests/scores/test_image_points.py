@@ -11,9 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from neuspring.core.artifacts import Trajectory
 from neuspring.data.capture import Camera
-from neuspring.report.benchmark import marked_blocks
+from neuspring.report.summary import marked_blocks
 from neuspring.scores import metrics
 from neuspring.scores.carried import BEHIND, carried_in_image, points_in_image, points_on_table
+from neuspring.scores.numbers import Numbers
+from neuspring.scores.runs import Collected
 from tests.support.colored import observed
 from tests.support.study_runs import rows_of
 
@@ -131,5 +133,6 @@ def test_scores_of_color_alone_have_the_errors_of_marked_points():
     assert not len(
         metrics.score(Trajectory(positions=still, frame_count=len(still)), seen, "m", 0).query("metric == 'image_error'")
     )
-    (table,) = marked_blocks(rows, pd.DataFrame({"method": ["still"], "scenario": ["small"], "status": ["ok"]}))
+    runs = pd.DataFrame({"method": ["still"], "scenario": ["small"], "seed": [0], "status": ["ok"]})
+    (table,) = marked_blocks(Numbers(everything=Collected(rows, runs), baseline="still"))
     assert rows_of(table)["still"]["Future Marked"].text == "12.0"

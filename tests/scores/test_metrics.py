@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from neuspring.config.settings import Aim
 from neuspring.core.artifacts import Trajectory
+from neuspring.core.errors import InputError
+from neuspring.report.summary import write
 from neuspring.scores import metrics, paper
+from neuspring.scores.metrics import require_metrics
+from neuspring.scores.numbers import Numbers
+from neuspring.scores.runs import Collected
 from tests.support.scenarios import observations, scenario
 
 GOLDEN = 1e-5
@@ -210,14 +217,46 @@ def test_averages_of_nothing_are_empty() -> None:
 
 def test_every_metric_of_the_papers_tables_is_declared_once() -> None:
     printed = {metric for name in paper.tables() for _, _, metric in paper.table(name)}
-    assert printed == set(metrics.IN_PAPER)
-    headings = metrics.HEADINGS | metrics.IMAGE_HEADINGS | metrics.MARKED_HEADINGS
-    assert len(set(headings.values())) == len(headings) == 2 * len(metrics.METRICS)
+    assert printed == set(paper.metrics())
+    assert list(paper.metrics()) == ["chamfer", "track_error", "iou", "psnr", "ssim", "lpips"]
+    assert list(paper.in_studies()) == [*paper.metrics(), "track_error_bound"]
+    assert len({metric.column for metric in metrics.METRICS.values()}) == len(metrics.METRICS)
 
 
 def test_values_are_printed_in_the_unit_of_the_table() -> None:
     assert metrics.METRICS["chamfer"].text(0.00512) == "5.12"
-    assert metrics.METRICS["psnr"].text(1.234, "+") == "+1.23"
-    assert metrics.METRICS["iou"].paper_text(84.06) == "84.1"
-    assert metrics.METRICS["iou"].paper_text(float("nan")) == "–"
-    assert [metric.paper_column for metric in metrics.IN_PAPER.values()][:3] == ["CD ↓", "TE ↓", "IoU % ↑"]
+    assert metrics.METRICS["psnr"].text(1.234, "+") == "+1.234"
+    assert metrics.METRICS["iou"].shown(84.06) == metrics.METRICS["iou"].text(0.8406) == "84.1"
+    assert metrics.METRICS["iou"].shown(float("nan")) == "–"
+    assert metrics.METRICS["iou"].column == "IoU %"
+
+
+def test_a_packages_metric_is_one_entry_that_is_scored_shown_and_may_be_aimed_at(monkeypatch, tmp_path) -> None:
+    """As the registry gives it where an installed package names it in its entry points."""
+    extent = metrics.Metric(
+        name="extent", title="extent", heading="Extent", unit="m", shown_unit="cm", factor=100.0, digits=1, in_studies=True,
+        function=lambda positions, _: np.ptp(positions[..., 2], axis=1),
+    )  # fmt: skip
+    point = EntryPoint("extent", "package.metrics:EXTENT", "neuspring.metrics")
+    monkeypatch.setattr(EntryPoint, "load", lambda _: extent)
+    monkeypatch.setitem(vars(metrics.METRICS), "_foreign", {"extent": point})
+    monkeypatch.setitem(vars(metrics.METRICS), "_loaded", {})
+    given = observations()
+    positions = np.repeat(given.nodes[None], given.scenario.frame_count, axis=0)
+    scores = pd.concat(
+        metrics.score(rollout(factor * positions), given, name, 0).assign(scenario=scenario)
+        for name, factor in (("x", 1.0), ("y", 2.0))
+        for scenario in "abc"
+    )
+    runs = scores[["scenario", "method", "seed"]].drop_duplicates().assign(status="ok", reason="", notes="", source="", run_key="")
+    aim = Aim(method="y", baseline="x", metric="extent", ratio=2.5, below=3.0)
+    require_metrics([aim])
+    study = paper.Study(title="T", reference=None, baseline="x", rows={"x": "x", "y": "y"})
+    found = Collected(scores, runs.assign(images="null"))
+    numbers = Numbers(everything=found, baseline="x", aims=(aim,), studies={"s": study}, known_studies={"s": study})
+    assert numbers.ratios.set_index(["metric", "task"]).loc[("extent", "future"), "ratio"] == pytest.approx(2.0)
+    assert "Future Extent" in write(numbers, tmp_path)
+    cells = numbers.by_study["s"].cells.set_index(["metric", "task", "label"])
+    assert cells.loc[("extent", "future", "y"), "relative"] == pytest.approx(1.0)
+    with pytest.raises(InputError, match=r"aims, metric: .*Known: .*extent"):
+        require_metrics([dataclasses.replace(aim, metric="psnr")])

@@ -21,7 +21,7 @@ from neuspring.core.files import write_table, write_text
 from neuspring.core.job_records import Attempt, JobRecord
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.report.video import Video
-from neuspring.scores.metrics import COLUMNS, UNITS
+from neuspring.scores.metrics import COLUMNS, METRICS
 from tests.support.runs import run_record
 
 FRAMES, TRAIN, RATE = 20, 14, 30.0
@@ -189,7 +189,7 @@ def _scores(scenario: Scenario, method: str, seed: int, pictured: bool, rng: np.
                 value = level - 0.02 * level * factor * better * rng.uniform(0.8, 1.25)
             else:
                 continue
-            rows.append((scenario.name, scenario.category, method, seed, task, metric, value, UNITS[metric], frames))
+            rows.append((scenario.name, scenario.category, method, seed, task, metric, value, METRICS[metric].unit, frames))
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 

@@ -13,10 +13,15 @@ import pandas as pd
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.core.run_record import key_of
 from neuspring.core.table import Cell, Table
-from neuspring.report.benchmark import Benchmark, summary_text
 from neuspring.report.blocks import Block, Fold
-from neuspring.scores.metrics import COLUMNS, UNITS
-from neuspring.scores.runs import Collected
+from neuspring.report.study import write_study
+from neuspring.report.summary import summary_text
+from neuspring.scores.failures import LeftOut
+from neuspring.scores.metrics import COLUMNS, METRICS
+from neuspring.scores.numbers import Numbers
+from neuspring.scores.paper import Study
+from neuspring.scores.runs import Collected, collect
+from neuspring.scores.study import StudyNumbers
 from tests.support.runs import run_record
 
 Scores = Mapping[tuple[str, str], float]
@@ -46,7 +51,8 @@ def write_run(
     folder = results / scenario / method / str(seed)
     folder.mkdir(parents=True, exist_ok=True)
     for name, values in {"scores": scores, "held": frozen}.items():
-        rows = [(scenario, category, method, seed, *key, value, UNITS[key[1]], frames) for key, value in (values or {}).items()]
+        units = {key: METRICS[key[1]].unit for key in values or {}}
+        rows = [(scenario, category, method, seed, *key, value, units[key], frames) for key, value in (values or {}).items()]
         if values is not None:
             pd.DataFrame(rows, columns=list(COLUMNS)).to_parquet(folder / f"{name}.parquet")
     (folder / "twin.npz").write_bytes(f"{scenario} {method} {seed}".encode())
@@ -103,7 +109,28 @@ def write_benchmark(
 
 def summary(found: Collected, baseline: str = "x") -> str:
     """The scores of a benchmark in Markdown."""
-    return summary_text(Benchmark(everything=found, baseline=baseline))
+    return summary_text(Numbers(everything=found, baseline=baseline))
+
+
+def study_text(
+    name: str,
+    study: Study,
+    results: Path,
+    scenarios: Iterable[str],
+    seeds: Iterable[int],
+    methods: Iterable[str],
+    folder: Path,
+    left_out: LeftOut | None = None,
+    beside: Study | None = None,
+) -> str:
+    """Write the files of a study from the records in a results folder, and its numbers beside its folder; returns the Markdown."""
+    found = collect(results, scenarios, methods, seeds, left_out or {})
+    known = {name: study} | ({study.beside or "": beside} if beside else {})
+    numbers = Numbers(everything=found, baseline="", studies={name: study}, known_studies=known)
+    numbers.save(folder.parent)
+    made = numbers.by_study[name]
+    assert isinstance(made, StudyNumbers)
+    return write_study(made, folder)
 
 
 def tables_in(blocks: Sequence[Block]) -> dict[str, Table]:

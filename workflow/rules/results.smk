@@ -1,4 +1,7 @@
 # Tables, report, and MLflow, which is an index of the records: its rules never fail a run, and no number depends on them.
+# The rule tables computes every number, once; study and report read its file.
+from neuspring.registry import modules
+
 PERCEIVED, TABULATED, STUDIED, REPORTED, TRACKED = (
     stamped_job(
         "perception_table",
@@ -12,8 +15,8 @@ PERCEIVED, TABULATED, STUDIED, REPORTED, TRACKED = (
         CONFIG.tables,
         TABLES,
         lambda wildcards: GRAPH.tables(),
-        "neuspring.report.benchmark",
-        "neuspring.report.sections.pictures",
+        "neuspring.report.summary",
+        "neuspring.report.gallery",
     ),
     stamped_job(
         "study",
@@ -24,6 +27,7 @@ PERCEIVED, TABULATED, STUDIED, REPORTED, TRACKED = (
             json.dumps(settings.plain(BENCHMARK.studies[wildcards.study])),
         ],
         "neuspring.report.study",
+        "neuspring.report.clips",
     ),
     stamped_job(
         "report",
@@ -31,6 +35,7 @@ PERCEIVED, TABULATED, STUDIED, REPORTED, TRACKED = (
         REPORT,
         lambda wildcards: [*GRAPH.report(), *GRAPH.report_stamp()],
         "neuspring.report.page",
+        *(place.partition(":")[0] for place in modules("neuspring.report.sections").values()),
     ),
     stamped_job(
         "track_init",
@@ -71,6 +76,7 @@ rule tables:
         compared=TABULATED[1],
     output:
         TABLES,
+        numbers=f"{GRAPH.folder}/numbers.json",
     log:
         TABULATED[0],
     conda:
@@ -87,8 +93,8 @@ rule tables:
 
 rule study:
     input:
-        lambda wildcards: GRAPH.study_runs(wildcards.study),
         STUDIED[1],
+        numbers=rules.tables.output.numbers,
     output:
         f"{GRAPH.folder}/studies/{{study}}.md",
     log:

@@ -38,7 +38,7 @@ from neuspring.data.released import (
 from neuspring.physics.stability import RELEASED_FRAME_TIME, RELEASED_SUBSTEPS
 from neuspring.scores import metrics
 from neuspring.scores.lpips import Lpips
-from neuspring.scores.metrics import METRICS, TASKS, UNITS, averages
+from neuspring.scores.metrics import METRICS, TASKS, averages
 from neuspring.scores.pictures import Pair, picture_scores
 from neuspring.splats.draw import OBJECT_COVERAGE, picture, prune_by_opacity, skinned_frames, view_of
 from neuspring.splats.model import Splats
@@ -134,7 +134,7 @@ class Published:
         scores = {}
         for row in csv.DictReader(text.splitlines()):
             task, metric = (PUBLISHED_NAMES.get(row[name], row[name]) for name in ("split", "metric"))
-            if task not in TASKS or metric not in UNITS:
+            if task not in TASKS or metric not in METRICS:
                 raise InputError(SCORES, "known splits and metrics are required", (row["split"], row["metric"]))
             digits = len(row["value"].partition(".")[2])
             scores[row["scenario"], task, metric] = Reference(value=float(row["value"]), half_digit=0.5 * 10.0**-digits)
@@ -167,7 +167,7 @@ def of_scores(
     rows = {(row["task"], row["metric"]): row for row in scores.to_dict("records")}
     findings = []
     for metric in metrics:
-        blank = replace(base, quantity=metric, unit=UNITS[metric])
+        blank = replace(base, quantity=metric, unit=METRICS[metric].unit)
         if metric in missing:
             findings.append(replace(blank, outcome="skipped", note=missing[metric]))
             continue
@@ -219,9 +219,9 @@ def _mean(row: Mapping[Any, Any], scores: pd.DataFrame, published: Published) ->
         check=row["check"],
         scenario=MEAN,
         quantity=row["metric"],
-        unit=UNITS[row["metric"]],
+        unit=METRICS[row["metric"]].unit,
         task=row["task"],
-        ours=float(row["frames" if weighted else "equal"]),
+        ours=float(row["mean"]),
         frames=int(scores["frames"].sum()),
         note=note,
     )

@@ -3,6 +3,7 @@ time."""
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterable, Sequence
 
@@ -14,10 +15,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from neuspring.scores.metrics import DISTANCES, averages
+from neuspring.scores.metrics import averages, metrics_of
 
-METRIC_STYLES = (("tab:orange", "s"), ("tab:blue", "o"), ("tab:green", "^"), ("tab:purple", "D"), ("tab:red", "v"))
-"""Color and marker of each distance."""
+METRIC_STYLES = (("tab:purple", "D"), ("tab:orange", "s"), ("tab:blue", "o"), ("tab:green", "^"), ("tab:red", "v"))
+"""Color and marker of the metrics of positions, in their order."""
 SHIFT = 0.24
 """The markers of a method stand within so much of its line."""
 TITLES = {"reconstruction": "training frames", "future": "future"}
@@ -37,7 +38,8 @@ def ratios_figure(ratios: pd.DataFrame, note: str) -> Figure | None:
     if not tasks:
         return None
     methods, baseline = list(dict.fromkeys(rows["method"])), rows["baseline"].iloc[0]
-    shown = [metric for metric in DISTANCES if (rows["metric"] == metric.name).any()]
+    styles = dict(zip(metrics_of("positions"), itertools.cycle(METRIC_STYLES)))
+    shown = [metric for metric in styles if (rows["metric"] == metric.name).any()]
     size = (4.4 * len(tasks) + 1.2, (0.22 + 0.13 * len(shown)) * len(methods) + 2.0)
     figure, axes = plt.subplots(1, len(tasks), figsize=size, layout="constrained", squeeze=False, sharey=True)
     shifts = np.linspace(SHIFT, -SHIFT, len(shown)) if len(shown) > 1 else [0.0]
@@ -48,7 +50,7 @@ def ratios_figure(ratios: pd.DataFrame, note: str) -> Figure | None:
             part = rows[(rows["task"] == task) & (rows["metric"] == metric.name)]
             if len(part):
                 place = np.array([methods.index(method) for method in part["method"]]) - shift
-                _intervals(axis, part, place, *METRIC_STYLES[DISTANCES.index(metric)], metric.title)
+                _intervals(axis, part, place, *styles[metric], metric.title)
         _scale(axis, rows[rows["task"] == task])
         axis.set(title=TITLES[task], xlabel=f"error / that of {baseline} (below 1 is better)")
     axes[0][0].set_yticks(range(len(methods)), methods)

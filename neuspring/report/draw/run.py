@@ -19,7 +19,7 @@ from neuspring.report.draw.scene import Prediction, Scene, chosen_frames
 from neuspring.report.draw.sheet import place, save
 from neuspring.report.draw.strip import strip_figure
 from neuspring.report.draw.twin import BAR, TwinPicture, histogram, rough_or_smooth, twin_figure
-from neuspring.scores.metrics import PICTURES, errors_per_frame
+from neuspring.scores.metrics import errors_per_frame, metrics_of
 from neuspring.twin.body import lines_of
 
 NAMES = ("errors.png", "motion.png", "losses.png", "topology.png", "stiffness.png")
@@ -102,7 +102,7 @@ def shade_future(axis: Axes, scenario: Scenario, label: str = "") -> None:
 
 def image_scores_figure(frames: pd.DataFrame, scenario: Scenario, method: str, folder: Path) -> Path:
     """Draw image_scores.png: every metric of pictures over time, from rows frame, camera, metric, value; returns the file."""
-    shown = [metric for metric in PICTURES if metric.name in set(frames["metric"])]
+    shown = [metric for metric in metrics_of("pictures") if metric.name in set(frames["metric"])]
     figure, axes = plt.subplots(
         len(shown), 1, figsize=(7, 1.5 * len(shown) + 0.8), layout="constrained", sharex=True, squeeze=False
     )

@@ -1,1 +1,1 @@
-"""Sections of the report page: curves, pictures, hours and failures, settings; `data` is what all of them read."""
+"""Sections of the report page, one module each; a `SECTION` says what makes it and where it stands."""

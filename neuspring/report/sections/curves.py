@@ -18,7 +18,7 @@ from neuspring.core.artifacts import Observations, Scenario, Trajectory
 from neuspring.core.records import StageRecord
 from neuspring.core.run_record import RunRecord
 from neuspring.report.blocks import Block, Fold, Grid, Legend, Picture, Section, Text
-from neuspring.report.sections.data import UNREADABLE, ReportData
+from neuspring.report.data import UNREADABLE, ReportData, ReportSection
 from neuspring.scores.metrics import METRICS, bound_track_errors, track_errors
 
 COLORS = ("#2f7ed8", "#d9731a", "#2a9d5c", "#a05cc4", "#c94f7c", "#8a7a2e", "#1f9aa8", "#8d6a57")
@@ -68,7 +68,7 @@ Lines = Mapping[str, Mapping[int, pd.Series]]
 """Name and seed to values."""
 
 
-def curves_section(material: ReportData) -> Section:
+def curves(material: ReportData) -> Section:
     """Error, search, fit and training curves of the shown methods."""
     scenarios = [name for name in material.choice.scenarios if material.first_runs(name)]
     if not scenarios:
@@ -198,3 +198,6 @@ def _panel(lines: Lines, styles: Mapping[str, Any], future: Scenario | None, cap
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
     data = base64.b64encode(stream.getvalue()).decode("ascii")
     return Picture(caption=caption, alt=alt, data=f"data:image/svg+xml;base64,{data}", paper=True)
+
+
+SECTION = ReportSection(order=40, make=curves)

@@ -1,28 +1,22 @@
-"""Pictures and films, methods side by side: in the report, made smaller or linked where they do not fit; and in `pictures.html`."""
+"""Pictures and films, methods side by side: in the report, made smaller or linked where they do not fit."""
 
 from __future__ import annotations
 
-import base64
 import io
 import os
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from urllib.parse import quote
 
-import pandas as pd
 from PIL import Image
 
 from neuspring.core.artifacts import Observations
-from neuspring.core.files import write_text
 from neuspring.core.run_record import RunRecord
-from neuspring.report.blocks import Block, Code, Fold, Grid, Picture, Section, Text, Video, html_page
+from neuspring.report.blocks import Block, Code, Fold, Grid, Picture, Section, Text, Video
+from neuspring.report.data import UNREADABLE, ReportData, ReportSection, data_uri, link, several
 from neuspring.report.draw.scene import chosen_frames
-from neuspring.report.sections.data import UNREADABLE, ReportData, several
-from neuspring.scores.metrics import METRICS
-from neuspring.scores.runs import Collected
 
 QUALITY = 75
 """Quality of WebP pictures, of 100."""
@@ -31,11 +25,8 @@ MARKUP = 400
 NO_ROOM = "not embedded, to keep this page small"
 ADDRESS = "http://127.0.0.1:8080/"
 """Where `neuspring play` listens unless it is told otherwise."""
-GALLERY = "pictures.html"
 MOST_OPEN = 3
 """Scenarios whose films are not folded."""
-CAPTIONED = ("track_error", "iou")
-"""Metrics in captions of the gallery."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +88,7 @@ class Media:
         room = min(room, video_room)
         for path in (path for path, kind in wanted.items() if not kind.width):
             if 4 * path.stat().st_size / 3 <= room:
-                self._films[path] = _uri("video/mp4", path.read_bytes())
+                self._films[path] = data_uri("video/mp4", path.read_bytes())
                 room -= len(self._films[path])
 
     def show(self, path: Path, caption: str, alt: str, kind: Kind, frames: Sequence[tuple[str, str]]) -> Block:
@@ -113,18 +104,6 @@ class Media:
         return Picture(caption=caption, alt=alt, link=target, reason=self._damaged.get(place, NO_ROOM), frames=frames)
 
 
-def link(path: Path, folder: Path) -> str:
-    """A relative link from a page in `folder`."""
-    return quote(Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix())
-
-
-def embedded(data: bytes, caption: str, alt: str, *, wide: bool = False) -> Picture:
-    """A PNG, drawn for white paper, as a picture of the page."""
-    return Picture(
-        caption=caption, alt=alt, data=_uri("image/png", data), size=Image.open(io.BytesIO(data)).size, wide=wide, paper=True
-    )
-
-
 def _smaller(path: Path, width: int) -> Picture | str:
     """The picture, not wider than `width`, as WebP; or the reason why it cannot be read."""
     try:
@@ -136,11 +115,7 @@ def _smaller(path: Path, width: int) -> Picture | str:
     picture.thumbnail((width, 10 * width))
     stream = io.BytesIO()
     picture.save(stream, "WEBP", quality=QUALITY)
-    return Picture(caption="", alt="", data=_uri("image/webp", stream.getvalue()), size=picture.size)
-
-
-def _uri(kind: str, data: bytes) -> str:
-    return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
+    return Picture(caption="", alt="", data=data_uri("image/webp", stream.getvalue()), size=picture.size)
 
 
 def frame_links(material: ReportData, scenario: str) -> tuple[tuple[str, str], ...]:
@@ -153,9 +128,9 @@ def frame_links(material: ReportData, scenario: str) -> tuple[tuple[str, str], .
     return tuple((f"frame {frame}", f"{ADDRESS}?frame={frame}&scenario={scenario}") for frame in frames)
 
 
-def pictures_section(material: ReportData, media: Media) -> Section:
+def pictures(material: ReportData) -> Section:
     """A fold per scenario, with the command that shows its runs in the playground."""
-    folds: list[Block] = []
+    media, folds = Media(material, material.room, int(1e6 * material.choice.video_megabytes)), list[Block]()
     for scenario in material.choice.scenarios:
         runs = material.first_runs(scenario)
         if blocks := _scenario(material, runs, media, frame_links(material, scenario)):
@@ -195,53 +170,4 @@ def _scenario(material: ReportData, runs: dict[str, RunRecord], media: Media, fr
     return blocks
 
 
-def write_gallery(
-    results: Path, scenarios: Iterable[str], methods: Sequence[str], seed: int, collected: Collected, folder: Path
-) -> Path:
-    """Write pictures.html into `folder`: the films of every scenario side by side, for one seed, with their scores.
-
-    Films and pictures are linked, not embedded, so that the page works wherever the results folder is. Runs that are missing are
-    left out.
-    """
-    sections: list[Section] = []
-    for scenario in scenarios:
-        place = Path(results) / scenario
-        figures: list[Block] = []
-        for method in methods:
-            if record := collected.records.get((scenario, method, seed)):
-                figures += _films(record, place / method / str(seed), collected.scores, folder)
-        # First the splats of all methods, then those of methods with splats of their own.
-        learned = sorted(place.glob(f"appearance*/{seed}/appearance.png"))
-        splats = [Picture(caption="", alt=path.stem, data=link(path, folder)) for path in learned]
-        blocks: list[Block] = [Text(text="No pictures: no images, or no finished run.")]
-        if figures:
-            shown: list[Block] = [Grid(blocks=figures, least=28, films=True)]
-            blocks = [*shown, Fold(summary="Splats of frame 0", blocks=[Grid(blocks=splats, least=28)])] if splats else shown
-        sections.append(Section(key=scenario, title=scenario, blocks=blocks))
-    about = (
-        "Observed, predicted and their difference, first camera; beside them the twin from all around. The bar above a film is "
-        f"blue in training frames and orange in the future. Seed {seed}."
-    )
-    write_text(folder / GALLERY, html_page("NeuSpring: pictures", about, sections, embedded=False))
-    return folder / GALLERY
-
-
-def _films(record: RunRecord, run: Path, scores: pd.DataFrame, folder: Path) -> list[Block]:
-    """A run's films, or its film strip where it has none, with its scores; nothing if it has no pictures."""
-    paths = {path.stem: path for path in (run / name for name in record.artifacts.get("images", [])) if path.is_file()}
-    own = scores[(scores["scenario"] == record.scenario) & (scores["method"] == record.method) & (scores["seed"] == record.seed)]
-    values, parts = own.set_index(["task", "metric"])["value"], []
-    for task, name in (("reconstruction", "training"), ("future", "future")):
-        metrics = [METRICS[metric] for metric in CAPTIONED if (task, metric) in values.index]
-        texts = [f"{one.heading} {one.text(values[task, one.name])} {one.shown_unit}".rstrip() for one in metrics]
-        parts += [f"{name} {', '.join(texts)}"] if texts else []
-    caption = f"{record.method}: {'; '.join(parts)}".removesuffix(": ")
-    if "video" in paths:
-        return [
-            Video(caption=caption, data=link(paths["video"], folder)),
-            Video(caption=f"{record.method}, from all around", data=link(paths["turntable"], folder)),
-        ]
-    if "images" in paths:
-        alt = f"Frames of {record.scenario}, {record.method}"
-        return [Picture(caption=caption, alt=alt, data=link(paths["images"], folder))]
-    return []
+SECTION = ReportSection(order=30, make=pictures, phase=1)

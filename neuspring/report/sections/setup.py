@@ -1,4 +1,4 @@
-"""Settings that differ from the defaults, methods, versions, machines; texts of other commands, and files beside the page."""
+"""Settings that differ from the defaults, versions, machines, and files beside the page."""
 
 from __future__ import annotations
 
@@ -7,60 +7,21 @@ import platform
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
 from importlib import metadata
-from pathlib import Path
 from typing import Any
 
 import yaml
-from markdown_it import MarkdownIt
-from markupsafe import Markup
 
 from neuspring import config
 from neuspring.config import Config
 from neuspring.core.run_record import RunRecord, flat
 from neuspring.core.table import Cell, Table
 from neuspring.core.text import listed
-from neuspring.report.blocks import Block, Code, Fold, Items, Link, Prose, Section, Text
-from neuspring.report.explain import departures
-from neuspring.report.sections.data import UNREADABLE, ReportData, several
-from neuspring.report.sections.pictures import link
+from neuspring.report.blocks import Block, Code, Fold, Items, Link, Section, Text
+from neuspring.report.data import ReportData, ReportSection, link, several
 
 DATA = (".md", ".csv", ".tex", ".html", ".parquet")
 SO_FAR = "so_far"
 """Folder of tables that an interrupted run left."""
-
-
-def render(text: str) -> Markup:
-    """Markdown as HTML with smaller headings, without links and pictures."""
-    parser = MarkdownIt("commonmark", {"html": False}).enable("table").disable(["image", "link"])
-
-    def opened(*_: Any) -> str:
-        return '<div class="scroll" tabindex="0" role="region" aria-label="Table"><table>'
-
-    parser.add_render_rule("table_open", opened)
-    parser.add_render_rule("table_close", lambda *_: "</table></div>")
-    tokens = parser.parse(text)
-    for token in tokens:
-        if token.type in ("heading_open", "heading_close"):
-            token.tag = "h3" if token.tag in ("h1", "h2") else "h4"
-    return Markup(parser.renderer.render(tokens, parser.options, {}))
-
-
-def file(material: ReportData, path: Path) -> Prose | None:
-    """A Markdown file; None if it is not there or cannot be read."""
-    if not path.is_file():
-        return None
-    try:
-        return Prose(html=render(path.read_text(encoding="utf-8")))
-    except UNREADABLE as error:
-        material.lost(path, error)
-        return None
-
-
-def tuning_section(material: ReportData) -> Section | None:
-    """The sweeps under results/tune; None without any."""
-    texts = {path.parent.name: file(material, path) for path in sorted((material.results / "tune").glob("*/summary.md"))}
-    folds: list[Block] = [Fold(summary=name, blocks=[text]) for name, text in texts.items() if text]
-    return Section(key="tuning", title="Tuning", blocks=folds) if folds else None
 
 
 def files(material: ReportData) -> list[tuple[str, str]]:
@@ -71,12 +32,6 @@ def files(material: ReportData) -> list[tuple[str, str]]:
     return [(material.relative(path), link(path, here.parent)) for path in paths]
 
 
-def perception_section(material: ReportData) -> Section | None:
-    """Perception against the truth of synthetic captures; None where it was not judged."""
-    text = file(material, material.results / material.choice.tables / "perception.md")
-    return Section(key="perception", title="Perception", blocks=[text]) if text else None
-
-
 PACKAGES = (
     *("torch", "warp-lang", "newton", "numpy", "scipy", "scikit-learn", "opencv-python-headless", "cma"),
     *("gsplat", "snakemake", "mlflow"),
@@ -84,9 +39,11 @@ PACKAGES = (
 WHAT = ("scenarios", "methods", "seeds", "results", "tables")
 """Keys that say what the benchmark is, not how it runs."""
 DIRTY = "-dirty"
+PICTURE_STAGES = ("appearance", "render")
+"""Their settings are those of `images` and of perception's lifting."""
 
 
-def setup_section(material: ReportData) -> Section:
+def setup(material: ReportData) -> Section:
     """Configuration, versions, machines, files."""
     blocks: list[Block] = [_commits(material.runs)] if material.runs else []
     blocks += _settings(material)
@@ -164,3 +121,30 @@ def _versions() -> Table:
         except metadata.PackageNotFoundError:
             continue
     return Table(caption="Versions where this page was written", header=["Package", "Version"], rows=rows)
+
+
+def departures(settings: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """The settings of every stage that differ from the defaults or have no default, under dotted names."""
+    defaults = config.plain(config.Config())
+    pictures = defaults | defaults["images"] | {"lift": defaults["perception"]["lift"]}
+    models = {None: defaults, **defaults["baselines"]}
+    different: dict[str, Any] = {}
+    for stage, values in settings.items():
+        # The settings of a baseline's training are those of the section of its model.
+        of_model = models.get(values.get("model"), defaults)
+        different |= _different(values, pictures if stage in PICTURE_STAGES else of_model, stage)
+    return {name: value for name, value in sorted(different.items()) if not name.endswith(".seed")}
+
+
+def _different(values: Mapping[str, Any], defaults: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    different: dict[str, Any] = {}
+    for name, value in values.items():
+        default = defaults.get(name)
+        if isinstance(value, Mapping) and isinstance(default, Mapping):
+            different |= _different(value, default, f"{prefix}.{name}")
+        elif name not in defaults or value != default:
+            different[f"{prefix}.{name}"] = value
+    return different
+
+
+SECTION = ReportSection(order=110, make=setup)

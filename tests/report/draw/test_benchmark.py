@@ -5,9 +5,10 @@ import pandas as pd
 import pytest
 from matplotlib import pyplot as plt
 
-from neuspring.report import benchmark as tables
+from neuspring.report import summary as tables
 from neuspring.report.draw import benchmark as figures
 from neuspring.scores.metrics import COLUMNS
+from neuspring.scores.numbers import Numbers
 from neuspring.scores.runs import Collected
 from tests.support.study_runs import collected
 
@@ -63,7 +64,7 @@ def test_cluster_methods_are_sorted_by_number():
 def test_the_cluster_picture_is_made_for_two_counts_or_more(tmp_path, methods, made):
     found = chamfer({key: value for key, value in STUDY.items() if key[1] in methods})
     (tmp_path / "clusters.png").write_text("of an earlier run")
-    tables.write(tables.Benchmark(everything=found, baseline="search_only"), tmp_path)
+    tables.write(Numbers(everything=found, baseline="search_only"), tmp_path)
     assert (tmp_path / "clusters.png").exists() == made
     assert ("(clusters.png)" in (tmp_path / "summary.md").read_text()) == made
     if made:
@@ -90,7 +91,7 @@ def test_a_pair_that_one_count_failed_is_left_out_for_all_of_them(monkeypatch):
     failed = [("a", "clusters_10", 1), *((scenario, "clusters_4", seed) for scenario in "ab" for seed in (0, 1))]
     kept = []
     monkeypatch.setattr(tables, "clusters_figure", lambda scores, note: kept.append((scores, note)))
-    assert not list(tables.pictures(tables.Benchmark(everything=chamfer(values, failed=tuple(failed)), baseline="search_only")))
+    assert not list(tables.figures(Numbers(everything=chamfer(values, failed=tuple(failed)), baseline="search_only")))
     ((scores, note),) = kept
     assert set(zip(scores["scenario"], scores["seed"], strict=True)) == {("a", 0), ("b", 0), ("b", 1)}
     # clusters_4 finished no run: it is not drawn and holds nobody back.
@@ -127,7 +128,7 @@ def test_ratios_are_drawn_with_their_intervals():
 def test_a_picture_of_ratios_needs_three_scenarios_and_is_not_left_over(tmp_path):
     def written(scenarios: str) -> str:
         values = {(s, m, 0): v for s in scenarios for m, v in (("x", 0.01), ("y", 0.008))}
-        tables.write(tables.Benchmark(everything=collected(values), baseline="x"), tmp_path)
+        tables.write(Numbers(everything=collected(values), baseline="x"), tmp_path)
         return (tmp_path / "summary.md").read_text()
 
     assert "](ratios.png)" in written("abc")

@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import math
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+from urllib.parse import quote
+
+from markdown_it import MarkdownIt
+from markupsafe import Markup
+from PIL import Image
 
 from neuspring.config import Config
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import JobRecord, read_jobs
 from neuspring.core.run_record import RUN_RECORD, RunRecord
+from neuspring.report.blocks import Picture, Prose, Section
 from neuspring.scores.failures import LeftOut, applying
 from neuspring.scores.metrics import DASH
+from neuspring.scores.numbers import Numbers
 from neuspring.scores.paper import Study
 from neuspring.scores.runs import DAMAGED, Collected, one_line
 
 UNREADABLE = (InputError, OSError, ValueError, KeyError, TypeError, AttributeError)
 """What a damaged record, table or picture raises."""
+MOST_ROWS = 400
+"""At most so many failures of a kind are listed; the rest is counted."""
 METHOD_RECORDS = (RUN_RECORD, "rollout.json", "fit.json", "train.json")
 METHOD_RULES = ("fit", "train", "rollout", "predict", "render", "score")
 """Rules whose jobs are named <rule>/<scenario>/<method>/<seed>."""
@@ -68,6 +80,10 @@ class ReportData:
     jobs: list[JobRecord]
     damaged: dict[str, str]
     """Files that cannot be read, relative to the results folder, and why."""
+    numbers: Numbers
+    """Of the benchmark and its studies."""
+    room: int = 0
+    """Characters that pictures and films may take."""
 
     @property
     def runs(self) -> list[RunRecord]:
@@ -157,3 +173,59 @@ def memory(mebibytes: float | None) -> str:
     if mebibytes is None or not math.isfinite(mebibytes):
         return DASH
     return f"{mebibytes / 1024:.1f} GiB" if mebibytes >= 1024 else f"{mebibytes:.0f} MiB"
+
+
+def link(path: Path, folder: Path) -> str:
+    """A relative link from a page in `folder`."""
+    return quote(Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix())
+
+
+def rendered(text: str) -> Markup:
+    """Markdown as HTML with smaller headings, without links and pictures."""
+    parser = MarkdownIt("commonmark", {"html": False}).enable("table").disable(["image", "link"])
+
+    def opened(*_: Any) -> str:
+        return '<div class="scroll" tabindex="0" role="region" aria-label="Table"><table>'
+
+    parser.add_render_rule("table_open", opened)
+    parser.add_render_rule("table_close", lambda *_: "</table></div>")
+    tokens = parser.parse(text)
+    for token in tokens:
+        if token.type in ("heading_open", "heading_close"):
+            token.tag = "h3" if token.tag in ("h1", "h2") else "h4"
+    return Markup(parser.renderer.render(tokens, parser.options, {}))
+
+
+def prose(material: ReportData, path: Path) -> Prose | None:
+    """A Markdown file; None if it is not there or cannot be read."""
+    if not path.is_file():
+        return None
+    try:
+        return Prose(html=rendered(path.read_text(encoding="utf-8")))
+    except UNREADABLE as error:
+        material.lost(path, error)
+        return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportSection:
+    """A section of the report: the member of a registry that a module of `sections`, or of a package, declares."""
+
+    order: int
+    """Its place on the page, by tens."""
+    make: Callable[[ReportData], Section | None]
+    """None where there is nothing to show."""
+    phase: Literal[0, 1, 2] = 0
+    """1: it takes the `room` that all others leave; 2: it lists the damaged files that all others found."""
+
+
+def embedded(data: bytes, caption: str, alt: str, *, wide: bool = False) -> Picture:
+    """A PNG, drawn for white paper, as a picture of the page."""
+    return Picture(
+        caption=caption, alt=alt, data=data_uri("image/png", data), size=Image.open(io.BytesIO(data)).size, wide=wide, paper=True
+    )
+
+
+def data_uri(kind: str, data: bytes) -> str:
+    """Bytes as the source of a picture or film."""
+    return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"

@@ -1,0 +1,41 @@
+"""Findings of perception: what its steps noticed of their own results."""
+
+from __future__ import annotations
+
+from neuspring.core.findings import Level, findings_of
+from neuspring.core.table import Cell, Chip, Table, Tone
+from neuspring.report.blocks import Block, Fold, Section, Text
+from neuspring.report.data import MOST_ROWS, ReportData, ReportSection, several
+
+TONES: dict[Level, Tone] = {"error": "bad", "warning": "warn", "note": "mute"}
+
+
+def findings(material: ReportData) -> Section | None:
+    """A table of warnings, and one of notes to unfold; None where perception found nothing worth saying, or did not run."""
+    found = [(name, one) for name in material.choice.scenarios for one in findings_of(material.results, name)]
+    if not found:
+        return None
+    loud = [(name, one) for name, one in found if one.level != "note"]
+    quiet = [(name, one) for name, one in found if one.level == "note"]
+    blocks: list[Block] = []
+    for caption, part in (("Warnings", loud), ("Notes", quiet)):
+        rows = [
+            [
+                Cell(text=name),
+                Cell(text=one.where),
+                Cell(text=one.name, chips=[Chip(text=one.level, tone=TONES[one.level])]),
+                Cell(text=one.text, wrap=True),
+            ]
+            for name, one in part[:MOST_ROWS]
+        ]
+        rest = f"{len(part) - MOST_ROWS} more are in the records." if len(part) > MOST_ROWS else ""
+        table = Table(caption=caption, header=["Scenario", "Where", "What", "Finding"], rows=rows, stub=1, note=rest)
+        if part:
+            blocks.append(table if part is loud else Fold(summary=several(len(part), "note"), blocks=[table]))
+    if not loud:
+        blocks.insert(0, Text(text="Perception noticed nothing that makes results worse.", tone="good"))
+    about = "Each step looks at its own result: a warning says what may make all methods worse, and what to do."
+    return Section(key="findings", title="Findings of perception", about=about, blocks=blocks)
+
+
+SECTION = ReportSection(order=60, make=findings)

@@ -1,0 +1,16 @@
+"""The sweeps of a results folder."""
+
+from __future__ import annotations
+
+from neuspring.report.blocks import Block, Fold, Section
+from neuspring.report.data import ReportData, ReportSection, prose
+
+
+def tuning(material: ReportData) -> Section | None:
+    """The sweeps under results/tune; None without any."""
+    texts = {path.parent.name: prose(material, path) for path in sorted((material.results / "tune").glob("*/summary.md"))}
+    folds: list[Block] = [Fold(summary=name, blocks=[text]) for name, text in texts.items() if text]
+    return Section(key="tuning", title="Tuning", blocks=folds) if folds else None
+
+
+SECTION = ReportSection(order=80, make=tuning)

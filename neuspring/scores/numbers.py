@@ -1,0 +1,259 @@
+"""The numbers of a benchmark: averages, intervals, verdicts. Each is computed once, and all are kept in one file, numbers.json.
+
+The tables, the studies, the report and `explain` are selections of them. The file has `tables` of the benchmark (""), of its twins
+on other recordings (moved) and of its studies (their names), each with columns and rows; NaN is null.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pandas as pd
+
+from neuspring.config import parse
+from neuspring.config.settings import Aim
+from neuspring.core.errors import InputError
+from neuspring.core.files import write_text
+from neuspring.core.findings import Finding
+from neuspring.core.records import read_json
+from neuspring.scores import failures, statistics
+from neuspring.scores.clips import ClipNumbers
+from neuspring.scores.metrics import METRICS, averages
+from neuspring.scores.paper import Study
+from neuspring.scores.runs import Collected, comparable, finished_scores, stacked
+from neuspring.scores.settings import differing
+from neuspring.scores.study import StudyNumbers, resolved
+
+NUMBERS = "numbers.json"
+NUMBERS_FORMAT = 1
+SUMMARY = "summary"
+"""Stands for a study where the benchmark's own table is meant."""
+JUDGES = tuple((task, name) for task in ("future", "reconstruction") for name in ("track_error", "chamfer", "image_error"))
+"""Task and metric that decide who is best: the first one that the runs have."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Numbers:
+    """The numbers of a benchmark; a table is computed when it is first asked for, the bootstrap takes seconds."""
+
+    TABLES: ClassVar = ("averages", "held", "differences", "ratios", "seeds", "floors", "aimed", "lead", "settings")
+    everything: Collected
+    baseline: str
+    objects: statistics.Objects = "scenario"
+    """What intervals of ratios are over."""
+    aims: tuple[Aim, ...] = ()
+    """Ratios that are aimed at."""
+    transfers: Collected | None = None
+    """Twins on other recordings of the same object, as runs."""
+    studies: Mapping[str, Study] = field(default_factory=dict)
+    """The studies that are shown."""
+    known_studies: Mapping[str, Study] = field(default_factory=dict)
+    """Those and the ones that may stand beside them."""
+    results: Path = Path("results")
+    """Where films of clips lie."""
+    warnings: tuple[tuple[str, Finding], ...] = ()
+    """Scenarios, and what steps of perception warned of."""
+    made_otherwise: tuple[str, ...] = ()
+    """Lines on runs that were not made with the configuration that the tables are laid out for."""
+
+    @cached_property
+    def collected(self) -> Collected:
+        """The runs without oracles."""
+        return self.everything.comparison
+
+    @cached_property
+    def usable(self) -> pd.DataFrame:
+        """The scores that can be compared."""
+        return comparable(self.collected)
+
+    @cached_property
+    def finished(self) -> pd.DataFrame:
+        """Scores of all finished runs without oracles."""
+        return finished_scores(self.collected)
+
+    @cached_property
+    def moved(self) -> Numbers | None:
+        """The same numbers of twins on other recordings, without oracles; None where there are none."""
+        if self.transfers is None or not len(self.transfers.runs):
+            return None
+        own = self.transfers.of([m for m in dict.fromkeys(self.transfers.runs["method"]) if m not in self.everything.oracles])
+        return Numbers(everything=own, baseline=self.baseline, objects=self.objects)
+
+    @cached_property
+    def averages(self) -> pd.DataFrame:
+        """Both averages of every method, on the pairs that count; oracles on the same pairs, each alone."""
+        scores = self.usable
+        if len(self.everything.oracles):
+            keys = ["scenario", "seed"]
+            own = finished_scores(self.everything.of(self.everything.oracles))
+            scores = pd.concat([scores, own.merge(scores[keys].drop_duplicates(), on=keys) if len(scores) else own])
+        return (
+            averages(scores) if len(scores) else pd.DataFrame(columns=["method", "task", "metric", "equal", "frames", "seed_std"])
+        )
+
+    @cached_property
+    def held(self) -> pd.DataFrame:
+        """Averages without and with failed runs."""
+        return failures.both_averages(*self.collected.parts)
+
+    @cached_property
+    def differences(self) -> pd.DataFrame:
+        """Paired differences of every method to the baseline, and whether they are resolved."""
+        table = statistics.paired_differences(self.usable, self.baseline) if len(self.usable) else pd.DataFrame()
+        rows: list[Any] = list(table.itertuples())
+        return table.assign(verdict=[resolved(row.low, row.high, row.scenarios, METRICS[row.metric]) for row in rows])
+
+    @cached_property
+    def ratios(self) -> pd.DataFrame:
+        """Ratios of errors to the baseline's, over objects."""
+        return statistics.ratios(self.finished, self.baseline, self.objects)
+
+    @cached_property
+    def seeds(self) -> pd.DataFrame:
+        """The spread of the log error over seeds."""
+        return statistics.seed_spread(self.finished)
+
+    @cached_property
+    def floors(self) -> pd.DataFrame:
+        """Errors in frame 0, which is given: scenario, metric, value. Methods of a scenario begin with the same nodes."""
+        runs, rows = self.everything.runs, dict[tuple[str, str], float]()
+        for row in runs.itertuples() if "floors" in runs else ():
+            values = json.loads(row.floors) if isinstance(row.floors, str) else {}
+            rows |= {(str(row.scenario), name): value for name, value in values.items()}
+        return pd.DataFrame([(*key, value) for key, value in rows.items()], columns=["scenario", "metric", "value"])
+
+    @cached_property
+    def aimed(self) -> pd.DataFrame:
+        """Aims and whether they are reached."""
+        moved = self.moved.finished if self.moved else self.finished[:0]
+        return statistics.judged_aims(self.finished, moved, self.aims, self.objects)
+
+    @cached_property
+    def lead(self) -> pd.DataFrame:
+        """The best method by the error that decides, and its ratio to its rival: what it is compared with, or else the second best.
+
+        One row (`statistics.ratios`, with `baseline` the rival, "" without one); none where nothing can be compared.
+        """
+        there = set(zip(self.usable["task"], self.usable["metric"], strict=True))
+        key = next((key for key in JUDGES if key in there), None)
+        if key is None:
+            return pd.DataFrame()
+        best, *others = self.means(*key)
+        rival = self.baseline if self.baseline in others else next(iter(others), "")
+        part = self.finished[self.finished["method"].isin([best, rival]) & (self.finished["task"] == key[0])]
+        found = statistics.ratios(part[part["metric"] == key[1]], rival, self.objects).to_dict("records")
+        row = {
+            "method": best,
+            "baseline": rival,
+            "task": key[0],
+            "metric": key[1],
+            "ratio": np.nan,
+            "n": 0,
+            "objects": self.objects,
+        }
+        return pd.DataFrame([row | {"verdict": statistics.TOO_FEW} | (found[0] if found else {})])  # type: ignore[arg-type]
+
+    def means(self, task: str, metric: str) -> dict[str, float]:
+        """Method to its mean over scenarios, m, the best first."""
+        table = self.averages[~self.averages["method"].isin(self.everything.oracles)]
+        own = table[(table["task"] == task) & (table["metric"] == metric)].sort_values("equal", kind="stable")
+        return dict(zip(own["method"], map(float, own["equal"]), strict=True))
+
+    @cached_property
+    def settings(self) -> pd.DataFrame:
+        """Settings that differ between the methods."""
+        return differing(self.everything.records.values(), {name: name for name in dict.fromkeys(self.everything.runs["method"])})
+
+    @cached_property
+    def by_study(self) -> dict[str, StudyNumbers | ClipNumbers]:
+        """The numbers of every study."""
+        return {name: self._of_study(name, study) for name, study in self.studies.items()}
+
+    def _of_study(self, name: str, study: Study) -> StudyNumbers | ClipNumbers:
+        if study.clips:
+            names: dict[str, Any] = {column: list(dict.fromkeys(self.everything.runs[column])) for column in ("method", "seed")}
+            sources = list(dict.fromkeys(self.everything.runs["scenario"]))
+            return ClipNumbers(
+                name=name, study=study, results=self.results, sources=sources, methods=names["method"], seeds=names["seed"]
+            )
+        beside = self.known_studies.get(study.beside or "")
+        return StudyNumbers(name=name, study=study, collected=self.everything, beside=beside)
+
+    @property
+    def size(self) -> str:
+        """How much is compared, in words."""
+        return f"{self.usable['scenario'].nunique()} scenarios, {self.usable['seed'].nunique()} seed(s)"
+
+    @cached_property
+    def key(self) -> str:
+        """A digest of what the numbers are made of: numbers of other runs, or against another method, have another one."""
+        runs = [found.runs.reindex(columns=["scenario", "method", "seed", "status", "run_key"]) for found in self._all_runs()]
+        told = [self.baseline, self.objects, [asdict(aim) for aim in self.aims], [table.to_csv() for table in runs]]
+        told += [found.scores.to_csv(index=False) for found in self._all_runs()]
+        return hashlib.sha256(json.dumps(told).encode()).hexdigest()
+
+    def _all_runs(self) -> list[Collected]:
+        return [self.everything, *([self.transfers] if self.transfers else [])]
+
+    @property
+    def _parts(self) -> dict[str, Numbers | StudyNumbers | ClipNumbers]:
+        """The names of tables' owners in the file: "" is this one, "moved" twins on other recordings, others are studies."""
+        return {"": self, **({"moved": self.moved} if self.moved else {}), **self.by_study}
+
+    def save(self, folder: Path) -> None:
+        """Write numbers.json."""
+        tables = {name: {table: _as_json(getattr(part, table)) for table in part.TABLES} for name, part in self._parts.items()}
+        values = {"format": NUMBERS_FORMAT, "key": self.key, "baseline": self.baseline, "left_out": self.everything.left_out}
+        values |= {"studies": {name: asdict(study) for name, study in self.known_studies.items()}, "shown": list(self.studies)}
+        values |= {"runs": _as_json(self.everything.runs), "tables": tables}
+        write_text(folder / NUMBERS, json.dumps(values, ensure_ascii=False) + "\n")
+
+    def take(self, folder: Path) -> Numbers:
+        """Take what a folder's numbers.json has of these very runs, so that nothing is computed twice; returns itself."""
+        if not (folder / NUMBERS).is_file():
+            return self
+        values = read_json(folder / NUMBERS, NUMBERS_FORMAT)
+        if values["key"] == self.key:
+            known = {name: asdict(study) for name, study in self.known_studies.items()}
+            for name, part in self._parts.items():
+                if name not in self.studies or json.loads(json.dumps(known)) == values["studies"]:
+                    vars(part).update({table: _of_json(value) for table, value in values["tables"].get(name, {}).items()})
+        return self
+
+    @classmethod
+    def load(cls, folder: Path, results: Path = Path("results")) -> Numbers:
+        """Read numbers.json: all tables, and runs without scores and records. Raises InputError."""
+        path = folder / NUMBERS
+        if not path.is_file():
+            raise InputError(folder, f"tables with {NUMBERS} are required", "none", "Make them first: `neuspring tables`.")
+        values = read_json(path, NUMBERS_FORMAT)
+        studies = {name: parse(Study, study, f"{path}, study {name}") for name, study in values["studies"].items()}
+        everything = Collected(stacked([]), _of_json(values["runs"]), left_out=values["left_out"])
+        shown = {name: studies[name] for name in values["shown"]}
+        found = cls(everything=everything, baseline=values["baseline"], studies=shown, known_studies=studies, results=results)
+        for name, part in found._parts.items():
+            vars(part).update({table: _of_json(value) for table, value in values["tables"][name].items()})
+        return found
+
+
+def kept_studies(folder: Path) -> list[str]:
+    """The studies whose numbers a folder's numbers.json has."""
+    return list(read_json(folder / NUMBERS, NUMBERS_FORMAT)["shown"]) if (folder / NUMBERS).is_file() else []
+
+
+def _as_json(table: pd.DataFrame) -> dict[str, Any]:
+    rows = table.astype(object).where(table.notna(), None)
+    return {"columns": [str(name) for name in table], "rows": rows.to_numpy().tolist()}
+
+
+def _of_json(value: Mapping[str, Any]) -> pd.DataFrame:
+    table = pd.DataFrame(value["rows"], columns=value["columns"])
+    # Of a column without any value the type is not known: it was one of numbers.
+    return table.astype({name: float for name in table if table[name].isna().all()})
