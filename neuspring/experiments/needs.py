@@ -36,9 +36,9 @@ HEADROOM_MEMORY, HEADROOM_TIME = 1.5, 3.0
 LEAST_MEMORY, LEAST_MINUTES = 1000, 10
 IN_MINUTES = 2.0
 """Hours below which a time is told in minutes."""
-ALWAYS_GPU = frozenset({"tune", *(name for name, stage in STAGES.items() if stage.gpu == "always")})
+ALWAYS_GPU = frozenset({"tune", *(name for name, stage in STAGES.items() if stage.gpu is True)})
 """Rules that take a GPU where there is one."""
-BACKEND_DECIDES = frozenset(name for name, stage in STAGES.items() if stage.gpu == "backend")
+BACKEND_DECIDES = frozenset(name for name, stage in STAGES.items() if callable(stage.gpu))
 """Rules whose backend decides whether they take a GPU."""
 FIRST_REQUEST = {name: (stage.memory_mb, stage.minutes) for name, stage in STAGES.items()} | {
     "tables": (2000, 10),

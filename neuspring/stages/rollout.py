@@ -7,7 +7,7 @@ from neuspring.core.records import Before, Recorder
 from neuspring.stages.stage import Written, stage
 
 
-@stage(output="{scenario}/{method}/{seed}/rollout.json", gpu="always", minutes=60)
+@stage(output="{scenario}/{method}/{seed}/rollout.json", gpu=True, minutes=60, when=lambda rows: rows.search is not None)
 def rollout(observations: Observations, learned: Before, run: Recorder, device: str = "auto") -> Written:
     """Twin -> trajectory over all frames, trajectory.npz. A rollout that diverges is recorded as a failure.
 
