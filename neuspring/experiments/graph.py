@@ -13,12 +13,12 @@ import json
 import re
 import shlex
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from neuspring.config import Config, ScenarioRow, plain
+from neuspring.config import Config, Method, ScenarioRow, plain
 from neuspring.config.settings import select
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
@@ -49,8 +49,9 @@ class Graph:
         tune = self.config.tune
         self.sweep_folder = f"{self.results}/tune/{tune.study}" if tune else ""
         self._texts: dict[tuple[Any, ...], str] = {}
-        laid = {name: with_method(self.config, row, name) for name, row in benchmark.table.items()}
-        self.owners = {one.name: self._owners(one.shared, laid) for one in STAGES.values() if one.shared}
+        # Thousands of jobs share a few rows.
+        self._of, self._laid = functools.cache(self._rows), functools.cache(self._lay)
+        self.owners = {one.name: self._owners(one.shared) for one in STAGES.values() if one.shared}
         """Stage whose jobs methods share -> chosen method -> the first row of the method table with the same job."""
         own = dict.fromkeys([*benchmark.methods, *(owner for owners in self.owners.values() for owner in owners.values())])
         self.wildcards = {
@@ -63,11 +64,10 @@ class Graph:
             "study": one_of(benchmark.studies),
         }
         """Pattern of each wildcard."""
-        self._of = functools.cache(self._rows)
 
-    def _owners(self, shared: Callable[..., Any], laid: Mapping[str, Config]) -> dict[str, str]:
+    def _owners(self, shared: Callable[[Config, Method], Any]) -> dict[str, str]:
         first: dict[Any, str] = {}
-        keys = {name: shared(config, self.benchmark.table[name]) for name, config in laid.items()}
+        keys = {name: shared(self._laid(name, None), row) for name, row in self.benchmark.table.items()}
         owners = {name: first.setdefault(key, name) for name, key in keys.items() if key is not None}
         return {name: owner for name, owner in owners.items() if name in self.benchmark.methods}
 
@@ -81,14 +81,12 @@ class Graph:
         return self._of(job.scenario, method, getattr(job, "search", None))
 
     def _rows(self, scenario: str, name: str | None, search: str | None) -> Rows:
-        known, config = self.benchmark, self.config
+        known = self.benchmark
         method = known.table[name] if name else None
         searched = search or (method.searched if method and method.search else None)
-        config = with_method(config, method, name) if method and name else config
-        config = with_search(config, known.searches[searched], searched) if searched else config
         pooled = any(row.pool and searched == row.searched for row in known.methods.values())
         return Rows(
-            config=config,
+            config=self._laid(name, searched),
             scenario=known.scenarios[scenario],
             source=known.source(scenario),
             data=known.data_path(scenario),
@@ -98,6 +96,11 @@ class Graph:
             pool=known.pools.get(scenario, ()) if pooled else (),
             targets=known.transfers.get(scenario, ()),
         )
+
+    def _lay(self, name: str | None, searched: str | None) -> Config:
+        """The configuration with the settings of a method and of a search on top."""
+        config = with_method(self.config, self.benchmark.table[name], name) if name else self.config
+        return with_search(config, self.benchmark.searches[searched], searched) if searched else config
 
     # --- which jobs there are
 
