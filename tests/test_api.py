@@ -100,7 +100,7 @@ def template(heading: str) -> str:
 def test_template_of_a_baseline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "mean_hand.py").write_text(template("**A baseline**"))
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setitem(BASELINES, "mean_hand", Baseline(prediction="mean_hand:mean_hand"))
+    monkeypatch.setitem(BASELINES._loaded, "mean_hand", Baseline(prediction="mean_hand:mean_hand"))
     seen = small.observations()
     predicted = BASELINES["mean_hand"].predict(seen, None, None, "cpu").trajectory
     hands = seen.controller_points.mean(axis=1)

@@ -3,8 +3,8 @@
 `BASELINES` declares them; a method row's `model` names one. PhysTwin is not here: it is a row of the method table, made of the
 platform's own search and fit.
 
-To add a baseline: its package, its settings in neuspring/config (a field of `Baselines`), its line here, and its row in
-config/methods.yaml.
+To add a baseline: its package, its line here, and its row in config/methods.yaml; if rows shall set something of it, its settings
+in neuspring/config (a field of `Baselines`). A package of your own adds one by an entry point of the group `neuspring.baselines`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 from neuspring.baselines.spring_gaus import find_vgg16
-from neuspring.config import Config
+from neuspring.config import Config, Method
+from neuspring.registry import Registry
 
 if TYPE_CHECKING:
     import numpy as np
@@ -64,22 +65,31 @@ class Baseline:
     model: str = ""
     """The artifact that is trained."""
     section: str = ""
-    """Its settings: a field of `config.Baselines`."""
+    """Its settings: a field of `config.Baselines`; empty: it has none, and the functions below get None for them."""
     takes_pictures: Callable[[Any], bool] = lambda section: False
-    """True, from its settings, where it is trained on silhouettes."""
+    """From its settings: True where it is trained on silhouettes."""
     reads: Callable[[Any], tuple[str, ...]] = lambda section: ()
     """Keys of the configuration, from its settings, that training reads beside its own section."""
     own_splats: bool = False
     """True where a method row may give it splats of its own to move (`appearance`)."""
     transfers: bool = False
-    """True where a trained model can be moved to another recording."""
+    """True where what it learned can be moved to another recording."""
     features: Callable[[Any], str] = lambda section: "none"
-    """State of its optional weights in a word, so that training runs again when they come. Raises InputError for wrong ones."""
+    """From its settings: which optional weights are there, so that training runs again when they come. Raises InputError for wrong
+    ones."""
 
     @property
     def trained(self) -> bool:
-        """True where it is trained."""
+        """True for a model that learns something."""
         return bool(self.training)
+
+    def settings(self, config: Config) -> Any:
+        """Its section of a configuration; None where it has none."""
+        return getattr(config.baselines, self.section) if self.section else None
+
+    def pictured(self, config: Config) -> bool:
+        """True where it is trained on silhouettes."""
+        return self.trained and self.takes_pictures(self.settings(config))
 
     @property
     def modules(self) -> tuple[str, ...]:
@@ -99,6 +109,12 @@ class Baseline:
         return result
 
 
+def without_pictures(method: Method | None, config: Config) -> tuple[str, ...]:
+    """The inputs of a stage that a method's model goes without: what is trained on points sees no pictures."""
+    pictured = bool(method and method.model and BASELINES[method.model].pictured(config))
+    return () if pictured else ("capture", "masks", "appearance")
+
+
 def _spring_gaus_reads(section: Any) -> tuple[str, ...]:
     if section.supervision == "masks":
         return ("simulation.gravity", "images.backend", "images.corner_pixels")
@@ -111,23 +127,27 @@ def _vgg16(section: Any) -> str:
 
 REFERENCES = ("static", "controller_lbs")
 """Methods that learn nothing: what others must be better than."""
-BASELINES = {
-    "spring_gaus": Baseline(
-        training="neuspring.baselines.spring_gaus.train:train",
-        prediction="neuspring.baselines.spring_gaus.model:predict",
-        model="neuspring.baselines.spring_gaus.model:SpringGausModel",
-        section="spring_gaus",
-        takes_pictures=lambda section: bool(section.supervision == "masks"),
-        reads=_spring_gaus_reads,
-        own_splats=True,
-        features=_vgg16,
-    ),
-    "gs_dynamics": Baseline(
-        training="neuspring.baselines.gs_dynamics.train:train",
-        prediction="neuspring.baselines.gs_dynamics.model:predict",
-        model="neuspring.baselines.gs_dynamics.model:GsDynamicsModel",
-        section="gs_dynamics",
-        transfers=True,
-    ),
-    **{name: Baseline(prediction=f"neuspring.baselines.references:{name}") for name in REFERENCES},
-}
+BASELINES = Registry(
+    "baselines",
+    {
+        "spring_gaus": Baseline(
+            training="neuspring.baselines.spring_gaus.train:train",
+            prediction="neuspring.baselines.spring_gaus.model:predict",
+            model="neuspring.baselines.spring_gaus.model:SpringGausModel",
+            section="spring_gaus",
+            takes_pictures=lambda section: bool(section.supervision == "masks"),
+            reads=_spring_gaus_reads,
+            own_splats=True,
+            features=_vgg16,
+        ),
+        "gs_dynamics": Baseline(
+            training="neuspring.baselines.gs_dynamics.train:train",
+            prediction="neuspring.baselines.gs_dynamics.model:predict",
+            model="neuspring.baselines.gs_dynamics.model:GsDynamicsModel",
+            section="gs_dynamics",
+            transfers=True,
+        ),
+        **{name: Baseline(prediction=f"neuspring.baselines.references:{name}") for name in REFERENCES},
+    },
+    Baseline,
+)

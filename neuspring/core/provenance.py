@@ -3,7 +3,8 @@
 Snakemake does not notice changes in imported code. Each record of a stage therefore holds `code_digest(module)`, which the workflow
 compares: the syntax trees, docstrings and comments stripped, of the module and of every package module it imports, directly or not.
 Editing `twin/fit.py` runs fits again; editing a docstring, or a table, runs no expensive step again. What a module imports by name
-(backends, readers, baselines) is named beside it (`neuspring.experiments.graph`).
+(backends, readers, baselines) is named beside it (`code` of `neuspring.stages.stage.Stage`). A module of another package that adds
+to a registry counts like ours, with all that it imports of its own package; one without source by the package's version.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import hashlib
 import re
 import subprocess
 from collections.abc import Iterator
+from importlib.metadata import packages_distributions, version
+from importlib.util import find_spec, resolve_name
 from pathlib import Path
 
 PACKAGE_NAME = "neuspring"
@@ -25,14 +28,23 @@ NOT_NUMERICS = tuple(
 """Declarations, records and progress: they change no number. Configured values reach a rule as parameters of their own."""
 
 
+def _root(package: str) -> Path | None:
+    """The folder of a package, or the path of a single module without its suffix."""
+    if package == PACKAGE_NAME:
+        return PACKAGE_FOLDER
+    found = find_spec(package)
+    if found is None or found.origin is None:
+        return None
+    return Path(found.origin).parent if found.submodule_search_locations else Path(found.origin).with_suffix("")
+
+
 @functools.cache
 def _source(module: str) -> Path | None:
-    parts = module.split(".")[1:]
-    path = PACKAGE_FOLDER.joinpath(*parts)
-    for file in (path.with_suffix(".py"), path / "__init__.py"):
-        if file.is_file():
-            return file
-    return None
+    package, *parts = module.split(".")
+    if (root := _root(package)) is None:
+        return None
+    path = root.joinpath(*parts)
+    return next((file for file in (path.with_suffix(".py"), path / "__init__.py") if file.is_file()), None)
 
 
 @functools.cache
@@ -66,19 +78,20 @@ def _statements(tree: ast.Module) -> Iterator[ast.AST]:
 
 @functools.cache
 def imported_modules(module: str) -> frozenset[str]:
-    """Package modules that `module` imports directly, anywhere in its text."""
-    found = set()
-    for node in _statements(_tree(module)):
+    """Modules of our package, and of its own, that `module` imports directly, anywhere in its text."""
+    found: set[str] = set()
+    path, own = _source(module), {PACKAGE_NAME, module.partition(".")[0]}
+    here = module if path and path.name == "__init__.py" else module.rpartition(".")[0]
+    for node in _statements(_tree(module)) if path else ():
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+        elif isinstance(node, ast.ImportFrom):
+            base = resolve_name("." * node.level + (node.module or ""), here) if node.level else node.module or ""
             # `from package import name` may name a module or something in one.
-            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+            names = [base, *(f"{base}.{alias.name}" for alias in node.names)]
         else:
             continue
-        found |= {
-            name for name in names if name.split(".")[0] == PACKAGE_NAME and name != PACKAGE_NAME and _source(name) is not None
-        }
+        found |= {name for name in names if name.split(".")[0] in own and name != PACKAGE_NAME and _source(name) is not None}
     return frozenset(found)
 
 
@@ -104,6 +117,10 @@ def _declares(module: str) -> bool:
 
 @functools.cache
 def _module_code(module: str) -> bytes:
+    if _source(module) is None:
+        package = module.partition(".")[0]
+        names = packages_distributions().get(package, [])
+        return hashlib.sha256(" ".join(f"{name} {version(name)}" for name in names).encode()).digest()
     return hashlib.sha256(_written(_tree(module)).encode()).digest()
 
 

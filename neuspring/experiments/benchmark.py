@@ -1,4 +1,8 @@
-"""A benchmark: the configuration with the rows of the three tables that it names, checked together before any job exists."""
+"""A benchmark: the configuration with the rows of the tables that it names, checked together before any job exists.
+
+`Benchmark` holds the rows, and says which method applies to which scenario; `with_search` and `with_method` lay a row's own
+settings on top of the configuration. Which jobs follow: `neuspring.experiments.graph`.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +10,7 @@ import dataclasses
 import difflib
 import fnmatch
 import shlex
-from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
-from functools import cached_property
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,8 +29,6 @@ from neuspring.twin.body import BODIES
 T = TypeVar("T")
 RESERVED = ("tables", "logs", "benchmarks", "jobs", "tune", "mlartifacts", "published", "appearance", "perception", "capture")
 """Folders of the results that are no scenarios or methods."""
-LEAST_TOGETHER = 3
-"""Fewer fits gain less from shared launches than from jobs of their own, which run at the same time."""
 REMEDY = "Name what to run on, for example --configfile config/data/demo.yaml."
 
 
@@ -42,7 +42,7 @@ def read_methods(path: Path) -> dict[str, Method]:
             raise InputError(f"{where}, fit", f"must be one of {', '.join(fits)}", repr(method.fit))
         if method.model and method.model not in BASELINES:
             raise InputError(f"{where}, model", f"must be one of {', '.join(BASELINES)}", method.model)
-        if method.settings and method.model and not BASELINES[method.model].trained:
+        if method.settings and method.model and not BASELINES[method.model].section:
             raise InputError(f"{where}, settings", f"model {method.model} has none", sorted(method.settings))
         if method.appearance is not None and not (method.model and BASELINES[method.model].own_splats):
             owners = ", ".join(name for name, baseline in BASELINES.items() if baseline.own_splats)
@@ -139,19 +139,13 @@ def with_method(config: Config, method: Method, name: str) -> Config:
     where = f"method {name}, settings"
     if method.search:
         config = dataclasses.replace(config, fit=overlaid(config.fit, method.settings, where))
-    elif method.model and BASELINES[method.model].trained:
-        section = BASELINES[method.model].section
+    elif method.model and (section := BASELINES[method.model].section):
         own = overlaid(getattr(config.baselines, section), method.settings, where)
         config = dataclasses.replace(config, baselines=dataclasses.replace(config.baselines, **{section: own}))
     if method.appearance:
         looks = overlaid(config.images.appearance, method.appearance, f"method {name}, appearance")
         config = dataclasses.replace(config, images=dataclasses.replace(config.images, appearance=looks))
     return config
-
-
-def section_of(config: Config, method: Method) -> Any:
-    """The settings of a trained baseline, in the configuration of its method."""
-    return getattr(config.baselines, BASELINES[method.model or ""].section)
 
 
 class Benchmark:
@@ -161,85 +155,112 @@ class Benchmark:
     """
 
     def __init__(self, values: Mapping[str, Any], root: Path) -> None:
-        self.root, whole = root, with_deform(parse(Config, values, "configuration"))
-        scenarios, methods = scenario_rows(whole, root), read_methods(root / whole.method_table)
-        self.studies = read_studies(root / whole.study_table)
-        """All rows of the study table; `config.studies` names those that are made without being asked for."""
-        _require_known("studies", whole.studies, self.studies, whole.study_table)
-        _require_known("methods", whole.methods, methods, whole.method_table)
-        # The methods in the rows of its studies come too. If they add any, all are in the order of the method table.
-        implied = {method for study in whole.studies for method in rows_of(self.studies, study) if method in methods}
-        if not implied <= set(whole.methods):
-            union = implied | set(whole.methods)
-            whole = dataclasses.replace(whole, methods=tuple(name for name in methods if name in union))
-        for name in ("scenarios", "methods", "seeds"):
-            if not getattr(whole, name):
-                raise InputError(f"configuration, {name}", "at least one entry is required", None, REMEDY)
-        _require_known("scenarios", whole.scenarios, scenarios, f"{whole.scenario_table}, or a capture or recording in data_root")
-        self.whole = whole = with_references(whole, scenarios, methods)
+        self.root, self.on_gpu = root, False
+        """`on_gpu`: True where jobs take GPUs; the workflow sets it."""
+        given = with_deform(parse(Config, values, "configuration"))
+        rows = scenario_rows(given, root)
+        searches = read_searches(root / given.search_table, given.clusters)
+        self.table = shared_searches(read_methods(root / given.method_table), searches)
+        self.studies = read_studies(root / given.study_table)
+        """All rows of the method and of the study table; `config` names those that are made without being asked for."""
+        self.whole = self._whole(given, rows)
         """The configuration as it was given: what tables are laid out for, whatever part of it is run now."""
-        self.config = config = chosen_part(whole, scenarios)
+        self.config = config = chosen_part(self.whole, rows)
         """With what `only` leaves of scenarios, methods and seeds."""
-        searches = read_searches(root / config.search_table, config.clusters)
-        methods = shared_searches(methods, searches)
-        wanted = tuple(dict.fromkeys(search for n in config.methods if (search := methods[n].search)))
-        _require_known("methods' search", wanted, searches, config.search_table)
-        require_metrics(config.aims)
-        _require_known("compare_with", (config.compare_with,) if config.compare_with else (), methods, config.method_table)
-        pairs = config.transfers or {}
-        everyone = tuple(name for source, names in pairs.items() for name in (source, *names))
-        _require_known("transfers", everyone, scenarios, config.scenario_table)
-        self.transfers = {source: names for source, names in pairs.items() if source in config.scenarios}
-        """Chosen scenario -> those that its twins are transferred to."""
-        _require_alike(config, scenarios, self.transfers)
-        self.pools = _pools(whole, scenarios, methods, searches)
-        """Scenario of the whole configuration -> the other recordings of its pool, where a method has one."""
-        targets = tuple(name for names in self.transfers.values() for name in names)
-        targets += tuple(other for name in config.scenarios for other in self.pools.get(name, ()))
-        self.tuned = whole.tune.scenarios or whole.scenarios if whole.tune else ()
+        self.methods = {name: self.table[name] for name in config.methods}
+        self.searches = self._searches(searches)
+        """The name of a search, which says on which recordings it is made -> its row."""
+        self.pools, self.transfers = self._groups(rows)
+        """`pools`: scenario of the whole configuration -> the other recordings of its pool, where a method has one. `transfers`:
+        chosen scenario -> those that its models are transferred to."""
+        self.tuned = self.whole.tune.scenarios or self.whole.scenarios if self.whole.tune else ()
         """The scenarios of the sweep: it keeps them, whatever part of the runs is made now."""
-        if whole.tune:
-            of = "this configuration's scenarios"
-            _require_known("tune.scenarios", whole.tune.scenarios, dict.fromkeys(whole.scenarios + targets), of)
-        self.scenarios = {n: scenarios[n] for n in dict.fromkeys(config.scenarios + targets + self.tuned)}
-        """Chosen ones, those that twins are transferred to, those of the sweep."""
-        self.whole_scenarios = {n: scenarios[n] for n in whole.scenarios}
+        others = [name for names in self.transfers.values() for name in names]
+        others += [other for name in config.scenarios for other in self.pools.get(name, ())]
+        if self.whole.tune:
+            known = dict.fromkeys([*self.whole.scenarios, *others])
+            _require_known("tune.scenarios", self.whole.tune.scenarios, known, "this configuration's scenarios")
+        self.scenarios = {name: rows[name] for name in dict.fromkeys([*config.scenarios, *others, *self.tuned])}
+        """Chosen ones, those that twins are transferred to or pooled with, those of the sweep."""
+        self.whole_scenarios = {name: rows[name] for name in self.whole.scenarios}
         """Those of the whole configuration."""
-        self.methods = {n: methods[n] for n in config.methods}
-        self.searches = {row.searched: searches[row.search] for row in self.methods.values() if row.search}
-        fitted = {n: m for n, m in methods.items() if m.fit}
-        own = {n: (m.search, m.pool, m.fit, m.oracle, with_method(config, m, n).fit) for n, m in fitted.items()}
-        self.fit_of_method = _owners(own, config.methods)
-        """Chosen method -> the method in whose folder its fit lies: the first row of the table with the same fit."""
-        looks = {n: with_method(config, m, n).images.appearance for n, m in methods.items() if m.appearance is not None}
-        self.splats_of_method = _owners(looks, config.methods)
-        """Chosen method with splats of its own -> the first row of the table with the same settings of theirs."""
-        self.fits = {n: methods[n] for n in self.fit_of_method.values()}
-        self.splats = {n: methods[n] for n in self.splats_of_method.values()}
-        self.pictured = frozenset(name for name in whole.methods if _trained_on_pictures(whole, methods[name], name))
-        """Methods of the whole configuration that are trained on pictures, so that scenarios without any are left out."""
-        self.pooled = frozenset(name for name in whole.methods if methods[name].pool)
-        """Methods of the whole configuration that are judged on a pool, so that scenarios without any are left out."""
-        self.on_gpu = False
-        """Whether jobs take GPUs."""
+        self.pictured = frozenset(
+            name
+            for name in self.whole.methods
+            if (model := self.table[name].model) and BASELINES[model].pictured(with_method(self.whole, self.table[name], name))
+        )
+        """Methods of the whole configuration that are trained on pictures."""
+        self._check()
+
+    # --- the rows that the configuration names
+
+    def _whole(self, given: Config, rows: Mapping[str, ScenarioRow]) -> Config:
+        """The configuration with all methods that stand in it by a study or by its data."""
+        _require_known("studies", given.studies, self.studies, given.study_table)
+        _require_known("methods", given.methods, self.table, given.method_table)
+        # The methods in the rows of its studies come too. If they add any, all are in the order of the method table.
+        implied = {method for study in given.studies for method in rows_of(self.studies, study) if method in self.table}
+        if not implied <= set(given.methods):
+            union = implied | set(given.methods)
+            given = dataclasses.replace(given, methods=tuple(name for name in self.table if name in union))
+        for name in ("scenarios", "methods", "seeds"):
+            if not getattr(given, name):
+                raise InputError(f"configuration, {name}", "at least one entry is required", None, REMEDY)
+        _require_known("scenarios", given.scenarios, rows, f"{given.scenario_table}, or a capture or recording in data_root")
+        compared = (given.compare_with,) if given.compare_with else ()
+        _require_known("compare_with", compared, self.table, given.method_table)
+        require_metrics(given.aims)
+        return with_references(given, rows, self.table)
+
+    def _searches(self, rows: Mapping[str, SearchRow]) -> dict[str, SearchRow]:
+        named = {row.searched: row.search for row in self.methods.values() if row.search}
+        _require_known("methods' search", tuple(dict.fromkeys(named.values())), rows, self.config.search_table)
+        if clash := sorted({row.searched for row in self.methods.values() if row.pool} & rows.keys()):
+            rule = "rows must not have the name of a search on a pool, which is its row's with the pool behind a hyphen"
+            raise InputError(self.config.search_table, rule, ", ".join(clash), "Rename the row.")
+        return {name: rows[row] for name, row in named.items()}
+
+    def _groups(self, rows: Mapping[str, ScenarioRow]) -> tuple[dict[str, tuple[str, ...]], dict[str, tuple[str, ...]]]:
+        """Pools and transfers: scenario -> recordings of the same object."""
+        transfers = self.config.transfers or {}
+        everyone = tuple(name for source, names in transfers.items() for name in (source, *names))
+        _require_known("transfers", everyone, rows, self.config.scenario_table)
+        transfers = {source: names for source, names in transfers.items() if source in self.config.scenarios}
+        _require_alike(self.config, rows, transfers, "transfers")
+        pools: dict[str, tuple[str, ...]] = {}
+        if any(self.table[name].pool for name in self.whole.methods):
+            for names in (self.whole.pools or {}).values():
+                _require_known("pools", names, rows, self.whole.scenario_table)
+                pools |= {name: tuple(other for other in names if other != name) for name in names}
+            _require_alike(self.whole, rows, pools, "pools")
+        return pools, transfers
+
+    # --- what is checked before a job starts
+
+    def _check(self) -> None:
+        folders = {*RESERVED, self.config.tables}
         for name in [*self.scenarios, *self.methods]:
-            if name in (*RESERVED, config.tables) or name.startswith("search-"):
-                rule = f"{', '.join(sorted({*RESERVED, config.tables}))} and search-... are folders of the results"
+            if name in folders or name.startswith("search-"):
+                rule = f"{', '.join(sorted(folders))} and search-... are folders of the results"
                 raise InputError("name of a scenario or method", rule, name, "Rename it.")
         for name, method in self.methods.items():
             self._check_settings(name, method)
-        self._require_data()
-        if not any(self.applies(method, scenario) for method in self.methods for scenario in config.scenarios):
+        if self.config.images.enabled:
+            # Named weights that are missing or wrong are an error before the first job.
+            configured_weights(self.config.images.lpips)
+        for name, row in self.scenarios.items():
+            self._check_data(name, row)
+        if not any(self.applies(method, scenario) for method in self.methods for scenario in self.config.scenarios):
             rule = "at least one method must apply to a scenario; what is trained on silhouettes needs images, a pool `pools`"
             remedy = "Choose scenarios with images (and images.enabled), name pools, or choose another method."
             raise InputError("configuration, methods", rule, ", ".join(self.methods), remedy)
 
     def _check_settings(self, name: str, method: Method) -> None:
-        """Settings of a method's own, before any job starts."""
         config = with_method(self.config, method, name)
         if name in self.pictured:
             # Named weights that are missing or wrong are an error before the first job.
-            BASELINES[method.model or ""].features(section_of(config, method))
+            baseline = BASELINES[method.model or ""]
+            baseline.features(baseline.settings(config))
         if not method.search:
             return
         row = self.searches[method.searched]
@@ -257,32 +278,21 @@ class Benchmark:
             rule = f"must hold the search's range of {wanted.low} to {wanted.high}, or springs start beyond their clamp"
             raise InputError(f"method {name}, fit.stiffness_range", rule, [low, high])
 
-    def pool_kind(self, job: Any) -> str | None:
-        """The pool on which the search that a job makes, or its method, is judged; None: the scenario's own recording."""
-        rows = self.fits | self.methods
-        if hasattr(job, "method"):
-            return rows[job.method].pool
-        return next((row.pool for row in rows.values() if row.search and row.searched == job.search), None)
+    def _check_data(self, name: str, row: ScenarioRow) -> None:
+        source, path = SOURCES[row.source], self.data_path(name)
+        if path is None:
+            return
+        where = f"scenario {name}"
+        if self.config.data_root is None:
+            remedy = "Give it: --config data_root=/path/to/data."
+            raise InputError(where, f"{row.source} scenarios need data_root", "null", remedy)
+        if not path.exists():
+            raise InputError(where, "its data must exist", path, "Correct data_root, or the scenario's name or path.")
+        source.required(path)
+        if source.films and not source.write_capture:
+            BACKENDS["segment"][self.config.perception.segment.backend].require(path)
 
-    def fits_together(self, scenario: str) -> tuple[tuple[str, int], ...]:
-        """The fits (method, seed) of a scenario that share launches: those in step (horizon, frames), if not too few.
-
-        None where `twins_per_launch` is 1.
-        """
-        if self.config.twins_per_launch == 1 or scenario not in self.config.scenarios:
-            return ()
-        # A fit on several recordings takes turns between them, and shares launches with nobody.
-        bodies = {name: BODIES[self.searches[method.searched].body] for name, method in self.fits.items()}
-        alone = [name for name, method in self.fits.items() if method.pool or not bodies[name].by_gradients]
-        rows = [name for name in self.fits if self.applies(name, scenario) and name not in alone]
-        seeds = self.config.seeds
-        alike = Counter(self._steps[name] for name in rows)
-        return tuple((name, seed) for name in rows if alike[self._steps[name]] * len(seeds) >= LEAST_TOGETHER for seed in seeds)
-
-    @cached_property
-    def _steps(self) -> dict[str, tuple[int, bool]]:
-        """Of each fit: frames per step, and whether it goes over all frames (an oracle) or over those before the split."""
-        return {name: (with_method(self.config, m, name).fit.horizon, m.oracle) for name, m in self.fits.items()}
+    # --- what is asked of it
 
     @property
     def compared_with(self) -> str:
@@ -295,7 +305,7 @@ class Benchmark:
         return tuple(name for name in rows_of(self.studies, study) if name in self.methods)
 
     def _row(self, name: str) -> ScenarioRow:
-        """Of a scenario, whether it is chosen or not."""
+        """Of a scenario, chosen or not."""
         return self.scenarios.get(name) or self.whole_scenarios[name]
 
     def source(self, name: str) -> Source:
@@ -307,9 +317,13 @@ class Benchmark:
         return location(self._row(name), self.config) if self.source(name).needs_data else None
 
     def has_images(self, name: str) -> bool:
-        """Whether a scenario's predictions are drawn and scored."""
+        """True for a scenario whose predictions are drawn and scored."""
         source, path = self.source(name), self.data_path(name)
         return self.config.images.enabled and (source.films or (path is not None and source.images_beside(path)))
+
+    def cameras(self, name: str) -> tuple[str, ...]:
+        """Names of a scenario's cameras, which are known before its capture is made. Raises InputError."""
+        return self.source(name).cameras(location(self._row(name), self.config), self.config)
 
     def applies(self, method: str, scenario: str) -> bool:
         """True where a method can be run on a scenario."""
@@ -317,48 +331,15 @@ class Benchmark:
 
     def why_not(self, method: str, scenario: str) -> str:
         """The reason why a method cannot be run on a scenario; empty where it can."""
-        if method in self.pooled and scenario not in self.pools:
+        if self.table[method].pool and scenario not in self.pools:
             return "it learns from a pool of recordings, and this one has none"
         return "it needs images" if method in self.pictured and not self.has_images(scenario) else ""
 
     @property
     def whole_left_out(self) -> dict[str, dict[str, str]]:
-        """Of the whole configuration: method -> the scenarios to which it does not apply, and why."""
-        some = [name for name in self.whole.methods if name in self.pictured | self.pooled]
-        without = {name: {s: why for s in self.whole_scenarios if (why := self.why_not(name, s))} for name in some}
-        return {name: scenarios for name, scenarios in without.items() if scenarios}
-
-    def capture_folder(self, name: str) -> Path:
-        """Where a scenario's capture lies: the user's folder, or one in the results that the workflow makes."""
-        own = None if self.source(name).write_capture else self.data_path(name)
-        return own or Path(self.config.results) / name / "capture"
-
-    def cameras(self, name: str) -> tuple[str, ...]:
-        """Names of a scenario's cameras, which are known before its capture is made. Raises InputError."""
-        return self.source(name).cameras(location(self._row(name), self.config), self.config)
-
-    def _require_data(self) -> None:
-        if self.config.images.enabled:
-            # Named weights that are missing or wrong are an error before the first job.
-            configured_weights(self.config.images.lpips)
-        for name, row in self.scenarios.items():
-            path = self.data_path(name)
-            if path is None:
-                continue
-            if self.config.data_root is None:
-                raise InputError(
-                    f"scenario {name}",
-                    f"{row.source} scenarios need data_root",
-                    "null",
-                    "Give it: --config data_root=/path/to/data.",
-                )
-            if not path.exists():
-                raise InputError(
-                    f"scenario {name}", "its data must exist", path, "Correct data_root, or the scenario's name or path."
-                )
-            SOURCES[row.source].required(path)
-            if SOURCES[row.source].films and not SOURCES[row.source].write_capture:
-                BACKENDS["segment"][self.config.perception.segment.backend].require(path)
+        """Methods of the whole configuration -> the scenarios to which they do not apply, and why; none where they apply to all."""
+        whole = {n: {s: why for s in self.whole_scenarios if (why := self.why_not(n, s))} for n in self.whole.methods}
+        return {name: scenarios for name, scenarios in whole.items() if scenarios}
 
 
 def with_references(config: Config, scenarios: Mapping[str, ScenarioRow], methods: Mapping[str, Method]) -> Config:
@@ -369,39 +350,9 @@ def with_references(config: Config, scenarios: Mapping[str, ScenarioRow], method
     return dataclasses.replace(config, methods=beside + config.methods) if beside else config
 
 
-def _owners(keys: Mapping[str, Any], chosen: Sequence[str]) -> dict[str, str]:
-    """Chosen row -> the first row of the table with the same key."""
-    first: dict[Any, str] = {}
-    owners = {name: first.setdefault(key, name) for name, key in keys.items()}
-    return {name: owner for name, owner in owners.items() if name in chosen}
-
-
-def _pools(
-    whole: Config, scenarios: Mapping[str, ScenarioRow], methods: Mapping[str, Method], searches: Mapping[str, SearchRow]
-) -> dict[str, tuple[str, ...]]:
-    """Scenario -> the others of its pool, of those that are in one; none where no method has a pool. Raises InputError."""
-    if not any(methods[name].pool for name in whole.methods):
-        return {}
-    taken = [name for name in searches if name.endswith(("-all", "-others"))]
-    if taken:
-        raise InputError(whole.search_table, "names that end with -all or -others belong to searches on a pool", ", ".join(taken))
-    members = {name: names for names in (whole.pools or {}).values() for name in names}
-    _require_known("pools", tuple(members), scenarios, whole.scenario_table)
-    pools = {name: tuple(other for other in names if other != name) for name, names in members.items()}
-    _require_alike(whole, scenarios, pools, "pools")
-    return pools
-
-
-def _trained_on_pictures(config: Config, method: Method, name: str) -> bool:
-    baseline = BASELINES.get(method.model or "")
-    return bool(baseline and baseline.trained and baseline.takes_pictures(section_of(with_method(config, method, name), method)))
-
-
-def _require_alike(
-    config: Config, scenarios: Mapping[str, ScenarioRow], transfers: Mapping[str, tuple[str, ...]], key: str = "transfers"
-) -> None:
-    """Twins go to recordings of the same object with as many nodes."""
-    for source, target in ((s, t) for s, targets in transfers.items() for t in targets):
+def _require_alike(config: Config, scenarios: Mapping[str, ScenarioRow], groups: Mapping[str, tuple[str, ...]], key: str) -> None:
+    """Raise InputError unless twins go to recordings of the same object with as many nodes."""
+    for source, target in ((s, t) for s, targets in groups.items() for t in targets):
         here, there = scenarios[source], scenarios[target]
         if (here.source, here.category) != (there.source, there.category):
             rule = f"{target} must be of the same object as {source}: source {here.source}, category {here.category}"

@@ -1,4 +1,4 @@
-"""What this machine can do: interpreter, libraries, devices, weights, disk, MLflow; and the next move where one is missing.
+"""What this machine can do: interpreter, libraries, devices, weights; and the next move where one is missing.
 
 broken: the configuration needs it and it is missing. absent: it is missing and not needed.
 """
@@ -6,38 +6,27 @@ broken: the configuration needs it and it is missing. absent: it is missing and 
 from __future__ import annotations
 
 import importlib.util
-import shutil
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import numpy as np
 import torch
 
 from neuspring.baselines.spring_gaus import VGG16, find_vgg16
-from neuspring.config import Config, ScenarioRow, Toy
+from neuspring.config import Config
 from neuspring.core.device import resolve_device, start_warp
 from neuspring.core.errors import InputError
 from neuspring.core.extras import EXTRAS, install
-from neuspring.core.text import masked
 from neuspring.core.weights import hub_folder
-from neuspring.data.synthetic import toy
 from neuspring.experiments import needs
-from neuspring.experiments.tracking import store
 from neuspring.perception.track_cotracker import ADDRESS, WEIGHTS
 from neuspring.scores import lpips
-from neuspring.splats.rasterize import choose_backend, rasterize
-from neuspring.splats.view import View
-from neuspring.twin.rollout import roll_out
+from neuspring.splats.rasterize import choose_backend
 
 State = Literal["ok", "absent", "broken"]
-FREE_GB = 20.0
-"""GB that the results of the whole benchmark take at most; less free space is told."""
-PARITY_POSITION, PARITY_COLOR = 2e-5, 2e-5
-"""m and intensity by which CUDA may differ from the CPU: the limits of the tests against golden clips and pictures."""
 DOWNLOAD = "curl -L --create-dirs -o"
 
 
@@ -54,7 +43,7 @@ class Check:
 
 def examine(settings: Config) -> list[Check]:
     """All checks, for what a configuration asks for."""
-    return [*_libraries(settings), *_devices(settings), *_weights(settings), *_storage(settings)]
+    return [*_libraries(settings), *_devices(settings), *_weights(settings)]
 
 
 def text(checks: list[Check]) -> str:
@@ -125,44 +114,6 @@ def _devices(settings: Config) -> Iterator[Check]:
     none = Check(leased.subject, "absent", "none: jobs run on the CPU", "Set gpus.devices, or CUDA_VISIBLE_DEVICES.")
     yield leased if leased.detail else none
     yield _checked("rasterizer", lambda: choose_backend(settings.images.backend, device))
-    if device.startswith("cuda"):
-        yield from _parity(device)
-
-
-def _parity(device: str) -> Iterator[Check]:
-    """Simulator and rasterizer on CUDA against the CPU, in a few seconds after kernels are compiled."""
-    row = ScenarioRow(
-        scenario="parity", source="toy", category="cloth", path="cloth/lift/smooth", self_collision=False, ground=True
-    )
-    scene = toy.make(row, Toy(frames=11))
-    hands = scene.observations.controller_points
-    positions = [roll_out(scene.truth, hands, where).positions for where in ("cpu", device)]
-    pictures = [_small_picture(where) for where in ("cpu", device)]
-    for what, difference, limit, unit in (
-        ("simulator", float(np.abs(positions[0] - positions[1]).max()), PARITY_POSITION, "m in 10 frames"),
-        ("rasterizer", float((pictures[0] - pictures[1]).abs().max()), PARITY_COLOR, "in color"),
-    ):
-        detail = f"{difference:.1e} {unit} from the CPU's (limit {limit:.0e})"
-        yield Check(f"{what} on {device}", "ok" if difference <= limit else "broken", detail, "Use device: cpu, and report this.")
-
-
-def _small_picture(device: str) -> torch.Tensor:
-    """RGB [H, W, 3] of 50 random splats."""
-    random, size = np.random.default_rng(0), 64
-
-    def tensor(values: Any) -> torch.Tensor:
-        return torch.tensor(np.asarray(values), dtype=torch.float32, device=device)
-
-    intrinsics = tensor([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1.0]])
-    return rasterize(
-        tensor(random.uniform([-0.4, -0.4, 0.8], [0.4, 0.4, 1.2], (50, 3))),
-        tensor(random.normal(size=(50, 4))),
-        tensor(random.uniform(0.01, 0.1, (50, 3))),
-        tensor(random.uniform(0.2, 0.9, 50)),
-        tensor(random.uniform(0, 1, (50, 3))),
-        View(torch.eye(4, device=device), intrinsics, size, size),
-        backend="warp",
-    ).rgb.cpu()
 
 
 def _weights(settings: Config) -> Iterator[Check]:
@@ -209,25 +160,3 @@ def _weights(settings: Config) -> Iterator[Check]:
     )
     detail = WEIGHTS if there else "code or weights are not in the cache of torch.hub"
     yield Check("CoTracker3", "ok" if there else "broken" if wanted else "absent", detail, remedy)
-
-
-def _storage(settings: Config) -> Iterator[Check]:
-    results = Path(settings.results)
-    place = next(folder for folder in (results.resolve(), *results.resolve().parents) if folder.is_dir())
-    free = shutil.disk_usage(place).free / 1e9
-    remedy = "Choose another folder: --config results=..."
-    yield Check("disk", "ok" if free >= FREE_GB else "absent", f"{free:.0f} GB free for {settings.results}", remedy)
-    if settings.data_root is not None:
-        there = Path(settings.data_root).is_dir()
-        yield Check("data_root", "ok" if there else "broken", str(settings.data_root), "Give the folder of the data.")
-    if not settings.tracking.enabled:
-        yield Check("MLflow store", "absent", "tracking.enabled: false")
-        return
-    uri = masked(store.uri_of(results, settings.tracking))
-    try:
-        state = "it answers" if store.find(results, settings.tracking) else "made by the first run"
-        yield Check("MLflow store", "ok", f"{uri}: {state}")
-    except Exception as error:  # whatever MLflow or a database raises
-        reason = str(error).partition("\n")[0]
-        remedy = "Start the server, or correct tracking.uri; runs wait on disk meanwhile (neuspring sync)."
-        yield Check("MLflow store", "broken", f"{uri}: {reason}", remedy)

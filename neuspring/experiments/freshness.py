@@ -1,4 +1,4 @@
-"""Whether results are what a run would make now: each stage's record against the settings, the code and the inputs of today.
+"""Results against what a run would make now: each stage's record against the settings, the code and the inputs of today.
 
 Records travel with the results folder. What Snakemake remembers in `.snakemake` does not: there a folder that was renamed, or whose
 `.snakemake` was deleted, counts as finished whatever is asked for.
@@ -13,6 +13,7 @@ import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from neuspring.core.errors import InputError
@@ -44,7 +45,7 @@ class Freshness:
         output = self.graph.output_of(stage, job)
         if output not in self.departures:
             there = Path(output).exists()
-            find = self._of_fits if stage.name == "fits" else self._of_record
+            find = self._of_shared if stage.together else self._of_record
             self.departures[output] = tuple(find(stage, job, Path(output))) if there else ()
         return self.departures[output]
 
@@ -52,8 +53,8 @@ class Freshness:
         """Lines on the runs of the configuration that are there but were made with something else; none if there are none."""
         found: dict[str, tuple[str, str, tuple[str, ...]]] = {}
         for path in self.graph.runs():
-            scenario, method, seed = Path(path).parts[-4:-1]
-            for stage, job in self.graph.behind(scenario, method, int(seed)) if Path(path).exists() else ():
+            run = SimpleNamespace(**dict(zip(("scenario", "method", "seed"), Path(path).parts[-4:-1], strict=True)))
+            for stage, job in self.graph.behind(STAGES["score"], run) if Path(path).exists() else ():
                 if departures := self.look(stage, job):
                     row = getattr(job, next((name for name in stage.wildcards if name in ("method", "search")), ""), "")
                     found[self.graph.output_of(stage, job)] = (stage.name, row, departures)
@@ -81,16 +82,18 @@ class Freshness:
             # What is not there will be made, and then this is made again too.
             if Path(path).exists() and self._digest(Path(path)) != digest:
                 yield f"input {role}"
-        images, wanted = inputs.pop(IMAGES, ""), self.graph.image_stamps(job.scenario) if "capture" in stage.inputs else ""
+        images, wanted = inputs.pop(IMAGES, ""), self.graph.rows(job).image_stamps if "capture" in stage.inputs else ""
         if wanted and images != wanted:
             yield "images"
         yield from (f"input {role}, which is no longer read" for role in inputs)
 
-    def _of_fits(self, stage: Stage, job: Any, output: Path) -> Iterator[str]:
-        """Its checkpoints are of use to fits that are still to be done; it makes no result of its own."""
-        for member in self.graph.members(job.scenario):
-            if self.look(STAGES["fit"], member) or not Path(self.graph.output_of(STAGES["fit"], member)).exists():
-                yield "its fits are not finished"
+    def _of_shared(self, stage: Stage, job: Any, output: Path) -> Iterator[str]:
+        """Its checkpoints are of use to jobs that are still to be done; it makes no result of its own."""
+        assert stage.together
+        other = STAGES[stage.together.stage]
+        for member in self.graph.in_step(stage, job.scenario):
+            if self.look(other, member) or not Path(self.graph.output_of(other, member)).exists():
+                yield f"its {stage.name} are not finished"
                 return
 
     def _roles(self, stage: Stage, job: Any) -> Mapping[str, str]:
@@ -131,7 +134,7 @@ def stamp_of(results: str, told: Iterable[str], *modules: str) -> str:
 
 
 def stamped(results: Path, log: Path, stamp: str) -> bool:
-    """Whether the last job with this log succeeded with this stamp."""
+    """True if the last job with this log succeeded with this stamp."""
     try:
         return JobRecord.load(JobRecord.of_log(results, log).path(results)).stamp == stamp
     except InputError:

@@ -1,33 +1,30 @@
 """The jobs of a benchmark: for a stage and the wildcards of a job its inputs, options, settings and code.
 
-A stage's signature says what it reads; here stands where that lies in the results folder, and what the rows of a configuration give
-it. The workflow's one rule per stage asks `inputs`, `command` and `stamp`.
+A stage declares what it reads and what of the tables concerns it (`neuspring.stages.stage`); here stands where that lies in the
+results folder. The workflow's one rule per stage asks `inputs`, `command` and `stamp`. No stage is known by name but those whose
+records tables and MLflow are made of: `score` and `transfer`.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import hashlib
 import json
 import re
 import shlex
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from neuspring.baselines import BASELINES
-from neuspring.config import Config, Search, SpringFieldSettings, plain
+from neuspring.config import Config, Method, ScenarioRow, plain
 from neuspring.config.settings import select
+from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
-from neuspring.core.provenance import image_stamps
-from neuspring.data.sources import SOURCES
-from neuspring.experiments.benchmark import Benchmark, read_methods, read_searches, section_of, with_method, with_search
-from neuspring.perception.backends import BACKENDS
-from neuspring.scores.lpips import configured_weights
-from neuspring.stages import STAGES
-from neuspring.stages.stage import Stage
+from neuspring.experiments.benchmark import Benchmark, read_methods, read_searches, with_method, with_search
+from neuspring.stages import STAGES, makers
+from neuspring.stages.stage import Member, Rows, Stage
 
 TEMPLATES = Path(__file__).parents[1] / "report" / "templates"
 SPLATS = "appearance"
@@ -42,17 +39,15 @@ NEUTRAL: dict[str, Any] = {
     "tune": None,
 }
 """Keys that no result depends on, with what stands for them where settings are compared."""
-Files = str | list[str]
-_stamps = functools.cache(image_stamps)
 
 
-def one_of(names: Sequence[str]) -> str:
+def one_of(names: Collection[str]) -> str:
     """A pattern of exactly these names; of none, one that matches nothing."""
     return "|".join(map(re.escape, names)) or "(?!)"
 
 
 class Graph:
-    """Answers for the jobs of one benchmark."""
+    """Answers for the jobs of one benchmark. A job is an object with its wildcards, such as Snakemake's."""
 
     def __init__(self, benchmark: Benchmark) -> None:
         self.benchmark, self.config = benchmark, benchmark.config
@@ -61,78 +56,121 @@ class Graph:
         """Of tables and report."""
         tune = self.config.tune
         self.sweep_folder = f"{self.results}/tune/{tune.study}" if tune else ""
-        self._texts: dict[tuple[str, str, str], str] = {}
+        self._texts: dict[tuple[Any, ...], str] = {}
+        # Thousands of jobs share a few rows.
+        self._of, self._laid = functools.cache(self._rows), functools.cache(self._lay)
+        self.owners = {one.name: self._owners(one.shared) for one in STAGES.values() if one.shared}
+        """Stage whose jobs methods share -> chosen method -> the first row of the method table with the same job."""
+        own = dict.fromkeys([*benchmark.methods, *(owner for owners in self.owners.values() for owner in owners.values())])
+        self.wildcards = {
+            "scenario": one_of(benchmark.scenarios),
+            "method": one_of(own),
+            "search": one_of(benchmark.searches),
+            "looks": one_of([SPLATS, *(f"{SPLATS}-{name}" for name in own)]),
+            "camera": r"[A-Za-z0-9][A-Za-z0-9_.-]*",
+            "seed": "|".join(map(str, self.whole.seeds)),
+            "study": one_of(benchmark.studies),
+        }
+        """Pattern of each wildcard."""
+
+    def _owners(self, shared: Callable[[Config, Method], Any]) -> dict[str, str]:
+        first: dict[Any, str] = {}
+        keys = {name: shared(self._laid(name, None), row) for name, row in self.benchmark.table.items()}
+        owners = {name: first.setdefault(key, name) for name, key in keys.items() if key is not None}
+        return {name: owner for name, owner in owners.items() if name in self.benchmark.methods}
+
+    # --- the rows behind a job
+
+    def rows(self, job: Any) -> Rows:
+        """The rows of the tables that the wildcards of a job name."""
+        method = getattr(job, "method", None)
+        if looks := getattr(job, "looks", None):
+            method = looks.removeprefix(SPLATS).removeprefix("-") or None
+        return self._of(job.scenario, method, getattr(job, "search", None))
+
+    def _rows(self, scenario: str, name: str | None, search: str | None) -> Rows:
+        known = self.benchmark
+        method = known.table[name] if name else None
+        searched = search or (method.searched if method and method.search else None)
+        pooled = any(row.pool and searched == row.searched for row in known.methods.values())
+        return Rows(
+            config=self._laid(name, searched),
+            scenario=known.scenarios[scenario],
+            source=known.source(scenario),
+            data=known.data_path(scenario),
+            images=known.has_images(scenario),
+            method=method,
+            search=known.searches[searched] if searched else None,
+            pool=known.pools.get(scenario, ()) if pooled else (),
+            targets=known.transfers.get(scenario, ()),
+        )
+
+    def _lay(self, name: str | None, searched: str | None) -> Config:
+        """The configuration with the settings of a method and of a search on top."""
+        config = with_method(self.config, self.benchmark.table[name], name) if name else self.config
+        return with_search(config, self.benchmark.searches[searched], searched) if searched else config
 
     # --- which jobs there are
 
     def constraints(self, stage: Stage) -> dict[str, str]:
-        """Patterns of a stage's wildcards, where they are narrower than those of all rules."""
-        rows = self.benchmark.methods.items()
-        sources = {name: self.benchmark.source(name) for name in self.benchmark.scenarios}
-        trained = {name for name, baseline in BASELINES.items() if baseline.trained}
+        """Patterns of a stage's wildcards: those of rows for which it has jobs."""
+        if "method" not in stage.wildcards:
+            found = [name for name in self.benchmark.scenarios if stage.when(self._of(name, None, None))]
+            return {"scenario": one_of(found)} if set(stage.wildcards) == {"scenario"} else {}
+        names = dict.fromkeys([*self.benchmark.methods, *self.owners.get(stage.name, {}).values()])
+        pairs = [(name, row) for name in names for row in self.benchmark.scenarios if stage.when(self._of(row, name, None))]
         return {
-            "capture": {"scenario": one_of([name for name, source in sources.items() if source.write_capture])},
-            "judge": {"scenario": one_of([name for name, source in sources.items() if source.has_truth])},
-            "rollout": {"method": one_of([name for name, row in rows if row.search])},
-            "predict": {"method": one_of([name for name, row in rows if row.model])},
-            "train": {"method": one_of([name for name, row in rows if row.model in trained])},
-            "appearance": {"looks": one_of([SPLATS, *(f"{SPLATS}-{name}" for name in self.benchmark.splats)])},
-        }.get(stage.name, {})
+            "scenario": one_of(dict.fromkeys(row for _, row in pairs)),
+            "method": one_of(dict.fromkeys(name for name, _ in pairs)),
+        }
 
     def earliness(self, scenario: str) -> float:
         """From 1 for the first scenario that is run down to 0."""
         names = self.config.scenarios
         return 1 - names.index(scenario) / len(names) if scenario in names else 0.0
 
-    def behind(self, scenario: str, method: str, seed: int) -> list[tuple[Stage, Any]]:
-        """The jobs behind a run's scores, but for those of one camera."""
-        row, job = self.benchmark.methods[method], SimpleNamespace(scenario=scenario, method=method, seed=seed)
-        source = self.benchmark.source(scenario)
-        names = ["capture"] * bool(source.write_capture) + ["lift"] * source.films + ["observe"]
-        jobs = [(STAGES[name], job) for name in names]
-        if row.search:
-            jobs.append((STAGES["search"], SimpleNamespace(scenario=scenario, search=row.searched, seed=seed)))
-        if owner := self.benchmark.fit_of_method.get(method):
-            jobs.append((STAGES["fit"], SimpleNamespace(scenario=scenario, method=owner, seed=seed)))
-        if row.model:
-            jobs += [(STAGES[name], job) for name in ("train", "predict") if name == "predict" or BASELINES[row.model].trained]
-        else:
-            jobs.append((STAGES["rollout"], job))
-        return [*jobs, *([(STAGES["render"], job)] if self.benchmark.has_images(scenario) else []), (STAGES["score"], job)]
-
     def judged(self, names: Sequence[str]) -> dict[str, str]:
         """Scenarios whose truth is known, and their categories."""
-        rows = self.benchmark.whole_scenarios
-        return {name: rows[name].category for name in names if SOURCES[rows[name].source].has_truth}
+        known = self.benchmark
+        return {name: known.whole_scenarios[name].category for name in names if known.source(name).has_truth}
+
+    def _records(self, stage: str, scenarios: Sequence[str], methods: Sequence[str] | None) -> list[str]:
+        """What a stage writes of all runs, or of those of some methods."""
+        return [
+            self.output_of(STAGES[stage], SimpleNamespace(scenario=scenario, method=method, seed=seed))
+            for scenario in scenarios
+            for method in (self.config.methods if methods is None else methods)
+            if self.benchmark.applies(method, scenario) and STAGES[stage].when(self._of(scenario, method, None))
+            for seed in self.config.seeds
+        ]
 
     def runs(self, methods: Sequence[str] | None = None) -> list[str]:
         """The records of all runs, or of those of some methods."""
-        return [
-            self._output("score", scenario=scenario, method=method, seed=seed)
-            for scenario in self.config.scenarios
-            for method in (self.config.methods if methods is None else methods)
-            if self.benchmark.applies(method, scenario)
-            for seed in self.config.seeds
-        ]
+        return self._records("score", self.config.scenarios, methods)
+
+    def transfers(self) -> list[str]:
+        """Records of transfers: per source, method and seed."""
+        return self._records("transfer", list(self.benchmark.transfers), None)
 
     def logged_runs(self, methods: Sequence[str] | None = None) -> list[str]:
         """Files that say that a run is in MLflow; none where tracking is off."""
         return [path.replace("run.json", "mlflow.txt") for path in self.runs(methods) if self.config.tracking.enabled]
 
-    def transfers(self) -> list[str]:
-        """Records of transfers: per source, method and seed. Oracles concern their own recording alone, and are not transferred."""
-        methods = [
-            name
-            for name, method in self.benchmark.methods.items()
-            if (method.search or (method.model and BASELINES[method.model].transfers)) and not method.oracle
-        ]
-        return [
-            self._output("transfer", scenario=scenario, method=method, seed=seed)
-            for scenario in self.benchmark.transfers
-            for method in methods
-            if self.benchmark.applies(method, scenario)
-            for seed in self.config.seeds
-        ]
+    def study_runs(self, name: str) -> list[str]:
+        """The records that a study is made of."""
+        moved = self.transfers() if self.benchmark.studies[name].clips else ()
+        return [*self.runs(self.benchmark.methods_of(name)), *moved]
+
+    def behind(self, stage: Stage, job: Any, known: set[str] | None = None) -> Iterator[tuple[Stage, Any]]:
+        """The jobs behind a job, and then itself; not those of one camera."""
+        known = set() if known is None else known
+        if "camera" in stage.wildcards or (output := self.output_of(stage, job)) in known:
+            return
+        known.add(output)
+        for name in stage.inputs:
+            for maker, other in self._makers(stage, name, job):
+                yield from self.behind(maker, other, known)
+        yield stage, job
 
     # --- what a job reads
 
@@ -140,81 +178,129 @@ class Graph:
         """Wildcards of a job -> its input files by parameter; `also`: files that it depends on beside them."""
 
         def found(wildcards: Any) -> dict[str, Any]:
-            files = {name: self._find(stage, name, wildcards) for name in stage.inputs}
-            return {name: paths for name, paths in (files | {"also": self._also(stage, wildcards)}).items() if paths}
+            files: dict[str, Any] = {}
+            for name, parameter in stage.inputs.items():
+                paths = self._find(stage, name, wildcards)
+                files[name] = paths if parameter.many else paths[0] if paths else None
+            also = [str(path) for path in stage.also(self.rows(wildcards))]
+            members = [one.inputs for one in self.members(stage, wildcards)]
+            also += dict.fromkeys(path for one in members for name, path in one.items() if name not in stage.inputs)
+            return {name: paths for name, paths in (files | {"also": also}).items() if paths}
 
         return found
 
-    def _find(self, stage: Stage, name: str, job: Any) -> Files:
+    def _find(self, stage: Stage, name: str, job: Any) -> list[str]:
         """The files of a parameter; none where a job goes without."""
-        source = self.benchmark.source(job.scenario)
-        pictured = stage.name not in ("train", "predict") or self.pictured(job)
-        match name:
-            case "capture":
-                wanted = pictured and (source.films or stage.name != "observe")
-                return f"{self.benchmark.capture_folder(job.scenario)}/capture.json" if wanted else []
-            case "masks" | "tracks":
-                if not pictured:
-                    return []
-                maker = next(other for other in STAGES.values() if other.product == name)
-                cameras = self._cameras(job.scenario) if stage.inputs[name].many else [job.camera]
-                return [self._output(maker.name, scenario=job.scenario, camera=camera) for camera in cameras]
-            case "lifted":
-                return self._output("lift", scenario=job.scenario) if source.films else []
-            case "observations":
-                # Perception's record says more than the observations where splats begin.
-                return [] if stage.name == "appearance" and source.films else self._observations(job.scenario)
-            case "pool":
-                others = self.benchmark.pools[job.scenario] if self.benchmark.pool_kind(job) else ()
-                return [self._observations(other) for other in others]
-            case "targets":
-                return [self._observations(target) for target in self.benchmark.transfers[job.scenario]]
-            case "search":
-                method = (self.benchmark.methods | self.benchmark.fits)[job.method]
-                return [] if method.model else self._search(job)
-            case "fit":
-                owner = self.benchmark.fit_of_method.get(job.method)
-                return self._output("fit", scenario=job.scenario, method=owner, seed=job.seed) if owner else []
-            case "train":
-                model = self.benchmark.methods[job.method].model
-                trained = bool(model and BASELINES[model].trained)
-                return self._output("train", scenario=job.scenario, method=job.method, seed=job.seed) if trained else []
-            case "learned":
-                return next(files for maker in ("train", "fit", "search") if (files := self._find(stage, maker, job)))
-            case "appearance":
-                if not (pictured and self.benchmark.has_images(job.scenario)):
-                    return []
-                owner = self.benchmark.splats_of_method.get(job.method)
-                looks = f"{SPLATS}-{owner}" if owner else SPLATS
-                return self._output("appearance", scenario=job.scenario, looks=looks, seed=job.seed)
-            case "render" if not self.benchmark.has_images(job.scenario):
-                return []
-        return self.output_of(next(other for other in STAGES.values() if other.product == name), job)
+        rows = self.rows(job)
+        if name in stage.without(rows):
+            return []
+        made = [self.output_of(maker, other) for maker, other in self._makers(stage, name, job)]
+        return made or [str(path) for maker in makers(name) if not maker.when(rows) and (path := maker.instead(rows))]
 
-    def _also(self, stage: Stage, job: Any) -> list[str]:
-        """Files without which a job cannot run, or whose change makes it run again, and which its command does not name."""
-        source, folder = self.benchmark.source(job.scenario), self.benchmark.data_path(job.scenario)
-        match stage.name:
-            case "capture":
-                return [str(folder / name) for name in source.capture_files if folder and (folder / name).exists()]
-            case "observe" if folder and not source.films:
-                if folder.is_file():
-                    return [str(folder)]
-                return [str(folder / name) for name in source.files if (folder / name).exists()]
-            case "lift" if self.config.perception.shape.mesh:
-                return [str(self.config.perception.shape.mesh)]
-            case "fits":
-                return list(dict.fromkeys(self._search(member) for member in self.members(job.scenario)))
-        return []
+    def _makers(self, stage: Stage, name: str, job: Any) -> list[tuple[Stage, Any]]:
+        """The jobs that make the files of a parameter: one of its maker, or one of each camera or recording."""
+        rows, parameter = self.rows(job), stage.inputs[name]
+        if name in stage.without(rows):
+            return []
+        if parameter.many and parameter.type is Observations:
+            return [(one, SimpleNamespace(scenario=other)) for one in makers("observations") for other in getattr(rows, name)]
+        found = [one for one in makers(name) if one.when(rows)]
+        if not found:
+            return []
+        maker, method = found[0], getattr(job, "method", None)
+        owners = self.owners.get(maker.name, {})
+        owner = owners.get(method or "")
+        values = {
+            "scenario": job.scenario,
+            "seed": getattr(job, "seed", None),
+            "method": owner or method,
+            "search": rows.method.searched if rows.method else None,
+            "looks": f"{SPLATS}-{owner}" if owner else SPLATS,
+        }
+        wildcards = {wildcard: values[wildcard] for wildcard in maker.wildcards if wildcard != "camera"}
+        if "camera" not in maker.wildcards:
+            return [(maker, SimpleNamespace(**wildcards))]
+        cameras = self._cameras(job.scenario) if parameter.many else [job.camera]
+        return [(maker, SimpleNamespace(**wildcards, camera=camera)) for camera in cameras]
 
-    def shared_launches(self, job: Any) -> list[str]:
-        """The record of the launches that a fit shared with others, if it is one of several."""
-        together = (job.method, int(job.seed)) in self.benchmark.fits_together(job.scenario)
-        return [self._output("fits", scenario=job.scenario)] if together else []
+    def _cameras(self, scenario: str) -> tuple[str, ...]:
+        try:
+            return self.benchmark.cameras(scenario)
+        except InputError:
+            # Damaged data must fail the jobs of their scenario, which say what is wrong, and not the planning of all.
+            return ("0",)
 
     def output_of(self, stage: Stage, job: Any) -> str:
         """The file that a job writes."""
-        return self._output(stage.name, **{name: getattr(job, name) for name in stage.wildcards})
+        return f"{self.results}/{stage.output.format(**{name: getattr(job, name) for name in stage.wildcards})}"
+
+    # --- jobs that share launches
+
+    def together(self, stage: Stage) -> Stage | None:
+        """The stage that does the jobs of a stage together; None if there is none."""
+        return next((one for one in STAGES.values() if one.together and one.together.stage == stage.name), None)
+
+    def shared_launches(self, stage: Stage, job: Any) -> list[str]:
+        """The record of the launches that a job shared with others, if it is one of several."""
+        shared, output = self.together(stage), self.output_of(stage, job)
+        if shared is None or output not in {self.output_of(stage, one) for one in self.in_step(shared, job.scenario)}:
+            return []
+        return [self.output_of(shared, job)]
+
+    def members(self, stage: Stage, job: Any) -> list[Member]:
+        """The jobs that a job does together; none for other stages."""
+        if not stage.together:
+            return []
+        other = STAGES[stage.together.stage]
+        return [
+            Member(
+                output=self.output_of(other, one),
+                inputs=self.inputs(other)(one),
+                options=self.options(other, one),
+                settings=self.settings(other, one),
+                method=one.method,
+            )
+            for one in self.in_step(stage, job.scenario)
+        ]
+
+    def in_step(self, stage: Stage, scenario: str) -> list[Any]:
+        """The jobs of a scenario that share launches: those in step, if not too few. None where `twins_per_launch` is 1."""
+        assert stage.together
+        if self.config.twins_per_launch == 1 or scenario not in self.config.scenarios:
+            return []
+        together, other = stage.together, STAGES[stage.together.stage]
+        names = [name for name in dict.fromkeys(self.owners[other.name].values()) if self.benchmark.applies(name, scenario)]
+        keys = {name: key for name in names if (key := together.key(self._of(scenario, name, None))) is not None}
+        counts, seeds = Counter(keys.values()), self.config.seeds
+        enough = [name for name, key in keys.items() if counts[key] * len(seeds) >= together.least]
+        return [SimpleNamespace(scenario=scenario, method=name, seed=seed) for name in enough for seed in seeds]
+
+    # --- what a job is told
+
+    def command(self, stage: Stage) -> Callable[..., str]:
+        """Wildcards and inputs of a job -> its command line, without where it runs and where it writes."""
+
+        def line(wildcards: Any, input: Any) -> str:
+            files = {name: _paths(input.get(name), parameter.many) for name, parameter in stage.inputs.items()}
+            text = self.settings(stage, wildcards)
+            settings = [] if text == "{}" else ["--settings", text]
+            return shlex.join([stage.name, *stage.words(files | self.options(stage, wildcards)), *settings])
+
+        return line
+
+    def options(self, stage: Stage, job: Any) -> dict[str, Any]:
+        """The options of a job's stage, by name."""
+        rows = self.rows(job)
+        given = dict(stage.given(rows))
+        if stage.together:
+            given |= stage.together.given(self.members(stage, job))
+        for name, option in stage.options.items():
+            if option.type is ScenarioRow:
+                given[name] = plain(rows.scenario)
+            elif name not in given:
+                # What rows do not tell has the default of the signature; a required one is a wildcard.
+                given[name] = getattr(job, name) if option.required else getattr(job, name, option.default)
+        return {name: given[name] for name in stage.options}
 
     def recorded(self, stage: Stage, job: Any) -> dict[str, Any]:
         """The settings and options that the record of a job would hold."""
@@ -224,183 +310,41 @@ class Graph:
         values: dict[str, Any] = json.loads(_json(json.loads(self.settings(stage, job)) | options))
         return values
 
-    def _output(self, stage: str, **wildcards: Any) -> str:
-        return f"{self.results}/{STAGES[stage].output.format(**wildcards)}"
-
-    def _observations(self, scenario: str) -> str:
-        return self._output("observe", scenario=scenario)
-
-    def _search(self, job: Any) -> str:
-        method = (self.benchmark.methods | self.benchmark.fits)[job.method]
-        return self._output("search", scenario=job.scenario, search=method.searched, seed=job.seed)
-
-    def _cameras(self, scenario: str) -> tuple[str, ...]:
-        try:
-            return self.benchmark.cameras(scenario)
-        except InputError:
-            # Damaged data must fail the jobs of their scenario, which say what is wrong, and not the planning of all.
-            return ("0",)
-
-    def pictured(self, job: Any) -> bool:
-        """Whether the method is trained on pictures, and moves splats itself."""
-        return job.method in self.benchmark.pictured
-
-    def members(self, scenario: str) -> list[Any]:
-        """The fits of a scenario that share launches."""
-        pairs = self.benchmark.fits_together(scenario)
-        return [SimpleNamespace(scenario=scenario, method=method, seed=seed) for method, seed in pairs]
-
-    # --- what a job is told
-
-    def command(self, stage: Stage) -> Callable[..., str]:
-        """Wildcards and inputs of a job -> its command line, without where it runs and where it writes."""
-
-        def line(wildcards: Any, input: Any) -> str:
-            files = {name: _paths(input.get(name), parameter.many) for name, parameter in stage.inputs.items()}
-            return shlex.join([stage.name, *stage.words(files | self.options(stage, wildcards)), *self._settings(stage, wildcards)])
-
-        return line
-
-    def _settings(self, stage: Stage, job: Any) -> list[str]:
-        text = self.settings(stage, job)
-        return [] if text == "{}" else ["--settings", text]
-
-    def options(self, stage: Stage, job: Any) -> dict[str, Any]:
-        """The options of a job's stage, by name."""
-        return {name: self._option(name, stage, job) for name in stage.options}
-
-    def _option(self, name: str, stage: Stage, job: Any) -> Any:
-        rows = self.benchmark
-        match name:
-            case "scenario":
-                return plain(rows.scenarios[job.scenario])
-            case "clusters":
-                return rows.searches[job.search].clusters
-            case "body":
-                return rows.searches[job.search].body
-            case "kind":
-                return rows.fits[job.method].fit
-            case "oracle":
-                return rows.fits[job.method].oracle
-            case "model":
-                return rows.methods[job.method].model
-            case "variant":
-                return self.variant(job)
-            case "rows":
-                return self._rows_of_fits(job.scenario)
-        # What the workflow does not know has the default of the signature; a required one is a wildcard.
-        option = stage.options[name]
-        return getattr(job, name) if option.required else getattr(job, name, option.default)
-
-    def _rows_of_fits(self, scenario: str) -> str:
-        """The fits of a scenario that share launches, by row of the method table, as JSON."""
-        rows: dict[str, dict[str, Any]] = {}
-        for member in self.members(scenario):
-            method = self.benchmark.fits[member.method]
-            row: dict[str, Any] = {"kind": method.fit, "oracle": method.oracle, "fits": {}}
-            row["settings"] = self.settings(STAGES["fit"], member)
-            made = self._output("fit", scenario=scenario, method=member.method, seed=member.seed)
-            rows.setdefault(member.method, row)["fits"][made] = self._search(member)
-        return _json(list(rows.values()))
-
-    def variant(self, job: Any) -> dict[str, Any]:
-        """The switches of a method, for the record of its run."""
-        method = self.benchmark.methods[job.method]
-        settings: dict[str, Any] = plain(method)["settings"]
-        if method.model:
-            return {"model": method.model, **settings}
-        row = self.benchmark.searches[method.searched]
-        switches: dict[str, Any] = {"search": method.search, "clusters": row.clusters, "fit": method.fit or "none"}
-        switches |= {"pool": method.pool} if method.pool else {}
-        # Named only where it is one: runs of other rows are compared with it nowhere.
-        switches |= {"oracle": True} if method.oracle else {}
-        switches |= {"released_quirks": sorted(key for key, on in row.released_quirks.items() if on)} if row.released_quirks else {}
-        return switches | settings
-
     def settings(self, stage: Stage, job: Any) -> str:
         """The settings that a stage reads, as JSON, so that changing another one runs nothing again."""
-        own = {"search": "search", "fit": "method", "train": "method", "appearance": "looks"}.get(stage.name)
         # Thousands of jobs share a few texts: those of one source and one row.
-        key = (stage.name, self.benchmark.scenarios[job.scenario].source, getattr(job, own) if own else "")
+        rows = (getattr(job, name, None) for name in ("method", "search", "looks"))
+        key = (stage.name, self.benchmark.scenarios[job.scenario].source, *rows)
         if key not in self._texts:
-            self._texts[key] = _json(stage.settings(self.config_of(stage, job), self._given(stage, job)))
+            self._texts[key] = _json(stage.settings(stage.settled(self.rows(job)), self._given(stage, job)))
         return self._texts[key]
 
     def _given(self, stage: Stage, job: Any) -> dict[str, Any]:
-        """What declarations of a stage ask for: its options, and which inputs there are."""
-        given = self.options(stage, job) if stage.name != "fits" else {}
-        method = self.benchmark.methods.get(getattr(job, "method", ""))
-        given |= {"model": method.model} if method else {}
-        if "scenario" in given:
-            given["scenario"] = self.benchmark.scenarios[job.scenario]
-        return given | {name: self._find(stage, name, job) for name in stage.inputs}
-
-    def config_of(self, stage: Stage, job: Any) -> Config:
-        """The configuration of a stage's job: with what the rows of its method and search lay on top.
-
-        What such a row does not read has its default, so that changing it does not run the job again.
-        """
-        config, rows = self.config, self.benchmark
-        if stage.name == "segment" and not rows.source(job.scenario).films:
-            # Processed data have masks; those are taken, whatever segments raw video.
-            given = dataclasses.replace(config.perception.segment, backend="given")
-            return dataclasses.replace(config, perception=dataclasses.replace(config.perception, segment=given))
-        if stage.name == "search":
-            row = rows.searches[job.search]
-            config = with_search(config, row, job.search)
-            # These concern nothing where there is one region.
-            alone: dict[str, Any] = {"tied_rollouts": Search().tied_rollouts} if row.clusters == 1 else {}
-            return dataclasses.replace(config, search=dataclasses.replace(config.search, **alone))
-        if stage.name == "fit":
-            method = rows.fits[job.method]
-            config = with_search(with_method(config, method, job.method), rows.searches[method.searched], method.searched)
-            unread: dict[str, Any] = {"field": SpringFieldSettings()} if method.fit == "springs" else {}
-            return dataclasses.replace(config, fit=dataclasses.replace(config.fit, **unread))
-        if stage.name == "train":
-            return with_method(config, rows.methods[job.method], job.method)
-        if stage.name == "appearance" and job.looks != SPLATS:
-            name = job.looks.removeprefix(f"{SPLATS}-")
-            return with_method(config, rows.splats[name], name)
-        return config
+        """Values of parameters that `reads` and `code` of a stage ask for: what rows tell, and which inputs there are."""
+        files = {name: self._find(stage, name, job) for name in stage.inputs}
+        rows = self.rows(job)
+        row = {name: rows.scenario for name, option in stage.options.items() if option.type is ScenarioRow}
+        return {**stage.given(rows), **row, **files}
 
     # --- what makes a job run again beside its command
 
     def code(self, stage: Stage, job: Any) -> str:
         """The digest of the code that makes a job's result."""
-        return stage.code_of(self.config_of(stage, job), self._given(stage, job))
+        return stage.code_of(stage.settled(self.rows(job)), self._given(stage, job))
 
     def stamp(self, stage: Stage) -> Callable[..., str]:
         """Wildcards of a job -> what no record holds of it: images that a capture is made of, weights that are there.
 
         Settings, code and inputs are compared with the records themselves (`neuspring.experiments.freshness`).
         """
-
-        def digest(wildcards: Any) -> str:
-            config, parts = self.config_of(stage, wildcards), []
-            if stage.name == "capture":
-                parts.append(self.image_stamps(wildcards.scenario))
-            if stage.name == "render":
-                parts.append("absent" if isinstance(configured_weights(self.config.images.lpips), str) else "found")
-            if stage.name == "train" and self.pictured(wildcards):
-                method = self.benchmark.methods[wildcards.method]
-                parts.append(BASELINES[method.model or ""].features(section_of(config, method)))
-            return " ".join(parts)
-
-        return digest
-
-    def image_stamps(self, scenario: str) -> str:
-        """A digest that tells changed images of the user's apart; empty where images are made here, or there are none."""
-        folder, source = self.benchmark.data_path(scenario), self.benchmark.source(scenario)
-        return _stamps(folder) if folder and (source.films or source.capture_files) else ""
+        return lambda wildcards: stage.stamp(self.rows(wildcards))
 
     def gpu(self, stage: Stage) -> Callable[..., int]:
         """Wildcards of a job -> 1 where it takes a GPU if there is one."""
 
         def taken(wildcards: Any) -> int:
-            if stage.gpu == "backend":
-                backend = getattr(self.config_of(stage, wildcards).perception, stage.name).backend
-                return int(self.benchmark.on_gpu and BACKENDS[stage.name][backend].gpu)
-            return int(self.benchmark.on_gpu and stage.gpu == "always")
+            wanted = stage.gpu(stage.settled(self.rows(wildcards))) if callable(stage.gpu) else stage.gpu
+            return int(self.benchmark.on_gpu and wanted)
 
         return taken
 

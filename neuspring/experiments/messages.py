@@ -1,15 +1,14 @@
-"""What a user is told while the workflow runs, and after it."""
+"""Messages to a user while the workflow runs, and after it."""
 
 from __future__ import annotations
 
 import json
-import math
 import shlex
 import shutil
 import subprocess
 import sys
 import threading
-import time
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import IO, Any
@@ -18,11 +17,9 @@ from neuspring.config import plain
 from neuspring.core.errors import InputError
 from neuspring.core.findings import warnings_of
 from neuspring.core.job_records import FOLDER, RUN_FILE, JobRecord, failure_lines, read_jobs, this_run
-from neuspring.core.table import Table
 from neuspring.core.text import listed
 from neuspring.experiments.freshness import told
 from neuspring.experiments.graph import Graph
-from neuspring.scores.metrics import METRICS, SHORT, TASKS
 
 MOST_FINDINGS = 20
 """Warnings that are printed at the end of a run."""
@@ -35,23 +32,17 @@ EVERY = 1.0
 
 
 class Overview:
-    """How far a quiet run is: a line per rule when its last job has succeeded, a table per scenario when its last run has scores,
-    and on a terminal a line that moves.
+    """How far a quiet run is: a line per rule when its last job has succeeded.
 
     It watches the records of the run's jobs, in a thread of its own, from `start` to `stop`.
     """
 
     def __init__(self, results: Path, logs: Iterable[Path], stream: IO[str] | None = None) -> None:
-        self._stream, self._run, self._begun = stream or sys.stdout, this_run(results), time.monotonic()
-        self._waiting: dict[str, set[Path]] = {}
-        self._scenes: dict[str, dict[Path, Path]] = {}
-        """Scenario -> the job records of its scores, and the folders of their runs."""
+        self._stream, self._run = stream or sys.stdout, this_run(results)
+        self._waiting: dict[str, set[Path]] = defaultdict(set)
         for log in logs:
             record = JobRecord.of_log(results, log)
-            self._waiting.setdefault(record.rule, set()).add(record.path(results))
-            if record.rule == "score":
-                run = results / record.name.partition("/")[2]
-                self._scenes.setdefault(run.parts[-3], {})[record.path(results)] = run
+            self._waiting[record.rule].add(record.path(results))
         self._counts = {rule: len(paths) for rule, paths in self._waiting.items()}
         self._seconds = dict.fromkeys(self._counts, 0.0)
         self._stopped = threading.Event()
@@ -70,7 +61,6 @@ class Overview:
         while not self._stopped.wait(EVERY):
             self._look()
         self._look()
-        self._show("")
 
     def _look(self) -> None:
         for rule, paths in list(self._waiting.items()):
@@ -80,20 +70,8 @@ class Overview:
             if not paths:
                 del self._waiting[rule]
                 count = self._counts[rule]
-                self._show("")
                 line = f"{rule:<17} {count:>5} job{'s' if count > 1 else ' '} {self._seconds[rule]:>8.0f} s"
                 print(line, file=self._stream, flush=True)
-        waiting = self._waiting.get("score", set())
-        for scenario in [name for name, runs in self._scenes.items() if waiting.isdisjoint(runs)]:
-            runs = self._scenes.pop(scenario)
-            # The last one is in the table of all, which follows.
-            if self._scenes:
-                self._show("")
-                print(scene_text(scenario, list(runs.values())), file=self._stream, flush=True)
-        left = {rule: len(paths) for rule, paths in self._waiting.items()}
-        total, (minutes, seconds) = sum(self._counts.values()), divmod(round(time.monotonic() - self._begun), 60)
-        begun = [f"{rule} {count - left[rule]}/{count}" for rule, count in self._counts.items() if 0 < left.get(rule, 0) < count]
-        self._show("  ".join([f"{total - sum(left.values())}/{total} jobs", *begun, f"{minutes}:{seconds:02}"]))
 
     def _ended(self, path: Path) -> float | None:
         """Seconds that a job of this run took; None while it has not succeeded."""
@@ -102,29 +80,6 @@ class Overview:
         except (InputError, IndexError):
             return None
         return last.seconds if last.run == self._run and last.outcome == "ok" else None
-
-    def _show(self, text: str) -> None:
-        """Put a text in place of the line that moves; nothing where the output is no terminal."""
-        if self._stream.isatty():
-            print(f"\r\x1b[K{text}", end="", file=self._stream, flush=True)
-
-
-def scene_text(scenario: str, runs: Sequence[Path]) -> str:
-    """A finished scenario: a table of the errors of its runs, mm, and where their films are."""
-    import pandas as pd
-
-    scores = pd.concat([pd.read_parquet(run / "scores.parquet") for run in runs])
-    scores = scores[scores["metric"].isin(name for name, metric in METRICS.items() if metric.unit == "m")]
-    if scores.empty:
-        return f"{scenario} is finished; no run has scores."
-    means = scores.groupby(["method", "task", "metric"])["value"].mean()
-    present = set(zip(scores["task"], scores["metric"], strict=True))
-    columns = [(task, name) for task in TASKS for name in METRICS if (task, name) in present]
-    header = ["Errors [mm]", *(f"{SHORT[task]} {METRICS[name].heading}" for task, name in columns)]
-    methods = list(dict.fromkeys(run.parent.name for run in runs))
-    rows = [[method, *(METRICS[key[1]].text(means.get((method, *key), math.nan)) for key in columns)] for method in methods]
-    films = sorted({f"  {run / 'video.mp4'}" for run in runs if (run / "video.mp4").is_file()})
-    return "\n".join([f"{scenario} is finished:", "", *Table.of_texts(header, rows).markdown(), "", *films])
 
 
 def replaced(jobs: Iterable[tuple[str, Any, tuple[str, ...]]]) -> str:

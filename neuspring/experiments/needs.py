@@ -1,15 +1,13 @@
-"""What the Snakefile asks before any job exists: a checked benchmark, GPUs of this machine, memory and time of jobs, the plan.
+"""Answers to the Snakefile before any job exists: a checked benchmark, GPUs of this machine, memory and time of jobs.
 
 A job asks for somewhat more than the most that earlier jobs of its rule needed, on the same scenario if there were any. Without
-earlier jobs it asks for its stage's first request (`memory_mb`, `minutes`). The plan adds up medians, and names the rules of which
-no job is on record.
+earlier jobs it asks for its stage's first request (`memory_mb`, `minutes`).
 """
 
 from __future__ import annotations
 
 import math
 import os
-import statistics
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -34,11 +32,9 @@ Key = tuple[str, Kind, str]
 HEADROOM_MEMORY, HEADROOM_TIME = 1.5, 3.0
 """What is asked for, over the most that earlier jobs needed."""
 LEAST_MEMORY, LEAST_MINUTES = 1000, 10
-IN_MINUTES = 2.0
-"""Hours below which a time is told in minutes."""
-ALWAYS_GPU = frozenset({"tune", *(name for name, stage in STAGES.items() if stage.gpu == "always")})
+ALWAYS_GPU = frozenset({"tune", *(name for name, stage in STAGES.items() if stage.gpu is True)})
 """Rules that take a GPU where there is one."""
-BACKEND_DECIDES = frozenset(name for name, stage in STAGES.items() if stage.gpu == "backend")
+BACKEND_DECIDES = frozenset(name for name, stage in STAGES.items() if callable(stage.gpu))
 """Rules whose backend decides whether they take a GPU."""
 FIRST_REQUEST = {name: (stage.memory_mb, stage.minutes) for name, stage in STAGES.items()} | {
     "tables": (2000, 10),
@@ -138,15 +134,15 @@ def check_gpus(wishes: Mapping[str, Any], pool: Sequence[str]) -> None:
 class History:
     """Earlier jobs of a results folder."""
 
-    seconds: Mapping[Key, list[float]] = field(default_factory=dict)
-    """Wall times of jobs that succeeded."""
+    seconds: Mapping[Key, float] = field(default_factory=dict)
+    """Longest wall time of jobs that succeeded."""
     memory: Mapping[Key, float] = field(default_factory=dict)
     """Largest resident memory of any attempt, MiB."""
 
     @classmethod
     def of(cls, records: Iterable[JobRecord]) -> History:
         """From job records. The time of a job is that of its last success, with the attempts that it went on from."""
-        seconds: dict[Key, list[float]] = defaultdict(list)
+        seconds: dict[Key, float] = defaultdict(float)
         memory: dict[Key, float] = defaultdict(float)
         for record in records:
             for attempt in record.attempts:
@@ -157,13 +153,9 @@ class History:
             if len(ends) > 1:
                 took = sum(attempt.seconds for attempt in record.attempts[ends[-2] + 1 : ends[-1] + 1])
                 for scenario in {"", record.scenario}:
-                    seconds[record.rule, record.attempts[ends[-1]].kind, scenario].append(took)
+                    key = (record.rule, record.attempts[ends[-1]].kind, scenario)
+                    seconds[key] = max(seconds[key], took)
         return cls(dict(seconds), dict(memory))
-
-    def expected(self, rule: str, kind: Kind, scenario: str) -> float | None:
-        """The median time of jobs of a rule, s: on the scenario, else on all; None where there was none."""
-        times = self.seconds.get((rule, kind, scenario)) or self.seconds.get((rule, kind, ""))
-        return statistics.median(times) if times else None
 
 
 class Needs:
@@ -185,7 +177,7 @@ class Needs:
     def minutes(self, rule: str) -> Callable[..., int]:
         """(wildcards, attempt) -> minutes to ask for: three times the longest that earlier jobs took."""
         _, first = FIRST_REQUEST[rule]
-        return self._request(rule, first, LEAST_MINUTES, lambda key: HEADROOM_TIME * max(self.history.seconds.get(key, [0.0])) / 60)
+        return self._request(rule, first, LEAST_MINUTES, lambda key: HEADROOM_TIME * self.history.seconds.get(key, 0.0) / 60)
 
     def _request(self, rule: str, first: int, least: int, known: Callable[[Key], float]) -> Callable[..., int]:
         """`known`: what earlier jobs call for; 0 where there are none."""
@@ -202,53 +194,3 @@ class Needs:
             return once if attempt == 1 else attempt * max(once, first)
 
         return asked
-
-
-def planned(jobs: Iterable[Any], needs: Needs) -> list[Key]:
-    """Jobs of Snakemake's DAG; targets, which have no log, do nothing."""
-    return [
-        (
-            JobRecord.of_log(needs.results, Path(job.log[0])).rule,
-            "gpu" if job.resources.get("gpu") else "cpu",
-            getattr(job.wildcards, "scenario", ""),
-        )
-        for job in jobs
-        if len(job.log)
-    ]
-
-
-def plan(jobs: Iterable[Key], history: History, slots: Mapping[Kind, int]) -> str:
-    """How many jobs there are, and the CPU- and GPU-time that they would take if each took the median of earlier ones."""
-    hours: dict[tuple[str, Kind], float] = defaultdict(float)
-    counts: dict[tuple[str, Kind], int] = defaultdict(int)
-    unknown: dict[str, int] = defaultdict(int)
-    for rule, kind, scenario in jobs:
-        counts[rule, kind] += 1
-        seconds = history.expected(rule, kind, scenario)
-        if seconds is None:
-            unknown[rule] += 1
-        else:
-            hours[rule, kind] += seconds / 3600
-    if not counts:
-        return ""
-    totals: dict[Kind, float] = {kind: sum(v for (_, k), v in hours.items() if k == kind) for kind in ("gpu", "cpu")}
-    parts = [duration(totals[kind], f"{kind.upper()}-", 1 if totals[kind] < 100 else 0) for kind in totals if totals[kind]]
-    lines = [f"Expected: {sum(counts.values())} jobs, {' and '.join(parts) or 'no time on record'}."]
-    largest = sorted(hours, key=lambda key: -hours[key])[: 5 if sum(totals.values()) >= IN_MINUTES else None]
-    for rule, kind in largest:
-        lines.append(f"  {rule}: {counts[rule, kind]} jobs, {duration(hours[rule, kind], f'{kind.upper()}-', 2)}")
-    if used := [kind for kind in totals if totals[kind] and slots.get(kind)]:
-        places = " and ".join(f"{slots[kind]} {'GPU slots' if kind == 'gpu' else 'cores'}" for kind in used)
-        lines.append(f"  with {places}: at least {duration(max(totals[kind] / slots[kind] for kind in used), '', 1)}")
-    if unknown:
-        jobs_of = ", ".join(f"{rule} ({count})" for rule, count in sorted(unknown.items()))
-        lines.append(f"  no earlier job of the rule in this results folder, not counted: {jobs_of}")
-    return "\n".join(lines)
-
-
-def duration(hours: float, of: str, digits: int) -> str:
-    """Hours in words, below two of them in minutes; `of` stands before the unit (GPU-, CPU-)."""
-    if hours >= IN_MINUTES:
-        return f"{hours:.{digits}f} {of}hours"
-    minutes = 60.0 * hours
-    return f"{minutes:.0f} {of}minutes" if minutes >= 1.0 else f"less than 1 {of}minute"

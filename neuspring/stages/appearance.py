@@ -32,9 +32,13 @@ NEAR_SEEN = 1.5
         # Perception has not lifted the masks of processed data.
         *(() if given.get("lifted") else ("perception.lift",)),
     ),
-    gpu="always",
+    gpu=True,
     memory_mb=8000,
     minutes=240,
+    when=lambda rows: rows.images,
+    # Perception's record says more than the observations where splats begin.
+    without=lambda rows: ("observations",) if rows.source.films else (),
+    shared=lambda config, row: None if row.appearance is None else config.images.appearance,
 )
 def appearance(
     capture: Capture,

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from neuspring.config import Config, ScenarioRow
+from neuspring.data.capture import CAPTURE
 from neuspring.data.sources import SOURCES, write_capture
-from neuspring.stages.stage import stage
+from neuspring.stages.stage import stage, there
 
 
 @stage(
@@ -14,6 +15,10 @@ from neuspring.stages.stage import stage
     reads=lambda settings, given: SOURCES[given["scenario"].source].reads,
     code=lambda settings, given: (SOURCES[given["scenario"].source].module,),
     minutes=120,
+    when=lambda rows: rows.source.write_capture,
+    instead=lambda rows: rows.data / CAPTURE if rows.data else None,
+    also=lambda rows: there(rows.data, rows.source.capture_files),
+    stamp=lambda rows: rows.image_stamps,
 )
 def capture(scenario: ScenarioRow, settings: Config, output: Path) -> None:
     """Synthetic scene or PhysTwin's raw layout -> capture folder, whose capture.json is `output`.

@@ -2,27 +2,39 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from neuspring.config import Config
+from neuspring.config import Config, SpringFieldSettings
 from neuspring.core.artifacts import Observations
 from neuspring.core.records import Before, Recorder
-from neuspring.stages.stage import Written, stage
+from neuspring.stages.stage import Rows, Written, stage
 from neuspring.twin.body import body_of, code
 
 if TYPE_CHECKING:
     from neuspring.twin.fit import FitProblem
 
 
+def _settled(rows: Rows) -> Config:
+    """The configuration; free springs have no field."""
+    if rows.method is None or rows.method.fit != "springs":
+        return rows.config
+    return dataclasses.replace(rows.config, fit=dataclasses.replace(rows.config.fit, field=SpringFieldSettings()))
+
+
 @stage(
     output="{scenario}/{method}/{seed}/fit.json",
     reads=("fit", "simulation", "losses", "released_quirks"),
     code=lambda settings, given: code(),
-    gpu="always",
+    gpu=True,
     memory_mb=8000,
     minutes=480,
+    when=lambda rows: bool(rows.method and rows.method.fit),
+    given=lambda rows: {"kind": rows.method.fit, "oracle": rows.method.oracle} if rows.method else {},
+    settled=_settled,
+    shared=lambda config, row: (row.search, row.pool, row.fit, row.oracle, config.fit) if row.fit else None,
 )
 def fit(
     observations: Observations,

@@ -18,7 +18,8 @@ from neuspring.core.artifacts import Observations
 from neuspring.core.records import Recorder, StageRecord
 from neuspring.stages import fit as alone
 from neuspring.stages.search import launch_size
-from neuspring.stages.stage import Job, Written, json_value, read_settings, stage
+from neuspring.stages.stage import Job, Member, Rows, Together, Written, json_value, read_settings, stage
+from neuspring.twin.body import BODIES
 
 if TYPE_CHECKING:
     from neuspring.twin.batch import Lane
@@ -46,10 +47,29 @@ class FitJob:
     key: str
 
 
+def _in_step(rows: Rows) -> tuple[int, bool] | None:
+    """Frames per step, and True for an oracle, which goes over all frames and not over those before the split alone.
+
+    None for a fit on several recordings, which takes turns between them, and for a body that is fitted without gradients.
+    """
+    row, search = rows.method, rows.search
+    if row is None or row.pool or search is None or not BODIES[search.body].by_gradients:
+        return None
+    return rows.config.fit.horizon, row.oracle
+
+
+def _rows(members: Sequence[Member]) -> dict[str, str]:
+    rows: dict[str, dict[str, Any]] = {}
+    for one in members:
+        row = {"kind": one.options["kind"], "oracle": one.options["oracle"], "settings": one.settings, "fits": {}}
+        rows.setdefault(one.method, row)["fits"][one.output] = one.inputs["search"]
+    return {"rows": json.dumps(list(rows.values()), sort_keys=True)}
+
+
 @stage(
     output="{scenario}/fits.json",
-    reads=(),
-    gpu="always",
+    together=Together(stage="fit", key=_in_step, least=3, given=_rows),
+    gpu=True,
     memory_mb=16000,
     minutes=960,
 )

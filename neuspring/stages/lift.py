@@ -15,6 +15,8 @@ from neuspring.stages.stage import Written, paths, stage
     reads=("perception.lift", "perception.shape", "perception.color"),
     memory_mb=8000,
     minutes=60,
+    when=lambda rows: rows.source.films,
+    also=lambda rows: [mesh] if (mesh := rows.config.perception.shape.mesh) else [],
 )
 def lift(capture: Capture, masks: Sequence[Before], tracks: Sequence[Before], settings: Config, run: Recorder) -> Written:
     """Masks and tracks of all cameras -> points in the world, shape prior: lifted.npz, shape.npz and lifted.png.

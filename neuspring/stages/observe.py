@@ -9,7 +9,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.records import CAPTURE_FOLDER, Before, Recorder
 from neuspring.data.capture import Capture
 from neuspring.data.sources import SOURCES, read_observations
-from neuspring.stages.stage import stage
+from neuspring.stages.stage import stage, there
 
 
 @stage(
@@ -20,6 +20,8 @@ from neuspring.stages.stage import stage
         else SOURCES[given["scenario"].source].reads
     ),
     code=lambda settings, given: () if SOURCES[given["scenario"].source].films else (SOURCES[given["scenario"].source].module,),
+    without=lambda rows: () if rows.source.films else ("capture",),
+    also=lambda rows: () if rows.source.films else there(rows.data, rows.source.files),
 )
 def observe(
     scenario: ScenarioRow, settings: Config, output: Path, capture: Capture | None = None, lifted: Before | None = None

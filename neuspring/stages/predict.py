@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from neuspring.baselines import BASELINES
+from neuspring.baselines import BASELINES, without_pictures
 from neuspring.core.artifacts import Observations, SplatCenters
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.records import Before, Recorder
@@ -17,8 +17,11 @@ if TYPE_CHECKING:
 @stage(
     output="{scenario}/{method}/{seed}/rollout.json",
     code=lambda settings, given: BASELINES[given["model"]].modules if given["model"] in BASELINES else (),
-    gpu="always",
+    gpu=True,
     minutes=60,
+    when=lambda rows: bool(rows.method and rows.method.model),
+    without=lambda rows: without_pictures(rows.method, rows.config),
+    given=lambda rows: {"model": rows.method and rows.method.model},
 )
 def predict(
     observations: Observations,

@@ -13,13 +13,20 @@ from neuspring.core.artifacts import Observations, SplatCenters, Trajectory
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.records import Before, Recorder
 from neuspring.data.capture import CAPTURE, Capture
-from neuspring.stages.stage import MayFail, Written, paths, require_length, stage
+from neuspring.stages.stage import MayFail, Rows, Written, paths, require_length, stage
 
 if TYPE_CHECKING:
     from neuspring.config.images import Images
     from neuspring.splats.model import Gaussians, Splats
 
 VIDEOS = ("video", "turntable")
+
+
+def _weights(rows: Rows) -> str:
+    """Optional weights, without which one metric is left out."""
+    from neuspring.scores.lpips import configured_weights
+
+    return "absent" if isinstance(configured_weights(rows.config.images.lpips), str) else "found"
 
 
 @stage(
@@ -32,9 +39,11 @@ VIDEOS = ("video", "turntable")
         "images.released_quirks",
         "images.corner_pixels",
     ),
-    gpu="always",
+    gpu=True,
     memory_mb=8000,
     minutes=120,
+    when=lambda rows: rows.images,
+    stamp=_weights,
 )
 def render(
     capture: Capture,

@@ -8,7 +8,13 @@ from neuspring.stages.stage import Written, stage
 from neuspring.twin.body import body_of, code
 
 
-@stage(output="{scenario}/{method}/{seed}/rollout.json", code=lambda settings, given: code(), gpu="always", minutes=60)
+@stage(
+    output="{scenario}/{method}/{seed}/rollout.json",
+    code=lambda settings, given: code(),
+    gpu=True,
+    minutes=60,
+    when=lambda rows: rows.search is not None,
+)
 def rollout(observations: Observations, learned: Before, run: Recorder, device: str = "auto") -> Written:
     """Twin -> trajectory over all frames, trajectory.npz. A rollout that diverges is recorded as a failure.
 

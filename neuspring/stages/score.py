@@ -8,12 +8,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from neuspring.config import plain
 from neuspring.core import provenance
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.records import StageRecord, digest_file, now
 from neuspring.core.run_folder import RunFolder
 from neuspring.core.run_record import RunRecord, flat, key_of
-from neuspring.stages.stage import MayFail, stage
+from neuspring.stages.stage import MayFail, Rows, stage
 from neuspring.twin.body import code, lines_of
 
 PICTURE_ROLES = ("strip", "video", "turntable")
@@ -27,7 +28,23 @@ FEW_TEXELS = 0.05
 """A share of texels that moved below this says that the settings were in training's way."""
 
 
-@stage(output="{scenario}/{method}/{seed}/run.json", code=lambda settings, given: code())
+def _variant(rows: Rows) -> dict[str, Any]:
+    """The switches of a method, for the record of its run."""
+    if rows.method is None:
+        return {}
+    own: dict[str, Any] = plain(rows.method)["settings"]
+    if rows.search is None:
+        return {"variant": {"model": rows.method.model, **own}}
+    switches: dict[str, Any] = {"search": rows.method.search, "clusters": rows.search.clusters, "fit": rows.method.fit or "none"}
+    switches |= {"pool": rows.method.pool} if rows.method.pool else {}
+    # Named only where it is one: runs of other rows are compared with it nowhere.
+    switches |= {"oracle": True} if rows.method.oracle else {}
+    quirks = rows.search.released_quirks
+    switches |= {"released_quirks": sorted(key for key, on in quirks.items() if on)} if quirks else {}
+    return {"variant": switches | own}
+
+
+@stage(output="{scenario}/{method}/{seed}/run.json", code=lambda settings, given: code(), given=_variant)
 def score(
     observations: Observations,
     rollout: MayFail,

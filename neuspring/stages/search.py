@@ -2,26 +2,37 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
-from neuspring.config import Config
+from neuspring.config import Config, Search
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.core.records import Recorder
-from neuspring.stages.stage import Written, stage
+from neuspring.stages.stage import Rows, Written, stage
 from neuspring.twin.body import BODIES, SearchOptions
 
 READS = ("search", "simulation", "losses", "released_quirks")
+
+
+def _settled(rows: Rows) -> Config:
+    """The configuration; a body of one region has none to tie."""
+    if rows.search is None or rows.search.clusters > 1:
+        return rows.config
+    return dataclasses.replace(rows.config, search=dataclasses.replace(rows.config.search, tied_rollouts=Search().tied_rollouts))
 
 
 @stage(
     output="{scenario}/search-{search}/{seed}/search.json",
     reads=lambda settings, given: (*READS, *BODIES[given["body"]].reads),
     code=lambda settings, given: (BODIES.module_of(given["body"]),),
-    gpu="always",
+    gpu=True,
     memory_mb=8000,
     minutes=240,
+    when=lambda rows: rows.search is not None,
+    given=lambda rows: {"clusters": rows.search.clusters, "body": rows.search.body} if rows.search else {},
+    settled=_settled,
 )
 def search(
     observations: Observations,

@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 from neuspring.config import Config
 from neuspring.core.errors import InputError
 from neuspring.core.records import Recorder
 from neuspring.data.capture import Capture
 from neuspring.perception.backends import BACKENDS, backend_keys, backend_modules, segmentation
-from neuspring.stages.stage import Written, stage
+from neuspring.stages.stage import Rows, Written, stage
+
+
+def _settled(rows: Rows) -> Config:
+    """The configuration; processed data have masks, and those are taken, whatever segments raw video."""
+    if rows.source.films:
+        return rows.config
+    perception = rows.config.perception
+    given = dataclasses.replace(perception.segment, backend="given")
+    return dataclasses.replace(rows.config, perception=dataclasses.replace(perception, segment=given))
 
 
 @stage(
     output="{scenario}/perception/{camera}/masks.json",
     reads=lambda settings, given: (*backend_keys("segment", settings.perception.segment.backend), "perception.segment.verdict"),
     code=lambda settings, given: backend_modules("segment", settings.perception.segment.backend),
-    gpu="backend",
+    gpu=lambda settings: BACKENDS["segment"][settings.perception.segment.backend].gpu,
     memory_mb=8000,
     minutes=120,
+    settled=_settled,
 )
 def segment(capture: Capture, camera: str, settings: Config, run: Recorder, device: str = "auto") -> Written:
     """One camera of a capture -> masks: masks.npz and masks.png."""

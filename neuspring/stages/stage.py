@@ -16,31 +16,38 @@ rule, the digests of the inputs and the settings in the record, the passing on o
 | `run` | the `Recorder` of the record to be; a stage without one writes its product, its parameter `output`, beside its record |
 | `device`, `threads`, `twins_per_launch` | where and how it runs, which changes no result and stands in no record |
 
-An input has the name of the file that it is: `masks` is the masks.json that stage `segment` writes, `search` a search.json.
+An input has the name of the file that it is: `masks` is the masks.json that stage `segment` writes, `search` a search.json. One
+that is a sequence of observations has the name of a field of `Rows`, which lists the recordings: `pool`, `targets`.
+
+The workflow asks the declarations of a stage with the `Rows` behind a job: where there are such jobs, which inputs one goes
+without, what the tables tell its options, what makes it run again beside its record. It knows no stage by name.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import inspect
 import json
 import re
 import types
 import typing
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from neuspring import config
-from neuspring.config import Config, ScenarioRow
+from neuspring.config import Config, Method, ScenarioRow, SearchRow
 from neuspring.config.settings import select
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.provenance import code_digest, image_stamps
 from neuspring.core.records import Before, Recorder
 from neuspring.data.capture import CAPTURE, Capture
+
+if TYPE_CHECKING:
+    from neuspring.data.sources import Source
 
 PLACES = ("device", "threads", "twins_per_launch")
 """Parameters that say where and how a stage runs."""
@@ -80,20 +87,76 @@ class Parameter:
     type: Any
     """Of its value, or of the entries of a sequence; without what says that it may be left out."""
     many: bool
-    """Whether it is a sequence."""
+    """True for a sequence."""
     default: Any
     note: str
     """The text beside the type, for the help of the command."""
 
     @property
     def is_input(self) -> bool:
-        """Whether it names files."""
+        """True for names of files."""
         return self.type in LOADERS
 
     @property
     def required(self) -> bool:
-        """Whether it must be given."""
+        """True where it must be given."""
         return self.default is inspect.Parameter.empty
+
+
+_stamps = functools.cache(image_stamps)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rows:
+    """The rows of a benchmark's tables behind a job: what declarations of its stage are asked with."""
+
+    config: Config
+    """With the settings of the method and of the search on top."""
+    scenario: ScenarioRow
+    source: Source
+    data: Path | None
+    """Folder or file of the scenario's data; None for scenes that are made here."""
+    images: bool
+    """True where predictions are drawn and scored."""
+    method: Method | None = None
+    """Of the wildcard `method`, or of `looks`; None where a job belongs to no method."""
+    search: SearchRow | None = None
+    """Of the wildcard `search`, or of the method; None for models of baselines."""
+    pool: tuple[str, ...] = ()
+    """The other recordings of the pool, of a method that has one."""
+    targets: tuple[str, ...] = ()
+    """Recordings to which the scenario's models are transferred."""
+
+    @property
+    def image_stamps(self) -> str:
+        """A digest that tells changed images of the user's apart; empty where images are made here, or there are none."""
+        return _stamps(self.data) if self.data and (self.source.films or self.source.capture_files) else ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Member:
+    """A job that shares launches with others."""
+
+    output: str
+    inputs: Mapping[str, Any]
+    options: Mapping[str, Any]
+    settings: str
+    """As JSON."""
+    method: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Together:
+    """The declaration of a stage whose jobs do those of another one together, as far as that goes, and make no result."""
+
+    stage: str
+    """The other one, whose jobs go on from there."""
+    key: Callable[[Rows], Any]
+    """Jobs of equal key are in step; None: that one is done alone."""
+    least: int
+    """Fewer in step are left to jobs of their own."""
+    given: Callable[[Sequence[Member]], Mapping[str, Any]]
+    """Values of options."""
 
 
 @dataclass(frozen=True)
@@ -118,11 +181,29 @@ class Stage:
     """Keys of the settings that it reads; or from the settings and the values of all parameters to these keys."""
     code: Callable[[Config, Mapping[str, Any]], Sequence[str]] = lambda settings, values: ()
     """Modules that it imports by name: backends, readers, baselines."""
-    gpu: Literal["never", "backend", "always"] = "never"
-    """Whether its jobs take a GPU where there is one; `backend`: its backend decides."""
+    gpu: bool | Callable[[Config], bool] = False
+    """True where its jobs take a GPU if there is one; or from the settings."""
     memory_mb: int = 4000
     minutes: int = 30
     """What its first jobs ask for, before any was measured."""
+    when: Callable[[Rows], bool] = lambda rows: True
+    """True where there is such a job."""
+    instead: Callable[[Rows], Path | None] = lambda rows: None
+    """The user's file that later stages take where there is no such job."""
+    without: Callable[[Rows], Collection[str]] = lambda rows: ()
+    """Inputs that a job goes without."""
+    given: Callable[[Rows], Mapping[str, Any]] = lambda rows: {}
+    """Options whose values stand in rows; others are wildcards, or have the default of the signature."""
+    settled: Callable[[Rows], Config] = lambda rows: rows.config
+    """The configuration with defaults for what such a job does not read, so that a change of it runs nothing again."""
+    also: Callable[[Rows], Iterable[Path]] = lambda rows: ()
+    """Files without which a job cannot run, or whose change runs it again, and which its command does not name."""
+    stamp: Callable[[Rows], str] = lambda rows: ""
+    """What makes a job run again and stands in no record: images that a capture is made of, weights that are there."""
+    shared: Callable[[Config, Method], Any] | None = None
+    """From a method and its configuration, what its result depends on: methods with the same share the job of the first one in the
+    table. None: it has no such job, or, without this declaration, each method has its own."""
+    together: Together | None = None
 
     # --- what it declares
 
@@ -151,12 +232,12 @@ class Stage:
         """The pattern that names its jobs in logs and job records."""
         return "/".join(f"{{{name}}}" for name in self.wildcards)
 
-    @cached_property
+    @functools.cached_property
     def signature(self) -> Mapping[str, inspect.Parameter]:
         """The parameters of the function, as Python has them."""
         return inspect.signature(self.function).parameters
 
-    @cached_property
+    @functools.cached_property
     def parameters(self) -> dict[str, Parameter]:
         """All parameters but the settings and the record."""
         hints, found = typing.get_type_hints(self.function, include_extras=True), {}
@@ -176,12 +257,12 @@ class Stage:
             found[name] = Parameter(kind, many, declared.default, note)
         return found
 
-    @cached_property
+    @functools.cached_property
     def inputs(self) -> dict[str, Parameter]:
         """The files that it reads."""
         return {name: parameter for name, parameter in self.parameters.items() if parameter.is_input}
 
-    @cached_property
+    @functools.cached_property
     def options(self) -> dict[str, Parameter]:
         """What it is told beside files and settings."""
         return {n: p for n, p in self.parameters.items() if not p.is_input and n not in (*PLACES, "output")}
@@ -197,8 +278,7 @@ class Stage:
 
     def code_of(self, values: Config, given: Mapping[str, Any]) -> str:
         """The digest of the code that makes it, given these values of its parameters."""
-        own = self.function.__module__
-        return code_digest(*([own] if own.startswith("neuspring.") else ()), *self.code(values, given))
+        return code_digest(self.function.__module__, *self.code(values, given))
 
     def settings(self, values: Config, given: Mapping[str, Any]) -> dict[str, Any]:
         """The part of the settings that the stage reads, given these values of its parameters."""
@@ -361,6 +441,13 @@ def json_value(option: str, text: str, kind: type = dict) -> Any:
 def paths(records: Iterable[Before]) -> list[Path]:
     """Where the records are."""
     return [before.path for before in records]
+
+
+def there(data: Path | None, names: Sequence[str]) -> list[Path]:
+    """The files of these names in a folder of the user's that are there; data that are one file are that file."""
+    if data is None:
+        return []
+    return [data] if data.is_file() else [data / name for name in names if (data / name).exists()]
 
 
 def require_length(capture: Capture, observations: Observations) -> None:

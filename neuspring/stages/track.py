@@ -13,7 +13,7 @@ from neuspring.stages.stage import Written, stage
     output="{scenario}/perception/{camera}/tracks.json",
     reads=lambda settings, given: (*backend_keys("track", settings.perception.track.backend), "perception.seed"),
     code=lambda settings, given: backend_modules("track", settings.perception.track.backend),
-    gpu="backend",
+    gpu=lambda settings: BACKENDS["track"][settings.perception.track.backend].gpu,
     memory_mb=8000,
     minutes=120,
 )

@@ -5,30 +5,39 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from neuspring.baselines import BASELINES
+from neuspring.baselines import BASELINES, without_pictures
 from neuspring.config import Config
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.core.records import Before, Recorder
 from neuspring.data.capture import Capture
-from neuspring.stages.stage import Written, paths, stage
+from neuspring.stages.stage import Rows, Written, paths, stage
 
 
 def _reads(settings: Config, given: Any) -> tuple[str, ...]:
     baseline = BASELINES.get(given["model"])
-    if baseline is None or not baseline.section:
+    if baseline is None:
         return ()
-    section = getattr(settings.baselines, baseline.section)
-    return (f"baselines.{baseline.section}", *baseline.reads(section))
+    return (*([f"baselines.{baseline.section}"] if baseline.section else []), *baseline.reads(baseline.settings(settings)))
+
+
+def _stamp(rows: Rows) -> str:
+    """Optional weights, where pictures are trained on."""
+    baseline = BASELINES[rows.method.model or ""] if rows.method else None
+    return baseline.features(baseline.settings(rows.config)) if baseline and baseline.pictured(rows.config) else ""
 
 
 @stage(
     output="{scenario}/{method}/{seed}/train.json",
     reads=_reads,
     code=lambda settings, given: BASELINES[given["model"]].modules if given["model"] in BASELINES else (),
-    gpu="always",
+    gpu=True,
     memory_mb=8000,
     minutes=480,
+    when=lambda rows: bool(rows.method and rows.method.model and BASELINES[rows.method.model].trained),
+    without=lambda rows: without_pictures(rows.method, rows.config),
+    given=lambda rows: {"model": rows.method and rows.method.model},
+    stamp=_stamp,
 )
 def train(
     observations: Observations,

@@ -9,16 +9,24 @@ from neuspring.baselines import BASELINES
 from neuspring.config import Config
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.records import Recorder
-from neuspring.stages.stage import MayFail, Written, stage
+from neuspring.stages.stage import MayFail, Rows, Written, stage
 from neuspring.twin.body import body_of, code
+
+
+def _moves(rows: Rows) -> bool:
+    """True for models that other recordings can take. Oracles concern their own recording alone."""
+    row = rows.method
+    return bool(rows.targets and row and not row.oracle and (row.search or BASELINES[row.model or ""].transfers))
 
 
 @stage(
     output="{scenario}/{method}/{seed}/transfer.json",
     reads=("simulation",),
     code=lambda settings, given: BASELINES[given["model"]].modules if given["model"] in BASELINES else code(),
-    gpu="always",
+    gpu=True,
     minutes=60,
+    when=_moves,
+    given=lambda rows: {"model": rows.method and rows.method.model},
 )
 def transfer(
     targets: Sequence[Observations],

@@ -125,3 +125,19 @@ def test_the_digest_is_that_of_every_version_of_python():
     function.newer = "something"
     assert provenance._written(tree) != written
     assert "value=0" in written
+
+
+def test_modules_of_other_packages_count_with_what_they_import_of_their_own(tmp_path, monkeypatch):
+    """A baseline that an installed package adds: its module, and the modules of its package behind it."""
+    package = tmp_path / "elsewhere"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "model.py").write_text('"""A model."""\nfrom .rates import RATE\nfrom neuspring.core.text import listed\n')
+    (package / "rates.py").write_text("RATE = 1.0\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    before = digest("elsewhere.model")
+    assert {"elsewhere.model", "elsewhere.rates", "neuspring.core.text"} <= set(provenance.used_modules("elsewhere.model"))
+    edit(package / "model.py", "A model.", "Another text.")
+    assert digest("elsewhere.model") == before
+    edit(package / "rates.py", "1.0", "2.0")
+    assert digest("elsewhere.model") != before

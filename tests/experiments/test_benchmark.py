@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import functools
 import json
 import re
@@ -394,8 +395,8 @@ def test_what_is_trained_on_silhouettes_needs_images_and_is_left_out_elsewhere(t
     left_out = {"toy_rope_lift_smooth": "it needs images"}
     assert made.whole_left_out == {"spring_gaus": left_out, "spring_gaus_few": left_out}
     # The same splats are made once; who trains on points draws with those of all methods.
-    assert made.splats_of_method == {"spring_gaus": "spring_gaus", "spring_gaus_few": "spring_gaus"}
-    assert list(made.splats) == ["spring_gaus"] and not made.fits and not made.searches
+    assert Graph(made).owners == {"appearance": {"spring_gaus": "spring_gaus", "spring_gaus_few": "spring_gaus"}, "fit": {}}
+    assert not made.searches
     blind = Benchmark(values | {"images": {"enabled": False}}, ROOT)
     assert blind.whole_left_out["spring_gaus"] == dict.fromkeys(values["scenarios"], "it needs images")
 
@@ -411,13 +412,12 @@ def test_twins_of_cables_move_only_where_all_have_as_many_nodes(tmp_path: Path) 
 
 
 def pooled(folder: Path, **changes: object) -> Benchmark:
-    """Two methods on the pool of a rope, and the same two alone."""
-    row = "{name}: {{search: uniform, fit: springs, pool: {pool}, description: x}}\n"
-    write(folder / "pooled.yaml", METHODS + row.format(name="one", pool="all") + row.format(name="two", pool="all"))
+    """A method on the pool of a rope, and the same alone."""
+    write(folder / "pooled.yaml", METHODS + "one: {search: uniform, fit: springs, pool: all, description: x}\n")
     toys = "".join(f"{name}\ttoy\trope\trope/lift/smooth\tfalse\ttrue\n" for name in ("a", "b", "c"))
     write(folder / "toys.tsv", HEADER + toys + "cloth\ttoy\tcloth\tcloth/lift/smooth\tfalse\ttrue\n")
     chosen: dict[str, object] = {"scenario_table": "toys.tsv", "method_table": "pooled.yaml", "pools": {"rope": ["a", "b", "c"]}}
-    return benchmark(folder, **(chosen | {"scenarios": ["a"], "methods": ["full", "one", "two"]} | changes))
+    return benchmark(folder, **(chosen | {"scenarios": ["a"], "methods": ["full", "one"]} | changes))
 
 
 def test_methods_on_a_pool_have_searches_and_fits_of_their_own(tmp_path: Path) -> None:
@@ -425,19 +425,24 @@ def test_methods_on_a_pool_have_searches_and_fits_of_their_own(tmp_path: Path) -
     assert made.pools["a"] == ("b", "c")
     assert list(made.scenarios) == ["a", "b", "c"], "the others are observed too"
     assert list(made.searches) == ["uniform", "uniform-all"]
-    assert made.fit_of_method == {"full": "full", "one": "one", "two": "one"}
     graph = Graph(made)
+    assert graph.owners["fit"] == {"full": "full", "one": "one"}
     jobs = {name: SimpleNamespace(scenario="a", method=name, seed=0) for name in made.methods}
     found = [graph.inputs(STAGES["fit"])(job) for job in jobs.values()]
     assert [files["search"] for files in found] == [
-        f"results/a/{name}/0/search.json" for name in ("search-uniform", "search-uniform-all", "search-uniform-all")
+        f"results/a/{name}/0/search.json" for name in ("search-uniform", "search-uniform-all")
     ]
     others = ["results/b/observations.npz", "results/c/observations.npz"]
-    assert [files.get("pool", []) for files in found] == [[], others, others]
+    assert [files.get("pool", []) for files in found] == [[], others]
     searches = [SimpleNamespace(scenario="a", search=name, seed=0) for name in made.searches]
     assert [graph.inputs(STAGES["search"])(job).get("pool", []) for job in searches] == [[], others]
-    assert [graph.variant(job).get("pool") for job in jobs.values()] == [None, "all", "all"]
-    assert graph.variant(jobs["one"])["clusters"] == 1
+    assert [variant(graph, job).get("pool") for job in jobs.values()] == [None, "all"]
+    assert variant(graph, jobs["one"])["clusters"] == 1
+
+
+def variant(graph: Graph, job: SimpleNamespace) -> dict[str, Any]:
+    found: dict[str, Any] = graph.options(STAGES["score"], job)["variant"]
+    return found
 
 
 def test_a_new_stage_s_options_have_their_defaults_and_a_required_one_is_a_wildcard(tmp_path: Path) -> None:
@@ -446,20 +451,23 @@ def test_a_new_stage_s_options_have_their_defaults_and_a_required_one_is_a_wildc
         raise AssertionError("not run")
 
     graph = Graph(benchmark(tmp_path))
-    assert graph.options(extent, SimpleNamespace(scenario="a", seed=3)) == {"seed": 3, "quantile": 0.5}
+    assert graph.options(extent, SimpleNamespace(scenario="rope", seed=3)) == {"seed": 3, "quantile": 0.5}
     with pytest.raises(AttributeError, match="seed"):
-        graph.options(extent, SimpleNamespace(scenario="a"))
+        graph.options(extent, SimpleNamespace(scenario="rope"))
 
 
 def test_scenarios_without_a_pool_are_left_out_of_its_methods_which_share_no_launches(tmp_path: Path) -> None:
     made = pooled(tmp_path, scenarios=["a", "cloth"], seeds=[0, 1, 2], twins_per_launch=8)
-    why = {"cloth": "it learns from a pool of recordings, and this one has none"}
-    assert made.whole_left_out == {"one": why, "two": why}
+    assert made.whole_left_out == {"one": {"cloth": "it learns from a pool of recordings, and this one has none"}}
     assert [path for path in Graph(made).runs() if "cloth" in path] == [f"results/cloth/full/{seed}/run.json" for seed in range(3)]
     assert made.applies("one", "a")
-    assert made.fits_together("a") == (("full", 0), ("full", 1), ("full", 2))
+    assert in_step(made, "a") == [("full", 0), ("full", 1), ("full", 2)]
     alone = pooled(tmp_path, methods=["full"])
     assert (alone.pools, list(alone.scenarios)) == ({}, ["a"]), "no pool is asked for without such a method"
+
+
+def in_step(made: Benchmark, scenario: str) -> list[tuple[str, int]]:
+    return [(job.method, job.seed) for job in Graph(made).in_step(STAGES["fits"], scenario)]
 
 
 def test_oracles_on_a_pool_have_fits_of_their_own_over_all_frames(tmp_path: Path) -> None:
@@ -468,13 +476,10 @@ def test_oracles_on_a_pool_have_fits_of_their_own_over_all_frames(tmp_path: Path
     write(tmp_path / "more.yaml", (tmp_path / "pooled.yaml").read_text() + oracle)
     made = pooled(tmp_path, method_table="more.yaml", methods=["one", "oracle"])
     assert list(made.searches) == ["uniform-all"], "no search alone is needed"
-    assert made.fit_of_method == {"one": "one", "oracle": "oracle"}
     graph = Graph(made)
+    assert graph.owners["fit"] == {"one": "one", "oracle": "oracle"}
     jobs = [SimpleNamespace(scenario="a", method=name, seed=0) for name in made.methods]
-    assert [(graph.variant(job).get("oracle"), graph.variant(job)["pool"]) for job in jobs] == [
-        (None, "all"),
-        (True, "all"),
-    ]
+    assert [(variant(graph, job).get("oracle"), variant(graph, job)["pool"]) for job in jobs] == [(None, "all"), (True, "all")]
     assert "released_quirks" in json.loads(graph.settings(STAGES["fit"], jobs[1]))
 
 
@@ -482,7 +487,7 @@ def test_oracles_on_a_pool_have_fits_of_their_own_over_all_frames(tmp_path: Path
     ("changes", "message"),
     [
         ({"pools": None, "methods": ["one"]}, r"at least one method must apply to a scenario.* a pool `pools`"),
-        ({"pools": {"more": ["b", "c"]}, "methods": ["one", "two"]}, r"at least one method must apply"),
+        ({"pools": {"more": ["b", "c"]}, "methods": ["one"]}, r"at least one method must apply"),
         ({"pools": {"rope": ["a"]}}, r"pools: at least two scenarios each"),
         ({"pools": {"rope": ["a", "b"], "more": ["a", "c"]}}, r"every scenario in one pool at most"),
         ({"pools": {"rope": ["a", "nobody"]}}, r"configuration, pools: every entry must be a row of toys\.tsv"),
@@ -538,7 +543,7 @@ def test_every_configuration_that_is_shipped_is_valid(overlays, tmp_path):
             (tmp_path / row.path).touch()
     benchmark = Benchmark(values, ROOT)
     assert benchmark.compared_with in benchmark.methods
-    assert set(benchmark.fits) <= set(tables.read_methods(ROOT / "config" / "methods.yaml"))
+    assert set(Graph(benchmark).owners["fit"]) == {name for name, row in benchmark.methods.items() if row.fit}
     if benchmark.config.tune:
         assert Plan.of(benchmark.config, benchmark.config.tune, ROOT)
 
@@ -630,7 +635,7 @@ def jobs_of(graph: Graph, files: list[str]) -> Counter[str]:
         [(stage, match)] = found
         job = SimpleNamespace(**match.groupdict())
         counts[stage.name] += 1
-        inputs = graph.inputs(stage)(job) | ({"shared": graph.shared_launches(job)} if stage.name == "fit" else {})
+        inputs = graph.inputs(stage)(job) | {"shared": graph.shared_launches(stage, job)}
         waiting += [path for value in inputs.values() for path in ([value] if isinstance(value, str) else value)]
     return counts
 
@@ -673,7 +678,8 @@ def test_every_method_that_is_shipped_is_valid():
     values = config.read_yaml(ROOT / "config" / "data" / "demo.yaml") | {"methods": list(methods)}
     made = Benchmark(values, ROOT)
     # No two rows are the same: each has a fit of its own, the oracle too. But one has as many regions as `clusters` says.
-    assert {name: owner for name, owner in made.fit_of_method.items() if name != owner} == {"clusters_5": "neuspring"}
+    owners = Graph(made).owners["fit"]
+    assert {name: owner for name, owner in owners.items() if name != owner} == {"clusters_5": "neuspring"}
     regions = {name: made.searches[row.searched].clusters for name, row in made.methods.items() if name.startswith("clusters_")}
     assert regions == {name: int(name.removeprefix("clusters_")) for name in regions}
 
@@ -728,7 +734,7 @@ def test_unknown_rows_are_refused_with_one_that_is_spelled_alike():
 
 def test_fits_of_equal_horizon_share_launches_where_they_are_not_too_few():
     def pairs(**changes):
-        return Benchmark(shipped("toy") | changes, ROOT).fits_together("toy_rope_lift_smooth")
+        return tuple(in_step(Benchmark(shipped("toy") | changes, ROOT), "toy_rope_lift_smooth"))
 
     # `baseline` takes a frame per step, `neuspring` ten: with two seeds each has one other in step.
     assert pairs(seeds=[0, 1]) == ()
@@ -753,9 +759,9 @@ def test_quirks_of_a_search_row_reach_its_search_and_its_fits_alone() -> None:
             assert found["released_quirks"] == dict.fromkeys(config.plain(config.ReleasedQuirks()), on)
     fitted = settings("fit", method="phystwin_released")["fit"]
     assert (fitted["horizon"], fitted["learning_rate"]) == (1, 1e-3)
-    variant = graph.variant(SimpleNamespace(method="phystwin_released"))
-    assert variant["released_quirks"] == sorted(config.plain(config.ReleasedQuirks()))
-    assert "released_quirks" not in graph.variant(SimpleNamespace(method="baseline"))
+    runs = [SimpleNamespace(scenario=values["scenarios"][0], method=name, seed=0) for name in ("phystwin_released", "baseline")]
+    assert variant(graph, runs[0])["released_quirks"] == sorted(config.plain(config.ReleasedQuirks()))
+    assert "released_quirks" not in variant(graph, runs[1])
 
 
 def test_the_released_rows_have_the_released_search() -> None:
@@ -856,10 +862,10 @@ def job(name: str) -> SimpleNamespace:
 def test_an_oracle_has_a_fit_of_its_own_is_named_in_its_record_and_is_not_transferred() -> None:
     made = oracles(seeds=[0, 1, 2], transfers={SCENES[0]: [SCENES[1]]})
     graph, fit = Graph(made), STAGES["fit"]
-    assert made.fit_of_method["oracle_neuspring"] == "oracle_neuspring"
-    assert [graph.variant(job(name)).get("oracle") for name in NAMES] == [None, None, True]
+    assert graph.owners["fit"]["oracle_neuspring"] == "oracle_neuspring"
+    assert [variant(graph, job(name)).get("oracle") for name in NAMES] == [None, None, True]
     plain = {"search": "uniform", "clusters": 1, "fit": "springs"}
-    assert graph.variant(job("baseline")) == plain | made.methods["baseline"].settings
+    assert variant(graph, job("baseline")) == plain | made.methods["baseline"].settings
     # Settings and inputs are those of another row.
     assert graph.settings(fit, job("oracle_neuspring")) == graph.settings(fit, job("neuspring"))
     assert graph.inputs(fit)(job("oracle_neuspring")) == graph.inputs(fit)(job("neuspring"))
@@ -873,3 +879,15 @@ def test_no_sweep_chooses_by_an_oracle():
     tune = parse(Tune, values, "x")
     with pytest.raises(InputError, match="an oracle sees the future"):
         Plan.of(config.Config(), tune, ROOT)
+
+
+def test_the_graph_asks_stages_and_compares_no_name_of_one() -> None:
+    """No `match`, and no comparison of a stage's name with a text: what a stage is like it declares itself."""
+    for name in ("graph", "freshness", "needs"):
+        tree = ast.parse((ROOT / "neuspring" / "experiments" / f"{name}.py").read_text())
+        nodes = list(ast.walk(tree))
+        assert not [node for node in nodes if isinstance(node, ast.Match)]
+        compared = [ast.unparse(node) for node in nodes if isinstance(node, ast.Compare)]
+        assert not [text for text in compared if ".name" in text and re.search(rf"['\"]({'|'.join(STAGES)})['\"]", text)]
+    rules = "\n".join(path.read_text() for path in (ROOT / "workflow" / "rules").glob("*.smk"))
+    assert not re.search(r"STAGE\.name ==|stage\.name ==", rules)

@@ -160,7 +160,7 @@ def test_an_error_of_the_gpu_that_may_be_the_job_s_own_does_not_stop_the_next_jo
     assert run(results, code, "--gpus", "1").returncode == 1
     assert run(results, "print('ran')", "--gpus", "1").stdout == "ran\n"
     # It worked, so nothing is left against it.
-    assert gpus.Notes.load(results / "jobs" / GPU_NOTES).failures == {}
+    assert gpus.failures(results / "jobs" / GPU_NOTES) == {}
 
 
 def test_a_command_that_cannot_be_started_ends_with_its_cause_and_is_not_tried_again(results, tmp_path):

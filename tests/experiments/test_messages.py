@@ -1,12 +1,8 @@
 """Lines that tell how far a run is."""
 
 import io
-from pathlib import Path
 from types import SimpleNamespace
 
-import pandas as pd
-
-from neuspring.core.files import write_table, write_text
 from neuspring.core.job_records import Attempt, JobRecord, begin_run, this_run
 from neuspring.experiments.messages import Overview, failed
 
@@ -33,40 +29,6 @@ def test_a_rule_is_told_once_when_its_last_job_of_this_run_has_succeeded(tmp_pat
     overview.start()
     overview.stop()
     assert stream.getvalue().split() == ["fit", "2", "jobs", "5", "s"]
-
-
-def scores(run: Path, chamfer: float) -> None:
-    rows = [(task, "chamfer", chamfer, "m") for task in ("reconstruction", "future")] + [("future", "psnr", 30.0, "dB")]
-    table = pd.DataFrame(rows, columns=["task", "metric", "value", "unit"]).assign(method=run.parent.name)
-    write_table(table, run / "scores.parquet")
-
-
-def test_a_scenario_is_shown_when_its_last_run_has_its_scores_but_not_the_last_scenario(tmp_path):
-    begin_run(tmp_path)
-    stream = io.StringIO()
-    runs = [f"{scenario}/{method}/0" for scenario in ("rope", "cloth") for method in ("search_only", "neuspring")]
-    overview = Overview(tmp_path, [tmp_path / "logs" / "score" / f"{run}.log" for run in runs], stream)
-    for index, run in enumerate(runs):
-        scores(tmp_path / run, 0.01 / (index + 1))
-    write_text(tmp_path / "rope/neuspring/0/video.mp4", "a film")
-    save(tmp_path, f"score/{runs[0]}")
-    overview._look()
-    assert stream.getvalue() == ""
-    save(tmp_path, f"score/{runs[1]}")
-    overview._look()
-    overview._look()
-    assert stream.getvalue() == (
-        "rope is finished:\n\n"
-        "| Errors [mm] | Recon. CD | Future CD |\n"
-        "|-------------|-----------|-----------|\n"
-        "| search_only | 10.00     | 10.00     |\n"
-        "| neuspring   | 5.00      | 5.00      |\n"
-        f"\n  {tmp_path}/rope/neuspring/0/video.mp4\n"
-    )
-    for run in runs[2:]:
-        save(tmp_path, f"score/{run}")
-    overview._look()
-    assert "cloth" not in stream.getvalue(), "the table of all scenarios follows"
 
 
 def interrupted(results, **outcomes):

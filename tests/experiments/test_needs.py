@@ -1,4 +1,4 @@
-"""What jobs ask for and what a run is expected to take, from the records of earlier jobs; GPUs that jobs may lease."""
+"""Memory and time that jobs ask for, from the records of earlier jobs; GPUs that jobs may lease."""
 
 from types import SimpleNamespace
 
@@ -10,7 +10,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.job_records import Attempt, JobRecord
 from neuspring.experiments import needs
 from neuspring.experiments.benchmark import Benchmark
-from neuspring.experiments.needs import History, Needs, plan
+from neuspring.experiments.needs import History, Needs
 from tests.support.project import ROOT, config_with
 
 
@@ -23,42 +23,13 @@ def record(rule, scenario, *attempts, devices=(), memory=0.0):
     return JobRecord(rule=rule, name=f"{rule}/{scenario}", log="", attempts=made, scenario=scenario)
 
 
-def job(rule, kind="cpu"):
-    return rule, kind, "rope"
-
-
-def test_a_job_is_expected_to_take_the_median_of_its_scenario_else_of_all():
-    times = {"rope": 20, "cloth": 90, "toy": 40}
-    history = History.of([record("fit", name, (seconds, "ok")) for name, seconds in times.items()])
-    assert {name: history.expected("fit", "cpu", name) for name in (*times, "unknown")} == times | {"unknown": 40}
-    assert history.expected("fit", "gpu", "rope") is None
-    assert history.expected("search", "cpu", "rope") is None
-
-
 def test_attempts_that_failed_say_nothing_of_time_but_of_memory():
     history = History.of([record("fit", "rope", (3, "transient"), memory=900.0)])
     assert history == History({}, {("fit", "cpu", ""): 900.0, ("fit", "cpu", "rope"): 900.0})
 
 
 def test_a_job_that_went_on_after_a_kill_took_as_long_as_all_its_attempts():
-    assert History.of([record("fit", "rope", (50, "ok"), (900, "killed"), (50, "ok"))]).seconds["fit", "cpu", "rope"] == [950]
-
-
-def test_the_plan_counts_hours_slots_and_what_is_unknown():
-    history = History.of([record("fit", "rope", (3600, "ok"), devices=["0"]), record("observe", "rope", (36, "ok"))])
-    jobs = [job("fit", kind="gpu")] * 80 + [job("observe")] * 10 + [job("unheard_of")]
-    lines = plan(jobs, history, {"gpu": 8, "cpu": 0}).splitlines()
-    assert lines[0] == "Expected: 91 jobs, 80.0 GPU-hours and 6 CPU-minutes."
-    assert lines[1] == "  fit: 80 jobs, 80.00 GPU-hours"
-    assert lines[-2] == "  with 8 GPU slots: at least 10.0 hours"
-    assert lines[-1].endswith("not counted: unheard_of (1)")
-    assert plan([], history, {}) == ""
-
-
-def test_a_plan_without_any_earlier_job_counts_jobs_alone():
-    text = plan([job("fit"), job("fit"), job("score")], History(), {"gpu": 0, "cpu": 2})
-    assert text.splitlines()[0] == "Expected: 3 jobs, no time on record."
-    assert "fit (2), score (1)" in text and "at least" not in text
+    assert History.of([record("fit", "rope", (50, "ok"), (900, "killed"), (50, "ok"))]).seconds["fit", "cpu", "rope"] == 950
 
 
 def test_a_cluster_is_asked_for_what_earlier_jobs_needed_and_for_more_at_each_attempt(tmp_path):

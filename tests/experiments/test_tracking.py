@@ -193,9 +193,7 @@ def test_a_failed_run_is_logged_as_failed(results: Path) -> None:
     assert set(run.data.metrics) == {"seconds.fit"}
 
 
-def test_a_killed_logger_leaves_one_closed_and_one_complete_run(
-    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_killed_logger_leaves_one_complete_run(results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from mlflow import MlflowClient
 
     record, mark = write_run(results), tmp_path / "uploading"
@@ -212,22 +210,18 @@ def test_a_killed_logger_leaves_one_closed_and_one_complete_run(
     while not mark.exists():
         assert time.monotonic() < deadline and logger.is_alive()
         time.sleep(0.05)
-    (alive,) = runs_of(results)
-    client = client_of(results)
-    assert not tracking._close_if_free(client, alive, tracking_store.lock_path(results, alive.data.tags["run_key"]))
+    assert len(runs_of(results)) == 1
     logger.kill()
     logger.join()
 
-    assert tracking.sync(results, SETTINGS) == {"closed": ["rope/ours/0"], "logged": ["rope/ours/0"]}
-    states = {run.info.status: run.data.tags for run in runs_of(results)}
-    assert set(states) == {"KILLED", "FINISHED"} and len(runs_of(results)) == 2
-    assert states["KILLED"]["superseded"] == "true" and "logged" not in states["KILLED"]
-    assert states["FINISHED"]["logged"] == "complete"
+    assert tracking.sync(results, SETTINGS) == {"logged": ["rope/ours/0"]}
+    (run,) = runs_of(results)
+    assert run.info.status == "FINISHED" and run.data.tags["logged"] == "complete"
     assert tracking.sync(results, SETTINGS) == {"already logged": ["rope/ours/0"]}
 
 
 @pytest.mark.parametrize("status", ["RUNNING", "FINISHED"])
-def test_log_run_closes_leftovers_of_its_record(results: Path, status: str) -> None:
+def test_log_run_deletes_leftovers_of_its_record(results: Path, status: str) -> None:
     """FINISHED without the last tag: killed between the two last requests."""
     record = write_run(results)
     tracking.init(results, SETTINGS)
@@ -238,8 +232,7 @@ def test_log_run_closes_leftovers_of_its_record(results: Path, status: str) -> N
     if status != "RUNNING":
         client.set_terminated(leftover, status)
     assert tracking.log_run(record, results, SETTINGS) == "logged"
-    assert client.get_run(leftover).info.status == "KILLED"
-    assert client.get_run(leftover).data.tags["superseded"] == "true"
+    assert client.get_run(leftover).info.lifecycle_stage == "deleted"
     assert tracking.sync(results, SETTINGS) == {"already logged": ["rope/ours/0"]}
     assert client.get_run(stranger).info.status == "RUNNING"
 
@@ -263,7 +256,7 @@ def test_a_server_that_fails_midway_leaves_nothing_double(results: Path, monkeyp
         patched.setattr(MlflowClient, "log_artifact", lambda *_: (_ for _ in ()).throw(OSError("No space left on device")))
         assert tracking.log_run(record, results, SETTINGS) == "unreachable: No space left on device"
     assert tracking.log_run(record, results, SETTINGS) == "logged"
-    assert sorted(run.info.status for run in runs_of(results)) == ["FINISHED", "KILLED"]
+    assert [run.info.status for run in runs_of(results)] == ["FINISHED"]
 
 
 def test_processes_that_log_the_same_records_at_once_double_none(results: Path) -> None:

@@ -69,16 +69,14 @@ def all_runs(results: Path, settings: Tracking) -> list[Any]:
 
 
 def assert_every_run_is_there_once(results: Path, settings: Tracking, groups: list[list[Path]]) -> None:
-    """Complete runs are the records on disk, one each; nothing runs any more; what was cut off is closed and marked."""
+    """Complete runs are the records on disk, one each; what was cut off is deleted."""
     runs = all_runs(results, settings)
     complete = Counter(run.info.run_name for run in runs if tracking_store.is_complete(run))
     records = [path.parent.relative_to(results).as_posix() for group in groups for path in group]
     assert complete == Counter(records)
-    others = [run for run in runs if not tracking_store.is_complete(run)]
-    assert {(run.info.status, run.data.tags.get("superseded")) for run in others} <= {("KILLED", "true")}
     for run in runs:
-        if tracking_store.is_complete(run):
-            assert run.data.params["fit.epochs"] == "3" and run.data.metrics["future.chamfer"] == 0.005
+        assert tracking_store.is_complete(run)
+        assert run.data.params["fit.epochs"] == "3" and run.data.metrics["future.chamfer"] == 0.005
 
 
 def kill_in_the_middle(index: int, out: Path, process: subprocess.Popen[str], results: Path, settings: Tracking) -> None:
@@ -137,7 +135,6 @@ def test_a_server_killed_under_load_loses_and_doubles_no_run(tmp_path: Path, bac
     # A run whose last tag arrived, but not the answer, is said to be unreachable and is there.
     assert synced["already logged"] >= outcomes["logged"]
     assert_every_run_is_there_once(results, settings, groups)
-    assert "KILLED" in {run.info.status for run in all_runs(results, settings)}, "what the killed logger had begun"
     assert {name: len(of) for name, of in tracking.sync(results, settings).items()} == {"already logged": 20}
 
 

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import json
+import pkgutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import pytest
 
-from neuspring import config
+from neuspring import config, stages
 from neuspring.config import Config
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.records import Before, Recorder, StageRecord, digest_file
-from neuspring.stages import LEARNED, STAGES
+from neuspring.stages import FLOW, LEARNED, STAGES
 from neuspring.stages.stage import MayFail, Written, stage
 from tests.support import small
 
@@ -130,3 +131,7 @@ def test_options_of_the_workflow_survive_the_command_line():
     variant = {"search": "uniform", "clusters": 5}
     words = STAGES["score"].words({"observations": "o", "rollout": "r", "method": "m", "variant": variant})
     assert STAGES["score"].parse([*words, "--output", "x"])["variant"] == json.loads(json.dumps(variant))
+
+
+def test_every_module_is_listed_in_the_flow():
+    assert {found.name for found in pkgutil.iter_modules(stages.__path__)} == {*FLOW.split(), "stage"}

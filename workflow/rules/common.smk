@@ -20,7 +20,7 @@ from neuspring.core.errors import InputError
 from neuspring.experiments import needs
 from neuspring.experiments.benchmark import for_targets
 from neuspring.experiments.freshness import Freshness, stamp_of, stamped
-from neuspring.experiments.graph import Graph, one_of
+from neuspring.experiments.graph import Graph
 from neuspring.experiments.jobs import warm, wrapper
 from neuspring.stages import STAGES
 
@@ -134,17 +134,12 @@ shell.prefix(job_prefix())
 
 
 wildcard_constraints:
-    scenario=one_of(BENCHMARK.scenarios),
-    method=one_of(BENCHMARK.methods | BENCHMARK.fits),
-    search=one_of(BENCHMARK.searches),
-    camera=r"[A-Za-z0-9][A-Za-z0-9_.-]*",
-    seed="|".join(map(str, BENCHMARK.whole.seeds)),
-    study=one_of(BENCHMARK.studies),
+    **GRAPH.wildcards,
 
 
 def priority_of(stage):
     """Jobs for a GPU first, then those of earlier scenarios: the first scenario is finished long before the last one."""
-    first = GPU_FIRST if stage.gpu != "never" else 0
+    first = GPU_FIRST if stage.gpu else 0
     return lambda wildcards: first + GRAPH.earliness(wildcards.scenario)
 
 
@@ -185,6 +180,22 @@ def unfinished(stage, wildcards):
     """Whether what a job makes is not there, or departs from what it would make now."""
     there = Path(GRAPH.output_of(stage, wildcards)).exists()
     return not there or bool(FRESH.look(stage, wildcards))
+
+
+def shared_launches(stage):
+    """The record of the launches that a job shared with others, as an input of a stage whose jobs may be done together.
+
+    Their checkpoints, from which a job goes on, are those that it would have left alone. But behind a job that is made again Snakemake
+    overlooks what is missing, if all that it reads is ancient.
+    """
+
+    def found(wildcards):
+        paths = GRAPH.shared_launches(stage, wildcards)
+        return (
+            paths if unfinished(stage, wildcards) else [ancient(path) for path in paths]
+        )
+
+    return {"shared": found} if GRAPH.together(stage) else {}
 
 
 def compared_with_stamp(log, output, stamp):
@@ -236,7 +247,7 @@ def stage_job(stage):
         "twins_per_launch": CONFIG.twins_per_launch,
     }
     where = [f"--{name.replace('_', '-')} {places[name]}" for name in stage.places]
-    gpus = "--gpus {resources.gpu}" if stage.gpu != "never" else ""
+    gpus = "--gpus {resources.gpu}" if stage.gpu else ""
     return wrapped(
         f"--scenario {{wildcards.scenario}} {gpus}",
         " ".join(["{params.command}", *where, "--output {output:q}"]),

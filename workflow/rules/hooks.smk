@@ -23,19 +23,11 @@ def tell_what_is_made_again():
     )
 
 
-def plan_of_run():
-    """How much time the run is expected to take."""
-    slots = {
-        "cpu": 0 if CLUSTER else workflow.cores,
-        "gpu": workflow.global_resources["gpu"].value if POOL else 0,
-    }
-    jobs = needs.planned(workflow.dag.needrun_jobs(exclude_finished=False), NEEDS)
-    print(needs.plan(jobs, NEEDS.history, slots), flush=True)
+def tell_without_gpu():
     if GPU and not CLUSTER and not POOL:
         print(
             "There is no GPU here: device: cuda will be refused when this is no dry run."
         )
-    return jobs
 
 
 def begin():
@@ -49,9 +41,8 @@ def begin():
     begin_run(Path(RESULTS))
     tell_what_is_made_again()
     RUN.begun = time.monotonic()
-    if not QUIET:
-        plan_of_run()
-    else:
+    tell_without_gpu()
+    if QUIET:
         jobs = [
             job
             for job in workflow.dag.needrun_jobs(exclude_finished=False)
@@ -74,15 +65,15 @@ def end():
         RUN.warm.wait()
 
 
-def plan_of_dry_run():
-    # Snakemake has no hook for the end of a dry run.
+def end_of_dry_run():
+    # Snakemake has no hook for it.
     if workflow.dryrun and workflow.dag:
         tell_what_is_made_again()
-        plan_of_run()
+        tell_without_gpu()
 
 
 if workflow.is_main_process:
-    atexit.register(plan_of_dry_run)
+    atexit.register(end_of_dry_run)
 
 
 def finish():

@@ -1,5 +1,5 @@
 # One rule per stage. What a job reads stands in the signature of its function, neuspring/stages/<rule>.py; where that lies, what its
-# options are and what makes it run again: neuspring/experiments/graph.py.
+# options are and what makes it run again follows from its declarations: neuspring/experiments/graph.py.
 for STAGE in STAGES.values():
     # Snakemake reads the text of a command once more when a job runs, where `rule` is the job's and STAGE the last one.
     globals()["rule"] = STAGE.name
@@ -9,18 +9,7 @@ for STAGE in STAGES.values():
             STAGE.name
         input:
             unpack(compared_with_records(STAGE)),
-            **(
-                {
-                    # Their checkpoints, from which a fit goes on, are those that it would have left alone. But behind a job that
-                    # is made again Snakemake overlooks what is missing, if all that it reads is ancient.
-                    "shared": lambda wildcards: [
-                        path if unfinished(STAGES["fit"], wildcards) else ancient(path)
-                        for path in GRAPH.shared_launches(wildcards)
-                    ]
-                }
-                if STAGE.name == "fit"
-                else {}
-            ),
+            **shared_launches(STAGE),
         output:
             f"{RESULTS}/{STAGE.output}",
         log:
@@ -31,7 +20,7 @@ for STAGE in STAGES.values():
         conda:
             ENVIRONMENT
         resources:
-            **({"gpu": GRAPH.gpu(STAGE)} if STAGE.gpu != "never" else {}),
+            **({"gpu": GRAPH.gpu(STAGE)} if STAGE.gpu else {}),
             mem_mb=NEEDS.memory(STAGE.name),
             runtime=NEEDS.minutes(STAGE.name),
         params:

@@ -4,25 +4,23 @@ A slot is a file that its holder keeps locked. The kernel frees it when the hold
 handed out under one short lock, all that a job needs or none, so that two jobs cannot wait for each other. The files lie in a
 folder of this machine.
 
-The jobs of one run of the workflow also share `Notes`. They name the devices that failed a job. Without them each job would fail on
-such a device at once and leave it free for the next one.
+The jobs of one run of the workflow also share notes, a file that names the devices that failed a job. Without it each job would
+fail on such a device at once and leave it free for the next one.
 """
 
 from __future__ import annotations
 
 import contextlib
 import itertools
-import json
 import os
 import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 from neuspring.core.errors import InputError
-from neuspring.core.files import write_text
 from neuspring.core.lock import try_lock, wait_for_lock
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"
@@ -30,32 +28,23 @@ LOCKS = "NEUSPRING_GPU_LOCKS"
 """Environment: the folder of the slots. Users who share GPUs set it to one folder that all of them can write to."""
 POLL = 0.05
 """s between two looks for a free slot."""
-LOST, SUSPECT = "lost", "suspect"
-"""How a device failed. Suspect: the job itself may have caused the error on a sound device."""
+LOST, SUSPECT, WORKS = "lost", "suspect", "works"
+"""Words of notes. Suspect: the job itself may have caused the error on a sound device."""
 
 
-@dataclass(frozen=True)
-class Notes:
-    """What the jobs of one run of the workflow tell each other about the devices; a JSON file in the results folder."""
+def failures(notes: Path | None) -> dict[str, str]:
+    """Device -> LOST or SUSPECT, the newest failure last; a device on which a job succeeded since has no entry.
 
-    scenarios: dict[str, str] = field(default_factory=dict)
-    """Device -> the scenario that it worked on last."""
-    failures: dict[str, str] = field(default_factory=dict)
-    """Device -> LOST or SUSPECT, the newest failure last. A device on which a job succeeded has no entry."""
-
-    @classmethod
-    def load(cls, path: Path | None) -> Notes:
-        """Read notes; empty ones if there are none, or if a full disk cut them short."""
-        try:
-            return cls(**json.loads(path.read_text(encoding="utf-8"))) if path else cls()
-        except (OSError, ValueError, TypeError):
-            return cls()
-
-    def save(self, path: Path | None) -> None:
-        """Write as JSON. A disk that takes no notes must not fail a job."""
-        if path:
-            with contextlib.suppress(OSError, InputError):
-                write_text(path, json.dumps(asdict(self)))
+    Read from notes, a line per failure or success; none where there are no notes.
+    """
+    found: dict[str, str] = {}
+    with contextlib.suppress(OSError):
+        for line in notes.read_text(encoding="utf-8").splitlines() if notes else ():
+            failure, _, device = line.partition(" ")
+            found.pop(device, None)
+            if failure in (LOST, SUSPECT):
+                found[device] = failure
+    return found
 
 
 @dataclass(frozen=True)
@@ -67,9 +56,8 @@ class Lease:
     files: tuple[IO[str], ...]
     waited: float
     """s."""
-    gate: Path
-    """The lock under which slots and notes are read and changed."""
     notes: Path | None = None
+    """The file that the jobs of a run share."""
 
     def environment(self) -> dict[str, str]:
         """Variables with which a command sees these devices alone, numbered as nvidia-smi does."""
@@ -77,16 +65,10 @@ class Lease:
 
     def note(self, failure: str) -> None:
         """Note for later jobs how these devices failed (LOST, SUSPECT), or that they worked (empty). Raises OSError."""
-        if not failure and not Notes.load(self.notes).failures.keys() & set(self.devices):
+        if self.notes is None or not (failure or failures(self.notes).keys() & set(self.devices)):
             return
-        with wait_for_lock(self.gate):
-            notes = Notes.load(self.notes)
-            for device in self.devices:
-                earlier = notes.failures.pop(device, "")
-                if failure:
-                    # Of several jobs on a device, one may have seen more plainly what became of it.
-                    notes.failures[device] = LOST if LOST in (earlier, failure) else failure
-            notes.save(self.notes)
+        with self.notes.open("a", encoding="utf-8") as file:
+            file.write("".join(f"{failure or WORKS} {device}\n" for device in self.devices))
 
     def release(self) -> None:
         """Give the slots back."""
@@ -157,7 +139,6 @@ def acquire(
     pool: Sequence[str],
     *,
     jobs_per_gpu: int = 1,
-    affinity: str = "",
     timeout: float = float("inf"),
     folder: Path | None = None,
     notes: Path | None = None,
@@ -165,9 +146,8 @@ def acquire(
 ) -> Lease:
     """Hold `count` different devices of `pool`; waits until they are free.
 
-    Of the free devices, one that worked last on the scenario `affinity` comes first: data and kernels of the scenario are still in
-    its caches. Devices without a job come before shared ones. `say` is told once that we wait, and which devices are passed over
-    because of `notes`. Raises InputError if the pool, or what is left of it, is too small; TimeoutError.
+    Devices without a job come before shared ones. `say` is told once that we wait, and which devices are passed over because of
+    `notes`. Raises InputError if the pool, or what is left of it, is too small; TimeoutError.
     """
     if count > len(pool):
         rule = f"a job needs {count} GPUs, more than there are"
@@ -185,38 +165,33 @@ def acquire(
         try:
             with wait_for_lock(gate):
                 # Read anew each time: a device may fail while we wait for it.
-                record = Notes.load(notes)
-                devices = _usable(count, pool, record)
-                if affinity:
-                    devices.sort(key=lambda device: (device in record.failures, record.scenarios.get(device) != affinity))
+                failed = failures(notes)
+                devices = _usable(count, pool, failed)
                 slots = _take(count, [(device, names[device]) for device in devices], jobs_per_gpu, folder)
-                if slots and affinity:
-                    record.scenarios.update(dict.fromkeys(slots, affinity))
-                    record.save(notes)
         except OSError as error:
             raise _unusable(folder, error) from error
-        if passed := [f"GPU {device} ({record.failures[device]})" for device in pool if device not in devices]:
+        if passed := [f"GPU {device} ({failed[device]})" for device in pool if device not in devices]:
             say_once(f"passed over: {', '.join(passed)}")
         waited = time.monotonic() - start
         if slots:
-            return Lease(tuple(slots), tuple(slots.values()), waited, gate, notes)
+            return Lease(tuple(slots), tuple(slots.values()), waited, notes)
         if waited > timeout:
             raise TimeoutError(f"no {count} of the GPUs {', '.join(pool)} became free within {timeout:.0f} s")
         say_once(f"waiting for {count} of the GPUs {', '.join(pool)}")
         time.sleep(POLL)
 
 
-def _usable(count: int, pool: Sequence[str], notes: Notes) -> list[str]:
+def _usable(count: int, pool: Sequence[str], failed: Mapping[str, str]) -> list[str]:
     """The devices that a job may take, best first: those without a failure, then suspects, the oldest failure first.
 
     A suspect is the last choice and no error: one bad job must not stop all others. Too few devices that are not lost are an error:
     waiting would not bring one back. Raises InputError.
     """
-    devices = [device for device in pool if device not in notes.failures]
+    devices = [device for device in pool if device not in failed]
     if len(devices) < count:
-        devices += [device for device, failure in notes.failures.items() if device in pool and failure == SUSPECT]
+        devices += [device for device, failure in failed.items() if device in pool and failure == SUSPECT]
     if len(devices) < count:
-        lost = ", ".join(f"GPU {device} (lost)" for device in pool if notes.failures.get(device) == LOST)
+        lost = ", ".join(f"GPU {device} (lost)" for device in pool if failed.get(device) == LOST)
         remedy = (
             "Look at nvidia-smi. Reset a GPU that it does not show as working (nvidia-smi --gpu-reset), or restart the machine. "
             "Then start the same command again, or let gpus.devices name other GPUs."

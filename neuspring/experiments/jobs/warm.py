@@ -1,4 +1,4 @@
-"""A process that has already imported the heavy libraries. It forks a child per job, which then starts in tenths of a second.
+"""A process that has already imported the heavy libraries. It forks a child per job, which starts in tenths of a second: 3 s saved.
 
 `python -m neuspring.experiments.jobs.warm SOCKET` runs it, for as long as its standard input is open: the workflow holds the other
 end, so it ends with the workflow. Jobs of one run use it; where it is not there (yet), the wrapper starts a process of its own. The
@@ -126,11 +126,12 @@ def main(path: str) -> None:
     for library in LIBRARIES:
         with contextlib.suppress(ImportError):
             importlib.import_module(library)
-    from neuspring.core.provenance import PACKAGE_FOLDER, code_digest
+    from neuspring.core.provenance import code_digest
+    from neuspring.stages import STAGES
 
     # Every job's record holds the digest of its code: here it is computed once for all.
-    for module in (PACKAGE_FOLDER / "stages").glob("*.py"):
-        code_digest(f"neuspring.stages.{module.stem}")
+    for stage in STAGES.values():
+        code_digest(stage.function.__module__)
     # Threads of this process beside the first.
     tasks = [task.read_text().strip() for task in Path("/proc/self/task").glob("*/comm") if task.parent.name != str(os.getpid())]
     if threading.active_count() > 1 or set(tasks) - SAFE_THREADS:

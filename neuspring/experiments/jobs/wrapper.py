@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--log", type=Path, required=True, help="its log, under <results>/logs/<rule>/")
     parser.add_argument("--gpus", type=int, default=0, help="GPUs that it needs")
-    parser.add_argument("--scenario", default="", help="its scenario; jobs of one scenario prefer the same GPU")
+    parser.add_argument("--scenario", default="", help="its scenario")
     parser.add_argument("--quiet", action="store_true", help="write output to the log alone")
     parser.add_argument("--stamp", default="", help="what its record holds once it has succeeded")
     parser.add_argument("command", nargs=argparse.REMAINDER)
@@ -133,7 +133,7 @@ def _run(command: Sequence[str], record: JobRecord, results: Path, lock: IO[str]
         if gpu_count and pool != GIVEN:
             names = [name for name in pool.split(",") if name] or gpus.visible_devices()
             share, notes = int(os.environ.get(SHARE, "1")), results / FOLDER / GPU_NOTES if this else None
-            lease = gpus.acquire(gpu_count, names, jobs_per_gpu=share, affinity=record.scenario, notes=notes, say=say)
+            lease = gpus.acquire(gpu_count, names, jobs_per_gpu=share, notes=notes, say=say)
     except (InputError, TimeoutError) as error:
         save(Attempt(started=_now(), run=this, outcome="permanent", cause="no GPU", message=str(error), exit=faults.BAD_INPUT))
         raise

@@ -4,12 +4,12 @@ Only the tracking modules import mlflow, and only when it is used. An MLflow, ne
 becomes the outcome `unreachable: <reason>` and a warning, and `sync` logs the run later.
 
 A run in MLflow is complete when it carries the tag `logged = complete`, which is set after everything else was sent. A run
-without that tag was left behind by a killed logger, if nobody holds the lock of its record (`<results>/.locks/<run key>.lock`).
+without that tag was left behind by a killed logger, if nobody holds the lock of its record (`<results>/.locks/<run key>.lock`); it
+is deleted when the record is logged.
 """
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import shlex
@@ -42,7 +42,6 @@ from neuspring.experiments.tracking.store import (
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
-    from mlflow.entities import Run
 
 MOST_PARAMS = 60
 PARAM_LENGTH, TAG_LENGTH = 500, 5000
@@ -100,9 +99,8 @@ def log_run(run_json: Path, results: Path, settings: Tracking) -> str:
 def sync(results: Path, settings: Tracking, progress: Callable[[str], object] = lambda line: None) -> dict[str, list[str]]:
     """Log every run.json under `results` that MLflow lacks; an empty database is rebuilt like this.
 
-    Runs that killed loggers left RUNNING are closed as KILLED. An mlflow.txt beside a record that says "unreachable" is corrected.
-    `progress` receives one line per run. Returns the run names by outcome: those of `log_run`, "damaged" (details on stderr) and
-    "closed" (leftovers).
+    An mlflow.txt beside a record that says "unreachable" is corrected. `progress` receives one line per run. Returns the run names
+    by outcome: those of `log_run`, and "damaged" (details on stderr).
     """
     results = Path(results).resolve()
     outcomes: dict[str, list[str]] = {}
@@ -116,7 +114,7 @@ def sync(results: Path, settings: Tracking, progress: Callable[[str], object] = 
         # Neither the copies among MLflow's artifacts, nor hidden folders.
         folders[:] = sorted(name for name in folders if not name.startswith(".") and name != ARTIFACTS)
         records += [Path(folder) / RUN_RECORD] if RUN_RECORD in files else []
-    down = _close_leftovers(results, settings, note) if settings.enabled else None
+    down = _down(results, settings) if settings.enabled else None
     for path in records:
         name = path.parent.relative_to(results).as_posix()
         if down:
@@ -133,7 +131,7 @@ def sync(results: Path, settings: Tracking, progress: Callable[[str], object] = 
             write_text(file, f"{outcome}\n")
         if outcome.startswith("unreachable"):
             # One bad run must not stop the others, but a server that is down must not cost its timeout once per run.
-            down = _close_leftovers(results, settings, note)
+            down = _down(results, settings)
     return outcomes
 
 
@@ -145,8 +143,8 @@ def _log(client: MlflowClient, experiment: str, record: RunRecord, run_json: Pat
     runs = search(client, experiment, run_key=record.run_key)
     # A killed logger may have ended its run and died before the last tag. Then the run is FINISHED, but not complete.
     for run in runs:
-        if not is_complete(run) and "superseded" not in run.data.tags:
-            _close(client, run)
+        if not is_complete(run):
+            client.delete_run(run.info.run_id)
     if complete := next(filter(is_complete, runs), None):
         # Tag it with the commit and time at which its results were made again, if they were.
         ended, tag = milliseconds(record.ended), f"{AGAIN}{record.commit}"
@@ -174,39 +172,16 @@ def _send(client: MlflowClient, experiment: str, record: RunRecord, content: Pay
     client.set_tag(run_id, "logged", "complete")
 
 
-def _close(client: MlflowClient, run: Run) -> None:
-    """End a run that a killed logger left behind. The tag comes last, so that a close that fails is tried again."""
-    client.set_terminated(run.info.run_id, "KILLED")
-    client.set_tag(run.info.run_id, "superseded", "true")
+# --- messages ---
 
 
-# --- leftovers, messages ---
-
-
-def _close_leftovers(results: Path, settings: Tracking, note: Callable[[str, str], None]) -> str | None:
-    """Close RUNNING runs that nobody is logging. Returns why the store cannot be used, None if it can."""
+def _down(results: Path, settings: Tracking) -> str | None:
+    """Why the store cannot be used; None if it can."""
     try:
-        client, experiment = connect(results, settings)
-        for run in search(client, experiment, status="RUNNING"):
-            path = lock_path(results, run.data.tags.get("run_key", ""))
-            # A shared store also holds runs of other results folders, whose locks are elsewhere: a logger may be alive there.
-            ours = "run_key" in run.data.tags and (settings.uri is None or path.exists())
-            if ours and _close_if_free(client, run, path):
-                note(run.info.run_name or run.info.run_id, "closed")
+        connect(results, settings)
     except Exception as error:
         return _unreachable(explained(error, results, settings), "the runs not yet logged are left for the next `sync`")
     return None
-
-
-def _close_if_free(client: MlflowClient, run: Run, path: Path) -> bool:
-    from filelock import Timeout
-
-    with contextlib.suppress(Timeout), lock(path, timeout=0):  # locked: a logger is at work
-        # Its logger may have finished between the search and the lock.
-        if client.get_run(run.info.run_id).info.status == "RUNNING":
-            _close(client, run)
-            return True
-    return False
 
 
 def _unreachable(line: str, consequence: str) -> str:

@@ -131,10 +131,9 @@ def prepare(results: Path, settings: Tracking) -> tuple[MlflowClient, str]:
             raise
 
 
-def search(client: MlflowClient, experiment: str, status: str | None = None, **tags: str) -> list[Run]:
-    """All runs of the experiment with this status and these tags (values without quotes: keys, names and numbers)."""
+def search(client: MlflowClient, experiment: str, **tags: str) -> list[Run]:
+    """All runs of the experiment with these tags (values without quotes: keys, names and numbers)."""
     terms = [f"tags.{name} = '{value}'" for name, value in tags.items()]
-    terms += [f"attributes.status = '{status}'"] if status else []
     runs: list[Run] = []
     token: str | None = None
     while True:
@@ -146,7 +145,7 @@ def search(client: MlflowClient, experiment: str, status: str | None = None, **t
 
 
 def is_complete(run: Run) -> bool:
-    """Whether everything of a run was sent."""
+    """True if everything of a run was sent."""
     return run.data.tags.get("logged") == "complete" and run.info.status in ("FINISHED", "FAILED")
 
 
