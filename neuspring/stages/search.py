@@ -18,7 +18,7 @@ READS = ("search", "simulation", "losses", "released_quirks")
 
 def _settled(rows: Rows) -> Config:
     """The configuration; a body of one region has none to tie."""
-    if rows.search is None or rows.search.clusters > 1:
+    if rows.search is None or rows.search.clusters != 1:
         return rows.config
     return dataclasses.replace(rows.config, search=dataclasses.replace(rows.config.search, tied_rollouts=Search().tied_rollouts))
 

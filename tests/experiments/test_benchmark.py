@@ -722,7 +722,7 @@ def test_rows_that_name_no_number_of_regions_have_that_of_the_key(values, region
     made = Benchmark(shipped("toy") | {"methods": names} | values, ROOT)
     assert [made.searches[made.methods[name].searched].clusters for name in names] == [1, 3, regions]
     # Rows that do the same share search and fit.
-    shared = {name: made.fit_of_method[name] for name in names}
+    shared = {name: Graph(made).owners["fit"][name] for name in names}
     assert shared == {name: "neuspring" if regions == 3 and name == "clusters_3" else name for name in names}
     assert len(made.searches) == (2 if regions == 3 else 3)
 

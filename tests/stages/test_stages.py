@@ -14,7 +14,7 @@ from neuspring.core.files import read_npz
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.experiments.tracking import log as tracking
 from neuspring.physics import stability
-from neuspring.report.summary import summary_text
+from neuspring.report.summary import write as write_summary
 from neuspring.scores import metrics
 from neuspring.scores.numbers import Numbers
 from neuspring.scores.runs import collect
@@ -269,7 +269,7 @@ def test_a_numerical_failure_is_a_result_that_the_table_shows(tmp_path, monkeypa
     by_name = collected.runs.set_index("scenario")
     assert by_name.loc["bad", "status"] == "failed"
     assert by_name.loc["bad", "reason"] == "fit: search: every candidate diverged"
-    text = summary_text(Numbers(everything=collected, baseline="phystwin"))
+    text = write_summary(Numbers(everything=collected, baseline="phystwin"), tmp_path / "tables")
     assert "1/2 (1 failed)" in text
     assert "bad / phystwin / seed 0: failed: fit: search: every candidate diverged" in text
     assert "nan" not in text.lower()
