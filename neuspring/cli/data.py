@@ -1,4 +1,4 @@
-"""Commands on data: fetch, check-data, verify-released, make-capture, cut-capture, mask, compare-masks, annotate."""
+"""Commands on data: check-data, make-capture, cut-capture, mask, compare-masks, annotate."""
 
 from __future__ import annotations
 
@@ -16,65 +16,19 @@ from neuspring.core.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from neuspring.core.findings import Finding
 
 SHOWN = 5
 """How many doubtful frames are named per camera."""
 BOARD = "SQUARES_XxSQUARES_Y:SQUARE_M:MARKER_M:DICTIONARY"
 
 
-def fetch(
-    source: Positional[Literal["phystwin"]],
-    scenarios: Annotated[Positional[tuple[str, ...]], arg(help="all 22 by default")] = (),
-    *,
-    data_root: Annotated[Path, arg(help="folder to write to; data_root of the configuration")],
-    parts: Annotated[
-        tuple[str, ...], arg(help="data, results, appearance, images, other; all: these five; extra: more clothes")
-    ] = ("data", "results"),
-    revision: Annotated[str, arg(help="branch, tag or commit of the data set")] = "main",
-    dry_run: Annotated[bool, arg(help="say what would be fetched and the space it takes")] = False,
-) -> int:
-    """Released archives -> the folders that the readers expect; exit status 2 if a fetched file is damaged."""
-    from neuspring.data import fetch
-    from neuspring.extensions.released.run import check
-
-    findings = fetch.fetch(data_root, scenarios, parts, revision=revision, dry_run=dry_run, check=check)
-    return 0 if dry_run else _tell(findings)
-
-
 def check_data(folder: Positional[Path]) -> int:
     """Report how a data folder departs from the expected layout; exit status 2 where it cannot be used."""
-    from neuspring.extensions.released.run import check
+    from neuspring.data.check import check_layout, render
 
-    return _tell(check(folder))
-
-
-def _tell(findings: list[Finding]) -> int:
-    from neuspring.data.check import render
-
+    findings = check_layout(folder)
     print(render(findings))
     return 2 if any(finding.level == "error" for finding in findings) else 0
-
-
-def verify_released(
-    data_root: Annotated[Positional[Path], arg(help="folder that holds data, experiments and the other released folders")],
-    output: Annotated[Path, arg(help="folder to write to")],
-    scenarios: Annotated[tuple[str, ...], arg(help="all that are there by default")] = (),
-    checks: Annotated[
-        tuple[int, ...],
-        arg(help="1 sizes and first frame, 2 springs, 3 scores, 4 deprojection, 5 pictures, 6 replay; all by default"),
-    ] = (),
-    settings: Settings = "{}",
-    device: Device = "auto",
-) -> int:
-    """PhysTwin's released results, checked against ours."""
-    from neuspring.extensions.released import run
-
-    lpips = read_settings(settings).images.lpips
-    chosen = checks or tuple(run.CHECKS)
-    report = run.verify_released(data_root, output, scenarios=scenarios, checks=chosen, device=device, lpips=lpips)
-    print(report.text, end="")
-    return report.status
 
 
 def make_capture(
@@ -182,7 +136,8 @@ def cut_capture(
     output: Annotated[Path, arg(help="the capture folder to write")],
 ) -> None:
     """Some frames of a capture, with their masks and tracks -> another capture; marks stay behind."""
-    from neuspring.data.capture import Capture, cut
+    from neuspring.data.capture import Capture
+    from neuspring.data.intake.cut import cut
 
     first, _, last = frames.partition("-")
     if not (first.isdigit() and last.isdigit()):
@@ -206,8 +161,9 @@ def mask(
 ) -> None:
     """Marks on a few frames, or masks of other tools -> masks of object and hands in every frame of a capture."""
     from neuspring.data.capture import Capture
+    from neuspring.data.checks.masks import mask_facts
     from neuspring.perception import segment_sam2
-    from neuspring.perception.findings import look_at_masks, mask_facts
+    from neuspring.perception.findings import look_at_masks
     from neuspring.perception.marks import store
     from neuspring.perception.marks.carry import carry_camera
     from neuspring.perception.marks.marks import MARKS, Marks
@@ -293,8 +249,8 @@ def annotate(
     settings: Settings = "{}",
 ) -> None:
     """Mark masks and tracks of a capture in the browser; serves until Ctrl-C."""
-    from neuspring.data.capture import Capture
     from neuspring.core.web import is_loopback
+    from neuspring.data.capture import Capture
     from neuspring.extensions.annotate.server import Server
 
     server = Server(Capture.load(capture), read_settings(settings).perception.segment.marks, host, port)

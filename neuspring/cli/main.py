@@ -18,8 +18,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from neuspring import __version__
 from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.version import __version__
 
 TOOLS = {
     "draw strip": ("pictures", "observed frames on top, each method's prediction and error below -> PDF or PNG"),

@@ -15,10 +15,11 @@ from neuspring.config.images import Images
 from neuspring.core.device import resolve_device
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
-from neuspring.data.capture import Camera, Capture
-from neuspring.perception.results import Masks
+from neuspring.data.camera import Camera
+from neuspring.data.capture import Capture
 from neuspring.extensions.play.results import Run, find
 from neuspring.extensions.play.results import Scene as Found
+from neuspring.perception.results import Masks
 from neuspring.report.draw import sheet
 from neuspring.report.draw.film import write_film
 from neuspring.report.draw.painter import DrawingStyle, Error, Painter, Style

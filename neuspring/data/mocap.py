@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -32,8 +31,10 @@ from scipy.spatial.transform import Rotation
 from neuspring.config import Config, Mocap, ScenarioRow
 from neuspring.core.artifacts import NO_REST_SHAPE, Observations, Scenario
 from neuspring.core.errors import InputError
-from neuspring.core.findings import Finding, broken, refusal, refuse, unusual
+from neuspring.core.findings import refuse
 from neuspring.core.records import digest_file
+from neuspring.data.checks import examine
+from neuspring.data.checks.cable import MIN_DISTANCE, MIN_FRAMES, Recording
 from neuspring.data.unpickle import load_pickle
 
 X, Y, Z = np.eye(3)
@@ -85,17 +86,8 @@ def transport(directions: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 RECORD_RATE = 100.0
 """Samples per second of a recording."""
-MIN_MARKERS = 6
-"""Two controllers at either end and at least two observed markers."""
-MIN_FRAMES = 4
 LARGEST_ALONG = 0.99
 """Cosine of the angle between an end of the cable and the roll axis: nearer to 1 a small turn of the end is a large roll."""
-MIN_DISTANCE = 1e-4
-"""Nodes must be farther apart than this, m; otherwise their spring would have no length."""
-RELEASED_SAMPLES = 500
-MAX_STRETCH = 0.5
-"""Relative change of a marker distance from its median above which markers may be swapped or lost. The released cables stay
-below a third."""
 OVERSAMPLING = 64
 """Evaluations of the spline per marker interval, for its arc length."""
 
@@ -112,7 +104,7 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
     """
     file = Path(file)
     raw = load_pickle(file)
-    refuse(recording_findings(file, raw))
+    refuse(examine(Recording(file, raw)))
     samples = np.asarray(raw)[settings.start :: settings.stride].transpose(0, 2, 1)
     markers = samples if settings.frames is None else samples[: settings.frames]
     frames, count, _ = markers.shape
@@ -239,54 +231,3 @@ def _arc(markers: np.ndarray) -> tuple[CubicSpline, np.ndarray, np.ndarray, np.n
     dense = np.unique(np.concatenate([np.linspace(a, b, OVERSAMPLING) for a, b in pairwise(knots)]))
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(spline(dense), axis=0), axis=1))])
     return spline, knots, dense, arc
-
-
-def recording_findings(file: Path, raw: Any) -> list[Finding]:
-    """Findings about one recording: what the reader refuses (errors) and what is not as released (warnings)."""
-    if not isinstance(raw, (np.ndarray, list, tuple)):
-        return [broken(file, "", "positions [T, 3, n] are required", type(raw).__name__)]
-    try:
-        data = np.asarray(raw)
-    except ValueError:
-        return [broken(file, "", "positions [T, 3, n] are required", "nested lists of different lengths")]
-    if data.ndim != 3 or data.shape[1] != 3:
-        return [broken(file, "", "the shape must be [T, 3, n]", data.shape)]
-    if data.dtype.kind != "f":
-        return [broken(file, "", "the dtype must be floating point", data.dtype)]
-    findings = []
-    if data.shape[2] < MIN_MARKERS:
-        findings.append(broken(file, "", f"at least {MIN_MARKERS} markers are required (4 of them are controllers)", data.shape[2]))
-    if len(data) < MIN_FRAMES:
-        findings.append(broken(file, "", f"at least {MIN_FRAMES} frames are required", len(data)))
-    bad = np.argwhere(~np.isfinite(data))
-    if len(bad):
-        t, axis, marker = (int(i) for i in bad[0])
-        place = f"{data[t, axis, marker]} at frame {t}, marker {marker} ({len(bad)} in all)"
-        findings.append(broken(file, "", "every coordinate must be finite", place))
-    if findings:
-        return findings
-    if data.dtype != np.float64:
-        findings.append(unusual(file, "", "the released dtype is float64", data.dtype))
-    if len(data) != RELEASED_SAMPLES:
-        findings.append(unusual(file, "", f"released recordings have {RELEASED_SAMPLES} samples", len(data)))
-    length = np.linalg.norm(np.diff(data, axis=2), axis=1)
-    short = np.argwhere(length[0] < MIN_DISTANCE)
-    if len(short):
-        i, rule = int(short[0, 0]), f"neighboring markers must be {MIN_DISTANCE} m apart in frame 0"
-        return [*findings, broken(file, "", rule, f"markers {i} and {i + 1}")]
-    stretch = np.abs(length / np.median(length, axis=0) - 1)
-    frame, segment = np.unravel_index(int(stretch.argmax()), stretch.shape)
-    if stretch[frame, segment] > MAX_STRETCH:
-        place = f"{length[frame, segment]:.3f} m between markers {segment} and {segment + 1} in frame {frame}"
-        rule = f"marker distances usually stay within {MAX_STRETCH:.0%} of their median {np.median(length[:, segment]):.3f} m"
-        findings.append(unusual(file, "", rule, place))
-    return findings
-
-
-def check_mocap(file: Path) -> list[Finding]:
-    """Every finding of one recording; nothing is raised for bad content."""
-    try:
-        raw = load_pickle(file)
-    except InputError as error:
-        return [refusal(error)]
-    return recording_findings(Path(file), raw)

@@ -25,13 +25,12 @@ from neuspring.core.files import DAMAGED, write_atomically
 from neuspring.core.findings import Finding, broken, refusal, refuse
 from neuspring.core.geometry import on_table
 from neuspring.core.records import digest_file
-from neuspring.data import plausible
 from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, TRACKS, Capture
+from neuspring.data.checks import examine
+from neuspring.data.checks.space import SAME, Cloud, Holding, Marked, Nodes
 
 COLUMNS = ("frame", "point", "x", "y", "z", "holds", "hand")
 """Of controllers.csv; the last two may be left out."""
-SAME = 1e-4
-"""m: nodes nearer than this are one, and no spring is between them."""
 LEAST = 3
 """Points that say how a body is turned."""
 
@@ -118,21 +117,17 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
     seen = annotated[np.isfinite(annotated).all(axis=2)]
     for what, file, points in (("nodes", files.get("nodes"), nodes), ("", marked, seen), ("", files.get("controllers"), held_at)):
         if file is not None and points.size:
-            findings += plausible.space_findings(file, points.reshape(-1, 3), ground, is_body=what == "nodes")
+            findings += examine(Cloud(file, points.reshape(-1, 3), ground, is_body=what == "nodes"))
     if any(one.level == "error" for one in findings):
         return InSpace(hands, nodes, tracks), findings
     if (body := files.get("nodes")) is not None:
-        findings += plausible.node_findings(body, len(nodes))
+        findings += examine(Nodes(body, nodes))
     if len(nodes):
-        findings += plausible.annotated_findings(marked, annotated[0], nodes)
+        findings += examine(Marked(marked, annotated[0], nodes))
     if (file := files.get("controllers")) is not None and hands is not None:
-        findings += plausible.holding_findings(file, hands.hand if hands.hand.size else np.zeros(hands.points.shape[1], int))
-        body_points = np.concatenate([nodes, first])
-        if len(nodes):
-            findings += plausible.contact_findings(file, hands.held(capture.train_end), nodes)
-        if len(body_points):
-            start = held(hands, annotated, capture.train_end)[0]
-            findings += plausible.doubled_findings(file, start, body_points, SAME)
+        grouped = hands.hand if hands.hand.size else np.zeros(hands.points.shape[1], int)
+        start = held(hands, annotated, capture.train_end)[0]
+        findings += examine(Holding(file, grouped, hands.held(capture.train_end), start, nodes, np.concatenate([nodes, first])))
     return InSpace(hands, nodes, tracks), findings
 
 

@@ -77,7 +77,7 @@ BACKENDS = {
         "opencv": Backend(module="neuspring.perception.track_opencv", section="opencv"),
         "cotracker3": Backend(module="neuspring.perception.track_cotracker", section="cotracker3", gpu=True),
         # The truth takes its count of points from the settings of opencv.
-        "truth": Backend(module="neuspring.perception.judge", section="opencv", truth=True),
+        "truth": Backend(module="neuspring.perception.truth", section="opencv", truth=True),
     },
 }
 

@@ -36,7 +36,8 @@ from neuspring.config.perception import ColorSettings, Perception
 from neuspring.core.artifacts import ImageObservations
 from neuspring.core.errors import InputError
 from neuspring.core.geometry import farthest
-from neuspring.data.capture import CAPTURE, CONTROLLERS, HANDS, NOTHING, OBJECT, Camera, Capture
+from neuspring.data.camera import Camera
+from neuspring.data.capture import CAPTURE, CONTROLLERS, HANDS, NOTHING, OBJECT, Capture
 from neuspring.data.points import InSpace, held, read
 from neuspring.perception.color_hands import follow_hands, grips, place
 from neuspring.perception.controllers import ALWAYS

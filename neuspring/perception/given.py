@@ -12,7 +12,8 @@ from scipy.spatial import cKDTree
 from neuspring.config.perception import Perception
 from neuspring.core.artifacts import ImageObservations
 from neuspring.core.errors import InputError
-from neuspring.data.capture import Camera, Capture
+from neuspring.data.camera import Camera
+from neuspring.data.capture import Capture
 from neuspring.data.points import read
 from neuspring.perception.color import BENEATH, FirstFrame, beneath_hands, from_color, lift_color
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior

@@ -14,7 +14,8 @@ from scipy.spatial import cKDTree
 
 from neuspring.config.perception import Lift
 from neuspring.core.errors import InputError
-from neuspring.data.capture import HANDS, OBJECT, Camera, Capture
+from neuspring.data.camera import Camera
+from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.data.points import held, read
 from neuspring.perception.controllers import ALWAYS, HAND_GAP, Body, choose_controllers, holding
 from neuspring.perception.results import LiftedTracks, Masks, PixelTracks

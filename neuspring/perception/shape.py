@@ -37,9 +37,11 @@ from warp.geometry import IsoSurfaceMarchingCubes
 
 from neuspring.config.perception import ShapePriorSettings
 from neuspring.core.errors import InputError
-from neuspring.data.capture import HANDS, OBJECT, THIN, Camera, Capture
+from neuspring.data.camera import Camera
+from neuspring.data.capture import HANDS, OBJECT, THIN, Capture
 from neuspring.perception.results import Masks, ShapePrior
 from neuspring.perception.sample import on_surface
+from neuspring.perception.truth import surface
 
 BACK_FRACTION = 1.2
 """Thickness of the object in local widths of its silhouette, with `back: fraction`; 1: a round cross-section."""
@@ -102,8 +104,6 @@ def _prior(
     if backend == "mesh":
         return align(capture, masks, cloud, settings)
     if backend == "truth":
-        from neuspring.perception.judge import surface
-
         return surface(capture)
     return no_prior()
 

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from neuspring.config.perception import OpenCvTracking
 from neuspring.data.capture import NOTHING, Capture
-from neuspring.perception.frames import gray
+from neuspring.data.frames import gray
 
 LEVELS = 3
 """Levels of the image pyramid, beside the image itself."""

@@ -21,8 +21,9 @@ from neuspring.stages.stage import Written, stage
 def segment(capture: Capture, camera: str, settings: Config, run: Recorder, device: str = "auto") -> Written:
     """One camera of a capture -> masks: masks.npz and masks.png."""
     from neuspring.core.findings import findings_as_facts
+    from neuspring.data.checks.masks import mask_facts
     from neuspring.perception import figures
-    from neuspring.perception.findings import WRONG, look_at_masks, mask_facts
+    from neuspring.perception.findings import WRONG, look_at_masks
     from neuspring.perception.results import Masks
 
     section = settings.perception.segment

@@ -9,17 +9,21 @@ import pytest
 
 from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
+from neuspring.core.geometry import rigid_inverse
 from neuspring.data.capture import CAPTURE, OBJECT, Capture
 from neuspring.data.check import check_layout
+from neuspring.data.checks import examine
+from neuspring.data.checks.masks import mask_facts
+from neuspring.data.checks.table import on_table
+from neuspring.data.checks.things import Silhouette
 from neuspring.data.intake.feeds import pairs
-from neuspring.data.intake.lenses import Board, rigid_inverse
+from neuspring.data.intake.lenses import Board
 from neuspring.data.intake.make import Intake, make_capture
-from neuspring.data.plausible import on_table, outline_findings
-from neuspring.perception import segment_opencv
 from neuspring.extensions.annotate.clicks import Annotations, Click, ClickedPoint
 from neuspring.extensions.annotate.tracks import TracksMode, tracks_of
+from neuspring.perception import segment_opencv
 from neuspring.perception.backends import BACKENDS
-from neuspring.perception.findings import look_at_masks, mask_facts
+from neuspring.perception.findings import look_at_masks
 from neuspring.perception.marks.carry import CameraFilm
 from neuspring.perception.marks.store import save_masks
 from tests.support.board import BOARD, LENS, board_image
@@ -230,7 +234,7 @@ def strip(length, width):
     ],
 )
 def test_an_outline_of_another_category(category, mask, words):
-    found = outline_findings("object", mask, category)
+    found = examine(Silhouette("object", mask, category))
     assert [one.name for one in found] == (["outline and category"] if words else [])
     if words:
         assert words in found[0].text and repr(category) in found[0].text and "meant?" in found[0].remedy

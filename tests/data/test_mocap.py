@@ -218,7 +218,7 @@ def test_bad_recordings_are_refused(tmp_path: Path, value: Any, message: str) ->
     path = write(tmp_path, value)
     with pytest.raises(InputError, match=rf"7\.pkl: .*{message}"):
         mocap.read(ROW, path, Mocap())
-    assert [d.level for d in mocap.check_mocap(path) if d.level == "error"]
+    assert [d.level for d in check_layout(path) if d.level == "error"]
 
 
 @pytest.mark.parametrize(
@@ -242,7 +242,7 @@ def test_check_of_files_and_folders(tmp_path: Path) -> None:
         findings = check_layout(target)
         assert [d.level for d in findings] == ["warning"]
         assert "in frame 30" in findings[0].message
-    assert [d.message for d in mocap.check_mocap(write(tmp_path, recording(samples=400)))] == [
+    assert [d.message for d in check_layout(write(tmp_path, recording(samples=400)))] == [
         "released recordings have 500 samples; received 400"
     ]
 

@@ -10,8 +10,9 @@ import trimesh
 
 from neuspring.config import Config
 from neuspring.core.errors import InputError
-from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, TRACKS, Capture, cut, write_tracks
+from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, TRACKS, Capture, write_tracks
 from neuspring.data.check import check_layout
+from neuspring.data.intake.cut import cut
 from neuspring.data.points import Hands, held, observe, read, standing, write
 from neuspring.data.sources import SOURCES, scenario_rows
 from tests.support import spaced as scene

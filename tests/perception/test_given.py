@@ -7,7 +7,8 @@ import torch
 from neuspring.config import Config, ScenarioRow
 from neuspring.config.perception import Lift, Perception, Sampling
 from neuspring.core.provenance import image_stamps
-from neuspring.data.capture import CAPTURE, TRACKS, Camera, write_tracks
+from neuspring.data.camera import Camera
+from neuspring.data.capture import CAPTURE, TRACKS, write_tracks
 from neuspring.data.points import Hands, write
 from neuspring.data.synthetic.meshes import sphere
 from neuspring.perception.figures import hands_strip

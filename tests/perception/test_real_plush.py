@@ -6,7 +6,8 @@ import pytest
 
 from neuspring.config.perception import Lift, ShapePriorSettings
 from neuspring.data.capture import CAPTURE, Capture
-from neuspring.perception.findings import look_at_masks, mask_facts
+from neuspring.data.checks.masks import mask_facts
+from neuspring.perception.findings import look_at_masks
 from neuspring.perception.lift import clean_masks
 from neuspring.perception.results import Masks
 from neuspring.perception.segment_given import segment

@@ -8,9 +8,10 @@ import pytest
 from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
+from neuspring.data.checks.masks import mask_facts
+from neuspring.data.frames import overlap
 from neuspring.perception import segment_opencv
-from neuspring.perception.findings import WRONG, look_at_masks, mask_facts
-from neuspring.perception.frames import overlap
+from neuspring.perception.findings import WRONG, look_at_masks
 from tests.support.captures import describe, entry
 from tests.support.filmed import FRAMES, film
 

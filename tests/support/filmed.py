@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import trimesh
 
-from neuspring.data.capture import HANDS, NOTHING, OBJECT, CameraEntry, Capture, Description, Writer
+from neuspring.data.camera import CameraEntry
+from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture, Description, Writer
 from neuspring.data.synthetic.make import looking
 from neuspring.data.synthetic.meshes import capsule, smooth_union, sphere, surface
 from neuspring.data.synthetic.render import Part, Renderer, quantized

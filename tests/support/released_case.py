@@ -15,11 +15,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from neuspring.core.artifacts import Material, Simulation, Twin
-from neuspring.data.released import Released
 from neuspring.data.unpickle import load_pickle
+from neuspring.extensions.released.checks import Published
+from neuspring.extensions.released.files import Released
 from neuspring.physics import reference as simulation
 from neuspring.physics.reference import Scene
-from neuspring.extensions.released.checks import Published
 from neuspring.splats.model import Splats
 from neuspring.splats.rasterize import reference
 from neuspring.splats.skinning import Skin

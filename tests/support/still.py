@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from neuspring.data.capture import OBJECT, CameraEntry, Capture, Writer
+from neuspring.data.camera import CameraEntry
+from neuspring.data.capture import OBJECT, Capture, Writer
 from neuspring.data.synthetic.make import looking
 from neuspring.data.synthetic.meshes import sphere, surface
 from neuspring.data.synthetic.render import HAND, Part, Renderer, quantized

@@ -16,8 +16,8 @@ from scipy.spatial import cKDTree
 from neuspring.core.artifacts import Observations
 from neuspring.core.table import Table
 from neuspring.data.capture import CAPTURE, Capture
+from neuspring.data.checks.observed import GRIP
 from neuspring.data.points import read
-from neuspring.perception.findings import GRIP
 from workflow.scripts.beside_data import PREFIX
 
 FEWEST = 3

@@ -20,7 +20,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from neuspring.config.perception import ColorSettings, MarksSegmentation
-from neuspring.data.capture import OBJECT, Camera
+from neuspring.data.camera import Camera
+from neuspring.data.capture import OBJECT
 from neuspring.data.synthetic import bodies
 from neuspring.data.synthetic.make import looking
 from neuspring.data.synthetic.meshes import Sdf, capsule, ellipsoid, fill, smooth_union, sphere, surface

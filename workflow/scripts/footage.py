@@ -24,10 +24,10 @@ import numpy as np
 
 from neuspring.config.perception import MarksSegmentation, OpenCvTracking
 from neuspring.data.capture import HANDS, OBJECT
-from neuspring.perception import track_opencv
+from neuspring.data.frames import overlap
 from neuspring.extensions.annotate.clicks import Click, GrayImages
 from neuspring.extensions.annotate.clicks import follow as follow_click
-from neuspring.perception.frames import overlap
+from neuspring.perception import track_opencv
 from neuspring.perception.marks.carry import carry
 from neuspring.perception.marks.marks import Marks
 from workflow.scripts.masks import MARKS, Frames

@@ -20,7 +20,7 @@ import numpy as np
 
 from neuspring.config.perception import MarksSegmentation
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.perception.frames import TINTS, overlap, overlay
+from neuspring.data.frames import TINTS, overlap, overlay
 from neuspring.perception.marks.carry import Carried, carry, carry_camera
 from neuspring.perception.marks.marks import Mark, Marks
 

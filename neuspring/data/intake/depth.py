@@ -14,9 +14,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neuspring.core.errors import InputError
+from neuspring.data.camera import FAR, FASTEST, NEAR, ROLL, SLOWEST, Plane
 
-NEAR, FAR = 0.1, 10.0
-"""m. Median depths outside this range are no table in a room."""
 LIKELY = (0.2, 3.0)
 """m. A guessed unit must bring the median depth into this range."""
 KNOWN = {
@@ -27,8 +26,6 @@ KNOWN = {
     1.0: "meters",
 }
 """m per count, and where it is used: most cameras, RealSense L515 and D405, L515's default, TUM's data sets, floating point."""
-SLOWEST, FASTEST = 1.0, 240.0
-"""Frames per second of a camera."""
 
 
 @dataclass(frozen=True)
@@ -120,38 +117,6 @@ LEAST = 0.03
 """Share of the points below which a plane is none."""
 
 
-@dataclass(frozen=True, eq=False)
-class Plane:
-    """A plane that a camera sees."""
-
-    normal: np.ndarray
-    """Unit normal [3] in the coordinates of the camera, towards the camera."""
-    height: float
-    """Distance of the camera, m."""
-    rms: float
-    """Root mean square distance of its points, m."""
-    share: float
-    """Its part of the points with depth."""
-    inliers: int
-    """Its points, of at most POINTS."""
-    points: np.ndarray
-    """They themselves [n, 3], m, in the coordinates of the camera."""
-
-    @property
-    def elevation(self) -> float:
-        """Angle by which the camera looks down at it, degrees: 90 from straight above, 0 along it."""
-        return float(np.degrees(np.arcsin(np.clip(-self.normal[2], -1.0, 1.0))))
-
-    def above(self, points: np.ndarray) -> np.ndarray:
-        """Signed distance [...], m, of points [..., 3] in the coordinates of the camera; the camera's side is positive."""
-        return np.asarray(points @ self.normal + self.height)
-
-    def text(self) -> str:
-        """What it is, in one line."""
-        size = f"{1e3 * self.rms:.1f} mm rms over {self.share:.0%} of the pixels with depth ({self.inliers} points)"
-        return f"{size}, camera {self.height:.3f} m above it, looking down at it by {self.elevation:.0f} degrees"
-
-
 def cloud(depths: Sequence[np.ndarray], intrinsics: np.ndarray, most: int = POINTS) -> np.ndarray:
     """Points [n, 3], m, in the coordinates of the camera, of depth images [H, W], m, 0: none; every k-th pixel of each."""
     clouds = []
@@ -233,8 +198,6 @@ def _largest(points: np.ndarray, total: int) -> Plane | None:
 
 SMALLEST = 0.1
 """Share of the pixels with depth below which a plane is no table."""
-ROLL = 60.0
-"""Degrees. The normal of a table leans from the upward direction of the image by less, that of a side wall or a ceiling by more."""
 FRONTAL = 12.0
 """Degrees between the optical axis and the normal below which a table seen from straight above and a wall look alike."""
 ROUGH = 0.02

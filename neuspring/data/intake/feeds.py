@@ -16,7 +16,7 @@ import importlib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
@@ -27,7 +27,8 @@ import numpy as np
 from neuspring.core.errors import InputError
 from neuspring.core.extras import needed
 from neuspring.data import phystwin
-from neuspring.data.capture import Camera, read_npy, read_picture
+from neuspring.data.camera import Camera, Lens
+from neuspring.data.images import read_npy, read_picture
 from neuspring.data.intake.moments import Series, matched, spans
 
 if TYPE_CHECKING:
@@ -231,22 +232,6 @@ def require_kind(path: Path, kind: Kind, image: np.ndarray) -> np.ndarray:
 
 Pair: TypeAlias = tuple[np.ndarray, np.ndarray | None]
 """RGB [H, W, 3] uint8, and depth [H, W] as stored; None: color alone."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Lens:
-    """A camera's intrinsics."""
-
-    matrix: np.ndarray
-    """K [3, 3], pixels."""
-    distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    """Coefficients; none: no distortion."""
-    model: str = "opencv"
-    """Of the distortion, as the source says it; see `lenses.MODELS`."""
-    size: tuple[int, int] | None = None
-    """(width, height) for which it holds, where it is said."""
-    unread: tuple[str, ...] = ()
-    """Keys beside them that were not read."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,8 +31,9 @@ import numpy as np
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
 from neuspring.core.findings import refuse
+from neuspring.core.geometry import rigid_inverse
+from neuspring.data.camera import Lens
 from neuspring.data.capture import TEXT_TOLERANCE, intrinsics_findings, pose_findings
-from neuspring.data.intake.feeds import Lens
 
 OPEN3D = "intrinsic_matrix"
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "taux", "tauy")
@@ -101,14 +102,6 @@ def read_poses(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
             remedy = "Divide the last columns by 1000 if they are millimeters, by 100 if they are centimeters."
             raise InputError(path, f"{key}: the position must be in meters", f"one {distance:.4g} m from the origin", remedy)
     return poses
-
-
-def rigid_inverse(pose: np.ndarray) -> np.ndarray:
-    """The inverse of a rigid motion [4, 4]."""
-    inverse = np.eye(4)
-    inverse[:3, :3] = pose[:3, :3].T
-    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-    return inverse
 
 
 def require_lens(where: Path, name: str, lens: Lens, size: tuple[int, int]) -> None:

@@ -22,7 +22,11 @@ from neuspring.core.findings import Finding, finding, refuse, refuse_errors
 from neuspring.core.records import digest_file
 from neuspring.core.text import Progress
 from neuspring.data import capture, points
-from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Camera, CameraEntry, Capture, Description, Writer, description_findings
+from neuspring.data.camera import Camera, CameraEntry
+from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Capture, Description, Writer, description_findings
+from neuspring.data.checks import examine
+from neuspring.data.checks.cameras import Edges
+from neuspring.data.checks.things import Category
 from neuspring.data.intake.depth import Unit, find_rate
 from neuspring.data.intake.feeds import CameraFeed, Paired, Raw, VideoFile
 from neuspring.data.intake.lenses import Board, Straightener, read_lenses, read_poses
@@ -44,7 +48,6 @@ from neuspring.data.intake.poses import (
     stored_as,
     straightened,
 )
-from neuspring.data.plausible import category_findings, edge_findings
 
 NAMES = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 FIRST = 5
@@ -145,9 +148,9 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     listed = read_lenses(intake.intrinsics, names) if intake.intrinsics else {}
     seen, unit = look(intake.views, choice, listed, intake.intrinsics, intake.depth_unit)
     for name, view in seen.items():
-        beside = edge_findings(str(view.path), zip(view.colors, view.depths, strict=False))
-        findings += [replace(one, name=f"camera {name}: {one.name}") for one in beside]
-    findings += category_findings(intake.folder, intake.category)
+        beside = examine(Edges(str(view.path), list(zip(view.colors, view.depths, strict=False))))
+        findings += [replace(one, title=f"camera {name}: {one.name}") for one in beside]
+    findings += examine(Category(intake.folder, intake.category))
     placed, how = _place(intake, seen, unit)
     made = _describe(intake, choice, rate, unit, seen, placed, how)
     if intake.brought and (intake.level or not (intake.poses or intake.board)):

@@ -15,22 +15,14 @@ import numpy as np
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.core.findings import Finding, refuse
-from neuspring.data.capture import Camera
-from neuspring.data.intake.depth import (
-    Plane,
-    Unit,
-    cloud,
-    common_plane,
-    find_table,
-    find_unit,
-    levelling,
-    planes,
-    pose_on,
-)
-from neuspring.data.intake.feeds import CameraFeed, Lens, Pair, Paired, open_images
+from neuspring.data.camera import Camera, Lens, Plane
+from neuspring.data.checks import examine
+from neuspring.data.checks.table import TableSeen, View
+from neuspring.data.checks.things import sampled
+from neuspring.data.intake.depth import Unit, cloud, common_plane, find_table, find_unit, levelling, planes, pose_on
+from neuspring.data.intake.feeds import CameraFeed, Pair, Paired, open_images
 from neuspring.data.intake.lenses import Board, Straightener, depth_ratio, require_lens, sight
 from neuspring.data.intake.moments import matched
-from neuspring.data.plausible import color_alone_findings, sampled, table_findings
 
 FEWEST = 5
 """Frames of a capture."""
@@ -292,7 +284,7 @@ def stand(
     found = {name: planes(points) for name, points in clouds.items()}
     judged: dict[str, list[Finding]] = {side: [] for side in ([up] if up else ["+z", "-z"])}
     for (side, listed), (name, view) in product(judged.items(), seen.items()):
-        listed += table_findings(file or view.path, name, found[name], moved[name], side, view.unit)
+        listed += examine(TableSeen(file or view.path, name, found[name], moved[name], side, view.unit))
     side = min(judged, key=lambda key: sum(d.level == "error" for d in judged[key]))
     refuse(one for one in judged[side] if one.level == "error")
     lines += [in_report(one) for one in judged[side]]
@@ -307,7 +299,7 @@ def given_alone(poses: Mapping[str, np.ndarray], seen: Mapping[str, SampledCamer
     """
     (name, view), pose = next(iter(seen.items())), next(iter(poses.values()))
     up = "+z" if pose[2, 3] > 0 else "-z"
-    judged = color_alone_findings(where, Camera(name, *view.size, view.lens.matrix, pose), up)
+    judged = examine(View(where, Camera(name, *view.size, view.lens.matrix, pose), up))
     refuse(one for one in judged if one.level == "error")
     return Placed(poses=dict(poses), up=up, table="z = 0 as given", lines=tuple(map(in_report, judged)))
 

@@ -17,7 +17,8 @@ from neuspring.core.files import write_text
 from neuspring.core.geometry import farthest
 from neuspring.core.records import digest_file
 from neuspring.core.text import Progress
-from neuspring.data.capture import Camera, Capture, Description, Writer
+from neuspring.data.camera import Camera
+from neuspring.data.capture import Capture, Description, Writer
 from neuspring.data.synthetic.bodies import SoftBody
 from neuspring.data.synthetic.fem import Clip, Damping, FiniteElements, VertexBlockDescent, certify, settle
 from neuspring.data.synthetic.render import HAND, OBJECT, Part, Renderer, measured, quantized

@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 from scipy.sparse import coo_matrix
 
-from neuspring.data.capture import Camera
+from neuspring.data.camera import Camera
 from neuspring.data.synthetic.kernels import cast, shade_table
 
 OBJECT, HAND = 1, 2

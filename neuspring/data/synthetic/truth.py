@@ -17,7 +17,8 @@ import warp as wp
 from neuspring.core.artifacts import Artifact, array
 from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
-from neuspring.data.capture import CAPTURE, Camera, Capture
+from neuspring.data.camera import Camera
+from neuspring.data.capture import CAPTURE, Capture
 from neuspring.data.synthetic.kernels import first_hit, nearest
 
 

@@ -21,9 +21,9 @@ from neuspring.core.artifacts import Material, Observations, Simulation, Topolog
 from neuspring.core.errors import InputError
 from neuspring.core.text import Progress
 from neuspring.data import phystwin
-from neuspring.data.capture import Camera
+from neuspring.data.camera import Camera
 from neuspring.data.phystwin import CALIBRATION, read_calibration, released_cases
-from neuspring.data.released import (
+from neuspring.extensions.released.files import (
     Released,
     ReleasedCheckpoint,
     depth_image,

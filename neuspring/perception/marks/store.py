@@ -26,7 +26,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
 from neuspring.core.records import canonical, digest_file
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, images_digest, read_labels
-from neuspring.perception.frames import Color, frames_of, overlap, overlay, spread, tints_of, write_png
+from neuspring.data.frames import Color, frames_of, overlap, overlay, spread, tints_of, write_png
 from neuspring.perception.marks.carry import Carried, carry_camera
 from neuspring.perception.marks.marks import MARKS, Mark, Marks, marks_digest
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.data.intake.feeds import Lens
+from neuspring.data.camera import Lens
 from neuspring.data.intake.lenses import Board, Straightener, depth_ratio, read_lenses, read_poses, require_lens, sight
 from tests.support.board import BOARD, LENS, board_image, depth_of_table
 from tests.support.desk import camera, looking, write_json, write_poses

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from neuspring.data.capture import Camera
+from neuspring.data.camera import Camera
 from neuspring.data.synthetic.make import looking
 from neuspring.data.synthetic.meshes import sphere, surface
 from neuspring.data.synthetic.render import HAND, OBJECT, Part, Renderer, measured, quantized

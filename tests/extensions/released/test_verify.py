@@ -15,7 +15,8 @@ import torch
 
 from neuspring.core.errors import InputError
 from neuspring.data.phystwin import read_calibration, released_cases
-from neuspring.data.released import (
+from neuspring.extensions.released.checks import MEAN, RELEASED, Comparison, Published, frame_scores, of_means
+from neuspring.extensions.released.files import (
     Released,
     depth_image,
     gated_lift,
@@ -23,10 +24,9 @@ from neuspring.data.released import (
     read_parameters,
     visible_pixels,
 )
+from neuspring.extensions.released.run import CHECKS, Report, read_observations, verify_released
 from neuspring.scores.lpips import CHANNELS, WINDOWS, Lpips
 from neuspring.scores.metrics import METRICS
-from neuspring.extensions.released.checks import MEAN, RELEASED, Comparison, Published, frame_scores, of_means
-from neuspring.extensions.released.run import CHECKS, Report, read_observations, verify_released
 from tests.support.phystwin_case import dump, edit, stored
 from tests.support.released_case import (
     DASHPOT,

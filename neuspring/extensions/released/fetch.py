@@ -36,12 +36,12 @@ from huggingface_hub import HfApi, HfFileSystem, errors, hf_hub_url
 from huggingface_hub.hf_file_system import HfFileSystemFile
 from huggingface_hub.utils import build_hf_headers, hf_raise_for_status, http_stream_backoff, httpx
 
-from neuspring import __version__
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from neuspring.core.findings import Finding, broken
 from neuspring.core.records import now, read_json
 from neuspring.core.text import Progress
+from neuspring.core.version import __version__
 from neuspring.data import phystwin
 from neuspring.data.check import check_layout, is_case
 from neuspring.data.phystwin import released_cases
@@ -85,14 +85,13 @@ def fetch(
     dry_run: bool = False,
     endpoint: str | None = None,
     say: Callable[[str], None] = print,
-    check: Callable[[Path], list[Finding]] = check_layout,
 ) -> list[Finding]:
     """Fetch `parts` of `scenarios` (default: all 22) below `data_root`, and check every scenario whose processed data are there.
 
     `parts` are of PARTS; "all" stands for every one of these, "extra" for the additional clothes. What will be fetched and the
     space it takes is said first; a dry run stops there. Files of other content are replaced. fetched.json records commit, archives
-    and digests. Returns what `check` finds. Raises InputError, also if the disk is too small, an archive is damaged or unsafe, or
-    the hub does not answer.
+    and digests. Returns what `check-data` finds. Raises InputError, also if the disk is too small, an archive is damaged or unsafe,
+    or the hub does not answer.
     """
     data_root = Path(data_root)
     released = list(released_cases())
@@ -133,10 +132,10 @@ def fetch(
     folders = [data_root / CASES / case for case in cases]
     present = [folder for folder in folders if is_case(folder)]
     if len(present) == len(released):
-        return check(data_root)  # also compares means over all cases
+        return check_layout(data_root)  # also compares means over all cases
     absent = [folder for folder in folders if "data" in part_names and folder not in present]
     findings = [broken(folder, "", "processed data are required") for folder in absent]
-    return findings + [finding for folder in present for finding in check(folder)]
+    return findings + [finding for folder in present for finding in check_layout(folder)]
 
 
 @contextmanager

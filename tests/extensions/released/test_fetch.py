@@ -26,10 +26,9 @@ from filelock import FileLock
 
 from neuspring.config import ScenarioRow
 from neuspring.core.errors import InputError
-from neuspring.data import fetch as fetching
 from neuspring.data import phystwin
-from neuspring.data.fetch import LOCK, RECORD, fetch
-from neuspring.extensions.released.run import check
+from neuspring.extensions.released import fetch as fetching
+from neuspring.extensions.released.fetch import LOCK, RECORD, fetch
 from tests.support.phystwin_case import write_case
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
@@ -232,7 +231,7 @@ def test_everything_lands_where_the_reader_looks_and_is_recorded(
     server: StandIn, released: dict[str, bytes], tmp_path: Path
 ) -> None:
     lines, say = said()
-    findings = fetch(tmp_path, [CASE, OTHER], ["all", "extra"], endpoint=server.endpoint, say=say, check=check)
+    findings = fetch(tmp_path, [CASE, OTHER], ["all", "extra"], endpoint=server.endpoint, say=say)
     expected = {}
     for content in released.values():
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -251,7 +250,7 @@ def test_everything_lands_where_the_reader_looks_and_is_recorded(
 
 
 def test_a_fetched_case_passes_check_data_and_is_not_fetched_again(server: StandIn, tmp_path: Path) -> None:
-    findings = fetch(tmp_path, [CASE], ["data", "images"], endpoint=server.endpoint, check=check)
+    findings = fetch(tmp_path, [CASE], ["data", "images"], endpoint=server.endpoint)
     assert {d.level for d in findings} == {"note"}
     assert not [d for d in findings if "not one of the 22" in d.message]
     first, record = server.served, (tmp_path / RECORD).read_text()
@@ -429,7 +428,7 @@ def test_no_telemetry_is_sent_and_a_token_only_where_the_environment_has_one(ser
     (tmp_path / "token").write_text("hf_stored")
     environment = os.environ | {"HF_ENDPOINT": server.endpoint, "HF_HOME": str(tmp_path), "HF_TOKEN": token, "HF_HUB_OFFLINE": ""}
     environment.pop("HF_HUB_DISABLE_TELEMETRY", None)
-    code = "import sys; from neuspring.data.fetch import fetch; fetch(sys.argv[1], [sys.argv[2]], dry_run=True)"
+    code = "import sys; from neuspring.extensions.released.fetch import fetch; fetch(sys.argv[1], [sys.argv[2]], dry_run=True)"
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "root"), CASE], env=environment, check=True, capture_output=True)
     allowed = ("/api/datasets/Jianghanxiao/PhysTwin/", "/datasets/Jianghanxiao/PhysTwin/resolve/", "/cdn/")
     assert server.paths

@@ -17,7 +17,9 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.core.findings import Finding, broken, refuse, unusual
-from neuspring.data.capture import Camera, read_array, read_image
+from neuspring.data.camera import Camera
+from neuspring.data.checks.case import Case
+from neuspring.data.images import read_array, read_image
 from neuspring.data.unpickle import load_pickle
 
 DEPTH_GATE = (0.2, 1.5)
@@ -44,18 +46,8 @@ SPLATS = Path("point_cloud") / "iteration_10000" / "point_cloud.ply"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Released:
+class Released(Case):
     """Where the files of one case lie below the folder that the archives were unpacked in."""
-
-    root: Path
-    name: str
-    loose: Path | None = None
-    """Folder of a processed case that lies elsewhere. No released results are known for it."""
-
-    @property
-    def folder(self) -> Path:
-        """The processed case."""
-        return self.loose or self.root / "data" / "different_types" / self.name
 
     @property
     def parameters(self) -> Path:
