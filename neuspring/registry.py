@@ -1,7 +1,7 @@
 """The door of each kind of thing: our own members, and those that installed packages bring.
 
-A kind is a `Registry` beside the code that uses it (`METRICS`, `BASELINES`, `STAGES`, ...). A package adds to it by an entry point of
-the group `neuspring.<kind>`, in its pyproject.toml, and nothing here changes:
+A kind is a `Registry` beside the code that uses it (`METRICS`, `BASELINES`, `STAGES`, ...). A package adds to it by an entry point
+of the group `neuspring.<kind>`, in its pyproject.toml, and nothing here changes:
 
     [project.entry-points."neuspring.metrics"]
     my_error = "my_package.errors:MY_ERROR"
@@ -42,7 +42,7 @@ class Registry(Mapping[str, T], Generic[T]):
         for point in entry_points(group=f"{OURS}.{self.kind}"):
             if _left_out(point):
                 continue
-            if point.name in self._own or (other := found.get(point.name)) and other.value != point.value:
+            if point.name in self._own or ((other := found.get(point.name)) and other.value != point.value):
                 rule = f"two packages bring the {self.kind} member {point.name}"
                 raise InputError(f"package {_package(point)}", rule, point.value, "Uninstall one of them.")
             found[point.name] = point

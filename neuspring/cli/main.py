@@ -1,6 +1,6 @@
 """The command line, `neuspring`: every stage of the workflow by hand, and the tools around it.
 
-A command is a typed function: a stage, or a function of `TOOLS`; tyro makes its options. Exit status: 0 done (a numerical failure
+A command is a typed function: a stage, or a member of `COMMANDS`; tyro makes its options. Exit status: 0 done (a numerical failure
 is a recorded result), 2 bad input (only another input can help), 1 anything else. Only the module of the command that runs is
 imported, after the number of threads is set.
 """
@@ -10,50 +10,27 @@ from __future__ import annotations
 import argparse
 import difflib
 import errno
-import importlib
 import os
+import re
 import shutil
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.version import __version__
+from neuspring.registry import Registry
 
-TOOLS = {
-    "draw strip": ("pictures", "observed frames on top, each method's prediction and error below -> PDF or PNG"),
-    "draw twin": ("pictures", "stiffness and regions of twins, from any side -> PDF or PNG"),
-    "draw film": ("pictures", "observed beside predicted, moving -> MP4 or GIF of limited size"),
-    "draw frames": ("pictures", "splats and trajectory -> RGBA pictures of any camera"),
-    "play": ("twins", "runs of a results folder in the browser; twins that can be pulled by hand"),
-    "export": ("twins", "a twin -> USD, PLY, Newton, MuJoCo, or npz with a JSON description"),
-    "fetch": ("data", "released archives -> the folders that the readers expect"),
-    "make-capture": ("data", "color and depth of a camera, or points in space -> a capture folder"),
-    "cut-capture": ("data", "some frames of a capture, with their masks -> another capture"),
-    "check-data": ("data", "report how a data folder departs from the expected layout"),
-    "mask": ("data", "marks on a few frames -> masks of object and hands in every frame of a capture"),
-    "compare-masks": ("data", "two folders of masks -> their overlap per frame"),
-    "annotate": ("data", "mark masks and tracks of a capture in the browser"),
-    "verify-released": ("data", "PhysTwin's released results, checked against ours"),
-    "tables": ("results", "run records -> tables"),
-    "perception-table": ("results", "errors of perception, per category"),
-    "study": ("results", "run records -> one of the paper's tables, beside the paper's values"),
-    "explain": ("results", "a cell of a study's table -> the runs behind it, and how to make them again"),
-    "report": ("results", "results folder -> one self-contained HTML file"),
-    "track-init": ("results", "prepare the MLflow store, once before any run is logged"),
-    "log": ("results", "log one run.json to MLflow"),
-    "sync": ("results", "send to MLflow what is missing there, and close runs that were killed"),
-    "ui": ("results", "open the MLflow UI of a results folder"),
-    "tune": ("results", "one worker of a sweep"),
-    "tune-report": ("results", "a sweep -> summary, plots, best.yaml"),
-    "doctor": ("results", "say what this machine can do, and what is missing"),
+_OURS = {
+    "data": "make-capture cut-capture check-data mask compare-masks",
+    "results": "tables perception-table study explain report track-init log sync ui tune tune-report doctor",
 }
-"""Command -> the module of neuspring.cli with a function of its name, and what it does."""
-LEFT = {
-    "compare": "Removed: name two runs on MLflow's page (`neuspring ui`) and press Compare; commit a72d24c is the last that has it."
-}
-"""Commands of older versions -> what to do now."""
+COMMANDS: Registry[Callable[..., int | None]] = Registry(
+    "commands",
+    {name: f"neuspring.cli.{module}:{name.replace('-', '_')}" for module, names in _OURS.items() for name in names.split()},
+)
+"""Tools beside the stages. A dot in a member's name is a space of the command: `draw.film` is `neuspring draw film`."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 OWN_THREADS = ("search",)
 """Commands that share their work among --threads threads of their own: numerical libraries have one in each of them."""
@@ -108,12 +85,12 @@ def _run(words: list[str]) -> int:
     if words[:1] in ([], ["-h"], ["--help"]):
         print(_overview())
         return 0 if words else 2
-    command = " ".join(words[:2]) if words[0] == "draw" else words[0]
-    if command in TOOLS:
+    tools = {name.replace(".", " "): name for name in COMMANDS}
+    command = next((name for name in (" ".join(words[:2]), words[0]) if name in tools), words[0])
+    if command in tools:
         import tyro
 
-        module = importlib.import_module(f"neuspring.cli.{TOOLS[command][0]}")
-        function = getattr(module, command.replace("-", "_").replace(" ", "_"))
+        function = COMMANDS[tools[command]]
         rest, options = words[len(command.split()) :], (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
         about = (function.__doc__ or "").strip()
         return tyro.cli(function, args=rest, prog=f"neuspring {command}", description=about, config=options) or 0
@@ -122,17 +99,22 @@ def _run(words: list[str]) -> int:
     if command in STAGES:
         STAGES[command](**STAGES[command].parse(words[1:]))
         return 0
-    close = [name for name in TOOLS if name.startswith(f"{words[0]} ")]
-    close = close or difflib.get_close_matches(command, [*STAGES, *TOOLS], n=1)
-    remedy = LEFT.get(command) or (f"Did you mean {' or '.join(close)}?" if close else "neuspring --help names all.")
+    close = [name for name in tools if name.startswith(f"{words[0]} ")]
+    close = close or difflib.get_close_matches(command, [*STAGES, *tools], n=1)
+    remedy = f"Did you mean {' or '.join(close)}?" if close else "neuspring --help names all."
     raise InputError("command", "must be a stage or a tool", command, remedy)
+
+
+def about(function: Callable[..., object]) -> str:
+    """The first sentence of a command's docstring, for the overview."""
+    return re.split(r"[.;] |\.$", (function.__doc__ or "").partition("\n")[0])[0].rstrip(".")
 
 
 def _overview() -> str:
     from neuspring.stages import STAGES
 
     stages = [f"  {name:<17} {stage.about}" for name, stage in STAGES.items()]
-    tools = [f"  {name:<17} {about}" for name, (_, about) in TOOLS.items()]
+    tools = [f"  {name.replace('.', ' '):<17} {about(function)}" for name, function in COMMANDS.items()]
     head = (
         "usage: neuspring COMMAND [options]; neuspring COMMAND --help\n\nSpring-mass twins of deformable objects from RGBD video."
     )

@@ -27,9 +27,9 @@ from neuspring.extensions.play.controls import MOST_FRAMES
 from neuspring.extensions.play.live import Live
 from neuspring.extensions.play.page import Page
 from neuspring.extensions.play.player import Player
-from neuspring.extensions.play.results import find
 from neuspring.extensions.play.serve import address, start
 from neuspring.extensions.play.simulator import Simulator, StartState
+from neuspring.report.shown import find
 from tests.benchmarks.memory import resident_mib
 from tests.benchmarks.scenes import box
 from tests.support import scenarios

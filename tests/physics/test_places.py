@@ -15,15 +15,15 @@ PLACES = {
     "physics/reference.py": "the specification",
     "config/search.py": "range, scale and start",
     "twin/parameters.py": "how it is trained",
-    "export/plain.py": "the equation in words",
+    "extensions/exports/formats/npz.py": "the equation in words",
 }
 """Of drag, with `decay`, what the kernels take of it: files of the package that a force with one trained parameter needs."""
 VALUES = {
     "data/synthetic/toy.py": "the drag of the toy's truth",
     "extensions/released/checks.py": "the released files' drag",
     "twin/search.py": "the released rounding of drag",
-    "export/simulators.py": "drag in MuJoCo",
-    "export/newton_twin.py": "drag in Newton",
+    "extensions/exports/formats/mujoco.py": "drag in MuJoCo",
+    "extensions/exports/newton_twin.py": "drag in Newton",
 }
 """Files that give or translate the value that drag, which has no default, has in their case. A new parameter has a default."""
 OTHERS = {"data/synthetic/fem.py", "data/synthetic/kernels.py", "play/page.py"}

@@ -11,9 +11,9 @@ from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations
 from neuspring.data.camera import CameraEntry
 from neuspring.data.capture import HANDS, OBJECT, Capture, Description, Writer
-from neuspring.extensions.play.results import find
 from neuspring.report.draw.painter import DrawingStyle, Painter
 from neuspring.report.draw.scene import Prediction, Scene, broad_side, seen_from, shown_points
+from neuspring.report.shown import find
 from neuspring.splats.draw import COVERED, picture, view_of
 from tests.support.filmed import rows
 from tests.support.played import dressed, results

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from neuspring.extensions.play.page import Page
-from neuspring.extensions.play.results import find
 from neuspring.extensions.play.serve import address, start
+from neuspring.report.shown import find
 from tests.support.browser import Browser
 from tests.support.pointing import WINDOW, choose_tab, pixel, pull, until
 

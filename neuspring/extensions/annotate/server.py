@@ -30,9 +30,9 @@ from starlette.staticfiles import StaticFiles
 
 from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
+from neuspring.core.web import Refused, check_host, check_origin
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.extensions.annotate.clicks import Annotations
-from neuspring.core.web import Refused, check_host, check_origin
 from neuspring.extensions.annotate.masks import MasksMode
 from neuspring.extensions.annotate.shared import Busy, Stale
 from neuspring.extensions.annotate.tracks import Foreign, TracksMode

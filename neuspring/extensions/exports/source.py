@@ -147,3 +147,10 @@ def _at_rest(name: str, twin: Twin, digests: dict[str, str]) -> Source:
         velocity=np.zeros(topology.nodes.shape),
         made_from=digests,
     )
+
+
+def require_start(frames: Sequence[int]) -> None:
+    """Raise InputError unless the frames are 0, 1, 2, ...: a simulator needs the hands from the start on."""
+    if list(frames) != list(range(len(frames))):
+        rule = "a simulator needs the hands of all frames from 0 on"
+        raise InputError("--frames", rule, f"{frames[0]} to {frames[-1]}, {len(frames)} frames", "Take 0:STOP, or leave it out.")

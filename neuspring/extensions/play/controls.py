@@ -13,8 +13,8 @@ import numpy as np
 
 from neuspring.core.artifacts import SAFE_NAME, Artifact, Trajectory, Twin, array
 from neuspring.core.errors import InputError
-from neuspring.extensions.play.results import Run, Scene, require_modest
 from neuspring.extensions.play.simulator import Simulator, Start
+from neuspring.report.shown import Found, Run, require_modest
 from neuspring.twin.rollout import Diverged
 
 MOST_FRAMES = 20_000
@@ -185,7 +185,7 @@ def compare(controls: Controls, own: Twin, other: Twin, seen: Trajectory | None 
     return Difference(frames, float(mean), float(last), float(worst), first.reason or second.reason)
 
 
-def pulled_run(found: Scene, controls: Controls, path: Path) -> Run:
+def pulled_run(found: Found, controls: Controls, path: Path) -> Run:
     """The run whose twin was pulled, told by its digest. Raises InputError where it is not there."""
     candidates = sorted((run for run in found.runs if "twin" in run.paths), key=lambda run: run.name != controls.name)
     for run in candidates:
@@ -196,7 +196,7 @@ def pulled_run(found: Scene, controls: Controls, path: Path) -> Run:
     raise InputError(path, rule, twins, "Give the results folder that it was recorded in.")
 
 
-def comparison(found: Scene, controls: Controls, own: Run) -> Iterator[str]:
+def comparison(found: Found, controls: Controls, own: Run) -> Iterator[str]:
     """A line per twin: how far its nodes are from those of the twin that was pulled, under the same controls."""
     assert own.twin is not None
     yield f"{len(controls.grabbed)} frames recorded with {own.name}; distances of nodes to it, mm"

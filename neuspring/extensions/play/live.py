@@ -15,8 +15,8 @@ from neuspring.core.errors import InputError
 from neuspring.extensions.play.controls import MOST_FRAMES, Controls, Recording
 from neuspring.extensions.play.layers import BodyLayer
 from neuspring.extensions.play.player import Player
-from neuspring.extensions.play.results import Run
 from neuspring.extensions.play.simulator import Simulator, StartState, hands_of
+from neuspring.report.shown import Run
 from neuspring.twin.rollout import Diverged
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ from neuspring.extensions.play.colors import QUANTITIES
 from neuspring.extensions.play.controls import Controls
 from neuspring.extensions.play.live import TOO_MUCH, Live
 from neuspring.extensions.play.player import MOST_SHOWN, SPEEDS, Player
-from neuspring.extensions.play.results import Scene
 from neuspring.extensions.play.simulator import StartState, start_state
+from neuspring.report.shown import Found
 
 if TYPE_CHECKING:
     import viser
@@ -63,7 +63,7 @@ MARKS = {
 class Page:
     """The controls of a recording, shared by all browsers that have it open."""
 
-    def __init__(self, server: viser.ViserServer, found: Scene, save_to: Path = Path()) -> None:
+    def __init__(self, server: viser.ViserServer, found: Found, save_to: Path = Path()) -> None:
         self.server, self.found, self.player = server, found, Player(server.scene, found)
         self._stop, self._moved = threading.Event(), False
         self._alive, self._before = False, (self.player.display.quantity, self.player.display.hands)

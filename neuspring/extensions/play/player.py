@@ -13,7 +13,7 @@ import numpy as np
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.extensions.play.colors import Scale, region_legend, scale_of, strain_scale
 from neuspring.extensions.play.layers import BodyLayer, Display, SplatLayer, Surroundings, TrackOverlay
-from neuspring.extensions.play.results import Run, Scene
+from neuspring.report.shown import Found, Run
 
 if TYPE_CHECKING:
     import viser
@@ -91,7 +91,7 @@ class Clock:
 class Player:
     """Draws the shown runs at the clock's frame. All methods may be called from any thread."""
 
-    def __init__(self, scene: viser.SceneApi, found: Scene) -> None:
+    def __init__(self, scene: viser.SceneApi, found: Found) -> None:
         scenario = found.observations.scenario
         self.found, self.lock, self.watched = found, threading.RLock(), threading.Event()
         self.watched.set()

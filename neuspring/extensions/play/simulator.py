@@ -24,7 +24,7 @@ from neuspring.physics.solver import solver_for
 from neuspring.twin.rollout import FAR, Diverged, initial_velocity
 
 if TYPE_CHECKING:
-    from neuspring.extensions.play.results import Run
+    from neuspring.report.shown import Run
 
 REST = 1e-6
 """Rest length of the spring of a grab, m: the solver has none of length 0."""

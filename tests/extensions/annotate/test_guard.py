@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from neuspring.core.errors import InputError
 from neuspring.core import web as guard
+from neuspring.core.errors import InputError
 from neuspring.extensions.annotate.server import MOST_BYTES, STATIC, Server
 from tests.support.moving import moving
 from tests.support.served import TOKEN, served

@@ -8,8 +8,9 @@ import pytest
 
 from neuspring.core.artifacts import Rod
 from neuspring.core.errors import InputError
-from neuspring.extensions.exports import ply, simulators, usd
 from neuspring.extensions.exports.cable import _rest
+from neuspring.extensions.exports.formats import mujoco as mujoco_format
+from neuspring.extensions.exports.formats import newton, npz, ply, usd
 from neuspring.extensions.exports.source import read_source
 from neuspring.twin.rollout import roll_out
 from tests.support import ropes
@@ -39,7 +40,7 @@ def hanging(tmp_path, **rod):
 def test_a_cable_hangs_between_its_clamps_in_mujoco_as_here(tmp_path, rest):
     mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (extra `export`)")
     source, ours = hanging(tmp_path, rest=rest)
-    model = mujoco.MjModel.from_xml_string(simulators.mjcf(source))
+    model = mujoco.MjModel.from_xml_string(mujoco_format.mjcf(source))
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     mujoco.mj_kinematics(model, data)
@@ -67,7 +68,7 @@ def test_a_joint_without_moments_has_the_unloaded_curvatures():
 def test_a_rope_with_hands_loads_in_mujoco(tmp_path):
     mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (extra `export`)")
     source = source_of(tmp_path)
-    made = simulators.write_mujoco(source, range(3), tmp_path / "out")
+    made = mujoco_format.write(source, range(3), tmp_path / "out")
     model = mujoco.MjModel.from_xml_path(str(made[0]))
     assert (model.ntendon, model.nmocap) == (len(source.twin.topology.springs), 3)
     assert model.body_mass.sum() == pytest.approx(source.twin.rod.mass.sum())
@@ -80,7 +81,7 @@ def test_a_rope_with_hands_loads_in_mujoco(tmp_path):
 
 def test_arrays_are_described_and_the_format_says_that_it_is_a_rod(tmp_path):
     source = source_of(tmp_path)
-    simulators.plain.write(source, [0, 1], tmp_path / "out")
+    npz.write(source, [0, 1], tmp_path / "out")
     said = json.loads((tmp_path / "out" / "description.json").read_text())
     assert (said["format"], said["version"]) == ("neuspring-rod", 1)
     assert {"stretching", "damping", "roll", "drag", "gravity"} <= said["settings"].keys()
@@ -100,7 +101,7 @@ def test_arrays_are_described_and_the_format_says_that_it_is_a_rod(tmp_path):
 
 def test_newton_is_refused_with_the_next_move(tmp_path):
     with pytest.raises(InputError, match=r"nodes and springs.*rod.*mujoco"):
-        simulators.write_newton(source_of(tmp_path), range(2), tmp_path / "out")
+        newton.write(source_of(tmp_path), range(2), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

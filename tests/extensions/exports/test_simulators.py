@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.extensions.exports import simulators
+from neuspring.extensions.exports.formats import mujoco as mujoco_format
+from neuspring.extensions.exports.formats import newton as newton_format
 from neuspring.extensions.exports.source import read_source
 from tests.support import exported
 
@@ -30,7 +31,7 @@ def swinging(tmp_path, material=None, **options):
 @pytest.mark.parametrize("options", [{}, {"up": "-z"}, {"controller_velocity": True}], ids=["plain", "-z up", "hand velocity"])
 def test_newton_swings_as_we_do(tmp_path, options):
     source, folder = swinging(tmp_path, ground=False, **options), tmp_path / "out"
-    simulators.write_newton(source, range(exported.FRAMES), folder)
+    newton_format.write(source, range(exported.FRAMES), folder)
     spec = importlib.util.spec_from_file_location("newton_twin", folder / "newton_twin.py")
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)
@@ -40,13 +41,13 @@ def test_newton_swings_as_we_do(tmp_path, options):
 
 def test_the_hands_are_needed_from_the_start(tmp_path):
     with pytest.raises(InputError, match="Take 0:STOP"):
-        simulators.write_newton(swinging(tmp_path), [2, 3], tmp_path / "out")
+        newton_format.write(swinging(tmp_path), [2, 3], tmp_path / "out")
 
 
 def by_mujoco(source, folder):
     """Positions [F, N, 3] by MuJoCo of what is exported, as the page says."""
     mujoco = pytest.importorskip("mujoco", reason="mujoco-core is not installed (extra `export`)")
-    simulators.write_mujoco(source, range(exported.FRAMES), folder)
+    mujoco_format.write(source, range(exported.FRAMES), folder)
     model = mujoco.MjModel.from_xml_path(str(folder / "twin.xml"))
     data = mujoco.MjData(model)
     if model.nkey:
@@ -79,7 +80,7 @@ def test_hands_that_only_push(tmp_path):
     assert np.abs(source.positions - swinging(tmp_path / "held", {"drag": 0.0}, ground=False).positions).max() > 0.01
     assert np.abs(source.positions - by_mujoco(source, tmp_path / "out")).max() < SWING
     with pytest.raises(InputError, match="whose hands only push"):
-        simulators.write_newton(source, range(exported.FRAMES), tmp_path / "newton")
+        newton_format.write(source, range(exported.FRAMES), tmp_path / "newton")
 
 
 def test_drag_in_mujoco_differs_by_the_time_step(tmp_path):
@@ -100,5 +101,5 @@ def test_a_first_velocity_is_a_keyframe(tmp_path):
     mujoco = pytest.importorskip("mujoco", reason="mujoco-core is not installed (extra `export`)")
     source = swinging(tmp_path)
     moving = replace(source, velocity=np.full(source.velocity.shape, 0.25))
-    model = mujoco.MjModel.from_xml_string(simulators.mjcf(moving))
-    assert np.allclose(model.key_qvel, 0.25) and not mujoco.MjModel.from_xml_string(simulators.mjcf(source)).nkey
+    model = mujoco.MjModel.from_xml_string(mujoco_format.mjcf(moving))
+    assert np.allclose(model.key_qvel, 0.25) and not mujoco.MjModel.from_xml_string(mujoco_format.mjcf(source)).nkey

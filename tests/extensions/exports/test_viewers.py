@@ -6,7 +6,7 @@ import pytest
 from neuspring.cli.main import main
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
-from neuspring.extensions.exports import usd
+from neuspring.extensions.exports.formats import usd
 from neuspring.extensions.exports.source import read_source
 from neuspring.splats.model import Splats
 from tests.support import exported

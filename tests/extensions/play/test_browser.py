@@ -8,8 +8,8 @@ import pytest
 pytest.importorskip("viser", reason="the extra [play] is not installed")
 
 from neuspring.extensions.play.page import Page
-from neuspring.extensions.play.results import find
 from neuspring.extensions.play.serve import address, start
+from neuspring.report.shown import find
 from tests.support.browser import Browser, chromium
 from tests.support.played import results
 from tests.support.pointing import SMALL, choose_tab, colored, pixel, press, pull, settled, until, until_drawn

@@ -8,11 +8,11 @@ import pytest
 
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
-from neuspring.physics import stability
 from neuspring.extensions.play.controls import Controls, Recording, compare, digest_motion, load_controls, replay
 from neuspring.extensions.play.live import FASTEST, Grab, nearest_to_ray
-from neuspring.extensions.play.results import find
 from neuspring.extensions.play.simulator import Simulator, Start, hands_of, start_state
+from neuspring.physics import stability
+from neuspring.report.shown import find
 from neuspring.twin.rollout import roll_out
 from tests.support import ropes, small
 from tests.support.played import results, rod_results, softer

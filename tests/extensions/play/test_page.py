@@ -18,7 +18,7 @@ from neuspring.core.records import digest_file
 from neuspring.extensions.play.layers import UNIT, SplatLayer, covariances
 from neuspring.extensions.play.page import Page
 from neuspring.extensions.play.player import Player
-from neuspring.extensions.play.results import find
+from neuspring.report.shown import find
 from neuspring.scores.metrics import track_errors
 from neuspring.splats.model import Gaussians
 from neuspring.splats.view import C0

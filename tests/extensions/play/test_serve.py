@@ -12,8 +12,8 @@ pytest.importorskip("viser", reason="the extra [play] is not installed")
 from neuspring.cli.main import main
 from neuspring.core.errors import InputError
 from neuspring.extensions.play.page import Page
-from neuspring.extensions.play.results import find
 from neuspring.extensions.play.serve import start
+from neuspring.report.shown import find
 from tests.support.played import results, softer
 
 UPGRADE = {

@@ -7,10 +7,10 @@ import pytest
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PathCollection
 
-from neuspring.extensions.play.results import find
 from neuspring.report.draw.scene import Prediction, Scene
 from neuspring.report.draw.sheet import CONTROLLER
 from neuspring.report.draw.twin import CROSSING, Lines, TwinPicture, node_stiffness, region_colors, twin_figure
+from neuspring.report.shown import find
 from tests.support.played import results, rod_results
 from tests.support.shown import METHODS, filmed, painter
 

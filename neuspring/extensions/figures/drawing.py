@@ -1,4 +1,4 @@
-"""What `neuspring draw strip`, `twin` and `film` draw: runs are chosen and read here, and what cannot be drawn is refused."""
+"""Strips, films and twins: runs are chosen and read here, and what cannot be drawn is refused."""
 
 from __future__ import annotations
 
@@ -6,19 +6,17 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
 
 import numpy as np
 
-from neuspring.cli.options import Device, Positional, Settings, arg, read_settings
+from neuspring.cli.options import read_settings
 from neuspring.config.images import Images
 from neuspring.core.device import resolve_device
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
 from neuspring.data.camera import Camera
 from neuspring.data.capture import Capture
-from neuspring.extensions.play.results import Run, find
-from neuspring.extensions.play.results import Scene as Found
+from neuspring.extensions.figures.commands import ComparedOptions, FilmOptions, RunOptions, StripOptions, TwinOptions
 from neuspring.perception.results import Masks
 from neuspring.report.draw import sheet
 from neuspring.report.draw.film import write_film
@@ -26,101 +24,7 @@ from neuspring.report.draw.painter import DrawingStyle, Error, Painter, Style
 from neuspring.report.draw.scene import ELEVATION, Prediction, Scene, chosen_frames
 from neuspring.report.draw.strip import caption, strip_figure
 from neuspring.report.draw.twin import TwinPicture, twin_figure
-
-MEGABYTES = 2.0
-"""Size of a film that a README loads at once."""
-
-
-@dataclass(kw_only=True)
-class RunOptions:
-    """Which runs, seen from where, as which file."""
-
-    results: Annotated[
-        Positional[tuple[Path, ...]], arg(help="results/<scenario>, or runs <scenario>/<method>/<seed> of one scenario")
-    ]
-    methods: Annotated[tuple[str, ...], arg(help="METHOD or METHOD/SEED, in the order of the picture")] = ()
-    labels: Annotated[tuple[str, ...], arg(help="names in the picture, one per method")] = ()
-    camera: Annotated[str | None, arg(help="a camera of the capture; the first by default, or a view of the broad side")] = None
-    azimuth: Annotated[float | None, arg(help="instead of a camera: degrees around the vertical axis, 0 from +x")] = None
-    elevation: Annotated[float | None, arg(help="degrees above the horizon; 25 by default")] = None
-    settings: Settings = "{}"
-    device: Device = "auto"
-    output: Annotated[Path, arg(help="file to write, for example picture.pdf or film.gif")]
-
-
-@dataclass(kw_only=True)
-class ComparedOptions(RunOptions):
-    """How predictions and errors are drawn."""
-
-    frames: Annotated[tuple[int, ...], arg(help="of a strip: first, last of training, middle of the future, last by default")] = ()
-    style: Annotated[Literal["splats", "nodes"] | None, arg(name="as", help="splats where the runs have them by default")] = None
-    error: Annotated[
-        Literal["best", "color", "distance", "none"],
-        arg(help="difference of pictures, distance of nodes to observed points, or no errors; best: what can be drawn"),
-    ] = "best"
-    most: Annotated[float | None, arg(help="upper end of the range of errors: of 1 for color, mm for distance")] = None
-    background: Annotated[
-        Literal["white", "image"] | None,
-        arg(help="white paper, or the photo (pale behind a prediction); white for splats, image for nodes by default"),
-    ] = None
-
-
-Inches = Annotated[float, arg(help="inches on paper, where text has 8 points")]
-Dots = Annotated[float, arg(help="dots per inch of what is not lines or text")]
-
-
-@dataclass(kw_only=True)
-class StripOptions(ComparedOptions):
-    """The size on paper."""
-
-    width: Inches = 7.0
-    dpi: Dots = 300.0
-
-
-@dataclass(kw_only=True)
-class FilmOptions(ComparedOptions):
-    """Size and speed."""
-
-    width: Annotated[int, arg(help="pixels")] = 800
-    speed: Annotated[float, arg(help="1: as fast as it was; 0.5: half as fast")] = 1.0
-    megabytes: Annotated[float, arg(help="largest file; a film beyond it is made coarser")] = MEGABYTES
-
-
-@dataclass(kw_only=True)
-class TwinOptions(RunOptions):
-    """What is drawn of twins, and the size on paper."""
-
-    by: Annotated[tuple[Literal["stiffness", "region"], ...], arg(help="rows: springs by stiffness, nodes by region")] = (
-        "stiffness",
-        "region",
-    )
-    frame: Annotated[int, arg(help="of the prediction")] = 0
-    style: Annotated[Literal["springs", "splats"], arg(name="as", help="springs as lines, or the surface that splats show")] = (
-        "springs"
-    )
-    background: Annotated[Literal["white", "image"], arg(help="what is behind: white paper, or the photo, pale")] = "white"
-    width: Inches = 7.0
-    dpi: Dots = 300.0
-
-
-def draw_frames(
-    capture: Annotated[Path, arg(help="capture.json")],
-    appearance: Annotated[Path, arg(help="appearance.json")],
-    rollout: Annotated[Path, arg(help="rollout.json")],
-    camera: str,
-    output: Annotated[Path, arg(help="folder to write to")],
-    frames: Annotated[tuple[int, ...], arg(help="all by default")] = (),
-    background: Literal["black", "white"] = "black",
-    settings: Settings = "{}",
-    device: Device = "auto",
-) -> None:
-    """Splats and trajectory -> RGBA pictures of any camera."""
-    from neuspring.core.records import Before
-    from neuspring.stages.render import draw_frames
-
-    records, chosen = (Before.load(appearance), Before.load(rollout)), read_settings(settings)
-    made = draw_frames(capture.parent, *records, camera, frames or None, background, chosen, device, output)
-    print(f"{len(made)} pictures: {output}")
+from neuspring.report.shown import Found, Run, find
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +38,7 @@ class Chosen:
     device: str
 
 
-def draw_strip(picture: StripOptions) -> None:
+def strip(picture: StripOptions) -> None:
     """Observed frames on top, each method's prediction and error below -> PDF or PNG."""
     sheet.require_ending(picture.output, sheet.PICTURES)
     sheet.require_size(picture.width, picture.dpi)
@@ -149,7 +53,7 @@ def draw_strip(picture: StripOptions) -> None:
     print(f"Caption: {caption(painter)}")
 
 
-def draw_film(picture: FilmOptions) -> None:
+def film(picture: FilmOptions) -> None:
     """Observed beside predicted, moving -> MP4 or GIF of limited size."""
     sheet.require_ending(picture.output, sheet.FILMS)
     chosen = _choose(picture)
@@ -160,7 +64,7 @@ def draw_film(picture: FilmOptions) -> None:
     print(f"Wrote {picture.output}: {made}, {painter.manner.style}")
 
 
-def draw_twin(picture: TwinOptions) -> None:
+def twin(picture: TwinOptions) -> None:
     """Stiffness and regions of twins, from any side -> PDF or PNG."""
     sheet.require_ending(picture.output, sheet.PICTURES)
     sheet.require_size(picture.width, picture.dpi)

@@ -12,7 +12,8 @@ from neuspring.core.artifacts import Rod
 from neuspring.core.errors import InputError
 from neuspring.core.extras import needed
 from neuspring.core.files import write_atomically
-from neuspring.extensions.exports import ply
+from neuspring.extensions.exports import Export
+from neuspring.extensions.exports.formats import ply
 from neuspring.extensions.exports.source import Source
 from neuspring.physics.rod_nodes import radius_of
 from neuspring.splats.view import C0
@@ -165,3 +166,6 @@ class _Shapes:
 
         made = self._geom.PrimvarsAPI(prim).CreatePrimvar(name, Sdf.ValueTypeNames.Find(kind), interpolation)
         made.Set(value)
+
+
+EXPORT = Export(write=write, name="{name}.usdc")

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from neuspring.core.files import write_atomically
+from neuspring.extensions.exports import Export
 from neuspring.extensions.exports.source import Source
 from neuspring.report.draw.twin import Lines
 
@@ -80,3 +81,6 @@ def _write_elements(path: Path, elements: dict[str, np.ndarray]) -> None:
     head = "\n".join([*lines, "end_header", ""]).encode()
     content = head + b"".join(table.tobytes() for table in elements.values())
     write_atomically(path, lambda temporary: temporary.write_bytes(content))
+
+
+EXPORT = Export(write=write, frames="0")

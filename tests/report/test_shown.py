@@ -10,7 +10,7 @@ import pytest
 from neuspring.core.errors import InputError
 from neuspring.core.records import CAPTURE_FOLDER, Recorder, digest_file
 from neuspring.data.capture import CAPTURE
-from neuspring.extensions.play.results import find
+from neuspring.report.shown import find
 from tests.support import small
 from tests.support.colored import paint
 from tests.support.played import record, results, spoil

@@ -1,4 +1,4 @@
-"""A twin for other simulators, beside the plain export: the script that makes Newton's model of it, and MuJoCo's MJCF file."""
+"""MuJoCo: an MJCF file, beside the plain export for the hands' motion."""
 
 from __future__ import annotations
 
@@ -9,43 +9,22 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
-from neuspring.extensions.exports import cable, plain
+from neuspring.extensions.exports import Export, cable
 from neuspring.extensions.exports.cable import AXES, text
-from neuspring.extensions.exports.source import Source
+from neuspring.extensions.exports.formats import npz
+from neuspring.extensions.exports.source import Source, require_start
 from neuspring.physics.rod_nodes import radius_of
 from neuspring.twin.rollout import FAR
 
-SCRIPT = Path(__file__).with_name("newton_twin.py")
 MODEL = "twin.xml"
 
 
-def write_newton(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
-    """Write arrays.npz, description.json and newton_twin.py to the folder `output`."""
-    require_start(frames)
-    if source.twin.rod is not None:
-        rule = "Newton's model is of nodes and springs"
-        raise InputError("--to newton", rule, f"{source.name}, whose twin is a rod", "Take --to mujoco, or a run with a lattice.")
-    if source.twin.topology.pushes.any():
-        rule = "Newton's springs pull as well as push"
-        raise InputError("--to newton", rule, f"{source.name}, whose hands only push", "Take --to mujoco or npz.")
-    write_text(output / SCRIPT.name, SCRIPT.read_text(encoding="utf-8"))
-    return [*plain.write(source, frames, output), output / SCRIPT.name]
-
-
-def write_mujoco(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
+def write(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
     """Write twin.xml, and arrays.npz and description.json for the hands' motion, to the folder `output`."""
     require_start(frames)
     write_text(output / MODEL, mjcf(source))
-    return [output / MODEL, *plain.write(source, frames, output)]
-
-
-def require_start(frames: Sequence[int]) -> None:
-    """Raise InputError unless the frames are 0, 1, 2, ...: a simulator needs the hands from the start on."""
-    if list(frames) != list(range(len(frames))):
-        rule = "a simulator needs the hands of all frames from 0 on"
-        raise InputError("--frames", rule, f"{frames[0]} to {frames[-1]}, {len(frames)} frames", "Take 0:STOP, or leave it out.")
+    return [output / MODEL, *npz.write(source, frames, output)]
 
 
 def mjcf(source: Source) -> str:
@@ -104,3 +83,6 @@ def mjcf(source: Source) -> str:
         ET.SubElement(keys, "key", name="start", qvel=text(*source.velocity.ravel()))
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
+
+
+EXPORT = Export(write=write, name="{name}_mujoco")

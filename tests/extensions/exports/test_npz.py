@@ -12,7 +12,7 @@ import pytest
 import neuspring.extensions.exports
 from neuspring.cli.main import main
 from neuspring.core.artifacts import Twin
-from neuspring.extensions.exports import plain
+from neuspring.extensions.exports.formats import npz
 from neuspring.extensions.exports.source import read_source
 from tests.support import exported
 
@@ -42,7 +42,7 @@ def test_the_script_on_the_page_simulates_the_first_frame(tmp_path, options):
     run = subprocess.run([sys.executable, "-I", str(path), str(tmp_path / "out")], capture_output=True, text=True, check=True)
     error = float(run.stdout.split()[-1])
     assert error < ERROR
-    arrays = np.load(tmp_path / "out" / plain.ARRAYS)
+    arrays = np.load(tmp_path / "out" / npz.ARRAYS)
     assert np.abs(arrays["positions"][1] - arrays["positions"][0]).max() > 100 * ERROR, "the body moves"
     if "gravity" in options:
         heights = arrays["positions"][:2, :, 2]
@@ -51,9 +51,9 @@ def test_the_script_on_the_page_simulates_the_first_frame(tmp_path, options):
 
 def test_every_array_is_described_as_it_is(tmp_path):
     folder = exported.run_folder(tmp_path)
-    plain.write(read_source(folder), [0, 2, 4], tmp_path / "out")
-    said = json.loads((tmp_path / "out" / plain.DESCRIPTION).read_text())
-    with np.load(tmp_path / "out" / plain.ARRAYS, allow_pickle=False) as arrays:
+    npz.write(read_source(folder), [0, 2, 4], tmp_path / "out")
+    said = json.loads((tmp_path / "out" / npz.DESCRIPTION).read_text())
+    with np.load(tmp_path / "out" / npz.ARRAYS, allow_pickle=False) as arrays:
         assert set(arrays.files) == set(said["arrays"])
         sizes: dict[str, int] = {}
         for name, entry in said["arrays"].items():
@@ -79,5 +79,5 @@ def test_masses_of_one_kilogram_are_written_out(tmp_path):
         material=type(twin.material)(**{**vars(twin.material), "mass": np.zeros(0)}),
     ).save(tmp_path / "twin.npz")
     assert main(["export", str(tmp_path / "twin.npz"), "--to", "npz", "--output", str(tmp_path / "out")]) == 0
-    arrays = np.load(tmp_path / "out" / plain.ARRAYS)
+    arrays = np.load(tmp_path / "out" / npz.ARRAYS)
     assert arrays["mass"].tolist() == [1.0] * exported.NODES and arrays["positions"].shape[0] == 1

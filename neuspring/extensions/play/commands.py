@@ -1,48 +1,16 @@
-"""Commands on twins: play, export."""
+"""The command `play`."""
 
 from __future__ import annotations
 
-import importlib
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from neuspring.cli.options import Positional, arg
 from neuspring.core.errors import InputError
 
 if TYPE_CHECKING:
     from neuspring.extensions.play.page import Page
-
-FORMATS = {
-    "npz": ("plain.write", "", "{name}_npz"),
-    "ply": ("ply.write", "0", "{name}"),
-    "newton": ("simulators.write_newton", "", "{name}_newton"),
-    "mujoco": ("simulators.write_mujoco", "", "{name}_mujoco"),
-    "usd": ("usd.write", "", "{name}.usdc"),
-}
-"""Format -> module and function of neuspring.extensions.exports, frames by default (all where empty), what is written by default."""
-
-
-def export(
-    twin: Annotated[Positional[Path], arg(help="a run's folder, results/<scenario>/<method>/<seed>, or a twin.npz")],
-    to: Annotated[Literal["npz", "ply", "newton", "mujoco", "usd"], arg(help="format")],
-    output: Annotated[Path | None, arg(help="file or folder to write; by default it is named after the run")] = None,
-    frames: Annotated[str | None, arg(help="FIRST, FIRST:STOP or FIRST:STOP:STEP; all by default, of ply frame 0")] = None,
-    rate: Annotated[float | None, arg(help="time codes per second (usd); the capture's frames per second by default")] = None,
-) -> None:
-    """A twin -> USD, PLY, Newton, MuJoCo, or npz with a JSON description."""
-    from neuspring.extensions.exports.source import chosen_frames, read_source
-
-    writer, default, name = FORMATS[to]
-    module, _, function = writer.partition(".")
-    if rate is not None and to != "usd":
-        raise InputError("--rate", "is for usd", f"--to {to}", "Leave it out: the files say the time of each frame.")
-    source = read_source(twin)
-    chosen = chosen_frames(frames, source, default)
-    target = output or Path("export") / name.format(name=source.name)
-    own = {"rate": rate} if to == "usd" else {}
-    for path in getattr(importlib.import_module(f"neuspring.extensions.exports.{module}"), function)(source, chosen, target, **own):
-        print(f"Wrote {path}")
 
 
 def play(
@@ -58,7 +26,7 @@ def play(
 ) -> None:
     """Runs of a results folder in the browser, until Ctrl-C; twins that can be pulled by hand."""
     from neuspring.extensions.play.controls import comparison, load_controls, pulled_run
-    from neuspring.extensions.play.results import find
+    from neuspring.report.shown import find
 
     found = find(results)
     frames = found.observations.scenario.frame_count

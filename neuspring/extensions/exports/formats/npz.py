@@ -13,6 +13,7 @@ import numpy as np
 from neuspring.core.artifacts import SCALARS, Artifact, Material, Rod, Topology
 from neuspring.core.files import write_atomically, write_text
 from neuspring.core.version import __version__
+from neuspring.extensions.exports import Export
 from neuspring.extensions.exports.source import Source
 from neuspring.splats.model import Splats
 
@@ -177,3 +178,6 @@ def arrays_of(source: Source, frames: Sequence[int]) -> tuple[dict[str, np.ndarr
     if source.splats is not None:
         declared(Splats, source.splats, "splat_")
     return arrays, described
+
+
+EXPORT = Export(write=write, name="{name}_npz")

@@ -101,7 +101,7 @@ class Run:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class Found:
     """A scenario's folder: what was observed, and runs."""
 
     folder: Path
@@ -113,7 +113,7 @@ class Scene:
     notes: tuple[str, ...] = ()
 
 
-def find(paths: Sequence[Path]) -> Scene:
+def find(paths: Sequence[Path]) -> Found:
     """What the folders have to show: one scenario's folder, or one or several runs of one scenario. Raises InputError."""
     named: list[Path] = []
     scenarios: list[Path] = []
@@ -141,7 +141,7 @@ def find(paths: Sequence[Path]) -> Scene:
     if not runs:
         raise InputError(folder, "must have at least one run <method>/<seed>", _content(folder), "Run the benchmark first.")
     shown = tuple(run.name for run in runs if run.folder in named) or _first(runs)
-    return Scene(folder, observations, runs, shown, _capture(folder, observations, notes), tuple(notes))
+    return Found(folder, observations, runs, shown, _capture(folder, observations, notes), tuple(notes))
 
 
 def _is_run(path: Path) -> bool:

@@ -1,0 +1,39 @@
+"""The command `annotate`."""
+
+from __future__ import annotations
+
+import os
+import sys
+import webbrowser
+from pathlib import Path
+from typing import Annotated
+
+from neuspring.cli.options import Positional, Settings, arg, read_settings
+
+
+def annotate(
+    capture: Annotated[Positional[Path], arg(help="folder with capture.json")],
+    host: Annotated[str, arg(help="address to listen at; the default is for this machine alone")] = "127.0.0.1",
+    port: Annotated[int, arg(help="0: any that is free")] = 8765,
+    no_open: Annotated[bool, arg(help="print the address, and open no browser")] = False,
+    settings: Settings = "{}",
+) -> None:
+    """Mark masks and tracks of a capture in the browser; serves until Ctrl-C."""
+    from neuspring.core.web import is_loopback
+    from neuspring.data.capture import Capture
+    from neuspring.extensions.annotate.server import Server
+
+    server = Server(Capture.load(capture), read_settings(settings).perception.segment.marks, host, port)
+    print(f"Annotate {capture} at {server.url} (stop with Ctrl-C)", flush=True)
+    if not is_loopback(host):
+        print("Anybody who can read this network's traffic can read the address; an SSH tunnel to 127.0.0.1 is safer.", flush=True)
+    # Without a window webbrowser may start a text browser in this terminal.
+    has_display = sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    if not no_open and has_display:
+        webbrowser.open(server.url)
+    try:
+        server.serve_forever()
+    except KeyboardInterrupt:
+        print("\nStopped. Marks and clicks are saved.", flush=True)
+    finally:
+        server.close()

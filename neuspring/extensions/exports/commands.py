@@ -1,0 +1,33 @@
+"""The command `export`."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from typing import Annotated
+
+from neuspring.cli.options import Positional, arg
+from neuspring.core.errors import InputError
+from neuspring.extensions.exports import EXPORTS
+
+
+def export(
+    twin: Annotated[Positional[Path], arg(help="a run's folder, results/<scenario>/<method>/<seed>, or a twin.npz")],
+    to: Annotated[str, arg(help=f"format: {', '.join(EXPORTS)}")],
+    output: Annotated[Path | None, arg(help="file or folder to write; by default it is named after the run")] = None,
+    frames: Annotated[str | None, arg(help="FIRST, FIRST:STOP or FIRST:STOP:STEP; all by default, of ply frame 0")] = None,
+    rate: Annotated[float | None, arg(help="time codes per second (usd); the capture's frames per second by default")] = None,
+) -> None:
+    """A twin -> a file of another tool, by format."""
+    from neuspring.extensions.exports.source import chosen_frames, read_source
+
+    if to not in EXPORTS:
+        raise InputError("--to", f"must be one of {', '.join(EXPORTS)}", to)
+    format = EXPORTS[to]
+    own = {} if rate is None else {"rate": rate}
+    if own and "rate" not in inspect.signature(format.write).parameters:
+        raise InputError("--rate", f"is no option of {to}", rate, "Leave it out: the files say the time of each frame.")
+    source = read_source(twin)
+    target = output or Path("export") / format.name.format(name=source.name)
+    for path in format.write(source, chosen_frames(frames, source, format.frames), target, **own):
+        print(f"Wrote {path}")
