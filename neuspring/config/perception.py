@@ -155,7 +155,7 @@ class ColorSettings(Section):
 class Segmentation(Section):
     """Which pixels show the object and the hands."""
 
-    backend: Literal["given", "opencv", "marks", "grounded_sam2"] = "given"
+    backend: str = "given"
     """given: the capture's masks. opencv: height and color; of a capture with marks.json, marks. marks: the capture's marks.json,
     carried through the video. grounded_sam2: GroundingDINO and SAM 2 (extra `perception`)."""
     marks: MarksSegmentation = field(default_factory=MarksSegmentation)
@@ -169,7 +169,7 @@ class Segmentation(Section):
 class PointTracking(Section):
     """Where the pixels of frame 0 go."""
 
-    backend: Literal["opencv", "cotracker3", "truth"] = "opencv"
+    backend: str = "opencv"
     """opencv: Lucas-Kanade or DIS flow. cotracker3: the online CoTracker3 of torch.hub. truth: exact tracks of a synthetic capture,
     as many as opencv follows, to measure what perception costs."""
     opencv: OpenCvTracking = field(default_factory=OpenCvTracking)

@@ -1,7 +1,7 @@
 """Where scenarios come from: `SOURCES` declares every kind of data, and everybody asks it.
 
 To add a source: a module that reads it, its line here, and rows of the scenario table; if it has settings, a section of
-`neuspring.config.data`. Its module has
+`neuspring.config.data`. A package adds one, a `Source`, by an entry point of the group `neuspring.sources`. Its module has
 
     observe(row, path, config, output) -> Observations     where it is not filmed; truth may be written beside `output`
     write_capture(row, path, config, folder)                where it is filmed, or has images beside processed data
@@ -23,6 +23,7 @@ from neuspring.config import Config, ScenarioRow, parse, read_text
 from neuspring.core.errors import InputError
 from neuspring.core.text import listed
 from neuspring.data import capture, phystwin
+from neuspring.registry import Registry
 
 if TYPE_CHECKING:
     from neuspring.core.artifacts import Observations
@@ -210,48 +211,52 @@ def _counted(folder: Path, config: Config) -> tuple[str, ...]:
 
 
 IN_SPACE = (*capture.CONTROLLERS, *capture.NODES)
-SOURCES = {
-    "toy": Source(module="neuspring.data.synthetic.toy", reads=("toy",), needs_data=False),
-    "mocap": Source(module="neuspring.data.mocap", reads=("data_root", "mocap"), require_alike=_require_rings),
-    "synthetic": Source(
-        module="neuspring.data.synthetic.make",
-        reads=("synthetic",),
-        films=True,
-        write_capture=True,
-        needs_data=False,
-        has_truth=True,
-        cameras=lambda folder, config: tuple(map(str, range(config.synthetic.cameras))),
-    ),
-    "capture": Source(
-        module="neuspring.data.capture",
-        reads=("data_root",),
-        films=True,
-        own=True,
-        required=_required_capture,
-        cameras=lambda folder, config: tuple(c.name for c in capture.read_description(folder / capture.CAPTURE).cameras),
-    ),
-    "points": Source(
-        module="neuspring.data.points",
-        reads=("data_root",),
-        own=True,
-        required=_required_points,
-        files=(capture.CAPTURE, capture.TRACKS, *IN_SPACE),
-    ),
-    "phystwin_raw": Source(
-        module="neuspring.data.phystwin",
-        reads=("data_root",),
-        films=True,
-        write_capture=True,
-        capture_files=phystwin.RAW_FILES,
-        cameras=_counted,
-    ),
-    "phystwin": Source(
-        module="neuspring.data.phystwin",
-        reads=("data_root",),
-        write_capture=True,
-        files=phystwin.FILES,
-        capture_files=phystwin.RAW_FILES,
-        images_beside=phystwin.has_images,
-        cameras=_counted,
-    ),
-}
+SOURCES = Registry(
+    "sources",
+    {
+        "toy": Source(module="neuspring.data.synthetic.toy", reads=("toy",), needs_data=False),
+        "mocap": Source(module="neuspring.data.mocap", reads=("data_root", "mocap"), require_alike=_require_rings),
+        "synthetic": Source(
+            module="neuspring.data.synthetic.make",
+            reads=("synthetic",),
+            films=True,
+            write_capture=True,
+            needs_data=False,
+            has_truth=True,
+            cameras=lambda folder, config: tuple(map(str, range(config.synthetic.cameras))),
+        ),
+        "capture": Source(
+            module="neuspring.data.capture",
+            reads=("data_root",),
+            films=True,
+            own=True,
+            required=_required_capture,
+            cameras=lambda folder, config: tuple(c.name for c in capture.read_description(folder / capture.CAPTURE).cameras),
+        ),
+        "points": Source(
+            module="neuspring.data.points",
+            reads=("data_root",),
+            own=True,
+            required=_required_points,
+            files=(capture.CAPTURE, capture.TRACKS, *IN_SPACE),
+        ),
+        "phystwin_raw": Source(
+            module="neuspring.data.phystwin",
+            reads=("data_root",),
+            films=True,
+            write_capture=True,
+            capture_files=phystwin.RAW_FILES,
+            cameras=_counted,
+        ),
+        "phystwin": Source(
+            module="neuspring.data.phystwin",
+            reads=("data_root",),
+            write_capture=True,
+            files=phystwin.FILES,
+            capture_files=phystwin.RAW_FILES,
+            images_beside=phystwin.has_images,
+            cameras=_counted,
+        ),
+    },
+    Source,
+)
