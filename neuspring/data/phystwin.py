@@ -9,14 +9,10 @@ per detection.
 from __future__ import annotations
 
 import csv
-import os
-import shutil
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 
 from neuspring.config import Config, ScenarioRow
@@ -25,11 +21,8 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
 from neuspring.core.findings import refuse
 from neuspring.core.records import digest_file
-from neuspring.data.camera import Camera
-from neuspring.data.capture import HANDS, OBJECT, Capture, Description, Writer
 from neuspring.data.checks import examine
-from neuspring.data.checks.case import RELEASED_FRAME_RATE, Calibration, FinalData, Metadata, Split, TrackFile
-from neuspring.data.images import make_way, read_image
+from neuspring.data.checks.case import RELEASED_FRAME_RATE, FinalData, Metadata, Split, TrackFile
 from neuspring.data.unpickle import load_pickle
 
 FEWEST = 5
@@ -54,11 +47,6 @@ RAW_FILES = (METADATA, CALIBRATION, SPLIT, TRACKS)
 def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Observations:
     """See `neuspring.data.sources`."""
     return read(row, path)
-
-
-def write_capture(row: ScenarioRow, path: Path, config: Config, folder: Path) -> None:
-    """See `neuspring.data.sources`."""
-    convert(row, path, folder)
 
 
 def read(row: ScenarioRow, folder: Path) -> Observations:
@@ -115,44 +103,6 @@ def has_images(case: Path) -> bool:
     return files and all((Path(case) / kind).is_dir() for kind in ("color", "depth", "mask"))
 
 
-def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
-    """Write `case` as a capture folder. Raises InputError naming file and key."""
-    case = Path(case)
-    metadata, cameras = read_calibration(case)
-    frames = int(metadata["frame_num"])
-    has_masks = (case / "mask").is_dir()
-    description = Description(
-        format=1,
-        name=row.scenario,
-        category=row.category,
-        frame_count=frames,
-        frame_rate=float(metadata.get("fps", RELEASED_FRAME_RATE)),
-        cameras=tuple(camera.entry() for camera in cameras),
-        depth_format="npy",
-        up="-z",
-        train_end=train_end_of(case, frames),
-        masks=has_masks,
-        provenance={name: f"sha256:{digest_file(case / name)}" for name in (METADATA, CALIBRATION)},
-    )
-    writer = Writer(folder, description)
-    for name, camera in writer.capture.cameras.items():
-        ids = detections(case, name) if has_masks else {}
-        for frame in range(frames):
-            for kind, ending in (("color", "png"), ("depth", "npy")):
-                source, target = case / kind / name / f"{frame}.{ending}", folder / kind / name / f"{frame:05d}.{ending}"
-                if not source.is_file():
-                    remedy = f"Make a capture of the frames that are there: `neuspring make-capture --phystwin-raw {case}`."
-                    raise InputError(source, "this image must exist", "no such file", remedy)
-                make_way(target)
-                try:
-                    os.link(source, target)
-                except OSError:
-                    shutil.copyfile(source, target)
-            if has_masks:
-                writer.mask(name, frame, labels_of(case, camera, frame, ids))
-    return writer.finish(annotated(case, frames))
-
-
 def camera_count(case: Path) -> int:
     """How many cameras metadata.json declares. Raises InputError."""
     path = Path(case) / METADATA
@@ -161,45 +111,6 @@ def camera_count(case: Path) -> int:
     if not isinstance(intrinsics, list) or not intrinsics:
         raise InputError(path, "intrinsics: a list of 3 x 3 matrices is required", type(intrinsics).__name__)
     return len(intrinsics)
-
-
-def read_calibration(case: Path) -> tuple[dict[str, Any], list[Camera]]:
-    """metadata.json, and the cameras in it and in calibrate.pkl, named by their numbers. Raises InputError."""
-    metadata, poses = load_json(case / METADATA), load_pickle(case / CALIBRATION)
-    refuse(examine(Metadata(case / METADATA, metadata, with_cameras=True)))
-    count = metadata.get("frame_num")
-    if type(count) is not int or count < FEWEST:
-        raise InputError(case / METADATA, f"frame_num: at least {FEWEST} frames are required", count)
-    refuse(examine(Calibration(case / CALIBRATION, poses, len(metadata["intrinsics"]))))
-    width, height = metadata["WH"]
-    intrinsics = np.asarray(metadata["intrinsics"], dtype=np.float64)
-    return metadata, [
-        Camera(str(index), width, height, matrix, np.asarray(pose, dtype=np.float64))
-        for index, (matrix, pose) in enumerate(zip(intrinsics, poses, strict=True))
-    ]
-
-
-def detections(case: Path, camera: str) -> dict[int, list[str]]:
-    """Label -> ids of its detections. Exactly one detection is not a hand."""
-    path = case / "mask" / f"mask_info_{camera}.json"
-    info = load_json(path)
-    if not isinstance(info, dict) or not all(isinstance(v, str) for v in info.values()):
-        raise InputError(path, "an object of detection ids and phrases is required", type(info).__name__)
-    objects = [key for key, phrase in info.items() if phrase != "hand"]
-    if len(objects) != 1:
-        rule = "exactly one detection must not be 'hand': the object"
-        raise InputError(path, rule, info, "Remove the others from this file, or give them the phrase 'hand'.")
-    return {OBJECT: objects, HANDS: [key for key in info if key not in objects]}
-
-
-def labels_of(case: Path, camera: Camera, frame: int, ids: dict[int, list[str]]) -> np.ndarray:
-    """Mask [H, W] uint8 of one frame, put together from the images of its detections. Raises InputError."""
-    labels = np.zeros((camera.height, camera.width), dtype=np.uint8)
-    for label, names in sorted(ids.items()):
-        for name in names:
-            mask = read_image(case / "mask" / camera.name / name / f"{frame}.png", camera, cv2.IMREAD_GRAYSCALE)
-            labels[mask > 0] = label
-    return labels
 
 
 def annotated(case: Path, frames: int) -> np.ndarray | None:

@@ -39,8 +39,8 @@ class Source:
     """Keys of the configuration that reading depends on."""
     films: bool = False
     """Raw video: perception makes observations of its capture."""
-    write_capture: bool = False
-    """Its module writes captures. No: the user supplies the capture, or there are no images."""
+    write_capture: str = ""
+    """The module that writes its captures. None: the user supplies the capture, or there are no images."""
     needs_data: bool = True
     """Whether it lies under data_root."""
     has_truth: bool = False
@@ -75,7 +75,7 @@ def write_capture(row: ScenarioRow, settings: Config, folder: Path) -> None:
     if not source.write_capture:
         makers = ", ".join(name for name, other in SOURCES.items() if other.write_capture)
         raise InputError(f"scenario {row.scenario}, source", f"captures are made of {makers} scenarios", row.source)
-    import_module(source.module).write_capture(row, location(row, settings), settings, folder)
+    import_module(source.write_capture).write_capture(row, location(row, settings), settings, folder)
 
 
 def location(row: ScenarioRow, settings: Config) -> Path:
@@ -220,7 +220,7 @@ SOURCES = Registry(
             module="neuspring.data.synthetic.make",
             reads=("synthetic",),
             films=True,
-            write_capture=True,
+            write_capture="neuspring.data.synthetic.make",
             needs_data=False,
             has_truth=True,
             cameras=lambda folder, config: tuple(map(str, range(config.synthetic.cameras))),
@@ -241,17 +241,17 @@ SOURCES = Registry(
             files=(capture.CAPTURE, capture.TRACKS, *IN_SPACE),
         ),
         "phystwin_raw": Source(
-            module="neuspring.data.phystwin",
+            module="neuspring.data.intake.formats.phystwin_raw",
             reads=("data_root",),
             films=True,
-            write_capture=True,
+            write_capture="neuspring.data.intake.formats.phystwin_raw",
             capture_files=phystwin.RAW_FILES,
             cameras=_counted,
         ),
         "phystwin": Source(
             module="neuspring.data.phystwin",
             reads=("data_root",),
-            write_capture=True,
+            write_capture="neuspring.data.intake.formats.phystwin_raw",
             files=phystwin.FILES,
             capture_files=phystwin.RAW_FILES,
             images_beside=phystwin.has_images,

@@ -12,7 +12,7 @@ from neuspring.stages.stage import stage
 @stage(
     output="{scenario}/capture/capture.json",
     reads=lambda settings, given: SOURCES[given["scenario"].source].reads,
-    code=lambda settings, given: (SOURCES[given["scenario"].source].module,),
+    code=lambda settings, given: (SOURCES[given["scenario"].source].write_capture,),
     minutes=120,
 )
 def capture(scenario: ScenarioRow, settings: Config, output: Path) -> None:

@@ -17,7 +17,6 @@ from neuspring.data.checks.masks import mask_facts
 from neuspring.data.checks.table import on_table
 from neuspring.data.checks.things import Silhouette
 from neuspring.data.intake.feeds import pairs
-from neuspring.data.intake.lenses import Board
 from neuspring.data.intake.make import Intake, make_capture
 from neuspring.extensions.annotate.clicks import Annotations, Click, ClickedPoint
 from neuspring.extensions.annotate.tracks import TracksMode, tracks_of
@@ -36,7 +35,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 def intake(root, **changes):
     """Color alone of the folders of `write_folders`, with the true pose."""
-    plain = {"folder": root / "capture", "name": "desk", "category": "ball", "rate": 30.0, "views": pairs([root / "color_0"], [])}
+    plain = {"output": root / "capture", "name": "desk", "category": "ball", "rate": 30.0, "color": (root / "color_0",)}
     plain["pose"] = "lying"
     poses = write_poses(root / "poses.json", 1) if "poses" not in changes else None
     return Intake(**(plain | {"intrinsics": root / "intrinsics.json", "poses": poses} | changes))
@@ -88,7 +87,7 @@ def test_a_board_gives_the_pose(tmp_path):
     for frame in range(5):
         cv2.imwrite(str(tmp_path / "color_0" / f"{frame}.png"), board_image(pose))
     write_json(tmp_path / "intrinsics.json", {"K": LENS.tolist()})
-    made, report = make_capture(intake(tmp_path, poses=None, board=Board.of(BOARD)))
+    made, report = make_capture(intake(tmp_path, poses=None, board=BOARD))
     np.testing.assert_allclose(made.cameras["0"].camera_to_world, pose, atol=4e-3)
     assert made.description.up == "+z" and not any("depth on it" in line for line in report)
 
@@ -256,7 +255,7 @@ def test_the_pose_of_a_body_is_asked_for_and_kept(tmp_path):
     assert holds(check_layout(made.folder), "warning", CAPTURE, asked)
     edit(made, lambda values: values.update(category="cloth"))
     assert not holds(check_layout(made.folder), "warning", CAPTURE, asked)
-    known, _ = make_capture(intake(tmp_path, folder=tmp_path / "known", pose="standing"))
+    known, _ = make_capture(intake(tmp_path, output=tmp_path / "known", pose="standing"))
     assert Capture.load(known.folder).description.pose == "standing"
     save_masks(known, "0", np.stack([disk()] * FRAMES))
     assert not holds(check_layout(known.folder), "warning", CAPTURE, asked)
@@ -265,7 +264,7 @@ def test_the_pose_of_a_body_is_asked_for_and_kept(tmp_path):
 def test_a_pose_is_refused_where_depth_is_measured(tmp_path):
     root = write_folders(tmp_path)
     with pytest.raises(InputError, match=r"--pose: is for color alone.*received standing"):
-        make_capture(intake(root, views=pairs([root / "color_0"], [root / "depth_0"]), pose="standing"))
+        make_capture(intake(root, depth=(root / "depth_0",), pose="standing"))
 
 
 def test_masks_of_a_run_are_not_judged_by_depth(capture):

@@ -20,7 +20,8 @@ from neuspring.data.checks import examine
 from neuspring.data.checks.table import TableSeen, View
 from neuspring.data.checks.things import sampled
 from neuspring.data.intake.depth import Unit, cloud, common_plane, find_table, find_unit, levelling, planes, pose_on
-from neuspring.data.intake.feeds import CameraFeed, Pair, Paired, open_images
+from neuspring.data.intake.feeds import Paired
+from neuspring.data.intake.formats import CameraFeed, Pair, open_images
 from neuspring.data.intake.lenses import Board, Straightener, depth_ratio, require_lens, sight
 from neuspring.data.intake.moments import matched
 

@@ -22,7 +22,8 @@ from neuspring.core.errors import InputError
 from neuspring.core.text import Progress
 from neuspring.data import phystwin
 from neuspring.data.camera import Camera
-from neuspring.data.phystwin import CALIBRATION, read_calibration, released_cases
+from neuspring.data.intake.formats.phystwin_raw import read_calibration
+from neuspring.data.phystwin import CALIBRATION, released_cases
 from neuspring.extensions.released.files import (
     Released,
     ReleasedCheckpoint,

@@ -12,8 +12,6 @@ from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, RECIPE, Capture
 from neuspring.data.check import check_layout
 from neuspring.data.intake import make
-from neuspring.data.intake.feeds import pairs
-from neuspring.data.intake.lenses import Board
 from neuspring.data.intake.make import Intake, make_capture
 from neuspring.data.sources import SOURCES
 from tests.support import realsense
@@ -26,8 +24,8 @@ ABOUT = {"width": 80, "height": 60, "fx": 70.0, "fy": 70.0, "ppx": 39.5, "ppy": 
 
 def intake(root, cameras=1, **changes):
     """An intake of the folders of `write_folders`."""
-    views = pairs([root / f"color_{k}" for k in range(cameras)], [root / f"depth_{k}" for k in range(cameras)])
-    plain = {"folder": root / "capture", "name": "desk", "category": "ball", "views": views, "rate": 30.0}
+    films = {kind: tuple(root / f"{kind}_{k}" for k in range(cameras)) for kind in ("color", "depth")}
+    plain = {"output": root / "capture", "name": "desk", "category": "ball", "rate": 30.0} | films
     return Intake(**(plain | {"intrinsics": root / "intrinsics.json"} | changes))
 
 
@@ -55,7 +53,7 @@ def test_a_color_video_and_a_depth_video_become_a_capture(tmp_path):
     depth = write_video(tmp_path / "depth.mkv", [counts(depth) for _, depth in pictures], "ffv1", "gray16le", rate=15)
     lens = write_json(tmp_path / "k.json", {"K": K.tolist()})
     capture, report = make_capture(
-        Intake(folder=tmp_path / "capture", name="v", category="ball", views=pairs([color], [depth]), intrinsics=lens)
+        Intake(output=tmp_path / "capture", name="v", category="ball", color=(color,), depth=(depth,), intrinsics=lens)
     )
     assert capture.description.frame_rate == pytest.approx(15, rel=0.01)
     assert any("as the source says" in line for line in report)
@@ -141,12 +139,12 @@ def test_a_capture_is_not_overwritten_and_masks_never(tmp_path):
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.tex").touch()
     with pytest.raises(InputError, match=r"received other files. Choose another folder"):
-        make_capture(intake(root, folder=tmp_path / "other", force=True))
+        make_capture(intake(root, output=tmp_path / "other", force=True))
 
 
 def test_an_interrupted_call_goes_on_where_it_was(tmp_path, monkeypatch):
     root = write_folders(tmp_path)
-    whole, _ = make_capture(intake(root, folder=tmp_path / "whole"))
+    whole, _ = make_capture(intake(root, output=tmp_path / "whole"))
     written, write = [], make.Writer.frame
 
     def stop_after_four(self, camera, frame, *images):
@@ -258,11 +256,11 @@ def test_intrinsics_of_the_capture_are_those_given_and_fit_its_images(tmp_path, 
 
 def test_depth_of_a_sensor_that_stands_elsewhere(tmp_path):
     root = write_folders(tmp_path, cameras=2)
-    views = pairs([root / "color_1"], [root / "depth_1"])
-    assert not any("not aligned" in line for line in make_capture(intake(root, views=views))[1])
+    films = {"color": (root / "color_1",), "depth": (root / "depth_1",)}
+    assert not any("not aligned" in line for line in make_capture(intake(root, **films))[1])
     for path in root.glob("depth_1/*"):
         cv2.imwrite(str(path), np.roll(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), 7, axis=1))
-    _, report = make_capture(intake(root, folder=tmp_path / "moved", views=views))
+    _, report = make_capture(intake(root, output=tmp_path / "moved", **films))
     line = next(line for line in report if "not aligned" in line)
     assert line.startswith("warning: camera 0: depth not aligned to color: edges of depth fit those of color when depth is ")
     assert (
@@ -295,10 +293,10 @@ def board_folders(root, unit=0.001):
 
 
 def test_a_board_in_the_first_frames_or_in_images_gives_the_poses(tmp_path):
-    root, board = board_folders(tmp_path), Board.of(BOARD)
+    root, board = board_folders(tmp_path), BOARD
     images = [root / f"color_{index}" / "0.png" for index in range(2)]
     for name, pictures, frames in (("frames", (), "2-6"), ("images", images, "")):
-        capture, report = make_capture(intake(root, 2, folder=tmp_path / name, board=board, board_images=pictures, frames=frames))
+        capture, report = make_capture(intake(root, 2, output=tmp_path / name, board=board, board_images=pictures, frames=frames))
         for view, pose in zip(capture.cameras.values(), BOARD_POSES, strict=True):
             np.testing.assert_allclose(view.camera_to_world, pose, atol=4e-3)
         assert sum("corners, 0." in line and "pixels rms" in line for line in report) == 2
@@ -308,7 +306,7 @@ def test_a_board_in_the_first_frames_or_in_images_gives_the_poses(tmp_path):
 
 def test_a_board_of_another_size_contradicts_depth(tmp_path):
     root = board_folders(tmp_path)
-    board = Board.of(BOARD.replace("0.04:0.03", "0.032:0.024"))
+    board = BOARD.replace("0.04:0.03", "0.032:0.024")
     with pytest.raises(InputError, match=r"depth must place the board where its size does.*the square is 1\.25 times as long"):
         make_capture(intake(root, 2, board=board))
     with pytest.raises(InputError, match="the board of --board-images must be described"):

@@ -9,7 +9,10 @@ import pytest
 from PIL import Image
 
 from neuspring.core.errors import InputError
-from neuspring.data.intake.feeds import ImageFolder, VideoFile, open_images, pairs
+from neuspring.data.intake.feeds import pairs
+from neuspring.data.intake.formats import open_images
+from neuspring.data.intake.formats.folder import ImageFolder
+from neuspring.data.intake.formats.video import VideoFile
 from neuspring.data.intake.make import CHECKS
 from neuspring.data.intake.moments import Evenness, Series, matched, spans
 from neuspring.data.intake.poses import choose

@@ -10,7 +10,6 @@ from neuspring.cli.main import main
 from neuspring.core.errors import InputError
 from neuspring.data.capture import CONTROLLERS, NODES, TRACKS, Capture
 from neuspring.data.check import check_layout
-from neuspring.data.intake.feeds import pairs
 from neuspring.data.intake.make import Intake, make_capture
 from neuspring.data.points import Hands, read, write
 from tests.support import spaced as scene
@@ -28,8 +27,8 @@ def brought(folder, frames=FRAMES):
 
 def filmed(root, depth=False, **changes):
     """One camera of the desk, and the files."""
-    views = pairs([root / "color_0"], [root / "depth_0"] if depth else [])
-    plain = {"folder": root / "capture", "name": "desk", "category": "ball", "rate": 30.0, "views": views}
+    films = {"color": (root / "color_0",), "depth": (root / "depth_0",) if depth else ()}
+    plain = {"output": root / "capture", "name": "desk", "category": "ball", "rate": 30.0} | films
     return Intake(**(plain | {"intrinsics": root / "intrinsics.json", "poses": write_poses(root / "poses.json", 1)} | changes))
 
 
@@ -78,7 +77,7 @@ def test_points_alone_become_a_capture(tmp_path, capsys):
 )
 def test_points_alone_are_refused_before_anything_is_written(tmp_path, changes, words):
     files = brought(tmp_path / "files", 8)
-    plain = {"folder": tmp_path / "made", "name": "m", "category": "toy", "views": (), "rate": 30.0}
+    plain = {"output": tmp_path / "made", "name": "m", "category": "toy", "rate": 30.0}
     with pytest.raises(InputError, match=words):
         make_capture(Intake(**(plain | files | changes)))
     assert not (tmp_path / "made").exists()
@@ -89,7 +88,7 @@ def test_both_counts_of_rows_are_named(tmp_path):
     hands = np.load(files["controllers"])["points"]
     np.savez(files["controllers"], points=hands[:6])
     with pytest.raises(InputError, match=r"a row per frame.*received 6 rows of --controllers, 8 of --tracks"):
-        make_capture(Intake(folder=tmp_path / "made", name="m", category="toy", views=(), rate=30.0, **files))
+        make_capture(Intake(output=tmp_path / "made", name="m", category="toy", rate=30.0, **files))
 
 
 def test_what_hangs_has_no_table(tmp_path):
@@ -99,7 +98,7 @@ def test_what_hangs_has_no_table(tmp_path):
         np.savez(files[name], points=np.load(files[name])["points"] + [0, 0.3, -0.4])
     listed = json.loads(files["tracks"].read_text())
     files["tracks"].write_text(json.dumps([[p and [p[0], p[1] + 0.3, p[2] - 0.4] for p in track] for track in listed]))
-    plain = {"folder": tmp_path / "made", "name": "m", "category": "toy", "views": (), "rate": 30.0}
+    plain = {"output": tmp_path / "made", "name": "m", "category": "toy", "rate": 30.0}
     with pytest.raises(InputError, match="--no-table"):
         make_capture(Intake(**plain, **files))
     made, _ = make_capture(Intake(**plain, **files, no_table=True))

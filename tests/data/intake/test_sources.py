@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.data.intake.feeds import ImageFolder, VideoFile, pairs
+from neuspring.data.intake.feeds import pairs
+from neuspring.data.intake.formats.folder import ImageFolder
+from neuspring.data.intake.formats.video import VideoFile
 from neuspring.data.intake.make import CHECKS
 from neuspring.data.intake.poses import choose, chosen
 from tests.support.desk import FRAMES, camera, counts, seen, write_folders, write_video

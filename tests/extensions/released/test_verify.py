@@ -14,7 +14,8 @@ import pytest
 import torch
 
 from neuspring.core.errors import InputError
-from neuspring.data.phystwin import read_calibration, released_cases
+from neuspring.data.intake.formats.phystwin_raw import read_calibration
+from neuspring.data.phystwin import released_cases
 from neuspring.extensions.released.checks import MEAN, RELEASED, Comparison, Published, frame_scores, of_means
 from neuspring.extensions.released.files import (
     Released,
