@@ -18,7 +18,8 @@ from neuspring.config.perception import Perception, Sampling
 from neuspring.core.artifacts import ImageObservations, Observations
 from neuspring.core.geometry import on_table
 from neuspring.data.capture import Capture
-from neuspring.data.points import SAME, in_both, read, scenario_of, standing, taught_by
+from neuspring.data.checks.space import SAME
+from neuspring.data.points import in_both, read, scenario_of, standing, taught_by
 from neuspring.perception.results import LiftedTracks, ShapePrior
 
 SURFACE, INTERIOR = 1024, 10000
