@@ -75,8 +75,8 @@ def mask(
     """Marks on a few frames, or masks of other tools -> masks of object and hands in every frame of a capture."""
     from neuspring.data.capture import Capture
     from neuspring.data.checks.masks import mask_facts
+    from neuspring.data.checks.perceived import look_at_masks
     from neuspring.perception import segment_sam2
-    from neuspring.perception.findings import look_at_masks
     from neuspring.perception.marks import store
     from neuspring.perception.marks.carry import carry_camera
     from neuspring.perception.marks.marks import MARKS, Marks

@@ -39,9 +39,9 @@ from neuspring.core.geometry import farthest
 from neuspring.data.camera import Camera
 from neuspring.data.capture import CAPTURE, CONTROLLERS, HANDS, NOTHING, OBJECT, Capture
 from neuspring.data.points import InSpace, held, read
+from neuspring.data.results import LiftedTracks, Masks, PixelTracks, ShapePrior
 from neuspring.perception.color_hands import follow_hands, grips, place
 from neuspring.perception.controllers import ALWAYS
-from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
 from neuspring.perception.shape import discs, inflated, no_prior, shape_prior
 
 BAND = 30.0

@@ -17,8 +17,8 @@ from neuspring.core.errors import InputError
 from neuspring.data.camera import Camera
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.data.points import held, read
+from neuspring.data.results import LiftedTracks, Masks, PixelTracks
 from neuspring.perception.controllers import ALWAYS, HAND_GAP, Body, choose_controllers, holding
-from neuspring.perception.results import LiftedTracks, Masks, PixelTracks
 
 REFERENCE_FOCAL = 430.0
 """Pixels: the focal length that `outlier_neighbors` is meant for. A longer one shows a surface in more pixels."""

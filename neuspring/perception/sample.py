@@ -20,7 +20,7 @@ from neuspring.core.geometry import on_table
 from neuspring.data.capture import Capture
 from neuspring.data.checks.space import SAME
 from neuspring.data.points import in_both, read, scenario_of, standing, taught_by
-from neuspring.perception.results import LiftedTracks, ShapePrior
+from neuspring.data.results import LiftedTracks, ShapePrior
 
 SURFACE, INTERIOR = 1024, 10000
 """Points drawn on the prior's surface, and in its bounding box, of which those inside are kept; as released."""

@@ -39,7 +39,7 @@ from neuspring.config.perception import ShapePriorSettings
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Camera
 from neuspring.data.capture import HANDS, OBJECT, THIN, Capture
-from neuspring.perception.results import Masks, ShapePrior
+from neuspring.data.results import Masks, ShapePrior
 from neuspring.perception.sample import on_surface
 from neuspring.perception.truth import surface
 

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from neuspring.config.perception import OpenCvTracking
 from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.data.results import ShapePrior
 from neuspring.data.synthetic.truth import truth_of, under_pixels
-from neuspring.perception.results import ShapePrior
 from neuspring.perception.track_opencv import Followed, choose
 
 DEPTH_TOLERANCE = 0.01

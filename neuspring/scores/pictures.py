@@ -11,7 +11,7 @@ import torch
 from neuspring.config.images import Images
 from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
-from neuspring.perception.results import Masks
+from neuspring.data.results import Masks
 from neuspring.scores.lpips import Lpips
 from neuspring.splats.draw import COVERED, picture, view_of
 from neuspring.splats.losses import RADIUS, check_pair, ssim_map

@@ -37,8 +37,8 @@ def observe(
         raise InputError(f"scenario {scenario.scenario}", rule, "neither", "Run neuspring capture, segment, track and lift first.")
     from neuspring.core.artifacts import ImageObservations
     from neuspring.core.findings import findings_as_facts, refuse_errors
-    from neuspring.perception.findings import look_at_observations
-    from neuspring.perception.results import LiftedTracks, ShapePrior
+    from neuspring.data.checks.perceived import look_at_observations
+    from neuspring.data.results import LiftedTracks, ShapePrior
     from neuspring.perception.sample import assemble
 
     record = Recorder("observe", output.with_suffix(".json"), inputs={"lifted": lifted.path})

@@ -22,9 +22,9 @@ def segment(capture: Capture, camera: str, settings: Config, run: Recorder, devi
     """One camera of a capture -> masks: masks.npz and masks.png."""
     from neuspring.core.findings import findings_as_facts
     from neuspring.data.checks.masks import mask_facts
+    from neuspring.data.checks.perceived import WRONG, look_at_masks
+    from neuspring.data.results import Masks
     from neuspring.perception import figures
-    from neuspring.perception.findings import WRONG, look_at_masks
-    from neuspring.perception.results import Masks
 
     section = settings.perception.segment
     capture.require_camera(camera)

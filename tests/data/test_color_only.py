@@ -14,6 +14,7 @@ from neuspring.data.capture import CAPTURE, OBJECT, Capture
 from neuspring.data.check import check_layout
 from neuspring.data.checks import examine
 from neuspring.data.checks.masks import mask_facts
+from neuspring.data.checks.perceived import look_at_masks
 from neuspring.data.checks.table import on_table
 from neuspring.data.checks.things import Silhouette
 from neuspring.data.intake.feeds import pairs
@@ -22,7 +23,6 @@ from neuspring.extensions.annotate.clicks import Annotations, Click, ClickedPoin
 from neuspring.extensions.annotate.tracks import TracksMode, tracks_of
 from neuspring.perception import segment_opencv
 from neuspring.perception.backends import BACKENDS
-from neuspring.perception.findings import look_at_masks
 from neuspring.perception.marks.carry import CameraFilm
 from neuspring.perception.marks.store import save_masks
 from tests.support.board import BOARD, LENS, board_image

@@ -13,8 +13,8 @@ from neuspring.core.findings import Finding, finding, findings_as_facts, finding
 from neuspring.core.records import Recorder
 from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
 from neuspring.data.checks.masks import mask_facts
-from neuspring.perception.findings import look_at_lifted, look_at_masks, look_at_observations, look_at_tracks
-from neuspring.perception.results import ShapePrior
+from neuspring.data.checks.perceived import look_at_lifted, look_at_masks, look_at_observations, look_at_tracks
+from neuspring.data.results import ShapePrior
 from neuspring.perception.shape import no_prior
 from tests.support.captures import FRAMES, describe, entry
 from tests.support.still import tracked

@@ -7,8 +7,8 @@ import pytest
 
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
+from neuspring.data.checks.perceived import look_at_observations
 from neuspring.perception.controllers import ALWAYS, Body, Grips, holding
-from neuspring.perception.findings import look_at_observations
 from tests.support.small import observations
 
 FRAMES = 30

@@ -9,9 +9,9 @@ from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
 from neuspring.data.checks.masks import mask_facts
+from neuspring.data.checks.perceived import WRONG, look_at_masks
 from neuspring.data.frames import overlap
 from neuspring.perception import segment_opencv
-from neuspring.perception.findings import WRONG, look_at_masks
 from tests.support.captures import describe, entry
 from tests.support.filmed import FRAMES, film
 

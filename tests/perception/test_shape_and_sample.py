@@ -9,10 +9,10 @@ from neuspring.config import ScenarioRow
 from neuspring.config.perception import Perception, Sampling, ShapePriorSettings
 from neuspring.core.errors import InputError
 from neuspring.core.geometry import on_table
+from neuspring.data.results import Masks, ShapePrior
 from neuspring.data.synthetic.meshes import capsule, smooth_union, sphere
 from neuspring.data.synthetic.render import HAND
 from neuspring.perception import shape
-from neuspring.perception.results import Masks, ShapePrior
 from neuspring.perception.sample import assemble, inside, structure, voxel_for
 from tests.support.still import overlap, still, tracked
 

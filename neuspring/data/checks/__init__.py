@@ -19,7 +19,7 @@ CHECKS: Registry[Check | tuple[Check, ...]] = Registry("checks", modules(__name_
 
 
 def examine(subject: Any, own: Sequence[Check] = ()) -> list[Finding]:
-    """All findings about a subject: by `own` checks, those of the file that declares its kind, and those of packages."""
+    """All findings about a subject: by `own` checks, those of the file here that declares its kind, and those of packages."""
     return checks.examine(subject, [*own, *_for(type(subject).__module__)])
 
 

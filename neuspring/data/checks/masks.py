@@ -181,7 +181,7 @@ class Motion:
         both = self.labels[:2]
         near = self.moving & grown((both == OBJECT).any(axis=0), BESIDE)
         bare = int((near & ~grown(np.any(both, axis=0), RIM)).sum())
-        return bare > max(OUTSIDE * near.sum(), RIM * (both[0] == OBJECT).sum())
+        return bool(bare > max(OUTSIDE * near.sum(), RIM * (both[0] == OBJECT).sum()))
 
     @cached_property
     def newly(self) -> tuple[int, int]:
@@ -251,7 +251,7 @@ def moves_outside(seen: Sequence[Motion]) -> dict[str, float]:
 
 def object_moves(seen: Sequence[Motion], train_end: int) -> dict[str, float]:
     """Share of training frames in which the object moves, as the picture shows it."""
-    return {"object_moves": float(np.mean([motion.stirred for motion in seen if motion.frame < train_end] or [0]))}
+    return {"object_moves": float(np.mean([motion.stirred for motion in seen if motion.frame < train_end] or [False]))}
 
 
 def newly_kept(seen: Sequence[Motion]) -> dict[str, float]:

@@ -6,7 +6,7 @@ import hashlib
 import json
 import re
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +18,7 @@ from neuspring.config import parse
 from neuspring.core.artifacts import Up
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
-from neuspring.core.findings import Finding, finding, refuse, refuse_errors
+from neuspring.core.findings import refuse, refuse_errors
 from neuspring.core.records import digest_file
 from neuspring.core.text import Progress
 from neuspring.data import capture, points
@@ -29,10 +29,9 @@ from neuspring.data.checks.cameras import Edges
 from neuspring.data.checks.things import Category
 from neuspring.data.intake.depth import Unit, find_rate
 from neuspring.data.intake.feeds import Paired, pairs
-from neuspring.data.intake.formats import CameraFeed, Recording, open_recording
-from neuspring.data.intake.formats.video import VideoFile
+from neuspring.data.intake.film import FILM_CHECKS, Film
+from neuspring.data.intake.formats import Recording, open_recording
 from neuspring.data.intake.lenses import Board, Straightener, read_lenses, read_poses
-from neuspring.data.intake.moments import DEPARTURE, LOST, Evenness, spans
 from neuspring.data.intake.poses import (
     FrameChoice,
     Placed,
@@ -178,7 +177,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
         remedy = "Leave it out. To learn from the case's own, write tracks: train in capture.json then."
         raise InputError(option, "a case in PhysTwin's raw layout brings annotated points of its own", "both", remedy)
     choice = choose(views, intake.frames)
-    findings = [one for check in CHECKS for one in check(views, choice)]
+    findings = examine(Film(views, choice), FILM_CHECKS)
     refuse_errors(findings)
     film.require_masks({name: [choice.numbers[frame] for frame in places] for name, places in choice.places.items()})
     known = [view.rate([*choice.places[view.name].values()]) for view in views]
@@ -219,75 +218,6 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
         f"training frames: 0 to {training - 1}; future frames: {training} to {made.frame_count - 1}",
     ]
     return Capture.load(intake.output), lines
-
-
-# What is odd or wrong in the files of the cameras, by name and level: errors are refused, warnings and notes stand in the report.
-# To add a check: a function of the feeds and the chosen frames that yields findings, and its name in CHECKS.
-
-
-def time_jumps(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[Finding]:
-    """Frames that are left out between others."""
-    if choice.jumps:
-        yield _odd("time jumps", "--frames", f"frame numbers are left out after {spans(choice.jumps)}")
-
-
-def images_alone(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[Finding]:
-    """Color without depth, or depth without color."""
-    for view in views:
-        if isinstance(view, Paired) and (alone := [f"{kind} {spans(numbers)}" for kind, numbers in view.alone.items() if numbers]):
-            text = f"camera {view.name}: images without their partner are left out: {'; '.join(alone)}"
-            yield _odd("images alone", view.path, text)
-
-
-def missing_frames(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[Finding]:
-    """Frames that some cameras have and others lack."""
-    for view in views:
-        if missing := choice.missing(view.name):
-            text = f"camera {view.name} lacks {spans([choice.numbers[frame] for frame in missing])}; other cameras have them"
-            yield _odd("missing frames", view.path, text)
-
-
-def not_by_numbers(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[Finding]:
-    """How frames belong together, where numbers in names do not say it."""
-    own = {f"camera {view.name}, color and depth": view.match[1] for view in views if isinstance(view, Paired)}
-    for names, by in (own | choice.pairing).items():
-        if by and "numbers" not in by:
-            yield Finding(name="pairs", level="note", where=names, text=f"{names}: by {by}")
-
-
-def uneven_time(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[Finding]:
-    """Time stamps that follow no even clock, as of a phone in dim light: a capture has one rate."""
-    for view in views:
-        times, places = view.series.times, choice.places[view.name]
-        if times is None:
-            continue
-        found, numbers = Evenness.of(times[[*places.values()]], [*places.values()]), [choice.numbers[frame] for frame in places]
-        text = f"camera {view.name}: {found.text()}"
-        if found.bad:
-            first, last = max(found.runs, key=lambda run: run[1] - run[0])
-            slow = 1 / sorted(found.steps)[int(0.9 * len(found.steps))]
-            anew = f"ffmpeg -i FILE -vf fps={slow:.0f} -crf 12 even.mp4 (depth: -c:v ffv1 even.mkv)"
-            rule = f"at most {DEPARTURE:g} frame and 1 lost picture in {1 / LOST:.0f} are allowed"
-            remedy = f"Keep the part of one rate, --frames {numbers[first]}-{numbers[last]}"
-            remedy += f", or write videos anew: {anew}" if view.path.is_file() else ""
-            yield finding("uneven time", "error", str(view.path), text, rule, remedy)
-        elif found.missing or found.odd:
-            yield Finding(name="uneven time", level="warning" if found.missing else "note", where=str(view.path), text=text)
-
-
-def several_tracks(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[Finding]:
-    """A file of which one video track of several is read, unnamed."""
-    for images in (images for view in views if isinstance(view, Paired) for images in view.sources):
-        if isinstance(images, VideoFile) and images.track is None and len(images.tracks) > 1:
-            listed = "; ".join(f"{images.path}#{number} is {text}" for number, text in enumerate(images.tracks))
-            yield _odd("several tracks", images.path, f"the first is read as {images.kind}: {listed}. Name the one you mean")
-
-
-def _odd(name: str, where: object, text: str) -> Finding:
-    return Finding(name=name, level="warning", where=str(where), text=text)
-
-
-CHECKS = (time_jumps, images_alone, missing_frames, not_by_numbers, uneven_time, several_tracks)
 
 
 def _require_for_color_alone(intake: Intake) -> None:

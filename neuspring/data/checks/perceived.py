@@ -1,7 +1,6 @@
 """What the steps of perception notice about their own results: masks, tracks, lifted points, the shape and the observations.
 
-Masks, tracks and observations have their checks in `neuspring.data.checks`; points in space and the shape have theirs here. Limits
-were chosen so that the synthetic scenes pass, whose perception is known to be good; lengths in m, of things that hands hold.
+Limits were chosen so that the synthetic scenes pass, whose perception is known to be good; lengths in m, of things that hands hold.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from neuspring.data.checks.followed import Tracked, few
 from neuspring.data.checks.masks import OFTEN, Segmented, Shown
 from neuspring.data.checks.observed import Observed
 from neuspring.data.checks.things import Body, Masked, Sample, Sheet, Silhouette, sampled
-from neuspring.perception.results import LiftedTracks, ShapePrior
+from neuspring.data.results import LiftedTracks, ShapePrior
 
 WRONG = ("background in the mask", "mask flickers", "hands too large", "hands inside the object", "labels are noise")
 """Findings of masks that cannot be right, by name: `perception.segment.verdict` decides what happens."""
@@ -80,7 +79,7 @@ def look_at_lifted(lifted: LiftedTracks, prior: ShapePrior, up: float, image: Im
     found = examine(Body("object in frame 0", [lifted.cloud], up))
     if image is None and prior.backend.startswith("visual_hull"):
         found += examine(Sheet("object in frame 0", lifted.cloud, up))
-    return found + examine(Lifted(lifted, prior, image), CHECKS)
+    return found + examine(Lifted(lifted, prior, image))
 
 
 SHAPE: dict[str, Any] = {"where": "shape"}
