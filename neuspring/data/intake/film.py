@@ -79,7 +79,8 @@ def several_tracks(film: Film) -> Iterator[dict[str, Any]]:
 FILM_CHECKS = (
     Check("time jumps", Film, lambda film: {"text": spans(film.choice.jumps)} if film.choice.jumps else None, None, "warning",
           "frame numbers are left out after {text}"),
-    Check("images alone", Film, images_alone, None, "warning", "camera {camera}: images without their partner are left out: {text}"),
+    Check("images alone", Film, images_alone, None, "warning",
+          "camera {camera}: images without their partner are left out: {text}"),
     Check("missing frames", Film, missing_frames, None, "warning", "camera {camera} lacks {text}; other cameras have them"),
     Check("pairs", Film, not_by_numbers, None, "note", "{where}: by {value}"),
     Check("uneven time", Film, uneven_time, None, "error", "{text}{rule}"),
