@@ -9,7 +9,8 @@ from neuspring.core import provenance
 
 PACKAGE = Path(provenance.__file__).parents[1]
 FLOORS = (
-    "extensions > cli > experiments > stages > report > scores baselines > splats perception > data > twin > physics config > core"
+    "extensions > cli > experiments > stages > report > scores baselines > splats perception > scenes > intake > checks > data > "
+    "twin > physics config > core"
 )
 LIGHT = (
     "",
@@ -17,7 +18,7 @@ LIGHT = (
     ".core",
     ".core.provenance",
     ".cli.main",
-    ".data.phystwin",
+    ".intake.phystwin",
     ".experiments.benchmark",
     ".experiments.tracking.log",
 )

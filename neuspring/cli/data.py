@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from neuspring.cli.options import Device, Positional, Settings, arg, read_settings
 from neuspring.core.errors import InputError
-from neuspring.data.intake.make import Intake
-from neuspring.data.intake.make import make_capture as make
+from neuspring.intake.make import Intake
+from neuspring.intake.make import make_capture as make
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -22,7 +22,7 @@ SHOWN = 5
 
 def check_data(folder: Positional[Path]) -> int:
     """Report how a data folder departs from the expected layout; exit status 2 where it cannot be used."""
-    from neuspring.data.check import check_layout, render
+    from neuspring.intake.check import check_layout, render
 
     findings = check_layout(folder)
     print(render(findings))
@@ -50,7 +50,7 @@ def cut_capture(
 ) -> None:
     """Some frames of a capture, with their masks and tracks -> another capture; marks stay behind."""
     from neuspring.data.capture import Capture
-    from neuspring.data.intake.cut import cut
+    from neuspring.intake.cut import cut
 
     first, _, last = frames.partition("-")
     if not (first.isdigit() and last.isdigit()):
@@ -73,9 +73,9 @@ def mask(
     device: Device = "auto",
 ) -> None:
     """Marks on a few frames, or masks of other tools -> masks of object and hands in every frame of a capture."""
+    from neuspring.checks.masks import mask_facts
+    from neuspring.checks.perceived import look_at_masks
     from neuspring.data.capture import Capture
-    from neuspring.data.checks.masks import mask_facts
-    from neuspring.data.checks.perceived import look_at_masks
     from neuspring.perception import segment_sam2
     from neuspring.perception.marks import store
     from neuspring.perception.marks.carry import carry_camera

@@ -17,8 +17,8 @@ from neuspring.config import Config, Method, ScenarioRow, SearchRow, merge, pars
 from neuspring.config.rows import RENAMED_ROWS
 from neuspring.core.errors import InputError
 from neuspring.core.text import listed
-from neuspring.data.sources import SOURCES, Source, location, scenario_rows, with_deform
 from neuspring.perception.backends import BACKENDS
+from neuspring.scenes.sources import SOURCES, Source, location, scenario_rows, with_deform
 from neuspring.scores.lpips import configured_weights
 from neuspring.scores.paper import Study, read_studies
 

@@ -24,10 +24,10 @@ from neuspring.core.errors import InputError
 from neuspring.core.extras import EXTRAS, install
 from neuspring.core.text import masked
 from neuspring.core.weights import hub_folder
-from neuspring.data.synthetic import toy
 from neuspring.experiments import needs
 from neuspring.experiments.tracking import store
 from neuspring.perception.track_cotracker import ADDRESS, WEIGHTS
+from neuspring.scenes.synthetic import toy
 from neuspring.scores import lpips
 from neuspring.splats.rasterize import choose_backend, rasterize
 from neuspring.splats.view import View

@@ -22,9 +22,9 @@ from neuspring.config import Config, Search, SpringField, plain
 from neuspring.config.settings import select
 from neuspring.core.errors import InputError
 from neuspring.core.provenance import image_stamps
-from neuspring.data.sources import SOURCES
 from neuspring.experiments.benchmark import Benchmark, read_methods, read_searches, rows_of, section_of, with_method, with_search
 from neuspring.perception.backends import BACKENDS
+from neuspring.scenes.sources import SOURCES
 from neuspring.scores.lpips import configured_weights
 from neuspring.stages import STAGES
 from neuspring.stages.stage import Stage

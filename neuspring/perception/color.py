@@ -38,8 +38,8 @@ from neuspring.core.errors import InputError
 from neuspring.core.geometry import farthest
 from neuspring.data.camera import Camera
 from neuspring.data.capture import CAPTURE, CONTROLLERS, HANDS, NOTHING, OBJECT, Capture
-from neuspring.data.points import InSpace, held, read
 from neuspring.data.results import LiftedTracks, Masks, PixelTracks, ShapePrior
+from neuspring.intake.points import InSpace, held, read
 from neuspring.perception.color_hands import follow_hands, grips, place
 from neuspring.perception.controllers import ALWAYS
 from neuspring.perception.shape import discs, inflated, no_prior, shape_prior

@@ -14,8 +14,8 @@ from neuspring.core.artifacts import ImageObservations
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Camera
 from neuspring.data.capture import Capture
-from neuspring.data.points import read
 from neuspring.data.results import LiftedTracks, Masks, PixelTracks, ShapePrior
+from neuspring.intake.points import read
 from neuspring.perception.color import BENEATH, FirstFrame, beneath_hands, from_color, lift_color
 from neuspring.perception.sample import spacing
 from neuspring.perception.shape import no_prior

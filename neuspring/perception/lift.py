@@ -16,8 +16,8 @@ from neuspring.config.perception import Lift
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Camera
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.data.points import held, read
 from neuspring.data.results import LiftedTracks, Masks, PixelTracks
+from neuspring.intake.points import held, read
 from neuspring.perception.controllers import ALWAYS, HAND_GAP, Body, choose_controllers, holding
 
 REFERENCE_FOCAL = 430.0

@@ -13,14 +13,14 @@ import numpy as np
 import warp as wp
 from scipy.spatial import cKDTree
 
+from neuspring.checks.space import SAME
 from neuspring.config import ScenarioRow
 from neuspring.config.perception import Perception, Sampling
 from neuspring.core.artifacts import ImageObservations, Observations
 from neuspring.core.geometry import on_table
 from neuspring.data.capture import Capture
-from neuspring.data.checks.space import SAME
-from neuspring.data.points import in_both, read, scenario_of, standing, taught_by
 from neuspring.data.results import LiftedTracks, ShapePrior
+from neuspring.intake.points import in_both, read, scenario_of, standing, taught_by
 
 SURFACE, INTERIOR = 1024, 10000
 """Points drawn on the prior's surface, and in its bounding box, of which those inside are kept; as released."""

@@ -16,7 +16,7 @@ import pandas as pd
 from neuspring.baselines import REFERENCES
 from neuspring.core.run_record import RunRecord, flat
 from neuspring.core.table import Cell, Table
-from neuspring.data.sources import SOURCES
+from neuspring.scenes.sources import SOURCES
 from neuspring.scores.metrics import AT_BOUND, METRICS
 from neuspring.scores.runs import Collected, finished_scores
 

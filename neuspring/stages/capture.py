@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from neuspring.config import Config, ScenarioRow
-from neuspring.data.sources import SOURCES, write_capture
+from neuspring.scenes.sources import SOURCES, write_capture
 from neuspring.stages.stage import stage
 
 

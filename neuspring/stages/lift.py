@@ -21,10 +21,10 @@ def lift(capture: Capture, masks: Sequence[Before], tracks: Sequence[Before], se
 
     Of color alone also image.npz: what losses read of the image.
     """
+    from neuspring.checks.perceived import look_at_lifted
     from neuspring.core.findings import findings_as_facts
-    from neuspring.data.checks.perceived import look_at_lifted
-    from neuspring.data.points import read
     from neuspring.data.results import masks_of_cameras, tracks_of_cameras
+    from neuspring.intake.points import read
     from neuspring.perception import figures
     from neuspring.perception.given import from_image
     from neuspring.perception.lift import lift as lift_points

@@ -20,9 +20,9 @@ from neuspring.stages.stage import Written, stage
 )
 def segment(capture: Capture, camera: str, settings: Config, run: Recorder, device: str = "auto") -> Written:
     """One camera of a capture -> masks: masks.npz and masks.png."""
+    from neuspring.checks.masks import mask_facts
+    from neuspring.checks.perceived import WRONG, look_at_masks
     from neuspring.core.findings import findings_as_facts
-    from neuspring.data.checks.masks import mask_facts
-    from neuspring.data.checks.perceived import WRONG, look_at_masks
     from neuspring.data.results import Masks
     from neuspring.perception import figures
 

@@ -327,7 +327,7 @@ def _about(name: str, parameter: Parameter) -> str:
 
 def read_row(text: str, settings: Config) -> ScenarioRow:
     """A row of the scenario table, by its name or as JSON. Raises InputError."""
-    from neuspring.data.sources import scenario_rows
+    from neuspring.scenes.sources import scenario_rows
 
     if text.lstrip().startswith("{"):
         return config.parse(ScenarioRow, json_value("--scenario", text), "--scenario")

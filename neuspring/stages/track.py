@@ -19,8 +19,8 @@ from neuspring.stages.stage import Written, stage
 )
 def track(capture: Capture, camera: str, masks: Before, settings: Config, run: Recorder, device: str = "auto") -> Written:
     """Masks of one camera -> tracks of pixels: tracks.npz and tracks.png."""
+    from neuspring.checks.perceived import look_at_tracks
     from neuspring.core.findings import findings_as_facts
-    from neuspring.data.checks.perceived import look_at_tracks
     from neuspring.data.results import Masks, PixelTracks
     from neuspring.perception import figures
 

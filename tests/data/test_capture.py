@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Camera, CameraEntry
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, Description, Writer
-from neuspring.data.intake.cut import cut
+from neuspring.intake.cut import cut
 from tests.support.captures import FRAMES, POSE, describe, entry
 
 

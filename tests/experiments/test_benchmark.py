@@ -18,12 +18,12 @@ from neuspring.config import Config, Method, parse
 from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
 from neuspring.core.records import Before, Recorder
-from neuspring.data.sources import read_scenarios, scenario_rows, with_deform
 from neuspring.experiments import benchmark as tables
 from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.graph import Graph
 from neuspring.experiments.needs import check_storage
 from neuspring.experiments.tuning.space import Plan
+from neuspring.scenes.sources import read_scenarios, scenario_rows, with_deform
 from neuspring.scores.paper import read_studies
 from neuspring.stages import STAGES
 from neuspring.stages.stage import Written, stage

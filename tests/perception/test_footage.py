@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from neuspring.checks.masks import mask_facts
+from neuspring.checks.perceived import look_at_masks
 from neuspring.data.capture import OBJECT, Writer
-from neuspring.data.checks.masks import mask_facts
-from neuspring.data.checks.perceived import look_at_masks
 from tests.support.captures import describe, entry
 from tests.support.real import FOOTAGE
 from workflow.scripts.footage import Errors, Points, carried, clicked, film, newly_covered, overlaps, stepwise, truths

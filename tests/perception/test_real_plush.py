@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from neuspring.checks.masks import mask_facts
+from neuspring.checks.perceived import look_at_masks
 from neuspring.config.perception import Lift, ShapePriorSettings
 from neuspring.data.capture import CAPTURE, Capture
-from neuspring.data.checks.masks import mask_facts
-from neuspring.data.checks.perceived import look_at_masks
 from neuspring.data.results import Masks
 from neuspring.perception.lift import clean_masks
 from neuspring.perception.segment_given import segment

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from neuspring.checks.perceived import look_at_observations
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
-from neuspring.data.checks.perceived import look_at_observations
 from neuspring.perception.controllers import ALWAYS, Body, Grips, holding
 from tests.support.small import observations
 

@@ -13,11 +13,11 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
+from neuspring.checks.observed import GRIP
 from neuspring.core.artifacts import Observations
 from neuspring.core.table import Table
 from neuspring.data.capture import CAPTURE, Capture
-from neuspring.data.checks.observed import GRIP
-from neuspring.data.points import read
+from neuspring.intake.points import read
 from workflow.scripts.beside_data import PREFIX
 
 FEWEST = 3

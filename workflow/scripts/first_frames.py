@@ -22,13 +22,13 @@ from scipy.spatial.transform import Rotation
 from neuspring.config.perception import ColorSettings, MarksSegmentation
 from neuspring.data.camera import Camera
 from neuspring.data.capture import OBJECT
-from neuspring.data.synthetic import bodies
-from neuspring.data.synthetic.make import looking
-from neuspring.data.synthetic.meshes import Sdf, capsule, ellipsoid, fill, smooth_union, sphere, surface
-from neuspring.data.synthetic.render import Part, Renderer
 from neuspring.perception.color import FirstFrame
 from neuspring.perception.marks.carry import carry
 from neuspring.perception.marks.marks import Marks
+from neuspring.scenes.synthetic import bodies
+from neuspring.scenes.synthetic.make import looking
+from neuspring.scenes.synthetic.meshes import Sdf, capsule, ellipsoid, fill, smooth_union, sphere, surface
+from neuspring.scenes.synthetic.render import Part, Renderer
 from workflow.scripts.footage import film
 from workflow.scripts.footage_captures import camera_of
 from workflow.scripts.masks import MARKS, Frames

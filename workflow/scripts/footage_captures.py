@@ -21,7 +21,7 @@ import numpy as np
 
 from neuspring.data.camera import Camera
 from neuspring.data.capture import CAPTURE, Capture, Description, Writer
-from neuspring.data.phystwin import released_cases
+from neuspring.intake.phystwin import released_cases
 from neuspring.perception.marks.marks import MARKS as MARKS_FILE
 from workflow.scripts.footage import VIDEOS, Points, carried, film
 from workflow.scripts.masks import MARKS

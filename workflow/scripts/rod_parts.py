@@ -19,8 +19,8 @@ import pandas as pd
 
 from neuspring import config
 from neuspring.core.device import start_warp
-from neuspring.data import mocap
-from neuspring.data.sources import scenario_rows
+from neuspring.scenes import mocap
+from neuspring.scenes.sources import scenario_rows
 from neuspring.scores.metrics import deform_l1
 from neuspring.twin.rod_fit import fit_rod, search_rod
 from neuspring.twin.rollout import initial_velocity, roll_out

@@ -20,8 +20,8 @@ def fetch(
     dry_run: Annotated[bool, arg(help="say what would be fetched and the space it takes")] = False,
 ) -> int:
     """Released archives -> the folders that the readers expect; exit status 2 if a fetched file is damaged."""
-    from neuspring.data.check import render
     from neuspring.extensions.released import fetch
+    from neuspring.intake.check import render
 
     findings = fetch.fetch(data_root, scenarios, parts, revision=revision, dry_run=dry_run)
     if dry_run:

@@ -42,9 +42,9 @@ from neuspring.core.findings import Finding, broken
 from neuspring.core.records import now, read_json
 from neuspring.core.text import Progress
 from neuspring.core.version import __version__
-from neuspring.data import phystwin
-from neuspring.data.check import check_layout, is_case
-from neuspring.data.phystwin import released_cases
+from neuspring.intake import phystwin
+from neuspring.intake.check import check_layout, is_case
+from neuspring.intake.phystwin import released_cases
 
 REPOSITORY = "Jianghanxiao/PhysTwin"
 RECORD, RECORD_FORMAT = "fetched.json", 1

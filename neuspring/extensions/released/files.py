@@ -15,10 +15,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from neuspring.checks.case import Case
 from neuspring.core.errors import InputError
 from neuspring.core.findings import Finding, broken, refuse, unusual
 from neuspring.data.camera import Camera
-from neuspring.data.checks.case import Case
 from neuspring.data.images import read_array, read_image
 from neuspring.data.unpickle import load_pickle
 

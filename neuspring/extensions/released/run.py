@@ -10,6 +10,7 @@ from typing import Any
 
 import pandas as pd
 
+from neuspring.checks.case import Case, Cases, FinalData
 from neuspring.config import ScenarioRow
 from neuspring.config.images import LpipsWeights
 from neuspring.core.artifacts import Observations
@@ -20,13 +21,12 @@ from neuspring.core.files import write_text
 from neuspring.core.findings import Finding, note, refusal
 from neuspring.core.table import Table
 from neuspring.core.text import Progress
-from neuspring.data import phystwin
-from neuspring.data.checks.case import Case, Cases, FinalData
-from neuspring.data.phystwin import released_cases
 from neuspring.data.unpickle import load_pickle
 from neuspring.extensions.released import checks
 from neuspring.extensions.released.checks import MEAN, Absent, Comparison, Outcome, Published, Tools, of_means, require
 from neuspring.extensions.released.files import Released, parameter_findings, prediction_findings, read_checkpoint
+from neuspring.intake import phystwin
+from neuspring.intake.phystwin import released_cases
 from neuspring.scores.lpips import Lpips
 
 CHECKS = {

@@ -2,8 +2,8 @@
 
 import pytest
 
+from neuspring import checks
 from neuspring.core.checks import Check
-from neuspring.data import checks
 from neuspring.extensions.released.run import RELEASED
 from neuspring.registry import Registry, modules
 

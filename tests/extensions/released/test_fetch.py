@@ -26,9 +26,9 @@ from filelock import FileLock
 
 from neuspring.config import ScenarioRow
 from neuspring.core.errors import InputError
-from neuspring.data import phystwin
 from neuspring.extensions.released import fetch as fetching
 from neuspring.extensions.released.fetch import LOCK, RECORD, fetch
+from neuspring.intake import phystwin
 from tests.support.phystwin_case import write_case
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"

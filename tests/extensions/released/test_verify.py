@@ -14,8 +14,6 @@ import pytest
 import torch
 
 from neuspring.core.errors import InputError
-from neuspring.data.intake.formats.phystwin_raw import read_calibration
-from neuspring.data.phystwin import released_cases
 from neuspring.extensions.released.checks import MEAN, RELEASED, Comparison, Published, frame_scores, of_means
 from neuspring.extensions.released.files import (
     Released,
@@ -26,6 +24,8 @@ from neuspring.extensions.released.files import (
     visible_pixels,
 )
 from neuspring.extensions.released.run import CHECKS, Report, read_observations, verify_released
+from neuspring.intake.formats.phystwin_raw import read_calibration
+from neuspring.intake.phystwin import released_cases
 from neuspring.scores.lpips import CHANNELS, WINDOWS, Lpips
 from neuspring.scores.metrics import METRICS
 from tests.support.phystwin_case import dump, edit, stored
