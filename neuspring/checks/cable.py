@@ -23,8 +23,8 @@ below a third."""
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
-    """What a file holds."""
+class CableRecording:
+    """The content of a file."""
 
     where: Path
     raw: Any
@@ -56,12 +56,12 @@ class Recording:
         return None if self.positions is None else np.linalg.norm(np.diff(self.positions, axis=2), axis=1)
 
 
-def sized(recording: Recording, axis: int) -> int | None:
+def sized(recording: CableRecording, axis: int) -> int | None:
     """Frames (0) or markers (2)."""
     return recording.form.shape[axis] if isinstance(recording.form, np.ndarray) else None
 
 
-def not_finite(recording: Recording) -> dict[str, Any] | None:
+def not_finite(recording: CableRecording) -> dict[str, Any] | None:
     """The first coordinate that is not finite, and how many there are."""
     if not isinstance(data := recording.form, np.ndarray) or not len(bad := np.argwhere(~np.isfinite(data))):
         return None
@@ -69,14 +69,14 @@ def not_finite(recording: Recording) -> dict[str, Any] | None:
     return {"value": float(data[t, axis, marker]), "frame": t, "marker": marker, "count": len(bad), "frames": (t,)}
 
 
-def too_near(recording: Recording) -> dict[str, Any] | None:
+def too_near(recording: CableRecording) -> dict[str, Any] | None:
     """The first marker of frame 0 that lies on its neighbor."""
     lengths = recording.lengths
     short = np.flatnonzero(lengths[0] < MIN_DISTANCE) if lengths is not None else np.zeros(0, int)
     return {"value": int(short[0]), "next": int(short[0]) + 1} if len(short) else None
 
 
-def stretch(recording: Recording) -> dict[str, Any] | None:
+def stretch(recording: CableRecording) -> dict[str, Any] | None:
     """The largest change of a distance of neighbors, as a part of its median."""
     if (lengths := recording.lengths) is None or too_near(recording):
         return None
@@ -86,7 +86,7 @@ def stretch(recording: Recording) -> dict[str, Any] | None:
     return told | {"frame": frame, "one": segment, "two": segment + 1, "frames": (frame,)}
 
 
-def unlike_released(recording: Recording) -> list[dict[str, Any]]:
+def unlike_released(recording: CableRecording) -> list[dict[str, Any]]:
     """Type and number of samples that are not as released."""
     if (data := recording.positions) is None:
         return []
@@ -97,18 +97,18 @@ def unlike_released(recording: Recording) -> list[dict[str, Any]]:
 
 # fmt: off
 CHECKS = (
-    Check("form of a recording", Recording, lambda recording: None if isinstance(recording.form, np.ndarray) else
+    Check("form of a recording", CableRecording, lambda recording: None if isinstance(recording.form, np.ndarray) else
           {"rule": recording.form[0], "received": recording.form[1]}, None, "error", "{rule}; received {received}", title=""),
-    Check("markers", Recording, lambda recording: sized(recording, 2), (MIN_MARKERS, np.inf), "error",
+    Check("markers", CableRecording, lambda recording: sized(recording, 2), (MIN_MARKERS, np.inf), "error",
           "at least {low} markers are required (4 of them are controllers); received {value}", title=""),
-    Check("samples", Recording, lambda recording: sized(recording, 0), (MIN_FRAMES, np.inf), "error",
+    Check("samples", CableRecording, lambda recording: sized(recording, 0), (MIN_FRAMES, np.inf), "error",
           "at least {low} frames are required; received {value}", title=""),
-    Check("finite positions", Recording, not_finite, None, "error",
+    Check("finite positions", CableRecording, not_finite, None, "error",
           "every coordinate must be finite; received {value} at frame {frame}, marker {marker} ({count} in all)", title=""),
-    Check("unlike the release", Recording, unlike_released, None, "warning", "{text}", title=""),
-    Check("markers on one place", Recording, too_near, None, "error",
+    Check("unlike the release", CableRecording, unlike_released, None, "warning", "{text}", title=""),
+    Check("markers on one place", CableRecording, too_near, None, "error",
           f"neighboring markers must be {MIN_DISTANCE} m apart in frame 0; received markers {{value}} and {{next}}", title=""),
-    Check("stretched cable", Recording, stretch, (0, MAX_STRETCH), "warning",
+    Check("stretched cable", CableRecording, stretch, (0, MAX_STRETCH), "warning",
           "marker distances usually stay within {high:.0%} of their median {median:.3f} m; received {length:.3f} m between markers "
           "{one} and {two} in frame {frame}", title=""),
 )

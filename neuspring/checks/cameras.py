@@ -39,7 +39,7 @@ STRIDE = 2
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """What cameras measured in one frame: depth [H, W], m, of each."""
+    """Depth [H, W], m, that each camera measured in one frame."""
 
     where: Path
     cameras: Mapping[str, Camera]
@@ -106,7 +106,7 @@ class Edges:
 
 
 def misplaced(edges: Edges) -> dict[str, Any] | None:
-    """How many times as well edges of depth fit those of color when depth is moved and scaled: depth of another sensor."""
+    """Gain of agreement where edges of depth fit those of color once depth is moved and scaled: depth of another sensor."""
     right, down, scale, gain = edge_shift(edges.pairs)
     if gain < BETTER:
         return None
@@ -117,8 +117,8 @@ def misplaced(edges: Edges) -> dict[str, Any] | None:
 
 
 def edge_shift(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[int, int, float, float]:
-    """What must be done to depth so that its edges agree best with those of color, and how many times as well as they do within
-    ALIGNED: pixels to the right and down, after a scaling about the center of the image. 0 times where there are too few edges.
+    """The shift and scale of depth with which its edges agree best with those of color, and how many times as well as they do
+    within ALIGNED: pixels to the right and down, after a scaling about the center of the image. 0 times where there are too few edges.
 
     The agreement is the mean strength of color's edges over depth's edge pixels, above its median over all shifts.
     """

@@ -52,7 +52,7 @@ KIND_NAMES = {"f": "floating point", "b": "bool"}
 
 
 def wrong(key: str, rule: str, value: object = None, level: Level = "error") -> dict[str, Any]:
-    """What a check says of a key: the rule that it breaks, and what was received."""
+    """Words about a key: the rule that it breaks, and what was received."""
     return {"key": key, "text": rule if value is None else f"{rule}; received {value}", "level": level}
 
 
@@ -63,7 +63,7 @@ def odd(key: str, rule: str, value: object = None) -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """Where one processed case lies."""
+    """One processed case: its place."""
 
     root: Path
     """The folder that the archives were unpacked in."""
@@ -95,7 +95,7 @@ class FinalData:
 
     @cached_property
     def structure(self) -> Words:
-        """What is wrong with its keys, types, shapes and dtypes. Without errors the content of the arrays can be looked at."""
+        """Faults of its keys, types, shapes and dtypes. Without errors the content of the arrays can be looked at."""
         return structure(self)
 
     @property
@@ -144,7 +144,7 @@ class Calibration:
 
 
 def structure(file: FinalData) -> Words:
-    """Keys, types, shapes and dtypes. Without errors the content of the arrays can be looked at."""
+    """Faults of keys, types, shapes and dtypes. Without errors the content of the arrays can be looked at."""
     data = file.data
     if not isinstance(data, dict):
         return [wrong("", "a dict of arrays is required", type(data).__name__)]
@@ -211,7 +211,7 @@ def describe_bad(value: np.ndarray, bad: np.ndarray) -> str:
 
 
 def motions(file: FinalData) -> Words:
-    """What the reader accepts, and is not as released."""
+    """Departures from the release that the reader accepts."""
     if not file.whole:
         return []
     findings, data = Words(), file.data

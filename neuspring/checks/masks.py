@@ -40,7 +40,7 @@ REMEDY = "Mark object and hands in a few frames (`neuspring mask`), or choose an
 
 
 class Shown:
-    """What the masks of one camera show, counted frame by frame."""
+    """The masks of one camera, counted frame by frame."""
 
     def __init__(self, camera: str, frames: int, size: tuple[int, int]) -> None:
         """Nothing so far, of images of `size` (width, height)."""
@@ -163,7 +163,7 @@ UNMARKED = (
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """How the picture of a camera changes from a frame on, at WIDTH pixels."""
+    """The change of a camera's picture from a frame on, at WIDTH pixels."""
 
     frame: int
     moving: np.ndarray
@@ -255,7 +255,7 @@ def object_moves(seen: Sequence[Motion], train_end: int) -> dict[str, float]:
 
 
 def newly_kept(seen: Sequence[Motion]) -> dict[str, float]:
-    """How much of what seems newly covered lies in the object's mask, and the first frame in which that is too little."""
+    """The part of what seems newly covered that lies in the object's mask, and the first frame in which that is too little."""
     newly = [(motion.frame, *motion.newly) for motion in seen if motion.newly[1] > NEW * motion.begin.sum()]
     if len(newly) < FEWEST_STEPS:
         return {}

@@ -93,7 +93,7 @@ def let_go(seen: Observed) -> dict[str, Any] | None:
 
 
 def motion_of_hands(seen: Observed) -> dict[str, Any] | None:
-    """How far controllers move, m."""
+    """The farthest motion of controllers, m."""
     points = seen.observations.controller_points
     moved = float(np.linalg.norm(points - points[0], axis=2).max())
     return HANDS | {"value": moved, "mm": 1e3 * moved} if seen.meets else None
@@ -109,13 +109,13 @@ def speed_of_hands(seen: Observed) -> dict[str, Any] | None:
 
 
 def first_hold(seen: Observed) -> dict[str, Any] | None:
-    """Where no controller holds in frame 0."""
+    """Controllers of frame 0, of which none holds."""
     told = hold(seen)
     return None if not told or told["value"] else told
 
 
 def partial_hold(seen: Observed) -> dict[str, Any] | None:
-    """Where fewer than half of the controllers hold in frame 0."""
+    """Controllers of frame 0, of which fewer than half hold."""
     told = hold(seen)
     return told if told and 0 < 2 * told["value"] < told["count"] else None
 

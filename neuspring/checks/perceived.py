@@ -15,7 +15,7 @@ from neuspring.checks import examine
 from neuspring.checks.followed import Tracked, few
 from neuspring.checks.masks import OFTEN, Segmented, Shown
 from neuspring.checks.observed import Observed
-from neuspring.checks.things import Body, Masked, Sample, Sheet, Silhouette, sampled
+from neuspring.checks.things import Masked, ObjectPoints, Sample, Sheet, Silhouette, sampled
 from neuspring.core.artifacts import ImageObservations, Observations
 from neuspring.core.checks import Check
 from neuspring.core.findings import Finding
@@ -76,7 +76,7 @@ class Lifted:
 
 def look_at_lifted(lifted: LiftedTracks, prior: ShapePrior, up: float, image: ImageObservations | None = None) -> list[Finding]:
     """Findings about points in the world and the shape; `up` is +1 or -1. `image`: the evidence of color alone."""
-    found = examine(Body("object in frame 0", [lifted.cloud], up))
+    found = examine(ObjectPoints("object in frame 0", [lifted.cloud], up))
     if image is None and prior.backend.startswith("visual_hull"):
         found += examine(Sheet("object in frame 0", lifted.cloud, up))
     return found + examine(Lifted(lifted, prior, image))

@@ -43,7 +43,7 @@ POSE = "Look at camera_to_world: the table must be z = 0 in meters, and the came
 
 @dataclass(frozen=True)
 class Stand:
-    """How a plane stands in the world."""
+    """Tilt and height of a plane in the world."""
 
     tilt: float
     """Angle of its normal with up, degrees."""
@@ -56,14 +56,14 @@ class Stand:
 
 
 def stand(plane: Plane, pose: np.ndarray, up: float, factor: float = 1.0) -> Stand:
-    """How `plane` stands in the world by `pose`, camera to world [4, 4], m, if depth is multiplied by `factor`."""
+    """Tilt and height of `plane` in the world by `pose`, camera to world [4, 4], m, if depth is multiplied by `factor`."""
     cosine = up * (pose[:3, :3] @ plane.normal)[2]
     z = (factor * plane.points.mean(axis=0)) @ pose[2, :3] + pose[2, 3]
     return Stand(float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))), float(up * z))
 
 
 def variants(pose: np.ndarray) -> dict[str, np.ndarray]:
-    """What a pose [4, 4] may be instead, with the next move, and the pose that is meant then."""
+    """Kinds of matrix that a pose [4, 4] may be instead, with the next move, and the pose that is meant then."""
     return {
         "a world-to-camera matrix. Invert it": rigid_inverse(pose),
         "a matrix for OpenGL's axes (y up, z backward). Change the signs of its second and third column": pose @ OPENGL,
@@ -140,7 +140,7 @@ class TableSeen:
 
     @property
     def text(self) -> str:
-        """Where it is."""
+        """Its place, in words."""
         table, standing = self.table
         side = "above" if standing.off > 0 else "below"
         return f"{1e3 * abs(standing.off):.0f} mm {side} z = 0 and tilted by {standing.tilt:.1f} degrees; plane: {table.text()}"
@@ -158,7 +158,7 @@ def unexplained(seen: TableSeen) -> dict[str, Any] | None:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class CameraAlone:
     """A camera without depth; the table is z = 0."""
 
     where: Path
@@ -174,7 +174,7 @@ class View:
 
     @property
     def height(self) -> float:
-        """Of the camera from z = 0, m."""
+        """Height of the camera above z = 0, m."""
         return abs(float(self.camera.camera_to_world[2, 3]))
 
     @cached_property
@@ -185,7 +185,7 @@ class View:
 
     @cached_property
     def wrong(self) -> tuple[str, str, bool] | None:
-        """What is wrong with the view of the table, the value, and whether a camera may be so all the same; None: nothing."""
+        """The fault of the view of the table, the value, and whether a camera may be so all the same; None: nothing."""
         sign, height = up_sign(self.up), float(self.camera.camera_to_world[2, 3])
         if height * sign <= 0:
             rule = "the camera must be above the table z = 0, on the side of it that is up"
@@ -210,13 +210,13 @@ def on_table(camera: Camera, pixels: np.ndarray) -> np.ndarray:
 
 
 def object_on_table(camera: Camera, mask: np.ndarray) -> np.ndarray:
-    """Where the object's pixels of a mask [H, W] meet the table [n, 3], m; NaN beyond the horizon."""
+    """Places at which the object's pixels of a mask [H, W] meet the table [n, 3], m; NaN beyond the horizon."""
     y, x = np.nonzero(mask == OBJECT)
     return on_table(camera, np.stack([x, y], axis=1))
 
 
-def wrong_view(view: View) -> dict[str, Any] | None:
-    """What is wrong with the view of the table, and the poses that would be right."""
+def wrong_view(view: CameraAlone) -> dict[str, Any] | None:
+    """The fault of the view of the table, and the poses that would be right."""
     if view.wrong is None:
         return None
     rule, received, possible = view.wrong
@@ -260,11 +260,12 @@ CHECKS = (
     Check("table elsewhere", TableSeen, unexplained, None, "warning",
           "the table that the camera sees {must} be z = 0; received {subject.text}. {next}",
           title="cameras.{subject.name}.camera_to_world"),
-    Check("view of the table", View, wrong_view, None, "error", "{subject.key}: {rule}; received {received}{also}", title=""),
-    Check("distance of the table", View, lambda view: None if view.wrong else view.away, None, "note",
+    Check("view of the table", CameraAlone, wrong_view, None, "error",
+          "{subject.key}: {rule}; received {received}{also}", title=""),
+    Check("distance of the table", CameraAlone, lambda view: None if view.wrong else view.away, None, "note",
           "camera {subject.camera.name}: color alone: the table is z = 0 as given, {value:.2f} m away in the center of the image, "
           "{subject.height:.2f} m below the camera", title=""),
-    Check("high camera", View, lambda view: None if view.wrong else view.height, (0, HIGHEST), "warning",
+    Check("high camera", CameraAlone, lambda view: None if view.wrong else view.height, (0, HIGHEST), "warning",
           "{subject.key}: a camera should be at most {high:g} m above the table; received {value:.2f} m. Is camera_to_world in "
           "meters?",
           title=""),

@@ -151,7 +151,7 @@ def gap(seen: Held) -> dict[str, Any] | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class ObjectPoints:
     """Points of the object in some frames, [n, 3] each, m, in the world; `up` is +1 or -1."""
 
     where: str
@@ -173,7 +173,7 @@ def in_cm(sides: Iterable[float]) -> str:
     return " x ".join(f"{100 * side:.0f}" for side in sides)
 
 
-def size(body: Body) -> dict[str, Any] | None:
+def size(body: ObjectPoints) -> dict[str, Any] | None:
     """Sides of the object and its heights above the table."""
     if body.place is None:
         return None
@@ -202,7 +202,7 @@ class Outline:
 
     @cached_property
     def sides(self) -> list[float]:
-        """Of the smallest rectangle around where it meets the table, m; none where little does. What rises seems larger."""
+        """Sides of the smallest rectangle around where it meets the table, m; none where little does. What rises seems larger."""
         own = object_on_table(self.camera, self.mask)
         own = own[np.isfinite(own[:, 0])]
         return [] if len(own) < FEW else sorted(cv2.minAreaRect(own[:, :2].astype(np.float32))[1], reverse=True)
@@ -342,7 +342,7 @@ def inside(among: Among) -> list[dict[str, Any]]:
 
 
 @dataclass(frozen=True)
-class Rate:
+class FrameRate:
     """Frames per second of a capture."""
 
     where: Path
@@ -398,7 +398,7 @@ SHORTEST = 1.0
 
 
 def hands_on(camera: Camera, sample: Sample) -> int:
-    """How many hands are within REACH of the object in a frame."""
+    """The number of hands within REACH of the object in a frame."""
     body, own = lifted(camera, sample, OBJECT), sample.mask == HANDS
     reach = max(int(0.5 * BESIDE * camera.width), 1)
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2)
@@ -408,7 +408,7 @@ def hands_on(camera: Camera, sample: Sample) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class Grips:
+class GripCounts:
     """Hands at the object in each frame [T], counted by all cameras of a capture."""
 
     where: Path
@@ -416,7 +416,7 @@ class Grips:
     rate: float
 
 
-def constant_grips(grips: Grips) -> dict[str, Any] | None:
+def constant_grips(grips: GripCounts) -> dict[str, Any] | None:
     """The times with a constant number of hands at the object, and the longest of them."""
     steady = median_filter(grips.counts, STEADY, mode="nearest")
     edges = [0, *(np.flatnonzero(np.diff(steady)) + 1).tolist(), len(steady)]
@@ -445,12 +445,14 @@ CHECKS = (
           f"the hand is never nearer to the object than {{cm:.1f}} cm, in {{count}} frames; within {100 * REACH:g} cm it can "
           f"move it.",
           "Look at the masks for a hand that is something else, or for the wrong object."),
-    Check("size of the object", Body, size, None, "note", "{text}; as its pixels with depth show it.", "Is that what was filmed?"),
-    Check("implausible size", Body, lambda body: body.place and longest(float(body.place[0].max())), None, "warning",
+    Check("size of the object", ObjectPoints, size, None, "note",
+          "{text}; as its pixels with depth show it.", "Is that what was filmed?"),
+    Check("implausible size", ObjectPoints, lambda body: body.place and longest(float(body.place[0].max())), None, "warning",
           f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE),
-    Check("object below the table", Body, lambda body: body.place and {"value": body.place[1], "cm": -100 * body.place[1]},
+    Check("object below the table", ObjectPoints, lambda body: body.place and {"value": body.place[1], "cm": -100 * body.place[1]},
           (-SUNK, np.inf), "warning", f"it reaches {{cm:.1f}} cm below the table; at most {100 * SUNK:g} cm are noise.", TABLE),
-    Check("object high above the table", Body, lambda body: body.place and {"value": body.place[2]}, (-np.inf, HIGH), "warning",
+    Check("object high above the table", ObjectPoints, lambda body: body.place and {"value": body.place[2]},
+          (-np.inf, HIGH), "warning",
           "it is up to {value:.2f} m above it; at most {high:g} m is expected; walls and people in the mask are no object.", TABLE),
     Check("size of the object", Outline, lambda seen: seen.sides and {"text": in_cm(seen.sides)}, None,
           "note", "color alone: table z = 0 as given, object size on the table {text} cm; by its mask of frame 0.",
@@ -470,7 +472,8 @@ CHECKS = (
           "they are "
           f"in meters, in the world of the cameras.; received {{value:.0%}} more than {1e3 * INSIDE:g} mm inside",
           title="obstacles[{number}]"),
-    Check("frame rate", Rate, lambda said: said.rate, (SLOWEST, FASTEST), "error",  # Speeds and forces of the twin scale with it.
+    # Speeds and forces of the twin scale with it.
+    Check("frame rate", FrameRate, lambda said: said.rate, (SLOWEST, FASTEST), "error",
           "frames per second at which it was filmed are required, {low:g} to {high:g}; received {value:g}", title="frame_rate"),
     Check("no depth", Depths, lambda seen: {} if seen.medians and seen.typical is None else None, None, "error",
           "some depth is required; received 0 in every pixel of every frame", title="cameras.{subject.camera}"),
@@ -481,7 +484,7 @@ CHECKS = (
     Check("category", Category, meant, None, "warning",
           f"only {' and '.join(THIN)} mean a thin thing, and only rope a round one; any other word is a filled body; "
           "received {subject.category!r}. Is {value} meant?", title="category"),
-    Check("constant grips", Grips, constant_grips, None, "note",
+    Check("constant grips", GripCounts, constant_grips, None, "note",
           f"hands within {100 * REACH:g} cm of the object, by frames: {{text}}. A twin is best learned from one constant "
           f"grip{{cut}}",
           title=""),

@@ -52,7 +52,7 @@ class Camera:
         return flat[..., :2] / np.where(np.abs(depth) < 1e-9, 1e-9, depth)[..., None], depth
 
     def sees(self, pixels: np.ndarray) -> np.ndarray:
-        """Whether pixels (x, y) [..., 2] round to one of the image."""
+        """True for pixels (x, y) [..., 2] that round to one of the image."""
         x, y = np.round(pixels[..., 0]), np.round(pixels[..., 1])
         return (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
 
@@ -100,7 +100,7 @@ class Plane:
         return np.asarray(points @ self.normal + self.height)
 
     def text(self) -> str:
-        """What it is, in one line."""
+        """Its size and place, in one line."""
         size = f"{1e3 * self.rms:.1f} mm rms over {self.share:.0%} of the pixels with depth ({self.inliers} points)"
         return f"{size}, camera {self.height:.3f} m above it, looking down at it by {self.elevation:.0f} degrees"
 

@@ -115,7 +115,7 @@ class Capture:
 
     @staticmethod
     def begun(folder: Path) -> bool:
-        """Whether a folder holds a capture, or one that is not finished."""
+        """True where a folder holds a capture, or one that is not finished."""
         return (folder / CAPTURE).exists() or (folder / RECIPE).exists()
 
     @cached_property
@@ -135,7 +135,7 @@ class Capture:
 
     @property
     def has_depth(self) -> bool:
-        """Whether depth was measured."""
+        """True where depth was measured."""
         return self.description.depth == "measured"
 
     def require_camera(self, name: str) -> None:
@@ -144,7 +144,7 @@ class Capture:
             raise InputError(self.folder / CAPTURE, f"must have a camera {name}", sorted(self.cameras))
 
     def has(self, camera: str, frame: int) -> bool:
-        """Whether the camera has this frame."""
+        """True where the camera has this frame."""
         return frame not in self._missing[camera]
 
     @cached_property

@@ -23,7 +23,7 @@ class _Result(Artifact):
 
 @dataclass(frozen=True, kw_only=True)
 class Masks(_Result):
-    """Which pixels of one camera show the object and the hands."""
+    """The pixels of one camera that show the object and the hands."""
 
     kind: ClassVar[str] = "masks"
     labels: np.ndarray = array("T,H,W", np.uint8, "1", "0 nothing, 1 object, 2 hands; all 0 in frames that the camera missed")

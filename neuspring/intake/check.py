@@ -15,23 +15,23 @@ from typing import Any
 import numpy as np
 
 from neuspring.checks import examine
-from neuspring.checks.cable import Recording
+from neuspring.checks.cable import CableRecording
 from neuspring.checks.cameras import Edges, Views
 from neuspring.checks.case import Calibration, Case, Cases, FinalData, Metadata, Split, TrackFile
 from neuspring.checks.masks import Shown
-from neuspring.checks.table import Horizon, TableSeen, View, object_on_table
+from neuspring.checks.table import CameraAlone, Horizon, TableSeen, object_on_table
 from neuspring.checks.things import (
     HAND_LEAST,
     INSIDE,
     Among,
-    Body,
     Category,
     Depths,
-    Grips,
+    FrameRate,
+    GripCounts,
     Held,
     Masked,
+    ObjectPoints,
     Outline,
-    Rate,
     Sample,
     Sheet,
     Silhouette,
@@ -63,7 +63,7 @@ def check_capture(folder: Path) -> list[Finding]:
         description = read_description(path)
     except InputError as error:
         return [refusal(error)]
-    findings = description_findings(path, description) + examine(Rate(path, description.frame_rate))
+    findings = description_findings(path, description) + examine(FrameRate(path, description.frame_rate))
     findings += examine(Category(path, description.category))
     capture, calibrated = Capture(folder, description), not any(one.level == "error" for one in findings)
     grips = np.zeros(capture.frame_count, int)
@@ -71,7 +71,7 @@ def check_capture(folder: Path) -> list[Finding]:
     for name in capture.cameras:
         samples[name], of_camera = _check_camera(capture, name, calibrated, grips)
         findings += of_camera
-    findings += examine(Grips(path, grips, description.frame_rate))
+    findings += examine(GripCounts(path, grips, description.frame_rate))
     if calibrated and len(samples) > 1:
         first = {name: found[0].depth for name, found in samples.items() if 0 in found}
         findings += examine(Views(path, capture.cameras, first, description.up))
@@ -145,7 +145,7 @@ def _with_depth(capture: Capture, name: str, samples: dict[int, Sample]) -> list
     bodies = {frame: lifted(camera, sample, OBJECT) for frame, sample in samples.items()}
     pairs = [(s.mask if s.mask.any() else s.color, s.depth) for s in samples.values() if s.color is not None]
     things: list[Any] = [Edges(f"camera {name}", pairs), Held(camera, samples)]  # type: ignore[arg-type]
-    things.append(Body(f"camera {name}, object", list(bodies.values()), up_sign(up)))
+    things.append(ObjectPoints(f"camera {name}, object", list(bodies.values()), up_sign(up)))
     if 0 in bodies:
         things.append(Support(camera, samples[0], up_sign(up), described.obstacles))
         things.append(Sheet(f"camera {name}, object", bodies[0], up_sign(up), described.category))
@@ -157,7 +157,7 @@ def _with_depth(capture: Capture, name: str, samples: dict[int, Sample]) -> list
 def _color_alone(capture: Capture, name: str, samples: dict[int, Sample]) -> list[Finding]:
     """The camera above the table, and the object in the mask of frame 0 on it, without depth."""
     path, camera, described, up = capture.folder / CAPTURE, capture.cameras[name], capture.description, capture.description.up
-    findings = examine(View(path, camera, up, f"poses {described.provenance.get('poses', '')}".rstrip()))
+    findings = examine(CameraAlone(path, camera, up, f"poses {described.provenance.get('poses', '')}".rstrip()))
     if any(one.level == "error" for one in findings) or 0 not in samples:
         return findings
     mask, category = samples[0].mask, described.category
@@ -207,7 +207,7 @@ def check_recording(file: Path) -> list[Finding]:
     """Every finding of one recording of a cable; nothing is raised for bad content."""
     findings: list[Finding] = []
     raw = _read(findings, Path(file), load_pickle)
-    return findings or examine(Recording(Path(file), raw))
+    return findings or examine(CableRecording(Path(file), raw))
 
 
 def find_cases(folder: Path) -> list[Case]:

@@ -30,7 +30,7 @@ class Paired:
 
     @property
     def path(self) -> Path:
-        """That of color."""
+        """The path of color."""
         return self.color.path
 
     @cached_property
@@ -51,7 +51,7 @@ class Paired:
 
     @cached_property
     def series(self) -> Series:
-        """Of the pairs."""
+        """Times of the pairs."""
         return self.color.series.part([left for left, _ in self._pairs])
 
     def rate(self, places: Sequence[int]) -> float | None:

@@ -15,7 +15,7 @@ from neuspring.intake.poses import FrameChoice
 
 
 @dataclass(frozen=True, eq=False)
-class Film:
+class FilmFiles:
     """The feeds of all cameras, and the frames that are kept."""
 
     views: Sequence[CameraFeed]
@@ -23,29 +23,29 @@ class Film:
     where: str = "--frames"
 
 
-def images_alone(film: Film) -> Iterator[dict[str, Any]]:
+def images_alone(film: FilmFiles) -> Iterator[dict[str, Any]]:
     """Color without depth, or depth without color."""
     for view in film.views:
         if isinstance(view, Paired) and (alone := [f"{kind} {spans(numbers)}" for kind, numbers in view.alone.items() if numbers]):
             yield {"where": view.path, "camera": view.name, "text": "; ".join(alone)}
 
 
-def missing_frames(film: Film) -> Iterator[dict[str, Any]]:
+def missing_frames(film: FilmFiles) -> Iterator[dict[str, Any]]:
     """Frames that some cameras have and others lack."""
     for view in film.views:
         if missing := [film.choice.numbers[frame] for frame in film.choice.missing(view.name)]:
             yield {"where": view.path, "camera": view.name, "text": spans(missing), "value": len(missing), "frames": missing}
 
 
-def not_by_numbers(film: Film) -> Iterator[dict[str, Any]]:
-    """How frames belong together, where numbers in names do not say it."""
+def not_by_numbers(film: FilmFiles) -> Iterator[dict[str, Any]]:
+    """The order in which frames belong together, where numbers in names do not say it."""
     own = {f"camera {view.name}, color and depth": view.match[1] for view in film.views if isinstance(view, Paired)}
     for names, by in (own | film.choice.pairing).items():
         if by and "numbers" not in by:
             yield {"where": names, "value": by}
 
 
-def uneven_time(film: Film) -> Iterator[dict[str, Any]]:
+def uneven_time(film: FilmFiles) -> Iterator[dict[str, Any]]:
     """Time stamps that follow no even clock, as of a phone in dim light: a capture has one rate."""
     for view in film.views:
         times, places = view.series.times, film.choice.places[view.name]
@@ -67,7 +67,7 @@ def uneven_time(film: Film) -> Iterator[dict[str, Any]]:
             yield told | {"level": "warning" if found.missing else "note", "rule": ""}
 
 
-def several_tracks(film: Film) -> Iterator[dict[str, Any]]:
+def several_tracks(film: FilmFiles) -> Iterator[dict[str, Any]]:
     """A file of which one video track of several is read, unnamed."""
     for images in (images for view in film.views if isinstance(view, Paired) for images in view.sources):
         if isinstance(images, VideoFile) and images.track is None and len(images.tracks) > 1:
@@ -77,12 +77,13 @@ def several_tracks(film: Film) -> Iterator[dict[str, Any]]:
 
 # fmt: off
 FILM_CHECKS = (
-    Check("time jumps", Film, lambda film: {"text": spans(film.choice.jumps)} if film.choice.jumps else None, None, "warning",
+    Check("time jumps", FilmFiles, lambda film: {"text": spans(film.choice.jumps)} if film.choice.jumps else None, None, "warning",
           "frame numbers are left out after {text}"),
-    Check("images alone", Film, images_alone, None, "warning",
+    Check("images alone", FilmFiles, images_alone, None, "warning",
           "camera {camera}: images without their partner are left out: {text}"),
-    Check("missing frames", Film, missing_frames, None, "warning", "camera {camera} lacks {text}; other cameras have them"),
-    Check("pairs", Film, not_by_numbers, None, "note", "{where}: by {value}"),
-    Check("uneven time", Film, uneven_time, None, "error", "{text}{rule}"),
-    Check("several tracks", Film, several_tracks, None, "warning", "the first is read as {kind}: {text}. Name the one you mean"),
+    Check("missing frames", FilmFiles, missing_frames, None, "warning", "camera {camera} lacks {text}; other cameras have them"),
+    Check("pairs", FilmFiles, not_by_numbers, None, "note", "{where}: by {value}"),
+    Check("uneven time", FilmFiles, uneven_time, None, "error", "{text}{rule}"),
+    Check("several tracks", FilmFiles, several_tracks, None, "warning",
+          "the first is read as {kind}: {text}. Name the one you mean"),
 )

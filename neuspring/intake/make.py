@@ -30,8 +30,8 @@ from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Capture, Description
 from neuspring.intake import points
 from neuspring.intake.depth import Unit, find_rate
 from neuspring.intake.feeds import Paired, pairs
-from neuspring.intake.film import FILM_CHECKS, Film
-from neuspring.intake.formats import Recording, open_recording
+from neuspring.intake.film import FILM_CHECKS, FilmFiles
+from neuspring.intake.formats import Recorded, open_recording
 from neuspring.intake.lenses import Board, Straightener, read_lenses, read_poses
 from neuspring.intake.poses import (
     FrameChoice,
@@ -58,7 +58,7 @@ FIRST = 5
 
 @dataclass(frozen=True, kw_only=True)
 class Intake:
-    """What a capture is made of: the options of `neuspring make-capture`."""
+    """The parts of a capture: the options of `neuspring make-capture`."""
 
     output: Path
     """the capture folder to write"""
@@ -129,8 +129,8 @@ class Intake:
         """The files of points in space, by option."""
         return {name: path for name in BROUGHT if (path := getattr(self, name)) is not None}
 
-    def opened(self) -> Recording:
-        """What the cameras gave; no views of points in space alone. Raises InputError."""
+    def opened(self) -> Recorded:
+        """The film of the cameras; no views of points in space alone. Raises InputError."""
         given = [f"--{name.replace('_', '-')}" for name in FILMS if getattr(self, name)]
         if len(given) != 1 and (given or not self.controllers):
             rule = "one of --color with --depth, --bag, --phystwin-raw, --recording is required, or --controllers with --nodes and "
@@ -142,7 +142,7 @@ class Intake:
             return open_recording((self.phystwin_raw,), "phystwin_raw", self.cameras)
         if self.recording:
             return open_recording(self.recording, self.format, self.cameras)
-        return Recording(views=pairs(self.color, self.depth, self.cameras) if self.color else ())
+        return Recorded(views=pairs(self.color, self.depth, self.cameras) if self.color else ())
 
 
 FILMS = ("color", "bag", "phystwin_raw", "recording")
@@ -178,7 +178,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
         remedy = "Leave it out. To learn from the case's own, write tracks: train in capture.json then."
         raise InputError(option, "a case in PhysTwin's raw layout brings annotated points of its own", "both", remedy)
     choice = choose(views, intake.frames)
-    findings = examine(Film(views, choice), FILM_CHECKS)
+    findings = examine(FilmFiles(views, choice), FILM_CHECKS)
     refuse_errors(findings)
     film.require_masks({name: [choice.numbers[frame] for frame in places] for name, places in choice.places.items()})
     known = [view.rate([*choice.places[view.name].values()]) for view in views]
@@ -235,7 +235,7 @@ def _require_for_color_alone(intake: Intake) -> None:
 
 
 def _place(
-    intake: Intake, film: Recording, board: Board | None, seen: Mapping[str, SampledCamera], unit: Unit | None
+    intake: Intake, film: Recorded, board: Board | None, seen: Mapping[str, SampledCamera], unit: Unit | None
 ) -> tuple[Placed, str]:
     """Poses of all cameras, and where they come from. Raises InputError."""
     names, level, top_down = list(seen), intake.level, intake.top_down
@@ -273,7 +273,7 @@ def _place(
 
 def _describe(
     intake: Intake,
-    film: Recording,
+    film: Recorded,
     choice: FrameChoice,
     rate: float,
     unit: Unit | None,
@@ -332,7 +332,7 @@ def _begin(folder: Path, made: Description, force: bool, lenses: Mapping[str, Le
 
 
 def _write(
-    writer: Writer, begun: bool, film: Recording, choice: FrameChoice, unit: Unit | None, seen: Mapping[str, SampledCamera]
+    writer: Writer, begun: bool, film: Recorded, choice: FrameChoice, unit: Unit | None, seen: Mapping[str, SampledCamera]
 ) -> None:
     """The images that are not there yet."""
     made, done = writer.capture.description, 0
@@ -391,7 +391,7 @@ def _of_points(intake: Intake) -> tuple[Capture, list[str]]:
 
 
 def brought_by(folder: Path, brought: Mapping[str, Path], made: Description) -> points.InSpace:
-    """What a user brings in space, before anything is written. Raises InputError for what no twin can be made of."""
+    """Hands, nodes and points that a user brings, before anything is written. Raises InputError for what no twin can be made of."""
     space, findings = points.look(Capture(folder, made), brought)
     refuse(findings)
     return space
@@ -404,7 +404,7 @@ def _bring(writer: Writer, space: points.InSpace, tracks: Path | None) -> np.nda
 
 
 def digests(files: Mapping[str, Path], what: str = " file") -> dict[str, str]:
-    """Of the files that a user brings, for the provenance."""
+    """Digests of files that a user brings, for the provenance."""
     return {f"{name}{what}": f"sha256:{digest_file(path)}" for name, path in files.items()}
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from neuspring.checks import examine
-from neuspring.checks.table import TableSeen, View
+from neuspring.checks.table import CameraAlone, TableSeen
 from neuspring.checks.things import sampled
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
@@ -50,7 +50,7 @@ class FrameChoice:
         return tuple(frame for frame in range(len(self.numbers)) if frame not in self.places[camera])
 
     def text(self) -> str:
-        """Which they are, in one line."""
+        """The kept frames, in one line."""
         stride = f", one in {self.step}" if self.step > 1 else ""
         return f"{len(self.numbers)} frames, numbers {self.numbers[0]} to {self.numbers[-1]} of the source{stride}"
 
@@ -108,7 +108,7 @@ def choose(views: Sequence[CameraFeed], wanted: str = "") -> FrameChoice:
 
 @dataclass(frozen=True, eq=False)
 class SampledCamera:
-    """What a camera saw in a few frames."""
+    """A few frames of a camera."""
 
     path: Path
     size: tuple[int, int]
@@ -181,7 +181,7 @@ def require_aligned(
 
 
 def stored_as(depth: np.ndarray) -> str:
-    """How the capture stores it: 16-bit counts as png, anything else as npy in meters."""
+    """The form in which the capture stores it: 16-bit counts as png, anything else as npy in meters."""
     return "png" if depth.dtype == np.uint16 else "npy"
 
 
@@ -201,7 +201,7 @@ RATIO = 0.04
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Placed:
-    """Where the cameras are."""
+    """Poses of the cameras."""
 
     poses: dict[str, np.ndarray]
     """Camera to world [4, 4], m."""
@@ -300,7 +300,7 @@ def given_alone(poses: Mapping[str, np.ndarray], seen: Mapping[str, SampledCamer
     """
     (name, view), pose = next(iter(seen.items())), next(iter(poses.values()))
     up = "+z" if pose[2, 3] > 0 else "-z"
-    judged = examine(View(where, Camera(name, *view.size, view.lens.matrix, pose), up))
+    judged = examine(CameraAlone(where, Camera(name, *view.size, view.lens.matrix, pose), up))
     refuse(one for one in judged if one.level == "error")
     return Placed(poses=dict(poses), up=up, table="z = 0 as given", lines=tuple(map(in_report, judged)))
 

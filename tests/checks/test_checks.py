@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from neuspring import checks, registry
-from neuspring.checks.cable import Recording as CableRecording
+from neuspring.checks.cable import CableRecording
 from neuspring.checks.masks import Shown
 from neuspring.checks.things import Masked
 from neuspring.cli.main import main
@@ -19,7 +19,7 @@ from neuspring.data.capture import CAPTURE, OBJECT, Capture
 from neuspring.intake import formats
 from neuspring.intake.check import check_layout
 from neuspring.intake.feeds import Paired
-from neuspring.intake.formats import CaptureFormat, Recording
+from neuspring.intake.formats import CaptureFormat, Recorded
 from neuspring.intake.formats.folder import ImageFolder
 from tests.support.desk import write_folders
 from tests.support.filmed import film
@@ -110,7 +110,7 @@ def test_a_package_adds_a_check(filmed, monkeypatch):
 def _twin_folders(paths, cameras):
     names = cameras or tuple(map(str, range(len(paths))))
     pairs = zip(names, paths, strict=True)
-    return Recording(
+    return Recorded(
         views=[Paired(name, ImageFolder(p / "color_0", "color"), ImageFolder(p / "depth_0", "depth")) for name, p in pairs]
     )
 

@@ -88,7 +88,7 @@ class CameraFeed(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Recording:
+class Recorded:
     """All that cameras gave, and what came along."""
 
     views: Sequence[CameraFeed]
@@ -116,7 +116,7 @@ class CaptureFormat:
     """True for a path of this form."""
     pictures: Callable[[Path, Kind], ImageSource] | None = None
     """Opens pictures of one kind. Raises InputError."""
-    recording: Callable[[Sequence[Path], Sequence[str]], Recording] | None = None
+    recording: Callable[[Sequence[Path], Sequence[str]], Recorded] | None = None
     """Opens files or folders, one per camera or one for all, with names of the cameras, if they are given. Raises InputError."""
 
 
@@ -133,7 +133,7 @@ def open_images(path: Path, kind: Kind) -> ImageSource:
     raise InputError(path, f"pictures of {kind} are required: {known}", received)
 
 
-def open_recording(paths: Sequence[Path], name: str | None = None, cameras: Sequence[str] = ()) -> Recording:
+def open_recording(paths: Sequence[Path], name: str | None = None, cameras: Sequence[str] = ()) -> Recorded:
     """All that cameras gave, by the format of this name, or the one that recognizes the first path. Raises InputError."""
     fitting = {key: one for key, one in FORMATS.items() if one.recording is not None}
     if name is None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Lens
-from neuspring.intake.formats import CaptureFormat, Pair, Recording, picked
+from neuspring.intake.formats import CaptureFormat, Pair, Recorded, picked
 from neuspring.intake.moments import Series
 
 MODULE = "pyrealsense2"
@@ -102,11 +102,11 @@ def _library() -> Any:
         raise InputError("--bag", f"the package {MODULE} is required to read a .bag file", "not installed", remedy) from error
 
 
-def _recording(paths: Sequence[Path], cameras: Sequence[str]) -> Recording:
+def _recording(paths: Sequence[Path], cameras: Sequence[str]) -> Recorded:
     names = cameras or tuple(map(str, range(len(paths))))
     if len(set(names)) != len(paths):
         raise InputError("--cameras", f"{len(paths)} different names are required", " ".join(names))
-    return Recording(views=[Bag(camera, path) for camera, path in zip(names, paths, strict=True)])
+    return Recorded(views=[Bag(camera, path) for camera, path in zip(names, paths, strict=True)])
 
 
 FORMAT = CaptureFormat(about="a RealSense .bag file", recognizes=lambda path: path.suffix.lower() == ".bag", recording=_recording)

@@ -26,7 +26,7 @@ from neuspring.data.capture import HANDS, OBJECT, Capture, Description, Writer
 from neuspring.data.images import make_way, read_image
 from neuspring.data.unpickle import load_pickle
 from neuspring.intake.feeds import Paired
-from neuspring.intake.formats import CaptureFormat, Recording, open_images
+from neuspring.intake.formats import CaptureFormat, Recorded, open_images
 from neuspring.intake.moments import spans
 from neuspring.intake.phystwin import CALIBRATION, METADATA, annotated, train_end_of
 
@@ -116,7 +116,7 @@ def labels_of(case: Path, camera: Camera, frame: int, ids: dict[int, list[str]])
     return labels
 
 
-def open_case(case: Path) -> Recording:
+def open_case(case: Path) -> Recorded:
     """A case with all its cameras. Raises InputError."""
     metadata, listed = read_calibration(case)
     cameras = {camera.name: camera for camera in listed}
@@ -147,7 +147,7 @@ def open_case(case: Path) -> Recording:
                 remedy = "Make them, take images of these frames away, or choose others with --frames."
                 raise InputError(folder, "a mask of every frame with color is required", f"none of {spans(lacking)}", remedy)
 
-    return Recording(
+    return Recorded(
         views=views,
         rate=float(metadata.get("fps", RELEASED_FRAME_RATE)),
         up="-z",
@@ -158,7 +158,7 @@ def open_case(case: Path) -> Recording:
     )
 
 
-def _recording(paths: Sequence[Path], cameras: Sequence[str]) -> Recording:
+def _recording(paths: Sequence[Path], cameras: Sequence[str]) -> Recorded:
     if len(paths) != 1:
         raise InputError("--phystwin-raw", "one case is required, with all its cameras", len(paths))
     return open_case(paths[0])
