@@ -118,7 +118,7 @@ def misplaced(edges: Edges) -> dict[str, Any] | None:
 
 def edge_shift(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[int, int, float, float]:
     """The shift and scale of depth with which its edges agree best with those of color, and how many times as well as they do
-    within ALIGNED: pixels to the right and down, after a scaling about the center of the image. 0 times where there are too few edges.
+    within ALIGNED: pixels to the right and down, after a scaling about the center of the image. 0 times with too few edges.
 
     The agreement is the mean strength of color's edges over depth's edge pixels, above its median over all shifts.
     """
