@@ -17,7 +17,7 @@ from neuspring.config import Config, Method, ScenarioRow, SearchRow, merge, pars
 from neuspring.config.rows import RENAMED_ROWS
 from neuspring.core.errors import InputError
 from neuspring.core.text import listed
-from neuspring.perception.backends import BACKENDS
+from neuspring.perception.backends import BACKENDS, require_known
 from neuspring.scenes.sources import SOURCES, Source, location, scenario_rows, with_deform
 from neuspring.scores.lpips import configured_weights
 from neuspring.scores.paper import Study, read_studies
@@ -315,6 +315,7 @@ class Benchmark:
         return self.source(name).cameras(location(self._row(name), self.config), self.config)
 
     def _require_data(self) -> None:
+        require_known(self.config.perception)
         if self.config.images.enabled:
             # Named weights that are missing or wrong are an error before the first job.
             configured_weights(self.config.images.lpips)

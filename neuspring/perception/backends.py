@@ -100,10 +100,15 @@ def segmentation(name: str, capture: Capture) -> str:
     return "marks" if name == "opencv" and (capture.folder / MARKS).exists() else name
 
 
+def require_known(settings: Perception) -> None:
+    """Raise InputError, with the names that there are, where a configured backend is none of them."""
+    for step, name in (("segment", settings.segment.backend), ("track", settings.track.backend)):
+        if name not in BACKENDS[step]:
+            raise InputError(f"perception.{step}.backend", f"must be one of {', '.join(BACKENDS[step])}", name)
+
+
 def _possible(step: str, name: str) -> list[Backend]:
-    """What may run where `name` is configured. Raises InputError."""
-    if name not in BACKENDS[step]:
-        raise InputError(f"perception.{step}.backend", f"must be one of {', '.join(BACKENDS[step])}", name)
+    """Backends that may run where `name` is configured."""
     return [BACKENDS[step][one] for one in ((name, "marks") if (step, name) == ("segment", "opencv") else (name,))]
 
 

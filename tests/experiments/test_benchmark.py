@@ -277,6 +277,8 @@ def test_a_capture_without_what_its_masks_are_made_of_is_named_before_any_job(tm
         chosen = {"perception": {"segment": {"backend": backend}}}
         return benchmark(tmp_path, scenarios=["mine"], data_root=str(tmp_path), **chosen)
 
+    with pytest.raises(InputError, match=r"perception\.segment\.backend: must be one of given, opencv, marks, .*received magic"):
+        planned("magic")
     (tmp_path / "mine").mkdir()
     with pytest.raises(InputError, match=r"mine: a capture is a folder with capture\.json.*neuspring make-capture"):
         planned("opencv")
