@@ -17,7 +17,7 @@ import numpy as np
 from neuspring.checks import examine
 from neuspring.checks.cable import CableRecording
 from neuspring.checks.cameras import Edges, Views
-from neuspring.checks.case import Calibration, Case, Cases, FinalData, Metadata, Split, TrackFile
+from neuspring.checks.case import Calibration, Case, Cases, Metadata, ReleasedData, Split, TrackFile
 from neuspring.checks.masks import Shown
 from neuspring.checks.table import CameraAlone, Horizon, TableSeen, object_on_table
 from neuspring.checks.things import (
@@ -263,7 +263,7 @@ def _check_case(case: Case) -> list[Finding]:
     folder, found = case.folder, list[Finding]()
     path, frames = folder / phystwin.FINAL_DATA, None
     if (data := _read(found, path, load_pickle)) is not None:
-        file = FinalData(path, data)
+        file = ReleasedData(path, data)
         found += examine(file)
         frames = len(data["object_points"]) if file.whole else None
     path = folder / phystwin.SPLIT

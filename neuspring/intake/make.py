@@ -133,7 +133,7 @@ class Intake:
         """The film of the cameras; no views of points in space alone. Raises InputError."""
         given = [f"--{name.replace('_', '-')}" for name in FILMS if getattr(self, name)]
         if len(given) != 1 and (given or not self.controllers):
-            rule = "one of --color with --depth, --bag, --phystwin-raw, --recording is required, or --controllers with --nodes and "
+            rule = "one of --color with --depth, --recording, --bag, --phystwin-raw is required, or --controllers with --nodes and "
             rule += "--tracks"
             raise InputError("make-capture", rule, " ".join(given) or "none")
         if self.bag:
@@ -145,7 +145,7 @@ class Intake:
         return Recorded(views=pairs(self.color, self.depth, self.cameras) if self.color else ())
 
 
-FILMS = ("color", "bag", "phystwin_raw", "recording")
+FILMS = ("color", "recording", "bag", "phystwin_raw")
 """Options of which one says where the film is."""
 BROUGHT = ("controllers", "nodes", "tracks")
 """Options of files of points in space."""

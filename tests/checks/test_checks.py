@@ -62,7 +62,7 @@ def test_frames_are_numbers_too():
     shown = Shown("0", 6, (40, 30))
     for frame in range(6):
         labels = np.zeros((30, 40), np.uint8)
-        labels[10:30, 10:25] = OBJECT if frame < 4 else 0
+        labels[10:30, 10:16] = OBJECT if frame < 4 else 0
         shown.see(frame, labels)
     found = {one.name: one for one in checks.examine(shown)}
     assert found["object missing"].frames == (4, 5)

@@ -111,7 +111,7 @@ class CaptureFormat:
     """One form of pictures."""
 
     about: str
-    """What it is, for messages."""
+    """Its name for messages; {kind} and {endings} stand for the kind of pictures and the endings of their files."""
     recognizes: Callable[[Path], bool]
     """True for a path of this form."""
     pictures: Callable[[Path, Kind], ImageSource] | None = None
@@ -130,7 +130,7 @@ def open_images(path: Path, kind: Kind) -> ImageSource:
             return format_.pictures(path, kind)
     received = "nothing there" if not path.exists() else f"a {path.suffix or 'plain'} file"
     known = " or ".join(format_.about for format_ in FORMATS.values() if format_.pictures is not None)
-    raise InputError(path, f"pictures of {kind} are required: {known}", received)
+    raise InputError(path, known.format(kind=kind, endings=" ".join(PICTURES[kind])), received)
 
 
 def open_recording(paths: Sequence[Path], name: str | None = None, cameras: Sequence[str] = ()) -> Recorded:

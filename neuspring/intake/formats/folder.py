@@ -77,4 +77,4 @@ def _stamp(path: Path) -> float | None:
     return time if 1e9 < time < 2e9 else None  # From 2e9 on digits are a date: 20260131...
 
 
-FORMAT = CaptureFormat(about=f"a folder of images ({' '.join(PICTURES['color'])})", recognizes=Path.is_dir, pictures=ImageFolder)
+FORMAT = CaptureFormat(about="a folder of {kind} images ({endings})", recognizes=Path.is_dir, pictures=ImageFolder)

@@ -122,4 +122,4 @@ def _recognized(path: Path) -> bool:
     return track is not None or (file.is_file() and file.suffix.lower() in VIDEOS)
 
 
-FORMAT = CaptureFormat(about=f"a video ({' '.join(VIDEOS)}; FILE#1 is its second track)", recognizes=_recognized, pictures=_opened)
+FORMAT = CaptureFormat(about=f"a video ({' '.join(VIDEOS)})", recognizes=_recognized, pictures=_opened)
