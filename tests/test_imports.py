@@ -46,14 +46,25 @@ def test_imports_go_down_only():
     upward = []
     for path in PACKAGE.rglob("*.py"):
         parts = path.relative_to(PACKAGE).with_suffix("").parts
-        if len(parts) == 1:  # the package itself, and `python -m neuspring`
+        if len(parts) == 1:  # the package itself, `python -m neuspring`, the registry
             continue
         module = ".".join(["neuspring", *(part for part in parts if part != "__init__")])
         for other in provenance.imported_modules(module):
             room = other.split(".")[1]
-            if room != parts[0] and floor[room] >= floor[parts[0]]:
+            if room != "registry" and room != parts[0] and floor[room] >= floor[parts[0]]:
                 upward.append(f"{module} imports {other}")
     assert not upward, "\n".join(upward)
+
+
+def test_extensions_know_only_the_core():
+    """Each can be left out: no other extension imports it, and no page of the core's code names one."""
+    for path in PACKAGE.glob("extensions/*/**/*.py"):
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        module = ".".join(["neuspring", *(part for part in parts if part != "__init__")])
+        others = {name.split(".")[2] for name in provenance.imported_modules(module) if name.startswith("neuspring.extensions.")}
+        assert others <= {parts[1]}, module
+    core = [path for path in PACKAGE.rglob("*.py") if path.relative_to(PACKAGE).parts[0] != "extensions"]
+    assert [path for path in core if "neuspring.extensions" in path.read_text()] == []
 
 
 def test_only_the_tracking_package_imports_mlflow():

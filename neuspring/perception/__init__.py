@@ -11,6 +11,6 @@
 | look, judge | `figures`: pictures; `judge`: errors against the truth; `truth`: exact tracks and surface |
 
 `backends`: `SEGMENTERS` and `TRACKERS` declare the backends. What the steps hand on (`Masks`, `PixelTracks`, `LiftedTracks`,
-`ShapePrior`) is in `neuspring.data.results`, and what they notice about it in `neuspring.checks`. `marks`: masks from a few marks of a
-user.
+`ShapePrior`) is in `neuspring.data.results`, and what they notice about it in `neuspring.checks`. `marks`: masks from a few marks
+of a user.
 """

@@ -1,11 +1,7 @@
-"""Registers and memory of every kernel on GPUs, from its machine code: `python -m tests.benchmarks.kernel_resources [--write]`.
-
-Needs no GPU. `--write` puts the table into GPU.md beside this file.
-"""
+"""Registers and memory of every kernel on GPUs, from machine code, without a GPU: `python -m tests.benchmarks.kernel_resources`."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import tempfile
@@ -16,23 +12,8 @@ import warp as wp
 from tests.support.cubin import Resources, resources
 from tests.support.cuda_kernels import ARCHITECTURES, FORWARD, compile_for_gpus, kernels, modules
 
-PAGE = Path(__file__).with_name("GPU.md")
-BEGIN, END = "<!-- kernel_resources: begin -->", "<!-- kernel_resources: end -->"
 BLOCK = 256
 """Warp's threads per block."""
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", action="store_true")
-    options = parser.parse_args()
-    text = table()
-    print(text)
-    if options.write:
-        page = PAGE.read_text(encoding="utf-8")
-        section = re.compile(f"{re.escape(BEGIN)}.*{re.escape(END)}", re.DOTALL)
-        assert section.search(page), f"{PAGE.name} lacks the lines {BEGIN} and {END}"
-        PAGE.write_text(section.sub(lambda _: f"{BEGIN}\n{text}{END}", page), encoding="utf-8")
 
 
 def table() -> str:
@@ -73,4 +54,4 @@ def blocks_by_registers(registers: int) -> int:
 
 
 if __name__ == "__main__":
-    main()
+    print(table())

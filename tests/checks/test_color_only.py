@@ -1,7 +1,6 @@
 """Captures of color alone: made, checked, and refused by what needs depth."""
 
 import json
-import time
 
 import cv2
 import numpy as np
@@ -16,8 +15,6 @@ from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
 from neuspring.core.geometry import rigid_inverse
 from neuspring.data.capture import CAPTURE, OBJECT, Capture
-from neuspring.extensions.annotate.clicks import Annotations, Click, ClickedPoint
-from neuspring.extensions.annotate.tracks import TracksMode, tracks_of
 from neuspring.intake.check import check_layout
 from neuspring.intake.feeds import pairs
 from neuspring.intake.make import Intake, make_capture
@@ -282,20 +279,3 @@ def test_segmentation_by_height_is_refused_at_the_start(capture):
             refuse()
     film = CameraFilm(capture, "0")
     assert film.depth(0) is None and film.height(0) is None
-
-
-def test_clicks_stay_in_the_image(capture):
-    clicks = Annotations(points=(ClickedPoint(name="corner", clicks={"0": (Click(frame=0, x=40.0, y=30.0),)}),))
-    with pytest.raises(InputError, match=r"color alone cannot lift clicks to 3D; received none. Clicks stay in annotations.json"):
-        tracks_of(capture, clicks)
-    clicks.save(capture.folder)
-    mode = TracksMode(capture)
-    try:
-        while mode.results(0)["busy"]:
-            time.sleep(0.01)
-        assert [note["text"] for note in mode.results(0)["points"][0]["notes"]][-1].startswith("color alone: followed")
-        with pytest.raises(InputError, match="tracks in the world need depth"):
-            mode.save(replace=False)
-    finally:
-        mode.close()
-    assert not (capture.folder / "tracks.json").exists()

@@ -6,9 +6,10 @@ import pytest
 from neuspring.checks.masks import mask_facts
 from neuspring.checks.perceived import look_at_masks
 from neuspring.data.capture import OBJECT, Writer
+from results.published.footage.film import Points, carried, film, truths
 from tests.support.captures import describe, entry
+from tests.support.films import Errors, newly_covered, overlaps, stepwise
 from tests.support.real import FOOTAGE
-from workflow.scripts.footage import Errors, Points, carried, clicked, film, newly_covered, overlaps, stepwise, truths
 
 pytestmark = pytest.mark.skipif(not FOOTAGE.is_dir(), reason="the footage is not part of the repository")
 MASKS = {
@@ -28,15 +29,6 @@ MEDIAN = 4.0
 
 def points(case: str) -> Points:
     return Points.load(FOOTAGE / "tracks" / f"{case}.json")
-
-
-def test_one_click_per_point_follows_the_rope():
-    case = "single_lift_rope"
-    own = points(case)
-    found = Errors.of(own, *clicked(film(FOOTAGE, case), np.empty(0), own.xy[:, 0]))
-    assert found.shown == 18
-    assert found.lost < 0.2
-    assert found.median < 2.5
 
 
 def test_what_is_counted():

@@ -16,6 +16,11 @@ from tests.support.colored import paint
 from tests.support.played import record, results, spoil
 
 
+@pytest.fixture
+def scenario(tmp_path):
+    return results(tmp_path)
+
+
 def test_a_scenarios_folder_shows_one_run_of_each_of_two_methods(scenario):
     found = find([scenario])
     assert [run.name for run in found.runs] == ["neuspring/0", "baseline/0"]

@@ -1,6 +1,6 @@
 """A twin in the formats of other tools. README.md here is the page for users.
 
-A format is a file of `formats/` with its `EXPORT`; an installed package brings one by an entry point of `neuspring.exports`.
+A format is a file of `formats/` with its `export`; an installed package brings one by an entry point of `neuspring.exports`.
 `source`
 is the run or twin that is exported, `cable` a rod as MuJoCo's chain of bodies, `newton_twin` the script that is exported.
 """
@@ -26,4 +26,4 @@ class Export:
     """File or folder by default; {name} is that of the run."""
 
 
-EXPORTS: Registry[Export] = Registry("exports", modules(f"{__name__}.formats", "EXPORT"), Export)
+EXPORTS: Registry[Export] = Registry("exports", modules(f"{__name__}.formats", "export"), Export)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from neuspring.cli.options import Positional, arg
 from neuspring.core.errors import InputError
-from neuspring.extensions.exports import EXPORTS
+from neuspring.extensions.exports import EXPORTS, Export
 
 
 def export(
@@ -25,9 +25,14 @@ def export(
         raise InputError("--to", f"must be one of {', '.join(EXPORTS)}", to)
     format = EXPORTS[to]
     own = {} if rate is None else {"rate": rate}
-    if own and "rate" not in inspect.signature(format.write).parameters:
-        raise InputError("--rate", f"is no option of {to}", rate, "Leave it out: the files say the time of each frame.")
+    if own and not _takes_rate(format):
+        takers = ", ".join(name for name, other in EXPORTS.items() if _takes_rate(other))
+        raise InputError("--rate", f"is for {takers}", f"--to {to}", "Leave it out: the files say the time of each frame.")
     source = read_source(twin)
     target = output or Path("export") / format.name.format(name=source.name)
     for path in format.write(source, chosen_frames(frames, source, format.frames), target, **own):
         print(f"Wrote {path}")
+
+
+def _takes_rate(format: Export) -> bool:
+    return "rate" in inspect.signature(format.write).parameters

@@ -17,7 +17,7 @@ from neuspring.core.records import StageRecord
 from neuspring.data.camera import Camera
 from neuspring.data.capture import Capture
 from neuspring.data.results import Masks
-from neuspring.extensions.figures.commands import ComparedOptions, FilmOptions, RunOptions, StripOptions, TwinOptions
+from neuspring.extensions.figures.options import ComparedOptions, FilmOptions, RunOptions, StripOptions, TwinOptions
 from neuspring.report.draw import sheet
 from neuspring.report.draw.film import write_film
 from neuspring.report.draw.painter import DrawingStyle, Error, Painter, Style

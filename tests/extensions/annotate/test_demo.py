@@ -1,7 +1,10 @@
 """The demo's scenes, marked with the mouse in a real browser: what a user gets for at most five marks a camera."""
 
 import json
+from collections.abc import Sequence
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -11,15 +14,35 @@ from neuspring.data.frames import overlap
 from neuspring.perception.marks.marks import Mark
 from neuspring.scenes.sources import read_scenarios
 from neuspring.scenes.synthetic.make import make
+from tests.extensions.annotate.served import TOKEN, Client, served
 from tests.support.browser import Browser, chromium
 from tests.support.project import ROOT
-from tests.support.served import TOKEN, Client, served
-from workflow.scripts.masks import MOST_MARKS, corrections, outlines
 
 DEMO = config.read_yaml(ROOT / "config" / "data" / "demo.yaml")
 KEYS = {"object": "1", "hand": "2"}
 LEAST = 0.95
 """Least mean overlap of a camera's masks with the truth: what was aimed at."""
+MOST_MARKS = 5
+OUTLINE = 1.5
+"""How far, pixels, the outline that a user draws is from the truth."""
+
+
+def outlines(truth: np.ndarray) -> list[Mark]:
+    """At most MOST_MARKS polygons that a user would draw around what frame 0 shows, the largest first."""
+    found = []
+    for label, name in ((OBJECT, "object"), (HANDS, "hand")):
+        contours, _ = cv2.findContours((truth == label).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        for contour in contours:
+            coarse = cv2.approxPolyDP(contour, OUTLINE, True)[:, 0]
+            if len(coarse) >= 3:
+                points = tuple((float(x), float(y)) for x, y in coarse)
+                found.append((cv2.contourArea(contour), Mark(frame=0, label=name, kind="polygon", points=points, radius=2.0)))  # type: ignore[arg-type]
+    return [own for _, own in sorted(found, key=lambda pair: -pair[0])[:MOST_MARKS]]
+
+
+def corrections(marks: Sequence[Mark], truth: np.ndarray, frame: int) -> list[Mark]:
+    """Outlines of what a later frame shows, as many as `marks` leave of MOST_MARKS."""
+    return [replace(own, frame=frame) for own in outlines(truth)[: MOST_MARKS - len(marks)]]
 
 
 @pytest.fixture(scope="module")

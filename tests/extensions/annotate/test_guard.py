@@ -10,8 +10,8 @@ import pytest
 from neuspring.core import web as guard
 from neuspring.core.errors import InputError
 from neuspring.extensions.annotate.server import MOST_BYTES, STATIC, Server
+from tests.extensions.annotate.served import TOKEN, served
 from tests.support.moving import moving
-from tests.support.served import TOKEN, served
 
 BODY = json.dumps({"revision": "none", "marks": {"format": 1, "cameras": {}}}).encode()
 

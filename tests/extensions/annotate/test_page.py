@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from neuspring.data.capture import Capture
+from tests.extensions.annotate.painted import Painted
+from tests.extensions.annotate.served import TOKEN, served
 from tests.support.browser import Browser, chromium
 from tests.support.moving import FRAMES, moving, truth
-from tests.support.painted import Painted
-from tests.support.served import TOKEN, served
 
 pytestmark = pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome is installed")
 POINT = (46.0, 62.0)

@@ -10,9 +10,9 @@ from neuspring.data.capture import TRACKS, Capture, write_tracks
 from neuspring.extensions.annotate.clicks import ANNOTATIONS
 from neuspring.extensions.annotate.server import COLORS, Server, overlay_png
 from neuspring.perception.marks.store import MasksFile
+from tests.extensions.annotate.painted import Painted
+from tests.extensions.annotate.served import decoded, served
 from tests.support.moving import FRAMES, moving, truth
-from tests.support.painted import Painted
-from tests.support.served import decoded, served
 
 BOX = {"frame": 1, "label": "object", "kind": "box", "points": [[40, 50], [60, 70]], "radius": 3.0}
 HAND = BOX | {"label": "hand", "points": [[80, 50], [100, 70]]}

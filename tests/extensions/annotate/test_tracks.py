@@ -242,7 +242,7 @@ def test_what_is_doubtful_is_noted_with_its_worst_frame(capture, what, frames, v
 
 
 def test_the_script_of_the_page_makes_tracks(tmp_path):
-    text = files("neuspring.perception").joinpath("README.md").read_text().split("## The page of annotate")[1]
+    text = files("neuspring.extensions.annotate").joinpath("README.md").read_text()
     script = re.search("```python\n(.*?)```", text, re.DOTALL)[1]
     capture = moving(tmp_path)
     exec(script.replace("FOLDER", str(tmp_path)), {})

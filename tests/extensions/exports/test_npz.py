@@ -14,7 +14,7 @@ from neuspring.cli.main import main
 from neuspring.core.artifacts import Twin
 from neuspring.extensions.exports.formats import npz
 from neuspring.extensions.exports.source import read_source
-from tests.support import exported
+from tests.extensions.exports import exported
 
 PAGE = Path(neuspring.extensions.exports.__file__).with_name("README.md")
 ERROR = 2e-7

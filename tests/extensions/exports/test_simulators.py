@@ -12,7 +12,7 @@ from neuspring.core.errors import InputError
 from neuspring.extensions.exports.formats import mujoco as mujoco_format
 from neuspring.extensions.exports.formats import newton as newton_format
 from neuspring.extensions.exports.source import read_source
-from tests.support import exported
+from tests.extensions.exports import exported
 
 NEWTON = 2e-6
 """m, over six frames of 60 steps, float32 on both sides. Measured: 2.6e-7."""

@@ -12,7 +12,7 @@ from neuspring.core.artifacts import Trajectory
 from neuspring.core.errors import InputError
 from neuspring.core.records import Recorder, StageRecord
 from neuspring.extensions.exports.source import chosen_frames, read_source
-from tests.support import exported
+from tests.extensions.exports import exported
 
 
 @pytest.fixture

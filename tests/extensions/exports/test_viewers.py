@@ -9,7 +9,7 @@ from neuspring.core.errors import InputError
 from neuspring.extensions.exports.formats import usd
 from neuspring.extensions.exports.source import read_source
 from neuspring.splats.model import Splats
-from tests.support import exported
+from tests.extensions.exports import exported
 
 
 def test_plyfile_reads_the_graph_as_it_is_and_splats_are_those_that_pictures_show(tmp_path):

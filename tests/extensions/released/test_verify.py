@@ -28,8 +28,7 @@ from neuspring.intake.formats.phystwin_raw import read_calibration
 from neuspring.intake.phystwin import released_cases
 from neuspring.scores.lpips import CHANNELS, WINDOWS, Lpips
 from neuspring.scores.metrics import METRICS
-from tests.support.phystwin_case import dump, edit, stored
-from tests.support.released_case import (
+from tests.extensions.released.released_case import (
     DASHPOT,
     DRAG,
     FRAMES,
@@ -46,6 +45,7 @@ from tests.support.released_case import (
     write_prediction,
     write_released,
 )
+from tests.support.phystwin_case import dump, edit, stored
 
 NAME = "single_lift_thing"
 

@@ -1,1 +1,1 @@
-"""One file a format, named after it: its `EXPORT`."""
+"""One file a format, named after it: its `export`."""

@@ -85,4 +85,4 @@ def mjcf(source: Source) -> str:
     return ET.tostring(root, encoding="unicode") + "\n"
 
 
-EXPORT = Export(write=write, name="{name}_mujoco")
+export = Export(write=write, name="{name}_mujoco")

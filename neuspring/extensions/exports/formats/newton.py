@@ -27,4 +27,4 @@ def write(source: Source, frames: Sequence[int], output: Path) -> list[Path]:
     return [*npz.write(source, frames, output), output / SCRIPT.name]
 
 
-EXPORT = Export(write=write, name="{name}_newton")
+export = Export(write=write, name="{name}_newton")

@@ -180,4 +180,4 @@ def arrays_of(source: Source, frames: Sequence[int]) -> tuple[dict[str, np.ndarr
     return arrays, described
 
 
-EXPORT = Export(write=write, name="{name}_npz")
+export = Export(write=write, name="{name}_npz")

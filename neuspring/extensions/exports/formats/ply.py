@@ -83,4 +83,4 @@ def _write_elements(path: Path, elements: dict[str, np.ndarray]) -> None:
     write_atomically(path, lambda temporary: temporary.write_bytes(content))
 
 
-EXPORT = Export(write=write, frames="0")
+export = Export(write=write, frames="0")

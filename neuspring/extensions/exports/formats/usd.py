@@ -168,4 +168,4 @@ class _Shapes:
         made.Set(value)
 
 
-EXPORT = Export(write=write, name="{name}.usdc")
+export = Export(write=write, name="{name}.usdc")

@@ -1,4 +1,4 @@
-"""How far off hands are that were seen in color alone, where they are given in space too: part of `beside_phystwin`.
+"""Errors of hands that were seen in color alone, where they are given in space too: part of `make`.
 
 A hand's grip is the mean of its controllers; the given one is the mean of its points that are near the object in frame 0. Seen
 hands move in a plane (neuspring/perception/color_hands.py).
@@ -18,7 +18,7 @@ from neuspring.core.artifacts import Observations
 from neuspring.core.table import Table
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.intake.points import read
-from workflow.scripts.beside_data import PREFIX
+from results.published.footage.runs import PREFIX
 
 FEWEST = 3
 """Given points of a grip, where fewer are within GRIP of the object."""

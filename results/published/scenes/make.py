@@ -1,8 +1,8 @@
 """Twins of the paper's own scenes beside PhysTwin's released errors, in millimeters: a table per scene, and errors over time.
 
-    python -m workflow.scripts.paper_scenes RESULTS --output OUT [--methods ...]
+    python -m results.published.scenes.make RESULTS --output OUT [--methods ...]
 
-RESULTS is a folder of results with scenarios CASE_points, CASE_film or CASE_both (`workflow.scripts.hands_captures`).
+RESULTS is a folder of results with scenarios CASE_points, CASE_film or CASE_both (`results.published.scenes.captures`).
 OUT/summary.md has the tables, OUT/scores.csv a row per run, OUT/CASE.png the errors by frame and by annotated point.
 """
 
@@ -25,7 +25,7 @@ from neuspring.report.blocks import markdown
 from neuspring.report.draw.sheet import save
 from neuspring.scores.paper import released
 from neuspring.scores.runs import collect
-from workflow.scripts.beside_data import METHODS
+from results.published.footage.runs import METHODS
 
 MM = 1e3
 PHYSTWIN = "PhysTwin (released)"
@@ -34,7 +34,7 @@ SEEN = {
     "film": "one color camera and the hands; annotated points are for scoring alone",
     "both": "one color camera, the hands, 320 nodes and the annotated points of training frames",
 }
-"""What methods saw, by the ending of the scenario's name."""
+"""The input of methods, by the ending of the scenario's name."""
 METRICS = {"track_error": "track error", "track_error_bound": "bound track error", "iou": "IoU"}
 TASKS = {"reconstruction": "training", "future": "future"}
 NOTE = """\

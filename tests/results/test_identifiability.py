@@ -1,4 +1,4 @@
-"""workflow/scripts/identifiability.py measures what it says, and repeats no finished run."""
+"""results/published/identifiability/make.py measures what it says, and repeats no finished run."""
 
 import functools
 from dataclasses import replace
@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 
 from neuspring.scenes.synthetic import toy
+from results.published.identifiability import make as study
 from tests.support import small
-from workflow.scripts import identifiability as study
 
 
 @functools.cache

@@ -1,6 +1,6 @@
 """First, middle and last frame of every capture in a results folder, and what each took: time, disk, numerics.
 
-python workflow/scripts/contact_sheet.py results/synthetic results/published/synthetic
+python -m results.published.synthetic.make results/synthetic results/published/synthetic
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def strip(capture: Capture) -> np.ndarray:
 
 
 def facts(capture: Capture, results: Path) -> dict[str, object]:
-    """What a capture took, from its files and the record of its job."""
+    """The cost of a capture, from its files and the record of its job."""
     folder = capture.folder.parent
     truth = Truth.load(truth_path(capture.folder))
     record = JobRecord.load(results / FOLDER / "capture" / f"{folder.name}.json")

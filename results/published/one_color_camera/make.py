@@ -1,7 +1,7 @@
-r"""What one color camera costs, where the truth is known: synthetic scenes seen by three RGBD cameras, by one, by color alone.
+r"""The cost of one color camera, where the truth is known: synthetic scenes seen by three RGBD cameras, by one, by color alone.
 
-    python -m workflow.scripts.one_color_camera make CAPTURES OUT       # captures of one camera, with and without depth
-    python -m workflow.scripts.one_color_camera table OUT RESULTS --output TABLES
+    python -m results.published.one_color_camera.make make CAPTURES OUT       # captures of one camera, with and without depth
+    python -m results.published.one_color_camera.make table OUT RESULTS --output TABLES
 
 CAPTURES is a folder of results of config/data/synthetic.yaml (`--until synthesize` is enough), whose scenarios have
 <scenario>/capture and its truth. OUT gets, per scene, SCENE_three (a link to the capture), SCENE_one and SCENE_color, and

@@ -12,11 +12,11 @@ from neuspring.data.capture import CAPTURE
 from neuspring.intake.check import check_layout
 from neuspring.intake.phystwin import released_cases
 from neuspring.intake.points import read
+from results.published.scenes.captures import add_hands, folders_of, moving, write_points
 from tests.support import spaced as scene
 from tests.support.colored import paint
 from tests.support.findings import serious
 from tests.support.real import HANDS
-from workflow.scripts.hands_captures import add_hands, folders_of, moving, write_points
 
 FRAMES = 68
 """As many as single_push_sloth has."""

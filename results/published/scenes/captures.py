@@ -1,6 +1,6 @@
 """Captures of PhysTwin scenes with hands in space: points alone, film with hands, and both.
 
-    python -m workflow.scripts.hands_captures FOLDER OUTPUT [--films FOLDER] [--cases ...] [--force]
+    python -m results.published.scenes.captures FOLDER OUTPUT [--films FOLDER] [--cases ...] [--force]
 
 Any folder below FOLDER is a case that has, in integers of 0.1 mm, controller.txt and landmarks.txt (a line per frame: its number,
 then points x y z; 0 0 0 of a landmark: not visible) and rest.txt (a line x y z per node of frame 0). Of each
@@ -9,7 +9,7 @@ then points x y z; 0 0 0 of a landmark: not visible) and rest.txt (a line x y z 
     OUTPUT/CASE_film     color of camera 0 and the hands; annotated points are for scoring alone
     OUTPUT/CASE_both     color, hands, nodes and annotated points
 
-is written, the last two where FOLDER of --films (that of `workflow.scripts.footage_captures`) has a film of the case and
+is written, the last two where FOLDER of --films (that of `results.published.footage.captures`) has a film of the case and
 tests/data/marks has marks. The world is that of the cameras: z = 0 is the table, up is -z. The split is the released one.
 A capture that is there is left alone without --force.
 """
@@ -27,8 +27,8 @@ from neuspring.core.files import write_text
 from neuspring.data.capture import CAPTURE, Capture, Description, Writer, write_tracks
 from neuspring.intake.phystwin import released_cases
 from neuspring.intake.points import Hands, read, write
-from workflow.scripts.footage_captures import RATE, cases_of, category_of, write_capture
-from workflow.scripts.masks import MARKS
+from results.published.footage.captures import RATE, cases_of, category_of, write_capture
+from results.published.footage.film import MARKS
 
 UNIT = 1e-4
 """m per count."""
@@ -60,7 +60,7 @@ def read_case(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def described(case: str, name: str, frames: int) -> Description:
-    """What capture.json says of the points alone."""
+    """Description of a capture of the points alone."""
     row = released_cases().get(case)
     split = int(row["train_end"]) if row is not None and int(row["frames"]) == frames else None
     return Description(

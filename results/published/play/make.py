@@ -1,4 +1,4 @@
-"""Pictures of the playground for its page: `python -m workflow.scripts.play_pictures RESULTS/SCENARIO OUTPUT`.
+"""Pictures of the playground for its page: `python -m results.published.play.make RESULTS/SCENARIO OUTPUT`.
 
 A headless Chromium opens the page as a user does. The scenario should be synthetic, with splats, and have runs of `neuspring` and
 `baseline`; pictures of real footage are not for this repository.
@@ -20,10 +20,10 @@ from tests.support.browser import Browser
 from tests.support.pointing import WINDOW, choose_tab, pixel, pull, until
 
 QUALITY = 82
-"""Of JPEG."""
+"""JPEG's quality."""
 PATIENCE = 900.0
 SECONDS = 20
-"""That a picture is given."""
+"""Seconds that a picture is given."""
 CLOSE_NOTES = "document.querySelectorAll('.mantine-Notification-closeButton').forEach((one) => one.click())"
 
 

@@ -15,20 +15,17 @@ from neuspring.core.records import RECORD_FORMAT, digest_file
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.intake.check import check_layout
 from neuspring.perception.marks.marks import MARKS, Marks
-from tests.support import small
-from tests.support.colored import paint
-from tests.support.findings import of_level
-from tests.support.real import FOOTAGE
-from workflow.scripts import masks
-from workflow.scripts.beside_data import PHYSTWIN, Published, Run, corrected, fitted_shift, iou_without_hands, shifted
-from workflow.scripts.beside_hands import COLUMNS as HAND_COLUMNS
-from workflow.scripts.beside_hands import grips, hand_lines
-from workflow.scripts.beside_hands import hand_errors as given_errors
-from workflow.scripts.beside_phystwin import Scores, labeled_rows
-from workflow.scripts.beside_tables import (
+from results.published.footage.captures import CARRYING, write_capture
+from results.published.footage.film import MARKS as MARKED
+from results.published.footage.film import film
+from results.published.footage.hands import COLUMNS as HAND_COLUMNS
+from results.published.footage.hands import grips, hand_lines
+from results.published.footage.hands import hand_errors as given_errors
+from results.published.footage.make import Scores, labeled_rows
+from results.published.footage.runs import PHYSTWIN, Published, Run, corrected, fitted_shift, iou_without_hands, shifted
+from results.published.footage.tables import (
     COLUMNS,
     GROUPS,
-    before_after,
     cell,
     costs,
     differences,
@@ -37,12 +34,14 @@ from workflow.scripts.beside_tables import (
     shared,
     tables,
 )
-from workflow.scripts.footage import film
-from workflow.scripts.footage_captures import CARRYING, write_capture
-from workflow.scripts.one_color_camera import hand_errors, one_camera
-from workflow.scripts.paper_scenes import PHYSTWIN as RELEASED
-from workflow.scripts.paper_scenes import point_errors
-from workflow.scripts.paper_scenes import tables as scene_tables
+from results.published.one_color_camera.make import hand_errors, one_camera
+from results.published.scenes.make import PHYSTWIN as RELEASED
+from results.published.scenes.make import point_errors
+from results.published.scenes.make import tables as scene_tables
+from tests.support import small
+from tests.support.colored import paint
+from tests.support.findings import of_level
+from tests.support.real import FOOTAGE
 
 
 def block(rows: slice, columns: slice, shape: tuple[int, int] = (40, 60)) -> np.ndarray:
@@ -209,22 +208,9 @@ def test_means_compare_the_same_films_only():
     assert [cells[PHYSTWIN][k].strip() for k in (0, 4)] == ["2", "0.800"]
 
 
-def test_before_and_after_compare_the_films_and_seeds_of_both():
-    def scores(values: dict[tuple[str, int], float]) -> pd.DataFrame:
-        return table(*((case, "m", seed, "future", "iou", value) for (case, seed), value in values.items()))
-
-    before = scores({("a", 0): 0.5, ("b", 0): 0.6, ("b", 1): 0.9, ("c", 0): 0.1})
-    after = scores({("a", 0): 0.6, ("b", 0): 0.8, ("d", 0): 0.9})
-    (line,) = [line for line in before_after(before, after) if "Future IoU" in line]
-    cells = [cell.strip() for cell in line.split("|")[1:-1]]
-    assert cells[1:5] == ["m", "0.550", "0.700", "+0.150"]
-    assert cells[-1] == "2"
-    assert before_after(before, scores({("d", 0): 0.9})) == []
-
-
 def test_the_committed_marks_lie_in_frame_0_alone():
     """Else a film stands in a table of its own."""
-    assert len(list((masks.MARKS / "phystwin_camera0").glob("*.json"))) == 12
+    assert len(list((MARKED / "phystwin_camera0").glob("*.json"))) == 12
     assert corrected() == []
 
 

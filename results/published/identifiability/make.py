@@ -1,6 +1,6 @@
-"""Does a fit recover a known stiffness, and a neural spring field better than free springs? Toy scenes, whose truth is known.
+"""Recovery of a known stiffness by fits of free springs and of a neural spring field: toy scenes, whose truth is known.
 
-    python workflow/scripts/identifiability.py OUTPUT_FOLDER [--epochs N] [--seeds 0 1 2] [--scenes ...] [--jobs 2]
+    python -m results.published.identifiability.make OUTPUT_FOLDER [--epochs N] [--seeds 0 1 2] [--scenes ...] [--jobs 2]
 
 A fit starts from the truth in everything (topology, dashpots, drag, contact, substeps) but the stiffness, which is the same
 everywhere and too low: 0.6 of the truth's geometric mean. Only the stiffness is trained, without bounds, by both kinds with
@@ -68,7 +68,7 @@ SHOWN = (0.0005, 0)
 CONSTANTS = {"start": 0.6, "constant": 1.0}
 """Homogeneous stiffness as a fraction of the truth's geometric mean."""
 RATES = {"springs": 3e-2, "field": 2e-3, "shuffled": 2e-3}
-"""What is fitted -> its learning rate. shuffled: a field that does not know which springs lie side by side."""
+"""Fitted kind -> its learning rate. shuffled: a field that does not know which springs lie side by side."""
 KINDS = ("truth", *CONSTANTS, *RATES)
 METRICS = {
     "correlation": ("r, springs", 1.0, 2),
@@ -110,7 +110,7 @@ class Run:
         return identity | ({"fit": config.plain(self.fit)} if self.kind in RATES else {})
 
     def record(self, folder: Path) -> dict[str, Any] | None:
-        """What a finished run with the same settings left in `folder`."""
+        """Record that a finished run with the same settings left in `folder`."""
         path = folder / f"{self.name}.json"
         record: dict[str, Any] | None = json.loads(path.read_text()) if path.is_file() else None
         return record if record and record["settings"] == self.settings() else None
@@ -119,7 +119,7 @@ class Run:
 @functools.cache
 def scene_of(path: str, noise: float, seed: int) -> toy.ToyScene:
     """The toy scene as seen with `noise` [m]."""
-    rows = read_scenarios(Path(__file__).parents[2] / "config/scenarios.tsv")
+    rows = read_scenarios(Path(__file__).parents[3] / "config/scenarios.tsv")
     return toy.make(rows[f"toy_{path.replace('/', '_')}"], config.Toy(noise=noise, seed=seed))
 
 

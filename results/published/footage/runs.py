@@ -1,4 +1,4 @@
-"""What is compared in `beside_phystwin`: footage with drawn masks, PhysTwin's published prediction, and runs of the workflow."""
+"""The sides of the comparison in `make`: footage with drawn masks, PhysTwin's published prediction, and runs of the workflow."""
 
 from __future__ import annotations
 
@@ -22,8 +22,7 @@ from neuspring.perception.marks.marks import Marks
 from neuspring.scores.pictures import Scored, iou
 from neuspring.splats.draw import picture
 from neuspring.stages.render import posed
-from workflow.scripts.footage import Points, truths
-from workflow.scripts.masks import MARKS
+from results.published.footage.film import MARKS, Points, truths
 
 PHYSTWIN = "PhysTwin (published)"
 STILL = "frame 0 repeated"
@@ -33,7 +32,7 @@ PREFIX = "footage_"
 """Scenarios of the workflow are named after cases, with this before."""
 MOST, STEP = 6.0, 0.5
 """Largest shift that is tried, and its step, px."""
-METHODS = Path(__file__).parents[2] / "config" / "methods.yaml"
+METHODS = Path(__file__).parents[3] / "config" / "methods.yaml"
 
 
 def shifted(image: np.ndarray, shift: tuple[float, float]) -> np.ndarray:
@@ -111,7 +110,7 @@ class Case:
 
     name: str
     folder: Path
-    """Of the footage."""
+    """The folder of the footage."""
     capture: Capture
 
     @property

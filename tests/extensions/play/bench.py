@@ -1,4 +1,4 @@
-"""The playground's live mode: `python -m tests.benchmarks.bench_play [--nodes N ...] [--seconds S] [--frames N] [--runs RUN ...]`.
+"""The playground's live mode: `python -m tests.extensions.play.bench [--nodes N ...] [--seconds S] [--frames N] [--runs RUN ...]`.
 
 For each size a box of random points (`scenes.py`, 100 substeps per frame of 1/30 s) is pulled by a mouse that moves 60 times per
 second. Columns: one frame of the simulation alone, and one with its drawing, in ms of processor time (medians), so that other work

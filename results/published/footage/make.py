@@ -1,15 +1,15 @@
 """Twins of color footage beside PhysTwin's published prediction, on the same frames of the same camera: tables and film strips.
 
-    python -m workflow.scripts.beside_phystwin FOLDER RESULTS --captures CAPTURES --output OUT
-        [--cases ...] [--methods ...] [--before SCORES] [--hands FOLDER] [--strips FOLDER] [--strip-methods ...] [--force] [--keep]
+    python -m results.published.footage.make FOLDER RESULTS --captures CAPTURES --output OUT
+        [--cases ...] [--methods ...] [--hands FOLDER] [--strips FOLDER] [--strip-methods ...] [--force] [--keep]
 
-FOLDER is that of `workflow.scripts.footage`, with result/CASE.npz and videos/combine_rendering__CASE.mp4. RESULTS is a folder of
-results of the workflow. CAPTURES has a capture per case (`workflow.scripts.footage_captures`). Cases are those that RESULTS has
+FOLDER is that of `film`, with result/CASE.npz and videos/combine_rendering__CASE.mp4. RESULTS is a folder of
+results of the workflow. CAPTURES has a capture per case (`results.published.footage.captures`). Cases are those that RESULTS has
 runs of; without any run, all captures. OUT/summary.md has the tables, OUT/scores.csv every number, OUT/costs.csv the times. Scores
 of runs that have not changed are taken from an earlier OUT/scores.csv; --force computes all anew. With --keep, runs of the earlier
 files that RESULTS does not have stay in them: so one table may hold the runs of several machines. Films whose marks are not of
-frame 0 alone have tables of their own. --before names the scores of an earlier study, for a table before and after. FOLDER of
---hands is that of `workflow.scripts.hands_captures`, for a table of how far off the hands were (`beside_hands`).
+frame 0 alone have tables of their own. FOLDER of --hands is that of `results.published.scenes.captures`, for a table of how far
+off the hands were (`hands`).
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from neuspring.report.draw.sheet import FUTURE, TRAINING
 from neuspring.scores.carried import point_errors, points_on_table
 from neuspring.scores.pictures import Pair, picture_scores
 from neuspring.splats.draw import COVERED
-from workflow.scripts.beside_data import PHYSTWIN, STILL, Case, Run, cases_of, corrected, iou_without_hands, runs_of
-from workflow.scripts.beside_hands import hand_lines, hand_rows
-from workflow.scripts.beside_tables import COLUMNS, PARTS, before_after, cost_lines, costs, merged, tables
-from workflow.scripts.footage_captures import CARRYING
+from results.published.footage.captures import CARRYING
+from results.published.footage.hands import hand_lines, hand_rows
+from results.published.footage.runs import PHYSTWIN, STILL, Case, Run, cases_of, corrected, iou_without_hands, runs_of
+from results.published.footage.tables import COLUMNS, PARTS, cost_lines, costs, merged, tables
 
 IMAGE_METRICS = ("iou", "psnr", "ssim")
 NO_LPIPS = "not compared here"
@@ -110,7 +110,7 @@ def published_rows(case: Case) -> list[Row]:
 
 
 def still_rows(case: Case) -> list[Row]:
-    """Of a prediction that nothing moves: the object as it is seen in frame 0, cut out by the capture's mask."""
+    """Rows of a prediction that nothing moves: the object as it is seen in frame 0, cut out by the capture's mask."""
     covered = case.labels(0) == OBJECT
     rgba = np.dstack([np.where(covered[..., None], case.color(0), 0), np.where(covered, 255, 0)]).astype(np.uint8)
     own = labeled_rows(case, ((frame, covered) for frame in case.labeled))
@@ -119,7 +119,7 @@ def still_rows(case: Case) -> list[Row]:
 
 
 def run_rows(case: Case, run: Run) -> list[Row]:
-    """Of a run; empty where it has no trajectory."""
+    """Rows of a run; empty where it has no trajectory."""
     positions = run.positions()
     if positions is None:
         return []
@@ -170,11 +170,11 @@ class Scores:
 SHOWN = 6
 """Frames of a strip."""
 WHITE = 0.3
-"""How much white PhysTwin's video has laid over its frames."""
+"""Share of white that PhysTwin's video has laid over its frames."""
 MARGIN = 24
 """px around object and hands."""
 WIDTH = 360
-"""Of a picture of the strip, px."""
+"""Width of a picture of the strip, px."""
 BAR, GAP = 24, 3
 """Height of the bar of time and width of gaps, px."""
 INK = (40, 40, 40)
@@ -266,7 +266,6 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--cases", nargs="+")
     parser.add_argument("--methods", nargs="*", help="all that have runs by default; none: PhysTwin alone")
-    parser.add_argument("--before", type=Path, help="scores.csv of an earlier study of these films")
     parser.add_argument("--hands", type=Path, help="folder of captures of points, CASE_points")
     parser.add_argument("--strips", type=Path, help="folder of film strips")
     parser.add_argument("--strip-methods", nargs="*", default=["neuspring"])
@@ -308,8 +307,6 @@ def main() -> None:
     lines = tables(scores.table[~later], notes)
     if later.any():
         lines += ["", *tables(scores.table[later], [], "Films with correction marks in later frames")]
-    if a.before:
-        lines += before_after(pd.read_csv(a.before, dtype={"part": str}), scores.table)
     if a.hands:
         hands = hand_rows(a.hands, [run.scenario for case in cases for run in runs[case.name][:1]])
         write_text(a.output / "hands.csv", hands.to_csv(index=False, float_format="%.2f"))

@@ -1,4 +1,4 @@
-"""Tables of `beside_phystwin`: means over cases with their spread over seeds, cases one by one, paired differences."""
+"""Tables of `make`: means over cases with their spread over seeds, cases one by one, paired differences."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from neuspring.config.parse import read_yaml
 from neuspring.core.job_records import read_jobs
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.core.table import Table
-from workflow.scripts.beside_data import LEFT_OUT, METHODS, PHYSTWIN, STILL, Run
+from results.published.footage.runs import LEFT_OUT, METHODS, PHYSTWIN, STILL, Run
 
 COLUMNS = ("case", "method", "seed", "part", "frame", "metric", "value", "key")
 PARTS = ("0", "1/3", "2/3", "last")
@@ -32,15 +32,7 @@ COMPARED = {
     ("future", "psnr"): "Future PSNR [dB]",
     ("last", "iou_drawn"): "IoU with the drawn mask of the last frame",
 }
-"""What differences are taken of."""
-CHANGED = {
-    ("reconstruction", "iou"): ("Recon. IoU", 3),
-    ("future", "iou"): ("Future IoU", 3),
-    ("last", "iou_drawn"): ("IoU with the drawn mask of the last frame", 3),
-    ("last", "points_median"): ("marked points, last frame, median, px", 1),
-    ("later", "points_table"): ("marked points on the table, mm", 1),
-}
-"""What is compared before and after a change."""
+"""Quantities of which differences are taken."""
 
 
 def select(table: pd.DataFrame, metric: str, part: str, *, all_cases: bool = False) -> pd.DataFrame:
@@ -56,7 +48,7 @@ def shared(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _in_means(rows: pd.DataFrame, metric: str, parts: Iterable[str]) -> tuple[dict[str, pd.DataFrame], list[str]]:
-    """What `select` finds of each part, of the cases shared by all methods; and a line that names the cases left out for that."""
+    """Rows that `select` finds of each part, of the cases shared by all methods; and a line that names the cases left out."""
     found = {part: select(rows, metric, part) for part in parts}
     kept = {part: shared(own) for part, own in found.items()}
     lost = {part: sorted(set(own["case"]) - set(kept[part]["case"])) for part, own in found.items()}
@@ -222,30 +214,6 @@ def _by_case(rows: pd.DataFrame) -> list[tuple[tuple[str, str], pd.DataFrame]]:
 
 def _text(value: float, digits: int) -> str:
     return DASH if np.isnan(value) else f"{value:.{digits}f}"
-
-
-def before_after(before: pd.DataFrame, after: pd.DataFrame) -> list[str]:
-    """What changed between two tables of scores: films, methods and seeds that both have; after less before, paired by film."""
-    names = ["case", "method", "seed"]
-    rows = []
-    for (part, metric), (title, digits) in CHANGED.items():
-        both = select(before, metric, part).merge(select(after, metric, part), on=names, suffixes=("_before", "_after"))
-        for method in in_order(both["method"]):
-            own = both[both["method"] == method]
-            stacked = pd.concat(
-                [own[names].assign(method=when, value=own[f"value_{when}"]) for when in ("before", "after")], ignore_index=True
-            )
-            found = differences(stacked, "after", "before")
-            if found is not None:
-                mean, low, high, count = found
-                sides = [cell(stacked[stacked["method"] == when], digits) for when in ("before", "after")]
-                span = DASH if np.isnan(low) else f"[{low:+.{digits}f}, {high:+.{digits}f}]"
-                rows.append([title, method, *sides, f"{mean:+.{digits}f}", span, str(count)])
-    if not rows:
-        return []
-    about = "The same films, methods and seeds, before and after; after less before, with 95 % t intervals over films."
-    header = ["quantity", "method", "before", "after", "difference", "95 % interval", "films"]
-    return ["", "## Before and after", "", about, "", *Table.of_texts(header, rows).markdown()]
 
 
 GROUPS = {

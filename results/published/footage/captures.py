@@ -1,8 +1,8 @@
 """Captures of color alone of real footage: the input of a run on film of one calibrated camera.
 
-    python -m workflow.scripts.footage_captures FOLDER OUTPUT [--cases ...] [--force]
+    python -m results.published.footage.captures FOLDER OUTPUT [--cases ...] [--force]
 
-FOLDER is that of `workflow.scripts.footage`, with cameras.json. Of each case with a video and with marks (tests/data/marks) a
+FOLDER is that of `film`, with cameras.json. Of each case with a video and with marks (tests/data/marks) a
 capture OUTPUT/CASE is written: the film, masks carried from the marks of frame 0, the marks, and as points.json the points that
 were marked by hand and are sure. Its provenance has the processor seconds of the carrying, for the table of costs. All objects lie
 in frame 0, as one sees there: `pose: lying`. A capture that is there is left alone without --force.
@@ -23,8 +23,7 @@ from neuspring.data.camera import Camera
 from neuspring.data.capture import CAPTURE, Capture, Description, Writer
 from neuspring.intake.phystwin import released_cases
 from neuspring.perception.marks.marks import MARKS as MARKS_FILE
-from workflow.scripts.footage import VIDEOS, Points, carried, film
-from workflow.scripts.masks import MARKS
+from results.published.footage.film import MARKS, VIDEOS, Points, carried, film
 
 NAME = "0"
 """The only camera."""

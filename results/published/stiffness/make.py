@@ -1,11 +1,11 @@
 """Twins of synthetic scenes beside the material that their bodies were made of.
 
-    python -m workflow.scripts.stiffness_truth RESULTS OUT [--methods ...] [--pictures SCENARIO ...]
+    python -m results.published.stiffness.make RESULTS OUT [--methods ...] [--pictures SCENARIO ...]
 
 A body of finite elements has a modulus per element (Young's modulus of a solid, membrane stiffness of a sheet), a twin a stiffness
 per spring. Around a node the twin has the geometric mean of its springs, the truth the modulus of the nearest element in frame 0.
-OUT/stiffness.md has the correlation of their logarithms, mean over seeds; OUT/stiffness.csv has a row per run, and OUT/SCENARIO.png
-shows both, relative to the geometric mean over nodes.
+OUT/beside_truth.md has the correlation of their logarithms, mean over seeds; OUT/beside_truth.csv has a row per run, and
+OUT/SCENARIO.png shows both, relative to the geometric mean over nodes.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def picture(scenario: str, takes: Sequence[Prediction], scene: Scene) -> Figure:
 
 
 def judged(home: Path, methods: Sequence[str]) -> tuple[list[tuple[str, int, float]], list[Prediction], Scene | None]:
-    """Of the runs of a scenario: (method, seed, correlation); the truth and a twin of each method at rest, and what shows them."""
+    """Judged runs of a scenario: (method, seed, correlation); the truth and a twin of each method at rest, and what shows them."""
     truth, rows, takes, scene = Truth.load(truth_path(home / "capture")), [], dict[str, Prediction](), None
     for path in (path for method in methods for path in sorted(home.glob(f"{method}/*/rollout.json"))):
         run = RunFolder.of(path.parent)
@@ -121,13 +121,13 @@ def main() -> None:
         if scene and folder.parent.name in options.pictures:
             save(picture(name, takes, scene), options.output / f"{name}.png")
     table = pd.DataFrame(rows, columns=["scenario", "method", "seed", "correlation"]).dropna()
-    write_text(options.output / "stiffness.csv", table.to_csv(index=False, float_format="%.4f"))
+    write_text(options.output / "beside_truth.csv", table.to_csv(index=False, float_format="%.4f"))
     wide = table.pivot_table(index="scenario", columns="method", values="correlation")
     wide = wide[[method for method in options.methods if method in wide]]
     wide.loc["mean over scenes"] = wide.mean()
     cells = [[str(name), *(f"{r:.2f}" for r in row)] for name, row in wide.iterrows()]
     lines = Table.of_texts(["scene", *wide.columns], cells).markdown()
-    write_text(options.output / "stiffness.md", "\n".join(["# Stiffness beside the truth", "", NOTE, "", *lines, ""]))
+    write_text(options.output / "beside_truth.md", "\n".join(["# Stiffness beside the truth", "", NOTE, "", *lines, ""]))
 
 
 if __name__ == "__main__":
