@@ -34,7 +34,7 @@ class ArrayRule:
     kind: str
     """NumPy's letter: f (finite floating point) or b (bool)."""
     required: bool = True
-    """Whether the reader uses it."""
+    """True where the reader uses it."""
 
 
 ARRAYS = (

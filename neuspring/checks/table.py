@@ -165,7 +165,7 @@ class CameraAlone:
     camera: Camera
     up: str
     source: str = ""
-    """Where its pose is from."""
+    """The source of its pose."""
 
     @property
     def key(self) -> str:

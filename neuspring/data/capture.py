@@ -81,11 +81,11 @@ class Description:
     train_end: Annotated[int, Field(ge=2)] | None = None
     """Training frames are [0, train_end); null: the first 70 %."""
     masks: bool = False
-    """Whether the capture has masks."""
+    """True where the capture has masks."""
     self_collision: bool | None = None
-    """Whether the object may touch itself, for a scenario without a row of its own; null: where the category is cloth."""
+    """True where the object may touch itself, for a scenario without a row of its own; null: where the category is cloth."""
     ground: bool = True
-    """Whether there is a table, for a scenario without a row of its own."""
+    """True where there is a table, for a scenario without a row of its own."""
     obstacles: tuple[Obstacle, ...] = ()
     """What else stands in the scene and does not move, besides the table, m: {"shape": "box", "center": [x, y, z], "half_sizes":
     [a, b, c], "rotation": [3 rows; own axes to world]} or {"shape": "sphere", "center": [x, y, z], "radius": r}."""

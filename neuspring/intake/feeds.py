@@ -26,7 +26,7 @@ class Paired:
     lens: Lens | None = None
     pose: np.ndarray | None = None
     numbered: bool = False
-    """Whether numbers in names are known to count the same moments everywhere."""
+    """True where numbers in names are known to count the same moments everywhere."""
 
     @property
     def path(self) -> Path:

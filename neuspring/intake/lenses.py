@@ -346,7 +346,7 @@ class Sighting:
     error: float
     """Root mean square reprojection error, pixels."""
     pixels: np.ndarray
-    """Where the corners were seen (x, y) [n, 2]."""
+    """The place where the corners were seen (x, y) [n, 2]."""
     depths: np.ndarray
     """Their depth along the optical axis by the pose [n], m."""
 

@@ -34,7 +34,7 @@ class Series:
     numbers: list[int]
     """Of every picture: that in its name, or its place, from 0."""
     named: bool = False
-    """Whether they are those in the names."""
+    """True where they are those in the names."""
     times: np.ndarray | None = None
     """s, ascending; None: unknown."""
     clock: str = ""
@@ -52,7 +52,7 @@ class Series:
 
     @property
     def whole(self) -> bool:
-        """Whether no picture is missing in between."""
+        """True where no picture is missing in between."""
         return bool((self._steps <= GAP * self.step).all())
 
     @property
@@ -141,12 +141,12 @@ class Evenness:
 
     @property
     def bad(self) -> bool:
-        """Whether a twin of these frames would have another time."""
+        """True where a twin of these frames would have another time."""
         return self.departure > DEPARTURE or self.missing > LOST * len(self.steps)
 
     @property
     def odd(self) -> bool:
-        """Whether intervals differ by more than rounding."""
+        """True where intervals differ by more than rounding."""
         return bool(np.ptp(self.steps) > JITTER * np.median(self.steps) + ROUNDED)
 
     def text(self) -> str:

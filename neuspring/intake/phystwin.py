@@ -98,7 +98,7 @@ def read(row: ScenarioRow, folder: Path) -> Observations:
 
 
 def has_images(case: Path) -> bool:
-    """Whether a case's folder holds what a capture with masks needs: images, masks and calibration."""
+    """True where a case's folder holds what a capture with masks needs: images, masks and calibration."""
     files = all((Path(case) / name).is_file() for name in (METADATA, CALIBRATION))
     return files and all((Path(case) / kind).is_dir() for kind in ("color", "depth", "mask"))
 

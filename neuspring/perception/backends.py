@@ -31,12 +31,12 @@ class Backend:
     section: str = ""
     """Its settings: a field of `perception.segment` or `perception.track`; empty: it has none."""
     gpu: bool = False
-    """Whether it takes a GPU where there is one; it is then given the device as its last argument."""
+    """True where it takes a GPU where there is one; it is then given the device as its last argument."""
     truth: bool = False
-    """Whether it reads the truth of a synthetic scene: for measuring perception; no method may use it."""
+    """True where it reads the truth of a synthetic scene: for measuring perception; no method may use it."""
 
     given: bool = False
-    """Whether a capture must have something for it that not every one has, which its `require(capture)` asks for."""
+    """True where a capture must have something for it that not every one has, which its `require(capture)` asks for."""
 
     def require(self, folder: Path) -> None:
         """Raise InputError where a capture lacks what it needs, before any job runs. Damaged ones fail their own jobs."""

@@ -74,7 +74,7 @@ SeenHands: TypeAlias = tuple[dict[str, np.ndarray], list[np.ndarray], dict[str, 
 
 @dataclass(frozen=True)
 class FirstFrame:
-    """Where the object is in frame 0; up is +1 or -1."""
+    """Place of the object in frame 0; up is +1 or -1."""
 
     camera: Camera
     up: float

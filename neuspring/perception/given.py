@@ -32,7 +32,7 @@ BESIDE, BEHIND = 0.75, 2.0
 
 @dataclass(frozen=True)
 class GivenFrame(FirstFrame):
-    """Where the object is in frame 0, by its nodes."""
+    """Place of the object in frame 0, by its nodes."""
 
     front: np.ndarray
     """Pixels (x, y) [F, 2] and depth, m, of the nodes that no other hides: [F, 3]."""

@@ -234,7 +234,7 @@ def local_depth(depth: np.ndarray, inside: np.ndarray, x: np.ndarray, y: np.ndar
 
 
 def _crowded(points: np.ndarray, radius: float, least: np.ndarray, by_coordinate: bool) -> np.ndarray:
-    """Whether more than `least` [n] points, itself included, lie within `radius` of each [n] bool.
+    """The points [n] bool that have more than `least` [n] points, themselves included, within `radius` of each.
 
     `by_coordinate`, as released: a point is also dropped if any one of its coordinates equals that of a dropped point.
     """

@@ -170,7 +170,7 @@ def one_sided(
 def _consistent(
     grid: np.ndarray, camera: Camera, labels: np.ndarray, depth: np.ndarray, end: np.ndarray | None, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whether one camera admits each voxel [nx, ny, nz] bool, and whether it shows the object there, not a hand before it.
+    """Voxels [nx, ny, nz] bool that one camera admits, and those where it shows the object there, not a hand before it.
 
     It admits nothing behind the object's `end` [H, W], m, if there is a guess of that.
     """
@@ -306,7 +306,7 @@ def _spanned(values: np.ndarray, rim: np.ndarray, mask: np.ndarray) -> np.ndarra
 def seen(
     vertices: np.ndarray, capture: Capture, masks: Mapping[str, Masks], reach: float, faces: np.ndarray | None = None
 ) -> np.ndarray:
-    """Whether some camera shows the object within `reach`, m, of each vertex [V] along its optical axis.
+    """True where some camera shows the object within `reach`, m, of each vertex [V] along its optical axis.
 
     With `faces` [F, 3], outward, a vertex must face that camera too: the back of a rope lies within any reach of its front.
     """

@@ -189,7 +189,7 @@ def _nearest_label(labels: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _held(labels: np.ndarray, points: np.ndarray, own: np.ndarray, rim: float) -> np.ndarray:
-    """Whether points (x, y) [n, 2] lie within `rim` pixels of their own labels [n]."""
+    """The points (x, y) [n, 2] that lie within `rim` pixels of their own labels [n], as bool [n]."""
     on: np.ndarray = _labels_at(labels, points) == own
     if rim > 0:
         for label in np.unique(own[~on]):
@@ -223,7 +223,7 @@ def _sample(field: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def inside(points: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Whether points (x, y) [n, 2] lie in an image of a shape [n]."""
+    """The points (x, y) [n, 2] that lie in an image of a shape, as bool [n]."""
     return np.asarray((points >= 0).all(axis=1) & (points[:, 0] <= shape[1] - 1) & (points[:, 1] <= shape[0] - 1))
 
 

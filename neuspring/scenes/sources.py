@@ -43,7 +43,7 @@ class Source:
     write_capture: str = ""
     """The module that writes its captures. None: the user supplies the capture, or there are no images."""
     needs_data: bool = True
-    """Whether it lies under data_root."""
+    """True where it lies under data_root."""
     has_truth: bool = False
     """Its captures have the truth beside them."""
     own: bool = False
@@ -53,7 +53,7 @@ class Source:
     capture_files: tuple[str, ...] = ()
     """Files of its folder that a capture is made from, beside images."""
     images_beside: Callable[[Path], bool] = lambda folder: False
-    """Whether images lie beside processed data, so that a capture can be made of them for pictures."""
+    """True where images lie beside processed data, so that a capture can be made of them for pictures."""
     required: Callable[[Path], None] = lambda folder: None
     """Raises InputError where its folder lacks what no run can do without."""
     require_alike: Callable[[Config], None] = lambda config: None
@@ -80,7 +80,7 @@ def write_capture(row: ScenarioRow, settings: Config, folder: Path) -> None:
 
 
 def location(row: ScenarioRow, settings: Config) -> Path:
-    """Where the data of a scenario lie."""
+    """The place where the data of a scenario lie."""
     return Path(settings.data_root or ".") / row.path
 
 
@@ -182,7 +182,7 @@ def _required_capture(folder: Path) -> None:
 
 
 def _filmed(folder: Path) -> bool | None:
-    """Whether a capture has cameras; None where its description cannot be read, which the jobs of its scenario say."""
+    """True where a capture has cameras; None where its description cannot be read, which the jobs of its scenario say."""
     try:
         return bool(capture.read_description(folder / capture.CAPTURE).cameras)
     except InputError:

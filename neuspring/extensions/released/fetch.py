@@ -310,7 +310,7 @@ def _wanted(name: str, files: list[zipfile.ZipInfo], cases: list[str], parts: se
 
 
 def _locate(info: zipfile.ZipInfo, trees: list[str]) -> ArchiveMember | None:
-    """Where a file belongs: below the name of a case, in a folder with the name of a tree; None elsewhere."""
+    """The place where a file belongs: below the name of a case, in a folder with the name of a tree; None elsewhere."""
     names = [name for name in info.filename.split("/") if name not in ("", ".")]
     if not names or names[0] == "__MACOSX" or names[-1] == ".DS_Store" or names[-1].startswith("._"):
         return None

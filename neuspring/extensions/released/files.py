@@ -47,7 +47,7 @@ SPLATS = Path("point_cloud") / "iteration_10000" / "point_cloud.ply"
 
 @dataclass(frozen=True, kw_only=True)
 class Released(Case):
-    """Where the files of one case lie below the folder that the archives were unpacked in."""
+    """The place where the files of one case lie below the folder that the archives were unpacked in."""
 
     @property
     def parameters(self) -> Path:

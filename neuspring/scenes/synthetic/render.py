@@ -25,7 +25,7 @@ LIGHT = np.array([0.35, -0.45, 0.85]) / np.linalg.norm([0.35, -0.45, 0.85])
 FARTHEST = 8.0
 """m; what lies further is background without depth."""
 SUBPIXELS = np.array([[0.0, 0.0], [0.25, 0.25], [-0.25, 0.25], [0.25, -0.25]])
-"""Where a pixel's color is sampled; depth and label are those of the first."""
+"""The place where a pixel's color is sampled; depth and label are those of the first."""
 GAMMA = 1.0 / 2.2
 
 

@@ -95,7 +95,7 @@ class SyntheticScene:
     hands: Callable[[np.ndarray, float], tuple[Hand, ...]]
     """Settled nodes [N, 3], m, and duration, s -> hands."""
     marked: bool = False
-    """Whether its capture has marks of frame 0, as a careful user draws them: its colors are the table's."""
+    """True where its capture has marks of frame 0, as a careful user draws them: its colors are the table's."""
 
 
 def wander(start: np.ndarray, offsets: Offsets, duration: float) -> tuple[KeyFrame, ...]:

@@ -55,7 +55,7 @@ class Truth(Artifact):
 
 
 def truth_path(folder: Path) -> Path:
-    """Where the truth of the capture in `folder` lies."""
+    """The place where the truth of the capture in `folder` lies."""
     folder = Path(folder).resolve()
     return folder.with_name(f"{folder.name}_truth.npz")
 
