@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from math import inf
+from math import inf, isfinite
 from typing import Any
 
 from neuspring.core.findings import Finding, Level
@@ -54,10 +54,14 @@ class Check:
                 text=f"{self.sentence.format(**words)} {remedy}".rstrip(),
                 remedy=remedy,
                 title=None if self.title is None else self.title.format(**words),
-                value=value,
-                limit=self.limit,
-                frames=tuple(measured.get("frames", ())),
+                value=value.item() if hasattr(value, "item") else value,  # a number of NumPy is none of JSON
+                limit=None if self.limit is None else (_bound(low), _bound(high)),
+                frames=tuple(int(frame) for frame in measured.get("frames", ())),
             )
+
+
+def _bound(limit: float) -> float | None:
+    return float(limit) if isfinite(limit) else None
 
 
 def _several(measured: float | Words | Iterable[Words] | None) -> Iterable[Words]:

@@ -41,8 +41,8 @@ class Finding:
     """What stands before the text in a message: the key of a file, or nothing; None: the name."""
     value: Any = None
     """What was measured, where that is one number or word."""
-    limit: tuple[float, float] | None = None
-    """Lowest and highest value that is fine."""
+    limit: tuple[float | None, float | None] | None = None
+    """Lowest and highest value that is fine; None: no bound on that side."""
     frames: tuple[int, ...] = ()
     """Frames that it is about, where it is about some."""
 
