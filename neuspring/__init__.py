@@ -5,10 +5,11 @@ The functions and classes of `neuspring.api` stand here as well, and are importe
 
 from typing import TYPE_CHECKING, Any
 
+from neuspring.core.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from neuspring.api import Observations, Topology, Trajectory, Twin, fit, load_run, roll_out, score, search
 
-__version__ = "0.6.0"
 __all__ = ["Observations", "Topology", "Trajectory", "Twin", "fit", "load_run", "roll_out", "score", "search"]
 
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from neuspring.config import Config, parse
+from neuspring.config.settings import read_settings as settings_of
 from neuspring.core.artifacts import Observations, Topology, Trajectory, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.run_folder import RunFolder
@@ -132,10 +133,8 @@ def fit(
 
 def read_settings(settings: Settings) -> Config:
     """Settings from any of their forms. Raises InputError for unknown keys and wrong values."""
-    from neuspring.stages.stage import read_settings as read
-
     if isinstance(settings, Config):
         return settings
     if settings is None or isinstance(settings, Mapping):
         return parse(Config, settings or {}, "settings")
-    return read(str(settings))
+    return settings_of(str(settings))

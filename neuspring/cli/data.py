@@ -1,168 +1,37 @@
-"""Commands on data: fetch, check-data, verify-released, make-capture, cut-capture, mask, compare-masks, annotate."""
+"""Commands on data: check-data, make-capture, cut-capture, mask, compare-masks, annotate."""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from neuspring.cli.options import Device, Positional, Settings, arg, read_settings
 from neuspring.core.errors import InputError
+from neuspring.intake.make import Intake
+from neuspring.intake.make import make_capture as make
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from neuspring.core.findings import Finding
 
 DOUBTFUL_FRAMES_SHOWN = 5
 """Number of doubtful frames that are named per camera."""
-BOARD = "SQUARES_XxSQUARES_Y:SQUARE_M:MARKER_M:DICTIONARY"
-
-
-def fetch(
-    source: Positional[Literal["phystwin"]],
-    scenarios: Annotated[Positional[tuple[str, ...]], arg(help="all 22 by default")] = (),
-    *,
-    data_root: Annotated[Path, arg(help="folder to write to; data_root of the configuration")],
-    parts: Annotated[
-        tuple[str, ...], arg(help="data, results, appearance, images, other; all: these five; extra: more clothes")
-    ] = ("data", "results"),
-    revision: Annotated[str, arg(help="branch, tag or commit of the data set")] = "main",
-    dry_run: Annotated[bool, arg(help="say what would be fetched and the space it takes")] = False,
-) -> int:
-    """Released archives -> the folders that the readers expect; exit status 2 if a fetched file is damaged."""
-    from neuspring.data import fetch
-    from neuspring.extensions.released.run import check
-
-    findings = fetch.fetch(data_root, scenarios, parts, revision=revision, dry_run=dry_run, check=check)
-    return 0 if dry_run else _tell(findings)
 
 
 def check_data(folder: Positional[Path]) -> int:
     """Report how a data folder departs from the expected layout; exit status 2 where it cannot be used."""
-    from neuspring.extensions.released.run import check
+    from neuspring.intake.check import check_layout, render
 
-    return _tell(check(folder))
-
-
-def _tell(findings: list[Finding]) -> int:
-    from neuspring.data.check import render
-
+    findings = check_layout(folder)
     print(render(findings))
     return 2 if any(finding.level == "error" for finding in findings) else 0
 
 
-def verify_released(
-    data_root: Annotated[Positional[Path], arg(help="folder that holds data, experiments and the other released folders")],
-    output: Annotated[Path, arg(help="folder to write to")],
-    scenarios: Annotated[tuple[str, ...], arg(help="all that are there by default")] = (),
-    checks: Annotated[
-        tuple[int, ...],
-        arg(help="1 sizes and first frame, 2 springs, 3 scores, 4 deprojection, 5 pictures, 6 replay; all by default"),
-    ] = (),
-    settings: Settings = "{}",
-    device: Device = "auto",
-) -> int:
-    """PhysTwin's released results, checked against ours."""
-    from neuspring.extensions.released import run
-
-    lpips = read_settings(settings).images.lpips
-    chosen = checks or tuple(run.CHECKS)
-    report = run.verify_released(data_root, output, scenarios=scenarios, checks=chosen, device=device, lpips=lpips)
-    print(report.text, end="")
-    return report.status
-
-
-def make_capture(
-    output: Annotated[Path, arg(help="the capture folder to write")],
-    category: Annotated[str, arg(help="kind of object: cloth, rope, package, or any other word")],
-    name: Annotated[str | None, arg(help="name of the capture; that of the folder by default")] = None,
-    color: Annotated[tuple[Path, ...], arg(help="per camera: a folder of images, or a video; FILE#1 is its second track")] = (),
-    depth: Annotated[
-        tuple[Path, ...],
-        arg(help="per camera: a folder, or a 16-bit gray video; none: color alone, of one camera with --intrinsics and --poses"),
-    ] = (),
-    bag: Annotated[tuple[Path, ...], arg(help="instead of color: per camera a RealSense .bag file")] = (),
-    phystwin_raw: Annotated[Path | None, arg(help="instead of color: a case in PhysTwin's raw layout")] = None,
-    cameras: Annotated[tuple[str, ...], arg(help="names of the cameras; 0 1 2 ... by default")] = (),
-    intrinsics: Annotated[Path | None, arg(help="JSON: fx, fy, cx, cy or K of each camera, and distortion")] = None,
-    depth_unit: Annotated[float | None, arg(help="meters per count of depth; guessed by default, and said")] = None,
-    rate: Annotated[float | None, arg(help="frames per second at which it was filmed; that of the video by default")] = None,
-    frames: Annotated[str, arg(help="what is kept, by number: 250-335, 0-300/2, 1,5,9-20")] = "",
-    train_end: Annotated[int | None, arg(help="training frames end before this frame; the first 70 percent by default")] = None,
-    poses: Annotated[
-        Path | None,
-        arg(help="JSON: camera_to_world or world_to_camera; one camera with depth needs none: the table gives its pose"),
-    ] = None,
-    board: Annotated[
-        str | None, arg(metavar=BOARD, help="a ChArUco board that every camera sees, like 5x7:0.04:0.03:DICT_5X5_100")
-    ] = None,
-    board_images: Annotated[
-        tuple[Path, ...], arg(help="per camera: an image of the board, or a folder of them; the first frames by default")
-    ] = (),
-    pose: Annotated[
-        Literal["lying", "standing"] | None, arg(help="color alone: how the object is in frame 0, which one picture cannot say")
-    ] = None,
-    level: Annotated[bool, arg(help="move the world of given poses so that the table is z = 0")] = False,
-    top_down: Annotated[bool, arg(help="the camera looks straight down: the plane it faces is the table")] = False,
-    table_at: Annotated[tuple[float, float] | None, arg(help="a pixel of the table, where another plane is larger")] = None,
-    controllers: Annotated[Path | None, arg(help="hands in space: .npz or .csv, m, a row per frame of the capture")] = None,
-    nodes: Annotated[Path | None, arg(help="the body of frame 0: .npz or .ply, m")] = None,
-    tracks: Annotated[Path | None, arg(help="annotated points in space: JSON, m")] = None,
-    teach: Annotated[bool, arg(help="annotated points of training frames teach the twin; without color they always do")] = False,
-    up: Annotated[Literal["+z", "-z"], arg(help="up of points in space alone")] = "+z",
-    no_table: Annotated[bool, arg(help="points in space alone: no table is below the object")] = False,
-    force: Annotated[bool, arg(help="replace the images of a capture that is there")] = False,
-) -> None:
+def make_capture(intake: Intake) -> None:
     """Color and depth of a camera, or points in space -> a capture folder. What was found is printed, and the next command."""
-    from neuspring.data.intake.feeds import Bag, CameraFeed, Raw, pairs
-    from neuspring.data.intake.lenses import Board
-    from neuspring.data.intake.make import Intake, make_capture
-
-    given = [option for option, value in (("--color", color), ("--bag", bag), ("--phystwin-raw", phystwin_raw)) if value]
-    if len(given) != 1 and (given or not controllers):
-        rule = "one of --color with --depth, --bag, --phystwin-raw is required, or --controllers with --nodes and --tracks"
-        raise InputError("make-capture", rule, " ".join(given) or "none")
-    raw = Raw.open(phystwin_raw) if phystwin_raw else None
-    views: Sequence[CameraFeed]
-    if raw:
-        views = raw.views
-    elif bag:
-        names = cameras or tuple(str(k) for k in range(len(bag)))
-        if len(set(names)) != len(bag):
-            raise InputError("--cameras", f"{len(bag)} different names are required", " ".join(names))
-        views = [Bag(camera, path) for camera, path in zip(names, bag, strict=True)]
-    else:
-        views = pairs(color, depth, cameras) if color else ()
-    intake = Intake(
-        folder=output,
-        name=name or output.resolve().name,
-        category=category,
-        views=views,
-        rate=rate if rate is not None or raw is None else raw.rate,
-        frames=frames,
-        depth_unit=depth_unit,
-        intrinsics=intrinsics,
-        poses=poses,
-        board=Board.of(board) if board else None,
-        board_images=board_images,
-        level=level,
-        top_down=top_down,
-        table_at=table_at,
-        train_end=train_end,
-        pose=pose,
-        controllers=controllers,
-        nodes=nodes,
-        tracks=tracks,
-        teach=teach,
-        up=up,
-        no_table=no_table,
-        raw=raw,
-        force=force,
-    )
-    capture, report = make_capture(intake)
+    capture, report = make(intake)
     print("\n".join(report))
     print(f"written: {capture.folder}\nnext:")
     print(f"  neuspring check-data {capture.folder}")
@@ -180,7 +49,8 @@ def cut_capture(
     output: Annotated[Path, arg(help="the capture folder to write")],
 ) -> None:
     """Some frames of a capture, with their masks and tracks -> another capture; marks stay behind."""
-    from neuspring.data.capture import Capture, cut
+    from neuspring.data.capture import Capture
+    from neuspring.intake.cut import cut
 
     first, _, last = frames.partition("-")
     if not (first.isdigit() and last.isdigit()):
@@ -203,9 +73,10 @@ def mask(
     device: Device = "auto",
 ) -> None:
     """Marks on a few frames, or masks of other tools -> masks of object and hands in every frame of a capture."""
+    from neuspring.checks.masks import mask_facts
+    from neuspring.checks.perceived import look_at_masks
     from neuspring.data.capture import Capture
     from neuspring.perception import segment_sam2
-    from neuspring.perception.findings import look_at_masks, mask_facts
     from neuspring.perception.marks import store
     from neuspring.perception.marks.carry import carry_camera
     from neuspring.perception.marks.marks import MARKS, Marks

@@ -18,12 +18,12 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from neuspring import __version__
 from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.version import __version__
 from neuspring.registry import Registry
 
 _OURS = {
-    "data": "fetch make-capture cut-capture check-data mask compare-masks verify-released",
+    "data": "make-capture cut-capture check-data mask compare-masks",
     "results": "tables perception-table study explain report track-init log sync ui tune tune-report doctor",
 }
 COMMANDS: Registry[Callable[..., int | None]] = Registry(

@@ -7,7 +7,9 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from neuspring.stages.stage import SETTINGS_HELP, json_value, read_settings
+from neuspring.config.parse import json_value
+from neuspring.config.settings import read_settings
+from neuspring.stages.stage import SETTINGS_HELP
 
 __all__ = ["Device", "Positional", "Results", "Settings", "arg", "json_value", "read_settings"]
 Settings = Annotated[str, arg(help=SETTINGS_HELP)]

@@ -173,3 +173,14 @@ def merge(base: dict[str, Any], overlay: Mapping[str, Any]) -> None:
             merge(below, value)
         else:
             base[key] = value
+
+
+def json_value(option: str, text: str, kind: type = dict) -> Any:
+    """The JSON object (or list) given with an option. Raises InputError."""
+    try:
+        values = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(option, "must be JSON", str(error)) from error
+    if not isinstance(values, kind):
+        raise InputError(option, f"must be a JSON {'object' if kind is dict else 'list'}", type(values).__name__)
+    return values

@@ -143,7 +143,7 @@ class ColorSettings(Section):
 class Segmentation(Section):
     """Pixels that show the object and the hands."""
 
-    backend: Literal["given", "opencv", "marks", "grounded_sam2"] = "given"
+    backend: str = "given"
     """Source of masks: the capture's, height and color, marks of a user, or networks. opencv: height and color; of a capture with
     marks.json, marks. marks: the capture's marks.json, carried through the video. grounded_sam2: GroundingDINO and SAM 2 (extra
     `perception`)."""
@@ -158,7 +158,7 @@ class Segmentation(Section):
 class PointTracking(Section):
     """The way of the pixels of frame 0."""
 
-    backend: Literal["opencv", "cotracker3", "truth"] = "opencv"
+    backend: str = "opencv"
     """Tracker: Lucas-Kanade, a network, or the truth of a synthetic capture. cotracker3: the online CoTracker3 of torch.hub.
     truth: exact tracks of a synthetic capture, as many as opencv follows, to measure what perception costs."""
     opencv: OpenCvTracking = field(default_factory=OpenCvTracking)

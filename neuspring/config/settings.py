@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, StringConstraints
@@ -13,7 +14,7 @@ from neuspring.config.baselines import Baselines
 from neuspring.config.data import Deform, Mocap, Synthetic, Toy
 from neuspring.config.effort import EFFORTS, Effort, sizes
 from neuspring.config.images import Images
-from neuspring.config.parse import Count, Name, Section, merge, plain
+from neuspring.config.parse import Count, Name, Section, json_value, merge, parse, plain, read_yaml
 from neuspring.config.perception import Perception
 from neuspring.config.rod import RodSettings
 from neuspring.config.search import Search
@@ -206,3 +207,13 @@ def select(config: Config, keys: Iterable[str]) -> dict[str, Any]:
             source, target = source[section], target.setdefault(section, {})
         target[last] = source[last]
     return part
+
+
+def read_settings(text: str) -> Config:
+    """Settings from JSON text, or from YAML files separated by commas (later ones override). Raises InputError."""
+    if text.lstrip().startswith("{"):
+        return parse(Config, json_value("--settings", text), "--settings")
+    values: dict[str, object] = {}
+    for name in text.split(","):
+        merge(values, read_yaml(Path(name)))
+    return parse(Config, values, f"--settings {text}")

@@ -29,7 +29,7 @@ class Finding:
     """
 
     name: str
-    """Subject in a few words, the same for every occurrence; for a file of data, the key, or empty."""
+    """Subject in a few words, the same for every occurrence: the name of the check, where a `Check` found it."""
     level: Level
     where: str
     """The file, the camera, or what else was looked at."""
@@ -37,11 +37,20 @@ class Finding:
     """The value, the rule that it departs from, and the next move."""
     remedy: str = ""
     """The next move alone, where it is known apart."""
+    title: str | None = None
+    """What stands before the text in a message: the key of a file, or nothing; None: the name."""
+    value: Any = None
+    """What was measured, where that is one number or word."""
+    limit: tuple[float | None, float | None] | None = None
+    """Lowest and highest value that is fine; None: no bound on that side."""
+    frames: tuple[int, ...] = ()
+    """Frames that it is about, where it is about some."""
 
     @property
     def message(self) -> str:
         """All but level and place."""
-        return f"{self.name}: {self.text}" if self.name else self.text
+        head = self.name if self.title is None else self.title
+        return f"{head}: {self.text}" if head else self.text
 
     def __str__(self) -> str:
         return f"{self.level}: {self.where}: {self.message}"
@@ -95,7 +104,11 @@ def findings_as_facts(findings: Sequence[Finding]) -> dict[str, Any]:
     """Print findings in the job's log; returns them as a fact of its record (none: no fact)."""
     for one in findings:
         print(one, flush=True)
-    return {FACT: [asdict(one) for one in findings]} if findings else {}
+    return (
+        {FACT: [{key: value for key, value in asdict(one).items() if value not in (None, ())} for one in findings]}
+        if findings
+        else {}
+    )
 
 
 def refuse_errors(findings: Iterable[Finding]) -> None:

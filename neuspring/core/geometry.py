@@ -92,3 +92,11 @@ def on_table(points: np.ndarray, up: float) -> np.ndarray:
     lifted = np.array(points, dtype=float)
     lifted[..., 2] = up * np.maximum(up * lifted[..., 2], 0.0)
     return lifted
+
+
+def rigid_inverse(pose: np.ndarray) -> np.ndarray:
+    """The inverse of a rigid motion [4, 4]."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = pose[:3, :3].T
+    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return inverse

@@ -1,11 +1,9 @@
-"""Data: captures and readers, which end in Observations, and the checks of their files.
+"""What everything is made of: the capture folder, and pickles of others without their code.
 
-- `sources`: `SOURCES` declares every kind of data; the table of scenarios.
-- `capture`: the capture folder (cameras, frames, masks) and its writer; `points`: what it may bring in space.
-- `intake`: from what a camera gave to a capture folder.
-- `phystwin`, `mocap`: readers; `released`: what PhysTwin released beside its data. Pickles are only read through `unpickle`.
-- `check`: what is wrong with a folder of data; `plausible`: a capture against the world.
-- `fetch`: the released archives; `synthetic`: scenes with known truth; `tables`: CSV tables that ship.
+- `camera`: a calibrated camera, its lens, a plane that it sees. `capture`: the capture folder (cameras, frames, masks) and its
+  writer.
+- `images`, `frames`: its pictures, and what several steps do with them. `results`: what the steps of perception hand on.
+- `unpickle`: the only way in which pickles are read. `tables`: CSV tables that ship.
 
-Importing this package loads none of them.
+Importing this package loads none of them. README.md here is the page for users of captures.
 """

@@ -16,30 +16,29 @@ and has no files.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
 from PIL import Image
-from PIL.ExifTags import Base
 from pydantic import Field, TypeAdapter
 
 from neuspring.config import parse
-from neuspring.config.parse import STRICT, Finite, Name, Positive
+from neuspring.config.parse import STRICT, Name, Positive
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
 from neuspring.core.findings import Finding, broken, refuse
 from neuspring.core.geometry import Obstacle
 from neuspring.core.records import digest_file
+from neuspring.data.camera import Camera, CameraEntry
+from neuspring.data.images import make_way, read_array, read_image, require_size, write_image
 
 CAPTURE, TRACKS, POINTS = "capture.json", "tracks.json", "points.json"
 CONTROLLERS, NODES = ("controllers.npz", "controllers.csv"), ("nodes.npz", "nodes.ply")
@@ -51,66 +50,6 @@ THIN = ("cloth", "package")
 """Categories of which no volume is made; those of all other words are filled."""
 TEXT_TOLERANCE = 1e-4
 """Allowed deviation from R^T R = 1 in JSON, where matrices may have five digits."""
-Row3: TypeAlias = tuple[Finite, Finite, Finite]
-Row4: TypeAlias = tuple[Finite, Finite, Finite, Finite]
-
-
-@dataclass(frozen=True, eq=False)
-class Camera:
-    """A calibrated camera."""
-
-    name: str
-    width: int
-    height: int
-    intrinsics: np.ndarray
-    """K [3, 3], pixels."""
-    camera_to_world: np.ndarray
-    """[4, 4], m."""
-
-    def entry(self) -> CameraEntry:
-        """Its entry in capture.json."""
-        intrinsics: Any = tuple(map(tuple, self.intrinsics.tolist()))
-        pose: Any = tuple(map(tuple, self.camera_to_world.tolist()))
-        return CameraEntry(name=self.name, width=self.width, height=self.height, intrinsics=intrinsics, camera_to_world=pose)
-
-    def lift(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """World points [..., 3], m, of pixels (x, y) [..., 2] at depth [...], m along the optical axis: c2w (z K^-1 [x, y, 1])."""
-        ones = np.ones((*np.shape(depth), 1))
-        rays = np.concatenate([pixels, ones], axis=-1) @ np.linalg.inv(self.intrinsics).T
-        return np.asarray((rays * np.asarray(depth)[..., None]) @ self.camera_to_world[:3, :3].T + self.camera_to_world[:3, 3])
-
-    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (x, y) [..., 2] and depth [...], m, of world points [..., 3]; pixels are meaningless for depth <= 0."""
-        local = (points - self.camera_to_world[:3, 3]) @ self.camera_to_world[:3, :3]
-        depth = local[..., 2]
-        flat = local @ self.intrinsics.T
-        return flat[..., :2] / np.where(np.abs(depth) < 1e-9, 1e-9, depth)[..., None], depth
-
-    def sees(self, pixels: np.ndarray) -> np.ndarray:
-        """Whether pixels (x, y) [..., 2] round to one of the image."""
-        x, y = np.round(pixels[..., 0]), np.round(pixels[..., 1])
-        return (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
-
-
-@dataclass(frozen=True, kw_only=True)
-class CameraEntry:
-    """One camera of capture.json."""
-
-    __pydantic_config__ = STRICT
-    name: Name
-    """Its folder under color, depth and mask."""
-    width: Annotated[int, Field(ge=16)]
-    height: Annotated[int, Field(ge=16)]
-    intrinsics: tuple[Row3, Row3, Row3]
-    """[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels; no distortion."""
-    camera_to_world: tuple[Row4, Row4, Row4, Row4]
-    """Rigid, m."""
-    missing: tuple[Annotated[int, Field(ge=0)], ...] = ()
-    """Frames that this camera does not have."""
-
-    def camera(self) -> Camera:
-        """The calibrated camera."""
-        return Camera(self.name, self.width, self.height, np.array(self.intrinsics), np.array(self.camera_to_world))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,11 +81,11 @@ class Description:
     train_end: Annotated[int, Field(ge=2)] | None = None
     """Training frames are [0, train_end); null: the first 70 %."""
     masks: bool = False
-    """Whether the capture has masks."""
+    """True where the capture has masks."""
     self_collision: bool | None = None
-    """Whether the object may touch itself, for a scenario without a row of its own; null: where the category is cloth."""
+    """True where the object may touch itself, for a scenario without a row of its own; null: where the category is cloth."""
     ground: bool = True
-    """Whether there is a table, for a scenario without a row of its own."""
+    """True where there is a table, for a scenario without a row of its own."""
     obstacles: tuple[Obstacle, ...] = ()
     """What else stands in the scene and does not move, besides the table, m: {"shape": "box", "center": [x, y, z], "half_sizes":
     [a, b, c], "rotation": [3 rows; own axes to world]} or {"shape": "sphere", "center": [x, y, z], "radius": r}."""
@@ -176,7 +115,7 @@ class Capture:
 
     @staticmethod
     def begun(folder: Path) -> bool:
-        """Whether a folder holds a capture, or one that is not finished."""
+        """True where a folder holds a capture, or one that is not finished."""
         return (folder / CAPTURE).exists() or (folder / RECIPE).exists()
 
     @cached_property
@@ -196,7 +135,7 @@ class Capture:
 
     @property
     def has_depth(self) -> bool:
-        """Whether depth was measured."""
+        """True where depth was measured."""
         return self.description.depth == "measured"
 
     def require_camera(self, name: str) -> None:
@@ -205,7 +144,7 @@ class Capture:
             raise InputError(self.folder / CAPTURE, f"must have a camera {name}", sorted(self.cameras))
 
     def has(self, camera: str, frame: int) -> bool:
-        """Whether the camera has this frame."""
+        """True where the camera has this frame."""
         return frame not in self._missing[camera]
 
     @cached_property
@@ -291,12 +230,12 @@ class Writer:
 
     def frame(self, camera: str, frame: int, color: np.ndarray, depth: np.ndarray | None, mask: np.ndarray | None = None) -> None:
         """RGB uint8 [H, W, 3], depth as stored [H, W] (None with `depth: none`), labels uint8 [H, W]."""
-        _write_png(self.capture.path("color", camera, frame), color[..., ::-1])
+        write_image(self.capture.path("color", camera, frame), color[..., ::-1])
         path = self.capture.path("depth", camera, frame)
         if depth is None:
             assert not self.capture.has_depth, "depth was measured"
         elif path.suffix == ".png":
-            _write_png(path, depth)
+            write_image(path, depth)
         else:
             make_way(path)
             np.save(path, depth, allow_pickle=False)
@@ -305,7 +244,7 @@ class Writer:
 
     def mask(self, camera: str, frame: int, labels: np.ndarray) -> None:
         """Labels uint8 [H, W]: 0 nothing, 1 object, 2 hands."""
-        _write_png(self.capture.path("mask", camera, frame), labels)
+        write_image(self.capture.path("mask", camera, frame), labels)
 
     def finish(
         self, tracks: np.ndarray | None = None, points: Mapping[str, np.ndarray] | None = None, **provenance: str
@@ -329,38 +268,6 @@ class Writer:
             del plain["pose"]
         write_text(folder / CAPTURE, json.dumps(plain, indent=1) + "\n")
         return Capture(folder, description)
-
-
-def cut(capture: Capture, first: int, last: int, folder: Path) -> Capture:
-    """Frames `first` to `last` of a capture, both included, as a capture of its own in a new `folder`, without marks and clicks.
-
-    Raises InputError for frames that it does not have, a first frame that a camera missed, or a folder with files.
-    """
-    from neuspring.data import points as in_space
-
-    description = capture.description
-    if not 0 <= first < last - 3 or last >= capture.frame_count:
-        rule = f"five frames or more of 0 to {capture.frame_count - 1} are required, as in 12-97"
-        raise InputError("--frames", rule, f"{first}-{last}")
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(folder, "--output must be a new or empty folder", "other files", "Choose another folder.")
-    kept = range(first, last + 1)
-    cameras = tuple(replace(c, missing=tuple(k - first for k in c.missing if k in kept)) for c in description.cameras)
-    if late := [c.name for c in cameras if 0 in c.missing]:
-        raise InputError("--frames", f"camera {late[0]} must have the first frame", f"{first}, which it missed", "Begin later.")
-    in_space.require_first(capture, first)
-    for path in [path for name in ("color", "depth", "mask") for path in (capture.folder / name).glob("*/*")]:
-        if path.stem.isdigit() and int(path.stem) in kept:
-            there = folder / path.relative_to(capture.folder).with_name(f"{int(path.stem) - first:05d}{path.suffix}")
-            make_way(there)
-            shutil.copyfile(path, there)
-    source = {"cut of": f"sha256:{digest_file(capture.folder / CAPTURE)}", "frames of it": f"{first}-{last}"}
-    own = replace(description, name=folder.resolve().name, frame_count=len(kept), cameras=cameras, train_end=None)
-    points = {name: capture.points(name)[kept] for name in capture.cameras} if (capture.folder / POINTS).exists() else None
-    tracks = capture.tracks()[kept] if (capture.folder / TRACKS).exists() else None
-    writer = Writer(folder, own)
-    in_space.cut(capture, kept, folder)
-    return writer.finish(tracks, points, **source)
 
 
 def write_tracks(folder: Path, tracks: np.ndarray) -> None:
@@ -453,33 +360,6 @@ def pose_findings(file: Path, key: str, pose: np.ndarray, tolerance: float) -> l
     return findings
 
 
-def read_image(path: Path, camera: Camera, flag: int, remedy: str = "") -> np.ndarray:
-    """A PNG of the camera's size, read with one of OpenCV's flags. Raises InputError, with `remedy` for a missing file."""
-    if not path.is_file():
-        raise InputError(path, "this image must exist", "no such file", remedy)
-    image = read_picture(path, flag)
-    _require_size(path, image, camera)
-    return image
-
-
-def read_picture(path: Path, flag: int) -> np.ndarray:
-    """An image by one of OpenCV's flags. Raises InputError for a damaged one, or one whose EXIF data turn it: some readers turn it,
-    others do not, and intrinsics and depth are of one of the two."""
-    with contextlib.suppress(OSError), Image.open(path) as header:
-        # Of a PNG without EXIF data PIL would decode the pixels to look for them.
-        turned = header.getexif().get(Base.Orientation, 1) if header.format != "PNG" or "exif" in header.info else 1
-        if turned not in (0, 1):
-            remedy = (
-                "Are intrinsics and depth those of the image as viewers show it? Then turn it: mogrify -auto-orient FILES. "
-                "Are they those of the sensor? Then remove the mark: exiftool -Orientation= FILES"
-            )
-            raise InputError(path, "an image must be stored upright, with EXIF orientation 1", turned, remedy)
-    image = cv2.imread(str(path), flag)
-    if image is None:
-        raise InputError(path, "this file must be a readable image", "a damaged file", "Copy it again from where it was made.")
-    return image
-
-
 def read_labels(path: Path, camera: Camera | None = None, remedy: str = "", *, binary: bool = False) -> np.ndarray:
     """Labels [H, W] uint8 of a mask as we or other tools write it: gray, one bit, or colors of a palette, whose indices count.
 
@@ -495,7 +375,7 @@ def read_labels(path: Path, camera: Camera | None = None, remedy: str = "", *, b
     except (OSError, SyntaxError, ValueError) as error:
         raise InputError(path, "this file must be a readable PNG", "a damaged file") from error
     if camera is not None:
-        _require_size(path, labels, camera)
+        require_size(path, labels, camera)
     if labels.ndim != 2:
         next_move = "Write the label of each pixel as its gray value, or a palette image whose indices are the labels."
         raise InputError(path, "masks are gray, palette or one-bit images", f"{labels.shape[2]} channels of color", next_move)
@@ -506,38 +386,3 @@ def read_labels(path: Path, camera: Camera | None = None, remedy: str = "", *, b
         next_move = "Of two folders, of the object and of hands, `neuspring mask --masks FOLDER --hands FOLDER` makes masks."
         raise InputError(path, "labels must be 0 (nothing), 1 (object) or 2 (hands)", f"label {max(found)}", next_move)
     return labels.astype(np.uint8)
-
-
-def read_array(path: Path, camera: Camera) -> np.ndarray:
-    """An .npy image [H, W] of the camera's size. Raises InputError."""
-    array = read_npy(path)
-    if array.ndim != 2:
-        raise InputError(path, "a depth image [H, W] is required", array.shape)
-    _require_size(path, array, camera)
-    return array
-
-
-def read_npy(path: Path) -> np.ndarray:
-    """The array of an .npy file. Raises InputError."""
-    try:
-        return np.asarray(np.load(path, allow_pickle=False))
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(path, "this file must be a NumPy array without pickle", str(error)) from error
-
-
-def _require_size(path: Path, image: np.ndarray, camera: Camera) -> None:
-    if image.shape[:2] != (camera.height, camera.width):
-        rule = f"camera {camera.name} has images of {camera.width} x {camera.height}"
-        raise InputError(path, rule, f"{image.shape[1]} x {image.shape[0]}", "Depth must be aligned to color.")
-
-
-def make_way(path: Path) -> None:
-    """Remove the old file. It may be a link to the original of an imported capture, which must not be overwritten."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.unlink(missing_ok=True)
-
-
-def _write_png(path: Path, image: np.ndarray) -> None:
-    make_way(path)
-    if not cv2.imwrite(str(path), np.ascontiguousarray(image), [cv2.IMWRITE_PNG_COMPRESSION, 3]):
-        raise InputError(path, "this file must be writable")

@@ -19,8 +19,8 @@ from neuspring.config import Config, Method, ScenarioRow, SearchRow, merge, pars
 from neuspring.config.parse import read_rows
 from neuspring.core.errors import InputError
 from neuspring.core.text import listed
-from neuspring.data.sources import SOURCES, Source, location, scenario_rows, with_deform
-from neuspring.perception.backends import BACKENDS
+from neuspring.perception.backends import BACKENDS, require_known
+from neuspring.scenes.sources import SOURCES, Source, location, scenario_rows, with_deform
 from neuspring.scores.lpips import configured_weights
 from neuspring.scores.metrics import require_metrics
 from neuspring.scores.paper import Study, read_studies
@@ -245,6 +245,7 @@ class Benchmark:
                 raise InputError("name of a scenario or method", rule, name, "Rename it.")
         for name, method in self.methods.items():
             self._check_settings(name, method)
+        require_known(self.config.perception)
         if self.config.images.enabled:
             # Named weights that are missing or wrong are an error before the first job.
             configured_weights(self.config.images.lpips)

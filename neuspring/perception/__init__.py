@@ -8,9 +8,9 @@
 | shape prior | `shape` (visual hull, a mesh from elsewhere, or none): what no camera sees |
 | sample | `sample`: the structure points of a twin, and observations |
 | color alone | `color`, `color_hands`: lift and shape prior of one camera without depth |
-| look, judge | `findings`: what the steps notice about their own results; `figures`: pictures; `judge`: errors against the truth |
+| look, judge | `figures`: pictures; `judge`: errors against the truth; `truth`: exact tracks and surface |
 
-`backends`: `BACKENDS` declares the backends of segmentation and tracking. `results` declares what the steps hand on: `Masks`,
-`PixelTracks`, `LiftedTracks`, `ShapePrior`. `frames`: frames of a camera, for all steps. `marks`: masks from a few marks of a user.
-`annotate`: the page on which a person makes masks and ground-truth tracks.
+`backends`: `SEGMENTERS` and `TRACKERS` declare the backends. What the steps hand on (`Masks`, `PixelTracks`, `LiftedTracks`,
+`ShapePrior`) is in `neuspring.data.results`, and what they notice about it in `neuspring.checks`. `marks`: masks from a few marks
+of a user.
 """

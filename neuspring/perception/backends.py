@@ -1,8 +1,8 @@
-"""The backends of segmentation and tracking: `BACKENDS` declares them, and stages and workflow ask it. Masks of the capture itself
-and those from marks are made here.
+"""The backends of segmentation and tracking: `SEGMENTERS` and `TRACKERS` declare them, and stages and workflow ask them.
 
-To add a backend: its module with the function `segment` or `track`; its name and its settings in neuspring/config/perception.py;
-its line here.
+To add a backend: its module with the function `segment` or `track`, and its line here; its settings, if it has some, in
+neuspring/config/perception.py. A package adds one, a `Backend`, by an entry point of the group `neuspring.segmenters` or
+`neuspring.trackers`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from neuspring.config.perception import Perception
 from neuspring.core.errors import InputError
+from neuspring.registry import Registry
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,12 +31,12 @@ class Backend:
     section: str = ""
     """Its settings: a field of `perception.segment` or `perception.track`; empty: it has none."""
     gpu: bool = False
-    """Whether it takes a GPU where there is one; it is then given the device as its last argument."""
+    """True where it takes a GPU where there is one; it is then given the device as its last argument."""
     truth: bool = False
-    """Whether it reads the truth of a synthetic scene: for measuring perception; no method may use it."""
+    """True where it reads the truth of a synthetic scene: for measuring perception; no method may use it."""
 
     given: bool = False
-    """Whether a capture must have something for it that not every one has, which its `require(capture)` asks for."""
+    """True where a capture must have something for it that not every one has, which its `require(capture)` asks for."""
 
     def require(self, folder: Path) -> None:
         """Raise InputError where a capture lacks what it needs, before any job runs. Damaged ones fail their own jobs."""
@@ -66,20 +67,27 @@ class Backend:
         return getattr(import_module(self.module), step)(*given, *own, *seed, *((resolve_device(device),) if self.gpu else ()))
 
 
-BACKENDS = {
-    "segment": {
+SEGMENTERS = Registry(
+    "segmenters",
+    {
         "given": Backend(module="neuspring.perception.segment_given", given=True),
         "opencv": Backend(module="neuspring.perception.segment_opencv", section="opencv", given=True),
         "marks": Backend(module="neuspring.perception.marks.store", section="marks", given=True),
         "grounded_sam2": Backend(module="neuspring.perception.segment_sam2", section="grounded_sam2", gpu=True),
     },
-    "track": {
+    Backend,
+)
+TRACKERS = Registry(
+    "trackers",
+    {
         "opencv": Backend(module="neuspring.perception.track_opencv", section="opencv"),
         "cotracker3": Backend(module="neuspring.perception.track_cotracker", section="cotracker3", gpu=True),
         # The truth takes its count of points from the settings of opencv.
-        "truth": Backend(module="neuspring.perception.judge", section="opencv", truth=True),
+        "truth": Backend(module="neuspring.perception.truth", section="opencv", truth=True),
     },
-}
+    Backend,
+)
+BACKENDS = {"segment": SEGMENTERS, "track": TRACKERS}
 
 
 def segmentation(name: str, capture: Capture) -> str:
@@ -92,8 +100,15 @@ def segmentation(name: str, capture: Capture) -> str:
     return "marks" if name == "opencv" and (capture.folder / MARKS).exists() else name
 
 
+def require_known(settings: Perception) -> None:
+    """Raise InputError, with the names that there are, where a configured backend is none of them."""
+    for step, name in (("segment", settings.segment.backend), ("track", settings.track.backend)):
+        if name not in BACKENDS[step]:
+            raise InputError(f"perception.{step}.backend", f"must be one of {', '.join(BACKENDS[step])}", name)
+
+
 def _possible(step: str, name: str) -> list[Backend]:
-    """What may run where `name` is configured."""
+    """Backends that may run where `name` is configured."""
     return [BACKENDS[step][one] for one in ((name, "marks") if (step, name) == ("segment", "opencv") else (name,))]
 
 

@@ -36,11 +36,12 @@ from neuspring.config.perception import ColorSettings, Perception
 from neuspring.core.artifacts import ImageObservations
 from neuspring.core.errors import InputError
 from neuspring.core.geometry import farthest
-from neuspring.data.capture import CAPTURE, CONTROLLERS, HANDS, NOTHING, OBJECT, Camera, Capture
-from neuspring.data.points import InSpace, held, read
+from neuspring.data.camera import Camera
+from neuspring.data.capture import CAPTURE, CONTROLLERS, HANDS, NOTHING, OBJECT, Capture
+from neuspring.data.results import LiftedTracks, Masks, PixelTracks, ShapePrior
+from neuspring.intake.points import InSpace, held, read
 from neuspring.perception.color_hands import follow_hands, grips, place
 from neuspring.perception.controllers import ALWAYS
-from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
 from neuspring.perception.shape import discs, inflated, no_prior, shape_prior
 
 BAND = 30.0
@@ -80,7 +81,7 @@ SeenHands: TypeAlias = tuple[dict[str, np.ndarray], list[np.ndarray], dict[str, 
 
 @dataclass(frozen=True)
 class FirstFrame:
-    """Where the object is in frame 0; up is +1 or -1."""
+    """Place of the object in frame 0; up is +1 or -1."""
 
     camera: Camera
     up: float

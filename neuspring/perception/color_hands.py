@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 
 from neuspring.core.artifacts import ImageObservations
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.perception.frames import gray
+from neuspring.data.frames import gray
 
 CORNERS, LEAST, KEPT = 120, 6, 0.5
 """Corners of a key frame, fewest for a fit, and the share of them below which there is a new key frame."""

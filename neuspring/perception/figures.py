@@ -11,8 +11,8 @@ import numpy as np
 from neuspring.core.artifacts import ImageObservations
 from neuspring.core.files import write_atomically
 from neuspring.data.capture import Capture
-from neuspring.perception.frames import frames_of, overlay, spread, tints_of, write_png
-from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
+from neuspring.data.frames import frames_of, overlay, spread, tints_of, write_png
+from neuspring.data.results import LiftedTracks, Masks, PixelTracks, ShapePrior
 
 FRAMES = 5
 """How many frames a strip shows."""

@@ -12,10 +12,11 @@ from scipy.spatial import cKDTree
 from neuspring.config.perception import Perception
 from neuspring.core.artifacts import ImageObservations
 from neuspring.core.errors import InputError
-from neuspring.data.capture import Camera, Capture
-from neuspring.data.points import read
+from neuspring.data.camera import Camera
+from neuspring.data.capture import Capture
+from neuspring.data.results import LiftedTracks, Masks, PixelTracks, ShapePrior
+from neuspring.intake.points import read
 from neuspring.perception.color import BENEATH, FirstFrame, beneath_hands, from_color, lift_color
-from neuspring.perception.results import LiftedTracks, Masks, PixelTracks, ShapePrior
 from neuspring.perception.sample import spacing
 from neuspring.perception.shape import no_prior
 
@@ -31,7 +32,7 @@ BESIDE, BEHIND = 0.75, 2.0
 
 @dataclass(frozen=True)
 class GivenFrame(FirstFrame):
-    """Where the object is in frame 0, by its nodes."""
+    """Place of the object in frame 0, by its nodes."""
 
     front: np.ndarray
     """Pixels (x, y) [F, 2] and depth, m, of the nodes that no other hides: [F, 3]."""

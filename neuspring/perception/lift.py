@@ -14,10 +14,11 @@ from scipy.spatial import cKDTree
 
 from neuspring.config.perception import Lift
 from neuspring.core.errors import InputError
-from neuspring.data.capture import HANDS, OBJECT, Camera, Capture
-from neuspring.data.points import held, read
+from neuspring.data.camera import Camera
+from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.data.results import LiftedTracks, Masks, PixelTracks
+from neuspring.intake.points import held, read
 from neuspring.perception.controllers import ALWAYS, HAND_GAP, Body, choose_controllers, holding
-from neuspring.perception.results import LiftedTracks, Masks, PixelTracks
 
 REFERENCE_FOCAL = 430.0
 """Pixels: the focal length that `outlier_neighbors` is meant for. A longer one shows a surface in more pixels."""
@@ -233,7 +234,7 @@ def local_depth(depth: np.ndarray, inside: np.ndarray, x: np.ndarray, y: np.ndar
 
 
 def _crowded(points: np.ndarray, radius: float, least: np.ndarray, by_coordinate: bool) -> np.ndarray:
-    """Whether more than `least` [n] points, itself included, lie within `radius` of each [n] bool.
+    """The points [n] bool that have more than `least` [n] points, themselves included, within `radius` of each.
 
     `by_coordinate`, as released: a point is also dropped if any one of its coordinates equals that of a dropped point.
     """

@@ -13,13 +13,14 @@ import numpy as np
 import warp as wp
 from scipy.spatial import cKDTree
 
+from neuspring.checks.space import SAME
 from neuspring.config import ScenarioRow
 from neuspring.config.perception import Perception, Sampling
 from neuspring.core.artifacts import ImageObservations, Observations
 from neuspring.core.geometry import on_table
 from neuspring.data.capture import Capture
-from neuspring.data.points import SAME, in_both, read, scenario_of, standing, taught_by
-from neuspring.perception.results import LiftedTracks, ShapePrior
+from neuspring.data.results import LiftedTracks, ShapePrior
+from neuspring.intake.points import in_both, read, scenario_of, standing, taught_by
 
 SURFACE, INTERIOR = 1024, 10000
 """Points drawn on the prior's surface, and in its bounding box, of which those inside are kept; as released."""
@@ -165,14 +166,14 @@ def on_surface(vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.rand
 
 @wp.kernel(enable_backward=False)  # type: ignore[untyped-decorator]
 def winding(mesh: wp.uint64, points: wp.array[wp.vec3], reach: float, inside: wp.array[bool]):  # type: ignore[no-untyped-def]
-    """Whether each point lies inside the closed mesh; `reach` bounds the search, m."""
+    """True where each point lies inside the closed mesh; `reach` bounds the search, m."""
     i = wp.tid()
     query = wp.mesh_query_point_sign_winding_number(mesh, points[i], reach)
     inside[i] = query.result and query.sign < 0.0  # type: ignore[index,attr-defined]
 
 
 def inside(prior: ShapePrior, points: np.ndarray) -> np.ndarray:
-    """Whether points [n, 3] lie inside the closed surface [n], by its winding number."""
+    """True where points [n, 3] lie inside the closed surface [n], by its winding number."""
     indices: wp.array = wp.array(prior.faces.ravel(), dtype=wp.int32, device="cpu")
     mesh = wp.Mesh(wp.array(prior.vertices, dtype=wp.vec3, device="cpu"), indices, support_winding_number=True)
     result = wp.zeros(len(points), dtype=wp.bool, device="cpu")

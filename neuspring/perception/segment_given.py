@@ -6,7 +6,7 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, Capture
-from neuspring.perception.frames import frames_of
+from neuspring.data.frames import frames_of
 
 
 def require(capture: Capture) -> None:

@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter
 from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.perception.frames import frames_of, heights, spread
+from neuspring.data.frames import frames_of, heights, spread
 from neuspring.perception.marks.colors import bins_of, count, lab_of
 
 BINS = (12, 64, 64)

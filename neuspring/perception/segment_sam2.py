@@ -19,7 +19,7 @@ from neuspring.config.perception import GroundedSam2, MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.core.extras import needed
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.perception.frames import frames_of
+from neuspring.data.frames import frames_of
 from neuspring.perception.marks.carry import CameraFilm, Carried, Cues, doubt_of, frame_mask, over_capture
 from neuspring.perception.marks.marks import Mark
 

@@ -37,9 +37,11 @@ from warp.geometry import IsoSurfaceMarchingCubes
 
 from neuspring.config.perception import ShapePriorSettings
 from neuspring.core.errors import InputError
-from neuspring.data.capture import HANDS, OBJECT, THIN, Camera, Capture
-from neuspring.perception.results import Masks, ShapePrior
+from neuspring.data.camera import Camera
+from neuspring.data.capture import HANDS, OBJECT, THIN, Capture
+from neuspring.data.results import Masks, ShapePrior
 from neuspring.perception.sample import on_surface
+from neuspring.perception.truth import surface
 
 BACK_FRACTION = 1.2
 """Thickness of the object in local widths of its silhouette, with `back: fraction`; 1: a round cross-section."""
@@ -102,8 +104,6 @@ def _prior(
     if backend == "mesh":
         return align(capture, masks, cloud, settings)
     if backend == "truth":
-        from neuspring.perception.judge import surface
-
         return surface(capture)
     return no_prior()
 
@@ -170,7 +170,7 @@ def one_sided(
 def _consistent(
     grid: np.ndarray, camera: Camera, labels: np.ndarray, depth: np.ndarray, end: np.ndarray | None, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whether one camera admits each voxel [nx, ny, nz] bool, and whether it shows the object there, not a hand before it.
+    """Voxels [nx, ny, nz] bool that one camera admits, and those where it shows the object there, not a hand before it.
 
     It admits nothing behind the object's `end` [H, W], m, if there is a guess of that.
     """
@@ -306,7 +306,7 @@ def _spanned(values: np.ndarray, rim: np.ndarray, mask: np.ndarray) -> np.ndarra
 def seen(
     vertices: np.ndarray, capture: Capture, masks: Mapping[str, Masks], reach: float, faces: np.ndarray | None = None
 ) -> np.ndarray:
-    """Whether some camera shows the object within `reach`, m, of each vertex [V] along its optical axis.
+    """True where some camera shows the object within `reach`, m, of each vertex [V] along its optical axis.
 
     With `faces` [F, 3], outward, a vertex must face that camera too: the back of a rope lies within any reach of its front.
     """

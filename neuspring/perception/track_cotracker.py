@@ -15,7 +15,7 @@ import torch
 from neuspring.config.perception import CoTracker3
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
-from neuspring.perception.frames import frames_of
+from neuspring.data.frames import frames_of
 from neuspring.perception.track_opencv import Followed, choose
 
 WEIGHTS = "scaled_online.pth"

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from neuspring.config.perception import OpenCvTracking
 from neuspring.data.capture import NOTHING, Capture
-from neuspring.perception.frames import gray
+from neuspring.data.frames import gray
 
 LEVELS = 3
 """Levels of the image pyramid, beside the image itself."""
@@ -165,7 +165,7 @@ def _nearest_label(labels: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _held(labels: np.ndarray, points: np.ndarray, own: np.ndarray, rim: float) -> np.ndarray:
-    """Whether points (x, y) [n, 2] lie within `rim` pixels of their own labels [n]."""
+    """The points (x, y) [n, 2] that lie within `rim` pixels of their own labels [n], as bool [n]."""
     on: np.ndarray = _labels_at(labels, points) == own
     if rim > 0:
         for label in np.unique(own[~on]):
@@ -199,7 +199,7 @@ def _sample(field: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def inside(points: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Whether points (x, y) [n, 2] lie in an image of a shape [n]."""
+    """The points (x, y) [n, 2] that lie in an image of a shape, as bool [n]."""
     return np.asarray((points >= 0).all(axis=1) & (points[:, 0] <= shape[1] - 1) & (points[:, 1] <= shape[0] - 1))
 
 

@@ -14,7 +14,7 @@ import pandas as pd
 
 from neuspring.baselines import REFERENCES
 from neuspring.core.run_record import RunRecord
-from neuspring.data.sources import SOURCES
+from neuspring.scenes.sources import SOURCES
 from neuspring.scores.metrics import AT_BOUND, METRICS
 from neuspring.scores.runs import Collected, finished_scores
 

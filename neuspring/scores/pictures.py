@@ -12,7 +12,7 @@ import torch
 from neuspring.config.images import Images
 from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
-from neuspring.perception.results import Masks
+from neuspring.data.results import Masks
 from neuspring.scores.lpips import Lpips
 from neuspring.scores.metrics import metrics_of
 from neuspring.splats.draw import OBJECT_COVERAGE, picture, view_of

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from neuspring.config.images import Images
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_atomically
-from neuspring.data.capture import Camera
+from neuspring.data.camera import Camera
 from neuspring.splats.model import Gaussians, Splats
 from neuspring.splats.rasterize import Backend
 from neuspring.splats.skinning import Skin

@@ -18,7 +18,7 @@ from neuspring.stages.stage import Written, paths, require_length, stage
 
 if TYPE_CHECKING:
     from neuspring.config.images import Images
-    from neuspring.perception.results import Masks, ShapePrior
+    from neuspring.data.results import Masks, ShapePrior
     from neuspring.splats.losses import Shot
 
 NEAR_SEEN = 1.5
@@ -58,7 +58,7 @@ def appearance(
     import pandas as pd
 
     from neuspring.core.files import write_table
-    from neuspring.perception.results import masks_of_cameras
+    from neuspring.data.results import masks_of_cameras
     from neuspring.report.draw import images as figures
     from neuspring.splats.draw import orbit_view, picture
     from neuspring.splats.model import Gaussians
@@ -104,7 +104,7 @@ def appearance(
 
 def _guessed_depth(capture: Capture, before: Before) -> dict[str, np.ndarray]:
     """Depth of frame 0 [H, W], m, of a camera without depth: where perception put what each pixel shows."""
-    from neuspring.perception.results import LiftedTracks
+    from neuspring.data.results import LiftedTracks
 
     lifted = LiftedTracks.load(before.file("lifted"))
     depths = {}
@@ -200,8 +200,8 @@ def _surface(
     observations: Observations | None,
 ) -> _Surface:
     """From perception's record, or from masks and processed observations; `width`, m, is a pixel's at the object."""
+    from neuspring.data.results import LiftedTracks, ShapePrior
     from neuspring.perception.lift import clean_masks, lifting_cameras
-    from neuspring.perception.results import LiftedTracks, ShapePrior
 
     if before is not None:
         lifted, prior = LiftedTracks.load(before.file("lifted")), ShapePrior.load(before.file("shape"))

@@ -6,14 +6,14 @@ from pathlib import Path
 
 from neuspring.config import Config, ScenarioRow
 from neuspring.data.capture import CAPTURE
-from neuspring.data.sources import SOURCES, write_capture
+from neuspring.scenes.sources import SOURCES, write_capture
 from neuspring.stages.stage import stage, there
 
 
 @stage(
     output="{scenario}/capture/capture.json",
     reads=lambda settings, given: SOURCES[given["scenario"].source].reads,
-    code=lambda settings, given: (SOURCES[given["scenario"].source].module,),
+    code=lambda settings, given: (SOURCES[given["scenario"].source].write_capture,),
     minutes=120,
     when=lambda rows: rows.source.write_capture,
     instead=lambda rows: rows.data / CAPTURE if rows.data else None,

@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from neuspring import config
+from neuspring.config.parse import json_value
+from neuspring.config.settings import read_settings
 from neuspring.core.artifacts import Observations
 from neuspring.core.records import Recorder, StageRecord
 from neuspring.stages import fit as alone
 from neuspring.stages.search import launch_size
-from neuspring.stages.stage import Job, Member, Rows, Together, Written, json_value, read_settings, stage
+from neuspring.stages.stage import Job, Member, Rows, Together, Written, stage
 from neuspring.twin.body import BODIES
 
 if TYPE_CHECKING:

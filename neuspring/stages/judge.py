@@ -15,9 +15,9 @@ def judge(
     capture: Capture, masks: Sequence[Before], tracks: Sequence[Before], lifted: Before, settings: Config, run: Recorder
 ) -> Written:
     """Perception of a synthetic capture -> its errors against the truth, as facts of the record."""
-    from neuspring.data.synthetic.truth import truth_of
+    from neuspring.data.results import LiftedTracks, masks_of_cameras, tracks_of_cameras
     from neuspring.perception import judge as errors_of
-    from neuspring.perception.results import LiftedTracks, masks_of_cameras, tracks_of_cameras
+    from neuspring.scenes.synthetic.truth import truth_of
 
     masks_of, tracks_of = masks_of_cameras(capture, paths(masks)), tracks_of_cameras(capture, paths(tracks))
     truth, points = truth_of(capture), LiftedTracks.load(lifted.file("lifted"))

@@ -23,13 +23,13 @@ def lift(capture: Capture, masks: Sequence[Before], tracks: Sequence[Before], se
 
     Of color alone also image.npz: what losses read of the image.
     """
+    from neuspring.checks.perceived import look_at_lifted
     from neuspring.core.findings import findings_as_facts
-    from neuspring.data.points import read
+    from neuspring.data.results import masks_of_cameras, tracks_of_cameras
+    from neuspring.intake.points import read
     from neuspring.perception import figures
-    from neuspring.perception.findings import look_at_lifted
     from neuspring.perception.given import from_image
     from neuspring.perception.lift import lift as lift_points
-    from neuspring.perception.results import masks_of_cameras, tracks_of_cameras
     from neuspring.perception.shape import no_prior, shape_prior
 
     perception = settings.perception

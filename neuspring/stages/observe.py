@@ -8,7 +8,7 @@ from neuspring.config import Config, ScenarioRow
 from neuspring.core.errors import InputError
 from neuspring.core.records import CAPTURE_FOLDER, Before, Recorder
 from neuspring.data.capture import Capture
-from neuspring.data.sources import SOURCES, read_observations
+from neuspring.scenes.sources import SOURCES, read_observations
 from neuspring.stages.stage import stage, there
 
 
@@ -37,10 +37,10 @@ def observe(
     if capture is None or lifted is None:
         rule = f"scenarios of source {scenario.source} need --capture and --lifted"
         raise InputError(f"scenario {scenario.scenario}", rule, "neither", "Run neuspring capture, segment, track and lift first.")
+    from neuspring.checks.perceived import look_at_observations
     from neuspring.core.artifacts import ImageObservations
     from neuspring.core.findings import findings_as_facts, refuse_errors
-    from neuspring.perception.findings import look_at_observations
-    from neuspring.perception.results import LiftedTracks, ShapePrior
+    from neuspring.data.results import LiftedTracks, ShapePrior
     from neuspring.perception.sample import assemble
 
     record = Recorder("observe", output.with_suffix(".json"), inputs={"lifted": lifted.path})

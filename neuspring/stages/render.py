@@ -64,7 +64,7 @@ def render(
 
     from neuspring.core.files import write_table
     from neuspring.core.text import Progress
-    from neuspring.perception.results import masks_of_cameras
+    from neuspring.data.results import masks_of_cameras
     from neuspring.report.draw import images as figures
     from neuspring.report.draw.scene import chosen_frames
     from neuspring.report.video import Video

@@ -32,10 +32,11 @@ def _settled(rows: Rows) -> Config:
 )
 def segment(capture: Capture, camera: str, settings: Config, run: Recorder, device: str = "auto") -> Written:
     """One camera of a capture -> masks: masks.npz and masks.png."""
+    from neuspring.checks.masks import mask_facts
+    from neuspring.checks.perceived import WRONG, look_at_masks
     from neuspring.core.findings import findings_as_facts
+    from neuspring.data.results import Masks
     from neuspring.perception import figures
-    from neuspring.perception.findings import WRONG, look_at_masks, mask_facts
-    from neuspring.perception.results import Masks
 
     section = settings.perception.segment
     capture.require_camera(camera)

@@ -39,7 +39,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from neuspring import config
 from neuspring.config import Config, Method, ScenarioRow, SearchRow
-from neuspring.config.settings import select
+from neuspring.config.parse import json_value
+from neuspring.config.settings import read_settings, select
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.provenance import code_digest, image_stamps
@@ -47,7 +48,7 @@ from neuspring.core.records import Before, Recorder
 from neuspring.data.capture import CAPTURE, Capture
 
 if TYPE_CHECKING:
-    from neuspring.data.sources import Source
+    from neuspring.scenes.sources import Source
 
 PLACES = ("device", "threads", "twins_per_launch")
 """Parameters that say where and how a stage runs."""
@@ -404,19 +405,9 @@ def _about(name: str, parameter: Parameter) -> str:
     return {Capture: "capture.json", Observations: "observations.npz"}.get(parameter.type, "")
 
 
-def read_settings(text: str) -> Config:
-    """Settings from JSON text, or from YAML files separated by commas (later ones override). Raises InputError."""
-    if text.lstrip().startswith("{"):
-        return config.parse(Config, json_value("--settings", text), "--settings")
-    values: dict[str, object] = {}
-    for name in text.split(","):
-        config.merge(values, config.read_yaml(Path(name)))
-    return config.parse(Config, values, f"--settings {text}")
-
-
 def read_row(text: str, settings: Config) -> ScenarioRow:
     """A row of the scenario table, by its name or as JSON. Raises InputError."""
-    from neuspring.data.sources import scenario_rows
+    from neuspring.scenes.sources import scenario_rows
 
     if text.lstrip().startswith("{"):
         return config.parse(ScenarioRow, json_value("--scenario", text), "--scenario")
@@ -425,17 +416,6 @@ def read_row(text: str, settings: Config) -> ScenarioRow:
         rule = f"must be a row of {settings.scenario_table}, a capture or recording in data_root, or JSON"
         raise InputError("--scenario", rule, text)
     return rows[text]
-
-
-def json_value(option: str, text: str, kind: type = dict) -> Any:
-    """The JSON object (or list) given with an option. Raises InputError."""
-    try:
-        values = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(option, "must be JSON", str(error)) from error
-    if not isinstance(values, kind):
-        raise InputError(option, f"must be a JSON {'object' if kind is dict else 'list'}", type(values).__name__)
-    return values
 
 
 def paths(records: Iterable[Before]) -> list[Path]:

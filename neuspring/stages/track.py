@@ -19,10 +19,10 @@ from neuspring.stages.stage import Written, stage
 )
 def track(capture: Capture, camera: str, masks: Before, settings: Config, run: Recorder, device: str = "auto") -> Written:
     """Masks of one camera -> tracks of pixels: tracks.npz and tracks.png."""
+    from neuspring.checks.perceived import look_at_tracks
     from neuspring.core.findings import findings_as_facts
+    from neuspring.data.results import Masks, PixelTracks
     from neuspring.perception import figures
-    from neuspring.perception.findings import look_at_tracks
-    from neuspring.perception.results import Masks, PixelTracks
 
     section = settings.perception.track
     capture.require_camera(camera)

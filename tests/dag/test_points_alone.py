@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from neuspring.core.artifacts import Observations, Twin
-from neuspring.data.points import Hands, write
+from neuspring.intake.points import Hands, write
 from tests.support import spaced as scene
 from tests.support.project import plan, run
 from tests.support.spaced import spaced

@@ -11,8 +11,8 @@ import pytest
 
 from neuspring import config
 from neuspring.core.job_records import read_jobs
-from neuspring.data.phystwin import released_cases
 from neuspring.experiments.jobs import gpus
+from neuspring.intake.phystwin import released_cases
 from tests.support.project import ROOT, SCENE, copy_workflow, jobs_in, output_of, run, start
 
 CHANGES = {"device": "auto", "seeds": [0, 1], "tracking": {"enabled": False}}

@@ -10,7 +10,9 @@ from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
 
 from neuspring.core.errors import InputError
-from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Camera, CameraEntry, Capture, Description, Writer, cut
+from neuspring.data.camera import Camera, CameraEntry
+from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, Description, Writer
+from neuspring.intake.cut import cut
 from tests.support.captures import FRAMES, POSE, describe, entry
 
 

@@ -20,12 +20,12 @@ from neuspring.config import Config, Method, parse
 from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
 from neuspring.core.records import Before, Recorder
-from neuspring.data.sources import read_scenarios, scenario_rows, with_deform
 from neuspring.experiments import benchmark as tables
 from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.graph import Graph
 from neuspring.experiments.needs import check_storage
 from neuspring.experiments.tuning.space import Plan
+from neuspring.scenes.sources import read_scenarios, scenario_rows, with_deform
 from neuspring.scores.paper import read_studies
 from neuspring.stages import STAGES
 from neuspring.stages.stage import Written, stage
@@ -286,6 +286,8 @@ def test_a_capture_without_what_its_masks_are_made_of_is_named_before_any_job(tm
         chosen = {"perception": {"segment": {"backend": backend}}}
         return benchmark(tmp_path, scenarios=["mine"], data_root=str(tmp_path), **chosen)
 
+    with pytest.raises(InputError, match=r"perception\.segment\.backend: must be one of given, opencv, marks, .*received magic"):
+        planned("magic")
     (tmp_path / "mine").mkdir()
     with pytest.raises(InputError, match=r"mine: a capture is a folder with capture\.json.*neuspring make-capture"):
         planned("opencv")

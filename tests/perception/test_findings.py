@@ -7,13 +7,14 @@ import cv2
 import numpy as np
 import pytest
 
+from neuspring.checks.masks import mask_facts
+from neuspring.checks.perceived import look_at_lifted, look_at_masks, look_at_observations, look_at_tracks
 from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.errors import InputError
 from neuspring.core.findings import Finding, finding, findings_as_facts, findings_of, refuse_errors
 from neuspring.core.records import Recorder
 from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
-from neuspring.perception.findings import look_at_lifted, look_at_masks, look_at_observations, look_at_tracks, mask_facts
-from neuspring.perception.results import ShapePrior
+from neuspring.data.results import ShapePrior
 from neuspring.perception.shape import no_prior
 from tests.support.captures import FRAMES, describe, entry
 from tests.support.still import tracked

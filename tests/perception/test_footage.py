@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from neuspring.checks.masks import mask_facts
+from neuspring.checks.perceived import look_at_masks
 from neuspring.data.capture import OBJECT, Writer
-from neuspring.perception.findings import look_at_masks, mask_facts
 from results.published.footage.film import Points, carried, film, truths
 from tests.support.captures import describe, entry
 from tests.support.films import Errors, newly_covered, overlaps, stepwise

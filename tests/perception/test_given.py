@@ -7,16 +7,17 @@ import torch
 from neuspring.config import Config, ScenarioRow
 from neuspring.config.perception import Lift, Perception, Sampling
 from neuspring.core.provenance import image_stamps
-from neuspring.data.capture import CAPTURE, TRACKS, Camera, write_tracks
-from neuspring.data.points import Hands, write
-from neuspring.data.synthetic.meshes import sphere
+from neuspring.data.camera import Camera
+from neuspring.data.capture import CAPTURE, TRACKS, write_tracks
+from neuspring.data.results import Masks, PixelTracks
+from neuspring.intake.points import Hands, write
 from neuspring.perception.figures import hands_strip
 from neuspring.perception.given import GivenFrame, facing, from_image
 from neuspring.perception.lift import lift
-from neuspring.perception.results import Masks, PixelTracks
 from neuspring.perception.sample import among, assemble, spacing
 from neuspring.perception.shape import no_prior
 from neuspring.perception.track_opencv import choose
+from neuspring.scenes.synthetic.meshes import sphere
 from neuspring.scores import metrics
 from neuspring.twin.losses import FrameLoss
 from tests.support import small

@@ -11,11 +11,12 @@ from neuspring.config import ScenarioRow, Synthetic
 from neuspring.config.perception import Lift, OpenCvTracking, ShapePriorSettings
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.data.capture import OBJECT, Capture
-from neuspring.data.synthetic import make as making
-from neuspring.data.synthetic.truth import at_points, truth_of, truth_path, under_pixels
-from neuspring.perception.judge import judge, lifted_quality, mask_quality, track, track_quality
+from neuspring.data.results import Masks, PixelTracks
+from neuspring.perception.judge import judge, lifted_quality, mask_quality, track_quality
 from neuspring.perception.lift import lift
-from neuspring.perception.results import Masks, PixelTracks
+from neuspring.perception.truth import track
+from neuspring.scenes.synthetic import make as making
+from neuspring.scenes.synthetic.truth import at_points, truth_of, truth_path, under_pixels
 from tests.support.filmed import film
 
 ROW = ScenarioRow(scenario="box", source="synthetic", category="package", path="weird_package", self_collision=True, ground=True)

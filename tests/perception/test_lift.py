@@ -11,9 +11,9 @@ from neuspring.config.perception import Lift
 from neuspring.core.errors import InputError
 from neuspring.core.geometry import farthest
 from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
+from neuspring.data.results import Masks, PixelTracks
 from neuspring.perception import lift as lifting
 from neuspring.perception.controllers import choose_controllers, fill_rigidly, hands_of, rigid_motion
-from neuspring.perception.results import Masks, PixelTracks
 from tests.support.captures import FRAMES, describe, entry
 
 SETTINGS = Lift(neighborhood=0.045, outlier_neighbors=460.0, least_controllers=3, controllers=4)

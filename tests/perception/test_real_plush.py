@@ -4,11 +4,12 @@ from pathlib import Path
 
 import pytest
 
+from neuspring.checks.masks import mask_facts
+from neuspring.checks.perceived import look_at_masks
 from neuspring.config.perception import Lift, ShapePriorSettings
 from neuspring.data.capture import CAPTURE, Capture
-from neuspring.perception.findings import look_at_masks, mask_facts
+from neuspring.data.results import Masks
 from neuspring.perception.lift import clean_masks
-from neuspring.perception.results import Masks
 from neuspring.perception.segment_given import segment
 from neuspring.perception.shape import shape_prior
 from tests.support.real import PLUSH

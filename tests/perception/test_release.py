@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from neuspring.checks.perceived import look_at_observations
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.perception.controllers import ALWAYS, Body, Grips, holding
-from neuspring.perception.findings import look_at_observations
 from tests.support.small import observations
 
 FRAMES = 30

@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from neuspring.checks.masks import mask_facts
+from neuspring.checks.perceived import WRONG, look_at_masks
 from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
+from neuspring.data.frames import overlap
 from neuspring.perception import segment_opencv
-from neuspring.perception.findings import WRONG, look_at_masks, mask_facts
-from neuspring.perception.frames import overlap
 from tests.support.captures import describe, entry
 from tests.support.filmed import FRAMES, film
 

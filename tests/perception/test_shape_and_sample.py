@@ -9,11 +9,11 @@ from neuspring.config import ScenarioRow
 from neuspring.config.perception import Perception, Sampling, ShapePriorSettings
 from neuspring.core.errors import InputError
 from neuspring.core.geometry import on_table
-from neuspring.data.synthetic.meshes import capsule, smooth_union, sphere
-from neuspring.data.synthetic.render import HAND
+from neuspring.data.results import Masks, ShapePrior
 from neuspring.perception import shape
-from neuspring.perception.results import Masks, ShapePrior
 from neuspring.perception.sample import assemble, inside, structure, voxel_for
+from neuspring.scenes.synthetic.meshes import capsule, smooth_union, sphere
+from neuspring.scenes.synthetic.render import HAND
 from tests.support.still import overlap, still, tracked
 
 BODY = smooth_union([sphere((0, 0, 0.06), 0.05), capsule((0, 0, 0.06), (0.1, 0, 0.04), 0.03)], 0.005)

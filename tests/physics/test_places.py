@@ -19,14 +19,14 @@ PLACES = {
 }
 """Of drag, with `decay`, what the kernels take of it: files of the package that a force with one trained parameter needs."""
 VALUES = {
-    "data/synthetic/toy.py": "the drag of the toy's truth",
+    "scenes/synthetic/toy.py": "the drag of the toy's truth",
     "extensions/released/checks.py": "the released files' drag",
     "twin/search.py": "the released rounding of drag",
     "extensions/exports/formats/mujoco.py": "drag in MuJoCo",
     "extensions/exports/newton_twin.py": "drag in Newton",
 }
 """Files that give or translate the value that drag, which has no default, has in their case. A new parameter has a default."""
-OTHERS = {"data/synthetic/fem.py", "data/synthetic/kernels.py", "extensions/play/page.py"}
+OTHERS = {"scenes/synthetic/fem.py", "data/synthetic/kernels.py", "extensions/play/page.py"}
 """Drag of another simulator; dragging with a mouse."""
 RODS = {
     "config/rod.py",

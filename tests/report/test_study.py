@@ -13,7 +13,7 @@ from neuspring.cli.main import main
 from neuspring.config import parse
 from neuspring.core.errors import InputError
 from neuspring.core.table import tex
-from neuspring.data.phystwin import released_cases
+from neuspring.intake.phystwin import released_cases
 from neuspring.report import study as tables_paper
 from neuspring.report import summary as tables
 from neuspring.scores import paper

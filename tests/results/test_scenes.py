@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from neuspring.data.capture import CAPTURE
-from neuspring.data.check import check_layout
-from neuspring.data.phystwin import released_cases
-from neuspring.data.points import read
+from neuspring.intake.check import check_layout
+from neuspring.intake.phystwin import released_cases
+from neuspring.intake.points import read
 from results.published.scenes.captures import add_hands, folders_of, moving, write_points
 from tests.support import spaced as scene
 from tests.support.colored import paint

@@ -13,7 +13,7 @@ import pytest
 
 from neuspring.core.records import RECORD_FORMAT, digest_file
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.data.check import check_layout
+from neuspring.intake.check import check_layout
 from neuspring.perception.marks.marks import MARKS, Marks
 from results.published.footage.captures import CARRYING, write_capture
 from results.published.footage.film import MARKS as MARKED

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from neuspring.core.artifacts import Trajectory
-from neuspring.data.capture import Camera
+from neuspring.data.camera import Camera
 from neuspring.report.summary import marked_blocks
 from neuspring.scores import metrics
 from neuspring.scores.carried import BEHIND, carried_in_image, points_in_image, points_on_table

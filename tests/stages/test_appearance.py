@@ -17,7 +17,7 @@ from neuspring.core.artifacts import SplatCenters
 from neuspring.core.errors import InputError
 from neuspring.core.records import Before, Recorder, StageRecord
 from neuspring.data.capture import HANDS, Capture
-from neuspring.perception.results import Masks
+from neuspring.data.results import Masks
 from neuspring.scores import metrics
 from neuspring.splats import draw
 from neuspring.splats.draw import orbit_view

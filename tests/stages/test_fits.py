@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 
 from neuspring import config
+from neuspring.config.settings import read_settings
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
@@ -18,7 +19,6 @@ from neuspring.stages.fit import fit
 from neuspring.stages.fits import Row, fits
 from neuspring.stages.observe import observe
 from neuspring.stages.search import search
-from neuspring.stages.stage import read_settings
 from neuspring.twin import fit as twin_fit
 from tests.support import small
 

@@ -12,10 +12,10 @@ from neuspring.config.perception import Lift, Segmentation
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
-from neuspring.data import phystwin
 from neuspring.data.capture import Capture
-from neuspring.data.synthetic.make import outlines
-from neuspring.perception.results import Masks
+from neuspring.data.results import Masks
+from neuspring.intake import phystwin
+from neuspring.scenes.synthetic.make import outlines
 from neuspring.stages.capture import capture
 from neuspring.stages.lift import lift
 from neuspring.stages.observe import observe

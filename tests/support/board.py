@@ -5,7 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from neuspring.data.intake.lenses import Board, rigid_inverse
+from neuspring.core.geometry import rigid_inverse
+from neuspring.intake.lenses import Board
 
 BOARD = "5x7:0.04:0.03:DICT_5X5_100"
 LENS = np.array([[600, 0, 319.5], [0, 600, 239.5], [0, 0, 1.0]])

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from neuspring.data.capture import CameraEntry, Description
+from neuspring.data.camera import CameraEntry
+from neuspring.data.capture import Description
 
 FRAMES = 5
 POSE = ((1.0, 0.0, 0.0, 0.1), (0.0, -1.0, 0.0, 0.2), (0.0, 0.0, -1.0, 0.9), (0.0, 0.0, 0.0, 1.0))

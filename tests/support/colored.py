@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 
 from neuspring.core.artifacts import ImageObservations, Observations
-from neuspring.data.capture import HANDS, OBJECT, Camera, Capture, Description, Writer
+from neuspring.data.camera import Camera
+from neuspring.data.capture import HANDS, OBJECT, Capture, Description, Writer
 from neuspring.perception.color import silhouettes
 from tests.support import small
 

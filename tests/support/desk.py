@@ -9,7 +9,7 @@ import av
 import cv2
 import numpy as np
 
-from neuspring.data.capture import Camera
+from neuspring.data.camera import Camera
 
 SIZE = (80, 60)
 K = np.array([[70.0, 0, 39.5], [0, 70.0, 29.5], [0, 0, 1]])

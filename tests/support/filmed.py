@@ -10,11 +10,12 @@ import cv2
 import numpy as np
 import trimesh
 
-from neuspring.data.capture import HANDS, NOTHING, OBJECT, CameraEntry, Capture, Description, Writer
-from neuspring.data.synthetic.make import looking
-from neuspring.data.synthetic.meshes import capsule, smooth_union, sphere, surface
-from neuspring.data.synthetic.render import Part, Renderer, quantized
-from neuspring.data.synthetic.scenes import SKIN
+from neuspring.data.camera import CameraEntry
+from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture, Description, Writer
+from neuspring.scenes.synthetic.make import looking
+from neuspring.scenes.synthetic.meshes import capsule, smooth_union, sphere, surface
+from neuspring.scenes.synthetic.render import Part, Renderer, quantized
+from neuspring.scenes.synthetic.scenes import SKIN
 from tests.support.phystwin_case import dump, write_json
 
 FRAMES = 6

@@ -10,8 +10,8 @@ import numpy as np
 
 from neuspring.config.perception import OpenCvTracking
 from neuspring.data.capture import HANDS, OBJECT
+from neuspring.data.frames import overlap
 from neuspring.perception import track_opencv
-from neuspring.perception.frames import overlap
 from results.published.footage.film import Points
 
 RIM = 3.0

@@ -9,7 +9,8 @@ import numpy as np
 
 from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations
-from neuspring.data.capture import HANDS, OBJECT, CameraEntry, Capture, Description, Writer
+from neuspring.data.camera import CameraEntry
+from neuspring.data.capture import HANDS, OBJECT, Capture, Description, Writer
 from neuspring.report.draw.painter import DrawingStyle, Painter
 from neuspring.report.draw.scene import Prediction, Scene, broad_side, seen_from, shown_points
 from neuspring.report.shown import find

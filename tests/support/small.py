@@ -13,7 +13,7 @@ import torch
 
 from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
-from neuspring.data.synthetic import toy
+from neuspring.scenes.synthetic import toy
 from neuspring.twin.candidates import SearchProblem, candidate
 from neuspring.twin.fit import FitProblem
 from neuspring.twin.losses import FrameLoss

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from neuspring.data.capture import CAPTURE, Capture, Writer
-from neuspring.data.points import Hands, write
+from neuspring.intake.points import Hands, write
 from tests.support.captures import describe
 
 NODES = np.stack(np.meshgrid(*[np.arange(n) * 0.02 for n in (6, 4, 2)], indexing="ij"), axis=-1).reshape(-1, 3)

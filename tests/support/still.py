@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from neuspring.data.capture import OBJECT, CameraEntry, Capture, Writer
-from neuspring.data.synthetic.make import looking
-from neuspring.data.synthetic.meshes import sphere, surface
-from neuspring.data.synthetic.render import HAND, Part, Renderer, quantized
-from neuspring.perception.results import LiftedTracks, Masks, ShapePrior
+from neuspring.data.camera import CameraEntry
+from neuspring.data.capture import OBJECT, Capture, Writer
+from neuspring.data.results import LiftedTracks, Masks, ShapePrior
 from neuspring.perception.sample import inside
+from neuspring.scenes.synthetic.make import looking
+from neuspring.scenes.synthetic.meshes import sphere, surface
+from neuspring.scenes.synthetic.render import HAND, Part, Renderer, quantized
 from tests.support.captures import FRAMES, K, describe
 from tests.support.filmed import rows
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from neuspring.data.synthetic import toy
+from neuspring.scenes.synthetic import toy
 from neuspring.twin.register import register, residual, spacing
 
 EXACT = 1e-9

@@ -9,7 +9,7 @@ import pytest
 from neuspring import config
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
-from neuspring.data import mocap
+from neuspring.scenes import mocap
 from neuspring.twin.candidates import candidate
 from neuspring.twin.fit import FitProblem
 from neuspring.twin.rod import rod_twin

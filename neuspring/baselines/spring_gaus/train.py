@@ -32,7 +32,7 @@ from neuspring.core.checkpoint import Checkpoint, adam_arrays, restore_adam
 from neuspring.core.errors import InputError
 from neuspring.core.weights import read_tensors
 from neuspring.data.capture import OBJECT, Capture
-from neuspring.perception.results import masks_of_cameras
+from neuspring.data.results import masks_of_cameras
 from neuspring.splats.draw import view_of
 from neuspring.splats.losses import ssim
 from neuspring.splats.model import Gaussians, Splats

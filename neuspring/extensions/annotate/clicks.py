@@ -33,7 +33,7 @@ from neuspring.config.parse import STRICT, Finite
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
 from neuspring.data.capture import Capture
-from neuspring.perception.frames import gray
+from neuspring.data.frames import gray
 from neuspring.perception.track_opencv import LEVELS, equalized, inside, likeness, lucas_kanade
 
 ANNOTATIONS = "annotations.json"

@@ -14,9 +14,10 @@ from neuspring.config.images import Images
 from neuspring.core.device import resolve_device
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
-from neuspring.data.capture import Camera, Capture
+from neuspring.data.camera import Camera
+from neuspring.data.capture import Capture
+from neuspring.data.results import Masks
 from neuspring.extensions.figures.options import ComparedOptions, FilmOptions, RunOptions, StripOptions, TwinOptions
-from neuspring.perception.results import Masks
 from neuspring.report.draw import sheet
 from neuspring.report.draw.film import write_film
 from neuspring.report.draw.painter import DrawingStyle, Error, Painter, Style

@@ -20,10 +20,8 @@ from neuspring.config.images import Images
 from neuspring.core.artifacts import Material, Observations, Simulation, Topology, Trajectory, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.text import Progress
-from neuspring.data import phystwin
-from neuspring.data.capture import Camera
-from neuspring.data.phystwin import CALIBRATION, read_calibration, released_cases
-from neuspring.data.released import (
+from neuspring.data.camera import Camera
+from neuspring.extensions.released.files import (
     Released,
     ReleasedCheckpoint,
     depth_image,
@@ -35,6 +33,9 @@ from neuspring.data.released import (
     read_prediction,
     visible_pixels,
 )
+from neuspring.intake import phystwin
+from neuspring.intake.formats.phystwin_raw import read_calibration
+from neuspring.intake.phystwin import CALIBRATION, released_cases
 from neuspring.physics.stability import RELEASED_FRAME_TIME, RELEASED_SUBSTEPS
 from neuspring.scores import metrics
 from neuspring.scores.lpips import Lpips

@@ -3,27 +3,30 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
+from neuspring.checks.case import Case, Cases, FinalData
 from neuspring.config import ScenarioRow
 from neuspring.config.images import LpipsWeights
 from neuspring.core.artifacts import Observations
+from neuspring.core.checks import Check
 from neuspring.core.device import resolve_device
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_text
 from neuspring.core.findings import Finding, note, refusal
 from neuspring.core.table import Table
 from neuspring.core.text import Progress
-from neuspring.data import phystwin
-from neuspring.data.check import check_layout, find_cases
-from neuspring.data.phystwin import released_cases
-from neuspring.data.released import Released
+from neuspring.data.unpickle import load_pickle
 from neuspring.extensions.released import checks
 from neuspring.extensions.released.checks import MEAN, Absent, Comparison, Outcome, Published, Tools, of_means, require
+from neuspring.extensions.released.files import Released, parameter_findings, prediction_findings, read_checkpoint
+from neuspring.intake import phystwin
+from neuspring.intake.phystwin import released_cases
 from neuspring.scores.lpips import Lpips
 
 CHECKS = {
@@ -252,41 +255,54 @@ OF_RESULTS, OF_DATA = (1, 2, 3, 4), (1, 4)
 """Checks of a case with a root, and of one without: it has no released results."""
 
 
-def check(folder: Path) -> list[Finding]:
-    """Every departure of `folder` from its layout and from the release; nothing is raised for bad content.
-
-    A failed check is an error, a measurement or a skipped check a note. Raises InputError if `folder` holds no data of a known
-    layout.
-    """
-    findings, compared = check_layout(folder), list[Comparison]()
-    tools = Tools(published=Published.load())
-    cases = find_cases(folder)
-    for case in cases:
+def conformance(given: Cases) -> Iterator[dict[str, Any]]:
+    """Every departure of the cases of a folder from the release: damaged results, failed checks, and what could not be compared."""
+    findings, compared, tools = list[Finding](), list[Comparison](), Tools(published=Published.load())
+    for case in given.cases:
         of_case, more = _check_case(case, tools)
-        compared += of_case
-        errors = [one for one in findings if one.level == "error"]
-        findings += [
-            one
-            for one in more
-            # What a reader refuses is an error of the layout already; the reader's text goes on with the next move.
-            if one.level != "error" or not any(one.where == e.where and one.message.startswith(e.message) for e in errors)
-        ]
-    if len(cases) > 1:
-        findings += [_finding(mean, Path(folder)) for mean in of_means(compared, tools.published)]
-    return findings
+        compared, findings = compared + of_case, findings + more
+    if len(given.cases) > 1:
+        findings += [_finding(mean, given.where) for mean in of_means(compared, tools.published)]
+    errors = [one for one in given.found if one.level == "error"]
+    for one in findings:
+        # What a reader refuses is an error of the layout already; the reader's text goes on with the next move.
+        if one.level != "error" or not any(one.where == e.where and one.message.startswith(e.message) for e in errors):
+            yield {"text": one.message, "level": one.level, "where": one.where}
 
 
-def _check_case(case: Released, tools: Tools) -> tuple[list[Comparison], list[Finding]]:
-    findings = []
+RELEASED = Check("released results", Cases, conformance, None, "error", "{text}", title="")
+"""What `check-data` says of released results beside a case: entry point `released` of the group `neuspring.checks`."""
+
+
+def _check_case(given: Case, tools: Tools) -> tuple[list[Comparison], list[Finding]]:
+    case = Released(root=given.root, name=given.name, loose=given.loose)
+    findings = [] if case.loose else _of_results(case)
     if case.loose:
         findings.append(note(case.folder, "no experiments folder is known for this case: conformance checks 2 and 3 skipped"))
     try:
         observations = read_observations(case)
     except (Absent, InputError) as error:
         reason = [refusal(error)] if isinstance(error, InputError) else []
-        return [], [*reason, note(case.folder, "the reader refuses this case: conformance checks 1 to 4 skipped")]
+        return [], [*findings, *reason, note(case.folder, "the reader refuses this case: conformance checks 1 to 4 skipped")]
     compared = check_case(case, observations, OF_DATA if case.loose else OF_RESULTS, tools)
     return compared, findings + [_finding(one, one.file or case.folder) for one in compared]
+
+
+def _of_results(case: Released) -> list[Finding]:
+    """Released files that cannot be read; one that is missing skips the checks that need it."""
+    findings: list[Finding] = []
+    try:
+        if case.parameters.exists():
+            findings += parameter_findings(case.parameters, load_pickle(case.parameters))
+        if case.checkpoint.exists():
+            read_checkpoint(case.checkpoint)
+        data = load_pickle(case.folder / phystwin.FINAL_DATA) if case.prediction.exists() else None
+        if data is not None and FinalData(case.folder, data).whole:
+            nodes = data["object_points"].shape[1] + len(data["surface_points"]) + len(data["interior_points"])
+            findings += prediction_findings(case.prediction, load_pickle(case.prediction), len(data["object_points"]), nodes)
+    except InputError as error:
+        findings.append(refusal(error))
+    return findings
 
 
 def _finding(compared: Comparison, file: Path) -> Finding:

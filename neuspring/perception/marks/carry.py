@@ -21,7 +21,7 @@ import numpy as np
 from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture
-from neuspring.perception.frames import frames_of, heights, overlap, spread
+from neuspring.data.frames import frames_of, heights, overlap, spread
 from neuspring.perception.marks.colors import DIFFERENT, Background, apart, lab_of, mixed
 from neuspring.perception.marks.marks import Mark, Seeds, require_marks
 from neuspring.perception.marks.solve import LABELS, CarriedFrame, MarkedFrame, Pass, start

@@ -149,7 +149,7 @@ class Background:
         return np.asarray(np.median(lab[sparse][known].astype(np.float32) - self.mean[sparse][known], axis=0), dtype=np.float32)
 
     def changed(self, lab: np.ndarray) -> np.ndarray:
-        """Where a frame differs plainly from the known background [H, W] bool."""
+        """Pixels at which a frame differs plainly from the known background [H, W] bool."""
         difference = cv2.absdiff(np.ascontiguousarray(lab), self.mean.astype(np.uint8)).max(axis=-1)
         return np.asarray((difference > DIFFERENT) & (self.seen > 0))
 
@@ -183,6 +183,6 @@ def shaded_density(step: np.ndarray, spread: np.ndarray) -> np.ndarray:
 
 
 def apart(labels: np.ndarray, distance: int) -> np.ndarray:
-    """Where a mask [H, W] has no label within `distance` pixels."""
+    """Pixels of a mask [H, W] without a label within `distance` pixels."""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * distance + 1,) * 2)
     return np.asarray(cv2.dilate((labels > 0).astype(np.uint8), kernel) == 0)

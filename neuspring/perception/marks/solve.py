@@ -282,7 +282,7 @@ class Pass:
     """Colors of the marked frames: counts [bins] of nothing, object, hands."""
     background: Background | None
     learns: bool
-    """Whether the background is learned on the way."""
+    """True where the background is learned on the way."""
     reach: float
     running: list[np.ndarray] = field(init=False)
     colors: list[np.ndarray] = field(init=False)

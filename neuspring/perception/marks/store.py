@@ -26,7 +26,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
 from neuspring.core.records import canonical, digest_file
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, images_digest, read_labels
-from neuspring.perception.frames import Color, frames_of, overlap, overlay, spread, tints_of, write_png
+from neuspring.data.frames import Color, frames_of, overlap, overlay, spread, tints_of, write_png
 from neuspring.perception.marks.carry import Carried, carry_camera
 from neuspring.perception.marks.marks import MARKS, Mark, Marks, marks_digest
 
@@ -106,7 +106,7 @@ def import_masks(capture: Capture, camera: str, masks: Path, hands: Path | None 
 
 
 def has_masks(capture: Capture, cameras: Sequence[str] = ()) -> bool:
-    """Whether there is a mask of every frame of these cameras, all by default."""
+    """True where there is a mask of every frame of these cameras, all by default."""
     names = cameras or capture.cameras
     return all(capture.path("mask", name, frame).is_file() for name in names for frame in frames_of(capture, name))
 
@@ -143,7 +143,7 @@ class MasksFile:
         return parse(cls, values, str(path))
 
     def holds(self, capture: Capture, camera: str, source: str) -> bool:
-        """Whether the camera's masks are there and were made from this source."""
+        """True where the camera's masks are there and were made from this source."""
         return camera in self.cameras and self.cameras[camera].source == source and has_masks(capture, [camera])
 
 
@@ -171,7 +171,7 @@ def source_digest(capture: Capture, camera: str, marks: Sequence[Mark], backend:
 
 
 def sheet_of(capture: Capture, camera: str) -> Path:
-    """Where the sheet of a camera lies: beside the masks."""
+    """The place where the sheet of a camera lies: beside the masks."""
     return capture.folder / f"mask_{camera}.png"
 
 

@@ -13,7 +13,7 @@ from matplotlib.colors import Normalize
 
 from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations
-from neuspring.data.capture import Camera
+from neuspring.data.camera import Camera
 from neuspring.report.draw.scene import Prediction, Scene, faded, masked, object_and_hands, over_white, shown_points
 from neuspring.report.draw.sheet import CONTROLLER, WORST, points_across
 from neuspring.scores.pictures import Pair, psnr

@@ -12,7 +12,8 @@ import numpy as np
 from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations, Scenario, Twin, Up
 from neuspring.core.errors import InputError
-from neuspring.data.capture import HANDS, NOTHING, OBJECT, Camera, Capture
+from neuspring.data.camera import Camera
+from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture
 from neuspring.splats.draw import frames_from_centers, skinned_frames
 from neuspring.splats.model import Gaussians, Splats
 

@@ -19,8 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from neuspring.data.capture import CAPTURE, Camera, Capture, Description, Writer
-from neuspring.data.phystwin import released_cases
+from neuspring.data.camera import Camera
+from neuspring.data.capture import CAPTURE, Capture, Description, Writer
+from neuspring.intake.phystwin import released_cases
 from neuspring.perception.marks.marks import MARKS as MARKS_FILE
 from results.published.footage.film import MARKS, VIDEOS, Points, carried, film
 

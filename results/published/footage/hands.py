@@ -13,11 +13,11 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
+from neuspring.checks.observed import GRIP
 from neuspring.core.artifacts import Observations
 from neuspring.core.table import Table
 from neuspring.data.capture import CAPTURE, Capture
-from neuspring.data.points import read
-from neuspring.perception.findings import GRIP
+from neuspring.intake.points import read
 from results.published.footage.runs import PREFIX
 
 FEWEST = 3

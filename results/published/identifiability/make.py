@@ -47,11 +47,11 @@ from neuspring.core.artifacts import Twin
 from neuspring.core.errors import NumericalFailure
 from neuspring.core.files import write_text
 from neuspring.core.table import Table
-from neuspring.data.sources import read_scenarios
-from neuspring.data.synthetic import toy
 from neuspring.report.draw.scene import Prediction, Scene
 from neuspring.report.draw.sheet import save
 from neuspring.report.draw.twin import COLORS, TwinPicture
+from neuspring.scenes.sources import read_scenarios
+from neuspring.scenes.synthetic import toy
 from neuspring.scores import metrics
 from neuspring.scores.statistics import paired_differences
 from neuspring.twin.fit import FitProblem, fit

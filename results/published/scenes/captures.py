@@ -25,8 +25,8 @@ import numpy as np
 
 from neuspring.core.files import write_text
 from neuspring.data.capture import CAPTURE, Capture, Description, Writer, write_tracks
-from neuspring.data.phystwin import released_cases
-from neuspring.data.points import Hands, read, write
+from neuspring.intake.phystwin import released_cases
+from neuspring.intake.points import Hands, read, write
 from results.published.footage.captures import RATE, cases_of, category_of, write_capture
 from results.published.footage.film import MARKS
 

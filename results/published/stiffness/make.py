@@ -27,10 +27,10 @@ from neuspring.core.artifacts import Twin
 from neuspring.core.files import write_text
 from neuspring.core.run_folder import RunFolder
 from neuspring.core.table import Table
-from neuspring.data.synthetic.truth import Truth, truth_path
 from neuspring.report.draw.scene import Prediction, Scene
 from neuspring.report.draw.sheet import save
 from neuspring.report.draw.twin import COLORS, TwinPicture
+from neuspring.scenes.synthetic.truth import Truth, truth_path
 from neuspring.twin.body import body_of
 
 METHODS = ["search_only", "baseline_ten_frames", "model_b", "shuffled", "neuspring", "neuspring_plus", "baseline_plus"]

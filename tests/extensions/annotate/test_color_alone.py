@@ -6,17 +6,16 @@ import pytest
 
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
-from neuspring.data.intake.feeds import pairs
-from neuspring.data.intake.make import Intake, make_capture
 from neuspring.extensions.annotate.clicks import Annotations, Click, ClickedPoint
 from neuspring.extensions.annotate.tracks import TracksMode, tracks_of
+from neuspring.intake.make import Intake, make_capture
 from tests.support.desk import write_folders, write_poses
 
 
 @pytest.fixture
 def capture(tmp_path):
     root = write_folders(tmp_path)
-    given = {"folder": root / "capture", "name": "desk", "category": "ball", "rate": 30.0, "views": pairs([root / "color_0"], [])}
+    given = {"output": root / "capture", "name": "desk", "category": "ball", "rate": 30.0, "color": (root / "color_0",)}
     given |= {"pose": "lying", "intrinsics": root / "intrinsics.json", "poses": write_poses(root / "poses.json", 1)}
     made, _ = make_capture(Intake(**given))
     return Capture.load(made.folder)

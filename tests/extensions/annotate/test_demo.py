@@ -10,10 +10,10 @@ import pytest
 
 from neuspring import config
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.data.sources import read_scenarios
-from neuspring.data.synthetic.make import make
-from neuspring.perception.frames import overlap
+from neuspring.data.frames import overlap
 from neuspring.perception.marks.marks import Mark
+from neuspring.scenes.sources import read_scenarios
+from neuspring.scenes.synthetic.make import make
 from tests.extensions.annotate.served import TOKEN, Client, served
 from tests.support.browser import Browser, chromium
 from tests.support.project import ROOT

@@ -15,9 +15,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from neuspring.core.artifacts import Material, Simulation, Twin
-from neuspring.data.released import Released
 from neuspring.data.unpickle import load_pickle
 from neuspring.extensions.released.checks import Published
+from neuspring.extensions.released.files import Released
 from neuspring.physics import reference as simulation
 from neuspring.physics.reference import ReferenceTwin
 from neuspring.splats.model import Splats

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neuspring.extensions.released.run import check
+from neuspring.intake.check import check_layout as check
 from tests.support.findings import holds, of_level, serious
 from tests.support.phystwin_case import dump, write_case, write_json, write_raw_frame, write_results
 

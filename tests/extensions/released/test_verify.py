@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from neuspring.core.errors import InputError
-from neuspring.data.phystwin import read_calibration, released_cases
-from neuspring.data.released import (
+from neuspring.extensions.released.checks import MEAN, RELEASED, Comparison, Published, frame_scores, of_means
+from neuspring.extensions.released.files import (
     Released,
     depth_image,
     gated_lift,
@@ -23,8 +23,9 @@ from neuspring.data.released import (
     read_parameters,
     visible_pixels,
 )
-from neuspring.extensions.released.checks import MEAN, RELEASED, Comparison, Published, frame_scores, of_means
 from neuspring.extensions.released.run import CHECKS, Report, read_observations, verify_released
+from neuspring.intake.formats.phystwin_raw import read_calibration
+from neuspring.intake.phystwin import released_cases
 from neuspring.scores.lpips import CHANNELS, WINDOWS, Lpips
 from neuspring.scores.metrics import METRICS
 from tests.extensions.released.released_case import (

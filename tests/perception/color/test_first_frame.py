@@ -12,9 +12,9 @@ from neuspring.config.perception import ColorSettings, Perception, Sampling, Sha
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT
+from neuspring.data.results import Masks, PixelTracks
 from neuspring.perception import color
 from neuspring.perception.color import SHEET_THICKNESS, FirstFrame, beneath_hands, camera_depth, from_color
-from neuspring.perception.results import Masks, PixelTracks
 from neuspring.perception.sample import structure
 from neuspring.perception.track_opencv import choose
 from tests.support.colored import HEIGHT, WIDTH, camera, paint

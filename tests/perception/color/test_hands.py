@@ -10,10 +10,10 @@ from neuspring.config import Config
 from neuspring.config.perception import ColorSettings
 from neuspring.core.artifacts import ImageObservations
 from neuspring.data.capture import HANDS, OBJECT
-from neuspring.data.points import read
+from neuspring.data.results import PixelTracks
+from neuspring.intake.points import read
 from neuspring.perception.color import FirstFrame, lift_color, silhouettes
 from neuspring.perception.color_hands import along_arms, follow_hands, grips, place
-from neuspring.perception.results import PixelTracks
 from neuspring.stages.lift import lift
 from neuspring.stages.segment import segment
 from neuspring.stages.track import track

@@ -10,8 +10,8 @@ import pytest
 from neuspring.cli.main import main
 from neuspring.config.perception import Perception, Segmentation
 from neuspring.core.errors import InputError
+from neuspring.data import frames
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.perception import frames
 from neuspring.perception.backends import BACKENDS
 from neuspring.perception.marks import store
 from neuspring.perception.marks.carry import CameraFilm, Carried

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from neuspring import __version__
 from neuspring.core.artifacts import SCALARS, Artifact, Material, Topology
 from neuspring.core.files import write_atomically, write_text
+from neuspring.core.version import __version__
 from neuspring.extensions.exports import Export
 from neuspring.extensions.exports.source import ExportSource
 from neuspring.splats.model import Splats

@@ -1,0 +1,126 @@
+"""A calibrated camera, its lens, a plane that it sees, and the limits of what cameras on a table are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Any, TypeAlias
+
+import numpy as np
+from pydantic import Field
+
+from neuspring.config.parse import STRICT, Finite, Name
+
+NEAR, FAR = 0.1, 10.0
+"""m. Median depths outside this range are no table in a room."""
+SLOWEST, FASTEST = 1.0, 240.0
+"""Frames per second of a camera."""
+ROLL = 60.0
+"""Degrees. The normal of a table leans from the upward direction of the image by less, that of a side wall or a ceiling by more."""
+Row3: TypeAlias = tuple[Finite, Finite, Finite]
+Row4: TypeAlias = tuple[Finite, Finite, Finite, Finite]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A calibrated camera."""
+
+    name: str
+    width: int
+    height: int
+    intrinsics: np.ndarray
+    """K [3, 3], pixels."""
+    camera_to_world: np.ndarray
+    """[4, 4], m."""
+
+    def entry(self) -> CameraEntry:
+        """Its entry in capture.json."""
+        intrinsics: Any = tuple(map(tuple, self.intrinsics.tolist()))
+        pose: Any = tuple(map(tuple, self.camera_to_world.tolist()))
+        return CameraEntry(name=self.name, width=self.width, height=self.height, intrinsics=intrinsics, camera_to_world=pose)
+
+    def lift(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """World points [..., 3], m, of pixels (x, y) [..., 2] at depth [...], m along the optical axis: c2w (z K^-1 [x, y, 1])."""
+        ones = np.ones((*np.shape(depth), 1))
+        rays = np.concatenate([pixels, ones], axis=-1) @ np.linalg.inv(self.intrinsics).T
+        return np.asarray((rays * np.asarray(depth)[..., None]) @ self.camera_to_world[:3, :3].T + self.camera_to_world[:3, 3])
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels (x, y) [..., 2] and depth [...], m, of world points [..., 3]; pixels are meaningless for depth <= 0."""
+        local = (points - self.camera_to_world[:3, 3]) @ self.camera_to_world[:3, :3]
+        depth = local[..., 2]
+        flat = local @ self.intrinsics.T
+        return flat[..., :2] / np.where(np.abs(depth) < 1e-9, 1e-9, depth)[..., None], depth
+
+    def sees(self, pixels: np.ndarray) -> np.ndarray:
+        """True for pixels (x, y) [..., 2] that round to one of the image."""
+        x, y = np.round(pixels[..., 0]), np.round(pixels[..., 1])
+        return (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lens:
+    """A camera's intrinsics."""
+
+    matrix: np.ndarray
+    """K [3, 3], pixels."""
+    distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """Coefficients; none: no distortion."""
+    model: str = "opencv"
+    """Of the distortion, as the source says it; see `lenses.MODELS`."""
+    size: tuple[int, int] | None = None
+    """(width, height) for which it holds, where it is said."""
+    unread: tuple[str, ...] = ()
+    """Keys beside them that were not read."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """A plane that a camera sees."""
+
+    normal: np.ndarray
+    """Unit normal [3] in the coordinates of the camera, towards the camera."""
+    height: float
+    """Distance of the camera, m."""
+    rms: float
+    """Root mean square distance of its points, m."""
+    share: float
+    """Its part of the points with depth."""
+    inliers: int
+    """Its points, of at most `intake.depth.POINTS`."""
+    points: np.ndarray
+    """They themselves [n, 3], m, in the coordinates of the camera."""
+
+    @property
+    def elevation(self) -> float:
+        """Angle by which the camera looks down at it, degrees: 90 from straight above, 0 along it."""
+        return float(np.degrees(np.arcsin(np.clip(-self.normal[2], -1.0, 1.0))))
+
+    def above(self, points: np.ndarray) -> np.ndarray:
+        """Signed distance [...], m, of points [..., 3] in the coordinates of the camera; the camera's side is positive."""
+        return np.asarray(points @ self.normal + self.height)
+
+    def text(self) -> str:
+        """Its size and place, in one line."""
+        size = f"{1e3 * self.rms:.1f} mm rms over {self.share:.0%} of the pixels with depth ({self.inliers} points)"
+        return f"{size}, camera {self.height:.3f} m above it, looking down at it by {self.elevation:.0f} degrees"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraEntry:
+    """One camera of capture.json."""
+
+    __pydantic_config__ = STRICT
+    name: Name
+    """Its folder under color, depth and mask."""
+    width: Annotated[int, Field(ge=16)]
+    height: Annotated[int, Field(ge=16)]
+    intrinsics: tuple[Row3, Row3, Row3]
+    """[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels; no distortion."""
+    camera_to_world: tuple[Row4, Row4, Row4, Row4]
+    """Rigid, m."""
+    missing: tuple[Annotated[int, Field(ge=0)], ...] = ()
+    """Frames that this camera does not have."""
+
+    def camera(self) -> Camera:
+        """The calibrated camera."""
+        return Camera(self.name, self.width, self.height, np.array(self.intrinsics), np.array(self.camera_to_world))

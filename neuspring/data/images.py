@@ -1,0 +1,78 @@
+"""Images of a capture's folder: pictures, labels and depth, read with a reason where they cannot be, and written."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+from PIL.ExifTags import Base
+
+from neuspring.core.errors import InputError
+from neuspring.data.camera import Camera
+
+
+def read_image(path: Path, camera: Camera, flag: int, remedy: str = "") -> np.ndarray:
+    """A PNG of the camera's size, read with one of OpenCV's flags. Raises InputError, with `remedy` for a missing file."""
+    if not path.is_file():
+        raise InputError(path, "this image must exist", "no such file", remedy)
+    image = read_picture(path, flag)
+    require_size(path, image, camera)
+    return image
+
+
+def read_picture(path: Path, flag: int) -> np.ndarray:
+    """An image by one of OpenCV's flags. Raises InputError for a damaged one, or one whose EXIF data turn it: some readers turn it,
+    others do not, and intrinsics and depth are of one of the two."""
+    with contextlib.suppress(OSError), Image.open(path) as header:
+        # Of a PNG without EXIF data PIL would decode the pixels to look for them.
+        turned = header.getexif().get(Base.Orientation, 1) if header.format != "PNG" or "exif" in header.info else 1
+        if turned not in (0, 1):
+            remedy = (
+                "Are intrinsics and depth those of the image as viewers show it? Then turn it: mogrify -auto-orient FILES. "
+                "Are they those of the sensor? Then remove the mark: exiftool -Orientation= FILES"
+            )
+            raise InputError(path, "an image must be stored upright, with EXIF orientation 1", turned, remedy)
+    image = cv2.imread(str(path), flag)
+    if image is None:
+        raise InputError(path, "this file must be a readable image", "a damaged file", "Copy it again from where it was made.")
+    return image
+
+
+def read_array(path: Path, camera: Camera) -> np.ndarray:
+    """An .npy image [H, W] of the camera's size. Raises InputError."""
+    array = read_npy(path)
+    if array.ndim != 2:
+        raise InputError(path, "a depth image [H, W] is required", array.shape)
+    require_size(path, array, camera)
+    return array
+
+
+def read_npy(path: Path) -> np.ndarray:
+    """The array of an .npy file. Raises InputError."""
+    try:
+        return np.asarray(np.load(path, allow_pickle=False))
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(path, "this file must be a NumPy array without pickle", str(error)) from error
+
+
+def require_size(path: Path, image: np.ndarray, camera: Camera) -> None:
+    """Raise InputError unless an image has the camera's size."""
+    if image.shape[:2] != (camera.height, camera.width):
+        rule = f"camera {camera.name} has images of {camera.width} x {camera.height}"
+        raise InputError(path, rule, f"{image.shape[1]} x {image.shape[0]}", "Depth must be aligned to color.")
+
+
+def make_way(path: Path) -> None:
+    """Remove the old file. It may be a link to the original of an imported capture, which must not be overwritten."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
+
+
+def write_image(path: Path, image: np.ndarray) -> None:
+    """Write a PNG; a link to another file is replaced."""
+    make_way(path)
+    if not cv2.imwrite(str(path), np.ascontiguousarray(image), [cv2.IMWRITE_PNG_COMPRESSION, 3]):
+        raise InputError(path, "this file must be writable")

@@ -1,0 +1,290 @@
+"""Findings about a data set: its layout, file by file, and a capture against what a scene on a table looks like.
+Nothing here raises for bad content.
+
+What cannot work is an error, what is only unusual a warning with the next move; `neuspring.checks` has what is looked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuspring.checks import examine
+from neuspring.checks.cable import CableRecording
+from neuspring.checks.cameras import Edges, Views
+from neuspring.checks.case import Calibration, Case, Cases, Metadata, ReleasedData, Split, TrackFile
+from neuspring.checks.masks import Shown
+from neuspring.checks.table import CameraAlone, Horizon, TableSeen, object_on_table
+from neuspring.checks.things import (
+    HAND_LEAST,
+    INSIDE,
+    Among,
+    Category,
+    Depths,
+    FrameRate,
+    GripCounts,
+    Held,
+    Masked,
+    ObjectPoints,
+    Outline,
+    Sample,
+    Sheet,
+    Silhouette,
+    Support,
+    hands_on,
+    lifted,
+    sampled,
+)
+from neuspring.core.artifacts import up_sign
+from neuspring.core.errors import InputError
+from neuspring.core.files import load_json
+from neuspring.core.findings import Finding, note, refusal, unusual
+from neuspring.data.capture import CAPTURE, NODES, OBJECT, POINTS, Capture, description_findings, read_description
+from neuspring.data.unpickle import load_pickle
+from neuspring.intake import phystwin
+from neuspring.intake.depth import cloud, planes
+from neuspring.intake.points import look
+
+LEAST_AROUND = 0.1
+"""Share of the image that must have depth, beside object and hands, before the table is looked for."""
+CAMERAS = 3
+"""Cameras of every released case."""
+
+
+def check_capture(folder: Path) -> list[Finding]:
+    """Description, calibration, every image, masks of frame 0, tracks, marked points."""
+    path = folder / CAPTURE
+    try:
+        description = read_description(path)
+    except InputError as error:
+        return [refusal(error)]
+    findings = description_findings(path, description) + examine(FrameRate(path, description.frame_rate))
+    findings += examine(Category(path, description.category))
+    capture, calibrated = Capture(folder, description), not any(one.level == "error" for one in findings)
+    grips = np.zeros(capture.frame_count, int)
+    samples = {}
+    for name in capture.cameras:
+        samples[name], of_camera = _check_camera(capture, name, calibrated, grips)
+        findings += of_camera
+    findings += examine(GripCounts(path, grips, description.frame_rate))
+    if calibrated and len(samples) > 1:
+        first = {name: found[0].depth for name, found in samples.items() if 0 in found}
+        findings += examine(Views(path, capture.cameras, first, description.up))
+    findings += look(capture)[1]
+    for name in capture.cameras:
+        _read(findings, folder / POINTS, lambda _, name=name: capture.points(name))  # type: ignore[misc]
+    if capture.cameras and not description.masks:
+        findings.append(note(path, f"no masks yet (masks: false). Draw them: `neuspring annotate {folder}`; then check again"))
+    return findings
+
+
+def _read(findings: list[Finding], path: Path, reader: Callable[[Path], Any], skipped: str = "") -> Any:
+    """The content of `path`, or None with a finding; where it is missing, a note says what is therefore `skipped`."""
+    if skipped and not path.exists():
+        findings.append(note(path, f"not found: {skipped} skipped"))
+        return None
+    try:
+        return reader(path)
+    except InputError as error:
+        findings.append(refusal(error))
+        return None
+
+
+def at(file: Path, findings: Iterable[Finding]) -> list[Finding]:
+    """Findings about the content of `file`."""
+    return [replace(one, where=str(file), title=f"{one.where}: {one.name}") for one in findings]
+
+
+def _check_camera(capture: Capture, name: str, calibrated: bool, grips: np.ndarray) -> tuple[dict[int, Sample], list[Finding]]:
+    """A few frames of a camera, and all findings about its images and these. `grips` [T] counts hands at the object."""
+    view, path, described = capture.cameras[name], capture.folder / CAPTURE, capture.description
+    medians, shown = list[float](), Shown(name, capture.frame_count, (view.width, view.height))
+    samples: dict[int, Sample] = {}
+    refused: dict[str, list[Finding]] = {}
+    wanted = sampled(capture.frame_count)
+    for frame in range(capture.frame_count):
+        if not capture.has(name, frame):
+            continue
+        try:
+            color, depth = capture.color(name, frame), capture.depth(name, frame)
+            if capture.has_depth:
+                medians.append(float(np.median(depth[depth > 0])) if (depth > 0).any() else np.nan)
+            mask = np.zeros(depth.shape, np.uint8)
+            if described.masks:
+                mask = capture.mask(name, frame)
+                shown.see(frame, mask)
+                if capture.has_depth:
+                    grips[frame] = max(grips[frame], hands_on(view, Sample(depth, mask)))
+            if frame in wanted:
+                samples[frame] = Sample(depth, mask, color)
+        except InputError as error:
+            one = refusal(error)
+            refused.setdefault(f"{Path(one.where).parent} {one.text}", []).append(one)
+    more = {key: f" The same in {len(alike) - 1} more files of the folder." for key, alike in refused.items() if len(alike) > 1}
+    findings = [replace(alike[0], text=alike[0].text + more.get(key, "")) for key, alike in refused.items()]
+    depths = Depths(path, name, described.depth_unit, medians)
+    findings += examine(depths)
+    if calibrated and (depths.fine or not medians):
+        findings += (_with_depth if capture.has_depth else _color_alone)(capture, name, samples)
+    return samples, findings + at(capture.folder / "mask" / name, examine(shown))
+
+
+def _with_depth(capture: Capture, name: str, samples: dict[int, Sample]) -> list[Finding]:
+    """The table, and object and hands in the masks, of one camera."""
+    path, camera, described, up = capture.folder / CAPTURE, capture.cameras[name], capture.description, capture.description.up
+    unit = described.depth_unit if described.depth_format == "png" else None
+    # Object and hands are no table; what is left must be enough of the image to tell one.
+    around = [np.where(sample.mask == 0, sample.depth, 0.0) for sample in samples.values()]
+    enough = around and np.mean([(depth > 0).mean() for depth in around]) >= LEAST_AROUND
+    found = planes(cloud(around, camera.intrinsics)) if enough else []
+    bodies = {frame: lifted(camera, sample, OBJECT) for frame, sample in samples.items()}
+    pairs = [(s.mask if s.mask.any() else s.color, s.depth) for s in samples.values() if s.color is not None]
+    things: list[Any] = [Edges(f"camera {name}", pairs), Held(camera, samples)]  # type: ignore[arg-type]
+    things.append(ObjectPoints(f"camera {name}, object", list(bodies.values()), up_sign(up)))
+    if 0 in bodies:
+        things.append(Support(camera, samples[0], up_sign(up), described.obstacles))
+        things.append(Sheet(f"camera {name}, object", bodies[0], up_sign(up), described.category))
+    findings = examine(TableSeen(path, name, found, camera.camera_to_world, up, unit))
+    findings += at(path, [one for thing in things for one in examine(thing)])
+    return findings + (examine(Among(path, described.obstacles, bodies[0])) if 0 in bodies else [])
+
+
+def _color_alone(capture: Capture, name: str, samples: dict[int, Sample]) -> list[Finding]:
+    """The camera above the table, and the object in the mask of frame 0 on it, without depth."""
+    path, camera, described, up = capture.folder / CAPTURE, capture.cameras[name], capture.description, capture.description.up
+    findings = examine(CameraAlone(path, camera, up, f"poses {described.provenance.get('poses', '')}".rstrip()))
+    if any(one.level == "error" for one in findings) or 0 not in samples:
+        return findings
+    mask, category = samples[0].mask, described.category
+    findings += examine(Horizon(path, camera, mask))
+    things = [Outline(camera, mask), Silhouette(f"camera {name}, object", mask, category)]
+    findings += at(path, [one for thing in things for one in examine(thing)])
+    # Nodes that are given say how it is.
+    given = any((capture.folder / file).exists() for file in NODES)
+    if not given and described.pose is None and category not in ("cloth", "rope"):
+        rule = 'one picture cannot say how the object is in frame 0: write "lying" or "standing"'
+        findings.append(unusual(path, "pose", f"{rule}. Without it, what would lie farther behind than it is wide rises", "none"))
+    # Hands are about as far as the object on the table.
+    places = object_on_table(camera, mask)
+    depth = np.nanmedian(camera.project(places)[1]) if (mask == OBJECT).any() else np.nan
+    if np.isfinite(depth):
+        supposed = {frame: replace(sample, depth=np.full(mask.shape, depth)) for frame, sample in samples.items()}
+        findings += [one for one in at(path, examine(Masked(camera, supposed, HAND_LEAST))) if one.name != "depth holes"]
+    # Obstacles stand on the table: what lies beneath one is met above it.
+    above = places[np.isfinite(places[:, 0])] + np.array([0.0, 0.0, 2 * INSIDE * up_sign(up)])
+    return findings + examine(Among(path, described.obstacles, above))
+
+
+def check_layout(folder: Path) -> list[Finding]:
+    """Check a capture or a folder of them, a processed case, a folder of cases, a root with data/different_types, or cable
+    recordings (folder or .pkl file). Returns every finding.
+
+    Raises InputError only if `folder` does not exist or holds no data of a known layout.
+    """
+    folder = Path(folder)
+    if folder.is_file():
+        return check_recording(folder)
+    if not folder.is_dir():
+        raise InputError(folder, "a folder or file to check is required", "nothing there")
+    if captures := _captures(folder):
+        return [finding for path in captures for finding in check_capture(path)]
+    if cases := find_cases(folder):
+        findings = [finding for case in cases for finding in _check_case(case)]
+        return findings + examine(Cases(folder, cases, findings))
+    files = sorted(folder.rglob("*.pkl"))
+    if not files:
+        rule = "a case with final_data.pkl, a folder of cases, a root with data/different_types, or cable recordings is required"
+        raise InputError(folder, rule, "none of them")
+    return [finding for file in files for finding in check_recording(file)]
+
+
+def check_recording(file: Path) -> list[Finding]:
+    """Every finding of one recording of a cable; nothing is raised for bad content."""
+    findings: list[Finding] = []
+    raw = _read(findings, Path(file), load_pickle)
+    return findings or examine(CableRecording(Path(file), raw))
+
+
+def find_cases(folder: Path) -> list[Case]:
+    """The processed cases in or below `folder`; none in a file, or if there are captures.
+
+    Raises InputError for a root with data/different_types that holds no case.
+    """
+    folder = Path(folder)
+    if folder.is_file() or _captures(folder):
+        return []
+    below = folder / "data" / "different_types"
+    if below.is_dir():
+        paths = _subfolders(below)
+        if not paths:
+            raise InputError(folder, "at least one case folder is required", "none")
+        return [Case(root=folder, name=path.name) for path in paths]
+    cases = []
+    for path in [folder] if is_case(folder) else filter(is_case, _subfolders(folder)):
+        path = path.absolute()
+        if path.parts[-3:-1] == ("data", "different_types"):
+            cases.append(Case(root=path.parents[2], name=path.name))
+        else:
+            cases.append(Case(root=path.parent, name=path.name, loose=path))
+    return cases
+
+
+def is_case(folder: Path) -> bool:
+    """True where the folder holds processed data."""
+    return (folder / phystwin.FINAL_DATA).exists() or (folder / phystwin.SPLIT).exists()
+
+
+def render(findings: list[Finding]) -> str:
+    """Findings as text, grouped by file, ending in 'N errors, N warnings'."""
+    ordered = sorted(findings, key=lambda d: d.where)
+    lines = []
+    for file, group in groupby(ordered, key=lambda d: d.where):
+        lines.append(file)
+        lines += [f"  {d.level:8} {d.message}" for d in group]
+    counts = [sum(d.level == level for d in findings) for level in ("error", "warning")]
+    total = ", ".join(f"{n} {word}{'' if n == 1 else 's'}" for n, word in zip(counts, ("error", "warning"), strict=True))
+    return "\n".join([*lines, total])
+
+
+def _captures(folder: Path) -> list[Path]:
+    return [path for path in (folder, *_subfolders(folder)) if Capture.begun(path)]
+
+
+def _subfolders(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+
+
+def _check_case(case: Case) -> list[Finding]:
+    folder, found = case.folder, list[Finding]()
+    path, frames = folder / phystwin.FINAL_DATA, None
+    if (data := _read(found, path, load_pickle)) is not None:
+        file = ReleasedData(path, data)
+        found += examine(file)
+        frames = len(data["object_points"]) if file.whole else None
+    path = folder / phystwin.SPLIT
+    split = _read(found, path, load_json)
+    if split is not None and frames is None:
+        found.append(note(path, "needs the number of frames of final_data.pkl: the check of the split is skipped"))
+    elif split is not None and frames is not None:
+        found += examine(Split(path, split, frames))
+    path = folder / phystwin.TRACKS
+    if (tracks := _read(found, path, load_pickle, "annotated tracks and the track error are")) is not None:
+        found += examine(TrackFile(path, tracks, frames))
+    path = folder / phystwin.CALIBRATION
+    if (poses := _read(found, path, load_pickle, "the calibration check is")) is not None:
+        found += examine(Calibration(path, poses, CAMERAS))
+    path = folder / phystwin.METADATA
+    metadata = _read(found, path, load_json, "the check of intrinsics and frame rate is")
+    if metadata is not None:
+        found += examine(Metadata(path, metadata, with_cameras=True, cameras=CAMERAS))
+    if isinstance(metadata, dict):
+        if "fps" not in metadata:
+            found.append(unusual(path, "fps", "missing; 30 frames per second are assumed"))
+        if frames is not None and metadata.get("frame_num", frames) != frames:
+            found.append(unusual(path, "frame_num", f"{phystwin.FINAL_DATA} has {frames} frames", metadata["frame_num"]))
+    return found

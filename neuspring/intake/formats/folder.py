@@ -1,0 +1,80 @@
+"""A folder of images."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from neuspring.core.errors import InputError
+from neuspring.data.images import read_npy, read_picture
+from neuspring.intake.formats import PICTURES, CaptureFormat, Kind, require_kind
+from neuspring.intake.moments import Series
+
+STAMP = re.compile(r"(?<![0-9])([0-9]{10,19})(\.[0-9]+)?(?![0-9])")
+SECOND = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}
+"""s per count of a time since 1970 with so many digits before the point."""
+
+
+@dataclass(frozen=True)
+class ImageFolder:
+    """Images in one folder, in the order of their names, in which runs of digits count as numbers: 10 comes after 9."""
+
+    path: Path
+    kind: Kind
+
+    @cached_property
+    def paths(self) -> list[Path]:
+        """Its images. Raises InputError where there are none, or of two formats."""
+        found = [path for path in self.path.iterdir() if path.suffix.lower() in PICTURES[self.kind] and path.name[0] != "."]
+        endings = sorted({path.suffix.lower() for path in found})
+        if len(endings) != 1:
+            rule = f"{self.kind} images of one format are required ({' '.join(PICTURES[self.kind])})"
+            raise InputError(self.path, rule, " and ".join(endings) or "none", "Color and depth need a folder of their own each.")
+        stamps = {path: _stamp(path) or 0.0 for path in found}
+        # re.split with a group alternates text and digits.
+        words = {path: [(p.isdigit(), int(p) if p.isdigit() else 0, p) for p in re.split(r"([0-9]+)", path.stem)] for path in found}
+        return sorted(found, key=lambda path: (stamps[path] if all(stamps.values()) else 0.0, words[path]))
+
+    @cached_property
+    def series(self) -> Series:
+        """Times since 1970 in the names, with places as numbers; else the only number in which names differ; else places."""
+        stems = [path.stem for path in self.paths]
+        times = np.array([_stamp(path) for path in self.paths], dtype=float)
+        if np.isfinite(times).all() and (np.diff(times) > 0).all():
+            return Series(list(range(len(stems))), times=times, clock="wall")
+        words = [re.split(r"([0-9]+)", stem) for stem in stems]
+        counts = list(zip(*(word[1::2] for word in words), strict=True)) if len({tuple(word[::2]) for word in words}) == 1 else []
+        moving = [column for column in counts if len(set(column)) > 1]
+        numbers = [int(digits) for digits in moving[0]] if len(moving) == 1 else []
+        return Series(numbers, named=True) if len(set(numbers)) == len(stems) else Series(list(range(len(stems))))
+
+    def read(self, places: Sequence[int]) -> Iterator[np.ndarray]:
+        """RGB [H, W, 3] uint8, or depth [H, W] as stored. Raises InputError for a damaged image or one of the wrong kind."""
+        for path in self.files(places):
+            if path.suffix.lower() == ".npy":
+                yield require_kind(path, self.kind, read_npy(path))
+                continue
+            image = read_picture(path, cv2.IMREAD_COLOR if self.kind == "color" else cv2.IMREAD_UNCHANGED)
+            yield require_kind(path, self.kind, image[..., ::-1] if self.kind == "color" else image)
+
+    def files(self, places: Sequence[int]) -> list[Path]:
+        """One per picture."""
+        return [self.paths[place] for place in places]
+
+
+def _stamp(path: Path) -> float | None:
+    """s since 1970 of a name with such a time, in s with a fraction, ms, us or ns."""
+    found = STAMP.search(path.stem)
+    if not found or len(found[1]) not in SECOND or not (found[2] or len(found[1]) > min(SECOND)):
+        return None
+    time = (int(found[1]) + float(found[2] or 0)) * SECOND[len(found[1])]
+    return time if 1e9 < time < 2e9 else None  # From 2e9 on digits are a date: 20260131...
+
+
+FORMAT = CaptureFormat(about="a folder of {kind} images ({endings})", recognizes=Path.is_dir, pictures=ImageFolder)

@@ -1,0 +1,168 @@
+"""Which pictures of two sources show the same moment, and whether time passes evenly from one to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+
+from neuspring.core.errors import InputError
+
+COMMON = 0.5
+"""Numbers in names count the same moments if this part of them is common to both sources."""
+GAP = 1.5
+"""Pictures this many times farther apart than usual have others missing between them."""
+DEPARTURE = 1.0
+"""Frames. A picture may be this far from where an even clock has it: a lost picture is half of it."""
+LOST = 0.05
+"""This part of the pictures may be missing."""
+JITTER, ROUNDED = 0.1, 0.001
+"""Intervals that differ by less than this part and these seconds are one rate: time stamps may be whole milliseconds."""
+REMEDY = (
+    "Numbers that each source counts for itself pair nothing. If one only ended early, remove the last pictures of the other. "
+    "Else name the images of both by the camera's own frame numbers, or by time stamps (s, ms, us or ns since 1970)."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """When the pictures of a source were taken, in their order."""
+
+    numbers: list[int]
+    """Of every picture: that in its name, or its place, from 0."""
+    named: bool = False
+    """True where they are those in the names."""
+    times: np.ndarray | None = None
+    """s, ascending; None: unknown."""
+    clock: str = ""
+    """What these count from: `wall`, a file with several tracks, or, empty, the source's first picture."""
+
+    @property
+    def _steps(self) -> np.ndarray:
+        """s, or numbers, from each picture to the next."""
+        return np.diff(self.numbers if self.times is None else self.times)
+
+    @property
+    def step(self) -> float:
+        """s, or numbers: the usual one."""
+        return float(np.median(self._steps)) if len(self.numbers) > 1 else 1.0
+
+    @property
+    def whole(self) -> bool:
+        """True where no picture is missing in between."""
+        return bool((self._steps <= GAP * self.step).all())
+
+    @property
+    def rate(self) -> float | None:
+        """Frames per second: the mean of intervals decides, as time stamps may be whole milliseconds; gaps do not count."""
+        if self.times is None or len(self.times) < 2:
+            return None
+        return float(1 / self._steps[self._steps <= GAP * self.step].mean())
+
+    def part(self, places: Sequence[int]) -> Series:
+        """Those at ascending places."""
+        times = None if self.times is None else self.times[list(places)]
+        return Series([self.numbers[place] for place in places], self.named, times, self.clock)
+
+    def text(self) -> str:
+        """How many there are, and what is known of them."""
+        known = f" at {self.rate:.3g} Hz" if self.rate else f" with the numbers {spans(self.numbers)}" if self.named else ""
+        return f"{len(self.numbers)} pictures{known}"
+
+
+def matched(where: Path, names: tuple[str, str], one: Series, other: Series, numbered: bool = False) -> tuple[dict[int, int], str]:
+    """The pictures of `other` that show the moments of `one`: the nearest time stamps, else equal numbers in names, else the order.
+
+    `numbered`: their numbers are known to count the same moments. Returns number of a picture of one -> place in the other, where
+    numbers decide also those that one lacks, and what decided. Raises InputError naming `where` and the two `names` where nothing
+    can be trusted.
+    """
+    rule, counts = f"{names[0]} and {names[1]} must show the same moments", (len(one.numbers), len(other.numbers))
+    received, alike = f"{one.text()} and {other.text()}", counts[0] == counts[1]
+    unlike = f", none missing in between, as if one had {max(counts) / max(min(counts), 1):.2f} times the rate"
+    if one.times is not None and other.times is not None:
+        absolute, largest = one.clock == other.clock != "", max(one.step, other.step)
+        left, right = one.times - (0 if absolute else one.times[0]), other.times - (0 if absolute else other.times[0])
+        if not absolute and one.whole and other.whole and abs(left[-1] - right[-1]) > GAP * largest:
+            raise InputError(where, rule, received + unlike, REMEDY)
+        forth = _nearest(left, right)
+        apart = np.abs(left - right[forth])
+        mutual = (_nearest(right, left)[forth] == np.arange(len(left))) & (apart <= largest / 2)
+        if mutual.sum() < COMMON * min(counts):
+            raise InputError(where, rule, f"{received}; {mutual.sum()} are within half a frame of each other", REMEDY)
+        places = {one.numbers[k]: int(forth[k]) for k in np.flatnonzero(mutual)}
+        return places, f"time stamps, at most {1e3 * apart[mutual].max():.0f} ms apart"
+    if numbered or (one.named and other.named):
+        common = len({*one.numbers} & {*other.numbers})
+        # A counter of its own has no gaps and begins at its own start: it says nothing of moments.
+        begins = not common or abs(one.numbers[0] - other.numbers[0]) <= one.step
+        ends = one.numbers[-1] != other.numbers[-1]
+        own = one.whole and other.whole and one.step == other.step and begins and ends and not alike
+        if numbered or (common >= COMMON * max(counts) and not own):
+            return {number: place for place, number in enumerate(other.numbers)}, "the numbers in their names"
+        if [number + other.numbers[0] - one.numbers[0] for number in one.numbers] != other.numbers:
+            raise InputError(where, rule, received + (unlike if own else f"; {common} numbers are common"), REMEDY)
+    elif not alike:
+        raise InputError(where, rule, received, REMEDY)
+    return {number: place for place, number in enumerate(one.numbers)}, "order"
+
+
+def _nearest(times: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """The place in `among` of the nearest to each of `times`; both ascend."""
+    return np.searchsorted((among[1:] + among[:-1]) / 2, times)
+
+
+@dataclass(frozen=True, eq=False)
+class Evenness:
+    """How the time stamps of some pictures follow an even clock."""
+
+    steps: np.ndarray
+    """s per picture of the source, from each to the next."""
+    departure: float
+    """Frames: the farthest from where the clock has it."""
+    missing: int
+    """Pictures that are missing in between."""
+    runs: list[tuple[int, int]]
+    """First and last picture of each part with one rate."""
+
+    @classmethod
+    def of(cls, times: np.ndarray, places: Sequence[int]) -> Evenness:
+        """`times` [n], s, of the pictures at `places` of the source."""
+        steps, usual = np.diff(times) / np.diff(places), float(np.median(np.diff(times) / np.diff(places)))
+        rest = times - np.polyval(np.polyfit(places, times, 1), places)
+        counted = np.where(steps > GAP * usual, np.round(steps / usual) - 1, 0) * np.diff(places)
+        breaks = np.abs(np.diff(steps)) > JITTER * steps[1:] + ROUNDED
+        label = np.concatenate([[0], np.cumsum(breaks)])
+        runs = [list(part) for _, part in groupby(range(len(steps)), key=lambda k: label[k])]
+        return cls(steps, float(np.ptp(rest) / 2 / steps.mean()), int(counted.sum()), [(part[0], part[-1] + 1) for part in runs])
+
+    @property
+    def bad(self) -> bool:
+        """True where a twin of these frames would have another time."""
+        return self.departure > DEPARTURE or self.missing > LOST * len(self.steps)
+
+    @property
+    def odd(self) -> bool:
+        """True where intervals differ by more than rounding."""
+        return bool(np.ptp(self.steps) > JITTER * np.median(self.steps) + ROUNDED)
+
+    def text(self) -> str:
+        """The intervals."""
+        first, last = 1e3 * self.steps.min(), 1e3 * self.steps.max()
+        lost = f"about {self.missing} lost pictures, " if self.missing else ""
+        return f"intervals of {first:.0f} to {last:.0f} ms, {lost}up to {self.departure:.1f} frames off an even clock"
+
+
+SHOWN = 6
+"""Runs of numbers that a message names."""
+
+
+def spans(numbers: Sequence[int]) -> str:
+    """Ascending numbers in few words: `6, 13, 20 to 25`."""
+    runs = [list(part) for _, part in groupby(enumerate(numbers), key=lambda pair: pair[1] - pair[0])]
+    texts = [f"{run[0][1]} to {run[-1][1]}" if len(run) > 2 else ", ".join(str(number) for _, number in run) for run in runs]
+    left = sum(map(len, runs[SHOWN:]))
+    return ", ".join(texts[:SHOWN]) + (f" and {left} more" if left else "")

@@ -1,0 +1,350 @@
+"""Hands, nodes and annotated points in space, which a capture may bring beside film or without any.
+
+    controllers.npz    points [T, C, 3]; optional: holds [T, C] bool (all hold), hand [C] int (not grouped)
+    controllers.csv    the same as rows, header frame,point,x,y,z[,holds][,hand]; frames from 0, holds 0 or 1
+    nodes.npz | .ply   points [N, 3]; or vertices: the body of frame 0
+    tracks.json        annotated points (capture.py); with `tracks: train` those of training frames teach the twin
+
+Meters, in the capture's world. Files of another form, in other units or axes are refused with what they look like.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from neuspring.checks import examine
+from neuspring.checks.space import SAME, Cloud, Holding, Marked, Nodes
+from neuspring.config import Config, ScenarioRow
+from neuspring.core.artifacts import Observations, Scenario
+from neuspring.core.errors import InputError
+from neuspring.core.files import NPZ_FAULTS, write_atomically
+from neuspring.core.findings import Finding, broken, refusal, refuse
+from neuspring.core.geometry import on_table
+from neuspring.core.records import digest_file
+from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, TRACKS, Capture
+
+COLUMNS = ("frame", "point", "x", "y", "z", "holds", "hand")
+"""Of controllers.csv; the last two may be left out."""
+LEAST = 3
+"""Points that say how a body is turned."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hands:
+    """Points that move the object."""
+
+    points: np.ndarray
+    """[T, C, 3], m."""
+    holds: np.ndarray
+    """[T, C] bool: when each holds the object; empty: all do in all frames."""
+    hand: np.ndarray
+    """[C] int: the hand of each; empty: not grouped."""
+
+    def held(self, end: int | None = None) -> np.ndarray:
+        """Places [n, 3], m, of controllers while they hold, before frame `end`."""
+        points = self.points[:end]
+        places: np.ndarray = points[self.holds[:end]] if self.holds.size else points.reshape(-1, 3)
+        return places
+
+
+@dataclass(frozen=True, eq=False)
+class InSpace:
+    """What a capture brings in space."""
+
+    hands: Hands | None
+    nodes: np.ndarray
+    """[N, 3], m; none: not given."""
+    tracks: np.ndarray
+    """[T, K, 3], m, NaN where not annotated: those that teach the twin; K = 0 where they are for scoring only."""
+
+
+def given(folder: Path, names: tuple[str, ...]) -> Path | None:
+    """The file of a capture's folder with one of `names`; None without any. Raises InputError for two."""
+    found = [folder / name for name in names if (folder / name).exists()]
+    if len(found) > 1:
+        raise InputError(folder, f"one of {' and '.join(names)} may be there", "both", "Remove one of them.")
+    return found[0] if found else None
+
+
+def read(capture: Capture) -> InSpace:
+    """Hands, nodes and points of a capture. Raises InputError, naming file and key, for what no twin can be made of."""
+    space, findings = look(capture)
+    refuse(findings)
+    return space
+
+
+def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[InSpace, list[Finding]]:
+    """Hands, nodes and points of a capture as far as they can be read, and every finding about them.
+
+    `brought` are files of `controllers`, `nodes` and `tracks` that are not in its folder yet.
+    """
+    folder, description = capture.folder, capture.description
+    findings: list[Finding] = []
+
+    def attempt(reader: Callable[..., Any], *values: Any) -> Any:
+        try:
+            return reader(*values)
+        except InputError as error:
+            findings.append(refusal(error))
+
+    files: dict[str, Path | None] = dict(brought or {})
+    for what, names in (("controllers", CONTROLLERS), ("nodes", NODES)):
+        if brought is None:
+            files[what] = attempt(given, folder, names)
+        if not files.get(what) and not findings and not description.cameras:
+            rule = f"a capture without cameras needs {' or '.join(names)}"
+            findings.append(broken(folder / names[0], "", rule, "no such file"))
+    marked, none = files.get("tracks") or folder / TRACKS, np.zeros((0, 3))
+    hands = attempt(read_hands, files["controllers"], capture.frame_count) if files.get("controllers") else None
+    nodes: Any = attempt(read_nodes, files["nodes"]) if files.get("nodes") else None
+    annotated, tracks = attempt(capture.tracks, marked), np.zeros((capture.frame_count, 0, 3))
+    nodes, annotated = none if nodes is None else nodes, tracks if annotated is None else annotated
+    first = annotated[0][np.isfinite(annotated[0]).all(axis=1)]
+    if description.tracks == "train":
+        tracks = annotated
+        if len(first) < LEAST:
+            rule = f"with tracks: train at least {LEAST} points must be annotated in frame 0, where the twin starts"
+            findings.append(broken(marked, "", rule, f"{len(first)} of {tracks.shape[1]}"))
+    ground = description.up_sign if description.ground else None
+    # A hand may be anywhere while it holds nothing.
+    held_at = none if hands is None else hands.held()
+    seen = annotated[np.isfinite(annotated).all(axis=2)]
+    for what, file, points in (("nodes", files.get("nodes"), nodes), ("", marked, seen), ("", files.get("controllers"), held_at)):
+        if file is not None and points.size:
+            findings += examine(Cloud(file, points.reshape(-1, 3), ground, is_body=what == "nodes"))
+    if any(one.level == "error" for one in findings):
+        return InSpace(hands, nodes, tracks), findings
+    if (body := files.get("nodes")) is not None:
+        findings += examine(Nodes(body, nodes))
+    if len(nodes):
+        findings += examine(Marked(marked, annotated[0], nodes))
+    if (file := files.get("controllers")) is not None and hands is not None:
+        grouped = hands.hand if hands.hand.size else np.zeros(hands.points.shape[1], int)
+        start = held(hands, annotated, capture.train_end)[0]
+        findings += examine(Holding(file, grouped, hands.held(capture.train_end), start, nodes, np.concatenate([nodes, first])))
+    return InSpace(hands, nodes, tracks), findings
+
+
+def read_hands(path: Path, frames: int | None = None) -> Hands:
+    """controllers.npz or controllers.csv, of so many frames, if given. Raises InputError."""
+    arrays = _rows(path) if path.suffix == ".csv" else _arrays(path, ("points", "holds", "hand"))
+    points = _places(path, arrays["points"], 3)
+    count, number = points.shape[:2]
+    if frames is not None and count != frames:
+        rule = f"{frames} frames are required, as frame_count of {CAPTURE} says"
+        raise InputError(path, rule, count, "Cut or resample the file: a row per frame of the capture.")
+    if not number:
+        raise InputError(path, "at least one controller is required", "none")
+    holds, hand = arrays.get("holds", np.zeros((0, 0), bool)), arrays.get("hand", np.zeros(0, int))
+    for key, value, shape, kinds in (("holds", holds, (count, number), "b"), ("hand", hand, (number,), "iu")):
+        if value.size and (value.shape != shape or value.dtype.kind not in kinds):
+            wanted = f"{list(shape)} {'bool' if kinds == 'b' else 'int'}"
+            raise InputError(path, f"{key}: must be {wanted}", f"{list(value.shape)} {value.dtype}")
+    if holds.size and not holds.any():
+        raise InputError(path, "holds: some controller must hold in some frame", "none", "Without it all hold always.")
+    return Hands(points, holds if holds.size and not holds.all() else np.zeros((0, 0), bool), hand)
+
+
+def read_nodes(path: Path) -> np.ndarray:
+    """The nodes [N, 3], m, of nodes.npz or the vertices of nodes.ply. Raises InputError."""
+    if path.suffix == ".npz":
+        nodes = _arrays(path, ("points",))["points"]
+    else:
+        import trimesh
+
+        try:
+            body: Any = trimesh.load(path, process=False)
+            nodes = np.array(body.vertices)
+        except Exception as error:  # trimesh raises whatever a damaged file leads it to
+            raise InputError(path, "vertices of a PLY file are required", f"{type(error).__name__}: {error}") from error
+    nodes = _places(path, nodes, 2)
+    if len(nodes) < LEAST:
+        raise InputError(path, f"at least {LEAST} nodes are required", len(nodes))
+    pairs = cKDTree(nodes).query_pairs(SAME, output_type="ndarray")
+    if len(pairs):
+        rule = f"nodes must lie {1e3 * SAME:g} mm apart: a spring between two needs a length"
+        value = f"{len(pairs)} pairs, first nodes {pairs[0][0]} and {pairs[0][1]}"
+        raise InputError(path, rule, value, "Remove the doubled nodes, np.unique(points, axis=0).")
+    return nodes
+
+
+def _arrays(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray]:
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+    except (*NPZ_FAULTS, AttributeError) as error:
+        raise InputError(path, "an .npz file without pickle is required", f"{type(error).__name__}: {error}") from error
+    if "points" not in arrays or not arrays.keys() <= set(keys):
+        optional = f", optional {' and '.join(keys[1:])}" if keys[1:] else ""
+        raise InputError(path, f"the array points is required{optional}", ", ".join(arrays) or "none")
+    return arrays
+
+
+def _rows(path: Path) -> dict[str, np.ndarray]:
+    import pandas as pd
+
+    try:
+        table = pd.read_csv(path)
+    except (OSError, ValueError) as error:
+        raise InputError(path, "rows of numbers with one header line are required", str(error)) from error
+    if not set(COLUMNS[:5]) <= set(table) <= set(COLUMNS):
+        rule = f"the header must be {','.join(COLUMNS[:5])}, and may have holds and hand"
+        raise InputError(path, rule, ",".join(map(str, table)))
+    for name, column in (table := table.apply(pd.to_numeric, errors="coerce")).items():
+        if len(bad := np.flatnonzero(~np.isfinite(column))):
+            raise InputError(path, f"{name}: every entry must be a number", f"another in row {bad[0] + 1} ({len(bad)} in all)")
+    sizes = table["frame"].nunique(), table["point"].nunique()
+    if table.duplicated(["frame", "point"]).any() or len(table) != np.prod(sizes) or table["frame"].max() != sizes[0] - 1:
+        rule = "each point needs one row in each frame, and frames are 0, 1, 2, ..."
+        raise InputError(path, rule, f"{len(table)} rows, {sizes[0]} frames up to {table['frame'].max():g}, {sizes[1]} points")
+    grid = {name: column.to_numpy().reshape(sizes) for name, column in table.sort_values(["frame", "point"]).items()}
+    arrays = {"points": np.stack([grid[name] for name in "xyz"], axis=-1)}
+    if "holds" in grid:
+        if not set(np.unique(grid["holds"])) <= {0, 1}:
+            raise InputError(path, "holds: must be 0 or 1", f"{np.unique(grid['holds'])[:4]}")
+        arrays["holds"] = grid["holds"] > 0
+    if "hand" in grid:
+        if (grid["hand"] != grid["hand"][0]).any() or (grid["hand"] % 1).any():
+            raise InputError(path, "hand: must be one whole number for each point", "numbers that change")
+        arrays["hand"] = grid["hand"][0].astype(int)
+    return arrays
+
+
+def _places(path: Path, points: np.ndarray, dimensions: int) -> np.ndarray:
+    form = "[T, C, 3]" if dimensions == 3 else "[N, 3]"
+    if points.ndim != dimensions or points.shape[-1] != 3 or points.dtype.kind not in "fiu":
+        raise InputError(path, f"points: numbers {form} are required", f"{list(points.shape)} {points.dtype}")
+    if len(bad := np.argwhere(~np.isfinite(points))):
+        place = f"{points[tuple(bad[0])]} at index {bad[0].tolist()} ({len(bad)} in all)"
+        raise InputError(path, "points: every coordinate must be finite", place, "With `holds` a hand may be anywhere.")
+    return points.astype(float)
+
+
+def write(folder: Path, hands: Hands | None, nodes: np.ndarray) -> None:
+    """Write controllers.npz and nodes.npz of a capture's folder; nothing of what there is not."""
+    if hands is not None:
+        named = {"holds": hands.holds, "hand": hands.hand}
+        arrays = {"points": hands.points} | {name: value for name, value in named.items() if value.size}
+        write_atomically(folder / CONTROLLERS[0], lambda path: _save(path, arrays))
+    if len(nodes):
+        write_atomically(folder / NODES[0], lambda path: _save(path, {"points": nodes}))
+
+
+def require_first(capture: Capture, first: int) -> None:
+    """Raise InputError where a cut that begins with frame `first` would have nodes of another frame."""
+    if first and (body := given(capture.folder, NODES)) is not None:
+        rule = "the nodes are those of frame 0, with which a cut must begin"
+        raise InputError(body, rule, f"frame {first}", "Write nodes of that frame, or remove the file.")
+
+
+def cut(capture: Capture, kept: range, folder: Path) -> None:
+    """Write hands and nodes of some frames of a capture to another folder."""
+    file, body = (given(capture.folder, names) for names in (CONTROLLERS, NODES))
+    hands = read_hands(file, capture.frame_count) if file else None
+    if hands is not None:
+        hands = replace(hands, points=hands.points[kept], holds=hands.holds[kept] if hands.holds.size else hands.holds)
+    write(folder, hands, read_nodes(body) if body else np.zeros((0, 3)))
+
+
+def _save(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    with path.open("wb") as stream:
+        np.savez(stream, **arrays)  # type: ignore[arg-type]
+
+
+def held(hands: Hands, tracks: np.ndarray, train_end: int) -> np.ndarray:
+    """Controllers [T, C, 3], m. One that first holds later gets in frame 0 the place of the body that it will hold.
+
+    That is its place when it begins to hold, less how far the annotated point nearest to it has moved until then; nothing of the
+    object is read in frames from `train_end` on.
+    """
+    points = hands.points.copy()
+    if not hands.holds.size:
+        return points
+    for number in np.flatnonzero(~hands.holds[0] & hands.holds.any(axis=0)):
+        begin = int(hands.holds[:, number].argmax())
+        points[0, number] = points[begin, number]
+        now = tracks[min(begin, train_end - 1)]
+        if len(known := np.flatnonzero(np.isfinite(now).all(axis=1) & np.isfinite(tracks[0]).all(axis=1))):
+            near = known[np.linalg.norm(now[known] - points[begin, number], axis=1).argmin()]
+            points[0, number] -= now[near] - tracks[0, near]
+    return points
+
+
+def standing(nodes: np.ndarray, up: float) -> np.ndarray:
+    """Nodes [n, 3], m, with those below the table moved up to it; of those that meet there one stays."""
+    lifted = on_table(nodes, up)
+    pairs = cKDTree(lifted).query_pairs(SAME, output_type="ndarray")
+    return np.delete(lifted, np.unique(pairs.max(axis=1)), axis=0) if len(pairs) else lifted
+
+
+def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Observations:
+    """Observations of a capture of points alone, see `neuspring.scenes.sources`.
+
+    Tracked points are the annotated points that are seen in frame 0, and the first nodes; the given nodes follow. The others are
+    for scoring. Points below the table are lifted to it.
+    """
+    capture = Capture.load(path)
+    description, space = capture.description, read(capture)
+    assert space.hands is not None, "read has refused a capture without hands"
+    points, visible = taught_by(space.tracks)
+    nodes = space.nodes
+    if row.ground:
+        points, nodes = on_table(points, description.up_sign), standing(nodes, description.up_sign)
+    nodes = nodes[cKDTree(points[0]).query(nodes)[0] > SAME]
+    return Observations(
+        scenario=scenario_of(row, capture, {}),
+        object_points=points,
+        object_visibility=visible,
+        object_motion_valid=in_both(visible),
+        controller_points=held(space.hands, space.tracks, capture.train_end),
+        controller_valid=space.hands.holds,
+        controller_hand=space.hands.hand,
+        surface_points=nodes,
+        interior_points=np.zeros((0, 3)),
+        tracks=space.tracks,
+    )
+
+
+def scenario_of(row: ScenarioRow, capture: Capture, origin: dict[str, str]) -> Scenario:
+    """The scenario of a capture. Its provenance is the capture's, digests of the files that are there, and `origin`."""
+    described, folder = capture.description, capture.folder
+    files = [name for name in (CAPTURE, *CONTROLLERS, *NODES) if (folder / name).exists()]
+    files += [TRACKS] if described.tracks == "train" else []
+    return Scenario(
+        name=row.scenario,
+        source=row.source,
+        category=row.category,
+        frame_count=capture.frame_count,
+        train_end=capture.train_end,
+        frame_rate=described.frame_rate,
+        up=described.up,
+        self_collision=row.self_collision,
+        ground=row.ground,
+        obstacles=described.obstacles,
+        provenance=described.provenance | {name: f"sha256:{digest_file(folder / name)}" for name in files} | origin,
+    )
+
+
+def taught_by(tracks: np.ndarray, end: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Of annotated tracks [T, K, 3] those that are seen in frame 0: their places, zeros where not seen, and whether they are seen.
+
+    From frame `end` on, if it is given, none is.
+    """
+    seen = np.isfinite(tracks).all(axis=2)
+    visible = seen[:, seen[0]]
+    if end is not None:
+        visible[end:] = False
+    return np.where(visible[..., None], tracks[:, seen[0]], 0.0), visible
+
+
+def in_both(visible: np.ndarray) -> np.ndarray:
+    """[T, n] bool, row t: whether a point is visible [T, n] in t and in t + 1."""
+    both = np.zeros_like(visible)
+    both[:-1] = visible[:-1] & visible[1:]
+    return both

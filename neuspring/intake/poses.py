@@ -1,0 +1,336 @@
+"""Before anything is written: which frames are kept, what cameras saw in a few of them (sizes, kinds, intrinsics, unit of depth),
+and where the cameras are, by given poses, a ChArUco board or the table alone.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise, product
+from pathlib import Path
+
+import numpy as np
+
+from neuspring.checks import examine
+from neuspring.checks.table import CameraAlone, TableSeen
+from neuspring.checks.things import sampled
+from neuspring.core.artifacts import up_sign
+from neuspring.core.errors import InputError
+from neuspring.core.findings import Finding, refuse
+from neuspring.data.camera import Camera, Lens, Plane
+from neuspring.intake.depth import Unit, cloud, common_plane, find_table, find_unit, levelling, planes, pose_on
+from neuspring.intake.feeds import Paired
+from neuspring.intake.formats import CameraFeed, Pair, open_images
+from neuspring.intake.lenses import Board, Straightener, depth_ratio, require_lens, sight
+from neuspring.intake.moments import matched
+
+FEWEST = 5
+"""Frames of a capture."""
+SYNTAX = re.compile(r"(\d+)(?:(-)(\d*))?(?:/(\d+))?")
+
+
+@dataclass(frozen=True)
+class FrameChoice:
+    """The frames of a capture."""
+
+    numbers: list[int]
+    """Of the source, per frame of the capture."""
+    places: dict[str, dict[int, int]]
+    """Camera -> frame of the capture -> place in its view; a frame that the camera lacks is absent."""
+    step: int
+    """Every so many frames of the source are kept; the rate falls by it."""
+    jumps: list[int]
+    """Numbers after which more are left out than elsewhere: there time jumps."""
+    pairing: dict[str, str]
+    """Cameras -> by what their frames belong together."""
+
+    def missing(self, camera: str) -> tuple[int, ...]:
+        """Frames that the camera lacks."""
+        return tuple(frame for frame in range(len(self.numbers)) if frame not in self.places[camera])
+
+    def text(self) -> str:
+        """The kept frames, in one line."""
+        stride = f", one in {self.step}" if self.step > 1 else ""
+        return f"{len(self.numbers)} frames, numbers {self.numbers[0]} to {self.numbers[-1]} of the source{stride}"
+
+
+def chosen(wanted: str, numbers: Sequence[int]) -> list[int]:
+    """The members of ascending `numbers` that `wanted` names: `250-335`, `0-`, `0-300/2`, `1,5,9-20`; both ends count.
+
+    Raises InputError for another syntax, or where nothing is left.
+    """
+    if not wanted:
+        return list(numbers)
+    kept: set[int] = set()
+    for part in wanted.split(","):
+        match = SYNTAX.fullmatch(part.strip())
+        if not match or (match[4] and int(match[4]) < 1) or (match[4] and not match[2]):
+            raise InputError("--frames", "ranges like 250-335, 0-, 0-300/2 or 1,5,9-20 are required", repr(part))
+        first = int(match[1])
+        last = first if not match[2] else int(match[3]) if match[3] else max(numbers, default=first)
+        kept |= {number for number in numbers if first <= number <= last and (number - first) % int(match[4] or 1) == 0}
+    return sorted(kept)
+
+
+def choose(views: Sequence[CameraFeed], wanted: str = "") -> FrameChoice:
+    """The frames of all cameras that are kept, numbered as those of the first.
+
+    See `moments.matched` for which frames of others belong to them. A number that one camera has and another lacks is a missing
+    frame of that one. Raises InputError for too few frames, or where cameras have no moments in common.
+    """
+    first = views[0]
+    where, pairing = {first.name: {number: place for place, number in enumerate(first.series.numbers)}}, dict[str, str]()
+    for view in views[1:]:
+        numbered = isinstance(view, Paired) and view.numbered
+        names = f"camera {first.name}", f"camera {view.name}"
+        where[view.name], pairing[" and ".join(names)] = matched(view.path, names, first.series, view.series, numbered)
+    numbers = sorted({number for of in where.values() for number in of})
+    kept = chosen(wanted, numbers)
+    received = f"{len(kept)} of the numbers {numbers[0]} to {numbers[-1]}" if numbers else "none"
+    if len(kept) < FEWEST:
+        raise InputError("--frames", f"a capture needs at least {FEWEST} frames", received)
+    places = {name: {frame: of[number] for frame, number in enumerate(kept) if number in of} for name, of in where.items()}
+    start = next((number for number in kept if all(number in of for of in where.values())), None)
+    for view in views:
+        if len(places[view.name]) < len(kept) / 2 or 0 not in places[view.name]:
+            rule = f"camera {view.name} must have the first of the chosen frames, number {kept[0]}, and half of the others"
+            remedy = "Name the images of all cameras by the same frame numbers"
+            remedy += "." if start in (None, kept[0]) else f", or begin where all have a frame: --frames {start}-"
+            raise InputError(view.path, rule, f"{len(places[view.name])} of {len(kept)}", remedy)
+    # The rate is that of the files that are there; a number that is not there is a moment that is missing.
+    order = {number: place for place, number in enumerate(numbers)}
+    step = min(order[after] - order[before] for before, after in pairwise(kept))
+    gaps = [after - before for before, after in pairwise(kept)]
+    jumps = [number for number, gap in zip(kept, gaps, strict=False) if gap != min(gaps)]
+    return FrameChoice(kept, places, step, jumps, pairing)
+
+
+@dataclass(frozen=True, eq=False)
+class SampledCamera:
+    """A few frames of a camera."""
+
+    path: Path
+    size: tuple[int, int]
+    """(width, height)."""
+    lens: Lens
+    colors: list[np.ndarray]
+    """[H, W, 3] uint8 RGB, without distortion."""
+    depths: list[np.ndarray]
+    """[H, W], m, without distortion; none with color alone."""
+    unit: float | None
+    """m per count of its images; None where they are floating point, or there are none."""
+
+
+def look(
+    views: Sequence[CameraFeed], choice: FrameChoice, listed: Mapping[str, Lens], file: Path | None, given_unit: float | None
+) -> tuple[dict[str, SampledCamera], Unit | None]:
+    """A few of the chosen frames of every camera, with intrinsics, and the unit of depth, which is one for all; None without any.
+
+    `listed` are the intrinsics of `file`; those of the source count where there are none. Raises InputError.
+    """
+    samples: dict[str, list[Pair]] = {}
+    lenses: dict[str, Lens] = {}
+    for view in views:
+        frames = sorted(choice.places[view.name])
+        picked = [choice.places[view.name][frames[k]] for k in sorted(sampled(len(frames)))]
+        samples[view.name] = list(view.read(picked))
+        lens = listed.get(view.name) or view.lens
+        if lens is None:
+            remedy = "Give a JSON file with fx, fy, cx, cy."
+            raise InputError("--intrinsics", f"intrinsics of camera {view.name} are required", "none", remedy)
+        lenses[view.name] = lens
+        color, depth = samples[view.name][0]
+        require_aligned(view.path, view.name, color, depth)
+        require_lens(file or view.path, view.name, lens, (color.shape[1], color.shape[0]))
+    depths = [depth for pairs in samples.values() for _, depth in pairs if depth is not None]
+    if len({stored_as(depth) for depth in depths}) > 1:
+        raise InputError("--depth", "all depth images must be of one kind, 16-bit integers or another", "both")
+    known = {view.unit for view in views}
+    if len(known) > 1 and given_unit is None:
+        raise InputError("--depth-unit", "all cameras must have one unit of depth", " and ".join(sorted(map(str, known))))
+    unit = find_unit(views[0].path, depths, given_unit, known.pop() if len(known) == 1 else None) if depths else None
+    return {view.name: straightened(view, samples[view.name], lenses[view.name], unit) for view in views}, unit
+
+
+def straightened(view: CameraFeed, pairs: Sequence[Pair], lens: Lens, unit: Unit | None) -> SampledCamera:
+    """Pairs of one camera, without distortion and in meters; `unit` is None with color alone. Raises InputError where their sizes
+    differ."""
+    size = (pairs[0][0].shape[1], pairs[0][0].shape[0])
+    for color, depth in pairs:
+        require_aligned(view.path, view.name, color, depth, size)
+    straight = Straightener(lens, size)
+    colors = [straight.color(color) for color, _ in pairs]
+    if unit is None:
+        return SampledCamera(view.path, size, lens, colors, [], None)
+    depths = [depth for _, depth in pairs if depth is not None]
+    meters = [meters_of(straight.depth(plain(depth)), unit) for depth in depths]
+    return SampledCamera(view.path, size, lens, colors, meters, unit.meters if stored_as(depths[0]) == "png" else None)
+
+
+def require_aligned(
+    where: Path, name: str, color: np.ndarray, depth: np.ndarray | None, size: tuple[int, int] | None = None
+) -> None:
+    """Raise InputError unless depth, where there is any, has the size of color, which is `size`."""
+    if depth is not None and color.shape[:2] != depth.shape:
+        received = f"{depth.shape[1]} x {depth.shape[0]} for {color.shape[1]} x {color.shape[0]}"
+        remedy = "Let the camera's software align depth to color (RealSense: rs.align; ROS: aligned_depth_to_color)."
+        raise InputError(where, f"camera {name}: depth must be aligned to color, pixel by pixel", received, remedy)
+    if size is not None and color.shape[1::-1] != size:
+        raise InputError(where, f"camera {name}: all images must be {size[0]} x {size[1]}", f"{color.shape[1]} x {color.shape[0]}")
+
+
+def stored_as(depth: np.ndarray) -> str:
+    """The form in which the capture stores it: 16-bit counts as png, anything else as npy in meters."""
+    return "png" if depth.dtype == np.uint16 else "npy"
+
+
+def plain(depth: np.ndarray) -> np.ndarray:
+    """Counts, or floating point without what is no depth."""
+    return depth if depth.dtype == np.uint16 else np.nan_to_num(depth.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0).clip(0)
+
+
+def meters_of(depth: np.ndarray, unit: Unit) -> np.ndarray:
+    """Depth in meters, of counts."""
+    return (depth * unit.meters).astype(np.float32)
+
+
+RATIO = 0.04
+"""Depth may differ by this part from the distance of the board by its printed size."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Placed:
+    """Poses of the cameras."""
+
+    poses: dict[str, np.ndarray]
+    """Camera to world [4, 4], m."""
+    up: str = "+z"
+    motion: np.ndarray = field(default_factory=lambda: np.eye(4))
+    """[4, 4]: from the world of the given poses to this one."""
+    table: str = "not found"
+    """How well its plane fits."""
+    lines: tuple[str, ...] = ()
+    """Of the report."""
+
+
+def by_table(name: str, seen: SampledCamera, *, top_down: bool, at: tuple[float, float] | None) -> Placed:
+    """The pose of the only camera: the table is z = 0. Raises InputError where it is not found; see `depth.find_table`."""
+    points = cloud(seen.depths, seen.lens.matrix)
+    table, remarks = find_table(seen.path, points, top_down=top_down, at=None if at is None else _point(seen, at))
+    lines = (f"table: {table.text()}", *(f"warning: {remark}" for remark in remarks))
+    return Placed(poses={name: pose_on(table, points, seen.size, seen.lens.matrix)}, table=table.text(), lines=lines)
+
+
+def by_board(board: Board, seen: Mapping[str, SampledCamera], images: Sequence[Path]) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Poses by a board that lies still: in `images`, an image or a folder of them per camera, else in the frames themselves.
+
+    Returns them with lines of the report. Raises InputError where the board is not seen, or depth contradicts its size.
+    """
+    if images and len(images) != len(seen):
+        raise InputError("--board-images", f"one image or folder per camera is required: {len(seen)}", len(images))
+    poses, lines = {}, []
+    for index, (name, view) in enumerate(seen.items()):
+        path = images[index] if images else view.path
+        pictures = _pictures(path, view) if images else view.colors
+        sighting = sight(path, board, pictures, view.lens.matrix)
+        poses[name] = sighting.camera_to_world
+        line = f"board, camera {name}: {sighting.corners} corners, {sighting.error:.2f} pixels rms"
+        if view.depths and not images:
+            ratios = [ratio for depth in view.depths if (ratio := depth_ratio(sighting, depth))]
+            ratio = float(np.median(ratios)) if ratios else 1.0
+            if abs(ratio - 1) > RATIO:
+                wrong = f"the square is {ratio:.3g} times as long as --board says, or --depth-unit is off by {1 / ratio:.3g}"
+                rule = f"depth must place the board where its size does, within {RATIO:.0%}"
+                raise InputError(path, rule, f"{ratio:.3f} times as far", f"Either {wrong}.")
+            line += f", depth {ratio:.3f} of its distance" if ratios else "; too little depth on it to check its size"
+        lines.append(line)
+    return poses, lines
+
+
+def stand(
+    poses: Mapping[str, np.ndarray],
+    seen: Mapping[str, SampledCamera],
+    *,
+    level: bool,
+    top_down: bool = False,
+    up: str | None = None,
+    file: Path | None = None,
+) -> Placed:
+    """Given poses, of `file`, against the table that the cameras see; with `level` the world is moved so that it is z = 0.
+
+    `up` is that of the source; None: +z where the world is moved, else the side on which the cameras are. Raises InputError where
+    the table is elsewhere, with what explains it; see `plausible`.
+    """
+    clouds = {name: cloud(view.depths, view.lens.matrix) for name, view in seen.items()}
+    moved, motion, lines, tables = dict(poses), np.eye(4), list[str](), dict[str, Plane]()
+    for name, view in seen.items():
+        try:
+            # A world that is to be moved may have any axes: up is then that of the image.
+            upright = None if level else poses[name]
+            tables[name] = find_table(view.path, clouds[name], pose=upright, top_down=top_down)[0]
+            lines.append(f"table, camera {name}: {tables[name].text()}")
+        except InputError as error:
+            if level:
+                raise
+            lines.append(f"warning: {error}")
+    if level:
+        normal, point, rms = common_plane(tables, poses)
+        up = up or "+z"
+        motion = levelling(normal, point, up_sign(up))
+        moved = {name: motion @ pose for name, pose in poses.items()}
+        turn = float(np.degrees(np.arccos(np.clip((np.trace(motion[:3, :3]) - 1) / 2, -1, 1))))
+        rise = f"its plane was {100 * abs(point[2]):.1f} cm from z = 0 there, {1e3 * rms:.1f} mm rms over all cameras"
+        lines.append(f"leveled: the world was turned by {turn:.1f} degrees; {rise}")
+    found = {name: planes(points) for name, points in clouds.items()}
+    judged: dict[str, list[Finding]] = {side: [] for side in ([up] if up else ["+z", "-z"])}
+    for (side, listed), (name, view) in product(judged.items(), seen.items()):
+        listed += examine(TableSeen(file or view.path, name, found[name], moved[name], side, view.unit))
+    side = min(judged, key=lambda key: sum(d.level == "error" for d in judged[key]))
+    refuse(one for one in judged[side] if one.level == "error")
+    lines += [in_report(one) for one in judged[side]]
+    text = "; ".join(f"camera {name}: {plane.text()}" for name, plane in tables.items())
+    return Placed(poses=moved, up=side, motion=motion, table=text or "not found", lines=tuple(lines))
+
+
+def given_alone(poses: Mapping[str, np.ndarray], seen: Mapping[str, SampledCamera], where: Path) -> Placed:
+    """A given pose without depth: the table is z = 0 as it says, and up the side of it on which the camera is.
+
+    Raises InputError naming `where` the pose comes from, where the camera does not look at such a table; see `plausible`.
+    """
+    (name, view), pose = next(iter(seen.items())), next(iter(poses.values()))
+    up = "+z" if pose[2, 3] > 0 else "-z"
+    judged = examine(CameraAlone(where, Camera(name, *view.size, view.lens.matrix, pose), up))
+    refuse(one for one in judged if one.level == "error")
+    return Placed(poses=dict(poses), up=up, table="z = 0 as given", lines=tuple(map(in_report, judged)))
+
+
+def in_report(one: Finding) -> str:
+    """A finding as a line of the report."""
+    return f"warning: {one.message}" if one.level == "warning" else one.message
+
+
+def _point(seen: SampledCamera, at: tuple[float, float]) -> np.ndarray:
+    """The point [3], m, in the camera's coordinates, at pixel (x, y): the median around it. Raises InputError without depth."""
+    x, y = round(at[0]), round(at[1])
+    if not (0 <= x < seen.size[0] and 0 <= y < seen.size[1]):
+        raise InputError("--table-at", f"a pixel of the {seen.size[0]} x {seen.size[1]} image is required", f"{at[0]:g} {at[1]:g}")
+    around = np.stack(seen.depths)[:, max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3]
+    if not (around > 0).any():
+        raise InputError("--table-at", "a pixel with depth is required", f"none at {x} {y}", "Name another pixel of the table.")
+    return np.asarray(np.median(around[around > 0]) * (np.linalg.inv(seen.lens.matrix) @ [x, y, 1.0]))
+
+
+def _pictures(path: Path, view: SampledCamera) -> list[np.ndarray]:
+    """Images of a board, without distortion."""
+    source = open_images(path if path.is_dir() else path.parent, "color")
+    places = [k for k, file in enumerate(source.files(range(len(source.series.numbers)))) if path.is_dir() or file == path]
+    if not places:
+        raise InputError(path, "an image of the board, or a folder of them, is required", "nothing there")
+    straight, pictures = Straightener(view.lens, view.size), []
+    for picture in source.read(places):
+        if picture.shape[1::-1] != view.size:
+            rule = f"images of the board must have the size of the camera's images, {view.size[0]} x {view.size[1]}"
+            raise InputError(path, rule, f"{picture.shape[1]} x {picture.shape[0]}")
+        pictures.append(straight.color(picture))
+    return pictures

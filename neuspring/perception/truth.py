@@ -1,0 +1,60 @@
+"""Perfect tracks and the true surface of a synthetic capture: they measure what perception costs, and are no method's input."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from neuspring.config.perception import OpenCvTracking
+from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.data.results import ShapePrior
+from neuspring.perception.track_opencv import Followed, choose
+from neuspring.scenes.synthetic.truth import truth_of, under_pixels
+
+DEPTH_TOLERANCE = 0.01
+"""m by which the depth image may differ from a point's depth for the point to count as seen."""
+
+
+def track(capture: Capture, camera: str, labels: np.ndarray, settings: OpenCvTracking, seed: int) -> Followed:
+    """Exact places [T, Q, 2] of up to `settings.points` pixels of the masks, and whether depth and mask show them there."""
+    truth, view = truth_of(capture), capture.cameras[camera]
+    start = choose(labels[0], settings.points, seed)
+    x, y = start.astype(int).T
+    material = under_pixels(truth, view, start)
+    traceable = (labels[0, y, x] == HANDS) | (material.face >= 0)
+    start, x, y = start[traceable], x[traceable], y[traceable]
+    own = labels[0, y, x]
+    in_hands = _with_nearest_hand(truth.hand_poses.astype(float), view.lift(start.astype(float), capture.depth(camera, 0)[y, x]))
+    pixels, distance = view.project(np.where((own == OBJECT)[:, None], material.places[:, traceable], in_hands))
+    visible = view.sees(pixels) & (distance > 0)
+    for frame, seen in enumerate(visible):
+        if capture.has(camera, frame):
+            x, y = np.round(pixels[frame, seen]).astype(int).T
+            near = np.abs(capture.depth(camera, frame)[y, x] - distance[frame, seen]) < DEPTH_TOLERANCE
+            seen[seen] = near & (labels[frame, y, x] == own[seen])
+        else:
+            seen[:] = False
+    pixels[0], visible[0] = start, True
+    return Followed(pixels.astype(np.float32), visible)
+
+
+def surface(capture: Capture) -> ShapePrior:
+    """The visible surface of frame 0."""
+    truth = truth_of(capture)
+    return ShapePrior(vertices=truth.surface(0), faces=truth.surface_faces, backend="truth")
+
+
+def carried(points: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """[T, n, 3], m: where points [n, 3] of frame 0 go with a rigid body of poses [T, 7] (position, quaternion x y z w)."""
+    local = Rotation.from_quat(poses[0, 3:]).inv().apply(points - poses[0, :3])
+    return np.stack([Rotation.from_quat(pose[3:]).apply(local) + pose[:3] for pose in poses])
+
+
+def _with_nearest_hand(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """[T, Q, 3], m: where points [Q, 3] of frame 0 go with the nearest of the hands, whose poses are [T, H, 7]."""
+    nearest = cKDTree(poses[0, :, :3]).query(points)[1]
+    places = np.zeros((len(poses), *points.shape))
+    for hand in range(poses.shape[1]):
+        places[:, nearest == hand] = carried(points[nearest == hand], poses[:, hand])
+    return places

@@ -1,0 +1,263 @@
+"""Where scenarios come from: `SOURCES` declares every kind of data, and everybody asks it.
+
+To add a source: a module that reads it, its line here, and rows of the scenario table; if it has settings, a section of
+`neuspring.config.data`. A package adds one, a `Source`, by an entry point of the group `neuspring.sources`. Its module has
+
+    observe(row, path, config, output) -> Observations     where it is not filmed; truth may be written beside `output`
+    write_capture(row, path, config, folder)                where it is filmed, or has images beside processed data
+
+with `path` where its data lie.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neuspring.config import Config, ScenarioRow, parse, read_text
+from neuspring.core.errors import InputError
+from neuspring.core.text import listed
+from neuspring.data import capture
+from neuspring.intake import phystwin
+from neuspring.registry import Registry
+
+if TYPE_CHECKING:
+    from neuspring.core.artifacts import Observations
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """A kind of data. Its module is named, and imported when it is used."""
+
+    module: str
+    """Reads its data; rules carry the digest of this module's code."""
+    reads: tuple[str, ...]
+    """Keys of the configuration that reading depends on."""
+    films: bool = False
+    """Raw video: perception makes observations of its capture."""
+    write_capture: str = ""
+    """The module that writes its captures. None: the user supplies the capture, or there are no images."""
+    needs_data: bool = True
+    """True where it lies under data_root."""
+    has_truth: bool = False
+    """Its captures have the truth beside them."""
+    own: bool = False
+    """What users film: methods that learn nothing always stand beside the others, and tables say what to be careful with."""
+    files: tuple[str, ...] = ()
+    """Files of its folder that observations are read from; none: the path itself."""
+    capture_files: tuple[str, ...] = ()
+    """Files of its folder that a capture is made from, beside images."""
+    images_beside: Callable[[Path], bool] = lambda folder: False
+    """True where images lie beside processed data, so that a capture can be made of them for pictures."""
+    required: Callable[[Path], None] = lambda folder: None
+    """Raises InputError where its folder lacks what no run can do without."""
+    require_alike: Callable[[Config], None] = lambda config: None
+    """Raises InputError where settings do not promise that recordings of one object have as many nodes, as transfers need."""
+    cameras: Callable[[Path, Config], tuple[str, ...]] = lambda folder, config: ()
+    """Names of the cameras before the capture is made. Raises InputError."""
+
+
+def read_observations(row: ScenarioRow, settings: Config, output: Path) -> Observations:
+    """The observations of a scenario that is not filmed; the truth of a toy scene is written beside `output`."""
+    source = SOURCES[row.source]
+    assert not source.films, f"{row.source} scenarios are filmed"
+    observations: Observations = import_module(source.module).observe(row, location(row, settings), settings, output)
+    return observations
+
+
+def write_capture(row: ScenarioRow, settings: Config, folder: Path) -> None:
+    """A capture folder of a synthetic scene, or of PhysTwin's raw layout. Raises InputError for other sources."""
+    source = SOURCES[row.source]
+    if not source.write_capture:
+        makers = ", ".join(name for name, other in SOURCES.items() if other.write_capture)
+        raise InputError(f"scenario {row.scenario}, source", f"captures are made of {makers} scenarios", row.source)
+    import_module(source.write_capture).write_capture(row, location(row, settings), settings, folder)
+
+
+def location(row: ScenarioRow, settings: Config) -> Path:
+    """The place where the data of a scenario lie."""
+    return Path(settings.data_root or ".") / row.path
+
+
+RECORDING = re.compile(r"(?P<cable>[A-Za-z0-9][\w.-]*)_(?P<part>train|eval)_(?P<number>\d+)")
+"""Name of a recording of DEFORM's data set, which lies in CABLE/PART/NUMBER.pkl."""
+
+
+def with_deform(settings: Config) -> Config:
+    """The configuration with the scenarios, pools and transfers of its section `deform`. Raises InputError where files lack."""
+    chosen = settings.deform
+    if chosen.cables and settings.data_root is None:
+        raise InputError(
+            "configuration, deform", "DEFORM's data need data_root", "null", "Give it: --config data_root=/path/to/data."
+        )
+    pools, transfers = dict(settings.pools or {}), dict(settings.transfers or {})
+    for cable in chosen.cables:
+        folder = Path(settings.data_root or ".") / cable
+        found = {
+            part: sorted(int(file.stem) for file in folder.glob(f"{part}/*.pkl") if file.stem.isdecimal())
+            for part in ("train", "eval")
+        }
+        if len(found["train"]) < chosen.clips or not found["eval"]:
+            rule = f"at least {chosen.clips} recordings train/NUMBER.pkl (deform.clips) and one eval/NUMBER.pkl are required"
+            there = listed(sorted({path.parent.parent.name for path in folder.parent.glob("*/eval/*.pkl")})) or "none"
+            received = f"{len(found['train'])} and {len(found['eval'])}"
+            raise InputError(folder, rule, received, f"Correct data_root, deform.cables (there: {there}) or deform.clips.")
+        last = len(found["train"]) - 1
+        picked = [found["train"][i * last // (chosen.clips - 1)] for i in range(chosen.clips)]
+        pools[cable] = tuple(f"{cable}_train_{number}" for number in picked)
+        transfers[pools[cable][0]] = tuple(f"{cable}_eval_{number}" for number in found["eval"])
+    scenarios = tuple(dict.fromkeys([*settings.scenarios, *(pools[cable][0] for cable in chosen.cables)]))
+    return dataclasses.replace(settings, scenarios=scenarios, pools=pools or None, transfers=transfers or None)
+
+
+def scenario_rows(settings: Config, root: Path = Path(), also: Iterable[str] = ()) -> dict[str, ScenarioRow]:
+    """All scenarios, name -> row: those of the table, which lies below `root`, and each capture in `data_root` that no row names.
+
+    Such a capture needs no row: its folder is the scenario's name, and capture.json says the rest. A recording of a cable that the
+    configuration or `also` names needs none either: its name says where it lies. Raises InputError.
+    """
+    rows = read_scenarios(root / settings.scenario_table)
+    groups = [*(settings.pools or {}).items(), *(settings.transfers or {}).items()]
+    for name in dict.fromkeys([*settings.scenarios, *also, *(name for first, others in groups for name in (first, *others))]):
+        if name not in rows and (found := RECORDING.fullmatch(name)):
+            file = f"{found['cable']}/{found['part']}/{found['number']}.pkl"
+            values = {"scenario": name, "source": "mocap", "category": found["cable"], "path": file}
+            rows[name] = parse(ScenarioRow, values | {"self_collision": False, "ground": False}, f"scenario {name}")
+    for path in sorted(Path(settings.data_root).glob(f"*/{capture.CAPTURE}")) if settings.data_root else ():
+        name = path.parent.name
+        try:
+            if name not in rows:
+                own = capture.read_description(path)
+                touches = own.category == "cloth" if own.self_collision is None else own.self_collision
+                source = "capture" if own.cameras else "points"
+                values = {"scenario": name, "source": source, "category": own.category, "path": name}
+                rows[name] = parse(ScenarioRow, values | {"self_collision": touches, "ground": own.ground}, str(path))
+        except InputError:
+            # Another capture that is damaged is no reason to stop.
+            if name in settings.scenarios:
+                raise
+    return rows
+
+
+def read_scenarios(path: Path) -> dict[str, ScenarioRow]:
+    """The scenario table (tab-separated, one header line, `#` comments): name -> row. Raises InputError."""
+    lines = [line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
+    columns = [f.name for f in dataclasses.fields(ScenarioRow)]
+    if not lines or lines[0].split("\t") != columns:
+        raise InputError(path, f"the header must be the tab-separated columns {columns}", lines[:1])
+    rows: dict[str, ScenarioRow] = {}
+    for line in lines[1:]:
+        cells = line.split("\t")
+        where = f"{path}, row {cells[0]!r}"
+        if len(cells) != len(columns):
+            raise InputError(where, f"{len(columns)} tab-separated cells are required", len(cells))
+        values: dict[str, Any] = dict(zip(columns, cells, strict=True))
+        for flag in ("self_collision", "ground"):
+            if values[flag] not in ("true", "false"):
+                raise InputError(f"{where}, {flag}", "must be true or false", values[flag])
+            values[flag] = values[flag] == "true"
+        if cells[0] in rows:
+            raise InputError(where, "scenario names must differ")
+        row = parse(ScenarioRow, values, where)
+        if row.source not in SOURCES:
+            raise InputError(f"{where}, source", f"must be one of {', '.join(SOURCES)}", repr(row.source))
+        rows[cells[0]] = row
+    return rows
+
+
+def _required_capture(folder: Path) -> None:
+    capture.require_finished(folder)
+    if not (folder / capture.CAPTURE).exists():
+        remedy = "Correct the path in the scenario table, or data_root, or make a capture: `neuspring make-capture --help`."
+        raise InputError(folder, "a capture is a folder with capture.json", "a folder without", remedy)
+    if _filmed(folder) is False:
+        raise InputError(folder, "the source capture is for film", "a capture without cameras", "Write points as its source.")
+    if any((folder / name).exists() for name in IN_SPACE):
+        _required_in_space(folder)
+
+
+def _filmed(folder: Path) -> bool | None:
+    """True where a capture has cameras; None where its description cannot be read, which the jobs of its scenario say."""
+    try:
+        return bool(capture.read_description(folder / capture.CAPTURE).cameras)
+    except InputError:
+        return None
+
+
+def _required_points(folder: Path) -> None:
+    if _filmed(folder):
+        raise InputError(folder, "the source points is for captures without cameras", "a film", "Write capture as its source.")
+    _required_in_space(folder)
+
+
+def _required_in_space(folder: Path) -> None:
+    from neuspring.intake.points import read
+
+    read(capture.Capture.load(folder))
+
+
+def _require_rings(config: Config) -> None:
+    if config.mocap.rings is None:
+        rule = "must be set where twins are transferred, so that all recordings have as many nodes"
+        raise InputError("configuration, mocap.rings", rule, None)
+
+
+def _counted(folder: Path, config: Config) -> tuple[str, ...]:
+    return tuple(map(str, range(phystwin.camera_count(folder))))
+
+
+IN_SPACE = (*capture.CONTROLLERS, *capture.NODES)
+SOURCES = Registry(
+    "sources",
+    {
+        "toy": Source(module="neuspring.scenes.synthetic.toy", reads=("toy",), needs_data=False),
+        "mocap": Source(module="neuspring.scenes.mocap", reads=("data_root", "mocap"), require_alike=_require_rings),
+        "synthetic": Source(
+            module="neuspring.scenes.synthetic.make",
+            reads=("synthetic",),
+            films=True,
+            write_capture="neuspring.scenes.synthetic.make",
+            needs_data=False,
+            has_truth=True,
+            cameras=lambda folder, config: tuple(map(str, range(config.synthetic.cameras))),
+        ),
+        "capture": Source(
+            module="neuspring.data.capture",
+            reads=("data_root",),
+            films=True,
+            own=True,
+            required=_required_capture,
+            cameras=lambda folder, config: tuple(c.name for c in capture.read_description(folder / capture.CAPTURE).cameras),
+        ),
+        "points": Source(
+            module="neuspring.intake.points",
+            reads=("data_root",),
+            own=True,
+            required=_required_points,
+            files=(capture.CAPTURE, capture.TRACKS, *IN_SPACE),
+        ),
+        "phystwin_raw": Source(
+            module="neuspring.intake.formats.phystwin_raw",
+            reads=("data_root",),
+            films=True,
+            write_capture="neuspring.intake.formats.phystwin_raw",
+            capture_files=phystwin.RAW_FILES,
+            cameras=_counted,
+        ),
+        "phystwin": Source(
+            module="neuspring.intake.phystwin",
+            reads=("data_root",),
+            write_capture="neuspring.intake.formats.phystwin_raw",
+            files=phystwin.FILES,
+            capture_files=phystwin.RAW_FILES,
+            images_beside=phystwin.has_images,
+            cameras=_counted,
+        ),
+    },
+    Source,
+)

@@ -1,0 +1,214 @@
+"""The 22 scenes: which body, how many frames, and what the hands do.
+
+Names, categories and frame counts are those of the PhysTwin data; bodies, materials and motions are ours. Hands are rigid meshes
+that follow key frames, hold what they grasp, or push. A hand's origin is where its fingers meet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from neuspring.scenes.synthetic import bodies
+from neuspring.scenes.synthetic.bodies import SoftBody
+from neuspring.scenes.synthetic.meshes import Sdf, capsule, ellipsoid, smooth_union, sphere, surface
+
+SKIN = (0.75, 0.5, 0.4)
+"""Linear RGB."""
+FIST_RADIUS = 0.032
+KeyFrame = tuple[float, Sequence[float], Sequence[float]]
+"""Time, s; position, m; rotation vector, rad."""
+
+
+@dataclass(frozen=True)
+class Hand:
+    """A hand's motion and what it does. `grip` holds nodes within `reach` of its origin from frame 0 on; `fist` pushes."""
+
+    keys: tuple[KeyFrame, ...]
+    kind: Literal["grip", "fist"] = "grip"
+    reach: float = 0.02
+    """m."""
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """How the mesh stands in the hand's frame: rotation vector, rad. Physics does not see it."""
+
+    def poses(self, times: np.ndarray) -> np.ndarray:
+        """Position and quaternion (x, y, z, w) [n, 7] at `times`, s: minimum jerk from key to key."""
+        at = np.array([key[0] for key in self.keys])
+        positions = np.array([key[1] for key in self.keys], dtype=float)
+        rotations = Rotation.from_rotvec([key[2] for key in self.keys])
+        if len(at) == 1:
+            return np.tile(np.concatenate([positions[0], rotations[0].as_quat()]), (len(times), 1))
+        piece = np.clip(np.searchsorted(at, times, side="right") - 1, 0, len(at) - 2)
+        fraction = minimum_jerk((times - at[piece]) / (at[piece + 1] - at[piece]))
+        place = positions[piece] + (positions[piece + 1] - positions[piece]) * fraction[:, None]
+        turned = Slerp(at, rotations)(np.clip(at[piece] + (at[piece + 1] - at[piece]) * fraction, at[0], at[-1]))
+        return np.concatenate([place, turned.as_quat()], axis=1)
+
+    def mesh(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices in the hand's frame [V, 3], m, and faces [F, 3]."""
+        if self.kind == "fist":
+            reach = 1.2 * FIST_RADIUS
+            return surface(sphere((0, 0, 0), FIST_RADIUS), (-reach,) * 3, (reach,) * 3, spacing)
+        vertices, faces = surface(_grip(), (-0.12, -0.07, -0.02), (0.07, 0.07, 0.25), spacing)
+        return Rotation.from_rotvec(self.turn).apply(vertices), faces
+
+
+def minimum_jerk(fraction: np.ndarray) -> np.ndarray:
+    """u^3 (10 - 15 u + 6 u^2), clipped to [0, 1]: starts and ends without velocity and acceleration."""
+    u = np.clip(fraction, 0.0, 1.0)
+    return np.asarray(u**3 * (10.0 - 15.0 * u + 6.0 * u * u))
+
+
+def place(vertices: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Vertices [n, V, 3] of a mesh [V, 3] at poses [n, 7]."""
+    turned = np.stack([Rotation.from_quat(pose[3:]).apply(vertices) for pose in poses])
+    return np.asarray(turned + poses[:, None, :3])
+
+
+def _grip() -> Sdf:
+    """Palm, wrist, four fingers and a thumb that close at the origin, coming from above."""
+    parts = [ellipsoid((-0.01, 0, 0.075), (0.03, 0.042, 0.03)), capsule((-0.02, 0, 0.1), (-0.07, 0, 0.2), 0.027)]
+    for y in (-0.03, -0.01, 0.01, 0.03):
+        parts.append(capsule((0.012, y, 0.08), (0.035, 0.8 * y, 0.045), 0.0095))
+        parts.append(capsule((0.035, 0.8 * y, 0.045), (0.02, 0.6 * y, 0.006), 0.0085))
+    parts.append(capsule((-0.03, 0, 0.07), (-0.035, 0, 0.04), 0.011))
+    parts.append(capsule((-0.035, 0, 0.04), (-0.018, 0, 0.006), 0.0095))
+    return smooth_union(parts, 0.004)
+
+
+MEAN_SPEED = 0.2
+"""m/s of a hand on its way; the peak of minimum-jerk motion is 1.875 times as fast."""
+Offsets = Sequence[Sequence[float] | np.ndarray]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SyntheticScene:
+    """A body, how long it is filmed, and its hands for a settled shape."""
+
+    body: Callable[[float, float], SoftBody]
+    """Mesh spacing and skin spacing, m, in parts of the size's own (see `CaptureSize`)."""
+    frames: int
+    hands: Callable[[np.ndarray, float], tuple[Hand, ...]]
+    """Settled nodes [N, 3], m, and duration, s -> hands."""
+    marked: bool = False
+    """True where its capture has marks of frame 0, as a careful user draws them: its colors are the table's."""
+
+
+def wander(start: np.ndarray, offsets: Offsets, duration: float) -> tuple[KeyFrame, ...]:
+    """Key frames that visit start + offset in turn, again and again, at MEAN_SPEED, until `duration` is over."""
+    keys: list[KeyFrame] = [(0.0, tuple(start), (0.0, 0.0, 0.0))]
+    now, here, k = 0.0, np.asarray(start, float), 0
+    while now < duration:
+        there = start + np.asarray(offsets[k % len(offsets)])
+        now += max(float(np.linalg.norm(there - here)) / MEAN_SPEED, 0.2)
+        keys.append((now, tuple(there), (0.0, 0.0, 0.0)))
+        here, k = there, k + 1
+    return tuple(keys)
+
+
+def nearest(nodes: np.ndarray, wanted: Sequence[float]) -> np.ndarray:
+    """The node nearest to `wanted`, in fractions of the bounding box (0 to 1 along x, y, z)."""
+    low, high = nodes.min(axis=0), nodes.max(axis=0)
+    return np.asarray(nodes[np.argmin((((nodes - low) / np.maximum(high - low, 1e-9) - np.asarray(wanted)) ** 2).sum(axis=1))])
+
+
+LIFT: Offsets = ((0, 0, 0.16), (-0.05, 0.06, 0.18), (0.04, -0.06, 0.14), (0, 0.03, 0.2), (0.03, 0.02, 0.09), (0, 0, 0.03))
+TOGETHER: Offsets = ((0, 0, 0.14), (-0.015, 0.06, 0.17), (0.015, -0.06, 0.13), (0, 0.03, 0.18), (0.01, 0.02, 0.08), (0, 0, 0.03))
+"""Two hands at the ends of one animal must not crush it."""
+LOW_LIFT: Offsets = ((0, 0, 0.1), (-0.03, 0.05, 0.11), (0.03, -0.04, 0.06), (0, 0, 0.12))
+
+
+def lift(*places: Sequence[float], reach: float = 0.02, offsets: Offsets = LIFT, turn: Sequence[float] = (0, 0, 0)) -> Callable:
+    """A grip at each place (parts of the bounding box); several move together, out of step by one offset."""
+
+    def hands(nodes: np.ndarray, duration: float) -> tuple[Hand, ...]:
+        grips = []
+        for k, wanted in enumerate(places):
+            point = nearest(nodes, wanted)
+            # The hands of one object take the same heights, not the same detours.
+            own = [(x * (1 - 2 * (k % 2)), y, z) for x, y, z in offsets]
+            grips.append(Hand(wander(point, own, duration), reach=reach, turn=tuple(turn)))  # type: ignore[arg-type]
+        return tuple(grips)
+
+    return hands
+
+
+def stretch(first: Sequence[float], second: Sequence[float], pull: float, reach: float = 0.022) -> Callable:
+    """Two grips that lift the object and pull it apart along the line between them, again and again."""
+
+    def hands(nodes: np.ndarray, duration: float) -> tuple[Hand, ...]:
+        points = [nearest(nodes, wanted) for wanted in (first, second)]
+        apart = (points[0] - points[1]) * [1, 1, 0]
+        apart /= np.linalg.norm(apart)
+        grips = []
+        for point, side in zip(points, (1.0, -1.0), strict=True):
+            far, up = side * pull * apart, np.array([0.0, 0.0, 0.1])
+            offsets = [up, up + far, up * 1.3 + 0.2 * far, up + far * 0.8, up * 0.5]
+            grips.append(Hand(wander(point, offsets, duration), reach=reach))
+        return tuple(grips)
+
+    return hands
+
+
+def push(place: Sequence[float], direction: Sequence[float], distance: float) -> Callable:
+    """A fist beside the object that pushes it along the table, there, half back, and on."""
+
+    def hands(nodes: np.ndarray, duration: float) -> tuple[Hand, ...]:
+        point, along = nearest(nodes, place), np.asarray(direction, float)
+        along /= np.linalg.norm(along)
+        start = point - (FIST_RADIUS + 0.006) * along
+        start[2] = max(start[2], FIST_RADIUS + 0.003)
+        across = np.array([-along[1], along[0], 0.0])
+        offsets = [along * distance, along * distance * 0.4, along * distance * 1.3 + across * 0.05, along * distance]
+        return (Hand(wander(start, offsets, duration), kind="fist"),)
+
+    return hands
+
+
+def _cloth(name: str) -> Callable[[float, float], SoftBody]:
+    return lambda spacing, skin: bodies.cloth(name, 0.72 * spacing, 0.75 * skin)
+
+
+def _rope(name: str) -> Callable[[float, float], SoftBody]:
+    return lambda spacing, skin: bodies.rope(name, 0.57 * spacing, 0.5 * skin)
+
+
+def _package(spacing: float, skin: float) -> SoftBody:
+    return bodies.package(0.86 * spacing, skin)
+
+
+CORNER, OTHER_CORNER, MIDDLE = (1.0, 0.0, 0.5), (1.0, 1.0, 0.5), (0.5, 0.5, 0.5)
+SCENES: dict[str, SyntheticScene] = {
+    "double_lift_cloth_1": SyntheticScene(body=_cloth("napkin"), frames=116, hands=lift(CORNER, OTHER_CORNER)),
+    "double_lift_cloth_3": SyntheticScene(body=_cloth("scarf"), frames=118, hands=lift(CORNER, OTHER_CORNER)),
+    "single_clift_cloth_1": SyntheticScene(body=_cloth("napkin"), frames=80, hands=lift(MIDDLE)),
+    "single_clift_cloth_3": SyntheticScene(body=_cloth("scarf"), frames=97, hands=lift(MIDDLE)),
+    "single_lift_cloth": SyntheticScene(body=_cloth("towel"), frames=173, hands=lift(CORNER)),
+    "single_lift_cloth_1": SyntheticScene(body=_cloth("napkin"), frames=110, hands=lift(OTHER_CORNER)),
+    "single_lift_cloth_3": SyntheticScene(body=_cloth("scarf"), frames=156, hands=lift(CORNER)),
+    "single_lift_cloth_4": SyntheticScene(body=_cloth("sheet"), frames=172, hands=lift(CORNER)),
+    "weird_package": SyntheticScene(body=_package, frames=39, hands=lift((1.0, 0.5, 1.0), reach=0.028, offsets=LOW_LIFT)),
+    "double_lift_sloth": SyntheticScene(body=bodies.sloth, frames=62, hands=lift((0.95, 0.0, 0.1), (0.95, 1.0, 0.1), reach=0.025)),
+    "double_stretch_sloth": SyntheticScene(body=bodies.sloth, frames=192, hands=stretch((0.9, 1.0, 0.2), (0.0, 0.1, 0.2), 0.05)),
+    "single_lift_sloth": SyntheticScene(body=bodies.sloth, frames=85, hands=lift((0.95, 1.0, 0.1), reach=0.025)),
+    "single_push_sloth": SyntheticScene(body=bodies.sloth, frames=68, hands=push((0.4, 0.1, 0.5), (0, 1, 0), 0.1)),
+    "double_lift_zebra": SyntheticScene(
+        body=bodies.zebra, frames=58, hands=lift((0.85, 0.5, 1.0), (0.15, 0.5, 0.75), reach=0.025, offsets=TOGETHER)
+    ),
+    "double_stretch_zebra": SyntheticScene(body=bodies.zebra, frames=198, hands=stretch((0.95, 0.5, 0.8), (0.1, 0.5, 0.6), 0.04)),
+    "single_lift_zebra": SyntheticScene(body=bodies.zebra, frames=66, hands=lift((0.4, 0.5, 1.0), reach=0.028)),
+    "single_lift_dinosor": SyntheticScene(
+        body=bodies.dinosaur, frames=86, hands=lift((0.0, 0.5, 0.1), reach=0.03, offsets=LOW_LIFT)
+    ),
+    "rope_double_hand": SyntheticScene(
+        body=_rope("twine"), frames=264, hands=lift((0.02, 0.5, 0.5), (0.98, 0.5, 0.5), reach=0.016), marked=True
+    ),
+    "single_lift_rope": SyntheticScene(body=_rope("cord"), frames=50, hands=lift((0.03, 0.5, 0.5), reach=0.016)),
+    "single_push_rope": SyntheticScene(body=_rope("twine"), frames=58, hands=push((0.5, 0.0, 0.5), (0, 1, 0), 0.1)),
+    "single_push_rope_1": SyntheticScene(body=_rope("twine"), frames=92, hands=push((0.25, 0.0, 0.5), (0.3, 1, 0), 0.12)),
+    "single_push_rope_4": SyntheticScene(body=_rope("cord"), frames=83, hands=push((0.7, 0.0, 0.5), (-0.2, 1, 0), 0.1)),
+}

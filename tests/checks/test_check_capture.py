@@ -1,0 +1,274 @@
+"""check-data on capture folders: a good one has measurements only, and every other finding is provoked once."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from neuspring.checks import examine
+from neuspring.checks.table import on_table
+from neuspring.checks.things import Category, Sample, Sheet, Support
+from neuspring.core.geometry import rigid_inverse
+from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, Writer
+from neuspring.intake.check import check_layout
+from tests.support.captures import describe, entry
+from tests.support.filmed import TURNED, film
+from tests.support.findings import holds, of_level, serious
+
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory):
+    return film(tmp_path_factory.mktemp("filmed") / "film", cameras=2)
+
+
+@pytest.fixture
+def both(filmed, tmp_path):
+    """Both cameras, to change."""
+    return Capture.load(shutil.copytree(filmed.folder, tmp_path / "film"))
+
+
+@pytest.fixture
+def capture(both):
+    """One camera of it."""
+    edit(both, lambda values: values.update(cameras=values["cameras"][:1]))
+    return Capture.load(both.folder)
+
+
+def edit(capture, change) -> None:
+    path = capture.folder / CAPTURE
+    values = json.loads(path.read_text())
+    change(values)
+    path.write_text(json.dumps(values))
+
+
+def moved(change, camera=0):
+    """A change of one camera's pose."""
+
+    def apply(values):
+        entry = values["cameras"][camera]
+        entry["camera_to_world"] = change(np.array(entry["camera_to_world"])).tolist()
+
+    return apply
+
+
+def shifted(x=0.0, y=0.0, z=0.0, tilt=0.0):
+    """A motion of the world: a tilt about x, degrees, then a shift, m."""
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = Rotation.from_euler("x", tilt, degrees=True).as_matrix(), (x, y, z)
+    return lambda pose: motion @ pose
+
+
+def enlarged(values) -> None:
+    values["depth_unit"] = 0.01
+    for row in values["cameras"][0]["camera_to_world"][:3]:
+        row[3] *= 10
+
+
+def test_a_good_film_has_measurements_only(filmed, tmp_path):
+    found = check_layout(filmed.folder)
+    assert serious(found) == [] == serious(check_layout(filmed.folder.parent))
+    for words in (("camera 0: the table is 0 mm",), ("camera 1", "depth holes: 0%"), ("size of the object",), ("cameras 0 and 1",)):
+        assert holds(found, "note", CAPTURE, *words)
+    assert serious(check_layout(film(tmp_path / "down", cameras=1, up="-z").folder)) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "level", "words"),
+    [
+        (moved(shifted(z=0.05)), "warning", ("cameras.0.camera_to_world", "50 mm above z = 0", "--level")),
+        (moved(shifted(tilt=5.0)), "warning", ("tilted by 5.0 degrees",)),
+        (moved(shifted(tilt=40.0)), "error", ("must be z = 0", "tilted by 40.0 degrees")),
+        (lambda values: values.update(up="-z"), "error", ("up", "received -z", "400 mm below the table")),
+        (moved(rigid_inverse), "error", ("what looks like a world-to-camera matrix. Invert it",)),
+        (moved(lambda pose: pose @ OPENGL), "error", ("what looks like a matrix for OpenGL's axes",)),
+        (moved(lambda pose: rigid_inverse(pose @ OPENGL)), "error", ("a world-to-camera matrix for OpenGL",)),
+        (lambda values: values.update(depth_unit=0.01), "error", ("depth_unit", "10 times as far", "Plausible would be 0.001")),
+        (lambda values: values.update(depth_unit=1.0), "error", ("depth_unit", "between 0.1 and 10 m")),
+        (enlarged, "warning", ("at most 3 m above the table", "received 4.00 m")),
+        (enlarged, "warning", ("implausible size: 13",)),
+        (enlarged, "warning", ("object high above the table",)),
+        (lambda values: values.update(frame_rate=3000.0), "error", ("frame_rate", "received 3000")),
+        (lambda values: values.update(frame_rate=0.033), "error", ("frame_rate", "received 0.033")),
+        (moved(shifted(z=-0.08)), "warning", ("object below the table", "4.5 cm")),
+        (lambda values: values["cameras"][0]["camera_to_world"][0].__setitem__(0, 3.0), "error", ("must be a rotation",)),
+    ],
+)
+def test_a_description_that_contradicts_the_images(capture, change, level, words):
+    edit(capture, change)
+    assert holds(check_layout(capture.folder), level, CAPTURE, *words)
+
+
+def second(labels, frame):
+    labels[2:22, 2:22] = OBJECT
+    return labels
+
+
+def extended(labels, frame):
+    row = int(np.nonzero((labels == OBJECT).any(axis=1))[0].mean())
+    labels[row : row + 3, : int(np.nonzero(labels[row] == OBJECT)[0].min())] = OBJECT
+    return labels
+
+
+def hand_elsewhere(labels, frame):
+    labels[labels == HANDS] = 0
+    labels[-20:-2, 4:24] = HANDS
+    return labels
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda labels, _: np.where(labels == OBJECT, 0, labels), ("no object in frame 0",)),
+        (lambda labels, _: np.where(labels == HANDS, 0, labels), ("no hand in frame 0",)),
+        (second, ("two objects", "2 pieces")),
+        (
+            lambda labels, frame: np.where((labels == OBJECT) & (frame > 3), 0, labels),
+            ("object missing", "2 frames, first in"),
+        ),
+        (extended, ("object at the border", "6 frames")),
+        (lambda labels, _: np.where(labels == 0, HANDS, labels), ("hands too large", "less than 1200 cm² and 12 times")),
+        (hand_elsewhere, ("hand far from the object",)),
+    ],
+)
+def test_masks_that_show_something_else(capture, change, words):
+    for frame in range(capture.frame_count):
+        labels = change(capture.mask("0", frame).copy(), frame)
+        cv2.imwrite(str(capture.path("mask", "0", frame)), labels.astype(np.uint8))
+    found = check_layout(capture.folder)
+    assert of_level(found, "error") == []
+    assert any(holds(found, "warning", file, "camera 0", *words) for file in (CAPTURE, "0"))
+
+
+def test_what_is_wrong_with_every_mask_is_said_once(capture):
+    for frame in range(capture.frame_count):
+        cv2.imwrite(str(capture.path("mask", "0", frame)), np.repeat(capture.mask("0", frame)[..., None], 3, axis=2))
+    found = of_level(check_layout(capture.folder), "error")
+    assert len(found) == 1
+    assert "00000.png: masks are gray, palette or one-bit images; received 3 channels" in found[0]
+    assert found[0].endswith("The same in 5 more files of the folder.")
+
+
+def test_depth_of_a_sensor_that_stands_elsewhere(capture):
+    rewrite_depth(capture, lambda depth, mask: np.roll(depth, 8, axis=1))
+    words = ("camera 0: depth not aligned to color", "moved 8 pixels to the left", "rs.align")
+    assert holds(check_layout(capture.folder), "warning", CAPTURE, *words)
+
+
+def rewrite_depth(capture, change) -> None:
+    for frame in range(capture.frame_count):
+        path = capture.path("depth", "0", frame)
+        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(path), change(depth, capture.mask("0", frame)).astype(np.uint16))
+
+
+def test_an_object_without_depth_and_a_table_that_is_not_seen(capture):
+    rewrite_depth(capture, lambda depth, mask: np.where((mask == OBJECT) & (np.arange(mask.shape[1]) % 2 == 0), 0, depth))
+    assert holds(check_layout(capture.folder), "warning", CAPTURE, "depth holes: 50%", "Film from farther")
+    rewrite_depth(capture, lambda depth, mask: np.where(mask == OBJECT, depth, 0))
+    assert holds(check_layout(capture.folder), "note", CAPTURE, "z = 0 and up are not checked")
+
+
+def test_cameras_that_disagree(both):
+    edit(both, moved(shifted(x=0.05), camera=1))
+    assert holds(check_layout(both.folder), "warning", CAPTURE, "cameras 0 and 1 should see the same", "Calibrate again")
+
+
+def test_images_of_another_size_or_missing(both):
+    cv2.imwrite(str(both.path("depth", "1", 2)), np.zeros((10, 20), np.uint16))
+    both.path("color", "1", 4).unlink()
+    found = check_layout(both.folder)
+    assert holds(found, "error", "00002.png", "160 x 90", "received 20 x 10")
+    assert holds(found, "error", "00004.png", "cameras.1.missing")
+
+
+@pytest.mark.parametrize("up", ["+z", "-z"])
+def test_an_object_on_something_is_said_with_the_box_to_add(tmp_path, up):
+    capture = film(tmp_path / "film", cameras=1, up=up, stand=0.08)
+    found = [one.message for one in check_layout(capture.folder) if one.level == "warning"]
+    assert len(found) == 1
+    assert (
+        "object above the table: what is seen of it in frame 0 begins 11 cm above the table, on something 8.0 cm high" in found[0]
+    )
+    box = json.loads(found[0].split('"obstacles": ')[1].split(". Or mark")[0])
+    sign = 1.0 if up == "+z" else -1.0
+    # The box of the film, as far as it is seen: two of its sides end behind the object.
+    assert box[0]["center"] == pytest.approx([0.03, 0.0, sign * 0.04], abs=0.01)
+    assert sorted(box[0]["half_sizes"]) == pytest.approx([0.04, 0.1, 0.13], abs=0.01)
+    long = np.array(box[0]["rotation"])[:, int(np.argmax(box[0]["half_sizes"]))]
+    assert abs(long @ [np.cos(np.radians(TURNED)), sign * np.sin(np.radians(TURNED)), 0]) > 0.99
+    edit(capture, lambda values: values.update(obstacles=box))
+    assert serious(check_layout(capture.folder)) == []
+
+
+def test_an_object_in_the_air_needs_a_hand_that_holds_it(filmed):
+    view = filmed.cameras["0"]
+    lifted = view.camera_to_world.copy()
+    lifted[2, 3] += 0.08
+    depth, mask = filmed.depth("0", 0), filmed.mask("0", 0)
+    for labels, words in (((OBJECT,), "begins 12 cm above the table, and no hand is near"), ((OBJECT, HANDS), "")):
+        sample = Sample(np.where(np.isin(mask, labels), depth, 0.0), mask)
+        found = examine(Support(replace(view, camera_to_world=lifted), sample, 1.0, ()))
+        assert [words in one.text for one in found] == ([True] if words else [])
+        assert examine(Support(view, sample, 1.0, ())) == []
+
+
+def sheet(view):
+    """A mask of 24 x 24 cm of the table beside the film's body."""
+    y, x = np.mgrid[: view.height, : view.width]
+    points = on_table(view, np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(view.height, view.width, 3)
+    return np.where((np.abs(points[..., :2] - (0.28, 0.2)) < 0.12).all(axis=-1), OBJECT, 0).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("category", "words"), [("towel", "the category 'towel' makes a filled body of it"), ("cloth", "")])
+def test_a_sheet_whose_category_is_a_body(capture, category, words):
+    for frame in range(capture.frame_count):
+        cv2.imwrite(str(capture.path("mask", "0", frame)), sheet(capture.cameras["0"]))
+    edit(capture, lambda values: values.update(category=category))
+    found = [text for text in of_level(check_layout(capture.folder), "warning") if "shape and category" in text]
+    assert [words in text and '"category": "cloth"' in text for text in found] == [True] * bool(words)
+
+
+@pytest.mark.parametrize(
+    ("category", "meant"),
+    [("Cloth", "cloth"), ("cloths", "cloth"), ("packge", "package"), ("Rope", "rope"), ("sloth", ""), ("bear", "")],
+)
+def test_a_category_that_is_nearly_another(category, meant):
+    found = examine(Category(Path("capture.json"), category))
+    assert [one.message.endswith(f"received {category!r}. Is {meant} meant?") for one in found] == [True] * bool(meant)
+
+
+@pytest.mark.parametrize(("width", "turns"), [(0.01, 4), (0.012, 6)])
+def test_a_rope_in_turns_is_no_sheet(width, turns):
+    along = np.linspace(0, turns, 1500)
+    middle = np.stack([0.12 * np.cos(np.pi * along), 0.04 * along, np.full(len(along), 0.008)], axis=1)
+    points = middle + np.random.default_rng(0).uniform(-width / 2, width / 2, (len(along), 3))
+    assert examine(Sheet("object", points, 1.0)) == []
+
+
+def test_an_object_inside_an_obstacle(capture):
+    around = {"shape": "sphere", "center": [0.0, 0.0, 0.0], "radius": 5.0}
+    beside = {"shape": "box", "center": [0.0, 9.0, 0.0], "half_sizes": [1.0, 1.0, 1.0]}
+    edit(capture, lambda values: values.update(obstacles=[beside]))
+    assert of_level(check_layout(capture.folder), "error") == []
+    edit(capture, lambda values: values.update(obstacles=[beside, around]))
+    assert holds(check_layout(capture.folder), "error", CAPTURE, "obstacles[1]", "100% more than 10 mm inside")
+
+
+def test_times_with_one_constant_grip_are_proposed(tmp_path):
+    """Of two hands one lets go in frame 20 of 60; at 10 frames/s both times last longer than a second."""
+    writer = Writer(tmp_path, describe(frame_count=60, frame_rate=10.0, cameras=(entry(width=120, height=68),)))
+    for frame in range(60):
+        labels = np.zeros((68, 120), np.uint8)
+        labels[20:50, 40:80], labels[20:40, 30:40] = OBJECT, HANDS
+        labels[20:40, 80:90] = HANDS if frame < 20 else 0
+        writer.frame("0", frame, np.zeros((68, 120, 3), np.uint8), np.full((68, 120), 900, np.uint16), labels)
+    found = check_layout(writer.finish().folder)
+    words = ("hands within 6 cm of the object, by frames: 0-19: 2, 20-59: 1.", "--frames 20-59 or --frames 0-19 --output")
+    assert holds(found, "note", CAPTURE, *words)

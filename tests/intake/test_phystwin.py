@@ -1,0 +1,98 @@
+"""The PhysTwin reader: what a conforming case becomes, and that every refusal names the file, the key and the place."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from neuspring.config import ScenarioRow
+from neuspring.core.errors import InputError
+from neuspring.core.records import digest_file
+from neuspring.intake import phystwin
+from tests.support.phystwin_case import edit, stored, write_case, write_json
+
+ROW = ScenarioRow(scenario="thing", source="phystwin", category="toy", path="x", self_collision=True, ground=True)
+
+
+def test_a_conforming_case(tmp_path: Path) -> None:
+    folder = write_case(tmp_path)
+    data = stored(folder)
+    observations = phystwin.read(ROW, folder)
+    assert (
+        observations.scenario.frame_count,
+        observations.scenario.train_end,
+        observations.scenario.frame_rate,
+        observations.scenario.up,
+    ) == (10, 7, 30.0, "-z")
+    assert observations.scenario.self_collision
+    assert observations.scenario.ground
+    np.testing.assert_array_equal(observations.object_points, data["object_points"].astype(np.float32))
+    np.testing.assert_array_equal(observations.object_motion_valid, data["object_motions_valid"])
+    assert observations.nodes.shape == (40 + 12 + 6, 3)
+    assert observations.surface_count == 52
+    assert observations.tracks.shape == (10, 5, 3)
+    assert np.isnan(observations.tracks).any()
+    files = ("final_data.pkl", "split.json", "gt_track_3d.pkl", "metadata.json")
+    assert observations.scenario.provenance == {name: f"sha256:{digest_file(folder / name)}" for name in files}
+
+
+def test_optional_files(tmp_path: Path) -> None:
+    folder = write_case(tmp_path, surface=0, interior=0)
+    for name in ("gt_track_3d.pkl", "metadata.json", "calibrate.pkl"):
+        (folder / name).unlink()
+    edit(folder, controller_mask=None, object_colors=None)
+    observations = phystwin.read(ROW, folder)
+    assert observations.tracks.shape == (10, 0, 3)
+    assert observations.scenario.frame_rate == phystwin.RELEASED_FRAME_RATE
+    assert len(observations.nodes) == 40
+
+
+def test_frame_rate_comes_from_the_metadata(tmp_path: Path) -> None:
+    folder = write_case(tmp_path)
+    write_json(folder / "metadata.json", {"fps": 15})
+    assert phystwin.read(ROW, folder).scenario.frame_rate == 15.0
+
+
+def test_a_frame_without_a_visible_point_is_readable(tmp_path: Path) -> None:
+    folder = write_case(tmp_path)
+    data = stored(folder)
+    data["object_visibilities"][4] = False
+    data["object_motions_valid"][3:5] = False
+    data["object_points"][4] = 0
+    edit(folder, **data)
+    assert not phystwin.read(ROW, folder).object_visibility[4].any()
+
+
+@pytest.mark.parametrize("fps", [0, -1, "30", True, float("nan"), 10**400])
+def test_bad_frame_rates_are_refused(tmp_path: Path, fps: Any) -> None:
+    folder = write_case(tmp_path)
+    write_json(folder / "metadata.json", {"fps": fps})
+    with pytest.raises(InputError, match=r"metadata\.json: fps"):
+        phystwin.read(ROW, folder)
+
+
+@pytest.mark.parametrize("name", ["final_data.pkl", "split.json"])
+def test_missing_and_damaged_files_are_named(tmp_path: Path, name: str) -> None:
+    folder = write_case(tmp_path)
+    (folder / name).write_bytes((folder / name).read_bytes()[:10])
+    with pytest.raises(InputError, match=name):
+        phystwin.read(ROW, folder)
+    (folder / name).unlink()
+    with pytest.raises(InputError, match=rf"{name}.*readable.*No such file"):
+        phystwin.read(ROW, folder)
+
+
+def test_the_table_of_released_cases() -> None:
+    cases = phystwin.released_cases()
+    assert len(cases) == 22
+    assert sum(int(row["frames"]) for row in cases.values()) == 2423
+    assert sum(int(row["frames"]) - int(row["train_end"]) for row in cases.values()) == 735
+    assert all(int(row["train_end"]) == int(0.7 * int(row["frames"])) for row in cases.values())
+    assert [name for name, row in cases.items() if not row["nodes"]] == [
+        "double_lift_sloth",
+        "double_stretch_sloth",
+        "single_lift_sloth",
+    ]
