@@ -42,7 +42,7 @@ class Check:
         """What it has to say of a subject, which has the field `where`."""
         low, high = self.limit or (-inf, inf)
         for measured in _several(self.measure(subject)):
-            value = measured.get("value")
+            value: Any = measured.get("value")
             if self.limit is not None and value is not None and low <= value <= high:
                 continue
             words = {"subject": subject, "low": low, "high": high, **measured}
