@@ -1,0 +1,65 @@
+"""A stranger's package is installed, and its members are in the help, in the graph of jobs, in the tables and in the report."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.support import project
+from tests.support.desk import FRAMES, SIZE, camera, counts, seen, write_json
+
+HERE = Path(__file__).parent
+METHOD = "\nvisiting: {model: lag, description: The mean of the hands.}\n"
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory) -> dict[str, str]:
+    """The package, installed by pip beside NeuSpring; the environment in which both are found."""
+    folder = tmp_path_factory.mktemp("foreign")
+    source = folder / "source"
+    shutil.copytree(HERE, source, ignore=shutil.ignore_patterns("__pycache__", "*.py"), dirs_exist_ok=True)
+    shutil.copytree(HERE / "visitor", source / "visitor", dirs_exist_ok=True)
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
+    subprocess.run([*pip, "--target", str(folder / "site"), str(source)], check=True, capture_output=True)
+    return {"PYTHONPATH": os.pathsep.join([str(folder / "site"), str(project.ROOT)])}
+
+
+def neuspring(installed: dict[str, str], *words: object, folder: Path | None = None) -> str:
+    command = [sys.executable, "-m", "neuspring", *map(str, words)]
+    return subprocess.run(
+        command, env=os.environ | installed, cwd=folder, check=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ).stdout
+
+
+def test_its_command_and_formats_are_in_the_help(installed):
+    assert "greet             Say hello" in neuspring(installed, "--help")
+    assert neuspring(installed, "greet", "--name", "springs") == "hello springs\n"
+    assert "xyz" in neuspring(installed, "export", "--help")
+
+
+def test_its_capture_format_is_read(installed, tmp_path):
+    pictures = [seen(camera(), frame) for frame in range(FRAMES)]
+    np.savez(tmp_path / "film.npz", color=[color for color, _ in pictures], depth=[counts(depth) for _, depth in pictures])
+    lens = {"width": SIZE[0], "height": SIZE[1], "fx": 70.0, "fy": 70.0, "cx": 39.5, "cy": 29.5}
+    write_json(tmp_path / "lens.json", lens)
+    film, options = tmp_path / "film.npz", ("--intrinsics", tmp_path / "lens.json", "--rate", 30, "--category", "ball")
+    made = neuspring(installed, "make-capture", "--color", film, "--depth", film, *options, "--output", tmp_path / "capture")
+    assert f"{FRAMES} frames" in made and (tmp_path / "capture" / "capture.json").exists()
+
+
+def test_its_baseline_metric_section_and_export_go_through_the_whole_workflow(installed, tmp_path):
+    copy = project.copy_workflow(tmp_path / "project")
+    methods = copy / "config" / "methods.yaml"
+    methods.write_text(methods.read_text() + METHOD)
+    project.run(copy, {"methods": ["visiting", "search_only"]}, **installed)
+    summary = (copy / "results" / "tables" / "summary.md").read_text()
+    assert "Sag" in summary and "visiting" in summary
+    assert "A visitor was here." in (copy / "results" / "tables" / "report.html").read_text()
+    runs = copy / "results" / project.SCENE
+    assert '"sag"' in (runs / "visiting" / "0" / "run.json").read_text()
+    neuspring(installed, "export", runs / "search_only" / "0", "--to", "xyz", "--output", tmp_path / "twin")
+    assert np.loadtxt(tmp_path / "twin.xyz").shape[1] == 3
