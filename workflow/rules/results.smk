@@ -35,7 +35,10 @@ PERCEIVED, TABULATED, STUDIED, REPORTED, TRACKED = (
         REPORT,
         lambda wildcards: [*GRAPH.report(), *GRAPH.report_stamp()],
         "neuspring.report.page",
-        *(place.partition(":")[0] for place in modules("neuspring.report.sections").values()),
+        *(
+            place.partition(":")[0]
+            for place in modules("neuspring.report.sections").values()
+        ),
     ),
     stamped_job(
         "track_init",
