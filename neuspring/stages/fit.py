@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from neuspring.config import Config, SpringFieldSettings
 from neuspring.core.artifacts import Observations
+from neuspring.core.errors import InputError
 from neuspring.core.records import Before, Recorder
 from neuspring.stages.stage import Rows, Written, stage
 from neuspring.twin.body import body_of, code
@@ -82,6 +83,8 @@ def prepared(
     from neuspring.twin.fit import FitProblem
 
     twin, seed = Twin.load(search.file("twin")), int(search.record.settings["seed"])
+    if kind not in (kinds := body_of(twin).fits):
+        raise InputError("--kind", f"must be one of {', '.join(kinds)} for this twin", kind)
     problem = FitProblem(
         observations=observations,
         pool=pool,

@@ -96,7 +96,8 @@ RED = Check(
 def brought(monkeypatch, group, value):
     """As if an installed package brought a member of a group."""
     point = EntryPoint(name="mine", value=value, group=f"neuspring.{group}")
-    monkeypatch.setattr(registry, "entry_points", lambda group: [point] if group == point.group else [])
+    real = registry.entry_points
+    monkeypatch.setattr(registry, "entry_points", lambda group: [point] if group == point.group else real(group=group))
 
 
 def test_a_package_adds_a_check(filmed, monkeypatch):

@@ -45,7 +45,7 @@ def observed(folder):
     return path
 
 
-def test_regions_and_fields_by_hand(tmp_path):
+def test_regions_and_fields_by_hand(tmp_path, capsys):
     """Options reach the stages; without them a search is uniform, and a fit trains single springs."""
     common = ["--observations", str(observed(tmp_path)), "--settings", json.dumps(TINY), "--device", "cpu"]
     for name, options, kind, regions in (("plain", [], [], 1), ("ours", ["--clusters", "2"], ["--kind", "field"], 2)):
@@ -56,6 +56,8 @@ def test_regions_and_fields_by_hand(tmp_path):
         assert (search.status, search.settings["clusters"], search.settings["seed"]) == ("ok", regions, 3)
         assert ("object_radius.1" in search.facts) == (regions == 2)
         assert (fit.status, fit.settings["kind"]) == ("ok", kind[-1] if kind else "springs")
+    assert main(["fit", *common, "--kind", "rod", "--search", str(found), "--output", str(tmp_path / "fit.json")]) == 2
+    assert "--kind: must be one of springs, field for this twin; received rod" in capsys.readouterr().err
 
 
 def test_a_numerical_failure_passes_through_every_stage_and_shows_in_the_table(tmp_path):
@@ -85,7 +87,6 @@ def test_a_number_of_regions_that_cannot_be_is_bad_input(clusters, tmp_path, cap
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["fit", "--kind", "network", "--observations", "x.npz", "--search", "x.json", "--output", "y.json"],
         ["search", "--clusters", "two", "--observations", "x.npz", "--output", "y.json"],
         ["search", "--twins-per-launch", "many", "--observations", "x.npz", "--output", "y.json"],
     ],

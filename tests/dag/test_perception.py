@@ -187,4 +187,3 @@ def test_own_yaml_lets_methods_that_learn_nothing_stand_beside(project):
     output = output_of(start(command, project))
     jobs = jobs_in(output)
     assert (jobs["segment"], jobs["lift"], jobs["predict"], jobs["fit"], jobs["score"]) == (1, 1, 2, 2, 5)
-    assert f"Expected: {sum(jobs.values()) - 1} jobs" in output

@@ -39,7 +39,7 @@ def test_the_search_does_not_see_the_tail(tmp_path):
 
 @pytest.mark.parametrize(("method", "selection"), [("baseline", "training_loss"), ("baseline", "tail"), ("search_only", "tail")])
 def test_a_trial_is_judged_by_the_twin_that_the_method_would_choose(folder, method, selection):
-    base = settings(fit={"selection": selection, "learning_rate": 1.0, "tail_fraction": 0.4, "epochs": 4})
+    base = settings(fit={"selection": selection, "learning_rate": 2.0, "tail_fraction": 0.4, "epochs": 8})
     tune = sweep(method=method, trials=1, space={"losses.acceleration": {"choices": [0.01, 0.02]}})
     work(folder, tune, base=base)
     value = trials(folder, tune, base)[0].value

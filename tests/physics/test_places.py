@@ -26,7 +26,7 @@ VALUES = {
     "extensions/exports/newton_twin.py": "drag in Newton",
 }
 """Files that give or translate the value that drag, which has no default, has in their case. A new parameter has a default."""
-OTHERS = {"scenes/synthetic/fem.py", "data/synthetic/kernels.py", "extensions/play/page.py"}
+OTHERS = {"scenes/synthetic/fem.py", "scenes/synthetic/kernels.py", "extensions/play/page.py"}
 """Drag of another simulator; dragging with a mouse."""
 RODS = {
     "config/rod.py",

@@ -160,11 +160,11 @@ def test_a_record_that_is_missing_damaged_failed_or_new_is_a_problem(results, ch
 
 def test_settings_are_compared_with_the_defaults_of_their_section():
     settings = {
-        "search": {"search": {"rollouts": 3, "variables": {"stiffness": {"start": 1e4}}}, "clusters": 5, "seed": 1},
+        "search": {"search": {"rollouts": 3, "variables": {"stiffness": {"start": 1e4}}}, "clusters": 7, "seed": 1},
         "render": {"margin": 123, "released_quirks": ["any_alpha"]},
     }
     assert departures(settings) == {
-        "search.clusters": 5,
+        "search.clusters": 7,
         "search.search.rollouts": 3,
         "search.search.variables.stiffness.start": 1e4,
         "render.margin": 123,

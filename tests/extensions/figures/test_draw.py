@@ -91,7 +91,7 @@ def test_frames_of_splats_are_pictures_of_any_camera(video, tmp_path):
 
 def test_a_picture_without_its_kind_is_refused_with_the_kinds(capsys):
     assert main(["draw", "--help"]) == 2
-    assert "draw strip or draw twin or draw film or draw frames" in capsys.readouterr().err
+    assert "draw film or draw frames or draw strip or draw twin" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
