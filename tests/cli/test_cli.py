@@ -51,13 +51,13 @@ def test_regions_and_fields_by_hand(tmp_path, capsys):
     for name, options, kind, regions in (("plain", [], [], 1), ("ours", ["--clusters", "2"], ["--kind", "field"], 2)):
         found, fitted = tmp_path / name / "search.json", tmp_path / name / "fit.json"
         assert main(["search", *common, *options, "--seed", "3", "--output", str(found)]) == 0
+        assert main(["fit", *common, "--kind", "rod", "--search", str(found), "--output", str(fitted)]) == 2
+        assert "--kind: must be one of springs, field for this twin; received rod" in capsys.readouterr().err
         assert main(["fit", *common, *kind, "--search", str(found), "--output", str(fitted)]) == 0
         search, fit = StageRecord.load(found), StageRecord.load(fitted)
         assert (search.status, search.settings["clusters"], search.settings["seed"]) == ("ok", regions, 3)
         assert ("object_radius.1" in search.facts) == (regions == 2)
         assert (fit.status, fit.settings["kind"]) == ("ok", kind[-1] if kind else "springs")
-    assert main(["fit", *common, "--kind", "rod", "--search", str(found), "--output", str(tmp_path / "fit.json")]) == 2
-    assert "--kind: must be one of springs, field for this twin; received rod" in capsys.readouterr().err
 
 
 def test_a_numerical_failure_passes_through_every_stage_and_shows_in_the_table(tmp_path):

@@ -139,7 +139,7 @@ def test_the_dry_run_tells_the_jobs_and_perception_makes_the_pictures(followed):
     project, _, _ = followed
     [asked] = shown("Ask what it costs")
     output = run(asked, project)
-    assert re.search(r"Expected: \d+ jobs", output)
+    assert re.search(r"total +\d+", output)
     assert jobs_in(output)["score"] == 5
     [look] = shown("Look at what was perceived")
     assert jobs_in(run(look, project)) == {"segment": 1, "track": 1, "lift": 1, "observe": 1}
