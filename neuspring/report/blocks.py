@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from neuspring.core.table import Chip, Table, Tone
 
-TEMPLATES = Path(__file__).parent / "templates"
+PAGE_TEMPLATES = Path(__file__).parent / "templates"
 SYMBOLS: dict[Tone, str] = {"good": "✓", "bad": "✗", "warn": "!", "mute": "○", "": ""}
 
 
@@ -45,7 +45,7 @@ class Link:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Verdict:
+class Answer:
     """The answer of one study."""
 
     kind: ClassVar[str] = "verdict"
@@ -78,7 +78,7 @@ class Picture:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Video:
+class PageVideo:
     """A video, as `Picture`."""
 
     kind: ClassVar[str] = "video"
@@ -138,11 +138,11 @@ class Fold:
     key: str = ""
 
 
-Block = Table | Text | Items | Verdict | Picture | Video | Legend | Prose | Code | Grid | Fold
+Block = Table | Text | Items | Answer | Picture | PageVideo | Legend | Prose | Code | Grid | Fold
 
 
 @dataclass(frozen=True, kw_only=True)
-class Section:
+class PageSection:
     """A part of the page with an entry in its table of contents."""
 
     key: str
@@ -172,9 +172,9 @@ def markdown(blocks: Sequence[Block], level: str = "##") -> str:
     return "\n\n".join(parts) + "\n" if parts else ""
 
 
-def html_page(title: str, subtitle: str, sections: Sequence[Section], *, written: str = "", embedded: bool = True) -> str:
+def html_page(title: str, subtitle: str, sections: Sequence[PageSection], *, written: str = "", embedded: bool = True) -> str:
     """The page as text. `embedded`: nothing but what it contains may be loaded; otherwise files beside it are shown too."""
-    loader = jinja2.FileSystemLoader(TEMPLATES)
+    loader = jinja2.FileSystemLoader(PAGE_TEMPLATES)
     template = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined).get_template("page.html.j2")
     return template.render(
         title=title,
@@ -183,6 +183,6 @@ def html_page(title: str, subtitle: str, sections: Sequence[Section], *, written
         sections=sections,
         embedded=embedded,
         symbols=SYMBOLS,
-        style=Markup((TEMPLATES / "style.css").read_text(encoding="utf-8")),
-        script=Markup((TEMPLATES / "page.js").read_text(encoding="utf-8")),
+        style=Markup((PAGE_TEMPLATES / "style.css").read_text(encoding="utf-8")),
+        script=Markup((PAGE_TEMPLATES / "page.js").read_text(encoding="utf-8")),
     )

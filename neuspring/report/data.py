@@ -1,4 +1,4 @@
-"""What a report page is about: runs, jobs and records of a results folder. Damaged files are listed and stop nothing."""
+"""Material of a report page: runs, jobs and records of a results folder. Damaged files are listed and stop nothing."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from neuspring.config import Config
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import JobRecord, read_jobs
 from neuspring.core.run_record import RUN_RECORD, RunRecord
-from neuspring.report.blocks import Picture, Prose, Section
+from neuspring.report.blocks import PageSection, Picture, Prose
 from neuspring.scores.failures import LeftOut, applying
 from neuspring.scores.metrics import DASH
 from neuspring.scores.numbers import Numbers
@@ -28,7 +28,7 @@ from neuspring.scores.paper import Study
 from neuspring.scores.runs import DAMAGED, Collected, one_line
 
 UNREADABLE = (InputError, OSError, ValueError, KeyError, TypeError, AttributeError)
-"""What a damaged record, table or picture raises."""
+"""Exceptions of a damaged record, table or picture."""
 MOST_ROWS = 400
 """At most so many failures of a kind are listed; the rest is counted."""
 METHOD_RECORDS = (RUN_RECORD, "rollout.json", "fit.json", "train.json")
@@ -38,7 +38,7 @@ METHOD_RULES = ("fit", "train", "rollout", "predict", "render", "score")
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What the report is about. What is left empty is taken from the settings, else from what lies in the results folder."""
+    """Subject of the report. What is left empty is taken from the settings, else from what lies in the results folder."""
 
     scenarios: Sequence[str] = ()
     methods: Sequence[str] = ()
@@ -81,7 +81,7 @@ class ReportData:
     damaged: dict[str, str]
     """Files that cannot be read, relative to the results folder, and why."""
     numbers: Numbers
-    """Of the benchmark and its studies."""
+    """Numbers of the benchmark and its studies."""
     room: int = 0
     """Characters that pictures and films may take."""
 
@@ -91,7 +91,7 @@ class ReportData:
         return list(self.collected.records.values())
 
     def folder(self, run: RunRecord) -> Path:
-        """Where a run lies."""
+        """The folder of a run."""
         return self.results / run.name
 
     def file(self, run: RunRecord, kind: str, stem: str) -> Path | None:
@@ -213,7 +213,7 @@ class ReportSection:
 
     order: int
     """Its place on the page, by tens."""
-    make: Callable[[ReportData], Section | None]
+    make: Callable[[ReportData], PageSection | None]
     """None where there is nothing to show."""
     phase: Literal[0, 1, 2] = 0
     """1: it takes the `room` that all others leave; 2: it lists the damaged files that all others found."""

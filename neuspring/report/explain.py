@@ -26,12 +26,12 @@ from neuspring.report.study import our_change, paper_change
 from neuspring.scores.failures import left_out_lines
 from neuspring.scores.metrics import DASH, METRICS
 from neuspring.scores.numbers import SUMMARY, Numbers
-from neuspring.scores.paper import TASKS, Study
+from neuspring.scores.paper import PAPER_TASKS, Study
 from neuspring.scores.runs import one_line
 from neuspring.scores.study import StudyNumbers, accounted, verdict_text
 
 SHOWN_FACTS = ("run_key", "source", "commit", "device", "machine", "started", "ended", "data_digest")
-MOST_RUNS = 12
+MOST_EXPLAINED = 12
 """Runs that are listed."""
 
 
@@ -93,7 +93,9 @@ def explain(cell: str, results: Path, folder: Path) -> Explanation:
     labels = {label: label for label in study.rows}
     # Labels may hold a slash.
     label = _choose("/".join(words[1:-2]), {method: label for label, method in study.rows.items()} | labels, "row")
-    task = _choose(words[-2], {theirs: ours for ours, theirs in TASKS.items()} | {task: task for task in cells["task"]}, "task")
+    task = _choose(
+        words[-2], {theirs: ours for ours, theirs in PAPER_TASKS.items()} | {task: task for task in cells["task"]}, "task"
+    )
     known = [METRICS[name] for name in dict.fromkeys(cells["metric"])]
     metric = _choose(
         words[-1], {word: one.name for one in known for word in (one.paper_name or one.name, one.heading, one.name)}, "metric"
@@ -159,7 +161,7 @@ def runs_of(word: str, results: Path) -> list[Path]:
 
 
 def run_text(path: Path) -> tuple[str, bool]:
-    """What the records of a run tell; and True where all are there and the run did not fail."""
+    """Facts that the records of a run tell; and True where all are there and the run did not fail."""
     try:
         record = RunRecord.load(path)
         scores = pd.read_parquet(path.parent / record.scores_file) if record.scores_file else pd.DataFrame()
@@ -183,7 +185,7 @@ def run_text(path: Path) -> tuple[str, bool]:
 
 
 def known(results: Path, folder: Path) -> str:
-    """What can be explained here."""
+    """List of what can be explained here."""
     runs = [path.parent.relative_to(results).as_posix() for path in sorted(Path(results).glob(f"*/*/*/{RUN_RECORD}"))]
     if not runs:
         raise InputError(results, "a results folder with finished runs is required", "none", "Name another: --results FOLDER.")
@@ -195,8 +197,8 @@ def known(results: Path, folder: Path) -> str:
             [f"A number of {folder}/summary.md: METHOD/TASK/METRIC, of\n  " + "\n  ".join(names)] if len(numbers.averages) else []
         )
         lines += [f"A study: {name}/ROW/TASK/METRIC" for name in numbers.by_study]
-    more = [f"and {len(runs) - MOST_RUNS} more"] if len(runs) > MOST_RUNS else []
-    return "\n".join([*lines, "A run: " + "\n       ".join([*runs[:MOST_RUNS], *more])])
+    more = [f"and {len(runs) - MOST_EXPLAINED} more"] if len(runs) > MOST_EXPLAINED else []
+    return "\n".join([*lines, "A run: " + "\n       ".join([*runs[:MOST_EXPLAINED], *more])])
 
 
 def text(explanation: Explanation) -> str:

@@ -9,7 +9,7 @@ import pandas as pd
 
 from neuspring.core.files import write_text
 from neuspring.core.run_record import RunRecord
-from neuspring.report.blocks import Block, Fold, Grid, Picture, Section, Text, Video, html_page
+from neuspring.report.blocks import Block, Fold, Grid, PageSection, PageVideo, Picture, Text, html_page
 from neuspring.report.data import link
 from neuspring.scores.metrics import METRICS
 from neuspring.scores.runs import Collected
@@ -27,7 +27,7 @@ def write_gallery(
     Films and pictures are linked, not embedded, so that the page works wherever the results folder is. Runs that are missing are
     left out.
     """
-    sections: list[Section] = []
+    sections: list[PageSection] = []
     for scenario in scenarios:
         place = Path(results) / scenario
         figures: list[Block] = []
@@ -41,7 +41,7 @@ def write_gallery(
         if figures:
             shown: list[Block] = [Grid(blocks=figures, least=28, films=True)]
             blocks = [*shown, Fold(summary="Splats of frame 0", blocks=[Grid(blocks=splats, least=28)])] if splats else shown
-        sections.append(Section(key=scenario, title=scenario, blocks=blocks))
+        sections.append(PageSection(key=scenario, title=scenario, blocks=blocks))
     about = (
         "Observed, predicted and their difference, first camera; beside them the twin from all around. The bar above a film is "
         f"blue in training frames and orange in the future. Seed {seed}."
@@ -62,8 +62,8 @@ def _films(record: RunRecord, run: Path, scores: pd.DataFrame, folder: Path) -> 
     caption = f"{record.method}: {'; '.join(parts)}".removesuffix(": ")
     if "video" in paths:
         return [
-            Video(caption=caption, data=link(paths["video"], folder)),
-            Video(caption=f"{record.method}, from all around", data=link(paths["turntable"], folder)),
+            PageVideo(caption=caption, data=link(paths["video"], folder)),
+            PageVideo(caption=f"{record.method}, from all around", data=link(paths["turntable"], folder)),
         ]
     if "images" in paths:
         alt = f"Frames of {record.scenario}, {record.method}"

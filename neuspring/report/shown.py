@@ -1,4 +1,4 @@
-"""What a results folder has to show: its scenario, its runs, and what is missing of each.
+"""The content of a results folder to look at: its scenario, its runs, and what is missing of each.
 
 Files are not trusted: sizes of arrays are checked before they are read, and names must stay inside the scenario's folder.
 """
@@ -27,7 +27,7 @@ from neuspring.splats.model import Splats
 Kind = TypeVar("Kind", bound=Artifact)
 OBSERVATIONS, ROLLOUT = "observations.npz", "rollout.json"
 SEED = re.compile(r"\d{1,9}")
-FIRST = ("neuspring_plus", "neuspring", "baseline")
+SHOWN_FIRST = ("neuspring_plus", "neuspring", "baseline")
 """Methods that are shown first."""
 MOST_RUNS = 200
 """Runs that are looked at in a scenario's folder."""
@@ -43,7 +43,7 @@ class Run:
 
     folder: Path
     notes: tuple[str, ...] = ()
-    """What a viewer must know."""
+    """Faults and gaps that a viewer must know."""
     paths: Mapping[str, Path] = field(default_factory=dict)
     """Files that it has: twin, trajectory, splats, and centers, where the method's own model puts its splats."""
 
@@ -81,7 +81,7 @@ class Run:
 
     @cached_property
     def centers(self) -> SplatCenters | None:
-        """Where the method's own model puts its splats, if it does. Raises InputError."""
+        """The centers at which the method's own model puts its splats, if it does. Raises InputError."""
         return self._read("centers", SplatCenters)
 
     @cached_property
@@ -114,7 +114,7 @@ class Found:
 
 
 def find(paths: Sequence[Path]) -> Found:
-    """What the folders have to show: one scenario's folder, or one or several runs of one scenario. Raises InputError."""
+    """The scenario and the runs of folders: one scenario's folder, or one or several runs of one scenario. Raises InputError."""
     named: list[Path] = []
     scenarios: list[Path] = []
     for path in (Path(path) for path in paths):
@@ -150,7 +150,7 @@ def _is_run(path: Path) -> bool:
 
 def _rank(path: Path) -> tuple[int, str, int]:
     method = path.parent.name
-    return (FIRST.index(method) if method in FIRST else len(FIRST), method, int(path.name))
+    return (SHOWN_FIRST.index(method) if method in SHOWN_FIRST else len(SHOWN_FIRST), method, int(path.name))
 
 
 def _first(runs: Sequence[Run]) -> tuple[str, ...]:

@@ -30,18 +30,20 @@ from neuspring.scores.paper import Study
 from neuspring.scores.runs import mixed_settings, pairs
 from neuspring.scores.study import LEAST_SCENARIOS, ORACLE_LINE, StudyNumbers, in_order, verdict_text
 
-VERDICTS = (
+VERDICT_NOTE = (
     "Verdict: within, the paper's value lies in the 95 % bootstrap interval of our mean, half a unit of its last digit allowed; "
     "better, worse: outside; partial: fewer than its 22 scenarios count; other data: these are other scenarios, whose values "
     "cannot be compared with the paper's."
 )
-DIRECTIONS = (
+DIRECTION_NOTE = (
     "Verdict: same direction, confirmed: our interval leaves out 0 on the paper's side; opposite: on the other side; not resolved: "
     f"it holds 0; better, worse: it leaves out 0, and the paper has no number; too few scenarios: fewer than {LEAST_SCENARIOS}, "
     "which too often change in one direction by chance."
 )
-BOUND = "TE bound: track error of points that move with the nodes around them, 0 for every rigid motion; TE has a floor, frame 0's."
-NAMED = 6
+BOUND_NOTE = (
+    "TE bound: track error of points that move with the nodes around them, 0 for every rigid motion; TE has a floor, frame 0's."
+)
+MOST_NAMED = 6
 """At most so many runs with the same reason are named. numbers.json has all."""
 FAILED_MARK = "*"
 """Stands beside the number of runs of a method if some of them failed."""
@@ -87,9 +89,9 @@ def study_tables(numbers: StudyNumbers) -> list[Table]:
     finished = (own.runs["status"] == "ok").any()
     nothing = "No pair of scenario and seed was finished by every method." if finished else "Nothing has finished."
     removed = " ".join(removed_lines(own.comparison.runs, own.left_out, numbers.labels))
-    notes = [VERDICTS if study.reference else "", which if kept else nothing, removed, _pictures(own.runs)]
+    notes = [VERDICT_NOTE if study.reference else "", which if kept else nothing, removed, _pictures(own.runs)]
     notes += [paper.CLUSTER_CLAIM] if cluster_methods(study.rows.values()) else []
-    notes += [BOUND] if "track_error_bound" in set(cells["metric"]) else []
+    notes += [BOUND_NOTE] if "track_error_bound" in set(cells["metric"]) else []
     tables = [
         main_table(study, cells, " ".join(note for note in notes if note)),
         *study_failures(numbers),
@@ -226,7 +228,7 @@ def change_table(study: Study, cells: pd.DataFrame) -> Table:
     in_db = " (PSNR: in dB)" if any(not metric.relative for _, metric in shown) else ""
     note = (
         f"Change against {study.baseline} on the same scenarios and seeds, in per cent of its mean{in_db}, with the paired 95 % "
-        f"bootstrap interval. {DIRECTIONS}"
+        f"bootstrap interval. {DIRECTION_NOTE}"
     )
     return grouped(f"Change against {study.baseline}", ["Method", ""], shown, table, note)
 
@@ -298,7 +300,7 @@ def _marks(study: Study, cells: pd.DataFrame, shown: Columns, source: str) -> di
 
 
 def _pictures(runs: pd.DataFrame) -> str:
-    """How pictures were scored, as far as it changes their scores against the paper's."""
+    """Conditions of the scores of pictures, as far as they change their scores against the paper's."""
     facts = [json.loads(text) for text in runs["images"].dropna()]
     scored = [fact for fact in facts if fact and "failed" not in fact]
     if not scored:
@@ -318,7 +320,7 @@ def left_out_items(numbers: StudyNumbers) -> list[Block]:
     left = runs[~runs["counted"].astype(bool)]
     for (label, status, why), part in left.groupby(["label", "status", "why"], sort=False):
         names = [f"{row.scenario} / seed {row.seed}" for row in part.itertuples()]
-        shown = names if status == "failed" else names[:NAMED]
+        shown = names if status == "failed" else names[:MOST_NAMED]
         more = f" and {len(names) - len(shown)} more" if len(names) > len(shown) else ""
         lines.append(f"{label}, {', '.join(shown)}{more}: {' '.join(str(why).split())}")
     lines += left_out_lines(own.left_out, numbers.labels)

@@ -23,13 +23,13 @@ from neuspring.report.grid import EMPTY, Columns, best, between, by_method, chip
 from neuspring.report.notes import honest_notes
 from neuspring.report.verdict import NOUNS, verdict
 from neuspring.scores import failures, statistics
-from neuspring.scores.metrics import COLUMNS, DASH, METRICS, SHORT, Metric, metrics_of
+from neuspring.scores.metrics import DASH, METRICS, SCORE_COLUMNS, SHORT, Metric, metrics_of
 from neuspring.scores.numbers import Numbers
 from neuspring.scores.runs import Collected, comparable, mixed_settings, pairs
 from neuspring.scores.study import ORACLE_LINE
 
 NOT_COMPUTED = Cell(text="not computed", value="")
-MOST_OPEN = 12
+MOST_OPEN_ROWS = 12
 """Most rows of a breakdown that is not folded."""
 LISTED = 12
 """At most so many missing runs, or notes, are listed one by one. If there are more, they are counted by method."""
@@ -62,7 +62,7 @@ def score_blocks(numbers: Numbers) -> list[Block]:
 
 
 def detail_blocks(numbers: Numbers) -> list[Block]:
-    """How sure the averages are: floors, spread, ratios, paired differences, failures, and what to be careful with."""
+    """Certainty of the averages: floors, spread, ratios, paired differences, failures, and what to be careful with."""
     differences, everyone = numbers.differences, numbers.everything.runs
     blocks: list[Block] = [Text(text=line) for line in floor_lines(numbers.floors)]
     if len(numbers.seeds):
@@ -209,7 +209,8 @@ def failure_table(caption: str, means: pd.DataFrame, labels: Mapping[str, str], 
         return cell
 
     ordered = pd.concat([means[means["method"] == method] for method in labels])
-    note = f"{failures.WHY} In brackets the other average: weighted by frames for errors, equally for pictures. {failures.DASHES}"
+    brackets = "In brackets the other average: weighted by frames for errors, equally for pictures."
+    note = f"{failures.FAILURE_NOTE} {brackets} {failures.DASH_NOTE}"
     stub = ["Method", "Succeeded", "Mean over"]
     made = rows(ordered, shown, ["method"], lines)
     return flat(caption, stub, shown, made, note=note) if scale else grouped(caption, stub, shown, made, note)
@@ -237,7 +238,7 @@ def floor_lines(floors: pd.DataFrame) -> list[str]:
 
 
 def image_blocks(numbers: Numbers) -> list[Block]:
-    """How pictures were scored, and both averages; a sentence if there are none."""
+    """Conditions of the scores of pictures, and both averages; a sentence if there are none."""
     collected, scores = numbers.collected, numbers.usable
     facts = [json.loads(text) if isinstance(text, str) else None for text in collected.runs.get("images", [])]
     runs = collected.runs[[bool(fact) for fact in facts] or [False] * len(collected.runs)]
@@ -274,7 +275,7 @@ def _unseen(runs: pd.DataFrame) -> str:
 
 
 def _image_conditions(facts: Iterable[dict[str, Any]]) -> str:
-    """How pictures were scored, from the runs' records."""
+    """Conditions of the scores of pictures, from the runs' records."""
 
     def several(name: str) -> str:
         return " and ".join(sorted({", ".join(v) if isinstance(v := values[name], list) else str(v) for values in facts}))
@@ -334,7 +335,7 @@ def breakdown_blocks(finished: pd.DataFrame) -> list[Block]:
                 lines.append([Cell(text=str(name)), Cell(text=str(method)), *cells, Cell(text=str(number))])
         caption = f"Per {column} (errors in mm, seeds averaged)"
         table = flat(caption, [column.capitalize(), "Method"], shown, lines, counted, sortable=True, note="All finished runs.")
-        blocks.append(Fold(summary=f"Per {column}", blocks=[table], open=column == "scenario" and len(lines) <= MOST_OPEN))
+        blocks.append(Fold(summary=f"Per {column}", blocks=[table], open=column == "scenario" and len(lines) <= MOST_OPEN_ROWS))
     return blocks
 
 
@@ -424,7 +425,7 @@ def write(numbers: Numbers, folder: Path) -> str:
     """
     collected, transfers = numbers.everything, numbers.transfers
     # All files are written every time, empty ones too, so that none is left over from an earlier run.
-    moved = transfers.scores if transfers else pd.DataFrame(columns=list(COLUMNS))
+    moved = transfers.scores if transfers else pd.DataFrame(columns=list(SCORE_COLUMNS))
     for name, table in {"scores": collected.scores, "runs": collected.runs, "transfers": moved}.items():
         write_text(folder / f"{name}.csv", table.to_csv(index=False))
     numbers.save(folder)

@@ -63,7 +63,7 @@ def configured_weights(settings: LpipsWeights) -> Weights | str:
 
 
 CHANNELS = (3, 64, 192, 384, 256, 256)
-"""Of the picture and after each convolution."""
+"""Channels of the picture and after each convolution."""
 WINDOWS = (11, 5, 3, 3, 3)
 """px, of each convolution."""
 STRIDES = (4, 1, 1, 1, 1)
@@ -72,10 +72,10 @@ LAYERS = (0, 3, 6, 8, 10)
 """Indices of the convolutions in torchvision's `features`."""
 POOLED = (1, 2)
 """Convolutions that follow a max-pooling of 3 px, stride 2."""
-SMALLEST = 31
+SMALLEST_PICTURE = 31
 """px: below it nothing is left after the second pooling."""
-SHIFT = (-0.030, -0.088, -0.188)
-SCALE = (0.458, 0.448, 0.450)
+RGB_SHIFT = (-0.030, -0.088, -0.188)
+RGB_SCALE = (0.458, 0.448, 0.450)
 """ImageNet's means and deviations of R, G, B, for pictures in [-1, 1]."""
 LEAST_NORM = 1e-10
 """Added to the length of a feature before dividing by it."""
@@ -86,7 +86,7 @@ class Lpips:
     """The distance with its weights, all float32 on one device."""
 
     kernels: list[torch.Tensor]
-    """Of each convolution [out, in, window, window]."""
+    """Kernel of each convolution [out, in, window, window]."""
     biases: list[torch.Tensor]
     heads: list[torch.Tensor]
     """w_l [1, channels, 1, 1]."""
@@ -137,12 +137,12 @@ class Lpips:
         shapes = f"{tuple(a.shape)}, {tuple(b.shape)}"
         if a.ndim < 3 or a.shape != b.shape or a.shape[-3] != 3:
             raise InputError("LPIPS", "two pictures [..., 3, H, W] of the same shape are needed", shapes)
-        if min(a.shape[-2:]) < SMALLEST:
-            raise InputError("LPIPS", f"AlexNet takes pictures of at least {SMALLEST} x {SMALLEST} px", shapes)
+        if min(a.shape[-2:]) < SMALLEST_PICTURE:
+            raise InputError("LPIPS", f"AlexNet takes pictures of at least {SMALLEST_PICTURE} x {SMALLEST_PICTURE} px", shapes)
         pictures = torch.cat([p.reshape(-1, *p.shape[-3:]).to(self.heads[0]) for p in (a, b)])
         if not released_range:
             pictures = 2 * pictures - 1
-        shift, scale = (pictures.new_tensor(values)[:, None, None] for values in (SHIFT, SCALE))
+        shift, scale = (pictures.new_tensor(values)[:, None, None] for values in (RGB_SHIFT, RGB_SCALE))
         distance = pictures.new_zeros(len(pictures) // 2)
         # Full single precision, so that a GPU reports what a CPU does.
         with torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False):

@@ -47,7 +47,7 @@ class Numbers:
     everything: Collected
     baseline: str
     objects: statistics.Objects = "scenario"
-    """What intervals of ratios are over."""
+    """Objects that intervals of ratios are over."""
     aims: tuple[Aim, ...] = ()
     """Ratios that are aimed at."""
     transfers: Collected | None = None
@@ -57,7 +57,7 @@ class Numbers:
     known_studies: Mapping[str, Study] = field(default_factory=dict)
     """Those and the ones that may stand beside them."""
     results: Path = Path("results")
-    """Where films of clips lie."""
+    """Folder in which films of clips lie."""
     warnings: tuple[tuple[str, Finding], ...] = ()
     """Scenarios, and what steps of perception warned of."""
     made_otherwise: tuple[str, ...] = ()
@@ -188,7 +188,7 @@ class Numbers:
 
     @property
     def size(self) -> str:
-        """How much is compared, in words."""
+        """Size of the comparison, in words."""
         return f"{self.usable['scenario'].nunique()} scenarios, {self.usable['seed'].nunique()} seed(s)"
 
     @cached_property

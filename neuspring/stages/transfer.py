@@ -56,7 +56,7 @@ def transfer(
     from neuspring.twin.rollout import initial_velocity, roll_out
     from neuspring.twin.transfer import move
 
-    tables, diverged = [pd.DataFrame(columns=list(metrics.COLUMNS))], []
+    tables, diverged = [pd.DataFrame(columns=list(metrics.SCORE_COLUMNS))], []
     courses, lines = [pd.DataFrame(columns=["scenario", "frame", "seconds", "metric", "value"])], {}
     updates, registered, record = 0, {}, learned.record
     twin = Twin.load(learned.file("twin")) if learned.has("twin") else None

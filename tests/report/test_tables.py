@@ -7,9 +7,9 @@ import pandas as pd
 import pytest
 
 from neuspring.core.table import Cell, Chip, Table
-from neuspring.report.blocks import Section, html_page
+from neuspring.report.blocks import PageSection, html_page
 from neuspring.report.summary import detail_blocks, errors_table, not_counted, score_blocks, write
-from neuspring.scores.metrics import COLUMNS
+from neuspring.scores.metrics import SCORE_COLUMNS
 from neuspring.scores.numbers import Numbers
 from neuspring.scores.runs import Collected, collect
 from neuspring.scores.statistics import paired_differences, resampled_means
@@ -96,7 +96,7 @@ def with_images(lpips: str = "computed", quirks: tuple[str, ...] = ()) -> Collec
         for k, m in enumerate(("x", "y"))
         for task in ("reconstruction", "future")
     ]
-    return Collected(pd.concat([base.scores, pd.DataFrame(rows, columns=list(COLUMNS))], ignore_index=True), runs)
+    return Collected(pd.concat([base.scores, pd.DataFrame(rows, columns=list(SCORE_COLUMNS))], ignore_index=True), runs)
 
 
 def test_pictures_have_a_table_of_their_own():
@@ -200,7 +200,7 @@ def test_a_table_is_drawn_as_markdown_latex_and_html():
     latex = table.latex("label", "T & U")
     assert r"a$|$b & \underline{1.5 $\pm$ 0.1 ($-$2): worse} & $<$3 \\" in latex
     assert r"\multicolumn{1}{c}{Reconstruction \& Resimulation}" in latex and r"\caption{\textbf{T \& U.} 50 \% of a\_b}" in latex
-    page = html_page("", "", [Section(key="a", title="A", blocks=[table])])
+    page = html_page("", "", [PageSection(key="a", title="A", blocks=[table])])
     assert page.count("<table") == 2 and "<caption>C: Future Prediction</caption>" in page
     assert '<td data-value="1.5"><b>1.5 ± 0.1</b><span class="hidden"> (second)</span><small>(-2)</small>' in page
     assert '<span class="chip bad"><span aria-hidden="true">▼</span> worse</span>' in page and "&lt;3" in page

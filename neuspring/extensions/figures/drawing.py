@@ -21,7 +21,7 @@ from neuspring.extensions.figures.options import ComparedOptions, FilmOptions, R
 from neuspring.report.draw import sheet
 from neuspring.report.draw.film import write_film
 from neuspring.report.draw.painter import DrawingStyle, Error, Painter, Style
-from neuspring.report.draw.scene import ELEVATION, Prediction, Scene, chosen_frames
+from neuspring.report.draw.scene import VIEW_ELEVATION, ShownRun, ShownScene, chosen_frames
 from neuspring.report.draw.strip import caption, strip_figure
 from neuspring.report.draw.twin import TwinPicture, twin_figure
 from neuspring.report.shown import Found, Run, find
@@ -33,14 +33,14 @@ class Chosen:
 
     found: Found
     runs: list[Run]
-    takes: list[Prediction]
+    takes: list[ShownRun]
     images: Images
     device: str
 
 
 def strip(picture: StripOptions) -> None:
     """Observed frames on top, each method's prediction and error below -> PDF or PNG."""
-    sheet.require_ending(picture.output, sheet.PICTURES)
+    sheet.require_ending(picture.output, sheet.PICTURE_ENDINGS)
     sheet.require_size(picture.width, picture.dpi)
     chosen = _choose(picture)
     scenario = chosen.found.observations.scenario
@@ -55,7 +55,7 @@ def strip(picture: StripOptions) -> None:
 
 def film(picture: FilmOptions) -> None:
     """Observed beside predicted, moving -> MP4 or GIF of limited size."""
-    sheet.require_ending(picture.output, sheet.FILMS)
+    sheet.require_ending(picture.output, sheet.FILM_ENDINGS)
     chosen = _choose(picture)
     count = chosen.found.observations.scenario.frame_count
     frames = sorted(set(_frames(picture.frames, count) or range(count)))
@@ -66,7 +66,7 @@ def film(picture: FilmOptions) -> None:
 
 def twin(picture: TwinOptions) -> None:
     """Stiffness and regions of twins, from any side -> PDF or PNG."""
-    sheet.require_ending(picture.output, sheet.PICTURES)
+    sheet.require_ending(picture.output, sheet.PICTURE_ENDINGS)
     sheet.require_size(picture.width, picture.dpi)
     chosen = _choose(picture, positions=picture.frame > 0)
     _frames([picture.frame], chosen.found.observations.scenario.frame_count, "--frame")
@@ -125,12 +125,12 @@ def _named(a: RunOptions, found: Found) -> list[Run]:
     return [run for run in chosen if run is not None]
 
 
-def _take(run: Run, label: str, positions: bool) -> Prediction:
+def _take(run: Run, label: str, positions: bool) -> ShownRun:
     if run.trajectory is None or not len(run.trajectory.positions):
         if positions or run.twin is None:
             raise InputError(f"--methods {run.name}", "must have a prediction", "; ".join(run.notes) or "none", "Name another run.")
-        return Prediction(label, run.twin.topology.nodes[None], run.twin)
-    return Prediction(label, run.trajectory.positions, run.twin, run.splats, None if run.centers is None else run.centers.positions)
+        return ShownRun(label, run.twin.topology.nodes[None], run.twin)
+    return ShownRun(label, run.trajectory.positions, run.twin, run.splats, None if run.centers is None else run.centers.positions)
 
 
 def _frames(wanted: Sequence[int] | None, count: int, option: str = "--frames") -> list[int]:
@@ -178,7 +178,7 @@ def _painter(a: ComparedOptions, chosen: Chosen, frames: list[int], error: Error
     return Painter(scene, chosen.takes, frames, manner, chosen.images, chosen.device)
 
 
-def _scene(a: RunOptions, chosen: Chosen, frames: list[int], takes: list[Prediction]) -> Scene:
+def _scene(a: RunOptions, chosen: Chosen, frames: list[int], takes: list[ShownRun]) -> ShownScene:
     """The scene from the camera that is asked for. Raises InputError."""
     found, observations = chosen.found, chosen.found.observations
     cameras = found.capture.cameras if found.capture else {}
@@ -190,8 +190,8 @@ def _scene(a: RunOptions, chosen: Chosen, frames: list[int], takes: list[Predict
         raise InputError("--camera", rule, a.camera, "Give --azimuth and --elevation for any other view.")
     if cameras and not turned:
         camera = cameras[a.camera or next(iter(cameras))]
-        return Scene.of(observations, camera, takes, frames, found.capture, _labels(found.folder, found.capture, camera))
-    return Scene.from_side(observations, takes, frames, a.azimuth, ELEVATION if a.elevation is None else a.elevation)
+        return ShownScene.of(observations, camera, takes, frames, found.capture, _labels(found.folder, found.capture, camera))
+    return ShownScene.from_side(observations, takes, frames, a.azimuth, VIEW_ELEVATION if a.elevation is None else a.elevation)
 
 
 def _labels(folder: Path, capture: Capture | None, camera: Camera) -> np.ndarray | None:

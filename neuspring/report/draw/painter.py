@@ -1,4 +1,4 @@
-"""What stands in one panel: the observed frame, a prediction, or its error."""
+"""Content of one panel: the observed frame, a prediction, or its error."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from matplotlib.colors import Normalize
 from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations
 from neuspring.data.camera import Camera
-from neuspring.report.draw.scene import Prediction, Scene, faded, masked, object_and_hands, over_white, shown_points
+from neuspring.report.draw.scene import ShownRun, ShownScene, faded, masked, object_and_hands, over_white, shown_points
 from neuspring.report.draw.sheet import CONTROLLER, WORST, points_across
 from neuspring.scores.pictures import Pair, psnr
 from neuspring.splats.draw import OBJECT_COVERAGE, picture, view_of
@@ -23,19 +23,19 @@ from neuspring.splats.rasterize import choose_backend
 Style = Literal["splats", "nodes"]
 Error = Literal["color", "distance", "none"]
 Ground = Literal["white", "image"]
-ERRORS = "magma_r"
+ERROR_COLORS = "magma_r"
 """Light for no error, on white paper; rising in darkness."""
-SEEN, PREDICTED, UNKNOWN = "tab:blue", "#303030", "#d5d5d5"
+BLUE_POINTS, DARK_NODES, UNKNOWN_COLOR = "tab:blue", "#303030", "#d5d5d5"
 """Observed points; predicted nodes; nodes whose error is not known."""
 HIDDEN = 200
 """Gray of hands, behind which nothing is compared."""
 LEAST_MM = 1.0
 """Least upper end of a range of distances."""
-NOTE, SMALLEST = 7.0, 5.0
+NOTE, SMALLEST_NOTE = 7.0, 5.0
 """Size of the text in a panel, points; the smallest is for narrow panels, of which it must not hide much."""
-CORNER = (0.4, 0.2)
+NOTE_CORNER = (0.4, 0.2)
 """Width and height of a note, of a panel."""
-MM = 1e3
+DRAWN_MM = 1e3
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +48,12 @@ class Drawn:
     """Mean absolute color difference [h, w], of 1; NaN where neither shows the object; None: nothing to compare with."""
     hands: np.ndarray | None = None
     psnr: float = float("nan")
-    """Of the whole picture, as in the tables, dB."""
+    """PSNR of the whole picture, as in the tables, dB."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DrawingStyle:
-    """How predictions and errors are drawn."""
+    """Style in which predictions and errors are drawn."""
 
     style: Style
     error: Error
@@ -65,7 +65,7 @@ class DrawingStyle:
     not trained on."""
 
 
-def distances(take: Prediction, observations: Observations, frame: int) -> tuple[np.ndarray, np.ndarray]:
+def distances(take: ShownRun, observations: Observations, frame: int) -> tuple[np.ndarray, np.ndarray]:
     """Nodes [P] whose point is seen in a frame, and their distances [P], m, to it. Node i is tracked point i."""
     seen = np.flatnonzero(observations.object_visibility[frame])
     gap = take.positions[frame][seen].astype(float) - observations.object_points[frame][seen]
@@ -77,8 +77,8 @@ class Painter:
 
     def __init__(
         self,
-        scene: Scene,
-        takes: Sequence[Prediction],
+        scene: ShownScene,
+        takes: Sequence[ShownRun],
         frames: Sequence[int],
         manner: DrawingStyle,
         images: Images,
@@ -89,7 +89,7 @@ class Painter:
         self.norm = Normalize(0, self._most())
         self._corner = self._free_corner()
 
-    def _splats(self, take: Prediction, images: Images, device: str) -> dict[int, Drawn]:
+    def _splats(self, take: ShownRun, images: Images, device: str) -> dict[int, Drawn]:
         view, backend = view_of(self.scene.camera, images, device), choose_backend(images.backend, device)
         made = {}
         for frame, gaussians in take.gaussians(self.frames, images, device):
@@ -120,7 +120,7 @@ class Painter:
             if frame < len(take.positions)
         ]
         values = np.concatenate(kept) if kept else np.zeros(0)
-        return _rounded(max(MM * float(np.quantile(values, 0.98)) if len(values) else 0.0, LEAST_MM))
+        return _rounded(max(DRAWN_MM * float(np.quantile(values, 0.98)) if len(values) else 0.0, LEAST_MM))
 
     @property
     def error_label(self) -> str:
@@ -138,8 +138,8 @@ class Painter:
         if self.scene.capture is not None:
             self._note(axis, f"camera {self.scene.camera.name} missed it")
         observations = self.scene.observations
-        self._line(axis, observations.object_points[frame], frame, SEEN)
-        self._points(axis, observations.object_points[frame][observations.object_visibility[frame]], SEEN)
+        self._line(axis, observations.object_points[frame], frame, BLUE_POINTS)
+        self._points(axis, observations.object_points[frame][observations.object_visibility[frame]], BLUE_POINTS)
         hands(axis, self.scene, frame)
 
     def draw_predicted(self, axis: Axes, which: int, frame: int) -> None:
@@ -158,10 +158,10 @@ class Painter:
             self._image(axis, below)
         else:
             observations = self.scene.observations
-            self._line(axis, observations.object_points[frame], frame, SEEN, alpha=0.5)
-            self._points(axis, observations.object_points[frame][observations.object_visibility[frame]], SEEN, alpha=0.5)
-        self._line(axis, take.positions[frame], frame, PREDICTED)
-        self._points(axis, take.positions[frame], PREDICTED)
+            self._line(axis, observations.object_points[frame], frame, BLUE_POINTS, alpha=0.5)
+            self._points(axis, observations.object_points[frame][observations.object_visibility[frame]], BLUE_POINTS, alpha=0.5)
+        self._line(axis, take.positions[frame], frame, DARK_NODES)
+        self._points(axis, take.positions[frame], DARK_NODES)
         hands(axis, self.scene, frame)
 
     def draw_error(self, axis: Axes, which: int, frame: int) -> None:
@@ -176,13 +176,13 @@ class Painter:
         seen, distance = distances(take, self.scene.observations, frame)
         nodes = take.positions[frame]
         others = np.setdiff1d(np.arange(len(nodes)), seen)
-        self._points(axis, nodes[others], UNKNOWN)
+        self._points(axis, nodes[others], UNKNOWN_COLOR)
         pairs = np.stack([self.scene.observations.object_points[frame][seen], nodes[seen]], axis=1)
         flat = self.scene.view.project(pairs.astype(float))[0]
         axis.add_collection(LineCollection(list(flat), colors="0.6", linewidths=0.4, zorder=2))
-        self._points(axis, nodes[seen], values=MM * distance)
+        self._points(axis, nodes[seen], values=DRAWN_MM * distance)
         if len(distance):
-            self._note(axis, f"{MM * distance.mean():.1f} mm")
+            self._note(axis, f"{DRAWN_MM * distance.mean():.1f} mm")
 
     def _difference(self, axis: Axes, drawn: Drawn) -> None:
         if drawn.difference is None or drawn.hands is None:
@@ -192,7 +192,7 @@ class Painter:
         ground[drawn.hands] = HIDDEN
         self._image(axis, ground, cut=False)
         shape = drawn.hands.shape
-        axis.imshow(drawn.difference, cmap=ERRORS, norm=self.norm, extent=_extent(shape), interpolation="nearest")
+        axis.imshow(drawn.difference, cmap=ERROR_COLORS, norm=self.norm, extent=_extent(shape), interpolation="nearest")
         self._note(axis, f"{drawn.psnr:.1f} dB" if np.isfinite(drawn.psnr) else "equal")
 
     def _free_corner(self) -> tuple[float, float]:
@@ -203,7 +203,7 @@ class Painter:
         x, y = part[:, 0], 1 - part[:, 1]
 
         def inside(corner: tuple[float, float]) -> int:
-            return int(((np.abs(x - corner[0]) < CORNER[0]) & (np.abs(y - corner[1]) < CORNER[1])).sum())
+            return int(((np.abs(x - corner[0]) < NOTE_CORNER[0]) & (np.abs(y - corner[1]) < NOTE_CORNER[1])).sum())
 
         return min(((1.0, 0.0), (0.0, 0.0), (1.0, 1.0), (0.0, 1.0)), key=inside)
 
@@ -212,7 +212,7 @@ class Painter:
         place: dict[str, Any] = {"ha": "right" if right else "left", "va": "top" if upper else "bottom"}
         box: dict[str, Any] = {"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 1.0}
         x, y = 0.025 + 0.95 * right, 0.035 + 0.93 * upper
-        size = float(np.clip(0.075 * points_across(axis), SMALLEST, NOTE))
+        size = float(np.clip(0.075 * points_across(axis), SMALLEST_NOTE, NOTE))
         axis.text(x, y, text, fontsize=size, bbox=box, transform=axis.transAxes, zorder=9, **place)
 
     def _line(self, axis: Axes, nodes: np.ndarray, frame: int, color: str, alpha: float = 1.0) -> None:
@@ -233,10 +233,10 @@ class Painter:
         flat, depth = self.scene.view.project(np.asarray(points, float))
         order = np.argsort(-depth)
         order = order[depth[order] > 0]
-        style = {"color": color} if values is None else {"c": values[order], "cmap": ERRORS, "norm": self.norm}
+        style = {"color": color} if values is None else {"c": values[order], "cmap": ERROR_COLORS, "norm": self.norm}
         edge = {"linewidths": 0.0} if values is None else {"linewidths": 0.25, "edgecolors": "0.45"}
         # All frames have dots of one size, however many points are seen.
-        nodes = color in (PREDICTED, UNKNOWN)
+        nodes = color in (DARK_NODES, UNKNOWN_COLOR)
         size = self._size(axis, len(observations.nodes) if nodes else observations.object_points.shape[1])
         axis.scatter(flat[order, 0], flat[order, 1], s=size, alpha=alpha, zorder=3, **style, **edge)
 
@@ -259,7 +259,7 @@ def empty(axis: Axes, view: Camera, *, framed: bool = True) -> None:
         side.set(linewidth=0.5, color="0.7", visible=framed)
 
 
-def hands(axis: Axes, scene: Scene, frame: int) -> None:
+def hands(axis: Axes, scene: ShownScene, frame: int) -> None:
     """The controllers of a frame."""
     flat, depth = scene.view.project(scene.hands(frame).astype(float))
     size = float(np.clip((0.021 * points_across(axis)) ** 2, 3.0, 14.0))

@@ -1,4 +1,4 @@
-"""What a picture is made of: the scene and its video as one camera sees them, from any side, and predictions."""
+"""Subject of a picture: the scene and its video as one camera sees them, from any side, and predictions."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture
 from neuspring.splats.draw import frames_from_centers, skinned_frames
 from neuspring.splats.model import Gaussians, Splats
 
-SIDE = 1200
+VIEW_SIZE = 1200
 """Pixels of the picture of a camera from any side; only a part of it is shown."""
 OPENING = math.radians(20)
 """Its angle of view: a long lens, so that near and far parts have almost one scale."""
 STEEPEST = 89.0
 """Degrees above or below the horizon; straight down no side of the picture is up."""
-ELEVATION = 25.0
+VIEW_ELEVATION = 25.0
 """Degrees above the horizon of a view that is not asked for."""
-MARGIN = 0.04
+VIEW_MARGIN = 0.04
 """Free space around what is shown, as a fraction of its larger side."""
-FLATTEST, TALLEST = 0.35, 1.3
+FLATTEST_PANEL, TALLEST_PANEL = 0.35, 1.3
 """Least and greatest height of a panel, over its width."""
 
 
@@ -63,9 +63,9 @@ def seen_from(points: np.ndarray, up: Up, azimuth: float, elevation: float) -> C
     away = float((np.abs(local[:, :2]).max(axis=1) / slope - local[:, 2]).max())
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = axes, middle - max(1.05 * away, 0.05) * forward
-    focal = 0.5 * SIDE / slope
-    half = 0.5 * (SIDE - 1)
-    return Camera("view", SIDE, SIDE, np.array([[focal, 0, half], [0, focal, half], [0, 0, 1]]), pose)
+    focal = 0.5 * VIEW_SIZE / slope
+    half = 0.5 * (VIEW_SIZE - 1)
+    return Camera("view", VIEW_SIZE, VIEW_SIZE, np.array([[focal, 0, half], [0, focal, half], [0, 0, 1]]), pose)
 
 
 def _sign(up: Up) -> float:
@@ -79,9 +79,9 @@ def box_around(pixels: np.ndarray, camera: Camera, *, clip: bool) -> tuple[int, 
     """
     low, high = pixels.min(axis=0), pixels.max(axis=0)
     size = np.maximum(high - low, 1.0)
-    size = size + 2 * MARGIN * size.max()
-    size[1] = max(size[1], FLATTEST * size[0])
-    size[0] = max(size[0], size[1] / TALLEST)
+    size = size + 2 * VIEW_MARGIN * size.max()
+    size[1] = max(size[1], FLATTEST_PANEL * size[0])
+    size[0] = max(size[0], size[1] / TALLEST_PANEL)
     whole = np.array([camera.width, camera.height], float)
     if clip:
         size = np.minimum(size, whole)
@@ -118,7 +118,7 @@ FADE = 0.6
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class ShownRun:
     """A run's prediction: F frames, N nodes."""
 
     label: str
@@ -127,7 +127,7 @@ class Prediction:
     twin: Twin | None = None
     splats: Splats | None = None
     centers: np.ndarray | None = None
-    """Where the method's own model puts its splats [F, G, 3], m; else the nodes carry them."""
+    """Centers [F, G, 3], m, at which the method's own model puts its splats; else the nodes carry them."""
 
     def gaussians(self, frames: Iterable[int], images: Images, device: str) -> Iterator[tuple[int, Gaussians]]:
         """The splats in these frames, in rising order; frames behind a divergence are left out."""
@@ -142,8 +142,8 @@ class Prediction:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
-    """What was observed, seen by one camera; `box` is the part of its picture that is shown."""
+class ShownScene:
+    """The observed scene, seen by one camera; `box` is the part of its picture that is shown."""
 
     observations: Observations
     camera: Camera
@@ -158,11 +158,11 @@ class Scene:
         cls,
         observations: Observations,
         camera: Camera,
-        takes: Sequence[Prediction],
+        takes: Sequence[ShownRun],
         frames: Sequence[int],
         capture: Capture | None = None,
         labels: np.ndarray | None = None,
-    ) -> Scene:
+    ) -> ShownScene:
         """The part of the picture that holds what these frames show."""
         pixels, depth = camera.project(shown_points(observations, takes, frames))
         seen = pixels[depth > 0]
@@ -177,12 +177,12 @@ class Scene:
     def from_side(
         cls,
         observations: Observations,
-        takes: Sequence[Prediction],
+        takes: Sequence[ShownRun],
         frames: Sequence[int],
         azimuth: float | None = None,
-        elevation: float = ELEVATION,
-    ) -> Scene:
-        """What these frames show from any side, degrees (`seen_from`); without an azimuth from the broad side."""
+        elevation: float = VIEW_ELEVATION,
+    ) -> ShownScene:
+        """The content of these frames from any side, degrees (`seen_from`); without an azimuth from the broad side."""
         points, up = shown_points(observations, takes, frames), observations.scenario.up
         camera = seen_from(points, up, broad_side(points, up) if azimuth is None else azimuth, elevation)
         return cls.of(observations, camera, takes, frames)
@@ -213,7 +213,7 @@ class Scene:
 
     @property
     def has_masks(self) -> bool:
-        """Whether observed and predicted pictures can be compared."""
+        """True where observed and predicted pictures can be compared."""
         return self.capture is not None and (self.capture.description.masks or self.labels is not None)
 
     def hands(self, frame: int) -> np.ndarray:
@@ -223,7 +223,7 @@ class Scene:
         return np.asarray(points[valid[frame]] if valid.size else points)
 
 
-def shown_points(observations: Observations, takes: Sequence[Prediction], frames: Sequence[int]) -> np.ndarray:
+def shown_points(observations: Observations, takes: Sequence[ShownRun], frames: Sequence[int]) -> np.ndarray:
     """Points [P, 3], m, that pictures of these frames must show: all observed ones, and predicted ones near them."""
     rows = list(frames)
     seen = [observations.object_points[frame][observations.object_visibility[frame]] for frame in rows]

@@ -1,4 +1,4 @@
-"""What all pictures share: sizes of text, colors, panels placed in inches, color bars, and how files are written."""
+"""Common parts of all pictures: sizes of text, colors, panels placed in inches, color bars, and how files are written."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from neuspring.core.files import write_atomically
 
 TEXT = 8.0
 """Size of text, points, at the width that the picture is made for."""
-PICTURES, FILMS = (".pdf", ".png", ".jpg", ".svg"), (".mp4", ".gif")
+PICTURE_ENDINGS, FILM_ENDINGS = (".pdf", ".png", ".jpg", ".svg"), (".mp4", ".gif")
 WIDTHS, RESOLUTIONS = (1.5, 20.0), (50.0, 1200.0)
 """Least and greatest width, inches, and dots per inch."""
 DPI = 110
@@ -39,8 +39,8 @@ def require_ending(path: Path, endings: Sequence[str]) -> None:
     """Raise InputError for a file that these pictures cannot be written to, before they are drawn."""
     if path.suffix.lower() not in endings:
         rule = f"the file must end in {', '.join(endings[:-1])} or {endings[-1]}"
-        other = FILMS if endings == PICTURES else PICTURES
-        kind = "neuspring draw film" if other == FILMS else "neuspring draw strip"
+        other = FILM_ENDINGS if endings == PICTURE_ENDINGS else PICTURE_ENDINGS
+        kind = "neuspring draw film" if other == FILM_ENDINGS else "neuspring draw strip"
         remedy = f"{kind} writes {path.suffix}." if path.suffix.lower() in other else ""
         raise InputError("--output", rule, path.name, remedy)
     if path.is_dir():

@@ -1,4 +1,4 @@
-"""What went wrong: failed jobs and their causes, numerical failures, damaged files; and a table of the runs that there are."""
+"""Failures: failed jobs and their causes, numerical failures, damaged files; and a table of the runs that there are."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import pandas as pd
 
 from neuspring.core.job_records import JobRecord
 from neuspring.core.table import Cell, Chip, Table
-from neuspring.report.blocks import Block, Fold, Section, Text
+from neuspring.report.blocks import Block, Fold, PageSection, Text
 from neuspring.report.data import MOST_ROWS, ReportData, ReportSection, duration, link, several
 
 
-def failures(material: ReportData) -> Section:
+def failures(material: ReportData) -> PageSection:
     """Everything that keeps runs out of the tables, and a table of the runs that there are."""
     failed = [job for job in material.jobs if job.failed]
     left = [job for job in material.jobs if job.last.outcome == "running"]
@@ -43,7 +43,7 @@ def failures(material: ReportData) -> Section:
         blocks.append(Fold(summary=summary, blocks=[_jobs("Jobs", retried, material)]))
     if len(runs):
         blocks.append(_matrix(runs))
-    return Section(key="failures", title="Failures and missing runs", blocks=blocks)
+    return PageSection(key="failures", title="Failures and missing runs", blocks=blocks)
 
 
 def _rest(count: int) -> str:
@@ -112,4 +112,4 @@ def _matrix(runs: pd.DataFrame) -> Fold:
     return Fold(summary=f"Runs: {done} of {len(runs)} finished, {missing} missing", blocks=[table], open=len(scenarios) <= 30)
 
 
-SECTION = ReportSection(order=100, make=failures, phase=2)
+section = ReportSection(order=100, make=failures, phase=2)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from neuspring.core.findings import Level, findings_of
 from neuspring.core.table import Cell, Chip, Table, Tone
-from neuspring.report.blocks import Block, Fold, Section, Text
+from neuspring.report.blocks import Block, Fold, PageSection, Text
 from neuspring.report.data import MOST_ROWS, ReportData, ReportSection, several
 
 TONES: dict[Level, Tone] = {"error": "bad", "warning": "warn", "note": "mute"}
 
 
-def findings(material: ReportData) -> Section | None:
+def findings(material: ReportData) -> PageSection | None:
     """A table of warnings, and one of notes to unfold; None where perception found nothing worth saying, or did not run."""
     found = [(name, one) for name in material.choice.scenarios for one in findings_of(material.results, name)]
     if not found:
@@ -35,7 +35,7 @@ def findings(material: ReportData) -> Section | None:
     if not loud:
         blocks.insert(0, Text(text="Perception noticed nothing that makes results worse.", tone="good"))
     about = "Each step looks at its own result: a warning says what may make all methods worse, and what to do."
-    return Section(key="findings", title="Findings of perception", about=about, blocks=blocks)
+    return PageSection(key="findings", title="Findings of perception", about=about, blocks=blocks)
 
 
-SECTION = ReportSection(order=60, make=findings)
+section = ReportSection(order=60, make=findings)

@@ -14,18 +14,18 @@ from PIL import Image
 
 from neuspring.core.artifacts import Observations
 from neuspring.core.run_record import RunRecord
-from neuspring.report.blocks import Block, Code, Fold, Grid, Picture, Section, Text, Video
+from neuspring.report.blocks import Block, Code, Fold, Grid, PageSection, PageVideo, Picture, Text
 from neuspring.report.data import UNREADABLE, ReportData, ReportSection, data_uri, link, several
 from neuspring.report.draw.scene import chosen_frames
 
-QUALITY = 75
+WEBP_QUALITY = 75
 """Quality of WebP pictures, of 100."""
 MARKUP = 400
 """Characters around an embedded picture."""
 NO_ROOM = "not embedded, to keep this page small"
-ADDRESS = "http://127.0.0.1:8080/"
-"""Where `neuspring play` listens unless it is told otherwise."""
-MOST_OPEN = 3
+PLAY_ADDRESS = "http://127.0.0.1:8080/"
+"""Address at which `neuspring play` listens unless it is told otherwise."""
+MOST_OPEN_FILMS = 3
 """Scenarios whose films are not folded."""
 
 
@@ -97,8 +97,8 @@ class Media:
         if not kind.width:
             wide = kind.least >= 40
             if place in self._films:
-                return Video(caption=caption, data=self._films[place], wide=wide)
-            return Video(caption=caption, link=target, reason=NO_ROOM, wide=wide)
+                return PageVideo(caption=caption, data=self._films[place], wide=wide)
+            return PageVideo(caption=caption, link=target, reason=NO_ROOM, wide=wide)
         if found := self._embedded.get(place):
             return Picture(caption=caption, alt=alt, data=found.data, size=found.size, wide=True, paper=kind.paper, frames=frames)
         return Picture(caption=caption, alt=alt, link=target, reason=self._damaged.get(place, NO_ROOM), frames=frames)
@@ -114,7 +114,7 @@ def _smaller(path: Path, width: int) -> Picture | str:
         return "damaged: not a picture"
     picture.thumbnail((width, 10 * width))
     stream = io.BytesIO()
-    picture.save(stream, "WEBP", quality=QUALITY)
+    picture.save(stream, "WEBP", quality=WEBP_QUALITY)
     return Picture(caption="", alt="", data=data_uri("image/webp", stream.getvalue()), size=picture.size)
 
 
@@ -125,10 +125,10 @@ def frame_links(material: ReportData, scenario: str) -> tuple[tuple[str, str], .
     except UNREADABLE:
         return ()
     frames = sorted(chosen_frames(facts, facts.frame_count))
-    return tuple((f"frame {frame}", f"{ADDRESS}?frame={frame}&scenario={scenario}") for frame in frames)
+    return tuple((f"frame {frame}", f"{PLAY_ADDRESS}?frame={frame}&scenario={scenario}") for frame in frames)
 
 
-def pictures(material: ReportData) -> Section:
+def pictures(material: ReportData) -> PageSection:
     """A fold per scenario, with the command that shows its runs in the playground."""
     media, folds = Media(material, material.room, int(1e6 * material.choice.video_megabytes)), list[Block]()
     for scenario in material.choice.scenarios:
@@ -137,14 +137,14 @@ def pictures(material: ReportData) -> Section:
             command = shlex.join(["neuspring", "play", *(str(material.folder(run)) for run in runs.values())])
             seeds = sorted({run.seed for run in runs.values()})
             summary = f"{scenario}: {several(len(runs), 'method')}, seed {', '.join(map(str, seeds))}"
-            folds.append(Fold(summary=summary, blocks=[*blocks, Code(text=command, whole=True)], open=len(folds) < MOST_OPEN))
+            folds.append(Fold(summary=summary, blocks=[*blocks, Code(text=command, whole=True)], open=len(folds) < MOST_OPEN_FILMS))
     if not folds:
-        return Section(key="pictures", title="Film", blocks=[Text(text="No run has left pictures yet.", tone="mute")])
+        return PageSection(key="pictures", title="Film", blocks=[Text(text="No run has left pictures yet.", tone="mute")])
     about = (
         "All methods in step, one seed of every scenario. The bar above a film is blue in training frames and orange in the "
         "future. The command below opens the twins in the browser, to be turned and pulled; links to frames lead there."
     )
-    return Section(key="pictures", title="Film", about=about, blocks=folds)
+    return PageSection(key="pictures", title="Film", about=about, blocks=folds)
 
 
 def _scenario(material: ReportData, runs: dict[str, RunRecord], media: Media, frames: Sequence[tuple[str, str]]) -> list[Block]:
@@ -170,4 +170,4 @@ def _scenario(material: ReportData, runs: dict[str, RunRecord], media: Media, fr
     return blocks
 
 
-SECTION = ReportSection(order=30, make=pictures, phase=1)
+section = ReportSection(order=30, make=pictures, phase=1)

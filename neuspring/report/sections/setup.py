@@ -16,7 +16,7 @@ from neuspring.config import Config
 from neuspring.core.run_record import RunRecord, flat
 from neuspring.core.table import Cell, Table
 from neuspring.core.text import listed
-from neuspring.report.blocks import Block, Code, Fold, Items, Link, Section, Text
+from neuspring.report.blocks import Block, Code, Fold, Items, Link, PageSection, Text
 from neuspring.report.data import ReportData, ReportSection, link, several
 
 DATA = (".md", ".csv", ".tex", ".html", ".parquet")
@@ -43,7 +43,7 @@ PICTURE_STAGES = ("appearance", "render")
 """Their settings are those of `images` and of perception's lifting."""
 
 
-def setup(material: ReportData) -> Section:
+def setup(material: ReportData) -> PageSection:
     """Configuration, versions, machines, files."""
     blocks: list[Block] = [_commits(material.runs)] if material.runs else []
     blocks += _settings(material)
@@ -55,7 +55,7 @@ def setup(material: ReportData) -> Section:
     if beside:
         links = Items(items=[Link(text=text, target=target) for text, target in beside])
         blocks.append(Fold(summary=f"{several(len(beside), 'file')} with the tables' data, beside this page", blocks=[links]))
-    return Section(key="setup", title="Configuration and versions", blocks=blocks)
+    return PageSection(key="setup", title="Configuration and versions", blocks=blocks)
 
 
 def _commits(runs: Iterable[RunRecord]) -> Text:
@@ -147,4 +147,4 @@ def _different(values: Mapping[str, Any], defaults: Mapping[str, Any], prefix: s
     return different
 
 
-SECTION = ReportSection(order=110, make=setup)
+section = ReportSection(order=110, make=setup)

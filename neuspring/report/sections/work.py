@@ -9,7 +9,7 @@ import numpy as np
 
 from neuspring.core.job_records import JobRecord
 from neuspring.core.table import Cell, Table
-from neuspring.report.blocks import Block, Section, Text
+from neuspring.report.blocks import Block, PageSection, Text
 from neuspring.report.data import METHOD_RULES, ReportData, ReportSection, duration, hours, memory
 from neuspring.report.summary import timing_table
 from neuspring.scores.metrics import DASH
@@ -44,13 +44,15 @@ def gpu_hours(jobs: Sequence[JobRecord]) -> float:
     return sum(attempt.seconds * len(attempt.devices) for job in jobs for attempt in job.attempts) / 3600
 
 
-def work(material: ReportData) -> Section:
+def work(material: ReportData) -> PageSection:
     """Tables of hours."""
     title = "Time and hardware"
     jobs = material.jobs
     if not jobs:
         note = Text(text="There are no job records: times are those of finished runs alone.", tone="mute")
-        return Section(key="work", title=title, blocks=[note, timing_table(material.collected.runs)] if material.runs else [note])
+        return PageSection(
+            key="work", title=title, blocks=[note, timing_table(material.collected.runs)] if material.runs else [note]
+        )
     attempts = [attempt for job in jobs for attempt in job.attempts]
     hosts = sorted({a.host for a in attempts if a.host})
     names = sorted({name for a in attempts for name in a.device_names})
@@ -63,7 +65,7 @@ def work(material: ReportData) -> Section:
     if methods:
         caption = "By method (searches and splats apart, since methods share them)"
         blocks.append(_costs(caption, "Method", methods, sortable=True))
-    return Section(key="work", title=title, about=about, blocks=blocks)
+    return PageSection(key="work", title=title, about=about, blocks=blocks)
 
 
 def _costs(caption: str, what: str, groups: Mapping[str, Sequence[JobRecord]], *, sortable: bool) -> Table:
@@ -113,4 +115,4 @@ def _hours(seconds: float) -> Cell:
     return Cell(text=hours(seconds) if seconds else DASH, value=seconds)
 
 
-SECTION = ReportSection(order=90, make=work)
+section = ReportSection(order=90, make=work)

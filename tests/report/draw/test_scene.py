@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.report.draw.scene import FLATTEST, TALLEST, box_around, broad_side, finer, part, seen_from
+from neuspring.report.draw.scene import FLATTEST_PANEL, TALLEST_PANEL, box_around, broad_side, finer, part, seen_from
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.normal(size=(60, 3)) * [0.3, 0.05, 0.1] + [1.0, 2.0, 0.4]
@@ -59,9 +59,9 @@ def test_a_box_holds_its_pixels_has_a_shape_and_stays_inside_a_photo():
     flat = np.array([[300.0, 500.0], [800.0, 510.0]])
     left, top, right, bottom = box_around(flat, camera, clip=True)
     assert left <= 300 and right > 800 and top <= 500 and bottom > 510
-    assert (bottom - top) / (right - left) == pytest.approx(FLATTEST, abs=0.01)
+    assert (bottom - top) / (right - left) == pytest.approx(FLATTEST_PANEL, abs=0.01)
     tall = box_around(flat[:, ::-1], camera, clip=True)
-    assert (tall[3] - tall[1]) / (tall[2] - tall[0]) == pytest.approx(TALLEST, abs=0.01)
+    assert (tall[3] - tall[1]) / (tall[2] - tall[0]) == pytest.approx(TALLEST_PANEL, abs=0.01)
     corner = np.array([[0.0, 0.0], [30.0, 200.0]])
     assert box_around(corner, camera, clip=True)[:2] == (0, 0)
     assert min(box_around(corner, camera, clip=False)[:2]) < 0

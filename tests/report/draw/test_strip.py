@@ -9,8 +9,8 @@ from matplotlib import pyplot as plt
 from matplotlib.collections import PathCollection
 
 from neuspring.config.images import Images
-from neuspring.report.draw.painter import ERRORS, MM, Painter, distances
-from neuspring.report.draw.scene import Scene
+from neuspring.report.draw.painter import DRAWN_MM, ERROR_COLORS, Painter, distances
+from neuspring.report.draw.scene import ShownScene
 from neuspring.report.draw.strip import caption, rows_of, strip_figure
 from tests.support.played import results
 from tests.support.shown import METHODS, filmed, observed, painter, takes
@@ -63,7 +63,7 @@ def test_a_row_for_what_was_observed_and_each_method_and_a_column_per_frame(plai
 
 def test_distances_are_zero_for_the_twin_that_moves_as_was_observed(plain):
     paints = painter(plain, FRAMES)
-    exact, softer = ([distances(take, observed(plain), frame)[1].max() * MM for frame in FRAMES] for take in paints.takes)
+    exact, softer = ([distances(take, observed(plain), frame)[1].max() * DRAWN_MM for frame in FRAMES] for take in paints.takes)
     assert max(exact) < EXACT < softer[-1]
     panels = grid(strip_figure(paints, 6.0), 5, len(FRAMES))
     text = [[float(axis.texts[0].get_text().split()[0]) for axis in panels[row]] for row in (2, 4)]
@@ -92,7 +92,7 @@ def test_one_range_for_all_panels_and_darker_is_farther(plain):
         if isinstance(found, PathCollection) and found.get_array() is not None
     ]
     assert len(dots) == 2 * len(FRAMES) and {found.norm.vmax for found in dots} == {4.0}
-    lightness = colormaps[ERRORS](np.linspace(0, 1, 64))[:, :3] @ [0.2126, 0.7152, 0.0722]
+    lightness = colormaps[ERROR_COLORS](np.linspace(0, 1, 64))[:, :3] @ [0.2126, 0.7152, 0.0722]
     assert (np.diff(lightness) < 0).all()
 
 
@@ -159,7 +159,7 @@ def test_splats_that_a_method_moves_itself_are_where_it_puts_them(video):
 def test_a_far_prediction_does_not_shrink_the_picture(plain):
     paints = painter(plain, (0, 7))
     far = replace(paints.takes[1], positions=paints.takes[1].positions + np.float32(50.0))
-    scene = Scene.of(observed(plain), paints.scene.camera, [paints.takes[0], far], (0, 7))
+    scene = ShownScene.of(observed(plain), paints.scene.camera, [paints.takes[0], far], (0, 7))
     assert scene.view.width < 3 * paints.scene.view.width
 
 

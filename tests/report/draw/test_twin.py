@@ -7,7 +7,7 @@ import pytest
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PathCollection
 
-from neuspring.report.draw.scene import Prediction, Scene
+from neuspring.report.draw.scene import ShownRun, ShownScene
 from neuspring.report.draw.sheet import CONTROLLER
 from neuspring.report.draw.twin import CROSSING, TwinPicture, region_colors, twin_figure
 from neuspring.report.shown import find
@@ -118,8 +118,8 @@ def test_a_surface_has_the_colors_of_its_nodes(tmp_path):
 def test_a_rod_is_drawn_as_its_center_line_colored_by_its_bending_stiffness(tmp_path, clamped):
     found = find([rod_results(tmp_path, clamped=clamped)])
     (run,) = found.runs
-    take, rod = Prediction("rod", run.trajectory.positions, run.twin), run.twin.rod
-    scene = Scene.from_side(found.observations, [take], [0])
+    take, rod = ShownRun("rod", run.trajectory.positions, run.twin), run.twin.rod
+    scene = ShownScene.from_side(found.observations, [take], [0])
     uneven = replace(run.twin, rod=replace(rod, bending=np.linspace(1, 2, len(rod.bending)) * rod.bending))
     take = replace(take, twin=uneven)
     lines = lines_of(uneven)
