@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import jinja2
 from markupsafe import Markup
@@ -20,7 +19,6 @@ SYMBOLS: dict[Tone, str] = {"good": "✓", "bad": "✗", "warn": "!", "mute": "�
 class Text:
     """A paragraph; `tone` makes it a note, `label` stands in front of it."""
 
-    kind: ClassVar[str] = "text"
     text: str
     tone: Tone = ""
     label: str = ""
@@ -30,7 +28,6 @@ class Text:
 class Items:
     """A list below a title."""
 
-    kind: ClassVar[str] = "items"
     items: Sequence[str | Link]
     title: str = ""
 
@@ -48,7 +45,6 @@ class Link:
 class Answer:
     """The answer of one study."""
 
-    kind: ClassVar[str] = "verdict"
     title: str
     answer: str
     tone: Tone
@@ -59,11 +55,12 @@ class Answer:
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """A picture; without `data`, a link to the file and why it is not shown."""
+    """A picture or a film; without `data`, a link to the file and why it is not shown."""
 
-    kind: ClassVar[str] = "picture"
     caption: str
-    alt: str
+    alt: str = ""
+    """Empty for a film, which has no such text."""
+    film: bool = False
     data: str = ""
     """Its source: a data URI, or the path of a file on a page that is not self-contained."""
     link: str = ""
@@ -78,22 +75,9 @@ class Picture:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PageVideo:
-    """A video, as `Picture`."""
-
-    kind: ClassVar[str] = "video"
-    caption: str
-    data: str = ""
-    link: str = ""
-    reason: str = ""
-    wide: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
 class Legend:
     """Samples of lines: name, color, dash pattern (SVG)."""
 
-    kind: ClassVar[str] = "legend"
     entries: Sequence[tuple[str, str, str]]
 
 
@@ -101,7 +85,6 @@ class Legend:
 class Prose:
     """HTML that was rendered from Markdown."""
 
-    kind: ClassVar[str] = "prose"
     html: Markup
 
 
@@ -109,7 +92,6 @@ class Prose:
 class Code:
     """Preformatted text."""
 
-    kind: ClassVar[str] = "code"
     text: str
     whole: bool = False
     """A click selects all of it, to be copied."""
@@ -119,7 +101,6 @@ class Code:
 class Grid:
     """Blocks side by side, as many as fit."""
 
-    kind: ClassVar[str] = "grid"
     blocks: Sequence[Block]
     least: int = 17
     """Smallest width of a column, rem."""
@@ -131,14 +112,13 @@ class Grid:
 class Fold:
     """Blocks that are shown on a click."""
 
-    kind: ClassVar[str] = "fold"
     summary: str
     blocks: Sequence[Block]
     open: bool = False
     key: str = ""
 
 
-Block = Table | Text | Items | Answer | Picture | PageVideo | Legend | Prose | Code | Grid | Fold
+Block = Table | Text | Items | Answer | Picture | Legend | Prose | Code | Grid | Fold
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,7 +148,7 @@ def markdown(blocks: Sequence[Block], level: str = "##") -> str:
         elif isinstance(block, Fold):
             parts.append(markdown(block.blocks, level).rstrip("\n"))
         else:
-            raise TypeError(f"{block.kind} has no Markdown")
+            raise TypeError(f"{type(block).__name__} has no Markdown")
     return "\n\n".join(parts) + "\n" if parts else ""
 
 

@@ -25,7 +25,7 @@ from neuspring.report.grid import between
 from neuspring.report.study import our_change, paper_change
 from neuspring.scores.failures import left_out_lines
 from neuspring.scores.metrics import DASH, METRICS
-from neuspring.scores.numbers import SUMMARY, Numbers
+from neuspring.scores.numbers import NUMBERS, SUMMARY, Numbers
 from neuspring.scores.paper import PAPER_TASKS, Study
 from neuspring.scores.runs import one_line
 from neuspring.scores.study import StudyNumbers, accounted, verdict_text
@@ -190,12 +190,10 @@ def known(results: Path, folder: Path) -> str:
     if not runs:
         raise InputError(results, "a results folder with finished runs is required", "none", "Name another: --results FOLDER.")
     lines = []
-    if list(folder.glob("numbers.json")):
+    if (folder / NUMBERS).is_file():
         numbers = Numbers.load(folder, results)
         names = [" | ".join(dict.fromkeys(numbers.averages[column])) for column in ("method", "task", "metric")]
-        lines = (
-            [f"A number of {folder}/summary.md: METHOD/TASK/METRIC, of\n  " + "\n  ".join(names)] if len(numbers.averages) else []
-        )
+        lines += [f"A number of {folder}/summary.md: METHOD/TASK/METRIC, of\n  " + "\n  ".join(names)] if names[0] else []
         lines += [f"A study: {name}/ROW/TASK/METRIC" for name in numbers.by_study]
     more = [f"and {len(runs) - MOST_EXPLAINED} more"] if len(runs) > MOST_EXPLAINED else []
     return "\n".join([*lines, "A run: " + "\n       ".join([*runs[:MOST_EXPLAINED], *more])])
@@ -211,7 +209,7 @@ def text(explanation: Explanation) -> str:
         [
             run.scenario,
             str(run.seed),
-            DASH if run.value is None else metric.text(run.value),
+            metric.text(np.nan if run.value is None else run.value),
             run.commit[:12],
             run.device,
             run.record,

@@ -9,7 +9,7 @@ import pandas as pd
 
 from neuspring.core.files import write_text
 from neuspring.core.run_record import RunRecord
-from neuspring.report.blocks import Block, Fold, Grid, PageSection, PageVideo, Picture, Text, html_page
+from neuspring.report.blocks import Block, Fold, Grid, PageSection, Picture, Text, html_page
 from neuspring.report.data import link
 from neuspring.scores.metrics import METRICS
 from neuspring.scores.runs import Collected
@@ -62,8 +62,8 @@ def _films(record: RunRecord, run: Path, scores: pd.DataFrame, folder: Path) -> 
     caption = f"{record.method}: {'; '.join(parts)}".removesuffix(": ")
     if "video" in paths:
         return [
-            PageVideo(caption=caption, data=link(paths["video"], folder)),
-            PageVideo(caption=f"{record.method}, from all around", data=link(paths["turntable"], folder)),
+            Picture(film=True, caption=caption, data=link(paths["video"], folder)),
+            Picture(film=True, caption=f"{record.method}, from all around", data=link(paths["turntable"], folder)),
         ]
     if "images" in paths:
         alt = f"Frames of {record.scenario}, {record.method}"

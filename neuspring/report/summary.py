@@ -321,26 +321,23 @@ def breakdown_blocks(finished: pd.DataFrame) -> list[Block]:
         count, scenarios = finished[column].nunique(), finished["scenario"].nunique()
         if count == 1 or (column == "category" and count == scenarios):
             continue  # the same as the averages, or as the other breakdown
-        lines = []
+        lines: list[list[Cell]] = []
         for name, part in finished.groupby(column, sort=False):
-            means = part.groupby(["method", "task", "metric", "scenario"])["value"].mean().groupby(level=[0, 1, 2]).mean()
-            values: dict[Any, float] = {key: float(value) for key, value in means.items()}
-            tops = best((task, metric, value) for (_, task, metric), value in values.items())
-            counts = part.groupby("method", sort=False)[counted.lower().removesuffix("s")].nunique()
-            for method, number in counts.items():
-                cells = [
-                    _part_cell(values.get((method, task, metric.name)), metric, tops.get((task, metric.name)))
-                    for task, metric in shown
-                ]
-                lines.append([Cell(text=str(name)), Cell(text=str(method)), *cells, Cell(text=str(number))])
+            each = part.groupby(["method", "task", "metric", "scenario"], sort=False)["value"].mean()
+            means = each.groupby(level=["method", "task", "metric"], sort=False).mean().reset_index()
+            tops = best(means[["task", "metric", "value"]].itertuples(index=False))
+            counts = part.groupby("method")[counted.lower().removesuffix("s")].nunique()
+
+            def show(row: Any, metric: Metric, tops: Mapping[Any, float] = tops) -> Cell:
+                top = row.value == tops.get((row.task, row.metric))
+                return Cell(text=metric.text(row.value), value=row.value, mark="best" if top else "")
+
+            made = rows(means, shown, ["method"], lambda row, name=name: [([Cell(text=str(name)), Cell(text=row.method)], show)])
+            lines += [[*line, Cell(text=str(counts[line[1].text]))] for line in made]
         caption = f"Per {column} (errors in mm, seeds averaged)"
         table = flat(caption, [column.capitalize(), "Method"], shown, lines, counted, sortable=True, note="All finished runs.")
         blocks.append(Fold(summary=f"Per {column}", blocks=[table], open=column == "scenario" and len(lines) <= MOST_OPEN_ROWS))
     return blocks
-
-
-def _part_cell(value: float | None, metric: Metric, top: float | None) -> Cell:
-    return EMPTY if value is None else Cell(text=metric.text(value), value=value, mark="best" if value == top else "")
 
 
 def _notes(noted: pd.DataFrame, runs: pd.Series) -> list[str]:

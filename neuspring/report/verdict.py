@@ -128,7 +128,7 @@ class Duel:
         return [f"No. {what}: 1 lies in it. {would}", *more]
 
     def weak(self) -> list[str]:
-        """Scenarios in which the best method is weakest, and in which its rival is better, and whether it learned anything at all."""
+        """Scenarios in which the best method is weakest, and in which its rival is better; whether it learned anything."""
         said = []
         if len(self.by_scenario) > 1:
             said.append(f"{self.best} is weakest in {self.weakest} ({self.text(self.by_scenario[self.weakest])}).")
@@ -150,7 +150,7 @@ class Duel:
         return [f"By other measures {leader} is first: {', '.join(found)}." for leader, found in first.items()]
 
     def causes(self) -> list[tuple[str, str]]:
-        """Causes that records name, with the next move, weakest scenario first: warnings of perception there, then search and fit."""
+        """Causes that records name, with the next move, weakest scenario first: perception's warnings there, search, fit."""
         warned = [one for scenario, one in self.numbers.warnings if scenario == self.weakest]
         found = [(f"{self.weakest}: {one.name} ({one.where}).", one.remedy) for one in warned]
         for scenario in self.by_scenario:

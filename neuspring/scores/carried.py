@@ -145,9 +145,9 @@ def point_errors(
 def carried_in_image(
     intrinsics: np.ndarray, camera_to_world: np.ndarray, positions: np.ndarray, start: np.ndarray, surface: int
 ) -> np.ndarray:
-    """Places [F, K, 2], px, to which the nodes around them carry pixels [K, 2] of frame 0; NaN stays. Other arguments as in `points_in_image`.
+    """Places [F, K, 2], px, to which the nodes around them carry pixels [K, 2] of frame 0; NaN stays.
 
-    The nodes must lie in front of the camera. They are chosen once, in frame 0.
+    Other arguments as in `points_in_image`. The nodes must lie in front of the camera. They are chosen once, in frame 0.
     """
     from neuspring.data.camera import Camera
 

@@ -67,9 +67,9 @@ class Metric:
     of: Of = "positions"
     """Positions of nodes in space; pictures; points that were marked in images, where there is color alone."""
     function: Callable[..., Any] | str
-    """Function that computes it. Of positions and marks: (positions [F, N, 3] m, observations) -> values per frame [F], NaN where a frame has none, or None
-    where the metric does not apply. Of pictures: (`pictures.Pair`, LPIPS of two pictures or None) -> a value or None. Text
-    "module:name" is imported when it is first called."""
+    """Function that computes it. Of positions and marks: (positions [F, N, 3] m, observations) -> values per frame
+    [F], NaN where a frame has none, or None where the metric does not apply. Of pictures: (`pictures.Pair`, LPIPS of two pictures
+    or None) -> a value or None. Text "module:name" is imported when it is first called."""
     in_studies: bool = False
     """True where tables of studies show it too."""
     average: Literal["equal", "frames"] = "equal"

@@ -138,7 +138,7 @@ def t_interval(values: np.ndarray) -> tuple[float, float]:
 
 
 def needed(low: float, high: float, count: int, most: int = 200) -> int | None:
-    """Number of objects that resolve a ratio whose interval over `count` of them is [low, high], if all scatter alike; None: too many."""
+    """Number of objects that resolve a ratio with the interval [low, high] over `count`, if all scatter alike; None: too many."""
     from scipy.stats import t
 
     mean, reach = 0.5 * math.log(low * high), 0.5 * math.log(high / low)

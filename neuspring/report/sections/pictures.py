@@ -14,7 +14,7 @@ from PIL import Image
 
 from neuspring.core.artifacts import Observations
 from neuspring.core.run_record import RunRecord
-from neuspring.report.blocks import Block, Code, Fold, Grid, PageSection, PageVideo, Picture, Text
+from neuspring.report.blocks import Block, Code, Fold, Grid, PageSection, Picture, Text
 from neuspring.report.data import UNREADABLE, ReportData, ReportSection, data_uri, link, several
 from neuspring.report.draw.scene import chosen_frames
 
@@ -97,8 +97,8 @@ class Media:
         if not kind.width:
             wide = kind.least >= 40
             if place in self._films:
-                return PageVideo(caption=caption, data=self._films[place], wide=wide)
-            return PageVideo(caption=caption, link=target, reason=NO_ROOM, wide=wide)
+                return Picture(film=True, caption=caption, data=self._films[place], wide=wide)
+            return Picture(film=True, caption=caption, link=target, reason=NO_ROOM, wide=wide)
         if found := self._embedded.get(place):
             return Picture(caption=caption, alt=alt, data=found.data, size=found.size, wide=True, paper=kind.paper, frames=frames)
         return Picture(caption=caption, alt=alt, link=target, reason=self._damaged.get(place, NO_ROOM), frames=frames)
