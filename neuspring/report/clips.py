@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations
 from neuspring.core.files import read_npz, write_text
 from neuspring.core.table import LATEX_PREAMBLE, Cell, Table
@@ -137,5 +136,5 @@ def _painter(results: Path, clip: pd.Series, title: str, line: np.ndarray) -> Pa
     positions[:, seen.line[free]] = line[:, free]
     take = ShownRun(f"{title}: {clip['clip']}, L1 {clip['l1_mm']:.1f} mm", positions)
     frames = range(0, len(line), max(round(seen.scenario.frame_rate / FILM_RATE), 1))
-    manner = DrawingStyle(style="nodes", error="none", ground="white", together=True)
-    return Painter(ShownScene.from_side(seen, [take], frames), [take], frames, manner, Images(), "cpu")
+    manner = DrawingStyle(error="none", together=True)
+    return Painter(ShownScene.from_side(seen, [take], frames), [take], frames, manner)

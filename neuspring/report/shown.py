@@ -190,7 +190,7 @@ def _capture(folder: Path, observations: Observations, notes: list[str]) -> Capt
             if observations.scenario.provenance.get(CAPTURE) != f"sha256:{digest_file(path)}":
                 raise InputError(path, "must be the capture of this run", "one that was changed since", "Run the benchmark again.")
         return Capture.load(path.parent)
-    except InputError as error:
+    except (InputError, OSError) as error:
         notes.append(f"no cameras: {error}")
         return None
 

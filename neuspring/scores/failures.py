@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from neuspring.scores.metrics import METRICS, TASKS, averages
+from neuspring.scores.metrics import METRICS, TASKS, averages, in_order
 
 LeftOut = Mapping[str, Mapping[str, str]]
 """Method to the scenarios to which it does not apply, each with the reason."""
@@ -60,7 +60,7 @@ def both_averages(scores: pd.DataFrame, runs: pd.DataFrame, frozen: pd.DataFrame
     counts = ended.groupby("method")["status"].agg(succeeded=lambda status: int((status == "ok").sum()), attempted="size")
     counts["unknown"] = unknown.reindex(counts.index).fillna(0).astype(int)
     table = counts.reset_index().merge(table, on="method", how="left")[list(FAILURE_COLUMNS)]
-    return _in_order(table, list(dict.fromkeys(runs["method"])))
+    return in_order(table, {"method": dict.fromkeys(runs["method"]), "task": TASKS, "metric": METRICS})
 
 
 def _scores_of(scores: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
@@ -87,18 +87,6 @@ def _lacking(failed: pd.DataFrame, lost: pd.DataFrame, scores: pd.DataFrame) -> 
     keys = [*RUN_KEYS, "task", "metric"]
     there = pd.MultiIndex.from_frame(wanted[keys]).isin(pd.MultiIndex.from_frame(lost[keys].astype(object)) if len(lost) else [])
     return pd.MultiIndex.from_frame(wanted.loc[~there, CELL_KEYS].drop_duplicates())
-
-
-def _in_order(table: pd.DataFrame, methods: list[str]) -> pd.DataFrame:
-    ranks = {"method": methods, "task": list(TASKS), "metric": list(METRICS)}
-    places = pd.DataFrame({name: table[name].map({key: rank for rank, key in enumerate(keys)}) for name, keys in ranks.items()})
-    return table.loc[places.sort_values(["method", "task", "metric"]).index].reset_index(drop=True)
-
-
-def mean_rows(part: pd.DataFrame) -> list[tuple[str, str]]:
-    """The lines of a method, from its rows of `both_averages`: what each is a mean over, and its column. One if no run failed."""
-    first = part.iloc[0]
-    return [("all", "own")] if first["succeeded"] == first["attempted"] else [(OWN, "own"), (ALL, "all")]
 
 
 def unknown_lines(table: pd.DataFrame, labels: Labels = EMPTY_MAP) -> list[str]:

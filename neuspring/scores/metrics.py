@@ -305,29 +305,18 @@ def score(
     method: str,
     seed: int,
     errors: Mapping[str, np.ndarray] | None = None,
+    tasks: Mapping[str, range] | None = None,
 ) -> pd.DataFrame:
     """Tidy scores, one row per task and metric; `errors` are `errors_per_frame`, where they are known already.
 
-    There is no row, and never NaN, for a task without frames, a metric without annotation, a task that the rollout diverged in.
+    `tasks` maps names to the frames that they average over; None: `TASKS`. There is no row, and never NaN, for a task without
+    frames, a metric without annotation, a task that the rollout diverged in.
     """
-    tasks = {task: task_frames(observations.scenario, task) for task in TASKS}
-    return score_tasks(trajectory, observations, method, seed, tasks, errors)
-
-
-def score_tasks(
-    trajectory: Trajectory,
-    observations: Observations,
-    method: str,
-    seed: int,
-    tasks: Mapping[str, range],
-    errors: Mapping[str, np.ndarray] | None = None,
-) -> pd.DataFrame:
-    """As `score`, for any tasks: `tasks` maps names to the frames that they average over."""
     scenario = observations.scenario
     rows = []
     known = errors_per_frame(trajectory.positions, observations) if errors is None else errors
     per_frame = {**known, **errors_per_frame(trajectory.positions, observations, "marks")}
-    for task, frames in tasks.items():
+    for task, frames in (tasks or {task: task_frames(scenario, task) for task in TASKS}).items():
         if not len(frames) or frames[-1] >= len(trajectory.positions):
             continue
         for metric, values in per_frame.items():
@@ -377,6 +366,14 @@ def score_images(frames: pd.DataFrame, scenario: Scenario, drawn: int, method: s
             identity = (scenario.name, scenario.category, method, seed, task, metric)
             rows.append((*identity, float(per_frame.mean()), METRICS[str(metric)].unit, len(per_frame)))
     return _table(rows)
+
+
+def in_order(table: pd.DataFrame, ranks: Mapping[str, Iterable[str]]) -> pd.DataFrame:
+    """The table sorted by columns, each in the order of its names."""
+    import pandas as pd
+
+    places = {column: table[column].map({name: rank for rank, name in enumerate(names)}) for column, names in ranks.items()}
+    return table.loc[pd.DataFrame(places).sort_values(list(places)).index].reset_index(drop=True)
 
 
 def averages(scores: pd.DataFrame, by: Iterable[str] = ("method", "task", "metric")) -> pd.DataFrame:

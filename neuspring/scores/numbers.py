@@ -94,9 +94,8 @@ class Numbers:
             keys = ["scenario", "seed"]
             own = finished_scores(self.everything.of(self.everything.oracles))
             scores = pd.concat([scores, own.merge(scores[keys].drop_duplicates(), on=keys) if len(scores) else own])
-        return (
-            averages(scores) if len(scores) else pd.DataFrame(columns=["method", "task", "metric", "equal", "frames", "seed_std"])
-        )
+        columns = ["method", "task", "metric", "equal", "frames", "seed_std"]
+        return averages(scores) if len(scores) else pd.DataFrame(columns=columns)
 
     @cached_property
     def held(self) -> pd.DataFrame:
@@ -178,11 +177,10 @@ class Numbers:
 
     def _of_study(self, name: str, study: Study) -> StudyNumbers | ClipNumbers:
         if study.clips:
-            names: dict[str, Any] = {column: list(dict.fromkeys(self.everything.runs[column])) for column in ("method", "seed")}
-            sources = list(dict.fromkeys(self.everything.runs["scenario"]))
-            return ClipNumbers(
-                name=name, study=study, results=self.results, sources=sources, methods=names["method"], seeds=names["seed"]
-            )
+            runs = self.everything.runs
+            named: Any = {f"{name}s": list(dict.fromkeys(runs[name])) for name in ("method", "seed")}
+            named["sources"] = list(dict.fromkeys(runs["scenario"]))
+            return ClipNumbers(name=name, study=study, results=self.results, **named)
         beside = self.known_studies.get(study.beside or "")
         return StudyNumbers(name=name, study=study, collected=self.everything, beside=beside)
 

@@ -464,12 +464,6 @@ def test_settings_that_differ_come_first_and_all_follow(small):
     assert "1 scenario, 1 method, seed 0" in page
 
 
-def test_settings_are_read_from_the_runs_where_none_are_given(page):
-    text = section(page, "setup")
-    assert "fit.fit.epochs 5" in text
-    assert "search.search.rollouts 30" in text
-
-
 def test_runs_of_several_commits_are_pointed_out(small):
     assert "All runs were made by commit 0123456789ab." in section(report(small), "setup")
     seen = report_tree.observations("rope", "synthetic", 30)

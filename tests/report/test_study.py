@@ -415,7 +415,7 @@ def test_how_pictures_were_scored_is_said(tmp_path):
 
 
 def test_the_number_of_regions_is_a_curve_without_the_papers_numbers(tmp_path):
-    methods = {"model_b": 1.0, "neuspring": 0.7, "clusters_10": 1.2}
+    methods = {"model_b": 1.0, "clusters_5": 0.7, "clusters_10": 1.2}
     names = [f"rope_{index}" for index in range(6)]
     write_benchmark(tmp_path, names, methods, source="toy")
     text = study_text("clusters", STUDIES["clusters"], tmp_path, names, [0, 1], methods, tmp_path)

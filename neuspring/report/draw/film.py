@@ -25,14 +25,10 @@ DOTS = 110
 """Dots per inch at full width, so that text is as tall on a screen as on paper."""
 FILM_HEAD, FILM_GAP, FILM_EDGE, FILM_BAR, CLOCK = 0.24, 0.04, 0.03, 0.62, 0.15
 """Room for names, between panels, at the edges, for the color bar, and for the bar of time, inches."""
-PIXELS, SLOWEST_FILM, FASTEST_FILM = (160, 1920), 0.05, 8.0
-"""Least and greatest width, and speed."""
 HOLD = 0.8
 """Time for which a GIF shows its last frame before it begins again, s."""
 CENTISECOND, SHORTEST_FRAME = 100, 2
 """Centiseconds of a second, and of the shortest frame; browsers take a shorter time of a frame for 10."""
-LARGEST_FILM = 100.0
-"""Megabytes."""
 GIF_COLORS, FILM_QUALITY = 96, 23
 """Colors of a GIF, and rate factor of an MP4 (`video.Video`)."""
 PALETTE_FRAMES = 8
@@ -63,10 +59,9 @@ def write_film(
 ) -> WrittenFilm:
     """Write the film; if it does not fit, a GIF of every other frame, then fewer pixels until it does.
 
-    Painters `beside` the first one, of other scenes, paint the same frames at its side. Raises InputError for a bad size or speed,
-    and where nothing fits.
+    Painters `beside` the first one, of other scenes, paint the same frames at its side. Raises InputError where nothing
+    fits.
     """
-    _require(width, speed, megabytes)
     rate = painter.scene.observations.scenario.frame_rate * speed
     gif = path.suffix.lower() == ".gif"
     made, every, scale = path.with_name(f".{path.name}.try{path.suffix}"), 1, 1.0
@@ -90,16 +85,6 @@ def write_film(
                 scale = max(0.95 * scale * math.sqrt(1e6 * megabytes / size), LEAST_SCALE)
     finally:
         made.unlink(missing_ok=True)
-
-
-def _require(width: int, speed: float, megabytes: float) -> None:
-    for name, value, least, most in (
-        ("--width", width, *PIXELS),
-        ("--speed", speed, SLOWEST_FILM, FASTEST_FILM),
-        ("--megabytes", megabytes, 0.0, LARGEST_FILM),
-    ):
-        if not (least <= value <= most and value > 0):
-            raise InputError(name, f"must be {least:g} to {most:g}" if least else f"must be above 0, at most {most:g}", value)
 
 
 def _beside(pictures: Sequence[np.ndarray]) -> np.ndarray:

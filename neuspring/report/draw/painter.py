@@ -11,24 +11,16 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 
-from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations
 from neuspring.data.camera import Camera
-from neuspring.report.draw.scene import ShownRun, ShownScene, faded, masked, object_and_hands, over_white, shown_points
+from neuspring.report.draw.scene import ShownRun, ShownScene, shown_points
 from neuspring.report.draw.sheet import CONTROLLER, WORST, points_across
-from neuspring.scores.pictures import Pair, psnr
-from neuspring.splats.draw import OBJECT_COVERAGE, picture, view_of
-from neuspring.splats.rasterize import choose_backend
 
-Style = Literal["splats", "nodes"]
 Error = Literal["color", "distance", "none"]
-Ground = Literal["white", "image"]
 ERROR_COLORS = "magma_r"
 """Light for no error, on white paper; rising in darkness."""
 BLUE_POINTS, DARK_NODES, UNKNOWN_COLOR = "tab:blue", "#303030", "#d5d5d5"
 """Observed points; predicted nodes; nodes whose error is not known."""
-HIDDEN = 200
-"""Gray of hands, behind which nothing is compared."""
 LEAST_MM = 1.0
 """Least upper end of a range of distances."""
 NOTE, SMALLEST_NOTE = 7.0, 5.0
@@ -38,26 +30,11 @@ NOTE_CORNER = (0.4, 0.2)
 DRAWN_MM = 1e3
 
 
-@dataclass(frozen=True, eq=False)
-class Drawn:
-    """A prediction as splats in one frame, the shown part of the picture."""
-
-    rgba: np.ndarray
-    """[h, w, 4] uint8, over black."""
-    difference: np.ndarray | None = None
-    """Mean absolute color difference [h, w], of 1; NaN where neither shows the object; None: nothing to compare with."""
-    hands: np.ndarray | None = None
-    psnr: float = float("nan")
-    """PSNR of the whole picture, as in the tables, dB."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class DrawingStyle:
     """Style in which predictions and errors are drawn."""
 
-    style: Style
     error: Error
-    ground: Ground
     most: float | None = None
     """Upper end of the range of errors: of 1 for colors, mm for distances; None: from the data."""
     together: bool = False
@@ -81,32 +58,10 @@ class Painter:
         takes: Sequence[ShownRun],
         frames: Sequence[int],
         manner: DrawingStyle,
-        images: Images,
-        device: str,
     ) -> None:
         self.scene, self.takes, self.frames, self.manner = scene, takes, tuple(frames), manner
-        self._drawn = [self._splats(take, images, device) if manner.style == "splats" else {} for take in takes]
         self.norm = Normalize(0, self._most())
         self._corner = self._free_corner()
-
-    def _splats(self, take: ShownRun, images: Images, device: str) -> dict[int, Drawn]:
-        view, backend = view_of(self.scene.camera, images, device), choose_backend(images.backend, device)
-        made = {}
-        for frame, gaussians in take.gaussians(self.frames, images, device):
-            rgba = picture(gaussians, view, backend)
-            made[frame] = self._compared(rgba, frame) if self.manner.error == "color" else Drawn(self.scene.cut(rgba))
-        return made
-
-    def _compared(self, rgba: np.ndarray, frame: int) -> Drawn:
-        photo, labels = self.scene.photo(frame), self.scene.mask(frame)
-        if photo is None or labels is None:
-            return Drawn(self.scene.cut(rgba))
-        pair = Pair.of(photo, rgba, *object_and_hands(labels), OBJECT_COVERAGE)
-        difference = (pair.truth - pair.prediction).abs().mean(0).numpy()
-        shows = pair.silhouettes[0] | pair.silhouettes[1]
-        cut = self.scene.cut
-        part = cut(np.where(shows & ~pair.hands, difference, np.nan))
-        return Drawn(cut(rgba), part, cut(pair.hands), float(psnr(pair.prediction, pair.truth)))
 
     def _most(self) -> float:
         if self.manner.most is not None:
@@ -122,56 +77,40 @@ class Painter:
         values = np.concatenate(kept) if kept else np.zeros(0)
         return _rounded(max(DRAWN_MM * float(np.quantile(values, 0.98)) if len(values) else 0.0, LEAST_MM))
 
-    @property
-    def error_label(self) -> str:
-        """For the color bar."""
-        return "color difference" if self.manner.error == "color" else "distance [mm]"
+    error_name, error_label = "distance", "distance [mm]"
+    """Name of the rows of errors, and the label of their color bar."""
 
     def draw_observed(self, axis: Axes, frame: int) -> None:
-        """The photo, or the observed points where the camera has none."""
-        photo, labels = self.scene.photo(frame), self.scene.mask(frame)
+        """The observed points."""
         empty(axis, self.scene.view)
-        if photo is not None:
-            whole = self.manner.ground == "image" or labels is None
-            self._image(axis, photo if whole or labels is None else masked(photo, labels))
-            return
-        if self.scene.capture is not None:
-            self._note(axis, f"camera {self.scene.camera.name} missed it")
-        observations = self.scene.observations
-        self._line(axis, observations.object_points[frame], frame, BLUE_POINTS)
-        self._points(axis, observations.object_points[frame][observations.object_visibility[frame]], BLUE_POINTS)
+        self._observed(axis, frame)
         hands(axis, self.scene, frame)
 
     def draw_predicted(self, axis: Axes, which: int, frame: int) -> None:
-        """The prediction as splats, or as nodes; nodes stand on a pale photo, or before the observed points."""
-        take, photo = self.takes[which], self.scene.photo(frame)
+        """The predicted nodes before the observed points."""
         empty(axis, self.scene.view)
-        below = faded(photo) if photo is not None and self.manner.ground == "image" else None
-        if frame >= len(take.positions):
+        nodes = self.takes[which].positions
+        if frame >= len(nodes):
             self._note(axis, "diverged")
             return
-        if self.manner.style == "splats":
-            part = None if below is None else self.scene.cut(below)
-            self._image(axis, over_white(self._drawn[which][frame].rgba, part), cut=False)
-            return
-        if below is not None:
-            self._image(axis, below)
-        else:
-            observations = self.scene.observations
-            self._line(axis, observations.object_points[frame], frame, BLUE_POINTS, alpha=0.5)
-            self._points(axis, observations.object_points[frame][observations.object_visibility[frame]], BLUE_POINTS, alpha=0.5)
-        self._line(axis, take.positions[frame], frame, DARK_NODES)
-        self._points(axis, take.positions[frame], DARK_NODES)
+        self._below(axis, frame)
+        self._line(axis, nodes[frame], frame, DARK_NODES)
+        self._points(axis, nodes[frame], DARK_NODES)
         hands(axis, self.scene, frame)
 
+    def _observed(self, axis: Axes, frame: int, alpha: float = 1.0) -> None:
+        seen = self.scene.observations
+        self._line(axis, seen.object_points[frame], frame, BLUE_POINTS, alpha)
+        self._points(axis, seen.object_points[frame][seen.object_visibility[frame]], BLUE_POINTS, alpha=alpha)
+
+    def _below(self, axis: Axes, frame: int) -> None:
+        self._observed(axis, frame, 0.5)
+
     def draw_error(self, axis: Axes, which: int, frame: int) -> None:
-        """The error in false colors, and its mean: PSNR of pictures, or the mean distance."""
+        """The distances of nodes to their points in false colors, and their mean."""
         empty(axis, self.scene.view)
         take = self.takes[which]
         if frame >= len(take.positions):
-            return
-        if self.manner.error == "color":
-            self._difference(axis, self._drawn[which][frame])
             return
         seen, distance = distances(take, self.scene.observations, frame)
         nodes = take.positions[frame]
@@ -183,17 +122,6 @@ class Painter:
         self._points(axis, nodes[seen], values=DRAWN_MM * distance)
         if len(distance):
             self._note(axis, f"{DRAWN_MM * distance.mean():.1f} mm")
-
-    def _difference(self, axis: Axes, drawn: Drawn) -> None:
-        if drawn.difference is None or drawn.hands is None:
-            self._note(axis, "no picture")
-            return
-        ground = np.full((*drawn.hands.shape, 3), 255, np.uint8)
-        ground[drawn.hands] = HIDDEN
-        self._image(axis, ground, cut=False)
-        shape = drawn.hands.shape
-        axis.imshow(drawn.difference, cmap=ERROR_COLORS, norm=self.norm, extent=_extent(shape), interpolation="nearest")
-        self._note(axis, f"{drawn.psnr:.1f} dB" if np.isfinite(drawn.psnr) else "equal")
 
     def _free_corner(self) -> tuple[float, float]:
         """The corner of all panels (0 or 1 to the right, 0 or 1 upwards) that fewest points of any frame reach into."""
@@ -245,10 +173,6 @@ class Painter:
         width = points_across(axis)
         return float(np.clip((0.35 * width / np.sqrt(max(count, 1))) ** 2, 0.8, (0.035 * width) ** 2))
 
-    def _image(self, axis: Axes, rgb: np.ndarray, *, cut: bool = True) -> None:
-        shown = self.scene.cut(rgb) if cut else rgb
-        axis.imshow(shown, extent=_extent(shown.shape), interpolation="antialiased")
-
 
 def empty(axis: Axes, view: Camera, *, framed: bool = True) -> None:
     """A panel of the size of a camera's picture, its pixel centers at whole coordinates."""
@@ -265,10 +189,6 @@ def hands(axis: Axes, scene: ShownScene, frame: int) -> None:
     size = float(np.clip((0.021 * points_across(axis)) ** 2, 3.0, 14.0))
     style: dict[str, Any] = {"marker": "D", "color": CONTROLLER, "edgecolors": "white", "linewidths": 0.25, "zorder": 5}
     axis.scatter(flat[depth > 0, 0], flat[depth > 0, 1], s=size, **style)
-
-
-def _extent(shape: Sequence[int]) -> tuple[float, float, float, float]:
-    return (-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5)
 
 
 def _rounded(value: float) -> float:

@@ -12,7 +12,6 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations, Scenario, Trajectory, Twin
 from neuspring.report.draw.painter import DrawingStyle, Painter
 from neuspring.report.draw.scene import ShownRun, ShownScene, chosen_frames
@@ -151,8 +150,7 @@ def motion_figure(observations: Observations, trajectory: Trajectory, method: st
     scenario, take = observations.scenario, ShownRun(method, trajectory.positions)
     frames = sorted({*chosen_frames(scenario, len(take.positions)), *chosen_frames(scenario, scenario.frame_count)})
     scene = ShownScene.from_side(observations, [take], frames)
-    manner = DrawingStyle(style="nodes", error="distance", ground="white")
-    return strip_figure(Painter(scene, [take], frames, manner, Images(), "cpu"), RUN_WIDTH)
+    return strip_figure(Painter(scene, [take], frames, DrawingStyle(error="distance")), RUN_WIDTH)
 
 
 def _from_two_sides(observations: Observations, take: ShownRun, label: str, *quantities: str) -> TwinPicture:

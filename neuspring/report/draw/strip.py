@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from matplotlib import pyplot as plt
@@ -10,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from neuspring.report.draw.painter import DRAWN_MM, ERROR_COLORS, Painter, distances
+from neuspring.report.draw.painter import ERROR_COLORS, Painter
 from neuspring.report.draw.sheet import FUTURE, TEXT, TRAINING, color_bar, place, rgb
 
 LABEL, STRIP_HEAD = 0.22, 0.4
@@ -42,7 +41,7 @@ def rows_of(painter: Painter) -> list[StripRow]:
     for which, take in enumerate(painter.takes):
         rows.append(StripRow(take.label, which))
         if painter.manner.error != "none":
-            rows.append(StripRow("difference" if painter.manner.error == "color" else "distance", which, error=True))
+            rows.append(StripRow(painter.error_name, which, error=True))
     return rows
 
 
@@ -113,30 +112,3 @@ def _head(figure: Figure, painter: Painter, across: float, total: float, bottom:
     if first is not None and first > lefts[0]:
         x = (first - STRIP_GAP / 2) / width
         figure.add_artist(Line2D([x, x], [bottom / total, (total - 0.05) / total], color="0.2", linewidth=0.8, linestyle="--"))
-
-
-def caption(painter: Painter) -> str:
-    """Words for the text below the picture: what is shown, and the mean error of each method over its frames."""
-    scene, scenario, manner = painter.scene, painter.scene.observations.scenario, painter.manner
-    future = [frame for frame in painter.frames if frame >= scenario.train_end]
-    text = f"{scenario.name}, camera {scene.camera.name}, frames {_listed(painter.frames)}"
-    text += f"; future (from frame {scenario.train_end}): {_listed(future)}." if future else "; all of training."
-    if manner.style == "nodes" or scene.capture is None:
-        text += " Dark: predicted nodes. Blue: observed points. Red: controllers, where the hands hold."
-    if manner.error == "color":
-        text += f" Difference: mean absolute color difference of object pixels, 0 to {painter.norm.vmax:g}; hands left out; PSNR."
-    elif manner.error == "distance":
-        text += f" Distance of nodes to their observed points, 0 to {painter.norm.vmax:g} mm; gray: not seen; in panels: the mean."
-        text += f" Mean of these frames: {', '.join(f'{t.label} {_mean(painter, k):.1f} mm' for k, t in enumerate(painter.takes))}."
-    return text
-
-
-def _mean(painter: Painter, which: int) -> float:
-    take = painter.takes[which]
-    frames = [frame for frame in painter.frames if frame < len(take.positions)]
-    means = [DRAWN_MM * float(distances(take, painter.scene.observations, frame)[1].mean()) for frame in frames]
-    return sum(means) / len(means) if means else float("nan")
-
-
-def _listed(frames: Sequence[int]) -> str:
-    return ", ".join(map(str, frames))

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
-import cv2
 import numpy as np
-import torch
 from matplotlib import colormaps
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
@@ -18,17 +16,11 @@ from matplotlib.colors import LogNorm, to_rgba_array
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-from scipy.spatial import cKDTree
 
-from neuspring.config.images import Images
 from neuspring.core.artifacts import Twin
 from neuspring.report.draw.painter import empty, hands
-from neuspring.report.draw.scene import ShownRun, ShownScene, faded, finer, over_white
+from neuspring.report.draw.scene import ShownRun, ShownScene
 from neuspring.report.draw.sheet import CONTROLLER, TEXT, color_bar, place, points_across, sample
-from neuspring.splats.draw import picture, view_of
-from neuspring.splats.model import Gaussians
-from neuspring.splats.rasterize import choose_backend
-from neuspring.splats.view import C0
 from neuspring.twin.body import Lines, body_of, lines_of
 from neuspring.twin.field import midpoints
 from neuspring.twin.roughness import roughness, variogram
@@ -43,8 +35,6 @@ TWIN_TITLE, TWIN_GAP, LEGEND_ROOM, TWIN_EDGE = 0.22, 0.05, 0.75, 0.03
 """Room for names of methods, between panels, for a color bar or names of regions, and at the edges, inches."""
 MOST_VECTORS = 2500
 """More lines than this are stored as pixels: a page would open slowly."""
-FINE = 900
-"""Least width of a surface in pixels; nothing is compared with it, so it need not have the camera's."""
 LEAST_RATIO, DEEPEST = 2.0, 1e4
 """Smallest ratio of the ends of a stiffness axis, so that tiny differences do not fill it; largest ratio of a color range."""
 HISTOGRAM_BINS = 41
@@ -85,12 +75,10 @@ class TwinPicture:
     columns: Sequence[tuple[ShownScene, ShownRun]]
     frame: int
     quantities: Sequence[Quantity]
-    style: Literal["springs", "splats"] = "springs"
-    ground: Literal["white", "image"] = "white"
-    images: Images = Images()
-    device: str = "cpu"
     limits: tuple[float, float] | None = None
     """Range of stiffness, N; None: that of the twins."""
+
+    as_springs: ClassVar = True
 
     @cached_property
     def norm(self) -> LogNorm:
@@ -124,18 +112,8 @@ class TwinPicture:
 
     def paint(self, axis: Axes, scene: ShownScene, take: ShownRun, quantity: Quantity) -> None:
         """One panel."""
-        view, photo = scene.view, scene.photo(self.frame)
-        empty(axis, view, framed=self.ground == "image")
-        shown = scene.cut(faded(photo)) if photo is not None and self.ground == "image" else None
-        if self.style == "splats":
-            surface = self._surface(scene, take, quantity)
-            ground = None if shown is None else cv2.resize(shown, surface.shape[1::-1], interpolation=cv2.INTER_CUBIC)
-            shown = over_white(surface, ground)
-        if shown is not None:
-            extent = (-0.5, view.width - 0.5, view.height - 0.5, -0.5)
-            axis.imshow(shown, extent=extent, aspect="auto", interpolation="antialiased")
-        if self.style == "springs":
-            self._lines(axis, scene, take, quantity)
+        empty(axis, scene.view, framed=False)
+        self._lines(axis, scene, take, quantity)
         hands(axis, scene, self.frame)
 
     def _lines(self, axis: Axes, scene: ShownScene, take: ShownRun, quantity: Quantity) -> None:
@@ -163,18 +141,6 @@ class TwinPicture:
         near = near[depth[near] > 0]
         size = float(np.clip((0.2 * width) ** 2 / max(len(nodes), 1), 1.0, 14.0))
         axis.scatter(flat[near, 0], flat[near, 1], c=self.node_colors(take, quantity)[near], s=size, linewidths=0, zorder=3)
-
-    def _surface(self, scene: ShownScene, take: ShownRun, quantity: Quantity) -> np.ndarray:
-        """The splats [h, w, 4] over black, each in the color of the surface node that is nearest in frame 0."""
-        assert take.splats is not None
-        outer = take.positions[0][: scene.observations.surface_count]
-        nearest = cKDTree(outer).query(take.splats.means)[1]
-        rgb = self.node_colors(take, quantity)[nearest, :3]
-        (gaussians,) = (found for _, found in take.gaussians([self.frame], self.images, self.device))
-        plain = torch.tensor((rgb - 0.5) / C0, dtype=torch.float32, device=self.device)[:, None]
-        painted: Gaussians = replace(gaussians, harmonics=plain)
-        view = view_of(finer(scene.view, FINE), self.images, self.device)
-        return picture(painted, view, choose_backend(self.images.backend, self.device))
 
 
 def twin_figure(body: TwinPicture, width: float, room: float = LEGEND_ROOM) -> Figure:
@@ -213,7 +179,7 @@ def _regions(figure: Figure, body: TwinPicture, left: float, middle: float, *, c
     names = [f"region {k}" for k in range(count)] if count > 1 else ["one region"]
     dots = [Line2D([], [], ls="", marker="o", ms=4, color=color) for color in region_colors(count)]
     extra: list[tuple[Any, str, int, str]] = []
-    if count > 1 and body.style == "springs":
+    if count > 1 and body.as_springs:
         extra.append((CROSSING, "between", int(between.sum()), "springs"))
     if counted:
         ends = lines.labels[lines.pairs[: lines.inner]]

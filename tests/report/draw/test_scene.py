@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from neuspring.core.errors import InputError
-from neuspring.report.draw.scene import FLATTEST_PANEL, TALLEST_PANEL, box_around, broad_side, finer, part, seen_from
+from neuspring.report.draw.scene import FLATTEST_PANEL, TALLEST_PANEL, box_around, broad_side, part, seen_from
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.normal(size=(60, 3)) * [0.3, 0.05, 0.1] + [1.0, 2.0, 0.4]
@@ -68,22 +67,9 @@ def test_a_box_holds_its_pixels_has_a_shape_and_stays_inside_a_photo():
     assert box_around(np.array([[0.0, 0.0], [1199.0, 1199.0]]), camera, clip=True) == (0, 0, 1200, 1200)
 
 
-def test_parts_and_finer_pictures_show_the_same_points():
+def test_a_part_shows_the_same_points():
     camera = seen_from(POINTS, "+z", 0.0, 0.0)
     whole = camera.project(POINTS)[0]
     inner = part(camera, (100, 200, 700, 900))
     assert (inner.width, inner.height) == (600, 700)
     assert np.abs(inner.project(POINTS)[0] + [100, 200] - whole).max() < SUB
-    fine = finer(inner, 1000)
-    assert (fine.width, fine.height) == (1200, 1400)
-    # The border of a picture is half a pixel away from the center of its outer pixels.
-    assert np.abs((fine.project(POINTS)[0] + 0.5) / 2 - 0.5 - inner.project(POINTS)[0]).max() < SUB
-    assert finer(inner, 600).width == 600
-
-
-@pytest.mark.parametrize(
-    ("azimuth", "elevation", "text"), [(math.nan, 0, "--azimuth"), (0, 90, "-89 to 89"), (0, math.nan, "--elevation")]
-)
-def test_angles_that_no_camera_has(azimuth, elevation, text):
-    with pytest.raises(InputError, match=text):
-        seen_from(POINTS, "+z", azimuth, elevation)
