@@ -76,7 +76,6 @@ class ReportData:
     choice: Options
     """With nothing left empty."""
     collected: Collected
-    transfers: Collected
     jobs: list[JobRecord]
     damaged: dict[str, str]
     """Files that cannot be read, relative to the results folder, and why."""
@@ -155,17 +154,15 @@ def duration(seconds: float) -> str:
     """A time for people."""
     if not math.isfinite(seconds):
         return DASH
-    if seconds < 100:
-        return f"{seconds:.1f} s"
-    return f"{seconds / 60:.1f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+    minutes = f"{seconds / 60:.1f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+    return f"{seconds:.1f} s" if seconds < 100 else minutes
 
 
 def hours(seconds: float) -> str:
     """Hours, with fewer decimals for larger values."""
     value = seconds / 3600
-    if value < 0.01:
-        return "< 0.01" if value else "0"
-    return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 1 else f"{value:.2f}"
+    digits = 0 if value >= 100 or not value else 1 if value >= 1 else 2
+    return "< 0.01" if 0 < value < 0.01 else f"{value:.{digits}f}"
 
 
 def memory(mebibytes: float | None) -> str:
@@ -219,11 +216,10 @@ class ReportSection:
     """1: it takes the `room` that all others leave; 2: it lists the damaged files that all others found."""
 
 
-def embedded(data: bytes, caption: str, alt: str, *, wide: bool = False) -> Picture:
-    """A PNG, drawn for white paper, as a picture of the page."""
-    return Picture(
-        caption=caption, alt=alt, data=data_uri("image/png", data), size=Image.open(io.BytesIO(data)).size, wide=wide, paper=True
-    )
+def embedded(data: bytes, caption: str) -> Picture:
+    """A PNG, drawn for white paper, as a wide picture of the page."""
+    size = Image.open(io.BytesIO(data)).size
+    return Picture(caption=caption, alt=caption, data=data_uri("image/png", data), size=size, wide=True, paper=True)
 
 
 def data_uri(kind: str, data: bytes) -> str:

@@ -169,8 +169,7 @@ def run_text(path: Path) -> tuple[str, bool]:
         return f"{path}: damaged: {one_line(error)}", False
     lines, good = [f"{record.name}: {record.status}{': ' * bool(record.reason)}{record.reason}"], record.ok
     for task, part in scores.groupby("task", sort=False) if len(scores) else ():
-        values = [(METRICS[row["metric"]], row["value"]) for row in part.to_dict("records")]
-        texts = [f"{metric.heading} {metric.text(value)} {metric.shown_unit}".rstrip() for metric, value in values]
+        texts = [METRICS[row["metric"]].told(row["value"]) for row in part.to_dict("records")]
         lines.append(f"  {task}: {', '.join(texts)}")
     lines += [f"  note: {note}" for note in record.notes]
     lines += [f"  {name}: {getattr(record, name)}" for name in SHOWN_FACTS]

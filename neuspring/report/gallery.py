@@ -30,10 +30,8 @@ def write_gallery(
     sections: list[PageSection] = []
     for scenario in scenarios:
         place = Path(results) / scenario
-        figures: list[Block] = []
-        for method in methods:
-            if record := collected.records.get((scenario, method, seed)):
-                figures += _films(record, place / method / str(seed), collected.scores, folder)
+        records = [record for method in methods if (record := collected.records.get((scenario, method, seed)))]
+        figures = [one for record in records for one in _films(record, Path(results) / record.name, collected.scores, folder)]
         # First the splats of all methods, then those of methods with splats of their own.
         learned = sorted(place.glob(f"appearance*/{seed}/appearance.png"))
         splats = [Picture(caption="", alt=path.stem, data=link(path, folder)) for path in learned]
@@ -57,8 +55,7 @@ def _films(record: RunRecord, run: Path, scores: pd.DataFrame, folder: Path) -> 
     values, parts = own.set_index(["task", "metric"])["value"], []
     for task, name in (("reconstruction", "training"), ("future", "future")):
         metrics = [METRICS[metric] for metric in CAPTIONED if (task, metric) in values.index]
-        texts = [f"{one.heading} {one.text(values[task, one.name])} {one.shown_unit}".rstrip() for one in metrics]
-        parts += [f"{name} {', '.join(texts)}"] if texts else []
+        parts += [f"{name} {', '.join(one.told(values[task, one.name]) for one in metrics)}"] if metrics else []
     caption = f"{record.method}: {'; '.join(parts)}".removesuffix(": ")
     if "video" in paths:
         return [

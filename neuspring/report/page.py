@@ -83,15 +83,9 @@ def gather(results: Path, output: Path, options: Options) -> ReportData:
         results=results,
         warnings=warnings_of(results, choice.scenarios),
     )
+    numbers = numbers.take(output.parent)
     return ReportData(
-        results=results,
-        output=output,
-        choice=choice,
-        collected=collected,
-        transfers=transfers,
-        numbers=numbers.take(output.parent),
-        jobs=jobs,
-        damaged=damaged,
+        results=results, output=output, choice=choice, collected=collected, numbers=numbers, jobs=jobs, damaged=damaged
     )
 
 

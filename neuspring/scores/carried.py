@@ -131,15 +131,8 @@ def points_in_image(
     intrinsics [3, 3], px; camera_to_world [4, 4], m; positions of nodes [F, N, 3], m, of which the first `surface` can be seen;
     marked [F or more, K, 2], px, NaN where a point is not marked. A point that frame 0 does not have is left out.
     """
-    return _means(point_errors(intrinsics, camera_to_world, positions, marked, surface))
-
-
-def point_errors(
-    intrinsics: np.ndarray, camera_to_world: np.ndarray, positions: np.ndarray, marked: np.ndarray, surface: int
-) -> np.ndarray:
-    """As `points_in_image`, of every point: distances [F, K], px; NaN where a point is not marked in the frame or in frame 0."""
     places = carried_in_image(intrinsics, camera_to_world, positions, marked[0], surface)
-    return np.asarray(np.linalg.norm(places - marked[: len(places)], axis=2))
+    return _means(np.linalg.norm(places - marked[: len(places)], axis=2))
 
 
 def carried_in_image(

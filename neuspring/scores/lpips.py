@@ -32,16 +32,8 @@ PACKAGED_HEADS = {"lpips": "weights/v0.1/alex.pth", "torchmetrics": "functional/
 """Path of the heads inside each package that has them."""
 
 
-@dataclass(frozen=True)
-class Weights:
-    """Checked weight files."""
-
-    backbone: Path
-    heads: Path
-
-
-def find_weights(backbone: Path | None = None, heads: Path | None = None, *, trusted: bool = False) -> Weights | str:
-    """The weight files, or one line that says which are missing. None: look in the usual caches.
+def find_weights(backbone: Path | None = None, heads: Path | None = None, *, trusted: bool = False) -> tuple[Path, Path] | str:
+    """The files of backbone and heads, or one line that says which are missing. None: look in the usual caches.
 
     Checks SHA-256 unless `trusted`. Raises InputError only if a path that was given is missing or has another content.
     """
@@ -53,11 +45,11 @@ def find_weights(backbone: Path | None = None, heads: Path | None = None, *, tru
     first = find_file("AlexNet weights", backbone, [hub / BACKBONE], BACKBONE_DIGEST, trusted)
     second = find_file("LPIPS heads", heads, places, HEADS_DIGEST, trusted)
     if isinstance(first, Path) and isinstance(second, Path):
-        return Weights(first, second)
+        return first, second
     return "; ".join(reason for reason in (first, second) if isinstance(reason, str))
 
 
-def configured_weights(settings: LpipsWeights) -> Weights | str:
+def configured_weights(settings: LpipsWeights) -> tuple[Path, Path] | str:
     """As `find_weights`, with the paths of the configuration."""
     return find_weights(*(Path(path) if path else None for path in (settings.backbone, settings.heads)))
 
@@ -103,16 +95,16 @@ class Lpips:
             for layer, before, after, window in zip(LAYERS, CHANNELS[:-1], CHANNELS[1:], WINDOWS, strict=True)
         }
         biases = {f"features.{layer}.bias": (after,) for layer, after in zip(LAYERS, CHANNELS[1:], strict=True)}
-        tensors = read_tensors(weights.backbone, {**shapes, **biases}, device)
+        tensors = read_tensors(weights[0], {**shapes, **biases}, device)
         linear = {f"lin{k}.model.1.weight": (1, channels, 1, 1) for k, channels in enumerate(CHANNELS[1:])}
-        return cls(tensors[: len(LAYERS)], tensors[len(LAYERS) :], read_tensors(weights.heads, linear, device))
+        return cls(tensors[: len(LAYERS)], tensors[len(LAYERS) :], read_tensors(weights[1], linear, device))
 
     @classmethod
     def configured(cls, settings: LpipsWeights, device: str) -> Lpips | str:
         """As `load`, from the files of the configuration; one line that says which are missing."""
         weights = configured_weights(settings)
         # Their checksums have just been taken.
-        return weights if isinstance(weights, str) else cls.load(weights.backbone, weights.heads, device, trusted=True)
+        return weights if isinstance(weights, str) else cls.load(*weights, device, trusted=True)
 
     def features(self, pictures: torch.Tensor) -> list[torch.Tensor]:
         """The output of each ReLU [B, channels, h, w] for normalized pictures [B, 3, H, W]."""

@@ -108,6 +108,10 @@ class Metric:
         """A stored value as tables print it."""
         return self.shown(self.factor * value, sign)
 
+    def told(self, value: float) -> str:
+        """A stored value with heading and unit, for a sentence."""
+        return f"{self.heading} {self.text(value)} {self.shown_unit}".rstrip()
+
     def shown(self, value: float, sign: str = "") -> str:
         """A value in the unit of tables as they print it; a dash for NaN."""
         return DASH if np.isnan(value) else f"{value:{sign}.{self.digits}f}"

@@ -6,6 +6,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -76,9 +77,8 @@ def _intervals(axis: Axes, part: pd.DataFrame, place: np.ndarray, color: str, ma
         if value != shown:
             side = "right" if value > 1 else "left"
             gap = (-6, 0) if value > 1 else (6, 0)
-            axis.annotate(
-                f"{value:.2g}", (shown, at), gap, textcoords="offset points", ha=side, va="center", fontsize=7, color=color
-            )
+            style: dict[str, Any] = {"ha": side, "va": "center", "fontsize": 7, "color": color}
+            axis.annotate(f"{value:.2g}", (shown, at), gap, textcoords="offset points", **style)
 
 
 def _scale(axis: Axes, rows: pd.DataFrame) -> None:

@@ -70,7 +70,12 @@ def write_film(
             across = max(round(scale * width / (1 + len(beside))), 80)
             films = [film_pictures(each, painter.frames[::every], across) for each in (painter, *beside)]
             pictures = [_beside(each) for each in zip(*films, strict=True)]
-            (_write_gif if gif else _write_mp4)(made, pictures, rate / every)
+            if gif:
+                _write_gif(made, pictures, rate / every)
+            else:
+                with Video(made, rate / every, FILM_QUALITY) as video:
+                    for picture in pictures:
+                        video.add(picture)
             size, (high, wide) = made.stat().st_size, pictures[0].shape[:2]
             if size <= 1e6 * megabytes:
                 write_atomically(path, made.replace)
@@ -133,15 +138,11 @@ def _layout(painter: Painter, width: float) -> tuple[Figure, list[list[Axes]], A
 
 
 def _fill(painter: Painter, panels: list[list[Axes]], frame: int) -> None:
+    first = 0 if painter.manner.together else 1
     for row, axes in enumerate(panels):
         for column, axis in enumerate(axes):
             axis.clear()
-            if row:
-                painter.draw_error(axis, column, frame)
-            elif column or painter.manner.together:
-                painter.draw_predicted(axis, column - (not painter.manner.together), frame)
-            else:
-                painter.draw_observed(axis, frame)
+            painter.draw(axis, None if column < first and not row else column - first * (not row), frame, error=bool(row))
 
 
 def _tell(painter: Painter, clock: Axes, frame: int) -> None:
@@ -166,12 +167,6 @@ def _tell(painter: Painter, clock: Axes, frame: int) -> None:
     clock.text(scenario.frame_count - margin, 0.5, f"{frame / scenario.frame_rate:.2f} s", ha="right", **words)
     for side in clock.spines.values():
         side.set_visible(False)
-
-
-def _write_mp4(path: Path, pictures: Sequence[np.ndarray], rate: float) -> None:
-    with Video(path, rate, FILM_QUALITY) as video:
-        for picture in pictures:
-            video.add(picture)
 
 
 def _write_gif(path: Path, pictures: Sequence[np.ndarray], rate: float) -> None:

@@ -80,6 +80,13 @@ class Painter:
     error_name, error_label = "distance", "distance [mm]"
     """Name of the rows of errors, and the label of their color bar."""
 
+    def draw(self, axis: Axes, which: int | None, frame: int, error: bool = False) -> None:
+        """A panel: what was observed (no `which`), or a run's prediction or error."""
+        if which is None:
+            self.draw_observed(axis, frame)
+        else:
+            (self.draw_error if error else self.draw_predicted)(axis, which, frame)
+
     def draw_observed(self, axis: Axes, frame: int) -> None:
         """The observed points."""
         empty(axis, self.scene.view)

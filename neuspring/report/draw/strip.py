@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from matplotlib import pyplot as plt
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -59,7 +58,7 @@ def strip_figure(painter: Painter, width: float) -> Figure:
     for row, gap in zip(rows, gaps, strict=True):
         for column, frame in enumerate(frames):
             axis = place(figure, LABEL + column * (across + STRIP_GAP), top - high, across, high)
-            _paint(painter, axis, row, frame)
+            painter.draw(axis, row.which, frame, row.error)
         bars += [top - high, top] if row.error else []
         _row_label(figure, row, top - high / 2, high)
         top -= high + gap
@@ -69,15 +68,6 @@ def strip_figure(painter: Painter, width: float) -> Figure:
         cax = place(figure, width - STRIP_BAR + 0.06, 0.5 * (min(bars) + max(bars) - tall), 0.09, tall)
         color_bar(figure, cax, painter.norm, ERROR_COLORS, painter.error_label, extend="max")
     return figure
-
-
-def _paint(painter: Painter, axis: Axes, row: StripRow, frame: int) -> None:
-    if row.which is None:
-        painter.draw_observed(axis, frame)
-    elif row.error:
-        painter.draw_error(axis, row.which, frame)
-    else:
-        painter.draw_predicted(axis, row.which, frame)
 
 
 def _row_label(figure: Figure, row: StripRow, middle: float, high: float) -> None:

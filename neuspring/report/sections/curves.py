@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import io
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,12 +17,12 @@ from neuspring.core.artifacts import Observations, Scenario, Trajectory
 from neuspring.core.records import StageRecord
 from neuspring.core.run_record import RunRecord
 from neuspring.report.blocks import Block, Fold, Grid, Legend, PageSection, Picture, Text
-from neuspring.report.data import UNREADABLE, ReportData, ReportSection
+from neuspring.report.data import UNREADABLE, ReportData, ReportSection, data_uri
 from neuspring.scores.metrics import METRICS, bound_track_errors, track_errors
 
 LINE_COLORS = ("#2f7ed8", "#d9731a", "#2a9d5c", "#a05cc4", "#c94f7c", "#8a7a2e", "#1f9aa8", "#8d6a57")
-LINE_DASHES: tuple[Any, ...] = (("-", ""), ((0, (5, 2)), "7 3"), ((0, (1.5, 1.5)), "2 2"), ((0, (6, 2, 1.5, 2)), "8 3 2 3"))
-"""Line styles for matplotlib and for SVG. Each is used with all colors before the next one."""
+LINE_DASHES = ("", "7 3", "2 2", "8 3 2 3")
+"""Dash patterns, px. Each is used with all colors before the next one."""
 STYLE: Any = {
     "svg.fonttype": "none",
     "font.size": 9,
@@ -90,12 +89,11 @@ def curves(material: ReportData) -> PageSection:
             name: (LINE_COLORS[i % len(LINE_COLORS)], LINE_DASHES[i // len(LINE_COLORS) % len(LINE_DASHES)])
             for name, i in index.items()
         }
-        legend = Legend(entries=[(name, color, dash[1]) for name, (color, dash) in styles.items()])
+        legend = Legend(entries=[(name, *style) for name, style in styles.items()])
         pictures = []
         for scenario, own in lines.items():
-            observations = seen[scenario] if what in CURVE_ERRORS else None
-            alt = f"{title}, {scenario}: {', '.join(own)}"
-            pictures.append(_panel(own, styles, observations.scenario if observations else None, scenario, alt))
+            future = observed.scenario if what in CURVE_ERRORS and (observed := seen[scenario]) else None
+            pictures.append(_panel(own, styles, future, scenario, f"{title}, {scenario}: {', '.join(own)}"))
         is_open = what == "track_error" or len(pictures) <= MOST_OPEN_PANELS
         blocks.append(Fold(summary=title, blocks=[Text(text=text), legend, Grid(blocks=pictures)], open=is_open))
     return PageSection(key="curves", title="Curves", about=about, blocks=blocks)
@@ -172,13 +170,11 @@ def _panel(lines: Lines, styles: Mapping[str, Any], future: Scenario | None, cap
         for name in reversed(list(lines)):
             for index, values in enumerate(lines[name].values()):
                 steps = np.unique(np.linspace(0, len(values) - 1, LINE_POINTS).round().astype(int))
-                style: dict[str, Any] = {
-                    "color": styles[name][0],
-                    "ls": styles[name][1][0],
-                    "marker": "o" if len(steps) == 1 else "",
-                }
+                color, dash = styles[name]
+                style: Any = {"color": color, "ls": (0, [float(part) / 1.4 for part in dash.split()]) if dash else "-"}
                 style |= {"lw": 0.8, "alpha": 0.5} if index else {"lw": 1.5}
-                axis.plot(values.index[steps], values.to_numpy()[steps], ms=3, **style)
+                dot = "o" if len(steps) == 1 else ""
+                axis.plot(values.index[steps], values.to_numpy()[steps], marker=dot, ms=3, **style)
         if future is not None:
             end = future.frame_count / future.frame_rate
             axis.axvspan(future.train_end / future.frame_rate, end, color="#888", alpha=0.18, lw=0)
@@ -199,8 +195,7 @@ def _panel(lines: Lines, styles: Mapping[str, Any], future: Scenario | None, cap
         axis.tick_params(length=2.5, width=0.6)
         stream = io.BytesIO()
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
-    data = base64.b64encode(stream.getvalue()).decode("ascii")
-    return Picture(caption=caption, alt=alt, data=f"data:image/svg+xml;base64,{data}", paper=True)
+    return Picture(caption=caption, alt=alt, data=data_uri("image/svg+xml", stream.getvalue()), paper=True)
 
 
 section = ReportSection(order=40, make=curves)

@@ -18,7 +18,7 @@ def details(material: ReportData) -> PageSection | None:
     for _, caption, figure in figures(material.numbers) if len(material.numbers.usable) else ():
         stream = io.BytesIO()
         figure.savefig(stream, dpi=DPI, format="png")
-        blocks.append(embedded(stream.getvalue(), caption, caption, wide=True))
+        blocks.append(embedded(stream.getvalue(), caption))
     return PageSection(key="details", title="How sure the scores are", blocks=[*blocks, *detail_blocks(material.numbers)])
 
 

@@ -15,19 +15,13 @@ def findings(material: ReportData) -> PageSection | None:
     found = [(name, one) for name in material.choice.scenarios for one in findings_of(material.results, name)]
     if not found:
         return None
-    loud = [(name, one) for name, one in found if one.level != "note"]
-    quiet = [(name, one) for name, one in found if one.level == "note"]
+    loud, quiet = ([pair for pair in found if (pair[1].level == "note") == noted] for noted in (False, True))
     blocks: list[Block] = []
     for caption, part in (("Warnings", loud), ("Notes", quiet)):
-        rows = [
-            [
-                Cell(text=name),
-                Cell(text=one.where),
-                Cell(text=one.name, chips=[Chip(text=one.level, tone=TONES[one.level])]),
-                Cell(text=one.text, wrap=True),
-            ]
-            for name, one in part[:MOST_ROWS]
-        ]
+        rows = []
+        for name, one in part[:MOST_ROWS]:
+            level = Chip(text=one.level, tone=TONES[one.level])
+            rows.append([Cell(text=name), Cell(text=one.where), Cell(text=one.name, chips=[level]), Cell(text=one.text, wrap=True)])
         rest = f"{len(part) - MOST_ROWS} more are in the records." if len(part) > MOST_ROWS else ""
         table = Table(caption=caption, header=["Scenario", "Where", "What", "Finding"], rows=rows, stub=1, note=rest)
         if part:
