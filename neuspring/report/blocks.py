@@ -28,17 +28,8 @@ class Text:
 class Items:
     """A list below a title."""
 
-    items: Sequence[str | Link]
+    items: Sequence[str]
     title: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Link:
-    """A file beside the report; `note` follows it."""
-
-    text: str
-    target: str
-    note: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 from urllib.parse import quote
 
 from markdown_it import MarkdownIt
@@ -29,6 +29,7 @@ from neuspring.scores.runs import DAMAGED, Collected, one_line
 
 UNREADABLE = (InputError, OSError, ValueError, KeyError, TypeError, AttributeError)
 """Exceptions of a damaged record, table or picture."""
+Value = TypeVar("Value")
 MOST_ROWS = 400
 """At most so many failures of a kind are listed; the rest is counted."""
 METHOD_RECORDS = (RUN_RECORD, "rollout.json", "fit.json", "train.json")
@@ -106,6 +107,14 @@ class ReportData:
     def lost(self, path: Path, reason: Exception | str) -> None:
         """Remember a damaged file, once."""
         self.damaged.setdefault(self.relative(path), one_line(reason) if isinstance(reason, Exception) else reason)
+
+    def read(self, path: Path, read: Callable[[Path], Value]) -> Value | None:
+        """The content of a file, read by a function; None, and remembered, for a damaged one."""
+        try:
+            return read(path)
+        except UNREADABLE as error:
+            self.lost(path, error)
+            return None
 
     def runs_of(self, scenario: str, method: str) -> list[RunRecord]:
         """All seeds of a method on a scenario."""
@@ -195,13 +204,7 @@ def rendered(text: str) -> Markup:
 
 def prose(material: ReportData, path: Path) -> Prose | None:
     """A Markdown file; None if it is not there or cannot be read."""
-    if not path.is_file():
-        return None
-    try:
-        return Prose(html=rendered(path.read_text(encoding="utf-8")))
-    except UNREADABLE as error:
-        material.lost(path, error)
-        return None
+    return material.read(path, lambda path: Prose(html=rendered(path.read_text(encoding="utf-8")))) if path.is_file() else None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -217,10 +217,10 @@ def text(explanation: Explanation) -> str:
     ]
     lines += [f"{len(table)} runs behind it:", "", *Table.of_texts(header, table).markdown()] if table else ["No run counts."]
     lines += ["", *left_out_lines({str(method): explanation.not_applying})] if explanation.not_applying else []
-    lines += ["", f"Left out: {len(explanation.left_out)}", ""] if explanation.left_out else []
-    lines += [f"- {run.scenario} / seed {run.seed}: {run.why}" for run in explanation.left_out]
-    lines += ["", "Not as the table was made of:", ""] if explanation.problems else []
-    return "\n".join([*lines, *(f"- {problem}" for problem in explanation.problems)]) + "\n"
+    left = [f"{run.scenario} / seed {run.seed}: {run.why}" for run in explanation.left_out]
+    for title, items in ((f"Left out: {len(left)}", left), ("Not as the table was made of:", explanation.problems)):
+        lines += ["", title, "", *(f"- {item}" for item in items)] if items else []
+    return "\n".join(lines) + "\n"
 
 
 def _value(row: Mapping[str, Any], alone: bool) -> list[str]:

@@ -67,7 +67,7 @@ def rotations(carrying: np.ndarray) -> np.ndarray:
     moments = np.einsum("fpki,pkj->fpij", offsets, offsets[0])
     left, size, right = np.linalg.svd(moments)
     signs = np.sign(np.linalg.det(left) * np.linalg.det(right))
-    found = np.einsum("fpij,fpj,fpjk->fpik", left, _last(signs), right)
+    found = np.einsum("fpij,fpj,fpjk->fpik", left, np.stack([*[np.ones_like(signs)] * 2, signs], axis=-1), right)
     # The rotation is unique if the two smaller values do not cancel, with the sign of the last.
     unclear = size[..., 1] + signs * size[..., 2] <= ON_A_LINE * size[..., 0]
     groups = np.flatnonzero(unclear.any(axis=0))
@@ -75,11 +75,6 @@ def rotations(carrying: np.ndarray) -> np.ndarray:
         found[0, groups] = np.where(unclear[0, groups, None, None], np.eye(3), found[0, groups])
         _carry(found, moments, unclear, groups)
     return np.asarray(found)
-
-
-def _last(signs: np.ndarray) -> np.ndarray:
-    ones = np.ones_like(signs)
-    return np.stack([ones, ones, signs], axis=-1)
 
 
 def _carry(found: np.ndarray, moments: np.ndarray, unclear: np.ndarray, groups: np.ndarray) -> None:

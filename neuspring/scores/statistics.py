@@ -96,8 +96,6 @@ Objects = Literal["scenario", "category"]
 BELOW, NOT_RESOLVED, ABOVE, TOO_FEW = "below 1", "not resolved", "above 1", "too few objects"
 REACHED, MISSED, NOT_RUN = "reached", "missed", "not run"
 RATIO_COLUMNS = ("method", "baseline", "task", "metric", "ratio", "ratio_low", "ratio_high", "n", "objects", "pairs", "verdict")
-AIM_COLUMNS = ("aim", "below", "aim_verdict")
-SEED_COLUMNS = ("method", "task", "metric", "spread", "scenarios")
 LEAST_OBJECTS = 3
 """With two objects, the t-interval spans a factor of exp(12.7 SE) on either side: it says nothing."""
 
@@ -170,7 +168,7 @@ def judged_aims(scores: pd.DataFrame, transfers: pd.DataFrame, aims: Iterable[Ai
         rows.append(
             row | {"aim": aim.ratio, "below": aim.below, "aim_verdict": (REACHED if reached else MISSED) if found else NOT_RUN}
         )
-    return pd.DataFrame(rows, columns=[*RATIO_COLUMNS, *AIM_COLUMNS])
+    return pd.DataFrame(rows, columns=[*RATIO_COLUMNS, "aim", "below", "aim_verdict"])
 
 
 def seed_spread(scores: pd.DataFrame) -> pd.DataFrame:
@@ -183,4 +181,4 @@ def seed_spread(scores: pd.DataFrame) -> pd.DataFrame:
     keys = ["method", "task", "metric"]
     each = rows.groupby([*keys, "scenario"], sort=False)["log"].std(ddof=1).dropna()
     table = each.groupby(level=keys, sort=False).agg(spread="mean", scenarios="count")
-    return table.reset_index().reindex(columns=list(SEED_COLUMNS))
+    return table.reset_index().reindex(columns=[*keys, "spread", "scenarios"])

@@ -13,7 +13,7 @@ from matplotlib.colors import Normalize
 
 from neuspring.core.artifacts import Observations
 from neuspring.data.camera import Camera
-from neuspring.report.draw.scene import ShownRun, ShownScene, shown_points
+from neuspring.report.draw.scene import ShownRun, ShownScene
 from neuspring.report.draw.sheet import CONTROLLER, WORST, points_across
 
 Error = Literal["color", "distance", "none"]
@@ -25,8 +25,6 @@ LEAST_MM = 1.0
 """Least upper end of a range of distances."""
 NOTE, SMALLEST_NOTE = 7.0, 5.0
 """Size of the text in a panel, points; the smallest is for narrow panels, of which it must not hide much."""
-NOTE_CORNER = (0.4, 0.2)
-"""Width and height of a note, of a panel."""
 DRAWN_MM = 1e3
 
 
@@ -61,7 +59,6 @@ class Painter:
     ) -> None:
         self.scene, self.takes, self.frames, self.manner = scene, takes, tuple(frames), manner
         self.norm = Normalize(0, self._most())
-        self._corner = self._free_corner()
 
     def _most(self) -> float:
         if self.manner.most is not None:
@@ -130,25 +127,10 @@ class Painter:
         if len(distance):
             self._note(axis, f"{DRAWN_MM * distance.mean():.1f} mm")
 
-    def _free_corner(self) -> tuple[float, float]:
-        """The corner of all panels (0 or 1 to the right, 0 or 1 upwards) that fewest points of any frame reach into."""
-        view = self.scene.view
-        flat = view.project(shown_points(self.scene.observations, self.takes, self.frames))[0]
-        part = flat / [view.width, view.height]
-        x, y = part[:, 0], 1 - part[:, 1]
-
-        def inside(corner: tuple[float, float]) -> int:
-            return int(((np.abs(x - corner[0]) < NOTE_CORNER[0]) & (np.abs(y - corner[1]) < NOTE_CORNER[1])).sum())
-
-        return min(((1.0, 0.0), (0.0, 0.0), (1.0, 1.0), (0.0, 1.0)), key=inside)
-
     def _note(self, axis: Axes, text: str) -> None:
-        right, upper = self._corner
-        place: dict[str, Any] = {"ha": "right" if right else "left", "va": "top" if upper else "bottom"}
         box: dict[str, Any] = {"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 1.0}
-        x, y = 0.025 + 0.95 * right, 0.035 + 0.93 * upper
-        size = float(np.clip(0.075 * points_across(axis), SMALLEST_NOTE, NOTE))
-        axis.text(x, y, text, fontsize=size, bbox=box, transform=axis.transAxes, zorder=9, **place)
+        style: dict[str, Any] = {"ha": "right", "va": "bottom", "bbox": box, "transform": axis.transAxes, "zorder": 9}
+        axis.text(0.975, 0.035, text, fontsize=float(np.clip(0.075 * points_across(axis), SMALLEST_NOTE, NOTE)), **style)
 
     def _line(self, axis: Axes, nodes: np.ndarray, frame: int, color: str, alpha: float = 1.0) -> None:
         """The center line of a long thin body through its nodes [P, 3], m (the first ones at least); nothing if none is known."""

@@ -17,7 +17,7 @@ from neuspring.core.artifacts import Observations, Scenario, Trajectory
 from neuspring.core.records import StageRecord
 from neuspring.core.run_record import RunRecord
 from neuspring.report.blocks import Block, Fold, Grid, Legend, PageSection, Picture, Text
-from neuspring.report.data import UNREADABLE, ReportData, ReportSection, data_uri
+from neuspring.report.data import ReportData, ReportSection, data_uri
 from neuspring.scores.metrics import METRICS, bound_track_errors, track_errors
 
 LINE_COLORS = ("#2f7ed8", "#d9731a", "#2a9d5c", "#a05cc4", "#c94f7c", "#8a7a2e", "#1f9aa8", "#8d6a57")
@@ -101,11 +101,7 @@ def curves(material: ReportData) -> PageSection:
 
 def _observations(material: ReportData, scenario: str) -> Observations | None:
     place = material.results / scenario / "observations.npz"
-    try:
-        return Observations.load(place) if place.is_file() else None
-    except UNREADABLE as error:
-        material.lost(place, error)
-        return None
+    return material.read(place, Observations.load) if place.is_file() else None
 
 
 def _lines(material: ReportData, scenario: str, what: str, observations: Observations | None) -> Lines:
@@ -133,15 +129,14 @@ def _history(material: ReportData, run: RunRecord, stage: str) -> pd.Series | No
     """Losses or best costs by step; None if the run has none."""
     if not run.histories.get(stage):
         return None
-    path = (material.folder(run) / run.histories[stage]).resolve()
-    try:
+
+    def read(path: Path) -> pd.Series:
         table = pd.read_parquet(path, columns=["step", "metric", "value"])
         own = table["metric"] == ("best_cost" if stage == "search" else "loss")
         values = table.loc[own].set_index("step")["value"].astype(float)
-    except UNREADABLE as error:
-        material.lost(path, error)
-        return None
-    return values[values < DIVERGED_COST] if stage == "search" else 1e6 * values if stage == "fit" else values
+        return values[values < DIVERGED_COST] if stage == "search" else 1e6 * values if stage == "fit" else values
+
+    return material.read((material.folder(run) / run.histories[stage]).resolve(), read)
 
 
 def _error(material: ReportData, run: RunRecord, metric: str, observations: Observations | None) -> pd.Series | None:
@@ -149,17 +144,17 @@ def _error(material: ReportData, run: RunRecord, metric: str, observations: Obse
     record = material.file(run, "records", "rollout")
     if record is None or observations is None or not run.ok:
         return None
-    try:
-        stage = StageRecord.load(record)
+
+    def read(path: Path) -> pd.Series | None:
+        stage = StageRecord.load(path)
         if "trajectory" not in stage.files:
             return None
-        positions = Trajectory.load(record.parent / stage.files["trajectory"][0]).positions
+        positions = Trajectory.load(path.parent / stage.files["trajectory"][0]).positions
         values = METRICS[metric].factor * CURVE_ERRORS[metric](positions, observations.tracks[: len(positions)])
-    except UNREADABLE as error:
-        material.lost(record, error)
-        return None
-    seconds = np.arange(len(values)) / observations.scenario.frame_rate
-    return None if np.isnan(values).all() else pd.Series(values, index=seconds)
+        seconds = np.arange(len(values)) / observations.scenario.frame_rate
+        return None if np.isnan(values).all() else pd.Series(values, index=seconds)
+
+    return material.read(record, read)
 
 
 def _panel(lines: Lines, styles: Mapping[str, Any], future: Scenario | None, caption: str, alt: str) -> Picture:

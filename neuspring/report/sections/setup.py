@@ -13,9 +13,9 @@ import yaml
 from neuspring import config
 from neuspring.config import Config
 from neuspring.core.run_record import RunRecord, flat
-from neuspring.core.table import Table
+from neuspring.core.table import Cell, Table
 from neuspring.core.text import listed
-from neuspring.report.blocks import Block, Code, Fold, Items, Link, PageSection, Text
+from neuspring.report.blocks import Block, Code, Fold, PageSection, Text
 from neuspring.report.data import Options, ReportData, ReportSection, link, several
 
 DATA = (".md", ".csv", ".tex", ".html", ".parquet")
@@ -23,12 +23,12 @@ SO_FAR = "so_far"
 """Folder of tables that an interrupted run left."""
 
 
-def files(material: ReportData) -> list[tuple[str, str]]:
-    """Files of the tables' folder beside the report: text and link."""
+def files(material: ReportData) -> list[Cell]:
+    """Files of the tables' folder beside the report, with links."""
     folder, here = material.results / material.choice.tables, material.output.resolve()
     paths = (path for path in sorted(folder.rglob("*")) if path.suffix in DATA and path.resolve() != here)
     paths = (path for path in paths if path.is_file() and SO_FAR not in path.relative_to(folder).parts)
-    return [(material.relative(path), link(path, here.parent)) for path in paths]
+    return [Cell(text=material.relative(path), link=link(path, here.parent)) for path in paths]
 
 
 PACKAGES = (
@@ -48,9 +48,8 @@ def setup(material: ReportData) -> PageSection:
     if machines := Counter(f"{run.machine}; {run.device}" for run in material.runs):
         rows = [(name, str(count)) for name, count in sorted(machines.items())]
         blocks.append(Table.of_texts(["Machine; device", "Runs"], rows, "Machines of the runs"))
-    beside = files(material)
-    if beside:
-        links = Items(items=[Link(text=text, target=target) for text, target in beside])
+    if beside := files(material):
+        links = Table(header=["File"], rows=[[one] for one in beside])
         blocks.append(Fold(summary=f"{several(len(beside), 'file')} with the tables' data, beside this page", blocks=[links]))
     return PageSection(key="setup", title="Configuration and versions", blocks=blocks)
 
