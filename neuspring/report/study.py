@@ -19,11 +19,11 @@ import pandas as pd
 
 from neuspring.core.files import write_text
 from neuspring.core.table import LATEX_PREAMBLE, Cell, Table
-from neuspring.report.blocks import Block, Fold, Items, Text, markdown
+from neuspring.report.blocks import Block, Fold, Text, markdown
 from neuspring.report.draw.benchmark import cluster_methods, clusters_figure
 from neuspring.report.draw.sheet import save
 from neuspring.report.grid import Columns, Show, between, chip, grouped, rows
-from neuspring.report.summary import failure_table, settings_table
+from neuspring.report.summary import failure_table, not_counted, settings_table
 from neuspring.scores import paper
 from neuspring.scores.failures import left_out_lines, removed_lines, unknown_lines
 from neuspring.scores.metrics import DASH, Metric, present
@@ -44,8 +44,6 @@ DIRECTION_NOTE = (
 BOUND_NOTE = (
     "TE bound: track error of points that move with the nodes around them, 0 for every rigid motion; TE has a floor, frame 0's."
 )
-MOST_NAMED = 6
-"""At most so many runs with the same reason are named. numbers.json has all."""
 FAILED_MARK = "*"
 """Stands beside the number of runs of a method if some of them failed."""
 Mark = Literal["", "best", "second"]
@@ -300,11 +298,4 @@ def left_out_items(numbers: StudyNumbers) -> list[Block]:
     asked = set(runs["label"]) | {label for label, method in study.rows.items() if method in own.left_out}
     absent = {label: method for label, method in study.rows.items() if label not in asked}
     lines = [f"{label}: {method} is not among the methods of this benchmark" for label, method in absent.items()]
-    left = runs[~runs["counted"].astype(bool)]
-    for (label, status, why), part in left.groupby(["label", "status", "why"], sort=False):
-        names = [f"{row.scenario} / seed {row.seed}" for row in part.itertuples()]
-        shown = names if status == "failed" else names[:MOST_NAMED]
-        more = f" and {len(names) - len(shown)} more" if len(names) > len(shown) else ""
-        lines.append(f"{label}, {', '.join(shown)}{more}: {' '.join(str(why).split())}")
-    lines += left_out_lines(own.left_out, numbers.labels)
-    return [Items(title="Not in the averages", items=lines)] if lines else []
+    return not_counted(runs, lines, left_out_lines(own.left_out, numbers.labels))

@@ -32,7 +32,9 @@ NOT_COMPUTED = Cell(text="not computed", value="")
 MOST_OPEN_ROWS = 12
 """Most rows of a breakdown that is not folded."""
 LISTED = 12
-"""At most so many missing runs, or notes, are listed one by one. If there are more, they are counted by method."""
+"""At most so many notes are listed one by one. If there are more, they are counted by kind."""
+MOST_NAMED = 6
+"""At most so many runs with the same reason are named. runs.csv and numbers.json have all."""
 NUMBER = r"(?<![\w.])\d+(?:\.\d+)?(?!\w)"
 """A number of a note: notes that differ in numbers alone are of one kind."""
 HOLE = "\ufffc"
@@ -367,15 +369,18 @@ def _several_seeds(scores: pd.DataFrame) -> bool:
     return len(scores) > 0 and scores["seed"].nunique() > 1
 
 
-def not_counted(runs: pd.DataFrame) -> list[Block]:
-    """Failures one by one; runs that are missing too, unless they are many, as when `only` makes a part of them."""
-    bad = runs[runs["status"] != "ok"]
-    missing = bad[bad["status"] == "missing"]
-    listed = bad if len(missing) <= LISTED else bad[bad["status"] != "missing"]
-    lines = [f"{row.scenario} / {row.method} / seed {row.seed}: {row.status}: {row.reason}" for row in listed.itertuples()]
-    if len(missing) > LISTED:
-        counts = ", ".join(f"{method} {count}" for method, count in missing["method"].value_counts(sort=False).items())
-        lines.append(f"{len(missing)} runs have not finished, or were not asked for ({counts}); runs.csv names them.")
+def not_counted(runs: pd.DataFrame, before: Sequence[str] = (), behind: Sequence[str] = ()) -> list[Block]:
+    """The runs that averages leave out, failures one by one and others by their reason; other lines stand before and behind.
+
+    `runs` have the columns label, scenario, seed, status, counted and why (`scores.study.accounted`).
+    """
+    lines = list(before)
+    for (label, status, why), part in runs[~runs["counted"].astype(bool)].groupby(["label", "status", "why"], sort=False):
+        names = [f"{row.scenario} / seed {row.seed}" for row in part.itertuples()]
+        shown = names if status == "failed" else names[:MOST_NAMED]
+        more = f" and {len(names) - len(shown)} more" if len(names) > len(shown) else ""
+        lines.append(f"{label}, {', '.join(shown)}{more}: {' '.join(str(why).split())}")
+    lines += behind
     return [Items(title="Not in the averages", items=lines)] if lines else []
 
 
@@ -438,4 +443,8 @@ def write(numbers: Numbers, folder: Path) -> str:
 def summary_text(numbers: Numbers) -> str:
     """The verdict, the scores, and the runs that are not among them, in Markdown."""
     blocks: Sequence[Block] = [*verdict(numbers), *score_blocks(numbers), *detail_blocks(numbers)]
-    return markdown([*blocks, *not_counted(numbers.everything.runs)])
+    runs = numbers.everything.runs
+    ended = runs.assign(
+        label=runs["method"], counted=runs["status"] == "ok", why=runs["status"] + ": " + runs["reason"].astype(str)
+    )
+    return markdown([*blocks, *not_counted(ended)])
