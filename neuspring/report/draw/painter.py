@@ -154,13 +154,10 @@ class Painter:
         edge = {"linewidths": 0.0} if values is None else {"linewidths": 0.25, "edgecolors": "0.45"}
         # All frames have dots of one size, however many points are seen.
         nodes = color in (DARK_NODES, UNKNOWN_COLOR)
-        size = self._size(axis, len(observations.nodes) if nodes else observations.object_points.shape[1])
+        count, width = len(observations.nodes) if nodes else observations.object_points.shape[1], points_across(axis)
+        # A third of the area that this many dots have if they fill the panel, within what can be seen.
+        size = float(np.clip((0.35 * width / np.sqrt(max(count, 1))) ** 2, 0.8, (0.035 * width) ** 2))
         axis.scatter(flat[order, 0], flat[order, 1], s=size, alpha=alpha, zorder=3, **style, **edge)
-
-    def _size(self, axis: Axes, count: int) -> float:
-        """Area of a dot, points^2: a third of what this many dots have if they fill the panel, within what can be seen."""
-        width = points_across(axis)
-        return float(np.clip((0.35 * width / np.sqrt(max(count, 1))) ** 2, 0.8, (0.035 * width) ** 2))
 
 
 def empty(axis: Axes, view: Camera, *, framed: bool = True) -> None:

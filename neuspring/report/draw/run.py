@@ -57,29 +57,27 @@ def run_figures(
     `errors` are those of `metrics.errors_per_frame`, m, computed here if not given. `searched` is the homogeneous stiffness that
     the search found, N, marked among the twin's.
     """
-    title = f"{observations.scenario.name}, {method}"
-    paths = []
+    title, drawn = f"{observations.scenario.name}, {method}", list[Path]()
     # A picture of an earlier result must not stay beside this one's.
     for name in (*RUN_FIGURES, IMAGE_SCORES):
         (folder / name).unlink(missing_ok=True)
+
+    def keep(name: str, figure: Figure) -> None:
+        drawn.append(save(figure, folder / name))
+
     if trajectory is not None and len(trajectory.positions):
-        values = errors or errors_per_frame(trajectory.positions, observations)
-        paths.append(save(_errors(observations, values, title), folder / "errors.png"))
-        paths.append(save(motion_figure(observations, trajectory, method), folder / "motion.png"))
+        keep("errors.png", _errors(observations, errors or errors_per_frame(trajectory.positions, observations), title))
+        keep("motion.png", motion_figure(observations, trajectory, method))
     if histories:
-        paths.append(save(losses_figure(histories, title), folder / "losses.png"))
+        keep("losses.png", losses_figure(histories, title))
     if twin is not None:
         take, lines = ShownRun(title, twin.topology.nodes[None], twin), lines_of(twin)
         label = f"{title}: {len(twin.topology.nodes)} nodes, {len(lines.pairs)} {lines.kinds}"
-        paths.append(
-            save(
-                twin_figure(_from_two_sides(observations, take, label, "region"), RUN_WIDTH, COUNTED_LEGEND),
-                folder / "topology.png",
-            )
-        )
+        two_sides = _from_two_sides(observations, take, label, "region")
+        keep("topology.png", twin_figure(two_sides, RUN_WIDTH, COUNTED_LEGEND))
         if lines.inner:
-            paths.append(save(stiffness_figure(observations, take, searched), folder / "stiffness.png"))
-    return paths
+            keep("stiffness.png", stiffness_figure(observations, take, searched))
+    return drawn
 
 
 def _errors(observations: Observations, values: Mapping[str, np.ndarray], title: str) -> Figure:

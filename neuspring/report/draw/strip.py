@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -25,23 +23,11 @@ TIME_BAND = 0.05
 """Height of the bands that say training and future, inches."""
 
 
-@dataclass(frozen=True)
-class StripRow:
-    """A row of panels: the observed frames (no `which`), or a method's prediction or error."""
-
-    label: str
-    which: int | None = None
-    error: bool = False
-
-
-def rows_of(painter: Painter) -> list[StripRow]:
-    """Observed, then two rows per method, or one without errors."""
-    rows = [StripRow("observed")]
-    for which, take in enumerate(painter.takes):
-        rows.append(StripRow(take.label, which))
-        if painter.manner.error != "none":
-            rows.append(StripRow(painter.error_name, which, error=True))
-    return rows
+def rows_of(painter: Painter) -> list[tuple[str, int | None, bool]]:
+    """Label, run and True for its error: the observed frames (no run), then two rows per method, or one without errors."""
+    kinds = (False, True) if painter.manner.error != "none" else (False,)
+    methods = [(painter.error_name if error else take.label, k, error) for k, take in enumerate(painter.takes) for error in kinds]
+    return [("observed", None, False), *methods]
 
 
 def strip_figure(painter: Painter, width: float) -> Figure:
@@ -51,16 +37,16 @@ def strip_figure(painter: Painter, width: float) -> Figure:
     right = STRIP_BAR if errors else STRIP_EDGE
     across = (width - LABEL - right - STRIP_GAP * (len(frames) - 1)) / len(frames)
     high = across * view.height / view.width
-    gaps = [BETWEEN if row.which is not None and not row.error else STRIP_GAP for row in rows[1:]] + [STRIP_EDGE]
+    gaps = [STRIP_GAP if error else BETWEEN for _, _, error in rows[1:]] + [STRIP_EDGE]
     total = STRIP_HEAD + sum(gaps) + high * len(rows)
     figure = plt.figure(figsize=(width, total))
     top, bars = total - STRIP_HEAD, []
-    for row, gap in zip(rows, gaps, strict=True):
+    for (label, which, error), gap in zip(rows, gaps, strict=True):
         for column, frame in enumerate(frames):
             axis = place(figure, LABEL + column * (across + STRIP_GAP), top - high, across, high)
-            painter.draw(axis, row.which, frame, row.error)
-        bars += [top - high, top] if row.error else []
-        _row_label(figure, row, top - high / 2, high)
+            painter.draw(axis, which, frame, error)
+        bars += [top - high, top] if error else []
+        _row_label(figure, label, error, top - high / 2, high)
         top -= high + gap
     _head(figure, painter, across, total, total - STRIP_HEAD - high * len(rows) - sum(gaps[:-1]))
     if errors:
@@ -70,13 +56,13 @@ def strip_figure(painter: Painter, width: float) -> Figure:
     return figure
 
 
-def _row_label(figure: Figure, row: StripRow, middle: float, high: float) -> None:
+def _row_label(figure: Figure, label: str, error: bool, middle: float, high: float) -> None:
     """The name of a row, smaller where it would not fit beside it."""
     width, height = figure.get_size_inches()
-    size = min(TEXT - row.error, 72 * high / (LETTER * len(row.label)))
-    color = "0.35" if row.error else "black"
+    size = min(TEXT - error, 72 * high / (LETTER * len(label)))
+    color = "0.35" if error else "black"
     place = ((LABEL - 0.05) / width, middle / height)
-    figure.text(*place, row.label, rotation=90, ha="right", va="center", fontsize=size, color=color)
+    figure.text(*place, label, rotation=90, ha="right", va="center", fontsize=size, color=color)
 
 
 def _head(figure: Figure, painter: Painter, across: float, total: float, bottom: float) -> None:

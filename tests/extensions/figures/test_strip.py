@@ -48,7 +48,7 @@ def grid(figure, rows: int, columns: int) -> np.ndarray:
 @pytest.mark.parametrize(("error", "rows"), [("distance", 5), ("none", 3)])
 def test_a_row_for_what_was_observed_and_each_method_and_a_column_per_frame(plain, error, rows):
     paints = painter(plain, FRAMES, error=error)
-    assert [row.which for row in rows_of(paints)] == ([None, 0, 0, 1, 1] if rows == 5 else [None, 0, 1])
+    assert [which for _, which, _ in rows_of(paints)] == ([None, 0, 0, 1, 1] if rows == 5 else [None, 0, 1])
     figure = strip_figure(paints, 6.0)
     panels = grid(figure, rows, len(FRAMES))
     assert figure.get_figwidth() == pytest.approx(6.0)
