@@ -21,7 +21,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.job_records import JobRecord, read_jobs
 from neuspring.core.run_record import RUN_RECORD, RunRecord
 from neuspring.report.blocks import PageSection, Picture, Prose
-from neuspring.scores.failures import LeftOut, applying
+from neuspring.scores.failures import LeftOut
 from neuspring.scores.metrics import DASH
 from neuspring.scores.numbers import Numbers
 from neuspring.scores.paper import Study
@@ -60,12 +60,6 @@ class Options:
     """Largest size of the page. Pictures and videos that do not fit are linked."""
     video_megabytes: float = 8.0
     """Largest part of that for videos."""
-
-    @property
-    def size(self) -> int:
-        """Runs that there should be."""
-        absent = applying(self.left_out, tuple(self.scenarios), tuple(self.methods))
-        return (len(self.scenarios) * len(self.methods) - sum(map(len, absent.values()))) * len(self.seeds)
 
 
 @dataclass(kw_only=True)

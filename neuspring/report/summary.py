@@ -405,7 +405,9 @@ def figures(numbers: Numbers) -> Iterator[tuple[str, str, Figure]]:
     For the latter only pairs of scenario and seed count that every method clusters_<K> finished. A method that finished no run is
     left out.
     """
-    figure = ratios_figure(numbers.ratios, numbers.size if len(numbers.usable) else "")
+    usable = numbers.usable
+    size = f"{usable['scenario'].nunique()} scenarios, {usable['seed'].nunique()} seed(s)" if len(usable) else ""
+    figure = ratios_figure(numbers.ratios, size)
     if figure:
         yield "ratios.png", f"Ratio of every method's errors to those of {numbers.baseline}", figure
     collected = numbers.everything

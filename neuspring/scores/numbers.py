@@ -184,21 +184,14 @@ class Numbers:
         beside = self.known_studies.get(study.beside or "")
         return StudyNumbers(name=name, study=study, collected=self.everything, beside=beside)
 
-    @property
-    def size(self) -> str:
-        """Size of the comparison, in words."""
-        return f"{self.usable['scenario'].nunique()} scenarios, {self.usable['seed'].nunique()} seed(s)"
-
     @cached_property
     def key(self) -> str:
         """A digest of what the numbers are made of: numbers of other runs, or against another method, have another one."""
-        runs = [found.runs.reindex(columns=["scenario", "method", "seed", "status", "run_key"]) for found in self._all_runs()]
+        parts = [found for found in (self.everything, self.transfers) if found]
+        runs = [found.runs.reindex(columns=["scenario", "method", "seed", "status", "run_key"]) for found in parts]
         told = [self.baseline, self.objects, [asdict(aim) for aim in self.aims], [table.to_csv() for table in runs]]
-        told += [found.scores.to_csv(index=False) for found in self._all_runs()]
+        told += [found.scores.to_csv(index=False) for found in parts]
         return hashlib.sha256(json.dumps(told).encode()).hexdigest()
-
-    def _all_runs(self) -> list[Collected]:
-        return [self.everything, *([self.transfers] if self.transfers else [])]
 
     @property
     def _parts(self) -> dict[str, Numbers | StudyNumbers | ClipNumbers]:

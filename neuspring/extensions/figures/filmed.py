@@ -142,7 +142,7 @@ class PhotoPainter(Painter):
         if manner.error == "color":
             self.error_name, self.error_label = "difference", "color difference"
 
-    def _splats(self, take: ShownRun, images: Images, device: str) -> dict[int, Drawn]:
+    def _splats(self, take: SplatRun, images: Images, device: str) -> dict[int, Drawn]:
         view, backend = view_of(self.scene.camera, images, device), choose_backend(images.backend, device)
         made = {}
         for frame, gaussians in take.gaussians(self.frames, images, device):

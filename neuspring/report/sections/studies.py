@@ -25,7 +25,7 @@ WITHOUT_DIRECTION = (Kind.NOT_RUN, Kind.NOT_COMPUTED, Kind.NOTHING_TO_COMPARE, K
 def studies(material: ReportData) -> PageSection | None:
     """Cards with the answers, and a fold per study; None without any."""
     found = material.numbers.by_study.values()
-    if not found or not material.choice.size:
+    if not found or not len(material.collected.runs):
         return None
     cards = [answer_card(one) for one in found if isinstance(one, StudyNumbers) and one.study.reference]
     folds = []

@@ -9,7 +9,7 @@ from neuspring.report.data import ReportData, ReportSection, several
 
 def verdict(material: ReportData) -> PageSection:
     """The answer, and how many jobs failed and files cannot be read."""
-    blocks: list[Block] = [*words.verdict(material.numbers)] if material.choice.size else []
+    blocks: list[Block] = [*words.verdict(material.numbers)] if len(material.collected.runs) else []
     if not blocks:
         text = f"Nothing to report yet: {material.results.resolve().name} holds no run, and none was asked for."
         blocks.append(Text(text=text, tone="warn"))
