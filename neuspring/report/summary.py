@@ -334,8 +334,8 @@ def breakdown_blocks(finished: pd.DataFrame) -> list[Block]:
                 top = row.value == tops.get((row.task, row.metric))
                 return Cell(text=metric.text(row.value), value=row.value, mark="best" if top else "")
 
-            made = rows(means, shown, ["method"], lambda row, name=name: [([Cell(text=str(name)), Cell(text=row.method)], show)])
-            lines += [[*line, Cell(text=str(counts[line[1].text]))] for line in made]
+            made = rows(means, shown, ["method"], lambda row: [([Cell(text=row.method)], show)])
+            lines += [[Cell(text=str(name)), *line, Cell(text=str(counts[line[0].text]))] for line in made]
         caption = f"Per {column} (errors in mm, seeds averaged)"
         table = flat(caption, [column.capitalize(), "Method"], shown, lines, counted, sortable=True, note="All finished runs.")
         blocks.append(Fold(summary=f"Per {column}", blocks=[table], open=column == "scenario" and len(lines) <= MOST_OPEN_ROWS))

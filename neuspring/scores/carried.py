@@ -27,12 +27,9 @@ where x_i are the projections of a few surface nodes, in pixels. In frame 0 the 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from neuspring.data.camera import Camera
+from neuspring.data.camera import Camera
 
 CARRIERS = 8
 """Nodes that a point is bound to, as many as the corners of a cell of a regular grid."""
@@ -137,8 +134,6 @@ def carried_in_image(
 
     Other arguments as in `points_in_image`. The nodes must lie in front of the camera. They are chosen once, in frame 0.
     """
-    from neuspring.data.camera import Camera
-
     camera = Camera("", 0, 0, intrinsics, camera_to_world)
     pixels, depth = camera.project(positions[:, :surface].astype(np.float64))
     places = np.full((len(positions), *np.shape(start)), np.nan)
@@ -158,8 +153,6 @@ def points_on_table(
     table in a frame in which the nodes that carry it are less than FLAT above it. There the marked pixel is lifted onto the plane
     at their height; the error is its distance from where they carry the point.
     """
-    from neuspring.data.camera import Camera
-
     errors = np.full((len(positions), marked.shape[1]), np.nan)
     if (up * positions[0, :, 2]).max() < FLAT_HEIGHT:
         camera = Camera("", 0, 0, intrinsics, camera_to_world)
