@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import sys
-import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from neuspring.cli.options import Device, Positional, Settings, arg, read_settings
 from neuspring.core.errors import InputError
 from neuspring.intake.make import Intake
 from neuspring.intake.make import make_capture as make
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
 
 DOUBTFUL_FRAMES_SHOWN = 5
 """Number of doubtful frames that are named per camera."""
@@ -75,6 +69,7 @@ def mask(
     """Marks on a few frames, or masks of other tools -> masks of object and hands in every frame of a capture."""
     from neuspring.checks.masks import mask_facts
     from neuspring.checks.perceived import look_at_masks
+    from neuspring.core.text import Progress
     from neuspring.data.capture import Capture
     from neuspring.perception import segment_sam2
     from neuspring.perception.marks import store
@@ -115,8 +110,8 @@ def mask(
 
                 carried = segment_sam2.carry(read, name, marked.of(name), segmentation.grounded_sam2, resolve_device(device))
             else:
-                bar = _bar(f"camera {name}")
-                carried = carry_camera(read, name, marked.of(name), segmentation.marks, progress=bar)
+                progress = Progress(f"camera {name}", 0).of
+                carried = carry_camera(read, name, marked.of(name), segmentation.marks, progress=progress)
             doubts = store.save_carried(read, name, carried, source, backend).doubt
             for finding in look_at_masks(read, name, carried.labels, mask_facts(read, name, carried.labels)):
                 print(finding)
@@ -127,21 +122,6 @@ def mask(
     without = [name for name in read.cameras if not store.has_masks(read, [name])]
     if without:
         print(f"cameras without masks: {', '.join(without)}; {read.folder / 'capture.json'} says masks: true when all have some")
-
-
-def _bar(name: str) -> Callable[[int, int], None]:
-    """A line that shows how far the work is: on a terminal it is drawn over and over, elsewhere it is written ten times."""
-    began, live, told = time.perf_counter(), sys.stderr.isatty(), [-1]
-
-    def show(done: int, total: int) -> None:
-        tenth = 10 * done // max(total, 1)
-        if live or tenth != told[0]:
-            told[0] = tenth
-            left = (time.perf_counter() - began) / max(done, 1) * (total - done)
-            line = f"{name}: {'#' * (2 * tenth):<20} {100 * done // max(total, 1):3d} %, {left:.0f} s left"
-            print(f"\r{line:<70}" if live else line, end="" if live and done < total else "\n", file=sys.stderr, flush=True)
-
-    return show
 
 
 def compare_masks(

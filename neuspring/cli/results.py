@@ -9,7 +9,7 @@ import socket
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from neuspring.cli.options import Device, Positional, Results, Settings, arg, json_value, read_settings
 from neuspring.config import parse
@@ -64,31 +64,19 @@ def tables(
     require_metrics(wanted)
     shown = {name: _study(table, name)[1] for name in studies}
     known = _study(table, studies[0])[0] if studies else {}
+    common: Any = {"objects": objects, "aims": wanted, "studies": shown, "known_studies": known, "results": results}
     if scores:
         found = _read_scores(scores, scenarios, methods, seeds, left_out)
-        against = baseline or str(found.runs["method"].iloc[0])
-        made = Numbers(
-            everything=found, baseline=against, objects=objects, aims=wanted, studies=shown, known_studies=known, results=results
-        )
-        print(write(made, output))
+        print(write(Numbers(everything=found, baseline=baseline or str(found.runs["method"].iloc[0]), **common), output))
         return
     there = traces(results, job_records(results)[0])
     scenarios, methods, seeds = scenarios or tuple(there[0]), methods or tuple(there[1]), seeds or tuple(there[2])
     if not (scenarios and methods and seeds):
         raise InputError(results, "a results folder with runs is required", "none", "Run the workflow first, or name another.")
     collected = collect(results, scenarios, methods, seeds, _read_left_out(left_out))
-    numbers = Numbers(
-        everything=collected,
-        baseline=baseline or methods[0],
-        objects=objects,
-        aims=wanted,
-        transfers=collect_transfers(results, transfers, methods, seeds),
-        studies=shown,
-        known_studies=known,
-        results=results,
-        warnings=warnings_of(results, scenarios),
-        made_otherwise=_made_otherwise(settings, results),
-    )
+    more: Any = {"warnings": warnings_of(results, scenarios), "made_otherwise": _made_otherwise(settings, results)}
+    moved = collect_transfers(results, transfers, methods, seeds)
+    numbers = Numbers(everything=collected, baseline=baseline or methods[0], transfers=moved, **common, **more)
     text = write(numbers, output)
     print(headline(text) if brief else text)
     print(f"Tables: {output / 'summary.md'}")
@@ -286,9 +274,6 @@ def sync(results: Results = Path("results"), settings: Settings = "{}") -> int:
 
 def ui(results: Results = Path("results"), settings: Settings = "{}", host: str = "127.0.0.1", port: int = 5000) -> None:
     """Open the MLflow UI of a results folder."""
-    import time
-    import urllib.request
-
     from neuspring.experiments.tracking.store import ENVIRONMENT, default_uri, page
 
     tracking = read_settings(settings).tracking
@@ -300,17 +285,7 @@ def ui(results: Results = Path("results"), settings: Settings = "{}", host: str 
         socket.create_server((host, port)).close()
     except OSError as error:
         raise InputError("--port", "must be free", f"{port} ({error.strerror})", f"Give another: --port {port + 1}.") from error
-    address, server = f"http://{host}:{port}", os.getpid()
-    if os.fork() == 0:
-        # Beside the server: it tells the address when there is an answer.
-        while os.getppid() == server:
-            try:
-                urllib.request.urlopen(f"{address}/health", timeout=5).close()
-                print(f"MLflow UI: {address}/{place} (stop with Ctrl-C)", flush=True)
-                break
-            except OSError:
-                time.sleep(0.2)
-        os._exit(0)
+    print(f"MLflow UI: http://{host}:{port}/{place} (stop with Ctrl-C)", flush=True)
     command = [sys.executable, "-m", "mlflow", "ui", "--backend-store-uri", uri, "--host", host, "--port", str(port)]
     os.execve(sys.executable, command, ENVIRONMENT | {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"} | os.environ)
 

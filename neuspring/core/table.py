@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import Literal
 
 Tone = Literal["", "good", "bad", "warn", "mute"]
 LONG_GROUPS = {"Recon.": "Reconstruction & Resimulation", "Future": "Future Prediction"}
@@ -55,7 +55,6 @@ class Cell:
 class Table:
     """A table; the first `stub` cells of every row are its headings."""
 
-    kind: ClassVar[str] = "table"
     header: Sequence[str]
     rows: Sequence[Sequence[Cell]]
     caption: str = ""

@@ -36,6 +36,11 @@ class Progress:
         self._last = 0.0
         self._first: int | None = None
 
+    def of(self, done: int, total: int) -> None:
+        """As `update`, of work whose size is known when it begins."""
+        self._total = total
+        self.update(done)
+
     def update(self, done: int, note: str = "") -> None:
         """`done` of `total` steps are finished."""
         moment = time.monotonic()

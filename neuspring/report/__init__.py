@@ -1,4 +1,4 @@
-"""What people look at.
+"""Tables, figures and pages for people.
 
 - `blocks`: what pages are made of, as HTML and as Markdown.
 - `grid`, `summary`, `study`, `clips`, `verdict`, `notes`, `perception`: numbers laid out, once for files and for the page.

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import jinja2
 from markupsafe import Markup
 
 from neuspring.core.table import Chip, Table, Tone
 
-TEMPLATES = Path(__file__).parent / "templates"
+PAGE_TEMPLATES = Path(__file__).parent / "templates"
 SYMBOLS: dict[Tone, str] = {"good": "✓", "bad": "✗", "warn": "!", "mute": "○", "": ""}
 
 
@@ -20,7 +19,6 @@ SYMBOLS: dict[Tone, str] = {"good": "✓", "bad": "✗", "warn": "!", "mute": "�
 class Text:
     """A paragraph; `tone` makes it a note, `label` stands in front of it."""
 
-    kind: ClassVar[str] = "text"
     text: str
     tone: Tone = ""
     label: str = ""
@@ -30,25 +28,14 @@ class Text:
 class Items:
     """A list below a title."""
 
-    kind: ClassVar[str] = "items"
-    items: Sequence[str | Link]
+    items: Sequence[str]
     title: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Link:
-    """A file beside the report; `note` follows it."""
-
-    text: str
-    target: str
-    note: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Verdict:
+class Answer:
     """The answer of one study."""
 
-    kind: ClassVar[str] = "verdict"
     title: str
     answer: str
     tone: Tone
@@ -59,11 +46,12 @@ class Verdict:
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """A picture; without `data`, a link to the file and why it is not shown."""
+    """A picture or a film; without `data`, a link to the file and why it is not shown."""
 
-    kind: ClassVar[str] = "picture"
     caption: str
-    alt: str
+    alt: str = ""
+    """Empty for a film, which has no such text."""
+    film: bool = False
     data: str = ""
     """Its source: a data URI, or the path of a file on a page that is not self-contained."""
     link: str = ""
@@ -78,22 +66,9 @@ class Picture:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Video:
-    """A video, as `Picture`."""
-
-    kind: ClassVar[str] = "video"
-    caption: str
-    data: str = ""
-    link: str = ""
-    reason: str = ""
-    wide: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
 class Legend:
     """Samples of lines: name, color, dash pattern (SVG)."""
 
-    kind: ClassVar[str] = "legend"
     entries: Sequence[tuple[str, str, str]]
 
 
@@ -101,7 +76,6 @@ class Legend:
 class Prose:
     """HTML that was rendered from Markdown."""
 
-    kind: ClassVar[str] = "prose"
     html: Markup
 
 
@@ -109,7 +83,6 @@ class Prose:
 class Code:
     """Preformatted text."""
 
-    kind: ClassVar[str] = "code"
     text: str
     whole: bool = False
     """A click selects all of it, to be copied."""
@@ -119,7 +92,6 @@ class Code:
 class Grid:
     """Blocks side by side, as many as fit."""
 
-    kind: ClassVar[str] = "grid"
     blocks: Sequence[Block]
     least: int = 17
     """Smallest width of a column, rem."""
@@ -131,18 +103,17 @@ class Grid:
 class Fold:
     """Blocks that are shown on a click."""
 
-    kind: ClassVar[str] = "fold"
     summary: str
     blocks: Sequence[Block]
     open: bool = False
     key: str = ""
 
 
-Block = Table | Text | Items | Verdict | Picture | Video | Legend | Prose | Code | Grid | Fold
+Block = Table | Text | Items | Answer | Picture | Legend | Prose | Code | Grid | Fold
 
 
 @dataclass(frozen=True, kw_only=True)
-class Section:
+class PageSection:
     """A part of the page with an entry in its table of contents."""
 
     key: str
@@ -168,13 +139,13 @@ def markdown(blocks: Sequence[Block], level: str = "##") -> str:
         elif isinstance(block, Fold):
             parts.append(markdown(block.blocks, level).rstrip("\n"))
         else:
-            raise TypeError(f"{block.kind} has no Markdown")
+            raise TypeError(f"{type(block).__name__} has no Markdown")
     return "\n\n".join(parts) + "\n" if parts else ""
 
 
-def html_page(title: str, subtitle: str, sections: Sequence[Section], *, written: str = "", embedded: bool = True) -> str:
+def html_page(title: str, subtitle: str, sections: Sequence[PageSection], *, written: str = "", embedded: bool = True) -> str:
     """The page as text. `embedded`: nothing but what it contains may be loaded; otherwise files beside it are shown too."""
-    loader = jinja2.FileSystemLoader(TEMPLATES)
+    loader = jinja2.FileSystemLoader(PAGE_TEMPLATES)
     template = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined).get_template("page.html.j2")
     return template.render(
         title=title,
@@ -183,6 +154,6 @@ def html_page(title: str, subtitle: str, sections: Sequence[Section], *, written
         sections=sections,
         embedded=embedded,
         symbols=SYMBOLS,
-        style=Markup((TEMPLATES / "style.css").read_text(encoding="utf-8")),
-        script=Markup((TEMPLATES / "page.js").read_text(encoding="utf-8")),
+        style=Markup((PAGE_TEMPLATES / "style.css").read_text(encoding="utf-8")),
+        script=Markup((PAGE_TEMPLATES / "page.js").read_text(encoding="utf-8")),
     )

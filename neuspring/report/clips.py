@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations
 from neuspring.core.files import read_npz, write_text
 from neuspring.core.table import LATEX_PREAMBLE, Cell, Table
@@ -22,13 +21,13 @@ from neuspring.report.blocks import Block, Items, markdown
 from neuspring.report.draw.benchmark import growth_figure
 from neuspring.report.draw.film import write_film
 from neuspring.report.draw.painter import DrawingStyle, Painter
-from neuspring.report.draw.scene import Prediction, Scene
+from neuspring.report.draw.scene import ShownRun, ShownScene
 from neuspring.report.draw.sheet import save
-from neuspring.scores.clips import FACTS, ClipNumbers
+from neuspring.scores.clips import CLIP_FACTS, ClipNumbers
 from neuspring.scores.metrics import DASH
 from neuspring.scores.paper import TAGS
 
-SIGNS = {"second-hand": "†", "log": "‡", "others": "§", "reference": "¶", "": ""}
+TAG_SIGNS = {"second-hand": "†", "log": "‡", "others": "§", "reference": "¶", "": ""}
 """Tag of a published number to the sign behind it."""
 FILM_RATE, FILM_WIDTH, FILM_MEGABYTES = 20, 960, 3.0
 """Pictures per second, pixels, and size of a film."""
@@ -54,20 +53,20 @@ def _overview(found: ClipNumbers) -> Table:
     clips = ", ".join(f"{cable} {count}" for cable, count in counts.items()) or "not run"
     note += f"Ours: evaluation clips ({clips}), predicted open loop; ± standard deviation over seeds; * clips are missing. "
     note += f"{found.study.training}. "
-    note += " ".join(f"{SIGNS[tag]} {text}" for tag, text in TAGS.items() if tag in set(cells["tag"]))
+    note += " ".join(f"{TAG_SIGNS[tag]} {text}" for tag, text in TAGS.items() if tag in set(cells["tag"]))
     return Table(caption="L1 per cable", note=note.strip(), header=["Method", "Source", *found.cables], rows=rows, stub=2)
 
 
 def _l1(cell: Any, best: pd.Series) -> Cell:
     spread = f" ± {cell.spread_mm:.2f}" if np.isfinite(cell.spread_mm) else ""
-    text = f"{cell.text}{SIGNS[cell.tag]}" if cell.text else f"{cell.l1_mm:.2f}{spread}{'' if cell.ranked else ' *'}"
+    text = f"{cell.text}{TAG_SIGNS[cell.tag]}" if cell.text else f"{cell.l1_mm:.2f}{spread}{'' if cell.ranked else ' *'}"
     return Cell(text=text, mark="best" if cell.ranked and cell.l1_mm == best[cell.cable] else "", value=cell.l1_mm)
 
 
 def _details(found: ClipNumbers) -> Table:
     rows = []
     for cell in found.cells[found.cells["text"] == ""].itertuples():
-        numbers = [getattr(cell, name) for name in FACTS[:6]]
+        numbers = [getattr(cell, name) for name in CLIP_FACTS[:6]]
         texts = [DASH if np.isnan(value) else f"{value:.2f}" for value in numbers]
         texts += [str(cell.worst_clip), f"{cell.clips:.0f}/{cell.of:.0f}", f"{cell.seeds:.0f}"]
         rows.append([str(cell.cable), str(cell.label), *texts])
@@ -135,7 +134,7 @@ def _painter(results: Path, clip: pd.Series, title: str, line: np.ndarray) -> Pa
     free = seen.line < len(seen.nodes)
     positions = np.full((len(line), *seen.object_points.shape[1:]), np.nan)
     positions[:, seen.line[free]] = line[:, free]
-    take = Prediction(f"{title}: {clip['clip']}, L1 {clip['l1_mm']:.1f} mm", positions)
+    take = ShownRun(f"{title}: {clip['clip']}, L1 {clip['l1_mm']:.1f} mm", positions)
     frames = range(0, len(line), max(round(seen.scenario.frame_rate / FILM_RATE), 1))
-    manner = DrawingStyle(style="nodes", error="none", ground="white", together=True)
-    return Painter(Scene.from_side(seen, [take], frames), [take], frames, manner, Images(), "cpu")
+    manner = DrawingStyle(error="none", together=True)
+    return Painter(ShownScene.from_side(seen, [take], frames), [take], frames, manner)

@@ -1,4 +1,4 @@
-"""What a report page is about: runs, jobs and records of a results folder. Damaged files are listed and stop nothing."""
+"""Material of a report page: runs, jobs and records of a results folder. Damaged files are listed and stop nothing."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 from urllib.parse import quote
 
 from markdown_it import MarkdownIt
@@ -20,15 +20,16 @@ from neuspring.config import Config
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import JobRecord, read_jobs
 from neuspring.core.run_record import RUN_RECORD, RunRecord
-from neuspring.report.blocks import Picture, Prose, Section
-from neuspring.scores.failures import LeftOut, applying
+from neuspring.report.blocks import PageSection, Picture, Prose
+from neuspring.scores.failures import LeftOut
 from neuspring.scores.metrics import DASH
 from neuspring.scores.numbers import Numbers
 from neuspring.scores.paper import Study
 from neuspring.scores.runs import DAMAGED, Collected, one_line
 
 UNREADABLE = (InputError, OSError, ValueError, KeyError, TypeError, AttributeError)
-"""What a damaged record, table or picture raises."""
+"""Exceptions of a damaged record, table or picture."""
+Value = TypeVar("Value")
 MOST_ROWS = 400
 """At most so many failures of a kind are listed; the rest is counted."""
 METHOD_RECORDS = (RUN_RECORD, "rollout.json", "fit.json", "train.json")
@@ -38,7 +39,7 @@ METHOD_RULES = ("fit", "train", "rollout", "predict", "render", "score")
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What the report is about. What is left empty is taken from the settings, else from what lies in the results folder."""
+    """Subject of the report. What is left empty is taken from the settings, else from what lies in the results folder."""
 
     scenarios: Sequence[str] = ()
     methods: Sequence[str] = ()
@@ -60,12 +61,6 @@ class Options:
     video_megabytes: float = 8.0
     """Largest part of that for videos."""
 
-    @property
-    def size(self) -> int:
-        """Runs that there should be."""
-        absent = applying(self.left_out, tuple(self.scenarios), tuple(self.methods))
-        return (len(self.scenarios) * len(self.methods) - sum(map(len, absent.values()))) * len(self.seeds)
-
 
 @dataclass(kw_only=True)
 class ReportData:
@@ -76,12 +71,11 @@ class ReportData:
     choice: Options
     """With nothing left empty."""
     collected: Collected
-    transfers: Collected
     jobs: list[JobRecord]
     damaged: dict[str, str]
     """Files that cannot be read, relative to the results folder, and why."""
     numbers: Numbers
-    """Of the benchmark and its studies."""
+    """Numbers of the benchmark and its studies."""
     room: int = 0
     """Characters that pictures and films may take."""
 
@@ -91,7 +85,7 @@ class ReportData:
         return list(self.collected.records.values())
 
     def folder(self, run: RunRecord) -> Path:
-        """Where a run lies."""
+        """The folder of a run."""
         return self.results / run.name
 
     def file(self, run: RunRecord, kind: str, stem: str) -> Path | None:
@@ -107,6 +101,14 @@ class ReportData:
     def lost(self, path: Path, reason: Exception | str) -> None:
         """Remember a damaged file, once."""
         self.damaged.setdefault(self.relative(path), one_line(reason) if isinstance(reason, Exception) else reason)
+
+    def read(self, path: Path, read: Callable[[Path], Value]) -> Value | None:
+        """The content of a file, read by a function; None, and remembered, for a damaged one."""
+        try:
+            return read(path)
+        except UNREADABLE as error:
+            self.lost(path, error)
+            return None
 
     def runs_of(self, scenario: str, method: str) -> list[RunRecord]:
         """All seeds of a method on a scenario."""
@@ -155,17 +157,15 @@ def duration(seconds: float) -> str:
     """A time for people."""
     if not math.isfinite(seconds):
         return DASH
-    if seconds < 100:
-        return f"{seconds:.1f} s"
-    return f"{seconds / 60:.1f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+    minutes = f"{seconds / 60:.1f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+    return f"{seconds:.1f} s" if seconds < 100 else minutes
 
 
 def hours(seconds: float) -> str:
     """Hours, with fewer decimals for larger values."""
     value = seconds / 3600
-    if value < 0.01:
-        return "< 0.01" if value else "0"
-    return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 1 else f"{value:.2f}"
+    digits = 0 if value >= 100 or not value else 1 if value >= 1 else 2
+    return "< 0.01" if 0 < value < 0.01 else f"{value:.{digits}f}"
 
 
 def memory(mebibytes: float | None) -> str:
@@ -198,13 +198,7 @@ def rendered(text: str) -> Markup:
 
 def prose(material: ReportData, path: Path) -> Prose | None:
     """A Markdown file; None if it is not there or cannot be read."""
-    if not path.is_file():
-        return None
-    try:
-        return Prose(html=rendered(path.read_text(encoding="utf-8")))
-    except UNREADABLE as error:
-        material.lost(path, error)
-        return None
+    return material.read(path, lambda path: Prose(html=rendered(path.read_text(encoding="utf-8")))) if path.is_file() else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,17 +207,16 @@ class ReportSection:
 
     order: int
     """Its place on the page, by tens."""
-    make: Callable[[ReportData], Section | None]
+    make: Callable[[ReportData], PageSection | None]
     """None where there is nothing to show."""
     phase: Literal[0, 1, 2] = 0
     """1: it takes the `room` that all others leave; 2: it lists the damaged files that all others found."""
 
 
-def embedded(data: bytes, caption: str, alt: str, *, wide: bool = False) -> Picture:
-    """A PNG, drawn for white paper, as a picture of the page."""
-    return Picture(
-        caption=caption, alt=alt, data=data_uri("image/png", data), size=Image.open(io.BytesIO(data)).size, wide=wide, paper=True
-    )
+def embedded(data: bytes, caption: str) -> Picture:
+    """A PNG, drawn for white paper, as a wide picture of the page."""
+    size = Image.open(io.BytesIO(data)).size
+    return Picture(caption=caption, alt=caption, data=data_uri("image/png", data), size=size, wide=True, paper=True)
 
 
 def data_uri(kind: str, data: bytes) -> str:

@@ -25,13 +25,13 @@ from neuspring.report.grid import between
 from neuspring.report.study import our_change, paper_change
 from neuspring.scores.failures import left_out_lines
 from neuspring.scores.metrics import DASH, METRICS
-from neuspring.scores.numbers import SUMMARY, Numbers
-from neuspring.scores.paper import TASKS, Study
+from neuspring.scores.numbers import NUMBERS, SUMMARY, Numbers
+from neuspring.scores.paper import PAPER_TASKS, Study
 from neuspring.scores.runs import one_line
 from neuspring.scores.study import StudyNumbers, accounted, verdict_text
 
 SHOWN_FACTS = ("run_key", "source", "commit", "device", "machine", "started", "ended", "data_digest")
-MOST_RUNS = 12
+MOST_EXPLAINED = 12
 """Runs that are listed."""
 
 
@@ -93,7 +93,9 @@ def explain(cell: str, results: Path, folder: Path) -> Explanation:
     labels = {label: label for label in study.rows}
     # Labels may hold a slash.
     label = _choose("/".join(words[1:-2]), {method: label for label, method in study.rows.items()} | labels, "row")
-    task = _choose(words[-2], {theirs: ours for ours, theirs in TASKS.items()} | {task: task for task in cells["task"]}, "task")
+    task = _choose(
+        words[-2], {theirs: ours for ours, theirs in PAPER_TASKS.items()} | {task: task for task in cells["task"]}, "task"
+    )
     known = [METRICS[name] for name in dict.fromkeys(cells["metric"])]
     metric = _choose(
         words[-1], {word: one.name for one in known for word in (one.paper_name or one.name, one.heading, one.name)}, "metric"
@@ -159,7 +161,7 @@ def runs_of(word: str, results: Path) -> list[Path]:
 
 
 def run_text(path: Path) -> tuple[str, bool]:
-    """What the records of a run tell; and True where all are there and the run did not fail."""
+    """Facts that the records of a run tell; and True where all are there and the run did not fail."""
     try:
         record = RunRecord.load(path)
         scores = pd.read_parquet(path.parent / record.scores_file) if record.scores_file else pd.DataFrame()
@@ -167,8 +169,7 @@ def run_text(path: Path) -> tuple[str, bool]:
         return f"{path}: damaged: {one_line(error)}", False
     lines, good = [f"{record.name}: {record.status}{': ' * bool(record.reason)}{record.reason}"], record.ok
     for task, part in scores.groupby("task", sort=False) if len(scores) else ():
-        values = [(METRICS[row["metric"]], row["value"]) for row in part.to_dict("records")]
-        texts = [f"{metric.heading} {metric.text(value)} {metric.shown_unit}".rstrip() for metric, value in values]
+        texts = [METRICS[row["metric"]].told(row["value"]) for row in part.to_dict("records")]
         lines.append(f"  {task}: {', '.join(texts)}")
     lines += [f"  note: {note}" for note in record.notes]
     lines += [f"  {name}: {getattr(record, name)}" for name in SHOWN_FACTS]
@@ -183,20 +184,18 @@ def run_text(path: Path) -> tuple[str, bool]:
 
 
 def known(results: Path, folder: Path) -> str:
-    """What can be explained here."""
+    """List of what can be explained here."""
     runs = [path.parent.relative_to(results).as_posix() for path in sorted(Path(results).glob(f"*/*/*/{RUN_RECORD}"))]
     if not runs:
         raise InputError(results, "a results folder with finished runs is required", "none", "Name another: --results FOLDER.")
     lines = []
-    if list(folder.glob("numbers.json")):
+    if (folder / NUMBERS).is_file():
         numbers = Numbers.load(folder, results)
         names = [" | ".join(dict.fromkeys(numbers.averages[column])) for column in ("method", "task", "metric")]
-        lines = (
-            [f"A number of {folder}/summary.md: METHOD/TASK/METRIC, of\n  " + "\n  ".join(names)] if len(numbers.averages) else []
-        )
+        lines += [f"A number of {folder}/summary.md: METHOD/TASK/METRIC, of\n  " + "\n  ".join(names)] if names[0] else []
         lines += [f"A study: {name}/ROW/TASK/METRIC" for name in numbers.by_study]
-    more = [f"and {len(runs) - MOST_RUNS} more"] if len(runs) > MOST_RUNS else []
-    return "\n".join([*lines, "A run: " + "\n       ".join([*runs[:MOST_RUNS], *more])])
+    more = [f"and {len(runs) - MOST_EXPLAINED} more"] if len(runs) > MOST_EXPLAINED else []
+    return "\n".join([*lines, "A run: " + "\n       ".join([*runs[:MOST_EXPLAINED], *more])])
 
 
 def text(explanation: Explanation) -> str:
@@ -209,7 +208,7 @@ def text(explanation: Explanation) -> str:
         [
             run.scenario,
             str(run.seed),
-            DASH if run.value is None else metric.text(run.value),
+            metric.text(np.nan if run.value is None else run.value),
             run.commit[:12],
             run.device,
             run.record,
@@ -218,10 +217,10 @@ def text(explanation: Explanation) -> str:
     ]
     lines += [f"{len(table)} runs behind it:", "", *Table.of_texts(header, table).markdown()] if table else ["No run counts."]
     lines += ["", *left_out_lines({str(method): explanation.not_applying})] if explanation.not_applying else []
-    lines += ["", f"Left out: {len(explanation.left_out)}", ""] if explanation.left_out else []
-    lines += [f"- {run.scenario} / seed {run.seed}: {run.why}" for run in explanation.left_out]
-    lines += ["", "Not as the table was made of:", ""] if explanation.problems else []
-    return "\n".join([*lines, *(f"- {problem}" for problem in explanation.problems)]) + "\n"
+    left = [f"{run.scenario} / seed {run.seed}: {run.why}" for run in explanation.left_out]
+    for title, items in ((f"Left out: {len(left)}", left), ("Not as the table was made of:", explanation.problems)):
+        lines += ["", title, "", *(f"- {item}" for item in items)] if items else []
+    return "\n".join(lines) + "\n"
 
 
 def _value(row: Mapping[str, Any], alone: bool) -> list[str]:

@@ -9,7 +9,7 @@ import pandas as pd
 
 from neuspring.core.files import write_text
 from neuspring.core.run_record import RunRecord
-from neuspring.report.blocks import Block, Fold, Grid, Picture, Section, Text, Video, html_page
+from neuspring.report.blocks import Block, Fold, Grid, PageSection, Picture, Text, html_page
 from neuspring.report.data import link
 from neuspring.scores.metrics import METRICS
 from neuspring.scores.runs import Collected
@@ -27,13 +27,11 @@ def write_gallery(
     Films and pictures are linked, not embedded, so that the page works wherever the results folder is. Runs that are missing are
     left out.
     """
-    sections: list[Section] = []
+    sections: list[PageSection] = []
     for scenario in scenarios:
         place = Path(results) / scenario
-        figures: list[Block] = []
-        for method in methods:
-            if record := collected.records.get((scenario, method, seed)):
-                figures += _films(record, place / method / str(seed), collected.scores, folder)
+        records = [record for method in methods if (record := collected.records.get((scenario, method, seed)))]
+        figures = [one for record in records for one in _films(record, Path(results) / record.name, collected.scores, folder)]
         # First the splats of all methods, then those of methods with splats of their own.
         learned = sorted(place.glob(f"appearance*/{seed}/appearance.png"))
         splats = [Picture(caption="", alt=path.stem, data=link(path, folder)) for path in learned]
@@ -41,7 +39,7 @@ def write_gallery(
         if figures:
             shown: list[Block] = [Grid(blocks=figures, least=28, films=True)]
             blocks = [*shown, Fold(summary="Splats of frame 0", blocks=[Grid(blocks=splats, least=28)])] if splats else shown
-        sections.append(Section(key=scenario, title=scenario, blocks=blocks))
+        sections.append(PageSection(key=scenario, title=scenario, blocks=blocks))
     about = (
         "Observed, predicted and their difference, first camera; beside them the twin from all around. The bar above a film is "
         f"blue in training frames and orange in the future. Seed {seed}."
@@ -57,13 +55,12 @@ def _films(record: RunRecord, run: Path, scores: pd.DataFrame, folder: Path) -> 
     values, parts = own.set_index(["task", "metric"])["value"], []
     for task, name in (("reconstruction", "training"), ("future", "future")):
         metrics = [METRICS[metric] for metric in CAPTIONED if (task, metric) in values.index]
-        texts = [f"{one.heading} {one.text(values[task, one.name])} {one.shown_unit}".rstrip() for one in metrics]
-        parts += [f"{name} {', '.join(texts)}"] if texts else []
+        parts += [f"{name} {', '.join(one.told(values[task, one.name]) for one in metrics)}"] if metrics else []
     caption = f"{record.method}: {'; '.join(parts)}".removesuffix(": ")
     if "video" in paths:
         return [
-            Video(caption=caption, data=link(paths["video"], folder)),
-            Video(caption=f"{record.method}, from all around", data=link(paths["turntable"], folder)),
+            Picture(film=True, caption=caption, data=link(paths["video"], folder)),
+            Picture(film=True, caption=f"{record.method}, from all around", data=link(paths["turntable"], folder)),
         ]
     if "images" in paths:
         alt = f"Frames of {record.scenario}, {record.method}"

@@ -13,7 +13,7 @@ from neuspring.scores.metrics import DASH, METRICS, SHORT, TASKS, Metric, metric
 from neuspring.scores.study import Verdict
 
 EMPTY = Cell(text=DASH, value="")
-SIGNS: dict[str, tuple[Tone, str]] = {
+VERDICT_SIGNS: dict[str, tuple[Tone, str]] = {
     Verdict.WITHIN: ("good", "✓"),
     Verdict.BETTER: ("good", "▲"),
     Verdict.WORSE: ("bad", "▼"),
@@ -33,12 +33,12 @@ SIGNS: dict[str, tuple[Tone, str]] = {
 Columns = Sequence[tuple[str, Metric]]
 """Tasks and metrics."""
 Show = Callable[[Any, Metric], Cell]
-"""What a line shows of a row of numbers."""
+"""Function that gives a line's cell for a row of numbers."""
 
 
 def chip(verdict: str, text: str = "") -> Chip:
     """A verdict in its color, with its counts in `text`."""
-    tone, symbol = SIGNS.get(verdict, ("mute", "○"))
+    tone, symbol = VERDICT_SIGNS.get(verdict, ("mute", "○"))
     return Chip(text=text or str(verdict), tone=tone, symbol=symbol)
 
 

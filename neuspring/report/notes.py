@@ -1,4 +1,4 @@
-"""What to be careful with in tables: notes on recordings that users filmed, and settings that differ between rows.
+"""Notes of caution below tables: on on recordings that users filmed, and settings that differ between rows.
 
 No truth stands behind a table of own recordings, and a chain that went wrong still gives numbers. So: is a method better than the
 object frozen in frame 0 (`static`)? Do parameters lie at the ends of what was searched? Did training improve anything? Does a hand
@@ -15,7 +15,7 @@ import pandas as pd
 from neuspring.baselines import REFERENCES
 from neuspring.core.run_record import RunRecord
 from neuspring.scenes.sources import SOURCES
-from neuspring.scores.metrics import AT_BOUND, METRICS
+from neuspring.scores.metrics import METRICS, SHARE_AT_BOUND
 from neuspring.scores.runs import Collected, finished_scores
 
 STATIC = "static"
@@ -57,10 +57,10 @@ def _against_static(scenario: str, scores: pd.DataFrame) -> list[str]:
 
 
 def causes(runs: Iterable[RunRecord]) -> list[tuple[str, str]]:
-    """What the records of one method's seeds say against search and training, each with the next move."""
+    """Evidence in the records of one method's seeds against search and training, each with the next move."""
     facts = [record.params for record in runs]
     ends = {name.strip() for values in facts for name in str(values.get("search.result.at_ends", "")).split(",") if name.strip()}
-    bound = [values for values in facts if values.get("fit.result.at_bound", 0.0) > AT_BOUND]
+    bound = [values for values in facts if values.get("fit.result.at_bound", 0.0) > SHARE_AT_BOUND]
     first = [values for values in facts if values.get("fit.result.best_epoch", 1) <= 0]
     found = []
     if not max((held for values in facts if (held := _gripping(values)) is not None), default=1):
@@ -78,14 +78,14 @@ def causes(runs: Iterable[RunRecord]) -> list[tuple[str, str]]:
 
 
 def _grip(runs: Iterable[RunRecord]) -> list[tuple[str, str]]:
-    """How many springs hold the hands, if any do."""
+    """Number of springs that hold the hands, if any do."""
     counts = [held for record in runs if (held := _gripping(record.params))]
     number = f"{min(counts)}" if len(set(counts)) == 1 else f"{min(counts)} to {max(counts)}" if counts else ""
     return [(f"{number} springs join the hands to the object", "")] if counts else []
 
 
 def _gripping(values: Mapping[str, Any]) -> int | None:
-    """How many springs hold the hands: the fit's, else the search's. None of rods, whose clamps have none."""
+    """Number of springs that hold the hands: the fit's, else the search's. None of rods, whose clamps have none."""
     for stage in ("fit", "search"):
         if f"{stage}.result.vertices" in values:
             return None

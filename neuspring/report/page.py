@@ -16,14 +16,14 @@ from neuspring.core.findings import warnings_of
 from neuspring.core.records import now
 from neuspring.core.text import listed
 from neuspring.registry import Registry, modules
-from neuspring.report.blocks import Section, html_page
+from neuspring.report.blocks import PageSection, html_page
 from neuspring.report.data import Options, ReportData, ReportSection, damaged_files, job_records, several, traces
 from neuspring.scores.numbers import Numbers, kept_studies
 from neuspring.scores.runs import Collected, collect, collect_transfers
 
 __all__ = ["REPORT_SECTIONS", "Options", "write"]
 REPORT_SECTIONS: Registry[ReportSection] = Registry(
-    "report_sections", modules("neuspring.report.sections", "SECTION"), type=ReportSection
+    "report_sections", modules("neuspring.report.sections", "section"), type=ReportSection
 )
 MEGABYTE = 1_000_000
 MOST_SHOWN = 6
@@ -45,7 +45,7 @@ def write(results: Path, output: Path, options: Options, written: str | None = N
     numbers = f"{several(len(choice.scenarios), 'scenario')}, {several(len(choice.methods), 'method')}, {seeds}"
     subtitle = f"{numbers}; {results.resolve().name}. Errors are in mm."
     ordered = sorted(REPORT_SECTIONS.items(), key=lambda pair: (pair[1].order, pair[0]))
-    made: dict[str, Section | None] = {}
+    made: dict[str, PageSection | None] = {}
 
     def make(phase: int) -> None:
         made.update({name: section.make(material) for name, section in ordered if section.phase == phase})
@@ -83,15 +83,9 @@ def gather(results: Path, output: Path, options: Options) -> ReportData:
         results=results,
         warnings=warnings_of(results, choice.scenarios),
     )
+    numbers = numbers.take(output.parent)
     return ReportData(
-        results=results,
-        output=output,
-        choice=choice,
-        collected=collected,
-        transfers=transfers,
-        numbers=numbers.take(output.parent),
-        jobs=jobs,
-        damaged=damaged,
+        results=results, output=output, choice=choice, collected=collected, numbers=numbers, jobs=jobs, damaged=damaged
     )
 
 

@@ -1,4 +1,4 @@
-"""How well perception does on synthetic captures, per category, from the records of its judge (judged.json)."""
+"""Errors of perception on synthetic captures, per category, from the records of its judge (judged.json)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from neuspring.core.files import write_text
 from neuspring.core.records import StageRecord
 from neuspring.core.table import Table
 
-COLUMNS = {
+JUDGED_COLUMNS = {
     "mask_iou_object": ("Object IoU", ".3f"),
     "mask_iou_hands": ("Hand IoU", ".3f"),
     "track_median_px": ("Track px", ".2f"),
@@ -46,7 +46,7 @@ def write(table: pd.DataFrame, folder: Path) -> str:
     """perception.csv and perception.md; returns the text."""
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / "perception.csv", table.to_csv(index=False))
-    columns = {key: value for key, value in COLUMNS.items() if key in table}
+    columns = {key: value for key, value in JUDGED_COLUMNS.items() if key in table}
     groups = [(str(name), rows) for name, rows in table.groupby("category", sort=True)]
     rows = []
     for name, part in [*groups, ("all", table)] if len(groups) > 1 else groups:

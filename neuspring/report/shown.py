@@ -1,4 +1,4 @@
-"""What a results folder has to show: its scenario, its runs, and what is missing of each.
+"""The content of a results folder to look at: its scenario, its runs, and what is missing of each.
 
 Files are not trusted: sizes of arrays are checked before they are read, and names must stay inside the scenario's folder.
 """
@@ -27,14 +27,12 @@ from neuspring.splats.model import Splats
 Kind = TypeVar("Kind", bound=Artifact)
 OBSERVATIONS, ROLLOUT = "observations.npz", "rollout.json"
 SEED = re.compile(r"\d{1,9}")
-FIRST = ("neuspring_plus", "neuspring", "baseline")
+SHOWN_FIRST = ("neuspring_plus", "neuspring", "baseline")
 """Methods that are shown first."""
 MOST_RUNS = 200
 """Runs that are looked at in a scenario's folder."""
 MOST_BYTES = 2 * 1024**3
 """Largest file, unpacked, that is opened."""
-LARGEST_RECORD = 50_000_000
-"""Bytes of a JSON record."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +41,7 @@ class Run:
 
     folder: Path
     notes: tuple[str, ...] = ()
-    """What a viewer must know."""
+    """Faults and gaps that a viewer must know."""
     paths: Mapping[str, Path] = field(default_factory=dict)
     """Files that it has: twin, trajectory, splats, and centers, where the method's own model puts its splats."""
 
@@ -81,7 +79,7 @@ class Run:
 
     @cached_property
     def centers(self) -> SplatCenters | None:
-        """Where the method's own model puts its splats, if it does. Raises InputError."""
+        """The centers at which the method's own model puts its splats, if it does. Raises InputError."""
         return self._read("centers", SplatCenters)
 
     @cached_property
@@ -93,9 +91,7 @@ class Run:
         path = self.paths.get(role)
         if path is None:
             return None
-        if kind is Splats:
-            require_small(path, MOST_BYTES)
-        else:
+        if kind is not Splats:
             require_modest(path)
         return kind.load(path)
 
@@ -114,20 +110,16 @@ class Found:
 
 
 def find(paths: Sequence[Path]) -> Found:
-    """What the folders have to show: one scenario's folder, or one or several runs of one scenario. Raises InputError."""
-    named: list[Path] = []
-    scenarios: list[Path] = []
-    for path in (Path(path) for path in paths):
-        if not path.is_dir():
-            raise InputError(path, "must be a results folder", "no such folder", "Give results/<scenario>, or a run in it.")
-        if (path / OBSERVATIONS).is_file():
-            scenarios.append(path.resolve())
-        elif (path.resolve().parents[1] / OBSERVATIONS).is_file() and _is_run(path.resolve()):
-            named.append(path.resolve())
-            scenarios.append(path.resolve().parents[1])
-        else:
+    """The scenario and the runs of folders: one scenario's folder, or one or several runs of one scenario. Raises InputError."""
+    named, scenarios = list[Path](), list[Path]()
+    for path in map(Path, paths):
+        place = path.resolve()
+        if _is_run(place) and (place.parents[1] / OBSERVATIONS).is_file():
+            named.append(place)
+        elif not (place / OBSERVATIONS).is_file():
             rule = f"must be a scenario's folder, which has {OBSERVATIONS}, or a run <scenario>/<method>/<seed>"
-            raise InputError(path, rule, _content(path), "Give results/<scenario>, or a run in it.")
+            raise InputError(path, rule, _content(place), "Give results/<scenario>, or a run in it.")
+        scenarios.append(place.parents[1] if place in named else place)
     if len(set(scenarios)) != 1:
         raise InputError(", ".join(map(str, paths)), "all runs must be of one scenario", len(set(scenarios)))
     folder = scenarios[0]
@@ -150,7 +142,7 @@ def _is_run(path: Path) -> bool:
 
 def _rank(path: Path) -> tuple[int, str, int]:
     method = path.parent.name
-    return (FIRST.index(method) if method in FIRST else len(FIRST), method, int(path.name))
+    return (SHOWN_FIRST.index(method) if method in SHOWN_FIRST else len(SHOWN_FIRST), method, int(path.name))
 
 
 def _first(runs: Sequence[Run]) -> tuple[str, ...]:
@@ -164,18 +156,17 @@ def _run(folder: Path, scenario_folder: Path) -> Run:
     """A run with what can be used of it; a record that cannot be read is a note."""
     notes: list[str] = []
     run = RunFolder.of(folder, notes)
-
-    places = {
-        "twin": "fit" if "fit" in run.stages else "search",
-        "trajectory": "rollout",
-        "centers": "rollout",
-        "splats": "appearance",
-    }
+    model = "fit" if "fit" in run.stages else "search"
+    places = {"twin": model, "trajectory": "rollout", "centers": "rollout", "splats": "appearance"}
     paths: dict[str, Path] = {}
     for role, stage in places.items():
         try:
-            if (found := run.file(stage, role)) is not None:
-                paths[role] = inside(scenario_folder, found)
+            if (found := run.file(stage, role)) is None:
+                continue
+            if not found.resolve().is_relative_to(scenario_folder):
+                remedy = "A record of a results folder names files of its scenario."
+                raise InputError(found, f"must lie inside {scenario_folder}", str(found.resolve()), remedy)
+            paths[role] = found.resolve()
         except (InputError, TypeError, ValueError, IndexError) as error:
             notes.append(f"no {'prediction' if role == 'trajectory' else role}: {error}")
     if "rollout" in run.stages and run.records["rollout"].status == "failed":
@@ -196,19 +187,18 @@ def _capture(folder: Path, observations: Observations, notes: list[str]) -> Capt
                 return None
             # Named by a record, and so only believed if it is the one that was observed.
             path = Path(str(own)) / CAPTURE
-            require_small(path)
             if observations.scenario.provenance.get(CAPTURE) != f"sha256:{digest_file(path)}":
                 raise InputError(path, "must be the capture of this run", "one that was changed since", "Run the benchmark again.")
-        require_small(path)
         return Capture.load(path.parent)
-    except InputError as error:
+    except (InputError, OSError) as error:
         notes.append(f"no cameras: {error}")
         return None
 
 
 def _content(folder: Path) -> str:
-    names = sorted(path.name for path in folder.iterdir())[:8]
-    return ", ".join(names) or "an empty folder"
+    if not folder.is_dir():
+        return "no such folder"
+    return ", ".join(sorted(path.name for path in folder.iterdir())[:8]) or "an empty folder"
 
 
 def require_modest(path: Path, most: int = MOST_BYTES) -> None:
@@ -228,23 +218,3 @@ def require_modest(path: Path, most: int = MOST_BYTES) -> None:
         if name != META and math.prod(shape) > sizes[name]:
             rule = f"the header of {name} must agree with its content of {sizes[name]} bytes"
             raise InputError(path, rule, f"shape {shape}", "Delete it and run its step again.")
-
-
-def require_small(path: Path, most: int = LARGEST_RECORD) -> None:
-    """Raise InputError for a file that is larger than any of its kind that we write."""
-    try:
-        size = path.stat().st_size
-    except OSError as error:
-        raise InputError(path, "this record must be readable", error.strerror, "Run the step that makes it first.") from error
-    if size > most:
-        raise InputError(path, f"at most {most / 1e6:.0f} MB are opened", f"{size / 1e6:.0f} MB", "Run its step again.")
-
-
-def inside(folder: Path, path: Path) -> Path:
-    """The path, resolved. Raises InputError where it leads out of the folder."""
-    resolved = path.resolve()
-    if not resolved.is_relative_to(folder.resolve()):
-        raise InputError(
-            path, f"must lie inside {folder}", str(resolved), "A record of a results folder names files of its scenario."
-        )
-    return resolved

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,11 +19,11 @@ import pandas as pd
 
 from neuspring.core.files import write_text
 from neuspring.core.table import LATEX_PREAMBLE, Cell, Table
-from neuspring.report.blocks import Block, Fold, Items, Text, markdown
+from neuspring.report.blocks import Block, Fold, Text, markdown
 from neuspring.report.draw.benchmark import cluster_methods, clusters_figure
 from neuspring.report.draw.sheet import save
-from neuspring.report.grid import Columns, between, chip, grouped, rows
-from neuspring.report.summary import failure_table, settings_table
+from neuspring.report.grid import Columns, Show, between, chip, grouped, rows
+from neuspring.report.summary import failure_table, not_counted, settings_table
 from neuspring.scores import paper
 from neuspring.scores.failures import left_out_lines, removed_lines, unknown_lines
 from neuspring.scores.metrics import DASH, Metric, present
@@ -30,24 +31,26 @@ from neuspring.scores.paper import Study
 from neuspring.scores.runs import mixed_settings, pairs
 from neuspring.scores.study import LEAST_SCENARIOS, ORACLE_LINE, StudyNumbers, in_order, verdict_text
 
-VERDICTS = (
+VERDICT_NOTE = (
     "Verdict: within, the paper's value lies in the 95 % bootstrap interval of our mean, half a unit of its last digit allowed; "
     "better, worse: outside; partial: fewer than its 22 scenarios count; other data: these are other scenarios, whose values "
     "cannot be compared with the paper's."
 )
-DIRECTIONS = (
+DIRECTION_NOTE = (
     "Verdict: same direction, confirmed: our interval leaves out 0 on the paper's side; opposite: on the other side; not resolved: "
     f"it holds 0; better, worse: it leaves out 0, and the paper has no number; too few scenarios: fewer than {LEAST_SCENARIOS}, "
     "which too often change in one direction by chance."
 )
-BOUND = "TE bound: track error of points that move with the nodes around them, 0 for every rigid motion; TE has a floor, frame 0's."
-NAMED = 6
-"""At most so many runs with the same reason are named. numbers.json has all."""
+BOUND_NOTE = (
+    "TE bound: track error of points that move with the nodes around them, 0 for every rigid motion; TE has a floor, frame 0's."
+)
 FAILED_MARK = "*"
 """Stands beside the number of runs of a method if some of them failed."""
 Mark = Literal["", "best", "second"]
-Line = tuple[str, Callable[[Any, Metric], Cell]]
+Line = tuple[str, Show]
 """Name of a line and what it shows of a cell."""
+Lines = Sequence[Line] | Callable[[Any], Sequence[Line]]
+"""The same for all, or those of a cell."""
 
 
 def write_study(numbers: StudyNumbers, folder: Path) -> str:
@@ -87,9 +90,9 @@ def study_tables(numbers: StudyNumbers) -> list[Table]:
     finished = (own.runs["status"] == "ok").any()
     nothing = "No pair of scenario and seed was finished by every method." if finished else "Nothing has finished."
     removed = " ".join(removed_lines(own.comparison.runs, own.left_out, numbers.labels))
-    notes = [VERDICTS if study.reference else "", which if kept else nothing, removed, _pictures(own.runs)]
+    notes = [VERDICT_NOTE if study.reference else "", which if kept else nothing, removed, _pictures(own.runs)]
     notes += [paper.CLUSTER_CLAIM] if cluster_methods(study.rows.values()) else []
-    notes += [BOUND] if "track_error_bound" in set(cells["metric"]) else []
+    notes += [BOUND_NOTE] if "track_error_bound" in set(cells["metric"]) else []
     tables = [
         main_table(study, cells, " ".join(note for note in notes if note)),
         *study_failures(numbers),
@@ -107,20 +110,27 @@ def value_tables(numbers: StudyNumbers) -> list[Table]:
     released = [table.assign(value=table[name], label=label) for name, label in lines.items() if len(table)]
     beside = pd.concat(released).sort_values("scenario", kind="stable") if released else table
     parts = [
-        ("Per category", "Ours, in the average that the paper takes.", ["Category", "Method"], numbers.categories, "category"),
-        ("Per scenario", "Ours, all finished runs, seeds averaged.", ["Scenario", "Method"], numbers.scenarios, "scenario"),
-        ("Beside the released PhysTwin", note, ["Scenario", ""], beside, "scenario"),
+        ("Per category", "Ours, in the average that the paper takes.", ["Category", "Method"], numbers.categories),
+        ("Per scenario", "Ours, all finished runs, seeds averaged.", ["Scenario", "Method"], numbers.scenarios),
+        ("Beside the released PhysTwin", note, ["Scenario", ""], beside),
     ]
-    return [_values_table(title, note, stub, table, [key, "label"]) for title, note, stub, table, key in parts if len(table)]
+    value: list[Line] = [("", lambda cell, metric: Cell(text=metric.shown(cell.value)))]
+    return [layout(title, note, table, stub, [stub[0].lower(), "label"], value) for title, note, stub, table in parts if len(table)]
 
 
-def lines_of(cells: pd.DataFrame, columns: Columns, lines: Callable[[str], Sequence[Line]]) -> list[list[Cell]]:
-    """Rows of every label: `lines` of it are their names and what they show of a cell; a dash where there is no cell."""
+def layout(caption: str, note: str, cells: pd.DataFrame, stub: Sequence[str], keys: Sequence[str], lines: Lines) -> Table:
+    """A table of cells: for each combination of `keys` its `lines`, with a dash where there is no cell.
 
-    def stubbed(cell: Any) -> list[tuple[list[Cell], Any]]:
-        return [([Cell(text="" if k else cell.label), Cell(text=name)], show) for k, (name, show) in enumerate(lines(cell.label))]
+    A line begins with the keys, and with its name where the stub has room for it; below the first line keys are not repeated.
+    """
 
-    return rows(cells, columns, ["label"], stubbed, Cell(text=DASH))
+    def stubbed(cell: Any) -> list[tuple[list[Cell], Show]]:
+        own = lines(cell) if callable(lines) else lines
+        headings = [["" if k else str(getattr(cell, key)) for key in keys] + [name] for k, (name, _) in enumerate(own)]
+        return [([Cell(text=text) for text in texts[: len(stub)]], show) for texts, (_, show) in zip(headings, own, strict=True)]
+
+    shown = columns_in(cells)
+    return grouped(caption, stub, shown, rows(cells, shown, keys, stubbed, Cell(text=DASH)) if shown else [], note)
 
 
 def columns_in(cells: pd.DataFrame) -> list[tuple[str, Metric]]:
@@ -136,23 +146,18 @@ def main_table(study: Study, cells: pd.DataFrame, more: str = "") -> Table:
     def marked(source: str, text: Callable[[Any, Metric], str]) -> Callable[[Any, Metric], Cell]:
         return lambda cell, metric: Cell(text=text(cell, metric), mark=marks[source].get((cell.label, cell.task, cell.metric), ""))
 
-    def lines(cell: Any) -> list[tuple[list[Cell], Any]]:
-        ours = [Cell(text="" if study.reference else cell.label), Cell(text=_runs(cell)), Cell(text="ours")], marked("ours", _ours)
-        if not study.reference:
-            return [ours]
+    def lines(cell: Any) -> list[tuple[list[Cell], Show]]:
+        alone = cell.oracle or not study.reference
+        ours = [Cell(text=cell.label if alone else ""), Cell(text=_runs(cell)), Cell(text="ours")], marked("ours", _ours)
         printed = [Cell(text=cell.label), Cell(), Cell(text="paper")], marked("paper", lambda cell, _: cell.paper or DASH)
         verdict = (
             [Cell(), Cell(), Cell(text="verdict")],
             lambda cell, _: Cell(chips=[chip(cell.verdict, verdict_text(cell._asdict()))]),
         )
-        return [printed, ours, verdict]
+        return [ours] if alone else [printed, ours, verdict]
 
-    table, oracles = rows(cells[~cells["oracle"]], shown, ["label"], lines), cells[cells["oracle"]]
-    if len(oracles):
-        last = rows(
-            oracles, shown, ["label"], lambda cell: [([Cell(text=cell.label), Cell(), Cell(text="ours")], marked("ours", _ours))]
-        )
-        table += [[Cell(text=ORACLE_LINE), *[Cell()] * (2 + len(shown))], *last]
+    table, oracles = (rows(cells[cells["oracle"] == oracle], shown, ["label"], lines) for oracle in (False, True))
+    table += [[Cell(text=ORACLE_LINE), *[Cell()] * (2 + len(shown))], *oracles] if oracles else []
     names = {metric.name for _, metric in shown}
     note = f"CD (single-directional L1 Chamfer distance) and TE (track error) in mm{', PSNR in dB' * ('psnr' in names)}. "
     note += "Ours: mean over scenarios, seeds averaged within each, ± standard deviation over seeds"
@@ -161,14 +166,6 @@ def main_table(study: Study, cells: pd.DataFrame, more: str = "") -> Table:
     failed = f" {FAILED_MARK} Some runs failed; the table of failures has both averages, without and with them."
     note += f".{failed * bool(cells['failed'].any())} {more}"
     return grouped("Ours beside the paper's" if study.reference else "Ours", ["Method", "Runs", ""], shown, table, note.rstrip())
-
-
-def _interval_cell(cell: Any, metric: Metric) -> Cell:
-    return Cell(text=between(cell.low, cell.high, metric.shown) or DASH)
-
-
-def _change_cell(cell: Any, metric: Metric) -> Cell:
-    return Cell(text=our_change(cell, metric))
 
 
 def _direction_cell(cell: Any, _: Metric) -> Cell:
@@ -186,49 +183,45 @@ def both_trainings(numbers: StudyNumbers) -> list[Table]:
     order = both["label"].map({label: place for place, label in enumerate(study.rows)})
     both = both.assign(place=order).sort_values("place", kind="stable")
     both = both[both["label"].isin(shared) & ~both["oracle"]]
-    shown = columns_in(both[both["ours"].notna()])
-    changed = both[both["label"] != both["baseline"]]
+    # A metric that nobody finished has no column here.
+    both = both[pd.MultiIndex.from_frame(both[["task", "metric"]]).isin(present(both[both["ours"].notna()]))]
 
     def table(caption: str, cells: pd.DataFrame, text: Callable[[Any, Metric], str], note: str) -> Table:
-        seen = set[str]()
-
-        def line(cell: Any) -> list[tuple[list[Cell], Any]]:
-            name = "" if cell.label in seen else cell.label
-            seen.add(cell.label)
-            return [([Cell(text=name), Cell(text=cell.training)], lambda cell, metric: Cell(text=text(cell, metric)))]
-
-        made = rows(cells, shown, ["label", "training"], line, Cell(text=DASH))
-        return grouped(caption, ["Method", "Training"], shown, made if shown else [], note)
+        line: list[Line] = [("", lambda cell, metric: Cell(text=text(cell, metric)))]
+        made = layout(caption, note, cells, ["Method", "Training"], ["label", "training"], line)
+        first = [row[0].text for row in made.rows]
+        return replace(
+            made, rows=[[Cell(), *row[1:]] if k and first[k - 1] == first[k] else row for k, row in enumerate(made.rows)]
+        )
 
     note = "The same rows in two trainings. Each is averaged over the scenarios and seeds that all its rows finished."
     against = f"{note} Against {study.baseline} of the same training, with the paired 95 % bootstrap interval."
+    changed = both[both["label"] != both["baseline"]]
     return [table("Both trainings", both, _ours, note), table("Both trainings: change", changed, our_change, against)]
 
 
 def interval_table(cells: pd.DataFrame) -> Table:
     """The interval of our mean, and its distance from the paper's value, of finished rows."""
-    lines: list[Line] = [("95 %", _interval_cell)]
+    lines: list[Line] = [("95 %", lambda cell, metric: Cell(text=between(cell.low, cell.high, metric.shown) or DASH))]
     if compared := bool(cells["difference"].notna().any()):
         lines.append(("ours - paper", lambda cell, metric: Cell(text=metric.shown(cell.difference, "+"))))
     note = f"95 % bootstrap interval of our mean, over scenarios and seeds{'; ours minus the value of the paper' * compared}."
-    shown = columns_in(cells)
-    return grouped("Intervals", ["Method", ""], shown, lines_of(cells, shown, lambda _: lines), note)
+    return layout("Intervals", note, cells, ["Method", ""], ["label"], lines)
 
 
 def change_table(study: Study, cells: pd.DataFrame) -> Table:
     """The change against the baseline, in the paper and here."""
-    shown = columns_in(cells)
     others = cells[~cells["oracle"] & (cells["label"] != study.baseline)]
     printed = set(others.loc[others["paper_change"].notna(), "label"])
     of_paper: list[Line] = [("paper", lambda cell, metric: Cell(text=paper_change(cell, metric)))]
-    ours: list[Line] = [("ours", _change_cell), ("verdict", _direction_cell)]
-    table = lines_of(others, shown, lambda label: of_paper + ours if label in printed else ours)
-    in_db = " (PSNR: in dB)" if any(not metric.relative for _, metric in shown) else ""
+    ours: list[Line] = [("ours", lambda cell, metric: Cell(text=our_change(cell, metric))), ("verdict", _direction_cell)]
+    in_db = " (PSNR: in dB)" if any(not metric.relative for _, metric in columns_in(cells)) else ""
     note = (
         f"Change against {study.baseline} on the same scenarios and seeds, in per cent of its mean{in_db}, with the paired 95 % "
-        f"bootstrap interval. {DIRECTIONS}"
+        f"bootstrap interval. {DIRECTION_NOTE}"
     )
-    return grouped(f"Change against {study.baseline}", ["Method", ""], shown, table, note)
+    caption = f"Change against {study.baseline}"
+    return layout(caption, note, others, ["Method", ""], ["label"], lambda cell: of_paper * (cell.label in printed) + ours)
 
 
 def study_failures(numbers: StudyNumbers) -> list[Table]:
@@ -241,17 +234,7 @@ def study_failures(numbers: StudyNumbers) -> list[Table]:
     table = failure_table("Failures", failed, labels, columns_in(failed.dropna(subset="metric")), scale=False)
     unknown = unknown_lines(means, numbers.labels)
     note = " ".join([f"Rows marked {FAILED_MARK} above.", table.note, *unknown])
-    return [Table(caption=table.caption, header=table.header, groups=table.groups, stub=table.stub, rows=table.rows, note=note)]
-
-
-def _values_table(title: str, note: str, stub: list[str], table: pd.DataFrame, keys: list[str]) -> Table:
-    """Any table of ours in long form (task, metric, value and `keys`), one line per combination of keys."""
-    shown = columns_in(table)
-
-    def line(row: Any) -> list[tuple[list[Cell], Any]]:
-        return [([Cell(text=str(getattr(row, key))) for key in keys], lambda row, metric: Cell(text=metric.shown(row.value)))]
-
-    return grouped(title, stub, shown, rows(table, shown, keys, line, Cell(text=DASH)), note)
+    return [replace(table, note=note)]
 
 
 def our_change(cell: Any, metric: Metric) -> str:
@@ -298,7 +281,7 @@ def _marks(study: Study, cells: pd.DataFrame, shown: Columns, source: str) -> di
 
 
 def _pictures(runs: pd.DataFrame) -> str:
-    """How pictures were scored, as far as it changes their scores against the paper's."""
+    """Conditions of the scores of pictures, as far as they change their scores against the paper's."""
     facts = [json.loads(text) for text in runs["images"].dropna()]
     scored = [fact for fact in facts if fact and "failed" not in fact]
     if not scored:
@@ -315,11 +298,4 @@ def left_out_items(numbers: StudyNumbers) -> list[Block]:
     asked = set(runs["label"]) | {label for label, method in study.rows.items() if method in own.left_out}
     absent = {label: method for label, method in study.rows.items() if label not in asked}
     lines = [f"{label}: {method} is not among the methods of this benchmark" for label, method in absent.items()]
-    left = runs[~runs["counted"].astype(bool)]
-    for (label, status, why), part in left.groupby(["label", "status", "why"], sort=False):
-        names = [f"{row.scenario} / seed {row.seed}" for row in part.itertuples()]
-        shown = names if status == "failed" else names[:NAMED]
-        more = f" and {len(names) - len(shown)} more" if len(names) > len(shown) else ""
-        lines.append(f"{label}, {', '.join(shown)}{more}: {' '.join(str(why).split())}")
-    lines += left_out_lines(own.left_out, numbers.labels)
-    return [Items(title="Not in the averages", items=lines)] if lines else []
+    return not_counted(runs, lines, left_out_lines(own.left_out, numbers.labels))

@@ -23,16 +23,18 @@ from neuspring.report.grid import EMPTY, Columns, best, between, by_method, chip
 from neuspring.report.notes import honest_notes
 from neuspring.report.verdict import NOUNS, verdict
 from neuspring.scores import failures, statistics
-from neuspring.scores.metrics import COLUMNS, DASH, METRICS, SHORT, Metric, metrics_of
+from neuspring.scores.metrics import DASH, METRICS, SCORE_COLUMNS, SHORT, Metric, metrics_of
 from neuspring.scores.numbers import Numbers
 from neuspring.scores.runs import Collected, comparable, mixed_settings, pairs
 from neuspring.scores.study import ORACLE_LINE
 
 NOT_COMPUTED = Cell(text="not computed", value="")
-MOST_OPEN = 12
+MOST_OPEN_ROWS = 12
 """Most rows of a breakdown that is not folded."""
 LISTED = 12
-"""At most so many missing runs, or notes, are listed one by one. If there are more, they are counted by method."""
+"""At most so many notes are listed one by one. If there are more, they are counted by kind."""
+MOST_NAMED = 6
+"""At most so many runs with the same reason are named. runs.csv and numbers.json have all."""
 NUMBER = r"(?<![\w.])\d+(?:\.\d+)?(?!\w)"
 """A number of a note: notes that differ in numbers alone are of one kind."""
 HOLE = "\ufffc"
@@ -62,7 +64,7 @@ def score_blocks(numbers: Numbers) -> list[Block]:
 
 
 def detail_blocks(numbers: Numbers) -> list[Block]:
-    """How sure the averages are: floors, spread, ratios, paired differences, failures, and what to be careful with."""
+    """Certainty of the averages: floors, spread, ratios, paired differences, failures, and what to be careful with."""
     differences, everyone = numbers.differences, numbers.everything.runs
     blocks: list[Block] = [Text(text=line) for line in floor_lines(numbers.floors)]
     if len(numbers.seeds):
@@ -209,7 +211,8 @@ def failure_table(caption: str, means: pd.DataFrame, labels: Mapping[str, str], 
         return cell
 
     ordered = pd.concat([means[means["method"] == method] for method in labels])
-    note = f"{failures.WHY} In brackets the other average: weighted by frames for errors, equally for pictures. {failures.DASHES}"
+    brackets = "In brackets the other average: weighted by frames for errors, equally for pictures."
+    note = f"{failures.FAILURE_NOTE} {brackets} {failures.DASH_NOTE}"
     stub = ["Method", "Succeeded", "Mean over"]
     made = rows(ordered, shown, ["method"], lines)
     return flat(caption, stub, shown, made, note=note) if scale else grouped(caption, stub, shown, made, note)
@@ -237,7 +240,7 @@ def floor_lines(floors: pd.DataFrame) -> list[str]:
 
 
 def image_blocks(numbers: Numbers) -> list[Block]:
-    """How pictures were scored, and both averages; a sentence if there are none."""
+    """Conditions of the scores of pictures, and both averages; a sentence if there are none."""
     collected, scores = numbers.collected, numbers.usable
     facts = [json.loads(text) if isinstance(text, str) else None for text in collected.runs.get("images", [])]
     runs = collected.runs[[bool(fact) for fact in facts] or [False] * len(collected.runs)]
@@ -274,7 +277,7 @@ def _unseen(runs: pd.DataFrame) -> str:
 
 
 def _image_conditions(facts: Iterable[dict[str, Any]]) -> str:
-    """How pictures were scored, from the runs' records."""
+    """Conditions of the scores of pictures, from the runs' records."""
 
     def several(name: str) -> str:
         return " and ".join(sorted({", ".join(v) if isinstance(v := values[name], list) else str(v) for values in facts}))
@@ -320,26 +323,23 @@ def breakdown_blocks(finished: pd.DataFrame) -> list[Block]:
         count, scenarios = finished[column].nunique(), finished["scenario"].nunique()
         if count == 1 or (column == "category" and count == scenarios):
             continue  # the same as the averages, or as the other breakdown
-        lines = []
+        lines: list[list[Cell]] = []
         for name, part in finished.groupby(column, sort=False):
-            means = part.groupby(["method", "task", "metric", "scenario"])["value"].mean().groupby(level=[0, 1, 2]).mean()
-            values: dict[Any, float] = {key: float(value) for key, value in means.items()}
-            tops = best((task, metric, value) for (_, task, metric), value in values.items())
-            counts = part.groupby("method", sort=False)[counted.lower().removesuffix("s")].nunique()
-            for method, number in counts.items():
-                cells = [
-                    _part_cell(values.get((method, task, metric.name)), metric, tops.get((task, metric.name)))
-                    for task, metric in shown
-                ]
-                lines.append([Cell(text=str(name)), Cell(text=str(method)), *cells, Cell(text=str(number))])
+            each = part.groupby(["method", "task", "metric", "scenario"], sort=False)["value"].mean()
+            means = each.groupby(level=["method", "task", "metric"], sort=False).mean().reset_index()
+            tops = best(means[["task", "metric", "value"]].itertuples(index=False))
+            counts = part.groupby("method")[counted.lower().removesuffix("s")].nunique()
+
+            def show(row: Any, metric: Metric, tops: Mapping[Any, float] = tops) -> Cell:
+                top = row.value == tops.get((row.task, row.metric))
+                return Cell(text=metric.text(row.value), value=row.value, mark="best" if top else "")
+
+            made = rows(means, shown, ["method"], lambda row: [([Cell(text=row.method)], show)])
+            lines += [[Cell(text=str(name)), *line, Cell(text=str(counts[line[0].text]))] for line in made]
         caption = f"Per {column} (errors in mm, seeds averaged)"
         table = flat(caption, [column.capitalize(), "Method"], shown, lines, counted, sortable=True, note="All finished runs.")
-        blocks.append(Fold(summary=f"Per {column}", blocks=[table], open=column == "scenario" and len(lines) <= MOST_OPEN))
+        blocks.append(Fold(summary=f"Per {column}", blocks=[table], open=column == "scenario" and len(lines) <= MOST_OPEN_ROWS))
     return blocks
-
-
-def _part_cell(value: float | None, metric: Metric, top: float | None) -> Cell:
-    return EMPTY if value is None else Cell(text=metric.text(value), value=value, mark="best" if value == top else "")
 
 
 def _notes(noted: pd.DataFrame, runs: pd.Series) -> list[str]:
@@ -369,15 +369,18 @@ def _several_seeds(scores: pd.DataFrame) -> bool:
     return len(scores) > 0 and scores["seed"].nunique() > 1
 
 
-def not_counted(runs: pd.DataFrame) -> list[Block]:
-    """Failures one by one; runs that are missing too, unless they are many, as when `only` makes a part of them."""
-    bad = runs[runs["status"] != "ok"]
-    missing = bad[bad["status"] == "missing"]
-    listed = bad if len(missing) <= LISTED else bad[bad["status"] != "missing"]
-    lines = [f"{row.scenario} / {row.method} / seed {row.seed}: {row.status}: {row.reason}" for row in listed.itertuples()]
-    if len(missing) > LISTED:
-        counts = ", ".join(f"{method} {count}" for method, count in missing["method"].value_counts(sort=False).items())
-        lines.append(f"{len(missing)} runs have not finished, or were not asked for ({counts}); runs.csv names them.")
+def not_counted(runs: pd.DataFrame, before: Sequence[str] = (), behind: Sequence[str] = ()) -> list[Block]:
+    """The runs that averages leave out, failures one by one and others by their reason; other lines stand before and behind.
+
+    `runs` have the columns label, scenario, seed, status, counted and why (`scores.study.accounted`).
+    """
+    lines = list(before)
+    for (label, status, why), part in runs[~runs["counted"].astype(bool)].groupby(["label", "status", "why"], sort=False):
+        names = [f"{row.scenario} / seed {row.seed}" for row in part.itertuples()]
+        shown = names if status == "failed" else names[:MOST_NAMED]
+        more = f" and {len(names) - len(shown)} more" if len(names) > len(shown) else ""
+        lines.append(f"{label}, {', '.join(shown)}{more}: {' '.join(str(why).split())}")
+    lines += behind
     return [Items(title="Not in the averages", items=lines)] if lines else []
 
 
@@ -402,7 +405,9 @@ def figures(numbers: Numbers) -> Iterator[tuple[str, str, Figure]]:
     For the latter only pairs of scenario and seed count that every method clusters_<K> finished. A method that finished no run is
     left out.
     """
-    figure = ratios_figure(numbers.ratios, numbers.size if len(numbers.usable) else "")
+    usable = numbers.usable
+    size = f"{usable['scenario'].nunique()} scenarios, {usable['seed'].nunique()} seed(s)" if len(usable) else ""
+    figure = ratios_figure(numbers.ratios, size)
     if figure:
         yield "ratios.png", f"Ratio of every method's errors to those of {numbers.baseline}", figure
     collected = numbers.everything
@@ -424,7 +429,7 @@ def write(numbers: Numbers, folder: Path) -> str:
     """
     collected, transfers = numbers.everything, numbers.transfers
     # All files are written every time, empty ones too, so that none is left over from an earlier run.
-    moved = transfers.scores if transfers else pd.DataFrame(columns=list(COLUMNS))
+    moved = transfers.scores if transfers else pd.DataFrame(columns=list(SCORE_COLUMNS))
     for name, table in {"scores": collected.scores, "runs": collected.runs, "transfers": moved}.items():
         write_text(folder / f"{name}.csv", table.to_csv(index=False))
     numbers.save(folder)
@@ -440,4 +445,8 @@ def write(numbers: Numbers, folder: Path) -> str:
 def summary_text(numbers: Numbers) -> str:
     """The verdict, the scores, and the runs that are not among them, in Markdown."""
     blocks: Sequence[Block] = [*verdict(numbers), *score_blocks(numbers), *detail_blocks(numbers)]
-    return markdown([*blocks, *not_counted(numbers.everything.runs)])
+    runs = numbers.everything.runs
+    ended = runs.assign(
+        label=runs["method"], counted=runs["status"] == "ok", why=runs["status"] + ": " + runs["reason"].astype(str)
+    )
+    return markdown([*blocks, *not_counted(ended)])

@@ -20,10 +20,10 @@ from neuspring.scores.metrics import METRICS
 from neuspring.scores.numbers import Numbers
 from neuspring.scores.study import LEAST_SCENARIOS
 
-FRAMES = {"future": "future", "reconstruction": "training"}
+TASK_FRAMES = {"future": "future", "reconstruction": "training"}
 NOUNS = {"scenario": "scenarios", "category": "categories"}
-"""What intervals of ratios are over."""
-MOST = 3
+"""Objects that intervals of ratios are over."""
+MOST_SAID = 3
 """Rivals, scenarios, causes and moves that are named."""
 GROWS = 2.0
 """A future error of so many times that on training frames is a drift."""
@@ -38,7 +38,7 @@ def verdict(numbers: Numbers) -> list[Text]:
         said = {"Who wins": [f"Nothing can be compared yet: {ended} of {len(runs)} runs have finished."]}
         return _paragraphs(said | {"What went wrong": _unfinished(runs)})
     duel = Duel(numbers)
-    why = [*duel.drift(), *duel.causes()][:MOST]
+    why = [*duel.drift(), *duel.causes()][:MOST_SAID]
     said = {
         "Who wins": duel.winner(),
         "Is it resolved": duel.resolved(),
@@ -95,7 +95,7 @@ class Duel:
 
     def winner(self) -> list[str]:
         """Who is best, by how much."""
-        what = f"{self.metric.title} on {FRAMES[self.task]} frames"
+        what = f"{self.metric.title} on {TASK_FRAMES[self.task]} frames"
         if not self.rival:
             return [f"{self.best} is alone: its {what} is {self.text(self.means[self.best])}."]
         first, second = self.text(self.means[self.best]), self.text(self.means[self.rival])
@@ -103,7 +103,7 @@ class Duel:
             return [f"Nobody: {self.best} and {self.rival} have the same {what}, {first}."]
         lead = {name: 100 * (1 - self.means[self.best] / value) for name, value in self.means.items() if value > 0}
         names = [self.rival, *(name for name in self.means if name not in (self.best, self.rival))]
-        beaten = [f"{lead[name]:.0f} % below {name} ({self.text(self.means[name])})" for name in names[:MOST] if name in lead]
+        beaten = [f"{lead[name]:.0f} % below {name} ({self.text(self.means[name])})" for name in names[:MOST_SAID] if name in lead]
         over = f", mean over {self.scenarios} scenarios" if self.scenarios > 1 else f" in {self.weakest}"
         return [f"{self.best}, by {what}: {first}{over}. That is {' and '.join(beaten)}."]
 
@@ -128,13 +128,13 @@ class Duel:
         return [f"No. {what}: 1 lies in it. {would}", *more]
 
     def weak(self) -> list[str]:
-        """Where the best method is weakest, where its rival is better, and whether it learned anything at all."""
+        """Scenarios in which the best method is weakest, and in which its rival is better; whether it learned anything."""
         said = []
         if len(self.by_scenario) > 1:
             said.append(f"{self.best} is weakest in {self.weakest} ({self.text(self.by_scenario[self.weakest])}).")
         rivals = {name: self.each.get((self.rival, self.task, name)) for name in self.by_scenario}
         worse = [name for name, value in rivals.items() if value is not None and value < self.by_scenario[name]]
-        said += [f"{self.rival} is better in {listed(worse, MOST)}."] if worse else []
+        said += [f"{self.rival} is better in {listed(worse, MOST_SAID)}."] if worse else []
         return [*said, f"{self.best} learns nothing, and no method that learns is better."] if self.best in REFERENCES else said
 
     def others(self) -> list[str]:
@@ -150,7 +150,7 @@ class Duel:
         return [f"By other measures {leader} is first: {', '.join(found)}." for leader, found in first.items()]
 
     def causes(self) -> list[tuple[str, str]]:
-        """What records say, with the next move, weakest scenario first: warnings of perception there, then search and fit."""
+        """Causes that records name, with the next move, weakest scenario first: perception's warnings there, search, fit."""
         warned = [one for scenario, one in self.numbers.warnings if scenario == self.weakest]
         found = [(f"{self.weakest}: {one.name} ({one.where}).", one.remedy) for one in warned]
         for scenario in self.by_scenario:
@@ -160,7 +160,7 @@ class Duel:
         return found
 
     def drift(self) -> list[tuple[str, str]]:
-        """Whether the error of the weakest scenario is there from the start or grows where the twin predicts."""
+        """Sentence on the error of the weakest scenario: there from the start, or growing where the twin predicts."""
         trained = self.each.get((self.best, "reconstruction", self.weakest))
         if self.task != "future" or not trained:
             return []

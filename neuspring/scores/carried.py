@@ -27,14 +27,11 @@ where x_i are the projections of a few surface nodes, in pixels. In frame 0 the 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from neuspring.data.camera import Camera
+from neuspring.data.camera import Camera
 
-NEIGHBORS = 8
+CARRIERS = 8
 """Nodes that a point is bound to, as many as the corners of a cell of a regular grid."""
 ON_A_LINE = 1e-6
 """Nodes are on one line if their second moment across it is below so much of that along it: 0.1 % of their extent."""
@@ -42,8 +39,8 @@ LEAST_DISTANCE = 1e-6
 """Least d_i over the mean of all d_i, so that a node on the point has nearly all weight."""
 
 
-def bound_positions(positions: np.ndarray, points: np.ndarray, neighbors: int = NEIGHBORS) -> np.ndarray:
-    """Where points [P, 3] m of frame 0 are in every frame [F, P, 3], carried by nodes [F, N, 3] m; float64.
+def bound_positions(positions: np.ndarray, points: np.ndarray, neighbors: int = CARRIERS) -> np.ndarray:
+    """Places [F, P, 3], m, of points [P, 3], m, of frame 0 in every frame, carried by nodes [F, N, 3] m; float64.
 
     Fewer nodes than `neighbors` all carry. Nodes of all frames must be finite.
     """
@@ -67,7 +64,7 @@ def rotations(carrying: np.ndarray) -> np.ndarray:
     moments = np.einsum("fpki,pkj->fpij", offsets, offsets[0])
     left, size, right = np.linalg.svd(moments)
     signs = np.sign(np.linalg.det(left) * np.linalg.det(right))
-    found = np.einsum("fpij,fpj,fpjk->fpik", left, _last(signs), right)
+    found = np.einsum("fpij,fpj,fpjk->fpik", left, np.stack([*[np.ones_like(signs)] * 2, signs], axis=-1), right)
     # The rotation is unique if the two smaller values do not cancel, with the sign of the last.
     unclear = size[..., 1] + signs * size[..., 2] <= ON_A_LINE * size[..., 0]
     groups = np.flatnonzero(unclear.any(axis=0))
@@ -75,11 +72,6 @@ def rotations(carrying: np.ndarray) -> np.ndarray:
         found[0, groups] = np.where(unclear[0, groups, None, None], np.eye(3), found[0, groups])
         _carry(found, moments, unclear, groups)
     return np.asarray(found)
-
-
-def _last(signs: np.ndarray) -> np.ndarray:
-    ones = np.ones_like(signs)
-    return np.stack([ones, ones, signs], axis=-1)
 
 
 def _carry(found: np.ndarray, moments: np.ndarray, unclear: np.ndarray, groups: np.ndarray) -> None:
@@ -113,13 +105,13 @@ def _half_turn(axis: np.ndarray) -> np.ndarray:
     return np.asarray(2 * unit[:, :, None] * unit[:, None, :] - np.eye(3))
 
 
-FLAT = 0.015
+FLAT_HEIGHT = 0.015
 """m above the table, below which a point lies on it."""
 IN_IMAGE = 4
 """Nodes that a marked pixel moves with."""
 CANDIDATES = 8
 """Nodes, nearest in the image, among which the front-most one is looked for."""
-BEHIND = 0.03
+FAR_SIDE = 0.03
 """m behind the front-most candidate, beyond which a node is taken to be on another side of the object."""
 
 
@@ -131,26 +123,17 @@ def points_in_image(
     intrinsics [3, 3], px; camera_to_world [4, 4], m; positions of nodes [F, N, 3], m, of which the first `surface` can be seen;
     marked [F or more, K, 2], px, NaN where a point is not marked. A point that frame 0 does not have is left out.
     """
-    return _means(point_errors(intrinsics, camera_to_world, positions, marked, surface))
-
-
-def point_errors(
-    intrinsics: np.ndarray, camera_to_world: np.ndarray, positions: np.ndarray, marked: np.ndarray, surface: int
-) -> np.ndarray:
-    """As `points_in_image`, of every point: distances [F, K], px; NaN where a point is not marked in the frame or in frame 0."""
     places = carried_in_image(intrinsics, camera_to_world, positions, marked[0], surface)
-    return np.asarray(np.linalg.norm(places - marked[: len(places)], axis=2))
+    return _means(np.linalg.norm(places - marked[: len(places)], axis=2))
 
 
 def carried_in_image(
     intrinsics: np.ndarray, camera_to_world: np.ndarray, positions: np.ndarray, start: np.ndarray, surface: int
 ) -> np.ndarray:
-    """Where the nodes around them carry pixels [K, 2] of frame 0: [F, K, 2]; NaN stays. Other arguments as in `points_in_image`.
+    """Places [F, K, 2], px, to which the nodes around them carry pixels [K, 2] of frame 0; NaN stays.
 
-    The nodes must lie in front of the camera. They are chosen once, in frame 0.
+    Other arguments as in `points_in_image`. The nodes must lie in front of the camera. They are chosen once, in frame 0.
     """
-    from neuspring.data.camera import Camera
-
     camera = Camera("", 0, 0, intrinsics, camera_to_world)
     pixels, depth = camera.project(positions[:, :surface].astype(np.float64))
     places = np.full((len(positions), *np.shape(start)), np.nan)
@@ -170,10 +153,8 @@ def points_on_table(
     table in a frame in which the nodes that carry it are less than FLAT above it. There the marked pixel is lifted onto the plane
     at their height; the error is its distance from where they carry the point.
     """
-    from neuspring.data.camera import Camera
-
     errors = np.full((len(positions), marked.shape[1]), np.nan)
-    if (up * positions[0, :, 2]).max() < FLAT:
+    if (up * positions[0, :, 2]).max() < FLAT_HEIGHT:
         camera = Camera("", 0, 0, intrinsics, camera_to_world)
         nodes = positions[:, :surface].astype(np.float64)
         pixels, depth = camera.project(nodes[0])
@@ -183,7 +164,7 @@ def points_on_table(
             index, weights = _around(pixel, pixels, depth)
             start = _on_plane(camera, pixel[None], np.array([weights @ nodes[0, index, 2]]))[0]
             carried = start + np.einsum("i,fij->fj", weights, nodes[:, index] - nodes[0, index])
-            touching = (up * carried[:, 2] < FLAT) & np.isfinite(marked[: len(nodes), k]).all(axis=1)
+            touching = (up * carried[:, 2] < FLAT_HEIGHT) & np.isfinite(marked[: len(nodes), k]).all(axis=1)
             seen = _on_plane(camera, marked[: len(nodes), k][touching], carried[touching, 2])
             errors[touching, k] = np.linalg.norm(seen - carried[touching], axis=1)
     return _means(errors)
@@ -208,6 +189,6 @@ def _around(pixel: np.ndarray, pixels: np.ndarray, depth: np.ndarray) -> tuple[n
     distance = np.linalg.norm(pixels - pixel, axis=1)
     order = np.argsort(distance, kind="stable")
     front = depth[order[:CANDIDATES]].min()
-    seen = order[depth[order] <= front + BEHIND][:IN_IMAGE]
+    seen = order[depth[order] <= front + FAR_SIDE][:IN_IMAGE]
     inverse = 1.0 / (distance[seen] + 1.0)
     return seen, inverse / inverse.sum()

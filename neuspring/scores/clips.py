@@ -20,7 +20,7 @@ EUCLID = "track_error"
 LEARNING = ("search", "fit", "train")
 """Stages whose time is that of the model."""
 CLIP_COLUMNS = ["cable", "clip", "label", "method", "source", "seed", "l1_mm", "euclid_mm", "minutes"]
-FACTS = ["l1_mm", "spread_mm", "median_mm", "worst_mm", "euclid_mm", "minutes", "worst_clip", "clips", "of", "seeds"]
+CLIP_FACTS = ["l1_mm", "spread_mm", "median_mm", "worst_mm", "euclid_mm", "minutes", "worst_clip", "clips", "of", "seeds"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,10 +100,10 @@ class ClipNumbers:
             means, seeds = part.groupby("clip")[["l1_mm", "euclid_mm", "minutes"]].mean(), part.groupby("seed")
             l1, spread = means["l1_mm"], seeds["l1_mm"].mean()[seeds["clip"].nunique() == of].std(ddof=1)
             numbers = [l1.mean(), spread, l1.median(), l1.max(), means["euclid_mm"].mean(), means["minutes"].mean(), l1.idxmax()]
-            facts = dict(zip(FACTS, [*numbers, int(seeds["clip"].nunique().min()), of, len(seeds)], strict=True))
+            facts = dict(zip(CLIP_FACTS, [*numbers, int(seeds["clip"].nunique().min()), of, len(seeds)], strict=True))
             facts |= {"source": "ours", "tag": "", "text": "", "ranked": facts["clips"] == of}
             rows.append({"cable": cable, "label": label, **facts})
-        return pd.DataFrame(rows, columns=["cable", "label", *FACTS, "source", "tag", "text", "ranked"])
+        return pd.DataFrame(rows, columns=["cable", "label", *CLIP_FACTS, "source", "tag", "text", "ranked"])
 
     @cached_property
     def growth(self) -> pd.DataFrame:

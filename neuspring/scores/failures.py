@@ -13,25 +13,25 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from neuspring.scores.metrics import METRICS, TASKS, averages
+from neuspring.scores.metrics import METRICS, TASKS, averages, in_order
 
 LeftOut = Mapping[str, Mapping[str, str]]
 """Method to the scenarios to which it does not apply, each with the reason."""
 Labels = Mapping[str, str]
 """Method to its name in a table."""
-NOTHING: Mapping[str, Any] = MappingProxyType({})
-RUN = ["scenario", "method", "seed"]
-CELL = ["method", "task", "metric"]
-MEANS = ("own", "own_other", "all", "all_other")
-COLUMNS = ("method", "succeeded", "attempted", "unknown", *CELL[1:], *MEANS)
+EMPTY_MAP: Mapping[str, Any] = MappingProxyType({})
+RUN_KEYS = ["scenario", "method", "seed"]
+CELL_KEYS = ["method", "task", "metric"]
+MEAN_NAMES = ("own", "own_other", "all", "all_other")
+FAILURE_COLUMNS = ("method", "succeeded", "attempted", "unknown", *CELL_KEYS[1:], *MEAN_NAMES)
 OWN, ALL = "its successes", "all, failures held"
-"""What the two means are over."""
-WHY = (
+"""Runs that the two means are over."""
+FAILURE_NOTE = (
     "The published numbers of Spring-Gaus cover successful cases only, and an average that leaves failures out can flatter a "
     "method. So here is the mean over its own successful runs, which are other runs for every method, and that over all runs "
     "that ended, where a failed prediction stays at its last finite frame."
 )
-DASHES = "A dash in a mean over all runs: a failed run has no such score."
+DASH_NOTE = "A dash in a mean over all runs: a failed run has no such score."
 
 
 def both_averages(scores: pd.DataFrame, runs: pd.DataFrame, frozen: pd.DataFrame) -> pd.DataFrame:
@@ -42,41 +42,41 @@ def both_averages(scores: pd.DataFrame, runs: pd.DataFrame, frozen: pd.DataFrame
     failures, `unknown` the failures without such scores. A mean over all runs is NaN where a score of a failed run is missing.
     """
     ended = runs[runs["status"].isin(["ok", "failed"])]
-    failed = ended.loc[ended["status"] == "failed", RUN]
+    failed = ended.loc[ended["status"] == "failed", RUN_KEYS]
     if not len(failed):
-        return pd.DataFrame(columns=list(COLUMNS))
-    own = _scores_of(scores, ended.loc[ended["status"] == "ok", RUN])
+        return pd.DataFrame(columns=list(FAILURE_COLUMNS))
+    own = _scores_of(scores, ended.loc[ended["status"] == "ok", RUN_KEYS])
     lost = _scores_of(frozen, failed)
     everything = pd.concat([part for part in (own, lost) if len(part)]) if len(own) or len(lost) else own
     means = [_means(part, name) for part, name in ((own, "own"), (everything, "all")) if len(part)]
-    table = means[0] if means else pd.DataFrame(columns=CELL)
+    table = means[0] if means else pd.DataFrame(columns=CELL_KEYS)
     for other in means[1:]:
-        table = table.merge(other, on=CELL, how="outer")
-    table = table.reindex(columns=[*CELL, *MEANS])
+        table = table.merge(other, on=CELL_KEYS, how="outer")
+    table = table.reindex(columns=[*CELL_KEYS, *MEAN_NAMES])
     unknown = _unknown(failed, lost)
     lacking = _lacking(failed, lost, pd.concat([part for part in (scores, lost) if len(part)]) if len(everything) else scores)
-    without = table["method"].isin(unknown[unknown > 0].index) | pd.MultiIndex.from_frame(table[CELL]).isin(lacking)
+    without = table["method"].isin(unknown[unknown > 0].index) | pd.MultiIndex.from_frame(table[CELL_KEYS]).isin(lacking)
     table.loc[without, ["all", "all_other"]] = np.nan
     counts = ended.groupby("method")["status"].agg(succeeded=lambda status: int((status == "ok").sum()), attempted="size")
     counts["unknown"] = unknown.reindex(counts.index).fillna(0).astype(int)
-    table = counts.reset_index().merge(table, on="method", how="left")[list(COLUMNS)]
-    return _in_order(table, list(dict.fromkeys(runs["method"])))
+    table = counts.reset_index().merge(table, on="method", how="left")[list(FAILURE_COLUMNS)]
+    return in_order(table, {"method": dict.fromkeys(runs["method"]), "task": TASKS, "metric": METRICS})
 
 
 def _scores_of(scores: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     if not len(scores):
         return scores
-    return scores[pd.MultiIndex.from_frame(scores[RUN]).isin(pd.MultiIndex.from_frame(runs[RUN]))]
+    return scores[pd.MultiIndex.from_frame(scores[RUN_KEYS]).isin(pd.MultiIndex.from_frame(runs[RUN_KEYS]))]
 
 
 def _means(scores: pd.DataFrame, name: str) -> pd.DataFrame:
     names = {"mean": name, "other": f"{name}_other"}
-    return averages(scores)[[*CELL, *names]].rename(columns=names)
+    return averages(scores)[[*CELL_KEYS, *names]].rename(columns=names)
 
 
 def _unknown(failed: pd.DataFrame, lost: pd.DataFrame) -> pd.Series:
     """Method to the number of its failed runs without any score."""
-    scored = pd.MultiIndex.from_frame(failed).isin(pd.MultiIndex.from_frame(lost[RUN]) if len(lost) else [])
+    scored = pd.MultiIndex.from_frame(failed).isin(pd.MultiIndex.from_frame(lost[RUN_KEYS]) if len(lost) else [])
     return failed[~scored].groupby("method").size()
 
 
@@ -84,24 +84,12 @@ def _lacking(failed: pd.DataFrame, lost: pd.DataFrame, scores: pd.DataFrame) -> 
     """Method, task and metric of which a failed run has no score, although other runs of its scenario have one."""
     expected = scores[["scenario", "task", "metric"]].drop_duplicates().astype(object)
     wanted = failed.astype(object).merge(expected, on="scenario")
-    keys = [*RUN, "task", "metric"]
+    keys = [*RUN_KEYS, "task", "metric"]
     there = pd.MultiIndex.from_frame(wanted[keys]).isin(pd.MultiIndex.from_frame(lost[keys].astype(object)) if len(lost) else [])
-    return pd.MultiIndex.from_frame(wanted.loc[~there, CELL].drop_duplicates())
+    return pd.MultiIndex.from_frame(wanted.loc[~there, CELL_KEYS].drop_duplicates())
 
 
-def _in_order(table: pd.DataFrame, methods: list[str]) -> pd.DataFrame:
-    ranks = {"method": methods, "task": list(TASKS), "metric": list(METRICS)}
-    places = pd.DataFrame({name: table[name].map({key: rank for rank, key in enumerate(keys)}) for name, keys in ranks.items()})
-    return table.loc[places.sort_values(["method", "task", "metric"]).index].reset_index(drop=True)
-
-
-def mean_rows(part: pd.DataFrame) -> list[tuple[str, str]]:
-    """The lines of a method, from its rows of `both_averages`: what each is a mean over, and its column. One if no run failed."""
-    first = part.iloc[0]
-    return [("all", "own")] if first["succeeded"] == first["attempted"] else [(OWN, "own"), (ALL, "all")]
-
-
-def unknown_lines(table: pd.DataFrame, labels: Labels = NOTHING) -> list[str]:
+def unknown_lines(table: pd.DataFrame, labels: Labels = EMPTY_MAP) -> list[str]:
     """A sentence for every method with failed runs that have no scores."""
     counts = table.drop_duplicates("method")
     if labels:
@@ -114,7 +102,7 @@ def unknown_lines(table: pd.DataFrame, labels: Labels = NOTHING) -> list[str]:
     ]
 
 
-def removed_lines(runs: pd.DataFrame, left_out: LeftOut = NOTHING, labels: Labels = NOTHING) -> list[str]:
+def removed_lines(runs: pd.DataFrame, left_out: LeftOut = EMPTY_MAP, labels: Labels = EMPTY_MAP) -> list[str]:
     """Why averages do not take every pair of scenario and seed: failed runs, and methods that do not apply to a scenario.
 
     Empty if neither removes any. A method that finished no run takes no part, here as in the averages.
@@ -144,7 +132,7 @@ def removed_lines(runs: pd.DataFrame, left_out: LeftOut = NOTHING, labels: Label
     return lines
 
 
-def left_out_lines(left_out: LeftOut, labels: Labels = NOTHING) -> list[str]:
+def left_out_lines(left_out: LeftOut, labels: Labels = EMPTY_MAP) -> list[str]:
     """A sentence for every method and reason for which it does not apply to some scenarios."""
     lines = []
     for name, where in left_out.items():

@@ -32,16 +32,8 @@ PACKAGED_HEADS = {"lpips": "weights/v0.1/alex.pth", "torchmetrics": "functional/
 """Path of the heads inside each package that has them."""
 
 
-@dataclass(frozen=True)
-class Weights:
-    """Checked weight files."""
-
-    backbone: Path
-    heads: Path
-
-
-def find_weights(backbone: Path | None = None, heads: Path | None = None, *, trusted: bool = False) -> Weights | str:
-    """The weight files, or one line that says which are missing. None: look in the usual caches.
+def find_weights(backbone: Path | None = None, heads: Path | None = None, *, trusted: bool = False) -> tuple[Path, Path] | str:
+    """The files of backbone and heads, or one line that says which are missing. None: look in the usual caches.
 
     Checks SHA-256 unless `trusted`. Raises InputError only if a path that was given is missing or has another content.
     """
@@ -53,17 +45,17 @@ def find_weights(backbone: Path | None = None, heads: Path | None = None, *, tru
     first = find_file("AlexNet weights", backbone, [hub / BACKBONE], BACKBONE_DIGEST, trusted)
     second = find_file("LPIPS heads", heads, places, HEADS_DIGEST, trusted)
     if isinstance(first, Path) and isinstance(second, Path):
-        return Weights(first, second)
+        return first, second
     return "; ".join(reason for reason in (first, second) if isinstance(reason, str))
 
 
-def configured_weights(settings: LpipsWeights) -> Weights | str:
+def configured_weights(settings: LpipsWeights) -> tuple[Path, Path] | str:
     """As `find_weights`, with the paths of the configuration."""
     return find_weights(*(Path(path) if path else None for path in (settings.backbone, settings.heads)))
 
 
 CHANNELS = (3, 64, 192, 384, 256, 256)
-"""Of the picture and after each convolution."""
+"""Channels of the picture and after each convolution."""
 WINDOWS = (11, 5, 3, 3, 3)
 """px, of each convolution."""
 STRIDES = (4, 1, 1, 1, 1)
@@ -72,10 +64,10 @@ LAYERS = (0, 3, 6, 8, 10)
 """Indices of the convolutions in torchvision's `features`."""
 POOLED = (1, 2)
 """Convolutions that follow a max-pooling of 3 px, stride 2."""
-SMALLEST = 31
+SMALLEST_PICTURE = 31
 """px: below it nothing is left after the second pooling."""
-SHIFT = (-0.030, -0.088, -0.188)
-SCALE = (0.458, 0.448, 0.450)
+RGB_SHIFT = (-0.030, -0.088, -0.188)
+RGB_SCALE = (0.458, 0.448, 0.450)
 """ImageNet's means and deviations of R, G, B, for pictures in [-1, 1]."""
 LEAST_NORM = 1e-10
 """Added to the length of a feature before dividing by it."""
@@ -86,7 +78,7 @@ class Lpips:
     """The distance with its weights, all float32 on one device."""
 
     kernels: list[torch.Tensor]
-    """Of each convolution [out, in, window, window]."""
+    """Kernel of each convolution [out, in, window, window]."""
     biases: list[torch.Tensor]
     heads: list[torch.Tensor]
     """w_l [1, channels, 1, 1]."""
@@ -103,16 +95,16 @@ class Lpips:
             for layer, before, after, window in zip(LAYERS, CHANNELS[:-1], CHANNELS[1:], WINDOWS, strict=True)
         }
         biases = {f"features.{layer}.bias": (after,) for layer, after in zip(LAYERS, CHANNELS[1:], strict=True)}
-        tensors = read_tensors(weights.backbone, {**shapes, **biases}, device)
+        tensors = read_tensors(weights[0], {**shapes, **biases}, device)
         linear = {f"lin{k}.model.1.weight": (1, channels, 1, 1) for k, channels in enumerate(CHANNELS[1:])}
-        return cls(tensors[: len(LAYERS)], tensors[len(LAYERS) :], read_tensors(weights.heads, linear, device))
+        return cls(tensors[: len(LAYERS)], tensors[len(LAYERS) :], read_tensors(weights[1], linear, device))
 
     @classmethod
     def configured(cls, settings: LpipsWeights, device: str) -> Lpips | str:
         """As `load`, from the files of the configuration; one line that says which are missing."""
         weights = configured_weights(settings)
         # Their checksums have just been taken.
-        return weights if isinstance(weights, str) else cls.load(weights.backbone, weights.heads, device, trusted=True)
+        return weights if isinstance(weights, str) else cls.load(*weights, device, trusted=True)
 
     def features(self, pictures: torch.Tensor) -> list[torch.Tensor]:
         """The output of each ReLU [B, channels, h, w] for normalized pictures [B, 3, H, W]."""
@@ -137,12 +129,12 @@ class Lpips:
         shapes = f"{tuple(a.shape)}, {tuple(b.shape)}"
         if a.ndim < 3 or a.shape != b.shape or a.shape[-3] != 3:
             raise InputError("LPIPS", "two pictures [..., 3, H, W] of the same shape are needed", shapes)
-        if min(a.shape[-2:]) < SMALLEST:
-            raise InputError("LPIPS", f"AlexNet takes pictures of at least {SMALLEST} x {SMALLEST} px", shapes)
+        if min(a.shape[-2:]) < SMALLEST_PICTURE:
+            raise InputError("LPIPS", f"AlexNet takes pictures of at least {SMALLEST_PICTURE} x {SMALLEST_PICTURE} px", shapes)
         pictures = torch.cat([p.reshape(-1, *p.shape[-3:]).to(self.heads[0]) for p in (a, b)])
         if not released_range:
             pictures = 2 * pictures - 1
-        shift, scale = (pictures.new_tensor(values)[:, None, None] for values in (SHIFT, SCALE))
+        shift, scale = (pictures.new_tensor(values)[:, None, None] for values in (RGB_SHIFT, RGB_SCALE))
         distance = pictures.new_zeros(len(pictures) // 2)
         # Full single precision, so that a GPU reports what a CPU does.
         with torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False):

@@ -25,7 +25,7 @@ import numpy as np
 from neuspring.core.artifacts import Observations, Scenario, Trajectory
 from neuspring.core.errors import InputError
 from neuspring.registry import Registry
-from neuspring.scores.carried import NEIGHBORS, bound_positions, points_in_image, points_on_table
+from neuspring.scores.carried import CARRIERS, bound_positions, points_in_image, points_on_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -36,10 +36,10 @@ if TYPE_CHECKING:
 TASKS = ("reconstruction", "future")
 SHORT = {"reconstruction": "Recon.", "future": "Future", "transfer": "Transfer"}
 """Tasks in headings of columns."""
-COLUMNS = ("scenario", "category", "method", "seed", "task", "metric", "value", "unit", "frames")
+SCORE_COLUMNS = ("scenario", "category", "method", "seed", "task", "metric", "value", "unit", "frames")
 DASH = "–"
 """Stands for a value that there is not."""
-AT_BOUND = 0.05
+SHARE_AT_BOUND = 0.05
 """A share of springs at the bound of their stiffness above this says that the bound was in training's way: in notes of runs and
 below tables alike."""
 Of = Literal["positions", "pictures", "marks"]
@@ -54,7 +54,7 @@ class Metric:
     """In words, for legends."""
     heading: str
     unit: str
-    """Of stored values; 1 for plain numbers."""
+    """Unit of stored values; 1 for plain numbers."""
     shown_unit: str = ""
     """In tables; empty for plain numbers."""
     factor: float = 1.0
@@ -67,13 +67,13 @@ class Metric:
     of: Of = "positions"
     """Positions of nodes in space; pictures; points that were marked in images, where there is color alone."""
     function: Callable[..., Any] | str
-    """Of positions and marks: (positions [F, N, 3] m, observations) -> values per frame [F], NaN where a frame has none, or None
-    where the metric does not apply. Of pictures: (`pictures.Pair`, LPIPS of two pictures or None) -> a value or None. Text
-    "module:name" is imported when it is first called."""
+    """Function that computes it. Of positions and marks: (positions [F, N, 3] m, observations) -> values per frame
+    [F], NaN where a frame has none, or None where the metric does not apply. Of pictures: (`pictures.Pair`, LPIPS of two pictures
+    or None) -> a value or None. Text "module:name" is imported when it is first called."""
     in_studies: bool = False
     """True where tables of studies show it too."""
     average: Literal["equal", "frames"] = "equal"
-    """How the paper averages over scenarios: equally, or weighted by their frames."""
+    """The paper's average over scenarios: equally, or weighted by their frames."""
     tolerance: float = 1e-6
     """Largest difference, in the stored unit, from a published value of the same data that conformance checks allow.
 
@@ -86,7 +86,7 @@ class Metric:
     """In paper_tables.csv; empty for metrics that the paper does not have."""
 
     def measure(self, *given: Any) -> Any:
-        """What the function returns."""
+        """Values that the function returns."""
         return (resolve_name(self.function) if isinstance(self.function, str) else self.function)(*given)
 
     @property
@@ -108,6 +108,10 @@ class Metric:
         """A stored value as tables print it."""
         return self.shown(self.factor * value, sign)
 
+    def told(self, value: float) -> str:
+        """A stored value with heading and unit, for a sentence."""
+        return f"{self.heading} {self.text(value)} {self.shown_unit}".rstrip()
+
     def shown(self, value: float, sign: str = "") -> str:
         """A value in the unit of tables as they print it; a dash for NaN."""
         return DASH if np.isnan(value) else f"{value:{sign}.{self.digits}f}"
@@ -127,7 +131,7 @@ def _tree(points: np.ndarray) -> cKDTree:
 def _table(rows: Iterable[tuple[object, ...]]) -> pd.DataFrame:
     import pandas as pd
 
-    return pd.DataFrame(rows, columns=list(COLUMNS))
+    return pd.DataFrame(rows, columns=list(SCORE_COLUMNS))
 
 
 def visible_to_surface(nodes: np.ndarray, points: np.ndarray, visible: np.ndarray, surface: int) -> float:
@@ -154,7 +158,7 @@ def track_errors(positions: np.ndarray, tracks: np.ndarray) -> np.ndarray:
     return _mean_errors(positions, tracks, lambda points: positions[:, _tree(positions[0]).query(points)[1]].astype(np.float64))
 
 
-def bound_track_errors(positions: np.ndarray, tracks: np.ndarray, neighbors: int = NEIGHBORS) -> np.ndarray:
+def bound_track_errors(positions: np.ndarray, tracks: np.ndarray, neighbors: int = CARRIERS) -> np.ndarray:
     """As `track_errors`, of points that move with the nodes around them (`carried.bound_positions`): 0 for every rigid motion."""
     tracks = tracks.astype(np.float64)
     return _mean_errors(positions, tracks, lambda points: bound_positions(positions, points, neighbors))
@@ -305,29 +309,18 @@ def score(
     method: str,
     seed: int,
     errors: Mapping[str, np.ndarray] | None = None,
+    tasks: Mapping[str, range] | None = None,
 ) -> pd.DataFrame:
     """Tidy scores, one row per task and metric; `errors` are `errors_per_frame`, where they are known already.
 
-    There is no row, and never NaN, for a task without frames, a metric without annotation, a task that the rollout diverged in.
+    `tasks` maps names to the frames that they average over; None: `TASKS`. There is no row, and never NaN, for a task without
+    frames, a metric without annotation, a task that the rollout diverged in.
     """
-    tasks = {task: task_frames(observations.scenario, task) for task in TASKS}
-    return score_tasks(trajectory, observations, method, seed, tasks, errors)
-
-
-def score_tasks(
-    trajectory: Trajectory,
-    observations: Observations,
-    method: str,
-    seed: int,
-    tasks: Mapping[str, range],
-    errors: Mapping[str, np.ndarray] | None = None,
-) -> pd.DataFrame:
-    """As `score`, for any tasks: `tasks` maps names to the frames that they average over."""
     scenario = observations.scenario
     rows = []
     known = errors_per_frame(trajectory.positions, observations) if errors is None else errors
     per_frame = {**known, **errors_per_frame(trajectory.positions, observations, "marks")}
-    for task, frames in tasks.items():
+    for task, frames in (tasks or {task: task_frames(scenario, task) for task in TASKS}).items():
         if not len(frames) or frames[-1] >= len(trajectory.positions):
             continue
         for metric, values in per_frame.items():
@@ -377,6 +370,14 @@ def score_images(frames: pd.DataFrame, scenario: Scenario, drawn: int, method: s
             identity = (scenario.name, scenario.category, method, seed, task, metric)
             rows.append((*identity, float(per_frame.mean()), METRICS[str(metric)].unit, len(per_frame)))
     return _table(rows)
+
+
+def in_order(table: pd.DataFrame, ranks: Mapping[str, Iterable[str]]) -> pd.DataFrame:
+    """The table sorted by columns, each in the order of its names."""
+    import pandas as pd
+
+    places = {column: table[column].map({name: rank for rank, name in enumerate(names)}) for column, names in ranks.items()}
+    return table.loc[pd.DataFrame(places).sort_values(list(places)).index].reset_index(drop=True)
 
 
 def averages(scores: pd.DataFrame, by: Iterable[str] = ("method", "task", "metric")) -> pd.DataFrame:

@@ -47,7 +47,7 @@ class Numbers:
     everything: Collected
     baseline: str
     objects: statistics.Objects = "scenario"
-    """What intervals of ratios are over."""
+    """Objects that intervals of ratios are over."""
     aims: tuple[Aim, ...] = ()
     """Ratios that are aimed at."""
     transfers: Collected | None = None
@@ -57,7 +57,7 @@ class Numbers:
     known_studies: Mapping[str, Study] = field(default_factory=dict)
     """Those and the ones that may stand beside them."""
     results: Path = Path("results")
-    """Where films of clips lie."""
+    """Folder in which films of clips lie."""
     warnings: tuple[tuple[str, Finding], ...] = ()
     """Scenarios, and what steps of perception warned of."""
     made_otherwise: tuple[str, ...] = ()
@@ -94,9 +94,8 @@ class Numbers:
             keys = ["scenario", "seed"]
             own = finished_scores(self.everything.of(self.everything.oracles))
             scores = pd.concat([scores, own.merge(scores[keys].drop_duplicates(), on=keys) if len(scores) else own])
-        return (
-            averages(scores) if len(scores) else pd.DataFrame(columns=["method", "task", "metric", "equal", "frames", "seed_std"])
-        )
+        columns = ["method", "task", "metric", "equal", "frames", "seed_std"]
+        return averages(scores) if len(scores) else pd.DataFrame(columns=columns)
 
     @cached_property
     def held(self) -> pd.DataFrame:
@@ -178,29 +177,21 @@ class Numbers:
 
     def _of_study(self, name: str, study: Study) -> StudyNumbers | ClipNumbers:
         if study.clips:
-            names: dict[str, Any] = {column: list(dict.fromkeys(self.everything.runs[column])) for column in ("method", "seed")}
-            sources = list(dict.fromkeys(self.everything.runs["scenario"]))
-            return ClipNumbers(
-                name=name, study=study, results=self.results, sources=sources, methods=names["method"], seeds=names["seed"]
-            )
+            runs = self.everything.runs
+            named: Any = {f"{name}s": list(dict.fromkeys(runs[name])) for name in ("method", "seed")}
+            named["sources"] = list(dict.fromkeys(runs["scenario"]))
+            return ClipNumbers(name=name, study=study, results=self.results, **named)
         beside = self.known_studies.get(study.beside or "")
         return StudyNumbers(name=name, study=study, collected=self.everything, beside=beside)
-
-    @property
-    def size(self) -> str:
-        """How much is compared, in words."""
-        return f"{self.usable['scenario'].nunique()} scenarios, {self.usable['seed'].nunique()} seed(s)"
 
     @cached_property
     def key(self) -> str:
         """A digest of what the numbers are made of: numbers of other runs, or against another method, have another one."""
-        runs = [found.runs.reindex(columns=["scenario", "method", "seed", "status", "run_key"]) for found in self._all_runs()]
+        parts = [found for found in (self.everything, self.transfers) if found]
+        runs = [found.runs.reindex(columns=["scenario", "method", "seed", "status", "run_key"]) for found in parts]
         told = [self.baseline, self.objects, [asdict(aim) for aim in self.aims], [table.to_csv() for table in runs]]
-        told += [found.scores.to_csv(index=False) for found in self._all_runs()]
+        told += [found.scores.to_csv(index=False) for found in parts]
         return hashlib.sha256(json.dumps(told).encode()).hexdigest()
-
-    def _all_runs(self) -> list[Collected]:
-        return [self.everything, *([self.transfers] if self.transfers else [])]
 
     @property
     def _parts(self) -> dict[str, Numbers | StudyNumbers | ClipNumbers]:

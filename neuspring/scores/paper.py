@@ -1,4 +1,4 @@
-"""What was printed, as data: the paper's tables, the released PhysTwin's scores, published errors on DEFORM's cables; and studies,
+"""Printed numbers, as data: the paper's tables, the released PhysTwin's scores, published errors on DEFORM's cables; and studies,
 which say which of our methods stands in each row of a table."""
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from neuspring.scores.metrics import METRICS, Metric
 if TYPE_CHECKING:
     import pandas as pd
 
-TASKS = {"reconstruction": "reconstruction_resimulation", "future": "future_prediction"}
+PAPER_TASKS = {"reconstruction": "reconstruction_resimulation", "future": "future_prediction"}
 """Our tasks to the paper's."""
 UNDERLINED = ("table1_comparison", "table3_network")
 """Tables in which the paper underlines the second best; in all of them the best is bold."""
@@ -40,7 +40,7 @@ TAGS = {
     "others": "Others than DEFORM's authors trained DEFORM and published the number.",
     "reference": "We measured it. It is no method: it shows what one gets without learning, or the least that is possible.",
 }
-"""What the tag of a number in `CLIPS` means."""
+"""Meaning of the tag of a number in `CLIPS`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ class Printed:
     """Half a unit of the last digit: what rounding may have hidden."""
     source: str = ""
     tag: str = ""
-    """Of `TAGS`; empty: printed by the paper."""
+    """One of `TAGS`; empty: printed by the paper."""
 
 
 Values = dict[tuple[str, str, str], Printed]
@@ -80,7 +80,7 @@ def table(name: str) -> Values:
             (row["method"], row["cable"], CLIP_METRIC): replace(_printed(row["l1_mm"], False), source=row["source"], tag=row["tag"])
             for row in _rows(f"{CLIPS}.csv")
         }
-    tasks = {theirs: ours for ours, theirs in TASKS.items()}
+    tasks = {theirs: ours for ours, theirs in PAPER_TASKS.items()}
     ours = {metric.paper_name: metric for metric in metrics().values()}
     return {
         (row["method"], tasks[row["task"]], ours[row["metric"]].name): _printed(row["value"], ours[row["metric"]].unit == "m")
@@ -145,11 +145,11 @@ class Study:
     """The paper's label to a method of methods.yaml. A label that the paper does not have is shown without its values."""
 
     training: Text = "equal"
-    """How the rows are trained, in words."""
+    """Training of the rows, in words."""
     beside: Name | None = None
     """A study of the same labels whose numbers this one shows next to its own: the same rows, trained in another way."""
     clips: bool = False
-    """Whether the table is of twins on other recordings (`transfers`): a column per category, for example a cable. Published rows
+    """True for a table of twins on other recordings (`transfers`): a column per category, for example a cable. Published rows
     stand above ours, under labels of their own. Its films show the baseline."""
 
     def __post_init__(self) -> None:
@@ -170,7 +170,7 @@ class Study:
 
     @property
     def values(self) -> Values:
-        """What the paper prints; empty without a reference."""
+        """Values that the paper prints; empty without a reference."""
         return table(self.reference) if self.reference else {}
 
 

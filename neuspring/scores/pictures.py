@@ -78,7 +78,7 @@ def silhouettes(
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """What was observed and what is predicted, in one frame of one camera."""
+    """The observed and the predicted picture, in one frame of one camera."""
 
     observed: np.ndarray
     """[H, W, 3] uint8."""
@@ -149,7 +149,7 @@ def _ssim_on_black(a: torch.Tensor, b: torch.Tensor) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """What predictions are compared with: cameras, their masks, and how."""
+    """Reference of the scores of pictures: cameras, their masks, and how."""
 
     capture: Capture
     masks: Mapping[str, np.ndarray]

@@ -20,12 +20,12 @@ from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
 from neuspring.core.run_record import RUN_RECORD, RunRecord
 from neuspring.core.text import listed
-from neuspring.scores.failures import NOTHING, LeftOut, applying
-from neuspring.scores.metrics import COLUMNS
+from neuspring.scores.failures import EMPTY_MAP, LeftOut, applying
+from neuspring.scores.metrics import SCORE_COLUMNS
 
 RUN_COLUMNS = ("scenario", "method", "seed", "status", "reason", "notes", "images", "source", "run_key", "oracle", "floors")
 DAMAGED = "damaged record: "
-"""How the reason of a run begins whose files cannot be read."""
+"""Begin of the reason of a run whose files cannot be read."""
 Key = tuple[str, str, int]
 """Scenario, method, seed."""
 
@@ -33,7 +33,7 @@ Key = tuple[str, str, int]
 def stacked(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
     """One table of scores. Empty tables carry no column types and are left out."""
     filled = [table for table in tables if len(table)]
-    return pd.concat(filled, ignore_index=True) if filled else pd.DataFrame(columns=list(COLUMNS))
+    return pd.concat(filled, ignore_index=True) if filled else pd.DataFrame(columns=list(SCORE_COLUMNS))
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Collected:
 
 
 def collect(
-    results: Path, scenarios: Iterable[str], methods: Iterable[str], seeds: Iterable[int], left_out: LeftOut = NOTHING
+    results: Path, scenarios: Iterable[str], methods: Iterable[str], seeds: Iterable[int], left_out: LeftOut = EMPTY_MAP
 ) -> Collected:
     """Read the records of every (scenario, method, seed).
 
@@ -105,7 +105,7 @@ def collect(
         try:
             record = RunRecord.load(path)
             files = (record.scores_file, None if record.ok else record.held_file)
-            tables = [pd.read_parquet(path.parent / name)[list(COLUMNS)] if name else stacked([]) for name in files]
+            tables = [pd.read_parquet(path.parent / name)[list(SCORE_COLUMNS)] if name else stacked([]) for name in files]
         except (OSError, ValueError, KeyError) as error:
             rows.append(identity | {"status": "failed", "reason": f"{DAMAGED}{one_line(error)}"})
             continue
@@ -139,7 +139,7 @@ def one_line(error: Exception) -> str:
 
 
 def _facts(record: RunRecord) -> dict[str, Any]:
-    """What tables need of a record."""
+    """Facts that tables need of a record."""
     facts = {name: getattr(record, name) for name in ("status", "reason", "source", "run_key")}
     facts["notes"] = "; ".join(record.notes)
     facts |= {"oracle": record.oracle, "floors": json.dumps(record.floors)}
@@ -163,9 +163,9 @@ def read_scores(path: Path) -> Collected:
     """
     try:
         scores = pd.read_csv(path)
-        scores = scores[list(COLUMNS)].astype({"value": float, "seed": int})
+        scores = scores[list(SCORE_COLUMNS)].astype({"value": float, "seed": int})
     except (OSError, ValueError, KeyError) as error:
-        rule = f"must be a scores.csv with the columns {', '.join(COLUMNS)}"
+        rule = f"must be a scores.csv with the columns {', '.join(SCORE_COLUMNS)}"
         raise InputError(path, rule, one_line(error), "Take the file from a folder of tables.") from error
     runs = scores[["scenario", "method", "seed"]].drop_duplicates(ignore_index=True)
     beside = path.with_name("runs.csv")
@@ -211,11 +211,11 @@ def collect_transfers(results: Path, sources: Iterable[str], methods: Iterable[s
         return Collected(table, runs)
     keys = ["source", "category", "method", "seed", "task", "metric", "unit"]
     mean = table.groupby(keys, sort=False).agg(value=("value", "mean"), frames=("frames", "sum")).reset_index()
-    return Collected(mean.rename(columns={"source": "scenario"})[list(COLUMNS)], runs)
+    return Collected(mean.rename(columns={"source": "scenario"})[list(SCORE_COLUMNS)], runs)
 
 
 def pairs(table: pd.DataFrame) -> int:
-    """How many pairs of scenario and seed a table has."""
+    """Number of pairs of scenario and seed in a table."""
     return len(table[["scenario", "seed"]].drop_duplicates())
 
 

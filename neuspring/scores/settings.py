@@ -13,7 +13,7 @@ from neuspring.scores.metrics import DASH
 
 NOT_SETTINGS = ("seed", "device", "description", "batch")
 """Recorded beside the settings, without being one of the method."""
-STAGES = ("search", "fit", "train", "rollout")
+PREDICTING_STAGES = ("search", "fit", "train", "rollout")
 """Stages whose settings make a prediction. Pictures are drawn the same way for all."""
 
 
@@ -28,12 +28,12 @@ def differing(records: Iterable[RunRecord], labels: Mapping[str, str]) -> pd.Dat
     for record in records:
         if record.method not in labels:
             continue
-        stages.setdefault(record.method, set()).update(name for name in record.settings if name in STAGES)
+        stages.setdefault(record.method, set()).update(name for name in record.settings if name in PREDICTING_STAGES)
         for name, value in settings_of(record).items():
             text = value if isinstance(value, str) else json.dumps(value)
             found.setdefault(name, {}).setdefault(record.method, set()).add(text)
     methods = [method for method in labels if method in stages]
-    found["stages"] = {method: {" + ".join(name for name in STAGES if name in stages[method])} for method in methods}
+    found["stages"] = {method: {" + ".join(name for name in PREDICTING_STAGES if name in stages[method])} for method in methods}
     rows: dict[str, str] = {}
     for name, by_method in found.items():
         stage = name.partition(".")[0]
@@ -50,7 +50,7 @@ def settings_of(record: RunRecord) -> dict[str, Any]:
     """Every setting that makes a run's prediction, by its dotted name; a section of the name of its stage is not named twice."""
     named: dict[str, Any] = {}
     for stage, settings in record.settings.items():
-        if stage in STAGES:
+        if stage in PREDICTING_STAGES:
             values = {name.removeprefix(f"{stage}."): value for name, value in flat(settings).items()}
             named |= {f"{stage}.{name}": value for name, value in values.items() if name.split(".")[-1] not in NOT_SETTINGS}
     return named | {f"method.{name}": record.variant[name] for name in ("search",) if name in record.variant}

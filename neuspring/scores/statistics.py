@@ -1,4 +1,4 @@
-"""How sure an average is: intervals of means, paired differences, and the primary figure, ratios over objects, with aims.
+"""Certainty of an average: intervals of means, paired differences, and the primary figure, ratios over objects, with aims.
 
 The bootstrap resamples scenarios, and within each of them its seeds, because runs of one scenario are not independent.
 
@@ -92,12 +92,10 @@ def _mean_interval(values: pd.Series, rng: np.random.Generator) -> tuple[float, 
 
 
 Objects = Literal["scenario", "category"]
-"""What counts as one object: a scenario, or all scenarios of a category (a cable with several recordings)."""
+"""Objects that intervals are over: a scenario, or all scenarios of a category (a cable with several recordings)."""
 BELOW, NOT_RESOLVED, ABOVE, TOO_FEW = "below 1", "not resolved", "above 1", "too few objects"
 REACHED, MISSED, NOT_RUN = "reached", "missed", "not run"
-COLUMNS = ("method", "baseline", "task", "metric", "ratio", "ratio_low", "ratio_high", "n", "objects", "pairs", "verdict")
-AIM_COLUMNS = ("aim", "below", "aim_verdict")
-SEED_COLUMNS = ("method", "task", "metric", "spread", "scenarios")
+RATIO_COLUMNS = ("method", "baseline", "task", "metric", "ratio", "ratio_low", "ratio_high", "n", "objects", "pairs", "verdict")
 LEAST_OBJECTS = 3
 """With two objects, the t-interval spans a factor of exp(12.7 SE) on either side: it says nothing."""
 
@@ -124,7 +122,7 @@ def ratios(scores: pd.DataFrame, baseline: str, objects: Objects = "scenario") -
             row = {"method": method, "baseline": baseline, "task": task, "metric": metric, "ratio": math.exp(each.mean())}
             row |= {"ratio_low": math.exp(low), "ratio_high": math.exp(high), "n": len(each), "objects": objects}
             rows.append(row | {"pairs": len(both), "verdict": verdict(math.exp(low), math.exp(high))})
-    return pd.DataFrame(rows, columns=list(COLUMNS))
+    return pd.DataFrame(rows, columns=list(RATIO_COLUMNS))
 
 
 def t_interval(values: np.ndarray) -> tuple[float, float]:
@@ -138,7 +136,7 @@ def t_interval(values: np.ndarray) -> tuple[float, float]:
 
 
 def needed(low: float, high: float, count: int, most: int = 200) -> int | None:
-    """How many objects resolve a ratio whose interval over `count` of them is [low, high], if all scatter alike; None: too many."""
+    """Number of objects that resolve a ratio with the interval [low, high] over `count`, if all scatter alike; None: too many."""
     from scipy.stats import t
 
     mean, reach = 0.5 * math.log(low * high), 0.5 * math.log(high / low)
@@ -148,7 +146,7 @@ def needed(low: float, high: float, count: int, most: int = 200) -> int | None:
 
 
 def verdict(low: float, high: float) -> str:
-    """Where an interval lies with respect to 1."""
+    """Place of an interval with respect to 1."""
     if math.isnan(low):
         return TOO_FEW
     return BELOW if high < 1 else ABOVE if low > 1 else NOT_RESOLVED
@@ -170,7 +168,7 @@ def judged_aims(scores: pd.DataFrame, transfers: pd.DataFrame, aims: Iterable[Ai
         rows.append(
             row | {"aim": aim.ratio, "below": aim.below, "aim_verdict": (REACHED if reached else MISSED) if found else NOT_RUN}
         )
-    return pd.DataFrame(rows, columns=[*COLUMNS, *AIM_COLUMNS])
+    return pd.DataFrame(rows, columns=[*RATIO_COLUMNS, "aim", "below", "aim_verdict"])
 
 
 def seed_spread(scores: pd.DataFrame) -> pd.DataFrame:
@@ -183,4 +181,4 @@ def seed_spread(scores: pd.DataFrame) -> pd.DataFrame:
     keys = ["method", "task", "metric"]
     each = rows.groupby([*keys, "scenario"], sort=False)["log"].std(ddof=1).dropna()
     table = each.groupby(level=keys, sort=False).agg(spread="mean", scenarios="count")
-    return table.reset_index().reindex(columns=list(SEED_COLUMNS))
+    return table.reset_index().reindex(columns=[*keys, "spread", "scenarios"])

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pandas as pd
 
-from neuspring.scores import paper
+from neuspring.scores import metrics, paper
 from neuspring.scores.failures import both_averages
 from neuspring.scores.metrics import METRICS, TASKS, Metric, averages, present
 from neuspring.scores.paper import Printed, Study
@@ -224,15 +224,15 @@ def estimates(scores: pd.DataFrame, baseline: str) -> Estimates:
         task, metric = str(key[0]), paper.in_studies()[str(key[1])]
         resamples, spreads = _resamples(part, metric), _spreads(part, metric)
         for method, resampled in resamples.items():
-            mean = means[method, task, metric.name]
+            mean, other = (float(means[method, task, metric.name][name]) for name in ("mean", "other"))
             low, high = interval(resampled)
             change: dict[str, float] = {}
             if baseline in resamples and method != baseline:
                 base = float(means[baseline, task, metric.name]["mean"])
-                change = _change(float(mean["mean"]), base, resampled, resamples[baseline], metric)
+                change = _change(mean, base, resampled, resamples[baseline], metric)
             found[method, task, metric.name] = Estimate(
-                ours=float(mean["mean"]),
-                other_average=float(mean["other"]),
+                ours=mean,
+                other_average=other,
                 spread=spreads[method],
                 low=low,
                 high=high,
@@ -416,8 +416,7 @@ def released_comparison(own: Collected, method: str) -> pd.DataFrame:
 
 def _sorted(study: Study, table: pd.DataFrame) -> pd.DataFrame:
     """The table in the order of the study; scenarios or categories keep theirs."""
-    first = table.columns[0]
-    ranks = {first: list(dict.fromkeys(table[first])), "label": list(study.rows)}
-    ranks |= {"task": list(TASKS), "metric": list(paper.in_studies())}
-    place = {column: table[column].map({name: rank for rank, name in enumerate(names)}) for column, names in ranks.items()}
-    return table.loc[pd.DataFrame(place).sort_values(list(place)).index].reset_index(drop=True)
+    first = str(table.columns[0])
+    return metrics.in_order(
+        table, {first: dict.fromkeys(table[first]), "label": study.rows, "task": TASKS, "metric": paper.in_studies()}
+    )

@@ -154,7 +154,7 @@ def _picture_facts(records: Mapping[str, StageRecord]) -> dict[str, Any] | None:
 
 def _notes(records: Mapping[str, StageRecord]) -> list[str]:
     """What a reader of the scores must know although the run did not fail."""
-    from neuspring.scores.metrics import AT_BOUND
+    from neuspring.scores.metrics import SHARE_AT_BOUND
 
     notes = []
     render = records.get("render")
@@ -177,7 +177,7 @@ def _notes(records: Mapping[str, StageRecord]) -> list[str]:
             notes.append(f"{name}: the collision list overflowed (raise simulation.collision_capacity)")
         if record.facts.get("at_ends"):
             notes.append(f"{name}: at an end of its range: {record.facts['at_ends']}")
-        if record.facts.get("at_bound", 0.0) > AT_BOUND:
+        if record.facts.get("at_bound", 0.0) > SHARE_AT_BOUND:
             notes.append(
                 f"{name}: {record.facts['at_bound']:.0%} of the springs lie at the bound of their stiffness (fit.output_bound)"
             )

@@ -56,7 +56,7 @@ def transfer(
     from neuspring.twin.rollout import initial_velocity, roll_out
     from neuspring.twin.transfer import move
 
-    tables, diverged = [pd.DataFrame(columns=list(metrics.COLUMNS))], []
+    tables, diverged = [pd.DataFrame(columns=list(metrics.SCORE_COLUMNS))], []
     courses, lines = [pd.DataFrame(columns=["scenario", "frame", "seconds", "metric", "value"])], {}
     updates, registered, record = 0, {}, learned.record
     twin = Twin.load(learned.file("twin")) if learned.has("twin") else None
@@ -81,7 +81,7 @@ def transfer(
             diverged.append(observations.scenario.name)
         frames = range(1, observations.scenario.frame_count)
         errors = metrics.errors_per_frame(trajectory.positions, observations)
-        tables.append(metrics.score_tasks(trajectory, observations, method, seed, {"transfer": frames}, errors))
+        tables.append(metrics.score(trajectory, observations, method, seed, errors, {"transfer": frames}))
         course = pd.DataFrame(errors).rename_axis("frame").melt(var_name="metric", ignore_index=False).reset_index()
         course = course.assign(scenario=observations.scenario.name, seconds=course["frame"] / observations.scenario.frame_rate)
         if trajectory.diverged_frame is None:

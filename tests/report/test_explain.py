@@ -10,11 +10,9 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from neuspring import config
 from neuspring.cli.main import main
 from neuspring.core.errors import InputError
 from neuspring.report.explain import explain, text
-from neuspring.report.sections.setup import departures
 from neuspring.report.summary import write
 from neuspring.scores import paper
 from neuspring.scores.numbers import Numbers
@@ -156,33 +154,6 @@ def test_a_record_that_is_missing_damaged_failed_or_new_is_a_problem(results, ch
     assert of(results, "table3/fixed_resolution/future/cd").problems == []
     write_tables(results)
     assert of(results).problems == [], "the tables are of the runs that there are now"
-
-
-def test_settings_are_compared_with_the_defaults_of_their_section():
-    settings = {
-        "search": {"search": {"rollouts": 3, "variables": {"stiffness": {"start": 1e4}}}, "clusters": 7, "seed": 1},
-        "render": {"margin": 123, "released_quirks": ["any_alpha"]},
-    }
-    assert departures(settings) == {
-        "search.clusters": 7,
-        "search.search.rollouts": 3,
-        "search.search.variables.stiffness.start": 1e4,
-        "render.margin": 123,
-        "render.released_quirks": ["any_alpha"],
-    }
-
-
-def test_settings_of_a_baseline_are_compared_with_those_of_its_model():
-    defaults = config.plain(config.Config())["baselines"]["spring_gaus"]
-    settings = {"train": {"model": "spring_gaus", **defaults, "anchors": 7, "seed": 1}, "rollout": {"model": "spring_gaus"}}
-    assert {name: value for name, value in departures(settings).items() if not name.endswith(".model")} == {"train.anchors": 7}
-
-
-def test_pictures_settings_are_compared_with_their_defaults():
-    images = config.plain(config.Config())["images"]
-    assert departures({"appearance": {"images": images}, "render": {"images": images | {"video": not images["video"]}}}) == {
-        "render.images.video": not images["video"]
-    }
 
 
 def told(results: Path, *words: str) -> tuple[int, str]:

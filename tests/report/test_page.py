@@ -11,12 +11,12 @@ import pytest
 from neuspring import config
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
-from neuspring.report.blocks import Section, Text
+from neuspring.report.blocks import PageSection, Text
 from neuspring.report.data import ReportSection, duration, hours, rendered
 from neuspring.report.draw.scene import chosen_frames
 from neuspring.report.gallery import write_gallery
 from neuspring.report.page import REPORT_SECTIONS, Options, write
-from neuspring.report.sections.pictures import ADDRESS
+from neuspring.report.sections.pictures import PLAY_ADDRESS
 from neuspring.report.sections.studies import answer
 from neuspring.scores import paper
 from neuspring.scores.numbers import Numbers
@@ -121,7 +121,7 @@ def test_the_page_holds_together_and_names_nothing_outside_itself(page, full):
     inside = [target for target in parser.targets if target.startswith("#")]
     assert {target[1:] for target in inside} <= set(parser.ids)
     # The playground answers on the reader's own machine, and only where a link is followed.
-    others = [target for target in parser.targets if not target.startswith(("#", "data:", f"{ADDRESS}?frame="))]
+    others = [target for target in parser.targets if not target.startswith(("#", "data:", f"{PLAY_ADDRESS}?frame="))]
     # Links to files beside the page, which are there.
     assert others and all((full / target).exists() for target in others)
     assert not re.search(r"url\((?!#)|@import|https?://(?!www\.w3\.org/|127\.0\.0\.1:8080/\?frame=\d+&amp;scenario=\w+\")", page)
@@ -230,9 +230,9 @@ def test_numbers_that_tables_kept_are_not_computed_again(tmp_path, monkeypatch):
 
 def test_a_package_adds_a_section_that_stands_where_it_says(monkeypatch, small):
     def hello(material):
-        return Section(key="hello", title="Hello", blocks=[Text(text=f"{len(material.runs)} runs")])
+        return PageSection(key="hello", title="Hello", blocks=[Text(text=f"{len(material.runs)} runs")])
 
-    point = EntryPoint("hello", "package:SECTION", "neuspring.report_sections")
+    point = EntryPoint("hello", "package:section", "neuspring.report_sections")
     monkeypatch.setitem(vars(REPORT_SECTIONS), "_foreign", {"hello": point})
     monkeypatch.setattr(EntryPoint, "load", lambda _: ReportSection(order=15, make=hello))
     monkeypatch.setitem(vars(REPORT_SECTIONS), "_loaded", {})
@@ -462,12 +462,6 @@ def test_settings_that_differ_come_first_and_all_follow(small):
     assert text.index("search.rollouts 220 44") < text.index("Full configuration")
     assert "fit.epochs 200" not in text
     assert "1 scenario, 1 method, seed 0" in page
-
-
-def test_settings_are_read_from_the_runs_where_none_are_given(page):
-    text = section(page, "setup")
-    assert "fit.fit.epochs 5" in text
-    assert "search.search.rollouts 30" in text
 
 
 def test_runs_of_several_commits_are_pointed_out(small):

@@ -18,7 +18,7 @@ from neuspring.report import study as tables_paper
 from neuspring.report import summary as tables
 from neuspring.scores import paper
 from neuspring.scores import study as tables_cells
-from neuspring.scores.metrics import COLUMNS, averages
+from neuspring.scores.metrics import SCORE_COLUMNS, averages
 from neuspring.scores.numbers import Numbers
 from neuspring.scores.paper import Study, read_studies
 from neuspring.scores.runs import RUN_COLUMNS, Collected, collect, read_scores
@@ -42,7 +42,7 @@ def collected(values: Values, frames: Mapping[str, int] | None = None, failed: t
         rows += [(scenario, "rope", method, seed, *key, value, "", counts) for key, value in scores.items()]
         runs.append((scenario, method, seed, "ok", "", "", None, source, "k", False, "{}"))
     runs += [(*run, "failed", "it diverged", "", None, source, "k", False, "{}") for run in failed]
-    return Collected(pd.DataFrame(rows, columns=list(COLUMNS)), pd.DataFrame(runs, columns=list(RUN_COLUMNS)))
+    return Collected(pd.DataFrame(rows, columns=list(SCORE_COLUMNS)), pd.DataFrame(runs, columns=list(RUN_COLUMNS)))
 
 
 def cells_of(name: str, runs: Collected) -> pd.DataFrame:

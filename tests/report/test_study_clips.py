@@ -17,7 +17,7 @@ from neuspring.report.blocks import markdown
 from neuspring.report.clips import clip_blocks, filmed
 from neuspring.scores import paper
 from neuspring.scores.clips import ClipNumbers
-from neuspring.scores.metrics import COLUMNS
+from neuspring.scores.metrics import SCORE_COLUMNS
 from neuspring.scores.numbers import Numbers
 from neuspring.scores.paper import Study, read_studies
 from neuspring.scores.runs import collect
@@ -136,7 +136,7 @@ def test_the_command_writes_tables_growth_and_films(tmp_path, capsys, monkeypatc
         assert film.n_frames == 2 and film.info["duration"] == 50
     assert "\\begin{tabular}{@{} ll r @{}}" in (output / "deform.tex").read_text(), "numbers, and no paragraphs"
     assert "![DLO3" in (output / "deform.md").read_text() and "7.7†" in capsys.readouterr().out
-    pd.DataFrame(columns=list(COLUMNS)).to_csv(tmp_path / "scores.csv")
+    pd.DataFrame(columns=list(SCORE_COLUMNS)).to_csv(tmp_path / "scores.csv")
     assert main([*command, *known, "--scores", str(tmp_path / "scores.csv")]) != 0
     assert "a study of clips needs the transfers of a results folder" in capsys.readouterr().err
 

@@ -7,9 +7,9 @@ import pandas as pd
 import pytest
 
 from neuspring.core.table import Cell, Chip, Table
-from neuspring.report.blocks import Section, html_page
-from neuspring.report.summary import detail_blocks, errors_table, not_counted, score_blocks, write
-from neuspring.scores.metrics import COLUMNS
+from neuspring.report.blocks import PageSection, html_page
+from neuspring.report.summary import detail_blocks, errors_table, score_blocks, summary_text, write
+from neuspring.scores.metrics import SCORE_COLUMNS
 from neuspring.scores.numbers import Numbers
 from neuspring.scores.runs import Collected, collect
 from neuspring.scores.statistics import paired_differences, resampled_means
@@ -96,7 +96,7 @@ def with_images(lpips: str = "computed", quirks: tuple[str, ...] = ()) -> Collec
         for k, m in enumerate(("x", "y"))
         for task in ("reconstruction", "future")
     ]
-    return Collected(pd.concat([base.scores, pd.DataFrame(rows, columns=list(COLUMNS))], ignore_index=True), runs)
+    return Collected(pd.concat([base.scores, pd.DataFrame(rows, columns=list(SCORE_COLUMNS))], ignore_index=True), runs)
 
 
 def test_pictures_have_a_table_of_their_own():
@@ -143,25 +143,25 @@ def test_only_pairs_that_every_method_finished_are_averaged_and_the_others_liste
     assert [rows[name]["Future TE"].text for name in "xyz"] == ["10.00", "8.00", "–"]
     assert [rows[name]["Runs"].text for name in "xyz"] == ["2/2", "1/2 (1 failed)", "0/1 (1 failed)"]
     assert [rows[name]["Future TE"].mark for name in "xyz"] == ["", "best", ""]
-    (listed,) = not_counted(found.runs)
-    assert listed.items == ["b / y / seed 0: failed: diverged", "a / z / seed 0: failed: diverged"]
+    text = summary_text(Numbers(everything=found, baseline="x"))
+    assert "- y, b / seed 0: failed: diverged\n- z, a / seed 0: failed: diverged\n" in text
 
 
 def test_missing_runs_are_listed(tmp_path):
     found = collect(tmp_path, ["a"], ["x", "y"], [0, 1])
     assert (found.runs["status"] == "missing").all()
     text = write(Numbers(everything=found, baseline="x"), tmp_path / "tables")
-    assert text.count("missing: no run.json") == 4
+    for method in "xy":
+        assert f"- {method}, a / seed 0, a / seed 1: missing: no run.json" in text
     assert (tmp_path / "tables" / "summary.md").is_file()
 
 
 def test_many_missing_runs_are_counted_and_failures_named(tmp_path):
     found = collect(tmp_path, [f"s{i}" for i in range(9)], ["x", "y"], [0])
     found.runs.loc[0, ["status", "reason"]] = ["failed", "diverged"]
-    (listed,) = not_counted(found.runs)
-    failed, missing = listed.items
-    assert failed == "s0 / x / seed 0: failed: diverged"
-    assert missing.startswith("17 runs have not finished") and "x 8" in missing and "y 9" in missing
+    text = summary_text(Numbers(everything=found, baseline="x"))
+    assert "- x, s0 / seed 0: failed: diverged\n" in text and "- x, s1 / seed 0, " in text
+    assert "- y, s0 / seed 0, " in text and " and 2 more: missing" in text and " and 3 more: missing" in text
 
 
 def test_many_notes_are_counted_by_kind_with_the_range_of_their_numbers():
@@ -200,7 +200,7 @@ def test_a_table_is_drawn_as_markdown_latex_and_html():
     latex = table.latex("label", "T & U")
     assert r"a$|$b & \underline{1.5 $\pm$ 0.1 ($-$2): worse} & $<$3 \\" in latex
     assert r"\multicolumn{1}{c}{Reconstruction \& Resimulation}" in latex and r"\caption{\textbf{T \& U.} 50 \% of a\_b}" in latex
-    page = html_page("", "", [Section(key="a", title="A", blocks=[table])])
+    page = html_page("", "", [PageSection(key="a", title="A", blocks=[table])])
     assert page.count("<table") == 2 and "<caption>C: Future Prediction</caption>" in page
     assert '<td data-value="1.5"><b>1.5 ± 0.1</b><span class="hidden"> (second)</span><small>(-2)</small>' in page
     assert '<span class="chip bad"><span aria-hidden="true">▼</span> worse</span>' in page and "&lt;3" in page

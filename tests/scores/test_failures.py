@@ -14,7 +14,7 @@ from neuspring.report.explain import explain
 from neuspring.report.explain import text as explained
 from neuspring.report.grid import columns
 from neuspring.scores import failures
-from neuspring.scores.metrics import COLUMNS
+from neuspring.scores.metrics import SCORE_COLUMNS
 from neuspring.scores.numbers import Numbers
 from neuspring.scores.paper import Study
 from neuspring.scores.runs import DAMAGED, Collected, collect, comparable, read_scores
@@ -27,7 +27,7 @@ STUDY = Study(title="Systems", reference=None, baseline="Ours", rows={"Spring-Ga
 
 def frozen(values: dict[tuple[str, str, int], float], metric: str = "track_error") -> pd.DataFrame:
     rows = [(s, "rope", m, seed, "future", metric, value, "m", 10) for (s, m, seed), value in values.items()]
-    return pd.DataFrame(rows, columns=list(COLUMNS))
+    return pd.DataFrame(rows, columns=list(SCORE_COLUMNS))
 
 
 def with_frozen(found: Collected, values: dict[tuple[str, str, int], float], **options) -> Collected:

@@ -13,7 +13,7 @@ from neuspring.core.artifacts import Trajectory
 from neuspring.data.camera import Camera
 from neuspring.report.summary import marked_blocks
 from neuspring.scores import metrics
-from neuspring.scores.carried import BEHIND, carried_in_image, points_in_image, points_on_table
+from neuspring.scores.carried import FAR_SIDE, carried_in_image, points_in_image, points_on_table
 from neuspring.scores.numbers import Numbers
 from neuspring.scores.runs import Collected
 from tests.support.colored import observed
@@ -65,7 +65,7 @@ def test_a_shift_parallel_to_the_image_is_exact():
 
 def test_nodes_on_the_other_side_and_in_the_inside_do_not_count():
     rng = np.random.default_rng(1)
-    front, back = sheet(), sheet(depth=DEPTH + 2 * BEHIND)
+    front, back = sheet(), sheet(depth=DEPTH + 2 * FAR_SIDE)
     start = marked_pixels(rng)
     positions = np.stack([in_world(np.concatenate([front, back]))] * 2)
     positions[1, len(front) :] += 1.0

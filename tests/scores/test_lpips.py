@@ -11,7 +11,7 @@ from neuspring.core import weights as weight_files
 from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
 from neuspring.scores import lpips as module
-from neuspring.scores.lpips import Lpips, Weights, find_weights
+from neuspring.scores.lpips import Lpips, find_weights
 from tests.support.devices import DEVICES
 
 CHANNELS = (64, 192, 384, 256, 256)
@@ -154,11 +154,11 @@ def test_cached_weights_are_found(hub, files, monkeypatch):
     assert isinstance(reason, str)
     for path, expected in ((hub / "alexnet-owt-7be5be79.pth", "7be5be79"), (hub / "lpips_alex_v0.1.pth", "df73285e")):
         assert f"{path} has SHA-256 {digest_file(path)[:8]}..., not {expected}..." in reason
-    assert find_weights(trusted=True) == Weights(hub / "alexnet-owt-7be5be79.pth", hub / "lpips_alex_v0.1.pth")
+    assert find_weights(trusted=True) == (hub / "alexnet-owt-7be5be79.pth", hub / "lpips_alex_v0.1.pth")
     monkeypatch.setattr(module, "BACKBONE_DIGEST", digest_file(files[0])[:8])
     assert find_weights() == reason.partition("; ")[2]
     monkeypatch.setattr(module, "HEADS_DIGEST", digest_file(files[1]))
-    assert isinstance(find_weights(), Weights)
+    assert isinstance(find_weights(), tuple)
     a, b = pair(40, 40)
     assert Lpips.load()(a, b) == Lpips.load(*files, trusted=True)(a, b)
 
@@ -171,7 +171,7 @@ def test_heads_are_found_in_a_package_without_importing_it(hub, files, tmp_path,
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(module, "PACKAGED_HEADS", {"carries_heads": "weights/alex.pth", "absent_package": "alex.pth"})
     found = find_weights(files[0], trusted=True)
-    assert found == Weights(files[0], package / "weights/alex.pth")
+    assert found == (files[0], package / "weights/alex.pth")
     # A stale file in the cache does not hide the good one.
     (hub / "lpips_alex_v0.1.pth").write_bytes(b"stale")
     monkeypatch.setattr(module, "BACKBONE_DIGEST", digest_file(files[0]))

@@ -143,7 +143,7 @@ def test_without_tracks_there_is_no_track_row() -> None:
 def test_a_row_says_what_it_is() -> None:
     given = observations(tracks=np.zeros((5, 1, 3)))
     rows = metrics.score(rollout(np.tile(given.nodes, (5, 1, 1))), given, "ours", 7)
-    assert tuple(rows.columns) == metrics.COLUMNS
+    assert tuple(rows.columns) == metrics.SCORE_COLUMNS
     assert rows[["task", "metric"]].to_numpy().tolist() == [[t, m] for t in metrics.TASKS for m in DISTANCES]
     first = rows.iloc[0]
     assert (first["scenario"], first["category"], first["method"], first["seed"], first["unit"]) == ("scene", "toy", "ours", 7, "m")
@@ -157,7 +157,7 @@ def test_a_diverged_rollout_gives_no_row_for_the_tasks_it_missed(end: int, tasks
     broken = rollout(np.tile(given.nodes, (end, 1, 1)), frame_count=5, diverged_frame=end, reason="node 0 left the scene")
     rows = metrics.score(broken, given, "ours", 0)
     assert rows["task"].unique().tolist() == tasks
-    assert tuple(rows.columns) == metrics.COLUMNS
+    assert tuple(rows.columns) == metrics.SCORE_COLUMNS
     assert not rows["value"].isna().any()
 
 

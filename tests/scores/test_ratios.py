@@ -12,14 +12,14 @@ from scipy.stats import ttest_1samp
 from neuspring.config import parse
 from neuspring.config.settings import Aim
 from neuspring.core.errors import InputError
-from neuspring.scores.metrics import COLUMNS
+from neuspring.scores.metrics import SCORE_COLUMNS
 from neuspring.scores.statistics import judged_aims, ratios, seed_spread, t_interval
 
 
 def table(values: dict[tuple[str, str, int], float], category: str = "", task: str = "future") -> pd.DataFrame:
     """Track errors by (scenario, method, seed); the category is the scenario's first letter unless given."""
     rows = [(s, category or s[0], m, seed, task, "track_error", value, "m", 10) for (s, m, seed), value in values.items()]
-    return pd.DataFrame(rows, columns=list(COLUMNS))
+    return pd.DataFrame(rows, columns=list(SCORE_COLUMNS))
 
 
 def logs(changes: dict[str, list[float]]) -> dict[tuple[str, str, int], float]:

@@ -101,7 +101,7 @@ def test_a_network_moves_to_another_recording(seen, tmp_path):
     scores = pd.read_parquet(out / "transfer.parquet")
     model = GsDynamicsModel.load(out / "model.npz")
     frames = {"transfer": range(1, other.scenario.frame_count)}
-    wanted = metrics.score_tasks(predicted(model, other, None, "cpu").trajectory, other, "gs_dynamics", 0, frames)
+    wanted = metrics.score(predicted(model, other, None, "cpu").trajectory, other, "gs_dynamics", 0, tasks=frames)
     pd.testing.assert_frame_equal(scores, wanted)
 
 

@@ -271,7 +271,7 @@ def test_a_numerical_failure_is_a_result_that_the_table_shows(tmp_path, monkeypa
     assert by_name.loc["bad", "reason"] == "fit: search: every candidate diverged"
     text = write_summary(Numbers(everything=collected, baseline="phystwin"), tmp_path / "tables")
     assert "1/2 (1 failed)" in text
-    assert "bad / phystwin / seed 0: failed: fit: search: every candidate diverged" in text
+    assert "phystwin, bad / seed 0: failed: fit: search: every candidate diverged" in text
     assert "nan" not in text.lower()
     assert tracking.RunRecord.load(tmp_path / "bad" / "phystwin" / "0" / "run.json").status == "failed"
 

@@ -11,7 +11,7 @@ import pandas as pd
 from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.files import write_npz, write_table
 from neuspring.core.records import StageRecord, digest_file
-from neuspring.scores.metrics import COLUMNS
+from neuspring.scores.metrics import SCORE_COLUMNS
 
 FRAMES, RATE, MARKERS = 9, 100.0, 7
 HELD = (0, 1, MARKERS - 2, MARKERS - 1)
@@ -69,7 +69,7 @@ def write_transfer(
     paths = {
         role: record.with_name(f"transfer{suffix}") for role, suffix in (("scores", ".parquet"), ("frames", "_frames.parquet"))
     }
-    write_table(pd.DataFrame(rows, columns=list(COLUMNS)), paths["scores"])
+    write_table(pd.DataFrame(rows, columns=list(SCORE_COLUMNS)), paths["scores"])
     write_table(pd.concat(courses), paths["frames"])
     if line:
         paths["lines"] = record.with_name("transfer_lines.npz")

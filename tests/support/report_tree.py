@@ -21,7 +21,7 @@ from neuspring.core.files import write_table, write_text
 from neuspring.core.job_records import Attempt, JobRecord
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.report.video import Video
-from neuspring.scores.metrics import COLUMNS, METRICS
+from neuspring.scores.metrics import METRICS, SCORE_COLUMNS
 from tests.support.runs import run_record
 
 FRAMES, TRAIN, RATE = 20, 14, 30.0
@@ -190,7 +190,7 @@ def _scores(scenario: Scenario, method: str, seed: int, pictured: bool, rng: np.
             else:
                 continue
             rows.append((scenario.name, scenario.category, method, seed, task, metric, value, METRICS[metric].unit, frames))
-    return pd.DataFrame(rows, columns=list(COLUMNS))
+    return pd.DataFrame(rows, columns=list(SCORE_COLUMNS))
 
 
 def write_history(path: Path, metric: str, values: np.ndarray) -> None:

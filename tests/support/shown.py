@@ -11,8 +11,8 @@ from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations
 from neuspring.data.camera import CameraEntry
 from neuspring.data.capture import HANDS, OBJECT, Capture, Description, Writer
-from neuspring.report.draw.painter import DrawingStyle, Painter
-from neuspring.report.draw.scene import Prediction, Scene, broad_side, seen_from, shown_points
+from neuspring.extensions.figures.filmed import FilmedScene, PhotoPainter, PhotoStyle, SplatRun
+from neuspring.report.draw.scene import broad_side, seen_from, shown_points
 from neuspring.report.shown import find
 from neuspring.splats.draw import OBJECT_COVERAGE, picture, view_of
 from tests.support.filmed import rows
@@ -25,10 +25,10 @@ CORNER = 12
 METHODS = ("baseline", "neuspring")
 
 
-def takes(scenario: Path) -> list[Prediction]:
+def takes(scenario: Path) -> list[SplatRun]:
     """The runs of a scenario: that of METHODS[0] moves as the object does."""
     found = {run.method: run for run in find([scenario]).runs}
-    return [Prediction(name, found[name].trajectory.positions, found[name].twin, found[name].splats) for name in METHODS]
+    return [SplatRun(name, found[name].trajectory.positions, found[name].twin, found[name].splats) for name in METHODS]
 
 
 def observed(scenario: Path) -> Observations:
@@ -64,14 +64,14 @@ def filmed(folder: Path, missing: tuple[int, ...] = ()) -> Path:
     return scenario
 
 
-def painter(scenario: Path, frames: Sequence[int], **manner: object) -> Painter:
+def painter(scenario: Path, frames: Sequence[int], **manner: object) -> PhotoPainter:
     """What paints a scenario: from the camera of its video where it has one."""
     seen, shown = observed(scenario), takes(scenario)
     if (scenario / "capture").is_dir():
         capture = Capture.load(scenario / "capture")
-        scene = Scene.of(seen, capture.cameras["0"], shown, frames, capture)
+        scene = FilmedScene.of(seen, capture.cameras["0"], shown, frames, capture)
     else:
         points = shown_points(seen, shown, frames)
-        scene = Scene.of(seen, seen_from(points, seen.scenario.up, 250.0, 20.0), shown, frames)
+        scene = FilmedScene.of(seen, seen_from(points, seen.scenario.up, 250.0, 20.0), shown, frames)
     plain = {"style": "nodes", "error": "distance", "ground": "white"}
-    return Painter(scene, shown, frames, DrawingStyle(**(plain | manner)), Images(), "cpu")
+    return PhotoPainter(scene, shown, frames, PhotoStyle(**(plain | manner)), Images(), "cpu")

@@ -17,7 +17,7 @@ from neuspring.report.blocks import Block, Fold
 from neuspring.report.study import write_study
 from neuspring.report.summary import summary_text
 from neuspring.scores.failures import LeftOut
-from neuspring.scores.metrics import COLUMNS, METRICS
+from neuspring.scores.metrics import METRICS, SCORE_COLUMNS
 from neuspring.scores.numbers import Numbers
 from neuspring.scores.paper import Study
 from neuspring.scores.runs import Collected, collect
@@ -54,7 +54,7 @@ def write_run(
         units = {key: METRICS[key[1]].unit for key in values or {}}
         rows = [(scenario, category, method, seed, *key, value, units[key], frames) for key, value in (values or {}).items()]
         if values is not None:
-            pd.DataFrame(rows, columns=list(COLUMNS)).to_parquet(folder / f"{name}.parquet")
+            pd.DataFrame(rows, columns=list(SCORE_COLUMNS)).to_parquet(folder / f"{name}.parquet")
     (folder / "twin.npz").write_bytes(f"{scenario} {method} {seed}".encode())
     observations = results / scenario / "observations.npz"
     observations.write_bytes(scenario.encode())
@@ -85,7 +85,7 @@ def collected(values: dict[tuple[str, str, int], float], failed: tuple[tuple[str
     rows = [(s, "rope", m, seed, "future", "track_error", value, "m", 10) for (s, m, seed), value in values.items()]
     runs = [(*run, "ok", "", "") for run in values] + [(*run, "failed", "diverged", "") for run in failed]
     columns = ["scenario", "method", "seed", "status", "reason", "notes"]
-    return Collected(pd.DataFrame(rows, columns=list(COLUMNS)), pd.DataFrame(runs, columns=columns))
+    return Collected(pd.DataFrame(rows, columns=list(SCORE_COLUMNS)), pd.DataFrame(runs, columns=columns))
 
 
 def all_scores(factor: float = 1.0) -> dict[tuple[str, str], float]:

@@ -17,14 +17,17 @@ from neuspring.core.records import StageRecord
 from neuspring.data.camera import Camera
 from neuspring.data.capture import Capture
 from neuspring.data.results import Masks
+from neuspring.extensions.figures.filmed import FilmedScene, PhotoPainter, PhotoStyle, SplatRun, Style, SurfacePicture
 from neuspring.extensions.figures.options import ComparedOptions, FilmOptions, RunOptions, StripOptions, TwinOptions
 from neuspring.report.draw import sheet
 from neuspring.report.draw.film import write_film
-from neuspring.report.draw.painter import DrawingStyle, Error, Painter, Style
-from neuspring.report.draw.scene import ELEVATION, Prediction, Scene, chosen_frames
-from neuspring.report.draw.strip import caption, strip_figure
-from neuspring.report.draw.twin import TwinPicture, twin_figure
+from neuspring.report.draw.painter import DRAWN_MM, Error, distances
+from neuspring.report.draw.scene import VIEW_ELEVATION, broad_side, chosen_frames, seen_from, shown_points
+from neuspring.report.draw.strip import strip_figure
+from neuspring.report.draw.twin import twin_figure
 from neuspring.report.shown import Found, Run, find
+
+PICTURE_ENDINGS, FILM_ENDINGS = (".pdf", ".png", ".jpg", ".svg"), (".mp4", ".gif")
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,15 +36,16 @@ class Chosen:
 
     found: Found
     runs: list[Run]
-    takes: list[Prediction]
+    takes: list[SplatRun]
     images: Images
     device: str
 
 
 def strip(picture: StripOptions) -> None:
     """Observed frames on top, each method's prediction and error below -> PDF or PNG."""
-    sheet.require_ending(picture.output, sheet.PICTURES)
-    sheet.require_size(picture.width, picture.dpi)
+    require_ending(picture.output, PICTURE_ENDINGS)
+    require_between("--width", picture.width, 1.5, 20)
+    require_between("--dpi", picture.dpi, 50, 1200)
     chosen = _choose(picture)
     scenario = chosen.found.observations.scenario
     frames = sorted(set(_frames(picture.frames, scenario.frame_count) or chosen_frames(scenario, scenario.frame_count)))
@@ -55,7 +59,10 @@ def strip(picture: StripOptions) -> None:
 
 def film(picture: FilmOptions) -> None:
     """Observed beside predicted, moving -> MP4 or GIF of limited size."""
-    sheet.require_ending(picture.output, sheet.FILMS)
+    require_ending(picture.output, FILM_ENDINGS)
+    require_between("--width", picture.width, 160, 1920)
+    require_between("--speed", picture.speed, 0.05, 8)
+    require_between("--megabytes", picture.megabytes, 1e-3, 100)
     chosen = _choose(picture)
     count = chosen.found.observations.scenario.frame_count
     frames = sorted(set(_frames(picture.frames, count) or range(count)))
@@ -66,8 +73,9 @@ def film(picture: FilmOptions) -> None:
 
 def twin(picture: TwinOptions) -> None:
     """Stiffness and regions of twins, from any side -> PDF or PNG."""
-    sheet.require_ending(picture.output, sheet.PICTURES)
-    sheet.require_size(picture.width, picture.dpi)
+    require_ending(picture.output, PICTURE_ENDINGS)
+    require_between("--width", picture.width, 1.5, 20)
+    require_between("--dpi", picture.dpi, 50, 1200)
     chosen = _choose(picture, positions=picture.frame > 0)
     _frames([picture.frame], chosen.found.observations.scenario.frame_count, "--frame")
     for take, run in zip(chosen.takes, chosen.runs, strict=True):
@@ -83,20 +91,69 @@ def twin(picture: TwinOptions) -> None:
     scene = _scene(picture, chosen, [picture.frame], chosen.takes)
     if picture.background == "image" and scene.photo(picture.frame) is None:
         raise InputError("--background image", "needs a photo of this camera and frame", "none", "Leave it out.")
-    body = TwinPicture(
+    body = SurfacePicture(
         [(scene, take) for take in chosen.takes],
         picture.frame,
         tuple(dict.fromkeys(picture.by)),
-        picture.style,
-        picture.background,
-        chosen.images,
-        chosen.device,
+        style=picture.style,
+        ground=picture.background,
+        images=chosen.images,
+        device=chosen.device,
     )
     sheet.save(twin_figure(body, picture.width), picture.output, picture.dpi)
     print(
         f"Wrote {picture.output}: {', '.join(take.label for take in chosen.takes)}, frame {picture.frame}, "
         f"camera {scene.camera.name}"
     )
+
+
+def require_ending(path: Path, endings: Sequence[str]) -> None:
+    """Raise InputError for a file that these pictures cannot be written to, before they are drawn."""
+    if path.suffix.lower() not in endings:
+        rule = f"the file must end in {', '.join(endings[:-1])} or {endings[-1]}"
+        other = FILM_ENDINGS if endings == PICTURE_ENDINGS else PICTURE_ENDINGS
+        kind = "neuspring draw film" if other == FILM_ENDINGS else "neuspring draw strip"
+        remedy = f"{kind} writes {path.suffix}." if path.suffix.lower() in other else ""
+        raise InputError("--output", rule, path.name, remedy)
+    if path.is_dir():
+        raise InputError("--output", "must be a file", f"the folder {path}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(path.parent, "this folder must be writable", error.strerror, "Choose another --output.") from error
+
+
+def require_between(name: str, value: float, least: float, most: float) -> None:
+    """Raise InputError for an option outside of its range, or not finite."""
+    if not least <= value <= most:
+        raise InputError(name, f"must be {least:g} to {most:g}", value)
+
+
+def caption(painter: PhotoPainter) -> str:
+    """Words for the text below the picture: what is shown, and the mean error of each method over its frames."""
+    scene, scenario, manner = painter.scene, painter.scene.observations.scenario, painter.manner
+    future = [frame for frame in painter.frames if frame >= scenario.train_end]
+    text = f"{scenario.name}, camera {scene.camera.name}, frames {_listed(painter.frames)}"
+    text += f"; future (from frame {scenario.train_end}): {_listed(future)}." if future else "; all of training."
+    if manner.style == "nodes" or scene.capture is None:
+        text += " Dark: predicted nodes. Blue: observed points. Red: controllers, where the hands hold."
+    if manner.error == "color":
+        text += f" Difference: mean absolute color difference of object pixels, 0 to {painter.norm.vmax:g}; hands left out; PSNR."
+    elif manner.error == "distance":
+        text += f" Distance of nodes to their observed points, 0 to {painter.norm.vmax:g} mm; gray: not seen; in panels: the mean."
+        text += f" Mean of these frames: {', '.join(f'{t.label} {_mean(painter, k):.1f} mm' for k, t in enumerate(painter.takes))}."
+    return text
+
+
+def _mean(painter: PhotoPainter, which: int) -> float:
+    take = painter.takes[which]
+    frames = [frame for frame in painter.frames if frame < len(take.positions)]
+    means = [DRAWN_MM * float(distances(take, painter.scene.observations, frame)[1].mean()) for frame in frames]
+    return sum(means) / len(means) if means else float("nan")
+
+
+def _listed(frames: Sequence[int]) -> str:
+    return ", ".join(map(str, frames))
 
 
 def _choose(a: RunOptions, *, positions: bool = True) -> Chosen:
@@ -125,12 +182,12 @@ def _named(a: RunOptions, found: Found) -> list[Run]:
     return [run for run in chosen if run is not None]
 
 
-def _take(run: Run, label: str, positions: bool) -> Prediction:
+def _take(run: Run, label: str, positions: bool) -> SplatRun:
     if run.trajectory is None or not len(run.trajectory.positions):
         if positions or run.twin is None:
             raise InputError(f"--methods {run.name}", "must have a prediction", "; ".join(run.notes) or "none", "Name another run.")
-        return Prediction(label, run.twin.topology.nodes[None], run.twin)
-    return Prediction(label, run.trajectory.positions, run.twin, run.splats, None if run.centers is None else run.centers.positions)
+        return SplatRun(label, run.twin.topology.nodes[None], run.twin)
+    return SplatRun(label, run.trajectory.positions, run.twin, run.splats, None if run.centers is None else run.centers.positions)
 
 
 def _frames(wanted: Sequence[int] | None, count: int, option: str = "--frames") -> list[int]:
@@ -151,7 +208,7 @@ def _require_splats(chosen: Chosen, remedy: str) -> None:
         raise InputError("--as splats", rule, f"none for {without}", remedy)
 
 
-def _painter(a: ComparedOptions, chosen: Chosen, frames: list[int], error: Error | None) -> Painter:
+def _painter(a: ComparedOptions, chosen: Chosen, frames: list[int], error: Error | None) -> PhotoPainter:
     """The painter of a strip or a film; `error` is drawn where the options ask for none, None stands for the best there is."""
     if a.style == "splats":
         _require_splats(chosen, "Leave out --as splats to draw nodes.")
@@ -169,16 +226,16 @@ def _painter(a: ComparedOptions, chosen: Chosen, frames: list[int], error: Error
         raise InputError("--most", "must be above 0", a.most)
     if a.background == "image" and scene.capture is None:
         raise InputError("--background image", "needs a camera of a capture", scene.camera.name, "Leave it out.")
-    manner = DrawingStyle(
+    manner = PhotoStyle(
         style=style,
         error=(error if a.error == "best" else a.error) or ("color" if comparable else "distance"),
         ground=a.background or ("image" if style == "nodes" else "white"),
         most=a.most,
     )
-    return Painter(scene, chosen.takes, frames, manner, chosen.images, chosen.device)
+    return PhotoPainter(scene, chosen.takes, frames, manner, chosen.images, chosen.device)
 
 
-def _scene(a: RunOptions, chosen: Chosen, frames: list[int], takes: list[Prediction]) -> Scene:
+def _scene(a: RunOptions, chosen: Chosen, frames: list[int], takes: list[SplatRun]) -> FilmedScene:
     """The scene from the camera that is asked for. Raises InputError."""
     found, observations = chosen.found, chosen.found.observations
     cameras = found.capture.cameras if found.capture else {}
@@ -190,8 +247,11 @@ def _scene(a: RunOptions, chosen: Chosen, frames: list[int], takes: list[Predict
         raise InputError("--camera", rule, a.camera, "Give --azimuth and --elevation for any other view.")
     if cameras and not turned:
         camera = cameras[a.camera or next(iter(cameras))]
-        return Scene.of(observations, camera, takes, frames, found.capture, _labels(found.folder, found.capture, camera))
-    return Scene.from_side(observations, takes, frames, a.azimuth, ELEVATION if a.elevation is None else a.elevation)
+        return FilmedScene.of(observations, camera, takes, frames, found.capture, _labels(found.folder, found.capture, camera))
+    points, up = shown_points(observations, takes, frames), observations.scenario.up
+    azimuth = broad_side(points, up) if a.azimuth is None else a.azimuth
+    camera = seen_from(points, up, azimuth, VIEW_ELEVATION if a.elevation is None else a.elevation)
+    return FilmedScene.of(observations, camera, takes, frames)
 
 
 def _labels(folder: Path, capture: Capture | None, camera: Camera) -> np.ndarray | None:

@@ -11,7 +11,7 @@ from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
 from neuspring.core.artifacts import Twin
-from neuspring.report.draw.twin import COLORS, region_colors, stiffness_limits
+from neuspring.report.draw.twin import STIFFNESS_COLORS, region_colors, stiffness_limits
 from neuspring.twin.body import Lines, lines_of
 
 QUANTITIES = ("stiffness", "strain", "force", "region")
@@ -100,7 +100,7 @@ def scale_of(quantity: str, bodies: Sequence[Springs], strains: Sequence[np.ndar
         return None
     if quantity == "stiffness":
         low, high = stiffness_limits(np.concatenate([body.stiffness for body in bodies]))
-        return Scale("stiffness Y", low, high, "N", COLORS, log=True)
+        return Scale("stiffness Y", low, high, "N", STIFFNESS_COLORS, log=True)
     values = [one if quantity == "strain" else body.stiffness * one for body, one in zip(bodies, strains, strict=True)]
     least = LEAST_STRAIN if quantity == "strain" else LEAST_FORCE
     far = max(float(np.quantile(np.abs(np.concatenate([one.ravel() for one in values])), 0.99)), least)

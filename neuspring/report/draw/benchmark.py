@@ -6,6 +6,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,11 +20,11 @@ from neuspring.scores.metrics import averages, metrics_of
 
 METRIC_STYLES = (("tab:purple", "D"), ("tab:orange", "s"), ("tab:blue", "o"), ("tab:green", "^"), ("tab:red", "v"))
 """Color and marker of the metrics of positions, in their order."""
-SHIFT = 0.24
+MARKER_SHIFT = 0.24
 """The markers of a method stand within so much of its line."""
 TITLES = {"reconstruction": "training frames", "future": "future"}
 TICKS = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
-REACH = 2.5
+RATIO_REACH = 2.5
 """The axis ends here and at its inverse; what lies beyond stands at the edge with its number, so that it hides no other."""
 
 
@@ -42,7 +43,7 @@ def ratios_figure(ratios: pd.DataFrame, note: str) -> Figure | None:
     shown = [metric for metric in styles if (rows["metric"] == metric.name).any()]
     size = (4.4 * len(tasks) + 1.2, (0.22 + 0.13 * len(shown)) * len(methods) + 2.0)
     figure, axes = plt.subplots(1, len(tasks), figsize=size, layout="constrained", squeeze=False, sharey=True)
-    shifts = np.linspace(SHIFT, -SHIFT, len(shown)) if len(shown) > 1 else [0.0]
+    shifts = np.linspace(MARKER_SHIFT, -MARKER_SHIFT, len(shown)) if len(shown) > 1 else [0.0]
     for axis, task in zip(axes[0], tasks, strict=True):
         for index in range(0, len(methods), 2):
             axis.axhspan(index - 0.5, index + 0.5, color="0.96", lw=0)
@@ -65,8 +66,8 @@ def ratios_figure(ratios: pd.DataFrame, note: str) -> Figure | None:
 
 def _intervals(axis: Axes, part: pd.DataFrame, place: np.ndarray, color: str, marker: str, title: str) -> None:
     """Markers and intervals of a metric; the number of a ratio beyond the axis at its edge."""
-    ratio = part["ratio"].clip(1 / REACH, REACH)
-    ends = part["ratio_low"].clip(1 / REACH, REACH), part["ratio_high"].clip(1 / REACH, REACH)
+    ratio = part["ratio"].clip(1 / RATIO_REACH, RATIO_REACH)
+    ends = part["ratio_low"].clip(1 / RATIO_REACH, RATIO_REACH), part["ratio_high"].clip(1 / RATIO_REACH, RATIO_REACH)
     axis.errorbar(ratio, place, xerr=np.stack([ratio - ends[0], ends[1] - ratio]), fmt="none", ecolor=color, capsize=2, lw=1.1)
     sure = ((part["ratio_low"] > 1) | (part["ratio_high"] < 1)).to_numpy()
     axis.plot([], [], ls="", marker=marker, color=color, ms=4.5, label=title)
@@ -76,15 +77,14 @@ def _intervals(axis: Axes, part: pd.DataFrame, place: np.ndarray, color: str, ma
         if value != shown:
             side = "right" if value > 1 else "left"
             gap = (-6, 0) if value > 1 else (6, 0)
-            axis.annotate(
-                f"{value:.2g}", (shown, at), gap, textcoords="offset points", ha=side, va="center", fontsize=7, color=color
-            )
+            style: dict[str, Any] = {"ha": side, "va": "center", "fontsize": 7, "color": color}
+            axis.annotate(f"{value:.2g}", (shown, at), gap, textcoords="offset points", **style)
 
 
 def _scale(axis: Axes, rows: pd.DataFrame) -> None:
-    """A log axis around 1, no wider than the intervals and `REACH`."""
-    low = max(min(rows["ratio_low"].min(), 0.95), 1 / REACH) / 1.04
-    high = min(max(rows["ratio_high"].max(), 1.05), REACH) * 1.04
+    """A log axis around 1, no wider than the intervals and `RATIO_REACH`."""
+    low = max(min(rows["ratio_low"].min(), 0.95), 1 / RATIO_REACH) / 1.04
+    high = min(max(rows["ratio_high"].max(), 1.05), RATIO_REACH) * 1.04
     axis.axvline(1.0, color="0.3", lw=0.8, ls="--")
     axis.set(xscale="log", xlim=(low, high))
     axis.set_xticks([tick for tick in TICKS if low <= tick <= high])
@@ -94,11 +94,11 @@ def _scale(axis: Axes, rows: pd.DataFrame) -> None:
     axis.grid(axis="x", color="0.9")
 
 
-MM = 1e3
+CURVE_MM = 1e3
 MOST_PANELS = 4
 """For more scenarios than this, one panel shows their mean."""
 TASK_STYLES = {"reconstruction": ("tab:blue", "o"), "future": ("tab:orange", "s")}
-NAMED = {"model_b": 1}
+NAMED_CLUSTERS = {"model_b": 1}
 """Rows of this study that have names of their own."""
 
 
@@ -106,14 +106,14 @@ def cluster_methods(methods: Iterable[str]) -> dict[str, int]:
     """The methods named clusters_<K> and, beside such, model_b, with K; sorted by K."""
     names = set(methods)
     counts = {method: int(match[1]) for method in names if (match := re.fullmatch(r"clusters_(\d+)", method))}
-    counts |= {method: count for method, count in NAMED.items() if counts and method in names}
+    counts |= {method: count for method, count in NAMED_CLUSTERS.items() if counts and method in names}
     return dict(sorted(counts.items(), key=lambda item: item[1]))
 
 
 def cluster_curves(scores: pd.DataFrame) -> pd.DataFrame:
     """The curves: scenario, task, clusters (K), mean and std [mm] over seeds. Rows of the mean over scenarios have the scenario "".
 
-    `scores` are rows of `metrics.COLUMNS`, meters; other methods are ignored. The standard deviation
+    `scores` are rows of `metrics.SCORE_COLUMNS`, meters; other methods are ignored. The standard deviation
     is 0 for one seed. The mean over scenarios weighs scenarios equally; its deviation is that of the seeds' means.
     """
     methods = cluster_methods(scores["method"])
@@ -122,7 +122,7 @@ def cluster_curves(scores: pd.DataFrame) -> pd.DataFrame:
     all_of_them = averages(rows, by=("task", "method")).rename(columns={"equal": "mean", "seed_std": "std"}).assign(scenario="")
     names = ["scenario", "task", "clusters", "mean", "std"]
     table = pd.concat([own, all_of_them]).assign(clusters=lambda t: t["method"].map(methods))[names]
-    table[["mean", "std"]] *= MM
+    table[["mean", "std"]] *= CURVE_MM
     return table.sort_values(["scenario", "task", "clusters"], ignore_index=True)
 
 

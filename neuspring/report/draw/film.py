@@ -17,33 +17,29 @@ from PIL import Image
 
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_atomically
-from neuspring.report.draw.painter import ERRORS, Painter
+from neuspring.report.draw.painter import ERROR_COLORS, Painter
 from neuspring.report.draw.sheet import FUTURE, TEXT, TRAINING, color_bar, place, rgb
 from neuspring.report.video import Video
 
 DOTS = 110
 """Dots per inch at full width, so that text is as tall on a screen as on paper."""
-HEAD, GAP, EDGE, BAR, CLOCK = 0.24, 0.04, 0.03, 0.62, 0.15
+FILM_HEAD, FILM_GAP, FILM_EDGE, FILM_BAR, CLOCK = 0.24, 0.04, 0.03, 0.62, 0.15
 """Room for names, between panels, at the edges, for the color bar, and for the bar of time, inches."""
-PIXELS, SLOWEST, FASTEST = (160, 1920), 0.05, 8.0
-"""Least and greatest width, and speed."""
 HOLD = 0.8
-"""How long a GIF shows its last frame before it begins again, s."""
-CENTISECOND, SHORTEST = 100, 2
-"""Of a second; browsers take a shorter time of a frame for 10."""
-LARGEST = 100.0
-"""Megabytes."""
-COLORS, QUALITY = 96, 23
+"""Time for which a GIF shows its last frame before it begins again, s."""
+CENTISECOND, SHORTEST_FRAME = 100, 2
+"""Centiseconds of a second, and of the shortest frame; browsers take a shorter time of a frame for 10."""
+GIF_COLORS, FILM_QUALITY = 96, 23
 """Colors of a GIF, and rate factor of an MP4 (`video.Video`)."""
-KEYS = 8
+PALETTE_FRAMES = 8
 """Frames from which the colors of a GIF are chosen."""
 LEAST_SCALE = 0.25
 """A film that is still too large at this part of its width is refused."""
 
 
 @dataclass(frozen=True)
-class Made:
-    """What was written."""
+class WrittenFilm:
+    """Size and rate of a film that was written."""
 
     frames: int
     width: int
@@ -60,13 +56,12 @@ class Made:
 
 def write_film(
     painter: Painter, path: Path, width: int, speed: float = 1.0, megabytes: float = 2.0, beside: Sequence[Painter] = ()
-) -> Made:
+) -> WrittenFilm:
     """Write the film; if it does not fit, a GIF of every other frame, then fewer pixels until it does.
 
-    Painters `beside` the first one, of other scenes, paint the same frames at its side. Raises InputError for a bad size or speed,
-    and where nothing fits.
+    Painters `beside` the first one, of other scenes, paint the same frames at its side. Raises InputError where nothing
+    fits.
     """
-    _require(width, speed, megabytes)
     rate = painter.scene.observations.scenario.frame_rate * speed
     gif = path.suffix.lower() == ".gif"
     made, every, scale = path.with_name(f".{path.name}.try{path.suffix}"), 1, 1.0
@@ -75,11 +70,16 @@ def write_film(
             across = max(round(scale * width / (1 + len(beside))), 80)
             films = [film_pictures(each, painter.frames[::every], across) for each in (painter, *beside)]
             pictures = [_beside(each) for each in zip(*films, strict=True)]
-            (_write_gif if gif else _write_mp4)(made, pictures, rate / every)
+            if gif:
+                _write_gif(made, pictures, rate / every)
+            else:
+                with Video(made, rate / every, FILM_QUALITY) as video:
+                    for picture in pictures:
+                        video.add(picture)
             size, (high, wide) = made.stat().st_size, pictures[0].shape[:2]
             if size <= 1e6 * megabytes:
                 write_atomically(path, made.replace)
-                return Made(len(pictures), wide, high, rate / every, size, scale < 1 or every > 1)
+                return WrittenFilm(len(pictures), wide, high, rate / every, size, scale < 1 or every > 1)
             if scale <= LEAST_SCALE:
                 remedy = "Name fewer --frames or methods, or write .mp4." if gif else "Name fewer --frames or methods."
                 raise InputError("--megabytes", f"the coarsest film has {size / 1e6:.2g} MB", megabytes, remedy)
@@ -90,16 +90,6 @@ def write_film(
                 scale = max(0.95 * scale * math.sqrt(1e6 * megabytes / size), LEAST_SCALE)
     finally:
         made.unlink(missing_ok=True)
-
-
-def _require(width: int, speed: float, megabytes: float) -> None:
-    for name, value, least, most in (
-        ("--width", width, *PIXELS),
-        ("--speed", speed, SLOWEST, FASTEST),
-        ("--megabytes", megabytes, 0.0, LARGEST),
-    ):
-        if not (least <= value <= most and value > 0):
-            raise InputError(name, f"must be {least:g} to {most:g}" if least else f"must be above 0, at most {most:g}", value)
 
 
 def _beside(pictures: Sequence[np.ndarray]) -> np.ndarray:
@@ -129,34 +119,30 @@ def _layout(painter: Painter, width: float) -> tuple[Figure, list[list[Axes]], A
     """The figure, its panels (observed and methods; below, errors of methods), and the bar of time."""
     names = ["observed"][painter.manner.together :] + [take.label for take in painter.takes]
     view, columns, errors = painter.scene.view, len(names), painter.manner.error != "none"
-    right = BAR if errors else EDGE
-    across = (width - EDGE - right - GAP * (columns - 1)) / columns
+    right = FILM_BAR if errors else FILM_EDGE
+    across = (width - FILM_EDGE - right - FILM_GAP * (columns - 1)) / columns
     high = across * view.height / view.width
-    total = EDGE + CLOCK + HEAD + high * (1 + errors) + GAP * errors + EDGE
+    total = FILM_EDGE + CLOCK + FILM_HEAD + high * (1 + errors) + FILM_GAP * errors + FILM_EDGE
     figure = plt.figure(figsize=(width, total), facecolor="white")
-    top = total - EDGE - CLOCK - HEAD
-    lefts = [EDGE + k * (across + GAP) for k in range(columns)]
+    top = total - FILM_EDGE - CLOCK - FILM_HEAD
+    lefts = [FILM_EDGE + k * (across + FILM_GAP) for k in range(columns)]
     panels = [[place(figure, left, top - high, across, high) for left in lefts]]
     for left, name in zip(lefts, names, strict=True):
         figure.text((left + across / 2) / width, (top + 0.05) / total, name, ha="center", va="bottom", fontsize=TEXT)
     if errors:
-        panels.append([place(figure, left, top - 2 * high - GAP, across, high) for left in lefts[1:]])
-        cax = place(figure, width - BAR + 0.06, top - 2 * high - GAP + 0.04, 0.09, high - 0.08)
-        color_bar(figure, cax, painter.norm, ERRORS, painter.error_label, extend="max")
-    clock = place(figure, EDGE, total - EDGE - CLOCK, width - 2 * EDGE, CLOCK)
+        panels.append([place(figure, left, top - 2 * high - FILM_GAP, across, high) for left in lefts[1:]])
+        cax = place(figure, width - FILM_BAR + 0.06, top - 2 * high - FILM_GAP + 0.04, 0.09, high - 0.08)
+        color_bar(figure, cax, painter.norm, ERROR_COLORS, painter.error_label, extend="max")
+    clock = place(figure, FILM_EDGE, total - FILM_EDGE - CLOCK, width - 2 * FILM_EDGE, CLOCK)
     return figure, panels, clock
 
 
 def _fill(painter: Painter, panels: list[list[Axes]], frame: int) -> None:
+    first = 0 if painter.manner.together else 1
     for row, axes in enumerate(panels):
         for column, axis in enumerate(axes):
             axis.clear()
-            if row:
-                painter.draw_error(axis, column, frame)
-            elif column or painter.manner.together:
-                painter.draw_predicted(axis, column - (not painter.manner.together), frame)
-            else:
-                painter.draw_observed(axis, frame)
+            painter.draw(axis, None if column < first and not row else column - first * (not row), frame, error=bool(row))
 
 
 def _tell(painter: Painter, clock: Axes, frame: int) -> None:
@@ -183,20 +169,14 @@ def _tell(painter: Painter, clock: Axes, frame: int) -> None:
         side.set_visible(False)
 
 
-def _write_mp4(path: Path, pictures: Sequence[np.ndarray], rate: float) -> None:
-    with Video(path, rate, QUALITY) as video:
-        for picture in pictures:
-            video.add(picture)
-
-
 def _write_gif(path: Path, pictures: Sequence[np.ndarray], rate: float) -> None:
     """A GIF that begins again for ever. Its times are whole hundredths of a second; they add up to those of the film."""
     # One palette for all frames: colors that change from frame to frame flicker, and pixels that stay need no bytes.
-    keys = np.unique(np.linspace(0, len(pictures) - 1, KEYS).astype(int))
-    palette = Image.fromarray(np.vstack([pictures[k] for k in keys])).quantize(COLORS, method=Image.Quantize.MAXCOVERAGE)
+    keys = np.unique(np.linspace(0, len(pictures) - 1, PALETTE_FRAMES).astype(int))
+    palette = Image.fromarray(np.vstack([pictures[k] for k in keys])).quantize(GIF_COLORS, method=Image.Quantize.MAXCOVERAGE)
     frames = [Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     ends = np.round(CENTISECOND * np.arange(len(frames) + 1) / rate).astype(int)
-    times = 10 * np.maximum(np.diff(ends), SHORTEST)
+    times = 10 * np.maximum(np.diff(ends), SHORTEST_FRAME)
     times[-1] = max(times[-1], round(1000 * HOLD))
     more = {"duration": times.tolist(), "loop": 0, "optimize": False, "disposal": 1}
     frames[0].save(path, format="GIF", save_all=True, append_images=frames[1:], **more)

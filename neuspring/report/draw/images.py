@@ -16,9 +16,9 @@ from neuspring.report.draw.sheet import FUTURE, TRAINING, WORST, save
 from neuspring.scores.pictures import Pair, psnr
 from neuspring.splats.losses import Shot
 
-BAR = 6
+TIME_BAR = 6
 """Height of the bar that shows the time, px."""
-TITLE = 20
+TITLE_LINE = 20
 """Height of the line of names, px."""
 
 
@@ -89,13 +89,13 @@ def film_frame(scenario: Scenario, frame: int, panels: Mapping[str, np.ndarray])
     picture = np.hstack(list(panels.values()))
     width, total, end = picture.shape[1], scenario.frame_count, scenario.train_end
     future = frame >= end
-    title = np.zeros((TITLE, width, 3), np.uint8)
+    title = np.zeros((TITLE_LINE, width, 3), np.uint8)
     for k, name in enumerate(panels):
         text = f"{name}, frame {frame} ({'future' if future else 'training'})" if k == 0 else name
         color = (FUTURE if future else TRAINING) if k == 0 else (255, 255, 255)
-        place = (6 + k * width // len(panels), TITLE - 6)
+        place = (6 + k * width // len(panels), TITLE_LINE - 6)
         cv2.putText(title, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, 1, cv2.LINE_AA)
-    bar = np.zeros((BAR, width, 3), np.uint8)
+    bar = np.zeros((TIME_BAR, width, 3), np.uint8)
     border, now = (round(width * k / total) for k in (end, frame + 1))
     for start, stop, shade in ((0, border, TRAINING), (border, width, FUTURE)):
         bar[:, start:stop] = np.array(shade) // 4

@@ -1,4 +1,4 @@
-"""What stands in one panel: the observed frame, a prediction, or its error."""
+"""Content of one panel: the observed frame, a prediction, or its error."""
 
 from __future__ import annotations
 
@@ -11,53 +11,28 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 
-from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations
 from neuspring.data.camera import Camera
-from neuspring.report.draw.scene import Prediction, Scene, faded, masked, object_and_hands, over_white, shown_points
+from neuspring.report.draw.scene import ShownRun, ShownScene
 from neuspring.report.draw.sheet import CONTROLLER, WORST, points_across
-from neuspring.scores.pictures import Pair, psnr
-from neuspring.splats.draw import OBJECT_COVERAGE, picture, view_of
-from neuspring.splats.rasterize import choose_backend
 
-Style = Literal["splats", "nodes"]
 Error = Literal["color", "distance", "none"]
-Ground = Literal["white", "image"]
-ERRORS = "magma_r"
+ERROR_COLORS = "magma_r"
 """Light for no error, on white paper; rising in darkness."""
-SEEN, PREDICTED, UNKNOWN = "tab:blue", "#303030", "#d5d5d5"
+BLUE_POINTS, DARK_NODES, UNKNOWN_COLOR = "tab:blue", "#303030", "#d5d5d5"
 """Observed points; predicted nodes; nodes whose error is not known."""
-HIDDEN = 200
-"""Gray of hands, behind which nothing is compared."""
 LEAST_MM = 1.0
 """Least upper end of a range of distances."""
-NOTE, SMALLEST = 7.0, 5.0
+NOTE, SMALLEST_NOTE = 7.0, 5.0
 """Size of the text in a panel, points; the smallest is for narrow panels, of which it must not hide much."""
-CORNER = (0.4, 0.2)
-"""Width and height of a note, of a panel."""
-MM = 1e3
-
-
-@dataclass(frozen=True, eq=False)
-class Drawn:
-    """A prediction as splats in one frame, the shown part of the picture."""
-
-    rgba: np.ndarray
-    """[h, w, 4] uint8, over black."""
-    difference: np.ndarray | None = None
-    """Mean absolute color difference [h, w], of 1; NaN where neither shows the object; None: nothing to compare with."""
-    hands: np.ndarray | None = None
-    psnr: float = float("nan")
-    """Of the whole picture, as in the tables, dB."""
+DRAWN_MM = 1e3
 
 
 @dataclass(frozen=True, kw_only=True)
 class DrawingStyle:
-    """How predictions and errors are drawn."""
+    """Style in which predictions and errors are drawn."""
 
-    style: Style
     error: Error
-    ground: Ground
     most: float | None = None
     """Upper end of the range of errors: of 1 for colors, mm for distances; None: from the data."""
     together: bool = False
@@ -65,7 +40,7 @@ class DrawingStyle:
     not trained on."""
 
 
-def distances(take: Prediction, observations: Observations, frame: int) -> tuple[np.ndarray, np.ndarray]:
+def distances(take: ShownRun, observations: Observations, frame: int) -> tuple[np.ndarray, np.ndarray]:
     """Nodes [P] whose point is seen in a frame, and their distances [P], m, to it. Node i is tracked point i."""
     seen = np.flatnonzero(observations.object_visibility[frame])
     gap = take.positions[frame][seen].astype(float) - observations.object_points[frame][seen]
@@ -77,36 +52,13 @@ class Painter:
 
     def __init__(
         self,
-        scene: Scene,
-        takes: Sequence[Prediction],
+        scene: ShownScene,
+        takes: Sequence[ShownRun],
         frames: Sequence[int],
         manner: DrawingStyle,
-        images: Images,
-        device: str,
     ) -> None:
         self.scene, self.takes, self.frames, self.manner = scene, takes, tuple(frames), manner
-        self._drawn = [self._splats(take, images, device) if manner.style == "splats" else {} for take in takes]
         self.norm = Normalize(0, self._most())
-        self._corner = self._free_corner()
-
-    def _splats(self, take: Prediction, images: Images, device: str) -> dict[int, Drawn]:
-        view, backend = view_of(self.scene.camera, images, device), choose_backend(images.backend, device)
-        made = {}
-        for frame, gaussians in take.gaussians(self.frames, images, device):
-            rgba = picture(gaussians, view, backend)
-            made[frame] = self._compared(rgba, frame) if self.manner.error == "color" else Drawn(self.scene.cut(rgba))
-        return made
-
-    def _compared(self, rgba: np.ndarray, frame: int) -> Drawn:
-        photo, labels = self.scene.photo(frame), self.scene.mask(frame)
-        if photo is None or labels is None:
-            return Drawn(self.scene.cut(rgba))
-        pair = Pair.of(photo, rgba, *object_and_hands(labels), OBJECT_COVERAGE)
-        difference = (pair.truth - pair.prediction).abs().mean(0).numpy()
-        shows = pair.silhouettes[0] | pair.silhouettes[1]
-        cut = self.scene.cut
-        part = cut(np.where(shows & ~pair.hands, difference, np.nan))
-        return Drawn(cut(rgba), part, cut(pair.hands), float(psnr(pair.prediction, pair.truth)))
 
     def _most(self) -> float:
         if self.manner.most is not None:
@@ -120,100 +72,65 @@ class Painter:
             if frame < len(take.positions)
         ]
         values = np.concatenate(kept) if kept else np.zeros(0)
-        return _rounded(max(MM * float(np.quantile(values, 0.98)) if len(values) else 0.0, LEAST_MM))
+        return _rounded(max(DRAWN_MM * float(np.quantile(values, 0.98)) if len(values) else 0.0, LEAST_MM))
 
-    @property
-    def error_label(self) -> str:
-        """For the color bar."""
-        return "color difference" if self.manner.error == "color" else "distance [mm]"
+    error_name, error_label = "distance", "distance [mm]"
+    """Name of the rows of errors, and the label of their color bar."""
+
+    def draw(self, axis: Axes, which: int | None, frame: int, error: bool = False) -> None:
+        """A panel: what was observed (no `which`), or a run's prediction or error."""
+        if which is None:
+            self.draw_observed(axis, frame)
+        else:
+            (self.draw_error if error else self.draw_predicted)(axis, which, frame)
 
     def draw_observed(self, axis: Axes, frame: int) -> None:
-        """The photo, or the observed points where the camera has none."""
-        photo, labels = self.scene.photo(frame), self.scene.mask(frame)
+        """The observed points."""
         empty(axis, self.scene.view)
-        if photo is not None:
-            whole = self.manner.ground == "image" or labels is None
-            self._image(axis, photo if whole or labels is None else masked(photo, labels))
-            return
-        if self.scene.capture is not None:
-            self._note(axis, f"camera {self.scene.camera.name} missed it")
-        observations = self.scene.observations
-        self._line(axis, observations.object_points[frame], frame, SEEN)
-        self._points(axis, observations.object_points[frame][observations.object_visibility[frame]], SEEN)
+        self._observed(axis, frame)
         hands(axis, self.scene, frame)
 
     def draw_predicted(self, axis: Axes, which: int, frame: int) -> None:
-        """The prediction as splats, or as nodes; nodes stand on a pale photo, or before the observed points."""
-        take, photo = self.takes[which], self.scene.photo(frame)
+        """The predicted nodes before the observed points."""
         empty(axis, self.scene.view)
-        below = faded(photo) if photo is not None and self.manner.ground == "image" else None
-        if frame >= len(take.positions):
+        nodes = self.takes[which].positions
+        if frame >= len(nodes):
             self._note(axis, "diverged")
             return
-        if self.manner.style == "splats":
-            part = None if below is None else self.scene.cut(below)
-            self._image(axis, over_white(self._drawn[which][frame].rgba, part), cut=False)
-            return
-        if below is not None:
-            self._image(axis, below)
-        else:
-            observations = self.scene.observations
-            self._line(axis, observations.object_points[frame], frame, SEEN, alpha=0.5)
-            self._points(axis, observations.object_points[frame][observations.object_visibility[frame]], SEEN, alpha=0.5)
-        self._line(axis, take.positions[frame], frame, PREDICTED)
-        self._points(axis, take.positions[frame], PREDICTED)
+        self._below(axis, frame)
+        self._line(axis, nodes[frame], frame, DARK_NODES)
+        self._points(axis, nodes[frame], DARK_NODES)
         hands(axis, self.scene, frame)
 
+    def _observed(self, axis: Axes, frame: int, alpha: float = 1.0) -> None:
+        seen = self.scene.observations
+        self._line(axis, seen.object_points[frame], frame, BLUE_POINTS, alpha)
+        self._points(axis, seen.object_points[frame][seen.object_visibility[frame]], BLUE_POINTS, alpha=alpha)
+
+    def _below(self, axis: Axes, frame: int) -> None:
+        self._observed(axis, frame, 0.5)
+
     def draw_error(self, axis: Axes, which: int, frame: int) -> None:
-        """The error in false colors, and its mean: PSNR of pictures, or the mean distance."""
+        """The distances of nodes to their points in false colors, and their mean."""
         empty(axis, self.scene.view)
         take = self.takes[which]
         if frame >= len(take.positions):
             return
-        if self.manner.error == "color":
-            self._difference(axis, self._drawn[which][frame])
-            return
         seen, distance = distances(take, self.scene.observations, frame)
         nodes = take.positions[frame]
         others = np.setdiff1d(np.arange(len(nodes)), seen)
-        self._points(axis, nodes[others], UNKNOWN)
+        self._points(axis, nodes[others], UNKNOWN_COLOR)
         pairs = np.stack([self.scene.observations.object_points[frame][seen], nodes[seen]], axis=1)
         flat = self.scene.view.project(pairs.astype(float))[0]
         axis.add_collection(LineCollection(list(flat), colors="0.6", linewidths=0.4, zorder=2))
-        self._points(axis, nodes[seen], values=MM * distance)
+        self._points(axis, nodes[seen], values=DRAWN_MM * distance)
         if len(distance):
-            self._note(axis, f"{MM * distance.mean():.1f} mm")
-
-    def _difference(self, axis: Axes, drawn: Drawn) -> None:
-        if drawn.difference is None or drawn.hands is None:
-            self._note(axis, "no picture")
-            return
-        ground = np.full((*drawn.hands.shape, 3), 255, np.uint8)
-        ground[drawn.hands] = HIDDEN
-        self._image(axis, ground, cut=False)
-        shape = drawn.hands.shape
-        axis.imshow(drawn.difference, cmap=ERRORS, norm=self.norm, extent=_extent(shape), interpolation="nearest")
-        self._note(axis, f"{drawn.psnr:.1f} dB" if np.isfinite(drawn.psnr) else "equal")
-
-    def _free_corner(self) -> tuple[float, float]:
-        """The corner of all panels (0 or 1 to the right, 0 or 1 upwards) that fewest points of any frame reach into."""
-        view = self.scene.view
-        flat = view.project(shown_points(self.scene.observations, self.takes, self.frames))[0]
-        part = flat / [view.width, view.height]
-        x, y = part[:, 0], 1 - part[:, 1]
-
-        def inside(corner: tuple[float, float]) -> int:
-            return int(((np.abs(x - corner[0]) < CORNER[0]) & (np.abs(y - corner[1]) < CORNER[1])).sum())
-
-        return min(((1.0, 0.0), (0.0, 0.0), (1.0, 1.0), (0.0, 1.0)), key=inside)
+            self._note(axis, f"{DRAWN_MM * distance.mean():.1f} mm")
 
     def _note(self, axis: Axes, text: str) -> None:
-        right, upper = self._corner
-        place: dict[str, Any] = {"ha": "right" if right else "left", "va": "top" if upper else "bottom"}
         box: dict[str, Any] = {"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 1.0}
-        x, y = 0.025 + 0.95 * right, 0.035 + 0.93 * upper
-        size = float(np.clip(0.075 * points_across(axis), SMALLEST, NOTE))
-        axis.text(x, y, text, fontsize=size, bbox=box, transform=axis.transAxes, zorder=9, **place)
+        style: dict[str, Any] = {"ha": "right", "va": "bottom", "bbox": box, "transform": axis.transAxes, "zorder": 9}
+        axis.text(0.975, 0.035, text, fontsize=float(np.clip(0.075 * points_across(axis), SMALLEST_NOTE, NOTE)), **style)
 
     def _line(self, axis: Axes, nodes: np.ndarray, frame: int, color: str, alpha: float = 1.0) -> None:
         """The center line of a long thin body through its nodes [P, 3], m (the first ones at least); nothing if none is known."""
@@ -233,21 +150,14 @@ class Painter:
         flat, depth = self.scene.view.project(np.asarray(points, float))
         order = np.argsort(-depth)
         order = order[depth[order] > 0]
-        style = {"color": color} if values is None else {"c": values[order], "cmap": ERRORS, "norm": self.norm}
+        style = {"color": color} if values is None else {"c": values[order], "cmap": ERROR_COLORS, "norm": self.norm}
         edge = {"linewidths": 0.0} if values is None else {"linewidths": 0.25, "edgecolors": "0.45"}
         # All frames have dots of one size, however many points are seen.
-        nodes = color in (PREDICTED, UNKNOWN)
-        size = self._size(axis, len(observations.nodes) if nodes else observations.object_points.shape[1])
+        nodes = color in (DARK_NODES, UNKNOWN_COLOR)
+        count, width = len(observations.nodes) if nodes else observations.object_points.shape[1], points_across(axis)
+        # A third of the area that this many dots have if they fill the panel, within what can be seen.
+        size = float(np.clip((0.35 * width / np.sqrt(max(count, 1))) ** 2, 0.8, (0.035 * width) ** 2))
         axis.scatter(flat[order, 0], flat[order, 1], s=size, alpha=alpha, zorder=3, **style, **edge)
-
-    def _size(self, axis: Axes, count: int) -> float:
-        """Area of a dot, points^2: a third of what this many dots have if they fill the panel, within what can be seen."""
-        width = points_across(axis)
-        return float(np.clip((0.35 * width / np.sqrt(max(count, 1))) ** 2, 0.8, (0.035 * width) ** 2))
-
-    def _image(self, axis: Axes, rgb: np.ndarray, *, cut: bool = True) -> None:
-        shown = self.scene.cut(rgb) if cut else rgb
-        axis.imshow(shown, extent=_extent(shown.shape), interpolation="antialiased")
 
 
 def empty(axis: Axes, view: Camera, *, framed: bool = True) -> None:
@@ -259,16 +169,12 @@ def empty(axis: Axes, view: Camera, *, framed: bool = True) -> None:
         side.set(linewidth=0.5, color="0.7", visible=framed)
 
 
-def hands(axis: Axes, scene: Scene, frame: int) -> None:
+def hands(axis: Axes, scene: ShownScene, frame: int) -> None:
     """The controllers of a frame."""
     flat, depth = scene.view.project(scene.hands(frame).astype(float))
     size = float(np.clip((0.021 * points_across(axis)) ** 2, 3.0, 14.0))
     style: dict[str, Any] = {"marker": "D", "color": CONTROLLER, "edgecolors": "white", "linewidths": 0.25, "zorder": 5}
     axis.scatter(flat[depth > 0, 0], flat[depth > 0, 1], s=size, **style)
-
-
-def _extent(shape: Sequence[int]) -> tuple[float, float, float, float]:
-    return (-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5)
 
 
 def _rounded(value: float) -> float:

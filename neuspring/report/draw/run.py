@@ -12,21 +12,20 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations, Scenario, Trajectory, Twin
 from neuspring.report.draw.painter import DrawingStyle, Painter
-from neuspring.report.draw.scene import Prediction, Scene, chosen_frames
+from neuspring.report.draw.scene import ShownRun, ShownScene, chosen_frames
 from neuspring.report.draw.sheet import place, save
 from neuspring.report.draw.strip import strip_figure
-from neuspring.report.draw.twin import BAR, TwinPicture, histogram, rough_or_smooth, twin_figure
+from neuspring.report.draw.twin import LEGEND_ROOM, TwinPicture, histogram, rough_or_smooth, twin_figure
 from neuspring.scores.metrics import errors_per_frame, metrics_of
 from neuspring.twin.body import lines_of
 
-NAMES = ("errors.png", "motion.png", "losses.png", "topology.png", "stiffness.png")
+RUN_FIGURES = ("errors.png", "motion.png", "losses.png", "topology.png", "stiffness.png")
 IMAGE_SCORES = "image_scores.png"
-MM = 1e3
-WIDTH, COUNTS, HISTOGRAM, FOOT = 10.0, 1.9, 3.4, 0.8
-"""Of figures of motion and twins, of a legend with counts, of the histogram, and below the histogram, inches."""
+PLOTTED_MM = 1e3
+RUN_WIDTH, COUNTED_LEGEND, HISTOGRAM, FOOT = 10.0, 1.9, 3.4, 0.8
+"""Width of figures of motion and twins, of a legend with counts, of the histogram, and below the histogram, inches."""
 FROM_ABOVE = 75.0
 """Elevation of the second view of a twin, degrees."""
 LOG_FROM = 3.0
@@ -37,7 +36,7 @@ SERIES = {
     "train": (("loss", "training loss"),),
 }
 """Stage to the metrics of its history that are drawn, and their labels."""
-AXES = {"search": ("rollout", "training cost"), "fit": ("epoch", "loss [m$^2$]"), "train": ("step", "loss")}
+LOSS_AXES = {"search": ("rollout", "training cost"), "fit": ("epoch", "loss [m$^2$]"), "train": ("step", "loss")}
 """Stage to the labels of its axes. Baselines train by epochs or iterations, on squared distances or silhouettes."""
 
 
@@ -58,26 +57,27 @@ def run_figures(
     `errors` are those of `metrics.errors_per_frame`, m, computed here if not given. `searched` is the homogeneous stiffness that
     the search found, N, marked among the twin's.
     """
-    title = f"{observations.scenario.name}, {method}"
-    paths = []
+    title, drawn = f"{observations.scenario.name}, {method}", list[Path]()
     # A picture of an earlier result must not stay beside this one's.
-    for name in (*NAMES, IMAGE_SCORES):
+    for name in (*RUN_FIGURES, IMAGE_SCORES):
         (folder / name).unlink(missing_ok=True)
+
+    def keep(name: str, figure: Figure) -> None:
+        drawn.append(save(figure, folder / name))
+
     if trajectory is not None and len(trajectory.positions):
-        values = errors or errors_per_frame(trajectory.positions, observations)
-        paths.append(save(_errors(observations, values, title), folder / "errors.png"))
-        paths.append(save(motion_figure(observations, trajectory, method), folder / "motion.png"))
+        keep("errors.png", _errors(observations, errors or errors_per_frame(trajectory.positions, observations), title))
+        keep("motion.png", motion_figure(observations, trajectory, method))
     if histories:
-        paths.append(save(losses_figure(histories, title), folder / "losses.png"))
+        keep("losses.png", losses_figure(histories, title))
     if twin is not None:
-        take, lines = Prediction(title, twin.topology.nodes[None], twin), lines_of(twin)
+        take, lines = ShownRun(title, twin.topology.nodes[None], twin), lines_of(twin)
         label = f"{title}: {len(twin.topology.nodes)} nodes, {len(lines.pairs)} {lines.kinds}"
-        paths.append(
-            save(twin_figure(_from_two_sides(observations, take, label, "region"), WIDTH, COUNTS), folder / "topology.png")
-        )
+        two_sides = _from_two_sides(observations, take, label, "region")
+        keep("topology.png", twin_figure(two_sides, RUN_WIDTH, COUNTED_LEGEND))
         if lines.inner:
-            paths.append(save(stiffness_figure(observations, take, searched), folder / "stiffness.png"))
-    return paths
+            keep("stiffness.png", stiffness_figure(observations, take, searched))
+    return drawn
 
 
 def _errors(observations: Observations, values: Mapping[str, np.ndarray], title: str) -> Figure:
@@ -88,7 +88,7 @@ def _errors(observations: Observations, values: Mapping[str, np.ndarray], title:
         ("track_error_bound", "track error of bound points", "tab:green"),
         ("chamfer", "Chamfer distance (L1)", "tab:orange"),
     ):
-        axis.plot(seconds, MM * values[metric], label=label, color=color)
+        axis.plot(seconds, PLOTTED_MM * values[metric], label=label, color=color)
     shade_future(axis, observations.scenario, label="future")
     axis.set(xlabel="time [s]", ylabel="error [mm]", title=title, ylim=(0, None), xlim=(0, None))
     axis.legend(frameon=False)
@@ -125,7 +125,7 @@ def losses_figure(histories: Mapping[str, pd.DataFrame], title: str) -> Figure:
             if len(rows):
                 single = "." if metric == "cost" or len(rows) == 1 else ""
                 axis.plot(rows["step"], rows["value"], ls="" if metric == "cost" else "-", marker=single, ms=4, label=label)
-        axis.set(title=stage, xlabel=AXES[stage][0], ylabel=AXES[stage][1])
+        axis.set(title=stage, xlabel=LOSS_AXES[stage][0], ylabel=LOSS_AXES[stage][1])
         search = stage == "search"
         values = history.loc[history["metric"].isin(["best_cost"] if search else ["loss", "tail_loss"]), "value"]
         low, high = (values.min(), values.max()) if len(values) else (np.nan, np.nan)
@@ -145,23 +145,22 @@ def losses_figure(histories: Mapping[str, pd.DataFrame], title: str) -> Figure:
 
 def motion_figure(observations: Observations, trajectory: Trajectory, method: str) -> Figure:
     """A strip of a few frames: observed points, predicted nodes, and their distances, as `neuspring draw strip --as nodes`."""
-    scenario, take = observations.scenario, Prediction(method, trajectory.positions)
+    scenario, take = observations.scenario, ShownRun(method, trajectory.positions)
     frames = sorted({*chosen_frames(scenario, len(take.positions)), *chosen_frames(scenario, scenario.frame_count)})
-    scene = Scene.from_side(observations, [take], frames)
-    manner = DrawingStyle(style="nodes", error="distance", ground="white")
-    return strip_figure(Painter(scene, [take], frames, manner, Images(), "cpu"), WIDTH)
+    scene = ShownScene.from_side(observations, [take], frames)
+    return strip_figure(Painter(scene, [take], frames, DrawingStyle(error="distance")), RUN_WIDTH)
 
 
-def _from_two_sides(observations: Observations, take: Prediction, label: str, *quantities: str) -> TwinPicture:
+def _from_two_sides(observations: Observations, take: ShownRun, label: str, *quantities: str) -> TwinPicture:
     """The twin in frame 0 from its broad side, and from above."""
     columns = [
-        (Scene.from_side(observations, [take], [0]), replace(take, label=label)),
-        (Scene.from_side(observations, [take], [0], elevation=FROM_ABOVE), replace(take, label="from above")),
+        (ShownScene.from_side(observations, [take], [0]), replace(take, label=label)),
+        (ShownScene.from_side(observations, [take], [0], elevation=FROM_ABOVE), replace(take, label="from above")),
     ]
     return TwinPicture(columns, 0, quantities)  # type: ignore[arg-type]
 
 
-def stiffness_figure(observations: Observations, take: Prediction, searched: float | None) -> Figure:
+def stiffness_figure(observations: Observations, take: ShownRun, searched: float | None) -> Figure:
     """The body's lines in frame 0 colored by stiffness in two views, their histogram with the searched stiffness [N] marked, and
     the variogram of springs between nodes.
 
@@ -172,12 +171,12 @@ def stiffness_figure(observations: Observations, take: Prediction, searched: flo
     stiffness = lines.stiffness[: lines.inner].astype(float)
     body = _from_two_sides(observations, take, f"{take.label}: {len(stiffness)} {lines.about}", "stiffness")
     columns = 2 if take.twin.topology.object_spring_count and stiffness.std() > 0 else 1
-    figure = twin_figure(body, WIDTH + columns * HISTOGRAM, BAR + columns * HISTOGRAM)
+    figure = twin_figure(body, RUN_WIDTH + columns * HISTOGRAM, LEGEND_ROOM + columns * HISTOGRAM)
     high = figure.get_figheight()
-    axis = place(figure, WIDTH + 0.6, FOOT, HISTOGRAM - 0.9, max(high - FOOT - 0.1, 0.5))
+    axis = place(figure, RUN_WIDTH + 0.6, FOOT, HISTOGRAM - 0.9, max(high - FOOT - 0.1, 0.5))
     histogram(axis, stiffness, body.norm, searched)
     axis.set_ylabel(lines.kind)
     if columns == 2:
-        axis = place(figure, WIDTH + HISTOGRAM + 0.6, FOOT, HISTOGRAM - 0.9, max(high - FOOT - 0.1, 0.5))
+        axis = place(figure, RUN_WIDTH + HISTOGRAM + 0.6, FOOT, HISTOGRAM - 0.9, max(high - FOOT - 0.1, 0.5))
         rough_or_smooth(axis, take.twin)
     return figure

@@ -1,33 +1,29 @@
-"""What a picture is made of: the scene and its video as one camera sees them, from any side, and predictions."""
+"""Subject of a picture: the scene and its video as one camera sees them, from any side, and predictions."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations, Scenario, Twin, Up
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Camera
-from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture
-from neuspring.splats.draw import frames_from_centers, skinned_frames
-from neuspring.splats.model import Gaussians, Splats
 
-SIDE = 1200
+VIEW_SIZE = 1200
 """Pixels of the picture of a camera from any side; only a part of it is shown."""
 OPENING = math.radians(20)
 """Its angle of view: a long lens, so that near and far parts have almost one scale."""
 STEEPEST = 89.0
 """Degrees above or below the horizon; straight down no side of the picture is up."""
-ELEVATION = 25.0
+VIEW_ELEVATION = 25.0
 """Degrees above the horizon of a view that is not asked for."""
-MARGIN = 0.04
+VIEW_MARGIN = 0.04
 """Free space around what is shown, as a fraction of its larger side."""
-FLATTEST, TALLEST = 0.35, 1.3
+FLATTEST_PANEL, TALLEST_PANEL = 0.35, 1.3
 """Least and greatest height of a panel, over its width."""
 
 
@@ -63,9 +59,9 @@ def seen_from(points: np.ndarray, up: Up, azimuth: float, elevation: float) -> C
     away = float((np.abs(local[:, :2]).max(axis=1) / slope - local[:, 2]).max())
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = axes, middle - max(1.05 * away, 0.05) * forward
-    focal = 0.5 * SIDE / slope
-    half = 0.5 * (SIDE - 1)
-    return Camera("view", SIDE, SIDE, np.array([[focal, 0, half], [0, focal, half], [0, 0, 1]]), pose)
+    focal = 0.5 * VIEW_SIZE / slope
+    half = 0.5 * (VIEW_SIZE - 1)
+    return Camera("view", VIEW_SIZE, VIEW_SIZE, np.array([[focal, 0, half], [0, focal, half], [0, 0, 1]]), pose)
 
 
 def _sign(up: Up) -> float:
@@ -79,9 +75,9 @@ def box_around(pixels: np.ndarray, camera: Camera, *, clip: bool) -> tuple[int, 
     """
     low, high = pixels.min(axis=0), pixels.max(axis=0)
     size = np.maximum(high - low, 1.0)
-    size = size + 2 * MARGIN * size.max()
-    size[1] = max(size[1], FLATTEST * size[0])
-    size[0] = max(size[0], size[1] / TALLEST)
+    size = size + 2 * VIEW_MARGIN * size.max()
+    size[1] = max(size[1], FLATTEST_PANEL * size[0])
+    size[0] = max(size[0], size[1] / TALLEST_PANEL)
     whole = np.array([camera.width, camera.height], float)
     if clip:
         size = np.minimum(size, whole)
@@ -103,118 +99,42 @@ def part(camera: Camera, box: tuple[int, int, int, int]) -> Camera:
     return replace(camera, width=right - left, height=bottom - top, intrinsics=intrinsics)
 
 
-def finer(camera: Camera, least: int) -> Camera:
-    """The same view in more pixels, at least `least` wide; pixel centers stay at whole coordinates."""
-    factor = max(math.ceil(least / camera.width), 1)
-    intrinsics = camera.intrinsics.copy()
-    intrinsics[:2] *= factor
-    # Half a pixel of the border belongs to the outer pixels, whatever their size.
-    intrinsics[:2, 2] += 0.5 * (factor - 1)
-    return replace(camera, width=factor * camera.width, height=factor * camera.height, intrinsics=intrinsics)
-
-
-FADE = 0.6
-"""Part of white in a photo behind a drawing."""
-
-
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class ShownRun:
     """A run's prediction: F frames, N nodes."""
 
     label: str
     positions: np.ndarray
     """Nodes [F, N, 3], m; fewer frames than the scenario where it diverged."""
     twin: Twin | None = None
-    splats: Splats | None = None
-    centers: np.ndarray | None = None
-    """Where the method's own model puts its splats [F, G, 3], m; else the nodes carry them."""
-
-    def gaussians(self, frames: Iterable[int], images: Images, device: str) -> Iterator[tuple[int, Gaussians]]:
-        """The splats in these frames, in rising order; frames behind a divergence are left out."""
-        assert self.splats is not None
-        wanted = {frame for frame in frames if frame < len(self.positions)}
-        stop = max(wanted, default=-1) + 1
-        if self.centers is None:
-            every = skinned_frames(self.splats, self.positions[:stop], images, device) if stop else iter(())
-        else:
-            every = frames_from_centers(self.splats, self.centers[:stop], device)
-        return ((frame, gaussians) for frame, gaussians in enumerate(every) if frame in wanted)
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
-    """What was observed, seen by one camera; `box` is the part of its picture that is shown."""
+class ShownScene:
+    """The observed scene, seen by one camera; `box` is the part of its picture that is shown."""
 
     observations: Observations
     camera: Camera
     box: tuple[int, int, int, int]
-    capture: Capture | None = None
-    """The video, where the camera is one of its."""
-    labels: np.ndarray | None = None
-    """Perceived masks [T, H, W] of the camera, where the capture has none of its own."""
-
-    @classmethod
-    def of(
-        cls,
-        observations: Observations,
-        camera: Camera,
-        takes: Sequence[Prediction],
-        frames: Sequence[int],
-        capture: Capture | None = None,
-        labels: np.ndarray | None = None,
-    ) -> Scene:
-        """The part of the picture that holds what these frames show."""
-        pixels, depth = camera.project(shown_points(observations, takes, frames))
-        seen = pixels[depth > 0]
-        if not len(seen):
-            seen = np.array([[0.0, 0.0], [camera.width - 1, camera.height - 1]])
-        if capture is not None:
-            seen = np.clip(seen, 0, [camera.width - 1, camera.height - 1])
-        box = box_around(seen, camera, clip=capture is not None)
-        return cls(observations, camera, box, capture, labels)
 
     @classmethod
     def from_side(
         cls,
         observations: Observations,
-        takes: Sequence[Prediction],
+        takes: Sequence[ShownRun],
         frames: Sequence[int],
         azimuth: float | None = None,
-        elevation: float = ELEVATION,
-    ) -> Scene:
-        """What these frames show from any side, degrees (`seen_from`); without an azimuth from the broad side."""
+        elevation: float = VIEW_ELEVATION,
+    ) -> ShownScene:
+        """The content of these frames from any side, degrees (`seen_from`); without an azimuth from the broad side."""
         points, up = shown_points(observations, takes, frames), observations.scenario.up
         camera = seen_from(points, up, broad_side(points, up) if azimuth is None else azimuth, elevation)
-        return cls.of(observations, camera, takes, frames)
+        return cls(observations, camera, box_around(camera.project(points)[0], camera, clip=False))
 
     @cached_property
     def view(self) -> Camera:
         """The camera of the shown part."""
         return part(self.camera, self.box)
-
-    def cut(self, picture: np.ndarray) -> np.ndarray:
-        """The shown part of a picture [H, W, ...]."""
-        left, top, right, bottom = self.box
-        return picture[top:bottom, left:right]
-
-    def photo(self, frame: int) -> np.ndarray | None:
-        """RGB [H, W, 3] uint8 of the whole picture; None: there is none."""
-        if self.capture is None or not self.capture.has(self.camera.name, frame):
-            return None
-        return self.capture.color(self.camera.name, frame)
-
-    def mask(self, frame: int) -> np.ndarray | None:
-        """Labels [H, W] of the whole picture; None: there are none."""
-        if self.capture is None or not self.capture.has(self.camera.name, frame):
-            return None
-        if self.capture.description.masks:
-            return self.capture.mask(self.camera.name, frame)
-        return None if self.labels is None else self.labels[frame]
-
-    @property
-    def has_masks(self) -> bool:
-        """Whether observed and predicted pictures can be compared."""
-        return self.capture is not None and (self.capture.description.masks or self.labels is not None)
 
     def hands(self, frame: int) -> np.ndarray:
         """Controllers [C, 3], m, that hold the object."""
@@ -223,7 +143,7 @@ class Scene:
         return np.asarray(points[valid[frame]] if valid.size else points)
 
 
-def shown_points(observations: Observations, takes: Sequence[Prediction], frames: Sequence[int]) -> np.ndarray:
+def shown_points(observations: Observations, takes: Sequence[ShownRun], frames: Sequence[int]) -> np.ndarray:
     """Points [P, 3], m, that pictures of these frames must show: all observed ones, and predicted ones near them."""
     rows = list(frames)
     seen = [observations.object_points[frame][observations.object_visibility[frame]] for frame in rows]
@@ -253,29 +173,3 @@ def chosen_frames(scenario: Scenario, frames: int) -> dict[int, str]:
     if frames <= last:
         shown.setdefault(frames - 1, "last before divergence")
     return dict(sorted(shown.items()))
-
-
-def over_white(rgba: np.ndarray, below: np.ndarray | None = None) -> np.ndarray:
-    """RGB [H, W, 3] uint8 of a picture drawn over black [H, W, 4], laid over white or over the picture `below`."""
-    ground = 255.0 if below is None else below.astype(float)
-    mixed = rgba[..., :3] + (1 - rgba[..., 3:] / 255.0) * ground
-    return np.asarray(np.clip(mixed + 0.5, 0, 255), np.uint8)
-
-
-def masked(photo: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """The photo with white where there is neither the object nor a hand."""
-    picture = photo.copy()
-    picture[labels == NOTHING] = 255
-    return picture
-
-
-def faded(photo: np.ndarray) -> np.ndarray:
-    """A photo that a drawing can be read on: gray, and mostly white."""
-    gray = photo.astype(float).mean(axis=2, keepdims=True)
-    return np.asarray(np.repeat((1 - FADE) * gray + FADE * 255, 3, axis=2), np.uint8)
-
-
-def object_and_hands(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Masks [H, W] uint8, 0 or 255, of the object and of hands."""
-    first, second = (np.where(labels == label, 255, 0).astype(np.uint8) for label in (OBJECT, HANDS))
-    return first, second

@@ -1,4 +1,4 @@
-"""What all pictures share: sizes of text, colors, panels placed in inches, color bars, and how files are written."""
+"""Common parts of all pictures: sizes of text, colors, panels placed in inches, color bars, and how files are written."""
 
 from __future__ import annotations
 
@@ -15,14 +15,10 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from neuspring.core.errors import InputError
 from neuspring.core.files import write_atomically
 
 TEXT = 8.0
 """Size of text, points, at the width that the picture is made for."""
-PICTURES, FILMS = (".pdf", ".png", ".jpg", ".svg"), (".mp4", ".gif")
-WIDTHS, RESOLUTIONS = (1.5, 20.0), (50.0, 1200.0)
-"""Least and greatest width, inches, and dots per inch."""
 DPI = 110
 """Dots per inch of pictures of runs and benchmarks."""
 JPEG = 90
@@ -33,29 +29,6 @@ WORST = 0.5
 CONTROLLER = "tab:red"
 MOST_SPRINGS = 20_000
 """More springs than this are not drawn: lines would cover each other."""
-
-
-def require_ending(path: Path, endings: Sequence[str]) -> None:
-    """Raise InputError for a file that these pictures cannot be written to, before they are drawn."""
-    if path.suffix.lower() not in endings:
-        rule = f"the file must end in {', '.join(endings[:-1])} or {endings[-1]}"
-        other = FILMS if endings == PICTURES else PICTURES
-        kind = "neuspring draw film" if other == FILMS else "neuspring draw strip"
-        remedy = f"{kind} writes {path.suffix}." if path.suffix.lower() in other else ""
-        raise InputError("--output", rule, path.name, remedy)
-    if path.is_dir():
-        raise InputError("--output", "must be a file", f"the folder {path}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(path.parent, "this folder must be writable", error.strerror, "Choose another --output.") from error
-
-
-def require_size(width: float, dpi: float) -> None:
-    """Raise InputError for a size that no page has."""
-    for name, value, (least, most) in (("--width", width, WIDTHS), ("--dpi", dpi, RESOLUTIONS)):
-        if not least <= value <= most:
-            raise InputError(name, f"must be {least:g} to {most:g}", value)
 
 
 def rgb(color: Sequence[int], shade: float = 1.0) -> tuple[float, float, float]:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
-import cv2
 import numpy as np
-import torch
 from matplotlib import colormaps
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
@@ -18,36 +16,28 @@ from matplotlib.colors import LogNorm, to_rgba_array
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-from scipy.spatial import cKDTree
 
-from neuspring.config.images import Images
 from neuspring.core.artifacts import Twin
 from neuspring.report.draw.painter import empty, hands
-from neuspring.report.draw.scene import Prediction, Scene, faded, finer, over_white
+from neuspring.report.draw.scene import ShownRun, ShownScene
 from neuspring.report.draw.sheet import CONTROLLER, TEXT, color_bar, place, points_across, sample
-from neuspring.splats.draw import picture, view_of
-from neuspring.splats.model import Gaussians
-from neuspring.splats.rasterize import choose_backend
-from neuspring.splats.view import C0
 from neuspring.twin.body import Lines, body_of, lines_of
 from neuspring.twin.field import midpoints
 from neuspring.twin.roughness import roughness, variogram
 from neuspring.twin.topology import node_spacing
 
 Quantity = Literal["stiffness", "region"]
-COLORS = "viridis"
+STIFFNESS_COLORS = "viridis"
 PALETTE = [f"tab:{name}" for name in ("blue", "orange", "green", "purple", "brown", "pink", "olive", "cyan")] + ["navy", "gold"]
 CROSSING = (0.35, 0.35, 0.35, 1.0)
 """Springs between regions."""
-TITLE, GAP, BAR, EDGE = 0.22, 0.05, 0.75, 0.03
+TWIN_TITLE, TWIN_GAP, LEGEND_ROOM, TWIN_EDGE = 0.22, 0.05, 0.75, 0.03
 """Room for names of methods, between panels, for a color bar or names of regions, and at the edges, inches."""
 MOST_VECTORS = 2500
 """More lines than this are stored as pixels: a page would open slowly."""
-FINE = 900
-"""Least width of a surface in pixels; nothing is compared with it, so it need not have the camera's."""
 LEAST_RATIO, DEEPEST = 2.0, 1e4
 """Smallest ratio of the ends of a stiffness axis, so that tiny differences do not fill it; largest ratio of a color range."""
-BINS = 41
+HISTOGRAM_BINS = 41
 """Odd, so that equal values sit in the middle of a bar, under the mark of the searched one."""
 
 
@@ -82,15 +72,13 @@ def _widened(low: float, high: float) -> tuple[float, float]:
 class TwinPicture:
     """Twins in one frame, and what their colors say: a column for each of `takes`, seen in the scene beside it."""
 
-    columns: Sequence[tuple[Scene, Prediction]]
+    columns: Sequence[tuple[ShownScene, ShownRun]]
     frame: int
     quantities: Sequence[Quantity]
-    style: Literal["springs", "splats"] = "springs"
-    ground: Literal["white", "image"] = "white"
-    images: Images = Images()
-    device: str = "cpu"
     limits: tuple[float, float] | None = None
-    """Of stiffness, N; None: those of the twins."""
+    """Range of stiffness, N; None: that of the twins."""
+
+    as_springs: ClassVar = True
 
     @cached_property
     def norm(self) -> LogNorm:
@@ -100,7 +88,7 @@ class TwinPicture:
         twins = [_twin(take) for _, take in self.columns]
         return LogNorm(*stiffness_limits(np.concatenate([lines.stiffness[: lines.inner] for lines in map(lines_of, twins)])))
 
-    def node_colors(self, take: Prediction, quantity: Quantity) -> np.ndarray:
+    def node_colors(self, take: ShownRun, quantity: Quantity) -> np.ndarray:
         """RGBA [N, 4]."""
         twin = _twin(take)
         if quantity == "stiffness":
@@ -108,7 +96,7 @@ class TwinPicture:
         names, region = np.unique(twin.topology.labels, return_inverse=True)
         return np.asarray(region_colors(len(names))[region])
 
-    def spring_colors(self, take: Prediction, quantity: Quantity) -> np.ndarray:
+    def spring_colors(self, take: ShownRun, quantity: Quantity) -> np.ndarray:
         """RGBA [S, 4] of object springs."""
         lines = lines_of(_twin(take))
         if quantity == "stiffness":
@@ -120,25 +108,15 @@ class TwinPicture:
 
     def _of_stiffness(self, values: np.ndarray) -> np.ndarray:
         # A stiffness of 0 has no color on a log scale; it takes that of the lower end.
-        return np.asarray(colormaps[COLORS](self.norm(np.clip(values, self.norm.vmin, self.norm.vmax))))
+        return np.asarray(colormaps[STIFFNESS_COLORS](self.norm(np.clip(values, self.norm.vmin, self.norm.vmax))))
 
-    def paint(self, axis: Axes, scene: Scene, take: Prediction, quantity: Quantity) -> None:
+    def paint(self, axis: Axes, scene: ShownScene, take: ShownRun, quantity: Quantity) -> None:
         """One panel."""
-        view, photo = scene.view, scene.photo(self.frame)
-        empty(axis, view, framed=self.ground == "image")
-        shown = scene.cut(faded(photo)) if photo is not None and self.ground == "image" else None
-        if self.style == "splats":
-            surface = self._surface(scene, take, quantity)
-            ground = None if shown is None else cv2.resize(shown, surface.shape[1::-1], interpolation=cv2.INTER_CUBIC)
-            shown = over_white(surface, ground)
-        if shown is not None:
-            extent = (-0.5, view.width - 0.5, view.height - 0.5, -0.5)
-            axis.imshow(shown, extent=extent, aspect="auto", interpolation="antialiased")
-        if self.style == "springs":
-            self._lines(axis, scene, take, quantity)
+        empty(axis, scene.view, framed=False)
+        self._lines(axis, scene, take, quantity)
         hands(axis, scene, self.frame)
 
-    def _lines(self, axis: Axes, scene: Scene, take: Prediction, quantity: Quantity) -> None:
+    def _lines(self, axis: Axes, scene: ShownScene, take: ShownRun, quantity: Quantity) -> None:
         """Springs and nodes, the farthest first, so that the nearest are on top; by region also the springs of hands in frame 0."""
         lines, nodes = lines_of(_twin(take)), take.positions[self.frame].astype(float)
         seen = scene.observations.controller_points
@@ -164,43 +142,31 @@ class TwinPicture:
         size = float(np.clip((0.2 * width) ** 2 / max(len(nodes), 1), 1.0, 14.0))
         axis.scatter(flat[near, 0], flat[near, 1], c=self.node_colors(take, quantity)[near], s=size, linewidths=0, zorder=3)
 
-    def _surface(self, scene: Scene, take: Prediction, quantity: Quantity) -> np.ndarray:
-        """The splats [h, w, 4] over black, each in the color of the surface node that is nearest in frame 0."""
-        assert take.splats is not None
-        outer = take.positions[0][: scene.observations.surface_count]
-        nearest = cKDTree(outer).query(take.splats.means)[1]
-        rgb = self.node_colors(take, quantity)[nearest, :3]
-        (gaussians,) = (found for _, found in take.gaussians([self.frame], self.images, self.device))
-        plain = torch.tensor((rgb - 0.5) / C0, dtype=torch.float32, device=self.device)[:, None]
-        painted: Gaussians = replace(gaussians, harmonics=plain)
-        view = view_of(finer(scene.view, FINE), self.images, self.device)
-        return picture(painted, view, choose_backend(self.images.backend, self.device))
 
-
-def twin_figure(body: TwinPicture, width: float, room: float = BAR) -> Figure:
+def twin_figure(body: TwinPicture, width: float, room: float = LEGEND_ROOM) -> Figure:
     """The picture, `width` inches wide: columns from left to right, quantities from top to bottom, each with its legend.
 
     `room` is kept for legends on the right, inches; with more than a legend needs, that of regions counts nodes and springs.
     """
     shapes = [scene.view.width / scene.view.height for scene, _ in body.columns]
-    high = (width - 2 * EDGE - room - GAP * (len(shapes) - 1)) / sum(shapes)
-    total = TITLE + len(body.quantities) * (high + GAP) + EDGE
+    high = (width - 2 * TWIN_EDGE - room - TWIN_GAP * (len(shapes) - 1)) / sum(shapes)
+    total = TWIN_TITLE + len(body.quantities) * (high + TWIN_GAP) + TWIN_EDGE
     figure = plt.figure(figsize=(width, total))
-    lefts = EDGE + np.cumsum([0.0, *(high * shape + GAP for shape in shapes[:-1])])
+    lefts = TWIN_EDGE + np.cumsum([0.0, *(high * shape + TWIN_GAP for shape in shapes[:-1])])
     for left, shape, (_, take) in zip(lefts, shapes, body.columns, strict=True):
-        where = ((left + high * shape / 2) / width, (total - TITLE + 0.05) / total)
+        where = ((left + high * shape / 2) / width, (total - TWIN_TITLE + 0.05) / total)
         figure.text(*where, take.label, ha="center", va="bottom", fontsize=TEXT)
-    legend, top = width - EDGE - room, total - TITLE
+    legend, top = width - TWIN_EDGE - room, total - TWIN_TITLE
     for quantity in body.quantities:
         for left, shape, (scene, take) in zip(lefts, shapes, body.columns, strict=True):
             body.paint(place(figure, left, top - high, high * shape, high), scene, take, quantity)
         if quantity == "stiffness":
             tall = min(high, 1.8)
             cax = place(figure, legend + 0.1, top - 0.5 * (high + tall) + 0.06, 0.09, tall - 0.12)
-            color_bar(figure, cax, body.norm, COLORS, "stiffness [N]", extend="both")
+            color_bar(figure, cax, body.norm, STIFFNESS_COLORS, "stiffness [N]", extend="both")
         else:
-            _regions(figure, body, legend, top - high / 2, counted=room > BAR)
-        top -= high + GAP
+            _regions(figure, body, legend, top - high / 2, counted=room > LEGEND_ROOM)
+        top -= high + TWIN_GAP
     return figure
 
 
@@ -213,7 +179,7 @@ def _regions(figure: Figure, body: TwinPicture, left: float, middle: float, *, c
     names = [f"region {k}" for k in range(count)] if count > 1 else ["one region"]
     dots = [Line2D([], [], ls="", marker="o", ms=4, color=color) for color in region_colors(count)]
     extra: list[tuple[Any, str, int, str]] = []
-    if count > 1 and body.style == "springs":
+    if count > 1 and body.as_springs:
         extra.append((CROSSING, "between", int(between.sum()), "springs"))
     if counted:
         ends = lines.labels[lines.pairs[: lines.inner]]
@@ -238,10 +204,12 @@ def histogram(axis: Axes, stiffness: np.ndarray, norm: LogNorm, searched: float 
     shown = np.maximum(stiffness, (stiffness.max() or 1.0) / 1e6)
     low, high = _widened(float(shown.min()), float(shown.max()))
     # Rounding must not push the extremes out of the outer bins.
-    edges = np.geomspace(low * (1 - 1e-6), high * (1 + 1e-6), BINS + 1)
+    edges = np.geomspace(low * (1 - 1e-6), high * (1 + 1e-6), HISTOGRAM_BINS + 1)
     counts, _ = np.histogram(shown, edges)
     middles = np.clip(np.sqrt(edges[1:] * edges[:-1]), norm.vmin, norm.vmax)
-    axis.bar(edges[:-1], counts, np.diff(edges), align="edge", color=colormaps[COLORS](norm(middles)), edgecolor="0.4", lw=0.3)
+    axis.bar(
+        edges[:-1], counts, np.diff(edges), align="edge", color=colormaps[STIFFNESS_COLORS](norm(middles)), edgecolor="0.4", lw=0.3
+    )
     middle = float(np.median(stiffness))
     text = f"median {_newtons(middle)}"
     if searched:
@@ -264,7 +232,7 @@ def rough_or_smooth(axis: Axes, twin: Twin) -> None:
     values = np.log(np.maximum(twin.material.stiffness[:inner].astype(float), 1e-12))
     spacing = node_spacing(topology.canonical[: len(topology.nodes)])
     far = 0.5 * float(np.linalg.norm(np.ptp(middles, axis=0)))
-    edges = np.linspace(0, max(far, spacing), BINS + 1)
+    edges = np.linspace(0, max(far, spacing), HISTOGRAM_BINS + 1)
     axis.plot((edges[1:] + edges[:-1]) / (2 * spacing), variogram(middles, values, edges), ".-", color="0.2", lw=1)
     axis.axhline(1, color="0.6", lw=0.8, ls=":")
     axis.set(ylim=(0, None), ylabel="difference, share of variance")
@@ -277,11 +245,11 @@ def _newtons(value: float) -> str:
 
 
 def _between(lines: Lines) -> np.ndarray:
-    """Whether a line of the body joins two regions [S]."""
+    """True [S] where a line of the body joins two regions."""
     ends = lines.labels[lines.pairs[: lines.inner]]
     return np.asarray(ends[:, 0] != ends[:, 1])
 
 
-def _twin(take: Prediction) -> Twin:
+def _twin(take: ShownRun) -> Twin:
     assert take.twin is not None
     return take.twin

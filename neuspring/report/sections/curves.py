@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import io
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,13 +16,13 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from neuspring.core.artifacts import Observations, Scenario, Trajectory
 from neuspring.core.records import StageRecord
 from neuspring.core.run_record import RunRecord
-from neuspring.report.blocks import Block, Fold, Grid, Legend, Picture, Section, Text
-from neuspring.report.data import UNREADABLE, ReportData, ReportSection
+from neuspring.report.blocks import Block, Fold, Grid, Legend, PageSection, Picture, Text
+from neuspring.report.data import ReportData, ReportSection, data_uri
 from neuspring.scores.metrics import METRICS, bound_track_errors, track_errors
 
-COLORS = ("#2f7ed8", "#d9731a", "#2a9d5c", "#a05cc4", "#c94f7c", "#8a7a2e", "#1f9aa8", "#8d6a57")
-DASHES: tuple[Any, ...] = (("-", ""), ((0, (5, 2)), "7 3"), ((0, (1.5, 1.5)), "2 2"), ((0, (6, 2, 1.5, 2)), "8 3 2 3"))
-"""Line styles for matplotlib and for SVG. Each is used with all colors before the next one."""
+LINE_COLORS = ("#2f7ed8", "#d9731a", "#2a9d5c", "#a05cc4", "#c94f7c", "#8a7a2e", "#1f9aa8", "#8d6a57")
+LINE_DASHES = ("", "7 3", "2 2", "8 3 2 3")
+"""Dash patterns, px. Each is used with all colors before the next one."""
 STYLE: Any = {
     "svg.fonttype": "none",
     "font.size": 9,
@@ -33,13 +32,13 @@ STYLE: Any = {
 }
 PANEL, FRAME = (3.3, 2.1), (0.16, 0.11, 0.77, 0.83)
 """Size, inches, and place of the axes in a panel, which is fixed because a computed layout takes most of the time."""
-PENALTY = 1e3
+DIVERGED_COST = 1e3
 """Costs above this stand for candidates that could not be simulated."""
-POINTS = 120
+LINE_POINTS = 120
 """Most points of a line."""
-MOST_OPEN = 6
+MOST_OPEN_PANELS = 6
 """The panels of more scenarios than this are folded."""
-ERRORS = {"track_error": track_errors, "track_error_bound": bound_track_errors}
+CURVE_ERRORS = {"track_error": track_errors, "track_error_bound": bound_track_errors}
 PLOTS = (
     (
         "Track error over time",
@@ -68,11 +67,11 @@ Lines = Mapping[str, Mapping[int, pd.Series]]
 """Name and seed to values."""
 
 
-def curves(material: ReportData) -> Section:
+def curves(material: ReportData) -> PageSection:
     """Error, search, fit and training curves of the shown methods."""
     scenarios = [name for name in material.choice.scenarios if material.first_runs(name)]
     if not scenarios:
-        return Section(key="curves", title="Curves", blocks=[Text(text="No run has finished.", tone="mute")])
+        return PageSection(key="curves", title="Curves", blocks=[Text(text="No run has finished.", tone="mute")])
     shown, methods = material.choice.shown, material.choice.methods
     about = "" if len(shown) == len(methods) else f"{len(shown)} of {len(methods)} methods are drawn: {', '.join(shown)}."
     seen = {scenario: _observations(material, scenario) for scenario in scenarios}
@@ -86,25 +85,23 @@ def curves(material: ReportData) -> Section:
         order = {name: index for index, name in enumerate(shown)} if what != "search" else {}
         names = sorted({name for own in lines.values() for name in own}, key=lambda name: (order.get(name, 0), name))
         index = {name: order.get(name, place) for place, name in enumerate(names)}
-        styles = {name: (COLORS[i % len(COLORS)], DASHES[i // len(COLORS) % len(DASHES)]) for name, i in index.items()}
-        legend = Legend(entries=[(name, color, dash[1]) for name, (color, dash) in styles.items()])
+        styles = {
+            name: (LINE_COLORS[i % len(LINE_COLORS)], LINE_DASHES[i // len(LINE_COLORS) % len(LINE_DASHES)])
+            for name, i in index.items()
+        }
+        legend = Legend(entries=[(name, *style) for name, style in styles.items()])
         pictures = []
         for scenario, own in lines.items():
-            observations = seen[scenario] if what in ERRORS else None
-            alt = f"{title}, {scenario}: {', '.join(own)}"
-            pictures.append(_panel(own, styles, observations.scenario if observations else None, scenario, alt))
-        is_open = what == "track_error" or len(pictures) <= MOST_OPEN
+            future = observed.scenario if what in CURVE_ERRORS and (observed := seen[scenario]) else None
+            pictures.append(_panel(own, styles, future, scenario, f"{title}, {scenario}: {', '.join(own)}"))
+        is_open = what == "track_error" or len(pictures) <= MOST_OPEN_PANELS
         blocks.append(Fold(summary=title, blocks=[Text(text=text), legend, Grid(blocks=pictures)], open=is_open))
-    return Section(key="curves", title="Curves", about=about, blocks=blocks)
+    return PageSection(key="curves", title="Curves", about=about, blocks=blocks)
 
 
 def _observations(material: ReportData, scenario: str) -> Observations | None:
     place = material.results / scenario / "observations.npz"
-    try:
-        return Observations.load(place) if place.is_file() else None
-    except UNREADABLE as error:
-        material.lost(place, error)
-        return None
+    return material.read(place, Observations.load) if place.is_file() else None
 
 
 def _lines(material: ReportData, scenario: str, what: str, observations: Observations | None) -> Lines:
@@ -112,11 +109,11 @@ def _lines(material: ReportData, scenario: str, what: str, observations: Observa
     lines: dict[str, dict[int, pd.Series]] = {}
     first = material.first_runs(scenario)
     for method in first:
-        for run in [first[method]] if what in ERRORS else material.runs_of(scenario, method):
+        for run in [first[method]] if what in CURVE_ERRORS else material.runs_of(scenario, method):
             name = _search_row(run) if what == "search" else method
             if not name or run.seed in lines.get(name, {}):
                 continue
-            values = _error(material, run, what, observations) if what in ERRORS else _history(material, run, what)
+            values = _error(material, run, what, observations) if what in CURVE_ERRORS else _history(material, run, what)
             if values is not None and len(values):
                 lines.setdefault(name, {})[run.seed] = values
     return lines
@@ -132,15 +129,14 @@ def _history(material: ReportData, run: RunRecord, stage: str) -> pd.Series | No
     """Losses or best costs by step; None if the run has none."""
     if not run.histories.get(stage):
         return None
-    path = (material.folder(run) / run.histories[stage]).resolve()
-    try:
+
+    def read(path: Path) -> pd.Series:
         table = pd.read_parquet(path, columns=["step", "metric", "value"])
         own = table["metric"] == ("best_cost" if stage == "search" else "loss")
         values = table.loc[own].set_index("step")["value"].astype(float)
-    except UNREADABLE as error:
-        material.lost(path, error)
-        return None
-    return values[values < PENALTY] if stage == "search" else 1e6 * values if stage == "fit" else values
+        return values[values < DIVERGED_COST] if stage == "search" else 1e6 * values if stage == "fit" else values
+
+    return material.read((material.folder(run) / run.histories[stage]).resolve(), read)
 
 
 def _error(material: ReportData, run: RunRecord, metric: str, observations: Observations | None) -> pd.Series | None:
@@ -148,17 +144,17 @@ def _error(material: ReportData, run: RunRecord, metric: str, observations: Obse
     record = material.file(run, "records", "rollout")
     if record is None or observations is None or not run.ok:
         return None
-    try:
-        stage = StageRecord.load(record)
+
+    def read(path: Path) -> pd.Series | None:
+        stage = StageRecord.load(path)
         if "trajectory" not in stage.files:
             return None
-        positions = Trajectory.load(record.parent / stage.files["trajectory"][0]).positions
-        values = METRICS[metric].factor * ERRORS[metric](positions, observations.tracks[: len(positions)])
-    except UNREADABLE as error:
-        material.lost(record, error)
-        return None
-    seconds = np.arange(len(values)) / observations.scenario.frame_rate
-    return None if np.isnan(values).all() else pd.Series(values, index=seconds)
+        positions = Trajectory.load(path.parent / stage.files["trajectory"][0]).positions
+        values = METRICS[metric].factor * CURVE_ERRORS[metric](positions, observations.tracks[: len(positions)])
+        seconds = np.arange(len(values)) / observations.scenario.frame_rate
+        return None if np.isnan(values).all() else pd.Series(values, index=seconds)
+
+    return material.read(record, read)
 
 
 def _panel(lines: Lines, styles: Mapping[str, Any], future: Scenario | None, caption: str, alt: str) -> Picture:
@@ -168,14 +164,12 @@ def _panel(lines: Lines, styles: Mapping[str, Any], future: Scenario | None, cap
         axis = figure.add_axes(FRAME)
         for name in reversed(list(lines)):
             for index, values in enumerate(lines[name].values()):
-                steps = np.unique(np.linspace(0, len(values) - 1, POINTS).round().astype(int))
-                style: dict[str, Any] = {
-                    "color": styles[name][0],
-                    "ls": styles[name][1][0],
-                    "marker": "o" if len(steps) == 1 else "",
-                }
+                steps = np.unique(np.linspace(0, len(values) - 1, LINE_POINTS).round().astype(int))
+                color, dash = styles[name]
+                style: Any = {"color": color, "ls": (0, [float(part) / 1.4 for part in dash.split()]) if dash else "-"}
                 style |= {"lw": 0.8, "alpha": 0.5} if index else {"lw": 1.5}
-                axis.plot(values.index[steps], values.to_numpy()[steps], ms=3, **style)
+                dot = "o" if len(steps) == 1 else ""
+                axis.plot(values.index[steps], values.to_numpy()[steps], marker=dot, ms=3, **style)
         if future is not None:
             end = future.frame_count / future.frame_rate
             axis.axvspan(future.train_end / future.frame_rate, end, color="#888", alpha=0.18, lw=0)
@@ -196,8 +190,7 @@ def _panel(lines: Lines, styles: Mapping[str, Any], future: Scenario | None, cap
         axis.tick_params(length=2.5, width=0.6)
         stream = io.BytesIO()
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
-    data = base64.b64encode(stream.getvalue()).decode("ascii")
-    return Picture(caption=caption, alt=alt, data=f"data:image/svg+xml;base64,{data}", paper=True)
+    return Picture(caption=caption, alt=alt, data=data_uri("image/svg+xml", stream.getvalue()), paper=True)
 
 
-SECTION = ReportSection(order=40, make=curves)
+section = ReportSection(order=40, make=curves)

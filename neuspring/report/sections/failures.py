@@ -1,4 +1,4 @@
-"""What went wrong: failed jobs and their causes, numerical failures, damaged files; and a table of the runs that there are."""
+"""Failures: failed jobs and their causes, numerical failures, damaged files; and a table of the runs that there are."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 import pandas as pd
 
 from neuspring.core.job_records import JobRecord
-from neuspring.core.table import Cell, Chip, Table
-from neuspring.report.blocks import Block, Fold, Section, Text
+from neuspring.core.table import Cell, Chip, Table, Tone
+from neuspring.report.blocks import Block, Fold, PageSection, Text
 from neuspring.report.data import MOST_ROWS, ReportData, ReportSection, duration, link, several
 
 
-def failures(material: ReportData) -> Section:
+def failures(material: ReportData) -> PageSection:
     """Everything that keeps runs out of the tables, and a table of the runs that there are."""
     failed = [job for job in material.jobs if job.failed]
     left = [job for job in material.jobs if job.last.outcome == "running"]
@@ -43,7 +43,7 @@ def failures(material: ReportData) -> Section:
         blocks.append(Fold(summary=summary, blocks=[_jobs("Jobs", retried, material)]))
     if len(runs):
         blocks.append(_matrix(runs))
-    return Section(key="failures", title="Failures and missing runs", blocks=blocks)
+    return PageSection(key="failures", title="Failures and missing runs", blocks=blocks)
 
 
 def _rest(count: int) -> str:
@@ -84,32 +84,22 @@ def _numerical(broken: pd.DataFrame) -> Table:
 
 def _matrix(runs: pd.DataFrame) -> Fold:
     """A table of scenarios by methods that counts the finished seeds."""
-    counts = runs.groupby(["scenario", "method", "status"]).size().to_dict()
-    asked = set(zip(runs["scenario"], runs["method"], strict=True))
+    counts = runs.groupby(["scenario", "method"], sort=False)["status"].value_counts().unstack(fill_value=0)
+    counts = counts.reindex(columns=["ok", "failed", "missing"], fill_value=0)
     scenarios, methods = (list(dict.fromkeys(runs[name])) for name in ("scenario", "method"))
-    seeds, rows = runs["seed"].nunique(), []
-    for scenario in scenarios:
-        row = [Cell(text=str(scenario))]
-        for method in methods:
-            ok, failed = (counts.get((scenario, method, status), 0) for status in ("ok", "failed"))
-            wrong = f" ✗ {failed}" if failed else ""
-            if (scenario, method) not in asked:
-                row.append(Cell(text="", value=-1))
-                continue
-            text = (f"✓ {ok}" if ok == seeds else f"{ok} of {seeds}" if ok else "" if failed else "–") + wrong
-            tone = "bad" if failed else "good" if ok == seeds else "warn" if ok else "mute"
-            row.append(Cell(text=text.strip(), tone=tone, value=ok))  # type: ignore[arg-type]
-        rows.append(row)
-    missing = int((runs["status"] == "missing").sum())
-    table = Table(
-        caption="Finished seeds",
-        header=["Scenario", *map(str, methods)],
-        rows=rows,
-        sortable=True,
-        note=f"✓ all {several(seeds, 'seed')} finished; ✗ failed; – missing; empty: does not apply.",
-    )
-    done = int((runs["status"] == "ok").sum())
+    seeds, (done, _, missing) = runs["seed"].nunique(), map(int, counts.sum())
+
+    def cell(ok: int, failed: int, _: int) -> Cell:
+        text = f"✓ {ok}" if ok == seeds else f"{ok} of {seeds}" if ok else "" if failed else "–"
+        tone: Tone = "bad" if failed else "good" if ok == seeds else "warn" if ok else "mute"
+        return Cell(text=f"{text} ✗ {failed}".strip() if failed else text, tone=tone, value=ok)
+
+    own = {key: cell(*map(int, row)) for key, row in zip(counts.index, counts.to_numpy(), strict=True)}
+    rows = [[Cell(text=str(name)), *(own.get((name, method), Cell(value=-1)) for method in methods)] for name in scenarios]
+    note = f"✓ all {several(seeds, 'seed')} finished; ✗ failed; – missing; empty: does not apply."
+    header = ["Scenario", *map(str, methods)]
+    table = Table(caption="Finished seeds", header=header, rows=rows, sortable=True, note=note)
     return Fold(summary=f"Runs: {done} of {len(runs)} finished, {missing} missing", blocks=[table], open=len(scenarios) <= 30)
 
 
-SECTION = ReportSection(order=100, make=failures, phase=2)
+section = ReportSection(order=100, make=failures, phase=2)

@@ -4,30 +4,24 @@ from __future__ import annotations
 
 from neuspring.core.findings import Level, findings_of
 from neuspring.core.table import Cell, Chip, Table, Tone
-from neuspring.report.blocks import Block, Fold, Section, Text
+from neuspring.report.blocks import Block, Fold, PageSection, Text
 from neuspring.report.data import MOST_ROWS, ReportData, ReportSection, several
 
 TONES: dict[Level, Tone] = {"error": "bad", "warning": "warn", "note": "mute"}
 
 
-def findings(material: ReportData) -> Section | None:
+def findings(material: ReportData) -> PageSection | None:
     """A table of warnings, and one of notes to unfold; None where perception found nothing worth saying, or did not run."""
     found = [(name, one) for name in material.choice.scenarios for one in findings_of(material.results, name)]
     if not found:
         return None
-    loud = [(name, one) for name, one in found if one.level != "note"]
-    quiet = [(name, one) for name, one in found if one.level == "note"]
+    loud, quiet = ([pair for pair in found if (pair[1].level == "note") == noted] for noted in (False, True))
     blocks: list[Block] = []
     for caption, part in (("Warnings", loud), ("Notes", quiet)):
-        rows = [
-            [
-                Cell(text=name),
-                Cell(text=one.where),
-                Cell(text=one.name, chips=[Chip(text=one.level, tone=TONES[one.level])]),
-                Cell(text=one.text, wrap=True),
-            ]
-            for name, one in part[:MOST_ROWS]
-        ]
+        rows = []
+        for name, one in part[:MOST_ROWS]:
+            level = Chip(text=one.level, tone=TONES[one.level])
+            rows.append([Cell(text=name), Cell(text=one.where), Cell(text=one.name, chips=[level]), Cell(text=one.text, wrap=True)])
         rest = f"{len(part) - MOST_ROWS} more are in the records." if len(part) > MOST_ROWS else ""
         table = Table(caption=caption, header=["Scenario", "Where", "What", "Finding"], rows=rows, stub=1, note=rest)
         if part:
@@ -35,7 +29,7 @@ def findings(material: ReportData) -> Section | None:
     if not loud:
         blocks.insert(0, Text(text="Perception noticed nothing that makes results worse.", tone="good"))
     about = "Each step looks at its own result: a warning says what may make all methods worse, and what to do."
-    return Section(key="findings", title="Findings of perception", about=about, blocks=blocks)
+    return PageSection(key="findings", title="Findings of perception", about=about, blocks=blocks)
 
 
-SECTION = ReportSection(order=60, make=findings)
+section = ReportSection(order=60, make=findings)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from neuspring.report.blocks import Section
+from neuspring.report.blocks import PageSection
 from neuspring.report.data import ReportData, ReportSection, prose
 
 
-def perception(material: ReportData) -> Section | None:
+def perception(material: ReportData) -> PageSection | None:
     """Perception against the truth of synthetic captures; None where it was not judged."""
     text = prose(material, material.results / material.choice.tables / "perception.md")
-    return Section(key="perception", title="Perception", blocks=[text]) if text else None
+    return PageSection(key="perception", title="Perception", blocks=[text]) if text else None
 
 
-SECTION = ReportSection(order=70, make=perception)
+section = ReportSection(order=70, make=perception)

@@ -7,25 +7,25 @@ import os
 import shlex
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from PIL import Image
 
 from neuspring.core.artifacts import Observations
 from neuspring.core.run_record import RunRecord
-from neuspring.report.blocks import Block, Code, Fold, Grid, Picture, Section, Text, Video
+from neuspring.report.blocks import Block, Code, Fold, Grid, PageSection, Picture, Text
 from neuspring.report.data import UNREADABLE, ReportData, ReportSection, data_uri, link, several
 from neuspring.report.draw.scene import chosen_frames
 
-QUALITY = 75
+WEBP_QUALITY = 75
 """Quality of WebP pictures, of 100."""
 MARKUP = 400
 """Characters around an embedded picture."""
 NO_ROOM = "not embedded, to keep this page small"
-ADDRESS = "http://127.0.0.1:8080/"
-"""Where `neuspring play` listens unless it is told otherwise."""
-MOST_OPEN = 3
+PLAY_ADDRESS = "http://127.0.0.1:8080/"
+"""Address at which `neuspring play` listens unless it is told otherwise."""
+MOST_OPEN_FILMS = 3
 """Scenarios whose films are not folded."""
 
 
@@ -57,65 +57,48 @@ KINDS = (
 )
 
 
-class Media:
-    """The files that are embedded, of all that the pictures of a report may show."""
+def embed(material: ReportData, room: int, video_room: int) -> dict[Path, Picture]:
+    """Every file that the section shows, embedded, or with the reason why it is linked.
 
-    def __init__(self, material: ReportData, room: int, video_room: int) -> None:
-        """Pictures may take `room` characters, and films what they leave, up to `video_room`.
-
-        Of every kind, the first method's of all scenarios come before the second method's.
-        """
-        self._folder = material.output.resolve().parent
-        self._embedded: dict[Path, Picture] = {}
-        self._films: dict[Path, str] = {}
-        self._damaged: dict[Path, str] = {}
-        runs = [pair for scenario in material.choice.scenarios for pair in enumerate(material.first_runs(scenario).values())]
-        wanted: dict[Path, Kind] = {}
-        for kind in KINDS:
-            for _, run in sorted(runs, key=lambda pair: pair[0]):
-                if path := material.file(run, kind.artifact, kind.stem):
-                    wanted.setdefault(path.resolve(), kind)
-        room -= MARKUP * len(wanted)
-        pictures = {path: kind for path, kind in wanted.items() if kind.width}
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            for path, made in zip(pictures, pool.map(_smaller, pictures, (kind.width for kind in pictures.values())), strict=True):
-                if isinstance(made, str):
-                    self._damaged[path] = made
-                    material.lost(path, made)
-                elif len(made.data) <= room:
-                    self._embedded[path] = made
-                    room -= len(made.data)
-        room = min(room, video_room)
-        for path in (path for path, kind in wanted.items() if not kind.width):
-            if 4 * path.stat().st_size / 3 <= room:
-                self._films[path] = data_uri("video/mp4", path.read_bytes())
-                room -= len(self._films[path])
-
-    def show(self, path: Path, caption: str, alt: str, kind: Kind, frames: Sequence[tuple[str, str]]) -> Block:
-        """A picture or film; a link if it did not fit."""
-        place, target = path.resolve(), link(path, self._folder)
-        if not kind.width:
-            wide = kind.least >= 40
-            if place in self._films:
-                return Video(caption=caption, data=self._films[place], wide=wide)
-            return Video(caption=caption, link=target, reason=NO_ROOM, wide=wide)
-        if found := self._embedded.get(place):
-            return Picture(caption=caption, alt=alt, data=found.data, size=found.size, wide=True, paper=kind.paper, frames=frames)
-        return Picture(caption=caption, alt=alt, link=target, reason=self._damaged.get(place, NO_ROOM), frames=frames)
+    Pictures may take `room` characters, and films what they leave, up to `video_room`. Of every kind, the first method's of all
+    scenarios come before the second method's.
+    """
+    runs = [pair for scenario in material.choice.scenarios for pair in enumerate(material.first_runs(scenario).values())]
+    wanted, shown = dict[Path, Kind](), dict[Path, Picture]()
+    for kind in KINDS:
+        for _, run in sorted(runs, key=lambda pair: pair[0]):
+            if path := material.file(run, kind.artifact, kind.stem):
+                wanted.setdefault(path.resolve(), kind)
+    room -= MARKUP * len(wanted)
+    widths = {path: kind.width for path, kind in wanted.items() if kind.width}
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for path, made in zip(widths, pool.map(_smaller, widths, widths.values()), strict=True):
+            if made.reason:
+                material.lost(path, made.reason)
+            fits = len(made.data) <= room
+            room -= len(made.data) * fits
+            shown[path] = made if fits else Picture(caption="", reason=NO_ROOM)
+    room = min(room, video_room)
+    for path in (path for path in wanted if path not in widths):
+        fits = 4 * path.stat().st_size / 3 <= room
+        data = data_uri("video/mp4", path.read_bytes()) if fits else ""
+        room -= len(data)
+        shown[path] = Picture(caption="", film=True, data=data, reason="" if fits else NO_ROOM)
+    return shown
 
 
-def _smaller(path: Path, width: int) -> Picture | str:
+def _smaller(path: Path, width: int) -> Picture:
     """The picture, not wider than `width`, as WebP; or the reason why it cannot be read."""
     try:
         picture = Image.open(path).convert("RGB")
     except FileNotFoundError:
-        return "no such file"
+        return Picture(caption="", reason="no such file")
     except (OSError, SyntaxError, ValueError):
-        return "damaged: not a picture"
+        return Picture(caption="", reason="damaged: not a picture")
     picture.thumbnail((width, 10 * width))
     stream = io.BytesIO()
-    picture.save(stream, "WEBP", quality=QUALITY)
-    return Picture(caption="", alt="", data=data_uri("image/webp", stream.getvalue()), size=picture.size)
+    picture.save(stream, "WEBP", quality=WEBP_QUALITY)
+    return Picture(caption="", data=data_uri("image/webp", stream.getvalue()), size=picture.size)
 
 
 def frame_links(material: ReportData, scenario: str) -> tuple[tuple[str, str], ...]:
@@ -125,29 +108,32 @@ def frame_links(material: ReportData, scenario: str) -> tuple[tuple[str, str], .
     except UNREADABLE:
         return ()
     frames = sorted(chosen_frames(facts, facts.frame_count))
-    return tuple((f"frame {frame}", f"{ADDRESS}?frame={frame}&scenario={scenario}") for frame in frames)
+    return tuple((f"frame {frame}", f"{PLAY_ADDRESS}?frame={frame}&scenario={scenario}") for frame in frames)
 
 
-def pictures(material: ReportData) -> Section:
+def pictures(material: ReportData) -> PageSection:
     """A fold per scenario, with the command that shows its runs in the playground."""
-    media, folds = Media(material, material.room, int(1e6 * material.choice.video_megabytes)), list[Block]()
+    shown, folds = embed(material, material.room, int(1e6 * material.choice.video_megabytes)), list[Block]()
     for scenario in material.choice.scenarios:
         runs = material.first_runs(scenario)
-        if blocks := _scenario(material, runs, media, frame_links(material, scenario)):
+        if blocks := _scenario(material, runs, shown, frame_links(material, scenario)):
             command = shlex.join(["neuspring", "play", *(str(material.folder(run)) for run in runs.values())])
             seeds = sorted({run.seed for run in runs.values()})
             summary = f"{scenario}: {several(len(runs), 'method')}, seed {', '.join(map(str, seeds))}"
-            folds.append(Fold(summary=summary, blocks=[*blocks, Code(text=command, whole=True)], open=len(folds) < MOST_OPEN))
+            folds.append(Fold(summary=summary, blocks=[*blocks, Code(text=command, whole=True)], open=len(folds) < MOST_OPEN_FILMS))
     if not folds:
-        return Section(key="pictures", title="Film", blocks=[Text(text="No run has left pictures yet.", tone="mute")])
+        return PageSection(key="pictures", title="Film", blocks=[Text(text="No run has left pictures yet.", tone="mute")])
     about = (
         "All methods in step, one seed of every scenario. The bar above a film is blue in training frames and orange in the "
         "future. The command below opens the twins in the browser, to be turned and pulled; links to frames lead there."
     )
-    return Section(key="pictures", title="Film", about=about, blocks=folds)
+    return PageSection(key="pictures", title="Film", about=about, blocks=folds)
 
 
-def _scenario(material: ReportData, runs: dict[str, RunRecord], media: Media, frames: Sequence[tuple[str, str]]) -> list[Block]:
+def _scenario(
+    material: ReportData, runs: dict[str, RunRecord], shown: dict[Path, Picture], frames: Sequence[tuple[str, str]]
+) -> list[Block]:
+    folder = material.output.resolve().parent
     blocks: list[Block] = []
     for kind in KINDS:
         # Methods share most splats, so a picture may belong to several.
@@ -162,7 +148,10 @@ def _scenario(material: ReportData, runs: dict[str, RunRecord], media: Media, fr
             if kind.stem == "appearance":
                 caption = "Observed and drawn in frame 0" + (f", {caption}" if len(owners) > 1 else "")
             alt = f"{kind.title}: {run.scenario}, {', '.join(methods)}, seed {run.seed}"
-            figures.append(media.show(path, caption, alt, kind, frames if kind.frames else ()))
+            own = frames if kind.frames else ()
+            wide = bool(kind.width) or kind.least >= 40
+            target = "" if shown[path].data else link(path, folder)
+            figures.append(replace(shown[path], caption=caption, alt=alt, link=target, wide=wide, paper=kind.paper, frames=own))
         if figures:
             grid = Grid(blocks=figures, least=kind.least, films=not kind.width)
             # The first kind that there is can be seen at once.
@@ -170,4 +159,4 @@ def _scenario(material: ReportData, runs: dict[str, RunRecord], media: Media, fr
     return blocks
 
 
-SECTION = ReportSection(order=30, make=pictures, phase=1)
+section = ReportSection(order=30, make=pictures, phase=1)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import pandas as pd
 
 from neuspring.core.table import Tone
-from neuspring.report.blocks import Block, Fold, Grid, Section, Verdict
+from neuspring.report.blocks import Answer, Block, Fold, Grid, PageSection
 from neuspring.report.clips import clip_blocks
 from neuspring.report.data import ReportData, ReportSection, several
 from neuspring.report.grid import chip
@@ -22,10 +22,10 @@ WITHOUT_DIRECTION = (Kind.NOT_RUN, Kind.NOT_COMPUTED, Kind.NOTHING_TO_COMPARE, K
 """Verdicts on a change that name no direction."""
 
 
-def studies(material: ReportData) -> Section | None:
+def studies(material: ReportData) -> PageSection | None:
     """Cards with the answers, and a fold per study; None without any."""
     found = material.numbers.by_study.values()
-    if not found or not material.choice.size:
+    if not found or not len(material.collected.runs):
         return None
     cards = [answer_card(one) for one in found if isinstance(one, StudyNumbers) and one.study.reference]
     folds = []
@@ -33,7 +33,9 @@ def studies(material: ReportData) -> Section | None:
         blocks: list[Block] = clip_blocks(one) if isinstance(one, ClipNumbers) else study_blocks(one)
         folds.append(Fold(summary=f"{one.name}: {one.study.title}", blocks=blocks, open=True, key=f"study-{one.name}"))
     about = f"{_foreign(material.collected.runs)} The command neuspring explain STUDY/ROW/TASK/METRIC says what a cell is made of."
-    return Section(key="studies", title="The paper's tables", blocks=[Grid(blocks=cards, least=17), *folds], about=about.strip())
+    return PageSection(
+        key="studies", title="The paper's tables", blocks=[Grid(blocks=cards, least=17), *folds], about=about.strip()
+    )
 
 
 def _foreign(runs: pd.DataFrame) -> str:
@@ -46,7 +48,7 @@ def _foreign(runs: pd.DataFrame) -> str:
     return f"The data are {part} the paper's: {named}. Compare changes against a baseline, not values."
 
 
-def answer_card(numbers: StudyNumbers) -> Verdict:
+def answer_card(numbers: StudyNumbers) -> Answer:
     """The answer of a study of the paper."""
     name, cells = numbers.name, numbers.cells
     printed = cells[cells["paper"] != ""]
@@ -58,9 +60,7 @@ def answer_card(numbers: StudyNumbers) -> Verdict:
     given, tone = answer(Counter(printed["verdict"]), len(printed))
     counts = Counter((row["verdict"], verdict_text(row)) for row in printed.to_dict("records"))  # type: ignore[arg-type]
     chips = [chip(verdict, f"{count} {words}") for (verdict, words), count in counts.most_common()]
-    return Verdict(
-        title=f"{name}: {numbers.study.title}", answer=given, tone=tone, chips=chips, small=small, target=f"study-{name}"
-    )
+    return Answer(title=f"{name}: {numbers.study.title}", answer=given, tone=tone, chips=chips, small=small, target=f"study-{name}")
 
 
 def answer(counts: Mapping[str, int], total: int) -> tuple[str, Tone]:
@@ -77,4 +77,4 @@ def answer(counts: Mapping[str, int], total: int) -> tuple[str, Tone]:
     return f"{agree} of {total} cells within the interval or better, {worse} worse, {total - answered} open.", tone
 
 
-SECTION = ReportSection(order=55, make=studies)
+section = ReportSection(order=55, make=studies)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from neuspring.core.job_records import JobRecord
 from neuspring.core.table import Cell, Table
-from neuspring.report.blocks import Block, Section, Text
+from neuspring.report.blocks import Block, PageSection, Text
 from neuspring.report.data import METHOD_RULES, ReportData, ReportSection, duration, hours, memory
 from neuspring.report.summary import timing_table
 from neuspring.scores.metrics import DASH
@@ -19,13 +19,6 @@ ORDER = (
     *("train", "predict", "transfer", "appearance", "render", "score", "tables", "study", "report", "log_run", "track_init"),
 )
 """Rules in the order of the workflow."""
-
-
-def _grouped(jobs: Iterable[JobRecord], key: Callable[[JobRecord], str]) -> dict[str, list[JobRecord]]:
-    groups: dict[str, list[JobRecord]] = defaultdict(list)
-    for job in jobs:
-        groups[key(job)].append(job)
-    return groups
 
 
 def _owner(job: JobRecord) -> str:
@@ -44,18 +37,23 @@ def gpu_hours(jobs: Sequence[JobRecord]) -> float:
     return sum(attempt.seconds * len(attempt.devices) for job in jobs for attempt in job.attempts) / 3600
 
 
-def work(material: ReportData) -> Section:
+def work(material: ReportData) -> PageSection:
     """Tables of hours."""
     title = "Time and hardware"
     jobs = material.jobs
     if not jobs:
         note = Text(text="There are no job records: times are those of finished runs alone.", tone="mute")
-        return Section(key="work", title=title, blocks=[note, timing_table(material.collected.runs)] if material.runs else [note])
+        return PageSection(
+            key="work", title=title, blocks=[note, timing_table(material.collected.runs)] if material.runs else [note]
+        )
     attempts = [attempt for job in jobs for attempt in job.attempts]
     hosts = sorted({a.host for a in attempts if a.host})
     names = sorted({name for a in attempts for name in a.device_names})
     about = f"Hosts: {', '.join(hosts) or 'unknown'}. GPUs: {', '.join(names) or 'none used'}. Times include failed attempts."
-    by_rule, by_method = _grouped(jobs, lambda job: job.rule), _grouped(jobs, _owner)
+    by_rule, by_method = defaultdict[str, list[JobRecord]](list), defaultdict[str, list[JobRecord]](list)
+    for job in jobs:
+        by_rule[job.rule].append(job)
+        by_method[_owner(job)].append(job)
     rules = sorted(by_rule, key=lambda name: (ORDER.index(name) if name in ORDER else len(ORDER), name))
     steps = {name: by_rule[name] for name in rules} | ({"all": jobs} if len(rules) > 1 else {})
     methods = {name: by_method[name] for name in sorted(by_method) if name}
@@ -63,7 +61,7 @@ def work(material: ReportData) -> Section:
     if methods:
         caption = "By method (searches and splats apart, since methods share them)"
         blocks.append(_costs(caption, "Method", methods, sortable=True))
-    return Section(key="work", title=title, about=about, blocks=blocks)
+    return PageSection(key="work", title=title, about=about, blocks=blocks)
 
 
 def _costs(caption: str, what: str, groups: Mapping[str, Sequence[JobRecord]], *, sortable: bool) -> Table:
@@ -82,35 +80,24 @@ def _cost(name: str, jobs: Sequence[JobRecord]) -> list[Cell]:
     attempts = [attempt for job in jobs for attempt in job.attempts]
     failed, retries = sum(job.failed for job in jobs), sum(len(job.attempts) - 1 for job in jobs)
     seconds = [job.seconds for job in jobs]
-    median, longest = float(np.median(seconds)), max(seconds)
-    on_gpu, waited = 3600 * gpu_hours(jobs), sum(a.waited for a in attempts)
+    on_gpu, on_cpu, waited = 3600 * gpu_hours(jobs), sum(a.cpu_seconds for a in attempts), sum(a.waited for a in attempts)
     peak = max((a.peak_memory_mb for a in attempts), default=0.0)
     gpu_peak = max((a.peak_gpu_memory_mb for a in attempts if a.peak_gpu_memory_mb is not None), default=None)
     used = [(a.gpu_utilization, a.seconds * len(a.devices)) for a in attempts if a.gpu_utilization is not None and a.seconds > 0]
     weight = sum(weight for _, weight in used)
     use = sum(percent * weight for percent, weight in used) / weight if weight else None
-    return [
-        Cell(text=name),
-        _number(len(jobs)),
-        Cell(text=str(failed), tone="bad" if failed else "", value=failed),
-        _number(retries),
-        Cell(text=duration(median), value=median),
-        Cell(text=duration(longest), value=longest),
-        _hours(on_gpu),
-        _hours(sum(a.cpu_seconds for a in attempts)),
-        Cell(text=duration(waited) if on_gpu else DASH, value=waited),
-        Cell(text=memory(peak), value=peak),
-        Cell(text=memory(gpu_peak), value=gpu_peak or 0.0),
-        Cell(text=DASH if use is None else f"{use:.0f} %", value=use or 0.0),
+    values: list[tuple[str, float]] = [
+        (f"{len(jobs):,}", len(jobs)),
+        (str(failed), failed),
+        (f"{retries:,}", retries),
+        *((duration(value), value) for value in (float(np.median(seconds)), max(seconds))),
+        *((hours(value) if value else DASH, value) for value in (on_gpu, on_cpu)),
+        (duration(waited) if on_gpu else DASH, waited),
+        *((memory(value), value or 0.0) for value in (peak, gpu_peak)),
+        (DASH if use is None else f"{use:.0f} %", use or 0.0),
     ]
+    tones = {1: "bad"} if failed else {}
+    return [Cell(text=name), *(Cell(text=text, value=value, tone=tones.get(k, "")) for k, (text, value) in enumerate(values))]  # type: ignore[arg-type]
 
 
-def _number(value: int) -> Cell:
-    return Cell(text=f"{value:,}", value=value)
-
-
-def _hours(seconds: float) -> Cell:
-    return Cell(text=hours(seconds) if seconds else DASH, value=seconds)
-
-
-SECTION = ReportSection(order=90, make=work)
+section = ReportSection(order=90, make=work)

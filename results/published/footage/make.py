@@ -27,7 +27,7 @@ from neuspring.core.files import write_text
 from neuspring.core.records import digest_file
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT
 from neuspring.report.draw.sheet import FUTURE, TRAINING
-from neuspring.scores.carried import point_errors, points_on_table
+from neuspring.scores.carried import carried_in_image, points_on_table
 from neuspring.scores.pictures import Pair, picture_scores
 from neuspring.splats.draw import OBJECT_COVERAGE
 from results.published.footage.captures import CARRYING
@@ -87,7 +87,8 @@ def point_rows(case: Case, positions: np.ndarray | None, run: Run | None) -> Ite
         camera = case.capture.cameras[case.camera]
         chosen = positions[np.minimum(points.frames, len(positions) - 1)]
         view = camera.intrinsics, camera.camera_to_world, chosen, marked, run.observations.surface_count
-        errors = point_errors(*view)
+        places = carried_in_image(*view[:3], marked[0], view[4])
+        errors = np.linalg.norm(places - marked[: len(places)], axis=2)
         distances = points_on_table(*view, 1.0 if run.observations.scenario.up == "+z" else -1.0)[1:]
         if np.isfinite(distances).any():
             yield {"part": "later", "metric": "points_table", "value": MM * float(np.nanmean(distances))}

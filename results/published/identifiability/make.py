@@ -47,9 +47,9 @@ from neuspring.core.artifacts import Twin
 from neuspring.core.errors import NumericalFailure
 from neuspring.core.files import write_text
 from neuspring.core.table import Table
-from neuspring.report.draw.scene import Prediction, Scene
+from neuspring.report.draw.scene import ShownRun, ShownScene
 from neuspring.report.draw.sheet import save
-from neuspring.report.draw.twin import COLORS, TwinPicture
+from neuspring.report.draw.twin import STIFFNESS_COLORS, TwinPicture
 from neuspring.scenes.sources import read_scenarios
 from neuspring.scenes.synthetic import toy
 from neuspring.scores import metrics
@@ -241,12 +241,12 @@ def picture(scenes: dict[str, dict[str, np.ndarray]]) -> Figure:
     figure, axes = plt.subplots(len(scenes), 5, figsize=(17, 2.9 * len(scenes) + 1), squeeze=False, layout="constrained")
     for row, (scene, kinds) in zip(axes, scenes.items(), strict=True):
         truth, unit = scene_of(scene, *SHOWN).truth, np.exp(np.log(kinds["truth"]).mean())
-        seen = Scene.from_side(scene_of(scene, *SHOWN).observations, [], [0])
+        seen = ShownScene.from_side(scene_of(scene, *SHOWN).observations, [], [0])
         for axis, kind in zip(row, ("truth", *RATES), strict=False):
             stiffness = truth.material.stiffness.copy()
             stiffness[: len(kinds[kind])] = kinds[kind] / unit
             material = replace(truth.material, stiffness=stiffness)
-            take = Prediction(kind, truth.topology.nodes[None], replace(truth, material=material))
+            take = ShownRun(kind, truth.topology.nodes[None], replace(truth, material=material))
             TwinPicture([(seen, take)], 0, ("stiffness",), limits=LIMITS).paint(axis, seen, take, "stiffness")
             axis.set_aspect("equal")
             axis.set_title(f"{scene}: {kind}", fontsize=10)
@@ -262,7 +262,14 @@ def picture(scenes: dict[str, dict[str, np.ndarray]]) -> Figure:
     label = "stiffness / geometric mean of the truth"
     ticks: dict[str, Any] = {"ticks": [0.3, 0.5, 1, 2, 3], "format": "{x:g}", "extend": "both"}
     figure.colorbar(
-        ScalarMappable(LogNorm(*LIMITS), COLORS), ax=axes, label=label, location="bottom", aspect=60, shrink=0.6, pad=0.01, **ticks
+        ScalarMappable(LogNorm(*LIMITS), STIFFNESS_COLORS),
+        ax=axes,
+        label=label,
+        location="bottom",
+        aspect=60,
+        shrink=0.6,
+        pad=0.01,
+        **ticks,
     ).minorticks_off()
     figure.suptitle(f"Stiffness of object springs, noise {1e3 * SHOWN[0]:g} mm, seed {SHOWN[1]}")
     return figure

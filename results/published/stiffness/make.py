@@ -27,9 +27,9 @@ from neuspring.core.artifacts import Twin
 from neuspring.core.files import write_text
 from neuspring.core.run_folder import RunFolder
 from neuspring.core.table import Table
-from neuspring.report.draw.scene import Prediction, Scene
+from neuspring.report.draw.scene import ShownRun, ShownScene
 from neuspring.report.draw.sheet import save
-from neuspring.report.draw.twin import COLORS, TwinPicture
+from neuspring.report.draw.twin import STIFFNESS_COLORS, TwinPicture
 from neuspring.scenes.synthetic.truth import Truth, truth_path
 from neuspring.twin.body import body_of
 
@@ -62,7 +62,7 @@ def relative(twin: Twin) -> Twin:
     return replace(twin, material=replace(twin.material, stiffness=stiffness.astype(np.float32)))
 
 
-def picture(scenario: str, takes: Sequence[Prediction], scene: Scene) -> Figure:
+def picture(scenario: str, takes: Sequence[ShownRun], scene: ShownScene) -> Figure:
     """The truth and twins side by side, four in a row."""
     rows, height = -(-len(takes) // 4), 4 * scene.view.height / scene.view.width
     figure, axes = plt.subplots(rows, 4, figsize=(16, rows * (height + 0.3) + 0.9), layout="constrained", squeeze=False)
@@ -73,7 +73,7 @@ def picture(scenario: str, takes: Sequence[Prediction], scene: Scene) -> Figure:
         axis.set_title(take.label, fontsize=9)
     label = "stiffness / its geometric mean"
     bar = figure.colorbar(
-        ScalarMappable(LogNorm(*LIMITS), COLORS),
+        ScalarMappable(LogNorm(*LIMITS), STIFFNESS_COLORS),
         ax=axes,
         label=label,
         location="bottom",
@@ -88,9 +88,9 @@ def picture(scenario: str, takes: Sequence[Prediction], scene: Scene) -> Figure:
     return figure
 
 
-def judged(home: Path, methods: Sequence[str]) -> tuple[list[tuple[str, int, float]], list[Prediction], Scene | None]:
+def judged(home: Path, methods: Sequence[str]) -> tuple[list[tuple[str, int, float]], list[ShownRun], ShownScene | None]:
     """Judged runs of a scenario: (method, seed, correlation); the truth and a twin of each method at rest, and what shows them."""
-    truth, rows, takes, scene = Truth.load(truth_path(home / "capture")), [], dict[str, Prediction](), None
+    truth, rows, takes, scene = Truth.load(truth_path(home / "capture")), [], dict[str, ShownRun](), None
     for path in (path for method in methods for path in sorted(home.glob(f"{method}/*/rollout.json"))):
         run = RunFolder.of(path.parent)
         if (twin := run.twin) is None:
@@ -100,9 +100,9 @@ def judged(home: Path, methods: Sequence[str]) -> tuple[list[tuple[str, int, flo
         logs = np.log([modulus, body_of(twin).node_stiffness(twin)])
         known = (logs.std(axis=1) > LEAST_SPREAD).all()
         rows.append((method, int(seed), float(np.corrcoef(logs)[0, 1]) if known else np.nan))
-        takes.setdefault("truth", Prediction("truth", here, relative(made_of(twin, modulus))))
-        takes.setdefault(method, Prediction(method, here, relative(twin)))
-        scene = scene or Scene.from_side(run.observations, list(takes.values()), [0])
+        takes.setdefault("truth", ShownRun("truth", here, relative(made_of(twin, modulus))))
+        takes.setdefault(method, ShownRun(method, here, relative(twin)))
+        scene = scene or ShownScene.from_side(run.observations, list(takes.values()), [0])
     return rows, list(takes.values()), scene
 
 

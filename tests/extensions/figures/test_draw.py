@@ -180,4 +180,4 @@ def test_a_damaged_splat_file_and_a_missing_folder(video, tmp_path, capsys):
     assert main(["draw", "strip", str(scenario), "--dpi", "60", *output]) == 0
     assert "Nodes are drawn, since there are no splats for neuspring/0" in capsys.readouterr().out
     assert main(["draw", "strip", str(tmp_path / "nowhere"), *output]) == 2
-    assert "must be a results folder; received no such folder" in capsys.readouterr().err
+    assert "or a run <scenario>/<method>/<seed>; received no such folder" in capsys.readouterr().err

@@ -7,7 +7,7 @@ from matplotlib import pyplot as plt
 
 from neuspring.report import summary as tables
 from neuspring.report.draw import benchmark as figures
-from neuspring.scores.metrics import COLUMNS
+from neuspring.scores.metrics import SCORE_COLUMNS
 from neuspring.scores.numbers import Numbers
 from neuspring.scores.runs import Collected
 from tests.support.study_runs import collected
@@ -19,7 +19,7 @@ def chamfer(values: dict[tuple[str, str, int], float], **options) -> Collected:
     future = found.scores.assign(metric="chamfer")
     past = future.assign(task="reconstruction", value=future["value"] / 2)
     # Other metrics must not reach the picture.
-    return Collected(pd.concat([future, past, found.scores])[list(COLUMNS)], found.runs)
+    return Collected(pd.concat([future, past, found.scores])[list(SCORE_COLUMNS)], found.runs)
 
 
 STUDY = {
@@ -49,13 +49,8 @@ def test_cluster_curves_are_the_means_and_deviations_over_seeds():
 
 
 def test_cluster_methods_are_sorted_by_number():
-    assert list(
-        figures.cluster_methods(["clusters_10", "model_b", "neuspring", "clusters_2", "clusters_2", "clusters_x"]).values()
-    ) == [
-        1,
-        2,
-        10,
-    ]
+    names = ["clusters_10", "model_b", "neuspring", "clusters_2", "clusters_2", "clusters_x"]
+    assert list(figures.cluster_methods(names).values()) == [1, 2, 10]
     assert figures.cluster_methods(["model_b", "neuspring"]) == {}
 
 

@@ -11,7 +11,7 @@ from matplotlib.colors import LogNorm
 
 from neuspring.core.artifacts import Observations, Trajectory, Twin
 from neuspring.report.draw import run as figures
-from neuspring.report.draw.scene import Prediction, chosen_frames
+from neuspring.report.draw.scene import ShownRun, chosen_frames
 from neuspring.report.draw.sheet import sample
 from neuspring.report.draw.twin import histogram, region_colors, stiffness_limits
 from neuspring.twin.topology import piecewise_topology, regions
@@ -79,7 +79,7 @@ def check_pictures(paths) -> set[str]:
 
 def test_a_full_run_has_every_picture(tmp_path):
     paths = figures.run_figures(observed(), predicted(), HISTORIES, "m", tmp_path / "plots", twin=regional(3), searched=3e3)
-    assert check_pictures(paths) == NAMES == set(figures.NAMES)
+    assert check_pictures(paths) == NAMES == set(figures.RUN_FIGURES)
     assert sorted(paths) == sorted((tmp_path / "plots").iterdir())
 
 
@@ -153,7 +153,7 @@ def test_the_color_range_holds_most_springs_and_not_the_outliers():
 
 def test_the_searched_stiffness_is_marked():
     twin = regional(2)
-    figure = figures.stiffness_figure(observed(), Prediction("m", twin.topology.nodes[None], twin), 3e3)
+    figure = figures.stiffness_figure(observed(), ShownRun("m", twin.topology.nodes[None], twin), 3e3)
     axis = next(axis for axis in figure.axes if "3,000 N" in axis.get_xlabel())
     assert [float(line.get_xdata()[0]) for line in axis.lines] == [3e3]
     plt.close(figure)
@@ -171,8 +171,8 @@ def test_a_twin_without_object_springs_has_no_stiffness_picture(tmp_path):
 @pytest.mark.parametrize("count", [1, 2, 10, 14])
 def test_regions_are_counted_and_have_colors_of_their_own(count):
     twin = regional(count)
-    body = figures._from_two_sides(observed(), Prediction("m", twin.topology.nodes[None], twin), "m", "region")
-    figure = figures.twin_figure(body, figures.WIDTH, figures.COUNTS)
+    body = figures._from_two_sides(observed(), ShownRun("m", twin.topology.nodes[None], twin), "m", "region")
+    figure = figures.twin_figure(body, figures.RUN_WIDTH, figures.COUNTED_LEGEND)
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     nodes = [int(name.split(": ")[1].split(" nodes")[0]) for name in names if "nodes" in name]
     springs = [int(name.rpartition(" springs")[0].split()[-1]) for name in names]

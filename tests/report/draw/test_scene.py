@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from neuspring.core.errors import InputError
-from neuspring.report.draw.scene import FLATTEST, TALLEST, box_around, broad_side, finer, part, seen_from
+from neuspring.report.draw.scene import FLATTEST_PANEL, TALLEST_PANEL, box_around, broad_side, part, seen_from
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.normal(size=(60, 3)) * [0.3, 0.05, 0.1] + [1.0, 2.0, 0.4]
@@ -59,31 +58,18 @@ def test_a_box_holds_its_pixels_has_a_shape_and_stays_inside_a_photo():
     flat = np.array([[300.0, 500.0], [800.0, 510.0]])
     left, top, right, bottom = box_around(flat, camera, clip=True)
     assert left <= 300 and right > 800 and top <= 500 and bottom > 510
-    assert (bottom - top) / (right - left) == pytest.approx(FLATTEST, abs=0.01)
+    assert (bottom - top) / (right - left) == pytest.approx(FLATTEST_PANEL, abs=0.01)
     tall = box_around(flat[:, ::-1], camera, clip=True)
-    assert (tall[3] - tall[1]) / (tall[2] - tall[0]) == pytest.approx(TALLEST, abs=0.01)
+    assert (tall[3] - tall[1]) / (tall[2] - tall[0]) == pytest.approx(TALLEST_PANEL, abs=0.01)
     corner = np.array([[0.0, 0.0], [30.0, 200.0]])
     assert box_around(corner, camera, clip=True)[:2] == (0, 0)
     assert min(box_around(corner, camera, clip=False)[:2]) < 0
     assert box_around(np.array([[0.0, 0.0], [1199.0, 1199.0]]), camera, clip=True) == (0, 0, 1200, 1200)
 
 
-def test_parts_and_finer_pictures_show_the_same_points():
+def test_a_part_shows_the_same_points():
     camera = seen_from(POINTS, "+z", 0.0, 0.0)
     whole = camera.project(POINTS)[0]
     inner = part(camera, (100, 200, 700, 900))
     assert (inner.width, inner.height) == (600, 700)
     assert np.abs(inner.project(POINTS)[0] + [100, 200] - whole).max() < SUB
-    fine = finer(inner, 1000)
-    assert (fine.width, fine.height) == (1200, 1400)
-    # The border of a picture is half a pixel away from the center of its outer pixels.
-    assert np.abs((fine.project(POINTS)[0] + 0.5) / 2 - 0.5 - inner.project(POINTS)[0]).max() < SUB
-    assert finer(inner, 600).width == 600
-
-
-@pytest.mark.parametrize(
-    ("azimuth", "elevation", "text"), [(math.nan, 0, "--azimuth"), (0, 90, "-89 to 89"), (0, math.nan, "--elevation")]
-)
-def test_angles_that_no_camera_has(azimuth, elevation, text):
-    with pytest.raises(InputError, match=text):
-        seen_from(POINTS, "+z", azimuth, elevation)

@@ -9,9 +9,10 @@ from matplotlib import pyplot as plt
 from matplotlib.collections import PathCollection
 
 from neuspring.config.images import Images
-from neuspring.report.draw.painter import ERRORS, MM, Painter, distances
-from neuspring.report.draw.scene import Scene
-from neuspring.report.draw.strip import caption, rows_of, strip_figure
+from neuspring.extensions.figures.drawing import caption
+from neuspring.extensions.figures.filmed import FilmedScene, PhotoPainter
+from neuspring.report.draw.painter import DRAWN_MM, ERROR_COLORS, distances
+from neuspring.report.draw.strip import rows_of, strip_figure
 from tests.support.played import results
 from tests.support.shown import METHODS, filmed, observed, painter, takes
 
@@ -47,7 +48,7 @@ def grid(figure, rows: int, columns: int) -> np.ndarray:
 @pytest.mark.parametrize(("error", "rows"), [("distance", 5), ("none", 3)])
 def test_a_row_for_what_was_observed_and_each_method_and_a_column_per_frame(plain, error, rows):
     paints = painter(plain, FRAMES, error=error)
-    assert [row.which for row in rows_of(paints)] == ([None, 0, 0, 1, 1] if rows == 5 else [None, 0, 1])
+    assert [which for _, which, _ in rows_of(paints)] == ([None, 0, 0, 1, 1] if rows == 5 else [None, 0, 1])
     figure = strip_figure(paints, 6.0)
     panels = grid(figure, rows, len(FRAMES))
     assert figure.get_figwidth() == pytest.approx(6.0)
@@ -63,7 +64,7 @@ def test_a_row_for_what_was_observed_and_each_method_and_a_column_per_frame(plai
 
 def test_distances_are_zero_for_the_twin_that_moves_as_was_observed(plain):
     paints = painter(plain, FRAMES)
-    exact, softer = ([distances(take, observed(plain), frame)[1].max() * MM for frame in FRAMES] for take in paints.takes)
+    exact, softer = ([distances(take, observed(plain), frame)[1].max() * DRAWN_MM for frame in FRAMES] for take in paints.takes)
     assert max(exact) < EXACT < softer[-1]
     panels = grid(strip_figure(paints, 6.0), 5, len(FRAMES))
     text = [[float(axis.texts[0].get_text().split()[0]) for axis in panels[row]] for row in (2, 4)]
@@ -92,7 +93,7 @@ def test_one_range_for_all_panels_and_darker_is_farther(plain):
         if isinstance(found, PathCollection) and found.get_array() is not None
     ]
     assert len(dots) == 2 * len(FRAMES) and {found.norm.vmax for found in dots} == {4.0}
-    lightness = colormaps[ERRORS](np.linspace(0, 1, 64))[:, :3] @ [0.2126, 0.7152, 0.0722]
+    lightness = colormaps[ERROR_COLORS](np.linspace(0, 1, 64))[:, :3] @ [0.2126, 0.7152, 0.0722]
     assert (np.diff(lightness) < 0).all()
 
 
@@ -112,7 +113,7 @@ def test_pictures_that_agree_have_no_difference(video):
 def test_hands_are_gray_and_not_compared(video):
     paints = painter(video, (0,), style="splats", error="color")
     whole = replace(paints.scene, box=(0, 0, paints.scene.camera.width, paints.scene.camera.height))
-    again = Painter(whole, paints.takes, (0,), paints.manner, Images(), "cpu")
+    again = PhotoPainter(whole, paints.takes, (0,), paints.manner, Images(), "cpu")
     drawn = again._drawn[0][0]
     assert drawn.hands[:12, :12].all() and np.isnan(drawn.difference[:12, :12]).all()
     axis = plt.figure().add_axes((0, 0, 1, 1))
@@ -136,7 +137,7 @@ def test_the_observed_row_shows_the_photo_masked_or_whole(video):
 def test_a_frame_that_a_camera_missed_and_one_behind_a_divergence_say_so(tmp_path):
     paints = painter(filmed(tmp_path, missing=(4,)), (0, 4), style="splats", error="color")
     short = replace(paints.takes[1], positions=paints.takes[1].positions[:3])
-    paints = Painter(paints.scene, [paints.takes[0], short], (0, 4), paints.manner, Images(), "cpu")
+    paints = PhotoPainter(paints.scene, [paints.takes[0], short], (0, 4), paints.manner, Images(), "cpu")
     panels = grid(strip_figure(paints, 6.0), 5, 2)
     words = [[text.get_text() for text in axis.texts] for axis in panels[:, 1]]
     assert words == [["camera 0 missed it"], [], ["no picture"], ["diverged"], []]
@@ -151,7 +152,7 @@ def test_splats_that_a_method_moves_itself_are_where_it_puts_them(video):
     own = replace(still, centers=(take.splats.means + up).astype(np.float32))
     rows = []
     for shown in (still, own):
-        again = Painter(paints.scene, [shown], (0, 5), paints.manner, Images(), "cpu")
+        again = PhotoPainter(paints.scene, [shown], (0, 5), paints.manner, Images(), "cpu")
         rows.append([np.flatnonzero((again._drawn[0][frame].rgba[..., 3] > 128).any(axis=1)).mean() for frame in (0, 5)])
     assert rows[0][0] == rows[0][1] and rows[1][0] == rows[0][0] and rows[1][1] < rows[1][0] - 3
 
@@ -159,7 +160,7 @@ def test_splats_that_a_method_moves_itself_are_where_it_puts_them(video):
 def test_a_far_prediction_does_not_shrink_the_picture(plain):
     paints = painter(plain, (0, 7))
     far = replace(paints.takes[1], positions=paints.takes[1].positions + np.float32(50.0))
-    scene = Scene.of(observed(plain), paints.scene.camera, [paints.takes[0], far], (0, 7))
+    scene = FilmedScene.of(observed(plain), paints.scene.camera, [paints.takes[0], far], (0, 7))
     assert scene.view.width < 3 * paints.scene.view.width
 
 

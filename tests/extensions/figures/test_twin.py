@@ -7,7 +7,8 @@ import pytest
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PathCollection
 
-from neuspring.report.draw.scene import Prediction, Scene
+from neuspring.extensions.figures.filmed import SurfacePicture, finer
+from neuspring.report.draw.scene import ShownRun, ShownScene, part, seen_from
 from neuspring.report.draw.sheet import CONTROLLER
 from neuspring.report.draw.twin import CROSSING, TwinPicture, region_colors, twin_figure
 from neuspring.report.shown import find
@@ -107,7 +108,7 @@ def test_a_surface_has_the_colors_of_its_nodes(tmp_path):
     scenario = filmed(tmp_path)
     scene, takes = uneven(scenario)
     axis = plt.figure().add_axes((0, 0, 1, 1))
-    TwinPicture([(scene, take) for take in takes], 4, ("region",), style="splats").paint(axis, scene, takes[0], "region")
+    SurfacePicture([(scene, take) for take in takes], 4, ("region",), style="splats").paint(axis, scene, takes[0], "region")
     shown = np.asarray(axis.images[0].get_array())
     opaque = np.unique(shown.reshape(-1, 3), axis=0).astype(float) / 255
     for color in region_colors(3)[:, :3]:
@@ -118,8 +119,8 @@ def test_a_surface_has_the_colors_of_its_nodes(tmp_path):
 def test_a_rod_is_drawn_as_its_center_line_colored_by_its_bending_stiffness(tmp_path, clamped):
     found = find([rod_results(tmp_path, clamped=clamped)])
     (run,) = found.runs
-    take, rod = Prediction("rod", run.trajectory.positions, run.twin), run.twin.rod
-    scene = Scene.from_side(found.observations, [take], [0])
+    take, rod = ShownRun("rod", run.trajectory.positions, run.twin), run.twin.rod
+    scene = ShownScene.from_side(found.observations, [take], [0])
     uneven = replace(run.twin, rod=replace(rod, bending=np.linspace(1, 2, len(rod.bending)) * rod.bending))
     take = replace(take, twin=uneven)
     lines = lines_of(uneven)
@@ -134,3 +135,13 @@ def test_a_rod_is_drawn_as_its_center_line_colored_by_its_bending_stiffness(tmp_
     drawn_lines = [len(one.get_segments()) for one in drawn.axes[0].collections if isinstance(one, LineCollection)]
     assert drawn_lines == [lines.inner]
     assert f"{lines.inner} edges" in drawn.legends[0].get_texts()[0].get_text()
+
+
+def test_finer_pictures_show_the_same_points():
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, (40, 3))
+    inner = part(seen_from(points, "+z", 0.0, 0.0), (100, 200, 700, 900))
+    fine = finer(inner, 1000)
+    assert (fine.width, fine.height) == (1200, 1400)
+    # The border of a picture is half a pixel away from the center of its outer pixels.
+    assert np.abs((fine.project(points)[0] + 0.5) / 2 - 0.5 - inner.project(points)[0]).max() < 1e-6
+    assert finer(inner, 600).width == 600

@@ -7,6 +7,8 @@ from matplotlib import pyplot as plt
 from PIL import Image
 
 from neuspring.core.errors import InputError
+from neuspring.extensions.figures.drawing import film
+from neuspring.extensions.figures.options import FilmOptions
 from neuspring.report.draw.film import HOLD, film_pictures, write_film
 from neuspring.report.draw.sheet import FUTURE, TRAINING
 from tests.support.played import results
@@ -100,10 +102,10 @@ def test_a_scene_without_video_is_filmed_as_points(tmp_path):
     [
         ({"width": 40}, "--width: must be 160 to 1920; received 40"),
         ({"width": 300, "speed": 0.0}, "--speed: must be 0.05 to 8"),
-        ({"width": 300, "megabytes": 0.0}, "--megabytes: must be above 0, at most 100"),
+        ({"width": 300, "megabytes": 0.0}, "--megabytes: must be 0.001 to 100"),
         ({"width": 300, "megabytes": float("nan")}, "--megabytes"),
     ],
 )
 def test_sizes_that_no_film_has(video, tmp_path, values, text):
     with pytest.raises(InputError, match=text):
-        write_film(painter(video, (0,), style="splats", error="none"), tmp_path / "film.gif", **values)
+        film(FilmOptions(results=(video,), output=tmp_path / "film.gif", **values))

@@ -1,0 +1,307 @@
+"""Runs on the video: photos behind drawings, predictions as splats beside them, differences of colors, surfaces of twins."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from scipy.spatial import cKDTree
+
+from neuspring.config.images import Images
+from neuspring.core.artifacts import Observations
+from neuspring.data.camera import Camera
+from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture
+from neuspring.report.draw.painter import ERROR_COLORS, DrawingStyle, Painter, empty, hands
+from neuspring.report.draw.scene import ShownRun, ShownScene, box_around, shown_points
+from neuspring.report.draw.twin import Quantity, TwinPicture
+from neuspring.scores.pictures import Pair, psnr
+from neuspring.splats.draw import OBJECT_COVERAGE, frames_from_centers, picture, skinned_frames, view_of
+from neuspring.splats.model import Gaussians, Splats
+from neuspring.splats.rasterize import choose_backend
+from neuspring.splats.view import C0
+
+Style = Literal["splats", "nodes"]
+Ground = Literal["white", "image"]
+
+
+@dataclass(frozen=True, eq=False)
+class SplatRun(ShownRun):
+    """A run's prediction with its splats, where it has some."""
+
+    splats: Splats | None = None
+    centers: np.ndarray | None = None
+    """Centers [F, G, 3], m, at which the method's own model puts its splats; else the nodes carry them."""
+
+    def gaussians(self, frames: Iterable[int], images: Images, device: str) -> Iterator[tuple[int, Gaussians]]:
+        """The splats in these frames, in rising order; frames behind a divergence are left out."""
+        assert self.splats is not None
+        wanted = {frame for frame in frames if frame < len(self.positions)}
+        stop = max(wanted, default=-1) + 1
+        if self.centers is None:
+            every = skinned_frames(self.splats, self.positions[:stop], images, device) if stop else iter(())
+        else:
+            every = frames_from_centers(self.splats, self.centers[:stop], device)
+        return ((frame, gaussians) for frame, gaussians in enumerate(every) if frame in wanted)
+
+
+@dataclass(frozen=True, eq=False)
+class FilmedScene(ShownScene):
+    """The observed scene with the video of a camera of the capture, where it is one of its."""
+
+    capture: Capture | None = None
+    labels: np.ndarray | None = None
+    """Perceived masks [T, H, W] of the camera, where the capture has none of its own."""
+
+    @classmethod
+    def of(
+        cls,
+        observations: Observations,
+        camera: Camera,
+        takes: Sequence[ShownRun],
+        frames: Sequence[int],
+        capture: Capture | None = None,
+        labels: np.ndarray | None = None,
+    ) -> FilmedScene:
+        """The part of the picture that holds what these frames show."""
+        pixels, depth = camera.project(shown_points(observations, takes, frames))
+        seen, last = pixels[depth > 0], [camera.width - 1, camera.height - 1]
+        seen = seen if len(seen) else np.array([[0.0, 0.0], last])
+        seen = seen if capture is None else np.clip(seen, 0, last)
+        return cls(observations, camera, box_around(seen, camera, clip=capture is not None), capture, labels)
+
+    def cut(self, picture: np.ndarray) -> np.ndarray:
+        """The shown part of a picture [H, W, ...]."""
+        left, top, right, bottom = self.box
+        return picture[top:bottom, left:right]
+
+    def photo(self, frame: int) -> np.ndarray | None:
+        """RGB [H, W, 3] uint8 of the whole picture; None: there is none."""
+        if self.capture is None or not self.capture.has(self.camera.name, frame):
+            return None
+        return self.capture.color(self.camera.name, frame)
+
+    def mask(self, frame: int) -> np.ndarray | None:
+        """Labels [H, W] of the whole picture; None: there are none."""
+        if self.capture is None or not self.capture.has(self.camera.name, frame):
+            return None
+        if self.capture.description.masks:
+            return self.capture.mask(self.camera.name, frame)
+        return None if self.labels is None else self.labels[frame]
+
+    @property
+    def has_masks(self) -> bool:
+        """True where observed and predicted pictures can be compared."""
+        return self.capture is not None and (self.capture.description.masks or self.labels is not None)
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A prediction as splats in one frame, the shown part of the picture."""
+
+    rgba: np.ndarray
+    """[h, w, 4] uint8, over black."""
+    difference: np.ndarray | None = None
+    """Mean absolute color difference [h, w], of 1; NaN where neither shows the object; None: nothing to compare with."""
+    hands: np.ndarray | None = None
+    psnr: float = float("nan")
+    """PSNR of the whole picture, as in the tables, dB."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotoStyle(DrawingStyle):
+    """Style in which predictions are drawn, and what is behind them."""
+
+    style: Style
+    ground: Ground
+
+
+class PhotoPainter(Painter):
+    """Paints photos, predictions as splats or as nodes on the photo, and differences of colors."""
+
+    scene: FilmedScene
+    manner: PhotoStyle
+    takes: Sequence[SplatRun]
+
+    def __init__(
+        self,
+        scene: FilmedScene,
+        takes: Sequence[SplatRun],
+        frames: Sequence[int],
+        manner: PhotoStyle,
+        images: Images,
+        device: str,
+    ) -> None:
+        super().__init__(scene, takes, frames, manner)
+        self._drawn = [self._splats(take, images, device) if manner.style == "splats" else {} for take in takes]
+        if manner.error == "color":
+            self.error_name, self.error_label = "difference", "color difference"
+
+    def _splats(self, take: SplatRun, images: Images, device: str) -> dict[int, Drawn]:
+        view, backend = view_of(self.scene.camera, images, device), choose_backend(images.backend, device)
+        made = {}
+        for frame, gaussians in take.gaussians(self.frames, images, device):
+            rgba = picture(gaussians, view, backend)
+            made[frame] = self._compared(rgba, frame) if self.manner.error == "color" else Drawn(self.scene.cut(rgba))
+        return made
+
+    def _compared(self, rgba: np.ndarray, frame: int) -> Drawn:
+        photo, labels = self.scene.photo(frame), self.scene.mask(frame)
+        if photo is None or labels is None:
+            return Drawn(self.scene.cut(rgba))
+        pair = Pair.of(photo, rgba, *object_and_hands(labels), OBJECT_COVERAGE)
+        difference = (pair.truth - pair.prediction).abs().mean(0).numpy()
+        shows = pair.silhouettes[0] | pair.silhouettes[1]
+        cut = self.scene.cut
+        part = cut(np.where(shows & ~pair.hands, difference, np.nan))
+        return Drawn(cut(rgba), part, cut(pair.hands), float(psnr(pair.prediction, pair.truth)))
+
+    def draw_observed(self, axis: Axes, frame: int) -> None:
+        """The photo, or the observed points where the camera has none."""
+        photo, labels = self.scene.photo(frame), self.scene.mask(frame)
+        if photo is not None:
+            empty(axis, self.scene.view)
+            self._image(axis, photo if self.manner.ground == "image" or labels is None else masked(photo, labels))
+            return
+        super().draw_observed(axis, frame)
+        if self.scene.capture is not None:
+            self._note(axis, f"camera {self.scene.camera.name} missed it")
+
+    def draw_predicted(self, axis: Axes, which: int, frame: int) -> None:
+        """The prediction as splats, or as nodes; nodes stand on a pale photo, or before the observed points."""
+        if self.manner.style == "nodes" or frame >= len(self.takes[which].positions):
+            super().draw_predicted(axis, which, frame)
+            return
+        empty(axis, self.scene.view)
+        below = self._pale(frame)
+        self._image(axis, over_white(self._drawn[which][frame].rgba, None if below is None else self.scene.cut(below)), cut=False)
+
+    def draw_error(self, axis: Axes, which: int, frame: int) -> None:
+        """The error in false colors, and its mean: PSNR of pictures, or the mean distance."""
+        if self.manner.error != "color":
+            super().draw_error(axis, which, frame)
+            return
+        empty(axis, self.scene.view)
+        if frame < len(self.takes[which].positions):
+            self._difference(axis, self._drawn[which][frame])
+
+    def _pale(self, frame: int) -> np.ndarray | None:
+        photo = self.scene.photo(frame)
+        return faded(photo) if photo is not None and self.manner.ground == "image" else None
+
+    def _below(self, axis: Axes, frame: int) -> None:
+        below = self._pale(frame)
+        if below is None:
+            super()._below(axis, frame)
+        else:
+            self._image(axis, below)
+
+    def _difference(self, axis: Axes, drawn: Drawn) -> None:
+        if drawn.difference is None or drawn.hands is None:
+            self._note(axis, "no picture")
+            return
+        ground = np.full((*drawn.hands.shape, 3), 255, np.uint8)
+        ground[drawn.hands] = 200
+        self._image(axis, ground, cut=False)
+        shape = drawn.hands.shape
+        axis.imshow(drawn.difference, cmap=ERROR_COLORS, norm=self.norm, extent=_extent(shape), interpolation="nearest")
+        self._note(axis, f"{drawn.psnr:.1f} dB" if np.isfinite(drawn.psnr) else "equal")
+
+    def _image(self, axis: Axes, rgb: np.ndarray, *, cut: bool = True) -> None:
+        shown = self.scene.cut(rgb) if cut else rgb
+        axis.imshow(shown, extent=_extent(shown.shape), interpolation="antialiased")
+
+
+def _extent(shape: Sequence[int]) -> tuple[float, float, float, float]:
+    return (-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePicture(TwinPicture):
+    """Twins as springs, or as the surface that their splats show, on white or on the pale photo."""
+
+    style: Literal["springs", "splats"] = "springs"
+    ground: Ground = "white"
+    images: Images = Images()
+    device: str = "cpu"
+
+    @property
+    def as_springs(self) -> bool:  # type: ignore[override]
+        """True where springs are drawn as lines."""
+        return self.style == "springs"
+
+    def paint(self, axis: Axes, scene: ShownScene, take: ShownRun, quantity: Quantity) -> None:
+        """One panel."""
+        assert isinstance(scene, FilmedScene)
+        assert isinstance(take, SplatRun)
+        view, photo = scene.view, scene.photo(self.frame)
+        empty(axis, view, framed=self.ground == "image")
+        shown = scene.cut(faded(photo)) if photo is not None and self.ground == "image" else None
+        if self.style == "splats":
+            surface = self._surface(scene, take, quantity)
+            ground = None if shown is None else cv2.resize(shown, surface.shape[1::-1], interpolation=cv2.INTER_CUBIC)
+            shown = over_white(surface, ground)
+        if shown is not None:
+            extent = (-0.5, view.width - 0.5, view.height - 0.5, -0.5)
+            axis.imshow(shown, extent=extent, aspect="auto", interpolation="antialiased")
+        if self.style == "springs":
+            self._lines(axis, scene, take, quantity)
+        hands(axis, scene, self.frame)
+
+    def _surface(self, scene: FilmedScene, take: SplatRun, quantity: Quantity) -> np.ndarray:
+        """The splats [h, w, 4] over black, each in the color of the surface node that is nearest in frame 0."""
+        assert take.splats is not None
+        outer = take.positions[0][: scene.observations.surface_count]
+        nearest = cKDTree(outer).query(take.splats.means)[1]
+        rgb = self.node_colors(take, quantity)[nearest, :3]
+        (gaussians,) = (found for _, found in take.gaussians([self.frame], self.images, self.device))
+        plain = torch.tensor((rgb - 0.5) / C0, dtype=torch.float32, device=self.device)[:, None]
+        painted: Gaussians = replace(gaussians, harmonics=plain)
+        # Nothing is compared with it, so it need not have the camera's pixels.
+        view = view_of(finer(scene.view, 900), self.images, self.device)
+        return picture(painted, view, choose_backend(self.images.backend, self.device))
+
+
+def finer(camera: Camera, least: int) -> Camera:
+    """The same view in more pixels, at least `least` wide; pixel centers stay at whole coordinates."""
+    factor = max(math.ceil(least / camera.width), 1)
+    intrinsics = camera.intrinsics.copy()
+    intrinsics[:2] *= factor
+    # Half a pixel of the border belongs to the outer pixels, whatever their size.
+    intrinsics[:2, 2] += 0.5 * (factor - 1)
+    return replace(camera, width=factor * camera.width, height=factor * camera.height, intrinsics=intrinsics)
+
+
+FADE = 0.6
+"""Part of white in a photo behind a drawing."""
+
+
+def over_white(rgba: np.ndarray, below: np.ndarray | None = None) -> np.ndarray:
+    """RGB [H, W, 3] uint8 of a picture drawn over black [H, W, 4], laid over white or over the picture `below`."""
+    ground = 255.0 if below is None else below.astype(float)
+    mixed = rgba[..., :3] + (1 - rgba[..., 3:] / 255.0) * ground
+    return np.asarray(np.clip(mixed + 0.5, 0, 255), np.uint8)
+
+
+def masked(photo: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """The photo with white where there is neither the object nor a hand."""
+    picture = photo.copy()
+    picture[labels == NOTHING] = 255
+    return picture
+
+
+def faded(photo: np.ndarray) -> np.ndarray:
+    """A photo that a drawing can be read on: gray, and mostly white."""
+    gray = photo.astype(float).mean(axis=2, keepdims=True)
+    return np.asarray(np.repeat((1 - FADE) * gray + FADE * 255, 3, axis=2), np.uint8)
+
+
+def object_and_hands(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Masks [H, W] uint8, 0 or 255, of the object and of hands."""
+    first, second = (np.where(labels == label, 255, 0).astype(np.uint8) for label in (OBJECT, HANDS))
+    return first, second
