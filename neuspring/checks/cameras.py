@@ -7,11 +7,8 @@ table that is moved along itself looks the same.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -37,26 +34,14 @@ FEWEST = 150
 STRIDE = 2
 
 
-@dataclass(frozen=True, eq=False)
-class Views:
-    """Depth [H, W], m, that each camera measured in one frame."""
+def pairs(cameras: Mapping[str, Camera], depths: Mapping[str, np.ndarray], up: str) -> Iterator[dict[str, Any]]:
+    """Share of the points of one camera that another one looked through, for every two; no value where they share too few.
 
-    where: Path
-    cameras: Mapping[str, Camera]
-    depths: Mapping[str, np.ndarray]
-    up: str
-
-    @cached_property
-    def pairs(self) -> list[dict[str, Any]]:
-        """Share of the points of one camera that another one looked through, for every two; no value where they share too few."""
-        found = []
-        for one, two in combinations(self.depths, 2):
-            both = [
-                looked_through(self.cameras[a], self.depths[a], self.cameras[b], self.depths[b], self.up)
-                for a, b in ((one, two), (two, one))
-            ]
-            found.append({"one": one, "two": two, "value": max((share for count, share in both if count >= FEWEST), default=None)})
-        return found
+    `depths` [H, W], m, were measured in one frame. Shares up to MOST are notes.
+    """
+    for one, two in combinations(depths, 2):
+        both = [looked_through(cameras[a], depths[a], cameras[b], depths[b], up) for a, b in ((one, two), (two, one))]
+        yield {"one": one, "two": two, "value": max((share for count, share in both if count >= FEWEST), default=None)}
 
 
 def looked_through(a: Camera, depth_a: np.ndarray, b: Camera, depth_b: np.ndarray, up: str) -> tuple[int, float]:
@@ -97,17 +82,13 @@ WIDE = 400
 """Images are thinned until they are about as wide, pixels."""
 
 
-@dataclass(frozen=True, eq=False)
-class Edges:
-    """Images of color [H, W, 3] or masks [H, W] of one camera, each with its depth [H, W], m."""
-
-    where: str
-    pairs: Sequence[tuple[np.ndarray, np.ndarray]]
+Pictures = Sequence[tuple[np.ndarray, np.ndarray]]
+"""Images of color [H, W, 3] or masks [H, W] of one camera, each with its depth [H, W], m."""
 
 
-def misplaced(edges: Edges) -> dict[str, Any] | None:
+def misplaced(pictures: Pictures) -> dict[str, Any] | None:
     """Gain of agreement where edges of depth fit those of color once depth is moved and scaled: depth of another sensor."""
-    right, down, scale, gain = edge_shift(edges.pairs)
+    right, down, scale, gain = edge_shift(pictures)
     if gain < BETTER:
         return None
     ways = [f"made {scale:g} times as large"] if scale != 1 else []
@@ -116,7 +97,7 @@ def misplaced(edges: Edges) -> dict[str, Any] | None:
     return {"value": gain, "ways": " and ".join(ways)}
 
 
-def edge_shift(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[int, int, float, float]:
+def edge_shift(pairs: Pictures) -> tuple[int, int, float, float]:
     """The shift and scale of depth with which its edges agree best with those of color, and how many times as well as they do
     within ALIGNED: pixels to the right and down, after a scaling about the center of the image. 0 times with too few edges.
 
@@ -163,19 +144,16 @@ def edge_shift(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[int, int
 
 
 # fmt: off
-CHECKS = (
-    Check("views not compared", Views, lambda views: [one for one in views.pairs if one["value"] is None], None, "note",
+checks = (
+    Check("views not compared", "views", lambda views: [one for one in views if one["value"] is None], None, "note",
           "cameras {one} and {two} see too little in common above the table: not compared", title=""),
-    Check("views agree", Views, lambda views: [one for one in views.pairs if one["value"] is not None and one["value"] <= MOST],
-          None, "note",
-          "cameras {one} and {two} agree: {value:.0%} of the points of one float before what the other saw", title=""),
-    Check("views disagree", Views, lambda views: [one for one in views.pairs if one["value"] is not None], (0, MOST), "warning",
+    Check("views agree", "views", lambda views: [one for one in views if one["value"] is not None and one["value"] <= MOST], None,
+          "note", "cameras {one} and {two} agree: {value:.0%} of the points of one float before what the other saw", title=""),
+    Check("views disagree", "views", lambda views: [one for one in views if one["value"] is not None], (0, MOST), "warning",
           "cameras {one} and {two} should see the same surfaces above the table in the same place; received {value:.0%} of the "
-          "points "
-          "of one float before what the other saw. Calibrate again with one board that both see, and check that their frames "
-          "are of "
-          "the same moment", title="cameras"),
-    Check("depth not aligned to color", Edges, misplaced, None, "warning",
+          "points of one float before what the other saw. Calibrate again with one board that both see, and check that their "
+          "frames are of the same moment", title="cameras"),
+    Check("depth not aligned to color", "edges", misplaced, None, "warning",
           f"edges of depth fit those of color when depth is {{ways}}; as it is they must fit within {ALIGNED:.1%} of the width.",
           "Let the camera's software align depth to color (RealSense: rs.align; ROS: aligned_depth_to_color)."),
 )

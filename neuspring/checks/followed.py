@@ -36,11 +36,6 @@ class Tracked:
     visible: np.ndarray
     """[T, Q] bool."""
 
-    @property
-    def where(self) -> str:
-        """The camera."""
-        return f"camera {self.camera}"
-
     @cached_property
     def own(self) -> np.ndarray:
         """[Q] bool: points on the object in frame 0."""
@@ -92,16 +87,14 @@ def lost_where_it_moves(tracked: Tracked) -> dict[str, Any] | None:
 
 REMEDY = "Look at tracks.png; end the capture before frame {first}, use more light or shorter exposures, or cotracker3."
 # fmt: off
-CHECKS = (
-    Check("few tracks", Tracked, lambda tracked: int(tracked.own.sum()) or None, (TRACKS, np.inf), "warning",
+checks = (
+    Check("few tracks", "tracks", lambda tracked: int(tracked.own.sum()) or None, (TRACKS, np.inf), "warning",
           "{value} points are followed on the object; at least {low} are expected.",
           "Film from nearer by, or raise points of perception.track."),
-    Check("tracks lost", Tracked, lost, None, "warning",
+    Check("tracks lost", "tracks", lost, None, "warning",
           "{value:.0%} of the object's points are followed in frame {frame}; few in {count} frames; at least {least:.0%} are "
-          "expected in "
-          "every frame.", REMEDY),
-    Check("tracks lost where it moves", Tracked, lost_where_it_moves, None, "warning",
-          f"in {{value}} of {LOOKED} frames that were looked at, first in frame {{first}}, the part of the object that moves "
-          f"has followed "
-          f"points on less than {COVERED:.0%} of it; points that stand still alone teach no motion.", REMEDY),
+          "expected in every frame.", REMEDY),
+    Check("tracks lost where it moves", "tracks", lost_where_it_moves, None, "warning",
+          f"in {{value}} of {LOOKED} frames that were looked at, first in frame {{first}}, the part of the object that moves has "
+          f"followed points on less than {COVERED:.0%} of it; points that stand still alone teach no motion.", REMEDY),
 )

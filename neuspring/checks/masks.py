@@ -42,9 +42,9 @@ REMEDY = "Mark object and hands in a few frames (`neuspring mask`), or choose an
 class Shown:
     """The masks of one camera, counted frame by frame."""
 
-    def __init__(self, camera: str, frames: int, size: tuple[int, int]) -> None:
+    def __init__(self, frames: int, size: tuple[int, int]) -> None:
         """Nothing so far, of images of `size` (width, height)."""
-        self.where, self.size = f"camera {camera}", size
+        self.size = size
         self.objects = 0
         """Objects in frame 0."""
         self.areas = np.full((3, frames), np.nan)
@@ -55,7 +55,7 @@ class Shown:
     @classmethod
     def of(cls, capture: Capture, camera: str, labels: np.ndarray) -> Shown:
         """Counts of labels [T, H, W], over the frames that the camera has."""
-        shown = cls(camera, len(labels), (labels.shape[2], labels.shape[1]))
+        shown = cls(len(labels), (labels.shape[2], labels.shape[1]))
         for frame in frames_of(capture, camera):
             shown.see(frame, labels[frame])
         return shown
@@ -288,6 +288,9 @@ def hands_inside(labels: np.ndarray) -> float:
     return inside / max(int(hands.sum()), 1)
 
 
+Facts = Mapping[str, float]
+
+
 def mask_facts(capture: Capture, camera: str, labels: np.ndarray) -> dict[str, float]:
     """Shares and counts of labels [T, H, W], which the record of segmentation keeps."""
     shown, seen = Shown.of(capture, camera, labels), list(motions(capture, camera, labels))
@@ -314,70 +317,56 @@ def _median(values: Sequence[float] | np.ndarray) -> float:
     return float(np.median(values)) if len(values) else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class Segmented:
-    """The `mask_facts` of one camera."""
-
-    where: str
-    facts: Mapping[str, float]
-    has_depth: bool
-
-
-def outside(seen: Segmented) -> dict[str, Any]:
+def outside(facts: Facts) -> dict[str, Any]:
     """Share of the times in which something moves at the object and lies in no mask."""
-    first = int(seen.facts.get("first_outside", 0))
-    return {"value": seen.facts["moves_outside"], "first": first, "frames": (first,)}
+    first = int(facts.get("first_outside", 0))
+    return {"value": facts["moves_outside"], "first": first, "frames": (first,)}
 
 
-def kept(seen: Segmented) -> dict[str, Any] | None:
+def kept(facts: Facts, has_depth: bool) -> dict[str, Any] | None:
     """Share of newly covered parts that the object's mask keeps, of color alone."""
-    first = int(seen.facts.get("first_newly_lost", 0))
-    return None if seen.has_depth else {"value": seen.facts.get("newly_kept", 1.0), "first": first, "frames": (first,)}
+    first = int(facts.get("first_newly_lost", 0))
+    return None if has_depth else {"value": facts.get("newly_kept", 1.0), "first": first, "frames": (first,)}
 
 
 INF = float("inf")
 # fmt: off
-CHECKS = (
-    Check("no object in frame 0", Shown, lambda shown: first_area(shown, OBJECT), (0.5, INF), "warning",
+checks = (
+    Check("no object in frame 0", "masks", lambda shown: first_area(shown, OBJECT), (0.5, INF), "warning",
           f"no pixel with label {OBJECT} in frame 0; shape and points begin there.", REMEDY),
-    Check("no hand in frame 0", Shown, lambda shown: first_area(shown, HANDS), (0.5, INF), "warning",
+    Check("no hand in frame 0", "masks", lambda shown: first_area(shown, HANDS), (0.5, INF), "warning",
           f"no pixel with label {HANDS} in frame 0; controllers begin in frame 0, with what some camera shows of the hands there.",
           "Begin the capture when a hand is in view, or mark it."),
-    Check("two objects", Shown, lambda shown: shown.objects, (0, 1), "warning",
+    Check("two objects", "masks", lambda shown: shown.objects, (0, 1), "warning",
           "the object's mask of frame 0 has {value} pieces far apart; one object is expected, whose pieces lie together; two "
-          "become "
-          "one twin.", REMEDY),
-    Check("small object", Shown, lambda shown: first_area(shown, OBJECT) or None, (SMALL_MASK, INF), "warning",
+          "become one twin.", REMEDY),
+    Check("small object", "masks", lambda shown: first_area(shown, OBJECT) or None, (SMALL_MASK, INF), "warning",
           "{value:.0f} pixels of object in frame 0; at least {low} are expected.", "Film from nearer by."),
-    Check("object missing", Shown, missing, None, "warning",
+    Check("object missing", "masks", missing, None, "warning",
           "almost nothing of the object in {count} frames, first in frame {first}; each frame should show it; its points are "
-          "invisible "
-          "there.", REMEDY),
-    Check("background in the mask", Shown, lambda shown: shown.bordered, (0, BORDERED), "warning",
+          "invisible there.", REMEDY),
+    Check("background in the mask", "masks", lambda shown: shown.bordered, (0, BORDERED), "warning",
           "{value:.0%} of the image's border is object; at most {high:.0%} is expected; the mask holds the table, a sleeve or a "
           "person.", REMEDY),
-    Check("object at the border", Shown, at_border, None, "warning",
+    Check("object at the border", "masks", at_border, None, "warning",
           "the object touches the image border in {count} frames, first in frame {first}; what is outside is neither seen nor "
           "carved.",
           "Is it the object? Then move the camera back, or keep other frames (make-capture --frames). If not, mark what it is."),
-    Check("mask flickers", Shown, lambda shown: shown.steps, (0, STEPS), "warning",
-          f"the object's area changes {STEP:g}-fold or more in {{value:.0%}} of the frames; at most {{high:.0%}} are "
-          f"expected.", REMEDY),
-    Check("mask jumps", Shown, jumps, None, "warning",
-          "the object's area changes {value:.1f}-fold from frame {before} to {first} (so in {count} frames); "
-          f"less than {JUMP:g}-fold is expected.", REMEDY),
-    Check("hands inside the object", Segmented, lambda seen: seen.facts["hands_inside"], (0, HANDS_INSIDE), "warning",
+    Check("mask flickers", "masks", lambda shown: shown.steps, (0, STEPS), "warning",
+          f"the object's area changes {STEP:g}-fold or more in {{value:.0%}} of the frames; at most {{high:.0%}} are expected.",
+          REMEDY),
+    Check("mask jumps", "masks", jumps, None, "warning",
+          "the object's area changes {value:.1f}-fold from frame {before} to {first} (so in {count} frames); less than "
+          f"{JUMP:g}-fold is expected.", REMEDY),
+    Check("hands inside the object", "segmentation", lambda facts, _: facts["hands_inside"], (0, HANDS_INSIDE), "warning",
           "{value:.0%} of the hands' pixels lie inside of the object; at most {high:.0%} are expected; its own colors are taken "
-          "for "
-          "hands.", REMEDY),
-    Check("labels are noise", Segmented, lambda seen: seen.facts["flicker"], (0, FLICKER), "warning",
+          "for hands.", REMEDY),
+    Check("labels are noise", "segmentation", lambda facts, _: facts["flicker"], (0, FLICKER), "warning",
           "{value:.0%} of the masks changes its label where the image does not change; at most {high:.0%} is expected.", REMEDY),
-    Check("motion outside of the masks", Segmented, outside, (0, OFTEN), "warning",
+    Check("motion outside of the masks", "segmentation", lambda facts, _: outside(facts), (0, OFTEN), "warning",
           f"in {{value:.0%}} of the times that were looked at, first in frame {{first}}, more than {OUTSIDE:.0%} of what moves "
-          f"at the "
-          "object lies in no mask; less than {high:.0%} is expected.", UNMARKED),
-    Check("newly covered parts lost", Segmented, kept, (KEPT, INF), "warning",
-          "of what the object seems to cover newly since frame 0, its mask keeps {value:.0%}, too little first in frame "
-          "{first}; at "
-          "least {low:.0%} is expected.", UNMARKED),
+          "at the object lies in no mask; less than {high:.0%} is expected.", UNMARKED),
+    Check("newly covered parts lost", "segmentation", kept, (KEPT, INF), "warning",
+          "of what the object seems to cover newly since frame 0, its mask keeps {value:.0%}, too little first in frame {first}; "
+          "at least {low:.0%} is expected.", UNMARKED),
 )

@@ -36,11 +36,6 @@ class Observed:
     observations: Observations
     moves: float = 0.0
 
-    @property
-    def where(self) -> str:
-        """For messages."""
-        return "observations"
-
     @cached_property
     def motion(self) -> tuple[float, float]:
         """Farthest motion of the object in a training frame, m, which a tenth of its points exceed; largest share that is lost."""
@@ -127,41 +122,37 @@ def node_count(seen: Observed) -> dict[str, Any]:
 
 
 # fmt: off
-CHECKS = (
-    Check("hand far from the object", Observed,
+checks = (
+    Check("hand far from the object", "observations",
           lambda seen: HANDS | {"value": float(seen.apart.min()), "cm": 100 * seen.apart.min()}, (0, APART), "error",
           f"the hand is never nearer to the object than {{cm:.0f}} cm; it must come within {100 * APART:g} cm to move it.", MASKS),
-    Check("controllers hold nothing", Observed, first_hold, None, "warning",
+    Check("controllers hold nothing", "observations", first_hold, None, "warning",
           f"in frame 0 none of {{count}} has a point of the object within {100 * GRIP:g} cm; the nearest is {{cm:.0f}} cm away; "
-          f"springs of "
-          "hands are made in frame 0, and would span the air.", "Begin the capture at the grip."),
-    Check("most controllers hold nothing", Observed, partial_hold, None, "note",
+          "springs of hands are made in frame 0, and would span the air.", "Begin the capture at the grip."),
+    Check("most controllers hold nothing", "observations", partial_hold, None, "note",
           f"{{without}} of {{count}} have no point of the object within {100 * GRIP:g} cm in frame 0; only those that are near "
-          f"hold it.",
-          "perception.lift.grip: patch takes near ones."),
-    Check("hands let go", Observed, let_go, None, "note",
+          "hold it.", "perception.lift.grip: patch takes near ones."),
+    Check("hands let go", "observations", let_go, None, "note",
           "{value} of {count} let go, first in frame {first}{again}; while they do not hold, their springs do not act "
           "(perception.lift.release).", "Is that what was filmed?"),
-    Check("controllers stand still", Observed, motion_of_hands, (STILL, np.inf), "warning",
+    Check("controllers stand still", "observations", motion_of_hands, (STILL, np.inf), "warning",
           f"they move {{mm:.1f}} mm; at least {1e3 * STILL:g} mm are expected of hands that move an object.", MASKS),
-    Check("controllers too fast", Observed, speed_of_hands, (0, FASTEST), "warning",
+    Check("controllers too fast", "observations", speed_of_hands, (0, FASTEST), "warning",
           "{value:.0f} m/s between frames {frame} and {next}; hands are slower than {high:g} m/s.",
           "frame_rate ({rate:g}/s) or depth_unit of capture.json may be wrong, or a hand's tracks jump."),
-    Check("too few nodes", Observed, node_count, (NODES[0], np.inf), "warning",
+    Check("too few nodes", "observations", node_count, (NODES[0], np.inf), "warning",
           "{value} structure points; at least {low} are needed to deform.",
           "Lower perception.sample.voxel, or give the object more pixels."),
-    Check("many nodes", Observed, lambda seen: len(seen.observations.nodes), (0, NODES[1]), "note",
+    Check("many nodes", "observations", lambda seen: len(seen.observations.nodes), (0, NODES[1]), "note",
           "{value:,} structure points; more than {high:,} make searches take hours.", "perception.sample.nodes limits them."),
-    Check("object not followed", Observed,
-          lambda seen: {"value": seen.motion[0], "mm": 1e3 * seen.motion[0]} if seen.unfollowed else None, None,
-          "warning", "points of the object move {mm:.1f} mm in the training frames, its picture changes in {subject.moves:.0%} "
-          "of them, "
-          "and up to {subject.motion[1]:.0%} of the points are lost; where it moves it is not followed.",
+    Check("object not followed", "observations",
+          lambda seen: {"value": seen.motion[0], "mm": 1e3 * seen.motion[0]} if seen.unfollowed else None, None, "warning",
+          "points of the object move {mm:.1f} mm in the training frames, its picture changes in {0.moves:.0%} of them, and up to "
+          "{0.motion[1]:.0%} of the points are lost; where it moves it is not followed.",
           "Look at masks.png and tracks.png: mark what the masks lose, use more light or shorter exposures, or cotracker3."),
-    Check("object stands still", Observed,
+    Check("object stands still", "observations",
           lambda seen: None if seen.unfollowed else {"value": seen.motion[0], "mm": 1e3 * seen.motion[0]}, (STILL, np.inf),
           "warning",
           f"the object moves {{mm:.1f}} mm in the training frames; at least {1e3 * STILL:g} mm are needed to learn from; "
-          f"`static` cannot "
-          "be beaten.", "Film an interaction, or move the split."),
+          "`static` cannot be beaten.", "Film an interaction, or move the split."),
 )

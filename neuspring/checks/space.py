@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,7 +29,6 @@ SAME = 1e-4
 class Cloud:
     """Points [n, 3] of a file, m; of a body in frame 0 its size counts too. `up` is +1 or -1; None: no table."""
 
-    where: Path
     points: np.ndarray
     up: float | None
     is_body: bool
@@ -79,27 +77,10 @@ def off_table(cloud: Cloud) -> dict[str, Any] | None:
     return told | {"level": "error" if low < -FAR_OFF else "warning", "next": f". {remedy}"}
 
 
-@dataclass(frozen=True, eq=False)
-class Nodes:
-    """Nodes [N, 3], m, of a body in a file."""
-
-    where: Path
-    nodes: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class Marked:
-    """Annotated points of frame 0 [K, 3], m, NaN where unseen, of a file, and the nodes [N, 3] of the body that they are on."""
-
-    where: Path
-    points: np.ndarray
-    nodes: np.ndarray
-
-
-def far_from_nodes(marked: Marked) -> dict[str, Any] | None:
-    """Annotated points that are far from the body."""
-    known = np.flatnonzero(np.isfinite(marked.points).all(axis=1))
-    away = KDTree(marked.nodes).query(marked.points[known])[0] if len(known) else np.zeros(0)
+def far_from_nodes(points: np.ndarray, nodes: np.ndarray) -> dict[str, Any] | None:
+    """Annotated points of frame 0 [K, 3], m, NaN where unseen, that are far from the nodes [N, 3] of the body."""
+    known = np.flatnonzero(np.isfinite(points).all(axis=1))
+    away = KDTree(nodes).query(points[known])[0] if len(known) else np.zeros(0)
     if not (away > REACH).any():
         return None
     text = f"point {known[away.argmax()]} is {100 * away.max():.1f} cm away, {(away > REACH).sum()} of {len(away)} are farther"
@@ -110,7 +91,6 @@ def far_from_nodes(marked: Marked) -> dict[str, Any] | None:
 class Holding:
     """Hands of a file that hold a body."""
 
-    where: Path
     hand: np.ndarray
     """[C]: the hand of each controller."""
     held: np.ndarray
@@ -143,32 +123,30 @@ def doubled(hands: Holding) -> dict[str, Any] | None:
 
 
 # fmt: off
-CHECKS = (
-    Check("unit", Cloud, far, (0, FAR), "error",
+checks = (
+    Check("unit", "points", far, (0, FAR), "error",
           "coordinates must be meters, at most {high:g} from the origin; received {value:.4g}, in {size}. {next}", title="points"),
-    Check("implausible size", Cloud, lambda cloud: longest(cloud.side) if cloud.is_body and cloud.most <= FAR else None, None,
-          "warning",
-          f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE),
-    Check("off the table", Cloud, off_table, None, "error",
+    Check("implausible size", "points", lambda cloud: longest(cloud.side) if cloud.is_body and cloud.most <= FAR else None, None,
+          "warning", f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE),
+    Check("off the table", "points", off_table, None, "error",
           f"with up {{sign}}z points must lie between the table, z = 0, and {HIGH:g} m above it; received {{z}}{{next}}",
           title="points"),
-    Check("many nodes", Nodes, lambda body: len(body.nodes), (0, MOST_NODES), "warning",
+    Check("many nodes", "nodes", len, (0, MOST_NODES), "warning",
           "some hundred nodes are enough, more than {high} are slow; received {value}. Each of them costs time in every substep",
           title="points"),
-    Check("points off the body", Marked, far_from_nodes, None, "error",
-          f"annotated points must lie on the body: within {100 * REACH:g} cm of a node in frame 0; received {{text}}. Are "
-          f"points and "
-          "nodes of one recording, in one world?", title=""),
-    Check("hand of one point", Holding, fewest_points, (2, np.inf), "warning",
-          "three points of a hand, or of a jaw, turn what it holds; received one of some hand. It holds like a string: is that so?",
-          title="points"),
-    Check("nothing holds", Holding, lambda hands: None if len(hands.held) or not len(hands.nodes) else {}, None, "error",
+    Check("points off the body", "points on nodes", far_from_nodes, None, "error",
+          f"annotated points must lie on the body: within {100 * REACH:g} cm of a node in frame 0; received {{text}}. Are points "
+          "and nodes of one recording, in one world?", title=""),
+    Check("hand of one point", "holding", fewest_points, (2, np.inf), "warning",
+          "three points of a hand, or of a jaw, turn what it holds; received one of some hand. It holds like a string: is that "
+          "so?", title="points"),
+    Check("nothing holds", "holding", lambda hands: None if len(hands.held) or not len(hands.nodes) else {}, None, "error",
           "some controller must hold in some training frame; received none. A twin learns from training frames: see train_end",
           title="holds"),
-    Check("hand far from the nodes", Holding, reach, (0, REACH), "error",
+    Check("hand far from the nodes", "holding", reach, (0, REACH), "error",
           f"in some training frame a controller must come within {100 * REACH:g} cm of a node of frame 0 to move it; received "
           "{cm:.1f} cm at the nearest. Are hands and nodes of one recording, in one world?", title="points"),
-    Check("controllers on nodes", Holding, doubled, None, "error",
+    Check("controllers on nodes", "holding", doubled, None, "error",
           f"controllers must lie {1e3 * SAME:g} mm from nodes and annotated points in frame 0: a spring needs a length; received "
           "controller {value}, {count} in all. Move them off the body, or leave out the nodes below them", title="points"),
 )

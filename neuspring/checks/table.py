@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -84,7 +83,6 @@ def other_side(up: str) -> str:
 class TableSeen:
     """The planes that a camera with depth sees."""
 
-    where: Path
     name: str
     planes: Sequence[Plane]
     pose: np.ndarray
@@ -161,7 +159,6 @@ def unexplained(seen: TableSeen) -> dict[str, Any] | None:
 class CameraAlone:
     """A camera without depth; the table is z = 0."""
 
-    where: Path
     camera: Camera
     up: str
     source: str = ""
@@ -231,46 +228,33 @@ def wrong_view(view: CameraAlone) -> dict[str, Any] | None:
     return told | {"level": "warning", "also": ". If the camera is mounted so, go on"} if possible else told | {"also": ""}
 
 
-@dataclass(frozen=True, eq=False)
-class Horizon:
-    """The object's mask [H, W] of frame 0 of a camera without depth."""
-
-    where: Path
-    camera: Camera
-    mask: np.ndarray
-
-
-def beyond_horizon(outline: Horizon) -> dict[str, Any] | None:
+def beyond_horizon(camera: Camera, mask: np.ndarray) -> dict[str, Any] | None:
     """Pixels of the object that look past the table."""
-    own = object_on_table(outline.camera, outline.mask)
+    own = object_on_table(camera, mask)
     beyond = int(np.isnan(own[:, 0]).sum())
     return {"value": beyond, "count": len(own)} if beyond else None
 
 
 # fmt: off
-CHECKS = (
-    Check("no table seen", TableSeen, lambda seen: None if seen.candidates else {}, None, "note",
-          "camera {subject.name} sees no plane in depth: z = 0 and up are not checked against the table", title=""),
-    Check("table", TableSeen, lambda seen: seen.table[1].off if seen.right else None, None, "note",
-          "camera {subject.name}: the table is {subject.text}", title=""),
-    Check("high camera", TableSeen, lambda seen: seen.table[0].height if seen.right else None, (0, HIGHEST), "warning",
-          "cameras.{subject.name}.camera_to_world: a camera should be at most {high:g} m above the table; received {value:.2f} m. "
+checks = (
+    Check("no table seen", "table", lambda seen: None if seen.candidates else {}, None, "note",
+          "camera {0.name} sees no plane in depth: z = 0 and up are not checked against the table", title=""),
+    Check("table", "table", lambda seen: seen.table[1].off if seen.right else None, None, "note",
+          "camera {0.name}: the table is {0.text}", title=""),
+    Check("high camera", "table", lambda seen: seen.table[0].height if seen.right else None, (0, HIGHEST), "warning",
+          "cameras.{0.name}.camera_to_world: a camera should be at most {high:g} m above the table; received {value:.2f} m. "
           "Check depth_unit: ten times too large makes all of the scene so", title=""),
-    Check("table explained", TableSeen, lambda seen: seen.explained, None, "error", "{rule}; received {received}", title="{key}"),
-    Check("table elsewhere", TableSeen, unexplained, None, "warning",
-          "the table that the camera sees {must} be z = 0; received {subject.text}. {next}",
-          title="cameras.{subject.name}.camera_to_world"),
-    Check("view of the table", CameraAlone, wrong_view, None, "error",
-          "{subject.key}: {rule}; received {received}{also}", title=""),
-    Check("distance of the table", CameraAlone, lambda view: None if view.wrong else view.away, None, "note",
-          "camera {subject.camera.name}: color alone: the table is z = 0 as given, {value:.2f} m away in the center of the image, "
-          "{subject.height:.2f} m below the camera", title=""),
-    Check("high camera", CameraAlone, lambda view: None if view.wrong else view.height, (0, HIGHEST), "warning",
-          "{subject.key}: a camera should be at most {high:g} m above the table; received {value:.2f} m. Is camera_to_world in "
-          "meters?",
+    Check("table explained", "table", lambda seen: seen.explained, None, "error", "{rule}; received {received}", title="{key}"),
+    Check("table elsewhere", "table", unexplained, None, "warning",
+          "the table that the camera sees {must} be z = 0; received {0.text}. {next}", title="cameras.{0.name}.camera_to_world"),
+    Check("view of the table", "camera alone", wrong_view, None, "error", "{0.key}: {rule}; received {received}{also}", title=""),
+    Check("distance of the table", "camera alone", lambda view: None if view.wrong else view.away, None, "note",
+          "camera {0.camera.name}: color alone: the table is z = 0 as given, {value:.2f} m away in the center of the image, "
+          "{0.height:.2f} m below the camera", title=""),
+    Check("high camera", "camera alone", lambda view: None if view.wrong else view.height, (0, HIGHEST), "warning",
+          "{0.key}: a camera should be at most {high:g} m above the table; received {value:.2f} m. Is camera_to_world in meters?",
           title=""),
-    Check("beyond the horizon", Horizon, beyond_horizon, None, "error",
-          "camera {subject.camera.name}: every pixel of the object in frame 0 must look at the table z = 0; received {value} of "
-          "{count} "
-          "pixels at or above its horizon. " + POSE + " Or correct the mask", title=""),
+    Check("beyond the horizon", "horizon", beyond_horizon, None, "error",
+          "camera {0.name}: every pixel of the object in frame 0 must look at the table z = 0; received {value} of {count} pixels "
+          "at or above its horizon. " + POSE + " Or correct the mask", title=""),
 )

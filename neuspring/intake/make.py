@@ -15,8 +15,6 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from neuspring.checks import examine
-from neuspring.checks.cameras import Edges
-from neuspring.checks.things import Category
 from neuspring.config import parse
 from neuspring.core.artifacts import Up
 from neuspring.core.errors import InputError
@@ -30,7 +28,7 @@ from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Capture, Description
 from neuspring.intake import points
 from neuspring.intake.depth import Unit, find_rate
 from neuspring.intake.feeds import Paired, pairs
-from neuspring.intake.film import FILM_CHECKS, FilmFiles
+from neuspring.intake.film import looked_at
 from neuspring.intake.formats import Recorded, open_recording
 from neuspring.intake.lenses import Board, Straightener, read_lenses, read_poses
 from neuspring.intake.poses import (
@@ -178,7 +176,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
         remedy = "Leave it out. To learn from the case's own, write tracks: train in capture.json then."
         raise InputError(option, "a case in PhysTwin's raw layout brings annotated points of its own", "both", remedy)
     choice = choose(views, intake.frames)
-    findings = examine(FilmFiles(views, choice), FILM_CHECKS)
+    findings = looked_at(views, choice)
     refuse_errors(findings)
     film.require_masks({name: [choice.numbers[frame] for frame in places] for name, places in choice.places.items()})
     known = [view.rate([*choice.places[view.name].values()]) for view in views]
@@ -187,9 +185,9 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     listed = read_lenses(intake.intrinsics, names) if intake.intrinsics else {}
     seen, unit = look(views, choice, listed, intake.intrinsics, intake.depth_unit)
     for name, view in seen.items():
-        beside = examine(Edges(str(view.path), list(zip(view.colors, view.depths, strict=False))))
+        beside = examine("edges", view.path, list(zip(view.colors, view.depths, strict=False)))
         findings += [replace(one, title=f"camera {name}: {one.name}") for one in beside]
-    findings += examine(Category(intake.output, intake.category))
+    findings += examine("category", intake.output, intake.category)
     placed, how = _place(intake, film, board, seen, unit)
     made = _describe(intake, film, choice, rate, unit, seen, placed, how)
     if intake.brought and (intake.level or not (intake.poses or intake.board)):

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from neuspring.checks import examine
-from neuspring.checks.case import RELEASED_FRAME_RATE, FinalData, Metadata, Split, TrackFile
+from neuspring.checks.case import RELEASED_FRAME_RATE
 from neuspring.config import Config, ScenarioRow
 from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.errors import InputError
@@ -58,10 +58,10 @@ def read(row: ScenarioRow, folder: Path) -> Observations:
     folder = Path(folder)
     data_path, split_path = folder / FINAL_DATA, folder / SPLIT
     data = load_pickle(data_path)
-    refuse(examine(FinalData(data_path, data)))
+    refuse(examine("final data", data_path, data))
     frames = len(data["object_points"])
     split = load_json(split_path)
-    refuse(examine(Split(split_path, split, frames)))
+    refuse(examine("split", split_path, split, frames))
     used = [data_path, split_path]
 
     tracks = annotated(folder, frames)
@@ -70,7 +70,7 @@ def read(row: ScenarioRow, folder: Path) -> Observations:
     frame_rate = RELEASED_FRAME_RATE
     if (folder / METADATA).exists():
         metadata = load_json(folder / METADATA)
-        refuse(examine(Metadata(folder / METADATA, metadata)))
+        refuse(examine("metadata", folder / METADATA, metadata))
         frame_rate = float(metadata.get("fps", RELEASED_FRAME_RATE))
         used.append(folder / METADATA)
 
@@ -119,7 +119,7 @@ def annotated(case: Path, frames: int) -> np.ndarray | None:
     if not path.exists():
         return None
     tracks = load_pickle(path)
-    refuse(examine(TrackFile(path, tracks, frames)))
+    refuse(examine("annotated tracks", path, tracks, frames))
     return np.asarray(tracks, dtype=float)
 
 
@@ -129,5 +129,5 @@ def train_end_of(case: Path, frames: int) -> int | None:
     if not path.exists():
         return None
     split = load_json(path)
-    refuse(examine(Split(path, split, frames)))
+    refuse(examine("split", path, split, frames))
     return int(split["train"][1])

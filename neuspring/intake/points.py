@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from neuspring.checks import examine
-from neuspring.checks.space import SAME, Cloud, Holding, Marked, Nodes
+from neuspring.checks.space import SAME, Cloud, Holding
 from neuspring.config import Config, ScenarioRow
 from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.errors import InputError
@@ -117,17 +117,18 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
     seen = annotated[np.isfinite(annotated).all(axis=2)]
     for what, file, points in (("nodes", files.get("nodes"), nodes), ("", marked, seen), ("", files.get("controllers"), held_at)):
         if file is not None and points.size:
-            findings += examine(Cloud(file, points.reshape(-1, 3), ground, is_body=what == "nodes"))
+            findings += examine("points", file, Cloud(points.reshape(-1, 3), ground, is_body=what == "nodes"))
     if any(one.level == "error" for one in findings):
         return InSpace(hands, nodes, tracks), findings
     if (body := files.get("nodes")) is not None:
-        findings += examine(Nodes(body, nodes))
+        findings += examine("nodes", body, nodes)
     if len(nodes):
-        findings += examine(Marked(marked, annotated[0], nodes))
+        findings += examine("points on nodes", marked, annotated[0], nodes)
     if (file := files.get("controllers")) is not None and hands is not None:
         grouped = hands.hand if hands.hand.size else np.zeros(hands.points.shape[1], int)
         start = held(hands, annotated, capture.train_end)[0]
-        findings += examine(Holding(file, grouped, hands.held(capture.train_end), start, nodes, np.concatenate([nodes, first])))
+        holding = Holding(grouped, hands.held(capture.train_end), start, nodes, np.concatenate([nodes, first]))
+        findings += examine("holding", file, holding)
     return InSpace(hands, nodes, tracks), findings
 
 

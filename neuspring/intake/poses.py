@@ -285,7 +285,7 @@ def stand(
     found = {name: planes(points) for name, points in clouds.items()}
     judged: dict[str, list[Finding]] = {side: [] for side in ([up] if up else ["+z", "-z"])}
     for (side, listed), (name, view) in product(judged.items(), seen.items()):
-        listed += examine(TableSeen(file or view.path, name, found[name], moved[name], side, view.unit))
+        listed += examine("table", file or view.path, TableSeen(name, found[name], moved[name], side, view.unit))
     side = min(judged, key=lambda key: sum(d.level == "error" for d in judged[key]))
     refuse(one for one in judged[side] if one.level == "error")
     lines += [in_report(one) for one in judged[side]]
@@ -300,7 +300,7 @@ def given_alone(poses: Mapping[str, np.ndarray], seen: Mapping[str, SampledCamer
     """
     (name, view), pose = next(iter(seen.items())), next(iter(poses.values()))
     up = "+z" if pose[2, 3] > 0 else "-z"
-    judged = examine(CameraAlone(where, Camera(name, *view.size, view.lens.matrix, pose), up))
+    judged = examine("camera alone", where, CameraAlone(Camera(name, *view.size, view.lens.matrix, pose), up))
     refuse(one for one in judged if one.level == "error")
     return Placed(poses=dict(poses), up=up, table="z = 0 as given", lines=tuple(map(in_report, judged)))
 

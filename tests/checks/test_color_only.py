@@ -10,7 +10,6 @@ from neuspring.checks import examine
 from neuspring.checks.masks import mask_facts
 from neuspring.checks.perceived import look_at_masks
 from neuspring.checks.table import on_table
-from neuspring.checks.things import Silhouette
 from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
 from neuspring.core.geometry import rigid_inverse
@@ -230,7 +229,7 @@ def strip(length, width):
     ],
 )
 def test_an_outline_of_another_category(category, mask, words):
-    found = examine(Silhouette("object", mask, category))
+    found = examine("silhouette", "object", mask, category)
     assert [one.name for one in found] == (["outline and category"] if words else [])
     if words:
         assert words in found[0].text and repr(category) in found[0].text and "meant?" in found[0].remedy

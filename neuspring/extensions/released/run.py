@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from neuspring.checks.case import Case, Cases, FinalData
+from neuspring.checks.case import Case, whole
 from neuspring.config import ScenarioRow
 from neuspring.config.images import LpipsWeights
 from neuspring.core.artifacts import Observations
@@ -255,22 +255,22 @@ OF_RESULTS, OF_DATA = (1, 2, 3, 4), (1, 4)
 """Checks of a case with a root, and of one without: it has no released results."""
 
 
-def conformance(given: Cases) -> Iterator[dict[str, Any]]:
+def conformance(folder: Path, cases: Sequence[Case], found: Sequence[Finding]) -> Iterator[dict[str, Any]]:
     """Every departure of the cases of a folder from the release: damaged results, failed checks, and what could not be compared."""
     findings, compared, tools = list[Finding](), list[Comparison](), Tools(published=Published.load())
-    for case in given.cases:
+    for case in cases:
         of_case, more = _check_case(case, tools)
         compared, findings = compared + of_case, findings + more
-    if len(given.cases) > 1:
-        findings += [_finding(mean, given.where) for mean in of_means(compared, tools.published)]
-    errors = [one for one in given.found if one.level == "error"]
+    if len(cases) > 1:
+        findings += [_finding(mean, folder) for mean in of_means(compared, tools.published)]
+    errors = [one for one in found if one.level == "error"]
     for one in findings:
         # What a reader refuses is an error of the layout already; the reader's text goes on with the next move.
         if one.level != "error" or not any(one.where == e.where and one.message.startswith(e.message) for e in errors):
             yield {"text": one.message, "level": one.level, "where": one.where}
 
 
-RELEASED = Check("released results", Cases, conformance, None, "error", "{text}", title="")
+RELEASED = Check("released results", "cases", conformance, None, "error", "{text}", title="")
 """What `check-data` says of released results beside a case: entry point `released` of the group `neuspring.checks`."""
 
 
@@ -297,7 +297,7 @@ def _of_results(case: Released) -> list[Finding]:
         if case.checkpoint.exists():
             read_checkpoint(case.checkpoint)
         data = load_pickle(case.folder / phystwin.FINAL_DATA) if case.prediction.exists() else None
-        if data is not None and FinalData(case.folder, data).whole:
+        if data is not None and whole(data):
             nodes = data["object_points"].shape[1] + len(data["surface_points"]) + len(data["interior_points"])
             findings += prediction_findings(case.prediction, load_pickle(case.prediction), len(data["object_points"]), nodes)
     except InputError as error:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from neuspring.checks import examine
-from neuspring.checks.case import RELEASED_FRAME_RATE, Calibration, Metadata
+from neuspring.checks.case import RELEASED_FRAME_RATE
 from neuspring.config import Config, ScenarioRow
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
@@ -80,11 +80,12 @@ def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
 def read_calibration(case: Path) -> tuple[dict[str, Any], list[Camera]]:
     """metadata.json, and the cameras in it and in calibrate.pkl, named by their numbers. Raises InputError."""
     metadata, poses = load_json(case / METADATA), load_pickle(case / CALIBRATION)
-    refuse(examine(Metadata(case / METADATA, metadata, with_cameras=True)))
+    path = case / METADATA
+    refuse(examine("metadata", path, metadata) + examine("lenses of metadata", path, metadata, None))
     count = metadata.get("frame_num")
     if type(count) is not int or count < FEWEST:
         raise InputError(case / METADATA, f"frame_num: at least {FEWEST} frames are required", count)
-    refuse(examine(Calibration(case / CALIBRATION, poses, len(metadata["intrinsics"]))))
+    refuse(examine("calibration", case / CALIBRATION, poses, len(metadata["intrinsics"])))
     width, height = metadata["WH"]
     intrinsics = np.asarray(metadata["intrinsics"], dtype=np.float64)
     return metadata, [
