@@ -11,7 +11,7 @@ Meters, in the capture's world. Files of another form, in other units or axes ar
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -235,22 +235,6 @@ def write(folder: Path, hands: Hands | None, nodes: np.ndarray) -> None:
         write_atomically(folder / CONTROLLERS[0], lambda path: _save(path, arrays))
     if len(nodes):
         write_atomically(folder / NODES[0], lambda path: _save(path, {"points": nodes}))
-
-
-def require_first(capture: Capture, first: int) -> None:
-    """Raise InputError where a cut that begins with frame `first` would have nodes of another frame."""
-    if first and (body := given(capture.folder, NODES)) is not None:
-        rule = "the nodes are those of frame 0, with which a cut must begin"
-        raise InputError(body, rule, f"frame {first}", "Write nodes of that frame, or remove the file.")
-
-
-def cut(capture: Capture, kept: range, folder: Path) -> None:
-    """Write hands and nodes of some frames of a capture to another folder."""
-    file, body = (given(capture.folder, names) for names in (CONTROLLERS, NODES))
-    hands = read_hands(file, capture.frame_count) if file else None
-    if hands is not None:
-        hands = replace(hands, points=hands.points[kept], holds=hands.holds[kept] if hands.holds.size else hands.holds)
-    write(folder, hands, read_nodes(body) if body else np.zeros((0, 3)))
 
 
 def _save(path: Path, arrays: dict[str, np.ndarray]) -> None:

@@ -6,22 +6,14 @@ import shutil
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 from neuspring import checks, registry
 from neuspring.checks.masks import Shown
-from neuspring.cli.main import main
 from neuspring.core.checks import Check
-from neuspring.core.errors import InputError
-from neuspring.data.capture import CAPTURE, OBJECT, Capture
-from neuspring.intake import formats
+from neuspring.data.capture import CAPTURE, OBJECT
 from neuspring.intake.check import check_layout
-from neuspring.intake.feeds import Paired
-from neuspring.intake.formats import CaptureFormat, Recorded
-from neuspring.intake.formats.folder import ImageFolder
-from tests.support.desk import write_folders
 from tests.support.filmed import film
 
 
@@ -112,36 +104,3 @@ def test_a_package_adds_a_check(filmed, monkeypatch):
     monkeypatch.setattr(checks, "CHECKS", registry.Registry("checks", own, (Check, tuple)))
     (found,) = (one for one in check_layout(filmed.folder) if one.name == "red object")
     assert found.level == "note" and found.value > 1 and found.message.startswith("camera 0: red object: red of ")
-
-
-def _twin_folders(paths, cameras):
-    names = cameras or tuple(map(str, range(len(paths))))
-    pairs = zip(names, paths, strict=True)
-    return Recorded(
-        views=[Paired(name, ImageFolder(p / "color_0", "color"), ImageFolder(p / "depth_0", "depth")) for name, p in pairs]
-    )
-
-
-MINE = CaptureFormat(
-    about="a folder of two",
-    recognizes=lambda path: (path / "color_0").is_dir() and (path / "depth_0").is_dir(),
-    recording=_twin_folders,
-)
-
-
-@pytest.mark.parametrize("named", [(), ("--format", "mine")])
-def test_a_package_adds_a_capture_format(tmp_path, monkeypatch, named):
-    brought(monkeypatch, "capture_formats", "tests.checks.test_checks:MINE")
-    own = registry.modules(formats.__name__, "FORMAT")
-    monkeypatch.setattr(formats, "FORMATS", registry.Registry("capture_formats", own, CaptureFormat))
-    root = write_folders(tmp_path)
-    words = ["--recording", str(root), *named, "--intrinsics", str(root / "intrinsics.json"), "--rate", "30", "--category", "ball"]
-    assert main(["make-capture", *words, "--output", str(tmp_path / "made")]) == 0
-    made = Capture.load(tmp_path / "made")
-    assert [*made.cameras] == ["0"] and made.frame_count > 4
-
-
-def test_a_path_of_no_format_is_refused_with_the_names(tmp_path):
-    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4), np.uint8))
-    with pytest.raises(InputError, match=r"--format: must be one of bag, phystwin_raw; received none that reads"):
-        formats.open_recording([tmp_path])

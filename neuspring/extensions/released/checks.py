@@ -34,8 +34,8 @@ from neuspring.extensions.released.files import (
     visible_pixels,
 )
 from neuspring.intake import phystwin
-from neuspring.intake.formats.phystwin_raw import read_calibration
 from neuspring.intake.phystwin import CALIBRATION, released_cases
+from neuspring.intake.phystwin_raw import read_calibration
 from neuspring.physics.stability import RELEASED_FRAME_TIME, RELEASED_SUBSTEPS
 from neuspring.scores import metrics
 from neuspring.scores.lpips import Lpips

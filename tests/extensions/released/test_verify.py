@@ -24,8 +24,8 @@ from neuspring.extensions.released.files import (
     visible_pixels,
 )
 from neuspring.extensions.released.run import CHECKS, Report, read_observations, verify_released
-from neuspring.intake.formats.phystwin_raw import read_calibration
 from neuspring.intake.phystwin import released_cases
+from neuspring.intake.phystwin_raw import read_calibration
 from neuspring.scores.lpips import CHANNELS, WINDOWS, Lpips
 from neuspring.scores.metrics import METRICS
 from tests.extensions.released.released_case import (

@@ -12,8 +12,8 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Lens
-from neuspring.intake.formats import CaptureFormat, Pair, Recorded, picked
-from neuspring.intake.moments import Series
+from neuspring.extensions.make_capture.formats import CaptureFormat, Pair, Recorded, picked
+from neuspring.extensions.make_capture.moments import Series
 
 MODULE = "pyrealsense2"
 PATIENCE = 5000

@@ -9,13 +9,13 @@ import pytest
 from PIL import Image
 
 from neuspring.core.errors import InputError
-from neuspring.intake.feeds import pairs
-from neuspring.intake.film import looked_at
-from neuspring.intake.formats import open_images
-from neuspring.intake.formats.folder import ImageFolder
-from neuspring.intake.formats.video import VideoFile
-from neuspring.intake.moments import Evenness, Series, matched, spans
-from neuspring.intake.poses import choose
+from neuspring.extensions.make_capture.feeds import pairs
+from neuspring.extensions.make_capture.film import looked_at
+from neuspring.extensions.make_capture.formats import open_images
+from neuspring.extensions.make_capture.formats.folder import ImageFolder
+from neuspring.extensions.make_capture.formats.video import VideoFile
+from neuspring.extensions.make_capture.moments import Evenness, Series, matched, spans
+from neuspring.extensions.make_capture.poses import choose
 
 FILM = list(range(45))
 

@@ -25,13 +25,11 @@ from neuspring.core.text import Progress
 from neuspring.data import capture
 from neuspring.data.camera import Camera, CameraEntry, Lens
 from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Capture, Description, Writer, description_findings
-from neuspring.intake import points
-from neuspring.intake.depth import Unit, find_rate
-from neuspring.intake.feeds import Paired, pairs
-from neuspring.intake.film import looked_at
-from neuspring.intake.formats import Recorded, open_recording
-from neuspring.intake.lenses import Board, Straightener, read_lenses, read_poses
-from neuspring.intake.poses import (
+from neuspring.extensions.make_capture.feeds import Paired, pairs
+from neuspring.extensions.make_capture.film import looked_at
+from neuspring.extensions.make_capture.formats import Recorded, open_recording
+from neuspring.extensions.make_capture.lenses import Board, Straightener, read_lenses, read_poses
+from neuspring.extensions.make_capture.poses import (
     FrameChoice,
     Placed,
     SampledCamera,
@@ -48,6 +46,8 @@ from neuspring.intake.poses import (
     stored_as,
     straightened,
 )
+from neuspring.extensions.make_capture.table import Unit, find_rate
+from neuspring.intake import points
 
 NAMES = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 FIRST = 5

@@ -14,14 +14,14 @@ from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
 from neuspring.core.geometry import rigid_inverse
 from neuspring.data.capture import CAPTURE, OBJECT, Capture
+from neuspring.extensions.make_capture.feeds import pairs
+from neuspring.extensions.make_capture.make import Intake, make_capture
 from neuspring.intake.check import check_layout
-from neuspring.intake.feeds import pairs
-from neuspring.intake.make import Intake, make_capture
 from neuspring.perception import segment_opencv
 from neuspring.perception.backends import BACKENDS
 from neuspring.perception.marks.carry import CameraFilm
 from neuspring.perception.marks.store import save_masks
-from tests.support.board import BOARD, LENS, board_image
+from tests.extensions.make_capture.board import BOARD, LENS, board_image
 from tests.support.desk import FRAMES, SIZE, camera, looking, seen, write_folders, write_json, write_poses
 from tests.support.findings import holds, of_level, serious
 

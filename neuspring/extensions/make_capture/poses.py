@@ -19,11 +19,12 @@ from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.core.findings import Finding, refuse
 from neuspring.data.camera import Camera, Lens, Plane
-from neuspring.intake.depth import Unit, cloud, common_plane, find_table, find_unit, levelling, planes, pose_on
-from neuspring.intake.feeds import Paired
-from neuspring.intake.formats import CameraFeed, Pair, open_images
-from neuspring.intake.lenses import Board, Straightener, depth_ratio, require_lens, sight
-from neuspring.intake.moments import matched
+from neuspring.extensions.make_capture.feeds import Paired
+from neuspring.extensions.make_capture.formats import CameraFeed, Pair, open_images
+from neuspring.extensions.make_capture.lenses import Board, Straightener, depth_ratio, require_lens, sight
+from neuspring.extensions.make_capture.moments import matched
+from neuspring.extensions.make_capture.table import Unit, common_plane, find_table, find_unit, levelling, pose_on
+from neuspring.intake.depth import cloud, planes
 
 FEWEST = 5
 """Frames of a capture."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Lens
-from neuspring.intake.moments import Series
+from neuspring.extensions.make_capture.moments import Series
 from neuspring.registry import Registry, modules
 
 T = TypeVar("T")

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.intake.feeds import pairs
-from neuspring.intake.film import looked_at
-from neuspring.intake.formats.folder import ImageFolder
-from neuspring.intake.formats.video import VideoFile
-from neuspring.intake.poses import choose, chosen
+from neuspring.extensions.make_capture.feeds import pairs
+from neuspring.extensions.make_capture.film import looked_at
+from neuspring.extensions.make_capture.formats.folder import ImageFolder
+from neuspring.extensions.make_capture.formats.video import VideoFile
+from neuspring.extensions.make_capture.poses import choose, chosen
 from tests.support.desk import FRAMES, camera, counts, seen, write_folders, write_video
 
 

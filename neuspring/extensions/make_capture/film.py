@@ -7,11 +7,11 @@ from typing import Any
 
 from neuspring.core.checks import Check
 from neuspring.core.findings import Finding
-from neuspring.intake.feeds import Paired
-from neuspring.intake.formats import CameraFeed
-from neuspring.intake.formats.video import VideoFile
-from neuspring.intake.moments import DEPARTURE, LOST, Evenness, spans
-from neuspring.intake.poses import FrameChoice
+from neuspring.extensions.make_capture.feeds import Paired
+from neuspring.extensions.make_capture.formats import CameraFeed
+from neuspring.extensions.make_capture.formats.video import VideoFile
+from neuspring.extensions.make_capture.moments import DEPARTURE, LOST, Evenness, spans
+from neuspring.extensions.make_capture.poses import FrameChoice
 
 
 def looked_at(views: Sequence[CameraFeed], choice: FrameChoice) -> list[Finding]:

@@ -13,8 +13,8 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.data.images import read_npy, read_picture
-from neuspring.intake.formats import PICTURES, CaptureFormat, Kind, require_kind
-from neuspring.intake.moments import Series
+from neuspring.extensions.make_capture.formats import PICTURES, CaptureFormat, Kind, require_kind
+from neuspring.extensions.make_capture.moments import Series
 
 STAMP = re.compile(r"(?<![0-9])([0-9]{10,19})(\.[0-9]+)?(?![0-9])")
 SECOND = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}

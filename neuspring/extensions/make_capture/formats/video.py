@@ -13,8 +13,8 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.core.extras import needed
-from neuspring.intake.formats import CaptureFormat, Kind, picked, require_kind
-from neuspring.intake.moments import Series
+from neuspring.extensions.make_capture.formats import CaptureFormat, Kind, picked, require_kind
+from neuspring.extensions.make_capture.moments import Series
 
 if TYPE_CHECKING:
     import av
