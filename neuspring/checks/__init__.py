@@ -1,4 +1,4 @@
-"""What is looked for in data, before any cost: one file per area, with its measurements and its checks.
+"""Checks of data, before any cost: one file per area, with its measurements and its checks.
 
 To add a check: a function that measures, and an entry of `checks` in a file here. A package adds one, a `Check` of one of our kinds
 of subject, by an entry point of the group `neuspring.checks`.

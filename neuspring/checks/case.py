@@ -18,7 +18,7 @@ RELEASED_FRAME_RATE = 30.0
 MAX_FRAME_RATE = 1e6
 BINARY_TOLERANCE = 1e-5
 """Allowed deviation from R^T R = 1 in a pickle of float64 products of OpenCV rotations."""
-CONTROLLERS = 30
+RELEASED_CONTROLLERS = 30
 """Controller points of every released case."""
 Words = list[dict[str, Any]]
 
@@ -35,7 +35,7 @@ class ArrayRule:
     """True where the reader uses it."""
 
 
-ARRAYS = (
+CASE_ARRAYS = (
     ArrayRule("object_points", ("T", "No", "3"), "f"),
     ArrayRule("object_visibilities", ("T", "No"), "b"),
     ArrayRule("object_motions_valid", ("T", "No"), "b"),
@@ -79,11 +79,11 @@ def structure(data: Any) -> Words:
     """Faults of keys, types, shapes and dtypes of final_data.pkl. Without errors the content of the arrays can be looked at."""
     if not isinstance(data, dict):
         return [wrong("", "a dict of arrays is required", type(data).__name__)]
-    keys = {rule.key for rule in ARRAYS} | set(IGNORED)
+    keys = {rule.key for rule in CASE_ARRAYS} | set(IGNORED)
     findings = [odd(str(key), "unknown key, not read") for key in data if key not in keys]
     sizes: dict[str, int] = {}
     """The symbolic dimensions of the file."""
-    for rule in ARRAYS:
+    for rule in CASE_ARRAYS:
         severity = wrong if rule.required else odd
         shape, value = f"[{', '.join(rule.shape)}]", data.get(rule.key)
         if rule.key not in data:
@@ -113,7 +113,7 @@ def values(data: Any) -> Words:
     findings = Words()
     if not isinstance(data, dict):
         return findings
-    for rule in ARRAYS:
+    for rule in CASE_ARRAYS:
         value = data.get(rule.key)
         if rule.kind != "f" or not isinstance(value, np.ndarray) or value.dtype.kind != "f" or value.ndim != len(rule.shape):
             continue
@@ -179,8 +179,8 @@ def motions(data: Any) -> Words:
         rule = "columns are expected in lexicographic order of their frame-0 coordinates"
         findings.append(odd("object_points", rule, "another order"))
     controllers = data["controller_points"].shape[1]
-    if controllers != CONTROLLERS:
-        findings.append(odd("controller_points", f"released cases have {CONTROLLERS} controllers", controllers))
+    if controllers != RELEASED_CONTROLLERS:
+        findings.append(odd("controller_points", f"released cases have {RELEASED_CONTROLLERS} controllers", controllers))
     return findings
 
 

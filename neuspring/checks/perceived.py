@@ -1,4 +1,4 @@
-"""What the steps of perception notice about their own results: masks, tracks, lifted points, the shape and the observations.
+"""Checks by the steps of perception of their own results: masks, tracks, lifted points, the shape and the observations.
 
 Limits were chosen so that the synthetic scenes pass, whose perception is known to be good; lengths in m, of things that hands hold.
 """
@@ -23,7 +23,7 @@ from neuspring.data.results import LiftedTracks, ShapePrior
 
 WRONG = ("background in the mask", "mask flickers", "hands too large", "hands inside the object", "labels are noise")
 """Findings of masks that cannot be right, by name: `perception.segment.verdict` decides what happens."""
-VOLUME = 0.012
+LARGEST_HULL = 0.012
 """m^3 of a hull: a large plush animal has 5 liters."""
 INVENTED = 0.8
 """Share of the surface that no camera saw; of a body seen from one side it is about two thirds."""
@@ -31,7 +31,7 @@ RISES = 0.05
 """Part of a body that is not laid onto the table, because it would lie too far behind. Two sloths that lie have up to 0.03."""
 TRUSTED = 0.5
 """Share of motions that agree with their neighbors, of points that are seen in both frames; points that are lost are said apart."""
-SEEN = 0.05
+SEEN_SHARE = 0.05
 """Share of the object's points that are seen in a frame."""
 RESIZED = 1.8
 """Change of a hand's apparent size."""
@@ -132,7 +132,9 @@ def hand_sizes(image: ImageObservations) -> dict[str, Any] | None:
     return {"value": most, "least": least} if most > RESIZED or least < 1 / RESIZED else None
 
 
-LOST = "{value:.0%} of the object's points are seen in frame {frame}; few in {count} frames; at least {least:.0%} are expected in "
+LOST_TEXT = (
+    "{value:.0%} of the object's points are seen in frame {frame}; few in {count} frames; at least {least:.0%} are expected in "
+)
 # fmt: off
 checks = (
     Check("pose", "pose", given_pose, None, "note",
@@ -141,8 +143,8 @@ checks = (
     Check("pose", "pose", supposed_pose, None, "note",
           "if it lies, it reaches {deep:.0f} cm behind its nearest point and is {across:.0f} cm wide{rises}; one picture cannot "
           "say whether it lies or stands.", 'Write "pose": "lying" or "standing" in capture.json.'),
-    Check("volume of the hull", "shape", hull_volume, (-np.inf, VOLUME), "warning",
-          f"{{liters:.1f}} liters; at most {1e3 * VOLUME:g} liters are expected of a thing that hands hold.",
+    Check("volume of the hull", "shape", hull_volume, (-np.inf, LARGEST_HULL), "warning",
+          f"{{liters:.1f}} liters; at most {1e3 * LARGEST_HULL:g} liters are expected of a thing that hands hold.",
           "Masks that show sleeves, table or other things make it large: look at masks.png and lifted.png."),
     Check("invented surface", "shape", invented, None, "note", "no camera saw {value:.0%} of the surface ({0.backend}); {rule}.",
           "Add a camera from the other side, or a mesh (perception.shape.backend: mesh)."),
@@ -156,11 +158,11 @@ checks = (
           "in {value} training frames, first in frame {first}, a hand is on the object that no controller follows; what that "
           "hand does to the object reaches no twin: controllers are points of the hands of frame 0.",
           "End the capture before frame {first}, or begin it when all hands are in view (make-capture --frames)."),
-    Check("points lost", "lifted tracks", lambda lifted: few(lifted.object_visibility, SEEN), None, "warning",
-          LOST + "every frame.",
+    Check("points lost", "lifted tracks", lambda lifted: few(lifted.object_visibility, SEEN_SHARE), None, "warning",
+          LOST_TEXT + "every frame.",
           "End the capture before frame {first}. Look at tracks.png and lifted.png; perception.lift has neighborhood."),
-    Check("points lost", "tracks in the image", lambda image: few(image.visible[: len(image.inside)], SEEN), None, "warning",
-          LOST + "every training frame; silhouettes alone say where the object is in the others.", "Look at tracks.png."),
+    Check("points lost", "tracks in the image", lambda image: few(image.visible[: len(image.inside)], SEEN_SHARE), None, "warning",
+          LOST_TEXT + "every training frame; silhouettes alone say where the object is in the others.", "Look at tracks.png."),
     Check("size of hands", "hands in the image", hand_sizes, None, "warning",
           "a hand appears {least:.2f} to {value:.2f} times as large as in frame 0; a hand at arm's length changes by less than "
           f"{RESIZED:g} times; it was not followed well.", "Look at hands.png, and mark the hands anew."),

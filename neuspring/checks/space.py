@@ -10,13 +10,13 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from neuspring.checks.table import FAR_OFF
-from neuspring.checks.things import HIGH, LARGE, REACH, SCALE, SMALL, SUNK, WITHIN, longest
+from neuspring.checks.things import HAND_REACH, HIGHEST_OBJECT, LARGE, SCALE_REMEDY, SMALL, SUNK, WITHIN, longest
 from neuspring.core.checks import Check
 from neuspring.data.camera import FAR
 from neuspring.data.capture import CAPTURE
 
 UNITS = {"millimeters": 1000.0, "tenths of a millimeter": 10000.0, "centimeters": 100.0}
-"""What meters may be instead."""
+"""Units that may have been meant, and how many are in 1 m."""
 AWAY = 0.3
 """m. Hands that never come nearer to the nodes, and nodes that are farther from annotated points, are of another scene."""
 MOST_NODES = 5000
@@ -58,7 +58,7 @@ def off_table(cloud: Cloud) -> dict[str, Any] | None:
     points, up, is_body = cloud.points, cloud.up, cloud.is_body
     low, high = np.quantile(up * points[:, 2], WITHIN)
     # A body may hang in the air, and need not.
-    if low >= -SUNK and high <= HIGH and not (is_body and low > FAR_OFF):
+    if low >= -SUNK and high <= HIGHEST_OBJECT and not (is_body and low > FAR_OFF):
         return None
     sign = "+-" if up > 0 else "-+"
     told = {"value": float(low), "z": "z from {:.3g} to {:.3g} m".format(*np.quantile(points[:, 2], (0, 1)) + 0.0), "sign": sign[0]}
@@ -70,7 +70,7 @@ def off_table(cloud: Cloud) -> dict[str, Any] | None:
     if high <= SUNK:
         either = f"Is up {sign[1]}z? Then write so in {CAPTURE} (make-capture: --up). Without a table: ground: false (--no-table)"
         return told | {"next": f". {either}"}
-    if low > FAR_OFF and high <= HIGH:
+    if low > FAR_OFF and high <= HIGHEST_OBJECT:
         remedy = "If it stands on a table, the table must be z = 0; or is another axis up? If it hangs, this is right"
         return told | {"level": "warning", "next": f": {100 * low:.0f} cm above the table. {remedy}"}
     remedy = f"Move the world so that the table is z = 0, or write ground: false in {CAPTURE} (make-capture: --no-table)"
@@ -81,10 +81,10 @@ def far_from_nodes(points: np.ndarray, nodes: np.ndarray) -> dict[str, Any] | No
     """Annotated points of frame 0 [K, 3], m, NaN where unseen, that are far from the nodes [N, 3] of the body."""
     known = np.flatnonzero(np.isfinite(points).all(axis=1))
     away = KDTree(nodes).query(points[known])[0] if len(known) else np.zeros(0)
-    if not (away > REACH).any():
+    if not (away > HAND_REACH).any():
         return None
-    text = f"point {known[away.argmax()]} is {100 * away.max():.1f} cm away, {(away > REACH).sum()} of {len(away)} are farther"
-    return {"value": float(away.max()), "text": text, "level": "error" if np.median(away) > REACH else "warning"}
+    text = f"point {known[away.argmax()]} is {100 * away.max():.1f} cm away, {(away > HAND_REACH).sum()} of {len(away)} are farther"
+    return {"value": float(away.max()), "text": text, "level": "error" if np.median(away) > HAND_REACH else "warning"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,25 +127,25 @@ checks = (
     Check("unit", "points", far, (0, FAR), "error",
           "coordinates must be meters, at most {high:g} from the origin; received {value:.4g}, in {size}. {next}", title="points"),
     Check("implausible size", "points", lambda cloud: longest(cloud.side) if cloud.is_body and cloud.most <= FAR else None, None,
-          "warning", f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE),
+          "warning", f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE_REMEDY),
     Check("off the table", "points", off_table, None, "error",
-          f"with up {{sign}}z points must lie between the table, z = 0, and {HIGH:g} m above it; received {{z}}{{next}}",
+          f"with up {{sign}}z points must lie between the table, z = 0, and {HIGHEST_OBJECT:g} m above it; received {{z}}{{next}}",
           title="points"),
     Check("many nodes", "nodes", len, (0, MOST_NODES), "warning",
           "some hundred nodes are enough, more than {high} are slow; received {value}. Each of them costs time in every substep",
           title="points"),
     Check("points off the body", "points on nodes", far_from_nodes, None, "error",
-          f"annotated points must lie on the body: within {100 * REACH:g} cm of a node in frame 0; received {{text}}. Are points "
-          "and nodes of one recording, in one world?", title=""),
+          f"annotated points must lie on the body: within {100 * HAND_REACH:g} cm of a node in frame 0; received {{text}}. Are "
+          "points and nodes of one recording, in one world?", title=""),
     Check("hand of one point", "holding", fewest_points, (2, np.inf), "warning",
           "three points of a hand, or of a jaw, turn what it holds; received one of some hand. It holds like a string: is that "
           "so?", title="points"),
     Check("nothing holds", "holding", lambda hands: None if len(hands.held) or not len(hands.nodes) else {}, None, "error",
           "some controller must hold in some training frame; received none. A twin learns from training frames: see train_end",
           title="holds"),
-    Check("hand far from the nodes", "holding", reach, (0, REACH), "error",
-          f"in some training frame a controller must come within {100 * REACH:g} cm of a node of frame 0 to move it; received "
-          "{cm:.1f} cm at the nearest. Are hands and nodes of one recording, in one world?", title="points"),
+    Check("hand far from the nodes", "holding", reach, (0, HAND_REACH), "error",
+          f"in some training frame a controller must come within {100 * HAND_REACH:g} cm of a node of frame 0 to move it; "
+          "received {cm:.1f} cm at the nearest. Are hands and nodes of one recording, in one world?", title="points"),
     Check("controllers on nodes", "holding", doubled, None, "error",
           f"controllers must lie {1e3 * SAME:g} mm from nodes and annotated points in frame 0: a spring needs a length; received "
           "controller {value}, {count} in all. Move them off the body, or leave out the nodes below them", title="points"),

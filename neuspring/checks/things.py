@@ -27,11 +27,11 @@ SAMPLED = 5
 """Frames per camera, evenly spaced, that are compared with the world, or in which the table is looked for."""
 SMALL, LARGE = 0.02, 1.2
 """m. Objects whose longest side is another are a wrong mask or a wrong unit of depth."""
-SUNK, HIGH = 0.02, 1.2
-"""m. An object lower than SUNK below the table, or higher than HIGH above it, stands in another world than the table."""
+SUNK, HIGHEST_OBJECT = 0.02, 1.2
+"""m. An object lower than SUNK below the table, or higher than HIGHEST_OBJECT above it, stands in another world than the table."""
 WITHIN = (0.05, 0.95)
 """Quantiles between which a body lies: beyond them are pixels of its outline with the depth of something else."""
-HOLES, BAD_HOLES = 0.4, 0.8
+USUAL_HOLES, BAD_HOLES = 0.4, 0.8
 """Share of the object's pixels without depth from which twins suffer, and from which little is left to lift. Outlines have none: a
 tenth of a cloth or a toy in the synthetic scenes, and a third of a rope."""
 HAND_AREA, HAND_RATIO = 0.12, 12.0
@@ -39,14 +39,14 @@ HAND_AREA, HAND_RATIO = 0.12, 12.0
 the image are another thing."""
 HAND_LEAST = 0.002
 """m². Real hands with a part of the forearm have 0.015 to 0.05 in color alone; fewer are a wrong scale of the pose."""
-REACH = 0.06
+HAND_REACH = 0.06
 """m. A hand that never comes nearer to the object does not hold it. Where they touch, depth may be hidden."""
-POINTS = 1500
+COMPARED_POINTS = 1500
 """Points of each thing that are compared."""
-FEW = 20
+FEWEST_POINTS = 20
 """Points below which nothing is said of a thing in a frame."""
 TABLE = "Look at the mask of frame 0 and at depth_unit; make-capture --level puts the table at z = 0."
-SCALE = (
+SCALE_REMEDY = (
     "Look at the mask of frame 0, and at the units of depth and poses: meters, with the table at z = 0. Poses of COLMAP have no "
     "scale: multiply their positions by a true length over the measured one."
 )
@@ -70,9 +70,9 @@ def sampled(frames: int) -> set[int]:
 
 
 def lifted(camera: Camera, sample: Sample, label: int) -> np.ndarray:
-    """World points [n, 3], m, of the pixels with a label and depth; at most POINTS."""
+    """World points [n, 3], m, of the pixels with a label and depth; at most COMPARED_POINTS."""
     y, x = np.nonzero((sample.mask == label) & (sample.depth > 0))
-    step = -(-len(x) // POINTS) or 1
+    step = -(-len(x) // COMPARED_POINTS) or 1
     y, x = y[::step], x[::step]
     return camera.lift(np.stack([x, y], axis=-1).astype(float), sample.depth[y, x])
 
@@ -93,7 +93,7 @@ class Masked:
         for sample in self.samples.values():
             own = sample.mask == HANDS
             measured = own & (sample.depth > 0)
-            if measured.sum() < FEW or not (sample.mask == OBJECT).any():
+            if measured.sum() < FEWEST_POINTS or not (sample.mask == OBJECT).any():
                 continue
             depth = np.where(sample.depth > 0, sample.depth, np.median(sample.depth[measured]))
             areas.append(float((depth[own] ** 2).sum() / np.prod(np.diag(self.camera.intrinsics)[:2])))
@@ -109,8 +109,8 @@ def holes(seen: Masked) -> dict[str, Any] | None:
     if not missing:
         return None
     worst, mean = max(missing, key=lambda frame: missing[frame]), float(np.mean(list(missing.values())))
-    bad = mean > HOLES or missing[worst] > BAD_HOLES
-    rule = f"at most {HOLES:.0%} are expected, and never {BAD_HOLES:.0%}" if bad else f"up to {HOLES:.0%} are usual"
+    bad = mean > USUAL_HOLES or missing[worst] > BAD_HOLES
+    rule = f"at most {USUAL_HOLES:.0%} are expected, and never {BAD_HOLES:.0%}" if bad else f"up to {USUAL_HOLES:.0%} are usual"
     next_move = "Film from farther than the sensor's least distance, without shine and direct sun; look whether depth is aligned."
     told = {"value": mean, "frames": (worst,), "frame": worst, "worst": missing[worst], "rule": rule}
     return told | ({"next": next_move} if bad else {"level": "note", "next": ""})
@@ -136,7 +136,7 @@ def gap(seen: Masked) -> dict[str, Any] | None:
     gaps = []
     for sample in seen.samples.values():
         body, hands = (lifted(seen.camera, sample, label) for label in (OBJECT, HANDS))
-        if min(len(body), len(hands)) >= FEW:
+        if min(len(body), len(hands)) >= FEWEST_POINTS:
             gaps.append(float(KDTree(body).query(hands)[0].min()))
     return {"value": min(gaps), "cm": 100 * min(gaps), "count": len(gaps)} if gaps else None
 
@@ -151,7 +151,7 @@ class ObjectPoints:
     @cached_property
     def place(self) -> tuple[np.ndarray, float, float] | None:
         """Sides [3], and its lowest and highest height above the table, m."""
-        whole = [points * (1, 1, self.up) for points in self.bodies if len(points) >= FEW]
+        whole = [points * (1, 1, self.up) for points in self.bodies if len(points) >= FEWEST_POINTS]
         ranges = np.array([np.quantile(points, WITHIN, axis=0) for points in whole])
         if not len(ranges):
             return None
@@ -179,7 +179,7 @@ def outline(camera: Camera, mask: np.ndarray) -> list[float]:
     """
     own = object_on_table(camera, mask)
     own = own[np.isfinite(own[:, 0])]
-    return [] if len(own) < FEW else sorted(cv2.minAreaRect(own[:, :2].astype(np.float32))[1], reverse=True)
+    return [] if len(own) < FEWEST_POINTS else sorted(cv2.minAreaRect(own[:, :2].astype(np.float32))[1], reverse=True)
 
 
 def longest(side: float) -> dict[str, Any] | None:
@@ -195,7 +195,7 @@ boxes, real and rendered from all sides, up to 4.1."""
 def slenderness(mask: np.ndarray, category: str) -> dict[str, Any] | None:
     """Area of an outline over the square of its greatest width, where that is not its category's."""
     own = np.pad(mask == OBJECT, 1).astype(np.uint8)
-    if own.sum() < FEW:
+    if own.sum() < FEWEST_POINTS:
         return None
     slender = float(own.sum() / (2 * cv2.distanceTransform(own, cv2.DIST_L2, 5).max()) ** 2)
     if (slender > SLENDER) == (category == "rope"):
@@ -206,19 +206,19 @@ def slenderness(mask: np.ndarray, category: str) -> dict[str, Any] | None:
 
 SHEET_HIGH, SHEET_SIDE = 0.015, 0.08
 """m: a sheet that lies on the table is lower, but for a tenth of it, and each of its sides is longer."""
-COVERED = 0.6
+SHEET_COVERED = 0.6
 """Part of its outline that a sheet covers; a rope in turns covers less."""
 
 
 def flat(points: np.ndarray, up: float, category: str = "") -> dict[str, Any] | None:
     """Sides and height of a sheet on the table, by points [n, 3], m; none of a thin category. "" is a filled body."""
-    if category in THIN or len(points) < FEW or (high := float(np.quantile(up * points[:, 2], 0.9))) > SHEET_HIGH:
+    if category in THIN or len(points) < FEWEST_POINTS or (high := float(np.quantile(up * points[:, 2], 0.9))) > SHEET_HIGH:
         return None
     level = points[:, :2].astype(np.float32)
     sides, outline = sorted(cv2.minAreaRect(level)[1], reverse=True), cv2.contourArea(cv2.convexHull(level))
     # Cells of which a sheet has 2.25 points each: one in ten is empty.
     cell = 1.5 * float(np.sqrt(outline / len(points)))
-    if sides[1] < SHEET_SIDE or len(np.unique(level // cell, axis=0)) * cell**2 < COVERED * outline:
+    if sides[1] < SHEET_SIDE or len(np.unique(level // cell, axis=0)) * cell**2 < SHEET_COVERED * outline:
         return None
     rule = f"the category {category!r} makes a filled body of it" if category else "a filled hull was made of it"
     return {"value": high, "text": f"{100 * sides[0]:.0f} x {100 * sides[1]:.0f} cm, {1e3 * high:.0f} mm high", "rule": rule}
@@ -227,11 +227,11 @@ def flat(points: np.ndarray, up: float, category: str = "") -> dict[str, Any] | 
 RAISED, AIR = 0.025, (0.05, 0.3)
 """m that a support is high; and the height above the table, m and as part of its own height, from which an object that is seen from
 the side is not on it. The lowest visible points of a ball on the table are a tenth of its height above it."""
-SIDE = 50.0
+SIDE_VIEW = 50.0
 """Degrees: a camera that looks down more steeply does not see where an object ends below."""
 LEVEL, BY = 0.01, 0.1
 """m: how even a support is, and how far from the object it is looked for."""
-RIM = 9
+OBJECT_RIM = 9
 """Pixels beside a mask may still be of its object."""
 
 
@@ -241,17 +241,19 @@ def height_in_air(camera: Camera, sample: Sample, up: float, obstacles: Sequence
     Where a level surface is seen around its foot, the words have the box that stands for it.
     """
     own = lifted(camera, sample, OBJECT) * (1, 1, up)
-    if len(own) < FEW:
+    if len(own) < FEWEST_POINTS:
         return None
     low, high = np.quantile(own[:, 2], WITHIN)
     foot, away = own[own[:, 2] < low + LEVEL], max(AIR[0], AIR[1] * (high - low))
     if low < RAISED or any((one.depth((foot - (0, 0, away)) * (1, 1, up)) > 0).any() for one in obstacles):
         return None
-    y, x = np.nonzero((cv2.dilate((sample.mask > 0).astype(np.uint8), np.ones((RIM, RIM), np.uint8)) == 0) & (sample.depth > 0))
+    y, x = np.nonzero(
+        (cv2.dilate((sample.mask > 0).astype(np.uint8), np.ones((OBJECT_RIM, OBJECT_RIM), np.uint8)) == 0) & (sample.depth > 0)
+    )
     seen = camera.lift(np.stack([x, y], axis=1).astype(float), sample.depth[y, x]) * (1, 1, up)
     near = ((seen[:, :2] > foot[:, :2].min(axis=0) - BY) & (seen[:, :2] < foot[:, :2].max(axis=0) + BY)).all(axis=1)
     top = seen[near & (seen[:, 2] > max(RAISED, low - away)) & (seen[:, 2] < low + LEVEL)]
-    level = float(np.median(top[:, 2])) if len(top) > 2 * FEW else 0.0
+    level = float(np.median(top[:, 2])) if len(top) > 2 * FEWEST_POINTS else 0.0
     if level and np.mean(np.abs(top[:, 2] - level) < LEVEL) > 0.8:
         (x0, y0), sides, angle = cv2.minAreaRect(np.concatenate([top, foot])[:, :2].astype(np.float32))
         turn = Rotation.from_euler("z", angle, degrees=True).as_matrix()
@@ -259,8 +261,8 @@ def height_in_air(camera: Camera, sample: Sample, up: float, obstacles: Sequence
         box = json.dumps({"shape": "box", "center": center, "half_sizes": half, "rotation": (turn.round(4) + 0.0).tolist()})
         next_move = f'Add to capture.json, as measured here: "obstacles": [{box}]. Or mark it as the object too, if both move.'
         return {"value": low, "cm": 100 * low, "on": f"on something {100 * level:.1f} cm high", "next": next_move}
-    hands, steep = lifted(camera, sample, HANDS), -up * camera.camera_to_world[2, 2] > np.sin(np.radians(SIDE))
-    if low < away or steep or (len(hands) and KDTree(own).query(hands * (1, 1, up))[0].min() < REACH):
+    hands, steep = lifted(camera, sample, HANDS), -up * camera.camera_to_world[2, 2] > np.sin(np.radians(SIDE_VIEW))
+    if low < away or steep or (len(hands) and KDTree(own).query(hands * (1, 1, up))[0].min() < HAND_REACH):
         return None
     next_move = "Measure what it stands on, and add it to obstacles of capture.json; or mark it as the object too."
     return {"value": low, "cm": 100 * low, "on": "and no hand is near", "next": next_move}
@@ -297,32 +299,36 @@ class Depths:
         return self.typical is not None and NEAR < self.typical < FAR
 
 
-BODIES = ("sloth", "plush", "toy", "ball", "cable", "rod")
+BODY_WORDS = ("sloth", "plush", "toy", "ball", "cable", "rod")
 """Words for bodies that are near to those that mean another thing."""
 
 
 def meant(category: str) -> dict[str, Any] | None:
     """The word that means something, where another one is nearly it."""
-    close = difflib.get_close_matches(category.casefold(), (*THIN, "rope", *BODIES), n=1, cutoff=0.75)
-    return None if not close or category == close[0] or close[0] in BODIES else {"value": close[0]}
+    close = difflib.get_close_matches(category.casefold(), (*THIN, "rope", *BODY_WORDS), n=1, cutoff=0.75)
+    return None if not close or category == close[0] or close[0] in BODY_WORDS else {"value": close[0]}
 
 
-BESIDE = 0.04
+HANDS_BESIDE = 0.04
 """Distance between two pieces of the hands' mask, as a part of the image, within which they are one hand."""
 STEADY = 5
 """Frames over whose median hands are counted."""
-SHORTEST = 1.0
+SHORTEST_GRIP = 1.0
 """s. Shorter times with one constant grip are not proposed."""
 
 
 def hands_on(camera: Camera, sample: Sample) -> int:
-    """The number of hands within REACH of the object in a frame."""
+    """The number of hands within HAND_REACH of the object in a frame."""
     body, own = lifted(camera, sample, OBJECT), sample.mask == HANDS
-    reach = max(int(0.5 * BESIDE * camera.width), 1)
+    reach = max(int(0.5 * HANDS_BESIDE * camera.width), 1)
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2)
     count, pieces = cv2.connectedComponents(cv2.dilate(own.astype(np.uint8), disk))
     each = [lifted(camera, Sample(sample.depth, np.where(own & (pieces == k), HANDS, 0)), HANDS) for k in range(1, count)]
-    return sum((KDTree(body).query(hand)[0] <= REACH).sum() >= FEW for hand in each) if len(body) >= FEW else 0
+    return (
+        sum((KDTree(body).query(hand)[0] <= HAND_REACH).sum() >= FEWEST_POINTS for hand in each)
+        if len(body) >= FEWEST_POINTS
+        else 0
+    )
 
 
 def constant_grips(counts: np.ndarray, rate: float, folder: Path) -> dict[str, Any] | None:
@@ -332,10 +338,10 @@ def constant_grips(counts: np.ndarray, rate: float, folder: Path) -> dict[str, A
     spans = [(first, end - 1, int(steady[first])) for first, end in pairwise(edges)]
     if len(spans) < 2:
         return None
-    held = [span for span in spans if span[2] and span[1] - span[0] + 1 >= SHORTEST * rate]
+    held = [span for span in spans if span[2] and span[1] - span[0] + 1 >= SHORTEST_GRIP * rate]
     ranked = sorted(held, key=lambda span: span[0] - span[1])[:3]
     commands = " or ".join(f"--frames {first}-{last}" for first, last, _ in ranked)
-    cut = f": neuspring cut-capture {folder} {commands} --output ..." if ranked else f"; none lasts {SHORTEST:g} s"
+    cut = f": neuspring cut-capture {folder} {commands} --output ..." if ranked else f"; none lasts {SHORTEST_GRIP:g} s"
     return {"text": ", ".join(f"{first}-{last}: {count}" for first, last, count in spans), "cut": cut}
 
 
@@ -344,28 +350,28 @@ checks = (
     Check("depth holes", "object and hands", holes, None, "warning",
           "{value:.0%} of the object's pixels have no depth (frame {frame}: {worst:.0%}); {rule}.", "{next}"),
     Check("hands too small", "object and hands", small_hands, None, "warning",
-          f"hands (label {HANDS}) of {{cm:.2g}} cm²; at least {1e4 * HAND_LEAST:g} cm² are expected.", SCALE),
+          f"hands (label {HANDS}) of {{cm:.2g}} cm²; at least {1e4 * HAND_LEAST:g} cm² are expected.", SCALE_REMEDY),
     Check("hands too large", "object and hands", large_hands, None, "warning",
           f"hands (label {HANDS}) of {{cm:.0f}} cm², {{ratio:.1f}} times the object's pixels; less than {1e4 * HAND_AREA:g} cm² "
           f"and {HAND_RATIO:g} times are expected.",
           "Sleeves, torso or table are no hands: mark them to be ignored (`neuspring mask`)."),
-    Check("hand far from the object", "hands", gap, (0, REACH), "warning",
-          f"the hand is never nearer to the object than {{cm:.1f}} cm, in {{count}} frames; within {100 * REACH:g} cm it can "
-          "move it.", "Look at the masks for a hand that is something else, or for the wrong object."),
+    Check("hand far from the object", "hands", gap, (0, HAND_REACH), "warning",
+          f"the hand is never nearer to the object than {{cm:.1f}} cm, in {{count}} frames; within {100 * HAND_REACH:g} cm it "
+          "can move it.", "Look at the masks for a hand that is something else, or for the wrong object."),
     Check("size of the object", "object", size, None, "note", "{text}; as its pixels with depth show it.",
           "Is that what was filmed?"),
     Check("implausible size", "object", lambda body: body.place and longest(float(body.place[0].max())), None, "warning",
-          f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE),
+          f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE_REMEDY),
     Check("object below the table", "object", lambda body: body.place and {"value": body.place[1], "cm": -100 * body.place[1]},
           (-SUNK, np.inf), "warning", f"it reaches {{cm:.1f}} cm below the table; at most {100 * SUNK:g} cm are noise.", TABLE),
-    Check("object high above the table", "object", lambda body: body.place and {"value": body.place[2]}, (-np.inf, HIGH),
+    Check("object high above the table", "object", lambda body: body.place and {"value": body.place[2]}, (-np.inf, HIGHEST_OBJECT),
           "warning",
           "it is up to {value:.2f} m above it; at most {high:g} m is expected; walls and people in the mask are no object.", TABLE),
     Check("size of the object", "outline", lambda sides: sides and {"text": in_cm(sides)}, None, "note",
           "color alone: table z = 0 as given, object size on the table {text} cm; by its mask of frame 0.",
           "Is that what was filmed?"),
     Check("implausible size", "outline", lambda sides: sides and longest(sides[0]), None, "warning",
-          f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE),
+          f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE_REMEDY),
     Check("outline and category", "silhouette", slenderness, None, "warning",
           "the category is {1!r}, and the outline is that of {shape}: {value:.1f} squares of its greatest width; a rope has more "
           f"than {SLENDER:g}, all else less.", "Is {other} meant? Or look at the mask of frame 0."),
@@ -390,6 +396,6 @@ checks = (
           f"only {' and '.join(THIN)} mean a thin thing, and only rope a round one; any other word is a filled body; received "
           "{0!r}. Is {value} meant?", title="category"),
     Check("constant grips", "grips", constant_grips, None, "note",
-          f"hands within {100 * REACH:g} cm of the object, by frames: {{text}}. A twin is best learned from one constant "
+          f"hands within {100 * HAND_REACH:g} cm of the object, by frames: {{text}}. A twin is best learned from one constant "
           "grip{cut}", title=""),
 )

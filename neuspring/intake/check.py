@@ -253,7 +253,7 @@ def _check_case(case: Case) -> list[Finding]:
         found.append(note(path, "needs the number of frames of final_data.pkl: the check of the split is skipped"))
     elif split is not None and frames is not None:
         found += examine("split", path, split, frames)
-    path = folder / phystwin.TRACKS
+    path = folder / phystwin.GT_TRACKS
     if (tracks := _read(found, path, load_pickle, "annotated tracks and the track error are")) is not None:
         found += examine("annotated tracks", path, tracks, frames)
     path = folder / phystwin.CALIBRATION

@@ -15,9 +15,9 @@ from neuspring.data.camera import Plane
 
 HYPOTHESES = 2000
 """Triples of points per search: a plane with a tenth of the points is hit twice."""
-SCORED = 800
+SCORED_POINTS = 800
 """Points on which a hypothesis is scored."""
-POINTS = 20000
+CLOUD_POINTS = 20000
 """Points of all frames together."""
 FLATNESS = 0.001
 """m. Deviation of a table from a plane, and of the sensor from its calibration."""
@@ -25,15 +25,15 @@ SIGMAS = 3.0
 """A point within so many deviations of the noise lies on the plane."""
 BEST = 8
 """Hypotheses that are refined."""
-ROUNDS = 8
+REFINEMENTS = 8
 """Refinements of a plane."""
 PLANES = 4
 """Planes that are looked for, the largest first."""
-LEAST = 0.03
+PLANE_SHARE = 0.03
 """Share of the points below which a plane is none."""
 
 
-def cloud(depths: Sequence[np.ndarray], intrinsics: np.ndarray, most: int = POINTS) -> np.ndarray:
+def cloud(depths: Sequence[np.ndarray], intrinsics: np.ndarray, most: int = CLOUD_POINTS) -> np.ndarray:
     """Points [n, 3], m, in the coordinates of the camera, of depth images [H, W], m, 0: none; every k-th pixel of each."""
     clouds = []
     for depth in depths:
@@ -57,9 +57,9 @@ def noise(points: np.ndarray, height: float | np.ndarray) -> np.ndarray:
 def planes(points: np.ndarray, most: int = PLANES) -> list[Plane]:
     """The planes in points [n, 3], m, the largest first: each is searched among the points that those before it left."""
     left, found = points, list[Plane]()
-    while len(found) < most and len(left) >= max(LEAST * len(points), 50):
+    while len(found) < most and len(left) >= max(PLANE_SHARE * len(points), 50):
         plane = _largest(left, len(points))
-        if plane is None or plane.share < LEAST:
+        if plane is None or plane.share < PLANE_SHARE:
             break
         found.append(plane)
         left = left[np.abs(plane.above(left)) > 2 * SIGMAS * noise(left, plane.height)]
@@ -70,7 +70,7 @@ def refined(points: np.ndarray, normal: np.ndarray, height: float, total: int | 
     """The plane near the given one that fits points [n, 3] best by weighted least squares, or None where too few lie near it."""
     scale = 2.0
     near = np.zeros(len(points), dtype=bool)
-    for _ in range(ROUNDS):
+    for _ in range(REFINEMENTS):
         sigma = noise(points, height)
         distance = np.abs(points @ normal + height) / sigma
         near = distance < SIGMAS * scale
@@ -101,7 +101,7 @@ def _largest(points: np.ndarray, total: int) -> Plane | None:
     if not len(normals):
         return None
     heights = -np.einsum("ij,ij->i", normals, corners[:, 0])
-    scored = points[rng.permutation(len(points))[:SCORED]]
+    scored = points[rng.permutation(len(points))[:SCORED_POINTS]]
     votes = np.concatenate(
         [
             (np.abs(scored @ part.T + height) < SIGMAS * noise(scored, height[:, None]).T).sum(axis=0)

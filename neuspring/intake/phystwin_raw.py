@@ -21,13 +21,10 @@ from neuspring.core.files import load_json
 from neuspring.core.findings import refuse
 from neuspring.core.records import digest_file
 from neuspring.data.camera import Camera
-from neuspring.data.capture import HANDS, OBJECT, Capture, Description, Writer
+from neuspring.data.capture import FEWEST_FRAMES, HANDS, OBJECT, Capture, Description, Writer
 from neuspring.data.images import make_way, read_image
 from neuspring.data.unpickle import load_pickle
 from neuspring.intake.phystwin import CALIBRATION, METADATA, annotated, train_end_of
-
-FEWEST = 5
-"""Frames of a capture."""
 
 
 def write_capture(row: ScenarioRow, path: Path, config: Config, folder: Path) -> None:
@@ -79,8 +76,8 @@ def read_calibration(case: Path) -> tuple[dict[str, Any], list[Camera]]:
     path = case / METADATA
     refuse(examine("metadata", path, metadata) + examine("lenses of metadata", path, metadata, None))
     count = metadata.get("frame_num")
-    if type(count) is not int or count < FEWEST:
-        raise InputError(case / METADATA, f"frame_num: at least {FEWEST} frames are required", count)
+    if type(count) is not int or count < FEWEST_FRAMES:
+        raise InputError(case / METADATA, f"frame_num: at least {FEWEST_FRAMES} frames are required", count)
     refuse(examine("calibration", case / CALIBRATION, poses, len(metadata["intrinsics"])))
     width, height = metadata["WH"]
     intrinsics = np.asarray(metadata["intrinsics"], dtype=np.float64)

@@ -29,9 +29,9 @@ from neuspring.core.geometry import on_table
 from neuspring.core.records import digest_file
 from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, TRACKS, Capture
 
-COLUMNS = ("frame", "point", "x", "y", "z", "holds", "hand")
-"""Of controllers.csv; the last two may be left out."""
-LEAST = 3
+CSV_COLUMNS = ("frame", "point", "x", "y", "z", "holds", "hand")
+"""Columns of controllers.csv; the last two may be left out."""
+LEAST_NODES = 3
 """Points that say how a body is turned."""
 
 
@@ -55,7 +55,7 @@ class Hands:
 
 @dataclass(frozen=True, eq=False)
 class InSpace:
-    """What a capture brings in space."""
+    """Points in space that a capture brings."""
 
     hands: Hands | None
     nodes: np.ndarray
@@ -108,8 +108,8 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
     first = annotated[0][np.isfinite(annotated[0]).all(axis=1)]
     if description.tracks == "train":
         tracks = annotated
-        if len(first) < LEAST:
-            rule = f"with tracks: train at least {LEAST} points must be annotated in frame 0, where the twin starts"
+        if len(first) < LEAST_NODES:
+            rule = f"with tracks: train at least {LEAST_NODES} points must be annotated in frame 0, where the twin starts"
             findings.append(broken(marked, "", rule, f"{len(first)} of {tracks.shape[1]}"))
     ground = description.up_sign if description.ground else None
     # A hand may be anywhere while it holds nothing.
@@ -165,8 +165,8 @@ def read_nodes(path: Path) -> np.ndarray:
         except Exception as error:  # trimesh raises whatever a damaged file leads it to
             raise InputError(path, "vertices of a PLY file are required", f"{type(error).__name__}: {error}") from error
     nodes = _places(path, nodes, 2)
-    if len(nodes) < LEAST:
-        raise InputError(path, f"at least {LEAST} nodes are required", len(nodes))
+    if len(nodes) < LEAST_NODES:
+        raise InputError(path, f"at least {LEAST_NODES} nodes are required", len(nodes))
     pairs = cKDTree(nodes).query_pairs(SAME, output_type="ndarray")
     if len(pairs):
         rule = f"nodes must lie {1e3 * SAME:g} mm apart: a spring between two needs a length"
@@ -194,8 +194,8 @@ def _rows(path: Path) -> dict[str, np.ndarray]:
         table = pd.read_csv(path)
     except (OSError, ValueError) as error:
         raise InputError(path, "rows of numbers with one header line are required", str(error)) from error
-    if not set(COLUMNS[:5]) <= set(table) <= set(COLUMNS):
-        rule = f"the header must be {','.join(COLUMNS[:5])}, and may have holds and hand"
+    if not set(CSV_COLUMNS[:5]) <= set(table) <= set(CSV_COLUMNS):
+        rule = f"the header must be {','.join(CSV_COLUMNS[:5])}, and may have holds and hand"
         raise InputError(path, rule, ",".join(map(str, table)))
     for name, column in (table := table.apply(pd.to_numeric, errors="coerce")).items():
         if len(bad := np.flatnonzero(~np.isfinite(column))):
@@ -317,7 +317,7 @@ def scenario_of(row: ScenarioRow, capture: Capture, origin: dict[str, str]) -> S
 
 
 def taught_by(tracks: np.ndarray, end: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Of annotated tracks [T, K, 3] those that are seen in frame 0: their places, zeros where not seen, and whether they are seen.
+    """Those annotated tracks [T, K, 3] that are seen in frame 0: their places, zeros where not seen, and whether they are seen.
 
     From frame `end` on, if it is given, none is.
     """

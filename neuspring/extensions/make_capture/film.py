@@ -1,4 +1,4 @@
-"""What is odd or wrong in the files of the cameras: errors are refused, warnings and notes stand in the report."""
+"""Checks of the files of the cameras: errors are refused, warnings and notes stand in the report."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from neuspring.core.findings import Finding
 from neuspring.extensions.make_capture.feeds import Paired
 from neuspring.extensions.make_capture.formats import CameraFeed
 from neuspring.extensions.make_capture.formats.video import VideoFile
-from neuspring.extensions.make_capture.moments import DEPARTURE, LOST, Evenness, spans
+from neuspring.extensions.make_capture.moments import DEPARTURE, MISSING_SHARE, Evenness, spans
 from neuspring.extensions.make_capture.poses import FrameChoice
 
 
@@ -56,7 +56,7 @@ def uneven_time(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[di
             first, last = max(found.runs, key=lambda run: run[1] - run[0])
             slow = 1 / sorted(found.steps)[int(0.9 * len(found.steps))]
             anew = f"ffmpeg -i FILE -vf fps={slow:.0f} -crf 12 even.mp4 (depth: -c:v ffv1 even.mkv)"
-            rule = f"; at most {DEPARTURE:g} frame and 1 lost picture in {1 / LOST:.0f} are allowed. "
+            rule = f"; at most {DEPARTURE:g} frame and 1 lost picture in {1 / MISSING_SHARE:.0f} are allowed. "
             rule += f"Keep the part of one rate, --frames {numbers[first]}-{numbers[last]}"
             yield told | {"rule": rule + (f", or write videos anew: {anew}" if view.path.is_file() else "")}
         elif found.missing or found.odd:

@@ -49,8 +49,8 @@ from neuspring.extensions.make_capture.poses import (
 from neuspring.extensions.make_capture.table import Unit, find_rate
 from neuspring.intake import points
 
-NAMES = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
-FIRST = 5
+NAME_FORM = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
+BOARD_FRAMES = 5
 """Frames of the source, from its beginning, in which a board is looked for where it has no images of its own."""
 
 
@@ -125,11 +125,11 @@ class Intake:
     @property
     def brought(self) -> dict[str, Path]:
         """The files of points in space, by option."""
-        return {name: path for name in BROUGHT if (path := getattr(self, name)) is not None}
+        return {name: path for name in SPACE_OPTIONS if (path := getattr(self, name)) is not None}
 
     def opened(self) -> Recorded:
         """The film of the cameras; no views of points in space alone. Raises InputError."""
-        given = [f"--{name.replace('_', '-')}" for name in FILMS if getattr(self, name)]
+        given = [f"--{name.replace('_', '-')}" for name in FILM_OPTIONS if getattr(self, name)]
         if len(given) != 1 and (given or not self.controllers):
             rule = "one of --color with --depth, --recording, --bag, --phystwin-raw is required, or --controllers with --nodes and "
             rule += "--tracks"
@@ -143,9 +143,9 @@ class Intake:
         return Recorded(views=pairs(self.color, self.depth, self.cameras) if self.color else ())
 
 
-FILMS = ("color", "recording", "bag", "phystwin_raw")
+FILM_OPTIONS = ("color", "recording", "bag", "phystwin_raw")
 """Options of which one says where the film is."""
-BROUGHT = ("controllers", "nodes", "tracks")
+SPACE_OPTIONS = ("controllers", "nodes", "tracks")
 """Options of files of points in space."""
 OF_FILM = ("frames", "depth_unit", "intrinsics", "poses", "board", "board_images", "level", "top_down", "table_at", "pose")
 """Options that say nothing of points in space alone."""
@@ -165,7 +165,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
         rule = "is for points in space alone: cameras are placed by the table"
         raise InputError("--no-table", rule, "a film", "Leave it out, and write ground: false in capture.json.")
     for option, name in (("--name", intake.called), *(("--cameras", view.name) for view in views)):
-        if not NAMES.fullmatch(name):
+        if not NAME_FORM.fullmatch(name):
             raise InputError(option, "letters, digits, '.', '_' and '-' are required, a letter or digit first", repr(name))
     if all(isinstance(view, Paired) and view.depth is None for view in views):
         _require_for_color_alone(intake)
@@ -253,7 +253,7 @@ def _place(
         shown = dict(seen)
         if not intake.board_images:
             for view in film.views:
-                first = list(view.read(range(min(FIRST, len(view.series.numbers)))))
+                first = list(view.read(range(min(BOARD_FRAMES, len(view.series.numbers)))))
                 shown[view.name] = straightened(view, first, seen[view.name].lens, unit)
         poses, lines = by_board(board, shown, intake.board_images)
         if unit is None:
@@ -361,7 +361,7 @@ def _write(
 def _of_points(intake: Intake) -> tuple[Capture, list[str]]:
     """A capture of points in space alone."""
     brought, folder = intake.brought, intake.output
-    if missing := [f"--{name}" for name in BROUGHT if name not in brought]:
+    if missing := [f"--{name}" for name in SPACE_OPTIONS if name not in brought]:
         rule = "without --color, --bag and --phystwin-raw, --controllers, --nodes and --tracks are required"
         raise InputError("make-capture", rule, f"no {' '.join(missing)}")
     for option in OF_FILM:

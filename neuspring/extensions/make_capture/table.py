@@ -94,17 +94,17 @@ def _advice(count: float) -> str:
     return f"Plausible would be {' or '.join(fitting)}."
 
 
-SMALLEST = 0.1
+TABLE_SHARE = 0.1
 """Share of the pixels with depth below which a plane is no table."""
 FRONTAL = 12.0
 """Degrees between the optical axis and the normal below which a table seen from straight above and a wall look alike."""
 ROUGH = 0.02
 """m rms. A plane that fits worse is no table."""
-HIGHEST = 4.0
+CAMERA_ABOVE = 4.0
 """m. A camera higher above the table has another unit of depth."""
-LEVEL_ANGLE, APART = 10.0, 0.03
+LEVEL_ANGLE, LEVELS_APART = 10.0, 0.03
 """Degrees and m: planes with nearly the normal of the table, this far above or below it, are other level surfaces."""
-MIDDLE = 1.0 / 3.0
+CENTER_OF_VIEW = 1.0 / 3.0
 """Part of the image, in its center, that is the center of view."""
 
 
@@ -137,7 +137,7 @@ def find_table(
     for other in fitting[1:]:
         height = float(np.median(table.above(other.points)))
         level = np.degrees(np.arccos(np.clip(other.normal @ table.normal, -1, 1))) < LEVEL_ANGLE
-        if level and abs(height) > APART:
+        if level and abs(height) > LEVELS_APART:
             side = "above" if height > 0 else "below"
             remarks.append(
                 f"another level surface, {100 * abs(height):.0f} cm {side} it, has {other.share:.0%} of the pixels: if that is the "
@@ -148,12 +148,12 @@ def find_table(
 
 def _objection(plane: Plane, top_down: bool, pose: np.ndarray | None) -> str:
     """Why a plane is not the table; empty if it may be."""
-    if plane.share < SMALLEST:
-        return f"it has less than {SMALLEST:.0%} of the pixels with depth"
+    if plane.share < TABLE_SHARE:
+        return f"it has less than {TABLE_SHARE:.0%} of the pixels with depth"
     if plane.rms > ROUGH:
         return f"it is not flat: more than {1e3 * ROUGH:g} mm rms"
-    if plane.height > HIGHEST:
-        return f"the camera would be more than {HIGHEST:g} m above it: is the unit of depth right?"
+    if plane.height > CAMERA_ABOVE:
+        return f"the camera would be more than {CAMERA_ABOVE:g} m above it: is the unit of depth right?"
     if pose is not None:
         angle = float(np.degrees(np.arccos(np.clip(abs((pose[:3, :3] @ plane.normal)[2]), 0, 1))))
         return f"it is a wall: its normal is {angle:.0f} degrees from the vertical of the poses" if angle > ROLL else ""
@@ -177,7 +177,7 @@ def pose_on(table: Plane, points: np.ndarray, size: tuple[int, int], intrinsics:
     y /= np.linalg.norm(y)
     axes = np.stack([np.cross(y, up), y, up])
     rays = points[:, :2] / points[:, 2:]
-    middle = points[(np.abs(rays) < 0.5 * MIDDLE * np.array(size) / np.diag(intrinsics)[:2]).all(axis=1)]
+    middle = points[(np.abs(rays) < 0.5 * CENTER_OF_VIEW * np.array(size) / np.diag(intrinsics)[:2]).all(axis=1)]
     target = np.median(middle if len(middle) else table.points, axis=0)
     origin = target - table.above(target) * up
     pose = np.eye(4)

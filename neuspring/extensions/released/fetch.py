@@ -47,7 +47,7 @@ from neuspring.intake.check import check_layout, is_case
 from neuspring.intake.phystwin import released_cases
 
 REPOSITORY = "Jianghanxiao/PhysTwin"
-RECORD, RECORD_FORMAT = "fetched.json", 1
+RECORD, FETCHED_FORMAT = "fetched.json", 1
 LOCK = ".fetch.lock"
 PARTS = ("data", "results", "appearance", "images", "other")
 """Parts of a scenario. data: what the reader and check-data read. results: released parameters, checkpoints and predictions.
@@ -57,7 +57,7 @@ DEFAULT_PARTS = ("data", "results")
 ALLOCATION = 4096
 """File systems round the size of a file up to a multiple of this, bytes."""
 CASES = "data/different_types"
-"""Where processed cases lie below data_root."""
+"""Place of processed cases below data_root."""
 EXTRA = "additional_data"
 TREES: dict[str, tuple[str, tuple[str, ...]]] = {
     CASES: ("data.zip", ("data", "images", "other")),
@@ -184,7 +184,7 @@ def _extract(plan: FetchPlan, data_root: Path) -> None:
 
 def _record(path: Path, hub: Hub, plan: FetchPlan, cases: list[str], parts: set[str]) -> None:
     """Add an entry to fetched.json, unless nothing was missing and the same is recorded already."""
-    entries = read_json(path, RECORD_FORMAT)["fetched"] if path.exists() else []
+    entries = read_json(path, FETCHED_FORMAT)["fetched"] if path.exists() else []
     content = {
         "repository": hub.repository,
         "revision": hub.commit,
@@ -197,7 +197,7 @@ def _record(path: Path, hub: Hub, plan: FetchPlan, cases: list[str], parts: set[
     if not plan.missing and any(content.items() <= entry.items() for entry in entries):
         return
     entry = content | {"endpoint": hub.endpoint, "date": now(), "files": len(plan.missing)}
-    write_text(path, json.dumps({"format": RECORD_FORMAT, "fetched": [*entries, entry]}, indent=1) + "\n")
+    write_text(path, json.dumps({"format": FETCHED_FORMAT, "fetched": [*entries, entry]}, indent=1) + "\n")
 
 
 @dataclass(frozen=True)
@@ -229,7 +229,7 @@ class ArchiveMember:
 
 @dataclass(frozen=True, kw_only=True)
 class FetchPlan:
-    """What is to be extracted from one archive."""
+    """Files to extract from one archive."""
 
     file: HubFile
     archive: zipfile.ZipFile
@@ -238,7 +238,7 @@ class FetchPlan:
     missing: list[ArchiveMember]
     """Those that are not on disk in the archive's state, in the archive's order."""
     text: str
-    """What there is to do, for the user."""
+    """Summary for the user."""
 
 
 def make_plan(file: HubFile, remote: RemoteFile, cases: list[str], parts: set[str], data_root: Path) -> FetchPlan:
@@ -352,13 +352,13 @@ TIMEOUT = 30.0
 """Seconds without a byte after which a request has failed."""
 BLOCK = 2**24
 """Bytes that are read ahead in one range request."""
-GAP = 2**20
+SPAN_GAP = 2**20
 """Spans that lie closer, bytes, are read as one: a further request takes as long."""
 
 
 @dataclass(frozen=True)
 class HubFile:
-    """What the hub declares about a file."""
+    """A file, as the hub declares it."""
 
     name: str
     size: int
@@ -376,7 +376,7 @@ class RemoteFile(HfFileSystemFile):
         """Announce the spans [start, end) that will be read, ascending: reading ahead stops at their ends. Returns their bytes."""
         joined: list[tuple[int, int]] = []
         for start, end in spans:
-            first = joined.pop()[0] if joined and start - joined[-1][1] <= GAP else start
+            first = joined.pop()[0] if joined and start - joined[-1][1] <= SPAN_GAP else start
             joined.append((first, end))
         self._spans = joined
         return sum(end - start for start, end in joined)

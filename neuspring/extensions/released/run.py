@@ -29,7 +29,7 @@ from neuspring.intake import phystwin
 from neuspring.intake.phystwin import released_cases
 from neuspring.scores.lpips import Lpips
 
-CHECKS = {
+RELEASED_CHECKS = {
     1: "sizes of the case, and frame 0 of the released prediction",
     2: "springs rebuilt from the searched parameters",
     3: "scores of the released prediction",
@@ -38,11 +38,11 @@ CHECKS = {
     6: "replay of the released checkpoint",
 }
 OUTCOMES: tuple[Outcome, ...] = ("passed", "failed", "measured", "skipped")
-COLUMNS = (
+VERIFY_COLUMNS = (
     *("check", "scenario", "task", "quantity", "unit", "ours", "published", "difference", "tolerance"),
     *("outcome", "frames", "note"),
 )
-CASES = Path("data") / "different_types"
+CASES_FOLDER = Path("data") / "different_types"
 SELF_COLLIDING = ("cloth", "package")
 """Released cases with one of these words in their name use the cloth configuration, in which nodes collide with each other."""
 
@@ -66,7 +66,7 @@ def verify_released(
     output: Path,
     *,
     scenarios: Sequence[str] = (),
-    checks: Collection[int] = tuple(CHECKS),
+    checks: Collection[int] = tuple(RELEASED_CHECKS),
     device: str = "auto",
     lpips: LpipsWeights | None = None,
     published: Published | None = None,
@@ -79,9 +79,9 @@ def verify_released(
     """
     present = _present(root)
     if unknown := [name for name in scenarios if name not in present]:
-        raise InputError("--scenarios", f"must be folders of {root / CASES}: {', '.join(present)}", ", ".join(unknown))
-    if wrong := [check for check in checks if check not in CHECKS]:
-        raise InputError("--checks", f"must be of {', '.join(map(str, CHECKS))}", wrong)
+        raise InputError("--scenarios", f"must be folders of {root / CASES_FOLDER}: {', '.join(present)}", ", ".join(unknown))
+    if wrong := [check for check in checks if check not in RELEASED_CHECKS]:
+        raise InputError("--checks", f"must be of {', '.join(map(str, RELEASED_CHECKS))}", wrong)
     device = resolve_device(device)
     metric = Lpips.configured(lpips or LpipsWeights(), device) if 5 in checks else ""
     tools = Tools(published=published or Published.load(), device=device, lpips=metric)
@@ -104,7 +104,7 @@ def verify_released(
 
 
 def _present(root: Path) -> list[str]:
-    folder = root / CASES
+    folder = root / CASES_FOLDER
     if not folder.is_dir():
         raise InputError(folder, "the released data must be there", "no such folder", "Name the folder that holds `data`.")
     names = sorted(path.name for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
@@ -153,7 +153,7 @@ _FUNCTIONS: dict[int, tuple[_Check, ...]] = {
 def _guarded(
     function: _Check, check: int, case: Released, observations: Observations | Exception, tools: Tools
 ) -> list[Comparison]:
-    blank = Comparison(check=check, scenario=case.name, quantity=CHECKS[check])
+    blank = Comparison(check=check, scenario=case.name, quantity=RELEASED_CHECKS[check])
     try:
         if isinstance(observations, Exception):
             raise observations
@@ -165,8 +165,8 @@ def _guarded(
 
 
 def _write(report: Report, output: Path) -> None:
-    rows = [[getattr(finding, name) for name in COLUMNS] for finding in report.findings]
-    write_text(output / "verify.csv", pd.DataFrame(rows, columns=list(COLUMNS)).to_csv(index=False))
+    rows = [[getattr(finding, name) for name in VERIFY_COLUMNS] for finding in report.findings]
+    write_text(output / "verify.csv", pd.DataFrame(rows, columns=list(VERIFY_COLUMNS)).to_csv(index=False))
     traces = [
         {"check": f.check, "scenario": f.scenario, "quantity": f.quantity, "frame": frame, "value": value, "unit": f.unit}
         for f in report.findings
@@ -195,7 +195,7 @@ def _text(findings: Sequence[Comparison], names: Sequence[str], published: Publi
     done = [finding for finding in findings if finding.outcome != "skipped"]
     if means := [finding for finding in done if finding.scenario == MEAN]:
         lines += ["", "## Means over scenarios", "", *_table(means)]
-    for check, title in CHECKS.items():
+    for check, title in RELEASED_CHECKS.items():
         if own := [finding for finding in done if finding.check == check and finding.scenario != MEAN]:
             lines += ["", f"## {check}: {title}", "", *_table(own), *(_conventions(own) if check == 4 else [])]
     if reasons := _reasons(findings):
@@ -205,7 +205,7 @@ def _text(findings: Sequence[Comparison], names: Sequence[str], published: Publi
 
 def _counts(findings: Sequence[Comparison]) -> list[str]:
     rows = []
-    for check, title in CHECKS.items():
+    for check, title in RELEASED_CHECKS.items():
         outcomes = Counter(finding.outcome for finding in findings if finding.check == check)
         if outcomes:
             rows.append([f"{check}: {title}", *(str(outcomes[name]) for name in OUTCOMES)])
@@ -223,7 +223,7 @@ def _table(findings: Sequence[Comparison]) -> list[str]:
 
 
 def _conventions(findings: Sequence[Comparison]) -> list[str]:
-    """How many scenarios follow which convention."""
+    """Number of scenarios that follow each convention."""
     counts = Counter(finding.note for finding in findings if finding.note)
     return ["", *(f"- {note}: {count} of {counts.total()} scenarios" for note, count in sorted(counts.items()))]
 
@@ -237,7 +237,7 @@ def _reasons(findings: Sequence[Comparison]) -> list[str]:
     groups: dict[tuple[int, str], list[str]] = {}
     for f in findings:
         if f.outcome == "skipped":
-            what = "" if f.quantity == CHECKS[f.check] else f"{f.task} {f.quantity}: ".lstrip()
+            what = "" if f.quantity == RELEASED_CHECKS[f.check] else f"{f.task} {f.quantity}: ".lstrip()
             groups.setdefault((f.check, what + f.note.replace(f.scenario, "<case>")), []).append(f.scenario)
     return [f"- {check}: {reason} ({len(names)}: {', '.join(names)})" for (check, reason), names in sorted(groups.items())]
 
@@ -271,7 +271,7 @@ def conformance(folder: Path, cases: Sequence[Case], found: Sequence[Finding]) -
 
 
 RELEASED = Check("released results", "cases", conformance, None, "error", "{text}", title="")
-"""What `check-data` says of released results beside a case: entry point `released` of the group `neuspring.checks`."""
+"""Check of released results beside a case, for `check-data`: entry point `released` of the group `neuspring.checks`."""
 
 
 def _check_case(given: Case, tools: Tools) -> tuple[list[Comparison], list[Finding]]:

@@ -37,7 +37,7 @@ def test_a_package_adds_a_capture_format(tmp_path, monkeypatch, named):
     point = EntryPoint(name="mine", value=f"{__name__}:MINE", group="neuspring.capture_formats")
     others = registry.entry_points
     monkeypatch.setattr(registry, "entry_points", lambda group: [point] if group == point.group else others(group=group))
-    own = registry.modules(formats.__name__, "FORMAT")
+    own = registry.modules(formats.__name__, "capture_format")
     monkeypatch.setattr(formats, "FORMATS", registry.Registry("capture_formats", own, CaptureFormat))
     root = write_folders(tmp_path)
     words = ["--recording", str(root), *named, "--intrinsics", str(root / "intrinsics.json"), "--rate", "30", "--category", "ball"]

@@ -63,7 +63,7 @@ def _recording(paths: Sequence[Path], cameras: Sequence[str]) -> Recorded:
     return open_case(paths[0])
 
 
-FORMAT = CaptureFormat(
+capture_format = CaptureFormat(
     about="a case in PhysTwin's raw layout",
     recognizes=lambda path: (path / METADATA).is_file() and (path / CALIBRATION).is_file(),
     recording=_recording,
