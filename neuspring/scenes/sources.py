@@ -47,7 +47,7 @@ class Source:
     has_truth: bool = False
     """Its captures have the truth beside them."""
     own: bool = False
-    """True for films of users: methods that learn nothing always stand beside the others, and tables say what to be careful with."""
+    """True for films of users: methods that learn nothing stand beside the others, and tables say what to be careful with."""
     files: tuple[str, ...] = ()
     """Files of its folder that observations are read from; none: the path itself."""
     capture_files: tuple[str, ...] = ()
