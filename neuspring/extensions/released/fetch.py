@@ -12,7 +12,6 @@ been met.
 from __future__ import annotations
 
 import difflib
-import itertools
 import json
 import math
 import os
@@ -22,7 +21,7 @@ import stat
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -261,11 +260,7 @@ def make_plan(file: HubFile, remote: RemoteFile, cases: list[str], parts: set[st
         progress.update(count)
     missing = sorted((m for m in wanted if m.path not in finished), key=lambda member: member.info.header_offset)
 
-    # A member reaches to the next one, or to the table of contents.
-    starts = {info.header_offset for info in archive.infolist()} | {archive.start_dir}
-    ends = dict(itertools.pairwise(sorted(starts)))
-    offsets = sorted({member.info.header_offset for member in missing})
-    cost = remote.expect((offset, ends.get(offset, archive.start_dir)) for offset in offsets)
+    cost = sum(member.info.compress_size for member in missing)
     differing = len(there) - len(finished)
     replaced = f", {differing} with other content on disk are replaced" if differing else ""
     lines = [
@@ -350,10 +345,8 @@ def _is_finished(path: Path, info: zipfile.ZipInfo) -> bool:
 
 TIMEOUT = 30.0
 """Seconds without a byte after which a request has failed."""
-BLOCK = 2**24
-"""Bytes that are read ahead in one range request."""
-SPAN_GAP = 2**20
-"""Spans that lie closer, bytes, are read as one: a further request takes as long."""
+BLOCK = 2**22
+"""Bytes that are read ahead in one range request; so many may be read in vain where the next file lies elsewhere."""
 
 
 @dataclass(frozen=True)
@@ -370,19 +363,7 @@ class HubFile:
 class RemoteFile(HfFileSystemFile):
     """A binary file of the hub, for `zipfile`. The library reads ahead, and retries lost connections."""
 
-    _spans: Sequence[tuple[int, int]] = ()
-
-    def expect(self, spans: Iterable[tuple[int, int]]) -> int:
-        """Announce the spans [start, end) that will be read, ascending: reading ahead stops at their ends. Returns their bytes."""
-        joined: list[tuple[int, int]] = []
-        for start, end in spans:
-            first = joined.pop()[0] if joined and start - joined[-1][1] <= SPAN_GAP else start
-            joined.append((first, end))
-        self._spans = joined
-        return sum(end - start for start, end in joined)
-
     def _fetch_range(self, start: int, end: int) -> bytes:
-        end = next((last for first, last in self._spans if first <= start < last < end), end)
         url = self.url()
         with _explained(url, self.path):
             content = bytes(super()._fetch_range(start, end))
