@@ -14,7 +14,7 @@ from neuspring.checks import examine
 from neuspring.checks.followed import Tracked, few
 from neuspring.checks.masks import OFTEN, Shown
 from neuspring.checks.observed import Observed
-from neuspring.checks.things import Masked, ObjectPoints, Sample, sampled
+from neuspring.checks.things import Sample, place_of, sampled
 from neuspring.core.artifacts import ImageObservations, Observations
 from neuspring.core.checks import Check
 from neuspring.core.findings import Finding
@@ -44,8 +44,8 @@ def look_at_masks(capture: Capture, camera: str, labels: np.ndarray, facts: Mapp
     if capture.has_depth:
         frames = [frame for frame in sorted(sampled(capture.frame_count)) if capture.has(camera, frame)]
         samples = {frame: Sample(capture.depth(camera, frame), labels[frame]) for frame in frames}
-        seen = Masked(capture.cameras[camera], samples)
-        found += [one for one in examine("object and hands", where, seen) if one.level != "note"]
+        seen = examine("object and hands", where, capture.cameras[camera], samples, 0.0)
+        found += [one for one in seen if one.level != "note"]
     else:
         found += examine("silhouette", f"{where}, object", labels[0], capture.description.category)
     return found + examine("segmentation", where, facts, capture.has_depth)
@@ -63,7 +63,7 @@ def look_at_observations(observations: Observations, moves: float = 0.0) -> list
 
 def look_at_lifted(lifted: LiftedTracks, prior: ShapePrior, up: float, image: ImageObservations | None = None) -> list[Finding]:
     """Findings about points in the world and the shape; `up` is +1 or -1. `image`: the evidence of color alone."""
-    found = examine("object", "object in frame 0", ObjectPoints([lifted.cloud], up))
+    found = examine("object", "object in frame 0", place_of([lifted.cloud], up))
     if image is None and prior.backend.startswith("visual_hull"):
         found += examine("sheet", "object in frame 0", lifted.cloud, up)
     found += examine("pose", "shape", lifted) + examine("shape", "shape", prior)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -25,37 +24,18 @@ SAME = 1e-4
 """m: nodes nearer than this are one, and no spring is between them."""
 
 
-@dataclass(frozen=True, eq=False)
-class Cloud:
-    """Points [n, 3] of a file, m; of a body in frame 0 its size counts too. `up` is +1 or -1; None: no table."""
-
-    points: np.ndarray
-    up: float | None
-    is_body: bool
-
-    @cached_property
-    def most(self) -> float:
-        """Largest coordinate."""
-        return float(np.abs(self.points).max())
-
-    @property
-    def side(self) -> float:
-        """Longest side."""
-        return float(np.ptp(self.points, axis=0).max())
+def far(points: np.ndarray) -> dict[str, Any]:
+    """The largest coordinate of points [n, 3] of a file, and the units in which it would be near."""
+    most = float(np.abs(points).max())
+    size = " x ".join(f"{side:.3g}" for side in np.ptp(points, axis=0))
+    fitting = [f"divide by {by:g} if they are {unit}" for unit, by in UNITS.items() if most / by < FAR]
+    return {"value": most, "size": size, "next": f"Likely: {', or '.join(fitting)}" if fitting else "Look at its unit"}
 
 
-def far(cloud: Cloud) -> dict[str, Any]:
-    """The largest coordinate, and the units in which it would be near."""
-    size = " x ".join(f"{side:.3g}" for side in np.ptp(cloud.points, axis=0))
-    fitting = [f"divide by {by:g} if they are {unit}" for unit, by in UNITS.items() if cloud.most / by < FAR]
-    return {"value": cloud.most, "size": size, "next": f"Likely: {', or '.join(fitting)}" if fitting else "Look at its unit"}
-
-
-def off_table(cloud: Cloud) -> dict[str, Any] | None:
-    """Heights of points that are not on or above the table, and what explains them."""
-    if cloud.up is None or cloud.most > FAR:
+def off_table(points: np.ndarray, up: float | None, is_body: bool) -> dict[str, Any] | None:
+    """Heights of points that are not on or above the table, and what explains them; `up` is +1 or -1, None without a table."""
+    if up is None or np.abs(points).max() > FAR:
         return None
-    points, up, is_body = cloud.points, cloud.up, cloud.is_body
     low, high = np.quantile(up * points[:, 2], WITHIN)
     # A body may hang in the air, and need not.
     if low >= -SUNK and high <= HIGHEST_OBJECT and not (is_body and low > FAR_OFF):
@@ -75,6 +55,11 @@ def off_table(cloud: Cloud) -> dict[str, Any] | None:
         return told | {"level": "warning", "next": f": {100 * low:.0f} cm above the table. {remedy}"}
     remedy = f"Move the world so that the table is z = 0, or write ground: false in {CAPTURE} (make-capture: --no-table)"
     return told | {"level": "error" if low < -FAR_OFF else "warning", "next": f". {remedy}"}
+
+
+def too_long(points: np.ndarray, up: float | None, is_body: bool) -> dict[str, Any] | None:
+    """Longest side of a body, m, that is that of nothing that hands hold."""
+    return longest(float(np.ptp(points, axis=0).max())) if is_body and np.abs(points).max() <= FAR else None
 
 
 def far_from_nodes(points: np.ndarray, nodes: np.ndarray) -> dict[str, Any] | None:
@@ -124,10 +109,10 @@ def doubled(hands: Holding) -> dict[str, Any] | None:
 
 # fmt: off
 checks = (
-    Check("unit", "points", far, (0, FAR), "error",
+    Check("unit", "points", lambda points, *_: far(points), (0, FAR), "error",
           "coordinates must be meters, at most {high:g} from the origin; received {value:.4g}, in {size}. {next}", title="points"),
-    Check("implausible size", "points", lambda cloud: longest(cloud.side) if cloud.is_body and cloud.most <= FAR else None, None,
-          "warning", f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE_REMEDY),
+    Check("implausible size", "points", too_long, None, "warning",
+          f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE_REMEDY),
     Check("off the table", "points", off_table, None, "error",
           f"with up {{sign}}z points must lie between the table, z = 0, and {HIGHEST_OBJECT:g} m above it; received {{z}}{{next}}",
           title="points"),

@@ -6,7 +6,6 @@ import difflib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -77,35 +76,27 @@ def lifted(camera: Camera, sample: Sample, label: int) -> np.ndarray:
     return camera.lift(np.stack([x, y], axis=-1).astype(float), sample.depth[y, x])
 
 
-@dataclass(frozen=True, eq=False)
-class Masked:
-    """Object and hands in a few frames of a camera, by number."""
-
-    camera: Camera
-    samples: Mapping[int, Sample]
-    least: float = 0.0
-    """m² that hands have at least."""
-
-    @cached_property
-    def hands(self) -> tuple[float, float] | None:
-        """Area of the hands, m², and as a multiple of the object's pixels, medians; None without any."""
-        areas, ratios = [], []
-        for sample in self.samples.values():
-            own = sample.mask == HANDS
-            measured = own & (sample.depth > 0)
-            if measured.sum() < FEWEST_POINTS or not (sample.mask == OBJECT).any():
-                continue
-            depth = np.where(sample.depth > 0, sample.depth, np.median(sample.depth[measured]))
-            areas.append(float((depth[own] ** 2).sum() / np.prod(np.diag(self.camera.intrinsics)[:2])))
-            ratios.append(float(own.sum() / (sample.mask == OBJECT).sum()))
-        return (float(np.median(areas)), float(np.median(ratios))) if areas else None
+Samples = Mapping[int, Sample]
+"""Object and hands in a few frames of a camera, by number."""
 
 
-def holes(seen: Masked) -> dict[str, Any] | None:
+def hands_of(camera: Camera, samples: Samples) -> tuple[float, float] | None:
+    """Area of the hands, m², and as a multiple of the object's pixels, medians; None without any."""
+    areas, ratios = [], []
+    for sample in samples.values():
+        own = sample.mask == HANDS
+        measured = own & (sample.depth > 0)
+        if measured.sum() < FEWEST_POINTS or not (sample.mask == OBJECT).any():
+            continue
+        depth = np.where(sample.depth > 0, sample.depth, np.median(sample.depth[measured]))
+        areas.append(float((depth[own] ** 2).sum() / np.prod(np.diag(camera.intrinsics)[:2])))
+        ratios.append(float(own.sum() / (sample.mask == OBJECT).sum()))
+    return (float(np.median(areas)), float(np.median(ratios))) if areas else None
+
+
+def holes(camera: Camera, samples: Samples, least: float) -> dict[str, Any] | None:
     """Share of the object's pixels without depth."""
-    missing = {
-        frame: float((s.depth[s.mask == OBJECT] <= 0).mean()) for frame, s in seen.samples.items() if (s.mask == OBJECT).any()
-    }
+    missing = {frame: float((s.depth[s.mask == OBJECT] <= 0).mean()) for frame, s in samples.items() if (s.mask == OBJECT).any()}
     if not missing:
         return None
     worst, mean = max(missing, key=lambda frame: missing[frame]), float(np.mean(list(missing.values())))
@@ -116,46 +107,40 @@ def holes(seen: Masked) -> dict[str, Any] | None:
     return told | ({"next": next_move} if bad else {"level": "note", "next": ""})
 
 
-def large_hands(seen: Masked) -> dict[str, Any] | None:
-    """Area of hands that is none of hands, m²."""
-    area, ratio = seen.hands or (0.0, 0.0)
-    return (
-        {"value": area, "cm": 1e4 * area, "ratio": ratio}
-        if area >= seen.least and (area > HAND_AREA or ratio > HAND_RATIO)
-        else None
-    )
+def large_hands(camera: Camera, samples: Samples, least: float) -> dict[str, Any] | None:
+    """Area of hands that is none of hands, m²; hands have `least` m² or more."""
+    area, ratio = hands_of(camera, samples) or (0.0, 0.0)
+    wrong = area >= least and (area > HAND_AREA or ratio > HAND_RATIO)
+    return {"value": area, "cm": 1e4 * area, "ratio": ratio} if wrong else None
 
 
-def small_hands(seen: Masked) -> dict[str, Any] | None:
+def small_hands(camera: Camera, samples: Samples, least: float) -> dict[str, Any] | None:
     """Area of hands that are smaller than hands, m²."""
-    return {"value": seen.hands[0], "cm": 1e4 * seen.hands[0]} if seen.hands and seen.hands[0] < seen.least else None
+    area, _ = hands_of(camera, samples) or (np.inf, 0.0)
+    return {"value": area, "cm": 1e4 * area} if area < least else None
 
 
-def gap(seen: Masked) -> dict[str, Any] | None:
+def gap(camera: Camera, samples: Samples) -> dict[str, Any] | None:
     """Least distance of hands from the object, m, over the frames in which both are in view."""
     gaps = []
-    for sample in seen.samples.values():
-        body, hands = (lifted(seen.camera, sample, label) for label in (OBJECT, HANDS))
+    for sample in samples.values():
+        body, hands = (lifted(camera, sample, label) for label in (OBJECT, HANDS))
         if min(len(body), len(hands)) >= FEWEST_POINTS:
             gaps.append(float(KDTree(body).query(hands)[0].min()))
     return {"value": min(gaps), "cm": 100 * min(gaps), "count": len(gaps)} if gaps else None
 
 
-@dataclass(frozen=True, eq=False)
-class ObjectPoints:
-    """Points of the object in some frames, [n, 3] each, m, in the world; `up` is +1 or -1."""
+Place = tuple[np.ndarray, float, float]
+"""Sides [3] of the object, and its lowest and highest height above the table, m."""
 
-    bodies: Sequence[np.ndarray]
-    up: float
 
-    @cached_property
-    def place(self) -> tuple[np.ndarray, float, float] | None:
-        """Sides [3], and its lowest and highest height above the table, m."""
-        whole = [points * (1, 1, self.up) for points in self.bodies if len(points) >= FEWEST_POINTS]
-        ranges = np.array([np.quantile(points, WITHIN, axis=0) for points in whole])
-        if not len(ranges):
-            return None
-        return np.median(np.ptp(ranges, axis=1), axis=0), float(ranges[:, 0, 2].min()), float(ranges[:, 1, 2].max())
+def place_of(bodies: Sequence[np.ndarray], up: float) -> Place | None:
+    """Place of the object by its points in some frames, [n, 3] each, m, in the world; `up` is +1 or -1. None of too few points."""
+    whole = [points * (1, 1, up) for points in bodies if len(points) >= FEWEST_POINTS]
+    ranges = np.array([np.quantile(points, WITHIN, axis=0) for points in whole])
+    if not len(ranges):
+        return None
+    return np.median(np.ptp(ranges, axis=1), axis=0), float(ranges[:, 0, 2].min()), float(ranges[:, 1, 2].max())
 
 
 def in_cm(sides: Iterable[float]) -> str:
@@ -163,11 +148,11 @@ def in_cm(sides: Iterable[float]) -> str:
     return " x ".join(f"{100 * side:.0f}" for side in sides)
 
 
-def size(body: ObjectPoints) -> dict[str, Any] | None:
+def size(place: Place | None) -> dict[str, Any] | None:
     """Sides of the object and its heights above the table."""
-    if body.place is None:
+    if place is None:
         return None
-    sides, low, high = body.place
+    sides, low, high = place
     text = in_cm(sides)
     return {"value": text, "text": f"{text} cm, from {100 * low:.1f} to {100 * high:.1f} cm above the table"}
 
@@ -278,27 +263,6 @@ def inside(obstacles: Sequence[Obstacle], points: np.ndarray) -> list[dict[str, 
     return [{"value": share, "number": number} for number, share in enumerate(shares)]
 
 
-@dataclass(frozen=True)
-class Depths:
-    """Median depth, m, of a camera's frames; NaN where nothing was measured."""
-
-    camera: str
-    unit: float
-    """m per count."""
-    medians: Sequence[float]
-
-    @cached_property
-    def typical(self) -> float | None:
-        """The median of all, m; None where nothing was measured at all."""
-        measured = [median for median in self.medians if np.isfinite(median)]
-        return float(np.median(measured)) if measured else None
-
-    @property
-    def fine(self) -> bool:
-        """True where the table can be looked for."""
-        return self.typical is not None and NEAR < self.typical < FAR
-
-
 BODY_WORDS = ("sloth", "plush", "toy", "ball", "cable", "rod")
 """Words for bodies that are near to those that mean another thing."""
 
@@ -360,11 +324,11 @@ checks = (
           "can move it.", "Look at the masks for a hand that is something else, or for the wrong object."),
     Check("size of the object", "object", size, None, "note", "{text}; as its pixels with depth show it.",
           "Is that what was filmed?"),
-    Check("implausible size", "object", lambda body: body.place and longest(float(body.place[0].max())), None, "warning",
+    Check("implausible size", "object", lambda place: place and longest(float(place[0].max())), None, "warning",
           f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE_REMEDY),
-    Check("object below the table", "object", lambda body: body.place and {"value": body.place[1], "cm": -100 * body.place[1]},
-          (-SUNK, np.inf), "warning", f"it reaches {{cm:.1f}} cm below the table; at most {100 * SUNK:g} cm are noise.", TABLE),
-    Check("object high above the table", "object", lambda body: body.place and {"value": body.place[2]}, (-np.inf, HIGHEST_OBJECT),
+    Check("object below the table", "object", lambda place: place and {"value": place[1], "cm": -100 * place[1]}, (-SUNK, np.inf),
+          "warning", f"it reaches {{cm:.1f}} cm below the table; at most {100 * SUNK:g} cm are noise.", TABLE),
+    Check("object high above the table", "object", lambda place: place and {"value": place[2]}, (-np.inf, HIGHEST_OBJECT),
           "warning",
           "it is up to {value:.2f} m above it; at most {high:g} m is expected; walls and people in the mask are no object.", TABLE),
     Check("size of the object", "outline", lambda sides: sides and {"text": in_cm(sides)}, None, "note",
@@ -387,11 +351,11 @@ checks = (
     # Speeds and forces of the twin scale with it.
     Check("frame rate", "frame rate", lambda rate: rate, (SLOWEST, FASTEST), "error",
           "frames per second at which it was filmed are required, {low:g} to {high:g}; received {value:g}", title="frame_rate"),
-    Check("no depth", "depths", lambda seen: {} if seen.medians and seen.typical is None else None, None, "error",
-          "some depth is required; received 0 in every pixel of every frame", title="cameras.{0.camera}"),
-    Check("depth unit", "depths", lambda seen: seen.typical, (NEAR, FAR), "error",
-          "the median depth of camera {0.camera} must lie between {low:g} and {high:g} m, with the unit of the images; received "
-          "{0.unit:g} m per count, which makes it {value:.4g} m", title="depth_unit"),
+    Check("no depth", "depths", lambda camera, unit, typical: {} if typical is None else None, None, "error",
+          "some depth is required; received 0 in every pixel of every frame", title="cameras.{0}"),
+    Check("depth unit", "depths", lambda camera, unit, typical: typical, (NEAR, FAR), "error",
+          "the median depth of camera {0} must lie between {low:g} and {high:g} m, with the unit of the images; received {1:g} m "
+          "per count, which makes it {value:.4g} m", title="depth_unit"),
     Check("category", "category", meant, None, "warning",
           f"only {' and '.join(THIN)} mean a thin thing, and only rope a round one; any other word is a filled body; received "
           "{0!r}. Is {value} meant?", title="category"),

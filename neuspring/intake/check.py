@@ -16,10 +16,10 @@ import numpy as np
 
 from neuspring.checks import examine
 from neuspring.checks.cameras import pairs
-from neuspring.checks.case import Case, whole
+from neuspring.checks.case import FINAL_DATA, Case, whole
 from neuspring.checks.masks import Shown
 from neuspring.checks.table import CameraAlone, TableSeen, object_on_table
-from neuspring.checks.things import HAND_LEAST, INSIDE, Depths, Masked, ObjectPoints, Sample, hands_on, lifted, outline, sampled
+from neuspring.checks.things import HAND_LEAST, INSIDE, Sample, hands_on, lifted, outline, place_of, sampled
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
@@ -107,9 +107,11 @@ def _check_camera(capture: Capture, name: str, calibrated: bool, grips: np.ndarr
             refused.setdefault(f"{Path(one.where).parent} {one.text}", []).append(one)
     more = {key: f" The same in {len(alike) - 1} more files of the folder." for key, alike in refused.items() if len(alike) > 1}
     findings = [replace(alike[0], text=alike[0].text + more.get(key, "")) for key, alike in refused.items()]
-    depths = Depths(name, described.depth_unit, medians)
-    findings += examine("depths", path, depths)
-    if calibrated and (depths.fine or not medians):
+    measured = [median for median in medians if np.isfinite(median)]
+    typical = float(np.median(measured)) if measured else None
+    wrong = examine("depths", path, name, described.depth_unit, typical) if medians else []
+    findings += wrong
+    if calibrated and not wrong:
         findings += (_with_depth if capture.has_depth else _color_alone)(capture, name, samples)
     return samples, findings + at(capture.folder / "mask" / name, examine("masks", f"camera {name}", shown))
 
@@ -124,9 +126,10 @@ def _with_depth(capture: Capture, name: str, samples: dict[int, Sample]) -> list
     tables = planes(cloud(around, camera.intrinsics)) if enough else []
     bodies = {frame: lifted(camera, sample, OBJECT) for frame, sample in samples.items()}
     pictures = [(s.mask if s.mask.any() else s.color, s.depth) for s in samples.values() if s.color is not None]
-    where, seen, sign = f"camera {name}", Masked(camera, samples), up_sign(up)
-    found = examine("edges", where, pictures) + examine("object and hands", where, seen) + examine("hands", where, seen)
-    found += examine("object", f"{where}, object", ObjectPoints(list(bodies.values()), sign))
+    where, sign = f"camera {name}", up_sign(up)
+    found = examine("edges", where, pictures) + examine("object and hands", where, camera, samples, 0.0)
+    found += examine("hands", where, camera, samples)
+    found += examine("object", f"{where}, object", place_of(list(bodies.values()), sign))
     findings = examine("table", path, TableSeen(name, tables, camera.camera_to_world, up, unit))
     if 0 not in bodies:
         return findings + at(path, found)
@@ -155,7 +158,7 @@ def _color_alone(capture: Capture, name: str, samples: dict[int, Sample]) -> lis
     depth = np.nanmedian(camera.project(places)[1]) if (mask == OBJECT).any() else np.nan
     if np.isfinite(depth):
         supposed = {frame: replace(sample, depth=np.full(mask.shape, depth)) for frame, sample in samples.items()}
-        seen = examine("object and hands", f"camera {name}", Masked(camera, supposed, HAND_LEAST))
+        seen = examine("object and hands", f"camera {name}", camera, supposed, HAND_LEAST)
         findings += at(path, [one for one in seen if one.name != "depth holes"])
     # Obstacles stand on the table: what lies beneath one is met above it.
     above = places[np.isfinite(places[:, 0])] + np.array([0.0, 0.0, 2 * INSIDE * up_sign(up)])
@@ -218,7 +221,7 @@ def find_cases(folder: Path) -> list[Case]:
 
 def is_case(folder: Path) -> bool:
     """True where the folder holds processed data."""
-    return (folder / phystwin.FINAL_DATA).exists() or (folder / phystwin.SPLIT).exists()
+    return (folder / FINAL_DATA).exists() or (folder / phystwin.SPLIT).exists()
 
 
 def render(findings: list[Finding]) -> str:
@@ -243,7 +246,7 @@ def _subfolders(folder: Path) -> list[Path]:
 
 def _check_case(case: Case) -> list[Finding]:
     folder, found = case.folder, list[Finding]()
-    path, frames = folder / phystwin.FINAL_DATA, None
+    path, frames = folder / FINAL_DATA, None
     if (data := _read(found, path, load_pickle)) is not None:
         found += examine("final data", path, data) + examine("released data", path, data)
         frames = len(data["object_points"]) if whole(data) else None
@@ -267,5 +270,5 @@ def _check_case(case: Case) -> list[Finding]:
         if "fps" not in metadata:
             found.append(unusual(path, "fps", "missing; 30 frames per second are assumed"))
         if frames is not None and metadata.get("frame_num", frames) != frames:
-            found.append(unusual(path, "frame_num", f"{phystwin.FINAL_DATA} has {frames} frames", metadata["frame_num"]))
+            found.append(unusual(path, "frame_num", f"{FINAL_DATA} has {frames} frames", metadata["frame_num"]))
     return found

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from neuspring.checks import examine
-from neuspring.checks.space import SAME, Cloud, Holding
+from neuspring.checks.space import SAME, Holding
 from neuspring.config import Config, ScenarioRow
 from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.errors import InputError
@@ -117,7 +117,7 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
     seen = annotated[np.isfinite(annotated).all(axis=2)]
     for what, file, points in (("nodes", files.get("nodes"), nodes), ("", marked, seen), ("", files.get("controllers"), held_at)):
         if file is not None and points.size:
-            findings += examine("points", file, Cloud(points.reshape(-1, 3), ground, is_body=what == "nodes"))
+            findings += examine("points", file, points.reshape(-1, 3), ground, what == "nodes")
     if any(one.level == "error" for one in findings):
         return InSpace(hands, nodes, tracks), findings
     if (body := files.get("nodes")) is not None:

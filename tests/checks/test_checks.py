@@ -85,10 +85,10 @@ def test_every_kind_of_subject_that_is_examined_has_a_check():
 RED = Check(
     "red object",
     "object and hands",
-    lambda seen: float(np.mean([s.color[s.mask == OBJECT][..., 0].mean() for s in seen.samples.values()])),
+    lambda camera, samples, least: float(np.mean([s.color[s.mask == OBJECT][..., 0].mean() for s in samples.values()])),
     (0, 1),
     "note",
-    "red of {value:.0f} in camera {0.camera.name}; up to {high} is usual.",
+    "red of {value:.0f} in camera {0.name}; up to {high} is usual.",
 )
 
 

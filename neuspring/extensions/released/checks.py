@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
+from neuspring.checks.case import FINAL_DATA
 from neuspring.config import Fit
 from neuspring.config.images import Images
 from neuspring.core.artifacts import Material, Observations, Simulation, Topology, Trajectory, Twin
@@ -248,7 +249,7 @@ def sizes(case: Released, observations: Observations, _: Tools) -> list[Comparis
     }
     findings = []
     for name, count in quantities.items():
-        finding = Comparison(check=1, scenario=case.name, quantity=name, ours=count, file=case.folder / phystwin.FINAL_DATA)
+        finding = Comparison(check=1, scenario=case.name, quantity=name, ours=count, file=case.folder / FINAL_DATA)
         if row is None:
             finding = replace(finding, note="not one of the 22 released cases")
         elif row[name]:

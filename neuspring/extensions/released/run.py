@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from neuspring.checks.case import Case, whole
+from neuspring.checks.case import FINAL_DATA, Case, whole
 from neuspring.config import ScenarioRow
 from neuspring.config.images import LpipsWeights
 from neuspring.core.artifacts import Observations
@@ -119,15 +119,23 @@ def check_case(case: Released, observations: Observations | Exception, checks: S
     `observations`: the processed case, or the exception of `read_observations`.
     """
     findings = list[Comparison]()
-    for check in checks:
-        for function in _FUNCTIONS[check]:
-            findings += _guarded(function, check, case, observations, tools)
+    for number in checks:
+        blank = Comparison(check=number, scenario=case.name, quantity=RELEASED_CHECKS[number])
+        for function in _FUNCTIONS[number]:
+            try:
+                if isinstance(observations, Exception):
+                    raise observations
+                findings += function(case, observations, tools)
+            except Absent as reason:
+                findings.append(replace(blank, outcome="skipped", note=str(reason), file=reason.file))
+            except (InputError, NumericalFailure) as error:
+                findings.append(replace(blank, outcome="failed", note=str(error)))
     return findings
 
 
 def read_observations(case: Released) -> Observations:
     """The processed case. Raises Absent if its files are missing, InputError if the reader refuses them."""
-    require(case.root, case.folder / phystwin.FINAL_DATA, case.folder / phystwin.SPLIT)
+    require(case.root, case.folder / FINAL_DATA, case.folder / phystwin.SPLIT)
     row = ScenarioRow(
         scenario=case.name,
         source="phystwin",
@@ -139,8 +147,7 @@ def read_observations(case: Released) -> Observations:
     return phystwin.read(row, case.folder)
 
 
-_Check = Callable[[Released, Observations, Tools], list[Comparison]]
-_FUNCTIONS: dict[int, tuple[_Check, ...]] = {
+_FUNCTIONS: dict[int, tuple[Callable[[Released, Observations, Tools], list[Comparison]], ...]] = {
     1: (checks.sizes, checks.first_frame),
     2: (checks.topology,),
     3: (checks.evaluator,),
@@ -148,20 +155,6 @@ _FUNCTIONS: dict[int, tuple[_Check, ...]] = {
     5: (checks.renderer,),
     6: (checks.simulator,),
 }
-
-
-def _guarded(
-    function: _Check, check: int, case: Released, observations: Observations | Exception, tools: Tools
-) -> list[Comparison]:
-    blank = Comparison(check=check, scenario=case.name, quantity=RELEASED_CHECKS[check])
-    try:
-        if isinstance(observations, Exception):
-            raise observations
-        return function(case, observations, tools)
-    except Absent as reason:
-        return [replace(blank, outcome="skipped", note=str(reason), file=reason.file)]
-    except (InputError, NumericalFailure) as error:
-        return [replace(blank, outcome="failed", note=str(error))]
 
 
 def _write(report: Report, output: Path) -> None:
@@ -296,7 +289,7 @@ def _of_results(case: Released) -> list[Finding]:
             findings += parameter_findings(case.parameters, load_pickle(case.parameters))
         if case.checkpoint.exists():
             read_checkpoint(case.checkpoint)
-        data = load_pickle(case.folder / phystwin.FINAL_DATA) if case.prediction.exists() else None
+        data = load_pickle(case.folder / FINAL_DATA) if case.prediction.exists() else None
         if data is not None and whole(data):
             nodes = data["object_points"].shape[1] + len(data["surface_points"]) + len(data["interior_points"])
             findings += prediction_findings(case.prediction, load_pickle(case.prediction), len(data["object_points"]), nodes)

@@ -15,6 +15,7 @@ import numpy as np
 from neuspring.config import Config, ScenarioRow, Toy
 from neuspring.core.artifacts import Material, Observations, Scenario, Simulation, Topology, Twin
 from neuspring.core.errors import InputError
+from neuspring.intake.points import in_both
 from neuspring.physics import reference, stability
 from neuspring.twin.topology import uniform_topology
 
@@ -172,8 +173,6 @@ def _observe(row: ScenarioRow, shape: Shape, motion: np.ndarray, hands: np.ndarr
     rng = np.random.default_rng([settings.seed, *row.scenario.encode()])
     noisy = motion + rng.normal(0.0, settings.noise, motion.shape)
     visible = _visibility(rng, frames, tracked, settings.occlusion)
-    moved = np.zeros_like(visible)
-    moved[:-1] = visible[:-1] & visible[1:]
     scenario = Scenario(
         name=row.scenario,
         source="toy",
@@ -196,7 +195,7 @@ def _observe(row: ScenarioRow, shape: Shape, motion: np.ndarray, hands: np.ndarr
         scenario=scenario,
         object_points=np.where(visible[..., None], noisy[:, :tracked], 0.0),
         object_visibility=visible,
-        object_motion_valid=moved,
+        object_motion_valid=in_both(visible),
         controller_points=hands,
         surface_points=noisy[0, tracked : tracked + surface],
         interior_points=noisy[0, tracked + surface :],
