@@ -18,6 +18,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -243,6 +245,14 @@ class Writer:
             np.save(path, depth, allow_pickle=False)
         if mask is not None:
             self.mask(camera, frame, mask)
+
+    def link(self, kind: Literal["color", "depth"], camera: str, frame: int, source: Path) -> None:
+        """An image that is there in the capture's form: linked where the file system allows it, else copied."""
+        make_way(path := self.capture.path(kind, camera, frame))
+        try:
+            os.link(source, path)
+        except OSError:
+            shutil.copyfile(source, path)
 
     def mask(self, camera: str, frame: int, labels: np.ndarray) -> None:
         """Labels uint8 [H, W]: 0 nothing, 1 object, 2 hands."""

@@ -5,10 +5,8 @@ Images of a scenario are linked where the file system allows it, else copied.
 
 from __future__ import annotations
 
-import os
-import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -22,7 +20,7 @@ from neuspring.core.findings import refuse
 from neuspring.core.records import digest_file
 from neuspring.data.camera import Camera
 from neuspring.data.capture import FEWEST_FRAMES, HANDS, OBJECT, Capture, Description, Writer
-from neuspring.data.images import make_way, read_image
+from neuspring.data.images import read_image
 from neuspring.data.unpickle import load_pickle
 from neuspring.intake.phystwin import CALIBRATION, METADATA, annotated, train_end_of
 
@@ -52,19 +50,16 @@ def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
         provenance={name: f"sha256:{digest_file(case / name)}" for name in (METADATA, CALIBRATION)},
     )
     writer = Writer(folder, description)
+    kinds: tuple[Literal["color", "depth"], ...] = ("color", "depth")
     for name, camera in writer.capture.cameras.items():
         ids = detections(case, name) if has_masks else {}
         for frame in range(frames):
-            for kind, ending in (("color", "png"), ("depth", "npy")):
-                source, target = case / kind / name / f"{frame}.{ending}", folder / kind / name / f"{frame:05d}.{ending}"
+            for kind in kinds:
+                source = case / kind / name / f"{frame}{writer.capture.path(kind, name, frame).suffix}"
                 if not source.is_file():
                     remedy = f"Make a capture of the frames that are there: `neuspring make-capture --phystwin-raw {case}`."
                     raise InputError(source, "this image must exist", "no such file", remedy)
-                make_way(target)
-                try:
-                    os.link(source, target)
-                except OSError:
-                    shutil.copyfile(source, target)
+                writer.link(kind, name, frame, source)
             if has_masks:
                 writer.mask(name, frame, labels_of(case, camera, frame, ids))
     return writer.finish(annotated(case, frames))
