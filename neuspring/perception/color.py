@@ -218,12 +218,7 @@ def beneath_hands(labels: np.ndarray, reach: float) -> np.ndarray:
 
 
 def lift_color(
-    capture: Capture,
-    labels: np.ndarray,
-    tracks: PixelTracks,
-    first: FirstFrame,
-    controllers: int,
-    space: InSpace,
+    capture: Capture, labels: np.ndarray, tracks: PixelTracks, first: FirstFrame, controllers: int, space: InSpace
 ) -> tuple[LiftedTracks, ImageObservations]:
     """Tracks and hands in the world as far as they are known, and the evidence in the image.
 

@@ -47,10 +47,8 @@ def uneven_time(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[di
         times, places = view.series.times, choice.places[view.name]
         if times is None:
             continue
-        found, numbers = (
-            Evenness.of(times[[*places.values()]], [*places.values()]),
-            [choice.numbers[frame] for frame in places],
-        )
+        found = Evenness.of(times[[*places.values()]], [*places.values()])
+        numbers = [choice.numbers[frame] for frame in places]
         told = {"where": view.path, "value": found.departure, "text": f"camera {view.name}: {found.text()}"}
         if found.bad:
             first, last = max(found.runs, key=lambda run: run[1] - run[0])

@@ -398,10 +398,7 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _distances(label: str, apart: np.ndarray) -> dict[str, np.ndarray]:
-    return {
-        f"mean distance of nodes, {label}": apart.mean(axis=1),
-        f"largest distance of a node, {label}": apart.max(axis=1),
-    }
+    return {f"mean distance of nodes, {label}": apart.mean(axis=1), f"largest distance of a node, {label}": apart.max(axis=1)}
 
 
 def _replayed(scenario: str, label: str, own: Trajectory, released: np.ndarray, order: np.ndarray) -> list[Comparison]:

@@ -152,12 +152,7 @@ class MarkedFrame:
         return np.asarray(self.probability.argmax(axis=0), dtype=np.uint8)
 
 
-def start(
-    lab: np.ndarray,
-    seeds: Seeds,
-    height: np.ndarray | None = None,
-    background: Background | None = None,
-) -> MarkedFrame:
+def start(lab: np.ndarray, seeds: Seeds, height: np.ndarray | None = None, background: Background | None = None) -> MarkedFrame:
     """Labels and colors of a frame, Lab [H, W, 3], from its marks; with heights above the table [H, W], m, and the background."""
     bins, labels = bins_of(lab), _first(lab, seeds)
     place = np.where(seeds.possible, seeds.prior, NEVER).astype(np.float32)
