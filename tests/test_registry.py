@@ -66,6 +66,6 @@ def test_an_extension_of_ours_without_its_folder_is_left_out(packages):
 
 
 def test_each_entry_point_of_ours_is_there():
-    """Names in pyproject.toml are those of objects that exist."""
+    """Names in pyproject.toml are those of members that exist."""
     ours = [point for point in importlib.metadata.distribution("neuspring").entry_points if point.group.startswith("neuspring.")]
-    assert ours and all(point.load() is not None for point in ours)
+    assert ours and all(point.load() for point in ours)

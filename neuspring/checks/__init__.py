@@ -1,30 +1,22 @@
-"""What is looked for in data, before any cost: one file per kind of subject, with its measurements and its checks.
+"""Checks of data, before any cost: one file per area, with its measurements and its checks.
 
-To add a check: a function that measures, and an entry of `CHECKS` in the file of its subject. A package adds one, a `Check` of one
-of our subjects, by an entry point of the group `neuspring.checks`.
+To add a check: a function that measures, and an entry of `checks` in a file here. A package adds one, a `Check` of one of our kinds
+of subject, by an entry point of the group `neuspring.checks`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from typing import Any
 
-from neuspring.core import checks
 from neuspring.core.checks import Check
 from neuspring.core.findings import Finding
 from neuspring.registry import Registry, modules
 
-CHECKS: Registry[Check | tuple[Check, ...]] = Registry("checks", modules(__name__, "CHECKS"), (Check, tuple))
-"""Our files, each with the checks of its subjects, and the checks of packages."""
+CHECKS: Registry[Check | tuple[Check, ...]] = Registry("checks", modules(__name__, "checks"), (Check, tuple))
+"""Our files, each with its checks, and the checks of packages."""
 
 
-def examine(subject: Any, own: Sequence[Check] = ()) -> list[Finding]:
-    """All findings about a subject: by `own` checks, those of the file here that declares its kind, and those of packages."""
-    return checks.examine(subject, [*own, *_for(type(subject).__module__)])
-
-
-def _for(module: str) -> Iterator[Check]:
-    for name in CHECKS:
-        if not (declared := CHECKS.module_of(name)).startswith(f"{__name__}.") or declared == module:
-            member = CHECKS[name]
-            yield from (member,) if isinstance(member, Check) else member
+def examine(of: str, where: object, *subject: Any) -> list[Finding]:
+    """All findings about a `subject` of the kind `of`, found at the file, camera or other place `where`."""
+    listed = [one for member in CHECKS.values() for one in ((member,) if isinstance(member, Check) else member)]
+    return [found for check in listed if check.of == of for found in check.findings(where, *subject)]

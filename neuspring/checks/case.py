@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from neuspring.core.checks import Check
-from neuspring.core.findings import Finding, Level
+from neuspring.core.findings import Level
 from neuspring.data.capture import intrinsics_findings, pose_findings
 
 FINAL_DATA = "final_data.pkl"
@@ -20,7 +18,7 @@ RELEASED_FRAME_RATE = 30.0
 MAX_FRAME_RATE = 1e6
 BINARY_TOLERANCE = 1e-5
 """Allowed deviation from R^T R = 1 in a pickle of float64 products of OpenCV rotations."""
-CONTROLLERS = 30
+RELEASED_CONTROLLERS = 30
 """Controller points of every released case."""
 Words = list[dict[str, Any]]
 
@@ -37,7 +35,7 @@ class ArrayRule:
     """True where the reader uses it."""
 
 
-ARRAYS = (
+CASE_ARRAYS = (
     ArrayRule("object_points", ("T", "No", "3"), "f"),
     ArrayRule("object_visibilities", ("T", "No"), "b"),
     ArrayRule("object_motions_valid", ("T", "No"), "b"),
@@ -77,86 +75,15 @@ class Case:
         return self.loose or self.root / "data" / "different_types" / self.name
 
 
-@dataclass(frozen=True, eq=False)
-class Cases:
-    """The cases of a folder, and what was found in their files: a package compares them with what else was released."""
-
-    where: Path
-    cases: Sequence[Case]
-    found: Sequence[Finding]
-
-
-@dataclass(frozen=True, eq=False)
-class FinalData:
-    """final_data.pkl."""
-
-    where: Path
-    data: Any
-
-    @cached_property
-    def structure(self) -> Words:
-        """Faults of its keys, types, shapes and dtypes. Without errors the content of the arrays can be looked at."""
-        return structure(self)
-
-    @property
-    def whole(self) -> bool:
-        """True where its arrays have the right keys, shapes and dtypes, and there are some points."""
-        return not any(one["level"] == "error" for one in self.structure) and bool(self.data["object_visibilities"].size)
-
-
-class ReleasedData(FinalData):
-    """The same, compared with how PhysTwin released it too: what its reader does not ask."""
-
-
-@dataclass(frozen=True, eq=False)
-class Split:
-    """split.json against the number of frames."""
-
-    where: Path
-    split: Any
-    frames: int
-
-
-@dataclass(frozen=True, eq=False)
-class TrackFile:
-    """gt_track_3d.pkl; without a number of frames T is not compared."""
-
-    where: Path
-    tracks: Any
-    frames: int | None
-
-
-@dataclass(frozen=True, eq=False)
-class Metadata:
-    """metadata.json."""
-
-    where: Path
-    metadata: Any
-    with_cameras: bool = False
-    """Image size and intrinsics count too."""
-    cameras: int | None = None
-    """That are required; None allows any but zero."""
-
-
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """calibrate.pkl; None of `cameras` allows any number."""
-
-    where: Path
-    poses: Any
-    cameras: int | None
-
-
-def structure(file: FinalData) -> Words:
-    """Faults of keys, types, shapes and dtypes. Without errors the content of the arrays can be looked at."""
-    data = file.data
+def structure(data: Any) -> Words:
+    """Faults of keys, types, shapes and dtypes of final_data.pkl. Without errors the content of the arrays can be looked at."""
     if not isinstance(data, dict):
         return [wrong("", "a dict of arrays is required", type(data).__name__)]
-    keys = {rule.key for rule in ARRAYS} | set(IGNORED)
+    keys = {rule.key for rule in CASE_ARRAYS} | set(IGNORED)
     findings = [odd(str(key), "unknown key, not read") for key in data if key not in keys]
     sizes: dict[str, int] = {}
     """The symbolic dimensions of the file."""
-    for rule in ARRAYS:
+    for rule in CASE_ARRAYS:
         severity = wrong if rule.required else odd
         shape, value = f"[{', '.join(rule.shape)}]", data.get(rule.key)
         if rule.key not in data:
@@ -176,12 +103,17 @@ def structure(file: FinalData) -> Words:
     return findings
 
 
-def values(file: FinalData) -> Words:
+def whole(data: Any) -> bool:
+    """True where final_data.pkl has arrays of the right keys, shapes and dtypes, and there are some points."""
+    return not any(one["level"] == "error" for one in structure(data)) and bool(data["object_visibilities"].size)
+
+
+def values(data: Any) -> Words:
     """Finite coordinates, and the rules without which nothing can be simulated."""
-    findings, data = Words(), file.data
+    findings = Words()
     if not isinstance(data, dict):
         return findings
-    for rule in ARRAYS:
+    for rule in CASE_ARRAYS:
         value = data.get(rule.key)
         if rule.kind != "f" or not isinstance(value, np.ndarray) or value.dtype.kind != "f" or value.ndim != len(rule.shape):
             continue
@@ -191,7 +123,7 @@ def values(file: FinalData) -> Words:
         if len(bad):
             severity = wrong if rule.required else odd
             findings.append(severity(rule.key, "every coordinate must be finite", describe_bad(value, bad)))
-    if any(one["level"] == "error" for one in [*findings, *file.structure]):
+    if any(one["level"] == "error" for one in [*findings, *structure(data)]):
         return findings
     frames, points = data["object_visibilities"].shape
     if points == 0:
@@ -214,11 +146,11 @@ def describe_bad(value: np.ndarray, bad: np.ndarray) -> str:
     return f"{value[first]} at {place} ({len(bad)} in all)"
 
 
-def motions(file: ReleasedData) -> Words:
+def motions(data: Any) -> Words:
     """Departures from the release that the reader accepts."""
-    if not file.whole:
+    if not whole(data):
         return []
-    findings, data = Words(), file.data
+    findings = Words()
     points, visible, valid = data["object_points"], data["object_visibilities"], data["object_motions_valid"]
     moved = np.argwhere(~visible & (points != 0).any(axis=2))
     if len(moved):
@@ -247,8 +179,8 @@ def motions(file: ReleasedData) -> Words:
         rule = "columns are expected in lexicographic order of their frame-0 coordinates"
         findings.append(odd("object_points", rule, "another order"))
     controllers = data["controller_points"].shape[1]
-    if controllers != CONTROLLERS:
-        findings.append(odd("controller_points", f"released cases have {CONTROLLERS} controllers", controllers))
+    if controllers != RELEASED_CONTROLLERS:
+        findings.append(odd("controller_points", f"released cases have {RELEASED_CONTROLLERS} controllers", controllers))
     return findings
 
 
@@ -257,9 +189,8 @@ def place(rows: np.ndarray) -> str:
     return f"frame {rows[0][0]}, point {rows[0][1]} ({len(rows)} in all)"
 
 
-def ranges(file: Split) -> Words:
+def ranges(split: Any, frames: int) -> Words:
     """split.json against the number of frames: half-open ranges [start, end) inside [0, frames]."""
-    split, frames = file.split, file.frames
     if not isinstance(split, dict):
         return [wrong("", "a JSON object with train and test is required", type(split).__name__)]
     findings = []
@@ -284,9 +215,8 @@ def ranges(file: Split) -> Words:
     return findings
 
 
-def tracks_of(file: TrackFile) -> Words:
+def tracks_of(tracks: Any, frames: int | None) -> Words:
     """gt_track_3d.pkl: floating point [T, K, 3], NaN rows where not annotated. `frames` None skips the comparison of T."""
-    tracks, frames = file.tracks, file.frames
     if not isinstance(tracks, np.ndarray):
         return [wrong("", "an array [T, K, 3] is required", type(tracks).__name__)]
     if tracks.ndim != 3 or tracks.shape[2] != 3:
@@ -304,14 +234,12 @@ def tracks_of(file: TrackFile) -> Words:
     missing = np.isnan(tracks)
     partial = np.argwhere(missing.any(axis=2) & ~missing.all(axis=2))
     if len(partial):
-        place = f"frame {partial[0][0]}, point {partial[0][1]} ({len(partial)} in all)"
-        findings.append(odd("", "a point is NaN in all three coordinates or in none", place))
+        findings.append(odd("", "a point is NaN in all three coordinates or in none", place(partial)))
     return findings
 
 
-def frame_rate(file: Metadata) -> Words:
+def frame_rate(metadata: Any) -> Words:
     """The only field of metadata.json that the reader uses: fps, a positive number; 30 where absent."""
-    metadata = file.metadata
     if not isinstance(metadata, dict):
         return [wrong("", "a JSON object is required", type(metadata).__name__)]
     fps = metadata.get("fps", RELEASED_FRAME_RATE)
@@ -322,10 +250,10 @@ def frame_rate(file: Metadata) -> Words:
     return []
 
 
-def cameras_of(file: Metadata) -> Words:
+def cameras_of(metadata: Any, cameras: int | None) -> Words:
     """Image size and intrinsics of metadata.json. `cameras` is the required number of cameras; None allows any but zero."""
-    findings, metadata, cameras = Words(), file.metadata, file.cameras
-    if not isinstance(metadata, dict) or not file.with_cameras:
+    findings = Words()
+    if not isinstance(metadata, dict):
         return findings
     size: Any = metadata.get("WH")
     has_size = isinstance(size, list) and len(size) == 2 and all(type(value) is int and value > 0 for value in size)
@@ -341,14 +269,13 @@ def cameras_of(file: Metadata) -> Words:
         return [*findings, wrong("intrinsics", rule, f"shape {intrinsics.shape}")]
     for index, matrix in enumerate(intrinsics):
         key = f"intrinsics, camera {index}"
-        of_lens = intrinsics_findings(file.where, key, matrix, (size[0], size[1]) if has_size else None)
+        of_lens = intrinsics_findings(Path(), key, matrix, (size[0], size[1]) if has_size else None)
         findings += [wrong(key, one.text) for one in of_lens]
     return findings
 
 
-def poses_of(file: Calibration) -> Words:
+def poses_of(poses: Any, cameras: int | None) -> Words:
     """The matrices of calibrate.pkl. `cameras` is the required number of cameras; None skips the comparison."""
-    poses, cameras = file.poses, file.cameras
     if not isinstance(poses, (list, tuple)) or (cameras is not None and len(poses) != cameras):
         received = f"{type(poses).__name__} of {len(poses)}" if isinstance(poses, (list, tuple)) else type(poses).__name__
         return [wrong("", f"a list of {cameras or ''} camera-to-world matrices is required".replace("  ", " "), received)]
@@ -361,18 +288,18 @@ def poses_of(file: Calibration) -> Words:
             continue
         if pose.dtype != np.float64:
             findings.append(odd(key, "the released dtype is float64", pose.dtype))
-        findings += [wrong(key, one.text) for one in pose_findings(file.where, key, pose, BINARY_TOLERANCE)]
+        findings += [wrong(key, one.text) for one in pose_findings(Path(), key, pose, BINARY_TOLERANCE)]
     return findings
 
 
 # fmt: off
-CHECKS = (
-    Check("arrays", FinalData, lambda file: file.structure, None, "error", "{text}", title="{key}"),
-    Check("values", FinalData, values, None, "error", "{text}", title="{key}"),
-    Check("motions", ReleasedData, motions, None, "warning", "{text}", title="{key}"),
-    Check("split", Split, ranges, None, "error", "{text}", title="{key}"),
-    Check("annotated tracks", TrackFile, tracks_of, None, "error", "{text}", title=""),
-    Check("frame rate", Metadata, frame_rate, None, "error", "{text}", title="{key}"),
-    Check("intrinsics", Metadata, cameras_of, None, "error", "{text}", title="{key}"),
-    Check("poses", Calibration, poses_of, None, "error", "{text}", title="{key}"),
+checks = (
+    Check("arrays", "final data", structure, None, "error", "{text}", title="{key}"),
+    Check("values", "final data", values, None, "error", "{text}", title="{key}"),
+    Check("motions", "released data", motions, None, "warning", "{text}", title="{key}"),
+    Check("split", "split", ranges, None, "error", "{text}", title="{key}"),
+    Check("annotated tracks", "annotated tracks", tracks_of, None, "error", "{text}", title=""),
+    Check("frame rate", "metadata", frame_rate, None, "error", "{text}", title="{key}"),
+    Check("intrinsics", "lenses of metadata", cameras_of, None, "error", "{text}", title="{key}"),
+    Check("poses", "calibration", poses_of, None, "error", "{text}", title="{key}"),
 )

@@ -9,15 +9,15 @@ from typing import Any
 import cv2
 import numpy as np
 
-from neuspring.checks.masks import FEWEST_STEPS, LOOKED, OFTEN, RIM, STIRRED, motions
+from neuspring.checks.masks import FEWEST_STEPS, LOOKED, MASK_RIM, OFTEN, STIRRED, motions
 from neuspring.core.checks import Check
 from neuspring.data.capture import OBJECT, Capture
 
-COVERED = 0.15
+COVERED_SHARE = 0.15
 """Share of the object's moving pixels with a followed point nearby; 0.16 at least in the synthetic scenes."""
 SPACING = 3.0
 """Nearby, as a multiple of the mean distance of points in frame 0."""
-TRACKS = 50
+FEWEST_TRACKS = 50
 """Points on the object in frame 0."""
 FOLLOWED = 0.1
 """Share of the points of frame 0 that are still followed."""
@@ -35,11 +35,6 @@ class Tracked:
     """[T, Q, 2]."""
     visible: np.ndarray
     """[T, Q] bool."""
-
-    @property
-    def where(self) -> str:
-        """The camera."""
-        return f"camera {self.camera}"
 
     @cached_property
     def own(self) -> np.ndarray:
@@ -65,7 +60,7 @@ class Tracked:
             x, y = np.clip(np.round(places).astype(int), 0, np.array(body.shape[::-1]) - 1).T
             empty[y, x] = 0
             away = cv2.distanceTransform(empty, cv2.DIST_L2, 5) if len(x) else np.full(body.shape, np.inf)
-            shares[motion.frame] = float((away[own] <= max(SPACING * spacing, RIM * body.shape[1])).mean())
+            shares[motion.frame] = float((away[own] <= max(SPACING * spacing, MASK_RIM * body.shape[1])).mean())
         return shares
 
 
@@ -84,24 +79,22 @@ def lost(tracked: Tracked) -> dict[str, Any] | None:
 
 def lost_where_it_moves(tracked: Tracked) -> dict[str, Any] | None:
     """Frames in which the moving part of the object has few followed points, where that is not said otherwise."""
-    if tracked.own.sum() < TRACKS or (tracked.few and tracked.few["often"]):
+    if tracked.own.sum() < FEWEST_TRACKS or (tracked.few and tracked.few["often"]):
         return None
-    bare = [frame for frame, share in tracked.covered().items() if share < COVERED]
+    bare = [frame for frame, share in tracked.covered().items() if share < COVERED_SHARE]
     return {"value": len(bare), "first": bare[0], "frames": bare} if len(bare) >= max(FEWEST_STEPS, OFTEN * LOOKED) else None
 
 
-REMEDY = "Look at tracks.png; end the capture before frame {first}, use more light or shorter exposures, or cotracker3."
+TRACKS_REMEDY = "Look at tracks.png; end the capture before frame {first}, use more light or shorter exposures, or cotracker3."
 # fmt: off
-CHECKS = (
-    Check("few tracks", Tracked, lambda tracked: int(tracked.own.sum()) or None, (TRACKS, np.inf), "warning",
+checks = (
+    Check("few tracks", "tracks", lambda tracked: int(tracked.own.sum()) or None, (FEWEST_TRACKS, np.inf), "warning",
           "{value} points are followed on the object; at least {low} are expected.",
           "Film from nearer by, or raise points of perception.track."),
-    Check("tracks lost", Tracked, lost, None, "warning",
+    Check("tracks lost", "tracks", lost, None, "warning",
           "{value:.0%} of the object's points are followed in frame {frame}; few in {count} frames; at least {least:.0%} are "
-          "expected in "
-          "every frame.", REMEDY),
-    Check("tracks lost where it moves", Tracked, lost_where_it_moves, None, "warning",
-          f"in {{value}} of {LOOKED} frames that were looked at, first in frame {{first}}, the part of the object that moves "
-          f"has followed "
-          f"points on less than {COVERED:.0%} of it; points that stand still alone teach no motion.", REMEDY),
+          "expected in every frame.", TRACKS_REMEDY),
+    Check("tracks lost where it moves", "tracks", lost_where_it_moves, None, "warning",
+          f"in {{value}} of {LOOKED} frames that were looked at, first in frame {{first}}, the part of the object that moves has "
+          f"followed points on less than {COVERED_SHARE:.0%} of it; points that stand still alone teach no motion.", TRACKS_REMEDY),
 )

@@ -15,36 +15,36 @@ from neuspring.core.checks import Check
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.data.frames import frames_of, gray, spread
 
-APART = 0.1
+PIECES_APART = 0.1
 """Distance between two pieces of one label, as a fraction of the image, from which they count as two objects."""
-SECOND = 0.3
+SECOND_PIECE = 0.3
 """A piece with at least this fraction of the largest piece's area counts as an object."""
 LEAVES = 0.1
 """Fraction of its area in frame 0 below which an object has left the view."""
 SMALL_MASK = 200
 """Pixels of the object in frame 0."""
-EDGE = 3
+BORDER_PIXELS = 3
 """Pixels of the object on the image border from which it may go on outside."""
 CUT = 0.1
 """Share of the frames from which an object at the border counts as cut off; frame 0 alone does, where its shape is taken."""
 BORDERED = 0.1
 """Part of the image's border that is object, median over frames, from which the mask shows the background or a person."""
-JUMP = 2.0
+AREA_JUMP = 2.0
 """Ratio of the object's areas in neighboring frames: no body grows that fast."""
-STEP, STEPS, FEWEST_STEPS = 1.5, 0.1, 3
+AREA_STEP, STEPS_SHARE, FEWEST_STEPS = 1.5, 0.1, 3
 """A smaller such ratio, and the part and number of frames with it from which a mask flickers: what is hidden once and comes back
 jumps twice."""
-FLOOR = 1e-4
+AREA_FLOOR = 1e-4
 """Part of the image by which areas are enlarged before they are divided: a few pixels of a hidden object are no jump."""
-REMEDY = "Mark object and hands in a few frames (`neuspring mask`), or choose another perception.segment.backend."
+MARK_REMEDY = "Mark object and hands in a few frames (`neuspring mask`), or choose another perception.segment.backend."
 
 
 class Shown:
     """The masks of one camera, counted frame by frame."""
 
-    def __init__(self, camera: str, frames: int, size: tuple[int, int]) -> None:
+    def __init__(self, frames: int, size: tuple[int, int]) -> None:
         """Nothing so far, of images of `size` (width, height)."""
-        self.where, self.size = f"camera {camera}", size
+        self.size = size
         self.objects = 0
         """Objects in frame 0."""
         self.areas = np.full((3, frames), np.nan)
@@ -55,7 +55,7 @@ class Shown:
     @classmethod
     def of(cls, capture: Capture, camera: str, labels: np.ndarray) -> Shown:
         """Counts of labels [T, H, W], over the frames that the camera has."""
-        shown = cls(camera, len(labels), (labels.shape[2], labels.shape[1]))
+        shown = cls(len(labels), (labels.shape[2], labels.shape[1]))
         for frame in frames_of(capture, camera):
             shown.see(frame, labels[frame])
         return shown
@@ -66,12 +66,12 @@ class Shown:
         own = labels == OBJECT
         self.rims[frame] = own[0].sum() + own[-1].sum() + own[1:-1, 0].sum() + own[1:-1, -1].sum()
         if frame == 0:
-            # Pieces count as one object if they meet when they are grown by half of APART.
-            reach = max(int(0.5 * APART * max(labels.shape)), 1)
+            # Pieces count as one object if they meet when they are grown by half of PIECES_APART.
+            reach = max(int(0.5 * PIECES_APART * max(labels.shape)), 1)
             disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2)
             count, pieces = cv2.connectedComponents(cv2.dilate(own.astype(np.uint8), disk))
             sizes = np.bincount(pieces[own], minlength=count)[1:]
-            self.objects = int((sizes >= SECOND * sizes.max()).sum()) if len(sizes) else 0
+            self.objects = int((sizes >= SECOND_PIECE * sizes.max()).sum()) if len(sizes) else 0
 
     @property
     def frames(self) -> np.ndarray:
@@ -85,14 +85,14 @@ class Shown:
 
     def ratios(self) -> dict[int, float]:
         """Ratio of the object's areas, 1 or more, in a frame and the one before it; of frames that follow each other."""
-        grown = self.areas[OBJECT] + FLOOR * self.size[0] * self.size[1]
+        grown = self.areas[OBJECT] + AREA_FLOOR * self.size[0] * self.size[1]
         return {b: float(max(grown[a] / grown[b], grown[b] / grown[a])) for a, b in pairwise(self.frames.tolist()) if b == a + 1}
 
     @property
     def steps(self) -> float:
-        """Part of the frames with a ratio above STEP; 0 where there are fewer than FEWEST_STEPS."""
+        """Part of the frames with a ratio above AREA_STEP; 0 where there are fewer than FEWEST_STEPS."""
         ratios = self.ratios().values()
-        count = sum(ratio > STEP for ratio in ratios)
+        count = sum(ratio > AREA_STEP for ratio in ratios)
         return count / len(ratios) if count >= FEWEST_STEPS else 0.0
 
 
@@ -110,14 +110,14 @@ def missing(shown: Shown) -> dict[str, Any] | None:
 
 def at_border(shown: Shown) -> dict[str, Any] | None:
     """Frames in which the object, and not the background with it, is cut off by the image."""
-    cut = shown.frames[shown.rims[shown.frames] >= EDGE]
+    cut = shown.frames[shown.rims[shown.frames] >= BORDER_PIXELS]
     cut_off = len(cut) and (cut[0] == 0 or len(cut) >= CUT * len(shown.frames))
     return _of_frames(cut) if cut_off and shown.bordered <= BORDERED else None
 
 
 def jumps(shown: Shown) -> dict[str, Any] | None:
     """Ratio of the object's areas in the first pair of frames between which it jumps."""
-    wild = {} if shown.steps > STEPS else {frame: ratio for frame, ratio in shown.ratios().items() if ratio > JUMP}
+    wild = {} if shown.steps > STEPS_SHARE else {frame: ratio for frame, ratio in shown.ratios().items() if ratio > AREA_JUMP}
     if not wild:
         return None
     frame = next(iter(wild))
@@ -130,17 +130,17 @@ def _of_frames(frames: Sequence[int] | np.ndarray) -> dict[str, Any]:
 
 SAME_GRAY = 6
 """Change of gray below which a pixel did not change."""
-PAIRS = 16
-"""How many pairs of frames are looked at for pixels that change their label alone."""
+FLICKER_PAIRS = 16
+"""Number of pairs of frames that are looked at for pixels that change their label alone."""
 HANDS_INSIDE = 0.25
 """Part of the hands' pixels that lie in pieces enclosed by the object, from which they are its print."""
 FLICKER = 0.08
 """Pixels that change their label and not their color, as part of object and hands, from which labels are noise."""
 LAG, LOOKED = 3, 24
-"""How many frames apart two are between which the picture changes, and how many such pairs are looked at."""
-WIDTH, MOVED = 320, 12
+"""Frames between two pictures that are compared, and number of such pairs."""
+COMPARED_WIDTH, COLOR_MOVED = 320, 12
 """Width, pixels, at which they are compared, and the change of a color value from which a pixel moves."""
-RIM, BESIDE = 0.01, 0.075
+MASK_RIM, MOTION_BESIDE = 0.01, 0.075
 """Part of the width by which a mask may be too small, and beside an object within which motion belongs to it or to a hand."""
 OUTSIDE = 0.25
 """Share of the moving pixels that lie in no mask. Right masks of real films and of synthetic scenes have more in at most 2 of 24
@@ -149,10 +149,10 @@ OFTEN = 0.1
 """Share of the frames, or of the pairs, from which something is a warning: a rope that turns away for two frames is none."""
 STIRRED = 0.05
 """Part of the object's pixels that change where it moves."""
-NEW, DARKER, TINT = 0.01, 0.05, 0.12
+NEW, DARKER, SHADOW_TINT = 0.01, 0.05, 0.12
 """Part of the object's pixels that must look new; how much lighter, as a log ratio, a shadow may make a pixel, and by how much the
 ratios of its three colors may differ."""
-KEPT = 0.4
+LEAST_NEWLY_KEPT = 0.4
 """Share of what the object seems to cover newly that lies in its mask. Right masks of real films keep 0.52 to 0.99, and masks that
 lose 80 % of it 0.2 or less. Of color alone: right masks of a real RGBD film, in which an arm comes near, keep 0.2 too."""
 UNMARKED = (
@@ -163,7 +163,7 @@ UNMARKED = (
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The change of a camera's picture from a frame on, at WIDTH pixels."""
+    """The change of a camera's picture from a frame on, at COMPARED_WIDTH pixels."""
 
     frame: int
     moving: np.ndarray
@@ -179,9 +179,9 @@ class Motion:
     def uncovered(self) -> bool:
         """True where much of what moves at the object lies in no mask."""
         both = self.labels[:2]
-        near = self.moving & grown((both == OBJECT).any(axis=0), BESIDE)
-        bare = int((near & ~grown(np.any(both, axis=0), RIM)).sum())
-        return bool(bare > max(OUTSIDE * near.sum(), RIM * (both[0] == OBJECT).sum()))
+        near = self.moving & grown((both == OBJECT).any(axis=0), MOTION_BESIDE)
+        bare = int((near & ~grown(np.any(both, axis=0), MASK_RIM)).sum())
+        return bool(bare > max(OUTSIDE * near.sum(), MASK_RIM * (both[0] == OBJECT).sum()))
 
     @cached_property
     def newly(self) -> tuple[int, int]:
@@ -191,8 +191,8 @@ class Motion:
         """
         now, first = self.labels[0], self.labels[2]
         new = cv2.morphologyEx((self.since & ~self.shaded).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
-        new &= ~grown((first > 0) | (now == HANDS), RIM)
-        around = grown((first == OBJECT) | (now == OBJECT), 2 * RIM)
+        new &= ~grown((first > 0) | (now == HANDS), MASK_RIM)
+        around = grown((first == OBJECT) | (now == OBJECT), 2 * MASK_RIM)
         pieces = cv2.connectedComponents((new | around).astype(np.uint8))[1]
         new &= np.isin(pieces, np.unique(pieces[around]))
         return int((new & (now == OBJECT)).sum()), int(new.sum())
@@ -205,14 +205,14 @@ class Motion:
     @cached_property
     def stirred(self) -> bool:
         """True where the picture is another where the object was in frame 0 and no hand is, or where it seems to be since."""
-        own = self.since & self.begin & ~grown((self.labels == HANDS).any(axis=0), RIM)
+        own = self.since & self.begin & ~grown((self.labels == HANDS).any(axis=0), MASK_RIM)
         return bool(own.sum() + self.newly[1] > STIRRED * max(self.begin.sum(), 1))
 
 
 def motions(capture: Capture, camera: str, labels: np.ndarray) -> Iterator[Motion]:
     """At most LOOKED of them, evenly spread."""
     frames, view = frames_of(capture, camera), capture.cameras[camera]
-    scale = min(1.0, WIDTH / view.width)
+    scale = min(1.0, COMPARED_WIDTH / view.width)
     size = round(scale * view.width), round(scale * view.height)
 
     def small(frame: int) -> np.ndarray:
@@ -231,8 +231,8 @@ def motions(capture: Capture, camera: str, labels: np.ndarray) -> Iterator[Motio
         image = small(here)
         three = [cv2.resize(labels[k], size, interpolation=cv2.INTER_NEAREST) for k in (here, there, frames[0])]
         ratio = np.log((image + 8) / (first + 8))
-        shaded = (ratio.max(axis=-1) < DARKER) & (np.ptp(ratio, axis=-1) < TINT)
-        yield Motion(here, change(image, small(there), MOVED), change(image, first, 2 * MOVED), shaded, np.stack(three))
+        shaded = (ratio.max(axis=-1) < DARKER) & (np.ptp(ratio, axis=-1) < SHADOW_TINT)
+        yield Motion(here, change(image, small(there), COLOR_MOVED), change(image, first, 2 * COLOR_MOVED), shaded, np.stack(three))
 
 
 def grown(mask: np.ndarray, share: float) -> np.ndarray:
@@ -259,7 +259,7 @@ def newly_kept(seen: Sequence[Motion]) -> dict[str, float]:
     newly = [(motion.frame, *motion.newly) for motion in seen if motion.newly[1] > NEW * motion.begin.sum()]
     if len(newly) < FEWEST_STEPS:
         return {}
-    lost = [frame for frame, kept, found in newly if kept < KEPT * found]
+    lost = [frame for frame, kept, found in newly if kept < LEAST_NEWLY_KEPT * found]
     share = sum(kept for _, kept, _ in newly) / sum(found for *_, found in newly)
     return {"newly_kept": share} | ({"first_newly_lost": float(lost[0])} if lost else {})
 
@@ -268,7 +268,7 @@ def flicker(capture: Capture, camera: str, labels: np.ndarray, frames: np.ndarra
     """Pixels that change their label and not their color from one frame to the next, as part of object and hands."""
     flips = total = 0
     pairs = list(pairwise(frames.tolist()))
-    for here, there in spread(pairs, PAIRS) if pairs else []:
+    for here, there in spread(pairs, FLICKER_PAIRS) if pairs else []:
         still = cv2.blur(cv2.absdiff(gray(capture, camera, here), gray(capture, camera, there)), (5, 5)) < SAME_GRAY
         flips += int((still & (labels[here] != labels[there])).sum())
         total += int((labels[here] > 0).sum())
@@ -286,6 +286,9 @@ def hands_inside(labels: np.ndarray) -> float:
         if around.any() and (labels[around] == OBJECT).mean() > 0.8:
             inside += int(boxes[piece, cv2.CC_STAT_AREA])
     return inside / max(int(hands.sum()), 1)
+
+
+Facts = Mapping[str, float]
 
 
 def mask_facts(capture: Capture, camera: str, labels: np.ndarray) -> dict[str, float]:
@@ -314,70 +317,57 @@ def _median(values: Sequence[float] | np.ndarray) -> float:
     return float(np.median(values)) if len(values) else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class Segmented:
-    """The `mask_facts` of one camera."""
-
-    where: str
-    facts: Mapping[str, float]
-    has_depth: bool
-
-
-def outside(seen: Segmented) -> dict[str, Any]:
+def outside(facts: Facts) -> dict[str, Any]:
     """Share of the times in which something moves at the object and lies in no mask."""
-    first = int(seen.facts.get("first_outside", 0))
-    return {"value": seen.facts["moves_outside"], "first": first, "frames": (first,)}
+    first = int(facts.get("first_outside", 0))
+    return {"value": facts["moves_outside"], "first": first, "frames": (first,)}
 
 
-def kept(seen: Segmented) -> dict[str, Any] | None:
+def kept(facts: Facts, has_depth: bool) -> dict[str, Any] | None:
     """Share of newly covered parts that the object's mask keeps, of color alone."""
-    first = int(seen.facts.get("first_newly_lost", 0))
-    return None if seen.has_depth else {"value": seen.facts.get("newly_kept", 1.0), "first": first, "frames": (first,)}
+    first = int(facts.get("first_newly_lost", 0))
+    return None if has_depth else {"value": facts.get("newly_kept", 1.0), "first": first, "frames": (first,)}
 
 
 INF = float("inf")
 # fmt: off
-CHECKS = (
-    Check("no object in frame 0", Shown, lambda shown: first_area(shown, OBJECT), (0.5, INF), "warning",
-          f"no pixel with label {OBJECT} in frame 0; shape and points begin there.", REMEDY),
-    Check("no hand in frame 0", Shown, lambda shown: first_area(shown, HANDS), (0.5, INF), "warning",
+checks = (
+    Check("no object in frame 0", "masks", lambda shown: first_area(shown, OBJECT), (0.5, INF), "warning",
+          f"no pixel with label {OBJECT} in frame 0; shape and points begin there.", MARK_REMEDY),
+    Check("no hand in frame 0", "masks", lambda shown: first_area(shown, HANDS), (0.5, INF), "warning",
           f"no pixel with label {HANDS} in frame 0; controllers begin in frame 0, with what some camera shows of the hands there.",
           "Begin the capture when a hand is in view, or mark it."),
-    Check("two objects", Shown, lambda shown: shown.objects, (0, 1), "warning",
+    Check("two objects", "masks", lambda shown: shown.objects, (0, 1), "warning",
           "the object's mask of frame 0 has {value} pieces far apart; one object is expected, whose pieces lie together; two "
-          "become "
-          "one twin.", REMEDY),
-    Check("small object", Shown, lambda shown: first_area(shown, OBJECT) or None, (SMALL_MASK, INF), "warning",
+          "become one twin.", MARK_REMEDY),
+    Check("small object", "masks", lambda shown: first_area(shown, OBJECT) or None, (SMALL_MASK, INF), "warning",
           "{value:.0f} pixels of object in frame 0; at least {low} are expected.", "Film from nearer by."),
-    Check("object missing", Shown, missing, None, "warning",
+    Check("object missing", "masks", missing, None, "warning",
           "almost nothing of the object in {count} frames, first in frame {first}; each frame should show it; its points are "
-          "invisible "
-          "there.", REMEDY),
-    Check("background in the mask", Shown, lambda shown: shown.bordered, (0, BORDERED), "warning",
+          "invisible there.", MARK_REMEDY),
+    Check("background in the mask", "masks", lambda shown: shown.bordered, (0, BORDERED), "warning",
           "{value:.0%} of the image's border is object; at most {high:.0%} is expected; the mask holds the table, a sleeve or a "
-          "person.", REMEDY),
-    Check("object at the border", Shown, at_border, None, "warning",
+          "person.", MARK_REMEDY),
+    Check("object at the border", "masks", at_border, None, "warning",
           "the object touches the image border in {count} frames, first in frame {first}; what is outside is neither seen nor "
           "carved.",
           "Is it the object? Then move the camera back, or keep other frames (make-capture --frames). If not, mark what it is."),
-    Check("mask flickers", Shown, lambda shown: shown.steps, (0, STEPS), "warning",
-          f"the object's area changes {STEP:g}-fold or more in {{value:.0%}} of the frames; at most {{high:.0%}} are "
-          f"expected.", REMEDY),
-    Check("mask jumps", Shown, jumps, None, "warning",
-          "the object's area changes {value:.1f}-fold from frame {before} to {first} (so in {count} frames); "
-          f"less than {JUMP:g}-fold is expected.", REMEDY),
-    Check("hands inside the object", Segmented, lambda seen: seen.facts["hands_inside"], (0, HANDS_INSIDE), "warning",
+    Check("mask flickers", "masks", lambda shown: shown.steps, (0, STEPS_SHARE), "warning",
+          f"the object's area changes {AREA_STEP:g}-fold or more in {{value:.0%}} of the frames; at most {{high:.0%}} are "
+          "expected.", MARK_REMEDY),
+    Check("mask jumps", "masks", jumps, None, "warning",
+          "the object's area changes {value:.1f}-fold from frame {before} to {first} (so in {count} frames); less than "
+          f"{AREA_JUMP:g}-fold is expected.", MARK_REMEDY),
+    Check("hands inside the object", "segmentation", lambda facts, _: facts["hands_inside"], (0, HANDS_INSIDE), "warning",
           "{value:.0%} of the hands' pixels lie inside of the object; at most {high:.0%} are expected; its own colors are taken "
-          "for "
-          "hands.", REMEDY),
-    Check("labels are noise", Segmented, lambda seen: seen.facts["flicker"], (0, FLICKER), "warning",
-          "{value:.0%} of the masks changes its label where the image does not change; at most {high:.0%} is expected.", REMEDY),
-    Check("motion outside of the masks", Segmented, outside, (0, OFTEN), "warning",
+          "for hands.", MARK_REMEDY),
+    Check("labels are noise", "segmentation", lambda facts, _: facts["flicker"], (0, FLICKER), "warning",
+          "{value:.0%} of the masks changes its label where the image does not change; at most {high:.0%} is expected.",
+          MARK_REMEDY),
+    Check("motion outside of the masks", "segmentation", lambda facts, _: outside(facts), (0, OFTEN), "warning",
           f"in {{value:.0%}} of the times that were looked at, first in frame {{first}}, more than {OUTSIDE:.0%} of what moves "
-          f"at the "
-          "object lies in no mask; less than {high:.0%} is expected.", UNMARKED),
-    Check("newly covered parts lost", Segmented, kept, (KEPT, INF), "warning",
-          "of what the object seems to cover newly since frame 0, its mask keeps {value:.0%}, too little first in frame "
-          "{first}; at "
-          "least {low:.0%} is expected.", UNMARKED),
+          "at the object lies in no mask; less than {high:.0%} is expected.", UNMARKED),
+    Check("newly covered parts lost", "segmentation", kept, (LEAST_NEWLY_KEPT, INF), "warning",
+          "of what the object seems to cover newly since frame 0, its mask keeps {value:.0%}, too little first in frame {first}; "
+          "at least {low:.0%} is expected.", UNMARKED),
 )

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from neuspring.checks.table import FAR_OFF
-from neuspring.checks.things import HIGH, LARGE, REACH, SCALE, SMALL, SUNK, WITHIN, longest
+from neuspring.checks.things import HAND_REACH, HIGHEST_OBJECT, LARGE, SCALE_REMEDY, SMALL, SUNK, WITHIN, longest
 from neuspring.core.checks import Check
 from neuspring.data.camera import FAR
 from neuspring.data.capture import CAPTURE
 
 UNITS = {"millimeters": 1000.0, "tenths of a millimeter": 10000.0, "centimeters": 100.0}
-"""What meters may be instead."""
+"""Units that may have been meant, and how many are in 1 m."""
 AWAY = 0.3
 """m. Hands that never come nearer to the nodes, and nodes that are farther from annotated points, are of another scene."""
 MOST_NODES = 5000
@@ -26,41 +24,21 @@ SAME = 1e-4
 """m: nodes nearer than this are one, and no spring is between them."""
 
 
-@dataclass(frozen=True, eq=False)
-class Cloud:
-    """Points [n, 3] of a file, m; of a body in frame 0 its size counts too. `up` is +1 or -1; None: no table."""
-
-    where: Path
-    points: np.ndarray
-    up: float | None
-    is_body: bool
-
-    @cached_property
-    def most(self) -> float:
-        """Largest coordinate."""
-        return float(np.abs(self.points).max())
-
-    @property
-    def side(self) -> float:
-        """Longest side."""
-        return float(np.ptp(self.points, axis=0).max())
+def far(points: np.ndarray) -> dict[str, Any]:
+    """The largest coordinate of points [n, 3] of a file, and the units in which it would be near."""
+    most = float(np.abs(points).max())
+    size = " x ".join(f"{side:.3g}" for side in np.ptp(points, axis=0))
+    fitting = [f"divide by {by:g} if they are {unit}" for unit, by in UNITS.items() if most / by < FAR]
+    return {"value": most, "size": size, "next": f"Likely: {', or '.join(fitting)}" if fitting else "Look at its unit"}
 
 
-def far(cloud: Cloud) -> dict[str, Any]:
-    """The largest coordinate, and the units in which it would be near."""
-    size = " x ".join(f"{side:.3g}" for side in np.ptp(cloud.points, axis=0))
-    fitting = [f"divide by {by:g} if they are {unit}" for unit, by in UNITS.items() if cloud.most / by < FAR]
-    return {"value": cloud.most, "size": size, "next": f"Likely: {', or '.join(fitting)}" if fitting else "Look at its unit"}
-
-
-def off_table(cloud: Cloud) -> dict[str, Any] | None:
-    """Heights of points that are not on or above the table, and what explains them."""
-    if cloud.up is None or cloud.most > FAR:
+def off_table(points: np.ndarray, up: float | None, is_body: bool) -> dict[str, Any] | None:
+    """Heights of points that are not on or above the table, and what explains them; `up` is +1 or -1, None without a table."""
+    if up is None or np.abs(points).max() > FAR:
         return None
-    points, up, is_body = cloud.points, cloud.up, cloud.is_body
     low, high = np.quantile(up * points[:, 2], WITHIN)
     # A body may hang in the air, and need not.
-    if low >= -SUNK and high <= HIGH and not (is_body and low > FAR_OFF):
+    if low >= -SUNK and high <= HIGHEST_OBJECT and not (is_body and low > FAR_OFF):
         return None
     sign = "+-" if up > 0 else "-+"
     told = {"value": float(low), "z": "z from {:.3g} to {:.3g} m".format(*np.quantile(points[:, 2], (0, 1)) + 0.0), "sign": sign[0]}
@@ -72,45 +50,32 @@ def off_table(cloud: Cloud) -> dict[str, Any] | None:
     if high <= SUNK:
         either = f"Is up {sign[1]}z? Then write so in {CAPTURE} (make-capture: --up). Without a table: ground: false (--no-table)"
         return told | {"next": f". {either}"}
-    if low > FAR_OFF and high <= HIGH:
+    if low > FAR_OFF and high <= HIGHEST_OBJECT:
         remedy = "If it stands on a table, the table must be z = 0; or is another axis up? If it hangs, this is right"
         return told | {"level": "warning", "next": f": {100 * low:.0f} cm above the table. {remedy}"}
     remedy = f"Move the world so that the table is z = 0, or write ground: false in {CAPTURE} (make-capture: --no-table)"
     return told | {"level": "error" if low < -FAR_OFF else "warning", "next": f". {remedy}"}
 
 
-@dataclass(frozen=True, eq=False)
-class Nodes:
-    """Nodes [N, 3], m, of a body in a file."""
-
-    where: Path
-    nodes: np.ndarray
+def too_long(points: np.ndarray, up: float | None, is_body: bool) -> dict[str, Any] | None:
+    """Longest side of a body, m, that is that of nothing that hands hold."""
+    return longest(float(np.ptp(points, axis=0).max())) if is_body and np.abs(points).max() <= FAR else None
 
 
-@dataclass(frozen=True, eq=False)
-class Marked:
-    """Annotated points of frame 0 [K, 3], m, NaN where unseen, of a file, and the nodes [N, 3] of the body that they are on."""
-
-    where: Path
-    points: np.ndarray
-    nodes: np.ndarray
-
-
-def far_from_nodes(marked: Marked) -> dict[str, Any] | None:
-    """Annotated points that are far from the body."""
-    known = np.flatnonzero(np.isfinite(marked.points).all(axis=1))
-    away = KDTree(marked.nodes).query(marked.points[known])[0] if len(known) else np.zeros(0)
-    if not (away > REACH).any():
+def far_from_nodes(points: np.ndarray, nodes: np.ndarray) -> dict[str, Any] | None:
+    """Annotated points of frame 0 [K, 3], m, NaN where unseen, that are far from the nodes [N, 3] of the body."""
+    known = np.flatnonzero(np.isfinite(points).all(axis=1))
+    away = KDTree(nodes).query(points[known])[0] if len(known) else np.zeros(0)
+    if not (away > HAND_REACH).any():
         return None
-    text = f"point {known[away.argmax()]} is {100 * away.max():.1f} cm away, {(away > REACH).sum()} of {len(away)} are farther"
-    return {"value": float(away.max()), "text": text, "level": "error" if np.median(away) > REACH else "warning"}
+    text = f"point {known[away.argmax()]} is {100 * away.max():.1f} cm away, {(away > HAND_REACH).sum()} of {len(away)} are farther"
+    return {"value": float(away.max()), "text": text, "level": "error" if np.median(away) > HAND_REACH else "warning"}
 
 
 @dataclass(frozen=True, eq=False)
 class Holding:
     """Hands of a file that hold a body."""
 
-    where: Path
     hand: np.ndarray
     """[C]: the hand of each controller."""
     held: np.ndarray
@@ -143,32 +108,30 @@ def doubled(hands: Holding) -> dict[str, Any] | None:
 
 
 # fmt: off
-CHECKS = (
-    Check("unit", Cloud, far, (0, FAR), "error",
+checks = (
+    Check("unit", "points", lambda points, *_: far(points), (0, FAR), "error",
           "coordinates must be meters, at most {high:g} from the origin; received {value:.4g}, in {size}. {next}", title="points"),
-    Check("implausible size", Cloud, lambda cloud: longest(cloud.side) if cloud.is_body and cloud.most <= FAR else None, None,
-          "warning",
-          f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE),
-    Check("off the table", Cloud, off_table, None, "error",
-          f"with up {{sign}}z points must lie between the table, z = 0, and {HIGH:g} m above it; received {{z}}{{next}}",
+    Check("implausible size", "points", too_long, None, "warning",
+          f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE_REMEDY),
+    Check("off the table", "points", off_table, None, "error",
+          f"with up {{sign}}z points must lie between the table, z = 0, and {HIGHEST_OBJECT:g} m above it; received {{z}}{{next}}",
           title="points"),
-    Check("many nodes", Nodes, lambda body: len(body.nodes), (0, MOST_NODES), "warning",
+    Check("many nodes", "nodes", len, (0, MOST_NODES), "warning",
           "some hundred nodes are enough, more than {high} are slow; received {value}. Each of them costs time in every substep",
           title="points"),
-    Check("points off the body", Marked, far_from_nodes, None, "error",
-          f"annotated points must lie on the body: within {100 * REACH:g} cm of a node in frame 0; received {{text}}. Are "
-          f"points and "
-          "nodes of one recording, in one world?", title=""),
-    Check("hand of one point", Holding, fewest_points, (2, np.inf), "warning",
-          "three points of a hand, or of a jaw, turn what it holds; received one of some hand. It holds like a string: is that so?",
-          title="points"),
-    Check("nothing holds", Holding, lambda hands: None if len(hands.held) or not len(hands.nodes) else {}, None, "error",
+    Check("points off the body", "points on nodes", far_from_nodes, None, "error",
+          f"annotated points must lie on the body: within {100 * HAND_REACH:g} cm of a node in frame 0; received {{text}}. Are "
+          "points and nodes of one recording, in one world?", title=""),
+    Check("hand of one point", "holding", fewest_points, (2, np.inf), "warning",
+          "three points of a hand, or of a jaw, turn what it holds; received one of some hand. It holds like a string: is that "
+          "so?", title="points"),
+    Check("nothing holds", "holding", lambda hands: None if len(hands.held) or not len(hands.nodes) else {}, None, "error",
           "some controller must hold in some training frame; received none. A twin learns from training frames: see train_end",
           title="holds"),
-    Check("hand far from the nodes", Holding, reach, (0, REACH), "error",
-          f"in some training frame a controller must come within {100 * REACH:g} cm of a node of frame 0 to move it; received "
-          "{cm:.1f} cm at the nearest. Are hands and nodes of one recording, in one world?", title="points"),
-    Check("controllers on nodes", Holding, doubled, None, "error",
+    Check("hand far from the nodes", "holding", reach, (0, HAND_REACH), "error",
+          f"in some training frame a controller must come within {100 * HAND_REACH:g} cm of a node of frame 0 to move it; "
+          "received {cm:.1f} cm at the nearest. Are hands and nodes of one recording, in one world?", title="points"),
+    Check("controllers on nodes", "holding", doubled, None, "error",
           f"controllers must lie {1e3 * SAME:g} mm from nodes and annotated points in frame 0: a spring needs a length; received "
           "controller {value}, {count} in all. Move them off the body, or leave out the nodes below them", title="points"),
 )

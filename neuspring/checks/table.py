@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,23 +19,23 @@ from neuspring.core.geometry import rigid_inverse
 from neuspring.data.camera import FAR, NEAR, ROLL, Camera, Plane
 from neuspring.data.capture import OBJECT
 
-SMALLEST = 0.08
+SMALLEST_PLANE = 0.08
 """Share of the pixels with depth from which a plane may be the table."""
-TILT, OFF = 2.0, 0.01
+TILT, TABLE_OFF = 2.0, 0.01
 """Degrees and m within which the table is level and at z = 0. Ground contact of the simulation is at z = 0."""
 TILTED, FAR_OFF = 15.0, 0.15
 """Degrees and m beyond which the table is elsewhere, and no twin can rest on it."""
 EXPLAINED = (4.0, 0.03)
 """Degrees and m within which the table lies after a change that explains a finding; m also as a part of the camera's height."""
-FACTORS = (0.1, 10.0, 0.001, 1000.0)
+WRONG_UNITS = (0.1, 10.0, 0.001, 1000.0)
 """Wrong units of depth make the scene so many times as large."""
-HIGHEST = 3.0
+HIGHEST_CAMERA = 3.0
 """m. Cameras higher above the table have too coarse a picture of what lies on it, or another unit of depth."""
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """From OpenCV's axes of a camera to OpenGL's, where y is up and z points backward."""
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """From a world with y up to one with z up."""
-STEEP = 20.0
+STRAIGHT_ABOVE = 20.0
 """Degrees from straight above, within which a camera has no upper side."""
 POSE = "Look at camera_to_world: the table must be z = 0 in meters, and the camera's z points forward."
 
@@ -84,7 +83,6 @@ def other_side(up: str) -> str:
 class TableSeen:
     """The planes that a camera with depth sees."""
 
-    where: Path
     name: str
     planes: Sequence[Plane]
     pose: np.ndarray
@@ -96,18 +94,18 @@ class TableSeen:
     @cached_property
     def candidates(self) -> list[Plane]:
         """Planes that are large enough."""
-        return [plane for plane in self.planes if plane.share >= SMALLEST]
+        return [plane for plane in self.planes if plane.share >= SMALLEST_PLANE]
 
     @cached_property
     def table(self) -> tuple[Plane, Stand]:
         """The plane that stands best, and how."""
         stands = [(plane, stand(plane, self.pose, up_sign(self.up))) for plane in self.candidates]
-        return min(stands, key=lambda one: one[1].tilt / TILT + abs(one[1].off) / OFF)
+        return min(stands, key=lambda one: one[1].tilt / TILT + abs(one[1].off) / TABLE_OFF)
 
     @cached_property
     def right(self) -> bool:
         """True where it is level and at z = 0."""
-        return bool(self.candidates) and self.table[1].tilt < TILT and abs(self.table[1].off) < OFF
+        return bool(self.candidates) and self.table[1].tilt < TILT and abs(self.table[1].off) < TABLE_OFF
 
     @cached_property
     def explained(self) -> dict[str, Any] | None:
@@ -122,7 +120,7 @@ class TableSeen:
             rule = f"must be the side of the table on which the cameras are: {other}"
             below = f"{self.up}, by which camera {self.name} is {abs(1e3 * sign * pose[2, 3]):.0f} mm below the table"
             return {"key": "up", "rule": rule, "received": below}
-        for factor in FACTORS:
+        for factor in WRONG_UNITS:
             if stand(plane, pose, sign, 1 / factor).near(pose[2, 3]):
                 rule, key = f"the table must be as far from camera {self.name} as its pose says", f"depth of camera {self.name}"
                 if self.unit is None:
@@ -161,7 +159,6 @@ def unexplained(seen: TableSeen) -> dict[str, Any] | None:
 class CameraAlone:
     """A camera without depth; the table is z = 0."""
 
-    where: Path
     camera: Camera
     up: str
     source: str = ""
@@ -195,7 +192,7 @@ class CameraAlone:
             return rule, f"{self.away:.3g} m" if np.isfinite(self.away) else "a view past it", False
         x, y, _ = sign * self.camera.camera_to_world[2, :3]
         roll = float(np.degrees(np.arctan2(abs(x), -y)))
-        if roll > ROLL and np.hypot(x, y) > np.sin(np.radians(STEEP)):
+        if roll > ROLL and np.hypot(x, y) > np.sin(np.radians(STRAIGHT_ABOVE)):
             return "up should point up in the image", f"a camera that is turned by {roll:.0f} degrees about its axis", True
         return None
 
@@ -231,46 +228,34 @@ def wrong_view(view: CameraAlone) -> dict[str, Any] | None:
     return told | {"level": "warning", "also": ". If the camera is mounted so, go on"} if possible else told | {"also": ""}
 
 
-@dataclass(frozen=True, eq=False)
-class Horizon:
-    """The object's mask [H, W] of frame 0 of a camera without depth."""
-
-    where: Path
-    camera: Camera
-    mask: np.ndarray
-
-
-def beyond_horizon(outline: Horizon) -> dict[str, Any] | None:
+def beyond_horizon(camera: Camera, mask: np.ndarray) -> dict[str, Any] | None:
     """Pixels of the object that look past the table."""
-    own = object_on_table(outline.camera, outline.mask)
+    own = object_on_table(camera, mask)
     beyond = int(np.isnan(own[:, 0]).sum())
     return {"value": beyond, "count": len(own)} if beyond else None
 
 
 # fmt: off
-CHECKS = (
-    Check("no table seen", TableSeen, lambda seen: None if seen.candidates else {}, None, "note",
-          "camera {subject.name} sees no plane in depth: z = 0 and up are not checked against the table", title=""),
-    Check("table", TableSeen, lambda seen: seen.table[1].off if seen.right else None, None, "note",
-          "camera {subject.name}: the table is {subject.text}", title=""),
-    Check("high camera", TableSeen, lambda seen: seen.table[0].height if seen.right else None, (0, HIGHEST), "warning",
-          "cameras.{subject.name}.camera_to_world: a camera should be at most {high:g} m above the table; received {value:.2f} m. "
+checks = (
+    Check("no table seen", "table", lambda seen: None if seen.candidates else {}, None, "note",
+          "camera {0.name} sees no plane in depth: z = 0 and up are not checked against the table", title=""),
+    Check("table", "table", lambda seen: seen.table[1].off if seen.right else None, None, "note",
+          "camera {0.name}: the table is {0.text}", title=""),
+    Check("high camera", "table", lambda seen: seen.table[0].height if seen.right else None, (0, HIGHEST_CAMERA), "warning",
+          "cameras.{0.name}.camera_to_world: a camera should be at most {high:g} m above the table; received {value:.2f} m. "
           "Check depth_unit: ten times too large makes all of the scene so", title=""),
-    Check("table explained", TableSeen, lambda seen: seen.explained, None, "error", "{rule}; received {received}", title="{key}"),
-    Check("table elsewhere", TableSeen, unexplained, None, "warning",
-          "the table that the camera sees {must} be z = 0; received {subject.text}. {next}",
-          title="cameras.{subject.name}.camera_to_world"),
-    Check("view of the table", CameraAlone, wrong_view, None, "error",
-          "{subject.key}: {rule}; received {received}{also}", title=""),
-    Check("distance of the table", CameraAlone, lambda view: None if view.wrong else view.away, None, "note",
-          "camera {subject.camera.name}: color alone: the table is z = 0 as given, {value:.2f} m away in the center of the image, "
-          "{subject.height:.2f} m below the camera", title=""),
-    Check("high camera", CameraAlone, lambda view: None if view.wrong else view.height, (0, HIGHEST), "warning",
-          "{subject.key}: a camera should be at most {high:g} m above the table; received {value:.2f} m. Is camera_to_world in "
-          "meters?",
+    Check("table explained", "table", lambda seen: seen.explained, None, "error", "{rule}; received {received}", title="{key}"),
+    Check("table elsewhere", "table", unexplained, None, "warning",
+          "the table that the camera sees {must} be z = 0; received {0.text}. {next}", title="cameras.{0.name}.camera_to_world"),
+    Check("view of the table", "camera alone", wrong_view, None, "error", "{0.key}: {rule}; received {received}{also}", title=""),
+    Check("distance of the table", "camera alone", lambda view: None if view.wrong else view.away, None, "note",
+          "camera {0.camera.name}: color alone: the table is z = 0 as given, {value:.2f} m away in the center of the image, "
+          "{0.height:.2f} m below the camera", title=""),
+    Check("high camera", "camera alone", lambda view: None if view.wrong else view.height, (0, HIGHEST_CAMERA), "warning",
+          "{0.key}: a camera should be at most {high:g} m above the table; received {value:.2f} m. Is camera_to_world in meters?",
           title=""),
-    Check("beyond the horizon", Horizon, beyond_horizon, None, "error",
-          "camera {subject.camera.name}: every pixel of the object in frame 0 must look at the table z = 0; received {value} of "
-          "{count} "
-          "pixels at or above its horizon. " + POSE + " Or correct the mask", title=""),
+    Check("beyond the horizon", "horizon", beyond_horizon, None, "error",
+          "camera {0.name}: every pixel of the object in frame 0 must look at the table z = 0; received {value} of {count} pixels "
+          "at or above its horizon. " + POSE + " Or correct the mask",
+          title=""),
 )

@@ -6,7 +6,6 @@ import difflib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -27,11 +26,11 @@ SAMPLED = 5
 """Frames per camera, evenly spaced, that are compared with the world, or in which the table is looked for."""
 SMALL, LARGE = 0.02, 1.2
 """m. Objects whose longest side is another are a wrong mask or a wrong unit of depth."""
-SUNK, HIGH = 0.02, 1.2
-"""m. An object lower than SUNK below the table, or higher than HIGH above it, stands in another world than the table."""
+SUNK, HIGHEST_OBJECT = 0.02, 1.2
+"""m. An object lower than SUNK below the table, or higher than HIGHEST_OBJECT above it, stands in another world than the table."""
 WITHIN = (0.05, 0.95)
 """Quantiles between which a body lies: beyond them are pixels of its outline with the depth of something else."""
-HOLES, BAD_HOLES = 0.4, 0.8
+USUAL_HOLES, BAD_HOLES = 0.4, 0.8
 """Share of the object's pixels without depth from which twins suffer, and from which little is left to lift. Outlines have none: a
 tenth of a cloth or a toy in the synthetic scenes, and a third of a rope."""
 HAND_AREA, HAND_RATIO = 0.12, 12.0
@@ -39,14 +38,14 @@ HAND_AREA, HAND_RATIO = 0.12, 12.0
 the image are another thing."""
 HAND_LEAST = 0.002
 """m². Real hands with a part of the forearm have 0.015 to 0.05 in color alone; fewer are a wrong scale of the pose."""
-REACH = 0.06
+HAND_REACH = 0.06
 """m. A hand that never comes nearer to the object does not hold it. Where they touch, depth may be hidden."""
-POINTS = 1500
+COMPARED_POINTS = 1500
 """Points of each thing that are compared."""
-FEW = 20
+FEWEST_POINTS = 20
 """Points below which nothing is said of a thing in a frame."""
 TABLE = "Look at the mask of frame 0 and at depth_unit; make-capture --level puts the table at z = 0."
-SCALE = (
+SCALE_REMEDY = (
     "Look at the mask of frame 0, and at the units of depth and poses: meters, with the table at z = 0. Poses of COLMAP have no "
     "scale: multiply their positions by a true length over the measured one."
 )
@@ -70,102 +69,78 @@ def sampled(frames: int) -> set[int]:
 
 
 def lifted(camera: Camera, sample: Sample, label: int) -> np.ndarray:
-    """World points [n, 3], m, of the pixels with a label and depth; at most POINTS."""
+    """World points [n, 3], m, of the pixels with a label and depth; at most COMPARED_POINTS."""
     y, x = np.nonzero((sample.mask == label) & (sample.depth > 0))
-    step = -(-len(x) // POINTS) or 1
+    step = -(-len(x) // COMPARED_POINTS) or 1
     y, x = y[::step], x[::step]
     return camera.lift(np.stack([x, y], axis=-1).astype(float), sample.depth[y, x])
 
 
-@dataclass(frozen=True, eq=False)
-class Masked:
-    """Object and hands in a few frames of a camera, by number."""
-
-    camera: Camera
-    samples: Mapping[int, Sample]
-    least: float = 0.0
-    """m² that hands have at least."""
-
-    @property
-    def where(self) -> str:
-        """The camera."""
-        return f"camera {self.camera.name}"
-
-    @cached_property
-    def hands(self) -> tuple[float, float] | None:
-        """Area of the hands, m², and as a multiple of the object's pixels, medians; None without any."""
-        areas, ratios = [], []
-        for sample in self.samples.values():
-            own = sample.mask == HANDS
-            measured = own & (sample.depth > 0)
-            if measured.sum() < FEW or not (sample.mask == OBJECT).any():
-                continue
-            depth = np.where(sample.depth > 0, sample.depth, np.median(sample.depth[measured]))
-            areas.append(float((depth[own] ** 2).sum() / np.prod(np.diag(self.camera.intrinsics)[:2])))
-            ratios.append(float(own.sum() / (sample.mask == OBJECT).sum()))
-        return (float(np.median(areas)), float(np.median(ratios))) if areas else None
+Samples = Mapping[int, Sample]
+"""Object and hands in a few frames of a camera, by number."""
 
 
-class Held(Masked):
-    """Object and hands of a finished capture, in which a hand must reach the object."""
+def hands_of(camera: Camera, samples: Samples) -> tuple[float, float] | None:
+    """Area of the hands, m², and as a multiple of the object's pixels, medians; None without any."""
+    areas, ratios = [], []
+    for sample in samples.values():
+        own = sample.mask == HANDS
+        measured = own & (sample.depth > 0)
+        if measured.sum() < FEWEST_POINTS or not (sample.mask == OBJECT).any():
+            continue
+        depth = np.where(sample.depth > 0, sample.depth, np.median(sample.depth[measured]))
+        areas.append(float((depth[own] ** 2).sum() / np.prod(np.diag(camera.intrinsics)[:2])))
+        ratios.append(float(own.sum() / (sample.mask == OBJECT).sum()))
+    return (float(np.median(areas)), float(np.median(ratios))) if areas else None
 
 
-def holes(seen: Masked) -> dict[str, Any] | None:
+def holes(camera: Camera, samples: Samples, least: float) -> dict[str, Any] | None:
     """Share of the object's pixels without depth."""
-    missing = {
-        frame: float((s.depth[s.mask == OBJECT] <= 0).mean()) for frame, s in seen.samples.items() if (s.mask == OBJECT).any()
-    }
+    missing = {frame: float((s.depth[s.mask == OBJECT] <= 0).mean()) for frame, s in samples.items() if (s.mask == OBJECT).any()}
     if not missing:
         return None
     worst, mean = max(missing, key=lambda frame: missing[frame]), float(np.mean(list(missing.values())))
-    bad = mean > HOLES or missing[worst] > BAD_HOLES
-    rule = f"at most {HOLES:.0%} are expected, and never {BAD_HOLES:.0%}" if bad else f"up to {HOLES:.0%} are usual"
+    bad = mean > USUAL_HOLES or missing[worst] > BAD_HOLES
+    rule = f"at most {USUAL_HOLES:.0%} are expected, and never {BAD_HOLES:.0%}" if bad else f"up to {USUAL_HOLES:.0%} are usual"
     next_move = "Film from farther than the sensor's least distance, without shine and direct sun; look whether depth is aligned."
     told = {"value": mean, "frames": (worst,), "frame": worst, "worst": missing[worst], "rule": rule}
     return told | ({"next": next_move} if bad else {"level": "note", "next": ""})
 
 
-def large_hands(seen: Masked) -> dict[str, Any] | None:
-    """Area of hands that is none of hands, m²."""
-    area, ratio = seen.hands or (0.0, 0.0)
-    return (
-        {"value": area, "cm": 1e4 * area, "ratio": ratio}
-        if area >= seen.least and (area > HAND_AREA or ratio > HAND_RATIO)
-        else None
-    )
+def large_hands(camera: Camera, samples: Samples, least: float) -> dict[str, Any] | None:
+    """Area of hands that is none of hands, m²; hands have `least` m² or more."""
+    area, ratio = hands_of(camera, samples) or (0.0, 0.0)
+    wrong = area >= least and (area > HAND_AREA or ratio > HAND_RATIO)
+    return {"value": area, "cm": 1e4 * area, "ratio": ratio} if wrong else None
 
 
-def small_hands(seen: Masked) -> dict[str, Any] | None:
+def small_hands(camera: Camera, samples: Samples, least: float) -> dict[str, Any] | None:
     """Area of hands that are smaller than hands, m²."""
-    return {"value": seen.hands[0], "cm": 1e4 * seen.hands[0]} if seen.hands and seen.hands[0] < seen.least else None
+    area, _ = hands_of(camera, samples) or (np.inf, 0.0)
+    return {"value": area, "cm": 1e4 * area} if area < least else None
 
 
-def gap(seen: Held) -> dict[str, Any] | None:
+def gap(camera: Camera, samples: Samples) -> dict[str, Any] | None:
     """Least distance of hands from the object, m, over the frames in which both are in view."""
     gaps = []
-    for sample in seen.samples.values():
-        body, hands = (lifted(seen.camera, sample, label) for label in (OBJECT, HANDS))
-        if min(len(body), len(hands)) >= FEW:
+    for sample in samples.values():
+        body, hands = (lifted(camera, sample, label) for label in (OBJECT, HANDS))
+        if min(len(body), len(hands)) >= FEWEST_POINTS:
             gaps.append(float(KDTree(body).query(hands)[0].min()))
     return {"value": min(gaps), "cm": 100 * min(gaps), "count": len(gaps)} if gaps else None
 
 
-@dataclass(frozen=True, eq=False)
-class ObjectPoints:
-    """Points of the object in some frames, [n, 3] each, m, in the world; `up` is +1 or -1."""
+Place = tuple[np.ndarray, float, float]
+"""Sides [3] of the object, and its lowest and highest height above the table, m."""
 
-    where: str
-    bodies: Sequence[np.ndarray]
-    up: float
 
-    @cached_property
-    def place(self) -> tuple[np.ndarray, float, float] | None:
-        """Sides [3], and its lowest and highest height above the table, m."""
-        whole = [points * (1, 1, self.up) for points in self.bodies if len(points) >= FEW]
-        ranges = np.array([np.quantile(points, WITHIN, axis=0) for points in whole])
-        if not len(ranges):
-            return None
-        return np.median(np.ptp(ranges, axis=1), axis=0), float(ranges[:, 0, 2].min()), float(ranges[:, 1, 2].max())
+def place_of(bodies: Sequence[np.ndarray], up: float) -> Place | None:
+    """Place of the object by its points in some frames, [n, 3] each, m, in the world; `up` is +1 or -1. None of too few points."""
+    whole = [points * (1, 1, up) for points in bodies if len(points) >= FEWEST_POINTS]
+    ranges = np.array([np.quantile(points, WITHIN, axis=0) for points in whole])
+    if not len(ranges):
+        return None
+    return np.median(np.ptp(ranges, axis=1), axis=0), float(ranges[:, 0, 2].min()), float(ranges[:, 1, 2].max())
 
 
 def in_cm(sides: Iterable[float]) -> str:
@@ -173,13 +148,23 @@ def in_cm(sides: Iterable[float]) -> str:
     return " x ".join(f"{100 * side:.0f}" for side in sides)
 
 
-def size(body: ObjectPoints) -> dict[str, Any] | None:
+def size(place: Place | None) -> dict[str, Any] | None:
     """Sides of the object and its heights above the table."""
-    if body.place is None:
+    if place is None:
         return None
-    sides, low, high = body.place
+    sides, low, high = place
     text = in_cm(sides)
     return {"value": text, "text": f"{text} cm, from {100 * low:.1f} to {100 * high:.1f} cm above the table"}
+
+
+def outline(camera: Camera, mask: np.ndarray) -> list[float]:
+    """Sides of the smallest rectangle around where the object of a mask [H, W] meets the table z = 0, m; none where little does.
+
+    Parts that rise seem larger.
+    """
+    own = object_on_table(camera, mask)
+    own = own[np.isfinite(own[:, 0])]
+    return [] if len(own) < FEWEST_POINTS else sorted(cv2.minAreaRect(own[:, :2].astype(np.float32))[1], reverse=True)
 
 
 def longest(side: float) -> dict[str, Any] | None:
@@ -187,48 +172,18 @@ def longest(side: float) -> dict[str, Any] | None:
     return None if SMALL < side < LARGE else {"value": side, "cm": 100 * side}
 
 
-@dataclass(frozen=True, eq=False)
-class Outline:
-    """The object's mask [H, W] of frame 0 of a camera without depth, on the table z = 0."""
-
-    camera: Camera
-    mask: np.ndarray
-    category: str = ""
-
-    @property
-    def where(self) -> str:
-        """The object in this camera."""
-        return f"camera {self.camera.name}, object"
-
-    @cached_property
-    def sides(self) -> list[float]:
-        """Sides of the smallest rectangle around where it meets the table, m; none where little does. What rises seems larger."""
-        own = object_on_table(self.camera, self.mask)
-        own = own[np.isfinite(own[:, 0])]
-        return [] if len(own) < FEW else sorted(cv2.minAreaRect(own[:, :2].astype(np.float32))[1], reverse=True)
-
-
 SLENDER = 6.0
 """Area of an outline over the square of its greatest width. Ropes of real films that lie have 8.9 and more; toys, cloths, rods and
 boxes, real and rendered from all sides, up to 4.1."""
 
 
-@dataclass(frozen=True, eq=False)
-class Silhouette:
-    """The object's mask [H, W] of frame 0 of a camera without depth, and its category."""
-
-    where: str
-    mask: np.ndarray
-    category: str
-
-
-def slenderness(seen: Silhouette) -> dict[str, Any] | None:
+def slenderness(mask: np.ndarray, category: str) -> dict[str, Any] | None:
     """Area of an outline over the square of its greatest width, where that is not its category's."""
-    own = np.pad(seen.mask == OBJECT, 1).astype(np.uint8)
-    if own.sum() < FEW:
+    own = np.pad(mask == OBJECT, 1).astype(np.uint8)
+    if own.sum() < FEWEST_POINTS:
         return None
     slender = float(own.sum() / (2 * cv2.distanceTransform(own, cv2.DIST_L2, 5).max()) ** 2)
-    if (slender > SLENDER) == (seen.category == "rope"):
+    if (slender > SLENDER) == (category == "rope"):
         return None
     shape, other = ("a long thin thing", "rope") if slender > SLENDER else ("a compact thing", "cloth, or another word for a body,")
     return {"value": slender, "shape": shape, "other": other}
@@ -236,78 +191,54 @@ def slenderness(seen: Silhouette) -> dict[str, Any] | None:
 
 SHEET_HIGH, SHEET_SIDE = 0.015, 0.08
 """m: a sheet that lies on the table is lower, but for a tenth of it, and each of its sides is longer."""
-COVERED = 0.6
+SHEET_COVERED = 0.6
 """Part of its outline that a sheet covers; a rope in turns covers less."""
 
 
-@dataclass(frozen=True, eq=False)
-class Sheet:
-    """Points [n, 3], m, of the object in frame 0, and its category; "" where it is known to be filled."""
-
-    where: str
-    points: np.ndarray
-    up: float
-    category: str = ""
-
-
-def flat(sheet: Sheet) -> dict[str, Any] | None:
-    """Sides and height of what is a sheet on the table, though its category is not thin."""
-    points, level = sheet.points, sheet.points[:, :2].astype(np.float32)
-    if sheet.category in THIN or len(points) < FEW or (high := float(np.quantile(sheet.up * points[:, 2], 0.9))) > SHEET_HIGH:
+def flat(points: np.ndarray, up: float, category: str = "") -> dict[str, Any] | None:
+    """Sides and height of a sheet on the table, by points [n, 3], m; none of a thin category. "" is a filled body."""
+    if category in THIN or len(points) < FEWEST_POINTS or (high := float(np.quantile(up * points[:, 2], 0.9))) > SHEET_HIGH:
         return None
+    level = points[:, :2].astype(np.float32)
     sides, outline = sorted(cv2.minAreaRect(level)[1], reverse=True), cv2.contourArea(cv2.convexHull(level))
     # Cells of which a sheet has 2.25 points each: one in ten is empty.
     cell = 1.5 * float(np.sqrt(outline / len(points)))
-    if sides[1] < SHEET_SIDE or len(np.unique(level // cell, axis=0)) * cell**2 < COVERED * outline:
+    if sides[1] < SHEET_SIDE or len(np.unique(level // cell, axis=0)) * cell**2 < SHEET_COVERED * outline:
         return None
-    rule = f"the category {sheet.category!r} makes a filled body of it" if sheet.category else "a filled hull was made of it"
+    rule = f"the category {category!r} makes a filled body of it" if category else "a filled hull was made of it"
     return {"value": high, "text": f"{100 * sides[0]:.0f} x {100 * sides[1]:.0f} cm, {1e3 * high:.0f} mm high", "rule": rule}
 
 
 RAISED, AIR = 0.025, (0.05, 0.3)
 """m that a support is high; and the height above the table, m and as part of its own height, from which an object that is seen from
 the side is not on it. The lowest visible points of a ball on the table are a tenth of its height above it."""
-SIDE = 50.0
+SIDE_VIEW = 50.0
 """Degrees: a camera that looks down more steeply does not see where an object ends below."""
 LEVEL, BY = 0.01, 0.1
 """m: how even a support is, and how far from the object it is looked for."""
-RIM = 9
+OBJECT_RIM = 9
 """Pixels beside a mask may still be of its object."""
 
 
-@dataclass(frozen=True, eq=False)
-class Support:
-    """The object of frame 0 and what may be under it."""
-
-    camera: Camera
-    sample: Sample
-    up: float
-    obstacles: Sequence[Obstacle]
-
-    @property
-    def where(self) -> str:
-        """The object in this camera."""
-        return f"camera {self.camera.name}, object"
-
-
-def height_in_air(support: Support) -> dict[str, Any] | None:
+def height_in_air(camera: Camera, sample: Sample, up: float, obstacles: Sequence[Obstacle]) -> dict[str, Any] | None:
     """Height of the object of frame 0 above the table, m, where no obstacle is under it: the twin would fall.
 
     Where a level surface is seen around its foot, the words have the box that stands for it.
     """
-    camera, sample, up = support.camera, support.sample, support.up
     own = lifted(camera, sample, OBJECT) * (1, 1, up)
-    if len(own) < FEW:
+    if len(own) < FEWEST_POINTS:
         return None
     low, high = np.quantile(own[:, 2], WITHIN)
     foot, away = own[own[:, 2] < low + LEVEL], max(AIR[0], AIR[1] * (high - low))
-    if low < RAISED or any((one.depth((foot - (0, 0, away)) * (1, 1, up)) > 0).any() for one in support.obstacles):
+    if low < RAISED or any((one.depth((foot - (0, 0, away)) * (1, 1, up)) > 0).any() for one in obstacles):
         return None
-    y, x = np.nonzero((cv2.dilate((sample.mask > 0).astype(np.uint8), np.ones((RIM, RIM), np.uint8)) == 0) & (sample.depth > 0))
+    y, x = np.nonzero(
+        (cv2.dilate((sample.mask > 0).astype(np.uint8), np.ones((OBJECT_RIM, OBJECT_RIM), np.uint8)) == 0) & (sample.depth > 0)
+    )
     seen = camera.lift(np.stack([x, y], axis=1).astype(float), sample.depth[y, x]) * (1, 1, up)
     near = ((seen[:, :2] > foot[:, :2].min(axis=0) - BY) & (seen[:, :2] < foot[:, :2].max(axis=0) + BY)).all(axis=1)
     top = seen[near & (seen[:, 2] > max(RAISED, low - away)) & (seen[:, 2] < low + LEVEL)]
-    level = float(np.median(top[:, 2])) if len(top) > 2 * FEW else 0.0
+    level = float(np.median(top[:, 2])) if len(top) > 2 * FEWEST_POINTS else 0.0
     if level and np.mean(np.abs(top[:, 2] - level) < LEVEL) > 0.8:
         (x0, y0), sides, angle = cv2.minAreaRect(np.concatenate([top, foot])[:, :2].astype(np.float32))
         turn = Rotation.from_euler("z", angle, degrees=True).as_matrix()
@@ -315,8 +246,8 @@ def height_in_air(support: Support) -> dict[str, Any] | None:
         box = json.dumps({"shape": "box", "center": center, "half_sizes": half, "rotation": (turn.round(4) + 0.0).tolist()})
         next_move = f'Add to capture.json, as measured here: "obstacles": [{box}]. Or mark it as the object too, if both move.'
         return {"value": low, "cm": 100 * low, "on": f"on something {100 * level:.1f} cm high", "next": next_move}
-    hands, steep = lifted(camera, sample, HANDS), -up * camera.camera_to_world[2, 2] > np.sin(np.radians(SIDE))
-    if low < away or steep or (len(hands) and KDTree(own).query(hands * (1, 1, up))[0].min() < REACH):
+    hands, steep = lifted(camera, sample, HANDS), -up * camera.camera_to_world[2, 2] > np.sin(np.radians(SIDE_VIEW))
+    if low < away or steep or (len(hands) and KDTree(own).query(hands * (1, 1, up))[0].min() < HAND_REACH):
         return None
     next_move = "Measure what it stands on, and add it to obstacles of capture.json; or mark it as the object too."
     return {"value": low, "cm": 100 * low, "on": "and no hand is near", "next": next_move}
@@ -326,166 +257,109 @@ INSIDE, INSIDE_SHARE = 0.01, 0.05
 """m, and share of the object's points: deeper in an obstacle than depth cameras err, they are inside."""
 
 
-@dataclass(frozen=True, eq=False)
-class Among:
-    """Points [n, 3], m, of the object in frame 0 among obstacles."""
-
-    where: Path
-    obstacles: Sequence[Obstacle]
-    points: np.ndarray
-
-
-def inside(among: Among) -> list[dict[str, Any]]:
-    """Share of the object that is inside each obstacle: nodes there would be thrown out."""
-    shares = [float((one.depth(among.points) > INSIDE).mean()) if len(among.points) else 0.0 for one in among.obstacles]
+def inside(obstacles: Sequence[Obstacle], points: np.ndarray) -> list[dict[str, Any]]:
+    """Share of the object's points [n, 3], m, of frame 0 that is inside each obstacle: nodes there would be thrown out."""
+    shares = [float((one.depth(points) > INSIDE).mean()) if len(points) else 0.0 for one in obstacles]
     return [{"value": share, "number": number} for number, share in enumerate(shares)]
 
 
-@dataclass(frozen=True)
-class FrameRate:
-    """Frames per second of a capture."""
-
-    where: Path
-    rate: float
-
-
-@dataclass(frozen=True)
-class Depths:
-    """Median depth, m, of a camera's frames; NaN where nothing was measured."""
-
-    where: Path
-    camera: str
-    unit: float
-    """m per count."""
-    medians: Sequence[float]
-
-    @cached_property
-    def typical(self) -> float | None:
-        """The median of all, m; None where nothing was measured at all."""
-        measured = [median for median in self.medians if np.isfinite(median)]
-        return float(np.median(measured)) if measured else None
-
-    @property
-    def fine(self) -> bool:
-        """True where the table can be looked for."""
-        return self.typical is not None and NEAR < self.typical < FAR
-
-
-BODIES = ("sloth", "plush", "toy", "ball", "cable", "rod")
+BODY_WORDS = ("sloth", "plush", "toy", "ball", "cable", "rod")
 """Words for bodies that are near to those that mean another thing."""
 
 
-@dataclass(frozen=True)
-class Category:
-    """The kind of object, as capture.json says it."""
-
-    where: Path
-    category: str
-
-
-def meant(said: Category) -> dict[str, Any] | None:
+def meant(category: str) -> dict[str, Any] | None:
     """The word that means something, where another one is nearly it."""
-    close = difflib.get_close_matches(said.category.casefold(), (*THIN, "rope", *BODIES), n=1, cutoff=0.75)
-    return None if not close or said.category == close[0] or close[0] in BODIES else {"value": close[0]}
+    close = difflib.get_close_matches(category.casefold(), (*THIN, "rope", *BODY_WORDS), n=1, cutoff=0.75)
+    return None if not close or category == close[0] or close[0] in BODY_WORDS else {"value": close[0]}
 
 
-BESIDE = 0.04
+HANDS_BESIDE = 0.04
 """Distance between two pieces of the hands' mask, as a part of the image, within which they are one hand."""
 STEADY = 5
 """Frames over whose median hands are counted."""
-SHORTEST = 1.0
+SHORTEST_GRIP = 1.0
 """s. Shorter times with one constant grip are not proposed."""
 
 
 def hands_on(camera: Camera, sample: Sample) -> int:
-    """The number of hands within REACH of the object in a frame."""
+    """The number of hands within HAND_REACH of the object in a frame."""
     body, own = lifted(camera, sample, OBJECT), sample.mask == HANDS
-    reach = max(int(0.5 * BESIDE * camera.width), 1)
+    reach = max(int(0.5 * HANDS_BESIDE * camera.width), 1)
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2)
     count, pieces = cv2.connectedComponents(cv2.dilate(own.astype(np.uint8), disk))
     each = [lifted(camera, Sample(sample.depth, np.where(own & (pieces == k), HANDS, 0)), HANDS) for k in range(1, count)]
-    return sum((KDTree(body).query(hand)[0] <= REACH).sum() >= FEW for hand in each) if len(body) >= FEW else 0
+    return (
+        sum((KDTree(body).query(hand)[0] <= HAND_REACH).sum() >= FEWEST_POINTS for hand in each)
+        if len(body) >= FEWEST_POINTS
+        else 0
+    )
 
 
-@dataclass(frozen=True, eq=False)
-class GripCounts:
-    """Hands at the object in each frame [T], counted by all cameras of a capture."""
-
-    where: Path
-    counts: np.ndarray
-    rate: float
-
-
-def constant_grips(grips: GripCounts) -> dict[str, Any] | None:
-    """The times with a constant number of hands at the object, and the longest of them."""
-    steady = median_filter(grips.counts, STEADY, mode="nearest")
+def constant_grips(counts: np.ndarray, rate: float, folder: Path) -> dict[str, Any] | None:
+    """The times with a constant number of hands at the object [T], counted by all cameras of a capture, and the longest of them."""
+    steady = median_filter(counts, STEADY, mode="nearest")
     edges = [0, *(np.flatnonzero(np.diff(steady)) + 1).tolist(), len(steady)]
     spans = [(first, end - 1, int(steady[first])) for first, end in pairwise(edges)]
     if len(spans) < 2:
         return None
-    held = [span for span in spans if span[2] and span[1] - span[0] + 1 >= SHORTEST * grips.rate]
+    held = [span for span in spans if span[2] and span[1] - span[0] + 1 >= SHORTEST_GRIP * rate]
     ranked = sorted(held, key=lambda span: span[0] - span[1])[:3]
     commands = " or ".join(f"--frames {first}-{last}" for first, last, _ in ranked)
-    cut = f": neuspring cut-capture {grips.where.parent} {commands} --output ..." if ranked else f"; none lasts {SHORTEST:g} s"
+    cut = f": neuspring cut-capture {folder} {commands} --output ..." if ranked else f"; none lasts {SHORTEST_GRIP:g} s"
     return {"text": ", ".join(f"{first}-{last}: {count}" for first, last, count in spans), "cut": cut}
 
 
 # fmt: off
-CHECKS = (
-    Check("depth holes", Masked, holes, None, "warning",
+checks = (
+    Check("depth holes", "object and hands", holes, None, "warning",
           "{value:.0%} of the object's pixels have no depth (frame {frame}: {worst:.0%}); {rule}.", "{next}"),
-    Check("hands too small", Masked, small_hands, None, "warning",
-          f"hands (label {HANDS}) of {{cm:.2g}} cm²; at least {1e4 * HAND_LEAST:g} cm² are expected.", SCALE),
-    Check("hands too large", Masked, large_hands, None, "warning",
+    Check("hands too small", "object and hands", small_hands, None, "warning",
+          f"hands (label {HANDS}) of {{cm:.2g}} cm²; at least {1e4 * HAND_LEAST:g} cm² are expected.", SCALE_REMEDY),
+    Check("hands too large", "object and hands", large_hands, None, "warning",
           f"hands (label {HANDS}) of {{cm:.0f}} cm², {{ratio:.1f}} times the object's pixels; less than {1e4 * HAND_AREA:g} cm² "
-          f"and "
-          f"{HAND_RATIO:g} times are expected.", "Sleeves, torso or table are no hands: mark them to be ignored (`neuspring "
-          "mask`)."),
-    Check("hand far from the object", Held, gap, (0, REACH), "warning",
-          f"the hand is never nearer to the object than {{cm:.1f}} cm, in {{count}} frames; within {100 * REACH:g} cm it can "
-          f"move it.",
-          "Look at the masks for a hand that is something else, or for the wrong object."),
-    Check("size of the object", ObjectPoints, size, None, "note",
-          "{text}; as its pixels with depth show it.", "Is that what was filmed?"),
-    Check("implausible size", ObjectPoints, lambda body: body.place and longest(float(body.place[0].max())), None, "warning",
-          f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE),
-    Check("object below the table", ObjectPoints, lambda body: body.place and {"value": body.place[1], "cm": -100 * body.place[1]},
-          (-SUNK, np.inf), "warning", f"it reaches {{cm:.1f}} cm below the table; at most {100 * SUNK:g} cm are noise.", TABLE),
-    Check("object high above the table", ObjectPoints, lambda body: body.place and {"value": body.place[2]},
-          (-np.inf, HIGH), "warning",
-          "it is up to {value:.2f} m above it; at most {high:g} m is expected; walls and people in the mask are no object.", TABLE),
-    Check("size of the object", Outline, lambda seen: seen.sides and {"text": in_cm(seen.sides)}, None,
-          "note", "color alone: table z = 0 as given, object size on the table {text} cm; by its mask of frame 0.",
+          f"and {HAND_RATIO:g} times are expected.",
+          "Sleeves, torso or table are no hands: mark them to be ignored (`neuspring mask`)."),
+    Check("hand far from the object", "hands", gap, (0, HAND_REACH), "warning",
+          f"the hand is never nearer to the object than {{cm:.1f}} cm, in {{count}} frames; within {100 * HAND_REACH:g} cm it "
+          "can move it.", "Look at the masks for a hand that is something else, or for the wrong object."),
+    Check("size of the object", "object", size, None, "note", "{text}; as its pixels with depth show it.",
           "Is that what was filmed?"),
-    Check("implausible size", Outline, lambda seen: seen.sides and longest(seen.sides[0]), None, "warning",
-          f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE),
-    Check("outline and category", Silhouette, slenderness, None, "warning",
-          "the category is {subject.category!r}, and the outline is that of {shape}: {value:.1f} squares of its greatest width; "
-          f"a rope has more than {SLENDER:g}, all else less.", "Is {other} meant? Or look at the mask of frame 0."),
-    Check("shape and category", Sheet, flat, None, "warning", "a flat thing of {text}; {rule}.",
+    Check("implausible size", "object", lambda place: place and longest(float(place[0].max())), None, "warning",
+          f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE_REMEDY),
+    Check("object below the table", "object", lambda place: place and {"value": place[1], "cm": -100 * place[1]}, (-SUNK, np.inf),
+          "warning", f"it reaches {{cm:.1f}} cm below the table; at most {100 * SUNK:g} cm are noise.", TABLE),
+    Check("object high above the table", "object", lambda place: place and {"value": place[2]}, (-np.inf, HIGHEST_OBJECT),
+          "warning",
+          "it is up to {value:.2f} m above it; at most {high:g} m is expected; walls and people in the mask are no object.", TABLE),
+    Check("size of the object", "outline", lambda sides: sides and {"text": in_cm(sides)}, None, "note",
+          "color alone: table z = 0 as given, object size on the table {text} cm; by its mask of frame 0.",
+          "Is that what was filmed?"),
+    Check("implausible size", "outline", lambda sides: sides and longest(sides[0]), None, "warning",
+          f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE_REMEDY),
+    Check("outline and category", "silhouette", slenderness, None, "warning",
+          "the category is {1!r}, and the outline is that of {shape}: {value:.1f} squares of its greatest width; a rope has more "
+          f"than {SLENDER:g}, all else less.", "Is {other} meant? Or look at the mask of frame 0."),
+    Check("shape and category", "sheet", flat, None, "warning", "a flat thing of {text}; {rule}.",
           'If it is a sheet, write "category": "cloth" in capture.json: then no volume is made of it.'),
-    Check("object above the table", Support, height_in_air, None, "warning",
+    Check("object above the table", "support", height_in_air, None, "warning",
           "what is seen of it in frame 0 begins {cm:.0f} cm above the table, {on}; there is nothing under the twin, and it falls.",
           "{next}"),
-    Check("inside an obstacle", Among, inside, (0, INSIDE_SHARE), "error",
+    Check("inside an obstacle", "obstacles", inside, (0, INSIDE_SHARE), "error",
           "the object of frame 0 must be outside, but for {high:.0%} of what is seen of it. Look at center, rotation and sizes; "
-          "they are "
-          f"in meters, in the world of the cameras.; received {{value:.0%}} more than {1e3 * INSIDE:g} mm inside",
+          f"they are in meters, in the world of the cameras.; received {{value:.0%}} more than {1e3 * INSIDE:g} mm inside",
           title="obstacles[{number}]"),
     # Speeds and forces of the twin scale with it.
-    Check("frame rate", FrameRate, lambda said: said.rate, (SLOWEST, FASTEST), "error",
+    Check("frame rate", "frame rate", lambda rate: rate, (SLOWEST, FASTEST), "error",
           "frames per second at which it was filmed are required, {low:g} to {high:g}; received {value:g}", title="frame_rate"),
-    Check("no depth", Depths, lambda seen: {} if seen.medians and seen.typical is None else None, None, "error",
-          "some depth is required; received 0 in every pixel of every frame", title="cameras.{subject.camera}"),
-    Check("depth unit", Depths, lambda seen: seen.typical, (NEAR, FAR), "error",
-          "the median depth of camera {subject.camera} must lie between {low:g} and {high:g} m, with the unit of the images; "
-          "received "
-          "{subject.unit:g} m per count, which makes it {value:.4g} m", title="depth_unit"),
-    Check("category", Category, meant, None, "warning",
-          f"only {' and '.join(THIN)} mean a thin thing, and only rope a round one; any other word is a filled body; "
-          "received {subject.category!r}. Is {value} meant?", title="category"),
-    Check("constant grips", GripCounts, constant_grips, None, "note",
-          f"hands within {100 * REACH:g} cm of the object, by frames: {{text}}. A twin is best learned from one constant "
-          f"grip{{cut}}",
-          title=""),
+    Check("no depth", "depths", lambda camera, unit, typical: {} if typical is None else None, None, "error",
+          "some depth is required; received 0 in every pixel of every frame", title="cameras.{0}"),
+    Check("depth unit", "depths", lambda camera, unit, typical: typical, (NEAR, FAR), "error",
+          "the median depth of camera {0} must lie between {low:g} and {high:g} m, with the unit of the images; received {1:g} m "
+          "per count, which makes it {value:.4g} m", title="depth_unit"),
+    Check("category", "category", meant, None, "warning",
+          f"only {' and '.join(THIN)} mean a thin thing, and only rope a round one; any other word is a filled body; received "
+          "{0!r}. Is {value} meant?", title="category"),
+    Check("constant grips", "grips", constant_grips, None, "note",
+          f"hands within {100 * HAND_REACH:g} cm of the object, by frames: {{text}}. A twin is best learned from one constant "
+          "grip{cut}", title=""),
 )

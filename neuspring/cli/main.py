@@ -23,7 +23,7 @@ from neuspring.core.version import __version__
 from neuspring.registry import Registry
 
 _OURS = {
-    "data": "make-capture cut-capture check-data mask compare-masks",
+    "data": "check-data mask compare-masks",
     "results": "tables perception-table study explain report track-init log sync ui tune tune-report doctor",
 }
 COMMANDS: Registry[Callable[..., int | None]] = Registry(

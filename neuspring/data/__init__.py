@@ -1,4 +1,4 @@
-"""What everything is made of: the capture folder, and pickles of others without their code.
+"""Data that everything is made of: the capture folder, and pickles of others without their code.
 
 - `camera`: a calibrated camera, its lens, a plane that it sees. `capture`: the capture folder (cameras, frames, masks) and its
   writer.

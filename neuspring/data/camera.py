@@ -66,7 +66,7 @@ class Lens:
     distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """Coefficients; none: no distortion."""
     model: str = "opencv"
-    """Of the distortion, as the source says it; see `lenses.MODELS`."""
+    """Model of the distortion, as the source says it; see `lenses.MODELS`."""
     size: tuple[int, int] | None = None
     """(width, height) for which it holds, where it is said."""
     unread: tuple[str, ...] = ()

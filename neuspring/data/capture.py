@@ -18,6 +18,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -43,9 +45,11 @@ from neuspring.data.images import make_way, read_array, read_image, require_size
 CAPTURE, TRACKS, POINTS = "capture.json", "tracks.json", "points.json"
 CONTROLLERS, NODES = ("controllers.npz", "controllers.csv"), ("nodes.npz", "nodes.ply")
 RECIPE = ".make-capture.json"
-"""What a folder is made of that make-capture has not finished. It is removed at the end."""
+"""Recipe of a folder that make-capture has not finished. It is removed at the end."""
 NOTHING, OBJECT, HANDS = 0, 1, 2
 """Labels of masks."""
+FEWEST_FRAMES = 5
+"""Frames of a capture."""
 THIN = ("cloth", "package")
 """Categories of which no volume is made; those of all other words are filled."""
 TEXT_TOLERANCE = 1e-4
@@ -61,7 +65,7 @@ class Description:
     name: Name
     category: str
     """Kind of object: cloth, rope, package, ..."""
-    frame_count: Annotated[int, Field(ge=5)]
+    frame_count: Annotated[int, Field(ge=FEWEST_FRAMES)]
     frame_rate: Positive
     """Frames per second."""
     cameras: tuple[CameraEntry, ...]
@@ -74,8 +78,8 @@ class Description:
     """Meters per count of an integer depth image."""
     depth_format: Literal["png", "npy"] = "png"
     pose: Literal["lying", "standing"] | None = None
-    """How the object is in frame 0, where `depth` is none and it is neither a sheet nor a rope. null: not known; what would lie too
-    far behind rises."""
+    """Pose of the object in frame 0, where `depth` is none and it is neither a sheet nor a rope. null: not known; what would lie
+    too far behind rises."""
     up: Literal["+z", "-z"] = "+z"
     """Direction of up along the world's z axis."""
     train_end: Annotated[int, Field(ge=2)] | None = None
@@ -87,7 +91,7 @@ class Description:
     ground: bool = True
     """True where there is a table, for a scenario without a row of its own."""
     obstacles: tuple[Obstacle, ...] = ()
-    """What else stands in the scene and does not move, besides the table, m: {"shape": "box", "center": [x, y, z], "half_sizes":
+    """Things that stand in the scene and do not move, besides the table, m: {"shape": "box", "center": [x, y, z], "half_sizes":
     [a, b, c], "rotation": [3 rows; own axes to world]} or {"shape": "sphere", "center": [x, y, z], "radius": r}."""
     provenance: dict[str, str] = field(default_factory=dict)
 
@@ -241,6 +245,14 @@ class Writer:
             np.save(path, depth, allow_pickle=False)
         if mask is not None:
             self.mask(camera, frame, mask)
+
+    def link(self, kind: Literal["color", "depth"], camera: str, frame: int, source: Path) -> None:
+        """An image that is there in the capture's form: linked where the file system allows it, else copied."""
+        make_way(path := self.capture.path(kind, camera, frame))
+        try:
+            os.link(source, path)
+        except OSError:
+            shutil.copyfile(source, path)
 
     def mask(self, camera: str, frame: int, labels: np.ndarray) -> None:
         """Labels uint8 [H, W]: 0 nothing, 1 object, 2 hands."""

@@ -19,7 +19,7 @@ TINTS = {OBJECT: (40, 220, 60), HANDS: (70, 110, 255)}
 """RGB of labels in pictures of masks: green and blue, where the picture has other colors."""
 OTHERS = ((255, 140, 0), (240, 50, 220), (250, 230, 30))
 """Tints in their place."""
-CLEAR, AROUND = 20.0, 15
+CLEAR, TINT_AROUND = 20.0, 15
 """Difference in a and b of Lab from which a tint is seen, and how far around a label it is compared, pixels."""
 
 
@@ -65,7 +65,7 @@ def tints_of(image: np.ndarray, labels: np.ndarray) -> dict[int, Color]:
     chosen: dict[int, Color] = {}
     for label, usual in TINTS.items():
         own = labels == label
-        around = cv2.dilate(own.astype(np.uint8), np.ones((2 * AROUND + 1,) * 2, np.uint8)).astype(bool) & ~own
+        around = cv2.dilate(own.astype(np.uint8), np.ones((2 * TINT_AROUND + 1,) * 2, np.uint8)).astype(bool) & ~own
         free = [tint for tint in (usual, *OTHERS) if tint not in chosen.values()]
         clear = [CLEAR]
         if own.any() and around.any():

@@ -1,4 +1,4 @@
-"""What the steps of perception hand on: one file each, with the backend that made it and its quality numbers."""
+"""Results that the steps of perception hand on: one file each, with the backend that made it and its quality numbers."""
 
 from __future__ import annotations
 

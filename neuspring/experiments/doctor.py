@@ -22,7 +22,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.extras import EXTRAS, install
 from neuspring.core.weights import hub_folder
 from neuspring.experiments import needs
-from neuspring.perception.track_cotracker import ADDRESS, WEIGHTS
+from neuspring.perception.track_cotracker import WEIGHTS, WEIGHTS_URL
 from neuspring.scores import lpips
 from neuspring.splats.rasterize import choose_backend
 
@@ -155,8 +155,7 @@ def _weights(settings: Config) -> Iterator[Check]:
     code = sorted(Path(torch.hub.get_dir()).glob("facebookresearch_co-tracker_*"))
     there = bool(code) and (hub_folder() / WEIGHTS).is_file()
     wanted = track.backend == "cotracker3" and not track.cotracker3.download
-    remedy = (
-        f"perception.track.cotracker3.download: true (not for commercial use), or {DOWNLOAD} {hub_folder() / WEIGHTS} {ADDRESS}"
-    )
+    download = f"{DOWNLOAD} {hub_folder() / WEIGHTS} {WEIGHTS_URL}"
+    remedy = f"perception.track.cotracker3.download: true (not for commercial use), or {download}"
     detail = WEIGHTS if there else "code or weights are not in the cache of torch.hub"
     yield Check("CoTracker3", "ok" if there else "broken" if wanted else "absent", detail, remedy)

@@ -15,31 +15,11 @@ from typing import Any
 import numpy as np
 
 from neuspring.checks import examine
-from neuspring.checks.cable import CableRecording
-from neuspring.checks.cameras import Edges, Views
-from neuspring.checks.case import Calibration, Case, Cases, Metadata, ReleasedData, Split, TrackFile
+from neuspring.checks.cameras import pairs
+from neuspring.checks.case import FINAL_DATA, Case, whole
 from neuspring.checks.masks import Shown
-from neuspring.checks.table import CameraAlone, Horizon, TableSeen, object_on_table
-from neuspring.checks.things import (
-    HAND_LEAST,
-    INSIDE,
-    Among,
-    Category,
-    Depths,
-    FrameRate,
-    GripCounts,
-    Held,
-    Masked,
-    ObjectPoints,
-    Outline,
-    Sample,
-    Sheet,
-    Silhouette,
-    Support,
-    hands_on,
-    lifted,
-    sampled,
-)
+from neuspring.checks.table import CameraAlone, TableSeen, object_on_table
+from neuspring.checks.things import HAND_LEAST, INSIDE, Sample, hands_on, lifted, outline, place_of, sampled
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
@@ -63,18 +43,18 @@ def check_capture(folder: Path) -> list[Finding]:
         description = read_description(path)
     except InputError as error:
         return [refusal(error)]
-    findings = description_findings(path, description) + examine(FrameRate(path, description.frame_rate))
-    findings += examine(Category(path, description.category))
+    findings = description_findings(path, description) + examine("frame rate", path, description.frame_rate)
+    findings += examine("category", path, description.category)
     capture, calibrated = Capture(folder, description), not any(one.level == "error" for one in findings)
     grips = np.zeros(capture.frame_count, int)
     samples = {}
     for name in capture.cameras:
         samples[name], of_camera = _check_camera(capture, name, calibrated, grips)
         findings += of_camera
-    findings += examine(GripCounts(path, grips, description.frame_rate))
+    findings += examine("grips", path, grips, description.frame_rate, folder)
     if calibrated and len(samples) > 1:
         first = {name: found[0].depth for name, found in samples.items() if 0 in found}
-        findings += examine(Views(path, capture.cameras, first, description.up))
+        findings += examine("views", path, list(pairs(capture.cameras, first, description.up)))
     findings += look(capture)[1]
     for name in capture.cameras:
         _read(findings, folder / POINTS, lambda _, name=name: capture.points(name))  # type: ignore[misc]
@@ -103,7 +83,7 @@ def at(file: Path, findings: Iterable[Finding]) -> list[Finding]:
 def _check_camera(capture: Capture, name: str, calibrated: bool, grips: np.ndarray) -> tuple[dict[int, Sample], list[Finding]]:
     """A few frames of a camera, and all findings about its images and these. `grips` [T] counts hands at the object."""
     view, path, described = capture.cameras[name], capture.folder / CAPTURE, capture.description
-    medians, shown = list[float](), Shown(name, capture.frame_count, (view.width, view.height))
+    medians, shown = list[float](), Shown(capture.frame_count, (view.width, view.height))
     samples: dict[int, Sample] = {}
     refused: dict[str, list[Finding]] = {}
     wanted = sampled(capture.frame_count)
@@ -127,11 +107,13 @@ def _check_camera(capture: Capture, name: str, calibrated: bool, grips: np.ndarr
             refused.setdefault(f"{Path(one.where).parent} {one.text}", []).append(one)
     more = {key: f" The same in {len(alike) - 1} more files of the folder." for key, alike in refused.items() if len(alike) > 1}
     findings = [replace(alike[0], text=alike[0].text + more.get(key, "")) for key, alike in refused.items()]
-    depths = Depths(path, name, described.depth_unit, medians)
-    findings += examine(depths)
-    if calibrated and (depths.fine or not medians):
+    measured = [median for median in medians if np.isfinite(median)]
+    typical = float(np.median(measured)) if measured else None
+    wrong = examine("depths", path, name, described.depth_unit, typical) if medians else []
+    findings += wrong
+    if calibrated and not wrong:
         findings += (_with_depth if capture.has_depth else _color_alone)(capture, name, samples)
-    return samples, findings + at(capture.folder / "mask" / name, examine(shown))
+    return samples, findings + at(capture.folder / "mask" / name, examine("masks", f"camera {name}", shown))
 
 
 def _with_depth(capture: Capture, name: str, samples: dict[int, Sample]) -> list[Finding]:
@@ -141,29 +123,31 @@ def _with_depth(capture: Capture, name: str, samples: dict[int, Sample]) -> list
     # Object and hands are no table; what is left must be enough of the image to tell one.
     around = [np.where(sample.mask == 0, sample.depth, 0.0) for sample in samples.values()]
     enough = around and np.mean([(depth > 0).mean() for depth in around]) >= LEAST_AROUND
-    found = planes(cloud(around, camera.intrinsics)) if enough else []
+    tables = planes(cloud(around, camera.intrinsics)) if enough else []
     bodies = {frame: lifted(camera, sample, OBJECT) for frame, sample in samples.items()}
-    pairs = [(s.mask if s.mask.any() else s.color, s.depth) for s in samples.values() if s.color is not None]
-    things: list[Any] = [Edges(f"camera {name}", pairs), Held(camera, samples)]  # type: ignore[arg-type]
-    things.append(ObjectPoints(f"camera {name}, object", list(bodies.values()), up_sign(up)))
-    if 0 in bodies:
-        things.append(Support(camera, samples[0], up_sign(up), described.obstacles))
-        things.append(Sheet(f"camera {name}, object", bodies[0], up_sign(up), described.category))
-    findings = examine(TableSeen(path, name, found, camera.camera_to_world, up, unit))
-    findings += at(path, [one for thing in things for one in examine(thing)])
-    return findings + (examine(Among(path, described.obstacles, bodies[0])) if 0 in bodies else [])
+    pictures = [(s.mask if s.mask.any() else s.color, s.depth) for s in samples.values() if s.color is not None]
+    where, sign = f"camera {name}", up_sign(up)
+    found = examine("edges", where, pictures) + examine("object and hands", where, camera, samples, 0.0)
+    found += examine("hands", where, camera, samples)
+    found += examine("object", f"{where}, object", place_of(list(bodies.values()), sign))
+    findings = examine("table", path, TableSeen(name, tables, camera.camera_to_world, up, unit))
+    if 0 not in bodies:
+        return findings + at(path, found)
+    found += examine("support", f"{where}, object", camera, samples[0], sign, described.obstacles)
+    found += examine("sheet", f"{where}, object", bodies[0], sign, described.category)
+    return findings + at(path, found) + examine("obstacles", path, described.obstacles, bodies[0])
 
 
 def _color_alone(capture: Capture, name: str, samples: dict[int, Sample]) -> list[Finding]:
     """The camera above the table, and the object in the mask of frame 0 on it, without depth."""
     path, camera, described, up = capture.folder / CAPTURE, capture.cameras[name], capture.description, capture.description.up
-    findings = examine(CameraAlone(path, camera, up, f"poses {described.provenance.get('poses', '')}".rstrip()))
+    findings = examine("camera alone", path, CameraAlone(camera, up, f"poses {described.provenance.get('poses', '')}".rstrip()))
     if any(one.level == "error" for one in findings) or 0 not in samples:
         return findings
     mask, category = samples[0].mask, described.category
-    findings += examine(Horizon(path, camera, mask))
-    things = [Outline(camera, mask), Silhouette(f"camera {name}, object", mask, category)]
-    findings += at(path, [one for thing in things for one in examine(thing)])
+    findings += examine("horizon", path, camera, mask)
+    where = f"camera {name}, object"
+    findings += at(path, examine("outline", where, outline(camera, mask)) + examine("silhouette", where, mask, category))
     # Nodes that are given say how it is.
     given = any((capture.folder / file).exists() for file in NODES)
     if not given and described.pose is None and category not in ("cloth", "rope"):
@@ -174,10 +158,11 @@ def _color_alone(capture: Capture, name: str, samples: dict[int, Sample]) -> lis
     depth = np.nanmedian(camera.project(places)[1]) if (mask == OBJECT).any() else np.nan
     if np.isfinite(depth):
         supposed = {frame: replace(sample, depth=np.full(mask.shape, depth)) for frame, sample in samples.items()}
-        findings += [one for one in at(path, examine(Masked(camera, supposed, HAND_LEAST))) if one.name != "depth holes"]
+        seen = examine("object and hands", f"camera {name}", camera, supposed, HAND_LEAST)
+        findings += at(path, [one for one in seen if one.name != "depth holes"])
     # Obstacles stand on the table: what lies beneath one is met above it.
     above = places[np.isfinite(places[:, 0])] + np.array([0.0, 0.0, 2 * INSIDE * up_sign(up)])
-    return findings + examine(Among(path, described.obstacles, above))
+    return findings + examine("obstacles", path, described.obstacles, above)
 
 
 def check_layout(folder: Path) -> list[Finding]:
@@ -195,7 +180,7 @@ def check_layout(folder: Path) -> list[Finding]:
         return [finding for path in captures for finding in check_capture(path)]
     if cases := find_cases(folder):
         findings = [finding for case in cases for finding in _check_case(case)]
-        return findings + examine(Cases(folder, cases, findings))
+        return findings + examine("cases", folder, folder, cases, findings)
     files = sorted(folder.rglob("*.pkl"))
     if not files:
         rule = "a case with final_data.pkl, a folder of cases, a root with data/different_types, or cable recordings is required"
@@ -207,7 +192,7 @@ def check_recording(file: Path) -> list[Finding]:
     """Every finding of one recording of a cable; nothing is raised for bad content."""
     findings: list[Finding] = []
     raw = _read(findings, Path(file), load_pickle)
-    return findings or examine(CableRecording(Path(file), raw))
+    return findings or examine("cable", file, raw)
 
 
 def find_cases(folder: Path) -> list[Case]:
@@ -236,7 +221,7 @@ def find_cases(folder: Path) -> list[Case]:
 
 def is_case(folder: Path) -> bool:
     """True where the folder holds processed data."""
-    return (folder / phystwin.FINAL_DATA).exists() or (folder / phystwin.SPLIT).exists()
+    return (folder / FINAL_DATA).exists() or (folder / phystwin.SPLIT).exists()
 
 
 def render(findings: list[Finding]) -> str:
@@ -261,30 +246,29 @@ def _subfolders(folder: Path) -> list[Path]:
 
 def _check_case(case: Case) -> list[Finding]:
     folder, found = case.folder, list[Finding]()
-    path, frames = folder / phystwin.FINAL_DATA, None
+    path, frames = folder / FINAL_DATA, None
     if (data := _read(found, path, load_pickle)) is not None:
-        file = ReleasedData(path, data)
-        found += examine(file)
-        frames = len(data["object_points"]) if file.whole else None
+        found += examine("final data", path, data) + examine("released data", path, data)
+        frames = len(data["object_points"]) if whole(data) else None
     path = folder / phystwin.SPLIT
     split = _read(found, path, load_json)
     if split is not None and frames is None:
         found.append(note(path, "needs the number of frames of final_data.pkl: the check of the split is skipped"))
     elif split is not None and frames is not None:
-        found += examine(Split(path, split, frames))
-    path = folder / phystwin.TRACKS
+        found += examine("split", path, split, frames)
+    path = folder / phystwin.GT_TRACKS
     if (tracks := _read(found, path, load_pickle, "annotated tracks and the track error are")) is not None:
-        found += examine(TrackFile(path, tracks, frames))
+        found += examine("annotated tracks", path, tracks, frames)
     path = folder / phystwin.CALIBRATION
     if (poses := _read(found, path, load_pickle, "the calibration check is")) is not None:
-        found += examine(Calibration(path, poses, CAMERAS))
+        found += examine("calibration", path, poses, CAMERAS)
     path = folder / phystwin.METADATA
     metadata = _read(found, path, load_json, "the check of intrinsics and frame rate is")
     if metadata is not None:
-        found += examine(Metadata(path, metadata, with_cameras=True, cameras=CAMERAS))
+        found += examine("metadata", path, metadata) + examine("lenses of metadata", path, metadata, CAMERAS)
     if isinstance(metadata, dict):
         if "fps" not in metadata:
             found.append(unusual(path, "fps", "missing; 30 frames per second are assumed"))
         if frames is not None and metadata.get("frame_num", frames) != frames:
-            found.append(unusual(path, "frame_num", f"{phystwin.FINAL_DATA} has {frames} frames", metadata["frame_num"]))
+            found.append(unusual(path, "frame_num", f"{FINAL_DATA} has {frames} frames", metadata["frame_num"]))
     return found

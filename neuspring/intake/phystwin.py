@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from neuspring.checks import examine
-from neuspring.checks.case import RELEASED_FRAME_RATE, FinalData, Metadata, Split, TrackFile
+from neuspring.checks.case import FINAL_DATA, RELEASED_FRAME_RATE
 from neuspring.config import Config, ScenarioRow
 from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.errors import InputError
@@ -24,9 +24,6 @@ from neuspring.core.files import load_json
 from neuspring.core.findings import refuse
 from neuspring.core.records import digest_file
 from neuspring.data.unpickle import load_pickle
-
-FEWEST = 5
-"""Frames of a capture."""
 
 
 @cache
@@ -36,11 +33,11 @@ def released_cases() -> dict[str, dict[str, str]]:
     return {row["case"]: row for row in csv.DictReader(text.splitlines())}
 
 
-FINAL_DATA, SPLIT, TRACKS, METADATA = "final_data.pkl", "split.json", "gt_track_3d.pkl", "metadata.json"
+SPLIT, GT_TRACKS, METADATA = "split.json", "gt_track_3d.pkl", "metadata.json"
 CALIBRATION = "calibrate.pkl"
-FILES = (FINAL_DATA, SPLIT, TRACKS, METADATA)
+FILES = (FINAL_DATA, SPLIT, GT_TRACKS, METADATA)
 """The files that the reader looks for in a processed case's folder."""
-RAW_FILES = (METADATA, CALIBRATION, SPLIT, TRACKS)
+RAW_FILES = (METADATA, CALIBRATION, SPLIT, GT_TRACKS)
 """The files beside images that the importer looks for in a raw case's folder."""
 
 
@@ -58,19 +55,19 @@ def read(row: ScenarioRow, folder: Path) -> Observations:
     folder = Path(folder)
     data_path, split_path = folder / FINAL_DATA, folder / SPLIT
     data = load_pickle(data_path)
-    refuse(examine(FinalData(data_path, data)))
+    refuse(examine("final data", data_path, data))
     frames = len(data["object_points"])
     split = load_json(split_path)
-    refuse(examine(Split(split_path, split, frames)))
+    refuse(examine("split", split_path, split, frames))
     used = [data_path, split_path]
 
     tracks = annotated(folder, frames)
     if tracks is not None:
-        used.append(folder / TRACKS)
+        used.append(folder / GT_TRACKS)
     frame_rate = RELEASED_FRAME_RATE
     if (folder / METADATA).exists():
         metadata = load_json(folder / METADATA)
-        refuse(examine(Metadata(folder / METADATA, metadata)))
+        refuse(examine("metadata", folder / METADATA, metadata))
         frame_rate = float(metadata.get("fps", RELEASED_FRAME_RATE))
         used.append(folder / METADATA)
 
@@ -104,7 +101,7 @@ def has_images(case: Path) -> bool:
 
 
 def camera_count(case: Path) -> int:
-    """How many cameras metadata.json declares. Raises InputError."""
+    """Number of cameras that metadata.json declares. Raises InputError."""
     path = Path(case) / METADATA
     metadata = load_json(path)
     intrinsics = metadata.get("intrinsics") if isinstance(metadata, dict) else None
@@ -115,11 +112,11 @@ def camera_count(case: Path) -> int:
 
 def annotated(case: Path, frames: int) -> np.ndarray | None:
     """Annotated tracks [T, K, 3], m, if there are any. Raises InputError."""
-    path = case / TRACKS
+    path = case / GT_TRACKS
     if not path.exists():
         return None
     tracks = load_pickle(path)
-    refuse(examine(TrackFile(path, tracks, frames)))
+    refuse(examine("annotated tracks", path, tracks, frames))
     return np.asarray(tracks, dtype=float)
 
 
@@ -129,5 +126,5 @@ def train_end_of(case: Path, frames: int) -> int | None:
     if not path.exists():
         return None
     split = load_json(path)
-    refuse(examine(Split(path, split, frames)))
+    refuse(examine("split", path, split, frames))
     return int(split["train"][1])

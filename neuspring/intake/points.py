@@ -11,7 +11,7 @@ Meters, in the capture's world. Files of another form, in other units or axes ar
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from neuspring.checks import examine
-from neuspring.checks.space import SAME, Cloud, Holding, Marked, Nodes
+from neuspring.checks.space import SAME, Holding
 from neuspring.config import Config, ScenarioRow
 from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.errors import InputError
@@ -29,9 +29,9 @@ from neuspring.core.geometry import on_table
 from neuspring.core.records import digest_file
 from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, TRACKS, Capture
 
-COLUMNS = ("frame", "point", "x", "y", "z", "holds", "hand")
-"""Of controllers.csv; the last two may be left out."""
-LEAST = 3
+CSV_COLUMNS = ("frame", "point", "x", "y", "z", "holds", "hand")
+"""Columns of controllers.csv; the last two may be left out."""
+LEAST_NODES = 3
 """Points that say how a body is turned."""
 
 
@@ -55,7 +55,7 @@ class Hands:
 
 @dataclass(frozen=True, eq=False)
 class InSpace:
-    """What a capture brings in space."""
+    """Points in space that a capture brings."""
 
     hands: Hands | None
     nodes: np.ndarray
@@ -108,8 +108,8 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
     first = annotated[0][np.isfinite(annotated[0]).all(axis=1)]
     if description.tracks == "train":
         tracks = annotated
-        if len(first) < LEAST:
-            rule = f"with tracks: train at least {LEAST} points must be annotated in frame 0, where the twin starts"
+        if len(first) < LEAST_NODES:
+            rule = f"with tracks: train at least {LEAST_NODES} points must be annotated in frame 0, where the twin starts"
             findings.append(broken(marked, "", rule, f"{len(first)} of {tracks.shape[1]}"))
     ground = description.up_sign if description.ground else None
     # A hand may be anywhere while it holds nothing.
@@ -117,17 +117,18 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
     seen = annotated[np.isfinite(annotated).all(axis=2)]
     for what, file, points in (("nodes", files.get("nodes"), nodes), ("", marked, seen), ("", files.get("controllers"), held_at)):
         if file is not None and points.size:
-            findings += examine(Cloud(file, points.reshape(-1, 3), ground, is_body=what == "nodes"))
+            findings += examine("points", file, points.reshape(-1, 3), ground, what == "nodes")
     if any(one.level == "error" for one in findings):
         return InSpace(hands, nodes, tracks), findings
     if (body := files.get("nodes")) is not None:
-        findings += examine(Nodes(body, nodes))
+        findings += examine("nodes", body, nodes)
     if len(nodes):
-        findings += examine(Marked(marked, annotated[0], nodes))
+        findings += examine("points on nodes", marked, annotated[0], nodes)
     if (file := files.get("controllers")) is not None and hands is not None:
         grouped = hands.hand if hands.hand.size else np.zeros(hands.points.shape[1], int)
         start = held(hands, annotated, capture.train_end)[0]
-        findings += examine(Holding(file, grouped, hands.held(capture.train_end), start, nodes, np.concatenate([nodes, first])))
+        holding = Holding(grouped, hands.held(capture.train_end), start, nodes, np.concatenate([nodes, first]))
+        findings += examine("holding", file, holding)
     return InSpace(hands, nodes, tracks), findings
 
 
@@ -164,8 +165,8 @@ def read_nodes(path: Path) -> np.ndarray:
         except Exception as error:  # trimesh raises whatever a damaged file leads it to
             raise InputError(path, "vertices of a PLY file are required", f"{type(error).__name__}: {error}") from error
     nodes = _places(path, nodes, 2)
-    if len(nodes) < LEAST:
-        raise InputError(path, f"at least {LEAST} nodes are required", len(nodes))
+    if len(nodes) < LEAST_NODES:
+        raise InputError(path, f"at least {LEAST_NODES} nodes are required", len(nodes))
     pairs = cKDTree(nodes).query_pairs(SAME, output_type="ndarray")
     if len(pairs):
         rule = f"nodes must lie {1e3 * SAME:g} mm apart: a spring between two needs a length"
@@ -193,8 +194,8 @@ def _rows(path: Path) -> dict[str, np.ndarray]:
         table = pd.read_csv(path)
     except (OSError, ValueError) as error:
         raise InputError(path, "rows of numbers with one header line are required", str(error)) from error
-    if not set(COLUMNS[:5]) <= set(table) <= set(COLUMNS):
-        rule = f"the header must be {','.join(COLUMNS[:5])}, and may have holds and hand"
+    if not set(CSV_COLUMNS[:5]) <= set(table) <= set(CSV_COLUMNS):
+        rule = f"the header must be {','.join(CSV_COLUMNS[:5])}, and may have holds and hand"
         raise InputError(path, rule, ",".join(map(str, table)))
     for name, column in (table := table.apply(pd.to_numeric, errors="coerce")).items():
         if len(bad := np.flatnonzero(~np.isfinite(column))):
@@ -234,22 +235,6 @@ def write(folder: Path, hands: Hands | None, nodes: np.ndarray) -> None:
         write_atomically(folder / CONTROLLERS[0], lambda path: _save(path, arrays))
     if len(nodes):
         write_atomically(folder / NODES[0], lambda path: _save(path, {"points": nodes}))
-
-
-def require_first(capture: Capture, first: int) -> None:
-    """Raise InputError where a cut that begins with frame `first` would have nodes of another frame."""
-    if first and (body := given(capture.folder, NODES)) is not None:
-        rule = "the nodes are those of frame 0, with which a cut must begin"
-        raise InputError(body, rule, f"frame {first}", "Write nodes of that frame, or remove the file.")
-
-
-def cut(capture: Capture, kept: range, folder: Path) -> None:
-    """Write hands and nodes of some frames of a capture to another folder."""
-    file, body = (given(capture.folder, names) for names in (CONTROLLERS, NODES))
-    hands = read_hands(file, capture.frame_count) if file else None
-    if hands is not None:
-        hands = replace(hands, points=hands.points[kept], holds=hands.holds[kept] if hands.holds.size else hands.holds)
-    write(folder, hands, read_nodes(body) if body else np.zeros((0, 3)))
 
 
 def _save(path: Path, arrays: dict[str, np.ndarray]) -> None:
@@ -332,7 +317,7 @@ def scenario_of(row: ScenarioRow, capture: Capture, origin: dict[str, str]) -> S
 
 
 def taught_by(tracks: np.ndarray, end: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Of annotated tracks [T, K, 3] those that are seen in frame 0: their places, zeros where not seen, and whether they are seen.
+    """Those annotated tracks [T, K, 3] that are seen in frame 0: their places, zeros where not seen, and whether they are seen.
 
     From frame `end` on, if it is given, none is.
     """

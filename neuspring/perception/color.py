@@ -44,10 +44,10 @@ from neuspring.perception.color_hands import follow_hands, grips, place
 from neuspring.perception.controllers import ALWAYS
 from neuspring.perception.shape import discs, inflated, no_prior, shape_prior
 
-BAND = 30.0
-"""How far from the object points beside it were drawn, pixels."""
+HAND_BAND = 30.0
+"""Distance from the object within which points beside it were drawn, pixels."""
 BENEATH = 0.03
-"""What a hand hides of the object in frame 0: its pixels between pixels of the object, up to this far from them, m."""
+"""Part of the object that a hand hides in frame 0: its pixels between pixels of the object, up to this far from them, m."""
 GRIP_REACH = 0.02
 """Distance from the object up to which pixels of a hand hold it in frame 0, m at the object."""
 GRIP_LENGTH = 0.04
@@ -56,9 +56,9 @@ HANDS_APART = 0.04
 """Distance between the grips of different hands, m at the object."""
 HAND_RADIUS = 0.08
 """Corners of a hand are followed this far around its grip, m at the object."""
-SAMPLES = 300
+OUTLINE_POINTS = 300
 """Points of the object's silhouette per frame."""
-CELL = 4
+DISTANCE_CELL = 4
 """Side of the cells of the distance from object and hands, pixels."""
 SHEET_THICKNESS = 0.004
 """m."""
@@ -69,14 +69,14 @@ FOOTPRINT, STANDING_FOOTPRINT = 1.2, 0.3
 across the view; what would lie farther off rises. For a pose that is not given, and a standing one; a lying body rises nowhere."""
 ROPE_WIDEST = 1.5
 """Largest thickness of a rope over its median."""
-STEEP = 0.35
+LEVEL_VIEW = 0.35
 """Part of a view's direction that is level, below which the camera looks down on things: nothing rises in its picture."""
 HIDDEN_STRIDE = 3
-"""Of the object's pixels beneath hands each third gets a point."""
+"""Stride among the object's pixels beneath hands: each third gets a point."""
 
 
 SeenHands: TypeAlias = tuple[dict[str, np.ndarray], list[np.ndarray], dict[str, float]]
-"""What ImageObservations hold of hands, the pixels of each grip, and facts."""
+"""Entries of ImageObservations about hands, the pixels of each grip, and facts."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class FirstFrame:
     pixel_size: float
     """Width of a pixel at the object, m (median)."""
     facts: dict[str, float]
-    """What was supposed of a rope or a body: `longest`, how far behind its nearest point it would lie on the table, m; `across`,
+    """Suppositions about a rope or a body: `longest`, how far behind its nearest point it would lie on the table, m; `across`,
     its width there, m; and `raised`, the part of its discs that rises instead."""
 
     @classmethod
@@ -190,7 +190,7 @@ def medial(
     across, shorter = float(np.ptp(aside)), np.ones(len(away))
     # A camera that looks down sees all of the footprint, and bodies may lie on both sides of it. A body that reaches no farther
     # than it is thick lies in any case.
-    if level > STEEP and nearest > 0 and np.ptp(away) > (depth * thick).max() / factor:
+    if level > LEVEL_VIEW and nearest > 0 and np.ptp(away) > (depth * thick).max() / factor:
         across = max(float(np.ptp(aside * nearest / away)), 1e-6)
         shorter = np.minimum((nearest + footprint * across) / away, 1.0)
     facts = {"longest": float(away.max() - nearest), "across": across, "raised": float((shorter < 1).mean())}
@@ -218,12 +218,7 @@ def beneath_hands(labels: np.ndarray, reach: float) -> np.ndarray:
 
 
 def lift_color(
-    capture: Capture,
-    labels: np.ndarray,
-    tracks: PixelTracks,
-    first: FirstFrame,
-    controllers: int,
-    space: InSpace,
+    capture: Capture, labels: np.ndarray, tracks: PixelTracks, first: FirstFrame, controllers: int, space: InSpace
 ) -> tuple[LiftedTracks, ImageObservations]:
     """Tracks and hands in the world as far as they are known, and the evidence in the image.
 
@@ -260,7 +255,7 @@ def lift_color(
         pixels=pixels,
         visible=visible,
         **silhouettes(labels[: capture.train_end]),
-        cell=CELL,
+        cell=DISTANCE_CELL,
         **seen,
         marked=capture.points(name),
     )
@@ -297,7 +292,7 @@ def lift_color(
 
 
 def _seen_hands(capture: Capture, labels: np.ndarray, first: FirstFrame, controllers: int, where: str) -> SeenHands:
-    """Of the hands in the masks. Raises InputError for none."""
+    """Evidence of the hands in the masks. Raises InputError for none."""
     # A hand above a sheet hides more of it than its fingers hold.
     sizes = (GRIP_REACH, HANDS_APART, GRIP_LENGTH if first.kind == "flat" else np.inf)
     found = grips(labels[0], first.filled, *(size / first.pixel_size for size in sizes))
@@ -318,16 +313,16 @@ def _seen_hands(capture: Capture, labels: np.ndarray, first: FirstFrame, control
 
 
 def no_seen_hands(frames: int) -> dict[str, np.ndarray]:
-    """What ImageObservations hold of hands that the capture brings: nothing."""
+    """Entries of ImageObservations about hands that the capture brings: none."""
     flat = np.zeros((frames, 0), np.float32)
     return {"hand_of": np.zeros(0, int), "hand_centers": flat[..., None].repeat(2, 2), "hand_angles": flat, "hand_sizes": flat}
 
 
-def silhouettes(labels: np.ndarray, samples: int = SAMPLES) -> dict[str, np.ndarray]:
+def silhouettes(labels: np.ndarray, samples: int = OUTLINE_POINTS) -> dict[str, np.ndarray]:
     """`inside` and `outside` of ImageObservations from labels [E, H, W]."""
     frames, height, width = labels.shape
     rng = np.random.default_rng(0)
-    count, cell = samples, CELL
+    count, cell = samples, DISTANCE_CELL
     inside = np.full((frames, count, 2), np.nan, np.float32)
     outside = np.zeros((frames, -(-height // cell), -(-width // cell)), np.float32)
     for frame, label in enumerate(labels):
@@ -342,7 +337,7 @@ def silhouettes(labels: np.ndarray, samples: int = SAMPLES) -> dict[str, np.ndar
         rows = rng.choice(len(x), min(count, len(x)), replace=False)
         inside[frame, : len(rows)] = np.stack([x[rows], y[rows]], axis=1)
         # As many points were once drawn beside the object too; without that draw the samples of later frames would be others.
-        near = int(((label == NOTHING) & (from_object <= BAND)).sum())
+        near = int(((label == NOTHING) & (from_object <= HAND_BAND)).sum())
         rng.choice(near, min(count, near), replace=False)
     return {"inside": inside, "outside": outside}
 
@@ -362,7 +357,7 @@ class Supposed(Capture):
 def from_color(
     capture: Capture, masks: Mapping[str, Masks], tracks: Mapping[str, PixelTracks], settings: Perception
 ) -> tuple[LiftedTracks, ShapePrior, ImageObservations]:
-    """What `lift` and `shape_prior` make of captures with depth, and the evidence of the image.
+    """Results as `lift` and `shape_prior` make them of captures with depth, and the evidence of the image.
 
     The prior of ropes and bodies is what lies between their supposed upper and lower side (`FirstFrame`), or a mesh that is placed
     on the upper side. Sheets have none. Raises InputError without object, hands or tracks.

@@ -30,19 +30,19 @@ from neuspring.core.artifacts import ImageObservations
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.data.frames import gray
 
-CORNERS, LEAST, KEPT = 120, 6, 0.5
+CORNERS, LEAST_CORNERS, CORNERS_KEPT = 120, 6, 0.5
 """Corners of a key frame, fewest for a fit, and the share of them below which there is a new key frame."""
-EDGE = 2
+CORNER_EDGE = 2
 """px: corners are this far within the mask, so that its own outline is not followed."""
-FORWARD_BACKWARD = 0.7
+CORNER_BACKWARD = 0.7
 """px by which a corner may miss its start."""
-WINDOW = 15
+CORNER_WINDOW = 15
 GRAY = 128
 SMOOTH = 9
 """Frames over which size and turn are smoothed (Savitzky-Golay, second order)."""
 LARGEST_STEP = 1.15
 """Change of size from frame to frame beyond which a fit is not believed."""
-NEAREST, FARTHEST = 0.5, 2.0
+NEAREST_HAND, FARTHEST_HAND = 0.5, 2.0
 """Depth of a hand over that of frame 0: beyond, the plane is seen edge on and says nothing."""
 
 
@@ -152,7 +152,7 @@ def _follow(capture: Capture, camera: str, labels: np.ndarray, center: np.ndarra
         else:
             lost += 1
             start = points = np.zeros((0, 2), np.float32)
-        if len(points) < max(LEAST, KEPT * CORNERS / 2):
+        if len(points) < max(LEAST_CORNERS, CORNERS_KEPT * CORNERS / 2):
             key, start = poses[frame], _corners(now, labels[frame], poses[frame, :2], radius)
             points = start
         before = now
@@ -168,32 +168,32 @@ def _hand_image(capture: Capture, camera: str, labels: np.ndarray, frame: int) -
 
 def _corners(image: np.ndarray, labels: np.ndarray, center: np.ndarray, radius: float) -> np.ndarray:
     """Corners (x, y) [n, 2] of hands around a place, within their mask; of a wider place if there are few."""
-    inside = cv2.erode((labels == HANDS).astype(np.uint8), np.ones((2 * EDGE + 1,) * 2, np.uint8))
+    inside = cv2.erode((labels == HANDS).astype(np.uint8), np.ones((2 * CORNER_EDGE + 1,) * 2, np.uint8))
     for factor in (1.0, 1.6, 2.5):
         disc = np.zeros_like(inside)
         cv2.circle(disc, tuple(np.round(center).astype(int).tolist()), int(factor * radius), 1, -1)
         found = cv2.goodFeaturesToTrack(image, CORNERS, 0.003, 2.0, mask=inside & disc, blockSize=3)  # type: ignore[operator]
-        if found is not None and len(found) >= 3 * LEAST:
+        if found is not None and len(found) >= 3 * LEAST_CORNERS:
             return np.asarray(found.reshape(-1, 2))
     return np.zeros((0, 2), np.float32) if found is None else np.asarray(found.reshape(-1, 2))
 
 
 def _flow(before: np.ndarray, now: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    options = {"winSize": (WINDOW, WINDOW), "maxLevel": 3}
+    options = {"winSize": (CORNER_WINDOW, CORNER_WINDOW), "maxLevel": 3}
     start = np.ascontiguousarray(points, np.float32)
     moved, there, _ = cv2.calcOpticalFlowPyrLK(before, now, start, None, **options)  # type: ignore[call-overload]
     back, again, _ = cv2.calcOpticalFlowPyrLK(now, before, moved, None, **options)  # type: ignore[call-overload]
-    ok = (there.ravel() > 0) & (again.ravel() > 0) & (np.linalg.norm(back - start, axis=1) < FORWARD_BACKWARD)
+    ok = (there.ravel() > 0) & (again.ravel() > 0) & (np.linalg.norm(back - start, axis=1) < CORNER_BACKWARD)
     return np.asarray(moved), ok
 
 
 def _similarity(key: np.ndarray, start: np.ndarray, points: np.ndarray) -> np.ndarray | None:
-    """What the similarity from corners of the key frame to their present places makes of its pose [4]; None: too few agree."""
-    if len(start) < LEAST:
+    """The pose [4] of the key frame, moved by the similarity from its corners to their present places; None: too few agree."""
+    if len(start) < LEAST_CORNERS:
         return None
     # OpenCV's RANSAC begins with the same seed in every call.
     matrix, agree = cv2.estimateAffinePartial2D(start, points, method=cv2.RANSAC, ransacReprojThreshold=1.5)
-    if matrix is None or agree.sum() < LEAST:
+    if matrix is None or agree.sum() < LEAST_CORNERS:
         return None
     angle, size = float(np.arctan2(matrix[1, 0], matrix[0, 0])), float(np.hypot(matrix[0, 0], matrix[1, 0]))
     return np.array([*(matrix[:, :2] @ key[:2] + matrix[:, 2]), key[2] + angle, key[3] * size])
@@ -233,8 +233,8 @@ def plane_depths(image: ImageObservations, normal: np.ndarray) -> np.ndarray:
     """
     along = rays(image) @ (normal @ image.camera_to_world[:3, :3])
     facing = along[0] * along > 0
-    ratio = np.divide(np.broadcast_to(along[0], along.shape), along, out=np.full(along.shape, FARTHEST), where=facing)
-    return np.clip(ratio, NEAREST, FARTHEST)  # type: ignore[no-any-return]
+    ratio = np.divide(np.broadcast_to(along[0], along.shape), along, out=np.full(along.shape, FARTHEST_HAND), where=facing)
+    return np.clip(ratio, NEAREST_HAND, FARTHEST_HAND)  # type: ignore[no-any-return]
 
 
 def rays(image: ImageObservations) -> np.ndarray:

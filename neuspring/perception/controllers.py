@@ -28,11 +28,11 @@ ALWAYS = np.zeros((0, 0), dtype=bool)
 """All controllers hold in all frames."""
 RELEASE_AFTER = 10
 """Frames without any hand in view after which hands have let go, and the fewest that a hand is away."""
-CELL = 0.01
+HAND_CELL = 0.01
 """m: pixels of hands in one cube count once where pieces of them are sought."""
 LEAST_OF_HAND = 20
 """Pixels of a hand near the object that are not noise of a mask."""
-GUIDES = 5
+GRIP_GUIDES = 5
 """Followed points of the object that say which part of it is near a hand."""
 
 
@@ -131,13 +131,13 @@ def hands_of(points: np.ndarray) -> list[np.ndarray]:
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
-    """What is known of the object, and what masks show of the hands, in the training frames."""
+class SeenBody:
+    """Evidence of the object, and of the hands in the masks, in the training frames."""
 
     clouds: Sequence[np.ndarray]
-    """What cameras see of the object in each frame [P_t, 3], m."""
+    """Points of the object that cameras see in each frame [P_t, 3], m."""
     hands: Sequence[np.ndarray]
-    """What cameras see of all hands in each frame [H_t, 3], m."""
+    """Points of all hands that cameras see in each frame [H_t, 3], m."""
     points: np.ndarray
     """Followed points [T, n, 3], m."""
     visible: np.ndarray
@@ -157,7 +157,7 @@ class Grips:
 
 
 def holding(
-    controllers: np.ndarray, hands: tuple[np.ndarray, np.ndarray], body: Body, in_view: np.ndarray, release: float
+    controllers: np.ndarray, hands: tuple[np.ndarray, np.ndarray], body: SeenBody, in_view: np.ndarray, release: float
 ) -> Grips:
     """When each of `controllers` [T, C, 3] holds, and where pixels of hands have no controllers.
 
@@ -198,7 +198,7 @@ def holding(
                 break
             # The part of the body that is near the hand now, where it was in frame 0.
             known = np.flatnonzero(body.visible[end] & body.visible[0])
-            nearest = np.argsort(cKDTree(controllers[end, members]).query(body.points[end, known])[0], kind="stable")[:GUIDES]
+            nearest = np.argsort(cKDTree(controllers[end, members]).query(body.points[end, known])[0], kind="stable")[:GRIP_GUIDES]
             there = cKDTree(controllers[0, members]).query(body.points[0, known[nearest]])[0]
             if not len(known) or np.median(there) > release:
                 valid[end:, members] = False
@@ -216,8 +216,8 @@ def _owners(pixels: np.ndarray, known: np.ndarray, hand: np.ndarray) -> np.ndarr
     owner = np.full(len(pixels), -1)
     if not len(pixels) or not len(known):
         return owner
-    cells, cell_of = np.unique(np.floor(pixels / CELL).astype(int), axis=0, return_inverse=True)
-    for piece in hands_of(CELL * cells):
+    cells, cell_of = np.unique(np.floor(pixels / HAND_CELL).astype(int), axis=0, return_inverse=True)
+    for piece in hands_of(HAND_CELL * cells):
         own = np.isin(cell_of.ravel(), piece)
         on_it = cKDTree(pixels[own]).query(known)[0] <= HAND_GAP
         if on_it.any():

@@ -14,10 +14,10 @@ from neuspring.data.capture import Capture
 from neuspring.data.frames import frames_of, overlay, spread, tints_of, write_png
 from neuspring.data.results import LiftedTracks, Masks, PixelTracks, ShapePrior
 
-FRAMES = 5
-"""How many frames a strip shows."""
+STRIP_FRAMES = 5
+"""Frames of a strip."""
 TRAIL = 8
-"""How many frames back the tail of a track reaches."""
+"""Frames by which the tail of a track reaches back."""
 MOST_TRACKS = 400
 HAND_ARROW = 40.0
 """Pixels of the arrow of a hand that appears as large as in frame 0."""
@@ -25,7 +25,7 @@ HAND_ARROW = 40.0
 
 def masks_strip(capture: Capture, camera: str, masks: Masks, path: Path) -> Path:
     """Frames of the video side by side, object and hands tinted."""
-    shown = spread(frames_of(capture, camera), FRAMES)
+    shown = spread(frames_of(capture, camera), STRIP_FRAMES)
     tints = tints_of(capture.color(camera, shown[0]), masks.labels[shown[0]])
     tiles = [overlay(capture.color(camera, frame), masks.labels[frame], tints) for frame in shown]
     return write_png(path, np.hstack(tiles))
@@ -39,7 +39,7 @@ def tracks_strip(capture: Capture, camera: str, tracks: PixelTracks, path: Path)
     shade = (hue - hue.min(initial=0.0)) / max(float(np.ptp(hue)) if count else 0.0, 1e-6)
     colors = (255 * matplotlib.colormaps["hsv"](0.85 * shade)[:, :3]).astype(int).tolist()
     tiles = []
-    for frame in spread(frames_of(capture, camera), FRAMES):
+    for frame in spread(frames_of(capture, camera), STRIP_FRAMES):
         image = np.ascontiguousarray(capture.color(camera, frame))
         recent = slice(max(frame - TRAIL, 0), frame + 1)
         for point, color in zip(shown, colors, strict=True):
@@ -55,7 +55,7 @@ def hands_strip(capture: Capture, image: ImageObservations, controllers: np.ndar
     """Frames of the video with the grip of each hand: its place, turn and size, and where it was; of hands that the capture brings
     the controllers [T, C, 3], m."""
     tiles, camera = [], next(iter(capture.cameras))
-    for frame in spread(frames_of(capture, camera), FRAMES):
+    for frame in spread(frames_of(capture, camera), STRIP_FRAMES):
         tile = np.ascontiguousarray(capture.color(camera, frame))
         if not image.hands:
             pixels, depth = capture.cameras[camera].project(controllers[frame].astype(float))

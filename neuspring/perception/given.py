@@ -20,13 +20,13 @@ from neuspring.perception.color import BENEATH, FirstFrame, beneath_hands, from_
 from neuspring.perception.sample import spacing
 from neuspring.perception.shape import no_prior
 
-AROUND = 6
+PLANE_NODES = 6
 """Front nodes around a pixel that say how deep it is."""
-FLAT = 1e-3
+PLANE_RIDGE = 1e-3
 """Ridge of the planes through them, a share of their spread in the image squared: nodes in one line have no slope across it."""
 
 
-BESIDE, BEHIND = 0.75, 2.0
+HIDDEN_BESIDE, HIDDEN_BEHIND = 0.75, 2.0
 """Distances of neighboring nodes within which one hides another: less, and it is seen between them; how far behind it lies."""
 
 
@@ -57,12 +57,12 @@ class GivenFrame(FirstFrame):
         The surface is a plane through the nodes around, by least squares: 1 / depth is affine in the image, 1 / z = a + b . (u - m)
         with the mean pixel m of the nodes. Depth stays between theirs.
         """
-        near = cKDTree(self.front[:, :2]).query(pixels, k=np.arange(1, min(AROUND, len(self.front)) + 1))[1]
+        near = cKDTree(self.front[:, :2]).query(pixels, k=np.arange(1, min(PLANE_NODES, len(self.front)) + 1))[1]
         around, inverse = self.front[near, :2], 1.0 / self.front[near, 2]
         middle, mean = around.mean(axis=1), inverse.mean(axis=1)
         offsets = around - middle[:, None]
         squares = np.einsum("nki,nkj->nij", offsets, offsets)
-        ridge = FLAT * np.trace(squares, axis1=1, axis2=2)[:, None, None] * np.eye(2) + 1e-12 * np.eye(2)
+        ridge = PLANE_RIDGE * np.trace(squares, axis1=1, axis2=2)[:, None, None] * np.eye(2) + 1e-12 * np.eye(2)
         slope = np.linalg.solve(squares + ridge, np.einsum("nki,nk->ni", offsets, inverse - mean[:, None])[..., None])[..., 0]
         found = mean + (slope * (pixels - middle)).sum(axis=1)
         depth = 1.0 / np.clip(found, inverse.min(axis=1), inverse.max(axis=1))
@@ -86,16 +86,16 @@ def from_image(
 def facing(camera: Camera, nodes: np.ndarray) -> np.ndarray:
     """Pixels (x, y) and depth, m, [F, 3] of the nodes [N, 3] that no other hides.
 
-    A node is hidden by one that is BEHIND distances of neighboring nodes nearer to the camera, and appears within BESIDE of one: a
-    surface hides itself where the camera sees it at less than atan(BESIDE / BEHIND), 20 degrees.
+    A node is hidden by one that is HIDDEN_BEHIND distances of neighboring nodes nearer to the camera, and appears within
+    HIDDEN_BESIDE of one: a surface hides itself where the camera sees it at less than 20 degrees, atan of their ratio.
     """
     apart = spacing(nodes)
     pixels, depth = camera.project(nodes)
     ahead = depth > 0
     pixels, depth = pixels[ahead], depth[ahead]
     # At one depth, a step of `apart` sideways is as many pixels.
-    reach = BESIDE * apart * camera.intrinsics[0, 0] / np.maximum(depth, 1e-9)
+    reach = HIDDEN_BESIDE * apart * camera.intrinsics[0, 0] / np.maximum(depth, 1e-9)
     near = cKDTree(pixels).query_ball_point(pixels, reach)
-    hidden = [bool((depth[others] < z - BEHIND * apart).any()) for others, z in zip(near, depth, strict=True)]
+    hidden = [bool((depth[others] < z - HIDDEN_BEHIND * apart).any()) for others, z in zip(near, depth, strict=True)]
     seen: np.ndarray = np.column_stack([pixels, depth])[~np.array(hidden, bool)]
     return seen

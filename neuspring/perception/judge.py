@@ -18,8 +18,8 @@ from neuspring.perception.shape import visual_hull
 from neuspring.perception.truth import carried
 from neuspring.scenes.synthetic.truth import Truth, at_points, under_pixels
 
-MM = 1e3
-GRID = 0.003
+IN_MM = 1e3
+VOLUME_GRID = 0.003
 """m between the points on which volumes are compared."""
 SURFACE_POINTS = 4000
 """Most vertices of a surface whose distances are averaged."""
@@ -72,9 +72,9 @@ def lifted_quality(truth: Truth, lifted: LiftedTracks) -> dict[str, float]:
     off = np.linalg.norm(places - lifted.object_points, axis=2)
     visible = lifted.object_visibility[1:]
     trusted = lifted.object_motion_valid[:-1] & visible
-    facts = _spread("lifted", MM * off[1:][visible], "mm") | _spread("trusted", MM * off[1:][trusted], "mm")
+    facts = _spread("lifted", IN_MM * off[1:][visible], "mm") | _spread("trusted", IN_MM * off[1:][trusted], "mm")
     facts |= {"lifted_share": float(visible.mean()), "trusted_share": float(trusted.mean())}
-    return facts | _spread("controllers", MM * _controller_errors(truth, lifted.controller_points), "mm")
+    return facts | _spread("controllers", IN_MM * _controller_errors(truth, lifted.controller_points), "mm")
 
 
 def _controller_errors(truth: Truth, controllers: np.ndarray) -> np.ndarray:
@@ -100,10 +100,10 @@ def hull_quality(
             facts[f"hull_iou_{count}"] = 0.0
             continue
         vertices = np.concatenate([surface.vertices, hull.vertices])
-        axes = [np.arange(low, high, GRID) for low, high in zip(vertices.min(axis=0), vertices.max(axis=0), strict=True)]
+        axes = [np.arange(low, high, VOLUME_GRID) for low, high in zip(vertices.min(axis=0), vertices.max(axis=0), strict=True)]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         facts[f"hull_iou_{count}"] = overlap(inside(hull, points), inside(surface, points))
-        facts[f"hull_distance_{count}_mm"] = MM * _apart(hull.vertices, surface.vertices)
+        facts[f"hull_distance_{count}_mm"] = IN_MM * _apart(hull.vertices, surface.vertices)
     return facts
 
 

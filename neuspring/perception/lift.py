@@ -18,7 +18,7 @@ from neuspring.data.camera import Camera
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.data.results import LiftedTracks, Masks, PixelTracks
 from neuspring.intake.points import held, read
-from neuspring.perception.controllers import ALWAYS, HAND_GAP, Body, choose_controllers, holding
+from neuspring.perception.controllers import ALWAYS, HAND_GAP, SeenBody, choose_controllers, holding
 
 REFERENCE_FOCAL = 430.0
 """Pixels: the focal length that `outlier_neighbors` is meant for. A longer one shows a surface in more pixels."""
@@ -28,8 +28,8 @@ LEAST_NEIGHBORS = 5
 """Smallest number of neighbors of a motion that is trusted, itself included."""
 AGREEMENT = 0.005
 """m, within which at least half of a motion's neighbors must move alike, as released."""
-STRIDE = 3
-"""Of the pixels of object and hands each third says how near they are."""
+NEAR_STRIDE = 3
+"""Stride among pixels of object and hands: each third says how near they are."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Seen:
 
     @classmethod
     def of_all(cls, cameras: list[Seen]) -> Seen:
-        """What several cameras saw."""
+        """Points that several cameras saw."""
         points = np.concatenate([camera.points for camera in cameras], axis=1)
         visible = np.concatenate([camera.visible for camera in cameras], axis=1)
         return cls(points, visible, np.concatenate([camera.colors for camera in cameras]))
@@ -109,19 +109,19 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
 
 def _body(
     capture: Capture, cameras: Mapping[str, Camera], labels: Mapping[str, np.ndarray], objects: Seen
-) -> tuple[Body, np.ndarray]:
-    """What says when hands hold, and whether any mask shows a hand [T]. Depth is read again."""
+) -> tuple[SeenBody, np.ndarray]:
+    """Evidence of when hands hold, and whether any mask shows a hand [T]. Depth is read again."""
     clouds: dict[int, list[np.ndarray]] = {OBJECT: [], HANDS: []}
     for frame in range(capture.train_end):
         depths = {name: capture.depth(name, frame) for name in cameras if capture.has(name, frame)}
         for label, own in clouds.items():
             seen = [np.zeros((0, 3))]
             for name, depth in depths.items():
-                y, x = (values[::STRIDE] for values in np.nonzero(labels[name][frame] == label))
+                y, x = (values[::NEAR_STRIDE] for values in np.nonzero(labels[name][frame] == label))
                 seen.append(cameras[name].lift(np.stack([x, y], axis=1).astype(float), depth[y, x]))
             own.append(np.concatenate(seen))
     in_view = np.any([(label == HANDS).any(axis=(1, 2)) for label in labels.values()], axis=0)
-    return Body(clouds[OBJECT], clouds[HANDS], objects.points, objects.visible), in_view
+    return SeenBody(clouds[OBJECT], clouds[HANDS], objects.points, objects.visible), in_view
 
 
 def lifting_cameras(capture: Capture, settings: Lift) -> dict[str, Camera]:

@@ -36,7 +36,7 @@ def assemble(
     settings: Perception,
     image: ImageObservations | None = None,
 ) -> Observations:
-    """What every method reads. Points that are invisible are zero. `image` is the evidence of color alone, of all tracks.
+    """Observations for every method. Points that are invisible are zero. `image` is the evidence of color alone, of all tracks.
 
     Nodes that the capture brings take the place of those that are sampled. Annotated points that teach (`tracks: train`) and are
     seen in frame 0 come first, are seen in training frames, and have no place in the image.

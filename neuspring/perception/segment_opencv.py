@@ -19,23 +19,23 @@ from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.data.frames import frames_of, heights, spread
 from neuspring.perception.marks.colors import bins_of, count, lab_of
 
-BINS = (12, 64, 64)
+HISTOGRAM_BINS = (12, 64, 64)
 """Bins of L, a and b."""
 SAMPLED_FRAMES = 24
-"""How many frames the histograms are made from."""
+"""Number of frames that the histograms are made from."""
 BORDER = 0.08
 """Part of the image, at each side, that is taken for the table."""
-SMOOTHING = 1.0
+HISTOGRAM_BLUR = 1.0
 """Width, in bins, by which histograms are blurred: a color seen once stands for its neighbors."""
-FLOOR = 1e-5
+UNSEEN_COLOR = 1e-5
 """Probability of a color never seen."""
-SHADES = (1.0, 0.85, 0.7, 0.55, 0.45)
+TABLE_SHADES = (1.0, 0.85, 0.7, 0.55, 0.45)
 """Factors that darken the table's colors, for shadows that fall beside the object and not on the border."""
-HIGH = 2.5
+CERTAIN_HEIGHT = 2.5
 """Pixels higher than this many times `height` are foreground by their height alone."""
 CERTAIN = 1.5
 """Log ratio from which a color alone decides."""
-MARGIN = 10
+GRABCUT_MARGIN = 10
 """Pixels around the seeds in which GrabCut may move the border."""
 HAND_PIECE = 0.15
 """A piece of hand color smaller than this part of the largest belongs to the object, which may have such colors too."""
@@ -43,7 +43,7 @@ LARGEST_HOLE = 0.0015
 """Holes in the foreground up to this part of the image are filled: print that has the table's color."""
 DECISION = 1.5
 """Width, pixels, over which the decision between hand and object is averaged."""
-SMALLEST = 0.0004
+SMALLEST_PIECE = 0.0004
 """Smallest area of a piece, as part of the image; smaller ones join what surrounds them."""
 SPECK = np.ones((3, 3), np.uint8)
 
@@ -73,18 +73,18 @@ def learn(capture: Capture, camera: str, settings: OpenCvSegmentation) -> tuple[
 
     Raises InputError where nothing rises above the table. Without the color of hands all that rises is the object.
     """
-    table, above = np.zeros(np.prod(BINS)), np.zeros(np.prod(BINS))
+    table, above = np.zeros(np.prod(HISTOGRAM_BINS)), np.zeros(np.prod(HISTOGRAM_BINS))
     views = []
     for frame in spread(frames_of(capture, camera), SAMPLED_FRAMES):
         image, height = capture.color(camera, frame), heights(capture, camera, capture.depth(camera, frame))
         risen = height > settings.height
         views.append((image, risen))
-        above += count(_bins(image), risen, BINS)
+        above += count(_bins(image), risen, HISTOGRAM_BINS)
         edge = ~(height > settings.height / 2)
         rows, columns = (max(int(BORDER * size), 2) for size in edge.shape)
         edge[rows:-rows, columns:-columns] = False
-        for shade in SHADES:
-            table += count(_bins((shade * image).astype(np.uint8)), edge, BINS)
+        for shade in TABLE_SHADES:
+            table += count(_bins((shade * image).astype(np.uint8)), edge, HISTOGRAM_BINS)
     where = f"{capture.folder}, camera {camera}"
     if not above.sum():
         raise InputError(where, f"an object more than {1e3 * settings.height:g} mm above the table z = 0 is required", "nothing")
@@ -99,11 +99,11 @@ def learn(capture: Capture, camera: str, settings: OpenCvSegmentation) -> tuple[
 
 def _divide(views: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """Histograms of hands and of the object in views of (image, what has risen, what has a hand's color)."""
-    hands, body = np.zeros(np.prod(BINS)), np.zeros(np.prod(BINS))
+    hands, body = np.zeros(np.prod(HISTOGRAM_BINS)), np.zeros(np.prod(HISTOGRAM_BINS))
     for image, risen, like_hand in views:
         labels = _tidy(np.where(risen, np.where(like_hand, HANDS, OBJECT), 0).astype(np.uint8))
-        hands += count(_bins(image), labels == HANDS, BINS)
-        body += count(_bins(image), labels == OBJECT, BINS)
+        hands += count(_bins(image), labels == HANDS, HISTOGRAM_BINS)
+        body += count(_bins(image), labels == OBJECT, HISTOGRAM_BINS)
     return hands, body
 
 
@@ -118,7 +118,7 @@ def _frame(
     # High things are foreground whatever their color; low ones need the color of something that rises in some frame.
     seeds = (height > settings.height) | (flat & (ratio > CERTAIN))
     seeds = cv2.morphologyEx(seeds.astype(np.uint8), cv2.MORPH_OPEN, SPECK).astype(bool)
-    foreground = _grab(image, seeds, ratio, height > HIGH * settings.height) if seeds.any() else seeds
+    foreground = _grab(image, seeds, ratio, height > CERTAIN_HEIGHT * settings.height) if seeds.any() else seeds
     foreground |= _holes(foreground)
     in_hand = cv2.GaussianBlur(hand[bins], (0, 0), DECISION) > 0
     return _tidy(np.where(foreground, np.where(in_hand, HANDS, OBJECT), 0).astype(np.uint8))
@@ -126,7 +126,7 @@ def _frame(
 
 def _grab(image: np.ndarray, seeds: np.ndarray, ratio: np.ndarray, high: np.ndarray) -> np.ndarray:
     """GrabCut around the seeds: their core is foreground, it decides on rims and gaps that have the table's color."""
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * MARGIN + 1,) * 2)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * GRABCUT_MARGIN + 1,) * 2)
     near = cv2.dilate(seeds.astype(np.uint8), kernel).astype(bool)
     core = cv2.erode(seeds.astype(np.uint8), SPECK).astype(bool)
     rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
@@ -163,7 +163,7 @@ def _tidy(labels: np.ndarray) -> np.ndarray:
     for label, share in ((HANDS, HAND_PIECE), (OBJECT, 0.0)):
         _, pieces, boxes, _ = cv2.connectedComponentsWithStats((tidy == label).astype(np.uint8), connectivity=4)
         areas = boxes[1:, cv2.CC_STAT_AREA]
-        least = max(SMALLEST * labels.size, share * areas.max(initial=0))
+        least = max(SMALLEST_PIECE * labels.size, share * areas.max(initial=0))
         for piece in 1 + np.flatnonzero(areas < least):
             own = pieces == piece
             around = cv2.dilate(own.astype(np.uint8), SPECK).astype(bool) & ~own
@@ -174,7 +174,7 @@ def _tidy(labels: np.ndarray) -> np.ndarray:
 
 
 def _skin(image: np.ndarray, settings: OpenCvSegmentation) -> np.ndarray:
-    """Where hue and chroma are those of hands [H, W]."""
+    """Pixels [H, W] whose hue and chroma are those of hands."""
     a, b = lab_of(image)[..., 1:].astype(float).transpose(2, 0, 1) - 128.0
     hue, chroma = np.degrees(np.arctan2(b, a)), np.hypot(a, b)
     (least_hue, most_hue), (least_chroma, most_chroma) = settings.hand_hue, settings.hand_chroma
@@ -182,9 +182,9 @@ def _skin(image: np.ndarray, settings: OpenCvSegmentation) -> np.ndarray:
 
 
 def _bins(image: np.ndarray) -> np.ndarray:
-    return bins_of(lab_of(image), BINS)
+    return bins_of(lab_of(image), HISTOGRAM_BINS)
 
 
 def _log_probability(counts: np.ndarray) -> np.ndarray:
-    blurred = gaussian_filter(counts.reshape(BINS), SMOOTHING).ravel()
-    return np.asarray(np.log(blurred / max(blurred.sum(), 1.0) + FLOOR))
+    blurred = gaussian_filter(counts.reshape(HISTOGRAM_BINS), HISTOGRAM_BLUR).ravel()
+    return np.asarray(np.log(blurred / max(blurred.sum(), 1.0) + UNSEEN_COLOR))

@@ -156,11 +156,7 @@ def detect(image: np.ndarray, prompt: str, settings: GroundedSam2, models: Model
     with torch.inference_mode():
         outputs = models.detector(**inputs)
     result = models.detector_processor.post_process_grounded_object_detection(
-        outputs,
-        inputs["input_ids"],
-        threshold=BOX_SCORE,
-        text_threshold=WORD_SCORE,
-        target_sizes=[image.shape[:2]],
+        outputs, inputs["input_ids"], threshold=BOX_SCORE, text_threshold=WORD_SCORE, target_sizes=[image.shape[:2]]
     )[0]
     rows = zip(result["boxes"].tolist(), result["text_labels"], result["scores"].tolist(), strict=True)
     detections = [Detection(tuple(box), str(text), float(score)) for box, text, score in rows]

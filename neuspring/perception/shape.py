@@ -45,23 +45,23 @@ from neuspring.perception.truth import surface
 
 BACK_FRACTION = 1.2
 """Thickness of the object in local widths of its silhouette, with `back: fraction`; 1: a round cross-section."""
-MARGIN = 0.02
+CARVED_MARGIN = 0.02
 """m around the cloud of frame 0 within which voxels are carved."""
-TOLERANCE = 0.004
+CARVING_TOLERANCE = 0.004
 """m by which measured depth may lie behind a voxel before the voxel is carved."""
-SMOOTHING = 1.0
+HULL_SMOOTHING = 1.0
 """Width, voxels, by which the hull is smoothed."""
 SEEN_WITHIN = 4.0
 """Voxels between a vertex of the shape and the depth of a camera that saw it: carving and smoothing move a surface by less."""
-RIM = 3
+MASK_BORDER = 3
 """Pixels that a rim is wide; depth is doubtful at its first."""
-LEAST = 0.006
+LEAST_THICKNESS = 0.006
 """m: a body is at least this thick."""
 POSES = 24 * 8
 REFINED = 6
 """Best poses that are refined to the end."""
 ITERATIONS = 40
-SAMPLES = 1500
+COMPARED_SURFACE = 1500
 """Points of cloud and mesh that are compared."""
 INLIERS = 0.85
 """Share of the nearest pairs that a step uses; the rest count as outliers."""
@@ -134,17 +134,17 @@ def visual_hull(
         if end is not None:
             y, x = np.nonzero(labels == OBJECT)
             space = np.concatenate([cloud, camera.lift(np.stack([x, y], axis=1).astype(float), end[y, x])])
-    low, high = space.min(axis=0) - MARGIN, space.max(axis=0) + MARGIN
+    low, high = space.min(axis=0) - CARVED_MARGIN, space.max(axis=0) + CARVED_MARGIN
     counts = np.ceil((high - low) / settings.voxel).astype(int) + 1
     # Voxel centers [nx, ny, nz, 3].
     grid = low + settings.voxel * np.moveaxis(np.indices(counts), 0, -1)
     hull = capture.description.up_sign * grid[..., 2] > 0
     shown = np.zeros_like(hull)
     for name in showing:
-        admitted, shows = _consistent(grid, capture.cameras[name], masks[name].labels[0], *sides[name], TOLERANCE)
+        admitted, shows = _consistent(grid, capture.cameras[name], masks[name].labels[0], *sides[name], CARVING_TOLERANCE)
         hull, shown = hull & admitted, shown | shows
     hull = _largest_piece(hull & shown)
-    vertices, faces = _surface(hull, low, settings.voxel, SMOOTHING)
+    vertices, faces = _surface(hull, low, settings.voxel, HULL_SMOOTHING)
     if not len(faces):
         rule = f"more than specks of {1e3 * settings.voxel:g} mm must be consistent with all cameras"
         remedy = "Masks, depth and calibration of frame 0 contradict each other; or take perception.shape.backend: none."
@@ -160,7 +160,7 @@ def one_sided(
     """Depth of the seen surface [H, W], m, without holes, and of the back; None where that is not guessed."""
     distance = camera.project(cloud)[1]
     # What lies far before or behind all usable points shines through, or is noise.
-    near, far = float(distance.min()) - MARGIN, float(distance.max()) + MARGIN
+    near, far = float(distance.min()) - CARVED_MARGIN, float(distance.max()) + CARVED_MARGIN
     filled = np.where(labels == OBJECT, front(labels == OBJECT, depth, near, far), depth)
     if settings.back == "none":
         return filled, None
@@ -227,11 +227,11 @@ def back(labels: np.ndarray, seen: np.ndarray, focal: float, how: Literal["symme
         extended = front(np.ones_like(mask), np.where(mask, seen, 0.0), 0.0, np.inf)
         smooth = cv2.medianBlur(extended.astype(np.float32), 5).astype(float)
         open_side = (labels != OBJECT) & (labels != HANDS)
-        rim = mask & _grown(open_side, RIM) & ~_grown(labels == HANDS, RIM + 1)
+        rim = mask & _grown(open_side, MASK_BORDER) & ~_grown(labels == HANDS, MASK_BORDER + 1)
         if not rim.any():
-            rim = mask & _grown(~mask, RIM)
+            rim = mask & _grown(~mask, MASK_BORDER)
         thickness = 2.0 * (_spanned(smooth + 0.5 * chord, rim, mask) - smooth)
-    return np.where(mask, seen + np.maximum(thickness, LEAST), 0.0)
+    return np.where(mask, seen + np.maximum(thickness, LEAST_THICKNESS), 0.0)
 
 
 def round_chord(mask: np.ndarray) -> np.ndarray:
@@ -336,8 +336,8 @@ def align(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray, setti
 def place(vertices: np.ndarray, faces: np.ndarray, cloud: np.ndarray) -> tuple[np.ndarray, float]:
     """Vertices [V, 3], m, after the similarity that brings the mesh to the cloud, and the RMS distance of the cloud to it, m."""
     rng = np.random.default_rng(0)
-    target = cloud[rng.permutation(len(cloud))[:SAMPLES]].astype(float)
-    source = on_surface(vertices, faces, SAMPLES, rng)
+    target = cloud[rng.permutation(len(cloud))[:COMPARED_SURFACE]].astype(float)
+    source = on_surface(vertices, faces, COMPARED_SURFACE, rng)
     center = source.mean(axis=0)
     spread = (source - center).std()
     unit = (source - center) / spread

@@ -20,7 +20,7 @@ from neuspring.perception.track_opencv import Followed, choose
 
 WEIGHTS = "scaled_online.pth"
 """Checkpoint of the online predictor."""
-ADDRESS = f"https://huggingface.co/facebook/cotracker3/resolve/main/{WEIGHTS}"
+WEIGHTS_URL = f"https://huggingface.co/facebook/cotracker3/resolve/main/{WEIGHTS}"
 
 
 def track(
@@ -73,5 +73,5 @@ def load(settings: CoTracker3) -> Any:
         predictor: Any = torch.hub.load(str(copies[-1]), "cotracker3_online", source="local", pretrained=False)
     else:
         predictor = torch.hub.load("facebookresearch/co-tracker", "cotracker3_online", trust_repo=True, pretrained=False)
-    predictor.model.load_state_dict(torch.hub.load_state_dict_from_url(ADDRESS, map_location="cpu", weights_only=True))
+    predictor.model.load_state_dict(torch.hub.load_state_dict_from_url(WEIGHTS_URL, map_location="cpu", weights_only=True))
     return predictor

@@ -20,21 +20,21 @@ from neuspring.data.frames import gray
 
 LEVELS = 3
 """Levels of the image pyramid, beside the image itself."""
-FORWARD_BACKWARD = 0.5
+TRACK_BACKWARD = 0.5
 """Largest distance, pixels, by which a point may miss its start when it is followed there and back."""
-WINDOW = 9
+FLOW_SIDE = 9
 """Side of the Lucas-Kanade window, pixels. A large window averages over deformation and background."""
 PATCH = 9
 """Side of compared patches, pixels."""
 LIKENESS = 0.85
 """Least correlation of a patch that is found again with the point's patch of frame 0."""
-GUIDES = 6
+LOST_GUIDES = 6
 """Nearest living points of frame 0, whose motion says where a lost point may be."""
 VOTERS = 8
 """Neighbors that vote on a point's motion."""
 CONSENSUS = 4.0
 """Pixels by which a point's motion since frame 0 may differ from the median of its neighbors'."""
-LOCAL = 2.0
+EQUALIZED_WIDTH = 2.0
 """Width, pixels, over which brightness and contrast are made equal for Lucas-Kanade, so that shading does not pull."""
 FAINT = 4.0
 """Gray levels of deviation below which contrast is not raised further: noise."""
@@ -47,7 +47,7 @@ REMAP_LIMIT = 30000
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """Where points of frame 0 are in every frame."""
+    """Places of points of frame 0 in every frame."""
 
     pixels: np.ndarray
     """[T, Q, 2]."""
@@ -87,7 +87,7 @@ def follow(capture: Capture, camera: str, labels: np.ndarray, start: np.ndarray,
         now = equalized(gray(capture, camera, frame))
         place, alive = pixels[last].copy(), visible[last].copy()
         if alive.any():
-            place[alive], alive[alive] = lucas_kanade(before, now, place[alive], place[alive], WINDOW)
+            place[alive], alive[alive] = lucas_kanade(before, now, place[alive], place[alive], FLOW_SIDE)
         alive &= inside(place, now.shape)
         alive |= _reacquire(first, now, start, place, alive)
         alive &= _held(labels[frame], place, own, settings.rim)
@@ -117,7 +117,7 @@ def lucas_kanade(
     # OpenCV writes its result into the guess.
     moved, there, _ = cv2.calcOpticalFlowPyrLK(source, target, points, np.array(guess, dtype=np.float32), **options)
     returned, back, _ = cv2.calcOpticalFlowPyrLK(target, source, moved, points.copy(), **options)
-    near = np.linalg.norm(returned - points, axis=1) < FORWARD_BACKWARD
+    near = np.linalg.norm(returned - points, axis=1) < TRACK_BACKWARD
     return np.asarray(moved), there.ravel().astype(bool) & back.ravel().astype(bool) & near
 
 
@@ -128,11 +128,11 @@ def _reacquire(first: np.ndarray, now: np.ndarray, start: np.ndarray, place: np.
     if not len(lost):
         return again
     guess = place[lost]
-    if len(guides) >= GUIDES:
-        nearest = guides[cKDTree(start[guides]).query(start[lost], k=GUIDES)[1]]
+    if len(guides) >= LOST_GUIDES:
+        nearest = guides[cKDTree(start[guides]).query(start[lost], k=LOST_GUIDES)[1]]
         guess = start[lost] + np.median((place - start)[nearest], axis=1)
-    moved, ok = lucas_kanade(first, now, start[lost], guess, WINDOW)
-    ok &= np.linalg.norm(moved - guess, axis=1) < WINDOW
+    moved, ok = lucas_kanade(first, now, start[lost], guess, FLOW_SIDE)
+    ok &= np.linalg.norm(moved - guess, axis=1) < FLOW_SIDE
     ok &= inside(moved, now.shape)
     if ok.any():
         ok[ok] = likeness(first, now, start[lost][ok], moved[ok]) > LIKENESS
@@ -205,6 +205,6 @@ def inside(points: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 def equalized(image: np.ndarray) -> np.ndarray:
     """A gray image [H, W] uint8, less its local mean and divided by its local deviation: what Lucas-Kanade gets."""
-    centered = image.astype(np.float32) - cv2.GaussianBlur(image.astype(np.float32), (0, 0), LOCAL)
-    deviation = np.sqrt(cv2.GaussianBlur(centered**2, (0, 0), LOCAL) + FAINT**2)
+    centered = image.astype(np.float32) - cv2.GaussianBlur(image.astype(np.float32), (0, 0), EQUALIZED_WIDTH)
+    deviation = np.sqrt(cv2.GaussianBlur(centered**2, (0, 0), EQUALIZED_WIDTH) + FAINT**2)
     return np.asarray(np.clip(128.0 + CONTRAST * centered / deviation, 0, 255).astype(np.uint8))

@@ -29,7 +29,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from neuspring.checks import examine
-from neuspring.checks.cable import MIN_DISTANCE, MIN_FRAMES, CableRecording
+from neuspring.checks.cable import MIN_DISTANCE, MIN_FRAMES
 from neuspring.config import Config, Mocap, ScenarioRow
 from neuspring.core.artifacts import NO_REST_SHAPE, Observations, Scenario
 from neuspring.core.errors import InputError
@@ -108,7 +108,7 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
     """
     file = Path(file)
     raw = load_pickle(file)
-    refuse(examine(CableRecording(file, raw)))
+    refuse(examine("cable", file, raw))
     samples = np.asarray(raw)[settings.start :: settings.stride].transpose(0, 2, 1)
     markers = samples if settings.frames is None else samples[: settings.frames]
     frames, count, _ = markers.shape

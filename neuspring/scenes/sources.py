@@ -1,4 +1,4 @@
-"""Where scenarios come from: `SOURCES` declares every kind of data, and everybody asks it.
+"""Sources of scenarios: `SOURCES` declares every kind of data, and everybody asks it.
 
 To add a source: a module that reads it, its line here, and rows of the scenario table; if it has settings, a section of
 `neuspring.config.data`. A package adds one, a `Source`, by an entry point of the group `neuspring.sources`. Its module has
@@ -47,7 +47,7 @@ class Source:
     has_truth: bool = False
     """Its captures have the truth beside them."""
     own: bool = False
-    """What users film: methods that learn nothing always stand beside the others, and tables say what to be careful with."""
+    """True for films of users: methods that learn nothing stand beside the others, and tables say what to be careful with."""
     files: tuple[str, ...] = ()
     """Files of its folder that observations are read from; none: the path itself."""
     capture_files: tuple[str, ...] = ()
@@ -242,17 +242,17 @@ SOURCES = Registry(
             files=(capture.CAPTURE, capture.TRACKS, *IN_SPACE),
         ),
         "phystwin_raw": Source(
-            module="neuspring.intake.formats.phystwin_raw",
+            module="neuspring.intake.phystwin_raw",
             reads=("data_root",),
             films=True,
-            write_capture="neuspring.intake.formats.phystwin_raw",
+            write_capture="neuspring.intake.phystwin_raw",
             capture_files=phystwin.RAW_FILES,
             cameras=_counted,
         ),
         "phystwin": Source(
             module="neuspring.intake.phystwin",
             reads=("data_root",),
-            write_capture="neuspring.intake.formats.phystwin_raw",
+            write_capture="neuspring.intake.phystwin_raw",
             files=phystwin.FILES,
             capture_files=phystwin.RAW_FILES,
             images_beside=phystwin.has_images,

@@ -3,7 +3,6 @@
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from neuspring.checks import examine
 from neuspring.checks.table import on_table
-from neuspring.checks.things import Category, Sample, Sheet, Support
+from neuspring.checks.things import Sample
 from neuspring.core.geometry import rigid_inverse
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, Writer
 from neuspring.intake.check import check_layout
@@ -214,9 +213,9 @@ def test_an_object_in_the_air_needs_a_hand_that_holds_it(filmed):
     depth, mask = filmed.depth("0", 0), filmed.mask("0", 0)
     for labels, words in (((OBJECT,), "begins 12 cm above the table, and no hand is near"), ((OBJECT, HANDS), "")):
         sample = Sample(np.where(np.isin(mask, labels), depth, 0.0), mask)
-        found = examine(Support(replace(view, camera_to_world=lifted), sample, 1.0, ()))
+        found = examine("support", "object", replace(view, camera_to_world=lifted), sample, 1.0, ())
         assert [words in one.text for one in found] == ([True] if words else [])
-        assert examine(Support(view, sample, 1.0, ())) == []
+        assert examine("support", "object", view, sample, 1.0, ()) == []
 
 
 def sheet(view):
@@ -240,7 +239,7 @@ def test_a_sheet_whose_category_is_a_body(capture, category, words):
     [("Cloth", "cloth"), ("cloths", "cloth"), ("packge", "package"), ("Rope", "rope"), ("sloth", ""), ("bear", "")],
 )
 def test_a_category_that_is_nearly_another(category, meant):
-    found = examine(Category(Path("capture.json"), category))
+    found = examine("category", "capture.json", category)
     assert [one.message.endswith(f"received {category!r}. Is {meant} meant?") for one in found] == [True] * bool(meant)
 
 
@@ -249,7 +248,7 @@ def test_a_rope_in_turns_is_no_sheet(width, turns):
     along = np.linspace(0, turns, 1500)
     middle = np.stack([0.12 * np.cos(np.pi * along), 0.04 * along, np.full(len(along), 0.008)], axis=1)
     points = middle + np.random.default_rng(0).uniform(-width / 2, width / 2, (len(along), 3))
-    assert examine(Sheet("object", points, 1.0)) == []
+    assert examine("sheet", "object", points, 1.0) == []
 
 
 def test_an_object_inside_an_obstacle(capture):

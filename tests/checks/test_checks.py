@@ -1,27 +1,19 @@
 """Checks as data: findings have name, level, value and limit; a package adds a check and a capture format, one object each."""
 
 import json
+import re
 import shutil
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 from neuspring import checks, registry
-from neuspring.checks.cable import CableRecording
 from neuspring.checks.masks import Shown
-from neuspring.checks.things import Masked
-from neuspring.cli.main import main
 from neuspring.core.checks import Check
-from neuspring.core.errors import InputError
-from neuspring.data.capture import CAPTURE, OBJECT, Capture
-from neuspring.intake import formats
+from neuspring.data.capture import CAPTURE, OBJECT
 from neuspring.intake.check import check_layout
-from neuspring.intake.feeds import Paired
-from neuspring.intake.formats import CaptureFormat, Recorded
-from neuspring.intake.formats.folder import ImageFolder
-from tests.support.desk import write_folders
 from tests.support.filmed import film
 
 
@@ -59,12 +51,12 @@ def test_a_finding_has_name_level_value_and_limit(filmed, tmp_path, change, name
 
 
 def test_frames_are_numbers_too():
-    shown = Shown("0", 6, (40, 30))
+    shown = Shown(6, (40, 30))
     for frame in range(6):
         labels = np.zeros((30, 40), np.uint8)
         labels[10:30, 10:16] = OBJECT if frame < 4 else 0
         shown.see(frame, labels)
-    found = {one.name: one for one in checks.examine(shown)}
+    found = {one.name: one for one in checks.examine("masks", "camera 0", shown)}
     assert found["object missing"].frames == (4, 5)
     assert found["object at the border"].frames == (0, 1, 2, 3)
     assert (found["no hand in frame 0"].value, found["no hand in frame 0"].level) == (0.0, "warning")
@@ -74,7 +66,7 @@ def test_a_cable_whose_marker_jumps(tmp_path):
     positions = np.zeros((8, 3, 7))
     positions[:, 0] = np.linspace(0, 0.6, 7)
     positions[5, 1, 3] = 0.3
-    (found,) = (one for one in checks.examine(CableRecording(tmp_path, positions)) if one.name == "stretched cable")
+    (found,) = (one for one in checks.examine("cable", tmp_path, positions) if one.name == "stretched cable")
     assert (found.level, found.frames) == ("warning", (5,)) and found.value > 2 and found.limit[1] == 0.5
 
 
@@ -83,13 +75,20 @@ def test_no_check_is_named_twice_for_one_subject_without_another_measure():
     assert len({(check.name, check.of, check.measure) for check in every}) == len(every) > 80
 
 
+def test_every_kind_of_subject_that_is_examined_has_a_check():
+    every = [check for member in checks.CHECKS.values() for check in (member if isinstance(member, tuple) else (member,))]
+    package = Path(checks.__file__).parents[1]
+    asked = {kind for path in package.rglob("*.py") for kind in re.findall(r'\bexamine\("([^"]+)"', path.read_text())}
+    assert asked - {"cases"} == {check.of for check in every} - {"cases"}  # cases: released results alone, an extension
+
+
 RED = Check(
     "red object",
-    Masked,
-    lambda seen: float(np.mean([s.color[s.mask == OBJECT][..., 0].mean() for s in seen.samples.values()])),
+    "object and hands",
+    lambda camera, samples, least: float(np.mean([s.color[s.mask == OBJECT][..., 0].mean() for s in samples.values()])),
     (0, 1),
     "note",
-    "red of {value:.0f} in {subject.where}; up to {high} is usual.",
+    "red of {value:.0f} in camera {0.name}; up to {high} is usual.",
 )
 
 
@@ -102,40 +101,7 @@ def brought(monkeypatch, group, value):
 
 def test_a_package_adds_a_check(filmed, monkeypatch):
     brought(monkeypatch, "checks", "tests.checks.test_checks:RED")
-    own = registry.modules(checks.__name__, "CHECKS")
+    own = registry.modules(checks.__name__, "checks")
     monkeypatch.setattr(checks, "CHECKS", registry.Registry("checks", own, (Check, tuple)))
     (found,) = (one for one in check_layout(filmed.folder) if one.name == "red object")
     assert found.level == "note" and found.value > 1 and found.message.startswith("camera 0: red object: red of ")
-
-
-def _twin_folders(paths, cameras):
-    names = cameras or tuple(map(str, range(len(paths))))
-    pairs = zip(names, paths, strict=True)
-    return Recorded(
-        views=[Paired(name, ImageFolder(p / "color_0", "color"), ImageFolder(p / "depth_0", "depth")) for name, p in pairs]
-    )
-
-
-MINE = CaptureFormat(
-    about="a folder of two",
-    recognizes=lambda path: (path / "color_0").is_dir() and (path / "depth_0").is_dir(),
-    recording=_twin_folders,
-)
-
-
-@pytest.mark.parametrize("named", [(), ("--format", "mine")])
-def test_a_package_adds_a_capture_format(tmp_path, monkeypatch, named):
-    brought(monkeypatch, "capture_formats", "tests.checks.test_checks:MINE")
-    own = registry.modules(formats.__name__, "FORMAT")
-    monkeypatch.setattr(formats, "FORMATS", registry.Registry("capture_formats", own, CaptureFormat))
-    root = write_folders(tmp_path)
-    words = ["--recording", str(root), *named, "--intrinsics", str(root / "intrinsics.json"), "--rate", "30", "--category", "ball"]
-    assert main(["make-capture", *words, "--output", str(tmp_path / "made")]) == 0
-    made = Capture.load(tmp_path / "made")
-    assert [*made.cameras] == ["0"] and made.frame_count > 4
-
-
-def test_a_path_of_no_format_is_refused_with_the_names(tmp_path):
-    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4), np.uint8))
-    with pytest.raises(InputError, match=r"--format: must be one of bag, phystwin_raw; received none that reads"):
-        formats.open_recording([tmp_path])

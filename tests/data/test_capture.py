@@ -11,21 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Camera, CameraEntry
-from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, Description, Writer
-from neuspring.intake.cut import cut
-from tests.support.captures import FRAMES, POSE, describe, entry
-
-
-def write(folder, description: Description | None = None, tracks: np.ndarray | None = None) -> Capture:
-    """A capture of random images: depth of 500 to 900 mm, every label."""
-    description = description or describe()
-    writer, rng = Writer(folder, description), np.random.default_rng(0)
-    for camera in description.cameras:
-        for frame in set(range(description.frame_count)) - set(camera.missing):
-            size = (camera.height, camera.width)
-            depth = rng.integers(500, 900, size).astype(np.uint16)
-            writer.frame(camera.name, frame, rng.integers(0, 256, (*size, 3), np.uint8), depth, rng.integers(0, 3, size, np.uint8))
-    return writer.finish(tracks)
+from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, Writer
+from tests.support.captures import FRAMES, POSE, describe, entry, write
 
 
 def edit(folder, **changes) -> None:
@@ -221,28 +208,3 @@ def test_bad_tracks_are_refused(tmp_path, text, message):
     (tmp_path / "tracks.json").write_text(text)
     with pytest.raises(InputError, match=message):
         capture.tracks()
-
-
-def test_frames_are_cut_out_with_their_masks_tracks_and_gaps(tmp_path):
-    tracks = np.random.default_rng(1).normal(size=(12, 3, 3)).round(6)
-    whole = write(tmp_path / "whole", describe(frame_count=12, cameras=(entry("a"), entry("b", missing=(0, 5, 11)))), tracks)
-    part = cut(whole, 3, 9, tmp_path / "part")
-    assert (part.description.name, part.frame_count, part.train_end) == ("part", 7, 4)
-    assert [camera.missing for camera in part.description.cameras] == [(), (2,)]
-    for frame in (0, 6):
-        for kind in ("color", "depth", "mask"):
-            np.testing.assert_array_equal(getattr(part, kind)("b", frame), getattr(whole, kind)("b", frame + 3))
-    np.testing.assert_array_equal(Capture.load(part.folder).tracks(), tracks[3:10])
-    assert not part.path("color", "a", 7).exists()
-
-
-@pytest.mark.parametrize(
-    ("first", "last", "message"),
-    [(3, 12, "five frames or more of 0 to 11.*received 3-12"), (3, 6, "received 3-6"), (5, 9, "camera b must have the first")],
-)
-def test_frames_that_make_no_capture_are_not_cut(tmp_path, first, last, message):
-    whole = write(tmp_path / "whole", describe(frame_count=12, cameras=(entry("a"), entry("b", missing=(5,)))))
-    with pytest.raises(InputError, match=message):
-        cut(whole, first, last, tmp_path / "part")
-    with pytest.raises(InputError, match="must be a new or empty folder"):
-        cut(whole, 0, 9, whole.folder)

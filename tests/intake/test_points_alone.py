@@ -12,7 +12,6 @@ from neuspring.config import Config
 from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, TRACKS, Capture, write_tracks
 from neuspring.intake.check import check_layout
-from neuspring.intake.cut import cut
 from neuspring.intake.points import Hands, held, observe, read, standing, write
 from neuspring.scenes.sources import SOURCES, scenario_rows
 from tests.support import spaced as scene
@@ -126,14 +125,6 @@ def test_a_controller_that_holds_later_begins_where_the_body_was_that_it_will_ho
     np.testing.assert_array_equal(
         held(Hands(points, holds, np.zeros(0, int)), changed, 5), held(Hands(points, holds, np.zeros(0, int)), tracks, 5)
     )
-
-
-def test_a_capture_is_cut_with_its_hands_and_nodes(original, tmp_path):
-    part = cut(original, 0, 5, tmp_path / "part")
-    np.testing.assert_allclose(read(part).hands.points, scene.risen(scene.GRIP, 6))
-    assert len(read(part).nodes) == len(scene.NODES)
-    with pytest.raises(InputError, match=r"nodes\.npz.*frame 0.*a cut must begin; received frame 1"):
-        cut(original, 1, 6, tmp_path / "later")
 
 
 def arrays(path, **changes):

@@ -8,7 +8,7 @@ import pytest
 from neuspring.checks.perceived import look_at_observations
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
-from neuspring.perception.controllers import ALWAYS, Body, Grips, holding
+from neuspring.perception.controllers import ALWAYS, Grips, SeenBody, holding
 from tests.support.small import observations
 
 FRAMES = 30
@@ -39,7 +39,7 @@ def scene(away: np.ndarray):
 def grips(away: np.ndarray, train_end: int = FRAMES, pixels: list[np.ndarray] | None = None, **changes: np.ndarray) -> Grips:
     points, seen, bodies, shown, in_view = scene(away)
     seen, in_view, bodies = changes.get("seen", seen), changes.get("in_view", in_view), changes.get("bodies", bodies)
-    body = Body(list(bodies[:train_end]), pixels or list(points[:train_end]), bodies, changes.get("shown", shown))
+    body = SeenBody(list(bodies[:train_end]), pixels or list(points[:train_end]), bodies, changes.get("shown", shown))
     return holding(points[:, [0, 3, 4]], (points, seen), body, in_view, RELEASE)
 
 
@@ -121,7 +121,7 @@ def test_a_hand_is_near_if_what_is_seen_of_it_is():
     points, seen, bodies, shown, in_view = scene(np.zeros(FRAMES))
     controllers = points[:, [0, 3, 4]].copy()
     controllers[12:, :2] += 0.4
-    body = Body(list(bodies), list(points), bodies, shown)
+    body = SeenBody(list(bodies), list(points), bodies, shown)
     assert holding(controllers, (points, seen), body, in_view, RELEASE).holds is ALWAYS
 
 
@@ -148,7 +148,7 @@ def test_pixels_apart_from_what_is_followed_of_a_hand_are_its_own_where_its_cont
     seen = np.ones(points.shape[:2], bool)
     seen[5:, :6] = False
     tips, forearm = np.repeat(hand[:2], 20, axis=0), hand[6:]
-    body = Body(list(bodies), [np.concatenate([tips, forearm])] * FRAMES, bodies, np.ones(bodies.shape[:2], bool))
+    body = SeenBody(list(bodies), [np.concatenate([tips, forearm])] * FRAMES, bodies, np.ones(bodies.shape[:2], bool))
     found = holding(points[:, :2], (points, seen), body, np.ones(FRAMES, bool), RELEASE)
     assert found.holds is ALWAYS and not found.strays
 

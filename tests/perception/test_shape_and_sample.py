@@ -9,11 +9,11 @@ from neuspring.config import ScenarioRow
 from neuspring.config.perception import Perception, Sampling, ShapePriorSettings
 from neuspring.core.errors import InputError
 from neuspring.core.geometry import on_table
+from neuspring.data.capture import HANDS
 from neuspring.data.results import Masks, ShapePrior
 from neuspring.perception import shape
 from neuspring.perception.sample import assemble, inside, structure, voxel_for
 from neuspring.scenes.synthetic.meshes import capsule, smooth_union, sphere
-from neuspring.scenes.synthetic.render import HAND
 from tests.support.still import overlap, still, tracked
 
 BODY = smooth_union([sphere((0, 0, 0.06), 0.05), capsule((0, 0, 0.06), (0.1, 0, 0.04), 0.03)], 0.005)
@@ -45,7 +45,7 @@ def test_the_hull_is_closed_near_the_truth_and_better_with_more_cameras(tmp_path
 
 def test_a_hand_before_the_object_does_not_carve_it(tmp_path):
     capture, masks, cloud, truth = film(tmp_path, 3, with_hand=True)
-    assert (masks["0"].labels == HAND).any()
+    assert (masks["0"].labels == HANDS).any()
     assert overlap(shape.visual_hull(capture, masks, cloud, ShapePriorSettings(voxel=0.004)), truth) > 0.8
 
 

@@ -76,7 +76,7 @@ def test_hidden_points_are_lost_and_found_again(video, monkeypatch):
 
 def test_missing_frames_are_bridged(video, monkeypatch):
     capture, labels = video
-    monkeypatch.setattr(track_opencv, "WINDOW", 15)
+    monkeypatch.setattr(track_opencv, "FLOW_SIDE", 15)
     tracks = track_opencv.track(capture, "late", labels, OpenCvTracking(points=200), 0)
     assert not tracks.visible[[3, 4]].any()
     seen = tracks.visible[5]

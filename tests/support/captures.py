@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from neuspring.data.camera import CameraEntry
-from neuspring.data.capture import Description
+from neuspring.data.capture import Capture, Description, Writer
 
 FRAMES = 5
 POSE = ((1.0, 0.0, 0.0, 0.1), (0.0, -1.0, 0.0, 0.2), (0.0, 0.0, -1.0, 0.9), (0.0, 0.0, 0.0, 1.0))
@@ -28,3 +28,15 @@ def describe(**changes: Any) -> Description:
         format=1, name="thing", category="rope", frame_count=FRAMES, frame_rate=30.0, cameras=(entry(),), masks=True
     )
     return replace(plain, **changes)
+
+
+def write(folder, description: Description | None = None, tracks: np.ndarray | None = None) -> Capture:
+    """A capture of random images: depth of 500 to 900 mm, every label."""
+    description = description or describe()
+    writer, rng = Writer(folder, description), np.random.default_rng(0)
+    for camera in description.cameras:
+        for frame in set(range(description.frame_count)) - set(camera.missing):
+            size = (camera.height, camera.width)
+            depth = rng.integers(500, 900, size).astype(np.uint16)
+            writer.frame(camera.name, frame, rng.integers(0, 256, (*size, 3), np.uint8), depth, rng.integers(0, 3, size, np.uint8))
+    return writer.finish(tracks)

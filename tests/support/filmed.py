@@ -15,7 +15,7 @@ from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture, Description,
 from neuspring.scenes.synthetic.make import looking
 from neuspring.scenes.synthetic.meshes import capsule, smooth_union, sphere, surface
 from neuspring.scenes.synthetic.render import Part, Renderer, quantized
-from neuspring.scenes.synthetic.scenes import SKIN
+from neuspring.scenes.synthetic.scenes import SKIN_COLOR
 from tests.support.phystwin_case import dump, write_json
 
 FRAMES = 6
@@ -54,7 +54,7 @@ def film(
     colors = np.where(np.sin(90 * vertices[:, :1] + 60 * vertices[:, 1:2]) > 0, [0.15, 0.3, 0.65], [0.3, 0.55, 0.3])
     parts = [
         Part(vertices, faces, colors, OBJECT, (60.0, 0.8)),
-        Part(ball, ball_faces, np.tile(SKIN, (len(ball), 1)), HANDS, (45.0, 0.6)),
+        Part(ball, ball_faces, np.tile(SKIN_COLOR, (len(ball), 1)), HANDS, (45.0, 0.6)),
     ]
     fixed = []
     if stand:

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from neuspring.data.camera import CameraEntry
-from neuspring.data.capture import OBJECT, Capture, Writer
+from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
 from neuspring.data.results import LiftedTracks, Masks, ShapePrior
 from neuspring.perception.sample import inside
 from neuspring.scenes.synthetic.make import looking
 from neuspring.scenes.synthetic.meshes import sphere, surface
-from neuspring.scenes.synthetic.render import HAND, Part, Renderer, quantized
+from neuspring.scenes.synthetic.render import Part, Renderer, quantized
 from tests.support.captures import FRAMES, K, describe
 from tests.support.filmed import rows
 
@@ -35,7 +35,7 @@ def still(
     parts, moved = [Part(vertices, faces, np.full((len(vertices), 3), 0.5), OBJECT, (30.0, 0.3))], [vertices]
     if hand is not None:
         ball, ball_faces = surface(sphere((0, 0, 0), 0.02), (-0.03,) * 3, (0.03,) * 3, 0.004)
-        parts.append(Part(ball, ball_faces, np.full((len(ball), 3), 0.5), HAND, (30.0, 0.3)))
+        parts.append(Part(ball, ball_faces, np.full((len(ball), 3), 0.5), HANDS, (30.0, 0.3)))
         moved.append(ball + np.array(hand))
     renderer = Renderer(parts)
     renderer.move(moved)

@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
+from neuspring.checks.case import FINAL_DATA
 from neuspring.config import Fit
 from neuspring.config.images import Images
 from neuspring.core.artifacts import Material, Observations, Simulation, Topology, Trajectory, Twin
@@ -34,8 +35,8 @@ from neuspring.extensions.released.files import (
     visible_pixels,
 )
 from neuspring.intake import phystwin
-from neuspring.intake.formats.phystwin_raw import read_calibration
 from neuspring.intake.phystwin import CALIBRATION, released_cases
+from neuspring.intake.phystwin_raw import read_calibration
 from neuspring.physics.stability import RELEASED_FRAME_TIME, RELEASED_SUBSTEPS
 from neuspring.scores import metrics
 from neuspring.scores.lpips import Lpips
@@ -52,7 +53,7 @@ MEAN = "mean"
 """The scenario of findings about all scenarios."""
 SCORES = "released_phystwin_scores.csv"
 PUBLISHED_NAMES = {"chamfer_distance_m": "chamfer", "track_error_m": "track_error", "train": "reconstruction"}
-MEANS = ("MEAN22_REEVAL", "MEAN22_PAPER")
+MEAN_ROWS = ("MEAN22_REEVAL", "MEAN22_PAPER")
 """Rows of means over the 22 scenarios: evaluated again with more digits, as printed in the paper."""
 
 
@@ -117,7 +118,7 @@ class Reference:
 
 @dataclass(frozen=True, kw_only=True)
 class Published:
-    """Published scores of the released results, keyed by (scenario, task, metric). Means stand under the names in MEANS."""
+    """Published scores of the released results, keyed by (scenario, task, metric). Means stand under the names in MEAN_ROWS."""
 
     scores: Mapping[tuple[str, str, str], Reference]
     scenarios: frozenset[str]
@@ -143,17 +144,17 @@ class Published:
 
     def means(self, task: str, metric: str) -> list[Reference]:
         """Published means of a task and metric, the one with most digits first."""
-        keys = [(name, task, metric) for name in MEANS]
+        keys = [(name, task, metric) for name in MEAN_ROWS]
         return [self.scores[key] for key in keys if key in self.scores]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tools:
-    """What the checks of every case share."""
+    """Tools that the checks of every case share."""
 
     published: Published
     device: str = "cpu"
-    """Where checks 5 and 6 run."""
+    """Device of checks 5 and 6."""
     lpips: Lpips | str = ""
     """The metric, or the reason why there is none."""
 
@@ -232,7 +233,7 @@ def _mean(row: Mapping[Any, Any], scores: pd.DataFrame, published: Published) ->
 DISTANCES = ("chamfer", "track_error")
 POSITION = 2e-5
 """m, mean over nodes: within this, recorded clips of the released simulator are followed."""
-SPREAD = 10.0
+REPLAY_SPREAD = 10.0
 """A replay may differ from the released one by this many times the effect of the order of additions alone: on a GPU that order is
 not defined, and contacts between nodes flip with rounding. On the recorded clips the largest ratio was 2.4."""
 
@@ -248,7 +249,7 @@ def sizes(case: Released, observations: Observations, _: Tools) -> list[Comparis
     }
     findings = []
     for name, count in quantities.items():
-        finding = Comparison(check=1, scenario=case.name, quantity=name, ours=count, file=case.folder / phystwin.FINAL_DATA)
+        finding = Comparison(check=1, scenario=case.name, quantity=name, ours=count, file=case.folder / FINAL_DATA)
         if row is None:
             finding = replace(finding, note="not one of the 22 released cases")
         elif row[name]:
@@ -295,7 +296,9 @@ def evaluator(case: Released, observations: Observations, tools: Tools) -> list[
     positions = _prediction(case, observations)
     trajectory = Trajectory(positions=positions, frame_count=len(positions))
     scores = metrics.score(trajectory, observations, "released", 0)
-    missing = {} if observations.tracks.shape[1] else {"track_error": f"no annotated tracks in {phystwin.TRACKS}, or no such file"}
+    missing = (
+        {} if observations.tracks.shape[1] else {"track_error": f"no annotated tracks in {phystwin.GT_TRACKS}, or no such file"}
+    )
     base = Comparison(check=3, scenario=case.name, quantity="", file=case.prediction)
     return of_scores(base, scores, DISTANCES, tools.published, missing)
 
@@ -395,10 +398,7 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _distances(label: str, apart: np.ndarray) -> dict[str, np.ndarray]:
-    return {
-        f"mean distance of nodes, {label}": apart.mean(axis=1),
-        f"largest distance of a node, {label}": apart.max(axis=1),
-    }
+    return {f"mean distance of nodes, {label}": apart.mean(axis=1), f"largest distance of a node, {label}": apart.max(axis=1)}
 
 
 def _replayed(scenario: str, label: str, own: Trajectory, released: np.ndarray, order: np.ndarray) -> list[Comparison]:
@@ -406,9 +406,9 @@ def _replayed(scenario: str, label: str, own: Trajectory, released: np.ndarray, 
     (name, mean), (other, largest) = _distances(label, _apart(own.positions, released)).items()
     # Until the next frame: which of two replays flips a contact first is chance.
     reached = np.maximum.accumulate(np.append(order[1:], order[-1]))
-    allowed = POSITION + SPREAD * np.pad(reached, (0, len(mean) - len(order)), mode="edge")
+    allowed = POSITION + REPLAY_SPREAD * np.pad(reached, (0, len(mean) - len(order)), mode="edge")
     worst = int(np.argmax(mean / allowed))
-    rule = f"allowed: {POSITION:g} m plus {SPREAD:g} times the effect of the order of nodes"
+    rule = f"allowed: {POSITION:g} m plus {REPLAY_SPREAD:g} times the effect of the order of nodes"
     judged = _at(scenario, name, mean, worst, rule).against(0.0, float(allowed[worst]))
     if own.diverged_frame is not None:
         judged = replace(judged, outcome="failed", note=own.reason)
@@ -427,14 +427,14 @@ def _at(scenario: str, quantity: str, per_frame: np.ndarray, frame: int, note: s
     return Comparison(check=6, scenario=scenario, quantity=quantity, unit="m", ours=value, note=note, per_frame=per_frame)
 
 
-SCORED = ("psnr", "ssim", "lpips", "iou")
-RELEASED = Images(
+PICTURE_SCORES = ("psnr", "ssim", "lpips", "iou")
+AS_RELEASED = Images(
     # gsplat since version 1.5 has another threshold of coverage than the released evaluation; ours has the same.
     backend="warp",
     released_quirks=("second_camera_intrinsics", "any_alpha", "unit_lpips", "degenerate_skinning"),
     corner_pixels=True,
 )
-"""How the released pictures were made and scored: first view, every quirk."""
+"""Settings by which the released pictures were made and scored: first view, every quirk."""
 LIFTED = 1e-4
 """m: points lifted with the right principal point come back but for rounding; with the other, the nearest is about 1 mm off."""
 TRUE, MIRRORED = "c_x", "W - c_x"
@@ -478,11 +478,11 @@ def renderer(case: Released, observations: Observations, tools: Tools) -> list[C
     rows = frame_scores(case, observations, tools.lpips, tools.device)
     scores = metrics.score_images(rows, observations.scenario, observations.scenario.frame_count, "released", 0)
     missing = {"lpips": f"not computed: {tools.lpips}"} if isinstance(tools.lpips, str) else {}
-    return of_scores(Comparison(check=5, scenario=case.name, quantity=""), scores, SCORED, tools.published, missing)
+    return of_scores(Comparison(check=5, scenario=case.name, quantity=""), scores, PICTURE_SCORES, tools.published, missing)
 
 
 def frame_scores(
-    case: Released, observations: Observations, lpips: Lpips | str, device: str, images: Images = RELEASED
+    case: Released, observations: Observations, lpips: Lpips | str, device: str, images: Images = AS_RELEASED
 ) -> pd.DataFrame:
     """Columns frame, camera, metric, value of every frame but the first, seen by the first camera."""
     cameras = read_calibration(case.folder)[1]

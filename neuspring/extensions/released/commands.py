@@ -45,7 +45,7 @@ def verify_released(
     from neuspring.extensions.released import run
 
     lpips = read_settings(settings).images.lpips
-    chosen = checks or tuple(run.CHECKS)
+    chosen = checks or tuple(run.RELEASED_CHECKS)
     report = run.verify_released(data_root, output, scenarios=scenarios, checks=chosen, device=device, lpips=lpips)
     print(report.text, end="")
     return report.status

@@ -12,7 +12,6 @@ been met.
 from __future__ import annotations
 
 import difflib
-import itertools
 import json
 import math
 import os
@@ -22,7 +21,7 @@ import stat
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,7 +46,7 @@ from neuspring.intake.check import check_layout, is_case
 from neuspring.intake.phystwin import released_cases
 
 REPOSITORY = "Jianghanxiao/PhysTwin"
-RECORD, RECORD_FORMAT = "fetched.json", 1
+RECORD, FETCHED_FORMAT = "fetched.json", 1
 LOCK = ".fetch.lock"
 PARTS = ("data", "results", "appearance", "images", "other")
 """Parts of a scenario. data: what the reader and check-data read. results: released parameters, checkpoints and predictions.
@@ -57,7 +56,7 @@ DEFAULT_PARTS = ("data", "results")
 ALLOCATION = 4096
 """File systems round the size of a file up to a multiple of this, bytes."""
 CASES = "data/different_types"
-"""Where processed cases lie below data_root."""
+"""Place of processed cases below data_root."""
 EXTRA = "additional_data"
 TREES: dict[str, tuple[str, tuple[str, ...]]] = {
     CASES: ("data.zip", ("data", "images", "other")),
@@ -184,7 +183,7 @@ def _extract(plan: FetchPlan, data_root: Path) -> None:
 
 def _record(path: Path, hub: Hub, plan: FetchPlan, cases: list[str], parts: set[str]) -> None:
     """Add an entry to fetched.json, unless nothing was missing and the same is recorded already."""
-    entries = read_json(path, RECORD_FORMAT)["fetched"] if path.exists() else []
+    entries = read_json(path, FETCHED_FORMAT)["fetched"] if path.exists() else []
     content = {
         "repository": hub.repository,
         "revision": hub.commit,
@@ -197,7 +196,7 @@ def _record(path: Path, hub: Hub, plan: FetchPlan, cases: list[str], parts: set[
     if not plan.missing and any(content.items() <= entry.items() for entry in entries):
         return
     entry = content | {"endpoint": hub.endpoint, "date": now(), "files": len(plan.missing)}
-    write_text(path, json.dumps({"format": RECORD_FORMAT, "fetched": [*entries, entry]}, indent=1) + "\n")
+    write_text(path, json.dumps({"format": FETCHED_FORMAT, "fetched": [*entries, entry]}, indent=1) + "\n")
 
 
 @dataclass(frozen=True)
@@ -229,7 +228,7 @@ class ArchiveMember:
 
 @dataclass(frozen=True, kw_only=True)
 class FetchPlan:
-    """What is to be extracted from one archive."""
+    """Files to extract from one archive."""
 
     file: HubFile
     archive: zipfile.ZipFile
@@ -238,7 +237,7 @@ class FetchPlan:
     missing: list[ArchiveMember]
     """Those that are not on disk in the archive's state, in the archive's order."""
     text: str
-    """What there is to do, for the user."""
+    """Summary for the user."""
 
 
 def make_plan(file: HubFile, remote: RemoteFile, cases: list[str], parts: set[str], data_root: Path) -> FetchPlan:
@@ -261,11 +260,7 @@ def make_plan(file: HubFile, remote: RemoteFile, cases: list[str], parts: set[st
         progress.update(count)
     missing = sorted((m for m in wanted if m.path not in finished), key=lambda member: member.info.header_offset)
 
-    # A member reaches to the next one, or to the table of contents.
-    starts = {info.header_offset for info in archive.infolist()} | {archive.start_dir}
-    ends = dict(itertools.pairwise(sorted(starts)))
-    offsets = sorted({member.info.header_offset for member in missing})
-    cost = remote.expect((offset, ends.get(offset, archive.start_dir)) for offset in offsets)
+    cost = sum(member.info.compress_size for member in missing)
     differing = len(there) - len(finished)
     replaced = f", {differing} with other content on disk are replaced" if differing else ""
     lines = [
@@ -350,15 +345,13 @@ def _is_finished(path: Path, info: zipfile.ZipInfo) -> bool:
 
 TIMEOUT = 30.0
 """Seconds without a byte after which a request has failed."""
-BLOCK = 2**24
-"""Bytes that are read ahead in one range request."""
-GAP = 2**20
-"""Spans that lie closer, bytes, are read as one: a further request takes as long."""
+BLOCK = 2**22
+"""Bytes that are read ahead in one range request; so many may be read in vain where the next file lies elsewhere."""
 
 
 @dataclass(frozen=True)
 class HubFile:
-    """What the hub declares about a file."""
+    """A file, as the hub declares it."""
 
     name: str
     size: int
@@ -370,19 +363,7 @@ class HubFile:
 class RemoteFile(HfFileSystemFile):
     """A binary file of the hub, for `zipfile`. The library reads ahead, and retries lost connections."""
 
-    _spans: Sequence[tuple[int, int]] = ()
-
-    def expect(self, spans: Iterable[tuple[int, int]]) -> int:
-        """Announce the spans [start, end) that will be read, ascending: reading ahead stops at their ends. Returns their bytes."""
-        joined: list[tuple[int, int]] = []
-        for start, end in spans:
-            first = joined.pop()[0] if joined and start - joined[-1][1] <= GAP else start
-            joined.append((first, end))
-        self._spans = joined
-        return sum(end - start for start, end in joined)
-
     def _fetch_range(self, start: int, end: int) -> bytes:
-        end = next((last for first, last in self._spans if first <= start < last < end), end)
         url = self.url()
         with _explained(url, self.path):
             content = bytes(super()._fetch_range(start, end))

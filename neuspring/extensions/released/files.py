@@ -28,7 +28,7 @@ DEPTH_SCALE = 1000.0
 """Depth units per meter."""
 HUMAN = "0"
 """The only detection that the released evaluation reads of a person's masks."""
-LARGEST = 1e30
+LARGEST_VALUE = 1e30
 """Larger values are refused, like infinity and NaN."""
 OPTIMAL_KEYS = (
     *("global_spring_Y", "object_radius", "object_max_neighbours", "controller_radius", "controller_max_neighbours"),
@@ -42,7 +42,7 @@ CONTACT_KEYS = {
     "contact_friction": "collide_object_fric",
 }
 """Our names of the scalars of a checkpoint, and its own."""
-SPLATS = Path("point_cloud") / "iteration_10000" / "point_cloud.ply"
+SPLATS_FILE = Path("point_cloud") / "iteration_10000" / "point_cloud.ply"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,11 +75,11 @@ class Released(Case):
     def splats(self) -> Path:
         """The last splats; a pattern if there are none. Raises InputError if several trainings lie side by side."""
         folder = self.root / "gaussian_output" / self.name
-        paths = sorted(folder.glob(f"*/{SPLATS}"))
+        paths = sorted(folder.glob(f"*/{SPLATS_FILE}"))
         if len(paths) > 1:
             names = [path.relative_to(folder).parts[0] for path in paths]
             raise InputError(folder, "one training of splats is expected", names, "Move the others away.")
-        return paths[0] if paths else folder / "*" / SPLATS
+        return paths[0] if paths else folder / "*" / SPLATS_FILE
 
     @property
     def colors(self) -> Path:
@@ -119,7 +119,7 @@ def parameter_findings(path: Path, parameters: Any) -> list[Finding]:
         value = parameters.get(key)
         if key not in parameters:
             findings.append(broken(path, key, "this key is missing"))
-        elif not isinstance(value, (int, float, np.integer, np.floating)) or not -LARGEST < value < LARGEST:
+        elif not isinstance(value, (int, float, np.integer, np.floating)) or not -LARGEST_VALUE < value < LARGEST_VALUE:
             findings.append(broken(path, key, "a finite number is required", value))
         elif key.endswith("neighbours") and value != int(value):
             findings.append(broken(path, key, "a whole number is required", value))
@@ -138,7 +138,7 @@ def read_parameters(path: Path) -> dict[str, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class ReleasedCheckpoint:
-    """What training left. The springs themselves are not stored: they follow from the parameters."""
+    """Result of a training. The springs themselves are not stored: they follow from the parameters."""
 
     object_springs: int
     """Springs between object nodes; they come first."""

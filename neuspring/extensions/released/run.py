@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from neuspring.checks.case import Case, Cases, FinalData
+from neuspring.checks.case import FINAL_DATA, Case, whole
 from neuspring.config import ScenarioRow
 from neuspring.config.images import LpipsWeights
 from neuspring.core.artifacts import Observations
@@ -29,7 +29,7 @@ from neuspring.intake import phystwin
 from neuspring.intake.phystwin import released_cases
 from neuspring.scores.lpips import Lpips
 
-CHECKS = {
+RELEASED_CHECKS = {
     1: "sizes of the case, and frame 0 of the released prediction",
     2: "springs rebuilt from the searched parameters",
     3: "scores of the released prediction",
@@ -38,11 +38,11 @@ CHECKS = {
     6: "replay of the released checkpoint",
 }
 OUTCOMES: tuple[Outcome, ...] = ("passed", "failed", "measured", "skipped")
-COLUMNS = (
+VERIFY_COLUMNS = (
     *("check", "scenario", "task", "quantity", "unit", "ours", "published", "difference", "tolerance"),
     *("outcome", "frames", "note"),
 )
-CASES = Path("data") / "different_types"
+CASES_FOLDER = Path("data") / "different_types"
 SELF_COLLIDING = ("cloth", "package")
 """Released cases with one of these words in their name use the cloth configuration, in which nodes collide with each other."""
 
@@ -66,7 +66,7 @@ def verify_released(
     output: Path,
     *,
     scenarios: Sequence[str] = (),
-    checks: Collection[int] = tuple(CHECKS),
+    checks: Collection[int] = tuple(RELEASED_CHECKS),
     device: str = "auto",
     lpips: LpipsWeights | None = None,
     published: Published | None = None,
@@ -79,9 +79,9 @@ def verify_released(
     """
     present = _present(root)
     if unknown := [name for name in scenarios if name not in present]:
-        raise InputError("--scenarios", f"must be folders of {root / CASES}: {', '.join(present)}", ", ".join(unknown))
-    if wrong := [check for check in checks if check not in CHECKS]:
-        raise InputError("--checks", f"must be of {', '.join(map(str, CHECKS))}", wrong)
+        raise InputError("--scenarios", f"must be folders of {root / CASES_FOLDER}: {', '.join(present)}", ", ".join(unknown))
+    if wrong := [check for check in checks if check not in RELEASED_CHECKS]:
+        raise InputError("--checks", f"must be of {', '.join(map(str, RELEASED_CHECKS))}", wrong)
     device = resolve_device(device)
     metric = Lpips.configured(lpips or LpipsWeights(), device) if 5 in checks else ""
     tools = Tools(published=published or Published.load(), device=device, lpips=metric)
@@ -104,7 +104,7 @@ def verify_released(
 
 
 def _present(root: Path) -> list[str]:
-    folder = root / CASES
+    folder = root / CASES_FOLDER
     if not folder.is_dir():
         raise InputError(folder, "the released data must be there", "no such folder", "Name the folder that holds `data`.")
     names = sorted(path.name for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
@@ -119,15 +119,23 @@ def check_case(case: Released, observations: Observations | Exception, checks: S
     `observations`: the processed case, or the exception of `read_observations`.
     """
     findings = list[Comparison]()
-    for check in checks:
-        for function in _FUNCTIONS[check]:
-            findings += _guarded(function, check, case, observations, tools)
+    for number in checks:
+        blank = Comparison(check=number, scenario=case.name, quantity=RELEASED_CHECKS[number])
+        for function in _FUNCTIONS[number]:
+            try:
+                if isinstance(observations, Exception):
+                    raise observations
+                findings += function(case, observations, tools)
+            except Absent as reason:
+                findings.append(replace(blank, outcome="skipped", note=str(reason), file=reason.file))
+            except (InputError, NumericalFailure) as error:
+                findings.append(replace(blank, outcome="failed", note=str(error)))
     return findings
 
 
 def read_observations(case: Released) -> Observations:
     """The processed case. Raises Absent if its files are missing, InputError if the reader refuses them."""
-    require(case.root, case.folder / phystwin.FINAL_DATA, case.folder / phystwin.SPLIT)
+    require(case.root, case.folder / FINAL_DATA, case.folder / phystwin.SPLIT)
     row = ScenarioRow(
         scenario=case.name,
         source="phystwin",
@@ -139,8 +147,7 @@ def read_observations(case: Released) -> Observations:
     return phystwin.read(row, case.folder)
 
 
-_Check = Callable[[Released, Observations, Tools], list[Comparison]]
-_FUNCTIONS: dict[int, tuple[_Check, ...]] = {
+_FUNCTIONS: dict[int, tuple[Callable[[Released, Observations, Tools], list[Comparison]], ...]] = {
     1: (checks.sizes, checks.first_frame),
     2: (checks.topology,),
     3: (checks.evaluator,),
@@ -150,23 +157,9 @@ _FUNCTIONS: dict[int, tuple[_Check, ...]] = {
 }
 
 
-def _guarded(
-    function: _Check, check: int, case: Released, observations: Observations | Exception, tools: Tools
-) -> list[Comparison]:
-    blank = Comparison(check=check, scenario=case.name, quantity=CHECKS[check])
-    try:
-        if isinstance(observations, Exception):
-            raise observations
-        return function(case, observations, tools)
-    except Absent as reason:
-        return [replace(blank, outcome="skipped", note=str(reason), file=reason.file)]
-    except (InputError, NumericalFailure) as error:
-        return [replace(blank, outcome="failed", note=str(error))]
-
-
 def _write(report: Report, output: Path) -> None:
-    rows = [[getattr(finding, name) for name in COLUMNS] for finding in report.findings]
-    write_text(output / "verify.csv", pd.DataFrame(rows, columns=list(COLUMNS)).to_csv(index=False))
+    rows = [[getattr(finding, name) for name in VERIFY_COLUMNS] for finding in report.findings]
+    write_text(output / "verify.csv", pd.DataFrame(rows, columns=list(VERIFY_COLUMNS)).to_csv(index=False))
     traces = [
         {"check": f.check, "scenario": f.scenario, "quantity": f.quantity, "frame": frame, "value": value, "unit": f.unit}
         for f in report.findings
@@ -195,7 +188,7 @@ def _text(findings: Sequence[Comparison], names: Sequence[str], published: Publi
     done = [finding for finding in findings if finding.outcome != "skipped"]
     if means := [finding for finding in done if finding.scenario == MEAN]:
         lines += ["", "## Means over scenarios", "", *_table(means)]
-    for check, title in CHECKS.items():
+    for check, title in RELEASED_CHECKS.items():
         if own := [finding for finding in done if finding.check == check and finding.scenario != MEAN]:
             lines += ["", f"## {check}: {title}", "", *_table(own), *(_conventions(own) if check == 4 else [])]
     if reasons := _reasons(findings):
@@ -205,7 +198,7 @@ def _text(findings: Sequence[Comparison], names: Sequence[str], published: Publi
 
 def _counts(findings: Sequence[Comparison]) -> list[str]:
     rows = []
-    for check, title in CHECKS.items():
+    for check, title in RELEASED_CHECKS.items():
         outcomes = Counter(finding.outcome for finding in findings if finding.check == check)
         if outcomes:
             rows.append([f"{check}: {title}", *(str(outcomes[name]) for name in OUTCOMES)])
@@ -223,7 +216,7 @@ def _table(findings: Sequence[Comparison]) -> list[str]:
 
 
 def _conventions(findings: Sequence[Comparison]) -> list[str]:
-    """How many scenarios follow which convention."""
+    """Number of scenarios that follow each convention."""
     counts = Counter(finding.note for finding in findings if finding.note)
     return ["", *(f"- {note}: {count} of {counts.total()} scenarios" for note, count in sorted(counts.items()))]
 
@@ -237,7 +230,7 @@ def _reasons(findings: Sequence[Comparison]) -> list[str]:
     groups: dict[tuple[int, str], list[str]] = {}
     for f in findings:
         if f.outcome == "skipped":
-            what = "" if f.quantity == CHECKS[f.check] else f"{f.task} {f.quantity}: ".lstrip()
+            what = "" if f.quantity == RELEASED_CHECKS[f.check] else f"{f.task} {f.quantity}: ".lstrip()
             groups.setdefault((f.check, what + f.note.replace(f.scenario, "<case>")), []).append(f.scenario)
     return [f"- {check}: {reason} ({len(names)}: {', '.join(names)})" for (check, reason), names in sorted(groups.items())]
 
@@ -255,23 +248,23 @@ OF_RESULTS, OF_DATA = (1, 2, 3, 4), (1, 4)
 """Checks of a case with a root, and of one without: it has no released results."""
 
 
-def conformance(given: Cases) -> Iterator[dict[str, Any]]:
+def conformance(folder: Path, cases: Sequence[Case], found: Sequence[Finding]) -> Iterator[dict[str, Any]]:
     """Every departure of the cases of a folder from the release: damaged results, failed checks, and what could not be compared."""
     findings, compared, tools = list[Finding](), list[Comparison](), Tools(published=Published.load())
-    for case in given.cases:
+    for case in cases:
         of_case, more = _check_case(case, tools)
         compared, findings = compared + of_case, findings + more
-    if len(given.cases) > 1:
-        findings += [_finding(mean, given.where) for mean in of_means(compared, tools.published)]
-    errors = [one for one in given.found if one.level == "error"]
+    if len(cases) > 1:
+        findings += [_finding(mean, folder) for mean in of_means(compared, tools.published)]
+    errors = [one for one in found if one.level == "error"]
     for one in findings:
         # What a reader refuses is an error of the layout already; the reader's text goes on with the next move.
         if one.level != "error" or not any(one.where == e.where and one.message.startswith(e.message) for e in errors):
             yield {"text": one.message, "level": one.level, "where": one.where}
 
 
-RELEASED = Check("released results", Cases, conformance, None, "error", "{text}", title="")
-"""What `check-data` says of released results beside a case: entry point `released` of the group `neuspring.checks`."""
+RELEASED = Check("released results", "cases", conformance, None, "error", "{text}", title="")
+"""Check of released results beside a case, for `check-data`: entry point `released` of the group `neuspring.checks`."""
 
 
 def _check_case(given: Case, tools: Tools) -> tuple[list[Comparison], list[Finding]]:
@@ -296,8 +289,8 @@ def _of_results(case: Released) -> list[Finding]:
             findings += parameter_findings(case.parameters, load_pickle(case.parameters))
         if case.checkpoint.exists():
             read_checkpoint(case.checkpoint)
-        data = load_pickle(case.folder / phystwin.FINAL_DATA) if case.prediction.exists() else None
-        if data is not None and FinalData(case.folder, data).whole:
+        data = load_pickle(case.folder / FINAL_DATA) if case.prediction.exists() else None
+        if data is not None and whole(data):
             nodes = data["object_points"].shape[1] + len(data["surface_points"]) + len(data["interior_points"])
             findings += prediction_findings(case.prediction, load_pickle(case.prediction), len(data["object_points"]), nodes)
     except InputError as error:

@@ -24,30 +24,30 @@ from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture
 from neuspring.data.frames import frames_of, heights, overlap, spread
 from neuspring.perception.marks.colors import DIFFERENT, Background, apart, lab_of, mixed
 from neuspring.perception.marks.marks import Mark, Seeds, require_marks
-from neuspring.perception.marks.solve import LABELS, CarriedFrame, MarkedFrame, Pass, start
+from neuspring.perception.marks.solve import ALL_LABELS, CarriedFrame, MarkedFrame, Pass, start
 
-AROUND = 4
+MEDIAN_AROUND = 4
 """Frames before and after with whose median an area is compared."""
-JUMP = 0.5
+DOUBTED_JUMP = 0.5
 """Jump of areas that makes a doubt of 63 %."""
 MISFIT = 2.0
 """Log ratio from which a color contradicts its label."""
-WIDTH = 848
-"""Width of images, pixels, for which REACH is given."""
-REACH = 4.0
-"""How far the border may be from where the flow carries it, pixels."""
+CARRY_WIDTH = 848
+"""Width of images, pixels, for which BORDER_MOVES is given."""
+BORDER_MOVES = 4.0
+"""Distance of the border from where the flow carries it, pixels, at most."""
 BACKGROUND_FRAMES = 60
-"""How many frames the background of the whole film is learned from."""
+"""Number of frames that the background of the whole film is learned from."""
 LATER, GONE = 12, 0.2
-"""How many later frames say whether what is ignored leaves, and the share of them that must show another thing in its place."""
-APART = 4
+"""Number of later frames that say whether what is ignored leaves, and the share of them that must show another thing there."""
+LEARNED_APART = 4
 """Pixels around object and hands that teach no background."""
 Progress: TypeAlias = Callable[[int, int], None]
-"""What work calls as it goes on: (done, of all)."""
+"""A call that work makes as it goes on: (done, of all)."""
 
 
 class Cues(NamedTuple):
-    """What speaks against one frame's labels, each 0 or more."""
+    """Doubts about one frame's labels, each 0 or more."""
 
     disagreement: float = 0.0
     """1 - IoU with the other direction or, outside of two marked frames, with the first pass; object or hands, the larger one."""
@@ -64,7 +64,7 @@ WHOLE = Cues(disagreement=0.35, flow=0.8, misfit=0.5, unsure=0.5)
 
 
 def cues_of(step: CarriedFrame, other: np.ndarray) -> Cues:
-    """What speaks against a frame's labels, with those [h, w] that it was given otherwise."""
+    """Doubts about a frame's labels, with those [h, w] that it was given otherwise."""
     labels = step.probability.argmax(axis=0)
     shown = labels > 0
     disagreement = max(1 - np.nan_to_num(overlap(labels == label, other == label), nan=1.0) for label in (OBJECT, HANDS))
@@ -85,8 +85,8 @@ def doubt_of(labels: np.ndarray, cues: list[Cues]) -> np.ndarray:
     for label in (OBJECT, HANDS):
         areas = (labels == label).sum(axis=(1, 2)).astype(float)
         logs = np.log(areas + 0.01 * max(float(areas.max(initial=0.0)), 100.0))
-        usual = [np.median(logs[max(frame - AROUND, 0) : frame + AROUND + 1]) for frame in range(len(logs))]
-        total += (np.abs(logs - usual) / JUMP) ** 2
+        usual = [np.median(logs[max(frame - MEDIAN_AROUND, 0) : frame + MEDIAN_AROUND + 1]) for frame in range(len(logs))]
+        total += (np.abs(logs - usual) / DOUBTED_JUMP) ** 2
     return np.asarray(1 - np.exp(-total))
 
 
@@ -186,7 +186,7 @@ def carry_camera(
 def over_capture(
     capture: Capture, camera: str, marks: Sequence[Mark], work: Callable[[CameraFilm, list[Mark]], Carried]
 ) -> Carried:
-    """What `work` makes of the film of a camera and its marks, at the frames of the capture; 0 where the camera has none.
+    """Result of `work` on the film of a camera and its marks, at the frames of the capture; 0 where the camera has none.
 
     Raises InputError where marks lie on frames that the camera lacks.
     """
@@ -235,7 +235,7 @@ class _Work:
         return lab_of(image)
 
     def seeds(self, frame: int, *, carried: bool = False) -> Seeds:
-        """What the marks on a frame say."""
+        """The marks on a frame, drawn."""
         return Seeds.of(self.marks[frame], self.size, self.scale, carried=carried)
 
     def resized(self, values: np.ndarray | None) -> np.ndarray | None:
@@ -285,7 +285,7 @@ class _Work:
             # The background of the whole film, from frames where their labels say nothing.
             self.background = Background.empty(self.size, self.background.guests)
             for frame in spread(range(count), BACKGROUND_FRAMES):
-                self.background.learn(self.lab(frame), apart(first[frame], APART), self.resized(self.film.depth(frame)))
+                self.background.learn(self.lab(frame), apart(first[frame], LEARNED_APART), self.resized(self.film.depth(frame)))
             # What was uncovered later shows where the object ended at first.
             self.starts[self.begin] = self.start(self.begin)
         labels, cues = np.zeros((count, *self.full), np.uint8), [Cues() for _ in range(count)]
@@ -315,7 +315,7 @@ class _Work:
         return Carried(labels, doubt_of(labels, cues))
 
     def guests(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-        """What is ignored in a marked frame and leaves: where [h, w] bool, and its look, Lab [h, w, 3].
+        """Things that are ignored in a marked frame and leave: where [h, w] bool, and its look, Lab [h, w, 3].
 
         It differs in the film's last frame and in GONE of those after the marked one. What stays is background.
         """
@@ -342,12 +342,12 @@ class _Work:
             first=self.colors(),
             background=self.background,
             learns=learns,
-            reach=REACH * max(self.size) / WIDTH,
+            reach=BORDER_MOVES * max(self.size) / CARRY_WIDTH,
         )
 
     def colors(self) -> tuple[np.ndarray, ...]:
         """Colors of nothing, object and hands in all marked frames so far."""
-        return tuple(mixed([(1.0, own.counts[label]) for own in self.starts.values()]) for label in LABELS)
+        return tuple(mixed([(1.0, own.counts[label]) for own in self.starts.values()]) for label in ALL_LABELS)
 
     def tick(self) -> None:
         """Tell the progress: the first pass solves all frames but its start, the second one all that are not marked."""

@@ -1,5 +1,5 @@
-"""What colors say: densities of nothing, object and hands as blurred histograms in Lab, and the background of a camera that stands
-still, with the usual color of every pixel and the depth behind what moves.
+"""Evidence of colors: densities of nothing, object and hands as blurred histograms in Lab, and the background of a camera that
+stands still, with the usual color of every pixel and the depth behind what moves.
 """
 
 from __future__ import annotations
@@ -10,21 +10,21 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-BINS = (32, 64, 64)
+LAB_BINS = (32, 64, 64)
 """Bins of L, a and b, each of which has 256 values."""
-VOLUME = float(np.prod([256 / count for count in BINS]))
+BIN_VOLUME = float(np.prod([256 / count for count in LAB_BINS]))
 """Values of (L, a, b) in a bin."""
 BLUR = (1.5, 1.0, 1.0)
 """Width of the blur, bins: a color stands for its neighbors, and for a little more or less light."""
 UNSEEN = 0.02
-"""Part of the probability that any color has, seen or not. It is spread evenly over the colors of SPREAD values."""
-SPREAD = 256.0 * 80.0 * 80.0
+"""Part of the probability that any color has, seen or not. It is spread evenly over the colors of COLOR_SPREAD values."""
+COLOR_SPREAD = 256.0 * 80.0 * 80.0
 LEAST_SPREAD = np.array([4.0, 2.5, 2.5], np.float32)
 """Smallest standard deviation of L, a and b: noise of sensor and compression."""
-SHADOW, TINT = 0.22, 0.08
+SHADOW, SHADOW_TINTED = 0.22, 0.08
 """Probabilities that a pixel of the background lies in a shadow, and in a shadow that has the color of what throws it."""
 SHADE, TINTED = 35.0, 2.0
-"""How much darker shadows are in the mean, L, and how much more a and b vary in a tinted one."""
+"""Darkening by a shadow in the mean, L, and by how much more a and b vary in a tinted one."""
 NEVER_SHADE = -50.0
 FORGET = 0.05
 """Smallest weight of a new frame in the running mean."""
@@ -39,7 +39,7 @@ LEAST_KNOWN = 500
 DEPTH_NOISE = (0.003, 0.008)
 """Spread of depth: m, and per m."""
 IN_FRONT = 0.5
-"""How far in front of the background things are, m; anywhere up to there."""
+"""Distance of things in front of the background, m; anywhere up to there."""
 MOST_DEPTH = 3.0
 """Largest log ratio that a pixel's depth counts; depth is off by pixels at borders."""
 
@@ -49,7 +49,7 @@ def lab_of(image: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2LAB)
 
 
-def bins_of(lab: np.ndarray, bins: tuple[int, int, int] = BINS) -> np.ndarray:
+def bins_of(lab: np.ndarray, bins: tuple[int, int, int] = LAB_BINS) -> np.ndarray:
     """The bin of every pixel [H, W], of so many bins of L, a and b."""
     first, second, third = (lab[..., axis].astype(np.int32) * count // 256 for axis, count in enumerate(bins))
     return np.asarray((first * bins[1] + second) * bins[2] + third)
@@ -57,13 +57,13 @@ def bins_of(lab: np.ndarray, bins: tuple[int, int, int] = BINS) -> np.ndarray:
 
 def log_density(counts: np.ndarray) -> np.ndarray:
     """Log density of colors per unit of (L, a, b) [bins], from counts [bins]."""
-    blurred = gaussian_filter(counts.reshape(BINS), BLUR, mode="nearest", truncate=2.5).ravel()
+    blurred = gaussian_filter(counts.reshape(LAB_BINS), BLUR, mode="nearest", truncate=2.5).ravel()
     share = blurred / max(float(blurred.sum()), 1e-9)
-    return np.asarray(np.log((1 - UNSEEN) * share / VOLUME + UNSEEN / SPREAD), dtype=np.float32)
+    return np.asarray(np.log((1 - UNSEEN) * share / BIN_VOLUME + UNSEEN / COLOR_SPREAD), dtype=np.float32)
 
 
-def count(seen: np.ndarray, where: np.ndarray, bins: tuple[int, int, int] = BINS) -> np.ndarray:
-    """How often each color is seen [bins] where a mask [H, W] is true; `seen` [H, W] are the bins of pixels."""
+def count(seen: np.ndarray, where: np.ndarray, bins: tuple[int, int, int] = LAB_BINS) -> np.ndarray:
+    """Counts of each color [bins] where a mask [H, W] is true; `seen` [H, W] are the bins of pixels."""
     return np.bincount(seen[where], minlength=int(np.prod(bins))).astype(float)
 
 
@@ -163,7 +163,7 @@ class Background:
 
 
 def _alike(lab: np.ndarray, look: np.ndarray) -> np.ndarray:
-    """Where two images in Lab [H, W, 3] do not differ plainly [H, W] bool."""
+    """Pixels [H, W] bool at which two images in Lab [H, W, 3] do not differ plainly."""
     return np.asarray(cv2.absdiff(np.ascontiguousarray(lab), np.ascontiguousarray(look)).max(axis=-1) <= DIFFERENT)
 
 
@@ -176,9 +176,9 @@ def shaded_density(step: np.ndarray, spread: np.ndarray) -> np.ndarray:
     near = step / spread
     hue = 0.5 * (near[..., 1] ** 2 + near[..., 2] ** 2)
     area = np.log(2 * np.pi * spread[..., 1] * spread[..., 2])
-    lit = np.log(1 - SHADOW - TINT) - 0.5 * near[..., 0] ** 2 - np.log(np.sqrt(2 * np.pi) * spread[..., 0]) - hue
+    lit = np.log(1 - SHADOW - SHADOW_TINTED) - 0.5 * near[..., 0] ** 2 - np.log(np.sqrt(2 * np.pi) * spread[..., 0]) - hue
     darker = np.where(step[..., 0] < 0, step[..., 0] / SHADE - np.log(SHADE), NEVER_SHADE)
-    shaded = np.logaddexp(np.log(SHADOW) - hue, np.log(TINT) - hue / TINTED**2 - 2 * np.log(TINTED))
+    shaded = np.logaddexp(np.log(SHADOW) - hue, np.log(SHADOW_TINTED) - hue / TINTED**2 - 2 * np.log(TINTED))
     return np.asarray(np.logaddexp(lit, darker + shaded) - area, dtype=np.float32)
 
 

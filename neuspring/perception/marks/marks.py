@@ -34,17 +34,17 @@ from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture
 
 MARKS = "marks.json"
 """Its name in a capture's folder."""
-LABELS = {"object": OBJECT, "hand": HANDS, "ignore": NOTHING}
-"""What a mark's label is in a mask."""
+MARK_VALUES = {"object": OBJECT, "hand": HANDS, "ignore": NOTHING}
+"""Label in a mask of a mark's word."""
 LEAST_POINTS = {"box": 2, "click": 1, "scribble": 1, "polygon": 3}
 EXACT_POINTS = ("box", "click")
-UNKNOWN = 255
+UNMARKED_PIXEL = 255
 """In `Seeds.certain`: no mark says what the pixel is."""
-FAR = 0.08
+ODDS_FALL = 0.08
 """Distance from its marks, as part of the image, by which the odds of a label without bounds fall by e."""
-STEEP = 0.3
+POLYGON_SLOPE = 0.3
 """Distance from the border of a polygon, as part of its `radius`, by which the log odds change by 1."""
-MOST = 4.0
+MOST_ODDS = 4.0
 """Largest log odds by place."""
 
 
@@ -75,7 +75,7 @@ class Mark:
     @property
     def value(self) -> int:
         """Its label in a mask: 1 object, 2 hands, 0 neither."""
-        return LABELS[self.label]
+        return MARK_VALUES[self.label]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,10 +151,10 @@ def marks_digest(marks: tuple[Mark, ...]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Seeds:
-    """What the marks of one frame say."""
+    """Evidence of the marks of one frame."""
 
     certain: np.ndarray
-    """[H, W] uint8: the label, or UNKNOWN."""
+    """[H, W] uint8: the label, or UNMARKED_PIXEL."""
     possible: np.ndarray
     """[3, H, W] bool: where nothing, object and hands can be."""
     prior: np.ndarray
@@ -162,13 +162,13 @@ class Seeds:
 
     @classmethod
     def of(cls, marks: Sequence[Mark], size: tuple[int, int], scale: float, *, carried: bool = False) -> Seeds:
-        """Of the marks on one frame, drawn into an image of `size` (height, width) that is `scale` times the camera's.
+        """Evidence of the marks on one frame, drawn into an image of `size` (height, width) that is `scale` times the camera's.
 
         Boxes and polygons bound a label, unless it is also clicked or scribbled outside of them. Hands lie over objects, what is
         ignored over both, and clicks and scribbles over polygons. With `carried` the place of labels is also known from the frame
         before: then a label without marks can be anywhere.
         """
-        certain, possible = np.full(size, UNKNOWN, np.uint8), np.ones((3, *size), bool)
+        certain, possible = np.full(size, UNMARKED_PIXEL, np.uint8), np.ones((3, *size), bool)
         prior = np.zeros((3, *size), np.float32)
         for label in (OBJECT, HANDS):
             own = [mark for mark in marks if mark.value == label]
@@ -181,19 +181,19 @@ class Seeds:
             elif not carried:
                 # Not bounded: what is far from all marks of a label needs a color that says so.
                 far = cv2.distanceTransform((~np.any([*areas, *lines], axis=0)).astype(np.uint8), cv2.DIST_L2, 5)
-                prior[label] = np.maximum(-far / (FAR * max(size)), -MOST)
+                prior[label] = np.maximum(-far / (ODDS_FALL * max(size)), -MOST_ODDS)
             for mark in own:
                 if mark.kind == "polygon":
                     inside = _drawn(mark, size, scale, grown=0)
                     away = [cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, 5) for part in (inside, ~inside)]
-                    slope = (away[0] - away[1]) / max(STEEP * mark.radius * scale, 0.5)
-                    prior[label] = np.maximum(prior[label], np.clip(slope, -MOST, MOST) * (possible[label]))
+                    slope = (away[0] - away[1]) / max(POLYGON_SLOPE * mark.radius * scale, 0.5)
+                    prior[label] = np.maximum(prior[label], np.clip(slope, -MOST_ODDS, MOST_ODDS) * (possible[label]))
         for kinds in (("polygon", "box"), ("scribble", "click")):
             for mark in sorted(marks, key=lambda mark: (OBJECT, HANDS, NOTHING).index(mark.value)):
                 # A box of a label says where it can be, not where it is.
                 if mark.kind in kinds and (mark.kind != "box" or mark.label == "ignore"):
                     certain[_drawn(mark, size, scale)] = mark.value
-        known = certain != UNKNOWN
+        known = certain != UNMARKED_PIXEL
         possible[:, known] = False
         for label in (NOTHING, OBJECT, HANDS):
             possible[label, certain == label] = True
@@ -201,8 +201,8 @@ class Seeds:
 
     @property
     def marked(self) -> np.ndarray:
-        """Where something is certain or inside of a polygon [H, W] bool."""
-        return np.asarray((self.certain != UNKNOWN) | (self.prior[1:] > 0).any(axis=0))
+        """Pixels [H, W] bool that are certain or inside of a polygon."""
+        return np.asarray((self.certain != UNMARKED_PIXEL) | (self.prior[1:] > 0).any(axis=0))
 
     def part(self, window: tuple[slice, slice]) -> Seeds:
         """A window of it."""

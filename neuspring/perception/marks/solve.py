@@ -14,36 +14,36 @@ import numpy as np
 
 from neuspring.data.capture import HANDS, NOTHING, OBJECT
 from neuspring.perception.marks.colors import Background, apart, bins_of, count, log_density, mixed, shaded_density
-from neuspring.perception.marks.marks import FAR, UNKNOWN, Seeds
+from neuspring.perception.marks.marks import ODDS_FALL, UNMARKED_PIXEL, Seeds
 
 SMOOTHNESS = 1.5
 """Cost of a border between two neighboring pixels of the same color, as a log ratio of probabilities."""
-ROUNDS = 10
-NEIGHBORS = ((0, 1, 1.0), (1, 0, 1.0), (1, 1, 0.7071), (1, -1, 0.7071))
+SOLVER_ROUNDS = 10
+GRID_NEIGHBORS = ((0, 1, 1.0), (1, 0, 1.0), (1, 1, 0.7071), (1, -1, 0.7071))
 """Steps down and right, and weights: the inverse of the distance. The other four neighbors are opposite."""
-CLOSE = 6
+BORDER_REACH = 6
 """Pixels from a border of labels within which a pixel may change."""
 DECIDED = 10.0
 """Log odds from which no neighbors change a pixel."""
 TURNS = 5
 NEVER = -40.0
 """Log odds of what marks exclude."""
-LABELS = (NOTHING, OBJECT, HANDS)
-SHADES = (0.88, 0.76)
+ALL_LABELS = (NOTHING, OBJECT, HANDS)
+BACKGROUND_SHADES = (0.88, 0.76)
 """Factors that darken the colors of the background near the object: its shadow."""
 SHADED = 0.1
 """Weight of each shade."""
-LOCAL = 0.8
+LOCAL_BACKGROUND = 0.8
 """Probability that the background looks like the background around it."""
-AROUND = 0.03
-"""How far around, as part of the image."""
-RISEN, RISEN_LOGS = 0.012, 2.0
+AROUND_SHARE = 0.03
+"""Reach around a pixel, as part of the image."""
+RISEN_HEIGHT, RISEN_LOGS = 0.012, 2.0
 """Height above the table, m, from which a pixel is probably object or hand, where marks let it be, and by which log odds."""
 COARSE = 6
 """Factor by which images are made smaller to be blurred."""
 LOCAL_NOISE = 2.0
 """Least spread of L, a, b."""
-FEW = 0.5
+FEW_VARIANCE = 0.5
 """Added variance where little of the background is seen."""
 CERTAIN_WEIGHT = 1.0
 """Weight of the colors beneath clicks, scribbles and polygons, against those of the whole mask so far."""
@@ -61,19 +61,19 @@ MOST_HOLE, FILLED = 0.2, 2.0
 between a toy and hands was filled too."""
 CONFIDENT = 0.95
 """Probability from which a pixel teaches colors."""
-LEARN, EVERY = 0.2, 4
+LEARN, LEARN_EVERY = 0.2, 4
 """Weight of a frame in the running colors, which are learned from each fourth frame."""
 TRUST_START = 0.75
 """Weight of the marked frames' colors, against the running ones."""
-SHOWN = 0.5
+MARKED_WEIGHT = 0.5
 """Weight of the colors beneath the marks of a frame on the way, against those of the frames before."""
 CORRECTION, CORRECTED = 6.0, 5.0
 """Log odds beside a mark that contradicts what was carried, and how far it reaches, as a multiple of `reach`."""
-MOVES = 12.0
-"""How far things move in a frame at most, as a multiple of `reach`: the margin of the part of the image that is worked on."""
+MOVES_AT_MOST = 12.0
+"""Largest motion of things in a frame, as a multiple of `reach`: the margin of the part of the image that is worked on."""
 LEAST_SIDE = 64
 """Smallest side of images between which flow is sought, pixels; smaller ones are continued."""
-BROUGHT = 0.2
+BROUGHT_FROM = 0.2
 """Probability by place from which a piece counts as brought by the flow."""
 LEAST_ENTERING = 0.0005
 """Smallest part of the image that a hand covers when it comes in."""
@@ -94,7 +94,7 @@ def solve(logs: np.ndarray, lab: np.ndarray, smoothness: float = SMOOTHNESS) -> 
     flat, color = logs.reshape(kinds, -1)[:, pixels], lab.reshape(-1, 3).astype(np.float32)
     rows, columns = np.divmod(pixels, width)
     beside, squares, weights = [], [], []
-    for down, right, weight in NEIGHBORS:
+    for down, right, weight in GRID_NEIGHBORS:
         for sign in (1, -1):
             row, column = rows + sign * down, columns + sign * right
             there = (row >= 0) & (row < height) & (column >= 0) & (column < width)
@@ -105,7 +105,7 @@ def solve(logs: np.ndarray, lab: np.ndarray, smoothness: float = SMOOTHNESS) -> 
     mean = max(float(np.mean(squares)), 1.0)
     links = [weight * np.exp(-square / (2 * mean)) for weight, square in zip(weights, squares, strict=True)]
     part = q[:, pixels]
-    for _ in range(ROUNDS):
+    for _ in range(SOLVER_ROUNDS):
         message = flat.copy()
         for place, link in zip(beside, links, strict=True):
             message += link * q[:, place]
@@ -120,7 +120,7 @@ def _open(logs: np.ndarray) -> np.ndarray:
     best = logs.argmax(axis=0).astype(np.uint8)
     kernel = np.ones((3, 3), np.uint8)
     border = (cv2.dilate(best, kernel) != cv2.erode(best, kernel)).astype(np.uint8)
-    near = cv2.dilate(border, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * CLOSE + 1,) * 2)).astype(bool)
+    near = cv2.dilate(border, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * BORDER_REACH + 1,) * 2)).astype(bool)
     first = logs.max(axis=0)
     others = np.stack([np.where(best == label, -np.inf, part) for label, part in enumerate(logs)]).max(axis=0)
     return np.asarray(near & (first - others < DECIDED))
@@ -152,22 +152,17 @@ class MarkedFrame:
         return np.asarray(self.probability.argmax(axis=0), dtype=np.uint8)
 
 
-def start(
-    lab: np.ndarray,
-    seeds: Seeds,
-    height: np.ndarray | None = None,
-    background: Background | None = None,
-) -> MarkedFrame:
+def start(lab: np.ndarray, seeds: Seeds, height: np.ndarray | None = None, background: Background | None = None) -> MarkedFrame:
     """Labels and colors of a frame, Lab [H, W, 3], from its marks; with heights above the table [H, W], m, and the background."""
     bins, labels = bins_of(lab), _first(lab, seeds)
     place = np.where(seeds.possible, seeds.prior, NEVER).astype(np.float32)
     if height is not None:
-        place[NOTHING] -= np.where(np.nan_to_num(height) > RISEN, RISEN_LOGS, 0.0)
+        place[NOTHING] -= np.where(np.nan_to_num(height) > RISEN_HEIGHT, RISEN_LOGS, 0.0)
     for _ in range(TURNS):
         counts = counts_of(lab, bins, labels, seeds.certain)
         logs = np.stack([log_density(own)[bins] if own.sum() else np.full(bins.shape, NEVER) for own in counts])
-        near = np.log(LOCAL) + _local_density(lab, labels == NOTHING)
-        logs[NOTHING] = np.logaddexp(near, np.log(1 - LOCAL) + logs[NOTHING])
+        near = np.log(LOCAL_BACKGROUND) + _local_density(lab, labels == NOTHING)
+        logs[NOTHING] = np.logaddexp(near, np.log(1 - LOCAL_BACKGROUND) + logs[NOTHING])
         if background is not None:
             logs[NOTHING] = background.explain(logs[NOTHING], lab, np.zeros(3, np.float32))
         logs = place + COLOR_AT_START * logs
@@ -180,7 +175,7 @@ def start(
 def counts_of(lab: np.ndarray, bins: np.ndarray, labels: np.ndarray, certain: np.ndarray) -> list[np.ndarray]:
     """Colors [bins] of nothing, object and hands: of a mask [H, W], of what is certain, and of shadows on the background."""
     counts = []
-    for label in LABELS:
+    for label in ALL_LABELS:
         own = labels == label
         core = cv2.erode(own.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
         # A thin rope has no core.
@@ -188,7 +183,7 @@ def counts_of(lab: np.ndarray, bins: np.ndarray, labels: np.ndarray, certain: np
         if label == NOTHING:
             near = own & (cv2.distanceTransform(own.astype(np.uint8), cv2.DIST_L2, 5) < 0.1 * max(own.shape))
             parts.append((1.0, count(bins, near)))
-            for shade in SHADES:
+            for shade in BACKGROUND_SHADES:
                 darker = lab.copy()
                 darker[..., 0] = (shade * lab[..., 0]).astype(np.uint8)
                 parts.append((SHADED, count(bins_of(darker), near)))
@@ -203,7 +198,7 @@ def _local_density(lab: np.ndarray, rest: np.ndarray) -> np.ndarray:
 
     A table is lit unevenly: as a whole it has the colors of a white toy, and beside the toy it has not.
     """
-    width, image = AROUND * max(rest.shape), lab.astype(np.float32)
+    width, image = AROUND_SHARE * max(rest.shape), lab.astype(np.float32)
     weight = rest.astype(np.float32)[..., None]
 
     def blurred(values: np.ndarray) -> np.ndarray:
@@ -213,14 +208,14 @@ def _local_density(lab: np.ndarray, rest: np.ndarray) -> np.ndarray:
 
     share = np.maximum(blurred(weight), 1e-4)
     mean = blurred(weight * image) / share
-    variance = np.maximum(blurred(weight * image**2) / share - mean**2, 0.0) + LOCAL_NOISE**2 + FEW / share
+    variance = np.maximum(blurred(weight * image**2) / share - mean**2, 0.0) + LOCAL_NOISE**2 + FEW_VARIANCE / share
     return shaded_density(image - mean, np.sqrt(variance))
 
 
 def _first(lab: np.ndarray, seeds: Seeds) -> np.ndarray:
     """Labels to begin with: what is certain or in polygons, and in boxes what has other colors than lie outside of them."""
     bins, labels = bins_of(lab), np.zeros(lab.shape[:2], np.uint8)
-    free = seeds.certain == UNKNOWN
+    free = seeds.certain == UNMARKED_PIXEL
     outside = ~seeds.possible[OBJECT] & ~seeds.possible[HANDS]
     if not outside.any():
         outside = free
@@ -272,12 +267,12 @@ class CarriedFrame:
 
 @dataclass(eq=False, kw_only=True)
 class Pass:
-    """What is known while labels are carried in one direction."""
+    """State while labels are carried in one direction."""
 
     lab: np.ndarray
     """The last frame, Lab [H, W, 3]."""
     probability: np.ndarray
-    """Of the last frame [3, H, W]."""
+    """Probabilities of the last frame [3, H, W]."""
     first: tuple[np.ndarray, ...]
     """Colors of the marked frames: counts [bins] of nothing, object, hands."""
     background: Background | None
@@ -306,7 +301,7 @@ class Pass:
             self._show(near, part)
             for label in self._new(part):
                 away = cv2.distanceTransform((part.certain != label).astype(np.uint8), cv2.DIST_L2, 5)
-                place[label] += np.exp(-away / (FAR * max(self.lab.shape)))
+                place[label] += np.exp(-away / (ODDS_FALL * max(self.lab.shape)))
             place = place / place.sum(axis=0)
         color = self.color_logs(near, before, window, None if depth is None else depth[window])
         logs = np.log(place) + color
@@ -333,7 +328,7 @@ class Pass:
                 return slice(None), slice(None)
         if self.background is not None:
             busy |= _entering(self.background.changed(lab))
-        margin = round(MOVES * self.reach)
+        margin = round(MOVES_AT_MOST * self.reach)
         places = []
         for axis in (1, 0):
             found = np.flatnonzero(busy.any(axis=axis))
@@ -356,7 +351,7 @@ class Pass:
         moved = np.stack([brought(part) for part in probability], axis=-1)
         narrow, wide = (cv2.GaussianBlur(moved, (0, 0), width * self.reach) for width in (0.35, 2.0))
         place = ((1 - doubt)[..., None] * narrow + doubt[..., None] * wide).transpose(2, 0, 1)
-        for label in LABELS:
+        for label in ALL_LABELS:
             if self.first[label].sum():
                 place[label] += ANYWHERE[label]
         place = place + np.float32(1e-6)
@@ -369,10 +364,10 @@ class Pass:
     def _show(self, lab: np.ndarray, seeds: Seeds) -> None:
         """Take the colors beneath the marks of a frame at once: they say what was not known before."""
         bins = bins_of(lab)
-        for label in LABELS:
+        for label in ALL_LABELS:
             shown = count(bins, seeds.certain == label)
             if shown.any():
-                self.colors[label] = log_density(mixed([(1.0, self.first[label]), (SHOWN, shown)]))
+                self.colors[label] = log_density(mixed([(1.0, self.first[label]), (MARKED_WEIGHT, shown)]))
 
     def color_logs(
         self, lab: np.ndarray, probability: np.ndarray, window: tuple[slice, slice], depth: np.ndarray | None
@@ -400,7 +395,7 @@ class Pass:
         rows, columns = self.lab.shape[:2]
         for label in (OBJECT, HANDS):
             number, pieces, boxes, _ = cv2.connectedComponentsWithStats((labels == label).astype(np.uint8))
-            support = np.bincount(pieces.ravel(), place[label].ravel() > BROUGHT, minlength=number)
+            support = np.bincount(pieces.ravel(), place[label].ravel() > BROUGHT_FROM, minlength=number)
             left, top, width, height, areas = boxes.T
             drop = (support < 0.05 * areas) | (areas < 4)
             if label == HANDS:
@@ -439,10 +434,10 @@ class Pass:
         if self.background is not None and self.learns:
             labels = self.probability.argmax(axis=0)
             self.background.learn(self.lab, apart(labels, 3) & (self.probability[NOTHING] > CONFIDENT), depth)
-        if self.steps % EVERY:
+        if self.steps % LEARN_EVERY:
             return
         bins = bins_of(self.lab)
-        for label in LABELS:
+        for label in ALL_LABELS:
             sure = self.probability[label] > CONFIDENT
             if label != NOTHING:
                 core = cv2.erode(sure.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
@@ -459,7 +454,7 @@ def corrections(place: np.ndarray, seeds: Seeds, reach: float) -> np.ndarray:
     """Log odds [3, h, w] of marks on a frame to which labels were carried: what contradicts them there fades with the distance."""
     logs = np.where(seeds.possible, seeds.prior, NEVER)
     carried = place.argmax(axis=0)
-    for label in LABELS:
+    for label in ALL_LABELS:
         wrong = (seeds.certain == label) & (carried != label)
         if wrong.any():
             away = cv2.distanceTransform((~wrong).astype(np.uint8), cv2.DIST_L2, 5)

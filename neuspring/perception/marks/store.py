@@ -31,12 +31,12 @@ from neuspring.perception.marks.carry import Carried, carry_camera
 from neuspring.perception.marks.marks import MARKS, Mark, Marks, marks_digest
 
 MADE = "masks.json"
-"""What the masks of a capture were made from, and how far each frame is doubted; in its folder."""
-COLUMNS = 4
+"""Source of the masks of a capture, and how far each frame is doubted; in its folder."""
+SHEET_COLUMNS = 4
 EVEN, DOUBTFUL = 8, 8
-"""How many frames are shown evenly over the video, and in doubt."""
-WIDTH = 424
-"""Of a tile, pixels, at most."""
+"""Frames that are shown evenly over the video, and in doubt."""
+TILE_WIDTH = 424
+"""Width of a tile, pixels, at most."""
 
 
 def require(capture: Capture) -> None:
@@ -113,7 +113,7 @@ def has_masks(capture: Capture, cameras: Sequence[str] = ()) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class MadeMasks:
-    """What the masks of one camera were made from."""
+    """Source of the masks of one camera."""
 
     __pydantic_config__ = STRICT
     source: str
@@ -133,7 +133,7 @@ class MasksFile:
 
     @classmethod
     def of(cls, capture: Capture) -> MasksFile:
-        """Of a capture; empty without the file. Raises InputError for a damaged one."""
+        """The file of a capture; empty where there is none. Raises InputError for a damaged one."""
         path = capture.folder / MADE
         if not path.exists():
             return cls()
@@ -181,18 +181,18 @@ def save_sheet(capture: Capture, camera: str, carried: Carried) -> Path:
     tints = tints_of(capture.color(camera, frames[0]), carried.labels[frames[0]])
     doubtful = sorted(frames, key=lambda frame: -carried.doubt[frame])[:DOUBTFUL]
     tiles = [_tile(capture, camera, carried, tints, frame, f"{frame}: doubt {carried.doubt[frame]:.2f}") for frame in doubtful]
-    tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % COLUMNS)
+    tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % SHEET_COLUMNS)
     tiles += [_tile(capture, camera, carried, tints, frame, str(frame)) for frame in spread(frames, EVEN)]
-    tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % COLUMNS)
-    rows = [np.hstack(tiles[index : index + COLUMNS]) for index in range(0, len(tiles), COLUMNS)]
+    tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % SHEET_COLUMNS)
+    rows = [np.hstack(tiles[index : index + SHEET_COLUMNS]) for index in range(0, len(tiles), SHEET_COLUMNS)]
     return write_png(sheet_of(capture, camera), np.vstack(rows))
 
 
 def _tile(capture: Capture, camera: str, carried: Carried, tints: Mapping[int, Color], frame: int, text: str) -> np.ndarray:
     image = overlay(capture.color(camera, frame), carried.labels[frame], tints)
     height, width = image.shape[:2]
-    if width > WIDTH:
-        image = cv2.resize(image, (WIDTH, round(height * WIDTH / width)), interpolation=cv2.INTER_AREA)
+    if width > TILE_WIDTH:
+        image = cv2.resize(image, (TILE_WIDTH, round(height * TILE_WIDTH / width)), interpolation=cv2.INTER_AREA)
     for color, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
         cv2.putText(image, text, (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.45, color, thick, cv2.LINE_AA)
     return image

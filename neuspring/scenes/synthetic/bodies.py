@@ -187,10 +187,7 @@ def cloth(name: str, spacing: float, skin_spacing: float) -> SoftBody:
     )
 
 
-ROPES = {
-    "twine": (0.5, (0.06,), (0.75, 0.68, 0.5)),
-    "cord": (0.44, (-0.1, 0.12), (0.3, 0.45, 0.7)),
-}
+ROPES = {"twine": (0.5, (0.06,), (0.75, 0.68, 0.5)), "cord": (0.44, (-0.1, 0.12), (0.3, 0.45, 0.7))}
 """Length, m; places of knots along x, m; color."""
 ROPE_RADIUS = 0.006
 KNOT_RADIUS = 0.0095
@@ -384,11 +381,7 @@ def _animal(parts: Mapping[str, Sdf], factors: Mapping[str, float], paint: Paint
     return SoftBody(
         nodes=nodes + lift,
         surface=Surface(
-            rest=vertices + lift,
-            faces=faces,
-            nodes=tetrahedra[element],
-            weights=weights,
-            colors=paint(vertices, parts),
+            rest=vertices + lift, faces=faces, nodes=tetrahedra[element], weights=weights, colors=paint(vertices, parts)
         ),
         radius=RADIUS,
         tetrahedra=tetrahedra,

@@ -32,7 +32,7 @@ else:
 
 GRAVITY = 9.81
 """m/s^2, towards -z."""
-GRID = (32, 32, 32)
+CONTACT_GRID = (32, 32, 32)
 """Cells in which near nodes are looked for. The engine's 128 in each direction are emptied in every substep: most of its time."""
 LEAST_MASS = 0.3
 """Nodes of a solid weigh at least this fraction of the median node; lighter ones alone would dictate the step."""
@@ -48,7 +48,7 @@ def lame(youngs_modulus: np.ndarray, poisson_ratio: np.ndarray) -> tuple[np.ndar
 
 
 def stable_moduli(youngs_modulus: np.ndarray, poisson_ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What the semi-implicit engine's stable neo-Hookean energy (Smith et al. 2018) needs to have these small-strain moduli:
+    """Constants of the semi-implicit engine's stable neo-Hookean energy (Smith et al. 2018) for these small-strain moduli:
     4/3 mu and lambda + 5/6 mu."""
     mu, first = lame(youngs_modulus, poisson_ratio)
     return 4.0 / 3.0 * mu, first + 5.0 / 6.0 * mu
@@ -77,7 +77,7 @@ def build(body: SoftBody, fists: int, moduli: Moduli = stable_moduli, dashpots: 
     if body.self_contact:
         model.particle_ke, model.particle_kd = body.self_contact_stiffness, 0.01
         model.particle_kf, model.particle_mu = 0.0, 0.3
-        model.particle_grid = wp.HashGrid(*GRID, device="cpu")
+        model.particle_grid = wp.HashGrid(*CONTACT_GRID, device="cpu")
     else:
         model.particle_grid = None
     model.soft_contact_ke, model.soft_contact_kd = body.contact_stiffness, body.contact_damping
@@ -429,7 +429,7 @@ def settle(body: SoftBody, frame_rate: float, seconds: float = 4.0, still: float
 
 
 def certify(engine: FiniteElements, clip: Clip, frames: int) -> tuple[float, float]:
-    """How far, m, the mean node of the first `frames` frames of the `engine`'s clip moves (largest of all frames) with twice the
+    """Motion, m, of the mean node of the first `frames` frames of the `engine`'s clip (largest of all frames) with twice the
     substeps, and with a start that is NUDGE off.
 
     A cloth that wrinkles multiplies any difference: there the second figure, not zero, is what the first has to be compared with.

@@ -230,12 +230,7 @@ def to_table(origin: wp.vec3, ray: wp.vec3):
 
 @wp.kernel(enable_backward=False)
 def shade_table(
-    pose: wp.transform,
-    focal: wp.vec2,
-    center: wp.vec2,
-    offsets: wp.array[wp.vec2],
-    farthest: float,
-    shades: wp.array3d[wp.vec3],
+    pose: wp.transform, focal: wp.vec2, center: wp.vec2, offsets: wp.array[wp.vec2], farthest: float, shades: wp.array3d[wp.vec3]
 ):
     """The empty table's color in every sample, before light falls on it: a camera and its table do not move."""
     y, x, s = wp.tid()
@@ -318,12 +313,7 @@ def cast(
 
 @wp.kernel(enable_backward=False)
 def first_hit(
-    mesh: wp.uint64,
-    origin: wp.vec3,
-    rays: wp.array[wp.vec3],
-    farthest: float,
-    face: wp.array[int],
-    weights: wp.array[wp.vec3],
+    mesh: wp.uint64, origin: wp.vec3, rays: wp.array[wp.vec3], farthest: float, face: wp.array[int], weights: wp.array[wp.vec3]
 ):
     """The triangle that a ray meets first, -1 for none, and the weights of its corners."""
     i = wp.tid()
@@ -335,13 +325,7 @@ def first_hit(
 
 
 @wp.kernel(enable_backward=False)
-def nearest(
-    mesh: wp.uint64,
-    points: wp.array[wp.vec3],
-    farthest: float,
-    face: wp.array[int],
-    weights: wp.array[wp.vec3],
-):
+def nearest(mesh: wp.uint64, points: wp.array[wp.vec3], farthest: float, face: wp.array[int], weights: wp.array[wp.vec3]):
     """The triangle that holds the point of the mesh nearest to each place, and the weights of its corners."""
     i = wp.tid()
     hit = wp.mesh_query_point_no_sign(mesh, points[i], farthest)

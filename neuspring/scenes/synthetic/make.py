@@ -18,11 +18,11 @@ from neuspring.core.geometry import farthest
 from neuspring.core.records import digest_file
 from neuspring.core.text import Progress
 from neuspring.data.camera import Camera
-from neuspring.data.capture import Capture, Description, Writer
+from neuspring.data.capture import HANDS, OBJECT, Capture, Description, Writer
 from neuspring.scenes.synthetic.bodies import SoftBody
 from neuspring.scenes.synthetic.fem import Clip, Damping, FiniteElements, VertexBlockDescent, certify, settle
-from neuspring.scenes.synthetic.render import HAND, OBJECT, Part, Renderer, measured, quantized
-from neuspring.scenes.synthetic.scenes import SCENES, SKIN, Hand, place
+from neuspring.scenes.synthetic.render import Part, Renderer, measured, quantized
+from neuspring.scenes.synthetic.scenes import SCENES, SKIN_COLOR, Hand, place
 from neuspring.scenes.synthetic.truth import Truth, truth_path
 
 FRAME_RATE = 30.0
@@ -32,14 +32,14 @@ FIELD_OF_VIEW = 55.0
 """Degrees, along the width."""
 AZIMUTHS = (-35.0, 85.0, 205.0)
 """Directions of the cameras around the object, degrees. The first camera looks at the object's head."""
-ELEVATION = 38.0
+CAMERA_ELEVATION = 38.0
 SENSOR_SEED = 0
 """Seed of the noise of the depth sensor; the scenario's name enters too."""
-MARGIN = 0.9
+IMAGE_MARGIN = 0.9
 """Object and hands' origins stay within this fraction of the image, from its center."""
-ANNOTATED = 40
+ANNOTATED_TRACKS = 40
 """Number of tracks for scoring."""
-LEAST_JACOBIAN, SHARE = 0.02, 0.1
+LEAST_JACOBIAN, CRUSHED_SHARE = 0.02, 0.1
 """A clip is refused if an element falls below this volume ratio in more than this fraction of the frames."""
 ENGINES = {"": FiniteElements, "vbd": VertexBlockDescent}
 MOST_DEVIATION = 0.001
@@ -149,7 +149,7 @@ def make(row: ScenarioRow, settings: Synthetic, folder: Path) -> tuple[Capture, 
 
 def _refuse(name: str, truth: Truth) -> None:
     crushed = float((truth.least_jacobian < LEAST_JACOBIAN).mean())
-    if crushed > SHARE:
+    if crushed > CRUSHED_SHARE:
         raise NumericalFailure(f"{name}: an element is crushed (det F < {LEAST_JACOBIAN}) in {crushed:.0%} of the frames")
     if truth.certificate > max(MOST_DEVIATION, CHAOS * truth.sensitivity):
         deviations = f"{1e3 * truth.certificate:.2f} mm, a start that is 1 um off by {1e3 * truth.sensitivity:.2f} mm"
@@ -165,14 +165,14 @@ def place_cameras(clip: Clip, hands: Sequence[Hand], size: CaptureSize, count: i
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     cameras = []
     for index, azimuth in enumerate(np.radians(AZIMUTHS[:count])):
-        up = np.radians(ELEVATION)
+        up = np.radians(CAMERA_ELEVATION)
         away = np.array([np.cos(up) * np.cos(azimuth), np.cos(up) * np.sin(azimuth), np.sin(up)])
         distance = 0.35
         while True:
             camera = Camera(str(index), size.width, size.height, k, looking(middle + distance * away, middle))
             pixels, depth = camera.project(points)
             off = np.abs(pixels / k[:2, 2] - 1.0).max()
-            if (depth > 0.1).all() and off < MARGIN:
+            if (depth > 0.1).all() and off < IMAGE_MARGIN:
                 break
             distance += 0.02
         cameras.append(camera)
@@ -205,7 +205,7 @@ def _film(
     placed = [place(vertices, hand.poses(times)) for hand, (vertices, _) in zip(hands, meshes, strict=True)]
     skin = body.surface
     parts = [Part(skin.rest, skin.faces, skin.colors, OBJECT, GRAINS.get(row.category, PLUSH_GRAIN))]
-    parts += [Part(vertices, faces, np.tile(SKIN, (len(vertices), 1)), HAND, HAND_GRAIN) for vertices, faces in meshes]
+    parts += [Part(vertices, faces, np.tile(SKIN_COLOR, (len(vertices), 1)), HANDS, HAND_GRAIN) for vertices, faces in meshes]
     renderer = Renderer(parts)
     surfaces = skin.follow(clip.positions)
     report = Progress(f"render {row.scenario}", frames)
@@ -222,8 +222,8 @@ def _film(
         report.update(frame + 1)
 
 
-MARK_LABELS = {OBJECT: "object", HAND: "hand"}
-OFF = 1.0
+MARK_LABELS = {OBJECT: "object", HANDS: "hand"}
+BORDER_OFF = 1.0
 """Pixels by which the border of a mark may be off, and by which its corners are rounded."""
 
 
@@ -236,10 +236,10 @@ def outlines(capture: Capture) -> dict[str, list[dict[str, Any]]]:
         mask = capture.mask(name, 0)
         for label, word in MARK_LABELS.items():
             for contour in cv2.findContours((mask == label).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]:
-                points = cv2.approxPolyDP(contour, OFF, closed=True)[:, 0].tolist()
+                points = cv2.approxPolyDP(contour, BORDER_OFF, closed=True)[:, 0].tolist()
                 # What is thinner than the rounding has no polygon.
                 kind = "polygon" if len(points) > 2 else "scribble"
-                marks.append({"frame": 0, "label": word, "kind": kind, "points": points, "radius": OFF})
+                marks.append({"frame": 0, "label": word, "kind": kind, "points": points, "radius": BORDER_OFF})
     return cameras
 
 
@@ -251,5 +251,5 @@ def _annotate(truth: Truth, camera: Camera, capture: Capture) -> np.ndarray:
     x, y = np.round(pixels[inside]).astype(int).T
     seen = capture.depth(camera.name, 0)[y, x]
     visible = inside[(capture.mask(camera.name, 0)[y, x] == OBJECT) & (np.abs(seen - depth[inside]) < 0.004)]
-    spread = visible[farthest(vertices[visible], ANNOTATED)]
+    spread = visible[farthest(vertices[visible], ANNOTATED_TRACKS)]
     return np.stack([truth.surface(frame)[spread] for frame in range(len(truth.nodes))])

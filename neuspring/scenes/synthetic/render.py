@@ -1,4 +1,4 @@
-"""What a depth camera sees: a ray caster on Warp meshes (color, depth along the optical axis, and who is seen: 0 table, 1 object, 2
+"""A depth camera: a ray caster on Warp meshes (color, depth along the optical axis, and who is seen: 0 table, 1 object, 2
 hand), and the sensor's flaws: noise that grows with distance and is alike in neighboring pixels, dropouts at edges and on grazing
 surfaces, holes, quantization.
 
@@ -19,10 +19,9 @@ from scipy.sparse import coo_matrix
 from neuspring.data.camera import Camera
 from neuspring.scenes.synthetic.kernels import cast, shade_table
 
-OBJECT, HAND = 1, 2
 LIGHT = np.array([0.35, -0.45, 0.85]) / np.linalg.norm([0.35, -0.45, 0.85])
 """Direction to the light."""
-FARTHEST = 8.0
+FARTHEST_HIT = 8.0
 """m; what lies further is background without depth."""
 SUBPIXELS = np.array([[0.0, 0.0], [0.25, 0.25], [-0.25, 0.25], [0.25, -0.25]])
 """The place where a pixel's color is sampled; depth and label are those of the first."""
@@ -46,7 +45,7 @@ class Part:
 
 @dataclass(frozen=True)
 class RenderedView:
-    """What one camera sees in one frame."""
+    """View of one camera in one frame."""
 
     color: np.ndarray
     """[H, W, 3] uint8 RGB."""
@@ -96,7 +95,7 @@ class Renderer:
             self._mesh.refit()
 
     def render(self, camera: Camera) -> RenderedView:
-        """What `camera` sees now."""
+        """The present view of `camera`."""
         assert self._mesh is not None, "move() comes first"
         size = (camera.height, camera.width)
         color = wp.zeros((*size, 3), dtype=wp.uint8, device="cpu")
@@ -107,11 +106,11 @@ class Renderer:
         key = (camera.camera_to_world.tobytes(), k.tobytes(), size)
         if key not in self._tables:
             shades = wp.zeros((*size, len(SUBPIXELS)), dtype=wp.vec3, device="cpu")
-            wp.launch(shade_table, shades.shape, [*view, FARTHEST, shades], device="cpu")
+            wp.launch(shade_table, shades.shape, [*view, FARTHEST_HIT, shades], device="cpu")
             self._tables[key] = shades
         arguments = [
             *(self._mesh.id, self._normals, self._rest, self._colors, self._indices, self._labels, self._grains),
-            *(*view, self._tables[key], wp.vec3(*LIGHT), GAMMA, FARTHEST, color, depth, label, slope),
+            *(*view, self._tables[key], wp.vec3(*LIGHT), GAMMA, FARTHEST_HIT, color, depth, label, slope),
         ]
         wp.launch(cast, size, arguments, device="cpu")
         return RenderedView(color.numpy(), depth.numpy(), label.numpy(), slope.numpy())

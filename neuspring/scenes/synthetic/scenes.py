@@ -17,7 +17,7 @@ from neuspring.scenes.synthetic import bodies
 from neuspring.scenes.synthetic.bodies import SoftBody
 from neuspring.scenes.synthetic.meshes import Sdf, capsule, ellipsoid, smooth_union, sphere, surface
 
-SKIN = (0.75, 0.5, 0.4)
+SKIN_COLOR = (0.75, 0.5, 0.4)
 """Linear RGB."""
 FIST_RADIUS = 0.032
 KeyFrame = tuple[float, Sequence[float], Sequence[float]]
@@ -33,7 +33,7 @@ class Hand:
     reach: float = 0.02
     """m."""
     turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """How the mesh stands in the hand's frame: rotation vector, rad. Physics does not see it."""
+    """Orientation of the mesh in the hand's frame: rotation vector, rad. Physics does not see it."""
 
     def poses(self, times: np.ndarray) -> np.ndarray:
         """Position and quaternion (x, y, z, w) [n, 7] at `times`, s: minimum jerk from key to key."""
@@ -181,16 +181,16 @@ def _package(spacing: float, skin: float) -> SoftBody:
     return bodies.package(0.86 * spacing, skin)
 
 
-CORNER, OTHER_CORNER, MIDDLE = (1.0, 0.0, 0.5), (1.0, 1.0, 0.5), (0.5, 0.5, 0.5)
+GRIPPED_CORNER, OTHER_CORNER, GRIPPED_MIDDLE = (1.0, 0.0, 0.5), (1.0, 1.0, 0.5), (0.5, 0.5, 0.5)
 SCENES: dict[str, SyntheticScene] = {
-    "double_lift_cloth_1": SyntheticScene(body=_cloth("napkin"), frames=116, hands=lift(CORNER, OTHER_CORNER)),
-    "double_lift_cloth_3": SyntheticScene(body=_cloth("scarf"), frames=118, hands=lift(CORNER, OTHER_CORNER)),
-    "single_clift_cloth_1": SyntheticScene(body=_cloth("napkin"), frames=80, hands=lift(MIDDLE)),
-    "single_clift_cloth_3": SyntheticScene(body=_cloth("scarf"), frames=97, hands=lift(MIDDLE)),
-    "single_lift_cloth": SyntheticScene(body=_cloth("towel"), frames=173, hands=lift(CORNER)),
+    "double_lift_cloth_1": SyntheticScene(body=_cloth("napkin"), frames=116, hands=lift(GRIPPED_CORNER, OTHER_CORNER)),
+    "double_lift_cloth_3": SyntheticScene(body=_cloth("scarf"), frames=118, hands=lift(GRIPPED_CORNER, OTHER_CORNER)),
+    "single_clift_cloth_1": SyntheticScene(body=_cloth("napkin"), frames=80, hands=lift(GRIPPED_MIDDLE)),
+    "single_clift_cloth_3": SyntheticScene(body=_cloth("scarf"), frames=97, hands=lift(GRIPPED_MIDDLE)),
+    "single_lift_cloth": SyntheticScene(body=_cloth("towel"), frames=173, hands=lift(GRIPPED_CORNER)),
     "single_lift_cloth_1": SyntheticScene(body=_cloth("napkin"), frames=110, hands=lift(OTHER_CORNER)),
-    "single_lift_cloth_3": SyntheticScene(body=_cloth("scarf"), frames=156, hands=lift(CORNER)),
-    "single_lift_cloth_4": SyntheticScene(body=_cloth("sheet"), frames=172, hands=lift(CORNER)),
+    "single_lift_cloth_3": SyntheticScene(body=_cloth("scarf"), frames=156, hands=lift(GRIPPED_CORNER)),
+    "single_lift_cloth_4": SyntheticScene(body=_cloth("sheet"), frames=172, hands=lift(GRIPPED_CORNER)),
     "weird_package": SyntheticScene(body=_package, frames=39, hands=lift((1.0, 0.5, 1.0), reach=0.028, offsets=LOW_LIFT)),
     "double_lift_sloth": SyntheticScene(body=bodies.sloth, frames=62, hands=lift((0.95, 0.0, 0.1), (0.95, 1.0, 0.1), reach=0.025)),
     "double_stretch_sloth": SyntheticScene(body=bodies.sloth, frames=192, hands=stretch((0.9, 1.0, 0.2), (0.0, 0.1, 0.2), 0.05)),

@@ -15,14 +15,15 @@ import numpy as np
 from neuspring.config import Config, ScenarioRow, Toy
 from neuspring.core.artifacts import Material, Observations, Scenario, Simulation, Topology, Twin
 from neuspring.core.errors import InputError
+from neuspring.intake.points import in_both
 from neuspring.physics import reference, stability
 from neuspring.twin.topology import uniform_topology
 
 TRAIN_FRACTION = 0.7
-FRAME_RATE = 30.0
-RUN = (3, 8)
+TOY_FRAME_RATE = 30.0
+TOY_OCCLUSION = (3, 8)
 """Shortest and longest occlusion, frames."""
-ANNOTATED = 16
+TOY_ANNOTATED = 16
 """Number of tracks for scoring; they have no noise."""
 
 
@@ -112,7 +113,7 @@ def true_stiffness(kind: str, shape: Shape, topology: Topology) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ToyScene:
-    """What may be seen, and the truth behind it."""
+    """Observations that may be seen, and the truth behind them."""
 
     observations: Observations
     truth: Twin
@@ -138,7 +139,7 @@ def make(row: ScenarioRow, settings: Toy) -> ToyScene:
         raise InputError(f"scenario {row.scenario}, path", rule, repr(row.path))
     shape = SHAPES[parts[0]]()
     truth = _true_twin(row, shape, parts[2], settings)
-    times = np.arange(settings.frames) / FRAME_RATE
+    times = np.arange(settings.frames) / TOY_FRAME_RATE
     hands = hand_motion(parts[1], shape.hands, times)
     rest = truth.topology.nodes.astype(np.float64)
     motion, _ = reference.rollout(reference.ReferenceTwin.of(truth), rest, np.zeros_like(rest), hands)
@@ -159,7 +160,7 @@ def _true_twin(row: ScenarioRow, shape: Shape, field: str, settings: Toy) -> Twi
         contact_friction=0.3,
         contact_distance=0.01,
     )
-    frame_time = 1.0 / FRAME_RATE
+    frame_time = 1.0 / TOY_FRAME_RATE
     simulation = Simulation(frame_time=frame_time, substeps=1, up="+z", ground=row.ground, self_collision=row.self_collision)
     twin = Twin(topology=topology, material=material, simulation=simulation)
     # Half of what stability allows, so that the truth's own time-stepping error stays small.
@@ -172,15 +173,13 @@ def _observe(row: ScenarioRow, shape: Shape, motion: np.ndarray, hands: np.ndarr
     rng = np.random.default_rng([settings.seed, *row.scenario.encode()])
     noisy = motion + rng.normal(0.0, settings.noise, motion.shape)
     visible = _visibility(rng, frames, tracked, settings.occlusion)
-    moved = np.zeros_like(visible)
-    moved[:-1] = visible[:-1] & visible[1:]
     scenario = Scenario(
         name=row.scenario,
         source="toy",
         category=row.category,
         frame_count=frames,
         train_end=int(TRAIN_FRACTION * frames),
-        frame_rate=FRAME_RATE,
+        frame_rate=TOY_FRAME_RATE,
         up="+z",
         ground=row.ground,
         self_collision=row.self_collision,
@@ -191,12 +190,12 @@ def _observe(row: ScenarioRow, shape: Shape, motion: np.ndarray, hands: np.ndarr
             "occlusion": str(settings.occlusion),
         },
     )
-    annotated = np.linspace(0, tracked - 1, min(ANNOTATED, tracked)).astype(int)
+    annotated = np.linspace(0, tracked - 1, min(TOY_ANNOTATED, tracked)).astype(int)
     return Observations(
         scenario=scenario,
         object_points=np.where(visible[..., None], noisy[:, :tracked], 0.0),
         object_visibility=visible,
-        object_motion_valid=moved,
+        object_motion_valid=in_both(visible),
         controller_points=hands,
         surface_points=noisy[0, tracked : tracked + surface],
         interior_points=noisy[0, tracked + surface :],
@@ -211,5 +210,5 @@ def _visibility(rng: np.random.Generator, frames: int, points: int, fraction: fl
     for point in range(points):
         while (~visible[:, point]).sum() < wanted:
             start = int(rng.integers(1, frames))
-            visible[start : start + int(rng.integers(*RUN)), point] = False
+            visible[start : start + int(rng.integers(*TOY_OCCLUSION)), point] = False
     return visible

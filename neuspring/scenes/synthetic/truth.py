@@ -72,7 +72,7 @@ def truth_of(capture: Capture) -> Truth:
     return Truth.load(path)
 
 
-FARTHEST = 8.0
+FARTHEST_TRUTH = 8.0
 """m."""
 
 
@@ -95,7 +95,7 @@ class MaterialPoints:
 
 
 def under_pixels(truth: Truth, camera: Camera, pixels: np.ndarray) -> MaterialPoints:
-    """What lies under the `pixels` (x, y) [Q, 2] in frame 0.
+    """Surface points under the `pixels` (x, y) [Q, 2] in frame 0.
 
     Hands are not looked at: a pixel that shows a hand gets the object behind it. Choose pixels by the capture's masks.
     """
@@ -115,5 +115,5 @@ def _ask(truth: Truth, kernel: wp.Kernel, count: int, *where: object) -> Materia
     mesh = wp.Mesh(wp.array(truth.surface(0), dtype=wp.vec3, device="cpu"), indices)
     face: wp.array = wp.empty(count, dtype=wp.int32, device="cpu")
     weights: wp.array = wp.zeros(count, dtype=wp.vec3, device="cpu")
-    wp.launch(kernel, count, [mesh.id, *where, FARTHEST, face, weights], device="cpu")
+    wp.launch(kernel, count, [mesh.id, *where, FARTHEST_TRUTH, face, weights], device="cpu")
     return MaterialPoints(truth, np.asarray(face.numpy()), np.asarray(weights.numpy(), dtype=float))

@@ -8,7 +8,7 @@ from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
 from neuspring.extensions.annotate.clicks import Annotations, Click, ClickedPoint
 from neuspring.extensions.annotate.tracks import TracksMode, tracks_of
-from neuspring.intake.make import Intake, make_capture
+from neuspring.extensions.make_capture.make import Intake, make_capture
 from tests.support.desk import write_folders, write_poses
 
 

@@ -194,8 +194,7 @@ def server(released: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> Itera
     monkeypatch.delenv("HF_TOKEN", raising=False)
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
     monkeypatch.setattr(constants, "HF_HUB_DISABLE_TELEMETRY", True)  # read at import, which another test may have caused
-    for name, value in {"BLOCK": 4096, "GAP": 1024}.items():  # as small as the archives
-        monkeypatch.setattr(fetching, name, value)
+    monkeypatch.setattr(fetching, "BLOCK", 4096)  # as small as the archives
     retry(monkeypatch, 0)
     close_session()  # its client knows the environment of its first use
     with StandIn() as standin:

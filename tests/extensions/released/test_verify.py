@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from neuspring.core.errors import InputError
-from neuspring.extensions.released.checks import MEAN, RELEASED, Comparison, Published, frame_scores, of_means
+from neuspring.extensions.released.checks import AS_RELEASED, MEAN, Comparison, Published, frame_scores, of_means
 from neuspring.extensions.released.files import (
     Released,
     depth_image,
@@ -23,9 +23,9 @@ from neuspring.extensions.released.files import (
     read_parameters,
     visible_pixels,
 )
-from neuspring.extensions.released.run import CHECKS, Report, read_observations, verify_released
-from neuspring.intake.formats.phystwin_raw import read_calibration
+from neuspring.extensions.released.run import RELEASED_CHECKS, Report, read_observations, verify_released
 from neuspring.intake.phystwin import released_cases
+from neuspring.intake.phystwin_raw import read_calibration
 from neuspring.scores.lpips import CHANNELS, WINDOWS, Lpips
 from neuspring.scores.metrics import METRICS
 from tests.extensions.released.released_case import (
@@ -72,7 +72,9 @@ def published(conforming: Path) -> Published:
 
 
 def verify(case: Released, published: Published, *checks: int) -> Report:
-    return verify_released(case.root, case.root.parent / "out", checks=checks or tuple(CHECKS), device="cpu", published=published)
+    return verify_released(
+        case.root, case.root.parent / "out", checks=checks or tuple(RELEASED_CHECKS), device="cpu", published=published
+    )
 
 
 def of(report: Report, outcome: str) -> set[int]:
@@ -350,11 +352,11 @@ def test_lpips_is_taken_as_released(case):
     assert score != pytest.approx(float(metric(*pair)), rel=0.05)
 
 
-@pytest.mark.parametrize("changed", [{"released_quirks": RELEASED.released_quirks[1:]}, {"corner_pixels": False}], ids=str)
+@pytest.mark.parametrize("changed", [{"released_quirks": AS_RELEASED.released_quirks[1:]}, {"corner_pixels": False}], ids=str)
 def test_an_error_in_drawing_exceeds_the_tolerance(conforming, changed):
     case = Released(root=conforming, name=NAME)
-    wrong = replace(RELEASED, **changed)
-    first, second = (frame_scores(case, read_observations(case), "none", "cpu", images) for images in (RELEASED, wrong))
+    wrong = replace(AS_RELEASED, **changed)
+    first, second = (frame_scores(case, read_observations(case), "none", "cpu", images) for images in (AS_RELEASED, wrong))
     for metric, values in first.groupby("metric")["value"]:
         other = second.loc[second["metric"] == metric, "value"]
         assert abs(values.mean() - other.mean()) > 4 * METRICS[metric].tolerance, metric

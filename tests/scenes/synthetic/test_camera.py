@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from neuspring.data.camera import Camera
+from neuspring.data.capture import HANDS, OBJECT
 from neuspring.scenes.synthetic.make import looking
 from neuspring.scenes.synthetic.meshes import sphere, surface
-from neuspring.scenes.synthetic.render import HAND, OBJECT, Part, Renderer, measured, quantized
+from neuspring.scenes.synthetic.render import Part, Renderer, measured, quantized
 from tests.support.captures import K
 
 
@@ -14,7 +15,7 @@ from tests.support.captures import K
 def ball():
     vertices, faces = surface(sphere((0, 0, 0), 0.06), (-0.08,) * 3, (0.08,) * 3, 0.004)
     part = Part(vertices, faces, np.full((len(vertices), 3), 0.5), OBJECT, (30.0, 0.3))
-    behind = Part(vertices * 0.3, faces, np.full((len(vertices), 3), 0.5), HAND, (30.0, 0.3))
+    behind = Part(vertices * 0.3, faces, np.full((len(vertices), 3), 0.5), HANDS, (30.0, 0.3))
     renderer = Renderer([part, behind])
     renderer.move([vertices + np.array([0, 0, 0.3]), vertices * 0.3 + np.array([0.12, 0, 0.3])])
     return renderer
@@ -50,8 +51,8 @@ def test_the_outline_is_where_rays_touch_the_sphere(ball):
 
 def test_what_is_in_front_hides_what_is_behind(ball):
     front, side = (ball.render(camera(eye, (0, 0, 0.3))) for eye in ((-0.6, 0.0, 0.3), (0.0, -0.6, 0.3)))
-    assert not (front.label == HAND).any()
-    assert (side.label == HAND).sum() > 20
+    assert not (front.label == HANDS).any()
+    assert (side.label == HANDS).sum() > 20
 
 
 def test_texture_sticks_to_the_material():

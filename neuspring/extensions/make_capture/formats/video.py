@@ -13,13 +13,13 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.core.extras import needed
-from neuspring.intake.formats import CaptureFormat, Kind, picked, require_kind
-from neuspring.intake.moments import Series
+from neuspring.extensions.make_capture.formats import CaptureFormat, Kind, picked, require_kind
+from neuspring.extensions.make_capture.moments import Series
 
 if TYPE_CHECKING:
     import av
 
-VIDEOS = (".mkv", ".mp4", ".mov", ".avi", ".m4v", ".webm")
+VIDEO_ENDINGS = (".mkv", ".mp4", ".mov", ".avi", ".m4v", ".webm")
 DEEP = ("gray16le", "gray16be")
 """Pixel formats of a video that holds depth. Those of 10 and 12 bits would be scaled when they are read."""
 LOSSLESS = ("ffv1", "png", "rawvideo", "tiff", "apng")
@@ -36,7 +36,7 @@ class VideoFile:
 
     @cached_property
     def tracks(self) -> list[str]:
-        """What its video tracks hold."""
+        """Content of its video tracks."""
         with self._opened() as (container, _):
             return [f"{s.name} {s.width} x {s.height} {s.pix_fmt}" for s in _films(container)]
 
@@ -119,7 +119,7 @@ def _opened(path: Path, kind: Kind) -> VideoFile:
 
 def _recognized(path: Path) -> bool:
     file, track = _track(path)
-    return track is not None or (file.is_file() and file.suffix.lower() in VIDEOS)
+    return track is not None or (file.is_file() and file.suffix.lower() in VIDEO_ENDINGS)
 
 
-FORMAT = CaptureFormat(about=f"a video ({' '.join(VIDEOS)})", recognizes=_recognized, pictures=_opened)
+capture_format = CaptureFormat(about=f"a video ({' '.join(VIDEO_ENDINGS)})", recognizes=_recognized, pictures=_opened)

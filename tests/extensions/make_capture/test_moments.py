@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from neuspring.checks import examine
 from neuspring.core.errors import InputError
-from neuspring.intake.feeds import pairs
-from neuspring.intake.film import FILM_CHECKS, FilmFiles
-from neuspring.intake.formats import open_images
-from neuspring.intake.formats.folder import ImageFolder
-from neuspring.intake.formats.video import VideoFile
-from neuspring.intake.moments import Evenness, Series, matched, spans
-from neuspring.intake.poses import choose
+from neuspring.extensions.make_capture.feeds import pairs
+from neuspring.extensions.make_capture.film import looked_at
+from neuspring.extensions.make_capture.formats import open_images
+from neuspring.extensions.make_capture.formats.folder import ImageFolder
+from neuspring.extensions.make_capture.formats.video import VideoFile
+from neuspring.extensions.make_capture.moments import Evenness, Series, matched, spans
+from neuspring.extensions.make_capture.poses import choose
 
 FILM = list(range(45))
 
@@ -35,7 +34,7 @@ def without(*lost):
 
 
 def said(views, choice):
-    return [str(one) for one in examine(FilmFiles(views, choice), FILM_CHECKS)]
+    return [str(one) for one in looked_at(views, choice)]
 
 
 def test_cameras_that_each_lost_another_frame_are_paired_by_the_numbers_in_the_names(tmp_path):
@@ -184,7 +183,7 @@ def ms(rates):
 )
 def test_a_rate_that_varies_is_refused_with_the_next_move(tmp_path, rates, words):
     views = pairs([film(tmp_path / "a.mkv", ms(rates))], [])
-    found = next(one for one in examine(FilmFiles(views, choose(views)), FILM_CHECKS) if one.level == "error")
+    found = next(one for one in looked_at(views, choose(views)) if one.level == "error")
     assert found.name == "uneven time" and "at most 1 frame and" in found.text
     for word in words:
         assert word in found.text

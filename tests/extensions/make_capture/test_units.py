@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.intake.depth import find_rate, find_unit
+from neuspring.extensions.make_capture.table import find_rate, find_unit
 
 
 def depth(value, kind=np.uint16):

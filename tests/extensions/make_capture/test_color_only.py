@@ -10,19 +10,18 @@ from neuspring.checks import examine
 from neuspring.checks.masks import mask_facts
 from neuspring.checks.perceived import look_at_masks
 from neuspring.checks.table import on_table
-from neuspring.checks.things import Silhouette
 from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
 from neuspring.core.geometry import rigid_inverse
 from neuspring.data.capture import CAPTURE, OBJECT, Capture
+from neuspring.extensions.make_capture.feeds import pairs
+from neuspring.extensions.make_capture.make import Intake, make_capture
 from neuspring.intake.check import check_layout
-from neuspring.intake.feeds import pairs
-from neuspring.intake.make import Intake, make_capture
 from neuspring.perception import segment_opencv
 from neuspring.perception.backends import BACKENDS
 from neuspring.perception.marks.carry import CameraFilm
 from neuspring.perception.marks.store import save_masks
-from tests.support.board import BOARD, LENS, board_image
+from tests.extensions.make_capture.board import BOARD, LENS, board_image
 from tests.support.desk import FRAMES, SIZE, camera, looking, seen, write_folders, write_json, write_poses
 from tests.support.findings import holds, of_level, serious
 
@@ -230,7 +229,7 @@ def strip(length, width):
     ],
 )
 def test_an_outline_of_another_category(category, mask, words):
-    found = examine(Silhouette("object", mask, category))
+    found = examine("silhouette", "object", mask, category)
     assert [one.name for one in found] == (["outline and category"] if words else [])
     if words:
         assert words in found[0].text and repr(category) in found[0].text and "meant?" in found[0].remedy

@@ -1,7 +1,7 @@
 """Forms in which cameras leave their pictures: one file each, which says what it recognizes and how it opens it.
 
-To add one: a file here with a `CaptureFormat` named FORMAT; or a package's entry point of the group `neuspring.capture_formats`.
-`neuspring make-capture` takes it by its name (--format) or by what it recognizes.
+To add one: a file here with a `CaptureFormat` named capture_format; or a package's entry point of the group
+`neuspring.capture_formats`. `neuspring make-capture` takes it by its name (--format) or by what it recognizes.
 
     pictures     color or depth of one camera (--color, --depth): a folder, a video
     recording    all that cameras gave (--recording): a bag, PhysTwin's raw layout
@@ -18,12 +18,12 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Lens
-from neuspring.intake.moments import Series
+from neuspring.extensions.make_capture.moments import Series
 from neuspring.registry import Registry, modules
 
 T = TypeVar("T")
 Kind = Literal["color", "depth"]
-PICTURES = {"color": (".png", ".jpg", ".jpeg", ".bmp", ".npy"), "depth": (".png", ".npy", ".tif", ".tiff")}
+ENDINGS = {"color": (".png", ".jpg", ".jpeg", ".bmp", ".npy"), "depth": (".png", ".npy", ".tif", ".tiff")}
 Pair: TypeAlias = tuple[np.ndarray, np.ndarray | None]
 """RGB [H, W, 3] uint8, and depth [H, W] as stored; None: color alone."""
 
@@ -97,7 +97,7 @@ class Recorded:
     up: Literal["+z", "-z"] | None = None
     """Up of its poses; None: found by the table."""
     train_end: int | None = None
-    """Of all its frames."""
+    """End of the training frames, of all its frames."""
     tracks: np.ndarray | None = None
     """[T, K, 3], m, in its world: annotated points."""
     labels: Callable[[str, int], np.ndarray] | None = None
@@ -120,7 +120,7 @@ class CaptureFormat:
     """Opens files or folders, one per camera or one for all, with names of the cameras, if they are given. Raises InputError."""
 
 
-FORMATS: Registry[CaptureFormat] = Registry("capture_formats", modules(__name__, "FORMAT"), CaptureFormat)
+FORMATS: Registry[CaptureFormat] = Registry("capture_formats", modules(__name__, "capture_format"), CaptureFormat)
 
 
 def open_images(path: Path, kind: Kind) -> ImageSource:
@@ -130,7 +130,7 @@ def open_images(path: Path, kind: Kind) -> ImageSource:
             return format_.pictures(path, kind)
     received = "nothing there" if not path.exists() else f"a {path.suffix or 'plain'} file"
     known = " or ".join(format_.about for format_ in FORMATS.values() if format_.pictures is not None)
-    raise InputError(path, known.format(kind=kind, endings=" ".join(PICTURES[kind])), received)
+    raise InputError(path, known.format(kind=kind, endings=" ".join(ENDINGS[kind])), received)
 
 
 def open_recording(paths: Sequence[Path], name: str | None = None, cameras: Sequence[str] = ()) -> Recorded:

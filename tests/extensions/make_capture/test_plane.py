@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.intake.depth import cloud, common_plane, find_table, levelling, planes, pose_on
+from neuspring.extensions.make_capture.table import common_plane, find_table, levelling, pose_on
+from neuspring.intake.depth import cloud, planes
 from tests.support.desk import RADIUS, SIZE, TARGET, K, camera, looking, seen
 
 NOISE = 0.001

@@ -6,9 +6,11 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
-from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Capture, Writer
+from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, POINTS, TRACKS, Capture, Writer
 from neuspring.data.images import make_way
 from neuspring.intake import points
 
@@ -28,7 +30,9 @@ def cut(capture: Capture, first: int, last: int, folder: Path) -> Capture:
     cameras = tuple(replace(c, missing=tuple(k - first for k in c.missing if k in kept)) for c in description.cameras)
     if late := [c.name for c in cameras if 0 in c.missing]:
         raise InputError("--frames", f"camera {late[0]} must have the first frame", f"{first}, which it missed", "Begin later.")
-    points.require_first(capture, first)
+    if first and (body := points.given(capture.folder, NODES)) is not None:
+        rule = "the nodes are those of frame 0, with which a cut must begin"
+        raise InputError(body, rule, f"frame {first}", "Write nodes of that frame, or remove the file.")
     for path in [path for name in ("color", "depth", "mask") for path in (capture.folder / name).glob("*/*")]:
         if path.stem.isdigit() and int(path.stem) in kept:
             there = folder / path.relative_to(capture.folder).with_name(f"{int(path.stem) - first:05d}{path.suffix}")
@@ -39,5 +43,9 @@ def cut(capture: Capture, first: int, last: int, folder: Path) -> Capture:
     marked = {name: capture.points(name)[kept] for name in capture.cameras} if (capture.folder / POINTS).exists() else None
     tracks = capture.tracks()[kept] if (capture.folder / TRACKS).exists() else None
     writer = Writer(folder, own)
-    points.cut(capture, kept, folder)
+    file, body = (points.given(capture.folder, names) for names in (CONTROLLERS, NODES))
+    hands = points.read_hands(file, capture.frame_count) if file else None
+    if hands is not None:
+        hands = replace(hands, points=hands.points[kept], holds=hands.holds[kept] if hands.holds.size else hands.holds)
+    points.write(folder, hands, points.read_nodes(body) if body else np.zeros((0, 3)))
     return writer.finish(tracks, marked, **source)

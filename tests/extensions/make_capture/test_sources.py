@@ -4,13 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
-from neuspring.checks import examine
 from neuspring.core.errors import InputError
-from neuspring.intake.feeds import pairs
-from neuspring.intake.film import FILM_CHECKS, FilmFiles
-from neuspring.intake.formats.folder import ImageFolder
-from neuspring.intake.formats.video import VideoFile
-from neuspring.intake.poses import choose, chosen
+from neuspring.extensions.make_capture.feeds import pairs
+from neuspring.extensions.make_capture.film import looked_at
+from neuspring.extensions.make_capture.formats.folder import ImageFolder
+from neuspring.extensions.make_capture.formats.video import VideoFile
+from neuspring.extensions.make_capture.poses import choose, chosen
 from tests.support.desk import FRAMES, camera, counts, seen, write_folders, write_video
 
 
@@ -131,7 +130,7 @@ def test_a_stride_and_a_jump_are_known(tmp_path):
     (root / "depth_0" / "frame_6.png").unlink()
     views = pairs([root / "color_0"], [root / "depth_0"])
     assert (choose(views).step, choose(views).jumps) == (1, [5])
-    found = examine(FilmFiles(views, choose(views)), FILM_CHECKS)
+    found = looked_at(views, choose(views))
     assert [(one.name, one.level) for one in found] == [("time jumps", "warning"), ("images alone", "warning")]
     with pytest.raises(InputError, match="a capture needs at least 5 frames; received 3 of the numbers 0 to 11"):
         choose(views, "0-2")

@@ -10,12 +10,12 @@ import pytest
 from neuspring.cli.main import main
 from neuspring.core.errors import InputError
 from neuspring.data.capture import CAPTURE, RECIPE, Capture
-from neuspring.intake import make
+from neuspring.extensions.make_capture import make
+from neuspring.extensions.make_capture.make import Intake, make_capture
 from neuspring.intake.check import check_layout
-from neuspring.intake.make import Intake, make_capture
 from neuspring.scenes.sources import SOURCES
+from tests.extensions.make_capture.board import BOARD, LENS, board_image, depth_of_table
 from tests.support import realsense
-from tests.support.board import BOARD, LENS, board_image, depth_of_table
 from tests.support.desk import FRAMES, SIZE, K, camera, counts, looking, seen, write_folders, write_json, write_poses, write_video
 from tests.support.findings import serious
 

@@ -19,15 +19,15 @@ from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.core.findings import Finding, refuse
 from neuspring.data.camera import Camera, Lens, Plane
-from neuspring.intake.depth import Unit, cloud, common_plane, find_table, find_unit, levelling, planes, pose_on
-from neuspring.intake.feeds import Paired
-from neuspring.intake.formats import CameraFeed, Pair, open_images
-from neuspring.intake.lenses import Board, Straightener, depth_ratio, require_lens, sight
-from neuspring.intake.moments import matched
+from neuspring.data.capture import FEWEST_FRAMES
+from neuspring.extensions.make_capture.feeds import Paired
+from neuspring.extensions.make_capture.formats import CameraFeed, Pair, open_images
+from neuspring.extensions.make_capture.lenses import Board, Straightener, depth_ratio, require_lens, sight
+from neuspring.extensions.make_capture.moments import matched
+from neuspring.extensions.make_capture.table import Unit, common_plane, find_table, find_unit, levelling, pose_on
+from neuspring.intake.depth import cloud, planes
 
-FEWEST = 5
-"""Frames of a capture."""
-SYNTAX = re.compile(r"(\d+)(?:(-)(\d*))?(?:/(\d+))?")
+RANGE_FORM = re.compile(r"(\d+)(?:(-)(\d*))?(?:/(\d+))?")
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class FrameChoice:
     """The frames of a capture."""
 
     numbers: list[int]
-    """Of the source, per frame of the capture."""
+    """Number in the source, per frame of the capture."""
     places: dict[str, dict[int, int]]
     """Camera -> frame of the capture -> place in its view; a frame that the camera lacks is absent."""
     step: int
@@ -64,7 +64,7 @@ def chosen(wanted: str, numbers: Sequence[int]) -> list[int]:
         return list(numbers)
     kept: set[int] = set()
     for part in wanted.split(","):
-        match = SYNTAX.fullmatch(part.strip())
+        match = RANGE_FORM.fullmatch(part.strip())
         if not match or (match[4] and int(match[4]) < 1) or (match[4] and not match[2]):
             raise InputError("--frames", "ranges like 250-335, 0-, 0-300/2 or 1,5,9-20 are required", repr(part))
         first = int(match[1])
@@ -88,8 +88,8 @@ def choose(views: Sequence[CameraFeed], wanted: str = "") -> FrameChoice:
     numbers = sorted({number for of in where.values() for number in of})
     kept = chosen(wanted, numbers)
     received = f"{len(kept)} of the numbers {numbers[0]} to {numbers[-1]}" if numbers else "none"
-    if len(kept) < FEWEST:
-        raise InputError("--frames", f"a capture needs at least {FEWEST} frames", received)
+    if len(kept) < FEWEST_FRAMES:
+        raise InputError("--frames", f"a capture needs at least {FEWEST_FRAMES} frames", received)
     places = {name: {frame: of[number] for frame, number in enumerate(kept) if number in of} for name, of in where.items()}
     start = next((number for number in kept if all(number in of for of in where.values())), None)
     for view in views:
@@ -209,9 +209,9 @@ class Placed:
     motion: np.ndarray = field(default_factory=lambda: np.eye(4))
     """[4, 4]: from the world of the given poses to this one."""
     table: str = "not found"
-    """How well its plane fits."""
+    """Fit of its plane, in words."""
     lines: tuple[str, ...] = ()
-    """Of the report."""
+    """Lines of the report."""
 
 
 def by_table(name: str, seen: SampledCamera, *, top_down: bool, at: tuple[float, float] | None) -> Placed:
@@ -285,7 +285,7 @@ def stand(
     found = {name: planes(points) for name, points in clouds.items()}
     judged: dict[str, list[Finding]] = {side: [] for side in ([up] if up else ["+z", "-z"])}
     for (side, listed), (name, view) in product(judged.items(), seen.items()):
-        listed += examine(TableSeen(file or view.path, name, found[name], moved[name], side, view.unit))
+        listed += examine("table", file or view.path, TableSeen(name, found[name], moved[name], side, view.unit))
     side = min(judged, key=lambda key: sum(d.level == "error" for d in judged[key]))
     refuse(one for one in judged[side] if one.level == "error")
     lines += [in_report(one) for one in judged[side]]
@@ -300,7 +300,7 @@ def given_alone(poses: Mapping[str, np.ndarray], seen: Mapping[str, SampledCamer
     """
     (name, view), pose = next(iter(seen.items())), next(iter(poses.values()))
     up = "+z" if pose[2, 3] > 0 else "-z"
-    judged = examine(CameraAlone(where, Camera(name, *view.size, view.lens.matrix, pose), up))
+    judged = examine("camera alone", where, CameraAlone(Camera(name, *view.size, view.lens.matrix, pose), up))
     refuse(one for one in judged if one.level == "error")
     return Placed(poses=dict(poses), up=up, table="z = 0 as given", lines=tuple(map(in_report, judged)))
 

@@ -6,8 +6,8 @@ import pytest
 
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Lens
-from neuspring.intake.lenses import Board, Straightener, depth_ratio, read_lenses, read_poses, require_lens, sight
-from tests.support.board import BOARD, LENS, board_image, depth_of_table
+from neuspring.extensions.make_capture.lenses import Board, Straightener, depth_ratio, read_lenses, read_poses, require_lens, sight
+from tests.extensions.make_capture.board import BOARD, LENS, board_image, depth_of_table
 from tests.support.desk import camera, looking, write_json, write_poses
 
 PLAIN = {"fx": 70, "fy": 71, "cx": 39.5, "cy": 29.5}

@@ -1,8 +1,8 @@
 """Intrinsics and poses from JSON files of other programs, the removal of distortion, and poses by a ChArUco board that lies still.
 
 Intrinsics: an object with fx, fy, cx, cy or K [3, 3] (intrinsic_matrix has 9 numbers, column by column, as Open3D writes them), and
-optionally width, height, distortion, model. `KEYS` has the spellings of other programs; another key that may be of the lens is an
-error. For several cameras: a list of such objects in the order of the cameras, or an object of them by name, also under the key
+optionally width, height, distortion, model. `LENS_KEYS` has the spellings of other programs; another key that may be of the lens is
+an error. For several cameras: a list of such objects in the order of the cameras, or an object of them by name, also under the key
 cameras. One alone is for all.
 
 Distortion: with ideal (x, y) = ((u - cx) / fx, (v - cy) / fy) and P the polynomial of OpenCV's coefficients k1, k2, p1, p2, k3, ...
@@ -42,8 +42,8 @@ SPELLINGS = (
     "fx fl_x / fy fl_y / cx ppx / cy ppy / K intrinsics camera_matrix / width w image_width / height h image_height / model "
     "distortion_model / camera_model / distortion D dist coeffs dist_coeffs distortion_coeffs distortion_coefficients"
 )
-KEYS = {words.split()[0]: words.split() for words in (*SPELLINGS.split(" / "), OPEN3D, *COEFFICIENTS)}
-"""What is read, and its spellings: ours, and those of OpenCV, ROS, librealsense, Open3D, nerfstudio and Kalibr."""
+LENS_KEYS = {words.split()[0]: words.split() for words in (*SPELLINGS.split(" / "), OPEN3D, *COEFFICIENTS)}
+"""Keys that are read, and their spellings: ours, and those of OpenCV, ROS, librealsense, Open3D, nerfstudio and Kalibr."""
 SILENT = "R P rectification_matrix projection_matrix roi header frames applied_transform camera_name camera_angle_x camera_angle_y"
 """Keys beside them that say nothing about a lens, or the same once more."""
 TELLING = re.compile(
@@ -59,15 +59,15 @@ MODELS = {
 }
 """Names of models and what we call them."""
 TWO_READINGS = "inverse_brown_conrady"
-COUNTS = {"opencv": (4, 5, 8, 12, 14), "distorted_to_ideal": (4, 5), "fisheye": (4,)}
+COEFFICIENT_COUNTS = {"opencv": (4, 5, 8, 12, 14), "distorted_to_ideal": (4, 5), "fisheye": (4,)}
 """Coefficients of a model."""
-STEPS = 20
-"""Of the solution; each leaves a fifth of the error at the corner of a wide lens."""
+UNDISTORT_STEPS = 20
+"""Iterations of the solution; each leaves a fifth of the error at the corner of a wide lens."""
 NARROWEST, WIDEST = 10.0, 150.0
 """Degrees. A field of view outside this range is a wrong focal length."""
-FARTHEST = 20.0
+FARTHEST_CAMERA = 20.0
 """m. A camera farther from the world's origin has its position in another unit."""
-DIRECTIONS = ("camera_to_world", "world_to_camera")
+POSE_KEYS = ("camera_to_world", "world_to_camera")
 
 
 def read_lenses(path: Path, names: Sequence[str]) -> dict[str, Lens]:
@@ -86,9 +86,9 @@ def read_lenses(path: Path, names: Sequence[str]) -> dict[str, Lens]:
 def read_poses(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
     """Camera to world [4, 4], m, of each camera. Raises InputError naming the file and the key."""
     content = load_json(path)
-    keys = [key for key in DIRECTIONS if isinstance(content, dict) and key in content]
+    keys = [key for key in POSE_KEYS if isinstance(content, dict) and key in content]
     if len(keys) != 1:
-        rule = f"exactly one of the keys {' and '.join(DIRECTIONS)} is required: it says what the matrices do"
+        rule = f"exactly one of the keys {' and '.join(POSE_KEYS)} is required: it says what the matrices do"
         raise InputError(path, rule, keys or "neither")
     poses = {}
     for name, listed in _by_camera(path, keys[0], content[keys[0]], names).items():
@@ -96,9 +96,9 @@ def read_poses(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
         matrix = _numbers(path, key, listed, ((4, 4), (3, 4)))
         matrix = np.vstack([matrix[:3], [0.0, 0.0, 0.0, 1.0]]) if len(matrix) == 3 else matrix
         refuse(pose_findings(path, key, matrix, TEXT_TOLERANCE))
-        poses[name] = matrix if keys[0] == DIRECTIONS[0] else rigid_inverse(matrix)
+        poses[name] = matrix if keys[0] == POSE_KEYS[0] else rigid_inverse(matrix)
         distance = float(np.linalg.norm(matrix[:3, 3]))
-        if distance > FARTHEST:
+        if distance > FARTHEST_CAMERA:
             remedy = "Divide the last columns by 1000 if they are millimeters, by 100 if they are centimeters."
             raise InputError(path, f"{key}: the position must be in meters", f"one {distance:.4g} m from the origin", remedy)
     return poses
@@ -137,18 +137,18 @@ class Straightener:
             # What belongs at an ideal pixel is seen at the pixel from which P leads there: a fixed point.
             ideal = np.stack([(_grid(size)[side] - k[side, 2]) / k[side, side] for side in (0, 1)], axis=-1).reshape(-1, 2)
             seen, still = ideal.astype(float), np.zeros(3)
-            for _ in range(STEPS):
+            for _ in range(UNDISTORT_STEPS):
                 points = np.concatenate([seen, np.ones((len(seen), 1))], axis=1)
                 seen = seen + ideal - cv2.projectPoints(points, still, still, np.eye(3), coefficients)[0].reshape(-1, 2)
             x, y = (seen * np.diag(k)[:2] + k[:2, 2]).T.reshape(2, size[1], size[0]).astype(np.float32)
             self.maps = (x, y)
         self.shown = _grid(size) if self.maps is None else np.stack(self.maps)
-        """Where ideal pixels are seen, x and y [2, H, W]."""
+        """Places at which ideal pixels are seen, x and y [2, H, W]."""
         moved = np.hypot(*(self.shown - _grid(size)))
         self.most, self.mean = float(moved.max()), float(moved.mean())
 
     def text(self, name: str) -> str:
-        """What was removed, in one line."""
+        """The distortion that was removed, in one line."""
         return f"distortion, camera {name}: removed, up to {self.most:.1f} pixels and {self.mean:.1f} on average"
 
     def color(self, image: np.ndarray) -> np.ndarray:
@@ -181,7 +181,7 @@ def _require_model(where: Path, name: str, lens: Lens, size: tuple[int, int]) ->
     if lens.model not in MODELS:
         remedy = "Undistort the images with the camera's software, and give the intrinsics of the result without coefficients."
         raise InputError(where, rule, lens.model, remedy)
-    counts = COUNTS[MODELS[lens.model]]
+    counts = COEFFICIENT_COUNTS[MODELS[lens.model]]
     if len(lens.distortion) not in counts:
         wanted = " or ".join(map(str, counts))
         raise InputError(where, f"camera {name}: the model {lens.model} has {wanted} coefficients", len(lens.distortion))
@@ -189,7 +189,7 @@ def _require_model(where: Path, name: str, lens: Lens, size: tuple[int, int]) ->
 
 def _spelled(entry: dict[str, Any], key: str) -> list[Any]:
     """The values of a key in all its spellings."""
-    return [entry[word] for word in KEYS[key] if word in entry]
+    return [entry[word] for word in LENS_KEYS[key] if word in entry]
 
 
 def _describes(entry: dict[str, Any]) -> bool:
@@ -199,7 +199,7 @@ def _describes(entry: dict[str, Any]) -> bool:
 
 def _unread(path: Path, where: str, entry: dict[str, Any]) -> tuple[str, ...]:
     """The keys that are not read. Raises InputError where one may be of the lens."""
-    read = [word for words in KEYS.values() for word in words]
+    read = [word for words in LENS_KEYS.values() for word in words]
     unread = [key for key in entry if key not in read and key not in SILENT.split()]
     if telling := [key for key in unread if TELLING.search(key) or isinstance(entry[key], (list, dict))]:
         close = difflib.get_close_matches(telling[0], read, n=1)
@@ -224,10 +224,10 @@ def _lens(path: Path, name: str, entry: Any) -> Lens:
         rule = f"{where}: fx, fy, cx, cy are required, or K [3, 3]"
         raise InputError(path, rule, sorted(entry) if isinstance(entry, dict) else type(entry).__name__)
     unread = _unread(path, where, entry)
-    for words in KEYS.values():
+    for words in LENS_KEYS.values():
         if len(twice := [word for word in words if word in entry]) > 1:
             raise InputError(path, f"{where}: one spelling of a key is required", " and ".join(twice), "Remove the others.")
-    said = {key: values[0] for key in KEYS if (values := _spelled(entry, key))}
+    said = {key: values[0] for key in LENS_KEYS if (values := _spelled(entry, key))}
     if "fx" in said:
         values = [said.get(key) for key in ("fx", "fy", "cx", "cy")]
         fx, fy, cx, cy = _numbers(path, f"{where}: fx, fy, cx, cy", values, ((4,),))
@@ -248,7 +248,7 @@ def _lens(path: Path, name: str, entry: Any) -> Lens:
 
 
 def _coefficients(path: Path, where: str, said: dict[str, Any], model: str) -> np.ndarray:
-    """Of a list in OpenCV's order, or by name; none without any."""
+    """Coefficients of a list in OpenCV's order, or by name; none without any."""
     named = {key: said[key] for key in COEFFICIENTS if key in said}
     listed = _plain(said.get("distortion", []))
     if isinstance(listed, dict):
@@ -256,7 +256,7 @@ def _coefficients(path: Path, where: str, said: dict[str, Any], model: str) -> n
             raise InputError(path, f"{where}: distortion: names {' '.join(COEFFICIENTS)} are required", unknown[0])
         named, listed = named | listed, []
     if not named:
-        counts = sorted({0, *(count for counts in COUNTS.values() for count in counts)})
+        counts = sorted({0, *(count for counts in COEFFICIENT_COUNTS.values() for count in counts)})
         return _numbers(path, f"{where}: distortion", listed, tuple((count,) for count in counts))
     if np.size(listed):
         rule = f"{where}: coefficients are required in a list or by name, not both"
@@ -264,7 +264,7 @@ def _coefficients(path: Path, where: str, said: dict[str, Any], model: str) -> n
     if MODELS.get(model) == "fisheye":
         order: tuple[str, ...] = ("k1", "k2", "k3", "k4")
     else:
-        order = COEFFICIENTS[: next(count for count in COUNTS["opencv"] if named.keys() <= set(COEFFICIENTS[:count]))]
+        order = COEFFICIENTS[: next(count for count in COEFFICIENT_COUNTS["opencv"] if named.keys() <= set(COEFFICIENTS[:count]))]
         if any(named.get(key) for key in ("k4", "k5", "k6")) and model not in RATIONAL:
             rule = f"{where}: k4 to k6 differ between programs: the model must be {' or '.join(RATIONAL)}, OpenCV's"
             raise InputError(path, rule, model, "Or give OpenCV's coefficients as the list distortion.")
@@ -290,11 +290,11 @@ def _numbers(path: Path, key: str, listed: Any, shapes: Sequence[tuple[int, ...]
     return array
 
 
-FEWEST = 6
+FEWEST_CORNERS = 6
 """Corners from which a pose is taken."""
 MOST_ERROR = 1.5
 """Pixels, rms. Beyond it the board moved, or it is another one, or the intrinsics are wrong."""
-SYNTAX = re.compile(r"(\d+)x(\d+):([0-9.]+):([0-9.]+):(\w+)")
+BOARD_FORM = re.compile(r"(\d+)x(\d+):([0-9.]+):([0-9.]+):(\w+)")
 
 
 @dataclass(frozen=True)
@@ -310,12 +310,12 @@ class Board:
     marker: float
     """Side of a marker, m."""
     dictionary: str
-    """Of OpenCV, as DICT_5X5_100."""
+    """Name by OpenCV, as DICT_5X5_100."""
 
     @classmethod
     def of(cls, text: str) -> Board:
         """From `5x7:0.04:0.03:DICT_5X5_100`. Raises InputError."""
-        match = SYNTAX.fullmatch(text)
+        match = BOARD_FORM.fullmatch(text)
         form = "SQUARES_XxSQUARES_Y:SQUARE_M:MARKER_M:DICTIONARY is required, like 5x7:0.04:0.03:DICT_5X5_100"
         if not match:
             raise InputError("--board", form, repr(text))
@@ -358,8 +358,8 @@ def sight(where: object, board: Board, images: Sequence[np.ndarray], intrinsics:
     """
     found = max((_corners(board, images, legacy) for legacy in (False, True)), key=lambda pair: len(pair[1]))
     points, pixels = found
-    if len(pixels) < FEWEST:
-        rule = f"at least {FEWEST} corners of the {board.across} x {board.down} board ({board.dictionary}) must be seen"
+    if len(pixels) < FEWEST_CORNERS:
+        rule = f"at least {FEWEST_CORNERS} corners of the {board.across} x {board.down} board ({board.dictionary}) must be seen"
         remedy = "Check --board (squares across and down, dictionary), light, and that the board fills a part of the image."
         raise InputError(where, rule, f"{len(pixels)} in {len(images)} images", remedy)
     _, rotation, translation = cv2.solvePnP(points, pixels, intrinsics, None, flags=cv2.SOLVEPNP_IPPE)
@@ -382,7 +382,7 @@ def depth_ratio(sighting: Sighting, depth: np.ndarray) -> float | None:
     x, y = np.clip(np.round(sighting.pixels).astype(int).T, 0, np.array(depth.shape[::-1])[:, None] - 1)
     measured = depth[y, x]
     valid = measured > 0
-    return float(np.median(measured[valid] / sighting.depths[valid])) if valid.sum() >= FEWEST else None
+    return float(np.median(measured[valid] / sighting.depths[valid])) if valid.sum() >= FEWEST_CORNERS else None
 
 
 def _corners(board: Board, images: Sequence[np.ndarray], legacy: bool) -> tuple[np.ndarray, np.ndarray]:

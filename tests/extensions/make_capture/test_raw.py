@@ -7,8 +7,9 @@ from neuspring.cli.main import main
 from neuspring.config import ScenarioRow
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture, Writer
-from neuspring.intake.formats import phystwin_raw
-from neuspring.intake.poses import choose
+from neuspring.extensions.make_capture.formats.phystwin_raw import open_case
+from neuspring.extensions.make_capture.poses import choose
+from neuspring.intake.phystwin_raw import convert
 from tests.support.captures import describe, entry
 from tests.support.filmed import film, write_raw
 
@@ -60,7 +61,7 @@ def test_frames_that_cameras_lost_are_missing_and_no_mask_meets_another_color(tm
         (case / "color" / camera / f"{lost}.png").unlink()
         (case / "depth" / camera / f"{lost}.npy").unlink()
     (case / "color" / "1" / "11.png").unlink()
-    raw = phystwin_raw.open_case(case)
+    raw = open_case(case)
     choice = choose(raw.views)
     assert (choice.numbers, choice.missing("0"), choice.missing("1")) == ([*range(12)], (3,), (8, 11))
     for view in raw.views:
@@ -70,7 +71,7 @@ def test_frames_that_cameras_lost_are_missing_and_no_mask_meets_another_color(tm
             assert np.flatnonzero(raw.labels(view.name, choice.numbers[frame]).any(axis=1)).tolist() == [frame]
     row = ScenarioRow(scenario="thing", source="phystwin_raw", category="toy", path="x", self_collision=False, ground=True)
     with pytest.raises(InputError, match=r"3\.png: this image must exist.* `neuspring make-capture --phystwin-raw .*case`"):
-        phystwin_raw.convert(row, case, tmp_path / "converted")
+        convert(row, case, tmp_path / "converted")
 
 
 def test_masks_that_are_missing_and_names_that_are_no_frame_numbers_are_refused(tmp_path):
@@ -81,10 +82,10 @@ def test_masks_that_are_missing_and_names_that_are_no_frame_numbers_are_refused(
     with pytest.raises(
         InputError, match=r"mask/1/0: a mask of every frame with color is required; received none of 4 to 6, 9\. Make them"
     ):
-        phystwin_raw.open_case(case).require_masks(dict.fromkeys("01", range(12)))
+        open_case(case).require_masks(dict.fromkeys("01", range(12)))
     assert main(words.split()) == 2 and not (tmp_path / "capture").exists()
     (case / "color" / "1" / "11.png").rename(case / "color" / "1" / "12.png")
     with pytest.raises(
         InputError, match=r"color/1: names must be frame numbers below frame_num of metadata\.json, 12; received 0 to 10, 12"
     ):
-        phystwin_raw.open_case(case)
+        open_case(case)

@@ -12,11 +12,11 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Lens
-from neuspring.intake.formats import CaptureFormat, Pair, Recorded, picked
-from neuspring.intake.moments import Series
+from neuspring.extensions.make_capture.formats import CaptureFormat, Pair, Recorded, picked
+from neuspring.extensions.make_capture.moments import Series
 
 MODULE = "pyrealsense2"
-PATIENCE = 5000
+BAG_PATIENCE = 5000
 """ms until the next frames of a file; none within it: the file ends."""
 
 
@@ -70,7 +70,7 @@ class Bag:
             profile.get_device().as_playback().set_real_time(False)
             align, last = library.align(library.stream.color), -1
             while True:
-                there, frames = pipeline.try_wait_for_frames(PATIENCE)
+                there, frames = pipeline.try_wait_for_frames(BAG_PATIENCE)
                 if not there:
                     return
                 color, depth = frames.get_color_frame(), frames.get_depth_frame()
@@ -109,4 +109,6 @@ def _recording(paths: Sequence[Path], cameras: Sequence[str]) -> Recorded:
     return Recorded(views=[Bag(camera, path) for camera, path in zip(names, paths, strict=True)])
 
 
-FORMAT = CaptureFormat(about="a RealSense .bag file", recognizes=lambda path: path.suffix.lower() == ".bag", recording=_recording)
+capture_format = CaptureFormat(
+    about="a RealSense .bag file", recognizes=lambda path: path.suffix.lower() == ".bag", recording=_recording
+)

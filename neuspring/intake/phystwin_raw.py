@@ -1,37 +1,28 @@
 """A case in PhysTwin's raw layout: images of all cameras, calibration, and masks, one image per detection.
 
-Of a scenario with this source images are linked where the file system allows it, else copied.
+Images of a scenario are linked where the file system allows it, else copied.
 """
 
 from __future__ import annotations
 
-import os
-import shutil
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 
 from neuspring.checks import examine
-from neuspring.checks.case import RELEASED_FRAME_RATE, Calibration, Metadata
+from neuspring.checks.case import RELEASED_FRAME_RATE
 from neuspring.config import Config, ScenarioRow
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
 from neuspring.core.findings import refuse
 from neuspring.core.records import digest_file
-from neuspring.data.camera import Camera, Lens
-from neuspring.data.capture import HANDS, OBJECT, Capture, Description, Writer
-from neuspring.data.images import make_way, read_image
+from neuspring.data.camera import Camera
+from neuspring.data.capture import FEWEST_FRAMES, HANDS, OBJECT, Capture, Description, Writer
+from neuspring.data.images import read_image
 from neuspring.data.unpickle import load_pickle
-from neuspring.intake.feeds import Paired
-from neuspring.intake.formats import CaptureFormat, Recorded, open_images
-from neuspring.intake.moments import spans
 from neuspring.intake.phystwin import CALIBRATION, METADATA, annotated, train_end_of
-
-FEWEST = 5
-"""Frames of a capture."""
 
 
 def write_capture(row: ScenarioRow, path: Path, config: Config, folder: Path) -> None:
@@ -59,19 +50,16 @@ def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
         provenance={name: f"sha256:{digest_file(case / name)}" for name in (METADATA, CALIBRATION)},
     )
     writer = Writer(folder, description)
+    kinds: tuple[Literal["color", "depth"], ...] = ("color", "depth")
     for name, camera in writer.capture.cameras.items():
         ids = detections(case, name) if has_masks else {}
         for frame in range(frames):
-            for kind, ending in (("color", "png"), ("depth", "npy")):
-                source, target = case / kind / name / f"{frame}.{ending}", folder / kind / name / f"{frame:05d}.{ending}"
+            for kind in kinds:
+                source = case / kind / name / f"{frame}{writer.capture.path(kind, name, frame).suffix}"
                 if not source.is_file():
                     remedy = f"Make a capture of the frames that are there: `neuspring make-capture --phystwin-raw {case}`."
                     raise InputError(source, "this image must exist", "no such file", remedy)
-                make_way(target)
-                try:
-                    os.link(source, target)
-                except OSError:
-                    shutil.copyfile(source, target)
+                writer.link(kind, name, frame, source)
             if has_masks:
                 writer.mask(name, frame, labels_of(case, camera, frame, ids))
     return writer.finish(annotated(case, frames))
@@ -80,11 +68,12 @@ def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
 def read_calibration(case: Path) -> tuple[dict[str, Any], list[Camera]]:
     """metadata.json, and the cameras in it and in calibrate.pkl, named by their numbers. Raises InputError."""
     metadata, poses = load_json(case / METADATA), load_pickle(case / CALIBRATION)
-    refuse(examine(Metadata(case / METADATA, metadata, with_cameras=True)))
+    path = case / METADATA
+    refuse(examine("metadata", path, metadata) + examine("lenses of metadata", path, metadata, None))
     count = metadata.get("frame_num")
-    if type(count) is not int or count < FEWEST:
-        raise InputError(case / METADATA, f"frame_num: at least {FEWEST} frames are required", count)
-    refuse(examine(Calibration(case / CALIBRATION, poses, len(metadata["intrinsics"]))))
+    if type(count) is not int or count < FEWEST_FRAMES:
+        raise InputError(case / METADATA, f"frame_num: at least {FEWEST_FRAMES} frames are required", count)
+    refuse(examine("calibration", case / CALIBRATION, poses, len(metadata["intrinsics"])))
     width, height = metadata["WH"]
     intrinsics = np.asarray(metadata["intrinsics"], dtype=np.float64)
     return metadata, [
@@ -114,58 +103,3 @@ def labels_of(case: Path, camera: Camera, frame: int, ids: dict[int, list[str]])
             mask = read_image(case / "mask" / camera.name / name / f"{frame}.png", camera, cv2.IMREAD_GRAYSCALE)
             labels[mask > 0] = label
     return labels
-
-
-def open_case(case: Path) -> Recorded:
-    """A case with all its cameras. Raises InputError."""
-    metadata, listed = read_calibration(case)
-    cameras = {camera.name: camera for camera in listed}
-    views = [
-        Paired(
-            name,
-            open_images(case / "color" / name, "color"),
-            open_images(case / "depth" / name, "depth"),
-            unit=0.001,
-            lens=Lens(matrix=camera.intrinsics, size=(camera.width, camera.height)),
-            pose=camera.camera_to_world,
-            numbered=True,
-        )
-        for name, camera in cameras.items()
-    ]
-    frames = int(metadata["frame_num"])
-    for images in (images for view in views for images in view.sources):
-        series = images.series
-        if not series.named or series.numbers[-1] >= frames:
-            rule = f"names must be frame numbers below frame_num of {METADATA}, {frames}"
-            raise InputError(images.path, rule, spans(series.numbers) if series.named else images.files([0])[0].name)
-    ids_of = {name: detections(case, name) for name in cameras} if (case / "mask").is_dir() else {}
-
-    def require_masks(numbers: Mapping[str, Sequence[int]]) -> None:
-        for name, one in ((name, one) for name, ids in ids_of.items() for listed in ids.values() for one in listed):
-            folder = case / "mask" / name / one
-            if lacking := [number for number in numbers[name] if not (folder / f"{number}.png").is_file()]:
-                remedy = "Make them, take images of these frames away, or choose others with --frames."
-                raise InputError(folder, "a mask of every frame with color is required", f"none of {spans(lacking)}", remedy)
-
-    return Recorded(
-        views=views,
-        rate=float(metadata.get("fps", RELEASED_FRAME_RATE)),
-        up="-z",
-        train_end=train_end_of(case, frames),
-        tracks=annotated(case, frames),
-        labels=(lambda camera, number: labels_of(case, cameras[camera], number, ids_of[camera])) if ids_of else None,
-        require_masks=require_masks,
-    )
-
-
-def _recording(paths: Sequence[Path], cameras: Sequence[str]) -> Recorded:
-    if len(paths) != 1:
-        raise InputError("--phystwin-raw", "one case is required, with all its cameras", len(paths))
-    return open_case(paths[0])
-
-
-FORMAT = CaptureFormat(
-    about="a case in PhysTwin's raw layout",
-    recognizes=lambda path: (path / METADATA).is_file() and (path / CALIBRATION).is_file(),
-    recording=_recording,
-)

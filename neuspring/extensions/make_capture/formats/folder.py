@@ -13,11 +13,11 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.data.images import read_npy, read_picture
-from neuspring.intake.formats import PICTURES, CaptureFormat, Kind, require_kind
-from neuspring.intake.moments import Series
+from neuspring.extensions.make_capture.formats import ENDINGS, CaptureFormat, Kind, require_kind
+from neuspring.extensions.make_capture.moments import Series
 
 STAMP = re.compile(r"(?<![0-9])([0-9]{10,19})(\.[0-9]+)?(?![0-9])")
-SECOND = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}
+STAMP_SECONDS = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}
 """s per count of a time since 1970 with so many digits before the point."""
 
 
@@ -31,10 +31,10 @@ class ImageFolder:
     @cached_property
     def paths(self) -> list[Path]:
         """Its images. Raises InputError where there are none, or of two formats."""
-        found = [path for path in self.path.iterdir() if path.suffix.lower() in PICTURES[self.kind] and path.name[0] != "."]
+        found = [path for path in self.path.iterdir() if path.suffix.lower() in ENDINGS[self.kind] and path.name[0] != "."]
         endings = sorted({path.suffix.lower() for path in found})
         if len(endings) != 1:
-            rule = f"{self.kind} images of one format are required ({' '.join(PICTURES[self.kind])})"
+            rule = f"{self.kind} images of one format are required ({' '.join(ENDINGS[self.kind])})"
             raise InputError(self.path, rule, " and ".join(endings) or "none", "Color and depth need a folder of their own each.")
         stamps = {path: _stamp(path) or 0.0 for path in found}
         # re.split with a group alternates text and digits.
@@ -71,10 +71,10 @@ class ImageFolder:
 def _stamp(path: Path) -> float | None:
     """s since 1970 of a name with such a time, in s with a fraction, ms, us or ns."""
     found = STAMP.search(path.stem)
-    if not found or len(found[1]) not in SECOND or not (found[2] or len(found[1]) > min(SECOND)):
+    if not found or len(found[1]) not in STAMP_SECONDS or not (found[2] or len(found[1]) > min(STAMP_SECONDS)):
         return None
-    time = (int(found[1]) + float(found[2] or 0)) * SECOND[len(found[1])]
+    time = (int(found[1]) + float(found[2] or 0)) * STAMP_SECONDS[len(found[1])]
     return time if 1e9 < time < 2e9 else None  # From 2e9 on digits are a date: 20260131...
 
 
-FORMAT = CaptureFormat(about="a folder of {kind} images ({endings})", recognizes=Path.is_dir, pictures=ImageFolder)
+capture_format = CaptureFormat(about="a folder of {kind} images ({endings})", recognizes=Path.is_dir, pictures=ImageFolder)

@@ -9,8 +9,8 @@ import pytest
 from neuspring.cli.main import main
 from neuspring.core.errors import InputError
 from neuspring.data.capture import CONTROLLERS, NODES, TRACKS, Capture
+from neuspring.extensions.make_capture.make import Intake, make_capture
 from neuspring.intake.check import check_layout
-from neuspring.intake.make import Intake, make_capture
 from neuspring.intake.points import Hands, read, write
 from tests.support import spaced as scene
 from tests.support.desk import FRAMES, write_folders, write_poses

@@ -13,15 +13,15 @@ from neuspring.core.errors import InputError
 
 COMMON = 0.5
 """Numbers in names count the same moments if this part of them is common to both sources."""
-GAP = 1.5
+MISSING_GAP = 1.5
 """Pictures this many times farther apart than usual have others missing between them."""
 DEPARTURE = 1.0
 """Frames. A picture may be this far from where an even clock has it: a lost picture is half of it."""
-LOST = 0.05
+MISSING_SHARE = 0.05
 """This part of the pictures may be missing."""
 JITTER, ROUNDED = 0.1, 0.001
 """Intervals that differ by less than this part and these seconds are one rate: time stamps may be whole milliseconds."""
-REMEDY = (
+PAIRING_REMEDY = (
     "Numbers that each source counts for itself pair nothing. If one only ended early, remove the last pictures of the other. "
     "Else name the images of both by the camera's own frame numbers, or by time stamps (s, ms, us or ns since 1970)."
 )
@@ -32,13 +32,13 @@ class Series:
     """When the pictures of a source were taken, in their order."""
 
     numbers: list[int]
-    """Of every picture: that in its name, or its place, from 0."""
+    """Number of every picture: that in its name, or its place, from 0."""
     named: bool = False
     """True where they are those in the names."""
     times: np.ndarray | None = None
     """s, ascending; None: unknown."""
     clock: str = ""
-    """What these count from: `wall`, a file with several tracks, or, empty, the source's first picture."""
+    """Start of the times: `wall`, a file with several tracks, or, empty, the source's first picture."""
 
     @property
     def _steps(self) -> np.ndarray:
@@ -53,14 +53,14 @@ class Series:
     @property
     def whole(self) -> bool:
         """True where no picture is missing in between."""
-        return bool((self._steps <= GAP * self.step).all())
+        return bool((self._steps <= MISSING_GAP * self.step).all())
 
     @property
     def rate(self) -> float | None:
         """Frames per second: the mean of intervals decides, as time stamps may be whole milliseconds; gaps do not count."""
         if self.times is None or len(self.times) < 2:
             return None
-        return float(1 / self._steps[self._steps <= GAP * self.step].mean())
+        return float(1 / self._steps[self._steps <= MISSING_GAP * self.step].mean())
 
     def part(self, places: Sequence[int]) -> Series:
         """Those at ascending places."""
@@ -68,7 +68,7 @@ class Series:
         return Series([self.numbers[place] for place in places], self.named, times, self.clock)
 
     def text(self) -> str:
-        """How many there are, and what is known of them."""
+        """Their number, and what is known of them."""
         known = f" at {self.rate:.3g} Hz" if self.rate else f" with the numbers {spans(self.numbers)}" if self.named else ""
         return f"{len(self.numbers)} pictures{known}"
 
@@ -86,13 +86,13 @@ def matched(where: Path, names: tuple[str, str], one: Series, other: Series, num
     if one.times is not None and other.times is not None:
         absolute, largest = one.clock == other.clock != "", max(one.step, other.step)
         left, right = one.times - (0 if absolute else one.times[0]), other.times - (0 if absolute else other.times[0])
-        if not absolute and one.whole and other.whole and abs(left[-1] - right[-1]) > GAP * largest:
-            raise InputError(where, rule, received + unlike, REMEDY)
+        if not absolute and one.whole and other.whole and abs(left[-1] - right[-1]) > MISSING_GAP * largest:
+            raise InputError(where, rule, received + unlike, PAIRING_REMEDY)
         forth = _nearest(left, right)
         apart = np.abs(left - right[forth])
         mutual = (_nearest(right, left)[forth] == np.arange(len(left))) & (apart <= largest / 2)
         if mutual.sum() < COMMON * min(counts):
-            raise InputError(where, rule, f"{received}; {mutual.sum()} are within half a frame of each other", REMEDY)
+            raise InputError(where, rule, f"{received}; {mutual.sum()} are within half a frame of each other", PAIRING_REMEDY)
         places = {one.numbers[k]: int(forth[k]) for k in np.flatnonzero(mutual)}
         return places, f"time stamps, at most {1e3 * apart[mutual].max():.0f} ms apart"
     if numbered or (one.named and other.named):
@@ -104,9 +104,9 @@ def matched(where: Path, names: tuple[str, str], one: Series, other: Series, num
         if numbered or (common >= COMMON * max(counts) and not own):
             return {number: place for place, number in enumerate(other.numbers)}, "the numbers in their names"
         if [number + other.numbers[0] - one.numbers[0] for number in one.numbers] != other.numbers:
-            raise InputError(where, rule, received + (unlike if own else f"; {common} numbers are common"), REMEDY)
+            raise InputError(where, rule, received + (unlike if own else f"; {common} numbers are common"), PAIRING_REMEDY)
     elif not alike:
-        raise InputError(where, rule, received, REMEDY)
+        raise InputError(where, rule, received, PAIRING_REMEDY)
     return {number: place for place, number in enumerate(one.numbers)}, "order"
 
 
@@ -117,7 +117,7 @@ def _nearest(times: np.ndarray, among: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Evenness:
-    """How the time stamps of some pictures follow an even clock."""
+    """Departure of the time stamps of some pictures from an even clock."""
 
     steps: np.ndarray
     """s per picture of the source, from each to the next."""
@@ -133,7 +133,7 @@ class Evenness:
         """`times` [n], s, of the pictures at `places` of the source."""
         steps, usual = np.diff(times) / np.diff(places), float(np.median(np.diff(times) / np.diff(places)))
         rest = times - np.polyval(np.polyfit(places, times, 1), places)
-        counted = np.where(steps > GAP * usual, np.round(steps / usual) - 1, 0) * np.diff(places)
+        counted = np.where(steps > MISSING_GAP * usual, np.round(steps / usual) - 1, 0) * np.diff(places)
         breaks = np.abs(np.diff(steps)) > JITTER * steps[1:] + ROUNDED
         label = np.concatenate([[0], np.cumsum(breaks)])
         runs = [list(part) for _, part in groupby(range(len(steps)), key=lambda k: label[k])]
@@ -142,7 +142,7 @@ class Evenness:
     @property
     def bad(self) -> bool:
         """True where a twin of these frames would have another time."""
-        return self.departure > DEPARTURE or self.missing > LOST * len(self.steps)
+        return self.departure > DEPARTURE or self.missing > MISSING_SHARE * len(self.steps)
 
     @property
     def odd(self) -> bool:
@@ -156,7 +156,7 @@ class Evenness:
         return f"intervals of {first:.0f} to {last:.0f} ms, {lost}up to {self.departure:.1f} frames off an even clock"
 
 
-SHOWN = 6
+SPANS_SHOWN = 6
 """Runs of numbers that a message names."""
 
 
@@ -164,5 +164,5 @@ def spans(numbers: Sequence[int]) -> str:
     """Ascending numbers in few words: `6, 13, 20 to 25`."""
     runs = [list(part) for _, part in groupby(enumerate(numbers), key=lambda pair: pair[1] - pair[0])]
     texts = [f"{run[0][1]} to {run[-1][1]}" if len(run) > 2 else ", ".join(str(number) for _, number in run) for run in runs]
-    left = sum(map(len, runs[SHOWN:]))
-    return ", ".join(texts[:SHOWN]) + (f" and {left} more" if left else "")
+    left = sum(map(len, runs[SPANS_SHOWN:]))
+    return ", ".join(texts[:SPANS_SHOWN]) + (f" and {left} more" if left else "")

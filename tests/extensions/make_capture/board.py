@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from neuspring.core.geometry import rigid_inverse
-from neuspring.intake.lenses import Board
+from neuspring.extensions.make_capture.lenses import Board
 
 BOARD = "5x7:0.04:0.03:DICT_5X5_100"
 LENS = np.array([[600, 0, 319.5], [0, 600, 239.5], [0, 0, 1.0]])

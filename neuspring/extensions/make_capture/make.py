@@ -15,8 +15,6 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from neuspring.checks import examine
-from neuspring.checks.cameras import Edges
-from neuspring.checks.things import Category
 from neuspring.config import parse
 from neuspring.core.artifacts import Up
 from neuspring.core.errors import InputError
@@ -27,13 +25,11 @@ from neuspring.core.text import Progress
 from neuspring.data import capture
 from neuspring.data.camera import Camera, CameraEntry, Lens
 from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Capture, Description, Writer, description_findings
-from neuspring.intake import points
-from neuspring.intake.depth import Unit, find_rate
-from neuspring.intake.feeds import Paired, pairs
-from neuspring.intake.film import FILM_CHECKS, FilmFiles
-from neuspring.intake.formats import Recorded, open_recording
-from neuspring.intake.lenses import Board, Straightener, read_lenses, read_poses
-from neuspring.intake.poses import (
+from neuspring.extensions.make_capture.feeds import Paired, pairs
+from neuspring.extensions.make_capture.film import looked_at
+from neuspring.extensions.make_capture.formats import Recorded, open_recording
+from neuspring.extensions.make_capture.lenses import Board, Straightener, read_lenses, read_poses
+from neuspring.extensions.make_capture.poses import (
     FrameChoice,
     Placed,
     SampledCamera,
@@ -50,9 +46,11 @@ from neuspring.intake.poses import (
     stored_as,
     straightened,
 )
+from neuspring.extensions.make_capture.table import Unit, find_rate
+from neuspring.intake import points
 
-NAMES = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
-FIRST = 5
+NAME_FORM = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
+BOARD_FRAMES = 5
 """Frames of the source, from its beginning, in which a board is looked for where it has no images of its own."""
 
 
@@ -127,11 +125,11 @@ class Intake:
     @property
     def brought(self) -> dict[str, Path]:
         """The files of points in space, by option."""
-        return {name: path for name in BROUGHT if (path := getattr(self, name)) is not None}
+        return {name: path for name in SPACE_OPTIONS if (path := getattr(self, name)) is not None}
 
     def opened(self) -> Recorded:
         """The film of the cameras; no views of points in space alone. Raises InputError."""
-        given = [f"--{name.replace('_', '-')}" for name in FILMS if getattr(self, name)]
+        given = [f"--{name.replace('_', '-')}" for name in FILM_OPTIONS if getattr(self, name)]
         if len(given) != 1 and (given or not self.controllers):
             rule = "one of --color with --depth, --recording, --bag, --phystwin-raw is required, or --controllers with --nodes and "
             rule += "--tracks"
@@ -145,9 +143,9 @@ class Intake:
         return Recorded(views=pairs(self.color, self.depth, self.cameras) if self.color else ())
 
 
-FILMS = ("color", "recording", "bag", "phystwin_raw")
+FILM_OPTIONS = ("color", "recording", "bag", "phystwin_raw")
 """Options of which one says where the film is."""
-BROUGHT = ("controllers", "nodes", "tracks")
+SPACE_OPTIONS = ("controllers", "nodes", "tracks")
 """Options of files of points in space."""
 OF_FILM = ("frames", "depth_unit", "intrinsics", "poses", "board", "board_images", "level", "top_down", "table_at", "pose")
 """Options that say nothing of points in space alone."""
@@ -167,7 +165,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
         rule = "is for points in space alone: cameras are placed by the table"
         raise InputError("--no-table", rule, "a film", "Leave it out, and write ground: false in capture.json.")
     for option, name in (("--name", intake.called), *(("--cameras", view.name) for view in views)):
-        if not NAMES.fullmatch(name):
+        if not NAME_FORM.fullmatch(name):
             raise InputError(option, "letters, digits, '.', '_' and '-' are required, a letter or digit first", repr(name))
     if all(isinstance(view, Paired) and view.depth is None for view in views):
         _require_for_color_alone(intake)
@@ -178,7 +176,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
         remedy = "Leave it out. To learn from the case's own, write tracks: train in capture.json then."
         raise InputError(option, "a case in PhysTwin's raw layout brings annotated points of its own", "both", remedy)
     choice = choose(views, intake.frames)
-    findings = examine(FilmFiles(views, choice), FILM_CHECKS)
+    findings = looked_at(views, choice)
     refuse_errors(findings)
     film.require_masks({name: [choice.numbers[frame] for frame in places] for name, places in choice.places.items()})
     known = [view.rate([*choice.places[view.name].values()]) for view in views]
@@ -187,9 +185,9 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     listed = read_lenses(intake.intrinsics, names) if intake.intrinsics else {}
     seen, unit = look(views, choice, listed, intake.intrinsics, intake.depth_unit)
     for name, view in seen.items():
-        beside = examine(Edges(str(view.path), list(zip(view.colors, view.depths, strict=False))))
+        beside = examine("edges", view.path, list(zip(view.colors, view.depths, strict=False)))
         findings += [replace(one, title=f"camera {name}: {one.name}") for one in beside]
-    findings += examine(Category(intake.output, intake.category))
+    findings += examine("category", intake.output, intake.category)
     placed, how = _place(intake, film, board, seen, unit)
     made = _describe(intake, film, choice, rate, unit, seen, placed, how)
     if intake.brought and (intake.level or not (intake.poses or intake.board)):
@@ -255,7 +253,7 @@ def _place(
         shown = dict(seen)
         if not intake.board_images:
             for view in film.views:
-                first = list(view.read(range(min(FIRST, len(view.series.numbers)))))
+                first = list(view.read(range(min(BOARD_FRAMES, len(view.series.numbers)))))
                 shown[view.name] = straightened(view, first, seen[view.name].lens, unit)
         poses, lines = by_board(board, shown, intake.board_images)
         if unit is None:
@@ -363,7 +361,7 @@ def _write(
 def _of_points(intake: Intake) -> tuple[Capture, list[str]]:
     """A capture of points in space alone."""
     brought, folder = intake.brought, intake.output
-    if missing := [f"--{name}" for name in BROUGHT if name not in brought]:
+    if missing := [f"--{name}" for name in SPACE_OPTIONS if name not in brought]:
         rule = "without --color, --bag and --phystwin-raw, --controllers, --nodes and --tracks are required"
         raise InputError("make-capture", rule, f"no {' '.join(missing)}")
     for option in OF_FILM:

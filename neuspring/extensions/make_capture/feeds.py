@@ -11,8 +11,8 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Lens
-from neuspring.intake.formats import CameraFeed, ImageSource, Pair, open_images
-from neuspring.intake.moments import Series, matched
+from neuspring.extensions.make_capture.formats import CameraFeed, ImageSource, Pair, open_images
+from neuspring.extensions.make_capture.moments import Series, matched
 
 
 @dataclass(frozen=True, eq=False)
