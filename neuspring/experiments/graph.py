@@ -19,10 +19,9 @@ from types import SimpleNamespace
 from typing import Any
 
 from neuspring.config import Config, Method, ScenarioRow, plain
-from neuspring.config.settings import select
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
-from neuspring.experiments.benchmark import Benchmark, read_methods, read_searches, with_method, with_search
+from neuspring.experiments.benchmark import Benchmark, with_method, with_search
 from neuspring.stages import STAGES, makers
 from neuspring.stages.stage import Member, Rows, Stage
 
@@ -412,19 +411,6 @@ class Graph:
             remedy = "Add the section `tune` (config/README.md, config/studies/tune.yaml)."
             raise InputError("configuration, tune", "the target sweep needs a sweep", None, remedy)
         return [f"{self.sweep_folder}/summary.md"]
-
-    def sweep(self) -> str:
-        """Settings of a sweep's workers, as JSON; its tables of methods and searches are found wherever a job runs."""
-        values = select(self.config, ("simulation", "losses", "search", "fit", "released_quirks", "tune"))
-        tables = {name: str(self.root / getattr(self.config, name)) for name in ("method_table", "search_table")}
-        return _json(values | tables | {"scenarios": list(self.whole.scenarios)})
-
-    def tuned_rows(self) -> str:
-        """The rows of the method that is varied, so that changed ones are tuned again."""
-        assert self.config.tune
-        method = read_methods(self.root / self.config.method_table)[self.config.tune.method]
-        search = read_searches(self.root / self.config.search_table, self.config.clusters)[method.search or ""]
-        return _json([plain(method), plain(search)])
 
 
 def _paths(files: Any, many: bool) -> Any:

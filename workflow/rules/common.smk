@@ -86,7 +86,7 @@ workflow.config_settings.config_args = [
         for key, value in CHOSEN.items()
     ),
 ]
-BENCHMARK = or_workflow_error(needs.checked, config, ROOT, cluster=CLUSTER)
+BENCHMARK = or_workflow_error(needs.checked, config, ROOT)
 CONFIG = BENCHMARK.config
 RESULTS = CONFIG.results
 POOL = () if CLUSTER else or_workflow_error(needs.pool_of, CONFIG, workflow)

@@ -7,11 +7,11 @@ import pytest
 
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.records import StageRecord
-from neuspring.experiments.tuning import trial, worker
-from neuspring.experiments.tuning.report import state
+from neuspring.extensions.tuning import trial, worker
+from neuspring.extensions.tuning.report import state
 from neuspring.twin.fit import FitProblem, TwinFit, fit, tail_start
+from tests.extensions.tuning.sweeps import furnish, report, results_of, settings, sweep, trials, work
 from tests.support import small
-from tests.support.sweeps import furnish, report, results_of, settings, sweep, trials, work
 
 
 def test_no_test_frame_changes_any_trial(tmp_path, finished):

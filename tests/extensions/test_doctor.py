@@ -2,7 +2,7 @@
 
 from neuspring import config
 from neuspring.cli.main import main
-from neuspring.experiments import doctor
+from neuspring.extensions.doctor import machine as doctor
 
 
 def findings(tmp_path, **values) -> dict[str, doctor.Check]:

@@ -28,7 +28,7 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_text
 from neuspring.core.provenance import code_digest
 from neuspring.core.records import StageRecord, canonical, digest_file
-from neuspring.experiments.tuning.space import Plan
+from neuspring.extensions.tuning.space import Plan
 from neuspring.stages.search import search as search_stage
 from neuspring.twin.fit import RELEASED_CHECKPOINT_EPOCHS, FitProblem, NonFinite, TwinFit, fit, tail_start
 
