@@ -194,11 +194,6 @@ def watched(parameters: TwinParameters) -> torch.Tensor:
     return field.planes.texels if field.planes is not None else next(iter(field.layers[0].parameters()))
 
 
-def median_gradient(tensor: torch.Tensor) -> float:
-    """Median |gradient| of a tensor; 0 if it has none."""
-    return 0.0 if tensor.grad is None else float(tensor.grad.abs().median())
-
-
 def movement(parameters: TwinParameters) -> dict[str, Any]:
     """Figures of the present values against those before the first step; those that do not apply are left out.
 

@@ -19,8 +19,9 @@ import torch
 
 from neuspring.config.search import TRIALS, Search
 from neuspring.core.levenberg import LevenbergMarquardt
+from neuspring.twin.body import TERMS
 from neuspring.twin.candidates import PENALTY, Map, SearchProblem, made
-from neuspring.twin.losses import OF_IMAGES, TERMS, FrameLoss
+from neuspring.twin.losses import OF_IMAGES, FrameLoss
 from neuspring.twin.rollout import FAR
 from neuspring.twin.trials import motions
 
@@ -44,8 +45,7 @@ class Polish(LevenbergMarquardt):
     def __init__(self, search: Search, columns: Sequence[int], base: np.ndarray, cost: float) -> None:
         """`base`: normalized variables, of which those at `columns` are polished."""
         raised = 10 * FACTORS[-1] / FACTORS[0]
-        options: dict[str, Any] = {"damping": 0.1, "most": 1e4, "tolerance": TOLERANCE}
-        super().__init__(base=base, cost=cost, factors=FACTORS, raised=raised, **options)
+        super().__init__(base=base, cost=cost, factors=FACTORS, raised=raised, damping=0.1, most=1e4, tolerance=TOLERANCE)
         self._most_rounds, self.columns = search.polish_rounds, list(columns)
         self.stage = SLOPES
         """Stage of the candidates that are asked for now."""
@@ -106,8 +106,7 @@ def residuals(
         for name, parts in loss.errors(frame, nodes, assigned, own).items():
             rows += [(rank[name], frame, part.residuals(len(x)).flatten()) for part in parts]
     # Sums depend on the order by a rounding; it is that of earlier results: terms one after the other, those of images by frames.
-    result: np.ndarray = torch.cat([r for _, _, r in sorted(rows, key=lambda row: row[:2])]).numpy()
-    return result
+    return np.asarray(torch.cat([r for _, _, r in sorted(rows, key=lambda row: row[:2])]).numpy())
 
 
 def products(

@@ -54,11 +54,9 @@ class Registration:
 def register(source: np.ndarray, target: np.ndarray, others: np.ndarray) -> Registration:
     """Map target points [M, 3], m, onto source points [N, 3], m; `others` [C, 3] follow the nearest target point."""
     source, target, others = (np.asarray(points, np.float64) for points in (source, target, others))
-    rotation, shift = _pose(_few(source), _few(target))
+    rotation, shift = _pose(*(points[:: -(-len(points) // MOST_POINTS)] for points in (source, target)))
     points, following = target @ rotation.T + shift, others @ rotation.T + shift
-    rigid = residual(source, points)
-    extent = extent_of(source)
-    bent = points
+    rigid, extent, bent = residual(source, points), extent_of(source), points
     if rigid > FLOOR * max(spacing(source), spacing(target)):
         bent = _bent(source, points, extent)
     _, nearest = cKDTree(points).query(following)
@@ -99,10 +97,6 @@ def _axes(points: np.ndarray) -> np.ndarray:
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=True)[2].T if len(points) > 2 else np.eye(3)
     axes[:, 2] *= np.sign(np.linalg.det(axes)) or 1.0
     return axes
-
-
-def _few(points: np.ndarray) -> np.ndarray:
-    return points[:: -(-len(points) // MOST_POINTS)]
 
 
 def _starts(source: np.ndarray, target: np.ndarray) -> Iterator[np.ndarray]:

@@ -75,11 +75,6 @@ class RodSteps(RodFit):
     robust: float = 0.02
     """Robustness b, m: errors e count as sqrt(e^2 + b^2), so that recordings that flip do not decide."""
 
-    @classmethod
-    def of(cls, settings: RodFit) -> RodSteps:
-        """The fit that the settings ask for."""
-        return cls(**vars(settings))
-
 
 @dataclass(frozen=True)
 class Variables:
@@ -118,12 +113,8 @@ class Variables:
 
     def part(self, q: np.ndarray, name: str) -> np.ndarray:
         """The variables of one kind; zeros where they are not varied."""
-        begin = 0
-        for kind, size in self.sizes.items():
-            if kind == name:
-                return q[begin : begin + size]
-            begin += size
-        return np.zeros(1)
+        parts = np.split(q, np.cumsum(list(self.sizes.values())))
+        return dict(zip(self.sizes, parts, strict=False)).get(name, np.zeros(1))
 
     def made(self, q: np.ndarray) -> Twin:
         """The twin of variables q [Q]."""
@@ -271,8 +262,7 @@ class Levenberg:
     def objective(self, errors: np.ndarray, q: np.ndarray, scale: np.ndarray) -> np.ndarray:
         """The objective of candidates, m, from errors [K, R] and variables [K, Q]."""
         b = self.settings.robust
-        value: np.ndarray = np.mean(np.sqrt(errors**2 + b**2) - b, axis=-1) + PRIOR * ((q / scale) ** 2).sum(axis=-1)
-        return value
+        return np.asarray(np.mean(np.sqrt(errors**2 + b**2) - b, axis=-1) + PRIOR * ((q / scale) ** 2).sum(axis=-1))
 
     def lowered(self, twin: Twin, progress: Progress) -> tuple[Twin, float, list[dict[str, Any]]]:
         """The twin after the stages of the settings, the objective of the last one, m, and a row per step."""
@@ -348,7 +338,7 @@ def search_rod(
     import pandas as pd
 
     require_pool(observations, pool)
-    first = replace(RodSteps.of(settings.fit.rod), stiffness="constant", curvature="constant", markers=False)
+    first = replace(RodSteps(**vars(settings.fit.rod)), stiffness="constant", curvature="constant", markers=False)
     first = replace(first, horizons=first.horizons[:1])
     lines = [rods.line_of(each) for each in [observations, *pool] if each.line.size]
     axis = max(np.eye(3)[:2].tolist(), key=lambda axis: sum(np.cos(turn_of(line, np.array(axis))) for line in lines))
@@ -374,7 +364,7 @@ def fit_rod(
     threads: int = 1,
 ) -> RodResult:
     """All variables of a rod, stage by stage, from the twin of its search. Raises InputError, NumericalFailure."""
-    recordings, settings = Recordings.of([observations, *pool], twin, oracle), RodSteps.of(settings)
+    recordings, settings = Recordings.of([observations, *pool], twin, oracle), RodSteps(**vars(settings))
     solver = Levenberg(recordings, settings, device, threads)
     progress = Progress(f"fit {observations.scenario.name}, rod", settings.rounds * len(settings.horizons))
     twin, value, history = solver.lowered(twin, progress)

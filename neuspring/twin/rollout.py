@@ -100,8 +100,7 @@ def spread(points: np.ndarray, values: np.ndarray, nodes: np.ndarray) -> np.ndar
     if len(places) == 1:
         return np.repeat(values, len(nodes), axis=0)
     interpolate = RBFInterpolator(places, values, min(SPREAD_NEIGHBORS, len(places)), SPREAD_SMOOTHING, "linear")
-    result: np.ndarray = interpolate(nodes.astype(np.float64))
-    return result
+    return np.asarray(interpolate(nodes.astype(np.float64)))
 
 
 def initial_velocity(observations: Observations, kind: InitialVelocity) -> np.ndarray:

@@ -37,8 +37,7 @@ def neighbors(points: np.ndarray, most: int) -> np.ndarray:
     # Points may coincide: one is not always the first of its own list.
     own = near == np.arange(len(points))[:, None]
     own[:, -1] |= ~own.any(axis=1)
-    others: np.ndarray = near[~own].reshape(len(points), count)
-    return others
+    return np.asarray(near[~own].reshape(len(points), count))
 
 
 def variogram(midpoints: np.ndarray, values: np.ndarray, edges: np.ndarray, seed: int = 0) -> np.ndarray:

@@ -178,9 +178,7 @@ def _best(problem: SearchProblem, rows: Sequence[dict[str, Any]], push: bool, at
 
     table = pd.DataFrame(rows)
     costs = table["cost"]
-    # Candidates for slopes are never the result.
-    judged = table[table["stage"] != SLOPES]
-    best = judged.iloc[int(judged["cost"].to_numpy().argmin())]
+    best = _least(table)
     if best["cost"] >= PENALTY:
         substeps = problem.simulation.substeps
         if substeps != "auto" and table["reason"].str.startswith(UNSTABLE).all():
@@ -218,6 +216,12 @@ def _best(problem: SearchProblem, rows: Sequence[dict[str, Any]], push: bool, at
     )
 
 
+def _least(trace: pd.DataFrame) -> Any:
+    """The row of the best candidate; those for slopes are never the result."""
+    judged = trace[trace["stage"] != SLOPES]
+    return judged.iloc[int(judged["cost"].to_numpy().argmin())]
+
+
 SURFACES = ("ground_", "contact_")
 """Beginnings of the names of variables that have no effect where nothing touches."""
 END = 0.01
@@ -226,8 +230,7 @@ END = 0.01
 
 def at_ends(trace: pd.DataFrame, variables: Sequence[str]) -> list[str]:
     """Variables of the best candidate that lie within `END` of an end of their range; contact is left out."""
-    judged = trace[trace["stage"] != SLOPES]
-    best = judged.iloc[int(judged["cost"].to_numpy().argmin())]
+    best = _least(trace)
     decisive = [name for name in variables if not name.startswith(SURFACES)]
     return [name for name in decisive if not END <= best[f"normalized.{name}"] <= 1 - END]
 

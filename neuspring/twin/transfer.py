@@ -188,9 +188,9 @@ def infer_radii(topology: Topology) -> tuple[list[float], list[int]]:
     from scipy.spatial import cKDTree
 
     points = topology.canonical[: len(topology.nodes)].astype(np.float64)
-    springs = topology.springs[: topology.object_spring_count]
+    springs, count = topology.springs[: topology.object_spring_count], int(topology.labels.max()) + 1
     if not len(springs):
-        return [0.0] * (int(topology.labels.max()) + 1), [2] * (int(topology.labels.max()) + 1)
+        return [0.0] * count, [2] * count
     degree = np.bincount(springs.ravel(), minlength=len(points))
     regular = (degree[springs] > REPAIR_SPRINGS).all(axis=1)
     springs = springs[regular] if regular.any() else springs
@@ -199,7 +199,7 @@ def infer_radii(topology: Topology) -> tuple[list[float], list[int]]:
     rank = np.minimum(*ranks)
     region = topology.labels[springs]
     radii, neighbors = [], []
-    for label in range(int(topology.labels.max()) + 1):
+    for label in range(count):
         within = (region == label).all(axis=1)
         within = within if within.any() else np.ones(len(springs), dtype=bool)
         radii.append(float(length[within].max()) * MARGIN)
@@ -225,9 +225,8 @@ def _carried(twin: Twin, new: Topology, material: Material, laid: np.ndarray) ->
         for name, numbers in values.items():
             found[name][there] = mean(numbers[here])
     for here, there, of_hands in zip(_parts(old), _parts(new), (False, True), strict=True):
-        for name in ("stiffness", "dashpot"):
-            # Powers of length in the sums of the module's text.
-            power = {"stiffness": 1, "dashpot": 2}[name] - 2 * of_hands
+        # Powers of length in the sums of the module's text.
+        for name, power in (("stiffness", 1 - 2 * of_hands), ("dashpot", 2 - 2 * of_hands)):
             before = _sum(old, here, values[name], lengths[id(old)], power, of_hands)
             after = _sum(new, there, found[name], lengths[id(new)], power, of_hands)
             found[name][there] *= before / after if after > 0 else 1.0

@@ -48,11 +48,11 @@ def outcomes(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor,
     sums = LossSums(solver, loss, velocity)
     for frame in _frames(solver, twins, hands, velocity):
         sums.add(frame)
-        if frame % CHECK_EVERY[device.partition(":")[0]] == 0 and not sums.any_alive:
+        if frame % CHECK_EVERY[device.partition(":")[0]] == 0 and bool(sums.diverged.all()):
             break
     return [
-        Outcome(math.inf if diverged else cost, diverged, overflow)
-        for cost, diverged, overflow in zip(sums.costs(len(hands) - 1), sums.diverged_frames, solver.overflows, strict=True)
+        Outcome(math.inf if frame else cost, int(frame), overflow)
+        for cost, frame, overflow in zip(sums.costs(len(hands) - 1), sums.diverged.tolist(), solver.overflows, strict=True)
     ]
 
 
@@ -127,14 +127,9 @@ class LossSums:
         return [float(total) / frames for total in totals.cpu()]
 
     @property
-    def diverged_frames(self) -> list[int]:
+    def diverged(self) -> torch.Tensor:
         """The frame in which each twin left the scene; 0 if it did not."""
-        return [int(frame) for frame in self._buffers.tensors["diverged"].reshape(-1)[: self._buffers.twins].cpu()]
-
-    @property
-    def any_alive(self) -> bool:
-        """True where any twin is in the scene."""
-        return not bool(self._buffers.tensors["diverged"].all())
+        return self._buffers.tensors["diverged"].reshape(-1)[: self._buffers.twins]
 
 
 @functools.cache

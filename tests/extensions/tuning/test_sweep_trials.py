@@ -60,8 +60,8 @@ def test_a_trial_is_judged_by_the_twin_that_the_method_would_choose(folder, meth
         return
     result = fit(problem)
     by_training = result.history["tail_loss"][result.history["loss"].argmin()]
-    assert value == (result.best_loss if selection == "tail" else by_training)
-    assert result.best_loss != by_training, "the two rules choose different twins, or this test could not tell them apart"
+    assert value == (result.facts["best_loss"] if selection == "tail" else by_training)
+    assert result.facts["best_loss"] != by_training, "the two rules choose different twins, or this test could not tell them apart"
 
 
 def test_hopeless_trials_are_pruned_before_their_last_epoch(folder):
