@@ -37,8 +37,6 @@ ENVIRONMENT = {
 and a server that is away costs seconds. With MLflow's own defaults (7 retries of 120 s) it would cost minutes."""
 ARTIFACTS = "mlartifacts"
 PORTS = {"postgresql": 5432, "mysql": 3306, "mssql": 1433}
-AGAIN = "commit."
-"""Prefix of the tags that name further commits, or a later time, at which the same results were made."""
 VIEW = "scores"
 """Name of the view of the table of runs that has scores as columns; a tag of the experiment holds it, as its page would."""
 COLUMNS = [f"metrics.`{task}.{metric}`" for task in ("reconstruction", "future") for metric in ("chamfer", "track_error", "psnr")]
