@@ -14,7 +14,7 @@ from neuspring.config.baselines import Baselines
 from neuspring.config.data import Deform, Mocap, Synthetic, Toy
 from neuspring.config.effort import EFFORTS, Effort, sizes
 from neuspring.config.images import Images
-from neuspring.config.parse import Count, Name, Section, json_value, merge, parse, plain, read_yaml
+from neuspring.config.parse import Count, Name, SettingsSection, json_value, merge, parse, plain, read_yaml
 from neuspring.config.perception import Perception
 from neuspring.config.rod import RodSettings
 from neuspring.config.search import Search
@@ -27,7 +27,7 @@ Device = Annotated[int, Field(ge=0)] | Annotated[str, StringConstraints(pattern=
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gpus(Section):
+class Gpus(SettingsSection):
     """GPUs of this machine that jobs lease. On a cluster these are not read: its scheduler chooses."""
 
     devices: Literal["all"] | tuple[Device, ...] = "all"
@@ -69,7 +69,7 @@ Seeds = Annotated[tuple[Annotated[int, Field(ge=0)], ...], BeforeValidator(_seed
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tracking(Section):
+class Tracking(SettingsSection):
     """MLflow, an index of the runs. The files are the record."""
 
     enabled: bool = True
@@ -86,7 +86,7 @@ class Tracking(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Aim(Section):
+class Aim(SettingsSection):
     """A ratio of errors that is aimed at: it is reached if the mean is at most `ratio` and the interval lies below `below`."""
 
     method: Name
@@ -104,7 +104,7 @@ class Aim(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Section):
+class Config(SettingsSection):
     """One benchmark: which scenarios, methods and seeds, and how."""
 
     scenarios: tuple[Name, ...] = ()

@@ -36,10 +36,10 @@ class Check:
     remedy: str = ""
     """The next move, a format string too."""
     title: str | None = None
-    """What stands before the sentence in messages, a format string: the key of a file; None: the name."""
+    """Beginning of messages before the sentence, a format string: the key of a file; None: the name."""
 
     def findings(self, subject: Any) -> Iterator[Finding]:
-        """What it has to say of a subject, which has the field `where`."""
+        """Measurements of a subject, which has the field `where`."""
         low, high = self.limit or (-inf, inf)
         for measured in _several(self.measure(subject)):
             value: Any = measured.get("value")

@@ -25,8 +25,8 @@ from neuspring.experiments.benchmark import Benchmark, with_method, with_search
 from neuspring.stages import STAGES, makers
 from neuspring.stages.stage import Member, Rows, Stage
 
-TEMPLATES = Path(__file__).parents[1] / "report" / "templates"
-SPLATS = "appearance"
+TEMPLATE_FOLDER = Path(__file__).parents[1] / "report" / "templates"
+SPLATS_FOLDER = "appearance"
 """Folder of the splats that all methods share; those of one method have its name behind a hyphen."""
 NEUTRAL: dict[str, Any] = {
     "only": "",
@@ -52,7 +52,7 @@ class Graph:
         self.benchmark, self.config = benchmark, benchmark.config
         self.results, self.root, self.whole = benchmark.config.results, benchmark.root, benchmark.whole
         self.folder = f"{self.results}/{self.config.tables}"
-        """Of tables and report."""
+        """Folder of tables and report."""
         tune = self.config.tune
         self.sweep_folder = f"{self.results}/tune/{tune.study}" if tune else ""
         self._texts: dict[tuple[Any, ...], str] = {}
@@ -65,7 +65,7 @@ class Graph:
             "scenario": one_of(benchmark.scenarios),
             "method": one_of(own),
             "search": one_of(benchmark.searches),
-            "looks": one_of([SPLATS, *(f"{SPLATS}-{name}" for name in own)]),
+            "looks": one_of([SPLATS_FOLDER, *(f"{SPLATS_FOLDER}-{name}" for name in own)]),
             "camera": r"[A-Za-z0-9][A-Za-z0-9_.-]*",
             "seed": "|".join(map(str, self.whole.seeds)),
             "study": one_of(benchmark.studies),
@@ -84,7 +84,7 @@ class Graph:
         """The rows of the tables that the wildcards of a job name."""
         method = getattr(job, "method", None)
         if looks := getattr(job, "looks", None):
-            method = looks.removeprefix(SPLATS).removeprefix("-") or None
+            method = looks.removeprefix(SPLATS_FOLDER).removeprefix("-") or None
         return self._of(job.scenario, method, getattr(job, "search", None))
 
     def _rows(self, scenario: str, name: str | None, search: str | None) -> Rows:
@@ -134,7 +134,7 @@ class Graph:
         return {name: known.whole_scenarios[name].category for name in names if known.source(name).has_truth}
 
     def _records(self, stage: str, scenarios: Sequence[str], methods: Sequence[str] | None) -> list[str]:
-        """What a stage writes of all runs, or of those of some methods."""
+        """Files that a stage writes of all runs, or of those of some methods."""
         return [
             self.output_of(STAGES[stage], SimpleNamespace(scenario=scenario, method=method, seed=seed))
             for scenario in scenarios
@@ -214,7 +214,7 @@ class Graph:
             "seed": getattr(job, "seed", None),
             "method": owner or method,
             "search": rows.method.searched if rows.method else None,
-            "looks": f"{SPLATS}-{owner}" if owner else SPLATS,
+            "looks": f"{SPLATS_FOLDER}-{owner}" if owner else SPLATS_FOLDER,
         }
         wildcards = {wildcard: values[wildcard] for wildcard in maker.wildcards if wildcard != "camera"}
         if "camera" not in maker.wildcards:
@@ -350,7 +350,7 @@ class Graph:
     # --- what commands are told that look at many runs: those of the whole benchmark, whatever part runs now
 
     def tables(self, output: str = "") -> list[str]:
-        """Of `neuspring tables`; into `output` instead of the folder of tables."""
+        """Options of `neuspring tables`; into `output` instead of the folder of tables."""
         objects = [] if self.config.objects == "scenario" else ["--objects", self.config.objects]
         aims = ["--aims", _json(plain(self.config)["aims"])] if self.config.aims else []
         compared = ["--baseline", self.benchmark.compared_with]
@@ -359,7 +359,7 @@ class Graph:
         return [*self._runs(output or self.folder), *self._transfers(), *compared, *objects, *aims, *studies, *settings]
 
     def study(self, name: str) -> list[str]:
-        """Of `neuspring study`."""
+        """Options of `neuspring study`."""
         place = ["--results", self.results, "--tables", self.config.tables]
         return ["--study", name, *place, "--output", f"{self.folder}/studies"]
 
@@ -367,11 +367,11 @@ class Graph:
         return ["--table", str(self.root / self.config.study_table)]
 
     def perception(self) -> list[str]:
-        """Of `neuspring perception-table`."""
+        """Options of `neuspring perception-table`."""
         return ["--results", self.results, "--scenarios", json.dumps(self.judged(self.whole.scenarios))]
 
     def report(self, output: str = "") -> list[str]:
-        """Of `neuspring report`; to the file `output` instead of the one in the folder of tables."""
+        """Options of `neuspring report`; to the file `output` instead of the one in the folder of tables."""
         values = plain(self.whole) | {"only": ""}
         # Where MLflow lies concerns nothing that the report shows.
         del values["tracking"]
@@ -401,7 +401,7 @@ class Graph:
         A sweep costs much: it is no input of the report, so that changed settings do not run it again.
         """
         summary = Path(self.sweep_folder) / "summary.md"
-        texts = [b"".join(path.read_bytes() for path in sorted(TEMPLATES.iterdir()))]
+        texts = [b"".join(path.read_bytes() for path in sorted(TEMPLATE_FOLDER.iterdir()))]
         texts += [summary.read_bytes()] if self.sweep_folder and summary.exists() else []
         return [hashlib.sha256(text).hexdigest()[:16] for text in texts]
 

@@ -28,7 +28,7 @@ Kind = Literal["cpu", "gpu"]
 Key = tuple[str, Kind, str]
 """Rule, kind and scenario of jobs; scenario "": of all."""
 HEADROOM_MEMORY, HEADROOM_TIME = 1.5, 3.0
-"""What is asked for, over the most that earlier jobs needed."""
+"""Factors on the most that earlier jobs needed."""
 LEAST_MEMORY, LEAST_MINUTES = 1000, 10
 ALWAYS_GPU = frozenset({"tune", *(name for name, stage in STAGES.items() if stage.gpu is True)})
 """Rules that take a GPU where there is one."""
@@ -97,7 +97,7 @@ def gpu_pool(settings: Gpus, device: str, *, plan_only: bool = False) -> tuple[s
 
 
 def gpu_slots(pool: Sequence[str], jobs_per_gpu: int, limit: int | None) -> int:
-    """How many jobs may hold a GPU at once: all slots, or `limit` (--resources gpu=...). Raises InputError if that cannot be."""
+    """Number of jobs that may hold a GPU at once: all slots, or `limit` (--resources gpu=...). Raises InputError."""
     slots = len(pool) * jobs_per_gpu
     where = "--resources gpu"
     if limit and not pool:

@@ -20,10 +20,10 @@ from neuspring.twin.body import code, lines_of
 PICTURE_ROLES = ("strip", "video", "turntable")
 """Files of the render stage to look at."""
 PICTURE_FACTS = ("backend", "masks", "views", "lpips", "quirks", "unseen_surface")
-"""What a reader of image scores must know."""
+"""Facts that a reader of image scores must know."""
 
 MANY_LEFT_OUT = 0.05
-"""Of the frames of all epochs; with a larger share left out, gradients say little about long motions."""
+"""Share of the frames of all epochs; where more are left out, gradients say little about long motions."""
 FEW_TEXELS = 0.05
 """A share of texels that moved below this says that the settings were in training's way."""
 
@@ -145,7 +145,7 @@ def score(
 
 
 def _picture_facts(records: Mapping[str, StageRecord]) -> dict[str, Any] | None:
-    """How pictures were scored, or why they were not; None for scenarios without images."""
+    """The way pictures were scored, or the reason why they were not; None for scenarios without images."""
     if "render" not in records:
         return None
     facts = records["render"].facts
@@ -153,7 +153,7 @@ def _picture_facts(records: Mapping[str, StageRecord]) -> dict[str, Any] | None:
 
 
 def _notes(records: Mapping[str, StageRecord]) -> list[str]:
-    """What a reader of the scores must know although the run did not fail."""
+    """Notes that a reader of the scores needs although the run did not fail."""
     from neuspring.scores.metrics import AT_BOUND
 
     notes = []

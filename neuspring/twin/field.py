@@ -17,7 +17,7 @@ from torch.nn.functional import embedding_bag
 
 from neuspring.config import SpringFieldSettings as Settings
 
-AXES = ((0, 1), (1, 2), (0, 2))
+PLANE_AXES = ((0, 1), (1, 2), (0, 2))
 """Coordinates that span the planes xy, yz, xz."""
 
 
@@ -73,7 +73,7 @@ def bilinear(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarra
     low = np.minimum(np.floor(grid).astype(np.int64), resolution - 2)
     part = grid - low
     cells, weights = [], []
-    for plane, (a, b) in enumerate(AXES):
+    for plane, (a, b) in enumerate(PLANE_AXES):
         for row in (0, 1):
             for column in (0, 1):
                 cells.append(plane * resolution**2 + (low[:, b] + row) * resolution + low[:, a] + column)

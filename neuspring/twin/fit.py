@@ -121,16 +121,16 @@ class _State:
     """Median |gradient| per step over Adam's epsilon, in the first epoch in which the median is not zero."""
 
     def checkpoint(self) -> Checkpoint:
-        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ARRAYS}
-        return Checkpoint({name: getattr(self, name) for name in ARRAYS}, plain)
+        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in FIT_ARRAYS}
+        return Checkpoint({name: getattr(self, name) for name in FIT_ARRAYS}, plain)
 
     @classmethod
     def of(cls, checkpoint: Checkpoint) -> _State:
-        arrays: dict[str, Any] = {name: dict(checkpoint.arrays[name]) for name in ARRAYS}
+        arrays: dict[str, Any] = {name: dict(checkpoint.arrays[name]) for name in FIT_ARRAYS}
         return cls(**arrays, **checkpoint.values)
 
 
-ARRAYS = ("values", "moments", "best_values")
+FIT_ARRAYS = ("values", "moments", "best_values")
 """The fields of a state that hold arrays."""
 
 

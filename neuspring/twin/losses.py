@@ -35,7 +35,7 @@ CHUNK_ENTRIES = 1 << 22
 """Distances computed at once in the nearest-node search; bounds memory."""
 BETA = 0.03
 """m: beyond it a track's error in the image counts linearly."""
-NEAR = 0.05
+NEAREST_DEPTH = 0.05
 """m: nodes nearer to the camera are projected as if they were there."""
 
 
@@ -245,7 +245,7 @@ class ImageEvidence:
         """Pixels [..., 2] of points [..., 3], m."""
         local = x @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
         flat = local @ self.intrinsics.T
-        return flat[..., :2] / flat[..., 2:].clamp_min(NEAR)
+        return flat[..., :2] / flat[..., 2:].clamp_min(NEAREST_DEPTH)
 
     def distance(self, frame: int, u: torch.Tensor) -> torch.Tensor:
         """D [N], pixels, at pixels [N, 2]; beyond the image as at its border."""

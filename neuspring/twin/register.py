@@ -16,9 +16,9 @@ from scipy.spatial.distance import cdist
 ICP_STEPS = 40
 MOST_POINTS = 1500
 """Points of each set that ICP looks at; a pose needs no more."""
-CLOSE = 1.02
+ALIKE_STARTS = 1.02
 """Starts whose residual is within this factor of the best fit alike; the earliest wins, so that a symmetric body does not turn."""
-FLOOR = 0.75
+RIGID_ENOUGH = 0.75
 """In spacings of the coarser set: a rigid fit this close needs no bending."""
 BEND_WIDTHS = (0.3, 0.2, 0.12, 0.08)
 """Widths of the smooth displacement, one after the other, as fractions of the extent."""
@@ -57,7 +57,7 @@ def register(source: np.ndarray, target: np.ndarray, others: np.ndarray) -> Regi
     rotation, shift = _pose(*(points[:: -(-len(points) // MOST_POINTS)] for points in (source, target)))
     points, following = target @ rotation.T + shift, others @ rotation.T + shift
     rigid, extent, bent = residual(source, points), extent_of(source), points
-    if rigid > FLOOR * max(spacing(source), spacing(target)):
+    if rigid > RIGID_ENOUGH * max(spacing(source), spacing(target)):
         bent = _bent(source, points, extent)
     _, nearest = cKDTree(points).query(following)
     end = residual(source, bent)
@@ -122,7 +122,7 @@ def _pose(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarra
                 break
         poses.append((residual(source, target @ rotation.T + shift), rotation, shift))
     best = min(error for error, _, _ in poses)
-    return next((rotation, shift) for error, rotation, shift in poses if error <= CLOSE * best)
+    return next((rotation, shift) for error, rotation, shift in poses if error <= ALIKE_STARTS * best)
 
 
 def _kabsch(points: np.ndarray, onto: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -41,9 +41,9 @@ if TYPE_CHECKING:
 
 PRIOR = 1e-6
 """Weight of the variables' squares, m: they decide where recordings say nothing."""
-STEP = 5e-3
+SCALED_STEP = 5e-3
 """Step of the finite differences, in scales."""
-FARTHEST = 2.0
+LARGEST_ERROR = 2.0
 """Largest error of a coordinate that counts, m: what left the scene."""
 LEAST_GAIN = 2e-3
 """A step that lowers the objective by less than this part of it is a stage's last."""
@@ -51,7 +51,7 @@ DAMPINGS = (0.1, 1.0, 10.0, 100.0)
 """Factors on the damping, for each step that is tried."""
 LANES = 512
 """Rollouts that run in one solver at most."""
-SCALES = {
+VARIABLE_SCALES = {
     "bending": 1.0, "twisting": 1.0, "damping": 1.0, "drag": 1.0, "drag_quadratic": 1.0, "marker_mass": 1.0, "hands": 1.0,
     "dashpots": 1.0, "roll": 1.0, "curvature": 0.3, "bending_along": 0.5, "twisting_along": 0.5, "clamps": 0.02, "offsets": 0.01,
     "stretch": 0.01,
@@ -109,7 +109,7 @@ class Variables:
     @property
     def scale(self) -> np.ndarray:
         """Scale of each variable [Q]."""
-        return np.concatenate([np.full(size, SCALES[name]) for name, size in self.sizes.items()])
+        return np.concatenate([np.full(size, VARIABLE_SCALES[name]) for name, size in self.sizes.items()])
 
     def part(self, q: np.ndarray, name: str) -> np.ndarray:
         """The variables of one kind; zeros where they are not varied."""
@@ -223,7 +223,7 @@ class Recordings:
             if (frame - 1) % every == 0:
                 kept.append(solver.nodes()[0][:, :tracked].cpu())
         found = torch.stack(kept, dim=1).reshape(len(twins), count, len(kept), tracked, 3).numpy()
-        return np.asarray(np.nan_to_num(found, nan=FARTHEST * 10, posinf=FARTHEST * 10, neginf=-FARTHEST * 10))
+        return np.asarray(np.nan_to_num(found, nan=LARGEST_ERROR * 10, posinf=LARGEST_ERROR * 10, neginf=-LARGEST_ERROR * 10))
 
 
 def _paths(pairs: Sequence[tuple[Observations, np.ndarray]]) -> torch.Tensor:
@@ -252,7 +252,7 @@ class Levenberg:
 
         def one(part: np.ndarray) -> np.ndarray:
             found = recordings.predicted([variables.made(qs[k]) for k in part], frames, every, self.device)
-            apart = np.clip(found - recordings.points[None, :, kept], -FARTHEST, FARTHEST)
+            apart = np.clip(found - recordings.points[None, :, kept], -LARGEST_ERROR, LARGEST_ERROR)
             return np.asarray(apart[:, recordings.counts[:, kept]].reshape(len(part), -1))
 
         self.rollouts += len(qs) * len(recordings.observations)
@@ -291,9 +291,9 @@ class Levenberg:
             base=q, cost=value, damping=1e-2, factors=DAMPINGS, raised=DAMPINGS[-1] * 10, least=1e-6, most=1e6, tolerance=LEAST_GAIN
         )
         for _ in range(self.settings.rounds):
-            q, steps, bound = descent.base, np.diag(STEP * scale), np.ones(len(scale))
+            q, steps, bound = descent.base, np.diag(SCALED_STEP * scale), np.ones(len(scale))
             # In the units of their scales, so that bounds and damping mean the same for all.
-            slopes = (self.errors(variables, list(q + steps), frames, every) - errors) / STEP
+            slopes = (self.errors(variables, list(q + steps), frames, every) - errors) / SCALED_STEP
             weights = 1 / np.sqrt(errors**2 + b**2) / len(errors)
             products = (slopes * weights) @ slopes.T + 2 * PRIOR * np.eye(len(q))
             gradient = slopes @ (weights * errors) + 2 * PRIOR * q / scale

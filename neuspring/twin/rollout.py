@@ -13,7 +13,7 @@ from neuspring.physics.controllers import waypoints
 from neuspring.physics.solver import FrameSolver
 from neuspring.twin.body import body_of
 
-FAR = 1e3
+FAR_AWAY = 1e3
 """A node this far from the origin has left any plausible scene, m."""
 
 
@@ -41,7 +41,7 @@ def frames(
     for frame in range(1, len(hands)):
         x, v = solver.forward(x, v, hands[frame - 1], hands[frame])
         # NaN compares false, so this catches it together with infinity and absurd distances.
-        near = (x.abs() < FAR).all(dim=1)
+        near = (x.abs() < FAR_AWAY).all(dim=1)
         if not bool(near.all()):
             raise Diverged(frame, f"node {int((~near).nonzero()[0])} left the scene in frame {frame}")
         yield frame, x, v

@@ -41,7 +41,7 @@ WAYS = {"hold": (False,), "push": (True,), "auto": (False, True)}
 """Ways of hands that are judged, by `search.hands`: True where they only push."""
 FREED_SIGMA = 0.06
 """Step of CMA-ES in normalized variables when each region becomes free."""
-MOVES = 0.9
+MUST_MOVE = 0.9
 """Hands push if that costs less than this fraction of a body that stays as it is in frame 0."""
 
 
@@ -151,7 +151,7 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
                     other, attempts, earlier = [], 1, 0.0
             if not start and len(ways) > 1:
                 if len(trace) < stop or len(other) < len(population):
-                    trace, other = _ways(judge, population, ways, MOVES * still_cost(problem.recordings))
+                    trace, other = _ways(judge, population, ways, MUST_MOVE * still_cost(problem.recordings))
                 budget -= len(other)
                 push = bool(trace[0]["push"])
             fresh = population[max(len(trace) - start, 0) :]

@@ -246,7 +246,7 @@ def uniform_topology(
     return piecewise_topology(nodes, controllers, one, [object_radius], [object_neighbors], *of_controllers)
 
 
-MARGIN = 1 + 1e-6
+RADIUS_MARGIN = 1 + 1e-6
 """Factor on radii, so that the longest spring is made again."""
 
 
@@ -256,4 +256,4 @@ def infer_controller_radius(topology: Topology) -> tuple[float, int]:
     if not len(springs):
         return 1e-9, 1
     hands = springs.max(axis=1) - len(topology.nodes)
-    return float(distances(topology.canonical, springs).max()) * MARGIN, int(np.bincount(hands).max())
+    return float(distances(topology.canonical, springs).max()) * RADIUS_MARGIN, int(np.bincount(hands).max())

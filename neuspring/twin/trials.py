@@ -20,7 +20,7 @@ from neuspring.core.device import load
 from neuspring.physics.lanes import lanes
 from neuspring.physics.solver import FrameSolver, solver_for
 from neuspring.twin.losses import FrameLoss
-from neuspring.twin.rollout import FAR
+from neuspring.twin.rollout import FAR_AWAY
 
 CHECK_EVERY = {"cpu": 1, "cuda": 16}
 """Frames from one look for twins that all diverged to the next; on CUDA each check synchronizes."""
@@ -152,7 +152,7 @@ def kernels(width: int) -> list[Any]:
     slots: Any = wp.array3d(dtype=Vector)
     targets: Any = wp.array2d(dtype=wp.vec3)
     flags: Any = wp.array2d(dtype=wp.int32)
-    far, huge = wp.constant(wp.float32(FAR)), wp.constant(Number(*[3e38] * width))
+    far, huge = wp.constant(wp.float32(FAR_AWAY)), wp.constant(Number(*[3e38] * width))
     half, one = wp.constant(0.5), wp.constant(1.0)
 
     @wp.func

@@ -15,7 +15,7 @@ from neuspring.experiments.tracking import log as tracking
 @pytest.fixture
 def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A results folder in which a run of the workflow has begun; no GPU is leased to anybody."""
-    for name in (job.POOL, job.SHARE, gpus.VISIBLE):
+    for name in (job.POOL, job.GPU_SHARE, gpus.VISIBLE):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv(gpus.LOCKS, str(tmp_path / "locks"))
     begin_run(tmp_path / "results")

@@ -8,7 +8,7 @@ import torch
 from torch.nn.functional import grid_sample
 
 from neuspring import config
-from neuspring.twin.field import AXES, SpringField, TriPlane, bilinear, fourier, in_cube, midpoints
+from neuspring.twin.field import PLANE_AXES, SpringField, TriPlane, bilinear, fourier, in_cube, midpoints
 
 EXACT = 1e-12
 """Absolute, for values of order 1 in float64: the same sums in another order."""
@@ -172,7 +172,7 @@ def dense(at: np.ndarray, resolution: int, channels: int, scale: float) -> tuple
 
 def sample(full: torch.Tensor, at: np.ndarray) -> torch.Tensor:
     """Summed features [S, C] of full planes [3, C, N, N], by torch's own bilinear interpolation."""
-    grid = torch.stack([torch.from_numpy(at[:, list(axes)]) for axes in AXES])[:, None]
+    grid = torch.stack([torch.from_numpy(at[:, list(axes)]) for axes in PLANE_AXES])[:, None]
     return grid_sample(full, grid, mode="bilinear", align_corners=True)[:, :, 0].sum(dim=0).T
 
 

@@ -116,7 +116,7 @@ def job_prefix():
     values = {
         # Only inside a job that a cluster started; with --jobs beside --cores Snakemake runs jobs here.
         wrapper.POOL: wrapper.GIVEN if workflow.remote_exec else ",".join(POOL),
-        wrapper.SHARE: str(CONFIG.gpus.jobs_per_gpu),
+        wrapper.GPU_SHARE: str(CONFIG.gpus.jobs_per_gpu),
     }
     if not CLUSTER:
         values[warm.SOCKET] = str(WARM)

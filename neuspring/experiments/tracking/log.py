@@ -45,7 +45,7 @@ MOST_PARAMS = 60
 PARAM_LENGTH, TAG_LENGTH = 500, 5000
 """These keep MLflow's tables readable. The full text stays in run.json."""
 METRIC_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.:/ -]{0,249}")
-SAMPLES = ("cpu_percent", "memory_mb", "gpu_percent", "gpu_memory_mb")
+SAMPLE_COLUMNS = ("cpu_percent", "memory_mb", "gpu_percent", "gpu_memory_mb")
 """Columns of a job record's samples, after the time."""
 OUTCOME = "mlflow.txt"
 """The outcome of logging a record, beside it; the workflow's rule writes it."""
@@ -270,7 +270,7 @@ def _system_metrics(record: RunRecord, run_json: Path, results: Path) -> Iterato
         for attempt in attempts[-1:]:
             start = milliseconds(attempt.started)
             for seconds, *values in attempt.samples:
-                for what, value in zip(SAMPLES, values, strict=True):
+                for what, value in zip(SAMPLE_COLUMNS, values, strict=True):
                     if seconds is not None and value is not None:
                         yield Metric(f"usage/{stage}.{what}", value, start + round(1000 * seconds), round(seconds))
             totals = {

@@ -24,7 +24,7 @@ from neuspring.core.files import write_text
 from neuspring.core.table import Table
 from neuspring.experiments.benchmark import read_methods, read_searches
 from neuspring.extensions.tuning.space import CLUSTERS, Plan, labels
-from neuspring.extensions.tuning.worker import DEFINITION, FACTS, REASON, VALUES, WORKER, counted, origin, study_of
+from neuspring.extensions.tuning.worker import DEFINITION, REASON, TRIAL_FACTS, VALUES, WORKER, counted, origin, study_of
 
 SECTIONS_OF_NO_ROW = ("simulation", "losses", "released_quirks")
 """An overlay sets them for all methods."""
@@ -62,7 +62,7 @@ def report(settings: Config, tune: Tune, output: Path, root: Path = Path()) -> N
 def _table(trials: Sequence[FrozenTrial], plan: Plan) -> pd.DataFrame:
     rows = []
     for trial in trials:
-        facts = trial.user_attrs.get(FACTS, {})
+        facts = trial.user_attrs.get(TRIAL_FACTS, {})
         last = trial.intermediate_values[trial.last_step] if trial.last_step is not None else None
         loss = trial.value if trial.state == TrialState.COMPLETE else None
         row: dict[str, Any] = {"trial": origin(trial), "state": state(trial), "loss": loss, "last_loss": last}

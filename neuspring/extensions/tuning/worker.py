@@ -39,18 +39,18 @@ from neuspring.core.files import write_text
 from neuspring.core.records import RECORD_FORMAT, canonical, now
 from neuspring.core.run_record import flat
 from neuspring.extensions.tuning.space import Plan, holds, label, labels
-from neuspring.extensions.tuning.trial import Outcome, Scene, checkpoint, run
+from neuspring.extensions.tuning.trial import TrainingScene, TrialOutcome, checkpoint, run
 
 DATABASE = "optuna.db"
 DEFINITION = "definition"
 """Attribute of the study: what must not change while it lasts."""
 ORIGIN, WORKER, REASON = "origin", "worker", "reason"
 """Attributes of a trial: the number of the one that it continues, its worker, why it ended early (unless it was left behind)."""
-FACTS, VALUES = "facts", "values"
+TRIAL_FACTS, VALUES = "facts", "values"
 """Attributes of a trial: how it went, and its values. The baseline's include those that the space cannot hold."""
 MOST_DEATHS = 5
 """A trial that ends its worker this often is not continued; another takes its place."""
-PATIENCE = 60.0
+WRITER_PATIENCE = 60.0
 """Seconds that SQLite waits for another writer."""
 
 
@@ -69,7 +69,7 @@ def study_of(folder: Path, tune: Tune, facts: Mapping[str, Any], pruner: BasePru
     path, begun = folder / DATABASE, None
     uri = tune.storage or sqlalchemy.URL.create("sqlite", database=str(path.resolve())).render_as_string()
     # A server may close connections that are idle during a long fit.
-    engine = {"pool_pre_ping": True} if tune.storage else {"connect_args": {"timeout": PATIENCE}}
+    engine = {"pool_pre_ping": True} if tune.storage else {"connect_args": {"timeout": WRITER_PATIENCE}}
     # Several processes must not create the tables at once.
     with lock_of(folder):
         if pruner or tune.storage or path.is_file():
@@ -153,7 +153,7 @@ class MedianOfStep(BasePruner):
         self._inner = MedianPruner(n_startup_trials=max(tune.startup_trials, 1), n_warmup_steps=warmup)
 
     def prune(self, study: Study, trial: FrozenTrial) -> bool:
-        """Whether the trial is above the median of completed ones at its last step."""
+        """True where the trial is above the median of completed ones at its last step."""
         if trial.last_step is None:
             return False
         last = copy.copy(trial)
@@ -202,7 +202,7 @@ def work(
     if not 0 <= worker < tune.workers:
         raise InputError("--worker", f"0 to tune.workers - 1 = {tune.workers - 1} is required", worker)
     plan, folder, device = Plan.of(settings, tune, root), output.parent, resolve_device(device)
-    scenes = [Scene.of(path, plan.base["fit"]["tail_fraction"], folder / "frames") for path in observations]
+    scenes = [TrainingScene.of(path, plan.base["fit"]["tail_fraction"], folder / "frames") for path in observations]
     required, names = list(tune.scenarios or settings.scenarios), [scene.name for scene in scenes]
     if names != required:
         raise InputError("--observations", f"those of {', '.join(required)} are required", ", ".join(names))
@@ -239,9 +239,9 @@ def work(
     write_text(output, json.dumps(content, indent=1, sort_keys=True) + "\n")
 
 
-def _attempt(trial: Trial, number: int, plan: Plan, scenes: Sequence[Scene], folder: Path, device: str) -> float:
+def _attempt(trial: Trial, number: int, plan: Plan, scenes: Sequence[TrainingScene], folder: Path, device: str) -> float:
     """Run a trial: its value. Raises what Optuna takes as pruned or failed, and errors that say nothing about its settings."""
-    started, outcome = now(), Outcome()
+    started, outcome = now(), TrialOutcome()
 
     def report(step: int, loss: float, what: str) -> None:
         trial.report(loss, step)
@@ -258,7 +258,7 @@ def _attempt(trial: Trial, number: int, plan: Plan, scenes: Sequence[Scene], fol
     finally:
         facts = {"started": started, "ended": now(), "losses": outcome.losses, "seconds": outcome.seconds, "device": device}
         codes = provenance.code_digest("neuspring.twin.fit", "neuspring.twin.search")
-        trial.set_user_attr(FACTS, facts | {"commit": provenance.commit(), "code": codes})
+        trial.set_user_attr(TRIAL_FACTS, facts | {"commit": provenance.commit(), "code": codes})
     for scene in scenes:
         checkpoint(folder, number, scene.name).unlink(missing_ok=True)
     return outcome.value

@@ -30,7 +30,7 @@ def test_the_search_does_not_see_the_tail(tmp_path):
     heads = []
     for name, observations in {"as": scene, "changed": dataclasses.replace(scene, object_points=points)}.items():
         observations.save(tmp_path / f"{name}.npz")
-        made = trial.Scene.of(tmp_path / f"{name}.npz", 0.4, tmp_path / name)
+        made = trial.TrainingScene.of(tmp_path / f"{name}.npz", 0.4, tmp_path / name)
         heads.append(made.head.read_bytes())
         assert len(Observations.load(made.head).object_points) == end < scene.scenario.train_end
         assert len(made.training.object_points) == scene.scenario.train_end < scene.scenario.frame_count
