@@ -13,8 +13,6 @@ from neuspring.config.parse import STRICT, Count, Finite, SettingsSection
 
 LENGTHS = ("object_radius", "controller_radius", "contact_distance")
 """Variables in units of `search.lengths`."""
-TOPOLOGY = ("object_radius", "object_neighbors", "controller_radius", "controller_neighbors")
-"""Variables that decide which springs there are, so that a twin changes in jumps with them."""
 
 
 @dataclass(frozen=True)

@@ -54,10 +54,6 @@ def _seed_list(value: Any) -> Any:
     return tuple(entries)
 
 
-def _place(path: str) -> str:
-    return os.path.normpath(os.path.expanduser(path))
-
-
 def _transfers(value: Any) -> Any:
     """`--config transfers=null` arrives as text; pools too."""
     if isinstance(value, dict):
@@ -138,7 +134,9 @@ class Config(SettingsSection):
     """Scenario -> other recordings of the same object, on which its twins are rolled out as well; null: none."""
     pools: Annotated[dict[Name, tuple[Name, ...]] | None, BeforeValidator(_transfers)] = None
     """Name -> scenarios that are recordings of one object, with the same nodes, for methods with `pool`; null: none."""
-    results: Annotated[str, StringConstraints(pattern=r"^[^{}\n]+$"), AfterValidator(_place)] = "results"
+    results: Annotated[
+        str, StringConstraints(pattern=r"^[^{}\n]+$"), AfterValidator(lambda path: os.path.normpath(os.path.expanduser(path)))
+    ] = "results"
     """Folder for everything that is written; `~` is the home folder."""
     tables: Name = "tables"
     """Folder for tables in the results folder. Use another name to keep the tables of another choice of methods apart."""
