@@ -111,7 +111,7 @@ def test_template_of_a_baseline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 def test_template_of_a_loss_term(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "above_table.py").write_text(template("**A loss term**"))
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setitem(losses.TERMS, "above_table", importlib.import_module("above_table").above_table)
+    monkeypatch.setitem(losses.TERMS._own, "above_table", importlib.import_module("above_table").above_table)
 
     class Weights(Losses):
         above_table: float = 2.0

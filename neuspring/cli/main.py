@@ -24,7 +24,7 @@ from neuspring.registry import Registry
 
 _OURS = {
     "data": "check-data mask compare-masks",
-    "results": "tables perception-table study explain report track-init log sync ui tune tune-report doctor",
+    "results": "tables perception-table study explain report track-init log sync ui",
 }
 COMMANDS: Registry[Callable[..., int | None]] = Registry(
     "commands",

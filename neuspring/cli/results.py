@@ -1,5 +1,4 @@
-"""Commands on finished runs (tables, perception-table, study, explain, report), on MLflow (track-init, log, sync, ui), on
-sweeps (tune, tune-report), and on this machine (doctor)."""
+"""Commands on finished runs (tables, perception-table, study, explain, report) and on MLflow (track-init, log, sync, ui)."""
 
 from __future__ import annotations
 
@@ -11,15 +10,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from neuspring.cli.options import Device, Positional, Results, Settings, arg, json_value, read_settings
+from neuspring.cli.options import Positional, Results, Settings, arg, json_value, read_settings
 from neuspring.config import parse
 from neuspring.core.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from neuspring.config import Config
-    from neuspring.config.tuning import Tune
     from neuspring.scores.paper import Study
     from neuspring.scores.runs import Collected
 
@@ -288,41 +285,3 @@ def ui(results: Results = Path("results"), settings: Settings = "{}", host: str 
     print(f"MLflow UI: http://{host}:{port}/{place} (stop with Ctrl-C)", flush=True)
     command = [sys.executable, "-m", "mlflow", "ui", "--backend-store-uri", uri, "--host", host, "--port", str(port)]
     os.execve(sys.executable, command, ENVIRONMENT | {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"} | os.environ)
-
-
-def tune(
-    observations: Annotated[tuple[Path, ...], arg(help="observations.npz of the sweep's scenarios")],
-    output: Path,
-    worker: int = 0,
-    settings: Settings = "{}",
-    device: Device = "auto",
-    threads: int = 1,
-) -> None:
-    """One worker of a sweep."""
-    from neuspring.experiments.tuning.worker import work
-
-    work(*_sweep(settings), list(observations), worker, device, output)
-
-
-def tune_report(output: Path, settings: Settings = "{}") -> None:
-    """A sweep -> summary, plots, best.yaml."""
-    from neuspring.experiments.tuning.report import report
-
-    report(*_sweep(settings), output)
-    print(output.read_text(encoding="utf-8"))
-
-
-def _sweep(text: str) -> tuple[Config, Tune]:
-    settings = read_settings(text)
-    if settings.tune is None:
-        raise InputError("--settings, tune", "a sweep is required", None, "See config/README.md, tune.")
-    return settings, settings.tune
-
-
-def doctor(settings: Settings = "{}") -> int:
-    """Say what this machine can do, and what is missing; 1 where something that is configured cannot work."""
-    from neuspring.experiments.doctor import examine, text
-
-    findings = examine(read_settings(settings))
-    print(text(findings))
-    return int(any(finding.state == "broken" for finding in findings))

@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from neuspring.config.parse import Count, NonNegative, Positive, Section
+from neuspring.config.parse import Count, NonNegative, Positive, SettingsSection
 
 
 @dataclass(frozen=True, kw_only=True)
-class SpringGaus(Section):
+class SpringGaus(SettingsSection):
     """Anchors with directed springs, trained on masks, or, as a variant, on points."""
 
     supervision: Literal["masks", "points"] = "masks"
@@ -29,7 +29,7 @@ class SpringGaus(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GsDynamics(Section):
+class GsDynamics(SettingsSection):
     """A graph network that moves particles by what the hands do next, with a step per centimeter of hand motion."""
 
     batch: Count | None = None
@@ -48,7 +48,7 @@ class GsDynamics(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Baselines(Section):
+class Baselines(SettingsSection):
     """The models of the baselines; a method's own `settings` go on top."""
 
     spring_gaus: SpringGaus = field(default_factory=SpringGaus)

@@ -7,11 +7,11 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.parse import Count, Name, NonNegative, Section
+from neuspring.config.parse import Count, Name, NonNegative, SettingsSection
 
 
 @dataclass(frozen=True, kw_only=True)
-class Toy(Section):
+class Toy(SettingsSection):
     """Analytic scenes simulated by the float64 reference, with known stiffness."""
 
     frames: Annotated[int, Field(ge=5)] = 60
@@ -25,7 +25,7 @@ class Toy(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mocap(Section):
+class Mocap(SettingsSection):
     """Motion capture of cables: end markers control, inner markers are observed, the body is sampled as rings."""
 
     stride: Count = 2
@@ -53,7 +53,7 @@ class Mocap(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Deform(Section):
+class Deform(SettingsSection):
     """DEFORM's benchmark. For each cable: a pool of training recordings, whose twins go to all evaluation recordings."""
 
     cables: tuple[Name, ...] = ()
@@ -64,7 +64,7 @@ class Deform(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Synthetic(Section):
+class Synthetic(SettingsSection):
     """Synthetic captures: finite elements seen by a ray caster through a model of a depth sensor."""
 
     size: Literal["tiny", "small", "demo", "full"] = "demo"

@@ -7,13 +7,13 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.parse import Count, NonNegative, Positive, Section
+from neuspring.config.parse import Count, NonNegative, Positive, SettingsSection
 
 ImageQuirk = Literal["second_camera_intrinsics", "any_alpha", "unit_lpips", "degenerate_skinning"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Appearance(Section):
+class Appearance(SettingsSection):
     """Training of splats on frame 0; the defaults are those of the released training. Pixels are those of an image 848 wide."""
 
     iterations: Count = 10_000
@@ -47,7 +47,7 @@ class Appearance(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LpipsWeights(Section):
+class LpipsWeights(SettingsSection):
     """Weights of LPIPS. Nothing is downloaded; without the weights LPIPS is not computed, and tables say so."""
 
     backbone: str | None = None
@@ -58,7 +58,7 @@ class LpipsWeights(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Images(Section):
+class Images(SettingsSection):
     """Appearance and the scores of pictures, for scenarios that have images."""
 
     enabled: bool = True

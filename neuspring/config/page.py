@@ -19,7 +19,7 @@ from pydantic.fields import FieldInfo
 
 from neuspring.config import rows, settings
 from neuspring.config.effort import EFFORT_SIZES, EFFORTS
-from neuspring.config.parse import Section, parts
+from neuspring.config.parse import SettingsSection, parts
 
 PAGE = Path(__file__).parents[2] / "config" / "README.md"
 HEADING = "## Keys\n"
@@ -41,7 +41,7 @@ def sections(kind: type = settings.Config, path: str = "") -> dict[str, type]:
 
 def is_section(kind: Any) -> bool:
     """True for a type that has a table of its own on the page; a dataclass that is no section is one value."""
-    return isinstance(kind, type) and issubclass(kind, Section)
+    return isinstance(kind, type) and issubclass(kind, SettingsSection)
 
 
 def text() -> str:

@@ -31,7 +31,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Range = tuple[Finite, Finite]
 
 
-class Section:
+class SettingsSection:
     """Base of the dataclasses of settings."""
 
     __pydantic_config__ = STRICT
@@ -47,7 +47,7 @@ T = TypeVar("T")
 
 def parse(kind: type[T], values: Mapping[str, Any], where: str) -> T:
     """Build the dataclass `kind` from plain values, strictly. Raises InputError listing every problem with its path."""
-    values = kind.completed(values) if issubclass(kind, Section) and isinstance(values, Mapping) else values
+    values = kind.completed(values) if issubclass(kind, SettingsSection) and isinstance(values, Mapping) else values
     try:
         result: T = _adapter(kind).validate_json(json.dumps(values), strict=True)  # type: ignore[arg-type]
         return result

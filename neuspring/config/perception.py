@@ -7,11 +7,11 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.parse import Count, NonNegative, Positive, Range, Section
+from neuspring.config.parse import Count, NonNegative, Positive, Range, SettingsSection
 
 
 @dataclass(frozen=True, kw_only=True)
-class OpenCvSegmentation(Section):
+class OpenCvSegmentation(SettingsSection):
     """Segmentation by height and color against the table; hands by their color."""
 
     height: Positive = 0.012
@@ -23,7 +23,7 @@ class OpenCvSegmentation(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MarksSegmentation(Section):
+class MarksSegmentation(SettingsSection):
     """Segmentation from the marks of a user (`marks.json` of the capture), carried through the video."""
 
     background: bool = True
@@ -33,7 +33,7 @@ class MarksSegmentation(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OpenCvTracking(Section):
+class OpenCvTracking(SettingsSection):
     """Lucas-Kanade with a forward-backward check."""
 
     points: Count = 5000
@@ -43,7 +43,7 @@ class OpenCvTracking(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GroundedSam2(Section):
+class GroundedSam2(SettingsSection):
     """GroundingDINO and SAM 2, through `transformers` (extra `perception`); defaults are those of the released processing."""
 
     detector: str = "IDEA-Research/grounding-dino-tiny"
@@ -57,7 +57,7 @@ class GroundedSam2(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CoTracker3(Section):
+class CoTracker3(SettingsSection):
     """CoTracker3, online, from torch.hub."""
 
     points: Count = 5000
@@ -67,7 +67,7 @@ class CoTracker3(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lift(Section):
+class Lift(SettingsSection):
     """Pixels to points in the world, and which of them are trusted; defaults are those of the released processing."""
 
     depth_range: Range = (0.2, 1.5)
@@ -101,7 +101,7 @@ class Lift(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShapePriorSettings(Section):
+class ShapePriorSettings(SettingsSection):
     """The parts of the object in frame 0 that no camera sees."""
 
     backend: Literal["auto", "none", "visual_hull", "mesh", "truth"] = "auto"
@@ -119,7 +119,7 @@ class ShapePriorSettings(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sampling(Section):
+class Sampling(SettingsSection):
     """Structure points; defaults are those of the released processing."""
 
     voxel: Positive = 0.005
@@ -130,7 +130,7 @@ class Sampling(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ColorSettings(Section):
+class ColorSettings(SettingsSection):
     """Captures without depth (`depth: none`): the object of frame 0 on the table, hands and silhouettes in the image."""
 
     flat: tuple[str, ...] = ("cloth",)
@@ -140,7 +140,7 @@ class ColorSettings(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Segmentation(Section):
+class Segmentation(SettingsSection):
     """Pixels that show the object and the hands."""
 
     backend: str = "given"
@@ -155,7 +155,7 @@ class Segmentation(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PointTracking(Section):
+class PointTracking(SettingsSection):
     """The way of the pixels of frame 0."""
 
     backend: str = "opencv"
@@ -166,7 +166,7 @@ class PointTracking(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Perception(Section):
+class Perception(SettingsSection):
     """Raw video to observations."""
 
     segment: Segmentation = field(default_factory=Segmentation)

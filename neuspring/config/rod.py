@@ -7,11 +7,11 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.parse import Positive, Section
+from neuspring.config.parse import Positive, SettingsSection
 
 
 @dataclass(frozen=True, kw_only=True)
-class RodSettings(Section):
+class RodSettings(SettingsSection):
     """A long thin body as a rod (twin/rod.py): its vertices, and the stiffness that its fit starts from.
 
     Motion depends on stiffness over mass alone. So stiffness is given for a body of 1 kg/m; a body of another mass per length has
@@ -29,7 +29,7 @@ class RodSettings(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RodFit(Section):
+class RodFit(SettingsSection):
     """Levenberg-Marquardt on whole recordings (twin/rod_fit.py), for methods whose `fit` is rod."""
 
     stiffness: Literal["constant", "knots", "free"] = "constant"

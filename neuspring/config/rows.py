@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from neuspring.config.parse import Count, Name, Section
+from neuspring.config.parse import Count, Name, SettingsSection
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchRow(Section):
+class SearchRow(SettingsSection):
     """A row of the search table: into how many regions the topology is divided, and settings of its own."""
 
     clusters: Count | None = None
@@ -26,7 +26,7 @@ class SearchRow(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Method(Section):
+class Method(SettingsSection):
     """A row of the method table: a twin (which search it starts from, what follows) or a baseline's model; how it predicts."""
 
     description: str
@@ -69,7 +69,7 @@ class Method(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScenarioRow(Section):
+class ScenarioRow(SettingsSection):
     """A row of the scenario table: where a capture comes from, and what the simulation must know of it."""
 
     scenario: Name

@@ -9,12 +9,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from neuspring.config.parse import STRICT, Count, Finite, Section
+from neuspring.config.parse import STRICT, Count, Finite, SettingsSection
 
 LENGTHS = ("object_radius", "controller_radius", "contact_distance")
 """Variables in units of `search.lengths`."""
-TOPOLOGY = ("object_radius", "object_neighbors", "controller_radius", "controller_neighbors")
-"""Variables that decide which springs there are, so that a twin changes in jumps with them."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,7 @@ def _default(*values: Any) -> Any:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchVariables(Section):
+class SearchVariables(SettingsSection):
     """Variables of the search: lowest and highest value, start, and scale (linear or log). A setting names what differs."""
 
     stiffness: Variable = _default(10.0, 1e5, 3e3, "log")
@@ -101,7 +99,7 @@ VARIABLES = tuple(spec.name for spec in dataclasses.fields(SearchVariables))
 
 
 @dataclass(frozen=True, kw_only=True)
-class PolishSettings(Section):
+class PolishSettings(SettingsSection):
     """Levenberg-Marquardt after CMA-ES: from its best candidate, in few variables, on the residuals of all training frames."""
 
     rounds: Annotated[int, Field(ge=0)] = 6
@@ -109,7 +107,7 @@ class PolishSettings(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Search(Section):
+class Search(SettingsSection):
     """Zero-order stage: CMA-ES over homogeneous material and topology, then a polish of few variables."""
 
     rollouts: Count = 220

@@ -14,7 +14,7 @@ from neuspring.config.baselines import Baselines
 from neuspring.config.data import Deform, Mocap, Synthetic, Toy
 from neuspring.config.effort import EFFORTS, Effort, sizes
 from neuspring.config.images import Images
-from neuspring.config.parse import Count, Name, Section, json_value, merge, parse, plain, read_yaml
+from neuspring.config.parse import Count, Name, SettingsSection, json_value, merge, parse, plain, read_yaml
 from neuspring.config.perception import Perception
 from neuspring.config.rod import RodSettings
 from neuspring.config.search import Search
@@ -27,7 +27,7 @@ Device = Annotated[int, Field(ge=0)] | Annotated[str, StringConstraints(pattern=
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gpus(Section):
+class Gpus(SettingsSection):
     """GPUs of this machine that jobs lease. On a cluster these are not read: its scheduler chooses."""
 
     devices: Literal["all"] | tuple[Device, ...] = "all"
@@ -54,10 +54,6 @@ def _seed_list(value: Any) -> Any:
     return tuple(entries)
 
 
-def _place(path: str) -> str:
-    return os.path.normpath(os.path.expanduser(path))
-
-
 def _transfers(value: Any) -> Any:
     """`--config transfers=null` arrives as text; pools too."""
     if isinstance(value, dict):
@@ -69,7 +65,7 @@ Seeds = Annotated[tuple[Annotated[int, Field(ge=0)], ...], BeforeValidator(_seed
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tracking(Section):
+class Tracking(SettingsSection):
     """MLflow, an index of the runs. The files are the record."""
 
     enabled: bool = True
@@ -86,7 +82,7 @@ class Tracking(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Aim(Section):
+class Aim(SettingsSection):
     """A ratio of errors that is aimed at: it is reached if the mean is at most `ratio` and the interval lies below `below`."""
 
     method: Name
@@ -104,7 +100,7 @@ class Aim(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Section):
+class Config(SettingsSection):
     """One benchmark: which scenarios, methods and seeds, and how."""
 
     scenarios: tuple[Name, ...] = ()
@@ -138,7 +134,9 @@ class Config(Section):
     """Scenario -> other recordings of the same object, on which its twins are rolled out as well; null: none."""
     pools: Annotated[dict[Name, tuple[Name, ...]] | None, BeforeValidator(_transfers)] = None
     """Name -> scenarios that are recordings of one object, with the same nodes, for methods with `pool`; null: none."""
-    results: Annotated[str, StringConstraints(pattern=r"^[^{}\n]+$"), AfterValidator(_place)] = "results"
+    results: Annotated[
+        str, StringConstraints(pattern=r"^[^{}\n]+$"), AfterValidator(lambda path: os.path.normpath(os.path.expanduser(path)))
+    ] = "results"
     """Folder for everything that is written; `~` is the home folder."""
     tables: Name = "tables"
     """Folder for tables in the results folder. Use another name to keep the tables of another choice of methods apart."""

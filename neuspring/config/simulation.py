@@ -7,11 +7,11 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.parse import Count, Finite, Section
+from neuspring.config.parse import Count, Finite, SettingsSection
 
 
 @dataclass(frozen=True, kw_only=True)
-class SimulationSettings(Section):
+class SimulationSettings(SettingsSection):
     """Integration. Which way is up, the ground and self-collision come with the scenario."""
 
     substeps: Count | Literal["auto"] = "auto"
@@ -30,7 +30,7 @@ class SimulationSettings(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReleasedQuirks(Section):
+class ReleasedQuirks(SettingsSection):
     """Behaviors of the released PhysTwin code that differ from its description; all are off by default.
 
     Each is explained in neuspring/twin/README.md.

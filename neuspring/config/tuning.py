@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints
 
-from neuspring.config.parse import Count, Name, Section
+from neuspring.config.parse import Count, Name, SettingsSection
 from neuspring.core.text import refuse_password
 
 Whole = Annotated[int, Field(ge=0)]
@@ -15,7 +15,7 @@ Number = int | Annotated[float, Field(allow_inf_nan=False)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dimension(Section):
+class Dimension(SettingsSection):
     """Values of one setting: numbers between `low` and `high`, or `choices`."""
 
     low: Number | None = None
@@ -47,7 +47,7 @@ class Dimension(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tune(Section):
+class Tune(SettingsSection):
     """A sweep: which settings of one method are varied, and how trials are spent. Test frames are never read."""
 
     study: Annotated[Name, StringConstraints(max_length=60)]

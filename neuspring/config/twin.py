@@ -8,12 +8,12 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.parse import Count, NonNegative, Positive, Range, Section
+from neuspring.config.parse import Count, NonNegative, Positive, Range, SettingsSection
 from neuspring.config.rod import RodFit
 
 
 @dataclass(frozen=True, kw_only=True)
-class Losses(Section):
+class Losses(SettingsSection):
     """Weights of the training losses; the defaults are those of the released PhysTwin code."""
 
     chamfer: NonNegative = 1.0
@@ -29,7 +29,7 @@ class Losses(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SpringFieldSettings(Section):
+class SpringFieldSettings(SettingsSection):
     """Neural spring field: S(e) = S0 + F(x_mid(e)), F a tri-plane and a small MLP over spring midpoints in the rest shape."""
 
     triplane: bool = True
@@ -63,7 +63,7 @@ class SpringFieldSettings(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fit(Section):
+class Fit(SettingsSection):
     """First-order stage: Adam, with gradients through the simulation. A method's `fit` says what is free per spring."""
 
     epochs: Count = 200

@@ -39,13 +39,24 @@ def up_sign(up: str) -> float:
     return 1.0 if up == "+z" else -1.0
 
 
-def array(shape: str, dtype: type, unit: str, doc: str, *, nan: bool = False, optional: bool = False, omitted: bool = False) -> Any:
+def array(
+    shape: str,
+    dtype: type,
+    unit: str,
+    doc: str,
+    *,
+    sign: str = "",
+    nan: bool = False,
+    optional: bool = False,
+    omitted: bool = False,
+) -> Any:
     """Declare an array field: comma-separated dimensions (letters are symbols, digits are fixed), dtype, unit, meaning.
 
-    An optional one is empty where it is not given; an omitted one is optional, and not in the file where it is empty.
+    `sign` is what all entries must be: "positive" or "not negative". An optional one is empty where it is not given; an omitted one
+    is optional, and not in the file where it is empty.
     """
     sizes = tuple(shape.split(","))
-    metadata = {"shape": sizes, "dtype": np.dtype(dtype), "unit": unit, "doc": doc, "nan": nan, "omitted": omitted}
+    metadata = {"shape": sizes, "dtype": np.dtype(dtype), "unit": unit, "doc": doc, "nan": nan, "omitted": omitted, "sign": sign}
     if not (optional or omitted):
         return field(metadata=metadata)
     empty = tuple(int(size) if size.isdigit() else 0 for size in sizes)
@@ -94,6 +105,9 @@ class Artifact:
         if dtype.kind == "f" and not spec.metadata["nan"] and not np.isfinite(value).all():
             first = tuple(int(i) for i in np.argwhere(~np.isfinite(value))[0])
             raise InputError(where, "every entry must be finite", f"{value[first]} at index {first}")
+        sign = spec.metadata["sign"]
+        if sign and ((value < 0) | ((value == 0) & (sign == "positive"))).any():
+            raise InputError(where, f"must {'not be negative' if sign == 'not negative' else 'be positive'}", float(value.min()))
         return value
 
     def check(self) -> None:
@@ -444,23 +458,17 @@ class Material(Artifact):
     """Physical parameters. Nodes have 1 kg each, as in the released simulator, or masses of their own; forces scale with them."""
 
     kind: ClassVar[str] = "material"
-    stiffness: np.ndarray = array("S", np.float32, "N", "Y in f = Y (l / l0 - 1): force per unit strain")
-    dashpot: np.ndarray = array("S", np.float32, "N s/m", "damping along the spring")
+    stiffness: np.ndarray = array("S", np.float32, "N", "Y in f = Y (l / l0 - 1): force per unit strain", sign="not negative")
+    dashpot: np.ndarray = array("S", np.float32, "N s/m", "damping along the spring", sign="not negative")
     drag: float = number("1/s", "exponential decay of velocity")
     ground_elasticity: float = number("1", "part of the normal speed that is left")
     ground_friction: float = number("1", "Coulomb's coefficient")
     contact_elasticity: float = number("1", "as ground_elasticity, between nodes")
     contact_friction: float = number("1", "as ground_friction, between nodes")
     contact_distance: float = number("m", "distance below which approaching nodes collide")
-    mass: np.ndarray = array("N", np.float32, "kg", "mass of each node; empty: 1 kg each", optional=True)
+    mass: np.ndarray = array("N", np.float32, "kg", "mass of each node; empty: 1 kg each", sign="positive", optional=True)
 
     def check(self) -> None:
-        if (self.mass <= 0).any():
-            raise InputError("material.mass", "must be positive", float(self.mass.min()))
-        for name in ("stiffness", "dashpot"):
-            values = getattr(self, name)
-            if (values < 0).any():
-                raise InputError(f"material.{name}", "must not be negative", float(values.min()))
         for name in SCALARS:
             value = getattr(self, name)
             if not np.isfinite(value):
@@ -526,10 +534,10 @@ class Rod(Artifact):
     kind: ClassVar[str] = "rod"
     vertices: np.ndarray = array("V,3", np.float64, "m", "center line in frame 0")
     held: np.ndarray = array("V", np.int32, "1", "the controller that sets each vertex; -1: free")
-    lengths: np.ndarray = array("E", np.float64, "m", "unloaded length of each edge")
-    mass: np.ndarray = array("V", np.float64, "kg", "mass of each vertex")
-    bending: np.ndarray = array("V", np.float64, "N m^2", "EI at each vertex; the ends are not used")
-    twisting: np.ndarray = array("V", np.float64, "N m^2", "GJ at each vertex; the ends are not used")
+    lengths: np.ndarray = array("E", np.float64, "m", "unloaded length of each edge", sign="positive")
+    mass: np.ndarray = array("V", np.float64, "kg", "mass of each vertex", sign="positive")
+    bending: np.ndarray = array("V", np.float64, "N m^2", "EI at each vertex; the ends are not used", sign="not negative")
+    twisting: np.ndarray = array("V", np.float64, "N m^2", "GJ at each vertex; the ends are not used", sign="not negative")
     curvature: np.ndarray = array("V,2", np.float64, "1", "unloaded curvatures k1, k2 of each joint; the ends are not used")
     edge: np.ndarray = array("N", np.int32, "1", "the edge that each node of the topology follows")
     place: np.ndarray = array("N,3", np.float64, "1, m, m", "of each node: fraction along its edge, distances along m1 and m2")
@@ -559,12 +567,6 @@ class Rod(Artifact):
             raise InputError(
                 "rod.lengths", "at least 3 vertices, and one length per edge between them", (edges + 1, len(self.lengths))
             )
-        for name in ("lengths", "mass"):
-            if not (getattr(self, name) > 0).all():
-                raise InputError(f"rod.{name}", "must be positive", float(getattr(self, name).min()))
-        for name in ("bending", "twisting"):
-            if (getattr(self, name) < 0).any():
-                raise InputError(f"rod.{name}", "must not be negative", float(getattr(self, name).min()))
         if not (self.stretching > 0 and self.damping >= 0 and self.drag_quadratic >= 0 and np.isfinite(self.roll)):
             rule = "stretching > 0, damping >= 0, drag_quadratic >= 0 and a finite roll are required"
             raise InputError("rod", rule, (self.stretching, self.damping, self.drag_quadratic, self.roll))
@@ -595,12 +597,10 @@ class Twin(Artifact):
         nodes, masses = len(self.topology.nodes), len(self.material.mass)
         if masses not in (0, nodes):
             raise InputError("twin", f"the material must have one mass per node ({nodes}), or none", masses)
-        if self.rod:
-            self._check_rod(self.rod)
-
-    def _check_rod(self, rod: Rod) -> None:
-        if len(rod.edge) != len(self.topology.nodes):
-            raise InputError("twin.rod", f"one edge per node ({len(self.topology.nodes)})", len(rod.edge))
+        if (rod := self.rod) is None:
+            return
+        if len(rod.edge) != nodes:
+            raise InputError("twin.rod", f"one edge per node ({nodes})", len(rod.edge))
         if self.topology.object_spring_count:
             raise InputError("twin.rod", "a rod has no springs between its nodes", self.topology.object_spring_count)
         if rod.held.max() >= len(self.topology.controllers):

@@ -37,7 +37,7 @@ class Check:
     remedy: str = ""
     """The next move, a format string too."""
     title: str | None = None
-    """What stands before the sentence in messages, a format string: the key of a file; None: the name."""
+    """Beginning of messages before the sentence, a format string: the key of a file; None: the name."""
 
     def findings(self, where: object, *subject: Any) -> Iterator[Finding]:
         """Every finding about a subject, at the file, camera or other place `where`."""

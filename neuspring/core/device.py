@@ -31,7 +31,8 @@ _loaded: set[tuple[int, str]] = set()
 def start_warp() -> None:
     """Initialize Warp once, quietly: kernels here carry their own adjoints."""
     wp.config.enable_backward = False
-    quiet()
+    # Nothing of modules that it loads, only of errors.
+    wp.config.log_level = logging.ERROR
     with _without_driver_warning():
         wp.init()
 
@@ -87,11 +88,6 @@ def _warn_of_idle_gpu(held: str) -> None:
         file=sys.stderr,
         flush=True,
     )
-
-
-def quiet() -> None:
-    """Warp says nothing of modules that it loads, only of errors. Call this before it starts."""
-    wp.config.log_level = logging.ERROR
 
 
 def load(kernel: Any, device: Any) -> Any:

@@ -38,9 +38,9 @@ class Finding:
     remedy: str = ""
     """The next move alone, where it is known apart."""
     title: str | None = None
-    """What stands before the text in a message: the key of a file, or nothing; None: the name."""
+    """Beginning of the message before the text: the key of a file, or nothing; None: the name."""
     value: Any = None
-    """What was measured, where that is one number or word."""
+    """The measured value, where that is one number or word."""
     limit: tuple[float | None, float | None] | None = None
     """Lowest and highest value that is fine; None: no bound on that side."""
     frames: tuple[int, ...] = ()

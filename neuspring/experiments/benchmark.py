@@ -29,7 +29,7 @@ from neuspring.twin.body import BODIES
 T = TypeVar("T")
 RESERVED = ("tables", "logs", "benchmarks", "jobs", "tune", "mlartifacts", "published", "appearance", "perception", "capture")
 """Folders of the results that are no scenarios or methods."""
-REMEDY = "Name what to run on, for example --configfile config/data/demo.yaml."
+NAME_DATA = "Name what to run on, for example --configfile config/data/demo.yaml."
 
 
 def read_methods(path: Path) -> dict[str, Method]:
@@ -91,7 +91,7 @@ def chosen_part(config: Config, scenarios: Mapping[str, ScenarioRow]) -> Config:
 
 
 def for_targets(values: Mapping[str, Any], targets: Collection[str], root: Path) -> dict[str, Any]:
-    """What targets that are studies change in a configuration: `studies`; where all are, `only` with the methods of their rows.
+    """Changes of a configuration by targets that are studies: `studies`; where all are, `only` with the methods of their rows.
 
     So a table of the paper is made of its rows and no others, whatever methods the configuration names. Raises InputError.
     """
@@ -205,7 +205,7 @@ class Benchmark:
             given = dataclasses.replace(given, methods=tuple(name for name in self.table if name in union))
         for name in ("scenarios", "methods", "seeds"):
             if not getattr(given, name):
-                raise InputError(f"configuration, {name}", "at least one entry is required", None, REMEDY)
+                raise InputError(f"configuration, {name}", "at least one entry is required", None, NAME_DATA)
         _require_known("scenarios", given.scenarios, rows, f"{given.scenario_table}, or a capture or recording in data_root")
         compared = (given.compare_with,) if given.compare_with else ()
         _require_known("compare_with", compared, self.table, given.method_table)
@@ -306,7 +306,7 @@ class Benchmark:
         return tuple(name for name in rows_of(self.studies, study) if name in self.methods)
 
     def _row(self, name: str) -> ScenarioRow:
-        """Of a scenario, chosen or not."""
+        """The row of a scenario, chosen or not."""
         return self.scenarios.get(name) or self.whole_scenarios[name]
 
     def source(self, name: str) -> Source:
@@ -314,7 +314,7 @@ class Benchmark:
         return SOURCES[self._row(name).source]
 
     def data_path(self, name: str) -> Path | None:
-        """Where a scenario's data lie; None for scenes that are made here."""
+        """Place of a scenario's data; None for scenes that are made here."""
         return location(self._row(name), self.config) if self.source(name).needs_data else None
 
     def has_images(self, name: str) -> bool:

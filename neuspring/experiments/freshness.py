@@ -27,7 +27,7 @@ from neuspring.stages.stage import Stage
 
 IMAGES = "images"
 """The input that stands for all images of a capture."""
-LONGEST, MOST = 40, 6
+LONGEST_VALUE, MOST_DEPARTURES = 40, 6
 """Characters shown of a value, and departures shown of a group of jobs."""
 
 
@@ -41,7 +41,7 @@ class Freshness:
         self._digest = functools.cache(digest_file)
 
     def look(self, stage: Stage, job: Any) -> tuple[str, ...]:
-        """How what is there of a job departs from what it would make now; nothing where it does not, or nothing is there."""
+        """Departures of what is there of a job from what it would make now; nothing where it does not, or nothing is there."""
         output = self.graph.output_of(stage, job)
         if output not in self.departures:
             there = Path(output).exists()
@@ -115,7 +115,10 @@ def told(changed: Iterable[tuple[str, str, tuple[str, ...]]]) -> list[str]:
     lines = []
     for (rule, departures), rows in groups.items():
         named = ", ".join(dict.fromkeys(filter(None, rows)))
-        shown = [*departures[:MOST], *([f"{len(departures) - MOST} more"] if len(departures) > MOST else [])]
+        shown = [
+            *departures[:MOST_DEPARTURES],
+            *([f"{len(departures) - MOST_DEPARTURES} more"] if len(departures) > MOST_DEPARTURES else []),
+        ]
         jobs = f"{len(rows)} job{'s' * (len(rows) > 1)}"
         lines.append(f"  {rule} ({', '.join(filter(None, [named, jobs]))}): {', '.join(shown)}")
     return lines
@@ -123,7 +126,7 @@ def told(changed: Iterable[tuple[str, str, tuple[str, ...]]]) -> list[str]:
 
 def _short(value: Any) -> str:
     text = json.dumps(value)
-    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+    return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 3]}..."
 
 
 def stamp_of(results: str, told: Iterable[str], *modules: str) -> str:

@@ -19,15 +19,14 @@ from types import SimpleNamespace
 from typing import Any
 
 from neuspring.config import Config, Method, ScenarioRow, plain
-from neuspring.config.settings import select
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
-from neuspring.experiments.benchmark import Benchmark, read_methods, read_searches, with_method, with_search
+from neuspring.experiments.benchmark import Benchmark, with_method, with_search
 from neuspring.stages import STAGES, makers
 from neuspring.stages.stage import Member, Rows, Stage
 
-TEMPLATES = Path(__file__).parents[1] / "report" / "templates"
-SPLATS = "appearance"
+TEMPLATE_FOLDER = Path(__file__).parents[1] / "report" / "templates"
+SPLATS_FOLDER = "appearance"
 """Folder of the splats that all methods share; those of one method have its name behind a hyphen."""
 NEUTRAL: dict[str, Any] = {
     "only": "",
@@ -53,7 +52,7 @@ class Graph:
         self.benchmark, self.config = benchmark, benchmark.config
         self.results, self.root, self.whole = benchmark.config.results, benchmark.root, benchmark.whole
         self.folder = f"{self.results}/{self.config.tables}"
-        """Of tables and report."""
+        """Folder of tables and report."""
         tune = self.config.tune
         self.sweep_folder = f"{self.results}/tune/{tune.study}" if tune else ""
         self._texts: dict[tuple[Any, ...], str] = {}
@@ -66,7 +65,7 @@ class Graph:
             "scenario": one_of(benchmark.scenarios),
             "method": one_of(own),
             "search": one_of(benchmark.searches),
-            "looks": one_of([SPLATS, *(f"{SPLATS}-{name}" for name in own)]),
+            "looks": one_of([SPLATS_FOLDER, *(f"{SPLATS_FOLDER}-{name}" for name in own)]),
             "camera": r"[A-Za-z0-9][A-Za-z0-9_.-]*",
             "seed": "|".join(map(str, self.whole.seeds)),
             "study": one_of(benchmark.studies),
@@ -85,7 +84,7 @@ class Graph:
         """The rows of the tables that the wildcards of a job name."""
         method = getattr(job, "method", None)
         if looks := getattr(job, "looks", None):
-            method = looks.removeprefix(SPLATS).removeprefix("-") or None
+            method = looks.removeprefix(SPLATS_FOLDER).removeprefix("-") or None
         return self._of(job.scenario, method, getattr(job, "search", None))
 
     def _rows(self, scenario: str, name: str | None, search: str | None) -> Rows:
@@ -135,7 +134,7 @@ class Graph:
         return {name: known.whole_scenarios[name].category for name in names if known.source(name).has_truth}
 
     def _records(self, stage: str, scenarios: Sequence[str], methods: Sequence[str] | None) -> list[str]:
-        """What a stage writes of all runs, or of those of some methods."""
+        """Files that a stage writes of all runs, or of those of some methods."""
         return [
             self.output_of(STAGES[stage], SimpleNamespace(scenario=scenario, method=method, seed=seed))
             for scenario in scenarios
@@ -215,7 +214,7 @@ class Graph:
             "seed": getattr(job, "seed", None),
             "method": owner or method,
             "search": rows.method.searched if rows.method else None,
-            "looks": f"{SPLATS}-{owner}" if owner else SPLATS,
+            "looks": f"{SPLATS_FOLDER}-{owner}" if owner else SPLATS_FOLDER,
         }
         wildcards = {wildcard: values[wildcard] for wildcard in maker.wildcards if wildcard != "camera"}
         if "camera" not in maker.wildcards:
@@ -351,7 +350,7 @@ class Graph:
     # --- what commands are told that look at many runs: those of the whole benchmark, whatever part runs now
 
     def tables(self, output: str = "") -> list[str]:
-        """Of `neuspring tables`; into `output` instead of the folder of tables."""
+        """Options of `neuspring tables`; into `output` instead of the folder of tables."""
         objects = [] if self.config.objects == "scenario" else ["--objects", self.config.objects]
         aims = ["--aims", _json(plain(self.config)["aims"])] if self.config.aims else []
         compared = ["--baseline", self.benchmark.compared_with]
@@ -360,7 +359,7 @@ class Graph:
         return [*self._runs(output or self.folder), *self._transfers(), *compared, *objects, *aims, *studies, *settings]
 
     def study(self, name: str) -> list[str]:
-        """Of `neuspring study`."""
+        """Options of `neuspring study`."""
         place = ["--results", self.results, "--tables", self.config.tables]
         return ["--study", name, *place, "--output", f"{self.folder}/studies"]
 
@@ -368,11 +367,11 @@ class Graph:
         return ["--table", str(self.root / self.config.study_table)]
 
     def perception(self) -> list[str]:
-        """Of `neuspring perception-table`."""
+        """Options of `neuspring perception-table`."""
         return ["--results", self.results, "--scenarios", json.dumps(self.judged(self.whole.scenarios))]
 
     def report(self, output: str = "") -> list[str]:
-        """Of `neuspring report`; to the file `output` instead of the one in the folder of tables."""
+        """Options of `neuspring report`; to the file `output` instead of the one in the folder of tables."""
         values = plain(self.whole) | {"only": ""}
         # Where MLflow lies concerns nothing that the report shows.
         del values["tracking"]
@@ -402,7 +401,7 @@ class Graph:
         A sweep costs much: it is no input of the report, so that changed settings do not run it again.
         """
         summary = Path(self.sweep_folder) / "summary.md"
-        texts = [b"".join(path.read_bytes() for path in sorted(TEMPLATES.iterdir()))]
+        texts = [b"".join(path.read_bytes() for path in sorted(TEMPLATE_FOLDER.iterdir()))]
         texts += [summary.read_bytes()] if self.sweep_folder and summary.exists() else []
         return [hashlib.sha256(text).hexdigest()[:16] for text in texts]
 
@@ -412,19 +411,6 @@ class Graph:
             remedy = "Add the section `tune` (config/README.md, config/studies/tune.yaml)."
             raise InputError("configuration, tune", "the target sweep needs a sweep", None, remedy)
         return [f"{self.sweep_folder}/summary.md"]
-
-    def sweep(self) -> str:
-        """Settings of a sweep's workers, as JSON; its tables of methods and searches are found wherever a job runs."""
-        values = select(self.config, ("simulation", "losses", "search", "fit", "released_quirks", "tune"))
-        tables = {name: str(self.root / getattr(self.config, name)) for name in ("method_table", "search_table")}
-        return _json(values | tables | {"scenarios": list(self.whole.scenarios)})
-
-    def tuned_rows(self) -> str:
-        """The rows of the method that is varied, so that changed ones are tuned again."""
-        assert self.config.tune
-        method = read_methods(self.root / self.config.method_table)[self.config.tune.method]
-        search = read_searches(self.root / self.config.search_table, self.config.clusters)[method.search or ""]
-        return _json([plain(method), plain(search)])
 
 
 def _paths(files: Any, many: bool) -> Any:

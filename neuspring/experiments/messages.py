@@ -27,12 +27,12 @@ MOST_FINDINGS = 20
 
 LITTLE = 2_000_000
 """Bytes; with less a disk counts as full."""
-EVERY = 1.0
+LOOK_EVERY = 1.0
 """s between two looks at the records of jobs."""
 
 
 class Overview:
-    """How far a quiet run is: a line per rule when its last job has succeeded.
+    """Progress of a quiet run: a line per rule when its last job has succeeded.
 
     It watches the records of the run's jobs, in a thread of its own, from `start` to `stop`.
     """
@@ -58,7 +58,7 @@ class Overview:
         self._thread.join()
 
     def _watch(self) -> None:
-        while not self._stopped.wait(EVERY):
+        while not self._stopped.wait(LOOK_EVERY):
             self._look()
         self._look()
 
@@ -83,7 +83,7 @@ class Overview:
 
 
 def replaced(jobs: Iterable[tuple[str, Any, tuple[str, ...]]]) -> str:
-    """What is made again although it is there, of (rule, wildcards, departures); empty for no job."""
+    """Text on results that are made again although they are there, of (rule, wildcards, departures); empty for no job."""
     rows = [(rule, str(getattr(w, "method", getattr(w, "search", ""))), why) for rule, w, why in jobs]
     if not rows:
         return ""
@@ -151,7 +151,7 @@ def finished(graph: Graph, seconds: float) -> None:
 
 
 def tell_findings(results: Path, scenarios: Sequence[str]) -> None:
-    """What the steps of perception noticed: warnings of all scenarios; notes are in the report."""
+    """Findings of the steps of perception: warnings of all scenarios; notes are in the report."""
     found = warnings_of(results, scenarios)
     if found:
         print(f"Perception noticed {len(found)} thing{'s' * (len(found) > 1)} that may make results worse:")

@@ -18,19 +18,17 @@ from typing import Any, Literal
 
 from neuspring.config import Config
 from neuspring.config.settings import Gpus
-from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import JobRecord, read_jobs
 from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.jobs import gpus
-from neuspring.experiments.tuning.space import Plan
 from neuspring.stages import STAGES
 
 Kind = Literal["cpu", "gpu"]
 Key = tuple[str, Kind, str]
 """Rule, kind and scenario of jobs; scenario "": of all."""
 HEADROOM_MEMORY, HEADROOM_TIME = 1.5, 3.0
-"""What is asked for, over the most that earlier jobs needed."""
+"""Factors on the most that earlier jobs needed."""
 LEAST_MEMORY, LEAST_MINUTES = 1000, 10
 ALWAYS_GPU = frozenset({"tune", *(name for name, stage in STAGES.items() if stage.gpu is True)})
 """Rules that take a GPU where there is one."""
@@ -49,12 +47,9 @@ FIRST_REQUEST = {name: (stage.memory_mb, stage.minutes) for name, stage in STAGE
 """Rule -> MB and minutes to ask for, before any job of it was measured."""
 
 
-def checked(values: Mapping[str, Any], root: Path, *, cluster: bool) -> Benchmark:
+def checked(values: Mapping[str, Any], root: Path) -> Benchmark:
     """The benchmark of a configuration, after everything that can be checked before a job starts. Raises InputError."""
     benchmark = Benchmark(values, root)
-    if benchmark.config.tune:
-        Plan.of(benchmark.config, benchmark.config.tune, root)
-        check_storage(benchmark.config.tune, cluster=cluster)
     results = Path(benchmark.config.results)
     try:
         results.mkdir(parents=True, exist_ok=True)
@@ -63,13 +58,6 @@ def checked(values: Mapping[str, Any], root: Path, *, cluster: bool) -> Benchmar
         where, rule = f"configuration, results ({results})", "this folder must be writable"
         raise InputError(where, rule, error.strerror, "Choose another: --config results=...") from error
     return benchmark
-
-
-def check_storage(tune: Tune, *, cluster: bool) -> None:
-    """Raise InputError if workers of a sweep on several machines would share an SQLite file, whose locks hold within one alone."""
-    if cluster and tune.workers > 1 and tune.storage is None:
-        rule = "workers on several machines need storage: postgresql://...; SQLite is for those of one machine"
-        raise InputError("configuration, tune.storage", rule, None, "Name a PostgreSQL database, or use workers: 1.")
 
 
 def pool_of(config: Config, workflow: Any) -> tuple[str, ...]:
@@ -109,7 +97,7 @@ def gpu_pool(settings: Gpus, device: str, *, plan_only: bool = False) -> tuple[s
 
 
 def gpu_slots(pool: Sequence[str], jobs_per_gpu: int, limit: int | None) -> int:
-    """How many jobs may hold a GPU at once: all slots, or `limit` (--resources gpu=...). Raises InputError if that cannot be."""
+    """Number of jobs that may hold a GPU at once: all slots, or `limit` (--resources gpu=...). Raises InputError."""
     slots = len(pool) * jobs_per_gpu
     where = "--resources gpu"
     if limit and not pool:

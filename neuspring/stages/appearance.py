@@ -145,7 +145,7 @@ def _shots(
 
 @dataclass(frozen=True)
 class _Surface:
-    """What is known of the object's surface in frame 0."""
+    """Points known of the object's surface in frame 0."""
 
     cloud: np.ndarray
     """[P, 3] m, seen."""
@@ -156,10 +156,10 @@ class _Surface:
     reach: float
     """m: points of the prior this near to a seen one add nothing."""
     uniform: bool
-    """Whether the prior's points are uniform over its surface, so that their share is one of area."""
+    """True where the prior's points are uniform over its surface, so that their share is one of area."""
 
     def first(self, start: Literal["seen", "shape_prior"]) -> tuple[np.ndarray, np.ndarray]:
-        """Where splats begin, [R, 3] m, and their RGB [R, 3]."""
+        """First centers of splats, [R, 3] m, and their RGB [R, 3]."""
         distance, nearest = self._to_cloud
         if start == "shape_prior" and self.has_prior:
             return self.prior, self.colors[nearest]
@@ -169,7 +169,7 @@ class _Surface:
 
     @property
     def has_prior(self) -> bool:
-        """Whether there are points enough of a prior for splats to begin with."""
+        """True where there are points enough of a prior for splats to begin with."""
         from neuspring.splats.train import SCALE_NEIGHBORS
 
         return len(self.prior) > SCALE_NEIGHBORS

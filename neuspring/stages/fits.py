@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
+class FitRow:
     """The fits of one row of the method table: the arguments of their `neuspring fit`."""
 
     fits: dict[str, str]
@@ -92,7 +92,7 @@ def fits(
     from neuspring.twin.batch import run_batch
     from neuspring.twin.fit import FitResult
 
-    asked = [config.parse(Row, row, f"--rows, entry {place}") for place, row in enumerate(json_value("--rows", rows, list))]
+    asked = [config.parse(FitRow, row, f"--rows, entry {place}") for place, row in enumerate(json_value("--rows", rows, list))]
     jobs = [job for row in asked for job in _jobs(run.input_paths["observations"], row, device)]
     facts: dict[str, Any] = {"fits": sum(len(row.fits) for row in asked), "errors": {}, "spring_updates": 0}
     batches = batched(jobs, launch_size(twins_per_launch) or (LANE_WIDTHS[-1] if device == "cpu" else len(jobs)))
@@ -109,7 +109,7 @@ def fits(
     return Written(facts=facts)
 
 
-def _jobs(observations: Path, row: Row, device: str) -> Iterator[FitJob]:
+def _jobs(observations: Path, row: FitRow, device: str) -> Iterator[FitJob]:
     given: dict[str, Any] = {"settings": read_settings(row.settings), "kind": row.kind, "oracle": row.oracle, "device": device}
     for output, search in row.fits.items():
         job = alone.fit.job(output=Path(output), observations=observations, search=Path(search), **given)
@@ -136,7 +136,7 @@ def _fit(job: FitJob, lane: Lane) -> FitResult:
 
 
 def _is_done(job: Job) -> bool:
-    """Whether the fit's record is there, made of the same inputs and settings."""
+    """True where the fit's record is there, made of the same inputs and settings."""
     own = job.record
     if own is None or not own.output.is_file():
         return False

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from neuspring.config.images import Images
     from neuspring.splats.model import Gaussians, Splats
 
-VIDEOS = ("video", "turntable")
+RENDERED_VIDEOS = ("video", "turntable")
 
 
 def _weights(rows: Rows) -> str:
@@ -84,7 +84,7 @@ def render(
     rows: list[dict[str, Any]] = []
     shown, pairs = chosen_frames(scenario, predicted), {}
     first = next(iter(scored.views))
-    files = run.beside(**{role: f"{role}.mp4" for role in (VIDEOS if images.video else ())})
+    files = run.beside(**{role: f"{role}.mp4" for role in (RENDERED_VIDEOS if images.video else ())})
     progress = Progress("render", scenario.frame_count)
     with contextlib.ExitStack() as stack:
         videos = {role: stack.enter_context(Video(path, scenario.frame_rate)) for role, path in files.items()}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +14,34 @@ from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.records import StageRecord, digest_file, now
 from neuspring.core.run_folder import RunFolder
 from neuspring.core.run_record import RunRecord, flat, key_of
+from neuspring.scores.metrics import SHARE_AT_BOUND
 from neuspring.stages.stage import MayFail, Rows, stage
 from neuspring.twin.body import code, lines_of
 
 PICTURE_ROLES = ("strip", "video", "turntable")
 """Files of the render stage to look at."""
 PICTURE_FACTS = ("backend", "masks", "views", "lpips", "quirks", "unseen_surface")
-"""What a reader of image scores must know."""
+"""Facts that a reader of image scores must know."""
 
-MANY_LEFT_OUT = 0.05
-"""Of the frames of all epochs; with a larger share left out, gradients say little about long motions."""
-FEW_TEXELS = 0.05
-"""A share of texels that moved below this says that the settings were in training's way."""
+COMPUTED = ("computed", "not asked for")
+NOTED: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "start": (lambda v: str(v).startswith("seen:"), "without a shape prior, splats begin where something was seen"),
+    # Not why: that names places on this machine.
+    "vgg16": (lambda v: v not in COMPUTED, "without the loss of VGG16's features, whose weights are not there"),
+    "links": (lambda v: v == 0, "no anchor lies near a controller in frame 0, so the hands move nothing"),
+    "rollbacks": (bool, "{rolled_back} of {epochs} epochs rolled back, {epochs_asked} asked for"),
+    "collision_overflow": (bool, "the collision list overflowed (raise simulation.collision_capacity)"),
+    "at_ends": (bool, "at an end of its range: {at_ends}"),
+    "at_bound": (
+        lambda v: v > SHARE_AT_BOUND,
+        "{at_bound:.0%} of the springs lie at the bound of their stiffness (fit.output_bound)",
+    ),
+    # Where more are left out, gradients say little about long motions.
+    "frames_left_out": (lambda v: v > 0.05, "{frames_left_out:.0%} of the frames left out of gradients (fit.adjoint_limit)"),
+    # Where fewer moved, the settings were in training's way.
+    "texels_moved": (lambda v: v < 0.05, "only {texels_moved:.1%} of the texels moved by a tenth of their first scale"),
+}
+"""Facts of a stage's record, when they are worth a note, and the note."""
 
 
 def _variant(rows: Rows) -> dict[str, Any]:
@@ -145,7 +161,7 @@ def score(
 
 
 def _picture_facts(records: Mapping[str, StageRecord]) -> dict[str, Any] | None:
-    """How pictures were scored, or why they were not; None for scenarios without images."""
+    """The way pictures were scored, or the reason why they were not; None for scenarios without images."""
     if "render" not in records:
         return None
     facts = records["render"].facts
@@ -153,9 +169,7 @@ def _picture_facts(records: Mapping[str, StageRecord]) -> dict[str, Any] | None:
 
 
 def _notes(records: Mapping[str, StageRecord]) -> list[str]:
-    """What a reader of the scores must know although the run did not fail."""
-    from neuspring.scores.metrics import SHARE_AT_BOUND
-
+    """Notes that a reader of the scores needs although the run did not fail."""
     notes = []
     render = records.get("render")
     if render and render.status == "failed" and records["rollout"].status == "ok":
@@ -163,28 +177,8 @@ def _notes(records: Mapping[str, StageRecord]) -> list[str]:
     if render and render.facts.get("empty_frames"):
         notes.append(f"render: {render.facts['empty_frames']} frames show nothing of the object and have no PSNR")
     for name, record in records.items():
-        if str(record.facts.get("start", "")).startswith("seen:"):
-            notes.append(f"{name}: without a shape prior, splats begin where something was seen")
-        if record.facts.get("vgg16", "computed") not in ("computed", "not asked for"):
-            # Not why: that names places on this machine.
-            notes.append(f"{name}: without the loss of VGG16's features, whose weights are not there")
-        if record.facts.get("links") == 0:
-            notes.append(f"{name}: no anchor lies near a controller in frame 0, so the hands move nothing")
-        if record.facts.get("rollbacks"):
-            epochs, wanted = record.facts["epochs"], record.facts["epochs_asked"]
-            notes.append(f"{name}: {len(record.facts['rollbacks'])} of {epochs} epochs rolled back, {wanted} asked for")
-        if record.facts.get("collision_overflow"):
-            notes.append(f"{name}: the collision list overflowed (raise simulation.collision_capacity)")
-        if record.facts.get("at_ends"):
-            notes.append(f"{name}: at an end of its range: {record.facts['at_ends']}")
-        if record.facts.get("at_bound", 0.0) > SHARE_AT_BOUND:
-            notes.append(
-                f"{name}: {record.facts['at_bound']:.0%} of the springs lie at the bound of their stiffness (fit.output_bound)"
-            )
-        if record.facts.get("frames_left_out", 0.0) > MANY_LEFT_OUT:
-            notes.append(f"{name}: {record.facts['frames_left_out']:.0%} of the frames left out of gradients (fit.adjoint_limit)")
-        if record.facts.get("texels_moved", 1.0) < FEW_TEXELS:
-            notes.append(f"{name}: only {record.facts['texels_moved']:.1%} of the texels moved by a tenth of their first scale")
+        facts = record.facts | {"rolled_back": len(record.facts.get("rollbacks", ()))}
+        notes += [f"{name}: {text.format(**facts)}" for key, (noted, text) in NOTED.items() if key in facts and noted(facts[key])]
     return notes
 
 

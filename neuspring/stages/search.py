@@ -11,7 +11,7 @@ from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.core.records import Recorder
 from neuspring.stages.stage import Rows, Written, stage
-from neuspring.twin.body import BODIES, SearchOptions
+from neuspring.twin.body import BODIES, SearchOptions, code
 
 READS = ("search", "simulation", "losses", "released_quirks")
 
@@ -26,7 +26,7 @@ def _settled(rows: Rows) -> Config:
 @stage(
     output="{scenario}/search-{search}/{seed}/search.json",
     reads=lambda settings, given: (*READS, *BODIES[given["body"]].reads),
-    code=lambda settings, given: (BODIES.module_of(given["body"]),),
+    code=lambda settings, given: code(given["body"]),
     gpu=True,
     memory_mb=8000,
     minutes=240,

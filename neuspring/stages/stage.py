@@ -1,4 +1,4 @@
-"""What a stage of the workflow is: one typed function.
+"""A stage of the workflow: one typed function.
 
 The signature says what it reads, and from it and the decorator `stage` everything else follows: the command and its options, the
 rule, the digests of the inputs and the settings in the record, the passing on of failures.
@@ -57,7 +57,7 @@ LOADERS: dict[Any, Callable[[Path], Any]] = {
     Capture: lambda path: Capture.load(path.parent),
     Before: Before.load,
 }
-"""How a file of each type of input is read."""
+"""Reader of a file of each type of input."""
 MAY_FAIL = "may have failed"
 MayFail = Annotated[Before, MAY_FAIL]
 """A record that the function wants also of a stage that failed."""
@@ -66,7 +66,7 @@ SETTINGS_HELP = "JSON, or YAML files separated by commas; defaults otherwise"
 
 @dataclass(frozen=True, kw_only=True)
 class Written:
-    """What a stage has made, for its record."""
+    """The results of a stage, for its record."""
 
     files: Mapping[str, Path] = field(default_factory=dict)
     """Role -> file beside the record."""
@@ -76,7 +76,7 @@ class Written:
     """Why the stage failed, where it left files nevertheless."""
     attempts: int = 1
     earlier_seconds: float = 0.0
-    """Of the attempts that it continued."""
+    """Seconds of the attempts that it continued."""
     checkpoint: Path | None = None
     """No longer needed once the record is there."""
 
@@ -86,7 +86,7 @@ class Parameter:
     """A parameter of a stage: an input file, an option, or where it runs."""
 
     type: Any
-    """Of its value, or of the entries of a sequence; without what says that it may be left out."""
+    """Type of its value, or of the entries of a sequence; without what says that it may be left out."""
     many: bool
     """True for a sequence."""
     default: Any
@@ -120,9 +120,9 @@ class Rows:
     images: bool
     """True where predictions are drawn and scored."""
     method: Method | None = None
-    """Of the wildcard `method`, or of `looks`; None where a job belongs to no method."""
+    """The row of the wildcard `method`, or of `looks`; None where a job belongs to no method."""
     search: SearchRow | None = None
-    """Of the wildcard `search`, or of the method; None for models of baselines."""
+    """The row of the wildcard `search`, or of the method; None for models of baselines."""
     pool: tuple[str, ...] = ()
     """The other recordings of the pool, of a method that has one."""
     targets: tuple[str, ...] = ()
@@ -165,7 +165,7 @@ class Job:
     """A stage with everything that it was given."""
 
     arguments: dict[str, Any]
-    """Of the function."""
+    """Arguments of the function."""
     record: Recorder
     failed: Before | None
     """The first input whose failure is passed on."""
@@ -186,7 +186,7 @@ class Stage:
     """True where its jobs take a GPU if there is one; or from the settings."""
     memory_mb: int = 4000
     minutes: int = 30
-    """What its first jobs ask for, before any was measured."""
+    """Memory and time that its first jobs ask for, before any was measured."""
     when: Callable[[Rows], bool] = lambda rows: True
     """True where there is such a job."""
     instead: Callable[[Rows], Path | None] = lambda rows: None
@@ -200,7 +200,7 @@ class Stage:
     also: Callable[[Rows], Iterable[Path]] = lambda rows: ()
     """Files without which a job cannot run, or whose change runs it again, and which its command does not name."""
     stamp: Callable[[Rows], str] = lambda rows: ""
-    """What makes a job run again and stands in no record: images that a capture is made of, weights that are there."""
+    """Text that makes a job run again and stands in no record: images that a capture is made of, weights that are there."""
     shared: Callable[[Config, Method], Any] | None = None
     """From a method and its configuration, what its result depends on: methods with the same share the job of the first one in the
     table. None: it has no such job, or, without this declaration, each method has its own."""
@@ -215,7 +215,7 @@ class Stage:
 
     @property
     def about(self) -> str:
-        """What it makes of what, in a line."""
+        """Its products and inputs, in a line."""
         return (inspect.getdoc(self.function) or "").partition("\n")[0].partition(": ")[0].rstrip(".")
 
     @property
@@ -225,7 +225,7 @@ class Stage:
 
     @property
     def wildcards(self) -> tuple[str, ...]:
-        """What tells its jobs apart."""
+        """Names that tell its jobs apart."""
         return tuple(re.findall(r"{(\w+)}", self.output))
 
     @property
@@ -265,16 +265,16 @@ class Stage:
 
     @functools.cached_property
     def options(self) -> dict[str, Parameter]:
-        """What it is told beside files and settings."""
+        """Parameters beside files and settings."""
         return {n: p for n, p in self.parameters.items() if not p.is_input and n not in (*PLACES, "output")}
 
     @property
     def places(self) -> tuple[str, ...]:
-        """Which of `PLACES` it takes."""
+        """Those of `PLACES` that it takes."""
         return tuple(name for name in PLACES if name in self.parameters)
 
     def record_of(self, output: Path) -> Path:
-        """Where the record lies of a job that writes `output`: there, or beside a product that is no record."""
+        """Place of the record of a job that writes `output`: there, or beside a product that is no record."""
         return output if "run" in self.signature else output.with_name(f"{self.name}.record.json")
 
     def code_of(self, values: Config, given: Mapping[str, Any]) -> str:
@@ -397,7 +397,7 @@ def stage(output: str, **declared: Any) -> Callable[[Callable[..., Any]], Stage]
 
 
 def _about(name: str, parameter: Parameter) -> str:
-    """What the help of a command says of a parameter without a note."""
+    """Help of a command on a parameter without a note."""
     if parameter.type is ScenarioRow:
         return "a row of the scenario table, by its name or as JSON"
     if parameter.type is Before:
@@ -419,7 +419,7 @@ def read_row(text: str, settings: Config) -> ScenarioRow:
 
 
 def paths(records: Iterable[Before]) -> list[Path]:
-    """Where the records are."""
+    """Files of the records."""
     return [before.path for before in records]
 
 

@@ -47,7 +47,9 @@ class Lane:
     def of_twin(self, twin: Twin, frames: int = 1) -> Lane:
         """This lane, which simulates `twin` from now on, with gradients through so many frames."""
         self.frames = frames
-        self.batch.set_twin(self, twin)
+        with self.batch.turn:
+            if self.twin is not twin:
+                self.twin, self.batch.stale = twin, True
         return self
 
     def run(self, *inputs: Any) -> Results:
@@ -73,35 +75,29 @@ class BatchedFits:
         self.lanes = [Lane(self, twin) for twin in twins]
         self._device = device
         self._active = list(self.lanes)
-        self._turn = threading.Condition()
+        self.turn = threading.Condition()
         self._end: BaseException | None = None
         self.frame_token = 0
         self._window: FrameWindow | None = None
-        self._stale = True
+        self.stale = True
         """True where the next frame needs another window. The old one holds frames whose adjoints may be requested."""
         self._members: list[Lane] = []
         """Lanes of the present window, in the order of its solvers."""
         self._places: list[np.ndarray] = []
         self._springs = 0
 
-    def set_twin(self, lane: Lane, twin: Twin) -> None:
-        """Change what a lane simulates."""
-        with self._turn:
-            if lane.twin is not twin:
-                lane.twin, self._stale = twin, True
-
     def remove(self, lane: Lane) -> None:
         """Take out a lane whose fit has ended, so that nobody waits for it."""
-        with self._turn:
+        with self.turn:
             self._active.remove(lane)
-            self._stale = True
+            self.stale = True
             self._serve_if_all_wait()
 
     def stop(self, reason: BaseException) -> None:
         """End every fit at its next frame, by the same error."""
-        with self._turn:
+        with self.turn:
             self._end = reason
-            self._turn.notify_all()
+            self.turn.notify_all()
 
     def holding(self, token: int) -> FrameSolver | None:
         """The solver that holds a frame; None if it is no longer held."""
@@ -109,10 +105,10 @@ class BatchedFits:
 
     def request(self, lane: Lane, what: str, inputs: Sequence[Any]) -> Results:
         """Wait for the launch that serves a request."""
-        with self._turn:
+        with self.turn:
             lane.waiting, lane.answer = (what, inputs), None
             self._serve_if_all_wait()
-            self._turn.wait_for(lambda: lane.answer is not None or self._end is not None)
+            self.turn.wait_for(lambda: lane.answer is not None or self._end is not None)
             answer = self._end or lane.answer
         if isinstance(answer, BaseException):
             raise answer
@@ -127,7 +123,7 @@ class BatchedFits:
         except Exception as error:
             for lane in self._active:
                 lane.waiting, lane.answer = None, error
-        self._turn.notify_all()
+        self.turn.notify_all()
 
     def _serve(self) -> None:
         # Adjoints first: the frames that they belong to are in the buffers until the next frame is simulated.
@@ -145,7 +141,7 @@ class BatchedFits:
             lane.waiting, lane.answer = None, answer
 
     def _run(self, waiting: list[Lane], inputs: Sequence[Sequence[Any]]) -> list[Results]:
-        if self._stale or self._window is None:
+        if self.stale or self._window is None:
             self._window = self._made()
         solver, numbers = self._window.turn(), [self._members.index(lane) for lane in waiting]
         # A lane without a request repeats the first that has one.
@@ -175,7 +171,7 @@ class BatchedFits:
 
     def _made(self) -> FrameWindow:
         """A window of all active lanes."""
-        self._members, self._stale = list(self._active), False
+        self._members, self.stale = list(self._active), False
         twins = [lane.twin for lane in self._members]
         pairs, self._places = union([twin.topology for twin in twins])
         self._springs = len(pairs)

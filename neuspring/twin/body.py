@@ -185,9 +185,15 @@ class Body(ABC):
 BODIES: Registry[Body] = Registry("bodies", modules("neuspring.twin.bodies", "body"), type=Body)
 
 
-def code() -> tuple[str, ...]:
-    """Modules of all bodies, for digests of what treats any twin."""
-    return tuple(BODIES.module_of(name) for name in BODIES)
+TERMS: Registry[Any] = Registry(
+    "losses", {name: f"neuspring.twin.losses:{name}" for name in ("chamfer", "track", "acceleration", "image_track", "silhouette")}
+)
+"""Every term of the training loss, by the name of its weight: from a `FrameLoss` and a `FrameState` to a list of `Errors`."""
+
+
+def code(*bodies: str) -> tuple[str, ...]:
+    """Modules of some bodies, or of all, and of the loss: for digests of what treats their twins."""
+    return tuple(dict.fromkeys([BODIES.module_of(name) for name in bodies or BODIES] + [TERMS.module_of(name) for name in TERMS]))
 
 
 def body_of(twin: Twin) -> Body:

@@ -127,19 +127,15 @@ class SearchProblem:
             base = name.partition(".")[0]
             variable = getattr(self.search.variables, base)
             value = variable.value(float(searched[name])) if name in searched else float(variable.start)
-            values[name] = float(int(value)) if base in INTEGERS else self._meters(base, value)
+            if base in LENGTHS and self.search.lengths != "meter":
+                value = value * self.spacing + (self.reach if base == "controller_radius" else 0.0)
+            values[name] = float(int(value)) if base in INTEGERS else value
         return values
 
     def encode(self) -> np.ndarray:
         """Normalized `variables` of the starting values."""
         settings = [getattr(self.search.variables, name.partition(".")[0]) for name in self.variables]
         return np.array([variable.normalized(variable.start) for variable in settings])
-
-    def _meters(self, base: str, value: float) -> float:
-        """A setting's value; of a length in m, whatever unit it is searched in."""
-        if base not in LENGTHS or self.search.lengths == "meter":
-            return value
-        return value * self.spacing + (self.reach if base == "controller_radius" else 0.0)
 
     def of_regions(self, values: dict[str, float], name: str) -> list[float]:
         """A regional variable's value in each region."""

@@ -17,27 +17,20 @@ from torch.nn.functional import embedding_bag
 
 from neuspring.config import SpringFieldSettings as Settings
 
-AXES = ((0, 1), (1, 2), (0, 2))
+PLANE_AXES = ((0, 1), (1, 2), (0, 2))
 """Coordinates that span the planes xy, yz, xz."""
 
 
 def midpoints(canonical: np.ndarray, springs: np.ndarray) -> np.ndarray:
     """Canonical midpoints [S, 3], m, of springs [S, 2] that index the points `canonical` [N + C, 3], nodes, then controllers."""
-    middle: np.ndarray = canonical.astype(np.float64)[springs].mean(axis=1)
-    return middle
+    return np.asarray(canonical.astype(np.float64)[springs].mean(axis=1))
 
 
 def in_cube(points: np.ndarray) -> np.ndarray:
     """Points [S, 3] mapped to [-1, 1]^3 by their bounding cube: same center, the longest side of the bounding box."""
     low, high = points.min(axis=0), points.max(axis=0)
     half = max(float((high - low).max()) / 2, 1e-12)
-    mapped: np.ndarray = (points - (low + high) / 2) / half
-    return mapped
-
-
-def adaptive_resolution(springs: int, factor: float) -> int:
-    """N = round(factor sqrt(|E|)), at least 2, as bilinear interpolation needs."""
-    return max(round(factor * math.sqrt(springs)), 2)
+    return np.asarray((points - (low + high) / 2) / half)
 
 
 def fourier(values: torch.Tensor, bands: int) -> torch.Tensor:
@@ -80,7 +73,7 @@ def bilinear(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarra
     low = np.minimum(np.floor(grid).astype(np.int64), resolution - 2)
     part = grid - low
     cells, weights = [], []
-    for plane, (a, b) in enumerate(AXES):
+    for plane, (a, b) in enumerate(PLANE_AXES):
         for row in (0, 1):
             for column in (0, 1):
                 cells.append(plane * resolution**2 + (low[:, b] + row) * resolution + low[:, a] + column)
@@ -102,9 +95,9 @@ class SpringField(nn.Module):
         if settings.shuffled:
             mapped = mapped[np.random.default_rng(seed).permutation(len(mapped))]
         self.register_buffer("coordinates", torch.from_numpy(mapped.astype(np.float32)), persistent=False)
-        self.resolution = (
-            adaptive_resolution(len(points), settings.adaptive_factor) if settings.resolution == "adaptive" else settings.resolution
-        )
+        # At least 2, as bilinear interpolation needs.
+        adaptive = max(round(settings.adaptive_factor * math.sqrt(len(points))), 2)
+        self.resolution = adaptive if settings.resolution == "adaptive" else settings.resolution
         generator = torch.Generator().manual_seed(seed)
         self.planes = None
         if settings.triplane:

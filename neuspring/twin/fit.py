@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -35,7 +36,7 @@ from neuspring.physics.solver import AdjointLimit, FrameWindow, simulate_frame, 
 from neuspring.twin.batch import Lane
 from neuspring.twin.body import Learned, body_of
 from neuspring.twin.losses import FrameLoss, frames_seen
-from neuspring.twin.parameters import TwinParameters, median_gradient, movement, topology_spacing, watched
+from neuspring.twin.parameters import TwinParameters, movement, topology_spacing, watched
 from neuspring.twin.rollout import initial_velocity
 from neuspring.twin.transfer import in_pool
 
@@ -90,27 +91,16 @@ class FitProblem:
         """Frames that the fit reads, from frame 0 on: those before the split; all of them for an oracle."""
         return frames_seen(self.observations, oracle=self.oracle)
 
-    @property
-    def epoch_frames(self) -> int:
-        """Frames that an epoch simulates, on all recordings."""
-        return sum(frames_seen(one, oracle=self.oracle) - 1 for one in (self.observations, *self.pool))
-
 
 @dataclass(frozen=True, kw_only=True)
 class FitResult(Learned):
     """The best twin, and the history: one row per epoch (epoch, loss, tail_loss, gradient_norm, rolled_back, learning_rate).
 
-    Gradients are those of the loss in its unit (`fit.loss_unit`).
+    Gradients are those of the loss in its unit (`fit.loss_unit`). Facts: best_epoch, whose end is the result (-1: the start);
+    best_loss, the training loss or tail loss that selected it, m^2; rollbacks; what moved and what was in the way (`movement`).
     """
 
     history: pd.DataFrame
-    best_epoch: int
-    """The epoch whose end is the result; -1 is the start."""
-    best_loss: float
-    """Training loss or tail loss that selected it, m^2."""
-    rollbacks: list[str]
-    figures: dict[str, Any]
-    """Numbers on what moved and what was in the way (`movement`), and gradient_over_epsilon."""
 
 
 @dataclass
@@ -131,16 +121,16 @@ class _State:
     """Median |gradient| per step over Adam's epsilon, in the first epoch in which the median is not zero."""
 
     def checkpoint(self) -> Checkpoint:
-        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ARRAYS}
-        return Checkpoint({name: getattr(self, name) for name in ARRAYS}, plain)
+        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in FIT_ARRAYS}
+        return Checkpoint({name: getattr(self, name) for name in FIT_ARRAYS}, plain)
 
     @classmethod
     def of(cls, checkpoint: Checkpoint) -> _State:
-        arrays: dict[str, Any] = {name: dict(checkpoint.arrays[name]) for name in ARRAYS}
+        arrays: dict[str, Any] = {name: dict(checkpoint.arrays[name]) for name in FIT_ARRAYS}
         return cls(**arrays, **checkpoint.values)
 
 
-ARRAYS = ("values", "moments", "best_values")
+FIT_ARRAYS = ("values", "moments", "best_values")
 """The fields of a state that hold arrays."""
 
 
@@ -157,9 +147,7 @@ class TwinFit:
         observations, settings = problem.observations, problem.fit
         self.parameters = TwinParameters(problem.twin, settings, problem.kind, problem.device, problem.seed)
         self.loss = FrameLoss.of(
-            observations,
-            problem.losses,
-            problem.device,
+            *(observations, problem.losses, problem.device),
             frozen_counts=problem.quirks.frozen_loss_denominators,
             oracle=problem.oracle,
         )
@@ -195,11 +183,8 @@ class TwinFit:
         """The solver for the current number of substeps, or the lane in a shared one."""
         if self._solver is None:
             twin, device = self.twin, self.problem.device
-            self._solver = (
-                self._lane.of_twin(twin, self.horizon)
-                if self._lane
-                else FrameWindow(lambda: solver_for(twin, device), self.horizon)
-            )
+            own = functools.partial(FrameWindow, lambda: solver_for(twin, device), self.horizon)
+            self._solver = self._lane.of_twin(twin, self.horizon) if self._lane else own()
         return self._solver
 
     @property
@@ -268,12 +253,14 @@ class TwinFit:
         `frames_left_out` of gradients; and, if frames are held back and the epoch is one step, their `tail_loss` before it.
         """
         state: _Motion = (self.rest, self.velocity, None)
-        total, largest, left_out, row = 0.0, 0.0, 0, {}
+        total, largest, left_out, row, factor = 0.0, 0.0, 0, {}, self.problem.fit.adjoint_limit
         for start in range(1, self.fitted_end, self.horizon):
             window = range(start, min(start + self.horizon, self.fitted_end))
             self.optimizer.zero_grad(set_to_none=True)
             packed = self.stable_parameters()
-            limit = self._limit()
+            # None where a window is one frame, as released.
+            limited, time = factor is not None and self.horizon > 1, self.twin.simulation.frame_time
+            limit = AdjointLimit(factor, time) if limited else None
             state, mean = self._simulate(state, window, packed, limit)
             if not bool(torch.isfinite(mean)):
                 raise NonFinite(f"the loss is not finite in frames {window.start} to {window.stop - 1}")
@@ -303,11 +290,6 @@ class TwinFit:
             raise NonFinite("the loss of the held-back frames is not finite")
         return loss
 
-    def _limit(self) -> AdjointLimit | None:
-        """The limit of a window's gradient; none where a window is one frame, as released."""
-        factor = self.problem.fit.adjoint_limit
-        return AdjointLimit(factor, self.twin.simulation.frame_time) if factor is not None and self.horizon > 1 else None
-
     def _frame(self, state: _Motion, frame: int, packed: Parameters, limit: AdjointLimit | None = None) -> _Motion:
         """State at the end of a frame."""
         x, v, lengths = state
@@ -333,7 +315,8 @@ class TwinFit:
         if not bool(torch.isfinite(norm)):
             raise NonFinite(f"the gradient is not finite in frames {window.start} to {window.stop - 1}")
         if self.gradients is not None:
-            self.gradients.append(median_gradient(watched(self.parameters)))
+            gradient = watched(self.parameters).grad
+            self.gradients.append(0.0 if gradient is None else float(gradient.abs().median()))
         self.optimizer.step()
         return float(norm)
 
@@ -341,13 +324,6 @@ class TwinFit:
         """Set parameters and Adam's state."""
         self.parameters.restore(values)
         restore_adam(self.optimizer, moments)
-
-    def figures(self, state: _State) -> dict[str, Any]:
-        """Figures for the fit's record of the selected values, which are the present ones."""
-        figures = movement(self.parameters)
-        if state.gradient_over_epsilon is not None:
-            figures["gradient_over_epsilon"] = state.gradient_over_epsilon
-        return figures
 
 
 class PooledFit(TwinFit):
@@ -452,8 +428,11 @@ def fit(
     run.parameters.restore(state.best_values)
     run.use_substeps(state.best_substeps)
     best = run.parameters.as_twin(run.twin)
-    history, figures = pd.DataFrame(loop.history), run.figures(state)
-    frames, counts = problem.epoch_frames, best.counts
+    history, figures = pd.DataFrame(loop.history), movement(run.parameters)
+    if state.gradient_over_epsilon is not None:
+        figures["gradient_over_epsilon"] = state.gradient_over_epsilon
+    frames = sum(frames_seen(one, oracle=problem.oracle) - 1 for one in (problem.observations, *problem.pool))
+    counts = best.counts
     facts = {
         "best_epoch": state.best_epoch,
         "best_loss": state.best_loss,
@@ -476,10 +455,6 @@ def fit(
         facts=facts,
         attempts=loop.attempts,
         earlier_seconds=loop.earlier_seconds,
-        best_epoch=state.best_epoch,
-        best_loss=state.best_loss,
-        rollbacks=state.rollbacks,
-        figures=figures,
     )
 
 
@@ -518,14 +493,11 @@ def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> di
             state.gradient_over_epsilon = median / problem.fit.epsilon
         if problem.fit.selection == "tail" and not run.one_step:
             losses["tail_loss"] = run.tail_loss()
-        state.values, state.moments, state.substeps = (
-            run.parameters.copy(),
-            adam_arrays(run.optimizer),
-            run.twin.simulation.substeps,
-        )
+        state.values, state.moments = run.parameters.copy(), adam_arrays(run.optimizer)
+        state.substeps = run.twin.simulation.substeps
         row |= losses
         loss = losses["tail_loss" if problem.fit.selection == "tail" else "loss"]
-        if _eligible(epoch, problem) and loss < state.best_loss:
+        if eligible(epoch, problem) and loss < state.best_loss:
             state.best_loss, state.best_epoch = loss, epoch - run.one_step
             state.best_values, state.best_substeps = before if run.one_step else (state.values, state.substeps)
     except NonFinite as failure:
@@ -538,7 +510,7 @@ def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> di
     return row
 
 
-def _eligible(epoch: int, problem: FitProblem) -> bool:
+def eligible(epoch: int, problem: FitProblem) -> bool:
     """True for an epoch that may become the best: all of them, or with the released quirk every 20th and the last."""
-    last = problem.fit.epochs - 1
-    return not problem.quirks.sparse_checkpoints or epoch % RELEASED_CHECKPOINT_EPOCHS == 0 or epoch == last
+    sparse = problem.quirks.sparse_checkpoints and epoch % RELEASED_CHECKPOINT_EPOCHS
+    return not sparse or epoch == problem.fit.epochs - 1

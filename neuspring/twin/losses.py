@@ -12,28 +12,30 @@ A term's loss is weight / divisor times the sum of s(e)^2 over its errors e, m; 
 The last two are of one camera without depth, with the projection u(x) = K R^T (x - c) / depth, pixels, and p, m per pixel at the
 object in frame 0. The first three are those of the released PhysTwin code. The fit takes `FrameLoss.__call__`, the polish
 `Errors.residuals`. The search takes the first three on the lanes of its solver (trials.py, tested against this file) and what else
-there is from here: a term needs its function, its line in TERMS, and its weight.
+there is from here: a term needs its function, its name in `body.TERMS`, and its weight. A package's term weighs its errors itself.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch.nn.functional import grid_sample, smooth_l1_loss
 
 from neuspring.config import Losses
 from neuspring.core.artifacts import Observations
+from neuspring.twin.body import TERMS
 
+Evidence = TypeVar("Evidence", "ImageEvidence", "FrameLoss")
 CHUNK_ENTRIES = 1 << 22
 """Distances computed at once in the nearest-node search; bounds memory."""
 BETA = 0.03
 """m: beyond it a track's error in the image counts linearly."""
-NEAR = 0.05
+NEAREST_DEPTH = 0.05
 """m: nodes nearer to the camera are projected as if they were there."""
 
 
@@ -142,10 +144,6 @@ def _near(loss: FrameLoss, state: FrameState, term: str) -> torch.Tensor:
         return ASSIGNED[term](loss, state.frame, state.x)
 
 
-def _nearest_visible(loss: FrameLoss, frame: int, x: torch.Tensor) -> torch.Tensor:
-    return nearest(loss.points[frame][loss.visible[frame]], x[: loss.surface])
-
-
 def chamfer(loss: FrameLoss, state: FrameState) -> list[Errors]:
     """From visible points to nearest surface nodes, over the points that are visible."""
     visible = loss.visible[state.frame]
@@ -197,19 +195,19 @@ def _nearest_in_image(loss: FrameLoss, frame: int, x: torch.Tensor) -> torch.Ten
     return found
 
 
-Term = Callable[["FrameLoss", FrameState], list[Errors]]
-TERMS: dict[str, Term] = {
-    "chamfer": chamfer,
-    "track": track,
-    "acceleration": acceleration,
-    "image_track": image_track,
-    "silhouette": silhouette,
-}
-"""Every term of the training loss, by the name of its weight."""
 OF_IMAGES = ("image_track", "silhouette")
 """Terms of one camera without depth."""
-ASSIGNED = {"chamfer": _nearest_visible, "silhouette": _nearest_in_image}
+ASSIGNED: dict[str, Callable[[FrameLoss, int, torch.Tensor], torch.Tensor]] = {
+    "chamfer": lambda loss, frame, x: nearest(loss.points[frame][loss.visible[frame]], x[: loss.surface]),
+    "silhouette": _nearest_in_image,
+}
 """Functions by which terms that compare with a nearest node find it."""
+
+
+def moved(evidence: Evidence, device: str, dtype: torch.dtype) -> Evidence:
+    """The same tensors on another device, those of real numbers in another precision."""
+    tensors = {name: value for name, value in vars(evidence).items() if isinstance(value, torch.Tensor)}
+    return replace(evidence, **{name: t.to(device, dtype if t.is_floating_point() else t.dtype) for name, t in tensors.items()})
 
 
 @dataclass(frozen=True)
@@ -236,35 +234,18 @@ class ImageEvidence:
         image = observations.image
         if image is None:
             return None
-        end = len(image.inside)
         pose = torch.linalg.inv(torch.tensor(image.camera_to_world, dtype=torch.float64))
-
-        def tensor(values: object) -> torch.Tensor:
-            return torch.as_tensor(values).to(dtype=dtype, device=device)
-
-        return cls(
-            tensor(pose),
-            tensor(image.intrinsics.copy()),
-            tensor(image.pixels[:end].copy()),
-            torch.tensor(image.visible[:end], device=device),
-            tensor(image.inside.copy()),
-            tensor(image.outside.copy()),
-            image.cell,
-            image.pixel_size,
-        )
-
-    def to(self, device: str, dtype: torch.dtype) -> ImageEvidence:
-        """The same on another device, in another precision."""
-        values = dict(vars(self))
-        for name in ("world_to_camera", "intrinsics", "pixels", "inside", "outside"):
-            values[name] = values[name].to(device=device, dtype=dtype)
-        return ImageEvidence(**values | {"visible": self.visible.to(device)})
+        kept = {
+            name: torch.tensor(getattr(image, name)[: len(image.inside)]) for name in ("pixels", "visible", "inside", "outside")
+        }
+        known = {"intrinsics": torch.tensor(image.intrinsics), "cell": image.cell, "size": image.pixel_size}
+        return moved(cls(world_to_camera=pose, **kept, **known), device, dtype)
 
     def project(self, x: torch.Tensor) -> torch.Tensor:
         """Pixels [..., 2] of points [..., 3], m."""
         local = x @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
         flat = local @ self.intrinsics.T
-        return flat[..., :2] / flat[..., 2:].clamp_min(NEAR)
+        return flat[..., :2] / flat[..., 2:].clamp_min(NEAREST_DEPTH)
 
     def distance(self, frame: int, u: torch.Tensor) -> torch.Tensor:
         """D [N], pixels, at pixels [N, 2]; beyond the image as at its border."""
@@ -323,10 +304,7 @@ class FrameLoss:
 
     def to(self, device: str, dtype: torch.dtype) -> FrameLoss:
         """The same on another device, in another precision."""
-        flags = self.visible.to(device), self.motion_valid.to(device)
-        image = self.image.to(device, dtype) if self.image else None
-        points = self.points.to(device=device, dtype=dtype)
-        return FrameLoss(points, *flags, self.surface, self.weights, self.frozen_counts, image)
+        return replace(moved(self, device, dtype), image=self.image and moved(self.image, device, dtype))
 
     @cached_property
     def counts(self) -> list[tuple[int, int]]:
@@ -340,7 +318,8 @@ class FrameLoss:
     @property
     def names(self) -> tuple[str, ...]:
         """Terms that count: those with a weight, those of images where there are any."""
-        return tuple(name for name in TERMS if getattr(self.weights, name) and (self.image is not None or name not in OF_IMAGES))
+        there = [name for name in TERMS if self.image is not None or name not in OF_IMAGES]
+        return tuple(name for name in there if getattr(self.weights, name, 1.0))
 
     def errors(
         self,

@@ -23,7 +23,7 @@ from neuspring import config
 from neuspring.core.artifacts import Topology, Twin
 from neuspring.physics.parameters import CONTACT_LIMITS, Parameters, pack, twin_tensors
 from neuspring.twin.field import SpringField, midpoints
-from neuspring.twin.roughness import NEAREST, neighbors, roughness
+from neuspring.twin.roughness import SIDE_BY_SIDE, neighbors, roughness
 from neuspring.twin.topology import node_spacing
 
 CONTACT_SCALARS = tuple(CONTACT_LIMITS)
@@ -86,7 +86,7 @@ class TwinParameters(nn.Module):
         own = kind == "springs" or settings.field.offsets
         self.offsets = nn.Parameter(torch.zeros(count, 1)) if own else None
         smooth = kind == "field" and settings.field.smoothness > 0
-        self._near = torch.from_numpy(neighbors(self.midpoints, NEAREST)).to(device) if smooth else None
+        self._near = torch.from_numpy(neighbors(self.midpoints, SIDE_BY_SIDE)).to(device) if smooth else None
         self.scalars = nn.ParameterDict({name: nn.Parameter(self.start[name].clone()) for name in CONTACT_SCALARS})
         self.factors = nn.ParameterDict({name: nn.Parameter(torch.zeros(())) for name in self._factor_names()})
         self.to(device)
@@ -179,9 +179,9 @@ class TwinParameters(nn.Module):
         return replace(twin, material=replace(twin.material, **material))
 
 
-MOVED = 0.1
+MOVED_TEXEL = 0.1
 """A texel has moved if it changed by more than this fraction of the texels' scale at the start."""
-AT_BOUND = 0.95
+NEAR_BOUND = 0.95
 """A spring is at its bound beyond this fraction of it."""
 
 
@@ -192,11 +192,6 @@ def watched(parameters: TwinParameters) -> torch.Tensor:
         assert parameters.offsets is not None
         return parameters.offsets
     return field.planes.texels if field.planes is not None else next(iter(field.layers[0].parameters()))
-
-
-def median_gradient(tensor: torch.Tensor) -> float:
-    """Median |gradient| of a tensor; 0 if it has none."""
-    return 0.0 if tensor.grad is None else float(tensor.grad.abs().median())
 
 
 def movement(parameters: TwinParameters) -> dict[str, Any]:
@@ -211,10 +206,10 @@ def movement(parameters: TwinParameters) -> dict[str, Any]:
         if parameters.field is not None and parameters.field.planes is not None:
             first = torch.from_numpy(parameters.first["field.planes.texels"])
             change = (parameters.field.planes.texels.cpu() - first).abs()
-            figures["texels_moved"] = _share(change > MOVED * s.field.texel_scale)
+            figures["texels_moved"] = _share(change > MOVED_TEXEL * s.field.texel_scale)
         if s.output_bound:
             deviation = parameters.deviation().log()
-            figures["at_bound"] = _share(deviation.abs() >= AT_BOUND * s.output_bound)
+            figures["at_bound"] = _share(deviation.abs() >= NEAR_BOUND * s.output_bound)
         physical = parameters.physical()
         low, high = s.stiffness_range
         stiffness = physical["stiffness"]

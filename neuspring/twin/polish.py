@@ -2,9 +2,9 @@
 
 A round first asks for slopes: the base and one neighbor per variable. Their residuals r (losses.py, |r|^2 is the cost; points stay
 assigned as in the base, so that r is smooth) give the products J'J and J'r of finite differences. Then it asks for four damped
-steps (core/levenberg.py) of the normalized variables, within the ranges and at most `REACH` per variable, and takes the best of
-them if it costs less than the base. Nothing but the costs and products that it is told decides what it asks for next, so a polish
-is replayed from its record.
+steps (core/levenberg.py) of the normalized variables, within the ranges and at most `LONGEST_STEP` per variable, and takes the best
+of them if it costs less than the base. Nothing but the costs and products that it is told decides what it asks for next, so a
+polish is replayed from its record.
 """
 
 from __future__ import annotations
@@ -19,22 +19,23 @@ import torch
 
 from neuspring.config.search import TRIALS, Search
 from neuspring.core.levenberg import LevenbergMarquardt
+from neuspring.twin.body import TERMS
 from neuspring.twin.candidates import PENALTY, Map, SearchProblem, made
-from neuspring.twin.losses import OF_IMAGES, TERMS, FrameLoss
-from neuspring.twin.rollout import FAR
+from neuspring.twin.losses import OF_IMAGES, FrameLoss
+from neuspring.twin.rollout import FAR_AWAY
 from neuspring.twin.trials import motions
 
 SLOPES, POLISH = "slopes", "polish"
 """Stages of a search after CMA-ES; candidates of `SLOPES` are its means alone and never its result."""
 RESIDUAL, PRODUCT = "product.residual", "product."
 """Columns of the trace: J_k'r and J_k'J_l in the row of the neighbor in variable k."""
-STEP = 0.01
+DIFFERENCE_STEP = 0.01
 """Step of the finite differences, in normalized variables."""
-TOLERANCE = 1e-3
+LEAST_DROP = 1e-3
 """A round whose step lowers the cost by less than this fraction of it is the last."""
-REACH = 0.25
+LONGEST_STEP = 0.25
 """Longest step of a round in a normalized variable."""
-FACTORS = tuple(10.0 ** (k - TRIALS + 2) for k in range(TRIALS))
+TRIED_DAMPINGS = tuple(10.0 ** (k - TRIALS + 2) for k in range(TRIALS))
 """Factors on the damping, for each step that is tried: from 0.01 to 10."""
 
 
@@ -43,9 +44,8 @@ class Polish(LevenbergMarquardt):
 
     def __init__(self, search: Search, columns: Sequence[int], base: np.ndarray, cost: float) -> None:
         """`base`: normalized variables, of which those at `columns` are polished."""
-        raised = 10 * FACTORS[-1] / FACTORS[0]
-        options: dict[str, Any] = {"damping": 0.1, "most": 1e4, "tolerance": TOLERANCE}
-        super().__init__(base=base, cost=cost, factors=FACTORS, raised=raised, **options)
+        raised = 10 * TRIED_DAMPINGS[-1] / TRIED_DAMPINGS[0]
+        super().__init__(base=base, cost=cost, factors=TRIED_DAMPINGS, raised=raised, damping=0.1, most=1e4, tolerance=LEAST_DROP)
         self._most_rounds, self.columns = search.polish_rounds, list(columns)
         self.stage = SLOPES
         """Stage of the candidates that are asked for now."""
@@ -60,7 +60,7 @@ class Polish(LevenbergMarquardt):
 
     def steps(self) -> np.ndarray:
         """Signed steps of the finite differences: downwards, where a twin needs no more substeps, but at a lower bound."""
-        here, step = self.base[self.columns], STEP
+        here, step = self.base[self.columns], DIFFERENCE_STEP
         return np.where(here - step < 0, step, -step)
 
     def ask(self) -> list[np.ndarray]:
@@ -69,7 +69,7 @@ class Polish(LevenbergMarquardt):
             moves = [np.zeros(len(self.columns)), *np.diag(self.steps())]
         else:
             here = self.base[self.columns]
-            low, high = np.maximum(-here, -REACH), np.minimum(1 - here, REACH)
+            low, high = np.maximum(-here, -LONGEST_STEP), np.minimum(1 - here, LONGEST_STEP)
             moves = self.moves(self._products, self._gradient, low, high)
         self._asked = [self.base.copy() for _ in moves]
         for candidate, move in zip(self._asked, moves, strict=True):
@@ -106,8 +106,7 @@ def residuals(
         for name, parts in loss.errors(frame, nodes, assigned, own).items():
             rows += [(rank[name], frame, part.residuals(len(x)).flatten()) for part in parts]
     # Sums depend on the order by a rounding; it is that of earlier results: terms one after the other, those of images by frames.
-    result: np.ndarray = torch.cat([r for _, _, r in sorted(rows, key=lambda row: row[:2])]).numpy()
-    return result
+    return np.asarray(torch.cat([r for _, _, r in sorted(rows, key=lambda row: row[:2])]).numpy())
 
 
 def products(
@@ -164,7 +163,7 @@ def slope_rows(
         twins = [family[place] for family in families]
         twins = [replace(twin, simulation=replace(twin.simulation, substeps=most[place])) for twin in twins]
         positions, velocities = motions(twins, recording.hands, recording.velocity, problem.device)
-        fine = [known and bool((positions[:, k].abs() < FAR).all()) for k, known in enumerate(fine)]
+        fine = [known and bool((positions[:, k].abs() < FAR_AWAY).all()) for k, known in enumerate(fine)]
         seen.append((recording.loss, recording.velocity, positions, velocities))
     # Only now is it known which candidates are fine everywhere.
     parts = [products(*rollout, fine, steps) for rollout in seen]

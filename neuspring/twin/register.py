@@ -16,9 +16,9 @@ from scipy.spatial.distance import cdist
 ICP_STEPS = 40
 MOST_POINTS = 1500
 """Points of each set that ICP looks at; a pose needs no more."""
-CLOSE = 1.02
+ALIKE_STARTS = 1.02
 """Starts whose residual is within this factor of the best fit alike; the earliest wins, so that a symmetric body does not turn."""
-FLOOR = 0.75
+RIGID_ENOUGH = 0.75
 """In spacings of the coarser set: a rigid fit this close needs no bending."""
 BEND_WIDTHS = (0.3, 0.2, 0.12, 0.08)
 """Widths of the smooth displacement, one after the other, as fractions of the extent."""
@@ -54,12 +54,10 @@ class Registration:
 def register(source: np.ndarray, target: np.ndarray, others: np.ndarray) -> Registration:
     """Map target points [M, 3], m, onto source points [N, 3], m; `others` [C, 3] follow the nearest target point."""
     source, target, others = (np.asarray(points, np.float64) for points in (source, target, others))
-    rotation, shift = _pose(_few(source), _few(target))
+    rotation, shift = _pose(*(points[:: -(-len(points) // MOST_POINTS)] for points in (source, target)))
     points, following = target @ rotation.T + shift, others @ rotation.T + shift
-    rigid = residual(source, points)
-    extent = extent_of(source)
-    bent = points
-    if rigid > FLOOR * max(spacing(source), spacing(target)):
+    rigid, extent, bent = residual(source, points), extent_of(source), points
+    if rigid > RIGID_ENOUGH * max(spacing(source), spacing(target)):
         bent = _bent(source, points, extent)
     _, nearest = cKDTree(points).query(following)
     end = residual(source, bent)
@@ -101,10 +99,6 @@ def _axes(points: np.ndarray) -> np.ndarray:
     return axes
 
 
-def _few(points: np.ndarray) -> np.ndarray:
-    return points[:: -(-len(points) // MOST_POINTS)]
-
-
 def _starts(source: np.ndarray, target: np.ndarray) -> Iterator[np.ndarray]:
     """Rotations that ICP starts from: none, quarter turns about the vertical, principal axes onto principal axes."""
     for cos, sin in ((1, 0), (0, 1), (-1, 0), (0, -1)):
@@ -128,7 +122,7 @@ def _pose(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarra
                 break
         poses.append((residual(source, target @ rotation.T + shift), rotation, shift))
     best = min(error for error, _, _ in poses)
-    return next((rotation, shift) for error, rotation, shift in poses if error <= CLOSE * best)
+    return next((rotation, shift) for error, rotation, shift in poses if error <= ALIKE_STARTS * best)
 
 
 def _kabsch(points: np.ndarray, onto: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

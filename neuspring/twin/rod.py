@@ -45,11 +45,6 @@ class RodStart(config.RodSettings):
     substep: float = 0.005
     """Longest integration step with `simulation.substeps: auto`, s."""
 
-    @classmethod
-    def of(cls, settings: config.RodSettings) -> RodStart:
-        """The start that the settings ask for."""
-        return cls(**vars(settings))
-
 
 def rod_twin(observations: Observations, settings: config.Config, axis: Sequence[float] = (0.0, 1.0, 0.0)) -> Twin:
     """The rod that a fit starts from (`settings.rod`), on the body of a recording in frame 0; `axis` [3]: see `Rod`.
@@ -57,7 +52,7 @@ def rod_twin(observations: Observations, settings: config.Config, axis: Sequence
     Springs of controllers and all scalars have the starts of `search.variables`, as a lattice's search does, but the linear drag of
     `rod`. Raises InputError if the body is not long and thin, nothing holds it, or only a camera without depth saw it.
     """
-    start, variables, scenario = RodStart.of(settings.rod), settings.search.variables, observations.scenario
+    start, variables, scenario = RodStart(**vars(settings.rod)), settings.search.variables, observations.scenario
     where = f"observations of {scenario.name}"
     if observations.image is not None:
         rule = "a rod is fitted to points that are tracked in space"

@@ -41,9 +41,9 @@ if TYPE_CHECKING:
 
 PRIOR = 1e-6
 """Weight of the variables' squares, m: they decide where recordings say nothing."""
-STEP = 5e-3
+SCALED_STEP = 5e-3
 """Step of the finite differences, in scales."""
-FARTHEST = 2.0
+LARGEST_ERROR = 2.0
 """Largest error of a coordinate that counts, m: what left the scene."""
 LEAST_GAIN = 2e-3
 """A step that lowers the objective by less than this part of it is a stage's last."""
@@ -51,7 +51,7 @@ DAMPINGS = (0.1, 1.0, 10.0, 100.0)
 """Factors on the damping, for each step that is tried."""
 LANES = 512
 """Rollouts that run in one solver at most."""
-SCALES = {
+VARIABLE_SCALES = {
     "bending": 1.0, "twisting": 1.0, "damping": 1.0, "drag": 1.0, "drag_quadratic": 1.0, "marker_mass": 1.0, "hands": 1.0,
     "dashpots": 1.0, "roll": 1.0, "curvature": 0.3, "bending_along": 0.5, "twisting_along": 0.5, "clamps": 0.02, "offsets": 0.01,
     "stretch": 0.01,
@@ -74,11 +74,6 @@ class RodSteps(RodFit):
     """Stride of the frames that count."""
     robust: float = 0.02
     """Robustness b, m: errors e count as sqrt(e^2 + b^2), so that recordings that flip do not decide."""
-
-    @classmethod
-    def of(cls, settings: RodFit) -> RodSteps:
-        """The fit that the settings ask for."""
-        return cls(**vars(settings))
 
 
 @dataclass(frozen=True)
@@ -114,16 +109,12 @@ class Variables:
     @property
     def scale(self) -> np.ndarray:
         """Scale of each variable [Q]."""
-        return np.concatenate([np.full(size, SCALES[name]) for name, size in self.sizes.items()])
+        return np.concatenate([np.full(size, VARIABLE_SCALES[name]) for name, size in self.sizes.items()])
 
     def part(self, q: np.ndarray, name: str) -> np.ndarray:
         """The variables of one kind; zeros where they are not varied."""
-        begin = 0
-        for kind, size in self.sizes.items():
-            if kind == name:
-                return q[begin : begin + size]
-            begin += size
-        return np.zeros(1)
+        parts = np.split(q, np.cumsum(list(self.sizes.values())))
+        return dict(zip(self.sizes, parts, strict=False)).get(name, np.zeros(1))
 
     def made(self, q: np.ndarray) -> Twin:
         """The twin of variables q [Q]."""
@@ -232,7 +223,7 @@ class Recordings:
             if (frame - 1) % every == 0:
                 kept.append(solver.nodes()[0][:, :tracked].cpu())
         found = torch.stack(kept, dim=1).reshape(len(twins), count, len(kept), tracked, 3).numpy()
-        return np.asarray(np.nan_to_num(found, nan=FARTHEST * 10, posinf=FARTHEST * 10, neginf=-FARTHEST * 10))
+        return np.asarray(np.nan_to_num(found, nan=LARGEST_ERROR * 10, posinf=LARGEST_ERROR * 10, neginf=-LARGEST_ERROR * 10))
 
 
 def _paths(pairs: Sequence[tuple[Observations, np.ndarray]]) -> torch.Tensor:
@@ -261,7 +252,7 @@ class Levenberg:
 
         def one(part: np.ndarray) -> np.ndarray:
             found = recordings.predicted([variables.made(qs[k]) for k in part], frames, every, self.device)
-            apart = np.clip(found - recordings.points[None, :, kept], -FARTHEST, FARTHEST)
+            apart = np.clip(found - recordings.points[None, :, kept], -LARGEST_ERROR, LARGEST_ERROR)
             return np.asarray(apart[:, recordings.counts[:, kept]].reshape(len(part), -1))
 
         self.rollouts += len(qs) * len(recordings.observations)
@@ -271,8 +262,7 @@ class Levenberg:
     def objective(self, errors: np.ndarray, q: np.ndarray, scale: np.ndarray) -> np.ndarray:
         """The objective of candidates, m, from errors [K, R] and variables [K, Q]."""
         b = self.settings.robust
-        value: np.ndarray = np.mean(np.sqrt(errors**2 + b**2) - b, axis=-1) + PRIOR * ((q / scale) ** 2).sum(axis=-1)
-        return value
+        return np.asarray(np.mean(np.sqrt(errors**2 + b**2) - b, axis=-1) + PRIOR * ((q / scale) ** 2).sum(axis=-1))
 
     def lowered(self, twin: Twin, progress: Progress) -> tuple[Twin, float, list[dict[str, Any]]]:
         """The twin after the stages of the settings, the objective of the last one, m, and a row per step."""
@@ -301,9 +291,9 @@ class Levenberg:
             base=q, cost=value, damping=1e-2, factors=DAMPINGS, raised=DAMPINGS[-1] * 10, least=1e-6, most=1e6, tolerance=LEAST_GAIN
         )
         for _ in range(self.settings.rounds):
-            q, steps, bound = descent.base, np.diag(STEP * scale), np.ones(len(scale))
+            q, steps, bound = descent.base, np.diag(SCALED_STEP * scale), np.ones(len(scale))
             # In the units of their scales, so that bounds and damping mean the same for all.
-            slopes = (self.errors(variables, list(q + steps), frames, every) - errors) / STEP
+            slopes = (self.errors(variables, list(q + steps), frames, every) - errors) / SCALED_STEP
             weights = 1 / np.sqrt(errors**2 + b**2) / len(errors)
             products = (slopes * weights) @ slopes.T + 2 * PRIOR * np.eye(len(q))
             gradient = slopes @ (weights * errors) + 2 * PRIOR * q / scale
@@ -348,7 +338,7 @@ def search_rod(
     import pandas as pd
 
     require_pool(observations, pool)
-    first = replace(RodSteps.of(settings.fit.rod), stiffness="constant", curvature="constant", markers=False)
+    first = replace(RodSteps(**vars(settings.fit.rod)), stiffness="constant", curvature="constant", markers=False)
     first = replace(first, horizons=first.horizons[:1])
     lines = [rods.line_of(each) for each in [observations, *pool] if each.line.size]
     axis = max(np.eye(3)[:2].tolist(), key=lambda axis: sum(np.cos(turn_of(line, np.array(axis))) for line in lines))
@@ -374,7 +364,7 @@ def fit_rod(
     threads: int = 1,
 ) -> RodResult:
     """All variables of a rod, stage by stage, from the twin of its search. Raises InputError, NumericalFailure."""
-    recordings, settings = Recordings.of([observations, *pool], twin, oracle), RodSteps.of(settings)
+    recordings, settings = Recordings.of([observations, *pool], twin, oracle), RodSteps(**vars(settings))
     solver = Levenberg(recordings, settings, device, threads)
     progress = Progress(f"fit {observations.scenario.name}, rod", settings.rounds * len(settings.horizons))
     twin, value, history = solver.lowered(twin, progress)

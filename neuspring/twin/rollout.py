@@ -13,7 +13,7 @@ from neuspring.physics.controllers import waypoints
 from neuspring.physics.solver import FrameSolver
 from neuspring.twin.body import body_of
 
-FAR = 1e3
+FAR_AWAY = 1e3
 """A node this far from the origin has left any plausible scene, m."""
 
 
@@ -41,7 +41,7 @@ def frames(
     for frame in range(1, len(hands)):
         x, v = solver.forward(x, v, hands[frame - 1], hands[frame])
         # NaN compares false, so this catches it together with infinity and absurd distances.
-        near = (x.abs() < FAR).all(dim=1)
+        near = (x.abs() < FAR_AWAY).all(dim=1)
         if not bool(near.all()):
             raise Diverged(frame, f"node {int((~near).nonzero()[0])} left the scene in frame {frame}")
         yield frame, x, v
@@ -100,8 +100,7 @@ def spread(points: np.ndarray, values: np.ndarray, nodes: np.ndarray) -> np.ndar
     if len(places) == 1:
         return np.repeat(values, len(nodes), axis=0)
     interpolate = RBFInterpolator(places, values, min(SPREAD_NEIGHBORS, len(places)), SPREAD_SMOOTHING, "linear")
-    result: np.ndarray = interpolate(nodes.astype(np.float64))
-    return result
+    return np.asarray(interpolate(nodes.astype(np.float64)))
 
 
 def initial_velocity(observations: Observations, kind: InitialVelocity) -> np.ndarray:

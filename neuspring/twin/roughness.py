@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import numpy as np
 
-NEAREST = 8
+SIDE_BY_SIDE = 8
 """Springs that a spring is compared with."""
-PAIRS = 200_000
+MOST_PAIRS = 200_000
 """Pairs that a variogram draws at most."""
 
 
@@ -23,7 +23,7 @@ def roughness(midpoints: np.ndarray, values: np.ndarray) -> float:
     variance = float(np.var(values)) if len(values) > 1 else 0.0
     if variance <= 0:
         return float("nan")
-    others = neighbors(midpoints, NEAREST)
+    others = neighbors(midpoints, SIDE_BY_SIDE)
     return float(np.square(values[:, None] - values[others]).mean() / (2 * variance))
 
 
@@ -37,15 +37,14 @@ def neighbors(points: np.ndarray, most: int) -> np.ndarray:
     # Points may coincide: one is not always the first of its own list.
     own = near == np.arange(len(points))[:, None]
     own[:, -1] |= ~own.any(axis=1)
-    others: np.ndarray = near[~own].reshape(len(points), count)
-    return others
+    return np.asarray(near[~own].reshape(len(points), count))
 
 
 def variogram(midpoints: np.ndarray, values: np.ndarray, edges: np.ndarray, seed: int = 0) -> np.ndarray:
     """Half the mean squared difference of values [S] over their variance, for pairs of springs whose midpoints [S, 3] are
     edges[b] to edges[b + 1] apart, m: [B], NaN where there are none. Of many springs random pairs are drawn."""
     count, variance = len(values), float(np.var(values))
-    first, second = np.triu_indices(count, 1) if count * (count - 1) <= 2 * PAIRS else _drawn(count, seed)
+    first, second = np.triu_indices(count, 1) if count * (count - 1) <= 2 * MOST_PAIRS else _drawn(count, seed)
     apart = np.linalg.norm(midpoints[first].astype(np.float64) - midpoints[second], axis=1)
     place = np.digitize(apart, edges) - 1
     inside = (place >= 0) & (place < len(edges) - 1) & (apart <= edges[-1])
@@ -57,5 +56,5 @@ def variogram(midpoints: np.ndarray, values: np.ndarray, edges: np.ndarray, seed
 
 
 def _drawn(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    first, second = np.random.default_rng(seed).integers(0, count, (2, PAIRS))
+    first, second = np.random.default_rng(seed).integers(0, count, (2, MOST_PAIRS))
     return first[first != second], second[first != second]

@@ -41,7 +41,7 @@ WAYS = {"hold": (False,), "push": (True,), "auto": (False, True)}
 """Ways of hands that are judged, by `search.hands`: True where they only push."""
 FREED_SIGMA = 0.06
 """Step of CMA-ES in normalized variables when each region becomes free."""
-MOVES = 0.9
+MUST_MOVE = 0.9
 """Hands push if that costs less than this fraction of a body that stays as it is in frame 0."""
 
 
@@ -151,7 +151,7 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
                     other, attempts, earlier = [], 1, 0.0
             if not start and len(ways) > 1:
                 if len(trace) < stop or len(other) < len(population):
-                    trace, other = _ways(judge, population, ways, MOVES * still_cost(problem.recordings))
+                    trace, other = _ways(judge, population, ways, MUST_MOVE * still_cost(problem.recordings))
                 budget -= len(other)
                 push = bool(trace[0]["push"])
             fresh = population[max(len(trace) - start, 0) :]
@@ -178,9 +178,7 @@ def _best(problem: SearchProblem, rows: Sequence[dict[str, Any]], push: bool, at
 
     table = pd.DataFrame(rows)
     costs = table["cost"]
-    # Candidates for slopes are never the result.
-    judged = table[table["stage"] != SLOPES]
-    best = judged.iloc[int(judged["cost"].to_numpy().argmin())]
+    best = _least(table)
     if best["cost"] >= PENALTY:
         substeps = problem.simulation.substeps
         if substeps != "auto" and table["reason"].str.startswith(UNSTABLE).all():
@@ -218,6 +216,12 @@ def _best(problem: SearchProblem, rows: Sequence[dict[str, Any]], push: bool, at
     )
 
 
+def _least(trace: pd.DataFrame) -> Any:
+    """The row of the best candidate; those for slopes are never the result."""
+    judged = trace[trace["stage"] != SLOPES]
+    return judged.iloc[int(judged["cost"].to_numpy().argmin())]
+
+
 SURFACES = ("ground_", "contact_")
 """Beginnings of the names of variables that have no effect where nothing touches."""
 END = 0.01
@@ -226,8 +230,7 @@ END = 0.01
 
 def at_ends(trace: pd.DataFrame, variables: Sequence[str]) -> list[str]:
     """Variables of the best candidate that lie within `END` of an end of their range; contact is left out."""
-    judged = trace[trace["stage"] != SLOPES]
-    best = judged.iloc[int(judged["cost"].to_numpy().argmin())]
+    best = _least(trace)
     decisive = [name for name in variables if not name.startswith(SURFACES)]
     return [name for name in decisive if not END <= best[f"normalized.{name}"] <= 1 - END]
 

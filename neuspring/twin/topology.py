@@ -10,6 +10,7 @@ Radii of a search are in units of the spacing of the nodes.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -87,8 +88,7 @@ def regions(nodes: np.ndarray, count: int) -> np.ndarray:
     centroids = np.round([points[clusters == label].mean(axis=0) for label in range(count)], 6)
     number = np.empty(count, np.int32)
     number[np.lexsort(centroids.T[::-1])] = np.arange(count)
-    labels: np.ndarray = number[clusters]
-    return labels
+    return np.asarray(number[clusters])
 
 
 def joined(nodes: np.ndarray, springs: np.ndarray) -> np.ndarray:
@@ -148,8 +148,7 @@ def _first_of_each(pairs: np.ndarray, count: int) -> np.ndarray:
     """Keep the first occurrence of every unordered pair."""
     ordered = np.sort(pairs, axis=1)
     _, index = np.unique(ordered[:, 0] * count + ordered[:, 1], return_index=True)
-    unique: np.ndarray = pairs[np.sort(index)]
-    return unique
+    return np.asarray(pairs[np.sort(index)])
 
 
 def controller_springs(nodes: np.ndarray, controllers: np.ndarray, radius: float, neighbors: int) -> np.ndarray:
@@ -166,8 +165,7 @@ def controller_springs(nodes: np.ndarray, controllers: np.ndarray, radius: float
 def distances(points: np.ndarray, springs: np.ndarray) -> np.ndarray:
     """Distance of the ends of each spring [S], m, in double precision."""
     ends = points.astype(np.float64)[springs.reshape(-1, 2)]
-    lengths: np.ndarray = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
-    return lengths
+    return np.asarray(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1))
 
 
 def unloaded(
@@ -238,22 +236,17 @@ def piecewise_topology(
 
 
 def uniform_topology(
-    nodes: np.ndarray,
-    controllers: np.ndarray,
-    object_radius: float,
-    object_neighbors: int,
-    controller_radius: float,
-    controller_neighbors: int,
+    nodes: np.ndarray, controllers: np.ndarray, object_radius: float, object_neighbors: int, *of_controllers: Any
 ) -> Topology:
-    """One radius [m] and one neighbor count (self included) for the whole object.
+    """One radius [m] and one neighbor count (self included) for the whole object; `of_controllers` are theirs.
 
     Raises InputError if a controller coincides with a node.
     """
     one = np.zeros(len(nodes), np.int32)
-    return piecewise_topology(nodes, controllers, one, [object_radius], [object_neighbors], controller_radius, controller_neighbors)
+    return piecewise_topology(nodes, controllers, one, [object_radius], [object_neighbors], *of_controllers)
 
 
-MARGIN = 1 + 1e-6
+RADIUS_MARGIN = 1 + 1e-6
 """Factor on radii, so that the longest spring is made again."""
 
 
@@ -263,4 +256,4 @@ def infer_controller_radius(topology: Topology) -> tuple[float, int]:
     if not len(springs):
         return 1e-9, 1
     hands = springs.max(axis=1) - len(topology.nodes)
-    return float(distances(topology.canonical, springs).max()) * MARGIN, int(np.bincount(hands).max())
+    return float(distances(topology.canonical, springs).max()) * RADIUS_MARGIN, int(np.bincount(hands).max())

@@ -28,14 +28,14 @@ from neuspring.core.artifacts import Material, Observations, Topology, Twin
 from neuspring.core.errors import InputError
 from neuspring.twin.body import body_of
 from neuspring.twin.field import midpoints
-from neuspring.twin.topology import MARGIN, REPAIR_SPRINGS, distances, infer_controller_radius, piecewise_topology, unloaded
+from neuspring.twin.topology import RADIUS_MARGIN, REPAIR_SPRINGS, distances, infer_controller_radius, piecewise_topology, unloaded
 
 if TYPE_CHECKING:
     from neuspring.twin.register import Registration
 
-SPREAD = 0.2
+LENGTH_SPREAD = 0.2
 """Cables bent in frame 0 reach 0.02; nodes in another order lie above 0.5."""
-SHORTEST = 1e-9
+LEAST_LENGTH = 1e-9
 """Shorter springs count as this long, m."""
 
 
@@ -84,16 +84,16 @@ def on_nodes(twin: Twin, observations: Observations) -> tuple[Twin, Registration
 def corresponds(topology: Topology, observations: Observations) -> bool:
     """True where node i of a recording is that of a twin: as many nodes and hands, and springs that keep their length or its scale.
 
-    The springs' lengths change by one factor, up to `SPREAD` (median deviation of its logarithm): points in another order make
-    distances across the whole body of neighbors.
+    The springs' lengths change by one factor, up to `LENGTH_SPREAD` (median deviation of its logarithm): points in another order
+    make distances across the whole body of neighbors.
     """
     alike = len(topology.nodes) == len(observations.nodes) and len(topology.controllers) == observations.controller_points.shape[1]
     springs = topology.springs[: topology.object_spring_count]
     if not alike or not len(springs):
         return alike
     lengths = distances(observations.canonical, springs), distances(topology.canonical, springs)
-    ratio = np.log(np.maximum(lengths[0], SHORTEST) / np.maximum(lengths[1], SHORTEST))
-    return bool(np.median(np.abs(ratio - np.median(ratio))) < SPREAD)
+    ratio = np.log(np.maximum(lengths[0], LEAST_LENGTH) / np.maximum(lengths[1], LEAST_LENGTH))
+    return bool(np.median(np.abs(ratio - np.median(ratio))) < LENGTH_SPREAD)
 
 
 def _same_nodes(topology: Topology, observations: Observations) -> Topology:
@@ -188,21 +188,21 @@ def infer_radii(topology: Topology) -> tuple[list[float], list[int]]:
     from scipy.spatial import cKDTree
 
     points = topology.canonical[: len(topology.nodes)].astype(np.float64)
-    springs = topology.springs[: topology.object_spring_count]
+    springs, count = topology.springs[: topology.object_spring_count], int(topology.labels.max()) + 1
     if not len(springs):
-        return [0.0] * (int(topology.labels.max()) + 1), [2] * (int(topology.labels.max()) + 1)
+        return [0.0] * count, [2] * count
     degree = np.bincount(springs.ravel(), minlength=len(points))
     regular = (degree[springs] > REPAIR_SPRINGS).all(axis=1)
     springs = springs[regular] if regular.any() else springs
     length, tree = distances(points, springs), cKDTree(points)
-    ranks = [tree.query_ball_point(points[springs[:, end]], length * MARGIN, return_length=True) for end in (0, 1)]
+    ranks = [tree.query_ball_point(points[springs[:, end]], length * RADIUS_MARGIN, return_length=True) for end in (0, 1)]
     rank = np.minimum(*ranks)
     region = topology.labels[springs]
     radii, neighbors = [], []
-    for label in range(int(topology.labels.max()) + 1):
+    for label in range(count):
         within = (region == label).all(axis=1)
         within = within if within.any() else np.ones(len(springs), dtype=bool)
-        radii.append(float(length[within].max()) * MARGIN)
+        radii.append(float(length[within].max()) * RADIUS_MARGIN)
         neighbors.append(max(int(rank[within].max()), 2))
     return radii, neighbors
 
@@ -225,9 +225,8 @@ def _carried(twin: Twin, new: Topology, material: Material, laid: np.ndarray) ->
         for name, numbers in values.items():
             found[name][there] = mean(numbers[here])
     for here, there, of_hands in zip(_parts(old), _parts(new), (False, True), strict=True):
-        for name in ("stiffness", "dashpot"):
-            # Powers of length in the sums of the module's text.
-            power = {"stiffness": 1, "dashpot": 2}[name] - 2 * of_hands
+        # Powers of length in the sums of the module's text.
+        for name, power in (("stiffness", 1 - 2 * of_hands), ("dashpot", 2 - 2 * of_hands)):
             before = _sum(old, here, values[name], lengths[id(old)], power, of_hands)
             after = _sum(new, there, found[name], lengths[id(new)], power, of_hands)
             found[name][there] *= before / after if after > 0 else 1.0

@@ -20,7 +20,7 @@ from neuspring.core.device import load
 from neuspring.physics.lanes import lanes
 from neuspring.physics.solver import FrameSolver, solver_for
 from neuspring.twin.losses import FrameLoss
-from neuspring.twin.rollout import FAR
+from neuspring.twin.rollout import FAR_AWAY
 
 CHECK_EVERY = {"cpu": 1, "cuda": 16}
 """Frames from one look for twins that all diverged to the next; on CUDA each check synchronizes."""
@@ -48,11 +48,11 @@ def outcomes(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor,
     sums = LossSums(solver, loss, velocity)
     for frame in _frames(solver, twins, hands, velocity):
         sums.add(frame)
-        if frame % CHECK_EVERY[device.partition(":")[0]] == 0 and not sums.any_alive:
+        if frame % CHECK_EVERY[device.partition(":")[0]] == 0 and bool(sums.diverged.all()):
             break
     return [
-        Outcome(math.inf if diverged else cost, diverged, overflow)
-        for cost, diverged, overflow in zip(sums.costs(len(hands) - 1), sums.diverged_frames, solver.overflows, strict=True)
+        Outcome(math.inf if frame else cost, int(frame), overflow)
+        for cost, frame, overflow in zip(sums.costs(len(hands) - 1), sums.diverged.tolist(), solver.overflows, strict=True)
     ]
 
 
@@ -127,14 +127,9 @@ class LossSums:
         return [float(total) / frames for total in totals.cpu()]
 
     @property
-    def diverged_frames(self) -> list[int]:
+    def diverged(self) -> torch.Tensor:
         """The frame in which each twin left the scene; 0 if it did not."""
-        return [int(frame) for frame in self._buffers.tensors["diverged"].reshape(-1)[: self._buffers.twins].cpu()]
-
-    @property
-    def any_alive(self) -> bool:
-        """True where any twin is in the scene."""
-        return not bool(self._buffers.tensors["diverged"].all())
+        return self._buffers.tensors["diverged"].reshape(-1)[: self._buffers.twins]
 
 
 @functools.cache
@@ -157,7 +152,7 @@ def kernels(width: int) -> list[Any]:
     slots: Any = wp.array3d(dtype=Vector)
     targets: Any = wp.array2d(dtype=wp.vec3)
     flags: Any = wp.array2d(dtype=wp.int32)
-    far, huge = wp.constant(wp.float32(FAR)), wp.constant(Number(*[3e38] * width))
+    far, huge = wp.constant(wp.float32(FAR_AWAY)), wp.constant(Number(*[3e38] * width))
     half, one = wp.constant(0.5), wp.constant(1.0)
 
     @wp.func

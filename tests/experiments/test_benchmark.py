@@ -17,14 +17,11 @@ import yaml
 
 from neuspring import config
 from neuspring.config import Config, Method, parse
-from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
 from neuspring.core.records import Before, Recorder
 from neuspring.experiments import benchmark as tables
 from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.graph import Graph
-from neuspring.experiments.needs import check_storage
-from neuspring.experiments.tuning.space import Plan
 from neuspring.scenes.sources import read_scenarios, scenario_rows, with_deform
 from neuspring.scores.paper import read_studies
 from neuspring.stages import STAGES
@@ -546,8 +543,6 @@ def test_every_configuration_that_is_shipped_is_valid(overlays, tmp_path):
     benchmark = Benchmark(values, ROOT)
     assert benchmark.compared_with in benchmark.methods
     assert set(Graph(benchmark).owners["fit"]) == {name for name, row in benchmark.methods.items() if row.fit}
-    if benchmark.config.tune:
-        assert Plan.of(benchmark.config, benchmark.config.tune, ROOT)
 
 
 def shipped(data: str, *studies: str) -> dict:
@@ -794,17 +789,6 @@ def test_methods_that_learn_nothing_stand_beside_on_own_recordings(source, metho
     assert tables.with_references(every, {"rope": row}, known).methods == every.methods
 
 
-def test_workers_on_several_machines_need_a_database_that_locks_across_them():
-    space = {"fit.learning_rate": {"low": 1e-4, "high": 1e-2}}
-    study = {"study": "rate", "method": "baseline", "workers": 2, "space": space}
-    tune = config.parse(Tune, study, "test")
-    check_storage(tune, cluster=False)
-    with pytest.raises(InputError, match="workers on several machines need storage"):
-        check_storage(tune, cluster=True)
-    check_storage(config.parse(Tune, study | {"storage": "postgresql://me@host/studies"}, "test"), cluster=True)
-    check_storage(config.parse(Tune, study | {"workers": 1}, "test"), cluster=True)
-
-
 def test_only_takes_a_part_by_scenario_category_method_and_seed():
     names = ["toy_rope_lift_smooth", "toy_rope_shake_smooth", "toy_cloth_lift_smooth"]
     all_of_it = {"scenarios": names, "methods": ["baseline", "clusters_2", "clusters_3"], "seeds": [0, 1, 2]}
@@ -874,13 +858,6 @@ def test_an_oracle_has_a_fit_of_its_own_is_named_in_its_record_and_is_not_transf
     together = json.loads(graph.options(STAGES["fits"], SimpleNamespace(scenario=SCENES[0]))["rows"])
     assert [bool(row.get("oracle")) for row in together] == [False, False, True]
     assert {path.split("/")[-3] for path in graph.transfers()} == {"baseline", "neuspring"}
-
-
-def test_no_sweep_chooses_by_an_oracle():
-    values = {"study": "s", "method": "oracle_neuspring", "space": {"fit.learning_rate": {"low": 1e-4, "high": 1e-2}}, "seed": 0}
-    tune = parse(Tune, values, "x")
-    with pytest.raises(InputError, match="an oracle sees the future"):
-        Plan.of(config.Config(), tune, ROOT)
 
 
 def test_the_graph_asks_stages_and_compares_no_name_of_one() -> None:

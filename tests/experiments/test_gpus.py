@@ -112,7 +112,7 @@ def run(tmp_path):
     return functools.partial(gpus.acquire, folder=tmp_path, notes=tmp_path / "notes")
 
 
-def fail_on(device, run, failure=gpus.LOST):
+def fail_on(device, run, failure=gpus.LOST_GPU):
     """A job that fails by an error of its device."""
     lease = run(1, (device,), timeout=0)
     lease.note(failure)
@@ -134,7 +134,7 @@ def test_a_lost_device_is_passed_over_and_not_waited_for(run):
 
 def test_a_device_that_works_again_is_no_longer_passed_over(run):
     lease = run(1, ("0",))
-    lease.note(gpus.LOST)
+    lease.note(gpus.LOST_GPU)
     lease.note("")
     lease.release()
     assert run(1, ("0", "1")).devices == ("0",)
@@ -153,7 +153,7 @@ def test_a_device_lost_while_others_wait_for_it_ends_their_wait(run):
     lease = run(1, ("0",))
 
     def lose(text):
-        lease.note(gpus.LOST)
+        lease.note(gpus.LOST_GPU)
         lease.release()
 
     with pytest.raises(InputError, match="too few are left"):
@@ -161,13 +161,13 @@ def test_a_device_lost_while_others_wait_for_it_ends_their_wait(run):
 
 
 def test_a_job_s_own_errors_do_not_take_all_devices_from_the_others(run):
-    fail_on("0", run, gpus.SUSPECT)
+    fail_on("0", run, gpus.SUSPECT_GPU)
     second = run(1, ("0", "1"))
     assert second.devices == ("1",)
     with pytest.raises(TimeoutError):
         run(1, ("0", "1"), timeout=0)
     second.release()
-    fail_on("1", run, gpus.SUSPECT)
+    fail_on("1", run, gpus.SUSPECT_GPU)
     # None is beyond doubt: the one whose failure is longest ago comes first.
     first = run(1, ("1", "0"))
     assert first.devices == ("0",)

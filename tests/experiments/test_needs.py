@@ -100,4 +100,4 @@ def test_resources_set_for_a_rule_beyond_the_gpus_there_are_are_refused():
 
 def test_a_results_folder_that_cannot_be_written_ends_the_run_before_it_begins():
     with pytest.raises(InputError, match="this folder must be writable"):
-        needs.checked(config_with({"results": "/proc/nowhere"}), ROOT, cluster=False)
+        needs.checked(config_with({"results": "/proc/nowhere"}), ROOT)

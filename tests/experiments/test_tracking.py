@@ -80,7 +80,7 @@ def test_parameters_are_what_has_not_its_default_under_the_names_of_the_configur
     params = {"fit.fit.epochs": 60, "fit.fit.horizon": settings["fit"]["horizon"], "fit.kind": "field", "long": "x" * 900}
     params |= {"search.search.rollouts": 11, "search.seed": 0, "search.result.cost": 0.5, "method.clusters": 4}
     path = write_run(results, params=params)
-    found = dict(tracking.payload(RunRecord.load(path), path, results).params)
+    found = {param.key: param.value for param in tracking.payload(RunRecord.load(path), path, results)[0]}
     assert found.pop("settings") and len(found.pop("long")) == 500
     variant = {"search": "uniform", "fit": "springs", "clusters": "4", "frozen": "False"}
     assert found == variant | {"fit.epochs": "60", "fit.kind": "field", "search.rollouts": "11", "search.seed": "0"}
@@ -162,7 +162,7 @@ def test_the_jobs_of_a_baseline_are_found_by_the_rules_that_made_them(results: P
         write_job(results, name, Attempt(started="2026-11-21T09:30:00+00:00", outcome="ok", peak_memory_mb=float(memory)))
     record = RunRecord.load(write_run(results, artifacts={"records": records}, variant={"model": "spring_gaus"}))
     points = _system_metrics(record, results / "rope" / "ours" / "0" / "run.json", results)
-    assert {point.name: point.value for point in points if point.name.endswith("memory_mb")} == {
+    assert {point.key: point.value for point in points if point.key.endswith("memory_mb")} == {
         "usage/train.peak_memory_mb": 1.0,
         "usage/rollout.peak_memory_mb": 2.0,
         "usage/appearance.peak_memory_mb": 3.0,
@@ -271,14 +271,12 @@ def test_processes_that_log_the_same_records_at_once_double_none(results: Path) 
     assert {run.info.status for run in runs} == {"FINISHED"}
 
 
-def test_results_that_another_commit_made_again_are_one_run_of_both(results: Path) -> None:
+def test_results_that_another_commit_made_again_are_one_run(results: Path) -> None:
     assert tracking.log_run(write_run(results), results, SETTINGS) == "logged"
     again = write_run(results, commit="def456-dirty", ended="2026-11-21T12:00:00+00:00")
-    for _ in range(2):
-        assert tracking.log_run(again, results, SETTINGS) == "already logged"
+    assert tracking.log_run(again, results, SETTINGS) == "already logged"
     (run,) = runs_of(results)
     assert run.info.end_time == ENDED_MS and run.data.tags["commit"] == "abc123"
-    assert run.data.tags["commit.def456-dirty"] == str(STARTED_MS + 2 * 3600_000)
 
 
 def test_damaged_records_are_input_errors(results: Path) -> None:

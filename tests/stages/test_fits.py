@@ -16,7 +16,7 @@ from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
 from neuspring.stages.fit import fit
-from neuspring.stages.fits import Row, fits
+from neuspring.stages.fits import FitRow, fits
 from neuspring.stages.observe import observe
 from neuspring.stages.search import search
 from neuspring.twin import fit as twin_fit
@@ -52,10 +52,10 @@ def text(name: str) -> str:
     return json.dumps({"fit": config.plain(ROWS[name])})
 
 
-def rows_of(started: Path, folder: Path) -> list[Row]:
+def rows_of(started: Path, folder: Path) -> list[FitRow]:
     """Three rows of the method table, two seeds each; the last has another horizon."""
     return [
-        Row(
+        FitRow(
             kind="field" if name == "field" else "springs",
             settings=text(name),
             fits={str(folder / name / str(k) / "fit.json"): str(started / f"search-{k}" / "search.json") for k in (0, 1)},
@@ -64,11 +64,11 @@ def rows_of(started: Path, folder: Path) -> list[Row]:
     ]
 
 
-def as_json(rows: list[Row]) -> str:
+def as_json(rows: list[FitRow]) -> str:
     return json.dumps([asdict(row) for row in rows])
 
 
-def finish(started: Path, rows: list[Row]) -> None:
+def finish(started: Path, rows: list[FitRow]) -> None:
     """The jobs of the fits themselves."""
     for row in rows:
         for output, found in row.fits.items():
@@ -131,7 +131,7 @@ def test_finished_fits_and_failed_searches_are_left_alone(started: Path, alone: 
     rows = rows_of(started, alone)
     broken = tmp_path / "failed.json"
     replace(StageRecord.load(started / "search-0" / "search.json"), status="failed", reason="x").save(broken)
-    rows.append(Row(fits={str(tmp_path / "a" / "fit.json"): str(broken)}))
+    rows.append(FitRow(fits={str(tmp_path / "a" / "fit.json"): str(broken)}))
     before = {path: path.stat().st_mtime_ns for path in alone.rglob("*") if path.is_file()}
     fits(observations=started / "observations.npz", rows=as_json(rows), device="cpu", output=tmp_path / "fits.json")
     assert StageRecord.load(tmp_path / "fits.json").facts["batches"] == []

@@ -8,7 +8,7 @@ import torch
 from torch.nn.functional import grid_sample
 
 from neuspring import config
-from neuspring.twin.field import AXES, SpringField, TriPlane, adaptive_resolution, bilinear, fourier, in_cube, midpoints
+from neuspring.twin.field import PLANE_AXES, SpringField, TriPlane, bilinear, fourier, in_cube, midpoints
 
 EXACT = 1e-12
 """Absolute, for values of order 1 in float64: the same sums in another order."""
@@ -63,7 +63,7 @@ def test_weights_follow_the_seed_alone():
 @pytest.mark.parametrize(("springs", "resolution"), [(1, 2), (9, 3), (50, 6), (1062, 28), (4000, 54), (20000, 120)])
 def test_the_adaptive_resolution_follows_the_number_of_springs(springs, resolution):
     """N = round(0.85 sqrt(|E|)), and two texels at least."""
-    assert adaptive_resolution(springs, 0.85) == max(2, math.floor(0.85 * math.sqrt(springs) + 0.5)) == resolution
+    assert field_of(points(springs)).resolution == max(2, math.floor(0.85 * math.sqrt(springs) + 0.5)) == resolution
 
 
 def test_the_resolution_is_adaptive_or_fixed():
@@ -172,7 +172,7 @@ def dense(at: np.ndarray, resolution: int, channels: int, scale: float) -> tuple
 
 def sample(full: torch.Tensor, at: np.ndarray) -> torch.Tensor:
     """Summed features [S, C] of full planes [3, C, N, N], by torch's own bilinear interpolation."""
-    grid = torch.stack([torch.from_numpy(at[:, list(axes)]) for axes in AXES])[:, None]
+    grid = torch.stack([torch.from_numpy(at[:, list(axes)]) for axes in PLANE_AXES])[:, None]
     return grid_sample(full, grid, mode="bilinear", align_corners=True)[:, :, 0].sum(dim=0).T
 
 

@@ -170,7 +170,7 @@ def height(loss: FrameLoss, state: losses.FrameState) -> list[losses.Errors]:
 
 def test_a_new_term_is_a_weight_and_a_function(monkeypatch: pytest.MonkeyPatch) -> None:
     """Search, fit and polish follow: their costs of a rollout agree, with that of the term itself."""
-    monkeypatch.setitem(losses.TERMS, "height", height)
+    monkeypatch.setitem(losses.TERMS._own, "height", height)
     weights = Weights(chamfer=0.0, track=0.0, acceleration=0.0)
     problem = small.search_problem(losses=weights)
     twin = candidate(problem, small.start_values())

@@ -15,7 +15,7 @@ from neuspring.core.records import StageRecord
 from neuspring.physics.parameters import twin_tensors
 from neuspring.stages.fit import fit as fit_stage
 from neuspring.stages.fit import prepared
-from neuspring.stages.fits import Row, fits
+from neuspring.stages.fits import FitRow, fits
 from neuspring.stages.rollout import rollout
 from neuspring.stages.search import search as search_stage
 from neuspring.twin.fit import fit
@@ -125,7 +125,9 @@ def test_an_oracle_in_shared_launches_is_the_oracle_alone(started, tmp_path):
     seen, found = started / "observations.npz", started / "search.json"
     settings = json.dumps({"fit": config.plain(SETTINGS.fit)})
     names = ["normal", "oracle", "oracle_again"]
-    rows = [Row(settings=settings, oracle=name != "normal", fits={str(tmp_path / name / "fit.json"): str(found)}) for name in names]
+    rows = [
+        FitRow(settings=settings, oracle=name != "normal", fits={str(tmp_path / name / "fit.json"): str(found)}) for name in names
+    ]
     fits(observations=seen, rows=json.dumps([asdict(row) for row in rows]), device="cpu", output=tmp_path / "fits.json")
     batches = StageRecord.load(tmp_path / "fits.json").facts["batches"]
     assert batches == [[str(tmp_path / name / "fit.json") for name in names[1:]]]

@@ -361,7 +361,7 @@ def test_common_factors_are_reported():
 def test_gradients_are_compared_with_epsilon():
     still = {"epochs": 1, "learning_rate": 1e-12}
     runs = [fit(small.fit_problem(fit=config.Fit(epsilon=epsilon, **still))) for epsilon in (1e-15, 1e-3)]
-    coarse, fine = (run.figures["gradient_over_epsilon"] for run in runs)
+    coarse, fine = (run.facts["gradient_over_epsilon"] for run in runs)
     assert coarse == pytest.approx(1e12 * fine, rel=1e-2)
     assert coarse > 1
     run = TwinFit(small.fit_problem(kind="springs", fit=config.Fit(epochs=1, horizon=0)))

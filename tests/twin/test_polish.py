@@ -15,7 +15,7 @@ from neuspring.core.levenberg import damped_step
 from neuspring.twin import search as module
 from neuspring.twin.candidates import CMAES, SearchProblem, candidate, evaluate
 from neuspring.twin.losses import FrameLoss
-from neuspring.twin.polish import POLISH, REACH, SLOPES, Polish, products, residuals, slope_rows
+from neuspring.twin.polish import LONGEST_STEP, POLISH, SLOPES, Polish, products, residuals, slope_rows
 from neuspring.twin.search import search
 from neuspring.twin.trials import motions
 from tests.support import small
@@ -151,7 +151,7 @@ def test_the_polish_of_a_quadratic_ends_at_its_least_within_the_box():
             rows = [{k if k.startswith("product") else f"product.{k}": x for k, x in row.items()} for row in rows]
         else:
             rows = [{"cost": cost(u)} for u in asked]
-            assert all(np.abs(u - here).max() <= REACH + 1e-12 for u in asked)
+            assert all(np.abs(u - here).max() <= LONGEST_STEP + 1e-12 for u in asked)
         polish.tell(rows)
         costs.append(polish.cost)
     assert costs == sorted(costs, reverse=True)

@@ -86,7 +86,7 @@ workflow.config_settings.config_args = [
         for key, value in CHOSEN.items()
     ),
 ]
-BENCHMARK = or_workflow_error(needs.checked, config, ROOT, cluster=CLUSTER)
+BENCHMARK = or_workflow_error(needs.checked, config, ROOT)
 CONFIG = BENCHMARK.config
 RESULTS = CONFIG.results
 POOL = () if CLUSTER else or_workflow_error(needs.pool_of, CONFIG, workflow)
@@ -116,7 +116,7 @@ def job_prefix():
     values = {
         # Only inside a job that a cluster started; with --jobs beside --cores Snakemake runs jobs here.
         wrapper.POOL: wrapper.GIVEN if workflow.remote_exec else ",".join(POOL),
-        wrapper.SHARE: str(CONFIG.gpus.jobs_per_gpu),
+        wrapper.GPU_SHARE: str(CONFIG.gpus.jobs_per_gpu),
     }
     if not CLUSTER:
         values[warm.SOCKET] = str(WARM)

@@ -1,20 +1,23 @@
 # A sweep: workers share one Optuna study; each is a job, and the sweep is as long as the configuration says, however many there are.
 SWEEP = GRAPH.sweep_folder
 if CONFIG.tune:
+    from neuspring.extensions.tuning import jobs
+
+    or_workflow_error(jobs.check, BENCHMARK, cluster=CLUSTER)
     TUNED, SWEPT = (
         stamped_job(
             "tune",
             f"{CONFIG.tune.study}/{{worker}}",
             f"{SWEEP}/worker-{{worker}}.json",
-            lambda wildcards: [GRAPH.sweep(), GRAPH.tuned_rows()],
-            "neuspring.experiments.tuning.trial",
+            lambda wildcards: [jobs.settings(BENCHMARK), jobs.rows(BENCHMARK)],
+            "neuspring.extensions.tuning.trial",
         ),
         stamped_job(
             "sweep",
             CONFIG.tune.study,
             f"{SWEEP}/summary.md",
-            lambda wildcards: [GRAPH.sweep()],
-            "neuspring.experiments.tuning.report",
+            lambda wildcards: [jobs.settings(BENCHMARK)],
+            "neuspring.extensions.tuning.report",
         ),
     )
 
@@ -38,7 +41,7 @@ if CONFIG.tune:
             mem_mb=NEEDS.memory("tune"),
             runtime=NEEDS.minutes("tune"),
         params:
-            settings=GRAPH.sweep(),
+            settings=jobs.settings(BENCHMARK),
             stamp=TUNED[2],
         shell:
             common_job(
@@ -61,7 +64,7 @@ if CONFIG.tune:
             mem_mb=NEEDS.memory("sweep"),
             runtime=NEEDS.minutes("sweep"),
         params:
-            settings=GRAPH.sweep(),
+            settings=jobs.settings(BENCHMARK),
             stamp=SWEPT[2],
         shell:
             common_job("tune-report --settings {params.settings:q} --output {output:q}")

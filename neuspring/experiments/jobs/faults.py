@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-TAIL = 40
+CAUSE_LINES = 40
 """Lines of output that are searched for a cause."""
 WARNING = re.compile(r"\s*warning\b", re.IGNORECASE)
 """A warning did not end the command, so it names no cause."""
@@ -29,7 +29,7 @@ class Fault:
     cause: str
     remedy: str = ""
     device: Literal["", "suspect", "lost"] = ""
-    """What the failure says about the job's GPUs. suspect: an error of the job itself can look like this on a sound GPU."""
+    """Meaning of the failure for the job's GPUs. suspect: an error of the job itself can look like this on a sound GPU."""
 
 
 FULL = Fault("permanent", "no space left on the disk", "Free some space; the same command continues.")
@@ -41,7 +41,7 @@ MEMORY = Fault("transient", "out of memory")
 UNREACHABLE = Fault("transient", "a store or host could not be reached")
 STORAGE = Fault("transient", "the storage failed")
 INPUT = Fault("permanent", "bad input")
-UNKNOWN = Fault("permanent", "the program failed")
+UNKNOWN_FAULT = Fault("permanent", "the program failed")
 CRASH = Fault("transient", "the process crashed")
 STOPPED = Fault("killed", "stopped from outside")
 MISSING = Fault("permanent", "the command was not found", "Install it, or correct PATH.")
@@ -77,7 +77,7 @@ def diagnose(status: int, output: Sequence[str]) -> Fault | None:
     number = -status if status < 0 else status - 128 if 128 < status < 160 else 0
     if number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         return STOPPED
-    text = "\n".join(line for line in output[-TAIL:] if not WARNING.match(line))
+    text = "\n".join(line for line in output[-CAUSE_LINES:] if not WARNING.match(line))
     for pattern, fault in PATTERNS:
         if re.search(pattern, text, re.IGNORECASE):
             return fault
@@ -87,7 +87,7 @@ def diagnose(status: int, output: Sequence[str]) -> Fault | None:
         return Fault("transient", "killed by the system, most likely out of memory")
     if number:
         return Fault(CRASH.outcome, f"{CRASH.cause} ({signal.Signals(number).name})")
-    return UNKNOWN
+    return UNKNOWN_FAULT
 
 
 def not_started(error: OSError) -> tuple[int, Fault]:

@@ -26,9 +26,9 @@ from neuspring.core.lock import try_lock, wait_for_lock
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 LOCKS = "NEUSPRING_GPU_LOCKS"
 """Environment: the folder of the slots. Users who share GPUs set it to one folder that all of them can write to."""
-POLL = 0.05
+SLOT_POLL = 0.05
 """s between two looks for a free slot."""
-LOST, SUSPECT, WORKS = "lost", "suspect", "works"
+LOST_GPU, SUSPECT_GPU, WORKS = "lost", "suspect", "works"
 """Words of notes. Suspect: the job itself may have caused the error on a sound device."""
 
 
@@ -42,7 +42,7 @@ def failures(notes: Path | None) -> dict[str, str]:
         for line in notes.read_text(encoding="utf-8").splitlines() if notes else ():
             failure, _, device = line.partition(" ")
             found.pop(device, None)
-            if failure in (LOST, SUSPECT):
+            if failure in (LOST_GPU, SUSPECT_GPU):
                 found[device] = failure
     return found
 
@@ -77,7 +77,7 @@ class Lease:
 
 
 def lock_folder() -> Path:
-    """Where slots lie; made if it is missing. Raises InputError if it cannot be used."""
+    """Folder of the slots; made if it is missing. Raises InputError if it cannot be used."""
     shared = os.environ.get(LOCKS)
     path = Path(shared or f"/var/tmp/neuspring-gpus-{os.getuid()}")
     try:
@@ -178,7 +178,7 @@ def acquire(
         if waited > timeout:
             raise TimeoutError(f"no {count} of the GPUs {', '.join(pool)} became free within {timeout:.0f} s")
         say_once(f"waiting for {count} of the GPUs {', '.join(pool)}")
-        time.sleep(POLL)
+        time.sleep(SLOT_POLL)
 
 
 def _usable(count: int, pool: Sequence[str], failed: Mapping[str, str]) -> list[str]:
@@ -189,9 +189,9 @@ def _usable(count: int, pool: Sequence[str], failed: Mapping[str, str]) -> list[
     """
     devices = [device for device in pool if device not in failed]
     if len(devices) < count:
-        devices += [device for device, failure in failed.items() if device in pool and failure == SUSPECT]
+        devices += [device for device, failure in failed.items() if device in pool and failure == SUSPECT_GPU]
     if len(devices) < count:
-        lost = ", ".join(f"GPU {device} (lost)" for device in pool if failed.get(device) == LOST)
+        lost = ", ".join(f"GPU {device} (lost)" for device in pool if failed.get(device) == LOST_GPU)
         remedy = (
             "Look at nvidia-smi. Reset a GPU that it does not show as working (nvidia-smi --gpu-reset), or restart the machine. "
             "Then start the same command again, or let gpus.devices name other GPUs."

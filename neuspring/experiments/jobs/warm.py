@@ -38,7 +38,7 @@ LIBRARIES = ("numpy", "scipy.spatial", "pandas", "torch", "warp", "cv2", "trimes
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 SAFE_THREADS = {"jemalloc_bg_thd"}
 """Threads of libraries that prepare for a fork themselves."""
-MOST_FILES, PATIENCE = 64, 10.0
+MOST_FILES, REQUEST_PATIENCE = 64, 10.0
 """Open files that a job inherits, at most; s that its request may take."""
 
 
@@ -178,7 +178,7 @@ def _begin(server: socket.socket, jobs: Mapping[int, socket.socket]) -> tuple[in
     connection, _ = server.accept()
     with contextlib.ExitStack() as begun:
         begun.enter_context(connection)
-        connection.settimeout(PATIENCE)
+        connection.settimeout(REQUEST_PATIENCE)
         length, files, *_ = socket.recv_fds(connection, 4, MOST_FILES)
         for file in files:
             begun.callback(os.close, file)

@@ -32,15 +32,15 @@ from neuspring.core.job_records import FOLDER, GPU_NOTES, LOGS, Attempt, JobReco
 from neuspring.core.lock import try_lock
 from neuspring.experiments.jobs import faults, gpus, warm
 
-TAIL = 200
+TAIL_LINES = 200
 """Lines of output that are searched for a cause of failure."""
-INTERVAL, MOST = 1.0, 120
+INTERVAL, MOST_SAMPLES = 1.0, 120
 """s between the first samples; the number of rows at which every second one is dropped and the interval doubles."""
 MIB = 2**20
 GIVEN = "given"
-POOL, SHARE = "NEUSPRING_GPUS", "NEUSPRING_JOBS_PER_GPU"
+POOL, GPU_SHARE = "NEUSPRING_GPUS", "NEUSPRING_JOBS_PER_GPU"
 """Environment: the devices that jobs share (or `given`: a cluster has chosen this job's), how many jobs a device takes."""
-POLL = 0.2
+JOB_POLL = 0.2
 """s between two looks whether an earlier run of a job has ended."""
 
 
@@ -91,7 +91,7 @@ def alone(record: Path, waiting: Callable[[str], object]) -> Iterator[IO[str] | 
                 end = f"waiting for its end. If it is gone, delete {path}"
                 waiting(f"an earlier run of this job still goes on ({holder}); {end}")
             told = True
-            time.sleep(POLL)
+            time.sleep(JOB_POLL)
         with contextlib.suppress(OSError):  # unbuffered: the file's own close must not try again what a full disk refused
             os.ftruncate(file.fileno(), 0)
             os.write(file.fileno(), f"pid {os.getpid()} on {platform.node()}".encode())
@@ -132,7 +132,7 @@ def _run(command: Sequence[str], record: JobRecord, results: Path, lock: IO[str]
     try:
         if gpu_count and pool != GIVEN:
             names = [name for name in pool.split(",") if name] or gpus.visible_devices()
-            share, notes = int(os.environ.get(SHARE, "1")), results / FOLDER / GPU_NOTES if this else None
+            share, notes = int(os.environ.get(GPU_SHARE, "1")), results / FOLDER / GPU_NOTES if this else None
             lease = gpus.acquire(gpu_count, names, jobs_per_gpu=share, notes=notes, say=say)
     except (InputError, TimeoutError) as error:
         save(Attempt(started=_now(), run=this, outcome="permanent", cause="no GPU", message=str(error), exit=faults.BAD_INPUT))
@@ -195,7 +195,7 @@ def execute(
         return replace(begun, outcome=refused.outcome, cause=refused.cause, message=str(error), exit=status), refused
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda received, frame: process.send_signal(received))
-    tail: collections.deque[str] = collections.deque(maxlen=TAIL)
+    tail: collections.deque[str] = collections.deque(maxlen=TAIL_LINES)
     assert process.stdout is not None
     with Watch(process.pid, begun.devices) as watch:
         for line in process.stdout:
@@ -228,7 +228,7 @@ def _print(text: str) -> None:
 
 
 def _log(path: Path) -> Callable[[str], None]:
-    """What appends to a log. A log that cannot be written is a warning: on a full disk the job's own error counts."""
+    """Writer that appends to a log. A log that cannot be written is a warning: on a full disk the job's own error counts."""
     file: IO[bytes] | None = None
 
     def write(text: str) -> None:
@@ -309,7 +309,7 @@ class Watch:
                 last, before = moment, cpu
                 if ended:
                     return
-                if len(self._rows) >= MOST:
+                if len(self._rows) >= MOST_SAMPLES:
                     del self._rows[::2]
                     interval *= 2
 

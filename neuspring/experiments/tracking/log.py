@@ -15,10 +15,9 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from neuspring.config import Config, Tracking, plain
 from neuspring.core.errors import InputError
@@ -28,8 +27,6 @@ from neuspring.core.job_records import JobRecord
 from neuspring.core.run_record import RUN_RECORD, RunRecord, flat, key_of
 from neuspring.core.text import masked
 from neuspring.experiments.tracking.store import (
-    AGAIN,
-    ARTIFACTS,
     connect,
     explained,
     is_complete,
@@ -42,12 +39,13 @@ from neuspring.experiments.tracking.store import (
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
+    from mlflow.entities import Metric, Param
 
 MOST_PARAMS = 60
 PARAM_LENGTH, TAG_LENGTH = 500, 5000
 """These keep MLflow's tables readable. The full text stays in run.json."""
 METRIC_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.:/ -]{0,249}")
-SAMPLES = ("cpu_percent", "memory_mb", "gpu_percent", "gpu_memory_mb")
+SAMPLE_COLUMNS = ("cpu_percent", "memory_mb", "gpu_percent", "gpu_memory_mb")
 """Columns of a job record's samples, after the time."""
 OUTCOME = "mlflow.txt"
 """The outcome of logging a record, beside it; the workflow's rule writes it."""
@@ -76,7 +74,7 @@ def init(results: Path, settings: Tracking) -> dict[str, str]:
 def log_run(run_json: Path, results: Path, settings: Tracking) -> str:
     """Log one run record; logging it again changes nothing.
 
-    The same results made again, by another commit or later, are the same run: it is noted there when, and by which commit.
+    The same results made again, by another commit or later, are the same run.
     Returns "logged", "already logged", "disabled" or "unreachable: <reason>". Raises InputError for a damaged record or a file
     that it names and that is missing or damaged; nothing else.
     """
@@ -109,13 +107,9 @@ def sync(results: Path, settings: Tracking, progress: Callable[[str], object] = 
         outcomes.setdefault(outcome, []).append(name)
         progress(f"{name}: {outcome}")
 
-    records: list[Path] = []
-    for folder, folders, files in os.walk(results):
-        # Neither the copies among MLflow's artifacts, nor hidden folders.
-        folders[:] = sorted(name for name in folders if not name.startswith(".") and name != ARTIFACTS)
-        records += [Path(folder) / RUN_RECORD] if RUN_RECORD in files else []
     down = _down(results, settings) if settings.enabled else None
-    for path in records:
+    # The copies among MLflow's artifacts lie deeper.
+    for path in sorted(results.glob(f"*/*/*/{RUN_RECORD}")):
         name = path.parent.relative_to(results).as_posix()
         if down:
             note(name, down)
@@ -145,31 +139,21 @@ def _log(client: MlflowClient, experiment: str, record: RunRecord, run_json: Pat
     for run in runs:
         if not is_complete(run):
             client.delete_run(run.info.run_id)
-    if complete := next(filter(is_complete, runs), None):
-        # Tag it with the commit and time at which its results were made again, if they were.
-        ended, tag = milliseconds(record.ended), f"{AGAIN}{record.commit}"
-        first = record.commit == complete.data.tags.get("commit") and ended == complete.info.end_time
-        if record.commit and not first and complete.data.tags.get(tag) != str(ended):
-            client.set_tag(complete.info.run_id, tag, str(ended))
+    if any(map(is_complete, runs)):
         return "already logged"
-    _send(client, experiment, record, payload(record, run_json, results))
-    return "logged"
-
-
-def _send(client: MlflowClient, experiment: str, record: RunRecord, content: Payload) -> None:
-    from mlflow.entities import Metric, Param
-
+    # All is read and checked before anything is sent.
+    params, metrics, files = payload(record, run_json, results)
     start, end = milliseconds(record.started), milliseconds(record.ended)
-    run_id = client.create_run(experiment, start_time=start, tags=content.tags, run_name=record.name).info.run_id
-    params = [Param(name, value) for name, value in content.params]
-    metrics = [Metric(point.name, point.value, point.time, point.step) for point in content.metrics]
+    tags = _tags(record, run_json.parent)
+    run_id = client.create_run(experiment, start_time=start, tags=tags, run_name=record.name).info.run_id
     client.log_batch(run_id, params=params)
     for first in range(0, len(metrics), METRICS_PER_CALL):
         client.log_batch(run_id, metrics=metrics[first : first + METRICS_PER_CALL])
-    for path, folder in content.files:
+    for path, folder in files:
         client.log_artifact(run_id, str(path), folder)
     client.set_terminated(run_id, "FINISHED" if record.status == "ok" else "FAILED", end)
     client.set_tag(run_id, "logged", "complete")
+    return "logged"
 
 
 # --- messages ---
@@ -198,29 +182,13 @@ def _warn(message: str) -> None:
 # --- what is sent for a run: its record and the files that it names, read and checked before anything is sent ---
 
 
-class Point(NamedTuple):
-    """One value of a metric."""
+def payload(record: RunRecord, run_json: Path, results: Path) -> tuple[list[Param], list[Metric], list[tuple[Path, str | None]]]:
+    """(parameters, metrics, local files with their artifact folder, None: the root) of a record and of its stages' job records.
 
-    name: str
-    value: float
-    step: int
-    time: int
-    """ms since 1970."""
+    Raises InputError.
+    """
+    from mlflow.entities import Param
 
-
-@dataclass(frozen=True, kw_only=True)
-class Payload:
-    """Everything of a record that goes to MLflow."""
-
-    tags: dict[str, str]
-    params: list[tuple[str, str]]
-    metrics: list[Point]
-    files: list[tuple[Path, str | None]]
-    """Local file, artifact folder (None: the root)."""
-
-
-def payload(record: RunRecord, run_json: Path, results: Path) -> Payload:
-    """Read what a record names, and the job records of its stages. Raises InputError."""
     folder = run_json.parent
     files: list[tuple[Path, str | None]] = [(run_json, None)]
     for target, names in record.artifacts.items():
@@ -229,11 +197,10 @@ def payload(record: RunRecord, run_json: Path, results: Path) -> Payload:
     if doubles := [target for target in targets if targets.count(target) > 1]:
         raise InputError(run_json, "artifacts of one folder must have different file names", doubles[0])
     metrics = [*_metrics(record, run_json), *_system_metrics(record, run_json, results)]
-    for name in [*record.params, *{point.name for point in metrics}]:
+    for name in [*record.params, *{metric.key for metric in metrics}]:
         if not METRIC_NAME.fullmatch(name):
             raise InputError(run_json, f"names of parameters and metrics must match {METRIC_NAME.pattern}", repr(name))
-    params = [(name, cut(str(value), PARAM_LENGTH)) for name, value in _params(record).items()]
-    return Payload(tags=_tags(record, folder), params=params, metrics=metrics, files=files)
+    return [Param(name, cut(str(value), PARAM_LENGTH)) for name, value in _params(record).items()], metrics, files
 
 
 def _params(record: RunRecord) -> dict[str, Any]:
@@ -273,20 +240,22 @@ def _tags(record: RunRecord, folder: Path) -> dict[str, str]:
     return {name: cut(value, TAG_LENGTH) for name, value in tags.items()}
 
 
-def _metrics(record: RunRecord, run_json: Path) -> Iterator[Point]:
+def _metrics(record: RunRecord, run_json: Path) -> Iterator[Metric]:
     """Scores as `{task}.{metric}`, timings as `seconds.{stage}`, histories as `{history}.{metric}` by step."""
+    from mlflow.entities import Metric
+
     end = milliseconds(record.ended)
     if record.scores_file:
         for task, metric, value in _table(run_json, record.scores_file, ("task", "metric", "value")):
-            yield Point(f"{task}.{metric}", value, 0, end)
+            yield Metric(f"{task}.{metric}", value, end, 0)
     for stage, seconds in record.timings.items():
-        yield Point(f"seconds.{stage}", seconds, 0, end)
+        yield Metric(f"seconds.{stage}", seconds, end, 0)
     for history, name in record.histories.items():
         for step, metric, value in _table(run_json, name, ("step", "metric", "value")):
-            yield Point(f"{history}.{metric}", value, int(step), end)
+            yield Metric(f"{history}.{metric}", value, end, int(step))
 
 
-def _system_metrics(record: RunRecord, run_json: Path, results: Path) -> Iterator[Point]:
+def _system_metrics(record: RunRecord, run_json: Path, results: Path) -> Iterator[Metric]:
     """Use of processor, memory and GPU as `usage/{stage}.{what}`; steps are seconds.
 
     Not under `system/`: MLflow's page shows what is named so before everything else, and scores come first.
@@ -294,14 +263,16 @@ def _system_metrics(record: RunRecord, run_json: Path, results: Path) -> Iterato
     They are those of each job's last attempt, which made the result. A stage that was run by hand has no job record and no such
     metrics.
     """
+    from mlflow.entities import Metric
+
     for stage, path in _jobs(record, run_json, results).items():
         attempts = JobRecord.load(path).attempts if path.is_file() else []
         for attempt in attempts[-1:]:
             start = milliseconds(attempt.started)
             for seconds, *values in attempt.samples:
-                for what, value in zip(SAMPLES, values, strict=True):
+                for what, value in zip(SAMPLE_COLUMNS, values, strict=True):
                     if seconds is not None and value is not None:
-                        yield Point(f"usage/{stage}.{what}", value, round(seconds), start + round(1000 * seconds))
+                        yield Metric(f"usage/{stage}.{what}", value, start + round(1000 * seconds), round(seconds))
             totals = {
                 "peak_memory_mb": attempt.peak_memory_mb,
                 "peak_gpu_memory_mb": attempt.peak_gpu_memory_mb,
@@ -309,7 +280,7 @@ def _system_metrics(record: RunRecord, run_json: Path, results: Path) -> Iterato
             }
             for what, value in totals.items():
                 if value is not None:
-                    yield Point(f"usage/{stage}.{what}", value, 0, start)
+                    yield Metric(f"usage/{stage}.{what}", value, start, 0)
 
 
 def _jobs(record: RunRecord, run_json: Path, results: Path) -> dict[str, Path]:

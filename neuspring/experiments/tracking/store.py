@@ -37,12 +37,12 @@ ENVIRONMENT = {
 and a server that is away costs seconds. With MLflow's own defaults (7 retries of 120 s) it would cost minutes."""
 ARTIFACTS = "mlartifacts"
 PORTS = {"postgresql": 5432, "mysql": 3306, "mssql": 1433}
-AGAIN = "commit."
-"""Prefix of the tags that name further commits, or a later time, at which the same results were made."""
 VIEW = "scores"
 """Name of the view of the table of runs that has scores as columns; a tag of the experiment holds it, as its page would."""
-COLUMNS = [f"metrics.`{task}.{metric}`" for task in ("reconstruction", "future") for metric in ("chamfer", "track_error", "psnr")]
-PATIENCE = 600.0
+SCORE_COLUMNS = [
+    f"metrics.`{task}.{metric}`" for task in ("reconstruction", "future") for metric in ("chamfer", "track_error", "psnr")
+]
+LOCK_PATIENCE = 600.0
 """Seconds to wait for another process that logs the same record or creates the database."""
 
 
@@ -85,7 +85,7 @@ def page(results: Path, settings: Tracking) -> str:
         raise InputError(uri, "MLflow's index must be there", "no such file", f"Make it: {again}.")
     try:
         client, experiment = prepare(results, settings)
-        client.set_experiment_tag(experiment, f"mlflow.sharedViewState.{VIEW}", json.dumps({"selectedColumns": COLUMNS}))
+        client.set_experiment_tag(experiment, f"mlflow.sharedViewState.{VIEW}", json.dumps({"selectedColumns": SCORE_COLUMNS}))
         held = len(search(client, experiment, logged="complete"))
     except Exception as error:
         rule = "MLflow must be able to open it"
@@ -157,7 +157,7 @@ def lock_path(results: Path, name: str) -> Path:
     return results / ".locks" / f"{name}.lock"
 
 
-def lock(path: Path, timeout: float = PATIENCE) -> BaseFileLock:
+def lock(path: Path, timeout: float = LOCK_PATIENCE) -> BaseFileLock:
     """A lock that the kernel frees when its holder dies. Its file stays: removing it would let two processes hold it."""
     from filelock import FileLock
 
@@ -179,7 +179,7 @@ def _client(uri: str) -> MlflowClient:
 
 
 def _upgrade(uri: str) -> None:
-    """What `mlflow db upgrade` does, in this process: a command line would show the database's password to `ps`."""
+    """Upgrade as `mlflow db upgrade` does, in this process: a command line would show the database's password to `ps`."""
     _set_environment()
     from mlflow.db import upgrade
 

@@ -20,7 +20,7 @@ from neuspring.core.errors import InputError
 from neuspring.physics import stability
 from neuspring.physics.controllers import BEGINS, begins, waypoints
 from neuspring.twin.body import body_of
-from neuspring.twin.rollout import FAR, Diverged, initial_velocity
+from neuspring.twin.rollout import FAR_AWAY, Diverged, initial_velocity
 
 if TYPE_CHECKING:
     from neuspring.report.shown import Run
@@ -173,7 +173,7 @@ class Simulator:
         ends = (torch.tensor(np.asarray(values, np.float32)) for values in (begin, end))
         x, v = solver.forward(self._x, self._v, *ends)
         # NaN compares false.
-        if not bool((x.abs() < FAR).all()):
+        if not bool((x.abs() < FAR_AWAY).all()):
             raise Diverged(self.frame + 1, f"a node left the scene in frame {self.frame + 1}")
         if (now == BEGINS).any():
             grips.append((np.column_stack([self.hands, now]), self.positions.copy()))

@@ -91,7 +91,7 @@ v_x, c v_y, -ground_elasticity v_z), c = max(0, 1 - ground_friction (1 + ground_
         """The edges of the center line, then the springs of hands."""
         from neuspring.physics.rod_nodes import at_vertices
 
-        topology, rod = twin.topology, _rod(twin)
+        topology, rod = twin.topology, self.center_line(twin)
         points = len(topology.nodes) + len(topology.controllers)
         edges = points + np.arange(len(rod.lengths))
         return Lines(
@@ -109,23 +109,19 @@ v_x, c v_y, -ground_elasticity v_z), c = max(0, 1 - ground_friction (1 + ground_
 
     def node_stiffness(self, twin: Twin) -> np.ndarray:
         """EI / l^2 of each node's edge [N], N."""
-        return np.asarray(_edge_stiffness(_rod(twin))[_rod(twin).edge])
+        return np.asarray(_edge_stiffness(self.center_line(twin))[self.center_line(twin).edge])
 
     def mass_at(self, twin: Twin, node: int) -> float:
         """The two vertices of the node's edge."""
-        edge = _rod(twin).edge[node]
-        return float(_rod(twin).mass[edge : edge + 2].sum())
+        edge = self.center_line(twin).edge[node]
+        return float(self.center_line(twin).mass[edge : edge + 2].sum())
 
     def parts(self, twin: Twin) -> tuple[Artifact, ...]:
-        return (_rod(twin),)
+        return (self.center_line(twin),)
 
     def center_line(self, twin: Twin) -> Rod:
-        return _rod(twin)
-
-
-def _rod(twin: Twin) -> Rod:
-    assert twin.rod is not None
-    return twin.rod
+        assert twin.rod is not None
+        return twin.rod
 
 
 def _edge_stiffness(rod: Rod) -> np.ndarray:

@@ -16,7 +16,7 @@ from neuspring.extensions.exports.formats import npz
 from neuspring.extensions.exports.source import ExportSource, require_start
 from neuspring.physics.rod_nodes import radius_of
 from neuspring.twin.body import body_of
-from neuspring.twin.rollout import FAR
+from neuspring.twin.rollout import FAR_AWAY
 
 MODEL = "twin.xml"
 
@@ -74,7 +74,7 @@ def mjcf(source: ExportSource) -> str:
     for index, (ends, stiffness, length, dashpot, push) in enumerate(zip(*columns, strict=True)):
         force = text(float(stiffness) / float(length))
         # Between two lengths a tendon has no force.
-        free = text(length, FAR) if push else text(length)
+        free = text(length, FAR_AWAY) if push else text(length)
         law: dict[str, Any] = {"stiffness": force, "damping": text(dashpot), "springlength": free}
         tendon = ET.SubElement(tendons, "spatial", name=f"spring{index}", width=text(radius / 5), **law)
         for end in ends:

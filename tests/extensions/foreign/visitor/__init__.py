@@ -11,8 +11,8 @@ import numpy as np
 
 from neuspring.baselines import Baseline
 from neuspring.extensions.exports import Export
-from neuspring.intake.formats import CaptureFormat
-from neuspring.intake.moments import Series
+from neuspring.extensions.make_capture.formats import CaptureFormat
+from neuspring.extensions.make_capture.moments import Series
 from neuspring.report.blocks import Section, Text
 from neuspring.report.data import ReportSection
 from neuspring.scores.metrics import Metric

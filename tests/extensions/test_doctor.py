@@ -2,10 +2,10 @@
 
 from neuspring import config
 from neuspring.cli.main import main
-from neuspring.experiments import doctor
+from neuspring.extensions.doctor import machine as doctor
 
 
-def findings(tmp_path, **values) -> dict[str, doctor.Check]:
+def findings(tmp_path, **values) -> dict[str, doctor.MachineCheck]:
     settings = config.parse(config.Config, {"results": str(tmp_path), "device": "cpu"} | values, "test")
     return {finding.subject: finding for finding in doctor.examine(settings)}
 

@@ -3,16 +3,22 @@
 import dataclasses
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from neuspring import config
+from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
-from neuspring.experiments.tuning.space import Plan
+from neuspring.experiments.benchmark import Benchmark
+from neuspring.extensions.tuning import jobs
+from neuspring.extensions.tuning.space import Plan
 from neuspring.twin.field import SpringField
-from tests.support.sweeps import plan, report, settings, sweep, trials, work
+from tests.extensions.tuning.sweeps import plan, report, settings, sweep, trials, work
+from tests.support.project import config_with
 
+ROOT = Path(__file__).parents[3]
 RANGE = {"low": 1, "high": 2}
 
 
@@ -102,7 +108,7 @@ def test_settings_that_exclude_each_other_only_inside_their_ranges_fail_the_tria
 
 def test_a_plan_is_made_without_heavy_imports():
     heavy = ("torch", "warp", "mlflow", "matplotlib", "optuna")
-    code = f"import sys, neuspring.experiments.tuning.space; print([m for m in {heavy} if m in sys.modules])"
+    code = f"import sys, neuspring.extensions.tuning.space; print([m for m in {heavy} if m in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
 
 
@@ -122,3 +128,30 @@ def test_what_a_sweep_cannot_be_begun_with_is_refused(folder):
         work(folder, sweep(scenarios=["other"]))
     with pytest.raises(InputError, match=r"0 to tune\.workers - 1 = 0"):
         work(folder, sweep(), 1)
+
+
+def test_no_sweep_chooses_by_an_oracle():
+    values = {"study": "s", "method": "oracle_neuspring", "space": {"fit.learning_rate": {"low": 1e-4, "high": 1e-2}}, "seed": 0}
+    with pytest.raises(InputError, match="an oracle sees the future"):
+        Plan.of(config.Config(), config.parse(Tune, values, "x"), ROOT)
+
+
+@pytest.mark.parametrize("data", ["toy", "phystwin"])
+def test_the_shipped_sweep_is_valid(data):
+    values: dict = {}
+    for name in ("config", f"data/{data}", "studies/tune"):
+        config.merge(values, config.read_yaml(ROOT / "config" / f"{name}.yaml"))
+    parsed = config.parse(config.Config, values, "shipped")
+    assert Plan.of(parsed, parsed.tune, ROOT)
+
+
+def test_workers_on_several_machines_need_a_database_that_locks_across_them():
+    def check(cluster, **changes):
+        values = {"study": "rate", "method": "baseline", "workers": 2, "space": {"fit.learning_rate": {"low": 1e-4, "high": 1e-2}}}
+        jobs.check(Benchmark(config_with({"tune": values | changes}), ROOT), cluster=cluster)
+
+    check(False)
+    with pytest.raises(InputError, match="workers on several machines need storage"):
+        check(True)
+    check(True, storage="postgresql://me@host/studies")
+    check(True, workers=1)

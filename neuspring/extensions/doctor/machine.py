@@ -1,4 +1,4 @@
-"""What this machine can do: interpreter, libraries, devices, weights; and the next move where one is missing.
+"""The machine: interpreter, libraries, devices, weights; and the next move where one is missing.
 
 broken: the configuration needs it and it is missing. absent: it is missing and not needed.
 """
@@ -31,7 +31,7 @@ DOWNLOAD = "curl -L --create-dirs -o"
 
 
 @dataclass(frozen=True)
-class Check:
+class MachineCheck:
     """One line of the report."""
 
     subject: str
@@ -41,12 +41,12 @@ class Check:
     """The next move, where something is absent or broken."""
 
 
-def examine(settings: Config) -> list[Check]:
+def examine(settings: Config) -> list[MachineCheck]:
     """All checks, for what a configuration asks for."""
     return [*_libraries(settings), *_devices(settings), *_weights(settings)]
 
 
-def text(checks: list[Check]) -> str:
+def text(checks: list[MachineCheck]) -> str:
     """The report: a line each, its next move below it, and the verdict."""
     signs = {"ok": "ok     ", "absent": "absent ", "broken": "BROKEN "}
     width = max(len(check.subject) for check in checks)
@@ -60,15 +60,15 @@ def text(checks: list[Check]) -> str:
     return "\n".join([*lines, "", verdict])
 
 
-def _libraries(settings: Config) -> Iterator[Check]:
-    yield Check("Python", "ok", sys.version.split()[0])
+def _libraries(settings: Config) -> Iterator[MachineCheck]:
+    yield MachineCheck("Python", "ok", sys.version.split()[0])
     cuda = f"CUDA {torch.version.cuda}" if torch.version.cuda else "build for the CPU"
-    yield Check("torch", "ok", f"{torch.__version__}, {cuda}")
+    yield MachineCheck("torch", "ok", f"{torch.__version__}, {cuda}")
     for package in ("warp-lang", "snakemake", "mlflow", "optuna"):
         try:
-            yield Check(package, "ok", version(package))
+            yield MachineCheck(package, "ok", version(package))
         except PackageNotFoundError:
-            yield Check(package, "broken", "not installed", "make install")
+            yield MachineCheck(package, "broken", "not installed", "make install")
     segments = settings.perception.segment.backend == "grounded_sam2"
     wanted = {
         "gsplat": settings.images.backend == "gsplat",
@@ -78,29 +78,31 @@ def _libraries(settings: Config) -> Iterator[Check]:
     }
     for module, extra in EXTRAS.items():
         if importlib.util.find_spec(module):
-            yield Check(module, "ok", f"extra {extra}")
+            yield MachineCheck(module, "ok", f"extra {extra}")
         else:
-            yield Check(module, "broken" if wanted.get(module) else "absent", f"extra {extra} is not installed", install(extra))
+            yield MachineCheck(
+                module, "broken" if wanted.get(module) else "absent", f"extra {extra} is not installed", install(extra)
+            )
     if importlib.util.find_spec("av"):
         import av
 
         try:
             av.codec.Codec("libx264", "w")
-            yield Check("H.264 encoder", "ok", f"libx264, av {av.__version__}")
+            yield MachineCheck("H.264 encoder", "ok", f"libx264, av {av.__version__}")
         except (ValueError, LookupError) as error:
             remedy = "Install av from its wheel: .venv/bin/pip install --force-reinstall av"
-            yield Check("H.264 encoder", "broken", str(error), remedy)
+            yield MachineCheck("H.264 encoder", "broken", str(error), remedy)
 
 
-def _checked(subject: str, examined: Callable[[], str], remedy: str = "") -> Check:
-    """What `examined` says; broken where it raises InputError."""
+def _checked(subject: str, examined: Callable[[], str], remedy: str = "") -> MachineCheck:
+    """The text of `examined`; broken where it raises InputError."""
     try:
-        return Check(subject, "ok", examined())
+        return MachineCheck(subject, "ok", examined())
     except InputError as error:
-        return Check(subject, "broken", str(error), remedy)
+        return MachineCheck(subject, "broken", str(error), remedy)
 
 
-def _devices(settings: Config) -> Iterator[Check]:
+def _devices(settings: Config) -> Iterator[MachineCheck]:
     import warp as wp
 
     found = _checked("device", lambda: resolve_device(settings.device), "Set device: cpu, or install what the message names.")
@@ -109,14 +111,14 @@ def _devices(settings: Config) -> Iterator[Check]:
         return
     device = found.detail
     start_warp()
-    yield Check("Warp devices", "ok", ", ".join(str(one.alias) for one in wp.get_devices()))
+    yield MachineCheck("Warp devices", "ok", ", ".join(str(one.alias) for one in wp.get_devices()))
     leased = _checked("GPUs that jobs may lease", lambda: ", ".join(needs.gpu_pool(settings.gpus, settings.device)))
-    none = Check(leased.subject, "absent", "none: jobs run on the CPU", "Set gpus.devices, or CUDA_VISIBLE_DEVICES.")
+    none = MachineCheck(leased.subject, "absent", "none: jobs run on the CPU", "Set gpus.devices, or CUDA_VISIBLE_DEVICES.")
     yield leased if leased.detail else none
     yield _checked("rasterizer", lambda: choose_backend(settings.images.backend, device))
 
 
-def _weights(settings: Config) -> Iterator[Check]:
+def _weights(settings: Config) -> Iterator[MachineCheck]:
     from huggingface_hub import try_to_load_from_cache
 
     # Files that are known by their checksum.
@@ -135,12 +137,12 @@ def _weights(settings: Config) -> Iterator[Check]:
         try:
             place = find()
         except InputError as error:
-            yield Check(subject, "broken", str(error))
+            yield MachineCheck(subject, "broken", str(error))
             continue
         if isinstance(place, str):
-            yield Check(subject, "absent", f"{place}; what needs it is left out, and tables say so", remedy)
+            yield MachineCheck(subject, "absent", f"{place}; what needs it is left out, and tables say so", remedy)
         else:
-            yield Check(subject, "ok", "checksum is right")
+            yield MachineCheck(subject, "ok", "checksum is right")
     # Weights of perception, which their libraries keep in caches of their own.
     segment, track = settings.perception.segment, settings.perception.track
     for subject, name in {
@@ -151,11 +153,11 @@ def _weights(settings: Config) -> Iterator[Check]:
         wanted = segment.backend == "grounded_sam2" and not segment.grounded_sam2.download
         remedy = f".venv/bin/hf download {name}, or perception.segment.grounded_sam2.download: true"
         detail = name if there else f"{name} is not in the cache of the Hugging Face hub"
-        yield Check(subject, "ok" if there else "broken" if wanted else "absent", detail, remedy)
+        yield MachineCheck(subject, "ok" if there else "broken" if wanted else "absent", detail, remedy)
     code = sorted(Path(torch.hub.get_dir()).glob("facebookresearch_co-tracker_*"))
     there = bool(code) and (hub_folder() / WEIGHTS).is_file()
     wanted = track.backend == "cotracker3" and not track.cotracker3.download
     download = f"{DOWNLOAD} {hub_folder() / WEIGHTS} {WEIGHTS_URL}"
     remedy = f"perception.track.cotracker3.download: true (not for commercial use), or {download}"
     detail = WEIGHTS if there else "code or weights are not in the cache of torch.hub"
-    yield Check("CoTracker3", "ok" if there else "broken" if wanted else "absent", detail, remedy)
+    yield MachineCheck("CoTracker3", "ok" if there else "broken" if wanted else "absent", detail, remedy)

@@ -1,9 +1,9 @@
 """One worker of a sweep, a job of the workflow: it runs trials until the sweep has as many as configured.
 
-Workers share an Optuna study, in SQLite or PostgreSQL, so each may be on another GPU or machine. A worker asks for a trial under a
-lock in the sweep's folder, and only while fewer count than were asked for: Optuna's `MaxTrialsCallback` counts after a trial, when
-other workers have begun more. When a killed worker starts again, the trial that it left running is queued anew with its values, so
-that its fits continue from their checkpoints.
+Workers share an Optuna study, in SQLite or PostgreSQL, so each may be on another GPU or machine. Those that look at the count at
+the same time may make a trial more each than were asked for. When a killed worker starts again, the trial that it left is queued
+anew with its values, so that its fits continue from their checkpoints. (Optuna's own callback for that is experimental, and waits
+until a heartbeat is missed.)
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import math
 import socket
 import tempfile
 import warnings
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -37,19 +38,19 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_text
 from neuspring.core.records import RECORD_FORMAT, canonical, now
 from neuspring.core.run_record import flat
-from neuspring.experiments.tuning.space import Plan, holds, label, labels
-from neuspring.experiments.tuning.trial import Outcome, Scene, checkpoint, run
+from neuspring.extensions.tuning.space import Plan, holds, label, labels
+from neuspring.extensions.tuning.trial import TrainingScene, TrialOutcome, checkpoint, run
 
 DATABASE = "optuna.db"
 DEFINITION = "definition"
 """Attribute of the study: what must not change while it lasts."""
 ORIGIN, WORKER, REASON = "origin", "worker", "reason"
 """Attributes of a trial: the number of the one that it continues, its worker, why it ended early (unless it was left behind)."""
-FACTS, VALUES = "facts", "values"
+TRIAL_FACTS, VALUES = "facts", "values"
 """Attributes of a trial: how it went, and its values. The baseline's include those that the space cannot hold."""
 MOST_DEATHS = 5
 """A trial that ends its worker this often is not continued; another takes its place."""
-PATIENCE = 60.0
+WRITER_PATIENCE = 60.0
 """Seconds that SQLite waits for another writer."""
 
 
@@ -64,11 +65,11 @@ def study_of(folder: Path, tune: Tune, facts: Mapping[str, Any], pruner: BasePru
 
     Raises InputError if there is none, or if it was begun with other `facts`.
     """
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
     path, begun = folder / DATABASE, None
     uri = tune.storage or sqlalchemy.URL.create("sqlite", database=str(path.resolve())).render_as_string()
     # A server may close connections that are idle during a long fit.
-    engine = {"pool_pre_ping": True} if tune.storage else {"connect_args": {"timeout": PATIENCE}}
+    engine = {"pool_pre_ping": True} if tune.storage else {"connect_args": {"timeout": WRITER_PATIENCE}}
     # Several processes must not create the tables at once.
     with lock_of(folder):
         if pruner or tune.storage or path.is_file():
@@ -95,41 +96,45 @@ def study_of(folder: Path, tune: Tune, facts: Mapping[str, Any], pruner: BasePru
     return study
 
 
-def origin(trial: FrozenTrial | Trial) -> int:
+def origin(trial: FrozenTrial) -> int:
     """The number of the trial that it continues; its own if none. Trial 0 is the baseline."""
     return int(trial.user_attrs.get(ORIGIN, trial.number))
 
 
 def counted(study: Study) -> list[FrozenTrial]:
-    """The trials that count, by origin: finished, pruned and running ones, and those that failed by their settings."""
-    there = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.RUNNING)
-    return sorted((t for t in study.get_trials(deepcopy=False) if t.state in there or REASON in t.user_attrs), key=origin)
+    """The trials that count, by origin: finished, pruned, running, failed by their settings, or to be continued."""
+    trials = study.get_trials(deepcopy=False)
+
+    def counts(trial: FrozenTrial) -> bool:
+        # One that runs and has no worker was begun at this moment, or by a process that died at that moment.
+        running = trial.state == TrialState.RUNNING and WORKER in trial.user_attrs
+        return running or trial.state in (TrialState.COMPLETE, TrialState.PRUNED) or REASON in trial.user_attrs
+
+    return sorted([*filter(counts, trials), *_left(trials)], key=origin)
 
 
-def claim(study: Study, worker: int, tune: Tune, first: Mapping[str, Any], sampler: Callable[[int], BaseSampler]) -> Trial | None:
-    """A trial to run, None if there are enough. `first` are the values of the baseline; the n-th that counts has its `sampler`.
+def _left(trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
+    """Trials that ended with their worker, which none continues yet; not those that did so too often."""
+    newest, times = {origin(trial): trial for trial in trials}, Counter(map(origin, trials))
+    ended = [trial for trial in newest.values() if trial.state == TrialState.FAIL and REASON not in trial.user_attrs]
+    return [trial for trial in ended if times[origin(trial)] < MOST_DEATHS]
 
-    The caller holds the sweep's lock, is the only process that is `worker`, and runs no other trial.
+
+def continue_left(study: Study, worker: int, tune: Tune, first: Mapping[str, Any]) -> None:
+    """Queue anew the trials that earlier processes of this worker left, or workers that the configuration no longer has.
+
+    `first` are the values of the baseline.
     """
-    begun = study.get_trials(deepcopy=False)
-    for left in begun:
-        owner = left.user_attrs.get(WORKER)
-        # Left behind by this worker's earlier process; by a process killed under this lock, before it named its worker; or by a
-        # worker that the configuration no longer has.
-        if left.state == TrialState.RUNNING and (owner in (None, worker) or owner >= tune.workers):
-            if sum(origin(trial) == origin(left) for trial in begun) < MOST_DEATHS:
-                values = (dict(first) if origin(left) == 0 else {}) | left.params
-                study.enqueue_trial(values, user_attrs={ORIGIN: origin(left)})
-            study.tell(left.number, state=TrialState.FAIL)
-    if not begun:
-        study.enqueue_trial(dict(first))
-    count = len(counted(study))
-    if count >= tune.trials and not study.get_trials(deepcopy=False, states=(TrialState.WAITING,)):
-        return None
-    study.sampler = sampler(count)
-    trial = study.ask()
-    trial.set_user_attr(WORKER, worker)
-    return trial
+
+    def concerns(trial: FrozenTrial) -> bool:
+        owner = trial.user_attrs.get(WORKER, worker if tune.workers == 1 else -1)
+        return bool(owner == worker or owner >= tune.workers)
+
+    for trial in filter(concerns, study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))):
+        study.tell(trial.number, state=TrialState.FAIL)
+    for trial in filter(concerns, _left(study.get_trials(deepcopy=False))):
+        values = (dict(first) if origin(trial) == 0 else {}) | trial.params
+        study.enqueue_trial(values, user_attrs={ORIGIN: origin(trial)})
 
 
 def sampler_of(tune: Tune, count: int, *, grouped: bool) -> BaseSampler:
@@ -148,7 +153,7 @@ class MedianOfStep(BasePruner):
         self._inner = MedianPruner(n_startup_trials=max(tune.startup_trials, 1), n_warmup_steps=warmup)
 
     def prune(self, study: Study, trial: FrozenTrial) -> bool:
-        """Whether the trial is above the median of completed ones at its last step."""
+        """True where the trial is above the median of completed ones at its last step."""
         if trial.last_step is None:
             return False
         last = copy.copy(trial)
@@ -197,7 +202,7 @@ def work(
     if not 0 <= worker < tune.workers:
         raise InputError("--worker", f"0 to tune.workers - 1 = {tune.workers - 1} is required", worker)
     plan, folder, device = Plan.of(settings, tune, root), output.parent, resolve_device(device)
-    scenes = [Scene.of(path, plan.base["fit"]["tail_fraction"], folder / "frames") for path in observations]
+    scenes = [TrainingScene.of(path, plan.base["fit"]["tail_fraction"], folder / "frames") for path in observations]
     required, names = list(tune.scenarios or settings.scenarios), [scene.name for scene in scenes]
     if names != required:
         raise InputError("--observations", f"those of {', '.join(required)} are required", ", ".join(names))
@@ -206,16 +211,26 @@ def work(
     facts = plan.facts() | {"frames": {scene.name: scene.digest for scene in scenes}}
     study = study_of(folder, tune, facts, pruner_of(tune, len(scenes), plan.epochs))
     finished: list[int] = []
+
+    def objective(trial: Trial) -> float:
+        trial.set_user_attr(WORKER, worker)
+        number = origin(study.get_trials(deepcopy=False)[trial.number])
+        return _attempt(trial, number, plan, scenes, folder, device)
+
+    def told(study: Study, trial: FrozenTrial) -> None:
+        finished.append(origin(trial))
+        words = {TrialState.COMPLETE: "{:.3e} m^2", TrialState.PRUNED: "pruned at {1}", TrialState.FAIL: "failed: {1}"}
+        done(finished[-1], words[trial.state].format(trial.value, trial.user_attrs.get(REASON)))
+
     try:
         with FileLock(folder / f".worker-{worker}.lock", timeout=0):
-            while True:
-                with lock_of(folder):
-                    trial = claim(study, worker, tune, first, sampler)
-                if trial is None:
-                    break
-                outcome = _attempt(study, trial, plan, scenes, folder, device)
-                finished.append(origin(trial))
-                done(finished[-1], outcome)
+            continue_left(study, worker, tune, first)
+            if not study.get_trials(deepcopy=False):
+                study.enqueue_trial(first, skip_if_exists=True)
+            waiting = (TrialState.WAITING,)
+            while (count := len(counted(study))) < tune.trials or study.get_trials(deepcopy=False, states=waiting):
+                study.sampler = sampler(count)
+                study.optimize(objective, n_trials=1, catch=(NumericalFailure, InputError), callbacks=[told])
     except Timeout as error:
         rule = "one process at a time may be this worker"
         raise InputError("--worker", rule, worker, "Wait for the other one to end.") from error
@@ -224,45 +239,35 @@ def work(
     write_text(output, json.dumps(content, indent=1, sort_keys=True) + "\n")
 
 
-def _attempt(study: Study, trial: Trial, plan: Plan, scenes: Sequence[Scene], folder: Path, device: str) -> str:
-    """Run a trial and tell Optuna how it ended; returns that as text. Raises errors that say nothing about its settings."""
-    number, started = origin(trial), now()
-    outcome = Outcome()
+def _attempt(trial: Trial, number: int, plan: Plan, scenes: Sequence[TrainingScene], folder: Path, device: str) -> float:
+    """Run a trial: its value. Raises what Optuna takes as pruned or failed, and errors that say nothing about its settings."""
+    started, outcome = now(), TrialOutcome()
 
     def report(step: int, loss: float, what: str) -> None:
         trial.report(loss, step)
         if trial.should_prune():
             raise optuna.TrialPruned(f"{what}: {loss:.3e} m^2")
 
-    def tell(state: TrialState, value: float | None = None, reason: str = "") -> None:
-        facts = {"started": started, "ended": now(), "losses": outcome.losses, "seconds": outcome.seconds, "device": device}
-        codes = provenance.code_digest("neuspring.twin.fit", "neuspring.twin.search")
-        trial.set_user_attr(FACTS, facts | {"commit": provenance.commit(), "code": codes})
-        if reason:
-            trial.set_user_attr(REASON, reason)
-        study.tell(trial, value, state=state)
-        for scene in scenes:
-            checkpoint(folder, number, scene.name).unlink(missing_ok=True)
-
     try:
-        values = _values(trial, plan)
-        run(plan, values, scenes, folder, number, device, report, outcome)
-        tell(TrialState.COMPLETE, outcome.value)
-        return f"{outcome.value:.3e} m^2"
-    except optuna.TrialPruned as cut:
-        tell(TrialState.PRUNED, reason=str(cut))
-        return f"pruned at {cut}"
-    except (NumericalFailure, InputError) as failure:
+        run(plan, _values(trial, number, plan), scenes, folder, number, device, report, outcome)
+    except (optuna.TrialPruned, NumericalFailure, InputError) as error:
         # A folder that cannot be written is no fault of these settings.
         tempfile.TemporaryFile(dir=folder).close()
-        tell(TrialState.FAIL, reason=str(failure))
-        return f"failed: {failure}"
+        trial.set_user_attr(REASON, str(error))
+        raise
+    finally:
+        facts = {"started": started, "ended": now(), "losses": outcome.losses, "seconds": outcome.seconds, "device": device}
+        codes = provenance.code_digest("neuspring.twin.fit", "neuspring.twin.search")
+        trial.set_user_attr(TRIAL_FACTS, facts | {"commit": provenance.commit(), "code": codes})
+    for scene in scenes:
+        checkpoint(folder, number, scene.name).unlink(missing_ok=True)
+    return outcome.value
 
 
-def _values(trial: Trial, plan: Plan) -> dict[str, Any]:
+def _values(trial: Trial, number: int, plan: Plan) -> dict[str, Any]:
     """Setting -> value of a trial; trial 0 is the baseline, whatever the space."""
     space = plan.tune.space
-    if origin(trial) == 0:
+    if number == 0:
         values = plan.baseline
         for name, value in values.items():
             if holds(space[name], value):

@@ -7,11 +7,11 @@ import pytest
 
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.records import StageRecord
-from neuspring.experiments.tuning import trial, worker
-from neuspring.experiments.tuning.report import state
+from neuspring.extensions.tuning import trial, worker
+from neuspring.extensions.tuning.report import state
 from neuspring.twin.fit import FitProblem, TwinFit, fit, tail_start
+from tests.extensions.tuning.sweeps import furnish, report, results_of, settings, sweep, trials, work
 from tests.support import small
-from tests.support.sweeps import furnish, report, results_of, settings, sweep, trials, work
 
 
 def test_no_test_frame_changes_any_trial(tmp_path, finished):
@@ -30,7 +30,7 @@ def test_the_search_does_not_see_the_tail(tmp_path):
     heads = []
     for name, observations in {"as": scene, "changed": dataclasses.replace(scene, object_points=points)}.items():
         observations.save(tmp_path / f"{name}.npz")
-        made = trial.Scene.of(tmp_path / f"{name}.npz", 0.4, tmp_path / name)
+        made = trial.TrainingScene.of(tmp_path / f"{name}.npz", 0.4, tmp_path / name)
         heads.append(made.head.read_bytes())
         assert len(Observations.load(made.head).object_points) == end < scene.scenario.train_end
         assert len(made.training.object_points) == scene.scenario.train_end < scene.scenario.frame_count
@@ -60,8 +60,8 @@ def test_a_trial_is_judged_by_the_twin_that_the_method_would_choose(folder, meth
         return
     result = fit(problem)
     by_training = result.history["tail_loss"][result.history["loss"].argmin()]
-    assert value == (result.best_loss if selection == "tail" else by_training)
-    assert result.best_loss != by_training, "the two rules choose different twins, or this test could not tell them apart"
+    assert value == (result.facts["best_loss"] if selection == "tail" else by_training)
+    assert result.facts["best_loss"] != by_training, "the two rules choose different twins, or this test could not tell them apart"
 
 
 def test_hopeless_trials_are_pruned_before_their_last_epoch(folder):

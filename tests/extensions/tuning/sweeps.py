@@ -14,11 +14,11 @@ from optuna.trial import FrozenTrial
 from neuspring import config
 from neuspring.config.tuning import Tune
 from neuspring.core.artifacts import Observations
-from neuspring.experiments.tuning import report as tuning_report
-from neuspring.experiments.tuning import worker
-from neuspring.experiments.tuning.report import state
-from neuspring.experiments.tuning.space import Plan
-from neuspring.experiments.tuning.worker import counted, origin, study_of
+from neuspring.extensions.tuning import report as tuning_report
+from neuspring.extensions.tuning import worker
+from neuspring.extensions.tuning.report import state
+from neuspring.extensions.tuning.space import Plan
+from neuspring.extensions.tuning.worker import counted, origin, study_of
 from tests.support import small
 
 OBSERVATIONS = "observations.npz"

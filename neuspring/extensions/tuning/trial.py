@@ -28,7 +28,7 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_text
 from neuspring.core.provenance import code_digest
 from neuspring.core.records import StageRecord, canonical, digest_file
-from neuspring.experiments.tuning.space import Plan
+from neuspring.extensions.tuning.space import Plan
 from neuspring.stages.search import search as search_stage
 from neuspring.twin.fit import RELEASED_CHECKPOINT_EPOCHS, FitProblem, NonFinite, TwinFit, fit, tail_start
 
@@ -37,7 +37,7 @@ Report = Callable[[int, float, str], None]
 
 
 @dataclass(frozen=True)
-class Scene:
+class TrainingScene:
     """A scenario's training frames, and the file of those before its tail."""
 
     name: str
@@ -45,7 +45,7 @@ class Scene:
     head: Path
 
     @classmethod
-    def of(cls, path: Path, tail_fraction: float, folder: Path) -> Scene:
+    def of(cls, path: Path, tail_fraction: float, folder: Path) -> TrainingScene:
         """Read observations; the frames before the tail are written to `folder`. Raises InputError."""
         observations = Observations.load(path)
         scenario = observations.scenario
@@ -74,7 +74,7 @@ def cut(observations: Observations, end: int) -> Observations:
 
 
 @dataclass
-class Outcome:
+class TrialOutcome:
     """Results of a trial so far."""
 
     losses: dict[str, float] = field(default_factory=dict)
@@ -100,12 +100,12 @@ class Outcome:
 def run(
     plan: Plan,
     values: Mapping[str, Any],
-    scenes: Sequence[Scene],
+    scenes: Sequence[TrainingScene],
     folder: Path,
     number: int,
     device: str,
     report: Report,
-    outcome: Outcome,
+    outcome: TrialOutcome,
 ) -> None:
     """Search and fit every scenario with a trial's values; `outcome` receives the results.
 
@@ -151,7 +151,7 @@ def run(
         outcome.losses[scene.name] = loss
 
 
-def searched(scene: Scene, settings: Config, clusters: int, seed: int, device: str, folder: Path) -> Path:
+def searched(scene: TrainingScene, settings: Config, clusters: int, seed: int, device: str, folder: Path) -> Path:
     """The record of a search on the frames before the tail. The first trial that needs the search makes it."""
     from filelock import FileLock
 
@@ -212,7 +212,7 @@ def _fitted(problem: FitProblem, settings: Config, partial: Path, key: str, repo
     see(result.history.to_dict("records"))  # type: ignore[arg-type]
     if by == "tail_loss":
         # The start may be best.
-        return result.best_loss
+        return result.facts["best_loss"]
     if not math.isfinite(selected):
-        raise NumericalFailure(f"no epoch with a finite loss over the tail; rolled back: {'; '.join(result.rollbacks)}")
+        raise NumericalFailure(f"no epoch with a finite loss over the tail; rolled back: {'; '.join(result.facts['rollbacks'])}")
     return selected

@@ -1,4 +1,4 @@
-"""What a sweep varies: settings of one method and of its search, checked before the first trial.
+"""The space of a sweep: settings of one method and of its search, checked before the first trial.
 
 The baseline is the configuration with the settings of the method's row and of its search row on top. A trial puts its values on top
 of that. Nothing heavy is imported: the workflow makes a plan before any job exists.
@@ -26,7 +26,7 @@ from neuspring.experiments.benchmark import read_methods, read_searches, with_me
 from neuspring.twin.body import BODIES
 
 SECTIONS = ("simulation", "losses", "search", "fit", "released_quirks")
-"""What a trial reads; observations are made before."""
+"""Sections that a trial reads; observations are made before."""
 CLUSTERS = "clusters"
 # The acceleration term guides the search alone; the objective is the loss of a fit.
 _WEIGHTS = tuple(f"losses.{term.name}" for term in dataclasses.fields(config.Losses) if term.name != "acceleration")
@@ -101,12 +101,12 @@ class Plan:
         return int(most) if self.method.fit else 1
 
     def facts(self) -> dict[str, Any]:
-        """What must not change while a sweep lasts, as plain values."""
+        """Facts that must not change while a sweep lasts, as plain values."""
         space = {name: config.plain(dimension) for name, dimension in self.tune.space.items()}
         return {"method": self.tune.method, "fit": self.method.fit, "base": self.base, "space": space, "seed": self.tune.seed}
 
     def is_whole(self, name: str) -> bool:
-        """Whether a setting takes whole numbers only."""
+        """True where a setting takes whole numbers only."""
         value, dimension = self.baseline[name], self.tune.space[name]
         # A word (auto) may stand where a whole number can, null where any number can.
         return isinstance(value, int) or (
@@ -160,7 +160,7 @@ def labels(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def holds(dimension: Dimension, value: Any) -> bool:
-    """Whether a dimension can take a value."""
+    """True where a dimension can take a value."""
     if dimension.choices:
         return value in dimension.choices
     if isinstance(value, bool) or not isinstance(value, int | float):

@@ -8,8 +8,8 @@ import pandas as pd
 
 from neuspring import config
 from neuspring.experiments import benchmark
-from neuspring.experiments.tuning.report import state
-from tests.support.sweeps import BASE, report, settings, sweep, trials, work
+from neuspring.extensions.tuning.report import state
+from tests.extensions.tuning.sweeps import BASE, report, settings, sweep, trials, work
 
 
 def test_trial_0_is_the_unchanged_configuration_and_all_values_lie_in_the_space(finished):
@@ -48,7 +48,7 @@ def test_the_best_overlay_makes_the_best_trial_a_method_row(finished):
     folder, tune = finished
     values = BASE | {"scenarios": ["toy_rope_lift_smooth"], "methods": ["search_only"]}
     config.merge(values, config.read_yaml(folder / "best.yaml"))
-    bench = benchmark.Benchmark(values, Path(__file__).parents[2])
+    bench = benchmark.Benchmark(values, Path(__file__).parents[3])
     by_number = trials(folder, tune)
     best = min(by_number.values(), key=lambda one: one.value)
     tuned = benchmark.with_method(bench.config, bench.methods["baseline_small"], "baseline_small").fit

@@ -1,0 +1,1 @@
+"""Sweeps: Optuna studies over settings of one method."""

@@ -1,0 +1,35 @@
+"""Answers to the workflow's rules of a sweep."""
+
+from __future__ import annotations
+
+import json
+
+from neuspring.config import plain
+from neuspring.config.settings import select
+from neuspring.core.errors import InputError
+from neuspring.experiments.benchmark import Benchmark
+from neuspring.extensions.tuning.space import Plan
+
+
+def check(benchmark: Benchmark, *, cluster: bool) -> None:
+    """Raise InputError for a sweep that cannot be run, before any job exists."""
+    tune = benchmark.config.tune
+    assert tune
+    Plan.of(benchmark.config, tune, benchmark.root)
+    if cluster and tune.workers > 1 and tune.storage is None:
+        rule = "workers on several machines need storage: postgresql://...; SQLite is for those of one machine"
+        raise InputError("configuration, tune.storage", rule, None, "Name a PostgreSQL database, or use workers: 1.")
+
+
+def settings(benchmark: Benchmark) -> str:
+    """Settings of a sweep's workers, as JSON; its tables of methods and searches are found wherever a job runs."""
+    values = select(benchmark.config, ("simulation", "losses", "search", "fit", "released_quirks", "tune"))
+    tables = {name: str(benchmark.root / getattr(benchmark.config, name)) for name in ("method_table", "search_table")}
+    return json.dumps(values | tables | {"scenarios": list(benchmark.whole.scenarios)}, sort_keys=True)
+
+
+def rows(benchmark: Benchmark) -> str:
+    """The rows of the method that is varied, so that changed ones are tuned again."""
+    assert benchmark.config.tune
+    plan = Plan.of(benchmark.config, benchmark.config.tune, benchmark.root)
+    return json.dumps([plain(plan.method), plain(plan.row)], sort_keys=True)
