@@ -192,8 +192,9 @@ TERMS: Registry[Any] = Registry(
 
 
 def code(*bodies: str) -> tuple[str, ...]:
-    """Modules of some bodies, or of all, and of the loss: for digests of what treats their twins."""
-    return tuple(dict.fromkeys([BODIES.module_of(name) for name in bodies or BODIES] + [TERMS.module_of(name) for name in TERMS]))
+    """Modules of some bodies, or of all, and of loss terms of packages: for digests of what treats their twins."""
+    modules = [*map(BODIES.module_of, bodies or BODIES), *map(TERMS.module_of, TERMS)]
+    return tuple(dict.fromkeys(name for name in modules if name != "neuspring.twin.losses"))
 
 
 def body_of(twin: Twin) -> Body:

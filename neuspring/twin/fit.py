@@ -259,8 +259,8 @@ class TwinFit:
             self.optimizer.zero_grad(set_to_none=True)
             packed = self.stable_parameters()
             # None where a window is one frame, as released.
-            limited, time = factor is not None and self.horizon > 1, self.twin.simulation.frame_time
-            limit = AdjointLimit(factor, time) if limited else None
+            time = self.twin.simulation.frame_time
+            limit = AdjointLimit(factor, time) if factor is not None and self.horizon > 1 else None
             state, mean = self._simulate(state, window, packed, limit)
             if not bool(torch.isfinite(mean)):
                 raise NonFinite(f"the loss is not finite in frames {window.start} to {window.stop - 1}")

@@ -21,7 +21,7 @@ import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch.nn.functional import grid_sample, smooth_l1_loss
@@ -207,7 +207,8 @@ ASSIGNED: dict[str, Callable[[FrameLoss, int, torch.Tensor], torch.Tensor]] = {
 def moved(evidence: Evidence, device: str, dtype: torch.dtype) -> Evidence:
     """The same tensors on another device, those of real numbers in another precision."""
     tensors = {name: value for name, value in vars(evidence).items() if isinstance(value, torch.Tensor)}
-    return replace(evidence, **{name: t.to(device, dtype if t.is_floating_point() else t.dtype) for name, t in tensors.items()})
+    changed: dict[str, Any] = {n: t.to(device, dtype if t.is_floating_point() else t.dtype) for n, t in tensors.items()}
+    return replace(evidence, **changed)
 
 
 @dataclass(frozen=True)
@@ -235,10 +236,10 @@ class ImageEvidence:
         if image is None:
             return None
         pose = torch.linalg.inv(torch.tensor(image.camera_to_world, dtype=torch.float64))
-        kept = {
+        kept: dict[str, Any] = {
             name: torch.tensor(getattr(image, name)[: len(image.inside)]) for name in ("pixels", "visible", "inside", "outside")
         }
-        known = {"intrinsics": torch.tensor(image.intrinsics), "cell": image.cell, "size": image.pixel_size}
+        known: dict[str, Any] = {"intrinsics": torch.tensor(image.intrinsics), "cell": image.cell, "size": image.pixel_size}
         return moved(cls(world_to_camera=pose, **kept, **known), device, dtype)
 
     def project(self, x: torch.Tensor) -> torch.Tensor:

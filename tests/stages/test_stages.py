@@ -305,7 +305,7 @@ def test_only_a_body_that_can_meet_itself_is_predicted_with_more_substeps(tmp_pa
 
 def test_a_diverging_rollout_is_a_result(tmp_path, finished, monkeypatch):
     folder, _, _ = finished
-    monkeypatch.setattr("neuspring.twin.rollout.FAR", 0.5)  # the rope's far end lies at 0.6 m
+    monkeypatch.setattr("neuspring.twin.rollout.FAR_AWAY", 0.5)  # the rope's far end lies at 0.6 m
     found = folder / "small" / "search-uniform" / "0" / "search.json"
     rollout(observations=folder / "small" / "observations.npz", learned=found, device="cpu", output=tmp_path / "rollout.json")
     record = StageRecord.load(tmp_path / "rollout.json")

@@ -212,7 +212,7 @@ def _fitted(problem: FitProblem, settings: Config, partial: Path, key: str, repo
     see(result.history.to_dict("records"))  # type: ignore[arg-type]
     if by == "tail_loss":
         # The start may be best.
-        return result.facts["best_loss"]
+        return float(result.facts["best_loss"])
     if not math.isfinite(selected):
         raise NumericalFailure(f"no epoch with a finite loss over the tail; rolled back: {'; '.join(result.facts['rollbacks'])}")
     return selected
