@@ -9,8 +9,8 @@ from neuspring.core import provenance
 
 PACKAGE = Path(provenance.__file__).parents[1]
 FLOORS = (
-    "extensions > cli > experiments > stages > report > scores baselines > splats perception > scenes > intake > checks > data > "
-    "twin > physics config > core"
+    "extensions > cli > experiments > stages > report > draw > scores baselines > splats perception > scenes > intake > checks > "
+    "data > twin > physics config > core"
 )
 LIGHT = (
     "",

@@ -17,12 +17,12 @@ import pandas as pd
 from neuspring.core.artifacts import Observations
 from neuspring.core.files import read_npz, write_text
 from neuspring.core.table import LATEX_PREAMBLE, Cell, Table
+from neuspring.draw.benchmark import growth_figure
+from neuspring.draw.film import write_film
+from neuspring.draw.painter import DrawingStyle, Painter
+from neuspring.draw.scene import ShownRun, ShownScene
+from neuspring.draw.sheet import save
 from neuspring.report.blocks import Block, Items, markdown
-from neuspring.report.draw.benchmark import growth_figure
-from neuspring.report.draw.film import write_film
-from neuspring.report.draw.painter import DrawingStyle, Painter
-from neuspring.report.draw.scene import ShownRun, ShownScene
-from neuspring.report.draw.sheet import save
 from neuspring.scores.clips import CLIP_FACTS, ClipNumbers
 from neuspring.scores.metrics import DASH
 from neuspring.scores.paper import TAGS

@@ -19,9 +19,9 @@ import pandas as pd
 
 from neuspring.core.files import write_text
 from neuspring.core.table import LATEX_PREAMBLE, Cell, Table
+from neuspring.draw.benchmark import cluster_methods, clusters_figure
+from neuspring.draw.sheet import save
 from neuspring.report.blocks import Block, Fold, Text, markdown
-from neuspring.report.draw.benchmark import cluster_methods, clusters_figure
-from neuspring.report.draw.sheet import save
 from neuspring.report.grid import Columns, Show, between, chip, grouped, rows
 from neuspring.report.summary import failure_table, not_counted, settings_table
 from neuspring.scores import paper

@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 
 from neuspring.core.files import write_text
 from neuspring.core.table import Cell, Table
+from neuspring.draw.benchmark import cluster_methods, clusters_figure, ratios_figure
+from neuspring.draw.sheet import save
 from neuspring.report.blocks import Block, Fold, Items, Text, markdown
-from neuspring.report.draw.benchmark import cluster_methods, clusters_figure, ratios_figure
-from neuspring.report.draw.sheet import save
 from neuspring.report.grid import EMPTY, Columns, best, between, by_method, chip, columns, flat, grouped, rows
 from neuspring.report.notes import honest_notes
 from neuspring.report.verdict import NOUNS, verdict

@@ -59,7 +59,7 @@ def appearance(
 
     from neuspring.core.files import write_table
     from neuspring.data.results import masks_of_cameras
-    from neuspring.report.draw import images as figures
+    from neuspring.draw import images as figures
     from neuspring.splats.draw import orbit_view, picture
     from neuspring.splats.model import Gaussians
     from neuspring.splats.rasterize import choose_backend

@@ -65,9 +65,9 @@ def render(
     from neuspring.core.files import write_table
     from neuspring.core.text import Progress
     from neuspring.data.results import masks_of_cameras
-    from neuspring.report.draw import images as figures
-    from neuspring.report.draw.scene import chosen_frames
-    from neuspring.report.video import Video
+    from neuspring.draw import images as figures
+    from neuspring.draw.scene import chosen_frames
+    from neuspring.draw.video import Video
     from neuspring.scores.lpips import Lpips
     from neuspring.scores.pictures import Scored, picture_scores
     from neuspring.splats.draw import orbit_view

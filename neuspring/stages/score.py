@@ -83,7 +83,7 @@ def score(
     import pandas as pd
 
     from neuspring.core.files import write_table
-    from neuspring.report.draw import run as figures
+    from neuspring.draw import run as figures
     from neuspring.scores import metrics
 
     began, folder = time.perf_counter(), output.parent

@@ -71,7 +71,7 @@ def test_the_code_of_a_stage_itself_counts(copy):
     [
         ("splats/draw.py", "OBJECT_COVERAGE = 128", "OBJECT_COVERAGE = 200"),
         ("scores/lpips.py", "SHIFT = (-0.030", "SHIFT = (-0.031"),
-        ("report/video.py", "quality: int = 20", "quality: int = 21"),
+        ("draw/video.py", "quality: int = 20", "quality: int = 21"),
         ("stages/render.py", 'VIDEOS = ("video", "turntable")', 'VIDEOS = ("turntable", "video")'),
         ("data/capture.py", "[..., ::-1]", "[..., ::1]"),
     ],

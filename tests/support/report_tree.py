@@ -20,7 +20,7 @@ from neuspring.core.artifacts import Observations, Scenario, Trajectory
 from neuspring.core.files import write_table, write_text
 from neuspring.core.job_records import Attempt, JobRecord
 from neuspring.core.records import StageRecord, digest_file
-from neuspring.report.video import Video
+from neuspring.draw.video import Video
 from neuspring.scores.metrics import METRICS, SCORE_COLUMNS
 from tests.support.runs import run_record
 

@@ -11,8 +11,8 @@ from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations
 from neuspring.data.camera import CameraEntry
 from neuspring.data.capture import HANDS, OBJECT, Capture, Description, Writer
+from neuspring.draw.scene import broad_side, seen_from, shown_points
 from neuspring.extensions.figures.filmed import FilmedScene, PhotoPainter, PhotoStyle, SplatRun
-from neuspring.report.draw.scene import broad_side, seen_from, shown_points
 from neuspring.report.shown import find
 from neuspring.splats.draw import OBJECT_COVERAGE, picture, view_of
 from tests.support.filmed import rows

@@ -17,14 +17,14 @@ from neuspring.core.records import StageRecord
 from neuspring.data.camera import Camera
 from neuspring.data.capture import Capture
 from neuspring.data.results import Masks
+from neuspring.draw import sheet
+from neuspring.draw.film import write_film
+from neuspring.draw.painter import DRAWN_MM, Error, distances
+from neuspring.draw.scene import VIEW_ELEVATION, broad_side, chosen_frames, seen_from, shown_points
+from neuspring.draw.strip import strip_figure
+from neuspring.draw.twin import twin_figure
 from neuspring.extensions.figures.filmed import FilmedScene, PhotoPainter, PhotoStyle, SplatRun, Style, SurfacePicture
 from neuspring.extensions.figures.options import ComparedOptions, FilmOptions, RunOptions, StripOptions, TwinOptions
-from neuspring.report.draw import sheet
-from neuspring.report.draw.film import write_film
-from neuspring.report.draw.painter import DRAWN_MM, Error, distances
-from neuspring.report.draw.scene import VIEW_ELEVATION, broad_side, chosen_frames, seen_from, shown_points
-from neuspring.report.draw.strip import strip_figure
-from neuspring.report.draw.twin import twin_figure
 from neuspring.report.shown import Found, Run, find
 
 PICTURE_ENDINGS, FILM_ENDINGS = (".pdf", ".png", ".jpg", ".svg"), (".mp4", ".gif")

@@ -17,9 +17,9 @@ from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations
 from neuspring.data.camera import Camera
 from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture
-from neuspring.report.draw.painter import ERROR_COLORS, DrawingStyle, Painter, empty, hands
-from neuspring.report.draw.scene import ShownRun, ShownScene, box_around, shown_points
-from neuspring.report.draw.twin import Quantity, TwinPicture
+from neuspring.draw.painter import ERROR_COLORS, DrawingStyle, Painter, empty, hands
+from neuspring.draw.scene import ShownRun, ShownScene, box_around, shown_points
+from neuspring.draw.twin import Quantity, TwinPicture
 from neuspring.scores.pictures import Pair, psnr
 from neuspring.splats.draw import OBJECT_COVERAGE, frames_from_centers, picture, skinned_frames, view_of
 from neuspring.splats.model import Gaussians, Splats

@@ -11,7 +11,7 @@ from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
 from neuspring.core.artifacts import Twin
-from neuspring.report.draw.twin import STIFFNESS_COLORS, region_colors, stiffness_limits
+from neuspring.draw.twin import STIFFNESS_COLORS, region_colors, stiffness_limits
 from neuspring.twin.body import Lines, lines_of
 
 QUANTITIES = ("stiffness", "strain", "force", "region")

@@ -17,8 +17,8 @@ from trimesh.visual.material import PBRMaterial
 from neuspring.core.artifacts import Observations, SplatCenters, Twin
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
+from neuspring.draw.sheet import sample
 from neuspring.extensions.play.colors import OVER_COLOR, Scale, Springs, linear, node_colors
-from neuspring.report.draw.sheet import sample
 from neuspring.splats.model import Splats
 from neuspring.splats.skinning import Skin
 from neuspring.splats.view import C0

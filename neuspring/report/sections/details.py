@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import io
 
+from neuspring.draw.sheet import DPI
 from neuspring.report.blocks import Block, PageSection
 from neuspring.report.data import ReportData, ReportSection, embedded
-from neuspring.report.draw.sheet import DPI
 from neuspring.report.summary import detail_blocks, figures
 
 

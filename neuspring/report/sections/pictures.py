@@ -14,9 +14,9 @@ from PIL import Image
 
 from neuspring.core.artifacts import Observations
 from neuspring.core.run_record import RunRecord
+from neuspring.draw.scene import chosen_frames
 from neuspring.report.blocks import Block, Code, Fold, Grid, PageSection, Picture, Text
 from neuspring.report.data import UNREADABLE, ReportData, ReportSection, data_uri, link, several
-from neuspring.report.draw.scene import chosen_frames
 
 WEBP_QUALITY = 75
 """Quality of WebP pictures, of 100."""

@@ -26,7 +26,7 @@ import pandas as pd
 from neuspring.core.files import write_text
 from neuspring.core.records import digest_file
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT
-from neuspring.report.draw.sheet import FUTURE, TRAINING
+from neuspring.draw.sheet import FUTURE, TRAINING
 from neuspring.scores.carried import carried_in_image, points_on_table
 from neuspring.scores.pictures import Pair, picture_scores
 from neuspring.splats.draw import OBJECT_COVERAGE

@@ -47,9 +47,9 @@ from neuspring.core.artifacts import Twin
 from neuspring.core.errors import NumericalFailure
 from neuspring.core.files import write_text
 from neuspring.core.table import Table
-from neuspring.report.draw.scene import ShownRun, ShownScene
-from neuspring.report.draw.sheet import save
-from neuspring.report.draw.twin import STIFFNESS_COLORS, TwinPicture
+from neuspring.draw.scene import ShownRun, ShownScene
+from neuspring.draw.sheet import save
+from neuspring.draw.twin import STIFFNESS_COLORS, TwinPicture
 from neuspring.scenes.sources import read_scenarios
 from neuspring.scenes.synthetic import toy
 from neuspring.scores import metrics

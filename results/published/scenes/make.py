@@ -21,8 +21,8 @@ from neuspring.core.artifacts import Observations, Trajectory
 from neuspring.core.files import write_text
 from neuspring.core.run_folder import RunFolder
 from neuspring.core.table import Table
+from neuspring.draw.sheet import save
 from neuspring.report.blocks import markdown
-from neuspring.report.draw.sheet import save
 from neuspring.scores.paper import released
 from neuspring.scores.runs import collect
 from results.published.footage.runs import METHODS

@@ -27,9 +27,9 @@ from neuspring.core.artifacts import Twin
 from neuspring.core.files import write_text
 from neuspring.core.run_folder import RunFolder
 from neuspring.core.table import Table
-from neuspring.report.draw.scene import ShownRun, ShownScene
-from neuspring.report.draw.sheet import save
-from neuspring.report.draw.twin import STIFFNESS_COLORS, TwinPicture
+from neuspring.draw.scene import ShownRun, ShownScene
+from neuspring.draw.sheet import save
+from neuspring.draw.twin import STIFFNESS_COLORS, TwinPicture
 from neuspring.scenes.synthetic.truth import Truth, truth_path
 from neuspring.twin.body import body_of
 

@@ -7,10 +7,10 @@ from matplotlib import pyplot as plt
 from PIL import Image
 
 from neuspring.core.errors import InputError
+from neuspring.draw.film import HOLD, film_pictures, write_film
+from neuspring.draw.sheet import FUTURE, TRAINING
 from neuspring.extensions.figures.drawing import film
 from neuspring.extensions.figures.options import FilmOptions
-from neuspring.report.draw.film import HOLD, film_pictures, write_film
-from neuspring.report.draw.sheet import FUTURE, TRAINING
 from tests.support.played import results
 from tests.support.shown import METHODS, filmed, painter
 

@@ -9,10 +9,10 @@ from matplotlib import pyplot as plt
 from matplotlib.collections import PathCollection
 
 from neuspring.config.images import Images
+from neuspring.draw.painter import DRAWN_MM, ERROR_COLORS, distances
+from neuspring.draw.strip import rows_of, strip_figure
 from neuspring.extensions.figures.drawing import caption
 from neuspring.extensions.figures.filmed import FilmedScene, PhotoPainter
-from neuspring.report.draw.painter import DRAWN_MM, ERROR_COLORS, distances
-from neuspring.report.draw.strip import rows_of, strip_figure
 from tests.support.played import results
 from tests.support.shown import METHODS, filmed, observed, painter, takes
 

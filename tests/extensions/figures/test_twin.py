@@ -7,10 +7,10 @@ import pytest
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PathCollection
 
+from neuspring.draw.scene import ShownRun, ShownScene, part, seen_from
+from neuspring.draw.sheet import CONTROLLER
+from neuspring.draw.twin import CROSSING, TwinPicture, region_colors, twin_figure
 from neuspring.extensions.figures.filmed import SurfacePicture, finer
-from neuspring.report.draw.scene import ShownRun, ShownScene, part, seen_from
-from neuspring.report.draw.sheet import CONTROLLER
-from neuspring.report.draw.twin import CROSSING, TwinPicture, region_colors, twin_figure
 from neuspring.report.shown import find
 from neuspring.twin.body import body_of, lines_of
 from tests.support.played import results, rod_results

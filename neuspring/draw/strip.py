@@ -6,8 +6,8 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from neuspring.report.draw.painter import ERROR_COLORS, Painter
-from neuspring.report.draw.sheet import FUTURE, TEXT, TRAINING, color_bar, place, rgb
+from neuspring.draw.painter import ERROR_COLORS, Painter
+from neuspring.draw.sheet import FUTURE, TEXT, TRAINING, color_bar, place, rgb
 
 LABEL, STRIP_HEAD = 0.22, 0.4
 """Room for the names of rows, and for the head of columns, inches."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.report.video import Video
+from neuspring.draw.video import Video
 
 
 def write_video(path: Path, frames, rate: float, quality: int = 20) -> None:

@@ -10,10 +10,10 @@ from matplotlib import pyplot as plt
 from matplotlib.colors import LogNorm
 
 from neuspring.core.artifacts import Observations, Trajectory, Twin
-from neuspring.report.draw import run as figures
-from neuspring.report.draw.scene import ShownRun, chosen_frames
-from neuspring.report.draw.sheet import sample
-from neuspring.report.draw.twin import histogram, region_colors, stiffness_limits
+from neuspring.draw import run as figures
+from neuspring.draw.scene import ShownRun, chosen_frames
+from neuspring.draw.sheet import sample
+from neuspring.draw.twin import histogram, region_colors, stiffness_limits
 from neuspring.twin.topology import piecewise_topology, regions
 from tests.support import small
 

@@ -18,9 +18,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from neuspring.core.artifacts import Twin
-from neuspring.report.draw.painter import empty, hands
-from neuspring.report.draw.scene import ShownRun, ShownScene
-from neuspring.report.draw.sheet import CONTROLLER, TEXT, color_bar, place, points_across, sample
+from neuspring.draw.painter import empty, hands
+from neuspring.draw.scene import ShownRun, ShownScene
+from neuspring.draw.sheet import CONTROLLER, TEXT, color_bar, place, points_across, sample
 from neuspring.twin.body import Lines, body_of, lines_of
 from neuspring.twin.field import midpoints
 from neuspring.twin.roughness import roughness, variogram

@@ -12,7 +12,7 @@ import torch
 from matplotlib import pyplot as plt
 
 from neuspring.core.artifacts import Scenario
-from neuspring.report.draw.sheet import FUTURE, TRAINING, WORST, save
+from neuspring.draw.sheet import FUTURE, TRAINING, WORST, save
 from neuspring.scores.pictures import Pair, psnr
 from neuspring.splats.losses import Shot
 

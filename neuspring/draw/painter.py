@@ -13,8 +13,8 @@ from matplotlib.colors import Normalize
 
 from neuspring.core.artifacts import Observations
 from neuspring.data.camera import Camera
-from neuspring.report.draw.scene import ShownRun, ShownScene
-from neuspring.report.draw.sheet import CONTROLLER, WORST, points_across
+from neuspring.draw.scene import ShownRun, ShownScene
+from neuspring.draw.sheet import CONTROLLER, WORST, points_across
 
 Error = Literal["color", "distance", "none"]
 ERROR_COLORS = "magma_r"

@@ -5,8 +5,8 @@ import pandas as pd
 import pytest
 from matplotlib import pyplot as plt
 
+from neuspring.draw import benchmark as figures
 from neuspring.report import summary as tables
-from neuspring.report.draw import benchmark as figures
 from neuspring.scores.metrics import SCORE_COLUMNS
 from neuspring.scores.numbers import Numbers
 from neuspring.scores.runs import Collected

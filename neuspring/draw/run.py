@@ -13,11 +13,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from neuspring.core.artifacts import Observations, Scenario, Trajectory, Twin
-from neuspring.report.draw.painter import DrawingStyle, Painter
-from neuspring.report.draw.scene import ShownRun, ShownScene, chosen_frames
-from neuspring.report.draw.sheet import place, save
-from neuspring.report.draw.strip import strip_figure
-from neuspring.report.draw.twin import LEGEND_ROOM, TwinPicture, histogram, rough_or_smooth, twin_figure
+from neuspring.draw.painter import DrawingStyle, Painter
+from neuspring.draw.scene import ShownRun, ShownScene, chosen_frames
+from neuspring.draw.sheet import place, save
+from neuspring.draw.strip import strip_figure
+from neuspring.draw.twin import LEGEND_ROOM, TwinPicture, histogram, rough_or_smooth, twin_figure
 from neuspring.scores.metrics import errors_per_frame, metrics_of
 from neuspring.twin.body import lines_of
 

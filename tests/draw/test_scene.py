@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from neuspring.report.draw.scene import FLATTEST_PANEL, TALLEST_PANEL, box_around, broad_side, part, seen_from
+from neuspring.draw.scene import FLATTEST_PANEL, TALLEST_PANEL, box_around, broad_side, part, seen_from
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.normal(size=(60, 3)) * [0.3, 0.05, 0.1] + [1.0, 2.0, 0.4]

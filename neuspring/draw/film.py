@@ -17,9 +17,9 @@ from PIL import Image
 
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_atomically
-from neuspring.report.draw.painter import ERROR_COLORS, Painter
-from neuspring.report.draw.sheet import FUTURE, TEXT, TRAINING, color_bar, place, rgb
-from neuspring.report.video import Video
+from neuspring.draw.painter import ERROR_COLORS, Painter
+from neuspring.draw.sheet import FUTURE, TEXT, TRAINING, color_bar, place, rgb
+from neuspring.draw.video import Video
 
 DOTS = 110
 """Dots per inch at full width, so that text is as tall on a screen as on paper."""
