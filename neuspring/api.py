@@ -1,4 +1,4 @@
-"""What a researcher calls from Python: `import neuspring as ns`.
+"""Functions for researchers in Python: `import neuspring as ns`.
 
     run = ns.load_run("results/synthetic_single_lift_sloth/neuspring/0")
     predicted = ns.roll_out(run.twin, run.observations)

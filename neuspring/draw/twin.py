@@ -37,7 +37,7 @@ MOST_VECTORS = 2500
 """More lines than this are stored as pixels: a page would open slowly."""
 LEAST_RATIO, DEEPEST = 2.0, 1e4
 """Smallest ratio of the ends of a stiffness axis, so that tiny differences do not fill it; largest ratio of a color range."""
-HISTOGRAM_BINS = 41
+STIFFNESS_BINS = 41
 """Odd, so that equal values sit in the middle of a bar, under the mark of the searched one."""
 
 
@@ -204,7 +204,7 @@ def histogram(axis: Axes, stiffness: np.ndarray, norm: LogNorm, searched: float 
     shown = np.maximum(stiffness, (stiffness.max() or 1.0) / 1e6)
     low, high = _widened(float(shown.min()), float(shown.max()))
     # Rounding must not push the extremes out of the outer bins.
-    edges = np.geomspace(low * (1 - 1e-6), high * (1 + 1e-6), HISTOGRAM_BINS + 1)
+    edges = np.geomspace(low * (1 - 1e-6), high * (1 + 1e-6), STIFFNESS_BINS + 1)
     counts, _ = np.histogram(shown, edges)
     middles = np.clip(np.sqrt(edges[1:] * edges[:-1]), norm.vmin, norm.vmax)
     axis.bar(
@@ -232,7 +232,7 @@ def rough_or_smooth(axis: Axes, twin: Twin) -> None:
     values = np.log(np.maximum(twin.material.stiffness[:inner].astype(float), 1e-12))
     spacing = node_spacing(topology.canonical[: len(topology.nodes)])
     far = 0.5 * float(np.linalg.norm(np.ptp(middles, axis=0)))
-    edges = np.linspace(0, max(far, spacing), HISTOGRAM_BINS + 1)
+    edges = np.linspace(0, max(far, spacing), STIFFNESS_BINS + 1)
     axis.plot((edges[1:] + edges[:-1]) / (2 * spacing), variogram(middles, values, edges), ".-", color="0.2", lw=1)
     axis.axhline(1, color="0.6", lw=0.8, ls=":")
     axis.set(ylim=(0, None), ylabel="difference, share of variance")

@@ -39,7 +39,7 @@ ARTIFACTS = "mlartifacts"
 PORTS = {"postgresql": 5432, "mysql": 3306, "mssql": 1433}
 VIEW = "scores"
 """Name of the view of the table of runs that has scores as columns; a tag of the experiment holds it, as its page would."""
-SCORE_COLUMNS = [
+LOGGED_COLUMNS = [
     f"metrics.`{task}.{metric}`" for task in ("reconstruction", "future") for metric in ("chamfer", "track_error", "psnr")
 ]
 LOCK_PATIENCE = 600.0
@@ -85,7 +85,7 @@ def page(results: Path, settings: Tracking) -> str:
         raise InputError(uri, "MLflow's index must be there", "no such file", f"Make it: {again}.")
     try:
         client, experiment = prepare(results, settings)
-        client.set_experiment_tag(experiment, f"mlflow.sharedViewState.{VIEW}", json.dumps({"selectedColumns": SCORE_COLUMNS}))
+        client.set_experiment_tag(experiment, f"mlflow.sharedViewState.{VIEW}", json.dumps({"selectedColumns": LOGGED_COLUMNS}))
         held = len(search(client, experiment, logged="complete"))
     except Exception as error:
         rule = "MLflow must be able to open it"
