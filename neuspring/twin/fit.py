@@ -102,6 +102,16 @@ class FitResult(Learned):
 
     history: pd.DataFrame
 
+    @property
+    def best_epoch(self) -> int:
+        """Epoch whose end is the result; -1: the start."""
+        return int(self.facts["best_epoch"])
+
+    @property
+    def best_loss(self) -> float:
+        """Training loss or tail loss that selected it, m^2."""
+        return float(self.facts["best_loss"])
+
 
 @dataclass
 class _State:

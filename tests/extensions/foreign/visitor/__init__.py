@@ -13,7 +13,7 @@ from neuspring.baselines import Baseline
 from neuspring.extensions.exports import Export
 from neuspring.extensions.make_capture.formats import CaptureFormat
 from neuspring.extensions.make_capture.moments import Series
-from neuspring.report.blocks import Section, Text
+from neuspring.report.blocks import PageSection, Text
 from neuspring.report.data import ReportSection
 from neuspring.scores.metrics import Metric
 
@@ -76,5 +76,5 @@ STACK = CaptureFormat(about="a .npz file with {kind}", recognizes=lambda path: p
 XYZ = Export(write=write_xyz, frames="0")
 SAG = Metric(name="sag", title="sag", heading="Sag", unit="m", shown_unit="mm", factor=1e3, digits=2, function=sag)
 VISIT = ReportSection(
-    order=99, make=lambda material: Section(key="visit", title="A visit", blocks=[Text(text="A visitor was here.")])
+    order=99, make=lambda material: PageSection(key="visit", title="A visit", blocks=[Text(text="A visitor was here.")])
 )
