@@ -129,7 +129,7 @@ def test_each_fault_costs_one_job_and_the_same_command_continues(project, tmp_pa
     # The server is away: the runs wait on disk.
     assert {path.read_text().split(":")[0] for path in results.glob("*/*/*/mlflow.txt")} == {"unreachable"}
     so_far = (results / "tables" / "so_far" / "summary.md").read_text()
-    assert f"{RELEASED} / baseline / seed 0: missing" in so_far
+    assert f"baseline, {RELEASED} / seed 0: missing" in so_far
     assert "have not finished" in output
     report = (results / "tables" / "so_far" / "report.html").read_text()
     assert "bad input" in report

@@ -110,7 +110,7 @@ def test_predictions_are_drawn_scored_and_filmed(perceived_run):
 @pytest.mark.slow
 def test_spring_gaus_has_splats_of_its_own_and_draws_with_them(perceived_run, tmp_path):
     project = copy_project(perceived_run, tmp_path / "project")
-    small = {"anchors": 100, "iterations": 1, "substeps": 100}
+    small = {"anchors": 100, "iterations": 1}
     changes = SYNTHETIC | {"methods": ["search_only", "spring_gaus"], "tracking": {"enabled": False}}
     jobs = plan(project, changes | {"baselines": {"spring_gaus": small}})
     # The splats of all methods are there.

@@ -1,7 +1,6 @@
 """The workflow on several GPUs, its targets and parts, the whole benchmark, and runs made again."""
 
 import json
-import re
 import sys
 from datetime import datetime
 from itertools import pairwise
@@ -34,7 +33,6 @@ def two_gpu_run(tmp_path_factory):
 @pytest.mark.slow
 def test_jobs_lease_a_gpu_each_and_those_without_need_hold_none(two_gpu_run):
     project, output = two_gpu_run
-    assert re.search(r"Expected: \d+ jobs, no time on record", output)
     leases: dict[str, list[tuple[float, float]]] = {"0": [], "1": []}
     on_gpu = {"search", "fit", "rollout", "render", "appearance"}
     for job in read_jobs(project / "results"):
@@ -83,8 +81,7 @@ def test_a_study_is_a_target_and_explain_names_its_runs(two_gpu_run):
     assert "not run" not in page, "the rows that the configuration does not name are made too"
     command = [sys.executable, "-m", "neuspring", "explain", "table2/Baseline/future/chamfer", "--results", "results"]
     explanation = output_of(start(command, project))
-    key = json.loads((project / "results" / SCENE / "baseline" / "0" / "run.json").read_text())["run_key"]
-    assert key[:12] in explanation
+    assert f"results/{SCENE}/baseline/0/run.json" in explanation
 
 
 @pytest.mark.slow

@@ -177,7 +177,11 @@ def execute(run: Run, folder: Path) -> dict[str, Any]:
             with redirect_stderr(io.StringIO()):
                 result = fit(problem)
             twin = result.twin
-            record |= {"best_epoch": result.best_epoch, "rollbacks": result.facts["rollbacks"], "losses": list(result.history["loss"])}
+            record |= {
+                "best_epoch": result.best_epoch,
+                "rollbacks": result.facts["rollbacks"],
+                "losses": list(result.history["loss"]),
+            }
         record |= {"values": compare(twin, scene), "substeps": twin.simulation.substeps}
         record["stiffness"] = [float(f"{y:.6g}") for y in twin.material.stiffness[: scene.truth.topology.object_spring_count]]
     except NumericalFailure as failure:

@@ -19,6 +19,7 @@ from tests.support.browser import Browser, chromium
 from tests.support.project import ROOT
 
 DEMO = config.read_yaml(ROOT / "config" / "data" / "demo.yaml")
+SIZES = config.parse(config.Config, DEMO, "demo.yaml").synthetic
 KEYS = {"object": "1", "hand": "2"}
 LEAST = 0.95
 """Least mean overlap of a camera's masks with the truth: what was aimed at."""
@@ -94,7 +95,7 @@ def go(browser: Browser, frame: int, of: int) -> None:
 @pytest.mark.parametrize("scenario", DEMO["scenarios"])
 def test_five_marks_a_camera_give_the_masks_of_the_demo(browser, tmp_path, scenario):
     row = read_scenarios(ROOT / "config" / "scenarios.tsv")[scenario]
-    capture, _ = make(row, config.parse(config.Synthetic, DEMO["synthetic"], "synthetic"), tmp_path / "capture")
+    capture, _ = make(row, SIZES, tmp_path / "capture")
     frames = capture.frame_count
     truths = {camera: np.stack([capture.mask(camera, frame) for frame in range(frames)]) for camera in capture.cameras}
     # A user's capture has no masks.
