@@ -32,7 +32,7 @@ def two_gpu_run(tmp_path_factory):
 
 @pytest.mark.slow
 def test_jobs_lease_a_gpu_each_and_those_without_need_hold_none(two_gpu_run):
-    project, output = two_gpu_run
+    project, _ = two_gpu_run
     leases: dict[str, list[tuple[float, float]]] = {"0": [], "1": []}
     on_gpu = {"search", "fit", "rollout", "render", "appearance"}
     for job in read_jobs(project / "results"):
