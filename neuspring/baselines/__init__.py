@@ -1,21 +1,18 @@
-"""The systems that the paper compares with, as models of their own: Spring-Gaus, GS-Dynamics, and two that learn nothing.
+"""The systems that the paper compares with, as models of their own, and two that learn nothing.
 
 `BASELINES` declares them; a method row's `model` names one. PhysTwin is not here: it is a row of the method table, made of the
-platform's own search and fit.
-
-To add a baseline: its package, its line here, and its row in config/methods.yaml; if rows shall set something of it, its settings
-in neuspring/config (a field of `Baselines`). A package of your own adds one by an entry point of the group `neuspring.baselines`.
+platform's own search and fit. Spring-Gaus and GS-Dynamics are extensions, and come through the door that is open to every package:
+an entry point of the group `neuspring.baselines`, and one of `neuspring.baseline_settings` for what rows shall set.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
-from neuspring.baselines.spring_gaus import find_vgg16
 from neuspring.config import Config, Method
 from neuspring.registry import Registry
 
@@ -55,6 +52,20 @@ class TrainingRequest:
 
 
 @dataclass(frozen=True, kw_only=True)
+class OptionalWeights:
+    """A file that is used where it is there."""
+
+    what: str
+    """The weights, for people."""
+    file: str
+    """Its name in torch hub's cache."""
+    address: str
+    """Where one gets it."""
+    find: Callable[[Any], Path | str]
+    """From the baseline's settings: the file, or one line that says why there is none. Raises InputError for a wrong one."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Baseline:
     """Declaration of a baseline. Its functions are named as `module:name` and imported when they are called."""
 
@@ -70,13 +81,14 @@ class Baseline:
     """From its settings: True where it is trained on silhouettes."""
     reads: Callable[[Any], tuple[str, ...]] = lambda section: ()
     """Keys of the configuration, from its settings, that training reads beside its own section."""
+    notes: Mapping[str, tuple[Callable[[Any], bool], str]] = field(default_factory=dict)
+    """Facts of its training's record: when one is worth a note, and the note."""
     own_splats: bool = False
     """True where a method row may give it splats of its own to move (`appearance`)."""
     transfers: bool = False
     """True where what it learned can be moved to another recording."""
-    features: Callable[[Any], str] = lambda section: "none"
-    """From its settings: which optional weights are there, so that training runs again when they come. Raises InputError for wrong
-    ones."""
+    weights: OptionalWeights | None = None
+    """A file of trained weights that a term of its loss needs; without it the term is left out."""
 
     @property
     def trained(self) -> bool:
@@ -86,6 +98,10 @@ class Baseline:
     def settings(self, config: Config) -> Any:
         """Its section of a configuration; None where it has none."""
         return getattr(config.baselines, self.section) if self.section else None
+
+    def features(self, config: Config) -> str:
+        """none, absent or found: its optional weights; training runs again when they come. Raises InputError for wrong ones."""
+        return "none" if not self.weights else "absent" if isinstance(self.weights.find(self.settings(config)), str) else "found"
 
     def pictured(self, config: Config) -> bool:
         """True where it is trained on silhouettes."""
@@ -115,38 +131,11 @@ def without_pictures(method: Method | None, config: Config) -> tuple[str, ...]:
     return () if pictured else ("capture", "masks", "appearance")
 
 
-def _spring_gaus_reads(section: Any) -> tuple[str, ...]:
-    if section.supervision == "masks":
-        return ("simulation.gravity", "images.backend", "images.corner_pixels")
-    return ("simulation.gravity", "losses")
-
-
-def _vgg16(section: Any) -> str:
-    return "absent" if isinstance(find_vgg16(section.vgg16), str) else "found"
-
-
 REFERENCES = ("static", "controller_lbs")
 """Methods that learn nothing: what others must be better than."""
 BASELINES = Registry(
     "baselines",
     {
-        "spring_gaus": Baseline(
-            training="neuspring.baselines.spring_gaus.train:train",
-            prediction="neuspring.baselines.spring_gaus.model:predict",
-            model="neuspring.baselines.spring_gaus.model:SpringGausModel",
-            section="spring_gaus",
-            takes_pictures=lambda section: bool(section.supervision == "masks"),
-            reads=_spring_gaus_reads,
-            own_splats=True,
-            features=_vgg16,
-        ),
-        "gs_dynamics": Baseline(
-            training="neuspring.baselines.gs_dynamics.train:train",
-            prediction="neuspring.baselines.gs_dynamics.model:predict",
-            model="neuspring.baselines.gs_dynamics.model:GsDynamicsModel",
-            section="gs_dynamics",
-            transfers=True,
-        ),
         **{name: Baseline(prediction=f"neuspring.baselines.references:{name}") for name in REFERENCES},
     },
     Baseline,

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.parse import Count, NonNegative, Positive, SettingsSection
+from neuspring.core.section import Count, NonNegative, Positive, SettingsSection
 
 ImageQuirk = Literal["second_camera_intrinsics", "any_alpha", "unit_lpips", "degenerate_skinning"]
 

@@ -19,7 +19,8 @@ from pydantic.fields import FieldInfo
 
 from neuspring.config import rows, settings
 from neuspring.config.effort import EFFORT_SIZES, EFFORTS
-from neuspring.config.parse import SettingsSection, parts
+from neuspring.config.parse import parts
+from neuspring.core.section import SettingsSection
 
 PAGE = Path(__file__).parents[2] / "config" / "README.md"
 HEADING = "## Keys\n"
@@ -75,7 +76,7 @@ def fields(kind: type) -> list[tuple[str, str, str, str]]:
 def declared_meanings(kind: type) -> dict[str, str]:
     """Key -> the first sentence below its declaration in the class's module."""
     module = ast.parse(Path(inspect.getfile(kind)).read_text(encoding="utf-8"))
-    body = next(node.body for node in module.body if isinstance(node, ast.ClassDef) and node.name == kind.__name__)
+    body = next((node.body for node in module.body if isinstance(node, ast.ClassDef) and node.name == kind.__name__), [])
     meanings = {}
     for statement, following in itertools.pairwise(body):
         if isinstance(statement, ast.AnnAssign) and isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant):

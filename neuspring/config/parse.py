@@ -1,5 +1,4 @@
-"""The types of which settings are made (strict: no casts, no unknown keys; and bounded), and plain YAML values to settings and
-back.
+"""Plain YAML values to settings and back.
 
 Unknown keys raise, values are never cast, every problem is listed with its path.
 """
@@ -13,34 +12,14 @@ import functools
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import yaml
-from pydantic import ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from neuspring.core.errors import InputError
+from neuspring.core.section import SettingsSection
 from neuspring.core.text import masked
-
-STRICT = ConfigDict(extra="forbid", strict=True)
-"""No unknown keys, no casts."""
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1)]
-Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,79}$")]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Range = tuple[Finite, Finite]
-
-
-class SettingsSection:
-    """Base of the dataclasses of settings."""
-
-    __pydantic_config__ = STRICT
-
-    @classmethod
-    def completed(cls, given: Mapping[str, Any]) -> Mapping[str, Any]:
-        """The given values, with those that follow from them."""
-        return given
-
 
 T = TypeVar("T")
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.parse import Count, NonNegative, Positive, Range, SettingsSection
+from neuspring.core.section import Count, NonNegative, Positive, Range, SettingsSection
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.parse import Positive, SettingsSection
+from neuspring.core.section import Positive, SettingsSection
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from neuspring.config.parse import Count, Name, SettingsSection
+from neuspring.core.section import Count, Name, SettingsSection
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ class Method(SettingsSection):
     """Unknowns that the first-order stage trains: each spring by itself, the neural spring field, or a rod (of a search with
     `body: rod`); null: there is no such stage."""
     model: Name | None = None
-    """A baseline, which has neither search nor fit: spring_gaus, gs_dynamics, static or controller_lbs."""
+    """A baseline, which has neither search nor fit, by its name in `BASELINES`."""
     settings: dict[str, Any] = field(default_factory=dict)
     """Settings of this method alone, on top of the configuration's: keys of `fit` (for example `horizon: 0`), or of its model's
     section of `baselines`."""

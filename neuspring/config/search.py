@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from neuspring.config.parse import STRICT, Count, Finite, SettingsSection
+from neuspring.core.section import STRICT, Count, Finite, SettingsSection
 
 LENGTHS = ("object_radius", "controller_radius", "contact_distance")
 """Variables in units of `search.lengths`."""

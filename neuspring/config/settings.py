@@ -14,13 +14,14 @@ from neuspring.config.baselines import Baselines
 from neuspring.config.data import Deform, Mocap, Synthetic, Toy
 from neuspring.config.effort import EFFORTS, Effort, sizes
 from neuspring.config.images import Images
-from neuspring.config.parse import Count, Name, SettingsSection, json_value, merge, parse, plain, read_yaml
+from neuspring.config.parse import json_value, merge, parse, plain, read_yaml
 from neuspring.config.perception import Perception
 from neuspring.config.rod import RodSettings
 from neuspring.config.search import Search
 from neuspring.config.simulation import ReleasedQuirks, SimulationSettings
 from neuspring.config.tuning import Tune
 from neuspring.config.twin import Fit, Losses
+from neuspring.core.section import Count, Name, SettingsSection
 from neuspring.core.text import refuse_password
 
 Device = Annotated[int, Field(ge=0)] | Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9/._-]*$")]

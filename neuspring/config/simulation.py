@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.config.parse import Count, Finite, SettingsSection
+from neuspring.core.section import Count, Finite, SettingsSection
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints
 
-from neuspring.config.parse import Count, Name, SettingsSection
+from neuspring.core.section import Count, Name, SettingsSection
 from neuspring.core.text import refuse_password
 
 Whole = Annotated[int, Field(ge=0)]

@@ -8,7 +8,7 @@ from typing import Annotated, Any, TypeAlias
 import numpy as np
 from pydantic import Field
 
-from neuspring.config.parse import STRICT, Finite, Name
+from neuspring.core.section import STRICT, Finite, Name
 
 NEAR, FAR = 0.1, 10.0
 """m. Median depths outside this range are no table in a room."""

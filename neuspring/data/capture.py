@@ -32,13 +32,13 @@ from PIL import Image
 from pydantic import Field, TypeAdapter
 
 from neuspring.config import parse
-from neuspring.config.parse import STRICT, Name, Positive
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
 from neuspring.core.findings import Finding, broken, refuse
 from neuspring.core.geometry import Obstacle
 from neuspring.core.records import digest_file
+from neuspring.core.section import STRICT, Name, Positive
 from neuspring.data.camera import Camera, CameraEntry
 from neuspring.data.images import make_way, read_array, read_image, require_size, write_image
 

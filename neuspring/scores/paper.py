@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Annotated
 from pydantic import StringConstraints
 
 from neuspring.config import parse, read_yaml
-from neuspring.config.parse import STRICT, Name
 from neuspring.core.artifacts import SAFE_NAME
 from neuspring.core.errors import InputError
+from neuspring.core.section import STRICT, Name
 from neuspring.scores.metrics import METRICS, Metric
 
 if TYPE_CHECKING:

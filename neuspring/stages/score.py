@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from neuspring.baselines import BASELINES
 from neuspring.config import plain
 from neuspring.core import provenance
 from neuspring.core.artifacts import Observations, Twin
@@ -23,12 +24,8 @@ PICTURE_ROLES = ("strip", "video", "turntable")
 PICTURE_FACTS = ("backend", "masks", "views", "lpips", "quirks", "unseen_surface")
 """Facts that a reader of image scores must know."""
 
-COMPUTED = ("computed", "not asked for")
 NOTED: dict[str, tuple[Callable[[Any], bool], str]] = {
     "start": (lambda v: str(v).startswith("seen:"), "without a shape prior, splats begin where something was seen"),
-    # Not why: that names places on this machine.
-    "vgg16": (lambda v: v not in COMPUTED, "without the loss of VGG16's features, whose weights are not there"),
-    "links": (lambda v: v == 0, "no anchor lies near a controller in frame 0, so the hands move nothing"),
     "rollbacks": (bool, "{rolled_back} of {epochs} epochs rolled back, {epochs_asked} asked for"),
     "collision_overflow": (bool, "the collision list overflowed (raise simulation.collision_capacity)"),
     "at_ends": (bool, "at an end of its range: {at_ends}"),
@@ -170,6 +167,7 @@ def _picture_facts(records: Mapping[str, StageRecord]) -> dict[str, Any] | None:
 
 def _notes(records: Mapping[str, StageRecord]) -> list[str]:
     """Notes that a reader of the scores needs although the run did not fail."""
+    noted_facts = NOTED | {key: note for baseline in BASELINES.values() for key, note in baseline.notes.items()}
     notes = []
     render = records.get("render")
     if render and render.status == "failed" and records["rollout"].status == "ok":
@@ -178,7 +176,9 @@ def _notes(records: Mapping[str, StageRecord]) -> list[str]:
         notes.append(f"render: {render.facts['empty_frames']} frames show nothing of the object and have no PSNR")
     for name, record in records.items():
         facts = record.facts | {"rolled_back": len(record.facts.get("rollbacks", ()))}
-        notes += [f"{name}: {text.format(**facts)}" for key, (noted, text) in NOTED.items() if key in facts and noted(facts[key])]
+        notes += [
+            f"{name}: {text.format(**facts)}" for key, (noted, text) in noted_facts.items() if key in facts and noted(facts[key])
+        ]
     return notes
 
 

@@ -11,9 +11,9 @@ import time
 import numpy as np
 import torch
 
-from neuspring.baselines.spring_gaus.model import SpringGausModel, SpringGausTraining
-from neuspring.baselines.spring_gaus.physics import AnchorGraph, AnchorSolver, reference_substep
 from neuspring.core.device import resolve_device
+from neuspring.extensions.spring_gaus.model import SpringGausModel, SpringGausTraining
+from neuspring.extensions.spring_gaus.physics import AnchorGraph, AnchorSolver, reference_substep
 
 ANCHORS, SUBSTEPS, REPEATS = 1024, 100, 5
 

@@ -364,7 +364,7 @@ def test_springs_may_not_start_beyond_their_clamp(tmp_path: Path) -> None:
         ),
         ("{model: gs_dynamics, appearance: {}, description: x}", "only spring_gaus draws with splats of its own"),
         ("{model: static, settings: {epochs: 1}, description: x}", r"model static has none; received \['epochs'\]"),
-        ("{model: spring_gauss, description: x}", "model: must be one of spring_gaus"),
+        ("{model: spring_gauss, description: x}", "model: must be one of static"),
         ("{model: spring_gaus, settings: {anchor: 9}, description: x}", "method bad, settings: .*anchor: unknown key"),
         ("{model: spring_gaus, settings: {anchors: 0}, description: x}", "method bad, settings: .*anchors: .*received 0"),
         ("{model: spring_gaus, appearance: {degrees: 0}, description: x}", "method bad, appearance: .*degrees: unknown key"),

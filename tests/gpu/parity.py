@@ -22,10 +22,10 @@ import numpy as np
 import torch
 
 from neuspring import config
-from neuspring.baselines.spring_gaus.model import SpringGausModel, SpringGausTraining
-from neuspring.baselines.spring_gaus.model import roll_out as roll_out_anchors
-from neuspring.baselines.spring_gaus.physics import AnchorGraph, AnchorSolver
 from neuspring.core.device import resolve_device
+from neuspring.extensions.spring_gaus.model import SpringGausModel, SpringGausTraining
+from neuspring.extensions.spring_gaus.model import roll_out as roll_out_anchors
+from neuspring.extensions.spring_gaus.physics import AnchorGraph, AnchorSolver
 from neuspring.physics.parameters import pack, twin_tensors
 from neuspring.physics.solver import simulate_frame, solver_for
 from neuspring.splats.rasterize import choose_backend, rasterize

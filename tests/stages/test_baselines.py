@@ -9,14 +9,16 @@ import pytest
 
 from neuspring import config
 from neuspring.baselines import BASELINES
-from neuspring.baselines.gs_dynamics.model import GsDynamicsModel
-from neuspring.baselines.gs_dynamics.model import predict as predicted
-from neuspring.baselines.spring_gaus.model import SpringGausModel, SpringGausTraining
-from neuspring.config.baselines import Baselines, GsDynamics, SpringGaus
+from neuspring.config.baselines import Baselines
 from neuspring.config.images import Appearance, Images
 from neuspring.core.artifacts import Observations, SplatCenters, Trajectory
 from neuspring.core.errors import InputError
 from neuspring.core.records import Recorder, StageRecord
+from neuspring.extensions.gs_dynamics.model import GsDynamicsModel
+from neuspring.extensions.gs_dynamics.model import predict as predicted
+from neuspring.extensions.gs_dynamics.settings import GsDynamics
+from neuspring.extensions.spring_gaus.model import SpringGausModel, SpringGausTraining
+from neuspring.extensions.spring_gaus.settings import SpringGaus
 from neuspring.scores import metrics
 from neuspring.scores.runs import collect
 from neuspring.stages.predict import predict
@@ -157,7 +159,7 @@ def test_all_that_training_reads_is_in_its_record(seen):
 
 
 def test_what_is_missing_is_named(seen):
-    with pytest.raises(InputError, match="only spring_gaus, gs_dynamics are trained"):
+    with pytest.raises(InputError, match="only gs_dynamics, spring_gaus are trained"):
         train(observations=seen, model="static", settings=settings(), seed=0, device="cpu", output=seen.with_name("train.json"))
     with pytest.raises(InputError, match="supervision: masks needs --capture"):
         train(

@@ -29,9 +29,9 @@ import numpy as np
 from pydantic import Field, StringConstraints
 
 from neuspring.config import parse, plain
-from neuspring.config.parse import STRICT, Finite
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
+from neuspring.core.section import STRICT, Finite
 from neuspring.data.capture import Capture
 from neuspring.data.frames import gray
 from neuspring.perception.track_opencv import LEVELS, equalized, inside, likeness, lucas_kanade

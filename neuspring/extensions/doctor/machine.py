@@ -5,6 +5,7 @@ broken: the configuration needs it and it is missing. absent: it is missing and 
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import sys
 from collections.abc import Callable, Iterator
@@ -15,7 +16,7 @@ from typing import Literal
 
 import torch
 
-from neuspring.baselines.spring_gaus import VGG16, find_vgg16
+from neuspring.baselines import BASELINES
 from neuspring.config import Config
 from neuspring.core.device import resolve_device, start_warp
 from neuspring.core.errors import InputError
@@ -128,11 +129,11 @@ def _weights(settings: Config) -> Iterator[MachineCheck]:
             lambda: lpips.configured_weights(settings.images.lpips),
             f"{DOWNLOAD} {hub / lpips.BACKBONE} {lpips.BACKBONE_ADDRESS}; .venv/bin/pip install --no-deps lpips",
         ),
-        "VGG16 (Spring-Gaus' features)": (
-            lambda: find_vgg16(settings.baselines.spring_gaus.vgg16),
-            f"{DOWNLOAD} {hub / VGG16} https://download.pytorch.org/models/{VGG16}",
-        ),
     }
+    for baseline in BASELINES.values():
+        if weights := baseline.weights:
+            find_theirs = functools.partial(weights.find, baseline.settings(settings))
+            checked[weights.what] = (find_theirs, f"{DOWNLOAD} {hub / weights.file} {weights.address}")
     for subject, (find, remedy) in checked.items():
         try:
             place = find()

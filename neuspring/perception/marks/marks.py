@@ -27,9 +27,9 @@ import numpy as np
 from pydantic import Field
 
 from neuspring.config import parse, plain
-from neuspring.config.parse import STRICT, Finite, Name
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
+from neuspring.core.section import STRICT, Finite, Name
 from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture
 
 MARKS = "marks.json"

@@ -20,11 +20,11 @@ import cv2
 import numpy as np
 
 from neuspring.config import parse, plain
-from neuspring.config.parse import STRICT, Name
 from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
 from neuspring.core.records import canonical, digest_file
+from neuspring.core.section import STRICT, Name
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, images_digest, read_labels
 from neuspring.data.frames import Color, frames_of, overlap, overlay, spread, tints_of, write_png
 from neuspring.perception.marks.carry import Carried, carry_camera

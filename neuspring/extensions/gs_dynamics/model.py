@@ -29,10 +29,10 @@ from torch.nn.functional import linear, relu
 from torch.nn.utils import parameters_to_vector, skip_init, vector_to_parameters
 
 from neuspring.baselines.results import DIVERGENCE_RADIUS, Prediction
-from neuspring.config.baselines import GsDynamics
 from neuspring.core.artifacts import Artifact, Observations, Trajectory, Up, array
 from neuspring.core.device import load, start_warp
 from neuspring.core.errors import InputError
+from neuspring.extensions.gs_dynamics.settings import GsDynamics
 from neuspring.splats.skinning import turn_nodes
 
 HISTORY = 3

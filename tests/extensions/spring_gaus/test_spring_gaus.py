@@ -8,8 +8,10 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from neuspring.baselines import spring_gaus
-from neuspring.baselines.spring_gaus.model import (
+from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.records import digest_file
+from neuspring.extensions.spring_gaus import baseline
+from neuspring.extensions.spring_gaus.model import (
     AnchorGraph,
     AnchorParameters,
     AnchorPhysics,
@@ -21,10 +23,8 @@ from neuspring.baselines.spring_gaus.model import (
     roll_out,
     soft_vector,
 )
-from neuspring.baselines.spring_gaus.physics import AnchorSolver, reference_substep
-from neuspring.baselines.spring_gaus.train import FEATURE_WEIGHT, Problem, SpringGausTrainer, load_features, run, silhouette_loss
-from neuspring.core.errors import InputError, NumericalFailure
-from neuspring.core.records import digest_file
+from neuspring.extensions.spring_gaus.physics import AnchorSolver, reference_substep
+from neuspring.extensions.spring_gaus.train import FEATURE_WEIGHT, Problem, SpringGausTrainer, load_features, run, silhouette_loss
 
 FRAME = 1 / 30
 SMALL = SpringGausTraining(anchors=72, neighbors=12, full_neighbors=8, substeps=150, damping=1.0)
@@ -206,7 +206,7 @@ def test_what_the_model_made_itself_is_fitted_back():
 
 
 def test_a_frame_that_fails_gets_more_substeps_and_training_never_ends_silently(capsys, monkeypatch):
-    monkeypatch.setattr("neuspring.baselines.spring_gaus.train.SUBSTEPS_ADDED", 150)
+    monkeypatch.setattr("neuspring.extensions.spring_gaus.train.SUBSTEPS_ADDED", 150)
     hands = swing(6)
     start = model_of(bar(), hands[0])
     settings = replace(SMALL, iterations=2, substeps=10, max_substeps=160)
@@ -256,7 +256,7 @@ def test_a_failure_keeps_the_parameters_of_the_last_complete_iteration():
 
 def test_a_killed_training_continues_to_the_same_model(tmp_path, monkeypatch):
     monkeypatch.setattr("neuspring.baselines.results.CHECKPOINT_EVERY", 1)
-    monkeypatch.setattr("neuspring.baselines.spring_gaus.train.SUBSTEPS_RAISED", (1,))
+    monkeypatch.setattr("neuspring.extensions.spring_gaus.train.SUBSTEPS_RAISED", (1,))
     hands = swing(6)
     start = model_of(bar(), hands[0])
     partial = tmp_path / "partial.npz"
@@ -334,11 +334,11 @@ def test_the_term_of_the_loss_is_weighted_and_differentiable(network, tmp_path):
 def test_a_file_is_known_by_its_digest_and_a_damaged_one_is_named(network, tmp_path, monkeypatch):
     path = stored(network, tmp_path)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "hub"))
-    assert "vgg16-397923af.pth is not there" in spring_gaus.find_vgg16(None)
+    assert "vgg16-397923af.pth is not there" in baseline.find_vgg16(None)
     with pytest.raises(InputError, match="must be the file of VGG16 weights; received has SHA-256"):
-        spring_gaus.find_vgg16(str(path))
-    monkeypatch.setattr(spring_gaus, "DIGEST", digest_file(path)[:8])
-    assert spring_gaus.find_vgg16(str(path)) == path
+        baseline.find_vgg16(str(path))
+    monkeypatch.setattr(baseline, "DIGEST", digest_file(path)[:8])
+    assert baseline.find_vgg16(str(path)) == path
     damaged = stored(network[:-2], tmp_path)
     with pytest.raises(InputError, match=r"`features\.7\.weight` must be a float tensor \[128, 128, 3, 3\]; received NoneType"):
         load_features(damaged, "cpu")

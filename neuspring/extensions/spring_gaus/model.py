@@ -11,9 +11,9 @@ import torch
 from scipy.spatial import cKDTree
 
 from neuspring.baselines.results import DIVERGENCE_RADIUS, Prediction
-from neuspring.baselines.spring_gaus.physics import AnchorGraph, AnchorParameters, AnchorPhysics, AnchorSolver
-from neuspring.config.baselines import SpringGaus
 from neuspring.core.artifacts import Observations, Trajectory, array
+from neuspring.extensions.spring_gaus.physics import AnchorGraph, AnchorParameters, AnchorPhysics, AnchorSolver
+from neuspring.extensions.spring_gaus.settings import SpringGaus
 
 ANCHOR_CELL_SIZES = (0.01, 0.001)
 """Cell sizes of the grids that anchors are drawn from, m."""

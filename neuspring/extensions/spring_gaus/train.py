@@ -24,15 +24,15 @@ import torch
 
 from neuspring.baselines import Pictures, TrainingRequest
 from neuspring.baselines.results import DIVERGENCE_RADIUS, Trained, TrainingStopped, run_epochs
-from neuspring.baselines.spring_gaus import find_vgg16
-from neuspring.baselines.spring_gaus.model import Follower, SpringGausModel, SpringGausTraining, choose_anchors
-from neuspring.baselines.spring_gaus.physics import AnchorGraph, AnchorSolver
 from neuspring.config import Config
 from neuspring.core.checkpoint import Checkpoint, adam_arrays, restore_adam
 from neuspring.core.errors import InputError
 from neuspring.core.weights import read_tensors
 from neuspring.data.capture import OBJECT, Capture
 from neuspring.data.results import masks_of_cameras
+from neuspring.extensions.spring_gaus.baseline import find_vgg16
+from neuspring.extensions.spring_gaus.model import Follower, SpringGausModel, SpringGausTraining, choose_anchors
+from neuspring.extensions.spring_gaus.physics import AnchorGraph, AnchorSolver
 from neuspring.splats.draw import view_of
 from neuspring.splats.losses import ssim
 from neuspring.splats.model import Gaussians, Splats

@@ -20,7 +20,11 @@ import torch
 from torch.nn.utils import vector_to_parameters
 
 from neuspring.baselines import TrainingRequest
-from neuspring.baselines.gs_dynamics.model import (
+from neuspring.baselines.results import Trained, TrainingStopped, run_epochs
+from neuspring.core.artifacts import Observations
+from neuspring.core.checkpoint import Checkpoint, adam_arrays, restore_adam
+from neuspring.core.geometry import farthest
+from neuspring.extensions.gs_dynamics.model import (
     HISTORY,
     Dynamics,
     GsDynamicsModel,
@@ -36,10 +40,6 @@ from neuspring.baselines.gs_dynamics.model import (
     steps,
     upright,
 )
-from neuspring.baselines.results import Trained, TrainingStopped, run_epochs
-from neuspring.core.artifacts import Observations
-from neuspring.core.checkpoint import Checkpoint, adam_arrays, restore_adam
-from neuspring.core.geometry import farthest
 
 DENSE_POINTS = 1000
 """Most tracks from which particles are drawn."""

@@ -11,8 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from neuspring import config
 from neuspring.baselines import TrainingRequest
-from neuspring.baselines.gs_dynamics import train as training
-from neuspring.baselines.gs_dynamics.model import (
+from neuspring.baselines.results import Prediction, Trained
+from neuspring.config import Config
+from neuspring.config.baselines import Baselines
+from neuspring.core.artifacts import Observations, Scenario
+from neuspring.core.errors import InputError
+from neuspring.extensions.gs_dynamics import train as training
+from neuspring.extensions.gs_dynamics.model import (
     Dynamics,
     GsDynamicsModel,
     GsDynamicsTraining,
@@ -30,7 +35,8 @@ from neuspring.baselines.gs_dynamics.model import (
     upright,
     weight_count,
 )
-from neuspring.baselines.gs_dynamics.train import (
+from neuspring.extensions.gs_dynamics.settings import GsDynamics
+from neuspring.extensions.gs_dynamics.train import (
     Tracks,
     Windows,
     ahead,
@@ -43,11 +49,6 @@ from neuspring.baselines.gs_dynamics.train import (
     smoothed,
     window_frames,
 )
-from neuspring.baselines.results import Prediction, Trained
-from neuspring.config import Config
-from neuspring.config.baselines import Baselines, GsDynamics
-from neuspring.core.artifacts import Observations, Scenario
-from neuspring.core.errors import InputError
 
 RULES, RECIPE = resolve(GsDynamicsTraining(width=16), "sloth")
 
@@ -209,7 +210,7 @@ def test_unseen_tracks_are_no_particles_and_no_targets(monkeypatch):
     batch = draw(windows, rules, recipe, torch.Generator().manual_seed(0))
     assert batch.history.abs().max() < 1 and batch.targets.abs().max() < 1 and batch.known.all()
     # Too few are seen throughout: those seen in the history take part, and what is not seen is no target.
-    monkeypatch.setattr("neuspring.baselines.gs_dynamics.train.MIN_VISIBLE", 28)
+    monkeypatch.setattr("neuspring.extensions.gs_dynamics.train.MIN_VISIBLE", 28)
     windows = Windows.of(hidden, settings, "cpu")
     in_history = (windows.frames[:, :3] == 6).any(dim=1)
     assert not windows.usable[in_history, :5].any() and windows.usable[~in_history].all()
@@ -281,8 +282,8 @@ SMALL = replace(resolve(PLAIN, "sloth")[0], coverage=0.0)
 @pytest.fixture
 def plain(monkeypatch):
     """Tracks are taken as they are, all are particles, and a checkpoint is written after each epoch."""
-    monkeypatch.setattr("neuspring.baselines.gs_dynamics.model.COVERAGE", 0.0)
-    monkeypatch.setattr("neuspring.baselines.gs_dynamics.train.SMOOTHING_PASSES", 0)
+    monkeypatch.setattr("neuspring.extensions.gs_dynamics.model.COVERAGE", 0.0)
+    monkeypatch.setattr("neuspring.extensions.gs_dynamics.train.SMOOTHING_PASSES", 0)
     monkeypatch.setattr("neuspring.baselines.results.CHECKPOINT_EVERY", 1)
 
 
