@@ -15,6 +15,8 @@ import pytest
 import torch
 import warp as wp
 
+pytest.importorskip("neuspring.extensions.spring_gaus")
+
 from tests.gpu import __main__ as command
 from tests.gpu import parity
 from tests.gpu.__main__ import main

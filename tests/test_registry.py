@@ -10,6 +10,7 @@ import pytest
 from neuspring import registry
 from neuspring.core.errors import InputError
 from neuspring.registry import Registry
+from tests.support.extensions import with_extensions
 
 
 def entry(name: str, value: str, kind: str = "things") -> EntryPoint:
@@ -65,6 +66,7 @@ def test_an_extension_of_ours_without_its_folder_is_left_out(packages):
     assert list(Registry("things", {})) == ["text"]
 
 
+@with_extensions
 def test_each_entry_point_of_ours_is_there():
     """Names in pyproject.toml are those of members that exist."""
     ours = [point for point in importlib.metadata.distribution("neuspring").entry_points if point.group.startswith("neuspring.")]

@@ -60,7 +60,7 @@ class OptionalWeights:
     file: str
     """Its name in torch hub's cache."""
     address: str
-    """Where one gets it."""
+    """The address that it can be had from."""
     find: Callable[[Any], Path | str]
     """From the baseline's settings: the file, or one line that says why there is none. Raises InputError for a wrong one."""
 

@@ -23,7 +23,7 @@ PACKAGE_NAME = "neuspring"
 PACKAGE_FOLDER = Path(__file__).parents[1]
 NOT_NUMERICS = tuple(
     f"{PACKAGE_NAME}.{name}"
-    for name in ("config", "core.text", "core.records", "core.run_record", "core.run_folder", "stages.stage")
+    for name in ("config", "core.section", "core.text", "core.records", "core.run_record", "core.run_folder", "stages.stage")
 )
 """Declarations, records and progress: they change no number. Configured values reach a rule as parameters of their own."""
 

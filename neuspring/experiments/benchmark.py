@@ -33,15 +33,16 @@ NAME_DATA = "Name what to run on, for example --configfile config/data/demo.yaml
 
 
 def read_methods(path: Path) -> dict[str, Method]:
-    """The method table: name -> Method. A row that is not run may name a model that is not installed. Raises InputError."""
+    """The method table: name -> Method, without rows whose model is of an extension that was left out. Raises InputError."""
     methods = read_rows(Method, path, "method")
+    methods = {name: method for name, method in methods.items() if method.model not in BASELINES.left_out}
     fits = [kind for body in BODIES.values() for kind in body.fits]
     for name, method in methods.items():
         where = f"{path}, method {name}"
         if method.fit and method.fit not in fits:
             raise InputError(f"{where}, fit", f"must be one of {', '.join(fits)}", repr(method.fit))
         if method.model and method.model not in BASELINES:
-            continue
+            raise InputError(f"{where}, model", f"must be one of {', '.join(BASELINES)}", method.model)
         if method.settings and method.model and not BASELINES[method.model].section:
             raise InputError(f"{where}, settings", f"model {method.model} has none", sorted(method.settings))
         if method.appearance is not None and not (method.model and BASELINES[method.model].own_splats):
@@ -203,11 +204,6 @@ class Benchmark:
         if not implied <= set(given.methods):
             union = implied | set(given.methods)
             given = dataclasses.replace(given, methods=tuple(name for name in self.table if name in union))
-        for name in given.methods:
-            if (model := self.table[name].model) and model not in BASELINES:
-                rule = f"must be one of {', '.join(BASELINES)}"
-                remedy = "Correct it, or install the package that brings it."
-                raise InputError(f"{given.method_table}, method {name}, model", rule, model, remedy)
         for name in ("scenarios", "methods", "seeds"):
             if not getattr(given, name):
                 raise InputError(f"configuration, {name}", "at least one entry is required", None, NAME_DATA)

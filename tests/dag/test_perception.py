@@ -12,6 +12,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from tests.support.extensions import with_extensions
 from tests.support.filmed import film, write_raw
 from tests.support.perceived import final_data, perceived
 from tests.support.phystwin_case import dump
@@ -108,6 +109,7 @@ def test_predictions_are_drawn_scored_and_filmed(perceived_run):
 
 
 @pytest.mark.slow
+@with_extensions
 def test_spring_gaus_has_splats_of_its_own_and_draws_with_them(perceived_run, tmp_path):
     project = copy_project(perceived_run, tmp_path / "project")
     small = {"anchors": 100, "iterations": 1}

@@ -8,6 +8,7 @@ import pytest
 
 from neuspring import config
 from neuspring.experiments.tracking import log as tracking
+from tests.support.extensions import with_extensions
 from tests.support.project import SCENE, plan, run
 
 
@@ -45,6 +46,7 @@ def test_variants_end_in_one_table_and_a_larger_budget_continues_the_search(proj
 
 
 @pytest.mark.slow
+@with_extensions
 def test_baselines_pass_through_the_same_workflow_and_say_where_they_do_not_apply(project):
     changes = {
         "methods": ["search_only", "static", "controller_lbs", "spring_gaus", "spring_gaus_points", "gs_dynamics"],

@@ -28,6 +28,7 @@ from neuspring.stages import STAGES
 from neuspring.stages.stage import Written, stage
 from tests.support.captures import describe
 from tests.support.colored import paint
+from tests.support.extensions import with_extensions
 from tests.support.project import config_with
 
 ROOT = Path(__file__).parents[2]
@@ -358,46 +359,16 @@ def test_springs_may_not_start_beyond_their_clamp(tmp_path: Path) -> None:
             "an oracle is fitted on all frames and holds none back",
         ),
         ("{model: static, search: uniform, description: x}", "either search or model is required"),
-        (
-            "{model: gs_dynamics, fit: field, pool: all, description: x}",
-            "fit, pool: these belong to methods",
-        ),
-        ("{model: gs_dynamics, appearance: {}, description: x}", "only spring_gaus draws with splats of its own"),
+        ("{model: static, fit: field, pool: all, description: x}", "fit, pool: these belong to methods"),
+        ("{model: static, appearance: {}, description: x}", "draws with splats of its own"),
         ("{model: static, settings: {epochs: 1}, description: x}", r"model static has none; received \['epochs'\]"),
         ("{model: spring_gauss, description: x}", "model: must be one of static"),
-        ("{model: spring_gaus, settings: {anchor: 9}, description: x}", "method bad, settings: .*anchor: unknown key"),
-        ("{model: spring_gaus, settings: {anchors: 0}, description: x}", "method bad, settings: .*anchors: .*received 0"),
-        ("{model: spring_gaus, appearance: {degrees: 0}, description: x}", "method bad, appearance: .*degrees: unknown key"),
-        ("{model: spring_gaus, description: x}", "at least one method must apply to a scenario"),
     ],
 )
 def test_rows_that_cannot_be(row: str, message: str, tmp_path: Path) -> None:
     write(tmp_path / "bad.yaml", f"bad: {row}\n")
     with pytest.raises(InputError, match=re.compile(message, re.DOTALL)):
         benchmark(tmp_path, method_table="bad.yaml", methods=["bad"])
-
-
-def test_what_is_trained_on_silhouettes_needs_images_and_is_left_out_elsewhere(tmp_path: Path) -> None:
-    names = ["spring_gaus", "spring_gaus_points", "gs_dynamics", "static", "spring_gaus_few"]
-    rows = config.read_yaml(ROOT / "config" / "methods.yaml")
-    write(
-        tmp_path / "methods.yaml", yaml.safe_dump(rows | {"spring_gaus_few": rows["spring_gaus"] | {"settings": {"anchors": 100}}})
-    )
-    values = config.read_yaml(ROOT / "config" / "data" / "demo.yaml") | {"methods": names}
-    values["method_table"] = str(tmp_path / "methods.yaml")
-    values |= {"scenarios": ["synthetic_single_lift_rope", "toy_rope_lift_smooth"]}
-    made = Benchmark(values, ROOT)
-    assert made.pictured == {"spring_gaus", "spring_gaus_few"}
-    assert made.applies("spring_gaus", "synthetic_single_lift_rope")
-    assert not made.applies("spring_gaus", "toy_rope_lift_smooth")
-    assert made.applies("spring_gaus_points", "toy_rope_lift_smooth")
-    left_out = {"toy_rope_lift_smooth": "it needs images"}
-    assert made.whole_left_out == {"spring_gaus": left_out, "spring_gaus_few": left_out}
-    # The same splats are made once; who trains on points draws with those of all methods.
-    assert Graph(made).owners == {"appearance": {"spring_gaus": "spring_gaus", "spring_gaus_few": "spring_gaus"}, "fit": {}}
-    assert not made.searches
-    blind = Benchmark(values | {"images": {"enabled": False}}, ROOT)
-    assert blind.whole_left_out["spring_gaus"] == dict.fromkeys(values["scenarios"], "it needs images")
 
 
 def test_twins_of_cables_move_only_where_all_have_as_many_nodes(tmp_path: Path) -> None:
@@ -514,7 +485,7 @@ def test_pools_that_cannot_be(tmp_path: Path, changes: dict[str, object], messag
         ["synthetic", "paper"],
         ["synthetic", "headline"],
         ["mocap"],
-        ["mocap", "baselines"],
+        pytest.param(["mocap", "baselines"], marks=with_extensions),
         ["mocap", "clusters"],
         ["mocap", "mocap_heldout"],
         ["mocap", "mocap_heldout", "headline"],
@@ -641,7 +612,7 @@ def jobs_of(graph: Graph, files: list[str]) -> Counter[str]:
 @pytest.mark.parametrize(
     ("study", "runs", "searches", "fits", "trainings"),
     [
-        ("table1", 24, 12, 12, 12),
+        pytest.param("table1", 24, 12, 12, 12, marks=with_extensions),
         ("table2", 24, 12, 24, 0),
         ("table2_ours", 48, 12, 48, 0),
         ("table3", 18, 6, 18, 0),

@@ -32,7 +32,7 @@ def write_baseline(results: Path, scenario: str, method: str, model: str, *, tra
     settings = {"rollout": {"model": model}}
     records = ["rollout.json"]
     if trained:
-        own = config.plain(config.Config())["baselines"][model]
+        own = config.plain(config.Config())["baselines"].get(model, {})
         settings["train"] = {"model": model, **own, "seed": 0} | ({"anchors": 77} if model == "spring_gaus" else {})
         report_tree.write_history(folder / "history.parquet", "loss", np.exp(-np.arange(6.0)))
         StageRecord(stage="train", status="ok", settings=settings["train"]).save(folder / "train.json")

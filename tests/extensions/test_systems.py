@@ -1,11 +1,14 @@
 """Stages of the baselines by hand: records name their files, failures are kept and passed on, nothing reads the future."""
 
 import json
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 
 from neuspring import config
 from neuspring.baselines import BASELINES
@@ -14,6 +17,8 @@ from neuspring.config.images import Appearance, Images
 from neuspring.core.artifacts import Observations, SplatCenters, Trajectory
 from neuspring.core.errors import InputError
 from neuspring.core.records import Recorder, StageRecord
+from neuspring.experiments.benchmark import Benchmark
+from neuspring.experiments.graph import Graph
 from neuspring.extensions.gs_dynamics.model import GsDynamicsModel
 from neuspring.extensions.gs_dynamics.model import predict as predicted
 from neuspring.extensions.gs_dynamics.settings import GsDynamics
@@ -29,6 +34,7 @@ from tests.support import small
 from tests.support.filmed import FRAMES, film
 from tests.support.pictured import Scene, pictured
 
+ROOT = Path(__file__).parents[2]
 POINTS = SpringGaus(supervision="points", anchors=60, iterations=2)
 MASKS = replace(POINTS, supervision="masks", anchors=150)
 NETWORK = GsDynamics(width=8, batch=2, epochs=1, updates_per_epoch=2, step=0.002)
@@ -215,3 +221,41 @@ def test_silhouettes_train_and_both_outputs_are_written(filmed):
     records = {"train": out / "train.json", "rollout": out / "rollout.json", "render": out / "render.json"}
     score(observations=seen, **(records | {"appearance": filmed.appearance}), method="spring_gaus", variant={}, seed=0, output=run)
     assert "without the loss of VGG16's features" in " ".join(json.loads(run.read_text())["notes"])
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("{model: spring_gaus, settings: {anchor: 9}, description: x}", "method bad, settings: .*anchor: unknown key"),
+        ("{model: spring_gaus, settings: {anchors: 0}, description: x}", "method bad, settings: .*anchors: .*received 0"),
+        ("{model: spring_gaus, appearance: {degrees: 0}, description: x}", "method bad, appearance: .*degrees: unknown key"),
+        ("{model: spring_gaus, description: x}", "at least one method must apply to a scenario"),
+    ],
+)
+def test_rows_with_settings_that_cannot_be(row: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "bad.yaml").write_text(f"bad: {row}\n")
+    with pytest.raises(InputError, match=re.compile(message, re.DOTALL)):
+        Benchmark({"scenarios": ["toy_rope_lift_smooth"], "methods": ["bad"], "method_table": str(tmp_path / "bad.yaml")}, ROOT)
+
+
+def test_what_is_trained_on_silhouettes_needs_images_and_is_left_out_elsewhere(tmp_path: Path) -> None:
+    names = ["spring_gaus", "spring_gaus_points", "gs_dynamics", "static", "spring_gaus_few"]
+    rows = config.read_yaml(ROOT / "config" / "methods.yaml")
+    (tmp_path / "methods.yaml").write_text(
+        yaml.safe_dump(rows | {"spring_gaus_few": rows["spring_gaus"] | {"settings": {"anchors": 100}}})
+    )
+    values = config.read_yaml(ROOT / "config" / "data" / "demo.yaml") | {"methods": names}
+    values["method_table"] = str(tmp_path / "methods.yaml")
+    values |= {"scenarios": ["synthetic_single_lift_rope", "toy_rope_lift_smooth"]}
+    made = Benchmark(values, ROOT)
+    assert made.pictured == {"spring_gaus", "spring_gaus_few"}
+    assert made.applies("spring_gaus", "synthetic_single_lift_rope")
+    assert not made.applies("spring_gaus", "toy_rope_lift_smooth")
+    assert made.applies("spring_gaus_points", "toy_rope_lift_smooth")
+    left_out = {"toy_rope_lift_smooth": "it needs images"}
+    assert made.whole_left_out == {"spring_gaus": left_out, "spring_gaus_few": left_out}
+    # The same splats are made once; who trains on points draws with those of all methods.
+    assert Graph(made).owners == {"appearance": {"spring_gaus": "spring_gaus", "spring_gaus_few": "spring_gaus"}, "fit": {}}
+    assert not made.searches
+    blind = Benchmark(values | {"images": {"enabled": False}}, ROOT)
+    assert blind.whole_left_out["spring_gaus"] == dict.fromkeys(values["scenarios"], "it needs images")
