@@ -12,6 +12,7 @@ from neuspring import config
 from neuspring.core.job_records import read_jobs
 from neuspring.experiments.jobs import gpus
 from neuspring.intake.phystwin import released_cases
+from tests.support.extensions import with_extensions
 from tests.support.project import ROOT, SCENE, copy_workflow, jobs_in, output_of, run, start
 
 CHANGES = {"device": "auto", "seeds": [0, 1], "tracking": {"enabled": False}}
@@ -119,6 +120,7 @@ def test_a_sweep_ends_with_its_best(project):
     assert "best" in (folder / "summary.md").read_text().lower()
 
 
+@with_extensions
 def test_the_whole_benchmark_is_planned_with_its_jobs(project, tmp_path):
     """Three of its scenarios here: every scenario has the same jobs, and all 22 take Snakemake 17 s."""
     assert set(config.read_yaml(ROOT / "config/data/phystwin.yaml")["scenarios"]) == set(released_cases())

@@ -473,7 +473,7 @@ def test_pools_that_cannot_be(tmp_path: Path, changes: dict[str, object], messag
     "overlays",
     [
         ["demo"],
-        ["demo", "baselines"],
+        pytest.param(["demo", "baselines"], marks=with_extensions),
         ["demo", "perception"],
         ["demo", "perception", "clean_depth"],
         ["demo", "heldout"],
