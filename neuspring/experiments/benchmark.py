@@ -243,7 +243,8 @@ class Benchmark:
         for name in [*self.scenarios, *self.methods]:
             if name in folders or name.startswith("search-"):
                 rule = f"{', '.join(sorted(folders))} and search-... are folders of the results"
-                raise InputError("name of a scenario or method", rule, name, "Rename it.")
+                remedy = "Choose another name of `tables`." if name == self.config.tables else "Rename it."
+                raise InputError("name of a scenario or method", rule, name, remedy)
         for name, method in self.methods.items():
             self._check_settings(name, method)
         require_known(self.config.perception)

@@ -1,4 +1,4 @@
-"""Results against what a run would make now: each stage's record against the settings, the code and the inputs of today.
+"""Which results are stale (out of date): each stage's record against the settings, the code and the inputs of today.
 
 Records travel with the results folder. What Snakemake remembers in `.snakemake` does not: there a folder that was renamed, or whose
 `.snakemake` was deleted, counts as finished whatever is asked for.

@@ -11,6 +11,8 @@ x' = x + v toi + v' (dt - toi). The response is that of all contacts (collision.
 [0, 1] and friction mu in [0, 2]: a relative velocity u = u_n + u_t (normal, tangential) becomes
 
     -e u_n + a u_t,   a = max(0, 1 - mu (1 + e) |u_n| / |u_t|).
+
+The same in float64: `reference.bounce`. Where obstacles stand in the scene, ground and obstacles are one law in obstacles.py.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 

@@ -33,7 +33,10 @@ def psnr(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 def iou(a: np.ndarray, b: np.ndarray) -> float:
-    """Intersection over union of two bool masks of the same shape; 1 where both are empty."""
+    """Intersection over union of two bool masks of the same shape; 1 where both are empty.
+
+    Of masks in perception it is `data.frames.overlap`.
+    """
     if a.dtype != bool or b.dtype != bool or a.shape != b.shape:
         received = f"{a.dtype.name} {a.shape}, {b.dtype.name} {b.shape}"
         raise InputError("iou", "two bool masks of the same shape are needed", received)
@@ -95,7 +98,7 @@ class Pair:
 
     @classmethod
     def of(cls, observed: np.ndarray, rendered: np.ndarray, mask: np.ndarray, hands: np.ndarray, covered: int) -> Pair:
-        """From bytes, as `images.masked_pair` takes them; `covered` is the least coverage, of 255, that counts as object."""
+        """From bytes, as `masked_pair` takes them; `covered` is the least coverage, of 255, that counts as object."""
         truth, prediction = masked_pair(observed, mask, rendered, hands)
         return cls(observed, rendered, truth, prediction, silhouettes(mask, rendered, hands, covered), hands > 0)
 

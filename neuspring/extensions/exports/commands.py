@@ -15,7 +15,7 @@ def export(
     twin: Annotated[Positional[Path], arg(help="a run's folder, results/<scenario>/<method>/<seed>, or a twin.npz")],
     to: Annotated[str, arg(help=f"format: {', '.join(EXPORTS)}")],
     output: Annotated[Path | None, arg(help="file or folder to write; by default it is named after the run")] = None,
-    frames: Annotated[str | None, arg(help="FIRST, FIRST:STOP or FIRST:STOP:STEP; all by default, of ply frame 0")] = None,
+    frames: Annotated[str | None, arg(help="FIRST, FIRST:STOP or FIRST:STOP:STEP; all by default, or 0 for ply")] = None,
     rate: Annotated[float | None, arg(help="time codes per second (usd); the capture's frames per second by default")] = None,
 ) -> None:
     """A twin -> a file of another tool, by format."""

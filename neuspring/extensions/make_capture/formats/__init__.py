@@ -1,7 +1,7 @@
 """Forms in which cameras leave their pictures: one file each, which says what it recognizes and how it opens it.
 
 To add one: a file here with a `CaptureFormat` named capture_format; or a package's entry point of the group
-`neuspring.capture_formats`. `neuspring make-capture` takes it by its name (--format) or by what it recognizes.
+`neuspring.capture_formats`. Pictures are taken by what a format recognizes, a recording by that or by its name (--format).
 
     pictures     color or depth of one camera (--color, --depth): a folder, a video
     recording    all that cameras gave (--recording): a bag, PhysTwin's raw layout
@@ -128,7 +128,8 @@ def open_images(path: Path, kind: Kind) -> ImageSource:
     for format_ in FORMATS.values():
         if format_.pictures is not None and format_.recognizes(path):
             return format_.pictures(path, kind)
-    received = "nothing there" if not path.exists() else f"a {path.suffix or 'plain'} file"
+    suffix = path.suffix or "plain"
+    received = "a folder without any" if path.is_dir() else f"a {suffix} file" if path.exists() else "nothing there"
     known = " or ".join(format_.about for format_ in FORMATS.values() if format_.pictures is not None)
     raise InputError(path, known.format(kind=kind, endings=" ".join(ENDINGS[kind])), received)
 

@@ -77,4 +77,9 @@ def _stamp(path: Path) -> float | None:
     return time if 1e9 < time < 2e9 else None  # From 2e9 on digits are a date: 20260131...
 
 
-capture_format = CaptureFormat(about="a folder of {kind} images ({endings})", recognizes=Path.is_dir, pictures=ImageFolder)
+def holds_images(path: Path) -> bool:
+    """True for a folder with an image in it; folders of other files are left to other formats."""
+    return path.is_dir() and any(file.suffix.lower() in (*ENDINGS["color"], *ENDINGS["depth"]) for file in path.iterdir())
+
+
+capture_format = CaptureFormat(about="a folder of {kind} images ({endings})", recognizes=holds_images, pictures=ImageFolder)
