@@ -1,8 +1,8 @@
 """A restricted unpickler: plain values and numeric NumPy arrays, nothing else.
 
-A pickle is a program. This one can name eight globals, and even those are stand-ins: no NumPy code sees the file's bytes
-before we have checked dtype, shape and length, because `ndarray.__setstate__` and `dtype.__setstate__` trust their input.
-Stand-ins become arrays and scalars after the program has ended.
+A pickle is a program. This one can name the globals of `ALLOWED` alone, and even those are stand-ins, which only note how they are
+called. Their notes become arrays and scalars after the program has ended: no NumPy code sees the file's bytes before we have
+checked dtype, shape and length, because `ndarray.__setstate__` and `dtype.__setstate__` trust their input.
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ import pickle
 import pickletools
 import re
 import reprlib
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, Literal
 
 import numpy as np
 
@@ -23,15 +22,10 @@ from neuspring.core.errors import InputError
 
 DTYPE_CODE = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248]|c8|c16)")
 """Booleans, integers, floats, complex numbers. Objects (O), records (V) and text (S, U) are refused."""
-BYTE_ORDERS = ("<", ">", "=", "|")
 REFUSED_OPCODES = {
-    "PERSID": "a persistent id",
-    "BINPERSID": "a persistent id",
-    "EXT1": "a registered extension",
-    "EXT2": "a registered extension",
-    "EXT4": "a registered extension",
-    "NEXT_BUFFER": "an out-of-band buffer",
-    "READONLY_BUFFER": "an out-of-band buffer",
+    **dict.fromkeys(("PERSID", "BINPERSID"), "a persistent id"),
+    **dict.fromkeys(("EXT1", "EXT2", "EXT4"), "a registered extension"),
+    **dict.fromkeys(("NEXT_BUFFER", "READONLY_BUFFER"), "an out-of-band buffer"),
 }
 MEMO_OPCODES = ("PUT", "BINPUT", "LONG_BINPUT")
 
@@ -41,131 +35,89 @@ class _Refused(pickle.UnpicklingError):
 
 
 class _StandIn:
-    """Base of all objects that a pickle can obtain. Without __dict__, and BUILD must not write to its slots."""
+    """A global of the allow-list, or a call of one: its arguments (None: not called), and the state that BUILD gives it.
 
-    __slots__ = ()
+    Without __dict__, and BUILD cannot write to its slots.
+    """
 
-    def __setstate__(self, state: Any) -> None:
-        raise _Refused(f"a state for {type(self).__name__}")
+    __slots__ = ("args", "name", "state")
 
+    def __init__(self, name: str, args: tuple[Any, ...] | None = None) -> None:
+        self.name, self.args, self.state = name, args, None
 
-class _Global(_StandIn):
-    """A name of the allow-list. Calling it calls our own constructor."""
-
-    __slots__ = ("_call", "name")
-
-    def __init__(self, name: str, call: Callable[..., Any]) -> None:
-        self.name, self._call = name, call
-
-    def __call__(self, *args: Any) -> Any:
-        return self._call(*args)
-
-
-class _Dtype(_StandIn):
-    """Stands for `numpy.dtype(code, align, copy)`, followed by a state that may only set the byte order."""
-
-    __slots__ = ("value",)
-
-    def __init__(self, code: Any, *_flags: Any) -> None:
-        if not isinstance(code, str) or not DTYPE_CODE.fullmatch(code):
-            kind = "an object dtype" if str(code).lstrip("<>|=").startswith("O") else "a dtype that is not plain numeric"
-            raise _Refused(f"{kind}, numpy.dtype({reprlib.repr(code)})")
-        self.value = np.dtype(code)
+    def __call__(self, *args: Any) -> _StandIn:
+        if self.args is not None:
+            raise _Refused(f"a call of what {self.name} returns")
+        return _StandIn(self.name, args)
 
     def __setstate__(self, state: Any) -> None:
-        if not isinstance(state, tuple) or len(state) < 5 or state[1] not in BYTE_ORDERS:
-            raise _Refused("a malformed dtype state")
-        _version, order, subarray, names, fields = state[:5]
-        if subarray is not None or names is not None or fields is not None:
-            raise _Refused("a structured or sub-array dtype")
-        if order in "<>":
-            self.value = self.value.newbyteorder(order)
+        self.state = state
+
+    def made(self) -> Any:
+        """The array, scalar or bytes that this call stands for."""
+        match self.name, self.args, self.state:
+            case "_reconstruct", (_StandIn(name="ndarray", args=None), _, _), (_version, shape, dtype, fortran, data):
+                return _array(data, dtype, shape, "F" if fortran else "C")
+            case "_frombuffer", (data, dtype, shape, "C" | "F" as order) | (data, dtype, shape, "C" | "F" as order, _), None:
+                return _array(data, dtype, shape, order)
+            case "_frombuffer", (data, dtype, shape, "K", tuple(axes)), None:
+                return _array(data, dtype, shape, "C").transpose(axes)
+            case "scalar", (dtype, data), None:
+                return _array(data, dtype, (), "C")[()]
+            # Old protocols spell bytes as text; only the encoding that pickle itself uses is accepted.
+            case "encode", (str(text), "latin1"), None:
+                return text.encode("latin1")
+        with_what = "" if self.args is None else f" with {reprlib.repr(self.args)}"
+        raise _Refused(f"{self.name}{with_what} and the state {reprlib.repr(self.state)}")
 
 
-class _Value(_StandIn):
-    """A finished array or scalar. Wrapped until the program ends, so that BUILD cannot reach NumPy's own __setstate__."""
-
-    __slots__ = ("value",)
-
-    def __init__(self, value: Any) -> None:
-        self.value = value
-
-
-class _Array(_StandIn):
-    """Stands for `_reconstruct(ndarray, (0,), b'b')`; its state brings shape, dtype, order and bytes."""
-
-    __slots__ = ("value",)
-
-    def __init__(self, kind: Any, _shape: Any, _code: Any) -> None:
-        if kind is not NDARRAY:
-            raise _Refused("an array of another class than numpy.ndarray")
-        self.value: np.ndarray | None = None
-
-    def __setstate__(self, state: Any) -> None:
-        if not isinstance(state, tuple) or len(state) != 5:
-            raise _Refused("a malformed array state")
-        _version, shape, dtype, fortran, data = state
-        self.value = _array(data, dtype, shape, "F" if fortran else "C")
+def _dtype(value: Any) -> np.dtype[Any]:
+    """`numpy.dtype(code, align, copy)`, followed by a state that may only set the byte order."""
+    match value:
+        case _StandIn(name="dtype", args=(str(code), *_)) if DTYPE_CODE.fullmatch(code):
+            dtype = np.dtype(code)
+        case _StandIn(name="dtype", args=args):
+            raise _Refused(f"a dtype that is not plain numeric, numpy.dtype{reprlib.repr(args)}")
+        case _:
+            raise _Refused("array content that is not numeric bytes")
+    match value.state:
+        case None | (_, "=" | "|", None, None, None, *_):
+            return dtype
+        case (_, "<" | ">" as order, None, None, None, *_):
+            return dtype.newbyteorder(order)
+    raise _Refused(f"a structured, sub-array or malformed dtype state {reprlib.repr(value.state)}")
 
 
-def _array(data: Any, dtype: Any, shape: Any, order: str) -> np.ndarray:
+def _array(data: Any, dtype: Any, shape: Any, order: Literal["C", "F"]) -> np.ndarray:
     """Bytes -> a native array that owns its memory, after checking that dtype and shape account for every byte."""
-    if not isinstance(dtype, _Dtype) or not isinstance(data, (bytes, bytearray)):
+    kind, content = _dtype(dtype), data.made() if isinstance(data, _StandIn) else data
+    if not isinstance(content, (bytes, bytearray)):
         raise _Refused("array content that is not numeric bytes")
     if not isinstance(shape, tuple) or not all(type(size) is int and size >= 0 for size in shape):
         raise _Refused(f"the array shape {reprlib.repr(shape)}")
-    wanted = math.prod(shape) * dtype.value.itemsize
-    if wanted != len(data):
-        raise _Refused(f"an array of shape {shape} and dtype {dtype.value} ({wanted} bytes) made of {len(data)} bytes")
-    if dtype.value.kind == "b":  # A byte other than 0 or 1 is not a valid bool in memory.
-        flags: np.ndarray = np.frombuffer(data, np.uint8).reshape(shape, order=order) != 0  # type: ignore[call-overload]
-        return flags
-    native = dtype.value.newbyteorder("=")
-    result: np.ndarray = np.frombuffer(data, dtype.value).astype(native).reshape(shape, order=order)  # type: ignore[call-overload]
+    wanted = math.prod(shape) * kind.itemsize
+    if wanted != len(content):
+        raise _Refused(f"an array of shape {shape} and dtype {kind} ({wanted} bytes) made of {len(content)} bytes")
+    # A byte other than 0 or 1 is not a valid bool in memory.
+    flat = (
+        np.frombuffer(content, np.uint8) != 0 if kind.kind == "b" else np.frombuffer(content, kind).astype(kind.newbyteorder("="))
+    )
+    result: np.ndarray = flat.reshape(shape, order=order)
     return result
 
 
-def _from_buffer(data: Any, dtype: Any, shape: Any, order: Any, axes: Any = None) -> _Value:
-    if order == "K" and axes is not None:
-        return _Value(_array(data, dtype, shape, "C").transpose(axes))
-    if order not in ("C", "F"):
-        raise _Refused(f"the array order {reprlib.repr(order)}")
-    return _Value(_array(data, dtype, shape, order))
-
-
-def _scalar(dtype: Any, data: Any) -> _Value:
-    return _Value(_array(data, dtype, (), "C")[()])
-
-
-def _encode(text: Any, encoding: Any = None) -> bytes:
-    """Old protocols spell bytes as text; only the encoding that pickle itself uses is accepted."""
-    if encoding != "latin1" or not isinstance(text, str):
-        raise _Refused(f"_codecs.encode with encoding {reprlib.repr(encoding)}")
-    return text.encode("latin1")
-
-
-def _no_call(*_args: Any) -> NoReturn:
-    raise _Refused("a direct call of numpy.ndarray")
-
-
-NDARRAY = _Global("numpy.ndarray", _no_call)
-ALLOWED: dict[tuple[str, str], _Global] = {
-    ("numpy", "ndarray"): NDARRAY,
-    ("numpy", "dtype"): _Global("numpy.dtype", _Dtype),
-    ("_codecs", "encode"): _Global("_codecs.encode", _encode),
+ALLOWED = {("numpy", "ndarray"), ("numpy", "dtype"), ("_codecs", "encode")} | {
+    (f"{core}.{module}", name)
+    for core in ("numpy.core", "numpy._core")  # NumPy 1 and 2
+    for module, name in (("multiarray", "_reconstruct"), ("multiarray", "scalar"), ("numeric", "_frombuffer"))
 }
-for _core in ("numpy.core", "numpy._core"):  # NumPy 1 and 2
-    ALLOWED[f"{_core}.multiarray", "_reconstruct"] = _Global("_reconstruct", _Array)
-    ALLOWED[f"{_core}.multiarray", "scalar"] = _Global("scalar", _scalar)
-    ALLOWED[f"{_core}.numeric", "_frombuffer"] = _Global("_frombuffer", _from_buffer)
 
 
 class _Unpickler(pickle.Unpickler):
-    def find_class(self, module: str, name: str) -> Any:
-        try:
-            return ALLOWED[module, name]
-        except KeyError:
-            raise _Refused(f"the global {module}.{name}") from None
+    def find_class(self, module: str, name: str) -> _StandIn:
+        if (module, name) not in ALLOWED:
+            raise _Refused(f"the global {module}.{name}")
+        return _StandIn(name)
 
 
 def load_pickle(path: Path) -> Any:
@@ -206,15 +158,13 @@ def _finished(value: Any, done: dict[int, Any]) -> Any:
         return value
     if id(value) in done:
         return done[id(value)]
-    if isinstance(value, (_Value, _Array)):
-        if value.value is None:
-            raise _Refused("an array without content")
-        result = value.value
+    if isinstance(value, _StandIn):
+        result = value.made()
     elif isinstance(value, dict):
         result = {_finished(key, done): _finished(item, done) for key, item in value.items()}
     elif isinstance(value, (list, tuple, set, frozenset)):
         result = type(value)(_finished(item, done) for item in value)
     else:
-        raise _Refused(f"a bare {getattr(value, 'name', type(value).__name__)}")
+        raise _Refused(f"a bare {type(value).__name__}")
     done[id(value)] = result
     return result
