@@ -7,14 +7,13 @@ from typing import Annotated
 
 from neuspring.cli.options import Positional, arg
 from neuspring.core.errors import InputError
-from neuspring.data.capture import Capture
-from neuspring.extensions.make_capture.cut import cut
-from neuspring.extensions.make_capture.make import Intake
-from neuspring.extensions.make_capture.make import make_capture as make
+from neuspring.extensions.make_capture.options import Intake
 
 
 def make_capture(intake: Intake) -> None:
     """Color and depth of a camera, or points in space -> a capture folder. What was found is printed, and the next command."""
+    from neuspring.extensions.make_capture.make import make_capture as make
+
     capture, report = make(intake)
     print("\n".join(report))
     print(f"written: {capture.folder}\nnext:")
@@ -33,6 +32,9 @@ def cut_capture(
     output: Annotated[Path, arg(help="the capture folder to write")],
 ) -> None:
     """Some frames of a capture, with their masks and tracks -> another capture; marks stay behind."""
+    from neuspring.data.capture import Capture
+    from neuspring.extensions.make_capture.cut import cut
+
     first, _, last = frames.partition("-")
     if not (first.isdigit() and last.isdigit()):
         raise InputError("--frames", "a first and a last frame are required, as in 12-97", frames)

@@ -7,7 +7,7 @@ import json
 import re
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +16,6 @@ from pydantic import TypeAdapter
 
 from neuspring.checks import examine
 from neuspring.config import parse
-from neuspring.core.artifacts import Up
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
 from neuspring.core.findings import refuse, refuse_errors
@@ -29,6 +28,7 @@ from neuspring.extensions.make_capture.feeds import Paired, pairs
 from neuspring.extensions.make_capture.film import looked_at
 from neuspring.extensions.make_capture.formats import Recorded, open_recording
 from neuspring.extensions.make_capture.lenses import Board, Straightener, read_lenses, read_poses
+from neuspring.extensions.make_capture.options import FILM_OPTIONS, SPACE_OPTIONS, Intake
 from neuspring.extensions.make_capture.poses import (
     FrameChoice,
     Placed,
@@ -54,99 +54,22 @@ BOARD_FRAMES = 5
 """Frames of the source, from its beginning, in which a board is looked for where it has no images of its own."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Intake:
-    """The parts of a capture: the options of `neuspring make-capture`."""
-
-    output: Path
-    """the capture folder to write"""
-    category: str
-    """kind of object: cloth, rope, package, or any other word"""
-    name: str | None = None
-    """name of the capture; that of the folder by default"""
-    color: tuple[Path, ...] = ()
-    """per camera: a folder of images, or a video; FILE#1 is its second track"""
-    depth: tuple[Path, ...] = ()
-    """per camera: a folder, or a 16-bit gray video; none: color alone, of one camera with --intrinsics and --poses"""
-    bag: tuple[Path, ...] = ()
-    """instead of color: per camera a RealSense .bag file"""
-    phystwin_raw: Path | None = None
-    """instead of color: a case in PhysTwin's raw layout"""
-    recording: tuple[Path, ...] = ()
-    """instead of color: files or folders of another format"""
-    format: str | None = None
-    """the format of --recording, by name; recognized by default"""
-    cameras: tuple[str, ...] = ()
-    """names of the cameras; 0 1 2 ... by default"""
-    intrinsics: Path | None = None
-    """JSON: fx, fy, cx, cy or K of each camera, and distortion"""
-    depth_unit: float | None = None
-    """meters per count of depth; guessed by default, and said"""
-    rate: float | None = None
-    """frames per second at which it was filmed; that of the video by default"""
-    frames: str = ""
-    """what is kept, by number: 250-335, 0-300/2, 1,5,9-20"""
-    train_end: int | None = None
-    """training frames end before this frame; the first 70 percent by default"""
-    poses: Path | None = None
-    """JSON: camera_to_world or world_to_camera; one camera with depth needs none: the table gives its pose"""
-    board: str | None = None
-    """a ChArUco board that every camera sees, SQUARES_XxSQUARES_Y:SQUARE_M:MARKER_M:DICTIONARY, like 5x7:0.04:0.03:DICT_5X5_100"""
-    board_images: tuple[Path, ...] = ()
-    """per camera: an image of the board, or a folder of them; the first frames by default"""
-    pose: Literal["lying", "standing"] | None = None
-    """color alone: how the object is in frame 0, which one picture cannot say"""
-    level: bool = False
-    """move the world of given poses so that the table is z = 0"""
-    top_down: bool = False
-    """the camera looks straight down: the plane it faces is the table"""
-    table_at: tuple[float, float] | None = None
-    """a pixel of the table, where another plane is larger"""
-    controllers: Path | None = None
-    """hands in space: .npz or .csv, m, a row per frame of the capture"""
-    nodes: Path | None = None
-    """the body of frame 0: .npz or .ply, m"""
-    tracks: Path | None = None
-    """annotated points in space: JSON, m"""
-    teach: bool = False
-    """annotated points of training frames teach the twin; without color they always do"""
-    up: Up = "+z"
-    """up of points in space alone"""
-    no_table: bool = False
-    """points in space alone: no table is below the object"""
-    force: bool = False
-    """replace the images of a capture that is there"""
-
-    @property
-    def called(self) -> str:
-        """The name of the capture."""
-        return self.name or self.output.resolve().name
-
-    @property
-    def brought(self) -> dict[str, Path]:
-        """The files of points in space, by option."""
-        return {name: path for name in SPACE_OPTIONS if (path := getattr(self, name)) is not None}
-
-    def opened(self) -> Recorded:
-        """The film of the cameras; no views of points in space alone. Raises InputError."""
-        given = [f"--{name.replace('_', '-')}" for name in FILM_OPTIONS if getattr(self, name)]
-        if len(given) != 1 and (given or not self.controllers):
-            rule = "one of --color with --depth, --recording, --bag, --phystwin-raw is required, or --controllers with --nodes and "
-            rule += "--tracks"
-            raise InputError("make-capture", rule, " ".join(given) or "none")
-        if self.bag:
-            return open_recording(self.bag, "bag", self.cameras)
-        if self.phystwin_raw:
-            return open_recording((self.phystwin_raw,), "phystwin_raw", self.cameras)
-        if self.recording:
-            return open_recording(self.recording, self.format, self.cameras)
-        return Recorded(views=pairs(self.color, self.depth, self.cameras) if self.color else ())
+def opened(intake: Intake) -> Recorded:
+    """The film of the cameras; no views of points in space alone. Raises InputError."""
+    given = [f"--{name.replace('_', '-')}" for name in FILM_OPTIONS if getattr(intake, name)]
+    if len(given) != 1 and (given or not intake.controllers):
+        rule = "one of --color with --depth, --recording, --bag, --phystwin-raw is required, or --controllers with --nodes and "
+        rule += "--tracks"
+        raise InputError("make-capture", rule, " ".join(given) or "none")
+    if intake.bag:
+        return open_recording(intake.bag, "bag", intake.cameras)
+    if intake.phystwin_raw:
+        return open_recording((intake.phystwin_raw,), "phystwin_raw", intake.cameras)
+    if intake.recording:
+        return open_recording(intake.recording, intake.format, intake.cameras)
+    return Recorded(views=pairs(intake.color, intake.depth, intake.cameras) if intake.color else ())
 
 
-FILM_OPTIONS = ("color", "recording", "bag", "phystwin_raw")
-"""Options of which one says where the film is."""
-SPACE_OPTIONS = ("controllers", "nodes", "tracks")
-"""Options of files of points in space."""
 OF_FILM = ("frames", "depth_unit", "intrinsics", "poses", "board", "board_images", "level", "top_down", "table_at", "pose")
 """Options that say nothing of points in space alone."""
 
@@ -157,7 +80,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     All is checked before the first image is written. An interrupted call goes on where it was. Raises InputError naming the option
     or file, the rule, what was received and the next move.
     """
-    film, board = intake.opened(), Board.of(intake.board) if intake.board else None
+    film, board = opened(intake), Board.of(intake.board) if intake.board else None
     views = film.views
     if not views:
         return _of_points(intake)
