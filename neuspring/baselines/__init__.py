@@ -122,7 +122,7 @@ def _spring_gaus_reads(section: Any) -> tuple[str, ...]:
 
 
 def _vgg16(section: Any) -> str:
-    return "absent" if isinstance(find_vgg16(section.vgg16), str) else "found"
+    return "absent" if isinstance(find_vgg16(), str) else "found"
 
 
 REFERENCES = ("static", "controller_lbs")

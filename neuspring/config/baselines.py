@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from neuspring.config.parse import Count, NonNegative, Positive, SettingsSection
+from neuspring.config.parse import Count, Positive, SettingsSection
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,9 +23,6 @@ class SpringGaus(SettingsSection):
     """Number N of anchors, drawn at random from the occupied cells of a grid of 1 cm, or of 1 mm where there are too few cells."""
     iterations: Count = 100
     """Passes over the training frames, with an optimizer step per frame."""
-    vgg16: str | None = None
-    """Path of torchvision's weights of VGG16 (vgg16-397923af.pth); null: they are looked for in torch hub's cache. Nothing is
-    downloaded."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,9 +35,6 @@ class GsDynamics(SettingsSection):
     """Units of all hidden layers."""
     step: Positive = 0.01
     """Motion of the tools that makes a step, m."""
-    outlier_deviations: NonNegative = 3.0
-    """Median absolute deviations by which the path length of a track may differ from the median before the track is dropped; 0
-    drops none."""
     epochs: Count = 50
     """Passes of training. The released predictions are of 50; the public code trains 500 to 1000."""
     updates_per_epoch: Count = 100

@@ -22,6 +22,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.extras import EXTRAS, install
 from neuspring.core.weights import hub_folder
 from neuspring.experiments import needs
+from neuspring.perception import segment_sam2
 from neuspring.perception.track_cotracker import WEIGHTS, WEIGHTS_URL
 from neuspring.scores import lpips
 from neuspring.splats.rasterize import choose_backend
@@ -125,11 +126,11 @@ def _weights(settings: Config) -> Iterator[MachineCheck]:
     hub = hub_folder()
     checked = {
         "LPIPS (AlexNet)": (
-            lambda: lpips.configured_weights(settings.images.lpips),
+            lpips.find_weights,
             f"{DOWNLOAD} {hub / lpips.BACKBONE} {lpips.BACKBONE_ADDRESS}; .venv/bin/pip install --no-deps lpips",
         ),
         "VGG16 (Spring-Gaus' features)": (
-            lambda: find_vgg16(settings.baselines.spring_gaus.vgg16),
+            find_vgg16,
             f"{DOWNLOAD} {hub / VGG16} https://download.pytorch.org/models/{VGG16}",
         ),
     }
@@ -146,18 +147,18 @@ def _weights(settings: Config) -> Iterator[MachineCheck]:
     # Weights of perception, which their libraries keep in caches of their own.
     segment, track = settings.perception.segment, settings.perception.track
     for subject, name in {
-        "GroundingDINO": segment.grounded_sam2.detector,
-        "SAM 2": segment.grounded_sam2.video_model,
+        "GroundingDINO": segment_sam2.DETECTOR,
+        "SAM 2": segment_sam2.VIDEO_MODEL,
     }.items():
-        there = Path(name).is_dir() or isinstance(try_to_load_from_cache(name, "config.json"), str)
+        there = isinstance(try_to_load_from_cache(name, "config.json"), str)
         wanted = segment.backend == "grounded_sam2" and not segment.grounded_sam2.download
         remedy = f".venv/bin/hf download {name}, or perception.segment.grounded_sam2.download: true"
         detail = name if there else f"{name} is not in the cache of the Hugging Face hub"
         yield MachineCheck(subject, "ok" if there else "broken" if wanted else "absent", detail, remedy)
     code = sorted(Path(torch.hub.get_dir()).glob("facebookresearch_co-tracker_*"))
     there = bool(code) and (hub_folder() / WEIGHTS).is_file()
-    wanted = track.backend == "cotracker3" and not track.cotracker3.download
+    wanted = track.backend == "cotracker3" and not track.download
     download = f"{DOWNLOAD} {hub_folder() / WEIGHTS} {WEIGHTS_URL}"
-    remedy = f"perception.track.cotracker3.download: true (not for commercial use), or {download}"
+    remedy = f"perception.track.download: true (not for commercial use), or {download}"
     detail = WEIGHTS if there else "code or weights are not in the cache of torch.hub"
     yield MachineCheck("CoTracker3", "ok" if there else "broken" if wanted else "absent", detail, remedy)
