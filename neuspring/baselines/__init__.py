@@ -61,8 +61,8 @@ class OptionalWeights:
     """Its name in torch hub's cache."""
     address: str
     """The address that it can be had from."""
-    find: Callable[[Any], Path | str]
-    """From the baseline's settings: the file, or one line that says why there is none. Raises InputError for a wrong one."""
+    find: Callable[[], Path | str]
+    """The file, or one line that says why there is none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,9 +99,9 @@ class Baseline:
         """Its section of a configuration; None where it has none."""
         return getattr(config.baselines, self.section) if self.section else None
 
-    def features(self, config: Config) -> str:
-        """none, absent or found: its optional weights; training runs again when they come. Raises InputError for wrong ones."""
-        return "none" if not self.weights else "absent" if isinstance(self.weights.find(self.settings(config)), str) else "found"
+    def features(self) -> str:
+        """none, absent or found: its optional weights; training runs again when they come."""
+        return "none" if not self.weights else "absent" if isinstance(self.weights.find(), str) else "found"
 
     def pictured(self, config: Config) -> bool:
         """True where it is trained on silhouettes."""

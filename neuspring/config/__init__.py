@@ -15,7 +15,7 @@ from neuspring.config.data import Mocap, Synthetic, Toy
 from neuspring.config.parse import merge, parse, plain, read_text, read_yaml, typed
 from neuspring.config.rod import RodSettings
 from neuspring.config.rows import Method, ScenarioRow, SearchRow
-from neuspring.config.search import PolishSettings, Search, SearchVariables, Variable
+from neuspring.config.search import Search, SearchVariables, Variable
 from neuspring.config.settings import Config, Tracking
 from neuspring.config.simulation import ReleasedQuirks, SimulationSettings
 from neuspring.config.twin import Fit, Losses, SpringFieldSettings
@@ -26,7 +26,6 @@ __all__ = [
     "Losses",
     "Method",
     "Mocap",
-    "PolishSettings",
     "ReleasedQuirks",
     "RodSettings",
     "ScenarioRow",

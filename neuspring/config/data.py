@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.core.section import Count, Name, NonNegative, SettingsSection
+from neuspring.core.section import Count, Name, SettingsSection
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,12 +16,6 @@ class Toy(SettingsSection):
 
     frames: Annotated[int, Field(ge=5)] = 60
     """Frames per scene; the first 70 % are for training."""
-    noise: NonNegative = 0.0005
-    """Standard deviation of the observation noise, m."""
-    occlusion: Annotated[float, Field(ge=0, lt=1)] = 0.2
-    """Fraction of point-frames hidden, in runs of several frames."""
-    seed: Annotated[int, Field(ge=0)] = 0
-    """Seed of noise and occlusion; the scenario's name enters too."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,8 +18,6 @@ class Appearance(SettingsSection):
 
     iterations: Count = 10_000
     """Optimizer steps. Each takes one view, drawn without replacement."""
-    isotropic: bool = True
-    """One scale per splat; false: one per axis."""
     fixed_radius: Positive | None = None
     """Standard deviation of every splat, m, which is then not trained; null: it is trained, and starts from the distance to the
     nearest splats."""
@@ -41,21 +39,6 @@ class Appearance(SettingsSection):
     opacity_rate: Positive = 0.025
     """Learning rate of opacity logits."""
 
-    def __post_init__(self) -> None:
-        if self.fixed_radius is not None and not self.isotropic:
-            raise ValueError("fixed_radius: splats of one radius are isotropic, received isotropic: false")
-
-
-@dataclass(frozen=True, kw_only=True)
-class LpipsWeights(SettingsSection):
-    """Weights of LPIPS. Nothing is downloaded; without the weights LPIPS is not computed, and tables say so."""
-
-    backbone: str | None = None
-    """Path of torchvision's AlexNet (alexnet-owt-7be5be79.pth); null: it is looked for in torch hub's cache."""
-    heads: str | None = None
-    """Path of the linear heads, version 0.1 (alex.pth); null: they are looked for in torch hub's cache (lpips_alex_v0.1.pth) and in
-    the packages lpips and torchmetrics."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Images(SettingsSection):
@@ -70,7 +53,6 @@ class Images(SettingsSection):
     video: bool = True
     """Videos: observed, predicted and error side by side, and a turntable of the twin."""
     appearance: Appearance = field(default_factory=Appearance)
-    lpips: LpipsWeights = field(default_factory=LpipsWeights)
     released_quirks: tuple[ImageQuirk, ...] = ()
     """Errors of the released evaluation of pictures that are made on purpose. second_camera_intrinsics: every view has the
     intrinsics of the second camera. any_alpha: a pixel counts as object whose 8-bit coverage is not zero, not only from a half on.

@@ -33,37 +33,13 @@ class MarksSegmentation(SettingsSection):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OpenCvTracking(SettingsSection):
-    """Lucas-Kanade with a forward-backward check."""
-
-    points: Count = 5000
-    """Largest number of pixels that are followed per camera, drawn at random from the masks of frame 0."""
-    rim: NonNegative = 0.0
-    """Distance outside of its mask at which a point is lost, pixels: masks are off by pixels at tips and corners."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class GroundedSam2(SettingsSection):
     """GroundingDINO and SAM 2, through `transformers` (extra `perception`); defaults are those of the released processing."""
 
-    detector: str = "IDEA-Research/grounding-dino-tiny"
-    """GroundingDINO: its name on the Hugging Face hub, or a folder."""
-    video_model: str = "facebook/sam2.1-hiera-large"
-    """SAM 2: its name on the Hugging Face hub, or a folder."""
     prompt: str | None = None
     """Words for the object; null: the capture's category."""
     download: bool = False
     """Download of weights that are not in the cache."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class CoTracker3(SettingsSection):
-    """CoTracker3, online, from torch.hub."""
-
-    points: Count = 5000
-    """Largest number of pixels that are followed per camera, drawn at random from the masks of frame 0."""
-    download: bool = False
-    """Download of code and weights that are not in the cache. Mind their license."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,8 +84,6 @@ class ShapePriorSettings(SettingsSection):
     """Shape of what was not seen; auto: none for cloth and packages, else visual_hull. none: only what was seen. visual_hull:
     voxels carved by masks and depth. mesh: a file, aligned to what was seen. truth: the surface of a synthetic capture, to measure
     what perception costs."""
-    voxel: Positive = 0.003
-    """Side of a voxel of the visual hull, m."""
     back: Literal["none", "symmetry", "fraction"] = "symmetry"
     """End of the hull where one camera alone shows the object in frame 0, so that its back is invented. fraction: behind the seen
     surface by 1.2 of the silhouette's local width, rounded to its edge. symmetry: where the seen surface is mirrored about the
@@ -160,9 +134,13 @@ class PointTracking(SettingsSection):
 
     backend: str = "opencv"
     """Tracker: Lucas-Kanade, a network, or the truth of a synthetic capture. cotracker3: the online CoTracker3 of torch.hub.
-    truth: exact tracks of a synthetic capture, as many as opencv follows, to measure what perception costs."""
-    opencv: OpenCvTracking = field(default_factory=OpenCvTracking)
-    cotracker3: CoTracker3 = field(default_factory=CoTracker3)
+    truth: exact tracks of a synthetic capture, to measure what perception costs."""
+    points: Count = 5000
+    """Largest number of pixels that are followed per camera, drawn at random from the masks of frame 0."""
+    rim: NonNegative = 0.0
+    """Distance outside of its mask at which a point of `opencv` is lost, pixels: masks are off by pixels at tips and corners."""
+    download: bool = False
+    """Download of code and weights of `cotracker3` that are not in the cache. Mind their license."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,5 +153,3 @@ class Perception(SettingsSection):
     shape: ShapePriorSettings = field(default_factory=ShapePriorSettings)
     sample: Sampling = field(default_factory=Sampling)
     color: ColorSettings = field(default_factory=ColorSettings)
-    seed: Annotated[int, Field(ge=0)] = 0
-    """Seed of the pixels that are followed and of the points that are sampled."""

@@ -99,14 +99,6 @@ VARIABLES = tuple(spec.name for spec in dataclasses.fields(SearchVariables))
 
 
 @dataclass(frozen=True, kw_only=True)
-class PolishSettings(SettingsSection):
-    """Levenberg-Marquardt after CMA-ES: from its best candidate, in few variables, on the residuals of all training frames."""
-
-    rounds: Annotated[int, Field(ge=0)] = 6
-    """Most rounds; 0: no polish. A round takes a rollout, one more per variable for the slopes, and four for the damped steps."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Search(SettingsSection):
     """Zero-order stage: CMA-ES over homogeneous material and topology, then a polish of few variables."""
 
@@ -132,8 +124,10 @@ class Search(SettingsSection):
     controller_rest: Literal["rest_shape", "first_frame"] = "rest_shape"
     """Shape in which springs of controllers have no force: the body's rest shape, or frame 0, as a hand takes hold of a body that
     is bent already."""
+    polish: Annotated[int, Field(ge=0)] = 6
+    """Most rounds of the polish: Levenberg-Marquardt from the best candidate of CMA-ES, in few variables, on the residuals of all
+    training frames; 0: none. A round takes a rollout, one more per variable for the slopes, and four for the damped steps."""
     variables: SearchVariables = field(default_factory=SearchVariables)
-    polish: PolishSettings = field(default_factory=PolishSettings)
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.fixed if name not in VARIABLES]
@@ -162,7 +156,7 @@ class Search(SettingsSection):
         """Most rounds of the polish that its share of the budget holds."""
         if not self.polished:
             return 0
-        return min(self.polish.rounds, int(POLISH_SHARE * self.rollouts) // self.round_rollouts)
+        return min(self.polish, int(POLISH_SHARE * self.rollouts) // self.round_rollouts)
 
     @property
     def round_rollouts(self) -> int:

@@ -15,11 +15,10 @@ class SimulationSettings(SettingsSection):
     """Integration. Which way is up, the ground and self-collision come with the scenario."""
 
     substeps: Count | Literal["auto"] = "auto"
-    """Integration steps per frame; `auto` takes the smallest count that the stability bound allows."""
+    """Integration steps per frame; `auto` takes the smallest count that the stability bound allows, 2000 at most: the
+    search penalizes a candidate that would need more."""
     safety: Annotated[float, Field(gt=0, le=0.95)] = 0.8
     """Fraction of the stability bound that `auto` uses. Predictions of a body that can meet itself use at most 0.4."""
-    max_substeps: Count = 2000
-    """Upper limit of `auto`; the search penalizes a candidate that would need more."""
     gravity: Finite = 9.8
     """Acceleration downwards, m/s^2."""
     collision_capacity: Count = 500

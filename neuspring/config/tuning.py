@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import Field, StringConstraints
 
 from neuspring.core.section import Count, Name, SettingsSection
 from neuspring.core.text import refuse_password
 
-Whole = Annotated[int, Field(ge=0)]
 Number = int | Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -48,7 +47,10 @@ class Dimension(SettingsSection):
 
 @dataclass(frozen=True, kw_only=True)
 class Tune(SettingsSection):
-    """A sweep: which settings of one method are varied, and how trials are spent. Test frames are never read."""
+    """A sweep: which settings of one method are varied, and how trials are spent. Test frames are never read.
+
+    The mean loss over the configuration's scenarios is minimized.
+    """
 
     study: Annotated[Name, StringConstraints(max_length=60)]
     """Name of the sweep and of its folder in `<results>/tune`. A sweep keeps its method, space, settings and data for good."""
@@ -57,10 +59,6 @@ class Tune(SettingsSection):
     space: dict[str, Dimension]
     """Setting -> values, see [tune.space](#tunespace). Keys are dotted paths of `simulation`, `losses`, `search`, `fit`,
     `released_quirks`, and `clusters`, the number of regions of the method's search."""
-    scenarios: tuple[Name, ...] = ()
-    """Scenarios whose mean loss is minimized; empty: those of the configuration."""
-    seed: Whole = 0
-    """Seed of search, field and sampler."""
     trials: Count = 40
     """Number of trials over all workers: finished, pruned and failed ones. With a larger number the sweep continues."""
     workers: Count = 1
@@ -68,18 +66,9 @@ class Tune(SettingsSection):
     storage: Annotated[str, StringConstraints(pattern=r"^postgresql(\+\w+)?://\S+$")] | None = None
     """PostgreSQL URI, for workers on several machines. It must hold no password: libpq reads PGPASSWORD or ~/.pgpass. null: SQLite
     in the sweep's folder, for workers of one machine."""
-    pruner: Literal["median", "none"] = "median"
-    """Rule by which trials end early: above the median of finished ones at the same epoch, or none."""
-    startup_trials: Whole = 10
-    """Number of random trials, before the sampler (TPE) learns from earlier ones and before the median prunes any."""
-    warmup_epochs: Whole = 5
-    """Epochs in which no trial is pruned. Of several scenarios, every trial first runs a third, in the order given, to their end:
-    the loss of one alone says little about the mean."""
 
     def __post_init__(self) -> None:
         if not self.space:
             raise ValueError("space: at least one setting is required")
         if self.storage:
             refuse_password("storage", self.storage, "PGPASSWORD or ~/.pgpass")
-        if len(set(self.scenarios)) != len(self.scenarios):
-            raise ValueError(f"scenarios: entries must differ, received {list(self.scenarios)}")

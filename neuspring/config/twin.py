@@ -94,13 +94,9 @@ class Fit(SettingsSection):
     damping: Literal["fixed", "homogeneous"] = "fixed"
     """Training of the damping: none (fixed), or drag and one factor of all dashpots (homogeneous)."""
     selection: Literal["training_loss", "tail"] = "training_loss"
-    """Loss that chooses the best epoch: that seen while training, as in the paper, or that on a tail of training frames. On a tail
-    nothing is fitted; the start of the fit is a candidate too."""
-    tail_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.2
-    """Fraction of the training frames on which nothing is fitted with `selection: tail`."""
+    """Loss that chooses the best epoch: that seen while training, as in the paper, or that on a tail of training frames. On a tail,
+    the last fifth, nothing is fitted; the start of the fit is a candidate too."""
     field: SpringFieldSettings = dataclasses.field(default_factory=SpringFieldSettings)
-    checkpoint_every: Count = 5
-    """Epochs between checkpoints from which a killed job continues."""
     rod: RodFit = dataclasses.field(default_factory=RodFit)
 
     def __post_init__(self) -> None:

@@ -21,7 +21,6 @@ from neuspring.core.errors import InputError
 from neuspring.core.text import listed
 from neuspring.perception.backends import BACKENDS, require_known
 from neuspring.scenes.sources import SOURCES, Source, location, scenario_rows, with_deform
-from neuspring.scores.lpips import configured_weights
 from neuspring.scores.metrics import require_metrics
 from neuspring.scores.paper import Study, read_studies
 from neuspring.twin.body import BODIES
@@ -174,13 +173,10 @@ class Benchmark:
         self.pools, self.transfers = self._groups(rows)
         """`pools`: scenario of the whole configuration -> the other recordings of its pool, where a method has one. `transfers`:
         chosen scenario -> those that its models are transferred to."""
-        self.tuned = self.whole.tune.scenarios or self.whole.scenarios if self.whole.tune else ()
+        self.tuned = self.whole.scenarios if self.whole.tune else ()
         """The scenarios of the sweep: it keeps them, whatever part of the runs is made now."""
         others = [name for names in self.transfers.values() for name in names]
         others += [other for name in config.scenarios for other in self.pools.get(name, ())]
-        if self.whole.tune:
-            known = dict.fromkeys([*self.whole.scenarios, *others])
-            _require_known("tune.scenarios", self.whole.tune.scenarios, known, "this configuration's scenarios")
         self.scenarios = {name: rows[name] for name in dict.fromkeys([*config.scenarios, *others, *self.tuned])}
         """Chosen ones, those that twins are transferred to or pooled with, those of the sweep."""
         self.whole_scenarios = {name: rows[name] for name in self.whole.scenarios}
@@ -248,9 +244,6 @@ class Benchmark:
         for name, method in self.methods.items():
             self._check_settings(name, method)
         require_known(self.config.perception)
-        if self.config.images.enabled:
-            # Named weights that are missing or wrong are an error before the first job.
-            configured_weights(self.config.images.lpips)
         for name, row in self.scenarios.items():
             self._check_data(name, row)
         if not any(self.applies(method, scenario) for method in self.methods for scenario in self.config.scenarios):
@@ -260,9 +253,6 @@ class Benchmark:
 
     def _check_settings(self, name: str, method: Method) -> None:
         config = with_method(self.config, method, name)
-        if name in self.pictured:
-            # Named weights that are missing or wrong are an error before the first job.
-            BASELINES[method.model or ""].features(config)
         if not method.search:
             return
         row = self.searches[method.searched]

@@ -23,13 +23,17 @@ if TYPE_CHECKING:
     from neuspring.perception.track_opencv import Followed
 
 
+PERCEPTION_SEED = 0
+"""Seed of the pixels that are followed and of the points that are sampled; methods have seeds of their own."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Backend:
     """One way to do a step. Its module is imported when it is used."""
 
     module: str
     section: str = ""
-    """Its settings: a field of `perception.segment` or `perception.track`; empty: it has none."""
+    """Settings of a segmentation: a field of `perception.segment`; empty: it has none. A tracker is given `perception.track`."""
     gpu: bool = False
     """True where it takes a GPU where there is one; it is then given the device as its last argument."""
     truth: bool = False
@@ -52,19 +56,19 @@ class Backend:
 
     def segment(self, capture: Capture, camera: str, settings: Perception, device: str) -> np.ndarray:
         """Labels [T, H, W] uint8 of one camera: 0 table, 1 object, 2 hands (`data.capture.OBJECT`, `HANDS`)."""
-        labels: np.ndarray = self._call("segment", (capture, camera), settings.segment, (), device)
+        own = (getattr(settings.segment, self.section),) if self.section else ()
+        labels: np.ndarray = self._call("segment", (capture, camera, *own), device)
         return labels
 
     def track(self, capture: Capture, camera: str, labels: np.ndarray, settings: Perception, device: str) -> Followed:
         """Tracks of pixels of the masks `labels` [T, H, W]."""
-        tracks: Followed = self._call("track", (capture, camera, labels), settings.track, (settings.seed,), device)
+        tracks: Followed = self._call("track", (capture, camera, labels, settings.track, PERCEPTION_SEED), device)
         return tracks
 
-    def _call(self, step: str, given: tuple[Any, ...], section: Any, seed: tuple[int, ...], device: str) -> Any:
+    def _call(self, step: str, given: tuple[Any, ...], device: str) -> Any:
         from neuspring.core.device import resolve_device
 
-        own = (getattr(section, self.section),) if self.section else ()
-        return getattr(import_module(self.module), step)(*given, *own, *seed, *((resolve_device(device),) if self.gpu else ()))
+        return getattr(import_module(self.module), step)(*given, *((resolve_device(device),) if self.gpu else ()))
 
 
 SEGMENTERS = Registry(
@@ -80,10 +84,9 @@ SEGMENTERS = Registry(
 TRACKERS = Registry(
     "trackers",
     {
-        "opencv": Backend(module="neuspring.perception.track_opencv", section="opencv"),
-        "cotracker3": Backend(module="neuspring.perception.track_cotracker", section="cotracker3", gpu=True),
-        # The truth takes its count of points from the settings of opencv.
-        "truth": Backend(module="neuspring.perception.truth", section="opencv", truth=True),
+        "opencv": Backend(module="neuspring.perception.track_opencv"),
+        "cotracker3": Backend(module="neuspring.perception.track_cotracker", gpu=True),
+        "truth": Backend(module="neuspring.perception.truth", truth=True),
     },
     Backend,
 )
@@ -112,10 +115,10 @@ def _possible(step: str, name: str) -> list[Backend]:
     return [BACKENDS[step][one] for one in ((name, "marks") if (step, name) == ("segment", "opencv") else (name,))]
 
 
-def backend_keys(step: str, name: str) -> tuple[str, ...]:
-    """Keys of the configuration that a backend reads."""
-    sections = [one.section for one in _possible(step, name) if one.section]
-    return (f"perception.{step}.backend", *(f"perception.{step}.{section}" for section in sections))
+def segmentation_keys(name: str) -> tuple[str, ...]:
+    """Keys of the configuration that a segmentation reads."""
+    sections = [one.section for one in _possible("segment", name) if one.section]
+    return ("perception.segment.backend", *(f"perception.segment.{section}" for section in sections))
 
 
 def backend_modules(step: str, name: str) -> tuple[str, ...]:

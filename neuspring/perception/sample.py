@@ -21,6 +21,7 @@ from neuspring.core.geometry import on_table
 from neuspring.data.capture import Capture
 from neuspring.data.results import LiftedTracks, ShapePrior
 from neuspring.intake.points import in_both, read, scenario_of, standing, taught_by
+from neuspring.perception.backends import PERCEPTION_SEED
 
 SURFACE, INTERIOR = 1024, 10000
 """Points drawn on the prior's surface, and in its bounding box, of which those inside are kept; as released."""
@@ -50,7 +51,7 @@ def assemble(
         indices, kept = among(on_table(lifted.object_points[0], up), rank, nodes)
         surface, interior, voxel = nodes[kept], nodes[:0], spacing(nodes)
     else:
-        indices, surface, interior, voxel = structure(lifted, prior, settings.sample, up, settings.seed, followed)
+        indices, surface, interior, voxel = structure(lifted, prior, settings.sample, up, PERCEPTION_SEED, followed)
     visible, valid = lifted.object_visibility[:, indices], lifted.object_motion_valid[:, indices]
     points = np.where(visible[..., None], on_table(lifted.object_points[:, indices], up), 0.0)
     if image is not None:

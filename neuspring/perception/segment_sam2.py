@@ -23,6 +23,8 @@ from neuspring.data.frames import frames_of
 from neuspring.perception.marks.carry import CameraFilm, Carried, Cues, doubt_of, frame_mask, over_capture
 from neuspring.perception.marks.marks import Mark
 
+DETECTOR, VIDEO_MODEL = "IDEA-Research/grounding-dino-tiny", "facebook/sam2.1-hiera-large"
+"""GroundingDINO and SAM 2 on the Hugging Face hub, as released."""
 BOX_SCORE, WORD_SCORE = 0.35, 0.25
 """Least scores of a box, and of a word for it, as released."""
 
@@ -135,14 +137,14 @@ def load(settings: GroundedSam2, device: str, *, words: bool = True) -> Models:
     video_model: Any = transformers.Sam2VideoModel
     try:
         return Models(
-            detector.from_pretrained(settings.detector, **weights).to(device).eval() if words else None,
-            transformers.AutoProcessor.from_pretrained(settings.detector, local_files_only=local) if words else None,
-            video_model.from_pretrained(settings.video_model, **weights).to(device).eval(),
-            transformers.Sam2VideoProcessor.from_pretrained(settings.video_model, local_files_only=local),
+            detector.from_pretrained(DETECTOR, **weights).to(device).eval() if words else None,
+            transformers.AutoProcessor.from_pretrained(DETECTOR, local_files_only=local) if words else None,
+            video_model.from_pretrained(VIDEO_MODEL, **weights).to(device).eval(),
+            transformers.Sam2VideoProcessor.from_pretrained(VIDEO_MODEL, local_files_only=local),
         )
     except OSError as error:
-        wanted = f"{settings.detector} and {settings.video_model}" if words else settings.video_model
-        rule = f"weights of {wanted} must be in the Hugging Face cache, or be folders"
+        wanted = f"{DETECTOR} and {VIDEO_MODEL}" if words else VIDEO_MODEL
+        rule = f"weights of {wanted} must be in the Hugging Face cache"
         remedy = "Set perception.segment.grounded_sam2.download: true once, or copy the cache from a machine that has it."
         raise InputError("perception.segment.grounded_sam2", rule, str(error).splitlines()[0], remedy) from error
 

@@ -49,6 +49,8 @@ CARVED_MARGIN = 0.02
 """m around the cloud of frame 0 within which voxels are carved."""
 CARVING_TOLERANCE = 0.004
 """m by which measured depth may lie behind a voxel before the voxel is carved."""
+HULL_VOXEL = 0.003
+"""Side of a voxel of the visual hull, m: a few depth pixels at a camera's distance."""
 HULL_SMOOTHING = 1.0
 """Width, voxels, by which the hull is smoothed."""
 SEEN_WITHIN = 4.0
@@ -85,7 +87,7 @@ def shape_prior(
     prior = _prior(capture, masks, cloud, settings, end)
     if not len(prior.faces):
         return prior
-    was_seen = seen(prior.vertices, capture, masks, SEEN_WITHIN * settings.voxel, prior.faces)
+    was_seen = seen(prior.vertices, capture, masks, SEEN_WITHIN * HULL_VOXEL, prior.faces)
     # A face counts by the share of its corners.
     corners = prior.vertices[prior.faces].astype(float)
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -135,21 +137,21 @@ def visual_hull(
             y, x = np.nonzero(labels == OBJECT)
             space = np.concatenate([cloud, camera.lift(np.stack([x, y], axis=1).astype(float), end[y, x])])
     low, high = space.min(axis=0) - CARVED_MARGIN, space.max(axis=0) + CARVED_MARGIN
-    counts = np.ceil((high - low) / settings.voxel).astype(int) + 1
+    counts = np.ceil((high - low) / HULL_VOXEL).astype(int) + 1
     # Voxel centers [nx, ny, nz, 3].
-    grid = low + settings.voxel * np.moveaxis(np.indices(counts), 0, -1)
+    grid = low + HULL_VOXEL * np.moveaxis(np.indices(counts), 0, -1)
     hull = capture.description.up_sign * grid[..., 2] > 0
     shown = np.zeros_like(hull)
     for name in showing:
         admitted, shows = _consistent(grid, capture.cameras[name], masks[name].labels[0], *sides[name], CARVING_TOLERANCE)
         hull, shown = hull & admitted, shown | shows
     hull = _largest_piece(hull & shown)
-    vertices, faces = _surface(hull, low, settings.voxel, HULL_SMOOTHING)
+    vertices, faces = _surface(hull, low, HULL_VOXEL, HULL_SMOOTHING)
     if not len(faces):
-        rule = f"more than specks of {1e3 * settings.voxel:g} mm must be consistent with all cameras"
+        rule = f"more than specks of {1e3 * HULL_VOXEL:g} mm must be consistent with all cameras"
         remedy = "Masks, depth and calibration of frame 0 contradict each other; or take perception.shape.backend: none."
         raise InputError(f"{capture.folder}, visual hull", rule, f"{hull.sum()} voxels", remedy)
-    facts |= {"volume": float(hull.sum() * settings.voxel**3), "cameras": len(showing)}
+    facts |= {"volume": float(hull.sum() * HULL_VOXEL**3), "cameras": len(showing)}
     backend = "visual_hull" if len(showing) > 1 else f"visual_hull, back: {settings.back}"
     return ShapePrior(vertices=vertices, faces=faces, backend=backend, facts=facts)
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from neuspring.config.perception import CoTracker3
+from neuspring.config.perception import PointTracking
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
 from neuspring.data.frames import frames_of
@@ -24,7 +24,7 @@ WEIGHTS_URL = f"https://huggingface.co/facebook/cotracker3/resolve/main/{WEIGHTS
 
 
 def track(
-    capture: Capture, camera: str, labels: np.ndarray, settings: CoTracker3, seed: int, device: str, model: Any = None
+    capture: Capture, camera: str, labels: np.ndarray, settings: PointTracking, seed: int, device: str, model: Any = None
 ) -> Followed:
     """Follow up to `settings.points` pixels of the masks `labels` [T, H, W]; none where frame 0 shows neither object nor hands.
 
@@ -60,14 +60,14 @@ def _windows(model: Any, video: torch.Tensor, queries: torch.Tensor, device: str
     return tracks[0, :count].cpu().numpy(), visible[0, :count].cpu().numpy().astype(bool)
 
 
-def load(settings: CoTracker3) -> Any:
+def load(settings: PointTracking) -> Any:
     """The online predictor of torch.hub. Raises InputError if it is neither cached nor may be downloaded."""
     hub = Path(torch.hub.get_dir())
     copies = sorted(hub.glob("facebookresearch_co-tracker_*"))
     if not (copies and (hub / "checkpoints" / WEIGHTS).is_file()) and not settings.download:
         rule = f"CoTracker3's code and checkpoints/{WEIGHTS} must be in the torch.hub cache"
-        remedy = "Set perception.track.cotracker3.download: true once (mind its license), or use the backend opencv."
-        raise InputError("perception.track.cotracker3", rule, f"not both in {hub}", remedy)
+        remedy = "Set perception.track.download: true once (mind its license), or use the backend opencv."
+        raise InputError("perception.track.backend", rule, f"not both in {hub}", remedy)
     # The hub's own code would read the weights as any pickle; here they come as tensors alone.
     if copies:
         predictor: Any = torch.hub.load(str(copies[-1]), "cotracker3_online", source="local", pretrained=False)

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from neuspring.config.perception import OpenCvTracking
+from neuspring.config.perception import PointTracking
 from neuspring.data.capture import NOTHING, Capture
 from neuspring.data.frames import gray
 
@@ -62,12 +62,12 @@ class Followed:
         return cls(np.repeat(start[None], frames, axis=0), visible)
 
 
-def track(capture: Capture, camera: str, labels: np.ndarray, settings: OpenCvTracking, seed: int) -> Followed:
+def track(capture: Capture, camera: str, labels: np.ndarray, settings: PointTracking, seed: int) -> Followed:
     """Follow up to `settings.points` pixels of the masks `labels` [T, H, W]; none where frame 0 shows neither object nor hands."""
     return follow(capture, camera, labels, choose(labels[0], settings.points, seed), settings)
 
 
-def follow(capture: Capture, camera: str, labels: np.ndarray, start: np.ndarray, settings: OpenCvTracking) -> Followed:
+def follow(capture: Capture, camera: str, labels: np.ndarray, start: np.ndarray, settings: PointTracking) -> Followed:
     """Follow points (x, y) [Q, 2] float32 of frame 0; they belong to its nearest label, and vote on each other's motion.
 
     `labels` [T, H, W] are masks; frame 0 must show object or hands.

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from neuspring.config.perception import OpenCvTracking
+from neuspring.config.perception import PointTracking
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.data.results import ShapePrior
 from neuspring.perception.track_opencv import Followed, choose
@@ -16,7 +16,7 @@ DEPTH_TOLERANCE = 0.01
 """m by which the depth image may differ from a point's depth for the point to count as seen."""
 
 
-def track(capture: Capture, camera: str, labels: np.ndarray, settings: OpenCvTracking, seed: int) -> Followed:
+def track(capture: Capture, camera: str, labels: np.ndarray, settings: PointTracking, seed: int) -> Followed:
     """Exact places [T, Q, 2] of up to `settings.points` pixels of the masks, and whether depth and mask show them there."""
     truth, view = truth_of(capture), capture.cameras[camera]
     start = choose(labels[0], settings.points, seed)

@@ -22,6 +22,8 @@ from neuspring.core.errors import InputError
 STABILITY_LIMIT = 4.0
 PREDICTION = 0.4
 """Fraction of the bound for predictions. A substep multiplies a damped mode by 1 - dt c; with dt c <= 0.8 it keeps its sign."""
+MAX_SUBSTEPS = 2000
+"""Upper limit of `simulation.substeps: auto`, per frame: beyond it a twin takes seconds per frame."""
 RELEASED_SUBSTEPS = 667
 RELEASED_FRAME_TIME = RELEASED_SUBSTEPS * 5e-5
 """s, whatever the frame rate (released_quirks.frame_time_667)."""

@@ -2,8 +2,8 @@
 
 d(a, b) = sum over the five ReLUs l of the mean over pixels of w_l . (f_l(a) - f_l(b))^2, f_l of unit length over its channels.
 AlexNet is that of torchvision (Krizhevsky 2014, "One weird trick"), written out here, so that torchvision is not needed. Its
-weights and the heads are files: in torch hub's cache, for the heads also inside an installed `lpips` or `torchmetrics`, or where
-the configuration says. They are recognized by their SHA-256. Nothing is downloaded; missing files are named.
+weights and the heads are files: in torch hub's cache, for the heads also inside an installed `lpips` or `torchmetrics`. They are
+recognized by their SHA-256. Nothing is downloaded; missing files are named.
 
 torch is imported where it is used, because the workflow asks for the weights before it plans any job.
 """
@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neuspring.config.images import LpipsWeights
 from neuspring.core.errors import InputError
 from neuspring.core.weights import find_file, hub_folder, read_tensors
 
@@ -47,11 +46,6 @@ def find_weights(backbone: Path | None = None, heads: Path | None = None, *, tru
     if isinstance(first, Path) and isinstance(second, Path):
         return first, second
     return "; ".join(reason for reason in (first, second) if isinstance(reason, str))
-
-
-def configured_weights(settings: LpipsWeights) -> tuple[Path, Path] | str:
-    """As `find_weights`, with the paths of the configuration."""
-    return find_weights(*(Path(path) if path else None for path in (settings.backbone, settings.heads)))
 
 
 CHANNELS = (3, 64, 192, 384, 256, 256)
@@ -89,7 +83,7 @@ class Lpips:
         weights = find_weights(backbone, heads, trusted=trusted)
         if isinstance(weights, str):
             remedy = f"Get the backbone from {BACKBONE_ADDRESS}, the heads with `pip install --no-deps lpips`."
-            raise InputError("LPIPS", "its weights must be in torch hub's cache or be named", weights, remedy)
+            raise InputError("LPIPS", "its weights must be in torch hub's cache", weights, remedy)
         shapes = {
             f"features.{layer}.weight": (after, before, window, window)
             for layer, before, after, window in zip(LAYERS, CHANNELS[:-1], CHANNELS[1:], WINDOWS, strict=True)
@@ -100,9 +94,9 @@ class Lpips:
         return cls(tensors[: len(LAYERS)], tensors[len(LAYERS) :], read_tensors(weights[1], linear, device))
 
     @classmethod
-    def configured(cls, settings: LpipsWeights, device: str) -> Lpips | str:
-        """As `load`, from the files of the configuration; one line that says which are missing."""
-        weights = configured_weights(settings)
+    def cached(cls, device: str) -> Lpips | str:
+        """As `load`, from the usual caches; one line that says which files are missing."""
+        weights = find_weights()
         # Their checksums have just been taken.
         return weights if isinstance(weights, str) else cls.load(*weights, device, trusted=True)
 

@@ -86,7 +86,7 @@ def first_splats(points: np.ndarray, colors: np.ndarray, settings: Appearance, w
     return Splats(
         means=points.astype(np.float32),
         quaternions=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        log_scales=np.tile(np.log(scale)[:, None], (1, 1 if settings.isotropic else 3)),
+        log_scales=np.log(scale)[:, None],
         opacity_logits=np.full(count, math.log(FIRST_OPACITY / (1 - FIRST_OPACITY))),
         harmonics=shades,
     )

@@ -15,9 +15,7 @@ from neuspring.stages.stage import stage, there
 @stage(
     output="{scenario}/observations.npz",
     reads=lambda settings, given: (
-        ("perception.sample", "perception.seed")
-        if SOURCES[given["scenario"].source].films
-        else SOURCES[given["scenario"].source].reads
+        ("perception.sample",) if SOURCES[given["scenario"].source].films else SOURCES[given["scenario"].source].reads
     ),
     code=lambda settings, given: () if SOURCES[given["scenario"].source].films else (SOURCES[given["scenario"].source].module,),
     without=lambda rows: () if rows.source.films else ("capture",),

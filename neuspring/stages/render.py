@@ -24,9 +24,9 @@ RENDERED_VIDEOS = ("video", "turntable")
 
 def _weights(rows: Rows) -> str:
     """Optional weights, without which one metric is left out."""
-    from neuspring.scores.lpips import configured_weights
+    from neuspring.scores.lpips import find_weights
 
-    return "absent" if isinstance(configured_weights(rows.config.images.lpips), str) else "found"
+    return "absent" if isinstance(find_weights(), str) else "found"
 
 
 @stage(
@@ -35,7 +35,6 @@ def _weights(rows: Rows) -> str:
         "images.backend",
         "images.views",
         "images.video",
-        "images.lpips",
         "images.released_quirks",
         "images.corner_pixels",
     ),
@@ -75,7 +74,7 @@ def render(
     images, scenario = settings.images, observations.scenario
     require_length(capture, observations)
     scored = Scored.of(capture, masks_of_cameras(capture, paths(masks)), images, device)
-    lpips = Lpips.configured(images.lpips, device)
+    lpips = Lpips.cached(device)
     trajectory = Trajectory.load(rollout.file("trajectory")) if rollout.has("trajectory") else None
     if trajectory is None or not len(trajectory.positions):
         raise NumericalFailure(rollout.record.reason)

@@ -8,7 +8,7 @@ from neuspring.config import Config
 from neuspring.core.errors import InputError
 from neuspring.core.records import Recorder
 from neuspring.data.capture import Capture
-from neuspring.perception.backends import BACKENDS, backend_keys, backend_modules, segmentation
+from neuspring.perception.backends import BACKENDS, backend_modules, segmentation, segmentation_keys
 from neuspring.stages.stage import Rows, Written, stage
 
 
@@ -23,7 +23,7 @@ def _settled(rows: Rows) -> Config:
 
 @stage(
     output="{scenario}/perception/{camera}/masks.json",
-    reads=lambda settings, given: (*backend_keys("segment", settings.perception.segment.backend), "perception.segment.verdict"),
+    reads=lambda settings, given: (*segmentation_keys(settings.perception.segment.backend), "perception.segment.verdict"),
     code=lambda settings, given: backend_modules("segment", settings.perception.segment.backend),
     gpu=lambda settings: BACKENDS["segment"][settings.perception.segment.backend].gpu,
     memory_mb=8000,

@@ -5,13 +5,13 @@ from __future__ import annotations
 from neuspring.config import Config
 from neuspring.core.records import Before, Recorder
 from neuspring.data.capture import Capture
-from neuspring.perception.backends import BACKENDS, backend_keys, backend_modules
+from neuspring.perception.backends import BACKENDS, backend_modules
 from neuspring.stages.stage import Written, stage
 
 
 @stage(
     output="{scenario}/perception/{camera}/tracks.json",
-    reads=lambda settings, given: (*backend_keys("track", settings.perception.track.backend), "perception.seed"),
+    reads=("perception.track",),
     code=lambda settings, given: backend_modules("track", settings.perception.track.backend),
     gpu=lambda settings: BACKENDS["track"][settings.perception.track.backend].gpu,
     memory_mb=8000,

@@ -24,7 +24,7 @@ def _reads(settings: Config, given: Any) -> tuple[str, ...]:
 def _stamp(rows: Rows) -> str:
     """Optional weights, where pictures are trained on."""
     baseline = BASELINES[rows.method.model or ""] if rows.method else None
-    return baseline.features(rows.config) if baseline and baseline.pictured(rows.config) else ""
+    return baseline.features() if baseline and baseline.pictured(rows.config) else ""
 
 
 @stage(

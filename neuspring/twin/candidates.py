@@ -145,7 +145,7 @@ class SearchProblem:
 def with_substeps(twin: Twin, settings: config.SimulationSettings, frame_time_667: bool) -> Twin:
     """The twin with its number of substeps: 667 with the quirk, else as configured: a fixed count or the smallest safe one.
 
-    Raises InputError if a fixed count is too small, NumericalFailure if `auto` would need more than `max_substeps`.
+    Raises InputError if a fixed count is too small, NumericalFailure if `auto` would need more than `stability.MAX_SUBSTEPS`.
     """
     if frame_time_667 or settings.substeps != "auto":
         count = stability.RELEASED_SUBSTEPS if frame_time_667 else int(settings.substeps)
@@ -153,8 +153,8 @@ def with_substeps(twin: Twin, settings: config.SimulationSettings, frame_time_66
         stability.check(twin)
         return twin
     count = stability.smallest_safe_substeps(stability.twin_spectrum(twin), twin.simulation.frame_time, settings.safety)
-    if count > settings.max_substeps:
-        raise NumericalFailure(f"needs {count} substeps per frame, more than max_substeps = {settings.max_substeps}")
+    if count > stability.MAX_SUBSTEPS:
+        raise NumericalFailure(f"needs {count} substeps per frame, more than {stability.MAX_SUBSTEPS}")
     return replace(twin, simulation=replace(twin.simulation, substeps=count))
 
 

@@ -46,6 +46,10 @@ if TYPE_CHECKING:
 
 BETAS = (0.9, 0.99)
 """Adam's decay rates of the first and the second moment, as released."""
+CHECKPOINT_EVERY = 5
+"""Epochs between checkpoints from which a killed job continues."""
+TAIL_FRACTION = 0.2
+"""Part of the training frames on which nothing is fitted with `fit.selection: tail`, as in sweeps."""
 MAX_ROLLBACKS = 5
 RELEASED_CHECKPOINT_EPOCHS = 20
 
@@ -144,9 +148,9 @@ FIT_ARRAYS = ("values", "moments", "best_values")
 """The fields of a state that hold arrays."""
 
 
-def tail_start(train_end: int, tail_fraction: float) -> int:
+def tail_start(train_end: int) -> int:
     """The first held-back frame of `train_end` training frames: at least one frame is trained on, and one selects the epoch."""
-    return train_end - min(max(round(tail_fraction * (train_end - 1)), 1), train_end - 2)
+    return train_end - min(max(round(TAIL_FRACTION * (train_end - 1)), 1), train_end - 2)
 
 
 class TwinFit:
@@ -168,7 +172,7 @@ class TwinFit:
         self.grips = ControllerSprings(graph.springs, len(graph.nodes), problem.device)
         if settings.selection == "tail" and end < 3:
             raise InputError("fit.selection", "a held-back tail needs at least two training frames after frame 0", end - 1)
-        self.fitted_end = tail_start(end, settings.tail_fraction) if settings.selection == "tail" else end
+        self.fitted_end = tail_start(end) if settings.selection == "tail" else end
         self.horizon = settings.horizon or self.fitted_end - 1
         self.rest = torch.tensor(problem.twin.topology.nodes, device=problem.device)
         velocity = initial_velocity(observations, problem.twin.simulation.initial_velocity)
@@ -214,7 +218,7 @@ class TwinFit:
         """The present parameters, packed, after seeing that they can be integrated.
 
         More substeps are taken where they may grow. Raises NonFinite where they may not (a fixed count, the released 667,
-        `max_substeps`) and the bound is passed.
+        `MAX_SUBSTEPS`) and the bound is passed.
         """
         packed = self.parameters.pack(self.twin.simulation.substep)
         springs = packed["springs"].detach().double().cpu().numpy()
@@ -245,7 +249,7 @@ class TwinFit:
             return simulation.substeps
         count = stability.smallest_safe_substeps(spectrum, simulation.frame_time, chosen.safety)
         may_grow = chosen.substeps == "auto" and not self.problem.quirks.frame_time_667
-        if may_grow and count <= chosen.max_substeps:
+        if may_grow and count <= stability.MAX_SUBSTEPS:
             return count
         if spectrum.load(simulation.substep) >= stability.STABILITY_LIMIT:
             raise NonFinite(f"stiffness grew beyond what {simulation.substeps} substeps per frame can integrate")
@@ -419,7 +423,7 @@ def fit(
 
     label = f"{'oracle ' * problem.oracle}fit {problem.observations.scenario.name}, {problem.kind}, seed {problem.seed}"
     share = 1 / len(lane.batch.lanes) if lane else 1.0
-    loop = TrainingLoop("the fit", label, problem.fit.epochs, problem.fit.checkpoint_every, partial, key, share=share)
+    loop = TrainingLoop("the fit", label, problem.fit.epochs, CHECKPOINT_EVERY, partial, key, share=share)
     run = PooledFit(problem) if problem.pool else TwinFit(problem, lane)
     state = _State.of(loop.restored) if loop.restored else _start(run, problem)
     overflow = state.overflow

@@ -30,8 +30,17 @@ MOST_STRETCH = 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class RodStart(config.RodSettings):
-    """The settings with the other values that a fit starts from, for a body of 1 kg/m."""
+    """The settings with the other values that a fit starts from, for a body of 1 kg/m.
 
+    Motion depends on stiffness over mass alone, so a body of another mass per length has as many times the stiffness.
+    """
+
+    vertices: int = 24
+    """Vertices of a center line that is found among nodes. One that the observations give has its own."""
+    bending: float = 0.1
+    """EI, N m^2."""
+    twisting: float = 0.1
+    """GJ, N m^2."""
     stretching: float = 2e4
     """EA, N."""
     damping: float = 0.05

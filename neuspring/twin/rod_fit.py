@@ -64,6 +64,8 @@ LOGARITHMIC = ("bending", "twisting", "damping", "drag", "drag_quadratic", "mark
 class RodSteps(RodFit):
     """The settings with the course of the fit."""
 
+    knots: int = 5
+    """Knots of a field along the arc, at least 4."""
     markers: bool = True
     """Fit of how far markers lie beside the center line, and the lengths between them."""
     horizons: tuple[int, ...] = (60, 150, 0)

@@ -62,7 +62,7 @@ def test_regions_and_fields_by_hand(tmp_path, capsys):
 
 def test_a_numerical_failure_passes_through_every_stage_and_shows_in_the_table(tmp_path):
     """No candidate can be integrated with a single substep, so the search fails numerically; no command does."""
-    settings = TINY | {"simulation": {"max_substeps": 1}, "search": {"rollouts": 11}}
+    settings = TINY | {"simulation": {"safety": 1e-6}, "search": {"rollouts": 11}}
     common = ["--observations", str(observed(tmp_path)), "--device", "cpu"]
     seen, folder = ["--observations", str(observed(tmp_path))], tmp_path / "toy_rope_lift_smooth" / "search_only" / "0"
     found, rolled = folder / "search.json", folder / "rollout.json"

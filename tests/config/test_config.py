@@ -93,7 +93,6 @@ MISTAKES = {
     "safety": ("simulation: {safety: 1.0}", "simulation.safety", "less than or equal to 0.95"),
     "substeps word": ("simulation: {substeps: many}", "simulation.substeps", "'auto'"),
     "no substeps": ("simulation: {substeps: 0}", "simulation.substeps", "received 0"),
-    "occlusion": ("toy: {occlusion: 1}", "toy.occlusion", "less than 1"),
     "reversed range": (
         "search: {variables: {drag: {low: 5, high: 1}}}",
         "search.variables",
@@ -116,7 +115,7 @@ MISTAKES = {
     "unknown scale": ("search: {variables: {drag: {scale: cubic}}}", "search.variables.drag.scale", "received 'cubic'"),
     "unit of lengths": ("search: {lengths: inch}", "search.lengths", "received 'inch'"),
     "a fixed stranger": ("search: {fixed: [mass]}", "fixed: different ones of stiffness, object_radius", "received ['mass']"),
-    "negative rounds": ("search: {polish: {rounds: -1}}", "search.polish.rounds", "received -1"),
+    "negative rounds": ("search: {polish: -1}", "search.polish", "received -1"),
     "isolated nodes": ("search: {isolated_nodes: ignore}", "search.isolated_nodes", "received 'ignore'"),
     "resolution word": ("fit: {field: {resolution: fine}}", "fit.field.resolution", "'adaptive'"),
     "no texels": ("fit: {field: {resolution: 0}}", "fit.field.resolution", "received 0"),
@@ -126,7 +125,6 @@ MISTAKES = {
         "aims.0.bellow: unknown key (did you mean below?)",
     ),
     "unknown effort": ("effort: fast", "effort", "'quick', 'normal' or 'paper', received 'fast'"),
-    "tail fraction": ("fit: {tail_fraction: 0}", "fit.tail_fraction", "greater than 0"),
     "null for a rate": ("fit: {learning_rate: null}", "fit.learning_rate", "received None"),
     "zero for an optional rate": ("fit: {factor_learning_rate: 0}", "fit.factor_learning_rate", "greater than 0"),
     "a password on command lines": (

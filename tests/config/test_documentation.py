@@ -63,7 +63,6 @@ def test_shown_defaults_are_accepted_as_they_are_written():
 def test_ranges_are_those_that_the_configuration_enforces():
     shown = {key.strip("`"): words for key, _, words, _ in config_page.fields(config.Fit)}
     assert shown["epochs"] == "integer >= 1"
-    assert shown["tail_fraction"] == "number > 0 and < 1"
     assert shown["factor_learning_rate"] == "number > 0 or `null`"
     assert shown["damping"] == "`fixed`, `homogeneous`"
     assert "field" not in shown

@@ -113,7 +113,7 @@ def test_a_sweep_without_a_study_is_explained(project):
 @pytest.mark.slow
 def test_a_sweep_ends_with_its_best(project):
     space = {"fit.learning_rate": {"low": 1e-4, "high": 1e-2, "log": True}}
-    tune = {"study": "rate", "method": "baseline", "trials": 3, "workers": 2, "startup_trials": 1, "space": space}
+    tune = {"study": "rate", "method": "baseline", "trials": 3, "workers": 2, "space": space}
     run(project, {"tune": tune}, "--", "sweep")
     folder = project / "results" / "tune" / "rate"
     assert len((folder / "trials.csv").read_text().splitlines()) == 1 + 3

@@ -208,7 +208,7 @@ def tiny_fit(device: str) -> dict[str, Any]:
     part: the middle one and the one at 95 % are compared, and the losses."""
     results = []
     for where in (device, "cpu"):
-        settings = config.Fit(epochs=3, learning_rate=5e-3, checkpoint_every=1)
+        settings = config.Fit(epochs=3, learning_rate=5e-3)
         with contextlib.redirect_stdout(io.StringIO()):
             results.append(fit(small.fit_problem(fit=settings, device=where)))
     losses = [result.history["loss"].to_numpy(np.float64) for result in results]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from neuspring.config import ScenarioRow, Synthetic
-from neuspring.config.perception import Lift, OpenCvTracking, ShapePriorSettings
+from neuspring.config.perception import Lift, PointTracking, ShapePriorSettings
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.data.capture import OBJECT, Capture
 from neuspring.data.results import Masks, PixelTracks
@@ -36,7 +36,7 @@ def perfect(tmp_path_factory):
     masks = {c: Masks(labels=np.stack([capture.mask(c, f) for f in frames]), backend="given") for c in capture.cameras}
     tracks = {}
     for camera in capture.cameras:
-        exact = track(capture, camera, masks[camera].labels, OpenCvTracking(points=500), 0)
+        exact = track(capture, camera, masks[camera].labels, PointTracking(points=500), 0)
         tracks[camera] = PixelTracks(pixels=exact.pixels, visible=exact.visible, backend="truth")
     lifted = lift(capture, masks, tracks, SETTINGS)
     return SimpleNamespace(capture=capture, truth=truth_of(capture), masks=masks, tracks=tracks, lifted=lifted)

@@ -193,6 +193,6 @@ def test_what_the_prompt_does_not_find_is_said(capture, monkeypatch, words, what
 
 def test_missing_weights_name_the_models_and_the_way_out(capture, monkeypatch, tmp_path):
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    settings = GroundedSam2(detector=str(tmp_path / "no_detector"))
+    monkeypatch.setattr(segment_sam2, "DETECTOR", str(tmp_path / "no_detector"))
     with pytest.raises(InputError, match=r"no_detector and facebook/sam2.* must be in the Hugging Face cache.*download: true once"):
-        segment_sam2.load(settings, "cpu")
+        segment_sam2.load(GroundedSam2(), "cpu")

@@ -35,7 +35,7 @@ def test_the_hull_is_closed_near_the_truth_and_better_with_more_cameras(tmp_path
     quality = []
     for cameras in (1, 2, 3):
         capture, masks, cloud, truth = film(tmp_path / str(cameras), cameras)
-        hull = shape.visual_hull(capture, masks, cloud, ShapePriorSettings(voxel=0.004))
+        hull = shape.visual_hull(capture, masks, cloud, ShapePriorSettings())
         quality.append(overlap(hull, truth))
     assert quality[0] < quality[1] < quality[2]
     assert quality[2] > 0.8
@@ -46,7 +46,7 @@ def test_the_hull_is_closed_near_the_truth_and_better_with_more_cameras(tmp_path
 def test_a_hand_before_the_object_does_not_carve_it(tmp_path):
     capture, masks, cloud, truth = film(tmp_path, 3, with_hand=True)
     assert (masks["0"].labels == HANDS).any()
-    assert overlap(shape.visual_hull(capture, masks, cloud, ShapePriorSettings(voxel=0.004)), truth) > 0.8
+    assert overlap(shape.visual_hull(capture, masks, cloud, ShapePriorSettings()), truth) > 0.8
 
 
 def test_contradicting_views_are_refused(tmp_path):

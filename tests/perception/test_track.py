@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from neuspring.config.perception import CoTracker3, OpenCvTracking
+from neuspring.config.perception import PointTracking
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Writer
 from neuspring.perception import track_cotracker, track_opencv
@@ -55,7 +55,7 @@ def error(tracks: track_opencv.Followed, frame: int) -> np.ndarray:
 
 def test_points_move_with_the_texture(video):
     capture, labels = video
-    tracks = track_opencv.track(capture, "0", labels, OpenCvTracking(points=200), 0)
+    tracks = track_opencv.track(capture, "0", labels, PointTracking(points=200), 0)
     seen = tracks.visible[2]
     assert seen.mean() > 0.8
     assert np.median(error(tracks, 2)[seen]) < 0.25
@@ -63,9 +63,9 @@ def test_points_move_with_the_texture(video):
 
 def test_hidden_points_are_lost_and_found_again(video, monkeypatch):
     capture, labels = video
-    tracks = track_opencv.track(capture, "0", labels, OpenCvTracking(points=400), 0)
+    tracks = track_opencv.track(capture, "0", labels, PointTracking(points=400), 0)
     monkeypatch.setattr(track_opencv, "LIKENESS", NEVER)
-    without = track_opencv.track(capture, "0", labels, OpenCvTracking(points=400), 0)
+    without = track_opencv.track(capture, "0", labels, PointTracking(points=400), 0)
     behind = (np.abs(tracks.pixels[0, :, 0] + 3 * SHIFT[0] - 56) < 4) & (np.abs(tracks.pixels[0, :, 1] + 3 * SHIFT[1] - 45) < 10)
     assert behind.sum() > 10
     assert tracks.visible[3][behind].mean() < 0.3
@@ -77,7 +77,7 @@ def test_hidden_points_are_lost_and_found_again(video, monkeypatch):
 def test_missing_frames_are_bridged(video, monkeypatch):
     capture, labels = video
     monkeypatch.setattr(track_opencv, "FLOW_SIDE", 15)
-    tracks = track_opencv.track(capture, "late", labels, OpenCvTracking(points=200), 0)
+    tracks = track_opencv.track(capture, "late", labels, PointTracking(points=200), 0)
     assert not tracks.visible[[3, 4]].any()
     seen = tracks.visible[5]
     assert seen.mean() > 0.5
@@ -96,7 +96,7 @@ def test_points_start_in_the_mask_and_follow_the_seed(video):
 
 def test_an_empty_mask_has_no_points(video):
     capture, labels = video
-    tracks = track_opencv.track(capture, "0", np.zeros_like(labels), OpenCvTracking(), 0)
+    tracks = track_opencv.track(capture, "0", np.zeros_like(labels), PointTracking(), 0)
     assert tracks.pixels.shape == (8, 0, 2)
 
 
@@ -105,7 +105,7 @@ def test_points_come_back_after_a_frame_without_a_mask(video, monkeypatch):
     monkeypatch.setattr(track_opencv, "LIKENESS", 0.5)
     gap = labels.copy()
     gap[1] = 0
-    settings = OpenCvTracking(points=200)
+    settings = PointTracking(points=200)
     plain, holed = (track_opencv.track(capture, "0", masks, settings, 0).visible for masks in (labels, gap))
     assert not holed[1].any()
     assert holed[2].sum() > 0.8 * plain[2].sum()
@@ -114,7 +114,7 @@ def test_points_come_back_after_a_frame_without_a_mask(video, monkeypatch):
 def test_points_leave_a_mask_that_stays_behind_unless_its_rim_is_wide(video, monkeypatch):
     capture, labels = video
     monkeypatch.setattr(track_opencv, "LIKENESS", NEVER)
-    tight, wide = (track_opencv.track(capture, "0", labels, OpenCvTracking(points=400, rim=rim), 0) for rim in (0.0, 20.0))
+    tight, wide = (track_opencv.track(capture, "0", labels, PointTracking(points=400, rim=rim), 0) for rim in (0.0, 20.0))
     places = np.round(wide.pixels[2]).astype(int)
     outside = wide.visible[2] & (labels[2, places[:, 1], places[:, 0]] == 0)
     assert outside.sum() > 10
@@ -127,7 +127,7 @@ def test_a_point_beside_the_mask_belongs_to_the_nearest_label(video):
     y, x = np.nonzero(labels[0])
     point = np.array([[x.max() - 5, (y.min() + y.max()) / 2]], np.float32)
     start = np.concatenate([point, track_opencv.choose(narrow[0], 200, 0)])
-    wide, tight = (track_opencv.follow(capture, "0", narrow, start, OpenCvTracking(rim=rim)) for rim in (4.0, 0.0))
+    wide, tight = (track_opencv.follow(capture, "0", narrow, start, PointTracking(rim=rim)) for rim in (4.0, 0.0))
     assert wide.visible[1, 0]
     assert error(wide, 1)[0] < 0.25
     assert not tight.visible[1:, 0].any()
@@ -163,13 +163,13 @@ class StandIn:
 def test_cotracker_is_called_as_its_online_predictor_wants(video):
     capture, labels = video
     model = StandIn()
-    tracks = track_cotracker.track(capture, "0", labels, CoTracker3(points=30), 0, "cpu", model)
+    tracks = track_cotracker.track(capture, "0", labels, PointTracking(points=30), 0, "cpu", model)
     assert tuple(model.queries.shape) == (1, 30, 3)
     assert not model.queries[0, :, 0].any()
     assert model.windows == [(1, 6, 3, 96, 128)] * 2
     assert tracks.visible.all()
     assert error(tracks, 7).max() < 1e-4
-    tracks = track_cotracker.track(capture, "late", labels, CoTracker3(points=30), 0, "cpu", StandIn())
+    tracks = track_cotracker.track(capture, "late", labels, PointTracking(points=30), 0, "cpu", StandIn())
     assert not tracks.visible[[3, 4]].any()
 
 
@@ -180,7 +180,7 @@ def test_cotracker_without_weights_says_where_they_would_be(monkeypatch, tmp_pat
     with pytest.raises(
         InputError, match=r"CoTracker3's code and checkpoints/scaled_online\.pth must be in the torch\.hub cache.*download: true"
     ):
-        track_cotracker.load(CoTracker3())
+        track_cotracker.load(PointTracking())
 
 
 HUB = """
@@ -210,10 +210,10 @@ def test_cotracker_s_weights_are_read_as_tensors_alone(monkeypatch, tmp_path):
     weights.parent.mkdir()
     (code / "hubconf.py").write_text(HUB)
     torch.save({"weight": torch.tensor([[3.0, 4.0]]), "bias": torch.zeros(1)}, weights)
-    assert track_cotracker.load(CoTracker3()).model.weight.tolist() == [[3.0, 4.0]]
+    assert track_cotracker.load(PointTracking()).model.weight.tolist() == [[3.0, 4.0]]
     torch.save({"weight": Harmful(tmp_path / "ran")}, weights)
     with pytest.raises(pickle.UnpicklingError, match=r"[Ww]eights"):
-        track_cotracker.load(CoTracker3())
+        track_cotracker.load(PointTracking())
     assert not (tmp_path / "ran").exists()
 
 

@@ -207,5 +207,3 @@ def test_a_fixed_radius_stays_whatever_is_trained(dense):
     result = train(start, shots, settings, 0, "warp")
     assert len(result.splats.means) > 200, "what is too coarse is cloned, however large"
     np.testing.assert_allclose(np.exp(result.splats.log_scales), 0.004, rtol=1e-6)
-    with pytest.raises(ValueError, match="splats of one radius are isotropic"):
-        Appearance(fixed_radius=0.003, isotropic=False)

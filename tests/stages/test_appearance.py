@@ -12,7 +12,6 @@ import pandas as pd
 import pytest
 import torch
 
-from neuspring.config.images import LpipsWeights
 from neuspring.core.artifacts import SplatCenters
 from neuspring.core.errors import InputError
 from neuspring.core.records import Before, Recorder, StageRecord
@@ -293,12 +292,6 @@ def test_captures_of_another_length_are_named_with_both_files(scene, tmp_path):
             output=rollout.with_name("render.json"),
             **before,
         )
-
-
-def test_named_lpips_weights_that_are_missing_are_an_error_before_drawing(scene, tmp_path):
-    missing = LpipsWeights(backbone=str(tmp_path / "none.pth"))
-    with pytest.raises(InputError, match=r"none\.pth"):
-        scene.render(scene.roll(STEP, "weights"), settings(lpips=missing))
 
 
 def test_processed_data_need_no_lifted_points(scene, tmp_path):

@@ -24,7 +24,7 @@ from tests.support import small
 
 SETTINGS = config.Config(
     search=config.Search(rollouts=11),
-    fit=config.Fit(epochs=3, checkpoint_every=2, field=config.SpringFieldSettings(channels=4, hidden=16, bands=2)),
+    fit=config.Fit(epochs=3, field=config.SpringFieldSettings(channels=4, hidden=16, bands=2)),
     toy=config.Toy(frames=8),
     device="cpu",
 )

@@ -15,7 +15,7 @@ from tests.support import small
 
 SETTINGS = config.Config(
     search=small.released(rollouts=6, start={"object_radius": 0.045, "stiffness": 1e4}),
-    fit=config.Fit(epochs=2, learning_rate=5e-2, checkpoint_every=1),
+    fit=config.Fit(epochs=2, learning_rate=5e-2),
 )
 
 

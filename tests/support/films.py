@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from neuspring.config.perception import OpenCvTracking
+from neuspring.config.perception import PointTracking
 from neuspring.data.capture import HANDS, OBJECT
 from neuspring.data.frames import overlap
 from neuspring.perception import track_opencv
@@ -53,7 +53,7 @@ def newly_covered(labels: np.ndarray, truth: dict[int, np.ndarray]) -> list[floa
 
 def stepwise(colors: list[np.ndarray], labels: np.ndarray, start: np.ndarray, **settings: Any) -> tuple[np.ndarray, np.ndarray]:
     """The tracker of the workflow: places [T, K, 2] and whether they are visible [T, K], among its own random points."""
-    chosen = replace(OpenCvTracking(rim=RIM), **settings)
+    chosen = replace(PointTracking(rim=RIM), **settings)
     points = np.concatenate([start, track_opencv.choose(labels[0], chosen.points, 0)]).astype(np.float32)
     found = track_opencv.follow(Film(colors), "0", labels, points, chosen)  # type: ignore[arg-type]
     return found.pixels[:, : len(start)], found.visible[:, : len(start)]

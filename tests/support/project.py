@@ -17,7 +17,7 @@ TINY = {
     "methods": ["search_only", "baseline"],
     "seeds": [0],
     "search": {"rollouts": 11},
-    "fit": {"epochs": 3, "checkpoint_every": 1},
+    "fit": {"epochs": 3},
     "toy": {"frames": 8},
     "device": "cpu",
 }

@@ -30,7 +30,7 @@ def row(path: str = "rope/lift/smooth", name: str = "small") -> config.ScenarioR
 @functools.cache
 def scene(path: str = "rope/lift/smooth", noise: float = 0.0, occlusion: float = 0.0, frames: int = FRAMES) -> toy.ToyScene:
     """A toy scene of a few frames."""
-    return toy.make(row(path), config.Toy(frames=frames, noise=noise, occlusion=occlusion))
+    return toy.make(row(path), toy.ToyObservation(frames=frames, noise=noise, occlusion=occlusion))
 
 
 def observations() -> Observations:
@@ -117,7 +117,7 @@ def fit_problem(seen: Observations | None = None, values: dict[str, float] | Non
     settings: dict[str, object] = {
         "observations": search.observations,
         "twin": candidate(search, values or start_values()),
-        "fit": config.Fit(epochs=3, learning_rate=5e-2, checkpoint_every=1),
+        "fit": config.Fit(epochs=3, learning_rate=5e-2),
         "simulation": search.simulation,
         "losses": search.losses,
         "quirks": search.quirks,

@@ -37,7 +37,7 @@ def true_problem(**settings) -> FitProblem:
 
 def field_fit(**settings) -> config.Fit:
     """Settings of a fit of a small field."""
-    return config.Fit(**({"epochs": 5, "learning_rate": 1e-2, "checkpoint_every": 1, "field": FIELD} | settings))
+    return config.Fit(**({"epochs": 5, "learning_rate": 1e-2, "field": FIELD} | settings))
 
 
 @pytest.mark.parametrize(("field", "horizon"), [({}, 1), ({"triplane": False}, 0)], ids=str)
@@ -70,7 +70,7 @@ def test_the_whole_horizon_gradient_moves_stiffness_towards_the_truth():
     assert result.history["loss"].iloc[-1] < 0.1 * result.history["loss"].iloc[0]
 
 
-GROWING = {"fit": config.Fit(epochs=12, learning_rate=0.3, horizon=0, checkpoint_every=1)}
+GROWING = {"fit": config.Fit(epochs=12, learning_rate=0.3, horizon=0)}
 EVERYTHING = {
     "kind": "field",
     "fit": field_fit(
@@ -83,19 +83,18 @@ EVERYTHING = {
         field=replace(FIELD, offsets=True, offset_prior=0.1, smoothness=0.1),
     ),
 }
-LIMITED = {
-    "fit": config.Fit(epochs=4, learning_rate=0.3, checkpoint_every=1),
-    "simulation": config.SimulationSettings(max_substeps=70),
-}
-"""Substeps grow within the second epoch, until it is rolled back because they may not grow further."""
+LIMITED = {"fit": config.Fit(epochs=4, learning_rate=0.3)}
+"""With 70 substeps at most they grow within the second epoch, until it is rolled back because they may not grow further."""
 
 
 @pytest.mark.parametrize(
-    ("changes", "killed_in"),
-    [(GROWING, 10), (EVERYTHING, 3), (LIMITED, 3)],
+    ("changes", "killed_in", "most_substeps"),
+    [(GROWING, 10, 2000), (EVERYTHING, 3, 2000), (LIMITED, 3, 70)],
     ids=["growing", "everything", "limited"],
 )
-def test_a_killed_fit_continues_bit_for_bit(tmp_path, monkeypatch, changes, killed_in):
+def test_a_killed_fit_continues_bit_for_bit(tmp_path, monkeypatch, changes, killed_in, most_substeps):
+    monkeypatch.setattr(module, "CHECKPOINT_EVERY", 1)
+    monkeypatch.setattr(stability, "MAX_SUBSTEPS", most_substeps)
     whole = fit(small.fit_problem(**changes))
     partial = tmp_path / "fit.npz"
     epochs = 0
@@ -230,18 +229,12 @@ def test_overflow_is_counted_although_solvers_are_rebuilt():
     assert dropped[1] > 0.9 * dropped[0] > 0
 
 
-def limited(kind: str) -> dict[str, object]:
-    """Settings under which stiffness outgrows the substeps that it may have."""
-    start = small.fit_problem(**GROWING).twin
-    count = start.simulation.substeps
-    if kind == "fixed":
-        return GROWING | {"simulation": config.SimulationSettings(substeps=count)}
-    return GROWING | {"simulation": config.SimulationSettings(max_substeps=count)}
-
-
-@pytest.mark.parametrize("kind", ["fixed", "max_substeps"])
-def test_stiffness_beyond_the_allowed_substeps_rolls_back_and_recovers(kind):
-    problem = small.fit_problem(**limited(kind))
+@pytest.mark.parametrize("kind", ["fixed", "auto"])
+def test_stiffness_beyond_the_allowed_substeps_rolls_back_and_recovers(kind, monkeypatch):
+    count = small.fit_problem(**GROWING).twin.simulation.substeps
+    monkeypatch.setattr(stability, "MAX_SUBSTEPS", count)
+    substeps = count if kind == "fixed" else "auto"
+    problem = small.fit_problem(**GROWING, simulation=config.SimulationSettings(substeps=substeps))
     result = fit(problem)
     assert any("stiffness grew beyond" in text for text in result.facts["rollbacks"])
     # The learning rate is halved, so training goes on after a rollback ...
@@ -288,9 +281,10 @@ def loss_of(twin: Twin, seen: Observations, frames: range) -> float:
 
 @pytest.mark.parametrize("horizon", [1, 0])
 @pytest.mark.parametrize("kind", ["springs", "field"])
-def test_the_held_back_tail_selects_and_is_not_trained_on(kind, horizon):
+def test_the_held_back_tail_selects_and_is_not_trained_on(kind, horizon, monkeypatch):
     """Half of the four training frames are held back. Where they show what the start does, the start wins."""
-    settings = field_fit(selection="tail", tail_fraction=0.5, horizon=horizon)
+    monkeypatch.setattr(module, "TAIL_FRACTION", 0.5)
+    settings = field_fit(selection="tail", horizon=horizon)
     start = small.fit_problem().twin
     problems = [small.fit_problem(seen, fit=settings, kind=kind) for seen in (small.observations(), observed_as(start, 3))]
     learned, stayed = (fit(problem) for problem in problems)
@@ -306,9 +300,10 @@ def test_the_held_back_tail_selects_and_is_not_trained_on(kind, horizon):
     assert learned.facts["best_loss"] == learned.history["tail_loss"].min()
 
 
-def test_at_least_one_frame_is_held_back_and_one_trained_on():
+def test_at_least_one_frame_is_held_back_and_one_trained_on(monkeypatch):
     for fraction, fitted_end in ((0.01, 4), (0.5, 3), (0.99, 2)):
-        assert TwinFit(small.fit_problem(fit=config.Fit(selection="tail", tail_fraction=fraction))).fitted_end == fitted_end
+        monkeypatch.setattr(module, "TAIL_FRACTION", fraction)
+        assert TwinFit(small.fit_problem(fit=config.Fit(selection="tail"))).fitted_end == fitted_end
     assert TwinFit(small.fit_problem()).fitted_end == 5
 
 

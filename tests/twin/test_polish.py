@@ -36,7 +36,7 @@ def any_share(monkeypatch):
 
 def polished(rollouts: int = 50, *, start: dict | None = None, rounds: int = 6, seen=None, **changes) -> SearchProblem:
     """A search on logarithmic scales with a polish."""
-    settings = {"scales": RATES, "ranges": RANGES, "polish": {"rounds": rounds}}
+    settings = {"scales": RATES, "ranges": RANGES, "polish": rounds}
     own = {"object_radius": 0.045, "stiffness": 6e3} | (start or {})
     return small.search_problem(seen, search=small.released(rollouts=rollouts, start=own, **settings), **changes)
 
@@ -261,4 +261,4 @@ def test_a_larger_budget_begins_its_polish_anew(tmp_path):
 
 def test_nothing_is_polished_where_no_candidate_could_be_simulated():
     with pytest.raises(NumericalFailure, match="none of 22 candidates"):
-        search(polished(30, rounds=1, simulation=config.SimulationSettings(max_substeps=1)), seed=0)
+        search(polished(30, rounds=1, simulation=config.SimulationSettings(safety=1e-6)), seed=0)

@@ -47,8 +47,7 @@ def seen(path: str) -> Observations:
 def polished(own: Observations, **changes) -> SearchProblem:
     """A search of one generation with a polish of one round."""
     start = {"object_radius": 0.045, "stiffness": 6e3}
-    polish = {"rounds": 1}
-    return small.search_problem(own, search=small.released(rollouts=ROLLOUTS, start=start, polish=polish, **POLISHED), **changes)
+    return small.search_problem(own, search=small.released(rollouts=ROLLOUTS, start=start, polish=1, **POLISHED), **changes)
 
 
 def on_pool(alone: SearchProblem, *others: str, **changes) -> SearchProblem:
@@ -148,7 +147,7 @@ def problem_of(path: str, *, oracle: bool = False, **settings) -> FitProblem:
     truth = small.scene(path).truth
     low = np.full_like(truth.material.stiffness, 0.5 * float(np.median(truth.material.stiffness)))
     start = replace(truth, material=replace(truth.material, stiffness=low))
-    changes = {"epochs": 4, "learning_rate": 5e-2, "checkpoint_every": 1} | settings
+    changes = {"epochs": 4, "learning_rate": 5e-2} | settings
     return small.fit_problem(seen(path), twin=start, fit=config.Fit(**changes), oracle=oracle)
 
 
@@ -214,7 +213,8 @@ def test_one_material_comes_nearer_to_two_recordings():
     assert result.facts["rollbacks"] == []
 
 
-def test_a_killed_fit_continues_exactly(tmp_path):
+def test_a_killed_fit_continues_exactly(tmp_path, monkeypatch):
+    monkeypatch.setattr("neuspring.twin.fit.CHECKPOINT_EVERY", 1)
     problem = problem_of(LIFTED, epochs=3)
     whole = pooled(problem, seen(SHAKEN))
 

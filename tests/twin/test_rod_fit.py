@@ -9,14 +9,14 @@ from neuspring import config
 from neuspring.core.artifacts import Observations, Scenario, Twin
 from neuspring.core.errors import InputError
 from neuspring.twin.fit import FitProblem
-from neuspring.twin.rod import rod_twin
+from neuspring.twin.rod import RodStart, rod_twin
 from neuspring.twin.rod_fit import Levenberg, Recordings, RodResult, RodSteps, Variables, fit_rod, search_rod
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.transfer import move
 from tests.support import ropes
 
 SETTINGS = config.Config(
-    rod=config.RodSettings(bending=0.02, twisting=0.02), fit=config.Fit(rod=RodSteps(horizons=(0,), rounds=5, every=1, robust=1e-3))
+    rod=RodStart(bending=0.02, twisting=0.02), fit=config.Fit(rod=RodSteps(horizons=(0,), rounds=5, every=1, robust=1e-3))
 )
 VERTICES = 8
 AXIS = (0.0, 1.0, 0.0)

@@ -5,7 +5,6 @@ broken: the configuration needs it and it is missing. absent: it is missing and 
 
 from __future__ import annotations
 
-import functools
 import importlib.util
 import sys
 from collections.abc import Callable, Iterator
@@ -23,6 +22,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.extras import EXTRAS, install
 from neuspring.core.weights import hub_folder
 from neuspring.experiments import needs
+from neuspring.perception import segment_sam2
 from neuspring.perception.track_cotracker import WEIGHTS, WEIGHTS_URL
 from neuspring.scores import lpips
 from neuspring.splats.rasterize import choose_backend
@@ -126,14 +126,13 @@ def _weights(settings: Config) -> Iterator[MachineCheck]:
     hub = hub_folder()
     checked: dict[str, tuple[Callable[[], object], str]] = {
         "LPIPS (AlexNet)": (
-            lambda: lpips.configured_weights(settings.images.lpips),
+            lpips.find_weights,
             f"{DOWNLOAD} {hub / lpips.BACKBONE} {lpips.BACKBONE_ADDRESS}; .venv/bin/pip install --no-deps lpips",
         ),
     }
     for baseline in BASELINES.values():
         if weights := baseline.weights:
-            find_theirs = functools.partial(weights.find, baseline.settings(settings))
-            checked[weights.what] = (find_theirs, f"{DOWNLOAD} {hub / weights.file} {weights.address}")
+            checked[weights.what] = (weights.find, f"{DOWNLOAD} {hub / weights.file} {weights.address}")
     for subject, (find, remedy) in checked.items():
         try:
             place = find()
@@ -147,18 +146,18 @@ def _weights(settings: Config) -> Iterator[MachineCheck]:
     # Weights of perception, which their libraries keep in caches of their own.
     segment, track = settings.perception.segment, settings.perception.track
     for subject, name in {
-        "GroundingDINO": segment.grounded_sam2.detector,
-        "SAM 2": segment.grounded_sam2.video_model,
+        "GroundingDINO": segment_sam2.DETECTOR,
+        "SAM 2": segment_sam2.VIDEO_MODEL,
     }.items():
-        there = Path(name).is_dir() or isinstance(try_to_load_from_cache(name, "config.json"), str)
+        there = isinstance(try_to_load_from_cache(name, "config.json"), str)
         wanted = segment.backend == "grounded_sam2" and not segment.grounded_sam2.download
         remedy = f".venv/bin/hf download {name}, or perception.segment.grounded_sam2.download: true"
         detail = name if there else f"{name} is not in the cache of the Hugging Face hub"
         yield MachineCheck(subject, "ok" if there else "broken" if wanted else "absent", detail, remedy)
     code = sorted(Path(torch.hub.get_dir()).glob("facebookresearch_co-tracker_*"))
     there = bool(code) and (hub_folder() / WEIGHTS).is_file()
-    wanted = track.backend == "cotracker3" and not track.cotracker3.download
+    wanted = track.backend == "cotracker3" and not track.download
     download = f"{DOWNLOAD} {hub_folder() / WEIGHTS} {WEIGHTS_URL}"
-    remedy = f"perception.track.cotracker3.download: true (not for commercial use), or {download}"
+    remedy = f"perception.track.download: true (not for commercial use), or {download}"
     detail = WEIGHTS if there else "code or weights are not in the cache of torch.hub"
     yield MachineCheck("CoTracker3", "ok" if there else "broken" if wanted else "absent", detail, remedy)

@@ -74,6 +74,9 @@ class GsDynamicsTraining(GsDynamics):
     """Half width of the uniform noise that training adds to positions in the history, m."""
     length_weight: float | None = None
     """Weight lambda of the length loss."""
+    outlier_deviations: float = 3.0
+    """Median absolute deviations by which the path length of a track may differ from the median before the track is dropped; 0
+    drops none."""
     future: int = 5
     """Steps that training predicts in a row."""
     yaw: bool = True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from neuspring.core.section import Count, NonNegative, Positive, SettingsSection
+from neuspring.core.section import Count, Positive, SettingsSection
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,9 +17,6 @@ class GsDynamics(SettingsSection):
     """Units of all hidden layers."""
     step: Positive = 0.01
     """Motion of the tools that makes a step, m."""
-    outlier_deviations: NonNegative = 3.0
-    """Median absolute deviations by which the path length of a track may differ from the median before the track is dropped; 0
-    drops none."""
     epochs: Count = 50
     """Passes of training. The released predictions are of 50; the public code trains 500 to 1000."""
     updates_per_epoch: Count = 100

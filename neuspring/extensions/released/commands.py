@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from neuspring.cli.options import Device, Positional, Settings, arg, read_settings
+from neuspring.cli.options import Device, Positional, arg
 
 
 def fetch(
@@ -38,14 +38,12 @@ def verify_released(
         tuple[int, ...],
         arg(help="1 sizes and first frame, 2 springs, 3 scores, 4 deprojection, 5 pictures, 6 replay; all by default"),
     ] = (),
-    settings: Settings = "{}",
     device: Device = "auto",
 ) -> int:
     """PhysTwin's released results, checked against ours."""
     from neuspring.extensions.released import run
 
-    lpips = read_settings(settings).images.lpips
     chosen = checks or tuple(run.RELEASED_CHECKS)
-    report = run.verify_released(data_root, output, scenarios=scenarios, checks=chosen, device=device, lpips=lpips)
+    report = run.verify_released(data_root, output, scenarios=scenarios, checks=chosen, device=device)
     print(report.text, end="")
     return report.status

@@ -23,6 +23,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout
 
@@ -268,7 +269,7 @@ def _extract(name: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, target:
 def _record(path: Path, info: DatasetInfo, file: RepoSibling, asked: dict[str, list[str]], count: int) -> None:
     """Add an entry to fetched.json, unless nothing was missing and the same is recorded already."""
     entries = read_json(path, FETCHED_FORMAT)["fetched"] if path.exists() else []
-    content = {"repository": REPOSITORY, "revision": info.sha, "archive": file.rfilename, "size": file.size}
+    content: dict[str, Any] = {"repository": REPOSITORY, "revision": info.sha, "archive": file.rfilename, "size": file.size}
     content |= {"sha256": file.lfs.sha256 if file.lfs else ""} | asked
     if count or not any(content.items() <= entry.items() for entry in entries):
         entries.append(content | {"date": now(), "files": count})

@@ -12,7 +12,6 @@ import pandas as pd
 
 from neuspring.checks.case import FINAL_DATA, Case, whole
 from neuspring.config import ScenarioRow
-from neuspring.config.images import LpipsWeights
 from neuspring.core.artifacts import Observations
 from neuspring.core.checks import Check
 from neuspring.core.device import resolve_device
@@ -68,7 +67,6 @@ def verify_released(
     scenarios: Sequence[str] = (),
     checks: Collection[int] = tuple(RELEASED_CHECKS),
     device: str = "auto",
-    lpips: LpipsWeights | None = None,
     published: Published | None = None,
 ) -> Report:
     """Check the released results below `root` (the folder that holds data, experiments, ...); write the report to folder `output`.
@@ -83,7 +81,7 @@ def verify_released(
     if wrong := [check for check in checks if check not in RELEASED_CHECKS]:
         raise InputError("--checks", f"must be of {', '.join(map(str, RELEASED_CHECKS))}", wrong)
     device = resolve_device(device)
-    metric = Lpips.configured(lpips or LpipsWeights(), device) if 5 in checks else ""
+    metric = Lpips.cached(device) if 5 in checks else ""
     tools = Tools(published=published or Published.load(), device=device, lpips=metric)
     names, findings = list(dict.fromkeys(scenarios)) or present, list[Comparison]()
     progress = Progress("verify", len(names), every=0.0)

@@ -12,12 +12,9 @@ VGG16, DIGEST = "vgg16-397923af.pth", "397923af"
 """Weights for a term of the loss, and the first digits of their SHA-256, which by torch hub's convention are in the file's name."""
 
 
-def find_vgg16(path: str | None) -> Path | str:
-    """The weight file that the configuration names or that is in torch hub's cache, else one line that says why there is none.
-
-    Raises InputError only for a named file that is missing or has another content.
-    """
-    return find_file("VGG16 weights", Path(path) if path else None, [hub_folder() / VGG16], DIGEST, False)
+def find_vgg16() -> Path | str:
+    """The weight file in torch hub's cache, else one line that says why there is none."""
+    return find_file("VGG16 weights", None, [hub_folder() / VGG16], DIGEST, False)
 
 
 def _reads(section: SpringGaus) -> tuple[str, ...]:
@@ -46,6 +43,6 @@ SPRING_GAUS = Baseline(
         what="VGG16 (Spring-Gaus' features)",
         file=VGG16,
         address=f"https://download.pytorch.org/models/{VGG16}",
-        find=lambda section: find_vgg16(section.vgg16),
+        find=find_vgg16,
     ),
 )

@@ -19,7 +19,4 @@ class SpringGaus(SettingsSection):
     """Number N of anchors, drawn at random from the occupied cells of a grid of 1 cm, or of 1 mm where there are too few cells."""
     iterations: Count = 100
     """Passes over the training frames, with an optimizer step per frame."""
-    vgg16: str | None = None
-    """Path of torchvision's weights of VGG16 (vgg16-397923af.pth); null: they are looked for in torch hub's cache. Nothing is
-    downloaded."""
     efforts = {"anchors": (400, 400, 1024), "iterations": (40, 40, 100)}

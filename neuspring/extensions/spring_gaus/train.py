@@ -93,7 +93,7 @@ def train(request: TrainingRequest) -> Trained[SpringGausModel]:
     follower = Follower(cloud, start.anchors, start.bound_anchors, device)
     facts: dict[str, Any] = {"anchors": len(anchors), "links": len(graph.links)}
     if pictures and splats:
-        weights = find_vgg16(chosen.vgg16)
+        weights = find_vgg16()
         facts |= {"vgg16": weights if isinstance(weights, str) else "computed", "splats": len(splats.means)}
         objective = silhouettes(pictures, splats, follower, weights, settings, request.seed, device)
     else:

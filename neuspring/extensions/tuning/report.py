@@ -25,6 +25,7 @@ from neuspring.core.table import Table
 from neuspring.experiments.benchmark import read_methods, read_searches
 from neuspring.extensions.tuning.space import CLUSTERS, Plan, labels
 from neuspring.extensions.tuning.worker import DEFINITION, REASON, TRIAL_FACTS, VALUES, WORKER, counted, origin, study_of
+from neuspring.twin.fit import TAIL_FRACTION
 
 SECTIONS_OF_NO_ROW = ("simulation", "losses", "released_quirks")
 """An overlay sets them for all methods."""
@@ -124,7 +125,7 @@ def summary(plan: Plan, trials: Sequence[FrozenTrial], table: pd.DataFrame, scen
         f"# Sweep {tune.study}: {tune.method} tuned",
         f"{sum(counts.values())} of {tune.trials} trials: {counts['complete']} finished, {counts['pruned']} pruned, "
         f"{counts['failed']} failed. {running} more are running, or were left behind by a killed worker.",
-        f"The loss, m², is that of the last {plan.base['fit']['tail_fraction']:.0%} of the training frames, which neither "
+        f"The loss, m², is that of the last {TAIL_FRACTION:.0%} of the training frames, which neither "
         f"search nor fit has seen. It is the mean over scenarios: {', '.join(scenes)}. Test frames were not read.",
     ]
     if codes > 1:

@@ -30,8 +30,10 @@ SECTIONS = ("simulation", "losses", "search", "fit", "released_quirks")
 CLUSTERS = "clusters"
 # The acceleration term guides the search alone; the objective is the loss of a fit.
 _WEIGHTS = tuple(f"losses.{term.name}" for term in dataclasses.fields(config.Losses) if term.name != "acceleration")
-FIXED = (*_WEIGHTS, "fit.selection", "fit.tail_fraction", "released_quirks.frozen_loss_denominators")
+FIXED = (*_WEIGHTS, "fit.selection", "released_quirks.frozen_loss_denominators")
 """The objective is measured with these, so all trials must share them."""
+SWEEP_SEED = 0
+"""Seed of search, field and sampler, the same in all trials, so that they differ by their settings alone."""
 MOST_COMBINATIONS = 256
 """Combinations of range ends that are checked before the first trial. If there are more, only all lowest and all highest ones."""
 
@@ -103,7 +105,7 @@ class Plan:
     def facts(self) -> dict[str, Any]:
         """Facts that must not change while a sweep lasts, as plain values."""
         space = {name: config.plain(dimension) for name, dimension in self.tune.space.items()}
-        return {"method": self.tune.method, "fit": self.method.fit, "base": self.base, "space": space, "seed": self.tune.seed}
+        return {"method": self.tune.method, "fit": self.method.fit, "base": self.base, "space": space, "seed": SWEEP_SEED}
 
     def is_whole(self, name: str) -> bool:
         """True where a setting takes whole numbers only."""

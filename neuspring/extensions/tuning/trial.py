@@ -1,6 +1,6 @@
 """One trial of a sweep: search and fit with its settings, judged by a tail of the training frames, which neither has seen.
 
-The tail is the last `fit.tail_fraction` of a scenario's training frames. Search and fit see only the frames before it. After every
+The tail is the last fifth of a scenario's training frames. Search and fit see only the frames before it. After every
 epoch of the fit its twin is rolled out over the tail. A trial's value is the mean loss over the tail of the twin that the method's
 own rule (`fit.selection`) selects, averaged over scenarios. All frames after the training frames are cut off before anything is
 computed.
@@ -28,7 +28,7 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_text
 from neuspring.core.provenance import code_digest
 from neuspring.core.records import StageRecord, canonical, digest_file
-from neuspring.extensions.tuning.space import Plan
+from neuspring.extensions.tuning.space import SWEEP_SEED, Plan
 from neuspring.stages.search import search as search_stage
 from neuspring.twin.fit import RELEASED_CHECKPOINT_EPOCHS, FitProblem, NonFinite, TwinFit, fit, tail_start
 
@@ -45,14 +45,14 @@ class TrainingScene:
     head: Path
 
     @classmethod
-    def of(cls, path: Path, tail_fraction: float, folder: Path) -> TrainingScene:
+    def of(cls, path: Path, folder: Path) -> TrainingScene:
         """Read observations; the frames before the tail are written to `folder`. Raises InputError."""
         observations = Observations.load(path)
         scenario = observations.scenario
         if scenario.train_end < 3:
             rule = "a tail needs at least two training frames after frame 0"
             raise InputError(f"scenario {scenario.name}", rule, scenario.train_end - 1)
-        head = cut(observations, tail_start(scenario.train_end, tail_fraction))
+        head = cut(observations, tail_start(scenario.train_end))
         target = folder / f"{scenario.name}.npz"
         head.save(target)
         return cls(scenario.name, cut(observations, scenario.train_end), target)
@@ -117,7 +117,7 @@ def run(
     tailed = replace(settings, fit=replace(settings.fit, selection="tail"))
     for index, scene in enumerate(scenes):
         with outcome.timed("search"):
-            path = searched(scene, settings, clusters, plan.tune.seed, device, folder)
+            path = searched(scene, settings, clusters, SWEEP_SEED, device, folder)
         record = StageRecord.load(path)
         if record.status == "failed":
             raise NumericalFailure(f"{scene.name}, search: {record.reason}")
@@ -131,7 +131,7 @@ def run(
             quirks=tailed.released_quirks,
             device=device,
             kind=plan.method.fit or "springs",
-            seed=plan.tune.seed,
+            seed=SWEEP_SEED,
         )
 
         def report_epoch(epoch: int, loss: float, name: str = scene.name, first: int = index * plan.epochs) -> None:

@@ -25,7 +25,7 @@ from typing import Any
 import optuna
 import sqlalchemy
 from filelock import FileLock, Timeout
-from optuna.pruners import BasePruner, MedianPruner, NopPruner
+from optuna.pruners import BasePruner, MedianPruner
 from optuna.samplers import BaseSampler, TPESampler
 from optuna.storages import RDBStorage
 from optuna.study import Study
@@ -38,7 +38,7 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_text
 from neuspring.core.records import RECORD_FORMAT, canonical, now
 from neuspring.core.run_record import flat
-from neuspring.extensions.tuning.space import Plan, holds, label, labels
+from neuspring.extensions.tuning.space import SWEEP_SEED, Plan, holds, label, labels
 from neuspring.extensions.tuning.trial import TrainingScene, TrialOutcome, checkpoint, run
 
 DATABASE = "optuna.db"
@@ -50,6 +50,10 @@ TRIAL_FACTS, VALUES = "facts", "values"
 """Attributes of a trial: how it went, and its values. The baseline's include those that the space cannot hold."""
 MOST_DEATHS = 5
 """A trial that ends its worker this often is not continued; another takes its place."""
+STARTUP_TRIALS = 10
+"""Random trials, before the sampler learns from earlier ones, and finished ones before the median prunes any."""
+WARMUP_EPOCHS = 5
+"""Epochs in which no trial is pruned."""
 WRITER_PATIENCE = 60.0
 """Seconds that SQLite waits for another writer."""
 
@@ -137,20 +141,19 @@ def continue_left(study: Study, worker: int, tune: Tune, first: Mapping[str, Any
         study.enqueue_trial(values, user_attrs={ORIGIN: origin(trial)})
 
 
-def sampler_of(tune: Tune, count: int, *, grouped: bool) -> BaseSampler:
+def sampler_of(count: int, *, grouped: bool) -> BaseSampler:
     """TPE with a seed of its own behind `count` trials. `grouped`: the baseline's trial lacks values that the space cannot hold."""
-    seed = int.from_bytes(hashlib.sha256(f"{tune.seed} {count}".encode()).digest()[:4], "big")
+    seed = int.from_bytes(hashlib.sha256(f"{SWEEP_SEED} {count}".encode()).digest()[:4], "big")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        return TPESampler(seed=seed, n_startup_trials=tune.startup_trials, multivariate=True, group=grouped, constant_liar=True)
+        return TPESampler(seed=seed, n_startup_trials=STARTUP_TRIALS, multivariate=True, group=grouped, constant_liar=True)
 
 
 class MedianOfStep(BasePruner):
     """Optuna's median rule, on the last value alone: losses at different steps are of different scenarios."""
 
-    def __init__(self, tune: Tune, warmup: int) -> None:
-        # There is no median before one trial has finished.
-        self._inner = MedianPruner(n_startup_trials=max(tune.startup_trials, 1), n_warmup_steps=warmup)
+    def __init__(self, warmup: int) -> None:
+        self._inner = MedianPruner(n_startup_trials=STARTUP_TRIALS, n_warmup_steps=warmup)
 
     def prune(self, study: Study, trial: FrozenTrial) -> bool:
         """True where the trial is above the median of completed ones at its last step."""
@@ -161,12 +164,13 @@ class MedianOfStep(BasePruner):
         return self._inner.prune(study, last)
 
 
-def pruner_of(tune: Tune, scenarios: int, epochs: int) -> BasePruner:
-    """The pruner of a sweep whose trials have at most `epochs` steps for each of its scenarios."""
-    # The loss of one scenario says little about the mean.
+def pruner_of(scenarios: int, epochs: int) -> MedianOfStep:
+    """The pruner of a sweep whose trials have at most `epochs` steps for each of its scenarios.
+
+    Of several scenarios every trial first runs a third to their end: the loss of one alone says little about the mean.
+    """
     unpruned = math.ceil(scenarios / 3) if scenarios > 1 else 0
-    warmup = unpruned * epochs + tune.warmup_epochs
-    return MedianOfStep(tune, warmup) if tune.pruner == "median" else NopPruner()
+    return MedianOfStep(unpruned * epochs + WARMUP_EPOCHS)
 
 
 def suggest(trial: Trial, name: str, plan: Plan) -> Any:
@@ -202,14 +206,14 @@ def work(
     if not 0 <= worker < tune.workers:
         raise InputError("--worker", f"0 to tune.workers - 1 = {tune.workers - 1} is required", worker)
     plan, folder, device = Plan.of(settings, tune, root), output.parent, resolve_device(device)
-    scenes = [TrainingScene.of(path, plan.base["fit"]["tail_fraction"], folder / "frames") for path in observations]
-    required, names = list(tune.scenarios or settings.scenarios), [scene.name for scene in scenes]
+    scenes = [TrainingScene.of(path, folder / "frames") for path in observations]
+    required, names = list(settings.scenarios), [scene.name for scene in scenes]
     if names != required:
         raise InputError("--observations", f"those of {', '.join(required)} are required", ", ".join(names))
     first = labels({name: value for name, value in plan.baseline.items() if holds(tune.space[name], value)})
-    sampler = functools.partial(sampler_of, tune, grouped=len(first) < len(tune.space))
+    sampler = functools.partial(sampler_of, grouped=len(first) < len(tune.space))
     facts = plan.facts() | {"frames": {scene.name: scene.digest for scene in scenes}}
-    study = study_of(folder, tune, facts, pruner_of(tune, len(scenes), plan.epochs))
+    study = study_of(folder, tune, facts, pruner_of(len(scenes), plan.epochs))
     finished: list[int] = []
 
     def objective(trial: Trial) -> float:

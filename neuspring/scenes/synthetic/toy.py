@@ -27,6 +27,18 @@ TOY_ANNOTATED = 16
 """Number of tracks for scoring; they have no noise."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class ToyObservation(Toy):
+    """The settings with what the observation of a scene lacks."""
+
+    noise: float = 0.0005
+    """Standard deviation of the observation noise, m."""
+    occlusion: float = 0.2
+    """Fraction of point-frames hidden, in runs of several frames."""
+    seed: int = 0
+    """Seed of noise and occlusion; the scenario's name enters too."""
+
+
 @dataclass(frozen=True)
 class Shape:
     """A body at rest: nodes in canonical order (tracked, surface, interior), hands, and how it is connected. Meters."""
@@ -123,12 +135,12 @@ class ToyScene:
 
 def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Observations:
     """See `neuspring.scenes.sources`. The truth is written beside `output`; no method reads it."""
-    scene = make(row, config.toy)
+    scene = make(row, ToyObservation(**vars(config.toy)))
     scene.truth.save(output.with_name("truth.npz"))
     return scene.observations
 
 
-def make(row: ScenarioRow, settings: Toy) -> ToyScene:
+def make(row: ScenarioRow, settings: ToyObservation) -> ToyScene:
     """Simulate and observe a scene; deterministic in `settings.seed` and the scenario's name.
 
     Raises InputError for unknown names.
@@ -138,7 +150,7 @@ def make(row: ScenarioRow, settings: Toy) -> ToyScene:
         rule = f"must be shape/motion/field with {sorted(SHAPES)} / {list(MOTIONS)} / {list(FIELDS)}"
         raise InputError(f"scenario {row.scenario}, path", rule, repr(row.path))
     shape = SHAPES[parts[0]]()
-    truth = _true_twin(row, shape, parts[2], settings)
+    truth = _true_twin(row, shape, parts[2])
     times = np.arange(settings.frames) / TOY_FRAME_RATE
     hands = hand_motion(parts[1], shape.hands, times)
     rest = truth.topology.nodes.astype(np.float64)
@@ -146,7 +158,7 @@ def make(row: ScenarioRow, settings: Toy) -> ToyScene:
     return ToyScene(_observe(row, shape, motion, hands, settings), truth, motion)
 
 
-def _true_twin(row: ScenarioRow, shape: Shape, field: str, settings: Toy) -> Twin:
+def _true_twin(row: ScenarioRow, shape: Shape, field: str) -> Twin:
     nodes = np.concatenate([shape.tracked, shape.surface, shape.interior])
     topology = uniform_topology(nodes, shape.hands, shape.radius, shape.neighbors, 0.03, 12)
     count = len(topology.springs)
@@ -168,7 +180,7 @@ def _true_twin(row: ScenarioRow, shape: Shape, field: str, settings: Toy) -> Twi
     return replace(twin, simulation=replace(simulation, substeps=substeps))
 
 
-def _observe(row: ScenarioRow, shape: Shape, motion: np.ndarray, hands: np.ndarray, settings: Toy) -> Observations:
+def _observe(row: ScenarioRow, shape: Shape, motion: np.ndarray, hands: np.ndarray, settings: ToyObservation) -> Observations:
     frames, tracked, surface = len(motion), len(shape.tracked), len(shape.surface)
     rng = np.random.default_rng([settings.seed, *row.scenario.encode()])
     noisy = motion + rng.normal(0.0, settings.noise, motion.shape)

@@ -120,7 +120,7 @@ class Run:
 def scene_of(path: str, noise: float, seed: int) -> toy.ToyScene:
     """The toy scene as seen with `noise` [m]."""
     rows = read_scenarios(Path(__file__).parents[3] / "config/scenarios.tsv")
-    return toy.make(rows[f"toy_{path.replace('/', '_')}"], config.Toy(noise=noise, seed=seed))
+    return toy.make(rows[f"toy_{path.replace('/', '_')}"], toy.ToyObservation(noise=noise, seed=seed))
 
 
 def constant(truth: Twin, fraction: float) -> Twin:

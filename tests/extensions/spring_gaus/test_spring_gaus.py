@@ -332,13 +332,14 @@ def test_the_term_of_the_loss_is_weighted_and_differentiable(network, tmp_path):
 
 
 def test_a_file_is_known_by_its_digest_and_a_damaged_one_is_named(network, tmp_path, monkeypatch):
-    path = stored(network, tmp_path)
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "hub"))
-    assert "vgg16-397923af.pth is not there" in baseline.find_vgg16(None)
-    with pytest.raises(InputError, match="must be the file of VGG16 weights; received has SHA-256"):
-        baseline.find_vgg16(str(path))
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    assert "vgg16-397923af.pth is not there" in baseline.find_vgg16()
+    path = tmp_path / "hub" / "checkpoints" / baseline.VGG16
+    path.parent.mkdir(parents=True)
+    stored(network, tmp_path).rename(path)
+    assert "vgg16-397923af.pth has SHA-256" in baseline.find_vgg16()
     monkeypatch.setattr(baseline, "DIGEST", digest_file(path)[:8])
-    assert baseline.find_vgg16(str(path)) == path
+    assert baseline.find_vgg16() == path
     damaged = stored(network[:-2], tmp_path)
     with pytest.raises(InputError, match=r"`features\.7\.weight` must be a float tensor \[128, 128, 3, 3\]; received NoneType"):
         load_features(damaged, "cpu")

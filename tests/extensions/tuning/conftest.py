@@ -19,7 +19,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Tune]:
     """A sweep of four trials, reported. Tests leave its trials as they are."""
     folder = sweeps.furnish(tmp_path_factory.mktemp("tune"))
     space = sweeps.FAST | {"fit.damping": {"choices": ["fixed", "homogeneous"]}}
-    tune = sweeps.sweep(trials=4, pruner="none", space=space)
+    tune = sweeps.sweep(trials=4, space=space)
     sweeps.work(folder, tune)
     sweeps.report(folder, tune)
     return folder, tune

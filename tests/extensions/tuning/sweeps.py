@@ -26,7 +26,7 @@ BASE = {
     "scenarios": ["small"],
     # Springs begin far too soft, so that a faster rate is better by a tenth, not by last digits that depend on the processor.
     "search": {"rollouts": 11, "fixed": ["stiffness"], "variables": {"stiffness": {"start": 1500.0}}},
-    "fit": {"epochs": 3, "checkpoint_every": 1, "learning_rate": 1e-4},
+    "fit": {"epochs": 3, "learning_rate": 1e-4},
 }
 METHODS = {
     "search_only": {"search": "uniform", "fit": None, "description": "No second stage"},
@@ -47,7 +47,7 @@ def settings(**changes: Any) -> config.Config:
 
 def sweep(**changes: Any) -> Tune:
     """A sweep of three trials over settings of the fit."""
-    base = {"study": "small", "method": "baseline", "trials": 3, "startup_trials": 2, "warmup_epochs": 1, "space": FAST}
+    base = {"study": "small", "method": "baseline", "trials": 3, "space": FAST}
     return config.parse(Tune, base | changes, "tune")
 
 

@@ -61,7 +61,7 @@ NAMES = ("learning_rate", "horizon", "damping")
 
 
 def test_varied_search_settings_and_clusters_get_a_search_row(folder):
-    space = {"clusters": {"low": 2, "high": 3}, "search.polish.rounds": {"choices": [0, 1]}}
+    space = {"clusters": {"low": 2, "high": 3}, "search.polish": {"choices": [0, 1]}}
     tune = sweep(method="search_only", trials=2, space=space | {"simulation.gravity": {"choices": [9.8, 9.7]}})
     work(folder, tune)
     report(folder, tune)
@@ -70,10 +70,10 @@ def test_varied_search_settings_and_clusters_get_a_search_row(folder):
     values = best.user_attrs["values"]
     row = config.read_yaml(folder / "searches.yaml")["search_only_small"]
     assert row["clusters"] == values["clusters"]
-    assert row["settings"] == {"polish": {"rounds": values["search.polish.rounds"]}}
+    assert row["settings"] == {"polish": values["search.polish"]}
     assert config.read_yaml(folder / "methods.yaml")["search_only_small"]["search"] == "search_only_small"
     assert config.read_yaml(folder / "best.yaml")["simulation"] == {"gravity": values["simulation.gravity"]}
     # The baseline has one region and six rounds, which the space cannot hold: it is trial 0 all the same.
     first = trials(folder, tune)[0]
-    assert first.user_attrs["values"] == {"clusters": 1, "search.polish.rounds": 6, "simulation.gravity": 9.8}
+    assert first.user_attrs["values"] == {"clusters": 1, "search.polish": 6, "simulation.gravity": 9.8}
     assert first.params == {"simulation.gravity": 9.8}

@@ -125,13 +125,13 @@ def test_what_a_sweep_cannot_be_begun_with_is_refused(folder):
     with pytest.raises(InputError, match="must have been begun"):
         report(folder, sweep())
     with pytest.raises(InputError, match="those of other are required"):
-        work(folder, sweep(scenarios=["other"]))
+        work(folder, sweep(), base=settings(scenarios=["other"]))
     with pytest.raises(InputError, match=r"0 to tune\.workers - 1 = 0"):
         work(folder, sweep(), 1)
 
 
 def test_no_sweep_chooses_by_an_oracle():
-    values = {"study": "s", "method": "oracle_neuspring", "space": {"fit.learning_rate": {"low": 1e-4, "high": 1e-2}}, "seed": 0}
+    values = {"study": "s", "method": "oracle_neuspring", "space": {"fit.learning_rate": {"low": 1e-4, "high": 1e-2}}}
     with pytest.raises(InputError, match="an oracle sees the future"):
         Plan.of(config.Config(), config.parse(Tune, values, "x"), ROOT)
 

@@ -9,6 +9,7 @@ from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.records import StageRecord
 from neuspring.extensions.tuning import trial, worker
 from neuspring.extensions.tuning.report import state
+from neuspring.twin import fit as twin_fit
 from neuspring.twin.fit import FitProblem, TwinFit, fit, tail_start
 from tests.extensions.tuning.sweeps import furnish, report, results_of, settings, sweep, trials, work
 from tests.support import small
@@ -22,15 +23,16 @@ def test_no_test_frame_changes_any_trial(tmp_path, finished):
     assert results_of(spoiled, tune) == results_of(folder, tune)
 
 
-def test_the_search_does_not_see_the_tail(tmp_path):
+def test_the_search_does_not_see_the_tail(tmp_path, monkeypatch):
+    monkeypatch.setattr(twin_fit, "TAIL_FRACTION", 0.4)
     scene = small.observations()
-    end = tail_start(scene.scenario.train_end, 0.4)
+    end = tail_start(scene.scenario.train_end)
     points = scene.object_points.copy()
     points[end:] += 1.0
     heads = []
     for name, observations in {"as": scene, "changed": dataclasses.replace(scene, object_points=points)}.items():
         observations.save(tmp_path / f"{name}.npz")
-        made = trial.TrainingScene.of(tmp_path / f"{name}.npz", 0.4, tmp_path / name)
+        made = trial.TrainingScene.of(tmp_path / f"{name}.npz", tmp_path / name)
         heads.append(made.head.read_bytes())
         assert len(Observations.load(made.head).object_points) == end < scene.scenario.train_end
         assert len(made.training.object_points) == scene.scenario.train_end < scene.scenario.frame_count
@@ -38,8 +40,9 @@ def test_the_search_does_not_see_the_tail(tmp_path):
 
 
 @pytest.mark.parametrize(("method", "selection"), [("baseline", "training_loss"), ("baseline", "tail"), ("search_only", "tail")])
-def test_a_trial_is_judged_by_the_twin_that_the_method_would_choose(folder, method, selection):
-    base = settings(fit={"selection": selection, "learning_rate": 2.0, "tail_fraction": 0.4, "epochs": 8})
+def test_a_trial_is_judged_by_the_twin_that_the_method_would_choose(folder, method, selection, monkeypatch):
+    monkeypatch.setattr(twin_fit, "TAIL_FRACTION", 0.4)
+    base = settings(fit={"selection": selection, "learning_rate": 2.0, "epochs": 8})
     tune = sweep(method=method, trials=1, space={"losses.acceleration": {"choices": [0.01, 0.02]}})
     work(folder, tune, base=base)
     value = trials(folder, tune, base)[0].value
@@ -64,9 +67,11 @@ def test_a_trial_is_judged_by_the_twin_that_the_method_would_choose(folder, meth
     assert result.facts["best_loss"] != by_training, "the two rules choose different twins, or this test could not tell them apart"
 
 
-def test_hopeless_trials_are_pruned_before_their_last_epoch(folder):
+def test_hopeless_trials_are_pruned_before_their_last_epoch(folder, monkeypatch):
+    monkeypatch.setattr(worker, "STARTUP_TRIALS", 1)
+    monkeypatch.setattr(worker, "WARMUP_EPOCHS", 0)
     space = {"simulation.gravity": {"choices": [9.8, 80.0]}, "fit.learning_rate": {"choices": [1e-3, 1.1e-3]}}
-    tune = sweep(trials=5, startup_trials=1, warmup_epochs=0, space=space)
+    tune = sweep(trials=5, space=space)
     work(folder, tune)
     heavy = [one for one in trials(folder, tune).values() if one.params["simulation.gravity"] == 80.0]
     assert heavy
@@ -76,11 +81,12 @@ def test_hopeless_trials_are_pruned_before_their_last_epoch(folder):
         assert list(one.intermediate_values) == [0]
 
 
-def test_losses_of_other_scenarios_do_not_keep_a_trial():
+def test_losses_of_other_scenarios_do_not_keep_a_trial(monkeypatch):
     """A median of best values over all steps would compare the second scenario with the first."""
     import optuna
 
-    study = optuna.create_study(pruner=worker.MedianOfStep(sweep(startup_trials=1), 0))
+    monkeypatch.setattr(worker, "STARTUP_TRIALS", 1)
+    study = optuna.create_study(pruner=worker.MedianOfStep(0))
     for losses in ([1e-5, 1e-3], [1e-5, 1e-3]):
         trial = study.ask()
         for step, loss in enumerate(losses):
@@ -95,19 +101,19 @@ def test_losses_of_other_scenarios_do_not_keep_a_trial():
 
 def test_pruning_waits_for_whole_scenarios():
     for scenarios, steps in ((1, 5), (2, 15), (22, 85)):
-        pruner = worker.pruner_of(sweep(warmup_epochs=5), scenarios, 10)
+        pruner = worker.pruner_of(scenarios, 10)
         assert pruner._inner._n_warmup_steps == steps
 
 
 def test_a_numerical_failure_is_a_failed_trial_with_its_reason(folder):
-    tune = sweep(trials=3, space={"simulation.max_substeps": {"choices": [2000, 1]}})
+    tune = sweep(trials=3, space={"simulation.safety": {"choices": [0.8, 1e-6]}})
     work(folder, tune)
     by_number = trials(folder, tune)
     failed = [one for one in by_number.values() if state(one) == "failed"]
     assert len(by_number) == 3
     assert failed
     assert all("search: none of 11 candidates could be simulated" in one.user_attrs[worker.REASON] for one in failed)
-    assert all(one.user_attrs["values"] == {"simulation.max_substeps": 1} for one in failed)
+    assert all(one.user_attrs["values"] == {"simulation.safety": 1e-6} for one in failed)
     report(folder, tune)
     assert f"{len(failed)} failed" in (folder / "summary.md").read_text()
 

@@ -15,6 +15,7 @@ from tests.support import stores
 
 
 def test_a_killed_and_continued_sweep_finds_what_one_in_a_single_go_finds(tmp_path, finished, monkeypatch):
+    monkeypatch.setattr("neuspring.twin.fit.CHECKPOINT_EVERY", 1)
     whole, tune = finished
     folder = furnish(tmp_path)
     epochs, run_epoch = 0, TwinFit.epoch
@@ -117,7 +118,7 @@ def two_workers(folder: Path, tune: Tune) -> None:
 def test_two_workers_and_a_kill_make_the_trials_asked_for(folder, monkeypatch):
     # Restored after the test.
     monkeypatch.setattr(trial, "search_stage", trial.search_stage)
-    two_workers(folder, sweep(trials=6, workers=2, pruner="none"))
+    two_workers(folder, sweep(trials=6, workers=2))
 
 
 @pytest.mark.slow
@@ -125,7 +126,7 @@ def test_two_workers_and_a_kill_make_the_trials_asked_for(folder, monkeypatch):
 def test_postgresql_holds_a_sweep(folder, monkeypatch):
     monkeypatch.setattr(trial, "search_stage", trial.search_stage)
     with stores.postgres() as cluster:
-        tune = sweep(trials=6, workers=2, pruner="none", storage=cluster.database("study"))
+        tune = sweep(trials=6, workers=2, storage=cluster.database("study"))
         two_workers(folder, tune)
         assert " of 6 trials" in report(folder, tune)
     assert not (folder / worker.DATABASE).exists()

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from neuspring.config.perception import ColorSettings, Perception, Sampling, ShapePriorSettings
+from neuspring.config.perception import ColorSettings, Perception, Sampling
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT
@@ -224,7 +224,7 @@ def test_observations_of_a_painted_capture(tmp_path, category):
     still = np.repeat(start[None], capture.frame_count, axis=0)
     tracks = PixelTracks(pixels=still, visible=np.ones(still.shape[:2], bool), backend="test")
     masks = {"0": Masks(labels=labels, backend="given")}
-    settings = Perception(sample=Sampling(voxel=0.01, nodes=300), shape=ShapePriorSettings(voxel=0.006))
+    settings = Perception(sample=Sampling(voxel=0.01, nodes=300))
     lifted, prior, image = from_color(capture, masks, {"0": tracks}, settings)
     assert image.hands == 1
     assert not image.visible[capture.train_end :].any()

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from neuspring import config
 from neuspring.core.errors import InputError
 from neuspring.scenes.synthetic import toy
 from tests.support import small
@@ -26,9 +25,9 @@ def test_every_scene_is_a_valid_capture_with_its_truth(path):
 
 
 def test_the_same_seed_gives_the_same_capture_and_another_seed_does_not():
-    settings = config.Toy(frames=5, seed=3)
+    settings = toy.ToyObservation(frames=5, seed=3)
     first, second = (toy.make(small.row(), settings).observations for _ in range(2))
-    other = toy.make(small.row(), config.Toy(frames=5, seed=4)).observations
+    other = toy.make(small.row(), toy.ToyObservation(frames=5, seed=4)).observations
     np.testing.assert_array_equal(first.object_points, second.object_points)
     assert not np.array_equal(first.object_points, other.object_points)
 
@@ -48,4 +47,4 @@ def test_noise_and_occlusion_are_as_configured():
 
 def test_an_unknown_scene_is_an_error_that_lists_the_choices():
     with pytest.raises(InputError, match=r"path: must be shape/motion/field with .*'rope'"):
-        toy.make(small.row("rope/fly/smooth"), config.Toy())
+        toy.make(small.row("rope/fly/smooth"), toy.ToyObservation())
