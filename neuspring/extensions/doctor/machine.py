@@ -124,7 +124,7 @@ def _weights(settings: Config) -> Iterator[MachineCheck]:
 
     # Files that are known by their checksum.
     hub = hub_folder()
-    checked = {
+    checked: dict[str, tuple[Callable[[], object], str]] = {
         "LPIPS (AlexNet)": (
             lpips.find_weights,
             f"{DOWNLOAD} {hub / lpips.BACKBONE} {lpips.BACKBONE_ADDRESS}; .venv/bin/pip install --no-deps lpips",
