@@ -191,7 +191,7 @@ def test_a_polish_never_raises_the_cost_and_keeps_the_topology():
     problem = polished(22 + 3 * ROUND, rounds=3)
     result = search(problem, seed=0)
     trace = result.trace
-    plain = search(replace(problem, search=replace(problem.search, rollouts=22, polish=config.PolishSettings(rounds=0))), seed=0)
+    plain = search(replace(problem, search=replace(problem.search, rollouts=22, polish=0)), seed=0)
     assert_same_trace(trace[:22].drop(columns=[c for c in trace if c.startswith("product.")]), plain.trace)
     assert result.cost < plain.cost
     assert set(trace["stage"][22:]) == {SLOPES, POLISH}
@@ -213,7 +213,7 @@ def test_the_polish_is_part_of_the_budget(monkeypatch, rollouts, rounds):
     settings = config.Search(rollouts=rollouts)
     assert settings.polish_rounds == rounds
     assert settings.cma_rollouts == rollouts - rounds * ROUND
-    assert config.Search(rollouts=rollouts, polish=config.PolishSettings(rounds=0)).cma_rollouts == rollouts
+    assert config.Search(rollouts=rollouts, polish=0).cma_rollouts == rollouts
 
 
 def test_the_polish_is_the_same_however_candidates_are_simulated():
