@@ -55,7 +55,7 @@ def _log(records: list[str], results: Path, settings: Tracking, out: Path, index
 
 def main() -> None:
     results, settings, out = Path(sys.argv[1]), Tracking(**json.loads(sys.argv[2])), Path(sys.argv[3])
-    tracking_store._set_environment()
+    os.environ.update(tracking_store.ENVIRONMENT)
     for name in ("mlflow.store.tracking.sqlalchemy_store", "mlflow.store.tracking.rest_store", "pandas", "pyarrow.parquet"):
         importlib.import_module(name)
     for index, records in enumerate(json.load(sys.stdin)):
