@@ -221,7 +221,7 @@ note('end')"""
     (results / "logs" / f"{NAME}.log").unlink()
     second = start(results, code, "--gpus", "1")
     line = second.stderr.readline()
-    assert f"an earlier run of this job still goes on (pid {first.pid} on " in line
+    assert "an earlier run of this job still goes on; waiting for its end" in line
     # While it waits it holds no GPU.
     gpus.acquire(1, ("1",), timeout=0).release()
     end.touch()
