@@ -173,7 +173,9 @@ class Artifact:
         if unknown := plain.keys() - hints.keys():
             raise TypeError(f"unknown fields {sorted(unknown)}")
         for spec in dataclasses.fields(cls):
-            held, name = (arrays, prefix + spec.name) if "shape" in spec.metadata else (plain, spec.name)
+            is_array = "shape" in spec.metadata
+            held: dict[str, Any] = arrays if is_array else plain
+            name = prefix + spec.name if is_array else spec.name
             has_default = spec.default is not dataclasses.MISSING or spec.default_factory is not dataclasses.MISSING
             if name not in held and has_default:
                 continue  # left out where it is empty

@@ -23,6 +23,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout
 
@@ -149,7 +150,9 @@ def fetch(
             for count, path in enumerate(sorted(missing, key=lambda path: missing[path].header_offset), start=1):
                 _extract(file.rfilename, archive, missing[path], data_root / path)
                 progress.update(count)
-            _record(data_root / RECORD, info, file, {"parts": sorted(chosen), "scenarios": cases}, len(missing))
+            held = {part for name, contents in TREES.values() if name == file.rfilename for part in contents}
+            asked = {"parts": sorted(chosen & held), "scenarios": cases, "endpoint": api.endpoint}
+            _record(data_root / RECORD, info, file, asked, len(missing))
     folders = [data_root / CASES / case for case in cases]
     present = [folder for folder in folders if is_case(folder)]
     if len(present) == len(released):
@@ -265,10 +268,10 @@ def _extract(name: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, target:
         part.unlink(missing_ok=True)
 
 
-def _record(path: Path, info: DatasetInfo, file: RepoSibling, asked: dict[str, list[str]], count: int) -> None:
+def _record(path: Path, info: DatasetInfo, file: RepoSibling, asked: dict[str, Any], count: int) -> None:
     """Add an entry to fetched.json, unless nothing was missing and the same is recorded already."""
     entries = read_json(path, FETCHED_FORMAT)["fetched"] if path.exists() else []
-    content = {"repository": REPOSITORY, "revision": info.sha, "archive": file.rfilename, "size": file.size}
+    content: dict[str, Any] = {"repository": REPOSITORY, "revision": info.sha, "archive": file.rfilename, "size": file.size}
     content |= {"sha256": file.lfs.sha256 if file.lfs else ""} | asked
     if count or not any(content.items() <= entry.items() for entry in entries):
         entries.append(content | {"date": now(), "files": count})
