@@ -262,9 +262,7 @@ def sync(results: Results = Path("results"), settings: Settings = "{}") -> int:
     """Send to MLflow what is missing there, and close runs that were killed; 1 where something could not be sent."""
     from neuspring.experiments.tracking import log
 
-    tracking = read_settings(settings).tracking
-    log.init(results, tracking)
-    outcomes = log.sync(results, tracking, progress=print)
+    outcomes = log.sync(results, read_settings(settings).tracking, progress=print)
     print("\n".join(f"{outcome}: {len(names)}" for outcome, names in outcomes.items()))
     return 1 if any(outcome.startswith(("unreachable", "damaged")) for outcome in outcomes) else 0
 

@@ -118,7 +118,7 @@ class Artifact:
         arrays: dict[str, np.ndarray] = {}
         plain = self._flatten(arrays, "")
         meta = {"kind": self.kind, "format": FORMAT_VERSION, "fields": plain}
-        text = json.dumps(meta, sort_keys=True, allow_nan=False)
+        text = json.dumps(meta, sort_keys=True, allow_nan=False, default=dataclasses.asdict)
         write_npz(Path(path), arrays, text, compress=True)
 
     def _flatten(self, arrays: dict[str, np.ndarray], prefix: str) -> dict[str, Any]:
@@ -132,10 +132,10 @@ class Artifact:
                 # Its arrays stand beside those of this one.
                 plain[spec.name] = value._flatten(arrays, f"{prefix}{spec.name}.")
             elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-                parts = dataclasses.asdict(value)
-                plain[spec.name] = {f.name: parts[f.name] for f in dataclasses.fields(value) if _kept(f, parts[f.name])}
+                parts = dataclasses.fields(value)
+                plain[spec.name] = {f.name: getattr(value, f.name) for f in parts if _kept(f, getattr(value, f.name))}
             elif _kept(spec, value):
-                plain[spec.name] = _lists(value)
+                plain[spec.name] = value
         return plain
 
     @classmethod
@@ -173,15 +173,13 @@ class Artifact:
         if unknown := plain.keys() - hints.keys():
             raise TypeError(f"unknown fields {sorted(unknown)}")
         for spec in dataclasses.fields(cls):
-            if "shape" in spec.metadata:
-                optional = spec.default_factory is not dataclasses.MISSING
-                if not optional or prefix + spec.name in arrays:
-                    values[spec.name] = arrays[prefix + spec.name]
-                continue
+            is_array = "shape" in spec.metadata
+            held: dict[str, Any] = arrays if is_array else plain
+            name = prefix + spec.name if is_array else spec.name
             has_default = spec.default is not dataclasses.MISSING or spec.default_factory is not dataclasses.MISSING
-            if spec.name not in plain and has_default:
+            if name not in held and has_default:
                 continue  # left out where it is empty
-            kind, value = hints[spec.name], plain[spec.name]
+            kind, value = hints[spec.name], held[name]
             if isinstance(kind, UnionType):
                 # An artifact or none; a file that has it has an artifact.
                 kind = get_args(kind)[0]
@@ -190,7 +188,7 @@ class Artifact:
             elif isinstance(kind, type) and dataclasses.is_dataclass(kind):
                 value = kind(**value)
             elif isinstance(value, list):
-                value = _tuples(value)
+                value = tuple(value)
             values[spec.name] = value
         return cls(**values)
 
@@ -198,17 +196,6 @@ class Artifact:
 def _kept(spec: dataclasses.Field[Any], value: object) -> bool:
     """True where a file has the field; an empty one may be left out."""
     return bool(value) or spec.metadata != OMITTED
-
-
-def _lists(value: Any) -> Any:
-    """Dataclasses in a tuple as JSON holds them."""
-    if not isinstance(value, tuple):
-        return value
-    return [dataclasses.asdict(one) if isinstance(one, Obstacle) else one for one in value]
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -132,14 +132,6 @@ def test_a_lost_device_is_passed_over_and_not_waited_for(run):
     assert run(1, ("0", "1"), timeout=0).devices == ("1",)
 
 
-def test_a_device_that_works_again_is_no_longer_passed_over(run):
-    lease = run(1, ("0",))
-    lease.note(gpus.LOST_GPU)
-    lease.note("")
-    lease.release()
-    assert run(1, ("0", "1")).devices == ("0",)
-
-
 def test_too_few_devices_that_are_not_lost_are_an_error_and_no_endless_wait(run):
     fail_on("0", run)
     with pytest.raises(InputError, match=r"needs 2 of the GPUs 0, 1, and too few are left; received GPU 0 \(lost\).*nvidia-smi"):

@@ -121,9 +121,6 @@ class Postgres:
             self._who |= {"user": "postgres", "group": "postgres", "extra_groups": []}
             shutil.chown(folder, "postgres", "postgres")
         self._run("initdb", "-D", "data", "-U", "neuspring", "--auth=trust", "--no-sync")
-        self.start()
-
-    def start(self) -> None:
         command = ["-D", "data", "-c", "listen_addresses=127.0.0.1", "-c", f"unix_socket_directories={self.folder}"]
         with (self.folder / "log").open("a") as log:
             self.process = subprocess.Popen(
@@ -131,9 +128,8 @@ class Postgres:
             )
         wait_until(self._answers, self.process, "PostgreSQL")
 
-    def stop(self, how: signal.Signals = signal.SIGINT) -> None:
-        """SIGINT: in order. SIGQUIT: as in a crash; the next start recovers."""
-        self.process.send_signal(how)
+    def stop(self) -> None:
+        self.process.send_signal(signal.SIGINT)
         self.process.wait(30)
 
     def database(self, name: str) -> str:

@@ -76,8 +76,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def alone(record: Path, waiting: Callable[[str], object]) -> Iterator[IO[str] | None]:
     """Lock a job, whose record is at `record`, against other wrappers of it.
 
-    If another wrapper holds the lock, `waiting` is told once which one, and we wait. Yields the locked file, for the command to
-    inherit: the job stays locked until both have ended. Yields None, and locks nothing, where files cannot be made or locked.
+    If another wrapper holds the lock, `waiting` is told so once, and we wait. Yields the locked file, for the command to inherit:
+    the job stays locked until both have ended. Yields None, and locks nothing, where files cannot be made or locked.
     """
     # Snakemake removes a job's log before it starts the job, so the log cannot be the locked file.
     path, file, told = record.with_suffix(".lock"), None, False
@@ -85,16 +85,9 @@ def alone(record: Path, waiting: Callable[[str], object]) -> Iterator[IO[str] | 
         path.parent.mkdir(parents=True, exist_ok=True)
         while (file := try_lock(path)) is None:
             if not told:
-                holder = "not known"
-                with contextlib.suppress(FileNotFoundError):
-                    holder = path.read_text(encoding="utf-8").strip() or holder
-                end = f"waiting for its end. If it is gone, delete {path}"
-                waiting(f"an earlier run of this job still goes on ({holder}); {end}")
+                waiting(f"an earlier run of this job still goes on; waiting for its end. If it is gone, delete {path}")
             told = True
             time.sleep(JOB_POLL)
-        with contextlib.suppress(OSError):  # unbuffered: the file's own close must not try again what a full disk refused
-            os.ftruncate(file.fileno(), 0)
-            os.write(file.fileno(), f"pid {os.getpid()} on {platform.node()}".encode())
     except OSError:  # a full or read-only disk ends the job itself, with its name; some network file systems have no locks
         pass
     try:

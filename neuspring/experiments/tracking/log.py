@@ -11,7 +11,6 @@ is deleted when the record is logged.
 from __future__ import annotations
 
 import os
-import re
 import shlex
 import sys
 from collections.abc import Callable, Iterator
@@ -26,48 +25,34 @@ from neuspring.core.job_records import FOLDER as JOBS
 from neuspring.core.job_records import JobRecord
 from neuspring.core.run_record import RUN_RECORD, RunRecord, flat, key_of
 from neuspring.core.text import masked
-from neuspring.experiments.tracking.store import (
-    connect,
-    explained,
-    is_complete,
-    lock,
-    lock_path,
-    prepare,
-    search,
-    uri_of,
-)
+from neuspring.experiments.tracking.store import connect, default_uri, explained, lock
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
-    from mlflow.entities import Metric, Param
+    from mlflow.entities import Metric
 
-MOST_PARAMS = 60
-PARAM_LENGTH, TAG_LENGTH = 500, 5000
-"""These keep MLflow's tables readable. The full text stays in run.json."""
-METRIC_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.:/ -]{0,249}")
+MOST_PARAMS, TAG_LENGTH = 60, 5000
+"""These keep MLflow's tables readable. All is in run.json."""
 SAMPLE_COLUMNS = ("cpu_percent", "memory_mb", "gpu_percent", "gpu_memory_mb")
 """Columns of a job record's samples, after the time."""
+USAGE = {"peak_memory_mb": "peak_memory_mb", "peak_gpu_memory_mb": "peak_gpu_memory_mb", "mean_gpu_percent": "gpu_utilization"}
+"""Metric of a whole job -> field of its record."""
 OUTCOME = "mlflow.txt"
 """The outcome of logging a record, beside it; the workflow's rule writes it."""
-METRICS_PER_CALL = 1000
-"""Limit of MLflow's API; that of parameters is 100."""
 
 
 def init(results: Path, settings: Tracking) -> dict[str, str]:
-    """Create or upgrade the database, and create the experiment. Run it once, before jobs that log; again does no harm.
+    """Create the database and the experiment. Run it once, before jobs that log; again does no harm.
 
-    MLflow breaks a new database for good when several processes create it at once, so this holds a lock, and a new SQLite
-    file is built aside and renamed when complete. Returns `outcome` ("ready", "disabled" or "unreachable: <reason>") with
-    `uri`, `experiment` and, when ready, `experiment_id`.
+    Returns `outcome` ("ready", "disabled" or "unreachable: <reason>") with `uri`, `experiment` and, when ready, `experiment_id`.
     """
-    facts = {"uri": masked(uri_of(results, settings)), "experiment": settings.experiment}
+    facts = {"uri": masked(settings.uri or default_uri(results)), "experiment": settings.experiment}
     if not settings.enabled:
         return {"outcome": "disabled", **facts}
     try:
-        _, experiment = prepare(Path(results), settings)
+        _, experiment = connect(results, settings)
     except Exception as error:
-        line = explained(error, results, settings)
-        return {"outcome": _unreachable(line, "no run will be logged until `init` succeeds"), **facts}
+        return {"outcome": _unreachable(error, results, settings, "no run will be logged until `init` succeeds"), **facts}
     return {"outcome": "ready", **facts, "experiment_id": experiment}
 
 
@@ -84,14 +69,12 @@ def log_run(run_json: Path, results: Path, settings: Tracking) -> str:
     record = RunRecord.load(run_json)
     try:
         # Locked to the end, not only while the run is created: the lock tells a live logger from a killed one.
-        with lock(lock_path(results, record.run_key)):
-            client, experiment = connect(results, settings)
-            return _log(client, experiment, record, run_json, results)
+        with lock(results, record.run_key):
+            return _log(*connect(results, settings), record, run_json, results)
     except InputError:
         raise
     except Exception as error:
-        line = explained(error, results, settings)
-        return _unreachable(line, f"{record.name} is not logged; its files are complete, `sync` will log it")
+        return _unreachable(error, results, settings, f"{record.name} is not logged; its files are complete, `sync` will log it")
 
 
 def sync(results: Path, settings: Tracking, progress: Callable[[str], object] = lambda line: None) -> dict[str, list[str]]:
@@ -102,75 +85,27 @@ def sync(results: Path, settings: Tracking, progress: Callable[[str], object] = 
     """
     results = Path(results).resolve()
     outcomes: dict[str, list[str]] = {}
-
-    def note(name: str, outcome: str) -> None:
-        outcomes.setdefault(outcome, []).append(name)
-        progress(f"{name}: {outcome}")
-
-    down = _down(results, settings) if settings.enabled else None
+    # A server that is down must not cost its timeout once per run.
+    first = init(results, settings)["outcome"]
     # The copies among MLflow's artifacts lie deeper.
     for path in sorted(results.glob(f"*/*/*/{RUN_RECORD}")):
         name = path.parent.relative_to(results).as_posix()
-        if down:
-            note(name, down)
-            continue
         try:
-            outcome = log_run(path, results, settings)
+            outcome = log_run(path, results, settings) if first == "ready" else first
         except InputError as error:
             _warn(f"{name} is not logged: {error}")
             outcome = "damaged"
-        note(name, outcome)
+        outcomes.setdefault(outcome, []).append(name)
+        progress(f"{name}: {outcome}")
         file = path.with_name(OUTCOME)
         if outcome in ("logged", "already logged") and file.is_file() and file.read_text().startswith("unreachable"):
             write_text(file, f"{outcome}\n")
-        if outcome.startswith("unreachable"):
-            # One bad run must not stop the others, but a server that is down must not cost its timeout once per run.
-            down = _down(results, settings)
     return outcomes
 
 
-# --- sending ---
-
-
-def _log(client: MlflowClient, experiment: str, record: RunRecord, run_json: Path, results: Path) -> str:
-    """Log a record whose lock the caller holds."""
-    runs = search(client, experiment, run_key=record.run_key)
-    # A killed logger may have ended its run and died before the last tag. Then the run is FINISHED, but not complete.
-    for run in runs:
-        if not is_complete(run):
-            client.delete_run(run.info.run_id)
-    if any(map(is_complete, runs)):
-        return "already logged"
-    # All is read and checked before anything is sent.
-    params, metrics, files = payload(record, run_json, results)
-    start, end = milliseconds(record.started), milliseconds(record.ended)
-    tags = _tags(record, run_json.parent)
-    run_id = client.create_run(experiment, start_time=start, tags=tags, run_name=record.name).info.run_id
-    client.log_batch(run_id, params=params)
-    for first in range(0, len(metrics), METRICS_PER_CALL):
-        client.log_batch(run_id, metrics=metrics[first : first + METRICS_PER_CALL])
-    for path, folder in files:
-        client.log_artifact(run_id, str(path), folder)
-    client.set_terminated(run_id, "FINISHED" if record.status == "ok" else "FAILED", end)
-    client.set_tag(run_id, "logged", "complete")
-    return "logged"
-
-
-# --- messages ---
-
-
-def _down(results: Path, settings: Tracking) -> str | None:
-    """Why the store cannot be used; None if it can."""
-    try:
-        connect(results, settings)
-    except Exception as error:
-        return _unreachable(explained(error, results, settings), "the runs not yet logged are left for the next `sync`")
-    return None
-
-
-def _unreachable(line: str, consequence: str) -> str:
-    """The outcome, with the first line of the error, short and without passwords; told as a warning with its consequence."""
-    outcome = f"unreachable: {cut(line, 300)}"
+def _unreachable(error: Exception, results: Path, settings: Tracking, consequence: str) -> str:
+    """The outcome of an error of MLflow, told as a warning with its consequence."""
+    outcome = f"unreachable: {explained(error, results, settings)}"
     _warn(f"{outcome}; {consequence}.")
     return outcome
 
@@ -182,28 +117,34 @@ def _warn(message: str) -> None:
 # --- what is sent for a run: its record and the files that it names, read and checked before anything is sent ---
 
 
-def payload(record: RunRecord, run_json: Path, results: Path) -> tuple[list[Param], list[Metric], list[tuple[Path, str | None]]]:
-    """(parameters, metrics, local files with their artifact folder, None: the root) of a record and of its stages' job records.
-
-    Raises InputError.
-    """
+def _log(client: MlflowClient, experiment: str, record: RunRecord, run_json: Path, results: Path) -> str:
+    """Log a record whose lock the caller holds."""
     from mlflow.entities import Param
 
-    folder = run_json.parent
-    files: list[tuple[Path, str | None]] = [(run_json, None)]
-    for target, names in record.artifacts.items():
-        files += [(_named_file(run_json, folder / name), target) for name in names]
-    targets = [(target, path.name) for path, target in files]
-    if doubles := [target for target in targets if targets.count(target) > 1]:
-        raise InputError(run_json, "artifacts of one folder must have different file names", doubles[0])
-    metrics = [*_metrics(record, run_json), *_system_metrics(record, run_json, results)]
-    for name in [*record.params, *{metric.key for metric in metrics}]:
-        if not METRIC_NAME.fullmatch(name):
-            raise InputError(run_json, f"names of parameters and metrics must match {METRIC_NAME.pattern}", repr(name))
-    return [Param(name, cut(str(value), PARAM_LENGTH)) for name, value in _params(record).items()], metrics, files
+    # A killed logger may have ended its run and died before the last tag. Then the run is FINISHED, but not complete.
+    runs = client.search_runs([experiment], f"tags.run_key = '{record.run_key}'")
+    complete = [run for run in runs if run.data.tags.get("logged") == "complete"]
+    for run in runs:
+        if run not in complete:
+            client.delete_run(run.info.run_id)
+    if complete:
+        return "already logged"
+    files = [(run_json, None)] + [(run_json.parent / name, target) for target, names in record.artifacts.items() for name in names]
+    for path, _ in files:
+        _require_file(run_json, path)
+    metrics = [*_metrics(record, run_json), *_usage(record, run_json, results)]
+    start, end = milliseconds(record.started), milliseconds(record.ended)
+    run_id = client.create_run(experiment, start, _tags(record, run_json.parent), record.name).info.run_id
+    params = [Param(name, str(value)) for name, value in params_of(record).items()]
+    client.log_batch(run_id, metrics=metrics, params=params)
+    for path, target in files:
+        client.log_artifact(run_id, str(path), target)
+    client.set_terminated(run_id, "FINISHED" if record.status == "ok" else "FAILED", end)
+    client.set_tag(run_id, "logged", "complete")
+    return "logged"
 
 
-def _params(record: RunRecord) -> dict[str, Any]:
+def params_of(record: RunRecord) -> dict[str, Any]:
     """The settings that tell runs apart, named as in the configuration: the method's switches, and what has not its default value.
 
     `settings` is a digest of all, so that a comparison sees also what is not listed. In full they are in run.json.
@@ -223,11 +164,6 @@ def milliseconds(time: str) -> int:
     return round(datetime.fromisoformat(time).timestamp() * 1000)
 
 
-def cut(text: str, length: int) -> str:
-    """The text; one longer than `length` is cut short and ends in dots."""
-    return text if len(text) <= length else text[: length - 3] + "..."
-
-
 def _tags(record: RunRecord, folder: Path) -> dict[str, str]:
     names = ("scenario", "category", "source", "method", "seed", "attempt", "status", "reason", "commit", "data_digest", "device")
     tags = {name: str(getattr(record, name)) for name in (*names, "run_key")}
@@ -237,7 +173,7 @@ def _tags(record: RunRecord, folder: Path) -> dict[str, str]:
     # How to look at the run and pull its twin: as a tag, and in the description on MLflow's page.
     tags["play"] = command = shlex.join(["neuspring", "play", str(folder)])
     tags["mlflow.note.content"] = f"To turn this run's twin in the browser, and pull it:\n\n```\n{command}\n```\n"
-    return {name: cut(value, TAG_LENGTH) for name, value in tags.items()}
+    return {name: value[:TAG_LENGTH] for name, value in tags.items()}
 
 
 def _metrics(record: RunRecord, run_json: Path) -> Iterator[Metric]:
@@ -246,16 +182,16 @@ def _metrics(record: RunRecord, run_json: Path) -> Iterator[Metric]:
 
     end = milliseconds(record.ended)
     if record.scores_file:
-        for task, metric, value in _table(run_json, record.scores_file, ("task", "metric", "value")):
+        for task, metric, value in _table(run_json, record.scores_file, "task"):
             yield Metric(f"{task}.{metric}", value, end, 0)
     for stage, seconds in record.timings.items():
         yield Metric(f"seconds.{stage}", seconds, end, 0)
     for history, name in record.histories.items():
-        for step, metric, value in _table(run_json, name, ("step", "metric", "value")):
+        for step, metric, value in _table(run_json, name, "step"):
             yield Metric(f"{history}.{metric}", value, end, int(step))
 
 
-def _system_metrics(record: RunRecord, run_json: Path, results: Path) -> Iterator[Metric]:
+def _usage(record: RunRecord, run_json: Path, results: Path) -> Iterator[Metric]:
     """Use of processor, memory and GPU as `usage/{stage}.{what}`; steps are seconds.
 
     Not under `system/`: MLflow's page shows what is named so before everything else, and scores come first.
@@ -269,18 +205,11 @@ def _system_metrics(record: RunRecord, run_json: Path, results: Path) -> Iterato
         attempts = JobRecord.load(path).attempts if path.is_file() else []
         for attempt in attempts[-1:]:
             start = milliseconds(attempt.started)
-            for seconds, *values in attempt.samples:
-                for what, value in zip(SAMPLE_COLUMNS, values, strict=True):
-                    if seconds is not None and value is not None:
-                        yield Metric(f"usage/{stage}.{what}", value, start + round(1000 * seconds), round(seconds))
-            totals = {
-                "peak_memory_mb": attempt.peak_memory_mb,
-                "peak_gpu_memory_mb": attempt.peak_gpu_memory_mb,
-                "mean_gpu_percent": attempt.gpu_utilization,
-            }
-            for what, value in totals.items():
-                if value is not None:
-                    yield Metric(f"usage/{stage}.{what}", value, start, 0)
+            rows = [(seconds, *pair) for seconds, *row in attempt.samples for pair in zip(SAMPLE_COLUMNS, row, strict=True)]
+            rows += [(0.0, what, getattr(attempt, name)) for what, name in USAGE.items()]
+            for seconds, what, value in rows:
+                if seconds is not None and value is not None:
+                    yield Metric(f"usage/{stage}.{what}", value, start + round(1000 * seconds), round(seconds))
 
 
 def _jobs(record: RunRecord, run_json: Path, results: Path) -> dict[str, Path]:
@@ -300,23 +229,23 @@ def _jobs(record: RunRecord, run_json: Path, results: Path) -> dict[str, Path]:
     return jobs
 
 
-def _table(run_json: Path, name: str, columns: tuple[str, ...]) -> list[tuple[Any, ...]]:
-    """Rows of the named columns of a Parquet file beside a record. Raises InputError."""
+def _table(run_json: Path, name: str, by: str) -> list[tuple[Any, ...]]:
+    """(`by`, metric, value) of each row of a Parquet file beside a record. Raises InputError."""
     import pandas
 
-    path = _named_file(run_json, run_json.parent / name)
+    path, columns = _require_file(run_json, run_json.parent / name), [by, "metric", "value"]
     try:
-        table = pandas.read_parquet(path, columns=list(columns))
-        types = {"step": "int64", "value": "float64"}
-        table = table.astype({column: types[column] for column in columns if column in types})
+        table = pandas.read_parquet(path, columns=columns).astype(
+            {"value": "float64"} | ({"step": "int64"} if by == "step" else {})
+        )
     except (OSError, ValueError, TypeError, KeyError) as error:
         rule = f"must be a Parquet table with the columns {', '.join(columns)}"
-        reason = cut(f"{type(error).__name__}: {error}".partition("\n")[0], 300)
+        reason = f"{type(error).__name__}: {error}".partition("\n")[0][:300]
         raise InputError(path, rule, reason, f"Delete {run_json} and run again.") from error
     return list(table.itertuples(index=False, name=None))
 
 
-def _named_file(run_json: Path, path: Path) -> Path:
+def _require_file(run_json: Path, path: Path) -> Path:
     if not path.is_file():
         raise InputError(path, f"named by {run_json}", "no such file", f"Delete {run_json} and run again.")
     return path

@@ -150,7 +150,9 @@ def fetch(
             for count, path in enumerate(sorted(missing, key=lambda path: missing[path].header_offset), start=1):
                 _extract(file.rfilename, archive, missing[path], data_root / path)
                 progress.update(count)
-            _record(data_root / RECORD, info, file, {"parts": sorted(chosen), "scenarios": cases}, len(missing))
+            held = {part for name, contents in TREES.values() if name == file.rfilename for part in contents}
+            asked = {"parts": sorted(chosen & held), "scenarios": cases, "endpoint": api.endpoint}
+            _record(data_root / RECORD, info, file, asked, len(missing))
     folders = [data_root / CASES / case for case in cases]
     present = [folder for folder in folders if is_case(folder)]
     if len(present) == len(released):
@@ -266,7 +268,7 @@ def _extract(name: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, target:
         part.unlink(missing_ok=True)
 
 
-def _record(path: Path, info: DatasetInfo, file: RepoSibling, asked: dict[str, list[str]], count: int) -> None:
+def _record(path: Path, info: DatasetInfo, file: RepoSibling, asked: dict[str, Any], count: int) -> None:
     """Add an entry to fetched.json, unless nothing was missing and the same is recorded already."""
     entries = read_json(path, FETCHED_FORMAT)["fetched"] if path.exists() else []
     content: dict[str, Any] = {"repository": REPOSITORY, "revision": info.sha, "archive": file.rfilename, "size": file.size}

@@ -32,11 +32,9 @@ SECTIONS_OF_NO_ROW = ("simulation", "losses", "released_quirks")
 
 
 def state(trial: FrozenTrial) -> str:
-    """complete, pruned, failed or running."""
-    if trial.state == TrialState.FAIL:
-        # One without a reason ended with its worker, and is continued.
-        return "failed" if REASON in trial.user_attrs else "running"
-    return trial.state.name.lower()
+    """complete, pruned, failed or running; one that is to be continued is running."""
+    words = {TrialState.FAIL: "failed", TrialState.WAITING: "running"}
+    return words.get(trial.state, trial.state.name.lower())
 
 
 def best_of(trials: Sequence[FrozenTrial]) -> FrozenTrial | None:
@@ -64,18 +62,14 @@ def _table(trials: Sequence[FrozenTrial], plan: Plan) -> pd.DataFrame:
     rows = []
     for trial in trials:
         facts = trial.user_attrs.get(TRIAL_FACTS, {})
-        last = trial.intermediate_values[trial.last_step] if trial.last_step is not None else None
-        loss = trial.value if trial.state == TrialState.COMPLETE else None
-        row: dict[str, Any] = {"trial": origin(trial), "state": state(trial), "loss": loss, "last_loss": last}
-        row |= {"reason": trial.user_attrs.get(REASON, "")}
+        row: dict[str, Any] = {"trial": origin(trial), "state": state(trial)}
+        row |= {"loss": trial.value if trial.state == TrialState.COMPLETE else math.nan, "reason": trial.user_attrs.get(REASON, "")}
         row |= dict.fromkeys(plan.tune.space) | labels(trial.user_attrs.get(VALUES, {}))
         row |= {f"loss/{name}": value for name, value in facts.get("losses", {}).items()}
-        row |= {f"seconds/{name}": round(value, 3) for name, value in facts.get("seconds", {}).items()}
-        row |= {"optuna_trial": trial.number, "worker": trial.user_attrs.get(WORKER)}
-        rows.append(row | {name: facts.get(name) for name in ("device", "started", "ended", "commit", "code")})
+        row |= {"started": trial.datetime_start, "ended": trial.datetime_complete, "worker": trial.user_attrs.get(WORKER)}
+        rows.append(row | {name: facts.get(name) for name in ("device", "commit", "code")})
     # As objects: null is a value, not a missing number.
-    table = pd.DataFrame(rows, dtype=object)
-    return table.astype({"trial": int, "loss": float, "last_loss": float})
+    return pd.DataFrame(rows, dtype=object).astype({"trial": int, "loss": float})
 
 
 def write_best(plan: Plan, best: FrozenTrial, settings: Config, folder: Path, root: Path) -> None:

@@ -10,9 +10,8 @@ import copy
 import dataclasses
 import difflib
 import functools
-import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,8 +33,6 @@ FIXED = (*_WEIGHTS, "fit.selection", "released_quirks.frozen_loss_denominators")
 """The objective is measured with these, so all trials must share them."""
 SWEEP_SEED = 0
 """Seed of search, field and sampler, the same in all trials, so that they differ by their settings alone."""
-MOST_COMBINATIONS = 256
-"""Combinations of range ends that are checked before the first trial. If there are more, only all lowest and all highest ones."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +63,8 @@ class Plan:
         plan = cls(tune, method, row, base)
         for name in tune.space:
             plan._require_setting(name)
-        for values in plan._corners():
+        ends = [{name: end} for name, dimension in tune.space.items() for end in _ends(dimension)]
+        for values in ({}, *ends):
             plan.at(values, "tune.space, " + ", ".join(f"{name} = {value!r}" for name, value in values.items()))
         return plan
 
@@ -129,26 +127,19 @@ class Plan:
             inside = known[part]
         if isinstance(inside, dict):
             raise InputError(where, "must be one setting, not a section", list(inside))
-        if name in FIXED:
-            raise InputError(where, "must be the same in all trials: their losses are measured with it")
-        if section == "fit" and self.method.fit is None:
-            raise InputError(where, f"method {self.tune.method} has no first-order stage that would read it")
-        if name.startswith("fit.field.") and self.method.fit != "field":
-            raise InputError(where, f"method {self.tune.method} trains springs and reads no settings of a field")
-        if isinstance(inside, bool | list) and not self.tune.space[name].choices:
-            raise InputError(where, "is no number: `choices` are required", inside)
-        if isinstance(self.tune.space[name].step, float) and self.is_whole(name):
-            raise InputError(f"{where}, step", "must be a whole number", self.tune.space[name].step)
-
-    def _corners(self) -> Iterator[dict[str, Any]]:
-        """The baseline, every end of every range by itself, then combinations of ends: all if they are few, else two."""
-        ends = {name: _ends(dimension) for name, dimension in self.tune.space.items()}
-        yield {}
-        yield from ({name: value} for name, values in ends.items() for value in values)
-        if math.prod(map(len, ends.values())) <= MOST_COMBINATIONS:
-            yield from (dict(zip(ends, values, strict=True)) for values in itertools.product(*ends.values()))
-        else:
-            yield from ({name: values[place] for name, values in ends.items()} for place in (0, -1))
+        method, dimension = self.tune.method, self.tune.space[name]
+        faults = {
+            "must be the same in all trials: their losses are measured with it": name in FIXED,
+            f"method {method} has no first-order stage that would read it": section == "fit" and self.method.fit is None,
+            f"method {method} trains springs and reads no settings of a field": (
+                name.startswith("fit.field.") and self.method.fit != "field"
+            ),
+            "is no number: `choices` are required": isinstance(inside, bool | list) and not dimension.choices,
+            "its step must be a whole number": isinstance(dimension.step, float) and self.is_whole(name),
+        }
+        for rule, broken in faults.items():
+            if broken:
+                raise InputError(where, rule, inside)
 
 
 def label(value: Any) -> Any:

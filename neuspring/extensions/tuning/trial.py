@@ -8,14 +8,11 @@ computed.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import hashlib
-import json
 import math
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +22,6 @@ from neuspring import config
 from neuspring.config import Config
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError, NumericalFailure
-from neuspring.core.files import write_text
 from neuspring.core.provenance import code_digest
 from neuspring.core.records import StageRecord, canonical, digest_file
 from neuspring.extensions.tuning.space import SWEEP_SEED, Plan
@@ -73,30 +69,6 @@ def cut(observations: Observations, end: int) -> Observations:
     return replace(observations, scenario=replace(observations.scenario, frame_count=end, train_end=end, provenance={}), **arrays)
 
 
-@dataclass
-class TrialOutcome:
-    """Results of a trial so far."""
-
-    losses: dict[str, float] = field(default_factory=dict)
-    """Scenario -> loss of its tail, m^2."""
-    seconds: dict[str, float] = field(default_factory=lambda: {"search": 0.0, "fit": 0.0})
-    """Wall time; a search that an earlier trial made counts 0."""
-
-    @contextlib.contextmanager
-    def timed(self, stage: str) -> Iterator[None]:
-        """Add the time of the block."""
-        began = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[stage] += time.perf_counter() - began
-
-    @property
-    def value(self) -> float:
-        """The mean over scenarios, m^2."""
-        return sum(self.losses.values()) / len(self.losses)
-
-
 def run(
     plan: Plan,
     values: Mapping[str, Any],
@@ -105,9 +77,9 @@ def run(
     number: int,
     device: str,
     report: Report,
-    outcome: TrialOutcome,
+    losses: dict[str, float],
 ) -> None:
-    """Search and fit every scenario with a trial's values; `outcome` receives the results.
+    """Search and fit every scenario with a trial's values; `losses` receives the loss of each one's tail, m^2.
 
     `folder` is the sweep's. Trials share the searches in it, and the fits continue from the checkpoints of trial `number`. Raises
     what `report` raises; NumericalFailure; InputError for settings that exclude each other or do not fit the data.
@@ -116,8 +88,7 @@ def run(
     # The loss over the tail is needed after every epoch, whichever rule selects one.
     tailed = replace(settings, fit=replace(settings.fit, selection="tail"))
     for index, scene in enumerate(scenes):
-        with outcome.timed("search"):
-            path = searched(scene, settings, clusters, SWEEP_SEED, device, folder)
+        path = searched(scene, settings, clusters, SWEEP_SEED, device, folder)
         record = StageRecord.load(path)
         if record.status == "failed":
             raise NumericalFailure(f"{scene.name}, search: {record.reason}")
@@ -135,20 +106,19 @@ def run(
         )
 
         def report_epoch(epoch: int, loss: float, name: str = scene.name, first: int = index * plan.epochs) -> None:
-            mean = (sum(outcome.losses.values()) + loss) / (len(outcome.losses) + 1)
+            mean = (sum(losses.values()) + loss) / (len(losses) + 1)
             report(first + epoch, mean, f"{name}, epoch {epoch}")
 
         try:
-            with outcome.timed("fit"):
-                if plan.method.fit is None:
-                    loss = TwinFit(problem).tail_loss()
-                    report_epoch(0, loss)
-                else:
-                    key = _key(problem, record.files["twin"][1], device)
-                    loss = _fitted(problem, settings, checkpoint(folder, number, scene.name), key, report_epoch)
+            if plan.method.fit is None:
+                loss = TwinFit(problem).tail_loss()
+                report_epoch(0, loss)
+            else:
+                key = _key(problem, record.files["twin"][1], device)
+                loss = _fitted(problem, settings, folder / "trials" / str(number) / f"{scene.name}.partial.npz", key, report_epoch)
         except (NonFinite, NumericalFailure) as failure:
             raise NumericalFailure(f"{scene.name}, fit: {failure}") from failure
-        outcome.losses[scene.name] = loss
+        losses[scene.name] = loss
 
 
 def searched(scene: TrainingScene, settings: Config, clusters: int, seed: int, device: str, folder: Path) -> Path:
@@ -170,16 +140,8 @@ def searched(scene: TrainingScene, settings: Config, clusters: int, seed: int, d
     record = place / "search.json"
     with FileLock(place / ".lock"):
         if not record.is_file():
-            write_text(
-                place / "settings.json", json.dumps({"scenario": scene.name, "clusters": clusters, **values}, indent=1) + "\n"
-            )
             search_stage(observations=scene.head, settings=settings, clusters=clusters, seed=seed, device=device, output=record)
     return record
-
-
-def checkpoint(folder: Path, number: int, scene: str) -> Path:
-    """The checkpoint of a trial's fit."""
-    return folder / "trials" / str(number) / f"{scene}.partial.npz"
 
 
 def _key(problem: FitProblem, twin: str, device: str) -> str:

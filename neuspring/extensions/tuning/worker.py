@@ -1,23 +1,21 @@
 """One worker of a sweep, a job of the workflow: it runs trials until the sweep has as many as configured.
 
 Workers share an Optuna study, in SQLite or PostgreSQL, so each may be on another GPU or machine. Those that look at the count at
-the same time may make a trial more each than were asked for. When a killed worker starts again, the trial that it left is queued
-anew with its values, so that its fits continue from their checkpoints. (Optuna's own callback for that is experimental, and waits
-until a heartbeat is missed.)
+the same time may make a trial more each than were asked for. When a killed worker starts again, Optuna queues the trial that it
+left anew, and its fits continue from their checkpoints. (Optuna's heartbeat would find such a trial too, but only after a grace
+period in which a sweep of one worker has gone on with other trials.)
 """
 
 from __future__ import annotations
 
-import contextlib
 import copy
-import functools
 import hashlib
 import json
 import math
+import shutil
 import socket
 import tempfile
 import warnings
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,7 +25,7 @@ import sqlalchemy
 from filelock import FileLock, Timeout
 from optuna.pruners import BasePruner, MedianPruner
 from optuna.samplers import BaseSampler, TPESampler
-from optuna.storages import RDBStorage
+from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback
 from optuna.study import Study
 from optuna.trial import FrozenTrial, Trial, TrialState
 
@@ -39,15 +37,15 @@ from neuspring.core.files import write_text
 from neuspring.core.records import RECORD_FORMAT, canonical, now
 from neuspring.core.run_record import flat
 from neuspring.extensions.tuning.space import SWEEP_SEED, Plan, holds, label, labels
-from neuspring.extensions.tuning.trial import TrainingScene, TrialOutcome, checkpoint, run
+from neuspring.extensions.tuning.trial import TrainingScene, run
 
 DATABASE = "optuna.db"
 DEFINITION = "definition"
 """Attribute of the study: what must not change while it lasts."""
-ORIGIN, WORKER, REASON = "origin", "worker", "reason"
-"""Attributes of a trial: the number of the one that it continues, its worker, why it ended early (unless it was left behind)."""
+WORKER, REASON = "worker", "reason"
+"""Attributes of a trial: its worker; why it was pruned or failed."""
 TRIAL_FACTS, VALUES = "facts", "values"
-"""Attributes of a trial: how it went, and its values. The baseline's include those that the space cannot hold."""
+"""Attributes of a trial: how it was made, and its values. The baseline's include those that the space cannot hold."""
 MOST_DEATHS = 5
 """A trial that ends its worker this often is not continued; another takes its place."""
 STARTUP_TRIALS = 10
@@ -64,8 +62,8 @@ def lock_of(folder: Path) -> FileLock:
     return FileLock(folder / ".lock")
 
 
-def study_of(folder: Path, tune: Tune, facts: Mapping[str, Any], pruner: BasePruner | None = None) -> Study:
-    """A sweep, which is made if there is none and it is given a `pruner`; it is kept in SQLite in its folder, or in PostgreSQL.
+def study_of(folder: Path, tune: Tune, facts: Mapping[str, Any], *, begin: bool = False) -> Study:
+    """A sweep, which is kept in SQLite in its folder, or in PostgreSQL. `begin`: make it if there is none.
 
     Raises InputError if there is none, or if it was begun with other `facts`.
     """
@@ -74,25 +72,21 @@ def study_of(folder: Path, tune: Tune, facts: Mapping[str, Any], pruner: BasePru
     uri = tune.storage or sqlalchemy.URL.create("sqlite", database=str(path.resolve())).render_as_string()
     # A server may close connections that are idle during a long fit.
     engine = {"pool_pre_ping": True} if tune.storage else {"connect_args": {"timeout": WRITER_PATIENCE}}
-    # Several processes must not create the tables at once.
-    with lock_of(folder):
-        if pruner or tune.storage or path.is_file():
+    if begin or tune.storage or path.is_file():
+        # Several processes must not create the tables at once.
+        with lock_of(folder):
             try:
                 storage = RDBStorage(uri, engine_kwargs=engine)
             except ImportError as error:
                 raise InputError("tune.storage", "PostgreSQL needs a driver", error, "pip install psycopg2-binary") from error
-            if pruner:
-                study = optuna.create_study(storage=storage, study_name=tune.study, pruner=pruner, load_if_exists=True)
-                if DEFINITION not in study.user_attrs:
-                    study.set_user_attr(DEFINITION, dict(facts))
-            with contextlib.suppress(KeyError):
-                study = optuna.load_study(storage=storage, study_name=tune.study, pruner=pruner)
-                begun = study.user_attrs[DEFINITION]
+            study = optuna.create_study(storage=storage, study_name=tune.study, load_if_exists=True)
+            if begin and DEFINITION not in study.user_attrs:
+                study.set_user_attr(DEFINITION, dict(facts))
+        begun = study.user_attrs.get(DEFINITION)
     if begun is None:
         raise InputError(f"sweep {tune.study}", "must have been begun", None, "Run neuspring tune first.")
-    definition = {name: begun.get(name) for name in facts}
-    if canonical(definition) != canonical(facts):
-        before, after = flat(definition), flat(facts)
+    before, after = flat({name: begun.get(name) for name in facts}), flat(facts)
+    if canonical(before) != canonical(after):
         changed = [name for name in sorted(before.keys() | after.keys()) if before.get(name) != after.get(name)]
         remedy = f"Name a new sweep (tune.study), or delete this one{'' if tune.storage else f' ({folder})'}."
         rule = "must go on with what it was begun with"
@@ -101,44 +95,33 @@ def study_of(folder: Path, tune: Tune, facts: Mapping[str, Any], pruner: BasePru
 
 
 def origin(trial: FrozenTrial) -> int:
-    """The number of the trial that it continues; its own if none. Trial 0 is the baseline."""
-    return int(trial.user_attrs.get(ORIGIN, trial.number))
+    """The number of the trial that it continues, as Optuna's callback notes it; its own if none. Trial 0 is the baseline."""
+    return int(trial.system_attrs.get("failed_trial", trial.number))
 
 
 def counted(study: Study) -> list[FrozenTrial]:
     """The trials that count, by origin: finished, pruned, running, failed by their settings, or to be continued."""
-    trials = study.get_trials(deepcopy=False)
 
     def counts(trial: FrozenTrial) -> bool:
         # One that runs and has no worker was begun at this moment, or by a process that died at that moment.
-        running = trial.state == TrialState.RUNNING and WORKER in trial.user_attrs
-        return running or trial.state in (TrialState.COMPLETE, TrialState.PRUNED) or REASON in trial.user_attrs
+        held = trial.state in (TrialState.RUNNING, TrialState.WAITING) and WORKER in trial.user_attrs
+        return held or trial.state in (TrialState.COMPLETE, TrialState.PRUNED) or REASON in trial.user_attrs
 
-    return sorted([*filter(counts, trials), *_left(trials)], key=origin)
-
-
-def _left(trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
-    """Trials that ended with their worker, which none continues yet; not those that did so too often."""
-    newest, times = {origin(trial): trial for trial in trials}, Counter(map(origin, trials))
-    ended = [trial for trial in newest.values() if trial.state == TrialState.FAIL and REASON not in trial.user_attrs]
-    return [trial for trial in ended if times[origin(trial)] < MOST_DEATHS]
+    return sorted(filter(counts, study.get_trials(deepcopy=False)), key=origin)
 
 
-def continue_left(study: Study, worker: int, tune: Tune, first: Mapping[str, Any]) -> None:
-    """Queue anew the trials that earlier processes of this worker left, or workers that the configuration no longer has.
-
-    `first` are the values of the baseline.
-    """
-
-    def concerns(trial: FrozenTrial) -> bool:
+def continue_left(study: Study, worker: int, tune: Tune) -> None:
+    """Queue anew the trials that earlier processes of this worker left, or workers that the configuration no longer has."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        queue_anew = RetryHeartbeatStaleTrialCallback(max_retry=MOST_DEATHS - 1)
+    for trial in study.get_trials(states=(TrialState.RUNNING,)):
         owner = trial.user_attrs.get(WORKER, worker if tune.workers == 1 else -1)
-        return bool(owner == worker or owner >= tune.workers)
-
-    for trial in filter(concerns, study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))):
-        study.tell(trial.number, state=TrialState.FAIL)
-    for trial in filter(concerns, _left(study.get_trials(deepcopy=False))):
-        values = (dict(first) if origin(trial) == 0 else {}) | trial.params
-        study.enqueue_trial(values, user_attrs={ORIGIN: origin(trial)})
+        if owner == worker or owner >= tune.workers:
+            study.tell(trial.number, state=TrialState.FAIL)
+            # One with a reason ended just before its worker.
+            if REASON not in trial.user_attrs:
+                queue_anew(study, trial)
 
 
 def sampler_of(count: int, *, grouped: bool) -> BaseSampler:
@@ -211,30 +194,21 @@ def work(
     if names != required:
         raise InputError("--observations", f"those of {', '.join(required)} are required", ", ".join(names))
     first = labels({name: value for name, value in plan.baseline.items() if holds(tune.space[name], value)})
-    sampler = functools.partial(sampler_of, grouped=len(first) < len(tune.space))
-    facts = plan.facts() | {"frames": {scene.name: scene.digest for scene in scenes}}
-    study = study_of(folder, tune, facts, pruner_of(len(scenes), plan.epochs))
+    study = study_of(folder, tune, plan.facts() | {"frames": {scene.name: scene.digest for scene in scenes}}, begin=True)
+    study.pruner = pruner_of(len(scenes), plan.epochs)
     finished: list[int] = []
-
-    def objective(trial: Trial) -> float:
-        trial.set_user_attr(WORKER, worker)
-        number = origin(study.get_trials(deepcopy=False)[trial.number])
-        return _attempt(trial, number, plan, scenes, folder, device)
-
-    def told(study: Study, trial: FrozenTrial) -> None:
-        finished.append(origin(trial))
-        words = {TrialState.COMPLETE: "{:.3e} m^2", TrialState.PRUNED: "pruned at {1}", TrialState.FAIL: "failed: {1}"}
-        done(finished[-1], words[trial.state].format(trial.value, trial.user_attrs.get(REASON)))
-
     try:
         with FileLock(folder / f".worker-{worker}.lock", timeout=0):
-            continue_left(study, worker, tune, first)
+            continue_left(study, worker, tune)
             if not study.get_trials(deepcopy=False):
                 study.enqueue_trial(first, skip_if_exists=True)
             waiting = (TrialState.WAITING,)
             while (count := len(counted(study))) < tune.trials or study.get_trials(deepcopy=False, states=waiting):
-                study.sampler = sampler(count)
-                study.optimize(objective, n_trials=1, catch=(NumericalFailure, InputError), callbacks=[told])
+                study.sampler = sampler_of(count, grouped=len(first) < len(tune.space))
+                trial = study.ask()
+                trial.set_user_attr(WORKER, worker)
+                finished.append(origin(study.get_trials(deepcopy=False)[trial.number]))
+                done(finished[-1], _attempt(trial, finished[-1], plan, scenes, folder, device))
     except Timeout as error:
         rule = "one process at a time may be this worker"
         raise InputError("--worker", rule, worker, "Wait for the other one to end.") from error
@@ -243,29 +217,34 @@ def work(
     write_text(output, json.dumps(content, indent=1, sort_keys=True) + "\n")
 
 
-def _attempt(trial: Trial, number: int, plan: Plan, scenes: Sequence[TrainingScene], folder: Path, device: str) -> float:
-    """Run a trial: its value. Raises what Optuna takes as pruned or failed, and errors that say nothing about its settings."""
-    started, outcome = now(), TrialOutcome()
+def _attempt(trial: Trial, number: int, plan: Plan, scenes: Sequence[TrainingScene], folder: Path, device: str) -> str:
+    """Run a trial and tell the study how it ended; returns that in words. Raises errors that say nothing about its settings.
+
+    Such an error leaves the trial as the death of this process does: running, to be continued.
+    """
 
     def report(step: int, loss: float, what: str) -> None:
         trial.report(loss, step)
         if trial.should_prune():
             raise optuna.TrialPruned(f"{what}: {loss:.3e} m^2")
 
+    losses: dict[str, float] = {}
+    state, reason = TrialState.COMPLETE, ""
     try:
-        run(plan, _values(trial, number, plan), scenes, folder, number, device, report, outcome)
+        run(plan, _values(trial, number, plan), scenes, folder, number, device, report, losses)
     except (optuna.TrialPruned, NumericalFailure, InputError) as error:
         # A folder that cannot be written is no fault of these settings.
         tempfile.TemporaryFile(dir=folder).close()
-        trial.set_user_attr(REASON, str(error))
-        raise
-    finally:
-        facts = {"started": started, "ended": now(), "losses": outcome.losses, "seconds": outcome.seconds, "device": device}
-        codes = provenance.code_digest("neuspring.twin.fit", "neuspring.twin.search")
-        trial.set_user_attr(TRIAL_FACTS, facts | {"commit": provenance.commit(), "code": codes})
-    for scene in scenes:
-        checkpoint(folder, number, scene.name).unlink(missing_ok=True)
-    return outcome.value
+        state = TrialState.PRUNED if isinstance(error, optuna.TrialPruned) else TrialState.FAIL
+        reason = str(error)
+        trial.set_user_attr(REASON, reason)
+    codes = provenance.code_digest("neuspring.twin.fit", "neuspring.twin.search")
+    trial.set_user_attr(TRIAL_FACTS, {"losses": losses, "device": device, "commit": provenance.commit(), "code": codes})
+    # The mean over scenarios.
+    value = sum(losses.values()) / len(losses) if state == TrialState.COMPLETE else None
+    trial.study.tell(trial, value, state)
+    shutil.rmtree(folder / "trials" / str(number), ignore_errors=True)
+    return f"{state.name.lower()}: {reason or f'{value:.3e} m^2'}"
 
 
 def _values(trial: Trial, number: int, plan: Plan) -> dict[str, Any]:

@@ -32,7 +32,7 @@ RANGE = {"low": 1, "high": 2}
         ({"fit.horizon.more": RANGE}, ["more must be a setting"]),
         ({"fit.horizon": {"low": 1.0, "high": 2.0}}, ["fit.horizon = 1.0", "valid integer"]),
         ({"clusters": {"low": 1, "high": 2.5}}, ["clusters", "whole number"]),
-        ({"fit.epochs": {"low": 1, "high": 9, "step": 0.5}}, ["fit.epochs, step", "whole number"]),
+        ({"fit.epochs": {"low": 1, "high": 9, "step": 0.5}}, ["fit.epochs", "its step must be a whole number"]),
         ({"clusters": {"low": 0, "high": 2}}, ["clusters", "at least 1"]),
         ({"fit.damping": RANGE}, ["fit.damping = 1", "'fixed'"]),
         ({"fit.damping": {"choices": ["fixed", "springs"]}}, ["fit.damping = 'springs'", "fixed", "homogeneous"]),
@@ -42,10 +42,6 @@ RANGE = {"low": 1, "high": 2}
         ({"losses.chamfer": RANGE}, ["same in all trials"]),
         ({"search.tied_rollouts": {"low": 0, "high": 11}}, ["search.tied_rollouts = 11", "below rollouts"]),
         ({"fit.stiffness_range": {"choices": [[0.0, 1e5], [0.0, 1e4]]}}, ["must hold search.variables.stiffness"]),
-        (
-            {"search.tied_rollouts": {"low": 0, "high": 8}, "search.rollouts": {"low": 5, "high": 11}},
-            ["search.tied_rollouts = 8, search.rollouts = 5", "below rollouts"],
-        ),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
