@@ -163,17 +163,8 @@ def test_a_search_knows_how_many_candidates_and_threads_it_may_take(tmp_path, mo
     ],
 )
 def test_a_search_without_threads_or_twins_is_bad_input(words, message, tmp_path, capsys):
-    arguments = [
-        "search",
-        "--observations",
-        str(observed(tmp_path)),
-        *words,
-        "--device",
-        "cpu",
-        "--output",
-        str(tmp_path / "y.json"),
-    ]
-    assert main(arguments) == 2
+    common = ["--observations", str(observed(tmp_path)), "--device", "cpu", "--output", str(tmp_path / "y.json")]
+    assert main(["search", *common, *words]) == 2
     assert message in capsys.readouterr().err
 
 
