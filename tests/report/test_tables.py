@@ -116,17 +116,16 @@ def test_what_was_not_computed_is_said_and_never_a_number():
     assert "LPIPS not computed: no AlexNet weights: x is not there" in summary(runs)
 
 
-def test_scenarios_without_images_are_said_to_have_none():
+@pytest.mark.parametrize(
+    ("images", "why"),
+    [
+        (None, "these scenarios have no images"),
+        ({"failed": "appearance: step 3 removed the last splat"}, "appearance: step 3 removed"),
+    ],
+)
+def test_where_no_picture_was_scored_the_reason_is_said(images, why):
     one = collected({("a", "x", 0): 0.01})
-    text = summary(Collected(one.scores, one.runs.assign(images="null")))
-    assert "No scores of pictures: these scenarios have no images" in text
-
-
-def test_pictures_that_could_not_be_made_say_why():
-    one = collected({("a", "x", 0): 0.01})
-    failed = json.dumps({"failed": "appearance: step 3 removed the last splat"})
-    text = summary(Collected(one.scores, one.runs.assign(images=failed)))
-    assert "No scores of pictures: appearance: step 3 removed the last splat." in text
+    assert f"No scores of pictures: {why}" in summary(Collected(one.scores, one.runs.assign(images=json.dumps(images))))
 
 
 def test_only_pairs_that_every_method_finished_are_averaged_and_the_others_listed():

@@ -305,7 +305,6 @@ def test_a_board_of_another_size_contradicts_depth(tmp_path):
     ("words", "message"),
     [
         ([], "--bag, --phystwin-raw is required, or --controllers with --nodes and --tracks; received none"),
-        (["--color", "{root}/color_0"], "color alone needs the intrinsics of the camera; received none"),
         (
             ["--color", "{root}/color_0", "--depth", "{root}/depth_0", "{root}/depth_0"],
             "as many folders or videos of depth as of color are required",
@@ -315,7 +314,6 @@ def test_a_board_of_another_size_contradicts_depth(tmp_path):
             ["--color", "{root}/color_0", "--depth", "{root}/depth_0", "--cameras", "a", "b"],
             "--cameras: 1 different names are required",
         ),
-        (["--color", "{root}/color_0", "--depth", "{root}/depth_0", "--board", "5x7"], "--board: SQUARES_XxSQUARES_Y"),
     ],
 )
 def test_bad_words_end_with_status_2(tmp_path, capsys, words, message):
