@@ -8,7 +8,7 @@ import pytest
 
 from neuspring.core.table import Cell, Chip, Table
 from neuspring.report.blocks import PageSection, html_page
-from neuspring.report.summary import detail_blocks, errors_table, score_blocks, summary_text, write
+from neuspring.report.summary import detail_blocks, errors_table, score_blocks, summary_text
 from neuspring.scores.metrics import SCORE_COLUMNS
 from neuspring.scores.numbers import Numbers
 from neuspring.scores.runs import Collected, collect
@@ -53,14 +53,8 @@ def test_the_relative_difference_weighs_scenarios_equally():
 
 
 def test_the_ratio_weighs_a_scenario_of_large_errors_like_another():
-    values = {
-        ("a", "x", 0): 1.0,
-        ("a", "y", 0): 2.0,
-        ("b", "x", 0): 0.01,
-        ("b", "y", 0): 0.005,
-        ("c", "x", 0): 0.01,
-        ("c", "y", 0): 0.005,
-    }
+    values = {("a", "x", 0): 1.0, ("a", "y", 0): 2.0}
+    values |= {(scenario, m, 0): v for scenario in "bc" for m, v in (("x", 0.01), ("y", 0.005))}
     row = paired_differences(collected(values).scores, "x").iloc[0]
     assert row["difference"] > 0
     assert row["ratio"] == pytest.approx((2 * 0.5 * 0.5) ** (1 / 3))
@@ -122,17 +116,16 @@ def test_what_was_not_computed_is_said_and_never_a_number():
     assert "LPIPS not computed: no AlexNet weights: x is not there" in summary(runs)
 
 
-def test_scenarios_without_images_are_said_to_have_none():
+@pytest.mark.parametrize(
+    ("images", "why"),
+    [
+        (None, "these scenarios have no images"),
+        ({"failed": "appearance: step 3 removed the last splat"}, "appearance: step 3 removed"),
+    ],
+)
+def test_where_no_picture_was_scored_the_reason_is_said(images, why):
     one = collected({("a", "x", 0): 0.01})
-    text = summary(Collected(one.scores, one.runs.assign(images="null")))
-    assert "No scores of pictures: these scenarios have no images" in text
-
-
-def test_pictures_that_could_not_be_made_say_why():
-    one = collected({("a", "x", 0): 0.01})
-    failed = json.dumps({"failed": "appearance: step 3 removed the last splat"})
-    text = summary(Collected(one.scores, one.runs.assign(images=failed)))
-    assert "No scores of pictures: appearance: step 3 removed the last splat." in text
+    assert f"No scores of pictures: {why}" in summary(Collected(one.scores, one.runs.assign(images=json.dumps(images))))
 
 
 def test_only_pairs_that_every_method_finished_are_averaged_and_the_others_listed():
@@ -145,15 +138,6 @@ def test_only_pairs_that_every_method_finished_are_averaged_and_the_others_liste
     assert [rows[name]["Future TE"].mark for name in "xyz"] == ["", "best", ""]
     text = summary_text(Numbers(everything=found, baseline="x"))
     assert "- y, b / seed 0: failed: diverged\n- z, a / seed 0: failed: diverged\n" in text
-
-
-def test_missing_runs_are_listed(tmp_path):
-    found = collect(tmp_path, ["a"], ["x", "y"], [0, 1])
-    assert (found.runs["status"] == "missing").all()
-    text = write(Numbers(everything=found, baseline="x"), tmp_path / "tables")
-    for method in "xy":
-        assert f"- {method}, a / seed 0, a / seed 1: missing: no run.json" in text
-    assert (tmp_path / "tables" / "summary.md").is_file()
 
 
 def test_many_missing_runs_are_counted_and_failures_named(tmp_path):

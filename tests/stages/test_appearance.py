@@ -23,7 +23,7 @@ from neuspring.splats.draw import orbit_view
 from neuspring.splats.model import Gaussians, Splats
 from neuspring.splats.view import View
 from neuspring.stages.appearance import appearance
-from neuspring.stages.render import draw_frames, render
+from neuspring.stages.render import draw_frames
 from tests.support.filmed import FLIP, FRAMES, SIZE, STEP, film
 from tests.support.pictured import IMAGES, Scene
 from tests.support.pictured import pictured as settings
@@ -43,6 +43,24 @@ def scene(tmp_path_factory):
 def mean(table: pd.DataFrame, metric: str, frame: int, camera: str = "0") -> float:
     chosen = table[(table["metric"] == metric) & (table["frame"] == frame) & (table["camera"] == camera)]
     return float(chosen["value"].iloc[0])
+
+
+def changed(scene: Scene, **parts: object) -> Scene:
+    """The scene with other parts, the rest shared."""
+    other = copy.copy(scene)
+    vars(other).update(parts)
+    return other
+
+
+def spoiled(scene: Scene, folder, camera: dict | None = None, **changes: object) -> Capture:
+    """The capture with other entries, and others for camera 0; its images are shared."""
+    values = json.loads((scene.capture.folder / "capture.json").read_text()) | changes
+    values["cameras"][0] |= camera or {}
+    folder.mkdir()
+    for kind in ("color", "depth", "mask", "tracks.json"):
+        (folder / kind).symlink_to(scene.capture.folder / kind)
+    (folder / "capture.json").write_text(json.dumps(values))
+    return Capture.load(folder)
 
 
 def test_splats_show_frame_0_and_say_what_they_could_not_see(scene):
@@ -132,8 +150,7 @@ def test_what_cannot_be_trained_or_drawn_is_recorded_and_passed_on(scene, tmp_pa
         rendered, table = scene.render(scene.roll(STEP, "faint"), settings())
     assert (rendered.status, table) == ("failed", None)
     assert "no splat has an opacity above 0.9999" in rendered.reason
-    broken = copy.copy(scene)
-    broken.appearance = tmp_path / "appearance" / "appearance.json"
+    broken = changed(scene, appearance=tmp_path / "appearance" / "appearance.json")
     record = broken.learn(settings(appearance=dataclasses.replace(IMAGES.appearance, scale_rate=1e4)))
     assert record.status == "failed"
     rendered, _ = broken.render(scene.roll(STEP, "failed"), settings())
@@ -143,25 +160,12 @@ def test_what_cannot_be_trained_or_drawn_is_recorded_and_passed_on(scene, tmp_pa
 
 def test_a_frame_with_nothing_to_compare_has_no_psnr_and_is_counted(scene, tmp_path):
     """Hands all over frame 1 leave black on both sides."""
-    for path in sorted((scene.capture.folder / "mask" / "0").iterdir()):
-        (tmp_path / "mask" / "0").mkdir(parents=True, exist_ok=True)
-        shutil.copy(path, tmp_path / "mask" / "0" / path.name)
-    cv2.imwrite(str(tmp_path / "mask" / "0" / "00001.png"), np.full((SIZE[1], SIZE[0]), HANDS, np.uint8))
-    for kind in ("color", "depth", "tracks.json", "capture.json"):
-        (tmp_path / kind).symlink_to(scene.capture.folder / kind)
-    rollout = scene.roll(STEP, "covered")
-    before = {"masks": scene.masks, "appearance": scene.appearance, "rollout": rollout}
-    render(
-        capture=tmp_path / "capture.json",
-        observations=scene.folder / "observations.npz",
-        settings=settings(video=False),
-        device="cpu",
-        output=rollout.with_name("render.json"),
-        **before,
-    )
-    record = StageRecord.load(rollout.with_name("render.json"))
+    capture = spoiled(scene, tmp_path / "covered")
+    capture.folder.joinpath("mask").unlink()
+    shutil.copytree(scene.capture.folder / "mask", capture.folder / "mask")
+    cv2.imwrite(str(capture.path("mask", "0", 1)), np.full((SIZE[1], SIZE[0]), HANDS, np.uint8))
+    record, table = changed(scene, capture=capture).render(scene.roll(STEP, "covered"), settings(video=False))
     assert record.facts["empty_frames"] == 1
-    table = pd.read_parquet(record.file("frames", rollout.with_name("render.json")))
     scores = metrics.score_images(table, scene.observations.scenario, FRAMES, "m", 0).set_index(["task", "metric"])
     assert np.isfinite(scores["value"]).all()
     assert scores.loc[("reconstruction", "psnr"), "frames"] == 2
@@ -205,8 +209,7 @@ def test_pictures_of_any_camera_and_frame(scene, tmp_path):
 
 
 def test_training_follows_its_seed_and_repeats(scene, tmp_path):
-    again, learned = copy.copy(scene), []
-    again.appearance = tmp_path / "appearance" / "appearance.json"
+    again, learned = changed(scene, appearance=tmp_path / "appearance" / "appearance.json"), []
     for seed in (0, 1, 0):
         again.learn(settings(appearance=SHORT), seed)
         learned.append(again.appearance.with_name("splats.ply").read_bytes())
@@ -226,35 +229,12 @@ def test_pictures_from_the_side_keep_the_object_in_view(scene):
     assert np.abs(pictures[0] / 255 - straight).max() < 0.02
 
 
-def spoiled(scene: Scene, folder, **changes: object) -> Capture:
-    """The capture with other entries for camera 0, its images shared."""
-    values = json.loads((scene.capture.folder / "capture.json").read_text())
-    values["cameras"][0] |= changes
-    folder.mkdir()
-    for kind in ("color", "depth", "mask", "tracks.json"):
-        (folder / kind).symlink_to(scene.capture.folder / kind)
-    (folder / "capture.json").write_text(json.dumps(values))
-    return Capture.load(folder)
-
-
-def learn_from(scene: Scene, capture: Capture, tmp_path, masks=None) -> None:
-    lifted = scene.folder / "lifted.json"
-    appearance(
-        capture=capture.folder / "capture.json",
-        masks=masks or scene.masks,
-        settings=settings(appearance=SHORT),
-        seed=0,
-        device="cpu",
-        output=tmp_path / "appearance.json",
-        lifted=lifted,
-    )
-
-
 def test_a_camera_inside_the_object_is_named(scene, tmp_path):
     pose = np.array(scene.capture.description.cameras[0].camera_to_world)
     pose[:3, 3] = scene.observations.nodes.mean(axis=0)
+    inside = spoiled(scene, tmp_path / "inside", {"camera_to_world": pose.tolist()})
     with pytest.raises(InputError, match=r"capture\.json: cameras\.0\.camera_to_world.*outside the object"):
-        learn_from(scene, spoiled(scene, tmp_path / "inside", camera_to_world=pose.tolist()), tmp_path)
+        changed(scene, capture=inside, appearance=tmp_path / "appearance.json").learn(settings(appearance=SHORT))
 
 
 def with_masks(scene: Scene, folder, labels: np.ndarray) -> list:
@@ -266,32 +246,24 @@ def with_masks(scene: Scene, folder, labels: np.ndarray) -> list:
 
 
 def test_masks_of_another_size_and_empty_ones_are_named(scene, tmp_path, capsys):
-    other = with_masks(scene, tmp_path / "small", np.ones((FRAMES, 45, 80), np.uint8))
+    made, short = changed(scene, appearance=tmp_path / "appearance.json"), settings(appearance=SHORT)
+    made.masks = with_masks(scene, tmp_path / "small", np.ones((FRAMES, 45, 80), np.uint8))
     with pytest.raises(InputError, match=r"masks\.json.*size of camera 0.*\(6, 45, 80\)"):
-        learn_from(scene, scene.capture, tmp_path, other)
-    empty = with_masks(scene, tmp_path / "empty", np.zeros((FRAMES, SIZE[1], SIZE[0]), np.uint8))
-    learn_from(scene, scene.capture, tmp_path, empty)
+        made.learn(short)
+    made.masks = with_masks(scene, tmp_path / "empty", np.zeros((FRAMES, SIZE[1], SIZE[0]), np.uint8))
+    record = made.learn(short)
     assert "camera 0: the object is not in view in frame 0" in capsys.readouterr().out
-    assert StageRecord.load(tmp_path / "appearance.json").facts["cameras"] == ["1", "2"]
+    assert record.facts["cameras"] == ["1", "2"]
+    made.masks = made.masks[:1] * 3
     with pytest.raises(InputError, match="at least one camera must have the object in view"):
-        learn_from(scene, scene.capture, tmp_path, [empty[0]] * 3)
+        made.learn(short)
 
 
 def test_captures_of_another_length_are_named_with_both_files(scene, tmp_path):
-    shorter = spoiled(scene, tmp_path / "shorter")
-    values = json.loads((shorter.folder / "capture.json").read_text())
-    (shorter.folder / "capture.json").write_text(json.dumps(values | {"frame_count": 5}))
+    shorter = spoiled(scene, tmp_path / "shorter", frame_count=5)
     rollout = scene.roll(STEP, "length")
-    before = {"masks": scene.masks, "appearance": scene.appearance, "rollout": rollout}
     with pytest.raises(InputError, match=r"capture\.json: must have as many frames as the observations: 6.*received 5.*enabled"):
-        render(
-            capture=shorter.folder / "capture.json",
-            observations=scene.folder / "observations.npz",
-            settings=settings(),
-            device="cpu",
-            output=rollout.with_name("render.json"),
-            **before,
-        )
+        changed(scene, capture=shorter).render(rollout, settings())
 
 
 def test_processed_data_need_no_lifted_points(scene, tmp_path):

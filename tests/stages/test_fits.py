@@ -64,8 +64,11 @@ def rows_of(started: Path, folder: Path) -> list[FitRow]:
     ]
 
 
-def as_json(rows: list[FitRow]) -> str:
-    return json.dumps([asdict(row) for row in rows])
+def together(started: Path, rows: list[FitRow] | str, output: Path, **options: object) -> dict:
+    """The facts of fits that share launches."""
+    given = rows if isinstance(rows, str) else json.dumps([asdict(row) for row in rows])
+    fits(observations=started / "observations.npz", rows=given, device="cpu", output=output, **options)
+    return StageRecord.load(output).facts
 
 
 def finish(started: Path, rows: list[FitRow]) -> None:
@@ -103,27 +106,20 @@ def assert_same(got: Path, wanted: Path) -> None:
 @pytest.mark.parametrize("most", [0, 3])
 def test_what_ran_together_is_continued_to_the_same_end(started: Path, alone: Path, tmp_path: Path, most: int) -> None:
     rows = rows_of(started, tmp_path)
-    fits(
-        observations=started / "observations.npz",
-        rows=as_json(rows),
-        device="cpu",
-        output=tmp_path / "fits.json",
-        twins_per_launch=most or "auto",
-    )
-    record = StageRecord.load(tmp_path / "fits.json")
-    sizes = [len(batch) for batch in record.facts["batches"]]
+    facts = together(started, rows, tmp_path / "fits.json", twins_per_launch=most or "auto")
+    sizes = [len(batch) for batch in facts["batches"]]
     # Four of one horizon and two of another; of three at most, one would be alone, and is left to itself.
     assert sizes == ([4, 2] if most == 0 else [3, 2])
-    assert record.facts["errors"] == {}
+    assert facts["errors"] == {}
     finish(started, rows)
     assert_same(tmp_path, alone)
-    together = {path for batch in record.facts["batches"] for path in batch}
+    shared = {path for batch in facts["batches"] for path in batch}
     for row in rows:
         for output in row.fits:
-            facts, attempts = StageRecord.load(Path(output)).facts, StageRecord.load(Path(output)).attempts
-            assert (facts["epochs_together"], attempts) == ((3, 1) if output in together else (0, 1))
-            assert (facts["spring_updates"] == 0) == (output in together)
-            assert (facts["earlier_processor_seconds"] > 0) == (output in together)
+            record = StageRecord.load(Path(output))
+            assert (record.facts["epochs_together"], record.attempts) == (3 if output in shared else 0, 1)
+            assert (record.facts["spring_updates"] == 0) == (output in shared)
+            assert (record.facts["earlier_processor_seconds"] > 0) == (output in shared)
             assert not Path(output).with_name("fit.partial.npz").exists()
 
 
@@ -133,8 +129,7 @@ def test_finished_fits_and_failed_searches_are_left_alone(started: Path, alone: 
     replace(StageRecord.load(started / "search-0" / "search.json"), status="failed", reason="x").save(broken)
     rows.append(FitRow(fits={str(tmp_path / "a" / "fit.json"): str(broken)}))
     before = {path: path.stat().st_mtime_ns for path in alone.rglob("*") if path.is_file()}
-    fits(observations=started / "observations.npz", rows=as_json(rows), device="cpu", output=tmp_path / "fits.json")
-    assert StageRecord.load(tmp_path / "fits.json").facts["batches"] == []
+    assert together(started, rows, tmp_path / "fits.json")["batches"] == []
     assert {path: path.stat().st_mtime_ns for path in alone.rglob("*") if path.is_file()} == before
 
 
@@ -142,8 +137,7 @@ def test_a_fit_with_other_settings_is_made_again(started: Path, alone: Path, tmp
     rows = rows_of(started, tmp_path)
     finish(started, rows)
     longer = [replace(row, settings=json.dumps({"fit": {"epochs": 4}})) for row in rows[:1]]
-    fits(observations=started / "observations.npz", rows=as_json(longer), device="cpu", output=tmp_path / "fits.json")
-    assert len(StageRecord.load(tmp_path / "fits.json").facts["batches"][0]) == 2
+    assert len(together(started, longer, tmp_path / "fits.json")["batches"][0]) == 2
 
 
 def test_an_error_of_one_is_named_and_holds_nobody_up(
@@ -158,8 +152,7 @@ def test_an_error_of_one_is_named_and_holds_nobody_up(
 
     with monkeypatch.context() as patch:
         patch.setattr(twin_fit, "fit", failing)
-        fits(observations=started / "observations.npz", rows=as_json(rows), device="cpu", output=tmp_path / "fits.json")
-    errors = StageRecord.load(tmp_path / "fits.json").facts["errors"]
+        errors = together(started, rows, tmp_path / "fits.json")["errors"]
     assert errors == {str(tmp_path / "field" / "1" / "fit.json"): "MemoryError: too large"}
     finish(started, rows)
     assert_same(tmp_path, alone)
@@ -171,4 +164,4 @@ def test_an_error_of_one_is_named_and_holds_nobody_up(
 )
 def test_bad_rows(started: Path, tmp_path: Path, given: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        fits(observations=started / "observations.npz", rows=given, device="cpu", output=tmp_path / "fits.json")
+        together(started, given, tmp_path / "fits.json")

@@ -54,11 +54,12 @@ def test_records_name_the_pool_and_count_its_frames(seen, tmp_path):
 
 
 def test_a_search_on_another_pool_starts_afresh(seen, tmp_path, capsys):
-    record = tmp_path / "search.json"
-    search(observations=seen["lift"], settings=SETTINGS, clusters=1, seed=0, device="cpu", output=record)
-    search(observations=seen["lift"], settings=SETTINGS, clusters=1, seed=0, device="cpu", output=record, pool=[seen["shake"]])
+    given = {"observations": seen["lift"], "settings": SETTINGS, "clusters": 1, "seed": 0, "device": "cpu"}
+    given["output"] = tmp_path / "search.json"
+    search(**given)
+    search(**given, pool=[seen["shake"]])
     assert "made with other inputs or settings" in capsys.readouterr().out
     first = pd.read_parquet(tmp_path / "trace.parquet")
-    search(observations=seen["lift"], settings=SETTINGS, clusters=1, seed=0, device="cpu", output=record, pool=[seen["shake"]])
+    search(**given, pool=[seen["shake"]])
     assert "continuing the search after 6 rollouts" in capsys.readouterr().out
     pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "trace.parquet"), first)

@@ -15,6 +15,7 @@ import numpy as np
 
 from neuspring.data.capture import Capture
 from neuspring.extensions.annotate.server import TOKEN_HEADER, Server
+from tests.support.browser import Browser
 
 TOKEN = "the-token"
 
@@ -74,6 +75,13 @@ def decoded(content: bytes) -> np.ndarray:
     image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     assert image is not None
     return image
+
+
+def show(browser: Browser, client: Client, query: str = "", width: int = 1280, height: int = 800) -> None:
+    """Open the page of a server, and wait until it can be used."""
+    browser.open("about:blank", width, height)
+    browser.open(f"http://127.0.0.1:{client.port}/{query}#{TOKEN}", width, height)
+    browser.wait("document.body.dataset.ready === 'yes'")
 
 
 @contextmanager

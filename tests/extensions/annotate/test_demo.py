@@ -14,7 +14,7 @@ from neuspring.data.frames import overlap
 from neuspring.perception.marks.marks import Mark
 from neuspring.scenes.sources import read_scenarios
 from neuspring.scenes.synthetic.make import make
-from tests.extensions.annotate.served import TOKEN, Client, served
+from tests.extensions.annotate.served import Client, served, show
 from tests.support.browser import Browser, chromium
 from tests.support.project import ROOT
 
@@ -44,12 +44,6 @@ def outlines(truth: np.ndarray) -> list[Mark]:
 def corrections(marks: Sequence[Mark], truth: np.ndarray, frame: int) -> list[Mark]:
     """Outlines of what a later frame shows, as many as `marks` leave of MOST_MARKS."""
     return [replace(own, frame=frame) for own in outlines(truth)[: MOST_MARKS - len(marks)]]
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with Browser(served=True) as browser:
-        yield browser
 
 
 def draw(browser: Browser, marks: list[Mark]) -> None:
@@ -103,9 +97,7 @@ def test_five_marks_a_camera_give_the_masks_of_the_demo(browser, tmp_path, scena
     (capture.folder / "capture.json").write_text(json.dumps(description | {"masks": False}))
     capture = Capture.load(capture.folder)
     with served(capture) as client:
-        browser.open("about:blank", 1280, 800)
-        browser.open(f"http://127.0.0.1:{client.port}/#{TOKEN}", 1280, 800)
-        browser.wait("document.body.dataset.ready === 'yes'")
+        show(browser, client)
         for camera, truth in truths.items():
             browser.wait(f"annotate.camera === '{camera}'")
             go(browser, 0, frames)

@@ -80,13 +80,6 @@ def test_a_camera_without_frame_0_has_masks_too(tmp_path):
     assert page.saved_cameras() == ["0"]
 
 
-def test_half_done_work_is_kept(capture):
-    """A hand is marked before the object."""
-    page = page_of(capture)
-    page.write("none", marks(box(0, "hand")))
-    assert page_of(capture).document.read()[1].of("0")[0].label == "hand"
-
-
 @pytest.mark.parametrize(
     ("values", "message"),
     [

@@ -6,37 +6,13 @@ import time
 import numpy as np
 import pytest
 
-from neuspring.data.capture import Capture
-from tests.extensions.annotate.painted import Painted
-from tests.extensions.annotate.served import TOKEN, served
+from tests.extensions.annotate.served import show
 from tests.support.browser import Browser, chromium
-from tests.support.moving import FRAMES, moving, truth
+from tests.support.moving import FRAMES, truth
 
 pytestmark = pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome is installed")
 POINT = (46.0, 62.0)
 CONTROL, SHIFT = 2, 8
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with Browser(served=True) as browser:
-        yield browser
-
-
-@pytest.fixture
-def capture(tmp_path) -> Capture:
-    return moving(tmp_path / "capture", missing=(4,))
-
-
-@pytest.fixture
-def painted(monkeypatch) -> Painted:
-    return Painted(monkeypatch)
-
-
-@pytest.fixture
-def client(capture, painted):
-    with served(capture) as client:
-        yield client
 
 
 class Page:
@@ -44,9 +20,7 @@ class Page:
 
     def __init__(self, browser: Browser, client, query: str = "") -> None:
         self.browser, self.client = browser, client
-        browser.open("about:blank", 1280, 800)
-        browser.open(f"http://127.0.0.1:{client.port}/{query}#{TOKEN}", 1280, 800)
-        browser.wait("document.body.dataset.ready === 'yes'")
+        show(browser, client, query)
 
     def at(self, *point: float) -> tuple[float, float]:
         """Where a pixel of the frame is in the window."""
@@ -285,9 +259,7 @@ def test_a_note_leads_to_its_frame_and_camera(browser, client):
 
 
 def test_the_page_works_in_a_narrow_window(browser, client):
-    browser.open("about:blank", 500, 900)
-    browser.open(f"http://127.0.0.1:{client.port}/#{TOKEN}", 500, 900)
-    browser.wait("document.body.dataset.ready === 'yes'")
+    show(browser, client, "", 500, 900)
     found = browser.check()
     assert found["needed"] == found["width"]
     assert found["errors"] == []

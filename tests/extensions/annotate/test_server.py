@@ -6,33 +6,16 @@ import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.data.capture import TRACKS, Capture, write_tracks
+from neuspring.data.capture import TRACKS, write_tracks
 from neuspring.extensions.annotate.clicks import ANNOTATIONS
 from neuspring.extensions.annotate.server import LABEL_COLORS, Server, overlay_png
 from neuspring.perception.marks.store import MasksFile
-from tests.extensions.annotate.painted import Painted
 from tests.extensions.annotate.served import decoded, served
-from tests.support.moving import FRAMES, moving, truth
+from tests.support.moving import FRAMES, truth
 
 BOX = {"frame": 1, "label": "object", "kind": "box", "points": [[40, 50], [60, 70]], "radius": 3.0}
 HAND = BOX | {"label": "hand", "points": [[80, 50], [100, 70]]}
 POINT = (46.0, 62.0)
-
-
-@pytest.fixture
-def capture(tmp_path) -> Capture:
-    return moving(tmp_path / "capture", missing=(4,))
-
-
-@pytest.fixture
-def painted(monkeypatch) -> Painted:
-    return Painted(monkeypatch)
-
-
-@pytest.fixture
-def client(capture, painted):
-    with served(capture) as client:
-        yield client
 
 
 def marks(*marks, camera="0") -> dict:

@@ -2,6 +2,7 @@
 
 import json
 import re
+import time
 from importlib.resources import files
 
 import cv2
@@ -11,9 +12,15 @@ import pytest
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
 from neuspring.extensions.annotate.clicks import ANNOTATIONS, Annotations, Click, ClickedPoint, GrayImages, Trail, follow
-from neuspring.extensions.annotate.tracks import expected_frames, join, lift_place, notes_of, tracks_of
+from neuspring.extensions.annotate.tracks import TracksMode, expected_frames, join, lift_place, notes_of, tracks_of
+from neuspring.extensions.make_capture.make import Intake, make_capture
+from results.published.footage.film import Points
+from results.published.footage.film import film as real_film
+from tests.support.desk import write_folders, write_poses
 from tests.support.filmed import film
+from tests.support.films import Errors, Film
 from tests.support.moving import COVERED, FRAMES, NEAR, moving, truth
+from tests.support.real import FOOTAGE
 
 POINT = (46.0, 62.0)
 """On the square, in frame 0."""
@@ -248,3 +255,37 @@ def test_the_script_of_the_page_makes_tracks(tmp_path):
     exec(script.replace("FOLDER", str(tmp_path)), {})
     assert capture.tracks().shape == (FRAMES, 1, 3)
     assert np.isfinite(capture.tracks()).any()
+
+
+def test_clicks_on_color_alone_stay_in_the_image(tmp_path):
+    root = write_folders(tmp_path)
+    given = {"output": root / "capture", "name": "desk", "category": "ball", "rate": 30.0, "color": (root / "color_0",)}
+    given |= {"pose": "lying", "intrinsics": root / "intrinsics.json", "poses": write_poses(root / "poses.json", 1)}
+    capture, _ = make_capture(Intake(**given))
+    clicks = Annotations(points=(ClickedPoint(name="corner", clicks={"0": (Click(frame=0, x=40.0, y=30.0),)}),))
+    with pytest.raises(InputError, match=r"color alone cannot lift clicks to 3D; received none. Clicks stay in annotations.json"):
+        tracks_of(capture, clicks)
+    clicks.save(capture.folder)
+    mode = TracksMode(capture)
+    try:
+        while mode.results(0)["busy"]:
+            time.sleep(0.01)
+        assert [note["text"] for note in mode.results(0)["points"][0]["notes"]][-1].startswith("color alone: followed")
+        with pytest.raises(InputError, match="tracks in the world need depth"):
+            mode.save(replace=False)
+    finally:
+        mode.close()
+    assert not (capture.folder / "tracks.json").exists()
+
+
+@pytest.mark.skipif(not FOOTAGE.is_dir(), reason="the footage is not part of the repository")
+def test_one_click_per_point_follows_a_real_rope():
+    """Against points that were marked by hand on real color film."""
+    case = "single_lift_rope"
+    own = Points.load(FOOTAGE / "tracks" / f"{case}.json")
+    images = GrayImages(Film(real_film(FOOTAGE, case)))
+    places = np.stack([follow(images, "0", [Click(frame=0, x=float(x), y=float(y))]).places for x, y in own.xy[:, 0]], axis=1)
+    found = Errors.of(own, places, np.isfinite(places[..., 0]))
+    assert found.shown == 18
+    assert found.lost < 0.2
+    assert found.median < 2.5

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from neuspring.core.artifacts import Material, Observations, Simulation, Topology, Twin
 from neuspring.core.records import Recorder
+from neuspring.extensions.exports.formats import npz
 from neuspring.splats.model import Splats
 from neuspring.stages.rollout import rollout
 from tests.support import scenarios
@@ -101,6 +104,20 @@ def run_folder(
         splats().save(files["splats"])
         trained.save(files)
     return folder
+
+
+def described(folder: Path) -> tuple[dict[str, Any], dict[str, np.ndarray], dict[str, int]]:
+    """What the description of exported arrays says, the arrays, and the sizes by their symbols; every shape is as described."""
+    said = json.loads((folder / npz.DESCRIPTION_FILE).read_text())
+    with np.load(folder / npz.ARRAYS_FILE, allow_pickle=False) as file:
+        arrays = dict(file)
+    sizes: dict[str, int] = {}
+    for name, entry in said["arrays"].items():
+        assert list(arrays[name].shape) == entry["shape"]
+        for symbol, size in zip(entry["dimensions"], entry["shape"], strict=True):
+            assert size == (int(symbol) if symbol.isdigit() else sizes.setdefault(symbol, size)), name
+            assert symbol.isdigit() or symbol in said["sizes"]
+    return said, arrays, sizes
 
 
 def stretched(twin: Twin, factor: float) -> Twin:

@@ -180,8 +180,11 @@ def test_a_pose_of_another_kind_is_named_with_its_file(tmp_path, change, message
     assert message in text
 
 
-@pytest.mark.parametrize(("factor", "words"), [(8.0, "hands too large"), (0.2, "hands too small: hands (label 2) of")])
-def test_poses_of_another_scale_show_in_the_hands(capture, factor, words):
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [(8.0, "hands too large"), (0.2, "hands too small: hands (label 2) of"), (5.0, "implausible size: 13")],
+)
+def test_poses_of_another_scale_show_in_the_hands_and_the_size(capture, factor, words):
     def scaled(values):
         for row in values["cameras"][0]["camera_to_world"][:3]:
             row[3] *= factor
@@ -197,15 +200,6 @@ def test_a_mask_above_the_horizon(capture):
     mask[5:40, 30:50] = OBJECT
     cv2.imwrite(str(capture.path("mask", "0", 0)), mask)
     assert "every pixel of the object in frame 0 must look at the table z = 0; received" in errors(capture)
-
-
-def test_a_pose_in_another_unit_makes_an_implausible_size(capture):
-    def five_times(values):
-        for row in values["cameras"][0]["camera_to_world"][:3]:
-            row[3] *= 5.0
-
-    edit(capture, five_times)
-    assert "implausible size: 13" in "\n".join(of_level(check_layout(capture.folder), "warning"))
 
 
 def strip(length, width):
@@ -235,12 +229,13 @@ def test_an_outline_of_another_category(category, mask, words):
         assert words in found[0].text and repr(category) in found[0].text and "meant?" in found[0].remedy
 
 
-def test_the_outline_is_checked_before_a_run_and_in_it(capture):
+def test_the_outline_is_checked_before_a_run_and_in_it_where_depth_judges_nothing(capture):
     edit(capture, lambda values: values.update(category="rope"))
     rope = Capture.load(capture.folder)
     assert holds(check_layout(rope.folder), "warning", CAPTURE, "outline and category")
     labels = np.stack([disk()] * FRAMES)
-    assert "outline and category" in {one.name for one in look_at_masks(rope, "0", labels, mask_facts(rope, "0", labels))}
+    names = {one.name for one in look_at_masks(rope, "0", labels, mask_facts(rope, "0", labels))}
+    assert "outline and category" in names and not names & {"depth holes", "hands too large"}
 
 
 def test_the_pose_of_a_body_is_asked_for_and_kept(tmp_path):
@@ -261,12 +256,6 @@ def test_a_pose_is_refused_where_depth_is_measured(tmp_path):
     root = write_folders(tmp_path)
     with pytest.raises(InputError, match=r"--pose: is for color alone.*received standing"):
         make_capture(intake(root, depth=(root / "depth_0",), pose="standing"))
-
-
-def test_masks_of_a_run_are_not_judged_by_depth(capture):
-    labels = np.stack([disk()] * FRAMES)
-    names = {one.name for one in look_at_masks(capture, "0", labels, mask_facts(capture, "0", labels))}
-    assert not names & {"depth holes", "hands too large"}
 
 
 def test_segmentation_by_height_is_refused_at_the_start(capture):

@@ -13,16 +13,13 @@ from tests.support.real import PLUSH
 
 
 @pytest.mark.skipif(not PLUSH.is_dir(), reason="the recording is not part of the repository")
-@pytest.mark.parametrize("frames", ["250-335", pytest.param("160-349", marks=pytest.mark.slow)])
-def test_the_table_of_a_real_recording(tmp_path, frames, capsys):
+def test_the_table_of_a_real_recording(tmp_path, capsys):
     words = ["--color", f"{PLUSH}/color", "--depth", f"{PLUSH}/depth", "--intrinsics", f"{PLUSH}/intrinsics.json", "--rate", "30"]
     output = tmp_path / "plush"
-    assert main(["make-capture", *words, "--category", "plush bear", "--frames", frames, "--output", str(output)]) == 0
+    assert main(["make-capture", *words, "--category", "plush bear", "--frames", "250-335", "--output", str(output)]) == 0
     said = capsys.readouterr().out
-    print(said)
     capture = Capture.load(output)
-    first, last = map(int, frames.split("-"))
-    assert capture.frame_count == last - first + 1
+    assert capture.frame_count == 86
     assert "0.001 m per count (millimeters), guessed" in said
     # Depth has steps of 1 to 3 mm; the plane was fitted to 1.6 mm rms by hand, with a threshold of its own.
     rms, share = (float(said.split("table: ")[1].split(word)[0].split()[-1].rstrip("%")) for word in (" mm rms", " of the pixels"))

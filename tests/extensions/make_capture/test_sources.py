@@ -6,11 +6,10 @@ import pytest
 
 from neuspring.core.errors import InputError
 from neuspring.extensions.make_capture.feeds import pairs
-from neuspring.extensions.make_capture.film import looked_at
 from neuspring.extensions.make_capture.formats.folder import ImageFolder
 from neuspring.extensions.make_capture.formats.video import VideoFile
 from neuspring.extensions.make_capture.poses import choose, chosen
-from tests.support.desk import FRAMES, camera, counts, seen, write_folders, write_video
+from tests.support.desk import camera, counts, seen, write_folders, write_video
 
 
 def test_numbers_sort_as_numbers_and_count_from_the_names(tmp_path):
@@ -91,23 +90,6 @@ def test_a_damaged_video_is_refused(tmp_path):
         list(VideoFile(tmp_path / "color.mp4", "color").series)
 
 
-def test_color_and_depth_pair_by_their_numbers_and_else_by_their_order(tmp_path):
-    root = write_folders(tmp_path, first=10)
-    (root / "depth_0" / "frame_12.png").unlink()
-    view = pairs([root / "color_0"], [root / "depth_0"])[0]
-    assert view.series.numbers == [10, 11, 13, 14, 15, 16]
-    assert view.alone == {"color": [12], "depth": []}
-    color, depth = next(view.read([2]))
-    np.testing.assert_array_equal(depth, counts(seen(camera(), 3)[1]))
-    np.testing.assert_array_equal(color, seen(camera(), 3)[0])
-    for path in sorted((root / "depth_0").iterdir()):
-        path.rename(path.with_name(f"frame_{500 + int(path.stem[6:])}.png"))
-    with pytest.raises(
-        InputError, match=r"camera 0: color and depth must show the same moments; received 7 pic.* 10 to 16 and 6 .* 510, 511, 513"
-    ):
-        list(pairs([root / "color_0"], [root / "depth_0"])[0].series.numbers)
-
-
 @pytest.mark.parametrize(
     ("wanted", "numbers"),
     [("", [3, 4, 5, 6, 8]), ("4-6", [4, 5, 6]), ("4-", [4, 5, 6, 8]), ("4-8/2", [4, 6, 8]), ("3,6-8", [3, 6, 8]), ("100", [])],
@@ -127,22 +109,8 @@ def test_a_stride_and_a_jump_are_known(tmp_path):
     views = pairs([root / "color_0"], [root / "depth_0"])
     assert (choose(views, "0-10/2").step, choose(views, "0-10/2").jumps) == (2, [])
     assert choose(views, "0-3,8-11").jumps == [3]
-    (root / "depth_0" / "frame_6.png").unlink()
-    views = pairs([root / "color_0"], [root / "depth_0"])
-    assert (choose(views).step, choose(views).jumps) == (1, [5])
-    found = looked_at(views, choose(views))
-    assert [(one.name, one.level) for one in found] == [("time jumps", "warning"), ("images alone", "warning")]
     with pytest.raises(InputError, match="a capture needs at least 5 frames; received 3 of the numbers 0 to 11"):
         choose(views, "0-2")
-
-
-def test_a_frame_that_a_camera_lacks_is_missing(tmp_path):
-    root = write_folders(tmp_path, cameras=2)
-    for kind in ("color", "depth"):
-        (root / f"{kind}_1" / "frame_4.png").unlink()
-    choice = choose(pairs([root / "color_0", root / "color_1"], [root / "depth_0", root / "depth_1"]))
-    assert (choice.missing("0"), choice.missing("1")) == ((), (4,))
-    assert choice.places["1"][5] == 4 and len(choice.numbers) == FRAMES
 
 
 def test_a_camera_without_the_first_frame_is_refused(tmp_path):

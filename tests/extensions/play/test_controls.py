@@ -73,14 +73,6 @@ def test_a_rod_begins_at_frame_0_alone(tmp_path):
         start_state(run, found.observations, 3, True)
 
 
-def test_a_saved_recording_gives_the_same_motion_bit_for_bit(twin, tmp_path):
-    controls, seen = pulled(twin)
-    controls.save(tmp_path / "controls.npz")
-    again = replay(twin, load_controls(tmp_path / "controls.npz"))
-    assert np.array_equal(again.positions, seen)
-    assert digest_motion(again.positions) == controls.motion_digest
-
-
 def test_the_difference_of_another_twin_is_that_of_its_own_motion(twin):
     controls, seen = pulled(twin)
     other = softer(twin, 0.5)

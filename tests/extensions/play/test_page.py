@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from neuspring.cli.main import main
 from neuspring.core.artifacts import SplatCenters, Trajectory
 from neuspring.core.files import read_npz, write_npz
 from neuspring.core.records import digest_file
@@ -22,7 +23,7 @@ from neuspring.report.shown import find
 from neuspring.scores.metrics import track_errors
 from neuspring.splats.model import Gaussians
 from neuspring.splats.view import C0
-from tests.support.played import dressed, record, rod_results, spoil
+from tests.support.played import dressed, record, rod_results, softer, spoil
 
 RUN = "baseline/0"
 
@@ -183,6 +184,41 @@ def test_splats_come_first_and_nodes_springs_and_hands_at_a_switch(opened, scena
     page.player.clock.show(7)
     page.player.draw()
     assert (body.splats.handle.centers != before).any()
+
+
+def test_switches_change_the_scene(opened, scenario):
+    page = opened(scenario)
+    body = page.player._bodies[RUN]
+    page.parts["nodes"].value = False
+    page._changed()
+    assert not body.nodes.visible
+    before = body.springs.colors.copy()
+    page.quantity.value = "strain"
+    page._changed()
+    assert (body.springs.colors != before).any() and "strain" in page.legend.content
+    page.boxes[RUN].value = False
+    page._changed()
+    assert RUN not in page.player._bodies
+
+
+def test_a_saved_recording_is_compared_and_names_its_twin(opened, scenario, capsys):
+    page = opened(scenario)
+    page.panel.start(RUN)
+    live = page.panel.live
+    live.grab.take(1, "node", 3, live.simulator.positions[3])
+    live.grab.pull(1, live.simulator.positions[3] + [0.1, 0, 0])
+    until(lambda: live.simulator.frame >= 6)
+    live.grab.release(1)
+    page.panel._save()
+    page.panel.stop()
+    replayed = ["--replay", str(next(page.panel._save_to.glob("controls_small_baseline_0_0.npz"))), "--compare"]
+    assert main(["play", str(scenario), *replayed]) == 0
+    said = capsys.readouterr().out
+    assert "recorded with baseline/0" in said and "neuspring/0" in said
+    assert json.dumps(str(scenario)) not in said
+    softer(page.player.run(RUN).twin, 0.9).save(scenario / "baseline" / "0" / "twin.npz")
+    assert main(["play", str(scenario), *replayed]) == 2
+    assert "must be among the runs" in capsys.readouterr().err
 
 
 def test_what_is_not_there_cannot_be_switched_on(opened, scenario):

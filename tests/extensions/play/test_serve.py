@@ -1,9 +1,7 @@
 """Whom the server answers: this machine's own pages, at the port that was asked for."""
 
 import http.client
-import json
 import socket
-import time
 
 import pytest
 
@@ -11,10 +9,8 @@ pytest.importorskip("viser", reason="the extra [play] is not installed")
 
 from neuspring.cli.main import main
 from neuspring.core.errors import InputError
-from neuspring.extensions.play.page import Page
 from neuspring.extensions.play.serve import start
-from neuspring.report.shown import find
-from tests.support.played import results, softer
+from tests.support.played import results
 
 UPGRADE = {
     "Connection": "Upgrade",
@@ -66,54 +62,6 @@ def test_a_port_in_use_and_a_place_that_is_none_are_refused(tmp_path, capsys):
     for host, port in (("no.such.host.invalid", 0), ("127.0.0.1", 70000)):
         with pytest.raises(InputError, match=r"--host|--port"):
             start(host, port)
-
-
-@pytest.fixture(scope="module")
-def page(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("play")
-    one = start("127.0.0.1", 0)
-    shown = Page(one, find([results(folder)]), folder / "saved")
-    yield shown
-    shown.close()
-    one.stop()
-
-
-def test_switches_change_the_scene(page):
-    body = page.player._bodies["baseline/0"]
-    page.parts["nodes"].value = False
-    page._changed()
-    assert not body.nodes.visible
-    before = body.springs.colors.copy()
-    page.quantity.value = "strain"
-    page._changed()
-    assert (body.springs.colors != before).any() and "strain" in page.legend.content
-    page.boxes["baseline/0"].value = False
-    page._changed()
-    assert "baseline/0" not in page.player._bodies
-    page.boxes["baseline/0"].value = page.parts["nodes"].value = True
-    page._changed()
-
-
-def test_a_saved_recording_is_compared_and_names_its_twin(page, capsys):
-    page.panel.start("baseline/0")
-    live = page.panel.live
-    live.grab.take(1, "node", 3, live.simulator.positions[3])
-    live.grab.pull(1, live.simulator.positions[3] + [0.1, 0, 0])
-    end = time.monotonic() + 60
-    while live.simulator.frame < 6 and time.monotonic() < end:
-        time.sleep(0.05)
-    live.grab.release(1)
-    page.panel._save()
-    page.panel.stop()
-    saved = next((page.panel._save_to).glob("controls_small_baseline_0_0.npz"))
-    folder = str(page.found.folder)
-    assert main(["play", folder, "--replay", str(saved), "--compare"]) == 0
-    said = capsys.readouterr().out
-    assert "recorded with baseline/0" in said and "neuspring/0" in said
-    softer(page.player.run("baseline/0").twin, 0.9).save(page.found.folder / "baseline" / "0" / "twin.npz")
-    assert main(["play", folder, "--replay", str(saved), "--compare"]) == 2
-    assert "must be among the runs" in capsys.readouterr().err
-    assert json.dumps(folder) not in said
 
 
 LINK = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}
