@@ -46,8 +46,9 @@ from neuspring.baselines.gs_dynamics.train import (
 from neuspring.baselines.results import Prediction, Trained
 from neuspring.config import Config
 from neuspring.config.baselines import Baselines, GsDynamics
-from neuspring.core.artifacts import Observations, Scenario
+from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
+from tests.support import scenarios
 
 RULES, RECIPE = resolve(GsDynamicsTraining(width=16), "sloth")
 
@@ -293,13 +294,8 @@ def corners(count: int, seed: int) -> np.ndarray:
 
 def capture(points: np.ndarray, tools: np.ndarray, train_end: int | None = None) -> Observations:
     """Of points [T, N, 3] that are always seen and two nodes more."""
-    frames, seen = len(points), np.ones(points.shape[:2], dtype=bool)
-    end = frames if train_end is None else train_end
-    scenario = Scenario(name="made", source="toy", category="sloth", frame_count=frames, train_end=end, frame_rate=30.0, up="+z")
-    return Observations(
-        scenario=scenario, object_points=points, object_visibility=seen, object_motion_valid=seen, controller_points=tools,
-        surface_points=corners(1, 8), interior_points=corners(1, 9), tracks=np.zeros((frames, 0, 3)),
-    )  # fmt: skip
+    about = {"category": "sloth", "train_end": train_end or len(points)}
+    return scenarios.seen(points, tools, about, surface_points=corners(1, 8), interior_points=corners(1, 9))
 
 
 def hands(frames: int, motion: float = 0.012) -> np.ndarray:

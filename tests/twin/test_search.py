@@ -329,15 +329,9 @@ def pushed(hands: str = "auto", rollouts: int = 26) -> SearchProblem:
     lump = np.tile(corners, (frames, 1, 1))
     lump[:, :, 0] += np.maximum.accumulate(np.maximum(way - 0.01, 0.0))[:, None]
     points = np.array([[-0.03, 0.005, 0.015], [-0.03, 0.025, 0.015]]) + way[:, None, None] * [1.0, 0.0, 0.0]
-    known = {name: np.ones((frames, len(corners)), bool) for name in ("object_visibility", "object_motion_valid")}
-    nothing = {name: np.zeros((0, 3)) for name in ("surface_points", "interior_points")}
-    hands_and_lump = {
-        "object_points": lump,
-        "controller_points": points,
-        "scenario": scenarios.scenario(frame_count=frames, train_end=frames),
-    }
-    seen = scenarios.observations(frames, **hands_and_lump, **known, **nothing)
-    return small.search_problem(seen, search=config.Search(hands=hands, rollouts=rollouts, lengths="spacing"))
+    return small.search_problem(
+        scenarios.seen(lump, points), search=config.Search(hands=hands, rollouts=rollouts, lengths="spacing")
+    )
 
 
 def test_the_first_generation_says_whether_hands_hold_or_push():
