@@ -360,11 +360,11 @@ def relative_error(model: GsDynamicsModel, points: np.ndarray, tools: np.ndarray
 
 @pytest.mark.usefixtures("plain")
 def test_what_a_known_network_made_is_fitted_back():
-    points, tools = taught(16)
+    points, tools = taught(12)
     sizes = np.linalg.norm(np.diff(points, axis=0), axis=2)
     assert 0.005 < sizes.mean() < 0.03 and points.std(axis=1).min() > 0.01
-    trained = train(capture(points, tools), replace(PLAIN, epochs=15, updates_per_epoch=40))
-    assert not trained.failure and trained.facts["windows"] == 15
+    trained = train(capture(points, tools), replace(PLAIN, epochs=9, updates_per_epoch=40))
+    assert not trained.failure and trained.facts["windows"] == 11
     assert relative_error(trained.model, points, tools) < 0.15
 
 

@@ -90,11 +90,7 @@ LIMITED = {
 """Substeps grow within the second epoch, until it is rolled back because they may not grow further."""
 
 
-@pytest.mark.parametrize(
-    ("changes", "killed_in"),
-    [(GROWING, 10), (EVERYTHING, 3), (LIMITED, 3)],
-    ids=["growing", "everything", "limited"],
-)
+@pytest.mark.parametrize(("changes", "killed_in"), [(GROWING, 10), (EVERYTHING, 3), (LIMITED, 3)])
 def test_a_killed_fit_continues_bit_for_bit(tmp_path, monkeypatch, changes, killed_in):
     whole = fit(small.fit_problem(**changes))
     partial = tmp_path / "fit.npz"
@@ -115,12 +111,9 @@ def test_a_killed_fit_continues_bit_for_bit(tmp_path, monkeypatch, changes, kill
     continued = fit(small.fit_problem(**changes), partial=partial, key="k")
     assert (whole.attempts, continued.attempts) == (1, 2)
     assert_same_twin(continued.twin, whole.twin)
-    assert (continued.facts["best_epoch"], continued.facts["best_loss"]) == (whole.facts["best_epoch"], whole.facts["best_loss"])
     pd.testing.assert_frame_equal(continued.history, whole.history, check_exact=True)
-    timed = ("earlier_processor_seconds",)
-    assert [value for name, value in continued.facts.items() if name not in timed] == [
-        value for name, value in whole.facts.items() if name not in timed
-    ]
+    timed = {"earlier_processor_seconds": 0.0}
+    assert continued.facts | timed == whole.facts | timed
 
 
 def assert_same_twin(twin: Twin, expected: Twin) -> None:
@@ -194,14 +187,6 @@ def test_substeps_grow_within_an_epoch(kind):
     run.set_rate(1.0)
     assert np.isfinite(run.epoch()["loss"])
     assert run.twin.simulation.substeps > problem.twin.simulation.substeps, "before the epoch's end"
-    fixed = fit(
-        replace(
-            problem,
-            simulation=config.SimulationSettings(substeps=problem.twin.simulation.substeps),
-            fit=replace(settings, epochs=6),
-        )
-    )
-    assert "stiffness grew beyond" in fixed.facts["rollbacks"][0]
 
 
 def test_growing_dashpots_get_more_substeps():
@@ -230,18 +215,10 @@ def test_overflow_is_counted_although_solvers_are_rebuilt():
     assert dropped[1] > 0.9 * dropped[0] > 0
 
 
-def limited(kind: str) -> dict[str, object]:
-    """Settings under which stiffness outgrows the substeps that it may have."""
-    start = small.fit_problem(**GROWING).twin
-    count = start.simulation.substeps
-    if kind == "fixed":
-        return GROWING | {"simulation": config.SimulationSettings(substeps=count)}
-    return GROWING | {"simulation": config.SimulationSettings(max_substeps=count)}
-
-
-@pytest.mark.parametrize("kind", ["fixed", "max_substeps"])
-def test_stiffness_beyond_the_allowed_substeps_rolls_back_and_recovers(kind):
-    problem = small.fit_problem(**limited(kind))
+@pytest.mark.parametrize("limit", ["substeps", "max_substeps"])
+def test_stiffness_beyond_the_allowed_substeps_rolls_back_and_recovers(limit):
+    count = small.fit_problem(**GROWING).twin.simulation.substeps
+    problem = small.fit_problem(**GROWING, simulation=config.SimulationSettings(**{limit: count}))
     result = fit(problem)
     assert any("stiffness grew beyond" in text for text in result.facts["rollbacks"])
     # The learning rate is halved, so training goes on after a rollback ...

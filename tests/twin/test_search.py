@@ -145,14 +145,8 @@ def test_lengths_are_multiples_of_the_spacing_of_the_nodes():
 def test_small_and_large_units_have_the_same_variables_and_springs():
     """What is measured in spacings grows with the body: 1024 times, a power of two, so that no distance is rounded."""
     seen = small.observations()
-    large = replace(
-        seen,
-        object_points=1024 * seen.object_points,
-        controller_points=1024 * seen.controller_points,
-        surface_points=1024 * seen.surface_points,
-        interior_points=1024 * seen.interior_points,
-        tracks=1024 * seen.tracks,
-    )
+    lengths = ("object_points", "controller_points", "surface_points", "interior_points", "tracks")
+    large = replace(seen, **{name: 1024 * getattr(seen, name) for name in lengths})
     meters, units = ours(), ours(seen=large)
     np.testing.assert_array_equal(units.encode(), meters.encode())
     rng = np.random.default_rng(0)
@@ -285,17 +279,6 @@ def die_after(evaluated: int, problem: SearchProblem, seed: int, record: Path, m
         patch.setattr(candidates, "made", dying)
         with pytest.raises(KeyboardInterrupt):
             search(problem, seed, record=record, key="k")
-
-
-def test_a_killed_search_continues_exactly(tmp_path, monkeypatch):
-    record = tmp_path / "trace.parquet"
-    whole = search(small.search_problem(), seed=5)
-    die_after(14, small.search_problem(), 5, record, monkeypatch)  # in the middle of the second generation
-    assert len(pd.read_parquet(record)) == 11
-    continued = search(small.search_problem(), seed=5, record=record, key="k")
-    assert (whole.attempts, continued.attempts) == (1, 2)
-    assert continued.earlier_seconds > 0
-    assert_same_trace(continued.trace, whole.trace)
 
 
 @pytest.mark.parametrize(("rollouts", "clusters", "population"), [(5, 1, 11), (11, 1, 11), (15, 3, 12)])
@@ -461,11 +444,9 @@ def test_a_record_that_replays_in_part_is_continued_from_there(tmp_path, capsys)
 
 def test_a_fixed_count_that_no_candidate_can_use_is_an_error_with_the_remedy():
     problem = small.search_problem(simulation=config.SimulationSettings(substeps=1))
-    with pytest.raises(
-        InputError, match=r"simulation.substeps: at least one of 22 candidates must be stable.*; received 1"
-    ) as caught:
+    named = r"simulation.substeps: at least one of 22 candidates must be stable.*; received 1.*unstable.*Use at least \d+ substeps"
+    with pytest.raises(InputError, match=named):
         search(problem, seed=0)
-    assert re.search(r"unstable: simulation.substeps, node \d+: .*stability bound.* Use at least \d+ substeps", str(caught.value))
 
 
 def test_a_search_whose_candidates_all_fail_is_a_named_failure():
@@ -540,7 +521,7 @@ def test_the_search_is_the_same_bit_for_bit_however_candidates_are_simulated(mak
     """The slow path, one candidate after the other, is the specification."""
     slow = search(make(clusters=clusters, together=1), seed=3)
     assert slow.trace["substeps"].nunique() > 10
-    for how in ({}, {"together": 4}, {"together": 1, "threads": 3}):
+    for how in ({}, {"together": 4}, {"together": 1, "threads": 6}):
         fast = search(make(clusters=clusters, **how), seed=3)
         assert_same_trace(fast.trace, slow.trace)
         assert (fast.values, fast.cost) == (slow.values, slow.cost)
@@ -553,12 +534,6 @@ def test_the_search_is_the_same_where_lists_of_partners_are_full():
     slow, fast = (search(crowded(simulation=settings, together=together), seed=3).trace for together in (1, 16))
     assert_same_trace(fast, slow)
     assert 0 < (slow["collision_overflow"] > 0).sum() < len(slow)
-
-
-def test_threads_that_simulate_at_the_same_time_do_not_meet():
-    """Many short simulations by more threads than there are cores."""
-    slow = search(crowded(together=1), seed=0).trace
-    assert_same_trace(search(crowded(together=1, threads=6), seed=0).trace, slow)
 
 
 def test_a_killed_search_continues_in_another_batch(tmp_path, monkeypatch):
@@ -581,6 +556,7 @@ def test_a_killed_search_continues_in_another_batch(tmp_path, monkeypatch):
     assert len(pd.read_parquet(record)) == 11
     continued = search(small.search_problem(together=4), seed=5, record=record, key="k")
     assert continued.attempts == 2
+    assert continued.earlier_seconds > 0
     assert_same_trace(continued.trace, search(small.search_problem(together=1), seed=5).trace)
 
 
