@@ -32,14 +32,7 @@ def swinging(name: str, cable: str) -> Observations:
 
 
 def write_transfer(
-    results: Path,
-    cable: str,
-    method: str,
-    seed: int,
-    l1: Mapping[str, float],
-    *,
-    diverged: tuple[str, ...] = (),
-    line: bool = True,
+    results: Path, cable: str, method: str, seed: int, l1: Mapping[str, float], *, diverged: tuple[str, ...] = (), line: bool = True
 ) -> Path:
     """A transfer from `<cable>_train` with the error l1, m, on each clip, three times that of free markers; returns its record."""
     source, courses, lines = f"{cable}_train", [], {}

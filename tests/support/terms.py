@@ -63,15 +63,7 @@ def kernels(width: int) -> Kernels:
         i, g = wp.tid()
         gathered_adjoint(model, state, adjoint, 0, 0, i, g)
 
-    def speed(
-        v: vectors,
-        force: vectors,
-        gravity: vectors,
-        dt: numbers,
-        decay: numbers,
-        light: numbers,
-        after: vectors,
-    ):
+    def speed(v: vectors, force: vectors, gravity: vectors, dt: numbers, decay: numbers, light: numbers, after: vectors):
         i = wp.tid()
         after[i] = updated(v[i], force[i], gravity[0], dt[0], decay[0], light[i])
 
