@@ -55,10 +55,14 @@ def test_an_oracle_holds_no_tail_back():
 def started(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("oracle")
     small.observations().save(folder / "observations.npz")
-    search_stage(
-        observations=folder / "observations.npz", settings=SETTINGS, clusters=1, seed=0, device="cpu", output=folder / "search.json"
-    )
+    seen, output = folder / "observations.npz", folder / "search.json"
+    search_stage(observations=seen, settings=SETTINGS, clusters=1, seed=0, device="cpu", output=output)
     return folder
+
+
+def fitted(started: Path, output: Path, oracle: bool) -> None:
+    before = {"observations": started / "observations.npz", "search": started / "search.json"}
+    fit_stage(**before, settings=SETTINGS, kind="springs", device="cpu", output=output, oracle=oracle)
 
 
 def test_records_of_fit_and_rollout_say_oracle_and_digests_differ(started, tmp_path):
@@ -69,21 +73,8 @@ def test_records_of_fit_and_rollout_say_oracle_and_digests_differ(started, tmp_p
         job = fit_stage.job(observations=seen, search=found, settings=SETTINGS, device="cpu", output=output, oracle=oracle)
         arguments = {name: value for name, value in job.arguments.items() if name != "threads"}
         keys[oracle] = prepared(**arguments)[2]
-        fit_stage(
-            observations=seen,
-            search=found,
-            settings=SETTINGS,
-            kind="springs",
-            device="cpu",
-            output=tmp_path / f"{oracle}" / "fit.json",
-            oracle=oracle,
-        )
-        rollout(
-            observations=seen,
-            learned=tmp_path / f"{oracle}" / "fit.json",
-            device="cpu",
-            output=tmp_path / f"{oracle}" / "rollout.json",
-        )
+        fitted(started, output, oracle)
+        rollout(observations=seen, learned=output, device="cpu", output=output.with_name("rollout.json"))
     assert keys[False] != keys[True]
     for name in ("fit", "rollout"):
         normal, seeing = (StageRecord.load(tmp_path / f"{oracle}" / f"{name}.json") for oracle in (False, True))
@@ -106,15 +97,7 @@ def test_an_oracle_in_shared_launches_is_the_oracle_alone(started, tmp_path):
     assert batches == [[str(tmp_path / name / "fit.json") for name in names[1:]]]
     twins = []
     for folder in (tmp_path / "oracle", tmp_path / "alone"):
-        fit_stage(
-            observations=seen,
-            search=found,
-            settings=SETTINGS,
-            kind="springs",
-            device="cpu",
-            output=folder / "fit.json",
-            oracle=True,
-        )
+        fitted(started, folder / "fit.json", True)
         twins.append(Twin.load(folder / "twin.npz"))
         history = pd.read_parquet(folder / "history.parquet")
         assert len(history)
