@@ -25,8 +25,6 @@ TRUNCATION = 1e-7
 SINGLE = 1e-6
 """Relative: a few operations in float32, whose rounding is 6e-8."""
 SMALL = {"channels": 3, "hidden": 8, "bands": 2}
-SOLVED = 1e-9
-"""Relative: a least-squares solution in float64."""
 DIFFERENCES = 2e-6
 """Relative: differences of positions in float32, some ten times longer than a spring."""
 ALL = {"damping": "homogeneous", "output_bound": 1.5}
