@@ -32,34 +32,20 @@ from tests.support import scenarios, small
 from tests.support.searches import assert_same_trace, budget
 
 RELEASED = {
-    "stiffness": 0.3,
-    "object_radius": 0.25,
-    "object_neighbors": 0.5,
-    "controller_radius": 3 / 7,
-    "controller_neighbors": 4 / 7,
-    "ground_elasticity": 0.5,
-    "ground_friction": 0.15,
-    "contact_elasticity": 0.7,
-    "contact_friction": 0.15,
-    "contact_distance": 0.25,
-    "drag": 0.15,
-    "dashpot": 0.5,
+    "stiffness": (0.0, 1e5, 0.3),
+    "object_radius": (0.01, 0.05, 0.25),
+    "object_neighbors": (10, 50, 0.5),
+    "controller_radius": (0.01, 0.08, 3 / 7),
+    "controller_neighbors": (10, 80, 4 / 7),
+    "ground_elasticity": (0.0, 1.0, 0.5),
+    "ground_friction": (0.0, 2.0, 0.15),
+    "contact_elasticity": (0.0, 1.0, 0.7),
+    "contact_friction": (0.0, 2.0, 0.15),
+    "contact_distance": (0.01, 0.05, 0.25),
+    "drag": (0.0, 20.0, 0.15),
+    "dashpot": (0.0, 200.0, 0.5),
 }
-"""The released variables in the released order, and the released start on the normalized scale."""
-RELEASED_RANGES = {
-    "stiffness": (0.0, 1e5),
-    "object_radius": (0.01, 0.05),
-    "object_neighbors": (10, 50),
-    "controller_radius": (0.01, 0.08),
-    "controller_neighbors": (10, 80),
-    "ground_elasticity": (0.0, 1.0),
-    "ground_friction": (0.0, 2.0),
-    "contact_elasticity": (0.0, 1.0),
-    "contact_friction": (0.0, 2.0),
-    "contact_distance": (0.01, 0.05),
-    "drag": (0.0, 20.0),
-    "dashpot": (0.0, 200.0),
-}
+"""The released variables in the released order: their ranges, and the released start on the normalized scale."""
 ROUND_TRIP = 1e-9
 """Absolute, of normalized variables: rounding of float64, over ranges of a part of their bounds."""
 START_ROUNDING = 1e-12
@@ -82,7 +68,7 @@ def plain(**changes: object) -> SearchProblem:
 def test_one_region_has_the_twelve_variables_of_the_released_search_and_its_start():
     problem = plain()
     assert problem.variables == tuple(RELEASED)
-    np.testing.assert_allclose(problem.encode(), list(RELEASED.values()), rtol=CODING)
+    np.testing.assert_allclose(problem.encode(), [start for *_, start in RELEASED.values()], rtol=CODING)
     assert not problem.labels.any()
 
 
@@ -94,7 +80,7 @@ def test_k_regions_have_2k_plus_10_variables(clusters):
     assert regional == [f"object_{name}.{region}" for name in ("radius", "neighbors") for region in range(clusters)]
     # Every region starts where the uniform search does.
     start = dict(zip(problem.variables, problem.encode(), strict=True))
-    assert start == pytest.approx({name: RELEASED[name.partition(".")[0]] for name in start}, rel=CODING)
+    assert start == pytest.approx({name: RELEASED[name.partition(".")[0]][2] for name in start}, rel=CODING)
     assert np.unique(problem.labels).tolist() == list(range(clusters))
 
 
@@ -181,11 +167,10 @@ def test_a_fixed_radius_is_that_of_every_region():
 def test_the_released_row_is_the_search_as_it_was(clusters):
     """Bit for bit: the linear formula on the released ranges, and CMA-ES from the released start, told the same costs."""
     trace = search(small.search_problem(search=small.released(rollouts=24), clusters=clusters), seed=3).trace
-    ranges = RELEASED_RANGES
     names = [n for n in trace if n.removeprefix("normalized.") != n]
-    start = [RELEASED[n.removeprefix("normalized.").partition(".")[0]] for n in names]
+    start = [RELEASED[n.removeprefix("normalized.").partition(".")[0]][2] for n in names]
     for name in (n.removeprefix("normalized.") for n in names):
-        low, high = ranges[name.partition(".")[0]]
+        low, high, _ = RELEASED[name.partition(".")[0]]
         value = low + trace[f"normalized.{name}"] * (high - low)
         whole = name.partition(".")[0] in candidates.INTEGERS
         np.testing.assert_array_equal(trace[name], value.astype(int) if whole else value)
