@@ -9,14 +9,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from neuspring import config
 from neuspring.baselines import TrainingRequest
 from neuspring.baselines.gs_dynamics import model as gs
 from neuspring.baselines.gs_dynamics import train as training
 from neuspring.baselines.gs_dynamics.train import past
 from neuspring.baselines.results import Prediction, Trained
 from neuspring.config import Config
-from neuspring.config.baselines import Baselines, GsDynamics
+from neuspring.config.baselines import Baselines
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from tests.support import scenarios
@@ -236,9 +235,7 @@ def test_presets_and_what_replaces_them():
     assert not gs.resolve(gs.GsDynamicsTraining(), "rope")[0].heights and rules.heights
 
 
-def test_wrong_settings_and_weights_are_refused():
-    with pytest.raises(InputError, match="tools: unknown key"):
-        config.parse(GsDynamics, {"tools": "centroids"}, "here")
+def test_a_wrong_number_of_weights_is_refused():
     with pytest.raises(InputError, match=r"gs_dynamics.weights: \d+ weights are required; received 7"):
         gs.GsDynamicsModel(weights=np.zeros(7), rules=RULES)
 
