@@ -81,9 +81,10 @@ bench: $(INSTALLED)
 	$(BIN)/python -m tests.extensions.play.bench
 	$(BIN)/python -m tests.benchmarks.bench_workflow
 
-# Needs a GPU; `make gpu GPU_OPTIONS=--again` passes options. See tests/benchmarks/GPU.md.
+# Needs a GPU; `make gpu GPU_OPTIONS="-k fit"` passes options to pytest. See tests/benchmarks/GPU.md.
 gpu: $(INSTALLED)
-	$(BIN)/python -m tests.gpu $(GPU_OPTIONS)
+	$(BIN)/python -m pytest -m cuda $(GPU_OPTIONS) $(shell grep -rlE '\b(DEVICES|WAYS)\b|import CUDA|mark\.cuda' --include='test_*.py' tests)
+	$(BIN)/python -m tests.benchmarks.bench --device cuda:0
 
 clean:
 	rm -rf .venv .snakemake

@@ -13,8 +13,6 @@ import pandas as pd
 from neuspring.core.artifacts import Artifact, Trajectory
 from neuspring.core.checkpoint import Checkpoint, TrainingLoop
 
-CHECKPOINT_EVERY = 5
-"""Epochs between checkpoints from which a killed training continues."""
 DIVERGENCE_RADIUS = 10.0
 """m from the origin. A state with a point beyond it counts as diverged: scenes are a meter or two wide."""
 Model = TypeVar("Model", bound=Artifact)
@@ -72,7 +70,7 @@ def run_epochs(
 
     Continues from the file `partial` if it holds a checkpoint with the same key.
     """
-    loop = TrainingLoop("the training", "train", epochs, CHECKPOINT_EVERY, partial, key)
+    loop = TrainingLoop("the training", "train", epochs, partial, key)
     if loop.restored:
         training.restore(loop.restored)
     for number in loop:

@@ -74,6 +74,10 @@ def checkpoint_key(inputs: Mapping[str, str], settings: Mapping[str, Any], devic
     return hashlib.sha256(canonical(values).encode()).hexdigest()
 
 
+CHECKPOINT_EVERY = 5
+"""Epochs between checkpoints from which a killed training continues."""
+
+
 class TrainingLoop:
     """The epochs that are left of a training which may have been killed before.
 
@@ -81,15 +85,13 @@ class TrainingLoop:
     equals an uninterrupted one if its checkpoints hold all that an epoch depends on.
     """
 
-    def __init__(
-        self, what: str, label: str, epochs: int, every: int, partial: Path | None, key: str, *, share: float = 1.0
-    ) -> None:
+    def __init__(self, what: str, label: str, epochs: int, partial: Path | None, key: str, *, share: float = 1.0) -> None:
         """`what` is the training in messages, `label` in the progress line. A checkpoint is written to `partial` after each
-        `every` epochs and after the last; one that lies there is continued from if it has the same `key`. `share` is the part of
-        the time that counts for this training, where several run together."""
+        CHECKPOINT_EVERY epochs and after the last; one that lies there is continued from if it has the same `key`. `share` is the
+        part of the time that counts for this training, where several run together."""
         self._share, self._alone = share, share == 1.0
         self._begun, self._processor_begun = time.monotonic(), time.process_time()
-        self._epochs, self._every, self._partial, self._key = epochs, every, partial, key
+        self._epochs, self._partial, self._key = epochs, partial, key
         self._progress = Progress(label, epochs)
         self.history: list[dict[str, Any]] = []
         """A row per epoch."""
@@ -125,7 +127,7 @@ class TrainingLoop:
     def save(self, checkpoint: Callable[[], Checkpoint]) -> None:
         """Save the training's own state, with the history, if a checkpoint is due."""
         done = len(self.history)
-        if self._partial is None or (done % self._every and done < self._epochs):
+        if self._partial is None or (done % CHECKPOINT_EVERY and done < self._epochs):
             return
         state = checkpoint()
         seconds = self.earlier_seconds + self._share * (time.monotonic() - self._begun)

@@ -46,8 +46,6 @@ if TYPE_CHECKING:
 
 BETAS = (0.9, 0.99)
 """Adam's decay rates of the first and the second moment, as released."""
-CHECKPOINT_EVERY = 5
-"""Epochs between checkpoints from which a killed job continues."""
 TAIL_FRACTION = 0.2
 """Part of the training frames on which nothing is fitted with `fit.selection: tail`, as in sweeps."""
 MAX_ROLLBACKS = 5
@@ -423,7 +421,7 @@ def fit(
 
     label = f"{'oracle ' * problem.oracle}fit {problem.observations.scenario.name}, {problem.kind}, seed {problem.seed}"
     share = 1 / len(lane.batch.lanes) if lane else 1.0
-    loop = TrainingLoop("the fit", label, problem.fit.epochs, CHECKPOINT_EVERY, partial, key, share=share)
+    loop = TrainingLoop("the fit", label, problem.fit.epochs, partial, key, share=share)
     run = PooledFit(problem) if problem.pool else TwinFit(problem, lane)
     state = _State.of(loop.restored) if loop.restored else _start(run, problem)
     overflow = state.overflow

@@ -3,7 +3,7 @@
     python -m tests.benchmarks.bench [--quick] [--only SECTION] [--device DEVICE] [--peer CHECKOUT] [--save]
 
 On the CPU, one thread, and on the first GPU where there is one; --device chooses one of them. Prints one table, and how every row
-changed since the table of the same kind of machine that was committed last. Writes results/bench/<kind of machine>.json, or with
+changed since the table of the same kind of machine that was kept last. Writes results/bench/<kind of machine>.json, or with
 --save results/published/bench/<kind of machine>.json, which is to be committed. Some five minutes on a CPU; on a GPU at most two.
 """
 
@@ -41,10 +41,10 @@ def main(arguments: list[str] | None = None) -> None:
             begin = time.perf_counter()
             rows += SECTIONS[section](bench)
             print(f"{section}, {device}: {time.perf_counter() - begin:.0f} s", file=sys.stderr, flush=True)
-    committed = table.last_committed(kind)
+    kept = table.last_kept(kind)
     print(", ".join(f"{name} {value}" for name, value in facts.items() if value))
-    print("", table.text(rows, committed), "", table.LEGEND, *dict.fromkeys(notes), sep="\n")
-    print(f"compared with commit {committed['machine']['commit']}" if committed else f"no table of {kind} is committed")
+    print("", table.text(rows, kept), "", table.LEGEND, *dict.fromkeys(notes), sep="\n")
+    print(f"compared with commit {kept['machine']['commit']}" if kept else f"no table of {kind} is kept")
     record = table.as_record(facts, rows, notes)
     print(table.save(record, kind, committed=options.save).relative_to(table.ROOT))
 

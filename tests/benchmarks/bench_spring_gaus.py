@@ -6,7 +6,6 @@ Both in float32, on one CPU thread or on a GPU (`cuda`); states and gradients ar
 from __future__ import annotations
 
 import sys
-import time
 
 import numpy as np
 import torch
@@ -14,6 +13,7 @@ import torch
 from neuspring.core.device import resolve_device
 from neuspring.extensions.spring_gaus.model import SpringGausModel, SpringGausTraining
 from neuspring.extensions.spring_gaus.physics import AnchorGraph, AnchorSolver, reference_substep
+from tests.benchmarks.simulators import take_turns
 
 ANCHORS, SUBSTEPS, REPEATS = 1024, 100, 5
 
@@ -28,7 +28,8 @@ def main() -> None:
         scale = float(wanted.abs().max())
         # Rounding grows in so stiff a body; the tests compare them in float64.
         np.testing.assert_allclose(found.cpu(), wanted.cpu(), atol=1e-2 * scale)
-    first, second = milliseconds(kernels), milliseconds(eager)
+    times = take_turns({"kernels": kernels.run, "eager": eager.run}, device, rounds=REPEATS, least=REPEATS)
+    first, second = (1e3 * its.least for its in times.values())
     print(f"Spring-Gaus, {ANCHORS} anchors, {SUBSTEPS} substeps, a frame and its gradient, {device}, ms (minimum of {REPEATS})")
     print(f"    kernels       {first:8.1f}")
     print(f"    eager torch   {second:8.1f}    {second / first:.1f} x as long")
@@ -79,18 +80,6 @@ class InTorch(ByKernels):
             at = self.hands[0] + (k + 1) / SUBSTEPS * (self.hands[1] - self.hands[0])
             x, v = reference_substep(model, model, parameters, x, v, at, model.frame_time / SUBSTEPS)
         return x
-
-
-def milliseconds(way: ByKernels) -> float:
-    """Shortest time of a run."""
-    best = float("inf")
-    for _ in range(REPEATS):
-        start = time.perf_counter()
-        way.run()
-        if way.x.is_cuda:
-            torch.cuda.synchronize()
-        best = min(best, time.perf_counter() - start)
-    return 1e3 * best
 
 
 if __name__ == "__main__":

@@ -14,11 +14,10 @@ import importlib
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import torch
@@ -161,50 +160,24 @@ def copy(checkout: Path, folder: Path, stem: str, device: str) -> None:
 def imported(folder: Path, stem: str, device: str) -> tuple[ModuleType, Any]:
     """The module and its settings, with all kernels and their adjoints compiled: a capture must load none."""
     start_warp()
-    with _search(folder), _adjoints(), _default_device():
-        module = importlib.import_module(f"{PACKAGE}.{stem}")
+    before = wp.get_device()
+    # From `folder` alone, and forgotten afterwards: a copy for another device has the same names. Adjoints are Warp's own there.
+    with (
+        mock.patch.dict(sys.modules),
+        mock.patch.object(sys, "path", [str(folder), *sys.path]),
+        mock.patch.object(wp.config, "enable_backward", True),
+    ):
+        for name in [name for name in sys.modules if name.split(".")[0] == PACKAGE]:
+            del sys.modules[name]
+        importlib.invalidate_caches()
+        try:
+            module = importlib.import_module(f"{PACKAGE}.{stem}")
+        finally:
+            wp.set_device(before)  # the module sets it
         settings = sys.modules[f"{PACKAGE}.utils"].cfg
         settings.device = device
         wp.load_module(module.__name__, device=device)
     return module, settings
-
-
-@contextmanager
-def _search(folder: Path) -> Iterator[None]:
-    """Import the package from `folder` alone, and forget its names afterwards: a copy for another device has the same ones."""
-
-    def forget() -> dict[str, ModuleType]:
-        return {name: sys.modules.pop(name) for name in list(sys.modules) if name.split(".")[0] == PACKAGE}
-
-    before = forget()
-    sys.path.insert(0, str(folder))
-    importlib.invalidate_caches()
-    try:
-        yield
-    finally:
-        sys.path.remove(str(folder))
-        forget()
-        sys.modules.update(before)
-
-
-@contextmanager
-def _adjoints() -> Iterator[None]:
-    """Let Warp generate adjoints, which the kernels of this project carry themselves."""
-    kept, wp.config.enable_backward = wp.config.enable_backward, True
-    try:
-        yield
-    finally:
-        wp.config.enable_backward = kept
-
-
-@contextmanager
-def _default_device() -> Iterator[None]:
-    """Give the process its default device back: the module sets it when it is imported."""
-    before = wp.get_device()
-    try:
-        yield
-    finally:
-        wp.set_device(before)
 
 
 def single_dashpot(twin: Twin) -> float:

@@ -11,8 +11,9 @@ import functools
 import numpy as np
 
 from neuspring import config
-from neuspring.core.artifacts import Observations, Scenario
+from neuspring.core.artifacts import Observations
 from neuspring.twin.candidates import SearchProblem
+from tests.support import scenarios
 
 FRAMES, RATE = 31, 30.0
 TRACKED, SURFACE, NODES, HANDS = 300, 150, 650, 30
@@ -45,18 +46,15 @@ def observations() -> Observations:
     seen[1:] = rng.random((FRAMES - 1, TRACKED)) > 0.2
     valid = np.zeros_like(seen)
     valid[:-1] = seen[:-1] & seen[1:]
-    scenario = Scenario(
-        name="plush", source="toy", category="plush", frame_count=FRAMES, train_end=FRAMES, frame_rate=RATE, up="+z"
-    )  # fmt: skip
-    return Observations(
-        scenario=scenario,
-        object_points=np.where(seen[..., None], moved[:, :TRACKED], 0.0),
+    nodes = {"surface_points": points[TRACKED : TRACKED + SURFACE], "interior_points": points[TRACKED + SURFACE :]}
+    return scenarios.seen(
+        np.where(seen[..., None], moved[:, :TRACKED], 0.0),
+        np.stack([at(hands, frame) for frame in range(FRAMES)]),
+        {"name": "plush", "category": "plush", "frame_rate": RATE},
         object_visibility=seen,
         object_motion_valid=valid,
-        controller_points=np.stack([at(hands, frame) for frame in range(FRAMES)]),
-        surface_points=points[TRACKED : TRACKED + SURFACE],
-        interior_points=points[TRACKED + SURFACE :],
         tracks=moved[:, :10],
+        **nodes,
     )
 
 

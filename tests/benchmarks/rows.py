@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from neuspring.core.artifacts import Twin
 from tests.benchmarks.ours import Ours
-from tests.benchmarks.simulators import Frame, Simulator, Times, distances, gradient_difference, take_turns
+from tests.benchmarks.simulators import Frame, Simulator, distances, gradient_difference, take_turns
 from tests.benchmarks.table import Row
 
 KINDS = (("forward", False), ("forward + backward", True))
@@ -31,10 +31,6 @@ class Bench:
     def on_gpu(self) -> bool:
         """Whether this is a run on CUDA."""
         return self.device != "cpu"
-
-    def clock(self, actions: dict[str, Callable[[], object]]) -> dict[str, Times]:
-        """Times of actions that take turns."""
-        return take_turns(actions, self.device, rounds=5 if self.quick else 9, seconds=2.0 if self.quick else 5.0)
 
 
 @dataclass(frozen=True)
@@ -64,7 +60,8 @@ def frame_of(simulator: Simulator, twin: Twin, hands: np.ndarray, gradient: bool
 
 def timed(bench: Bench, section: str, entries: Sequence[Entry]) -> list[Row]:
     """The rows of entries that take turns. Ratios are in time per spring, substep and twin."""
-    times = bench.clock({entry.name: entry.frame.run for entry in entries})
+    rounds, seconds = (5, 2.0) if bench.quick else (9, 5.0)
+    times = take_turns({entry.name: entry.frame.run for entry in entries}, bench.device, rounds=rounds, seconds=seconds)
     named = {entry.name: entry for entry in entries}
     rows = []
     for entry in entries:
@@ -76,8 +73,7 @@ def timed(bench: Bench, section: str, entries: Sequence[Entry]) -> list[Row]:
         if entry.reference:
             other = named[entry.reference]
             ratio, scale = mine.over(times[other.name]), np.prod(other.counts[1:]) / np.prod(entry.counts[1:])
-            median, least = float(scale * ratio.median), float(scale * ratio.least)
-            row = replace(row, ratio=median, least_ratio=least, reference=other.name)
+            row = replace(row, ratio=float(scale * ratio.median), least_ratio=float(scale * ratio.least), reference=other.name)
         rows.append(row)
     return rows
 

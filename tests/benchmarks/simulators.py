@@ -61,19 +61,9 @@ class Times:
         """The median, s."""
         return statistics.median(self.seconds)
 
-    def over(self, other: Times) -> Ratio:
-        """How many times as long as another that ran in the same rounds."""
-        ratios = [mine / its for mine, its in zip(self.seconds, other.seconds, strict=True)]
-        return Ratio(statistics.median(ratios), min(ratios), max(ratios))
-
-
-@dataclass(frozen=True)
-class Ratio:
-    """Ratios of two times within the same rounds."""
-
-    median: float
-    least: float
-    most: float
+    def over(self, other: Times) -> Times:
+        """Times in units of those of another that ran in the same rounds."""
+        return Times(tuple(mine / its for mine, its in zip(self.seconds, other.seconds, strict=True)))
 
 
 def take_turns(

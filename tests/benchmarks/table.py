@@ -1,4 +1,4 @@
-"""The rows of the table, its text, its file, its change against the table that was committed last, and what a machine is."""
+"""The rows of the table, its text, its file, its change against the table that was kept last, and what a machine is."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import json
 import os
 import platform
 import re
-import subprocess
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,7 +15,6 @@ import numpy as np
 import torch
 import warp as wp
 
-from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from neuspring.core.provenance import commit
 from neuspring.core.table import Table
@@ -28,7 +26,7 @@ SCRATCH = "results/bench"
 """Where a table goes that nobody asked to keep."""
 HEADER = ["section", "row", "device", "nodes", "springs", "substeps", "batch", "median", "least", "ns", "ratio", "to", "change"]
 LEGEND = """ns: median per spring, substep and twin. ratio: of ns to the row named after it, median of the rounds.
-change: of the median since the committed table of this kind of machine."""
+change: of the median since the table of this kind of machine that was kept last."""
 
 
 def facts() -> dict[str, str | int]:
@@ -105,22 +103,10 @@ def save(record: dict[str, Any], kind: str, *, committed: bool) -> Path:
     return path
 
 
-def last_committed(kind: str, root: Path = ROOT) -> dict[str, Any] | None:
-    """The table of a kind of machine in the commit that is checked out; None where there is none.
-
-    Raises InputError if it is no table.
-    """
-    name = f"{COMMITTED}/{kind}.json"
-    try:
-        shown = subprocess.run(["git", "show", f"HEAD:./{name}"], cwd=root, capture_output=True, text=True, timeout=10, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return None
-    try:
-        record: dict[str, Any] = json.loads(shown.stdout)
-        medians(record)
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(name, "must be a table that --save wrote", repr(error), "Run with --save and commit the file.") from error
-    return record
+def last_kept(kind: str) -> dict[str, Any] | None:
+    """The table of a kind of machine that --save wrote last; None where there is none."""
+    path = ROOT / COMMITTED / f"{kind}.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
 
 def medians(record: dict[str, Any]) -> dict[tuple[str, str, str], tuple[float, str]]:

@@ -1,14 +1,12 @@
 """Text and file of the benchmark table, its comparison with a committed one, and the clock."""
 
 import json
-import subprocess
 import time
 from dataclasses import replace
 from itertools import count
 
 import pytest
 
-from neuspring.core.errors import InputError
 from tests.benchmarks import bench, table
 from tests.benchmarks.simulators import take_turns
 from tests.benchmarks.table import Row
@@ -33,29 +31,6 @@ def test_the_text_has_a_line_per_row_with_its_cost_and_its_change():
     assert shown[2] | {"median": "2.5 s", "ns": "", "nodes": "", "batch": "", "change": ""} == shown[2]
 
 
-def test_a_table_is_compared_with_the_one_in_the_last_commit(tmp_path):
-    def git(*words: str) -> None:
-        subprocess.run(["git", "-c", "user.name=n", "-c", "user.email=e@e", *words], cwd=tmp_path, check=True, capture_output=True)
-
-    git("init")
-    assert table.last_committed("here", tmp_path) is None
-    file = tmp_path / table.COMMITTED / "here.json"
-    file.parent.mkdir(parents=True)
-    file.write_text(json.dumps(table.as_record({"commit": "c0"}, [ROW], [])))
-    git("add", ".")
-    git("commit", "-m", "table")
-    file.write_text("{}")
-    committed = table.last_committed("here", tmp_path)
-    assert committed is not None and committed["machine"] == {"commit": "c0"}
-    assert table.change(replace(ROW, median=5.0), table.medians(committed)) == pytest.approx(0.25)
-    assert table.change(SLOWER, table.medians(committed)) is None
-    assert table.last_committed("elsewhere", tmp_path) is None
-    git("add", ".")
-    git("commit", "-m", "damaged")
-    with pytest.raises(InputError, match=r"here\.json: must be a table that --save wrote"):
-        table.last_committed("here", tmp_path)
-
-
 @pytest.mark.parametrize(("committed", "folder"), [(True, table.COMMITTED), (False, table.SCRATCH)])
 def test_only_save_writes_into_the_committed_folder(tmp_path, monkeypatch, committed, folder):
     monkeypatch.setattr(table, "ROOT", tmp_path)
@@ -63,7 +38,10 @@ def test_only_save_writes_into_the_committed_folder(tmp_path, monkeypatch, commi
     path = table.save(record, "here", committed=committed)
     assert path == tmp_path / folder / "here.json"
     assert json.loads(path.read_text()) == record
+    assert table.last_kept("here") == (record if committed else None)
     assert record["rows"][0]["nanoseconds"] == pytest.approx(10)
+    assert table.change(replace(ROW, median=5.0), table.medians(record)) == pytest.approx(0.25)
+    assert table.change(START, table.medians(record)) is None
 
 
 @pytest.mark.parametrize("rest", ["--quick", "--only=nodes", "--device=cpu"])

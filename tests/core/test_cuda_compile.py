@@ -1,84 +1,82 @@
-"""Every kernel of the package compiles for GPUs, also where there is none: machine code for two architectures, by NVRTC."""
+"""Every kernel of the package compiles for GPUs, also where there is none: machine code for two architectures, by NVRTC.
 
-import ast
+A module's kernels stand at its top, or are made by factories: functions of the scalar type, of a width of lanes, and of switches.
+"""
+
+import importlib
+import inspect
+import itertools
+from pathlib import Path
 from typing import Any
 
 import pytest
 import warp as wp
 
+import neuspring
 from neuspring.core.device import start_warp
-from tests.support.cubin import resources
-from tests.support.cuda_kernels import (
-    ARCHITECTURES,
-    CHOICES,
-    FORWARD,
-    PACKAGE,
-    compile_for_gpus,
-    declared,
-    kernels,
-    modules,
-    variants,
-)
 
+PACKAGE = Path(neuspring.__file__).parent
+MODULES = sorted(
+    ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
+    for path in PACKAGE.rglob("*.py")
+    if "wp.kernel" in path.read_text(encoding="utf-8")
+)
 LONG = {"neuspring.physics.frame"}
 """Modules that take half a minute."""
-NO_KERNELS_HERE: set[str] = set()
-"""Modules that name `wp.kernel` for the kernels of others."""
+ARCHITECTURES = (80, 90)
+"""A100 and H100, as compute capability x 10."""
+CHOICES: dict[str, tuple[Any, ...]] = {"real": (wp.float32, wp.float64), "width": (1,)}
+"""What factories are asked for, by the name of the parameter. On a GPU a thread has one lane (neuspring/physics/arrays.py)."""
+FORWARD = "_cuda_kernel_forward"
+"""What Warp adds to a kernel's mangled name in machine code."""
+
+
+def variants(made: Any) -> list[tuple[Any, ...]]:
+    """Every set of arguments of a factory: all choices of each parameter, both values of a switch; none where it is no factory."""
+    parameters = inspect.signature(made).parameters.values() if inspect.isfunction(made) else ()
+    if not any(parameter.name in CHOICES for parameter in parameters):
+        return []
+    switches = {parameter.name: (False, True) for parameter in parameters if parameter.annotation in (bool, "bool")}
+    return list(itertools.product(*((CHOICES | switches)[parameter.name] for parameter in parameters)))
+
+
+def kernels(module: str, patch: pytest.MonkeyPatch) -> list[wp.Kernel]:
+    """Kernels of a module, those of factories in all their variants. Raises AssertionError if one in its text is not among them."""
+    start_warp()
+    loaded = importlib.import_module(module)
+    members = list(vars(loaded).values())
+    found = [member for member in members if isinstance(member, wp.Kernel) and member.func.__module__ == module]
+    decorator = wp.kernel
+
+    def recorded(*arguments: Any, **options: Any) -> Any:
+        return lambda function: found.append(decorator(*arguments, **options)(function)) or found[-1]
+
+    patch.setattr(wp, "kernel", recorded)
+    for factory in (inspect.unwrap(member) for member in members if getattr(member, "__module__", "") == module):
+        for arguments in variants(factory):
+            factory(*arguments)
+    text = inspect.getsource(loaded)
+    threads = sum(inspect.getsource(code).count("wp.tid()") for code in {kernel.func.__code__ for kernel in found})
+    assert threads == text.count("wp.tid()"), f"{module}: a kernel is made neither at the top nor by a function of {set(CHOICES)}"
+    return found
+
+
+def compiled(found: list[wp.Kernel], folder: Path, architecture: int) -> bytes:
+    """Their machine code. NVRTC needs neither GPU nor driver."""
+    paths: list[Path] = []
+    for module in {id(kernel.module): kernel.module for kernel in found}.values():
+        paths += wp.compile_aot_module(module, arch=[architecture], module_dir=folder, use_ptx=False)
+    return b"".join(path.read_bytes() for path in paths)
 
 
 @pytest.mark.parametrize(
     "architecture", [ARCHITECTURES[0], *(pytest.param(one, marks=pytest.mark.slow) for one in ARCHITECTURES[1:])]
 )
-@pytest.mark.parametrize("module", [pytest.param(one, marks=pytest.mark.slow) if one in LONG else one for one in modules()])
-def test_every_kernel_compiles_for_gpus(module, architecture, tmp_path):
-    found, entries = kernels(module), {}
-    for path in compile_for_gpus(found, tmp_path, (architecture,)):
-        entries |= resources(path.read_bytes())
-    assert entries.keys() == {kernel.get_mangled_name() + FORWARD for kernel in found.values()}
-    assert all(0 < used.registers <= 255 and used.shared < 48 * 1024 for used in entries.values())
-
-
-def test_no_module_that_makes_kernels_is_overlooked():
-    makers = set()
-    for path in PACKAGE.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            named = ast.unparse(node) in ("wp.kernel", "warp.kernel") if isinstance(node, ast.Attribute) else False
-            imported = isinstance(node, ast.ImportFrom) and node.module == "warp" and any(a.name == "kernel" for a in node.names)
-            if named or imported:
-                makers.add(".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts))
-    assert makers - set(modules()) == NO_KERNELS_HERE
-
-
-def test_kernels_are_found_in_text():
-    text = """
-import warp as wp
-@wp.kernel(enable_backward=False)
-def bare(): ...
-@wp.func
-def helper(): wp.tid()
-if True:
-    def factory(real):
-        def inner(a):
-            i = wp.tid()
-        def other(a):
-            for k in range(3):
-                a[k] = float(wp.tid())
-        def plain(a): ...
-"""
-    assert declared(text) == {"bare": {"bare"}, "factory": {"inner", "other"}}
-
-
-def test_factories_are_asked_for_every_variant(monkeypatch):
-    def with_switch(real: Any, batched: bool): ...
-
-    def with_number(real: Any, columns: int): ...
-
-    both = (wp.float32, wp.float64)
-    assert set(variants("m.with_switch", with_switch)) == {(real, batched) for real in both for batched in (False, True)}
-    with pytest.raises(AssertionError, match="takes `columns`: say in CHOICES"):
-        variants("m.with_number", with_number)
-    monkeypatch.setitem(CHOICES, "columns", (8,))
-    assert variants("m.with_number", with_number) == [(real, 8) for real in both]
+@pytest.mark.parametrize("module", [pytest.param(one, marks=pytest.mark.slow) if one in LONG else one for one in MODULES])
+def test_every_kernel_compiles_for_gpus(module, architecture, tmp_path, monkeypatch):
+    found = kernels(module, monkeypatch)
+    code = compiled(found, tmp_path, architecture)
+    assert found and all((kernel.get_mangled_name() + FORWARD).encode() in code for kernel in found)
 
 
 MODULE = """
@@ -93,13 +91,16 @@ def kernels(real):
 """
 
 
-def test_a_kernel_that_its_factory_keeps_is_an_error(tmp_path, monkeypatch):
+def test_kernels_are_found_in_all_variants_and_none_is_overlooked(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "module_that_gives.py").write_text(MODULE)
-    assert list(kernels("module_that_gives")) == ["first float32", "second float32", "first float64", "second float64"]
-    (tmp_path / "module_that_hides.py").write_text(MODULE.replace(", {", "  # {"))
-    with pytest.raises(AssertionError, match=r"does not give out \['second'\]"):
-        kernels("module_that_hides")
+    (tmp_path / "module_that_keeps.py").write_text(MODULE.replace("return ", "unique(first), "))
+    names = [kernel.func.__name__ for kernel in kernels("module_that_keeps", monkeypatch)]
+    assert sorted(names) == ["first"] * 4 + ["second"] * 2
+    monkeypatch.undo()
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "module_that_hides.py").write_text(MODULE.replace("real", "kind"))
+    with pytest.raises(AssertionError, match="module_that_hides: a kernel is made neither"):
+        kernels("module_that_hides", monkeypatch)
 
 
 @wp.func_native("this is not C++;")
@@ -115,5 +116,5 @@ def test_a_kernel_that_a_gpu_cannot_run_fails(tmp_path, capfd):
         values[i] = nonsense(values[i])
 
     with pytest.raises(Exception, match="build failed"):
-        compile_for_gpus({"wrong": wrong}, tmp_path)
+        compiled([wrong], tmp_path, ARCHITECTURES[0])
     assert "error" in capfd.readouterr().err

@@ -88,16 +88,10 @@ BAD_ROWS = {
     "rows that extend each other": (read_searches, "a: {extends: b}\nb: {extends: a}", "search b: extends: .*; received a"),
     "search": (tables.read_methods, "a: {search: ../up, description: x}", r"method a.*search.*received '\.\./up'"),
     "fit": (tables.read_methods, "a: {search: uniform, fit: network, description: x}", "method a.*fit.*received 'network'"),
-    "body": (
-        read_searches,
-        "a: {clusters: 1, body: jelly, description: x}",
-        "search a, body: must be one of lattice, rod",
-    ),
+    "body": (read_searches, "a: {clusters: 1, body: jelly, description: x}", "search a, body: must be one of lattice, rod"),
     "missing": (tables.read_methods, "a: {search: uniform, fit: null}", "method a.*description: required, but missing"),
-    "unknown": (tables.read_methods, "a: {search: uniform, description: x, lr: 1}", "method a.*lr: unknown key"),
     "not a mapping": (tables.read_methods, "a: 3", "method a"),
     "empty": (tables.read_methods, "", "must hold a YAML mapping; received NoneType"),
-    "list": (tables.read_methods, "[a]", "must hold a YAML mapping; received list"),
     "not YAML": (tables.read_methods, "a: [", "must be YAML"),
 }
 
@@ -156,8 +150,6 @@ def test_bad_scenario_tables(name: str, tmp_path: Path) -> None:
         read_scenarios(path)
     assert str(path) in str(caught.value)
 
-
-SCENES_OF_TARGETS = ["synthetic_single_lift_rope", "synthetic_single_lift_sloth"]
 
 # A benchmark: the configuration with its tables -----------------------------------------------------------------------
 
@@ -255,23 +247,28 @@ def test_deforms_benchmark_is_a_pool_of_evenly_spaced_recordings_per_cable(tmp_p
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"scenarios": []}, "configuration, scenarios: at least one entry is required"),
-        ({"methods": []}, "configuration, methods: at least one entry is required"),
-        ({"seeds": []}, "configuration, seeds: at least one entry is required"),
+        *(({name: []}, f"configuration, {name}: at least one entry is required") for name in ("scenarios", "methods", "seeds")),
         ({"methods": ["ful"]}, r"every entry must be a row of methods\.yaml; received 'ful' \(did you mean 'full'\?\)"),
         ({"scenarios": ["nothing"]}, r"row of scenarios\.tsv, or a capture or recording in data_root; received 'nothing'.*cable"),
         ({"scenarios": ["cable"]}, "scenario cable: mocap scenarios need data_root"),
         ({"scenarios": ["cable"], "data_root": "/nowhere"}, "scenario cable: its data must exist; received /nowhere/cable.csv"),
         ({"method_table": "missing.yaml"}, "must be readable"),
         ({"search_table": "missing.yaml"}, "must be readable"),
-        ({"device": "gpu"}, "device"),
+        ({"device": "gpu"}, "device: input should be 'auto', 'cpu' or 'cuda'"),
+        ({"results": "a{b}"}, "results: string should match pattern"),
+        ({"search": {"variables": {"object_neighbors": {"low": 0, "high": 50}}}}, "object_neighbors: at least 2 is required"),
+        ({"only": "category=ropes"}, "category 'ropes' matches none of the configuration's; received toy"),
+        ({"only": "method=neuspring"}, "method 'neuspring' matches none"),
+        ({"only": "color=red"}, "terms scenario="),
+        ({"only": "seed"}, "terms scenario="),
+        (
+            {"aims": [{"method": "long", "baseline": "full", "metric": "chanfer", "ratio": 0.9}]},
+            r"aims, metric: must be a metric of positions.*Known: deform_l1, chamfer",
+        ),
         ({"transfers": {"rope": []}}, r"transfers\.rope: at least one other scenario is required.*received \[\]"),
         ({"transfers": {"rope": ["rope"]}}, r"transfers\.rope: at least one other scenario"),
         ({"transfers": {"rope": ["cable", "cable"]}}, r"transfers\.rope: .* each once"),
-        (
-            {"transfers": {"rope": ["cable"]}},
-            "cable must be of the same object as rope: source toy, category toy; received source mocap",
-        ),
+        ({"transfers": {"rope": ["cable"]}}, "cable must be of the same object as rope: source toy.*; received source mocap"),
     ],
 )
 def test_a_benchmark_is_checked_before_any_job(values: dict[str, Any], message: str, tmp_path: Path) -> None:
@@ -305,29 +302,15 @@ def test_a_capture_without_what_its_masks_are_made_of_is_named_before_any_job(tm
 @pytest.mark.parametrize(
     ("table", "row", "message"),
     [
-        (
-            "method",
-            "full: {search: uniform, fit: springs, settings: {horizont: 0}, ",
-            "method full, settings:.*horizont",
-        ),
-        ("method", "full: {search: uniform, fit: springs, settings: {epochs: '7'}, ", "method full, settings:.*epochs"),
-        (
-            "method",
-            "full: {search: unifrom, fit: springs, ",
-            r"searches\.yaml; received 'unifrom' .did you mean 'uniform'",
-        ),
-        ("search", "uniform: {clusters: 1, settings: {rollout: 3}, ", "search uniform, settings:.*rollout: unknown key"),
-        ("search", "uniform: {clusters: 1, settings: {variables: {drag: {high: 0}}}, ", "search uniform, settings:.*drag"),
-        (
-            "search",
-            "uniform: {clusters: 1, released_quirks: {no_such: true}, ",
-            "released_quirks:.*no_such: unknown",
-        ),
+        ("method", "full: {search: uniform, fit: springs, settings: {horizont: 0}", "method full, settings:.*horizont"),
+        ("method", "full: {search: unifrom, fit: springs", r"searches\.yaml; received 'unifrom' .did you mean 'uniform'"),
+        ("search", "uniform: {clusters: 1, settings: {variables: {drag: {high: 0}}}", "search uniform, settings:.*drag"),
+        ("search", "uniform: {clusters: 1, released_quirks: {no_such: true}", "released_quirks:.*no_such: unknown"),
     ],
 )
 def test_settings_of_the_rows_that_are_named_are_checked_too(table: str, row: str, message: str, tmp_path: Path) -> None:
     other = "pieces: {clusters: 5, description: x}" if table == "search" else ""
-    write(tmp_path / "bad.yaml", f"{row}description: x}}\n{other}\n")
+    write(tmp_path / "bad.yaml", f"{row}, description: x}}\n{other}\n")
     with pytest.raises(InputError, match="(?s)" + message):
         benchmark(tmp_path, **{f"{table}_table": "bad.yaml"})
     if table == "search":
@@ -337,9 +320,7 @@ def test_settings_of_the_rows_that_are_named_are_checked_too(table: str, row: st
 def test_springs_may_not_start_beyond_their_clamp(tmp_path: Path) -> None:
     """A search's own bounds count, and a method without a second stage has no clamp."""
     narrow = {"fit": {"stiffness_range": [0.0, 5e4]}}
-    with pytest.raises(
-        InputError, match=r"method full, fit\.stiffness_range: must hold .*0\.0 to 100000\.0.*; received \[0\.0, 50000\.0\]"
-    ):
+    with pytest.raises(InputError, match=r"method full, fit\.stiffness_range: must hold .*0\.0 to 100000\.0.*; received \[0\.0, 5"):
         benchmark(tmp_path, **narrow)
     with pytest.raises(InputError, match=r"must hold .*; received \[1000\.0, 200000\.0\]"):
         benchmark(tmp_path, fit={"stiffness_range": [1000.0, 2e5]})
@@ -354,10 +335,7 @@ def test_springs_may_not_start_beyond_their_clamp(tmp_path: Path) -> None:
     [
         ("{description: x}", "either search or model is required, received search None and model None"),
         ("{search: uniform, oracle: true, description: x}", "an oracle has a fit"),
-        (
-            "{search: uniform, fit: field, oracle: true, description: x, settings: {selection: tail}}",
-            "an oracle is fitted on all frames and holds none back",
-        ),
+        ("{search: uniform, fit: field, oracle: true, description: x, settings: {selection: tail}}", "and holds none back"),
         ("{model: static, search: uniform, description: x}", "either search or model is required"),
         ("{model: static, fit: field, pool: all, description: x}", "fit, pool: these belong to methods"),
         ("{model: static, appearance: {}, description: x}", "draws with splats of its own"),
@@ -469,37 +447,30 @@ def test_pools_that_cannot_be(tmp_path: Path, changes: dict[str, object], messag
         pooled(tmp_path, **changes)
 
 
+STUDIES = {
+    "demo": ("", "baselines", "perception", "perception clean_depth", "heldout"),
+    "toy": ("", "clusters", "paper", "tune"),
+    "synthetic": ("", "paper", "headline"),
+    "mocap": ("", "baselines", "clusters", "mocap_heldout", "mocap_heldout headline", "paper"),
+    "deform": ("",),
+    "color": ("footage",),
+    "phystwin": ("", "tune"),
+}
+"""Files of config/studies that are laid over a file of config/data."""
+
+
 @pytest.mark.parametrize(
-    "overlays",
+    ("data", "studies"),
     [
-        ["demo"],
-        pytest.param(["demo", "baselines"], marks=with_extensions),
-        ["demo", "perception"],
-        ["demo", "perception", "clean_depth"],
-        ["demo", "heldout"],
-        ["toy"],
-        ["toy", "clusters"],
-        ["toy", "paper"],
-        ["toy", "tune"],
-        ["synthetic"],
-        ["synthetic", "paper"],
-        ["synthetic", "headline"],
-        ["mocap"],
-        pytest.param(["mocap", "baselines"], marks=with_extensions),
-        ["mocap", "clusters"],
-        ["mocap", "mocap_heldout"],
-        ["mocap", "mocap_heldout", "headline"],
-        ["mocap", "paper"],
-        ["deform"],
-        ["color", "footage"],
-        ["phystwin"],
-        ["phystwin", "tune"],
+        pytest.param(data, text, marks=[with_extensions] if text == "baselines" else [])
+        for data, texts in STUDIES.items()
+        for text in texts
     ],
 )
-def test_every_configuration_that_is_shipped_is_valid(overlays, tmp_path):
-    values = shipped(*overlays)
+def test_every_configuration_that_is_shipped_is_valid(data, studies, tmp_path):
+    values = shipped(data, *studies.split())
     for row in read_scenarios(ROOT / "config" / "scenarios.tsv").values():
-        if row.source == "capture" and "footage" in overlays:
+        if row.source == "capture" and studies == "footage":
             paint(tmp_path / row.path, frames=5)
         elif row.source not in ("capture", "synthetic", "toy"):
             (tmp_path / row.path).parent.mkdir(parents=True, exist_ok=True)
@@ -562,11 +533,7 @@ def test_studies_bring_the_methods_of_their_rows_in_the_order_of_the_table():
     # Methods that are all listed keep the order in which they are listed.
     some = shipped("toy") | {"studies": ["table3"], "methods": ["neuspring", "fixed_resolution", "no_triplane"]}
     assert Benchmark(some, ROOT).whole.methods == ("neuspring", "fixed_resolution", "no_triplane")
-    assert Benchmark(shipped("toy") | {"studies": ["table3"], "methods": []}, ROOT).whole.methods == (
-        "neuspring",
-        "no_triplane",
-        "fixed_resolution",
-    )
+    assert Benchmark(some | {"methods": []}, ROOT).whole.methods == ("neuspring", "no_triplane", "fixed_resolution")
 
 
 def test_a_study_of_clips_is_made_of_transfers_of_its_rows_whose_numbers_are_kept():
@@ -579,12 +546,6 @@ def test_a_study_of_clips_is_made_of_transfers_of_its_rows_whose_numbers_are_kep
     assert records >= {f"{scene}/{name}/0/{record}.json" for name in rows for record in ("run", "transfer")}
     words = graph.tables()
     assert words[words.index("--studies") + 1] == "deform"
-
-
-def test_an_aim_names_a_metric_of_positions():
-    aim = {"method": "neuspring", "baseline": "baseline", "metric": "chanfer", "ratio": 0.9}
-    with pytest.raises(InputError, match=r"aims, metric: must be a metric of positions.*Known: deform_l1, chamfer"):
-        Benchmark(shipped("toy") | {"aims": [aim]}, ROOT)
 
 
 def jobs_of(graph: Graph, files: list[str]) -> Counter[str]:
@@ -621,7 +582,8 @@ def jobs_of(graph: Graph, files: list[str]) -> Counter[str]:
 )
 def test_a_target_of_a_table_means_its_rows_and_no_others_with_any_data(overlays, study, runs, searches, fits, trainings):
     """Two scenes and three seeds, whatever methods and studies the configuration names beside."""
-    values = shipped(*overlays) | {"scenarios": SCENES_OF_TARGETS, "transfers": None, "seeds": [0, 1, 2]}
+    names = ["synthetic_single_lift_rope", "synthetic_single_lift_sloth"]
+    values = shipped(*overlays) | {"scenarios": names, "transfers": None, "seeds": [0, 1, 2]}
     made = Benchmark(values | tables.for_targets(values, [study], ROOT), ROOT)
     graph = Graph(made)
     count = jobs_of(graph, graph.runs(made.methods_of(study)))
@@ -654,11 +616,7 @@ def test_every_method_that_is_shipped_is_valid():
 
 def test_every_row_that_is_shipped_is_named_somewhere():
     """By a study, by a file of config/data or config/studies, or on the page of the twin or of the baselines."""
-    files = [
-        *(ROOT / "config" / "data").glob("*.yaml"),
-        *(ROOT / "config" / "studies").glob("*.yaml"),
-        ROOT / "config" / "studies.yaml",
-    ]
+    files = [path for name in ("data/*.yaml", "studies/*.yaml", "studies.yaml") for path in (ROOT / "config").glob(name)]
     files += [ROOT / "neuspring" / room / "README.md" for room in ("twin", "baselines")]
     words = set(re.findall(r"\w+", "\n".join(path.read_text() for path in files)))
     methods = tables.read_methods(ROOT / "config" / "methods.yaml")
@@ -693,11 +651,6 @@ def test_rows_that_name_no_number_of_regions_have_that_of_the_key(values, region
     shared = {name: Graph(made).owners["fit"][name] for name in names}
     assert shared == {name: "neuspring" if regions == 3 and name == "clusters_3" else name for name in names}
     assert len(made.searches) == (2 if regions == 3 else 3)
-
-
-def test_unknown_rows_are_refused_with_one_that_is_spelled_alike():
-    with pytest.raises(InputError, match="'baselin' \\(did you mean 'baseline'"):
-        Benchmark(shipped("toy") | {"methods": ["baselin"]}, ROOT)
 
 
 def test_fits_of_equal_horizon_share_launches_where_they_are_not_too_few():
@@ -778,27 +731,6 @@ def test_a_part_keeps_the_whole_that_tables_are_laid_out_for():
     made = Benchmark(config_with(part | {"only": "method=search_only seed=1"}), ROOT)
     assert (made.config.methods, made.config.seeds) == (("search_only",), (1,))
     assert (made.whole.methods, made.whole.seeds, made.compared_with) == (("search_only", "baseline"), (0, 1), "baseline")
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"only": "category=ropes"}, "category 'ropes' matches none of the configuration's; received rope"),
-        ({"only": "method=neuspring"}, "method 'neuspring' matches none"),
-        ({"only": "color=red"}, "terms scenario="),
-        ({"only": "seed"}, "terms scenario="),
-        ({"fit": {"learning_rate": "5e-5"}}, "YAML reads a number such as 5e-5 as text: write 5.0e-5"),
-        ({"scenarios": ["../../etc"]}, "scenarios.0: string should match pattern"),
-        ({"seeds": [0, 0]}, "seeds: entries must differ"),
-        ({"results": "a{b}"}, "results: string should match pattern"),
-        ({"device": "gpu"}, "device: input should be 'auto', 'cpu' or 'cuda'"),
-        ({"search": {"variables": {"object_neighbors": {"low": 0, "high": 50}}}}, "object_neighbors: at least 2 is required"),
-    ],
-)
-def test_what_the_workflow_checks_first(changes, message):
-    with pytest.raises(InputError) as error:
-        Benchmark(config_with(changes), ROOT)
-    assert message in str(error.value)
 
 
 # Oracles

@@ -22,7 +22,6 @@ from neuspring.experiments.jobs import faults
         (-signal.SIGKILL, [], "transient", "killed by the system, most likely out of memory"),
         (137, [], "transient", "killed by the system, most likely out of memory"),
         (-signal.SIGSEGV, [], "transient", "the process crashed (SIGSEGV)"),
-        (-signal.SIGTERM, [], "killed", "stopped from outside"),
         (1, ["psycopg2.OperationalError: connection to server failed: Connection refused"], "transient", faults.UNREACHABLE.cause),
         (1, ["sqlite3.OperationalError: database is locked"], "transient", faults.UNREACHABLE.cause),
         (1, ["OSError: [Errno 28] No space left on device"], "permanent", "no space left on the disk"),

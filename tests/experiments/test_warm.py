@@ -8,10 +8,14 @@ import sys
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 
+from neuspring import config
 from neuspring.experiments.jobs import warm
+from neuspring.stages.observe import observe
 from tests.support import small
+from tests.support.jobs import wait_for
 
 
 @pytest.fixture(scope="module")
@@ -43,17 +47,14 @@ def ended(process: warm.WarmProcess) -> tuple[int, str]:
 def test_output_and_exit_status_are_those_of_the_command(server, tmp_path):
     status, text = ended(begin(server, "--version"))
     assert status == 0 and text.strip().count(".") == 2
-    output = tmp_path / "observations.npz"
-    status, text = ended(begin(server, "observe", "--scenario", "nothing", "--output", str(output)))
-    assert status == 2 and "--scenario: must be a row" in text
-    row = json.dumps(small.row().__dict__)
-    settings = '{"toy": {"frames": 5}}'
+    status, text = ended(begin(server, "nothing"))
+    assert status == 2 and "command: must be a stage or a tool; received nothing" in text
+    output, here = tmp_path / "observations.npz", tmp_path / "here.npz"
+    row, settings = json.dumps(small.row().__dict__), '{"toy": {"frames": 5}}'
     status, text = ended(begin(server, "observe", "--scenario", row, "--settings", settings, "--output", str(output)))
     assert status == 0, text
-    cold = tmp_path / "cold.npz"
-    command = [sys.executable, "-m", "neuspring", "observe", "--scenario", row, "--settings", settings, "--output", str(cold)]
-    subprocess.run(command, check=True)
-    assert output.read_bytes() == cold.read_bytes()
+    observe(scenario=small.row(), settings=config.Config(toy=config.Toy(frames=5)), output=here)
+    assert output.read_bytes() == here.read_bytes()
 
 
 def opening(folder: Path) -> list[str]:
@@ -79,19 +80,13 @@ def test_a_job_ends_with_its_wrapper(server, tmp_path):
     pid = int(wrapper.stdout.readline())
     wrapper.kill()
     wrapper.wait()
-    deadline = time.monotonic() + 60
-    while _lives(pid):
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    wait_for(lambda: not psutil.pid_exists(pid))
 
 
 def test_what_the_warm_process_cannot_run_starts_by_itself(server, tmp_path):
-    environment = os.environ | {warm.SOCKET: str(server)}
-    assert warm.start(["ls"], [], environment) is None
-    assert warm.start([*warm.COMMAND, "--version"], [], environment | {"OMP_NUM_THREADS": "4"}) is None
-    assert warm.start([*warm.COMMAND, "--version"], [], environment | {warm.SOCKET: str(tmp_path / "none")}) is None
-    assert warm.start([*warm.COMMAND, "--version"], [], environment | {warm.SOCKET: ""}) is None
-    assert warm.start([*warm.COMMAND, "--version"], [], environment | {"CUDA_VISIBLE_DEVICES": "0"}) is None
+    assert warm.start(["ls"], [], os.environ | {warm.SOCKET: str(server)}) is None
+    cases = {"OMP_NUM_THREADS": "4"}, {warm.SOCKET: str(tmp_path / "none")}, {warm.SOCKET: ""}, {"CUDA_VISIBLE_DEVICES": "0"}
+    assert [begin(server, "--version", **case) for case in cases] == [None] * 4
 
 
 def test_files_that_a_job_must_hold_are_inherited(server, tmp_path):
@@ -103,11 +98,3 @@ def test_files_that_a_job_must_hold_are_inherited(server, tmp_path):
     # Both ends that could write are closed now: reading ends instead of waiting.
     with os.fdopen(reading) as stream:
         assert stream.read() == ""
-
-
-def _lives(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True

@@ -15,20 +15,7 @@ from neuspring.core.artifacts import Rod
 from neuspring.physics import rod_reference
 from neuspring.physics.rod import RodLanes, RodSolver
 from neuspring.physics.rod_reference import Parameters
-from tests.support.rods import (
-    GREENHILL,
-    SAG,
-    buckling_load,
-    cantilever,
-    coil,
-    column,
-    crooked,
-    real,
-    rod,
-    simulation,
-    straight,
-    twisted,
-)
+from tests.support import rods as make
 
 # Sums of some hundred numbers in float64, through a few hundred substeps.
 ROUNDING = 1e-9
@@ -37,8 +24,8 @@ LIVELY = {"curvature": np.random.default_rng(1).normal(0, 0.3, (7, 2)), "roll": 
 
 def solver_of(rods: list[Rod], v: Any = 0.0, drag: float = 0.0, **changes: Any) -> RodSolver:
     """A solver at frame 0: `v` is one velocity, or that of each vertex."""
-    solver = RodSolver(RodLanes.of(rods, [drag] * len(rods)), simulation(**changes), "cpu")
-    x = real([body.vertices for body in rods])
+    solver = RodSolver(RodLanes.of(rods, [drag] * len(rods)), make.simulation(**changes), "cpu")
+    x = make.real([body.vertices for body in rods])
     solver.start(x, torch.zeros_like(x) + v)
     return solver
 
@@ -46,7 +33,7 @@ def solver_of(rods: list[Rod], v: Any = 0.0, drag: float = 0.0, **changes: Any) 
 def roll_out(rods: list[Rod], hands: Any, v: Any = 0.0, drag: float = 0.0, **changes: Any) -> torch.Tensor:
     """Positions [T, B, V, 3]; held vertices of all rods move by `hands` [T, V, 3]."""
     solver = solver_of(rods, v, drag, **changes)
-    path = real(hands)[:, None] + solver.x
+    path = make.real(hands)[:, None] + solver.x
     rows = [solver.x.clone()]
     for begin, end in pairwise(path):
         solver.frame(begin, end)
@@ -69,12 +56,12 @@ def shaken(frames: int, vertices: int, seed: int = 0) -> np.ndarray:
     ("held", "damping"), [((0, 1, 5, 6), 0.0), ((0, 1, 5, 6), 0.01), ((0, 1), 0.01), ((0, 6), 0.01), ((), 0.01)]
 )
 def test_steps_converge_with_second_order_to_the_specification(held: tuple[int, ...], damping: float) -> None:
-    body = rod(crooked(7), held, damping=damping, **LIVELY)
-    hands, v, options = shaken(2, 7), real([0.2, -0.1, 0.3]), {"frame_time": 0.005, "gravity": 9.8}
+    body = make.rod(make.crooked(7), held, damping=damping, **LIVELY)
+    hands, v, options = shaken(2, 7), make.real([0.2, -0.1, 0.3]), {"frame_time": 0.005, "gravity": 9.8}
     coarse, middle, fine = (roll_out([body], hands, v, 0.5, substeps=n, **options)[-1, 0] for n in (10, 20, 40))
-    path = real(hands) + real(body.vertices)
+    path = make.real(hands) + make.real(body.vertices)
     slow, slower = (
-        rod_reference.roll_out(body, simulation(**options), path, v.expand(7, 3), drag=0.5, steps=n)[-1] for n in (4, 8)
+        rod_reference.roll_out(body, make.simulation(**options), path, v.expand(7, 3), drag=0.5, steps=n)[-1] for n in (4, 8)
     )
     order = np.log2(float((middle - coarse).norm() / (fine - middle).norm()))
     assert order == pytest.approx(2, abs=0.1)
@@ -83,17 +70,19 @@ def test_steps_converge_with_second_order_to_the_specification(held: tuple[int, 
 
 
 def test_at_rest_the_forces_of_the_specification_are_in_balance() -> None:
-    body = rod(crooked(7), (0, 1, 5, 6), damping=0.02, **(LIVELY | {"bending": 0.1, "twisting": 0.05, "stretching": 1e3}))
+    body = make.rod(make.crooked(7), (0, 1, 5, 6), damping=0.02, **(LIVELY | {"bending": 0.1, "twisting": 0.05, "stretching": 1e3}))
     x = still([body], 60, drag=20.0, gravity=9.8)[-1, 0]
     p = replace(Parameters.of(body), vertices=x)
     frames, theta = rod_reference.start(p, x)
-    weight = p.mass[:, None] * real([0, 0, -9.8])
+    weight = p.mass[:, None] * make.real([0, 0, -9.8])
     rest = (rod_reference.forces(p, x, frames, theta) + weight).detach()[2:-2]
     assert float(rest.abs().max()) < 1e-5 * float(weight.abs().max())
 
 
 def test_lanes_are_the_same_alone_and_in_company() -> None:
-    rods = [rod(crooked(7, seed=seed), (0, 1, 5, 6), bending=10.0**-seed, damping=0.01 * seed, **LIVELY) for seed in range(3)]
+    rods = [
+        make.rod(make.crooked(7, seed=seed), (0, 1, 5, 6), bending=10.0**-seed, damping=0.01 * seed, **LIVELY) for seed in range(3)
+    ]
     hands = shaken(5, 7)
     together = roll_out(rods, hands, gravity=9.8)
     for lane, body in enumerate(rods):
@@ -102,31 +91,31 @@ def test_lanes_are_the_same_alone_and_in_company() -> None:
 
 def test_a_rigid_motion_of_everything_changes_nothing() -> None:
     turn = Rotation.from_rotvec([0.4, -1.0, 0.7]).as_matrix()
-    body = rod(crooked(7), (0, 1, 5, 6), damping=0.01, **LIVELY)
+    body = make.rod(make.crooked(7), (0, 1, 5, 6), damping=0.01, **LIVELY)
     moved = replace(body, vertices=body.vertices @ turn.T + 3.0, axis=turn @ body.axis)
     hands = shaken(5, 7)
     np.testing.assert_allclose(
-        roll_out([moved], hands @ turn.T)[:, 0], roll_out([body], hands)[:, 0] @ real(turn).T + 3.0, atol=ROUNDING, rtol=0
+        roll_out([moved], hands @ turn.T)[:, 0], roll_out([body], hands)[:, 0] @ make.real(turn).T + 3.0, atol=ROUNDING, rtol=0
     )
 
 
 def test_clamps_keep_their_directors_to_the_axis() -> None:
-    body = rod(crooked(7), (0, 1, 5, 6), **LIVELY)
+    body = make.rod(make.crooked(7), (0, 1, 5, 6), **LIVELY)
     solver = solver_of([body], gravity=9.8)
-    path = real(body.vertices) + 5 * real(shaken(5, 7))
+    path = make.real(body.vertices) + 5 * make.real(shaken(5, 7))
     for begin, end in pairwise(path):
         solver.frame(begin[None], end[None])
     t, directors = rod_reference.tangents(path[-1])[[0, -1]], solver.directors()[0, [0, -1]]
-    wanted = [rod_reference.projected(real(body.axis), each) for each in t]
+    wanted = [rod_reference.projected(make.real(body.axis), each) for each in t]
     assert torch.allclose(directors[0], wanted[0], atol=ROUNDING)
     assert float(rod_reference.angle(wanted[1], directors[1], t[1])) == pytest.approx(body.roll)
 
 
 def test_a_free_rod_keeps_its_momentum() -> None:
     """Linear momentum exactly, angular momentum with the order of the scheme."""
-    body = rod(crooked(7), (), damping=0.01, stretching=20.0, curvature=LIVELY["curvature"])
-    v = real(np.random.default_rng(3).normal(0, 0.3, (7, 3)))
-    mass = real(body.mass)[:, None]
+    body = make.rod(make.crooked(7), (), damping=0.01, stretching=20.0, curvature=LIVELY["curvature"])
+    v = make.real(np.random.default_rng(3).normal(0, 0.3, (7, 3)))
+    mass = make.real(body.mass)[:, None]
     gains = []
     for substeps in (10, 20):
         solver = solver_of([body], v, substeps=substeps)
@@ -134,16 +123,16 @@ def test_a_free_rod_keeps_its_momentum() -> None:
             solver.frame(solver.x, solver.x)
         x, pushes = solver.x[0], mass * solver.v[0]
         assert torch.allclose(pushes.sum(0), (mass * v).sum(0), atol=ROUNDING, rtol=0)
-        gains.append(float((torch.linalg.cross(x, pushes) - torch.linalg.cross(real(body.vertices), mass * v)).sum(0).norm()))
+        gains.append(float((torch.linalg.cross(x, pushes) - torch.linalg.cross(make.real(body.vertices), mass * v)).sum(0).norm()))
     assert np.log2(gains[0] / gains[1]) == pytest.approx(2, abs=0.2)
 
 
 def test_a_stiff_rod_on_a_hinge_is_a_pendulum() -> None:
-    body = rod(straight(5, 0.5, (0, 0, -1)), (0,), bending=1e4, twisting=1e4, stretching=1e6)
+    body = make.rod(make.straight(5, 0.5, (0, 0, -1)), (0,), bending=1e4, twisting=1e4, stretching=1e6)
     away, mass = -body.vertices[:, 2], body.mass
     frequency = np.sqrt(9.8 * (mass @ away) / (mass @ away**2))
     period, speed, frames, substeps = 2 * np.pi / frequency, 0.01, 40, 10
-    v = real(np.outer(away, [speed, 0, 0]))
+    v = make.real(np.outer(away, [speed, 0, 0]))
     x = still([body], frames, v, frame_time=period / frames, substeps=substeps, gravity=9.8)[:, 0, -1, 0]
     amplitude = speed * 0.5 / frequency
     # BDF2 has frequencies that are too small by (w h)^2 / 3 of themselves.
@@ -155,7 +144,9 @@ def test_a_stiff_rod_on_a_hinge_is_a_pendulum() -> None:
 
 
 def test_a_cantilever_sags_as_theory_says_with_second_order_in_segments() -> None:
-    coarse, fine = (abs(float(-still([cantilever(n)], 20, drag=200.0, gravity=9.8)[-1, 0, -1, 2]) / SAG - 1) for n in (6, 11))
+    coarse, fine = (
+        abs(float(-still([make.cantilever(n)], 20, drag=200.0, gravity=9.8)[-1, 0, -1, 2]) / make.SAG - 1) for n in (6, 11)
+    )
     assert fine < 0.006
     # Segments from the clamp to the end: 4.5 and 9.5.
     assert np.log(coarse / fine) / np.log(9.5 / 4.5) == pytest.approx(2, abs=0.1)
@@ -164,9 +155,9 @@ def test_a_cantilever_sags_as_theory_says_with_second_order_in_segments() -> Non
 def test_a_column_swings_below_its_buckling_load_and_grows_above() -> None:
     """Exact for small w = w0(t) sin(pi x): w0'' = -w^2 (1 - load / buckling load) w0, of segments too."""
     segments, shares, speed = 6, (0.5, 1.5), 1e-4
-    rods = [column(segments, share * buckling_load(segments), stretching=1e5) for share in shares]
+    rods = [make.column(segments, share * make.buckling_load(segments), stretching=1e5) for share in shares]
     sine = np.sin(np.pi * rods[0].vertices[:, 0])
-    x = still(rods, 40, real(np.outer(sine, [0, 0, speed])), substeps=10)[..., segments // 2, 2]
+    x = still(rods, 40, make.real(np.outer(sine, [0, 0, speed])), substeps=10)[..., segments // 2, 2]
     frequency = 4 * np.sin(np.pi / 2 / segments) ** 2 * segments**2
     time = 0.01 * torch.arange(41, dtype=torch.float64)
     rate = frequency * 0.5**0.5
@@ -177,18 +168,18 @@ def test_a_column_swings_below_its_buckling_load_and_grows_above() -> None:
 
 
 def test_a_straight_line_curls_up_to_its_helix() -> None:
-    body = replace(coil(8, (0, 1)), bending=np.full(8, 0.1), twisting=np.full(8, 0.1))
+    body = replace(make.coil(8, (0, 1)), bending=np.full(8, 0.1), twisting=np.full(8, 0.1))
     line = body.vertices[0] + np.arange(8)[:, None] * (body.vertices[1] - body.vertices[0])
     x = still([replace(body, vertices=line)], 200, drag=10.0)[-1, 0]
     # The slowest motion has halved ten times and more on 2 s.
-    assert float((x - real(body.vertices)).abs().max()) < 1e-4
+    assert float((x - make.real(body.vertices)).abs().max()) < 1e-4
 
 
 def test_twist_makes_a_straight_rod_unstable() -> None:
     """Of Greenhill's moment, 1.035 times with eight segments (test_rod_reference.py)."""
-    rods = [twisted(8, share * 1.035 * GREENHILL) for share in (0.9, 1.1)]
+    rods = [make.twisted(8, share * 1.035 * make.GREENHILL) for share in (0.9, 1.1)]
     nudge = 1e-3 * np.sin(np.pi * rods[0].vertices[:, 0])
-    x = still(rods, 25, real(np.outer(nudge, [0, 0, 1])), frame_time=0.02)
+    x = still(rods, 25, make.real(np.outer(nudge, [0, 0, 1])), frame_time=0.02)
     away = x[..., 1:].abs().amax((2, 3))
     assert float(away[:, 0].max()) < 2e-4
     assert float(away[:, 1].max()) > 5e-3
@@ -200,7 +191,7 @@ def test_the_stiffest_cable_is_stable(damping: float, twisting: float, substeps:
     """EI = 1 N m^2 at 5 cm, in substeps of 2 and 10 ms: its highest frequency is 1,600 rad/s. It begins far from its rest shape."""
     curvature = np.random.default_rng(1).normal(0, 0.3, (9, 2))
     options: dict[str, Any] = {"bending": 1.0, "twisting": twisting, "stretching": 2e4, "damping": damping, "roll": 0.5}
-    body = rod(crooked(9, bend=0.1), (0, 1, 7, 8), curvature=curvature, **options)
+    body = make.rod(make.crooked(9, bend=0.1), (0, 1, 7, 8), curvature=curvature, **options)
     hands = 0.05 * np.sin(0.1 * np.minimum(np.arange(200), 94))[:, None, None] * np.array([0.3, 1, 0.5])
     x = roll_out([body], np.broadcast_to(hands, (200, 9, 3)), drag=0.3, gravity=9.8, substeps=substeps)[:, 0]
     speeds = x.diff(dim=0).norm(dim=2).amax(1) / 0.01

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from neuspring.core.artifacts import Material, Rod, Simulation, Topology, Twin
+from neuspring.core.artifacts import Material, Simulation, Topology, Twin
 from neuspring.core.errors import InputError
 from neuspring.physics.rod_nodes import RodFrames, at_vertices, bind, placed
 from neuspring.twin.rollout import roll_out
+from tests.support.rods import rod
+from tests.support.scenes import SCALARS
 
 EXACT = 1e-12
 SINGLE = 1e-6
@@ -37,43 +39,21 @@ def twin(
     x = np.stack([EDGE * np.arange(VERTICES), np.zeros(VERTICES), np.full(VERTICES, height)], axis=1)
     points = nodes + x[0]
     edge, place = bind(x, np.tile([0, 0, 1.0], (VERTICES - 1, 1)), points)
-    values = {
-        "vertices": x,
-        "held": np.full(VERTICES, -1),
-        "lengths": np.full(VERTICES - 1, EDGE),
-        "mass": np.full(VERTICES, EDGE),
-        "bending": np.full(VERTICES, 0.01),
-        "twisting": np.full(VERTICES, 0.01),
-        "curvature": np.zeros((VERTICES, 2)),
-        "edge": edge,
-        "place": place,
-        "axis": np.array([0, 0, 1.0]),
-        "stretching": 1e4,
-        "damping": 0.01,
-        "drag_quadratic": 0.0,
-        "roll": 0.0,
-    }
+    own = {"bending": 0.01, "twisting": 0.01, "stretching": 1e4, "damping": 0.01, "axis": np.array([0, 0, 1.0])} | changes
     count = len(springs)
+    topology = Topology(
+        nodes=points,
+        controllers=(hand + x[0])[None],
+        springs=np.array(springs, np.int32).reshape(-1, 2),
+        rest_lengths=np.full(count, rest),
+        labels=np.zeros(len(points), np.int32),
+    )
+    scalars = dict.fromkeys(SCALARS, 0.0) | {"drag": drag, "ground_friction": friction, "contact_distance": 0.01}
     return Twin(
-        topology=Topology(
-            nodes=points,
-            controllers=(hand + x[0])[None],
-            springs=np.array(springs, np.int32).reshape(-1, 2),
-            rest_lengths=np.full(count, rest),
-            labels=np.zeros(len(points), np.int32),
-        ),
-        material=Material(
-            stiffness=np.full(count, stiffness),
-            dashpot=np.zeros(count),
-            drag=drag,
-            ground_elasticity=0.0,
-            ground_friction=friction,
-            contact_elasticity=0.0,
-            contact_friction=0.0,
-            contact_distance=0.01,
-        ),
+        topology=topology,
+        material=Material(stiffness=np.full(count, stiffness), dashpot=np.zeros(count), **scalars),
         simulation=Simulation(frame_time=0.02, substeps=10, ground=ground, gravity=gravity),
-        rod=Rod(**(values | changes)),  # type: ignore[arg-type]
+        rod=rod(x, edge=edge, place=place, **({"mass": np.full(VERTICES, EDGE)} | own)),  # type: ignore[arg-type]
     )
 
 

@@ -15,20 +15,7 @@ from scipy.spatial.transform import Rotation
 from neuspring.core.artifacts import Rod
 from neuspring.physics import rod_reference as reference
 from neuspring.physics.rod_reference import Frames, Parameters, Rate
-from tests.support.rods import (
-    GREENHILL,
-    SAG,
-    buckling_load,
-    cantilever,
-    coil,
-    column,
-    crooked,
-    real,
-    rod,
-    simulation,
-    straight,
-    twisted,
-)
+from tests.support import rods as make
 
 # Central differences over STEP: rounding of 1e-16 / STEP, and STEP^2 / 6 times third derivatives of about 3 EA / L^2 = 1e3 N/m^2.
 STEP = 1e-6
@@ -40,7 +27,7 @@ ROUNDING = 1e-11
 def curled(held: Any = (0, 1, 6, 7), **changes: Any) -> Rod:
     """Eight vertices with rest curvature; clamped by default."""
     curvature = np.random.default_rng(1).normal(0, 0.3, (8, 2))
-    return rod(crooked(), held, **({"curvature": curvature, "roll": 0.5} | changes))
+    return make.rod(make.crooked(), held, **({"curvature": curvature, "roll": 0.5} | changes))
 
 
 @pytest.fixture(autouse=True)
@@ -84,11 +71,11 @@ def softest(p: Parameters, free: torch.Tensor | None = None) -> float:
 def test_forces_are_minus_the_slope_of_the_potential(held: tuple[int, ...], damped: bool) -> None:
     p = Parameters.of(curled(held, damping=0.02, stretching=1.0))
     frames, theta = reference.start(p, p.vertices)
-    x = p.vertices + 0.003 * real(np.random.default_rng(2).normal(size=(8, 3)))
+    x = p.vertices + 0.003 * make.real(np.random.default_rng(2).normal(size=(8, 3)))
     rate = Rate(50.0, 50.0 * reference.curvatures(frames, theta)) if damped else None
     theta = reference.relaxed(p, x, reference.carried(frames, x), theta, rate)
     forces = reference.forces(p, x, frames, theta, rate)
-    for direction in real(np.random.default_rng(4).normal(size=(5, 8, 3))):
+    for direction in make.real(np.random.default_rng(4).normal(size=(5, 8, 3))):
         ahead, behind = (settled(p, x + side * STEP * direction, frames, theta, rate) for side in (1, -1))
         slope = (ahead - behind) / (2 * STEP)
         assert float(-(forces * direction).sum()) == pytest.approx(float(slope), abs=SLOPE * float(direction.abs().sum()))
@@ -96,7 +83,7 @@ def test_forces_are_minus_the_slope_of_the_potential(held: tuple[int, ...], damp
 
 def test_a_rigid_motion_changes_nothing() -> None:
     p = Parameters.of(curled())
-    turn = real(Rotation.from_rotvec([0.4, -1.0, 0.7]).as_matrix())
+    turn = make.real(Rotation.from_rotvec([0.4, -1.0, 0.7]).as_matrix())
     moved = replace(p, vertices=p.vertices @ turn.T + 3.0, axis=turn @ p.axis)
     forces, energies = [], []
     for each in (p, moved):
@@ -111,7 +98,7 @@ def test_a_rigid_motion_changes_nothing() -> None:
 def test_a_free_rod_keeps_its_momentum_and_loses_energy_to_damping_alone(damping: float) -> None:
     stretching, h = 20.0, 1e-3
     p = Parameters.of(curled((), damping=damping, stretching=stretching))
-    state = reference.beginning(p, real(np.random.default_rng(3).normal(0, 0.3, (8, 3))))
+    state = reference.beginning(p, make.real(np.random.default_rng(3).normal(0, 0.3, (8, 3))))
     none = torch.zeros(3, dtype=torch.float64)
     mass = p.mass[:, None]
     momenta, energies = [], []
@@ -136,7 +123,7 @@ def test_steps_converge_with_second_order() -> None:
     hands = p.vertices + 0.002 * torch.arange(3)[:, None, None]
     v = torch.full((8, 3), 0.2, dtype=torch.float64)
     coarse, middle, fine = (
-        reference.roll_out(p, simulation(gravity=9.8, frame_time=0.005), hands, v, steps=n)[-1] for n in (3, 6, 12)
+        reference.roll_out(p, make.simulation(gravity=9.8, frame_time=0.005), hands, v, steps=n)[-1] for n in (3, 6, 12)
     )
     order = np.log2(float((middle - coarse).norm() / (fine - middle).norm()))
     assert order == pytest.approx(2, abs=0.2)
@@ -145,7 +132,7 @@ def test_steps_converge_with_second_order() -> None:
 @pytest.mark.parametrize("damping", [0.0, 0.01])
 def test_steps_that_are_needed_are_stable_and_few(damping: float) -> None:
     """A stiff rod swings on in them; in five times fewer it does not, without damping."""
-    body = rod(straight(4, 0.15), (0, 1), bending=0.1, stretching=2000.0, damping=damping)
+    body = make.rod(make.straight(4, 0.15), (0, 1), bending=0.1, stretching=2000.0, damping=damping)
     frame_time = 0.01
     needed = reference.steps_needed(Parameters.of(body), frame_time)
     v = torch.zeros(4, 3, dtype=torch.float64)
@@ -153,8 +140,8 @@ def test_steps_that_are_needed_are_stable_and_few(damping: float) -> None:
 
     def reach(steps: int) -> float:
         h = frame_time / steps
-        hands = real(body.vertices).expand(2, 4, 3)
-        return float(reference.roll_out(body, simulation(frame_time=25 * h), hands, v, steps=25)[-1].abs().max())
+        hands = make.real(body.vertices).expand(2, 4, 3)
+        return float(reference.roll_out(body, make.simulation(frame_time=25 * h), hands, v, steps=25)[-1].abs().max())
 
     assert reach(needed) < 0.2
     assert damping or not reach(needed // 5) < 0.2
@@ -166,16 +153,16 @@ def test_steps_that_are_needed_are_stable_and_few(damping: float) -> None:
 )
 def test_gradients_of_a_rollout_are_its_differences(name: str) -> None:
     curvature = np.random.default_rng(1).normal(0, 0.3, (5, 2))
-    body = rod(crooked(5), (0, 1, 3, 4), curvature=curvature, roll=0.5, damping=0.01, drag_quadratic=2.0)
+    body = make.rod(make.crooked(5), (0, 1, 3, 4), curvature=curvature, roll=0.5, damping=0.01, drag_quadratic=2.0)
     p = Parameters.of(body, drag=0.5)
-    weights = real(np.random.default_rng(5).normal(size=(3, 5, 3)))
+    weights = make.real(np.random.default_rng(5).normal(size=(3, 5, 3)))
     start = getattr(p, name)
-    direction = real(np.random.default_rng(6).normal(size=start.shape)) * start.abs().max()
+    direction = make.real(np.random.default_rng(6).normal(size=start.shape)) * start.abs().max()
 
     def loss(value: torch.Tensor) -> torch.Tensor:
         hands = p.vertices + 0.002 * torch.arange(3)[:, None, None]
         v = torch.full((5, 3), 0.5, dtype=torch.float64)
-        x = reference.roll_out(replace(p, **{name: value}), simulation(gravity=9.8, frame_time=0.004), hands, v, steps=2)
+        x = reference.roll_out(replace(p, **{name: value}), make.simulation(gravity=9.8, frame_time=0.004), hands, v, steps=2)
         return (weights * x).sum()
 
     with torch.enable_grad():
@@ -188,23 +175,23 @@ def test_gradients_of_a_rollout_are_its_differences(name: str) -> None:
 @pytest.mark.parametrize("held", [(), (0, 1)])
 def test_a_helix_is_at_rest_in_its_own_curvatures(held: tuple[int, ...]) -> None:
     """Neither mirrored nor turned: signs of curvatures, directors and axis are those that the docstring of `Rod` says."""
-    p = Parameters.of(coil(8, held))
+    p = Parameters.of(make.coil(8, held))
     frames, theta = reference.start(p, p.vertices)
     assert float(reference.energy(p, p.vertices, frames, theta)) < 1e-20
     np.testing.assert_allclose(reference.forces(p, p.vertices, frames, theta), 0, atol=ROUNDING)
-    mirrored = p.vertices * real([1, 1, -1])
+    mirrored = p.vertices * make.real([1, 1, -1])
     assert float(reference.energy(p, mirrored, *reference.start(p, mirrored))) > 1e-5
 
 
 def sag(vertices: int) -> float:
     """Of the end of a cantilever over that of theory: three steps of Newton."""
-    p = Parameters.of(cantilever(vertices))
+    p = Parameters.of(make.cantilever(vertices))
     x = p.vertices.clone()
     for _ in range(3):
         frames, theta = reference.start(p, x)
-        push = (reference.forces(p, x, frames, theta) + p.mass[:, None] * real([0, 0, -9.8]))[2:].ravel()
+        push = (reference.forces(p, x, frames, theta) + p.mass[:, None] * make.real([0, 0, -9.8]))[2:].ravel()
         x[2:] += torch.linalg.solve(stiffness(p, x), push).reshape(-1, 3)
-    return float(-x[-1, 2]) / SAG
+    return float(-x[-1, 2]) / make.SAG
 
 
 def test_a_cantilever_sags_as_theory_says_with_second_order_in_segments() -> None:
@@ -215,15 +202,15 @@ def test_a_cantilever_sags_as_theory_says_with_second_order_in_segments() -> Non
 
 
 def test_a_pinned_column_buckles_at_the_load_of_its_segments() -> None:
-    found = brentq(lambda load: softest(Parameters.of(column(6, load))), 5, 12, rtol=1e-6)
+    found = brentq(lambda load: softest(Parameters.of(make.column(6, load))), 5, 12, rtol=1e-6)
     # The column is shorter than at rest by its strain of 1e-6.
-    assert found == pytest.approx(buckling_load(6), rel=4e-6)
-    assert buckling_load(1000) == pytest.approx(np.pi**2, rel=1e-6)
+    assert found == pytest.approx(make.buckling_load(6), rel=4e-6)
+    assert make.buckling_load(1000) == pytest.approx(np.pi**2, rel=1e-6)
 
 
 def greenhill(segments: int) -> float:
     """Critical twisting moment of a straight rod over that of theory."""
-    return brentq(lambda moment: softest(Parameters.of(twisted(segments, moment))), 6, 12, rtol=1e-4) / GREENHILL
+    return brentq(lambda moment: softest(Parameters.of(make.twisted(segments, moment))), 6, 12, rtol=1e-4) / make.GREENHILL
 
 
 def ring(segments: int) -> float:
@@ -232,7 +219,7 @@ def ring(segments: int) -> float:
     points = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
 
     def level(roll: float) -> float:
-        body = rod(points, (0, 1, segments, segments + 1), bending=1.0, twisting=1.5, stretching=1e4, roll=roll)
+        body = make.rod(points, (0, 1, segments, segments + 1), bending=1.0, twisting=1.5, stretching=1e4, roll=roll)
         p = Parameters.of(body)
         # The ring can turn about the edge that is clamped.
         return softest(p, torch.linalg.cross(reference.tangents(p.vertices)[:1], p.vertices - p.vertices[:1]))

@@ -133,8 +133,8 @@ def test_deforms_error_counts_all_markers_and_coordinates_and_lifts_targets_from
 def test_without_tracks_there_is_no_track_row() -> None:
     late = np.full((5, 1, 3), np.nan)
     late[1:] = 0.0
-    for tracks in (None, late):
-        given = observations(tracks=tracks)
+    for own in ({}, {"tracks": late}):
+        given = observations(**own)
         assert np.isnan(metrics.track_errors(np.tile(given.nodes, (5, 1, 1)), given.tracks)).all()
         rows = metrics.score(rollout(np.tile(given.nodes, (5, 1, 1))), given, "ours", 0)
         assert set(rows["metric"]) == {"chamfer"}

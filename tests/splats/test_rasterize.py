@@ -243,6 +243,10 @@ def test_gsplat_draws_what_we_draw():
     view = View(view.world_to_camera.float().cuda(), view.intrinsics.float().cuda(), view.width, view.height)
     # gsplat's clamp of coverage is 0.99.
     splats[3] = splats[3].clamp(max=0.95)
+    splats = [tensor.requires_grad_() for tensor in splats]
     ours, theirs = (rasterize(*splats, view, limits=DEFAULT_LIMITS, backend=name) for name in ("warp", "gsplat"))
     assert (ours.rgb - theirs.rgb).abs().mean() < 1e-4
     assert (ours.alpha - theirs.alpha).abs().mean() < 1e-4
+    gradients = [torch.autograd.grad(one.rgb.sum() + one.alpha.sum(), splats) for one in (ours, theirs)]
+    for mine, other in zip(*gradients, strict=True):
+        assert (other - mine).norm() < 1e-2 * mine.norm()

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from neuspring.core.artifacts import Observations, Scenario
+from neuspring.core.artifacts import Observations
 from neuspring.core.files import write_npz, write_table
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.scores.metrics import SCORE_COLUMNS
+from tests.support import scenarios
 
 FRAMES, RATE, MARKERS = 9, 100.0, 7
 HELD = (0, 1, MARKERS - 2, MARKERS - 1)
@@ -25,30 +26,13 @@ def swinging(name: str, cable: str) -> Observations:
     turns = np.moveaxis(np.array([[c, -s, 0 * c], [s, c, 0 * c], [0 * c, 0 * c, 1 + 0 * c]]), -1, 0)
     markers = np.einsum("tij,vj->tvi", turns, shape)
     free = markers[:, 2:-2]
-    visible = np.ones(free.shape[:2], dtype=bool)
-    facts = {"source": "mocap", "frame_count": FRAMES, "train_end": FRAMES, "frame_rate": RATE, "up": "+z", "ground": False}
-    return Observations(
-        scenario=Scenario(name=name, category=cable, **facts),
-        object_points=free,
-        object_visibility=visible,
-        object_motion_valid=visible,
-        controller_points=markers[:, HELD],
-        surface_points=shape[2:4] + 0.01,
-        interior_points=np.zeros((0, 3)),
-        tracks=free,
-        line=np.array([5, 6, 0, 1, 2, 7, 8]),
-    )
+    about = {"name": name, "category": cable, "source": "mocap", "frame_rate": RATE, "ground": False}
+    order = np.array([5, 6, 0, 1, 2, 7, 8])
+    return scenarios.seen(free, markers[:, HELD], about, surface_points=shape[2:4] + 0.01, tracks=free, line=order)
 
 
 def write_transfer(
-    results: Path,
-    cable: str,
-    method: str,
-    seed: int,
-    l1: Mapping[str, float],
-    *,
-    diverged: tuple[str, ...] = (),
-    line: bool = True,
+    results: Path, cable: str, method: str, seed: int, l1: Mapping[str, float], *, diverged: tuple[str, ...] = (), line: bool = True
 ) -> Path:
     """A transfer from `<cable>_train` with the error l1, m, on each clip, three times that of free markers; returns its record."""
     source, courses, lines = f"{cable}_train", [], {}

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -19,27 +19,30 @@ CONTACT_SCALARS = ("ground_elasticity", "ground_friction", "contact_elasticity",
 """In the order of the columns of `grad_collide`."""
 
 
-@dataclass(frozen=True)
-class Clip:
-    """One recorded clip: a twin, what moved it, what it was fitted to, and what the released simulator answered."""
+RECORDED = {
+    "controllers": "controller_points",
+    "x": "expected_x",
+    "v": "expected_v",
+    "stiffness": "spring_Y",
+    "points": "gt_object_points",
+    "visible": "visibilities",
+    "motion_valid": "motions_valid",
+    "losses": "expected_losses",
+    "grad_log_stiffness": "expected_grad_log_Y",
+    "grad_collide": "expected_grad_collide",
+}
+"""Arrays of a clip, and their names in its file; the schema is in the golden data's README."""
 
-    name: str
-    twin: Twin
-    controllers: np.ndarray
-    x: np.ndarray
-    v: np.ndarray
-    stiffness: np.ndarray
-    stiffness_range: tuple[float, float]
-    topology_params: tuple[float, int, float, int]
-    object_springs: int
-    surface: int
-    points: np.ndarray
-    visible: np.ndarray
-    motion_valid: np.ndarray
-    weights: Losses
-    losses: np.ndarray
-    grad_log_stiffness: np.ndarray
-    grad_collide: np.ndarray
+
+WEIGHTS = {"chamfer": "chamfer", "track": "track", "acceleration": "acc"}
+"""Terms of the loss, and their names in its file."""
+
+
+class Clip(SimpleNamespace):
+    """One recorded clip: a twin, what moved it, what it was fitted to, and what the released simulator answered.
+
+    Beside the arrays of RECORDED: name, twin, weights, stiffness_range, topology_params, and the counts surface and object_springs.
+    """
 
     @property
     def frames(self) -> range:
@@ -48,28 +51,19 @@ class Clip:
 
     def frame_loss(self, device: str, dtype: torch.dtype) -> FrameLoss:
         """The clip's targets as a FrameLoss."""
-        return FrameLoss(
-            torch.tensor(self.points, dtype=dtype, device=device),
-            torch.tensor(self.visible, device=device),
-            torch.tensor(self.motion_valid, device=device),
-            self.surface,
-            self.weights,
-        )
+        points = torch.tensor(self.points, dtype=dtype, device=device)
+        seen = (torch.tensor(values.astype(bool), device=device) for values in (self.visible, self.motion_valid))
+        return FrameLoss(points, *seen, self.surface, self.weights)
 
 
 @cache
 def clip(name: str) -> Clip:
-    """Load sim_{name}.npz; the schema is in the golden data's README."""
+    """The clip of sim_{name}.npz."""
     with np.load(FOLDER / f"sim_{name}.npz", allow_pickle=False) as stored:
         d = {key: stored[key] for key in stored.files}
     count = int(d["num_substeps"])
     limits = float(d["spring_Y_min"]), float(d["spring_Y_max"])
-    simulation = Simulation(
-        frame_time=float(d["dt"]) * count,
-        substeps=count,
-        up="-z" if d["reverse_z"] else "+z",
-        self_collision=bool(d["self_collision"]),
-    )
+    world = {"up": "-z" if d["reverse_z"] else "+z", "self_collision": bool(d["self_collision"])}
     topology = Topology(
         nodes=d["points"],
         controllers=d["controller_points"][0],
@@ -77,34 +71,25 @@ def clip(name: str) -> Clip:
         rest_lengths=d["rest_lengths"],
         labels=np.zeros(len(d["points"]), np.int32),
     )
+    names = ("collide_elas", "collide_fric", "collide_object_elas", "collide_object_fric")
     material = Material(
         stiffness=np.clip(d["spring_Y"], *limits),
         dashpot=np.full(len(d["springs"]), float(d["dashpot_damping"])),
         drag=float(d["drag_damping"]),
-        ground_elasticity=float(d["collide_elas"]),
-        ground_friction=float(d["collide_fric"]),
-        contact_elasticity=float(d["collide_object_elas"]),
-        contact_friction=float(d["collide_object_fric"]),
         contact_distance=float(d["collision_dist"]),
+        **{scalar: float(d[stored]) for scalar, stored in zip(CONTACT_SCALARS, names, strict=True)},
     )
+    simulation = Simulation(frame_time=float(d["dt"]) * count, substeps=count, **world)
     r_o, n_o, r_c, n_c = d["topology_params"].tolist()
-    weights = Losses(chamfer=float(d["chamfer_weight"]), track=float(d["track_weight"]), acceleration=float(d["acc_weight"]))
+    arrays = {field: d[stored] for field, stored in RECORDED.items()}
+    arrays |= {field: arrays[field].astype(np.float64) for field in ("losses", "grad_log_stiffness", "grad_collide")}
     return Clip(
         name=name,
         twin=Twin(topology=topology, material=material, simulation=simulation),
-        controllers=d["controller_points"],
-        x=d["expected_x"],
-        v=d["expected_v"],
-        stiffness=d["spring_Y"],
+        weights=Losses(**{term: float(d[f"{short}_weight"]) for term, short in WEIGHTS.items()}),
         stiffness_range=limits,
         topology_params=(r_o, int(n_o), r_c, int(n_c)),
-        object_springs=int(d["num_object_springs"]),
         surface=int(d["num_surface_points"]),
-        points=d["gt_object_points"],
-        visible=d["visibilities"].astype(bool),
-        motion_valid=d["motions_valid"].astype(bool),
-        weights=weights,
-        losses=d["expected_losses"].astype(np.float64),
-        grad_log_stiffness=d["expected_grad_log_Y"].astype(np.float64),
-        grad_collide=d["expected_grad_collide"].astype(np.float64),
+        object_springs=int(d["num_object_springs"]),
+        **arrays,
     )

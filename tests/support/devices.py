@@ -1,4 +1,4 @@
-"""The devices that tests run on. Those on a GPU carry the marker `cuda`, by which `python -m tests.gpu` selects them."""
+"""The devices that tests run on. Those on a GPU carry the marker `cuda`, by which `make gpu` selects them."""
 
 import pytest
 import torch

@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+import torch
+
+from neuspring.physics import reference
+from neuspring.physics.reference import ReferenceTwin
+from tests.support.scenes import tensors, with_values
 
 # Central differences with step h of a smooth function: truncation h^2 f''' / 6 plus rounding 1e-16 f / h. With h = 1e-6 of
 # values of order 1, both stay below 1e-9 of the largest derivative; third derivatives grow with 1 / length^2 = 1e3..1e4.
@@ -26,6 +32,26 @@ def differences(function: Callable[[Arrays], float], at: Arrays, **steps: float)
             gradient[index] = (up - down) / (2 * shift[index])
         result[name] = gradient
     return result
+
+
+def compared(
+    name: str, body: ReferenceTwin, state: Arrays, hands: np.ndarray, simulated: Callable, valid: Any = None, **steps: float
+) -> tuple[Arrays, Arrays]:
+    """Gradients of a weighted sum of the last positions by one parameter or by x or v of `state`: the solver's, and differences.
+
+    `simulated` gives the last positions for the parameters by name, x and v; differences are those of the reference.
+    """
+    weights, values = np.random.default_rng(0).normal(size=state["x"].shape), tensors(body)
+    every = values | {key: torch.tensor(value) for key, value in state.items()}
+    every[name] = every[name].clone().requires_grad_()
+    (simulated({key: every[key] for key in values}, every["x"], every["v"]) * torch.tensor(weights)).sum().backward()
+
+    def loss(changed: Arrays) -> float:
+        other = with_values(body, {name: changed[name]}) if name in values else body
+        start = (state | changed)["x"], (state | changed)["v"]
+        return float((reference.rollout(other, *start, hands, valid)[0][-1] * weights).sum())
+
+    return {name: every[name].grad.numpy()}, differences(loss, {name: every[name].detach().numpy()}, **steps)
 
 
 def assert_gradients(got: Arrays, wanted: Arrays, tolerance: float) -> None:

@@ -22,6 +22,7 @@ from neuspring.core.job_records import Attempt, JobRecord
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.draw.video import Video
 from neuspring.scores.metrics import METRICS, SCORE_COLUMNS
+from tests.support import scenarios
 from tests.support.runs import run_record
 
 FRAMES, TRAIN, RATE = 20, 14, 30.0
@@ -163,19 +164,9 @@ def save_job(results: Path, name: str, attempts: Sequence[Attempt]) -> None:
 def observations(name: str, source: str, nodes: int) -> Observations:
     rng = np.random.default_rng(zlib.crc32(name.encode()))
     category = name.removeprefix("synthetic_").split("_")[-1] if not name[-1].isdigit() else name.split("_")[-2]
-    scenario = Scenario(name=name, source=source, category=category, frame_count=FRAMES, train_end=TRAIN, frame_rate=RATE, up="+z")
     points = rng.uniform(-0.1, 0.1, (nodes, 3)) + np.zeros((FRAMES, 1, 1))
-    everywhere = np.ones((FRAMES, nodes), bool)
-    return Observations(
-        scenario=scenario,
-        object_points=points,
-        object_visibility=everywhere,
-        object_motion_valid=everywhere,
-        controller_points=points[:, :1],
-        surface_points=np.zeros((0, 3)),
-        interior_points=np.zeros((0, 3)),
-        tracks=points[:, :5],
-    )
+    about = {"name": name, "source": source, "category": category, "train_end": TRAIN, "frame_rate": RATE}
+    return scenarios.seen(points, points[:, :1], about, tracks=points[:, :5])
 
 
 def _scores(scenario: Scenario, method: str, seed: int, pictured: bool, rng: np.random.Generator) -> pd.DataFrame:

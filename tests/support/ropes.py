@@ -38,16 +38,8 @@ def rope(frames: int = 4, height: float = HEIGHT, move: Any = (0.0, 0.0, 0.0), c
     """A straight rope that a hand of three points holds in the middle and moves by `move` per frame."""
     nodes = tube(straight(count, height))
     hand = np.array([[0.19, 0, 0.02], [0.2, 0.01, 0.02], [0.21, 0, 0.02]]) + np.array([0, 0, height])
-    return scenarios.observations(
-        frames=frames,
-        object_points=np.tile(nodes, (frames, 1, 1)),
-        object_visibility=np.ones((frames, len(nodes)), bool),
-        object_motion_valid=np.ones((frames, len(nodes)), bool),
-        controller_points=hand + np.arange(frames)[:, None, None] * np.asarray(move),
-        surface_points=np.zeros((0, 3)),
-        interior_points=np.zeros((0, 3)),
-        **changes,
-    )
+    hands = hand + np.arange(frames)[:, None, None] * np.asarray(move)
+    return scenarios.seen(np.tile(nodes, (frames, 1, 1)), hands, {"train_end": max(2, frames - 2)}, **changes)
 
 
 def cable(frames: int = 4, move: Any = (0.0, 0.0, 0.0), sag: float = 0.5, **changes: Any) -> Observations:
@@ -59,17 +51,8 @@ def cable(frames: int = 4, move: Any = (0.0, 0.0, 0.0), sag: float = 0.5, **chan
     path = np.tile(hands, (frames, 1, 1))
     path[:, 2:] += np.arange(frames)[:, None, None] * np.asarray(move)
     count = len(nodes)
-    return scenarios.observations(
-        frames=frames,
-        object_points=np.tile(nodes, (frames, 1, 1)),
-        object_visibility=np.ones((frames, count), bool),
-        object_motion_valid=np.ones((frames, count), bool),
-        controller_points=path,
-        surface_points=np.zeros((0, 3)),
-        interior_points=np.zeros((0, 3)),
-        line=np.array([count, count + 1, *range(count), count + 2, count + 3]),
-        **changes,
-    )
+    order = np.array([count, count + 1, *range(count), count + 2, count + 3])
+    return scenarios.seen(np.tile(nodes, (frames, 1, 1)), path, {"train_end": max(2, frames - 2)}, line=order, **changes)
 
 
 def twin(observations: Observations | None = None, settings: config.Config = SETTINGS) -> Twin:

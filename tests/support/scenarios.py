@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,17 +15,28 @@ def scenario(**changes: Any) -> Scenario:
     return Scenario(**(values | {"frame_rate": 30.0, "up": "+z"} | changes))
 
 
-def observations(frames: int = 5, points: int = 3, tracks: Any = None, **changes: Any) -> Observations:
-    """Points at rest on the x axis; everything visible and valid; one hand, one surface node, one interior node."""
-    row = np.arange(points)[:, None] * [1.0, 0, 0]
+def seen(points: np.ndarray, hands: np.ndarray, about: Mapping[str, Any] = {}, **changes: Any) -> Observations:
+    """Tracked points [T, N, 3] that are always visible, beside hands [T, C, 3], and nothing else; `about` changes the scenario."""
+    frames, shown = len(points), np.ones(points.shape[:2], bool)
     values: dict[str, Any] = {
-        "scenario": scenario(frame_count=frames, train_end=max(2, frames - 2)),
-        "object_points": np.tile(row, (frames, 1, 1)),
-        "object_visibility": np.ones((frames, points), bool),
-        "object_motion_valid": np.ones((frames, points), bool),
-        "controller_points": np.zeros((frames, 1, 3)) + 9,
-        "surface_points": np.array([[0.0, 5, 0]]),
-        "interior_points": np.array([[0.0, 0, 7]]),
-        "tracks": np.zeros((frames, 0, 3)) if tracks is None else tracks,
+        "scenario": scenario(**({"frame_count": frames, "train_end": frames} | about)),
+        "object_points": points,
+        "object_visibility": shown,
+        "object_motion_valid": shown,
+        "controller_points": hands,
+        "surface_points": np.zeros((0, 3)),
+        "interior_points": np.zeros((0, 3)),
+        "tracks": np.zeros((frames, 0, 3)),
     }
     return Observations(**(values | changes))
+
+
+def observations(frames: int = 5, points: int = 3, **changes: Any) -> Observations:
+    """Points at rest on the x axis; everything visible and valid; one hand, one surface node, one interior node."""
+    values: dict[str, Any] = {
+        "points": np.tile(np.arange(points)[:, None] * [1.0, 0, 0], (frames, 1, 1)),
+        "hands": np.zeros((frames, 1, 3)) + 9,
+        "surface_points": np.array([[0.0, 5, 0]]),
+        "interior_points": np.array([[0.0, 0, 7]]),
+    }
+    return seen(about={"train_end": max(2, frames - 2)}, **(values | changes))

@@ -9,6 +9,12 @@ import pandas as pd
 from neuspring.twin.candidates import SearchProblem
 from tests.support import small
 
+LOGARITHMIC = {
+    "scales": {"stiffness": "log", "dashpot": "log", "drag": "log"},
+    "ranges": {"stiffness": [1e2, 1e5], "dashpot": [0.1, 200.0], "drag": [0.05, 20.0]},
+}
+"""Settings of variables that a polish moves."""
+
 
 def budget(rollouts: int, clusters: int = 1) -> SearchProblem:
     """The small search with another budget."""

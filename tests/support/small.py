@@ -46,9 +46,10 @@ def spoiled_future() -> Observations:
         values = getattr(seen, name).copy()
         values[seen.scenario.train_end :] += 1.0
         changed[name] = values
-    for name in ("object_visibility", "object_motion_valid"):
+    # Motion of the last training frame is about its way into the future.
+    for name, first in (("object_visibility", seen.scenario.train_end), ("object_motion_valid", seen.scenario.train_end - 1)):
         values = getattr(seen, name).copy()
-        values[seen.scenario.train_end :] ^= True
+        values[first:] ^= True
         changed[name] = values
     return replace(seen, **changed, tracks=seen.tracks + 1.0)
 

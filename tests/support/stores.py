@@ -22,10 +22,11 @@ from typing import Any
 import pandas
 
 from neuspring.config import Tracking
-from neuspring.core.records import RECORD_FORMAT
 from neuspring.experiments.tracking.store import ENVIRONMENT, default_uri
+from tests.support.runs import STARTED as STARTED
+from tests.support.runs import run_record
 
-STARTED, ENDED = "2026-11-21T10:00:00+00:00", "2026-11-21T10:05:30+00:00"
+ENDED = "2026-11-21T10:05:30+00:00"
 STEPS = 1100
 """Points of the longest history: more than one call of `log_batch` takes."""
 PATIENCE = 120
@@ -46,31 +47,22 @@ def write_run(results: Path, scenario: str = "rope", seed: int = 0, **changes: A
     )
     (folder / "twin.npz").write_bytes(b"twin")
     (search / "coarse.npz").write_bytes(b"coarse")
-    record = {
-        "format": RECORD_FORMAT,
-        "run_key": hashlib.sha256(f"{scenario} {seed}".encode()).hexdigest(),
-        "scenario": scenario,
-        "source": "toy",
-        "category": "toy",
-        "method": "ours",
-        "variant": {"search": "uniform", "fit": "springs", "clusters": 4, "frozen": False},
-        "seed": seed,
-        "status": "ok",
-        "reason": "",
-        "attempt": 1,
-        "commit": "abc123",
-        "data_digest": "d1",
-        "device": "cpu",
-        "started": STARTED,
-        "ended": ENDED,
-        "params": {f"fit.p{i}": i for i in range(120)} | {"fit.betas": [0.9, 0.99], "long": "x" * 900},
-        "timings": {"fit": 12.5},
-        "scores_file": "scores.parquet",
-        "histories": {"fit": "fit.parquet", "search": "../../search-uniform/history.parquet"},
-        "artifacts": {"twin": ["twin.npz"], "search": ["../../search-uniform/coarse.npz"]},
-    }
     path = folder / "run.json"
-    path.write_text(json.dumps(record | changes))
+    run_record(
+        run_key=hashlib.sha256(f"{scenario} {seed}".encode()).hexdigest(),
+        scenario=scenario,
+        category="toy",
+        variant={"search": "uniform", "fit": "springs", "clusters": 4, "frozen": False},
+        seed=seed,
+        commit="abc123",
+        data_digest="d1",
+        ended=ENDED,
+        timings={"fit": 12.5},
+        histories={"fit": "fit.parquet", "search": "../../search-uniform/history.parquet"},
+        artifacts={"twin": ["twin.npz"], "search": ["../../search-uniform/coarse.npz"]},
+    ).save(path)
+    params = {f"fit.p{i}": i for i in range(120)} | {"fit.betas": [0.9, 0.99], "long": "x" * 900}
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"params": params} | changes))
     return path
 
 

@@ -2,7 +2,8 @@
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
 import functools
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -14,25 +15,9 @@ from neuspring.physics.lanes import lanes
 from neuspring.physics.motion import position, velocity
 
 
-class Kernels(NamedTuple):
-    """Terms for one width, each followed by its adjoint; impulses by a thread per node and by one thread for all pairs."""
-
-    rows: Any
-    rows_adjoint: Any
-    links: Any
-    links_adjoint: Any
-    speed: Any
-    speed_adjoint: Any
-    motion: Any
-    motion_adjoint: Any
-    collide: Any
-    collide_pairs: Any
-    collide_adjoint: Any
-
-
 @functools.cache
-def kernels(width: int) -> Kernels:
-    """The kernels, in a module of their own."""
+def kernels(width: int) -> SimpleNamespace:
+    """Terms for one width and their adjoints, in a module of their own; impulses by a thread per node and by one for all pairs."""
     start_warp()
     real = wp.float64
     Model, State, Adjoint = structs(real, width)
@@ -63,15 +48,7 @@ def kernels(width: int) -> Kernels:
         i, g = wp.tid()
         gathered_adjoint(model, state, adjoint, 0, 0, i, g)
 
-    def speed(
-        v: vectors,
-        force: vectors,
-        gravity: vectors,
-        dt: numbers,
-        decay: numbers,
-        light: numbers,
-        after: vectors,
-    ):
+    def speed(v: vectors, force: vectors, gravity: vectors, dt: numbers, decay: numbers, light: numbers, after: vectors):
         i = wp.tid()
         after[i] = updated(v[i], force[i], gravity[0], dt[0], decay[0], light[i])
 
@@ -146,20 +123,8 @@ def kernels(width: int) -> Kernels:
         collided_adjoint(model, state, adjoint, 0, i, g)
 
     made = wp.kernel(module=f"tests.support.terms.{width}", enable_backward=False)
-    terms = (
-        rows,
-        rows_adjoint,
-        links,
-        links_adjoint,
-        speed,
-        speed_adjoint,
-        motion,
-        motion_adjoint,
-        collide,
-        collide_pairs,
-        collide_adjoint,
-    )
-    return Kernels(*map(made, terms))
+    terms = (rows, rows_adjoint, links, links_adjoint, speed, speed_adjoint, motion, motion_adjoint)
+    return SimpleNamespace(**{term.__name__: made(term) for term in (*terms, collide, collide_pairs, collide_adjoint)})
 
 
 def launch(kernel: Any, size: int | tuple[int, int], *arguments: Any) -> None:

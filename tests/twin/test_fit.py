@@ -93,7 +93,7 @@ LIMITED = {"fit": config.Fit(epochs=4, learning_rate=0.3)}
     ids=["growing", "everything", "limited"],
 )
 def test_a_killed_fit_continues_bit_for_bit(tmp_path, monkeypatch, changes, killed_in, most_substeps):
-    monkeypatch.setattr(module, "CHECKPOINT_EVERY", 1)
+    monkeypatch.setattr("neuspring.core.checkpoint.CHECKPOINT_EVERY", 1)
     monkeypatch.setattr(stability, "MAX_SUBSTEPS", most_substeps)
     whole = fit(small.fit_problem(**changes))
     partial = tmp_path / "fit.npz"
@@ -114,12 +114,9 @@ def test_a_killed_fit_continues_bit_for_bit(tmp_path, monkeypatch, changes, kill
     continued = fit(small.fit_problem(**changes), partial=partial, key="k")
     assert (whole.attempts, continued.attempts) == (1, 2)
     assert_same_twin(continued.twin, whole.twin)
-    assert (continued.facts["best_epoch"], continued.facts["best_loss"]) == (whole.facts["best_epoch"], whole.facts["best_loss"])
     pd.testing.assert_frame_equal(continued.history, whole.history, check_exact=True)
-    timed = ("earlier_processor_seconds",)
-    assert [value for name, value in continued.facts.items() if name not in timed] == [
-        value for name, value in whole.facts.items() if name not in timed
-    ]
+    timed = {"earlier_processor_seconds": 0.0}
+    assert continued.facts | timed == whole.facts | timed
 
 
 def assert_same_twin(twin: Twin, expected: Twin) -> None:
@@ -193,14 +190,6 @@ def test_substeps_grow_within_an_epoch(kind):
     run.set_rate(1.0)
     assert np.isfinite(run.epoch()["loss"])
     assert run.twin.simulation.substeps > problem.twin.simulation.substeps, "before the epoch's end"
-    fixed = fit(
-        replace(
-            problem,
-            simulation=config.SimulationSettings(substeps=problem.twin.simulation.substeps),
-            fit=replace(settings, epochs=6),
-        )
-    )
-    assert "stiffness grew beyond" in fixed.facts["rollbacks"][0]
 
 
 def test_growing_dashpots_get_more_substeps():

@@ -14,10 +14,7 @@ from tests.support import small
 SINGLE = 1e-5
 """Relative: sums of gradients in float32."""
 FIELD = config.SpringFieldSettings(channels=4, hidden=16, bands=2, offsets=True, offset_prior=0.1, smoothness=0.1)
-SETTINGS = {
-    "springs": {},
-    "field": {"output_bound": 1.5, "horizon": 2},
-}
+SETTINGS = {"springs": {}, "field": {"output_bound": 1.5, "horizon": 2}}
 
 
 def in_unit(factor: float, kind: str, losses: config.Losses, **settings: object) -> FitProblem:

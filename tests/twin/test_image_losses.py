@@ -9,7 +9,7 @@ import torch
 from neuspring import config
 from neuspring.config import Losses
 from neuspring.twin.candidates import SearchProblem, candidate, evaluate
-from neuspring.twin.fit import FitProblem, TwinFit
+from neuspring.twin.fit import TwinFit
 from neuspring.twin.losses import BETA, FrameLoss
 from neuspring.twin.polish import POLISH, products
 from neuspring.twin.search import search
@@ -122,18 +122,10 @@ def test_gradients_of_stiffness_through_projection_and_simulator(name):
     twin = candidate(problem, problem.decode(problem.encode()))
     twin = replace(twin, simulation=replace(twin.simulation, substeps=100))
     settings = config.Fit(horizon=0, learning_rate=1e-12, epochs=1, global_stiffness=True)
+    simulation = config.SimulationSettings(substeps=100)
 
     def loss_at(shift: float) -> tuple[float, float]:
-        run = TwinFit(
-            FitProblem(
-                observations=problem.observations,
-                twin=twin,
-                fit=settings,
-                simulation=config.SimulationSettings(substeps=100),
-                losses=weights,
-                quirks=config.ReleasedQuirks(),
-            )
-        )
+        run = TwinFit(small.fit_problem(problem.observations, twin=twin, fit=settings, simulation=simulation, losses=weights))
         with torch.no_grad():
             run.parameters.factors["stiffness"] += shift
         packed = run.stable_parameters()

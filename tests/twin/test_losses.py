@@ -130,14 +130,6 @@ def test_frozen_counts_divide_by_frame_one() -> None:
         assert got.item() == pytest.approx(wanted.item() / 2)
 
 
-def test_counts_are_what_each_frame_is_divided_by() -> None:
-    """Points of the frame, motions from the frame before; frozen: those of frame 1."""
-    plain, _ = frame_loss()
-    frozen, _ = frame_loss(frozen=True)
-    assert plain.counts == [(2, 0), (2, 2), (1, 1)]
-    assert frozen.counts == [(2, 2)] * 3
-
-
 def test_weights() -> None:
     plain, nodes = frame_loss()
     weighted, _ = frame_loss(weights=Losses(chamfer=3.0, track=0.5))

@@ -19,10 +19,8 @@ from neuspring.twin.polish import LONGEST_STEP, POLISH, SLOPES, Polish, products
 from neuspring.twin.search import search
 from neuspring.twin.trials import motions
 from tests.support import small
-from tests.support.searches import assert_same_trace
+from tests.support.searches import LOGARITHMIC, assert_same_trace
 
-RATES = {"stiffness": "log", "dashpot": "log", "drag": "log"}
-RANGES = {"stiffness": [1e2, 1e5], "dashpot": [0.1, 200.0], "drag": [0.05, 20.0]}
 ROUND = 1 + 3 + TRIALS
 FLOAT32 = 1e-5
 """Relative, of costs whose terms are computed in float32."""
@@ -36,7 +34,7 @@ def any_share(monkeypatch):
 
 def polished(rollouts: int = 50, *, start: dict | None = None, rounds: int = 6, seen=None, **changes) -> SearchProblem:
     """A search on logarithmic scales with a polish."""
-    settings = {"scales": RATES, "ranges": RANGES, "polish": rounds}
+    settings = LOGARITHMIC | {"polish": rounds}
     own = {"object_radius": 0.045, "stiffness": 6e3} | (start or {})
     return small.search_problem(seen, search=small.released(rollouts=rollouts, start=own, **settings), **changes)
 

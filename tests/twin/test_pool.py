@@ -17,12 +17,8 @@ from neuspring.twin.polish import POLISH, SLOPES, Polish
 from neuspring.twin.search import search
 from neuspring.twin.trials import Outcome, outcomes
 from tests.support import small
+from tests.support.searches import LOGARITHMIC
 
-POLISHED = {
-    "scales": {"stiffness": "log", "dashpot": "log", "drag": "log"},
-    "ranges": {"stiffness": [1e2, 1e5], "dashpot": [0.1, 200.0], "drag": [0.05, 20.0]},
-}
-"""Settings of a search with a polish: one round in stiffness, dashpot and drag."""
 ROLLOUTS = 11 + 8
 MEAN = 1e-6
 """Relative: a mean of two losses in float32."""
@@ -47,7 +43,8 @@ def seen(path: str) -> Observations:
 def polished(own: Observations, **changes) -> SearchProblem:
     """A search of one generation with a polish of one round."""
     start = {"object_radius": 0.045, "stiffness": 6e3}
-    return small.search_problem(own, search=small.released(rollouts=ROLLOUTS, start=start, polish=1, **POLISHED), **changes)
+    settings = {"rollouts": ROLLOUTS, "start": start, "polish": 1}
+    return small.search_problem(own, search=small.released(**settings, **LOGARITHMIC), **changes)
 
 
 def on_pool(alone: SearchProblem, *others: str, **changes) -> SearchProblem:
@@ -214,7 +211,7 @@ def test_one_material_comes_nearer_to_two_recordings():
 
 
 def test_a_killed_fit_continues_exactly(tmp_path, monkeypatch):
-    monkeypatch.setattr("neuspring.twin.fit.CHECKPOINT_EVERY", 1)
+    monkeypatch.setattr("neuspring.core.checkpoint.CHECKPOINT_EVERY", 1)
     problem = problem_of(LIFTED, epochs=3)
     whole = pooled(problem, seen(SHAKEN))
 

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from neuspring.core.artifacts import Material, Observations, Scenario, Simulation, Twin
+from neuspring.core.artifacts import Material, Observations, Simulation, Twin
 from neuspring.core.errors import InputError
 from neuspring.physics import stability
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.topology import distances, infer_controller_radius, piecewise_topology, uniform_topology
 from neuspring.twin.transfer import infer_radii, move, resampled, scale_between
+from tests.support import scenarios
 
 FRAMES, RATE = 20, 30.0
 SUMS = 1e-4
@@ -29,19 +30,8 @@ def recording(nodes: np.ndarray, hands: np.ndarray) -> Observations:
     """Hands lift the body and shake it; where it goes is not looked at."""
     t = np.arange(FRAMES) / RATE
     way = np.stack([0.06 * np.sin(4 * t) ** 2, 0 * t, 0.10 * np.sin(3 * t)], axis=1)
-    scenario = Scenario(
-        name="box", source="toy", category="box", frame_count=FRAMES, train_end=14, frame_rate=RATE, up="+z", ground=False
-    )
-    return Observations(
-        scenario=scenario,
-        object_points=np.repeat(nodes[None], FRAMES, axis=0),
-        object_visibility=np.ones((FRAMES, len(nodes)), bool),
-        object_motion_valid=np.ones((FRAMES, len(nodes)), bool),
-        controller_points=hands[None] + way[:, None],
-        surface_points=np.zeros((0, 3)),
-        interior_points=np.zeros((0, 3)),
-        tracks=np.zeros((FRAMES, 0, 3)),
-    )
+    still = np.repeat(nodes[None], FRAMES, axis=0)
+    return scenarios.seen(still, hands[None] + way[:, None], {"train_end": 14, "frame_rate": RATE, "ground": False})
 
 
 def hands_of(size, count: int = 4) -> np.ndarray:

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from neuspring import config
-from neuspring.core.artifacts import Observations, Scenario, Twin
+from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError
 from neuspring.twin.fit import FitProblem
 from neuspring.twin.rod import RodStart, rod_twin
 from neuspring.twin.rod_fit import Levenberg, Recordings, RodResult, RodSteps, Variables, fit_rod, search_rod
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.transfer import move
-from tests.support import ropes
+from tests.support import ropes, scenarios
 
 SETTINGS = config.Config(
     rod=RodStart(bending=0.02, twisting=0.02), fit=config.Fit(rod=RodSteps(horizons=(0,), rounds=5, every=1, robust=1e-3))
@@ -35,16 +35,8 @@ def cable(name: str, seed: int, frames: int = 21) -> Observations:
     sway = 0.1 * np.sin(8 * time * rng.uniform(0.7, 1.3, 3) + rng.uniform(0, 6, 3)) * [1, 1, 0.5]
     hands = line[held] + np.where(np.arange(4)[:, None] < 2, sway - sway[:1], sway[:1] - sway)
     inner = np.repeat(line[None, 2:-2], frames, axis=0)
-    scenario = Scenario(
-        name=name, source="mocap", category="cable", frame_count=frames, train_end=frames, frame_rate=50.0, up="+z", ground=False
-    )
-    seen = np.ones(inner.shape[:2], dtype=bool)
-    none = np.zeros((0, 3))
-    index = np.array([4, 5, 0, 1, 2, 3, 6, 7])
-    return Observations(
-        scenario=scenario, object_points=inner, object_visibility=seen, object_motion_valid=seen, controller_points=hands,
-        surface_points=none, interior_points=none, tracks=inner, line=index,
-    )  # fmt: skip
+    about = {"name": name, "source": "mocap", "category": "cable", "frame_rate": 50.0, "ground": False}
+    return scenarios.seen(inner, hands, about, tracks=inner, line=np.array([4, 5, 0, 1, 2, 3, 6, 7]))
 
 
 def recorded(twin: Twin, observations: Observations) -> Observations:

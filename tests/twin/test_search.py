@@ -32,34 +32,20 @@ from tests.support import scenarios, small
 from tests.support.searches import assert_same_trace, budget
 
 RELEASED = {
-    "stiffness": 0.3,
-    "object_radius": 0.25,
-    "object_neighbors": 0.5,
-    "controller_radius": 3 / 7,
-    "controller_neighbors": 4 / 7,
-    "ground_elasticity": 0.5,
-    "ground_friction": 0.15,
-    "contact_elasticity": 0.7,
-    "contact_friction": 0.15,
-    "contact_distance": 0.25,
-    "drag": 0.15,
-    "dashpot": 0.5,
+    "stiffness": (0.0, 1e5, 0.3),
+    "object_radius": (0.01, 0.05, 0.25),
+    "object_neighbors": (10, 50, 0.5),
+    "controller_radius": (0.01, 0.08, 3 / 7),
+    "controller_neighbors": (10, 80, 4 / 7),
+    "ground_elasticity": (0.0, 1.0, 0.5),
+    "ground_friction": (0.0, 2.0, 0.15),
+    "contact_elasticity": (0.0, 1.0, 0.7),
+    "contact_friction": (0.0, 2.0, 0.15),
+    "contact_distance": (0.01, 0.05, 0.25),
+    "drag": (0.0, 20.0, 0.15),
+    "dashpot": (0.0, 200.0, 0.5),
 }
-"""The released variables in the released order, and the released start on the normalized scale."""
-RELEASED_RANGES = {
-    "stiffness": (0.0, 1e5),
-    "object_radius": (0.01, 0.05),
-    "object_neighbors": (10, 50),
-    "controller_radius": (0.01, 0.08),
-    "controller_neighbors": (10, 80),
-    "ground_elasticity": (0.0, 1.0),
-    "ground_friction": (0.0, 2.0),
-    "contact_elasticity": (0.0, 1.0),
-    "contact_friction": (0.0, 2.0),
-    "contact_distance": (0.01, 0.05),
-    "drag": (0.0, 20.0),
-    "dashpot": (0.0, 200.0),
-}
+"""The released variables in the released order: their ranges, and the released start on the normalized scale."""
 ROUND_TRIP = 1e-9
 """Absolute, of normalized variables: rounding of float64, over ranges of a part of their bounds."""
 START_ROUNDING = 1e-12
@@ -82,7 +68,7 @@ def plain(**changes: object) -> SearchProblem:
 def test_one_region_has_the_twelve_variables_of_the_released_search_and_its_start():
     problem = plain()
     assert problem.variables == tuple(RELEASED)
-    np.testing.assert_allclose(problem.encode(), list(RELEASED.values()), rtol=CODING)
+    np.testing.assert_allclose(problem.encode(), [start for *_, start in RELEASED.values()], rtol=CODING)
     assert not problem.labels.any()
 
 
@@ -94,7 +80,7 @@ def test_k_regions_have_2k_plus_10_variables(clusters):
     assert regional == [f"object_{name}.{region}" for name in ("radius", "neighbors") for region in range(clusters)]
     # Every region starts where the uniform search does.
     start = dict(zip(problem.variables, problem.encode(), strict=True))
-    assert start == pytest.approx({name: RELEASED[name.partition(".")[0]] for name in start}, rel=CODING)
+    assert start == pytest.approx({name: RELEASED[name.partition(".")[0]][2] for name in start}, rel=CODING)
     assert np.unique(problem.labels).tolist() == list(range(clusters))
 
 
@@ -145,14 +131,8 @@ def test_lengths_are_multiples_of_the_spacing_of_the_nodes():
 def test_small_and_large_units_have_the_same_variables_and_springs():
     """What is measured in spacings grows with the body: 1024 times, a power of two, so that no distance is rounded."""
     seen = small.observations()
-    large = replace(
-        seen,
-        object_points=1024 * seen.object_points,
-        controller_points=1024 * seen.controller_points,
-        surface_points=1024 * seen.surface_points,
-        interior_points=1024 * seen.interior_points,
-        tracks=1024 * seen.tracks,
-    )
+    lengths = ("object_points", "controller_points", "surface_points", "interior_points", "tracks")
+    large = replace(seen, **{name: 1024 * getattr(seen, name) for name in lengths})
     meters, units = ours(), ours(seen=large)
     np.testing.assert_array_equal(units.encode(), meters.encode())
     rng = np.random.default_rng(0)
@@ -187,11 +167,10 @@ def test_a_fixed_radius_is_that_of_every_region():
 def test_the_released_row_is_the_search_as_it_was(clusters):
     """Bit for bit: the linear formula on the released ranges, and CMA-ES from the released start, told the same costs."""
     trace = search(small.search_problem(search=small.released(rollouts=24), clusters=clusters), seed=3).trace
-    ranges = RELEASED_RANGES
     names = [n for n in trace if n.removeprefix("normalized.") != n]
-    start = [RELEASED[n.removeprefix("normalized.").partition(".")[0]] for n in names]
+    start = [RELEASED[n.removeprefix("normalized.").partition(".")[0]][2] for n in names]
     for name in (n.removeprefix("normalized.") for n in names):
-        low, high = ranges[name.partition(".")[0]]
+        low, high, _ = RELEASED[name.partition(".")[0]]
         value = low + trace[f"normalized.{name}"] * (high - low)
         whole = name.partition(".")[0] in candidates.INTEGERS
         np.testing.assert_array_equal(trace[name], value.astype(int) if whole else value)
@@ -287,17 +266,6 @@ def die_after(evaluated: int, problem: SearchProblem, seed: int, record: Path, m
             search(problem, seed, record=record, key="k")
 
 
-def test_a_killed_search_continues_exactly(tmp_path, monkeypatch):
-    record = tmp_path / "trace.parquet"
-    whole = search(small.search_problem(), seed=5)
-    die_after(14, small.search_problem(), 5, record, monkeypatch)  # in the middle of the second generation
-    assert len(pd.read_parquet(record)) == 11
-    continued = search(small.search_problem(), seed=5, record=record, key="k")
-    assert (whole.attempts, continued.attempts) == (1, 2)
-    assert continued.earlier_seconds > 0
-    assert_same_trace(continued.trace, whole.trace)
-
-
 @pytest.mark.parametrize(("rollouts", "clusters", "population"), [(5, 1, 11), (11, 1, 11), (15, 3, 12)])
 def test_every_search_uses_exactly_its_budget(rollouts, clusters, population):
     trace = search(budget(rollouts, clusters), seed=0).trace
@@ -329,15 +297,9 @@ def pushed(hands: str = "auto", rollouts: int = 26) -> SearchProblem:
     lump = np.tile(corners, (frames, 1, 1))
     lump[:, :, 0] += np.maximum.accumulate(np.maximum(way - 0.01, 0.0))[:, None]
     points = np.array([[-0.03, 0.005, 0.015], [-0.03, 0.025, 0.015]]) + way[:, None, None] * [1.0, 0.0, 0.0]
-    known = {name: np.ones((frames, len(corners)), bool) for name in ("object_visibility", "object_motion_valid")}
-    nothing = {name: np.zeros((0, 3)) for name in ("surface_points", "interior_points")}
-    hands_and_lump = {
-        "object_points": lump,
-        "controller_points": points,
-        "scenario": scenarios.scenario(frame_count=frames, train_end=frames),
-    }
-    seen = scenarios.observations(frames, **hands_and_lump, **known, **nothing)
-    return small.search_problem(seen, search=config.Search(hands=hands, rollouts=rollouts, lengths="spacing"))
+    return small.search_problem(
+        scenarios.seen(lump, points), search=config.Search(hands=hands, rollouts=rollouts, lengths="spacing")
+    )
 
 
 def test_the_first_generation_says_whether_hands_hold_or_push():
@@ -467,11 +429,9 @@ def test_a_record_that_replays_in_part_is_continued_from_there(tmp_path, capsys)
 
 def test_a_fixed_count_that_no_candidate_can_use_is_an_error_with_the_remedy():
     problem = small.search_problem(simulation=config.SimulationSettings(substeps=1))
-    with pytest.raises(
-        InputError, match=r"simulation.substeps: at least one of 22 candidates must be stable.*; received 1"
-    ) as caught:
+    named = r"simulation.substeps: at least one of 22 candidates must be stable.*; received 1.*unstable.*Use at least \d+ substeps"
+    with pytest.raises(InputError, match=named):
         search(problem, seed=0)
-    assert re.search(r"unstable: simulation.substeps, node \d+: .*stability bound.* Use at least \d+ substeps", str(caught.value))
 
 
 def test_a_search_whose_candidates_all_fail_is_a_named_failure():
@@ -546,7 +506,7 @@ def test_the_search_is_the_same_bit_for_bit_however_candidates_are_simulated(mak
     """The slow path, one candidate after the other, is the specification."""
     slow = search(make(clusters=clusters, together=1), seed=3)
     assert slow.trace["substeps"].nunique() > 10
-    for how in ({}, {"together": 4}, {"together": 1, "threads": 3}):
+    for how in ({}, {"together": 4}, {"together": 1, "threads": 6}):
         fast = search(make(clusters=clusters, **how), seed=3)
         assert_same_trace(fast.trace, slow.trace)
         assert (fast.values, fast.cost) == (slow.values, slow.cost)
@@ -559,12 +519,6 @@ def test_the_search_is_the_same_where_lists_of_partners_are_full():
     slow, fast = (search(crowded(simulation=settings, together=together), seed=3).trace for together in (1, 16))
     assert_same_trace(fast, slow)
     assert 0 < (slow["collision_overflow"] > 0).sum() < len(slow)
-
-
-def test_threads_that_simulate_at_the_same_time_do_not_meet():
-    """Many short simulations by more threads than there are cores."""
-    slow = search(crowded(together=1), seed=0).trace
-    assert_same_trace(search(crowded(together=1, threads=6), seed=0).trace, slow)
 
 
 def test_a_killed_search_continues_in_another_batch(tmp_path, monkeypatch):
@@ -587,6 +541,7 @@ def test_a_killed_search_continues_in_another_batch(tmp_path, monkeypatch):
     assert len(pd.read_parquet(record)) == 11
     continued = search(small.search_problem(together=4), seed=5, record=record, key="k")
     assert continued.attempts == 2
+    assert continued.earlier_seconds > 0
     assert_same_trace(continued.trace, search(small.search_problem(together=1), seed=5).trace)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from neuspring import config
-from neuspring.core.artifacts import Twin
+from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError
 from neuspring.scenes import mocap
 from neuspring.twin.candidates import candidate
@@ -28,6 +28,11 @@ STILL = 1e-5
 """m: what the rounding of rest lengths moves a node in five frames; the wrong rest length moves it by centimeters."""
 
 
+def scaled(seen: Observations, factor: float | tuple[float, ...]) -> Observations:
+    """Tracked points, surface and hands times a factor, or one per axis."""
+    return replace(seen, **{name: getattr(seen, name) * np.float32(factor) for name in PLACES})
+
+
 def test_the_same_recording_gives_the_same_twin():
     problem = small.fit_problem()
     moved = move(problem.twin, problem.observations)[0]
@@ -40,7 +45,7 @@ def test_rest_lengths_follow_the_new_first_frame_and_keep_what_was_learned():
     problem = small.fit_problem()
     learned = replace(problem.twin.topology, rest_lengths=problem.twin.topology.rest_lengths * 1.03)
     seen = problem.observations
-    larger = replace(seen, **{name: getattr(seen, name) * 2 for name in ("object_points", "surface_points", "controller_points")})
+    larger = scaled(seen, 2)
     moved = move(replace(problem.twin, topology=learned), larger)[0]
     np.testing.assert_allclose(moved.topology.rest_lengths, problem.twin.topology.rest_lengths * 2.06, rtol=SINGLE)
     assert np.array_equal(moved.topology.nodes, larger.nodes)
@@ -73,7 +78,7 @@ def calibrated():
 def test_calibrated_grips_take_hold_of_the_body_as_it_is_in_the_new_recording():
     seen, twin, body = calibrated()
     learned = replace(twin, topology=replace(twin.topology, rest_lengths=twin.topology.rest_lengths * 1.03))
-    other = replace(seen, **{name: getattr(seen, name) * 2 for name in ("object_points", "surface_points", "controller_points")})
+    other = scaled(seen, 2)
     moved = move(learned, other)[0].topology
     assert moved.controller_rest == "first_frame"
     # The body rests as before, for its rest shape is the same; the grips follow frame 0.
@@ -139,7 +144,7 @@ def test_a_twin_remembers_where_its_grips_rest(tmp_path):
 def test_more_substeps_where_the_new_distances_need_them():
     problem = small.fit_problem()
     seen = problem.observations
-    smaller = replace(seen, **{name: getattr(seen, name) / 4 for name in ("object_points", "surface_points", "controller_points")})
+    smaller = scaled(seen, 0.25)
     moved = move(problem.twin, smaller)[0]
     assert moved.simulation.substeps > problem.twin.simulation.substeps
     assert roll_out(moved, smaller.controller_points).diverged_frame is None
@@ -156,7 +161,7 @@ def test_the_same_nodes_are_told_from_others():
     problem = small.fit_problem()
     topology, seen = problem.twin.topology, problem.observations
     assert corresponds(topology, seen)
-    assert corresponds(topology, replace(seen, **{name: getattr(seen, name) * 3 for name in PLACES}))
+    assert corresponds(topology, scaled(seen, 3))
     assert not corresponds(topology, replace(seen, surface_points=seen.surface_points[1:]))
     assert not corresponds(topology, replace(seen, controller_points=seen.controller_points[:, 1:]))
     order = np.random.default_rng(0).permutation(seen.object_points.shape[1])
@@ -220,8 +225,4 @@ def test_a_pool_whose_rings_are_turned_about_the_cable_is_refused(tmp_path):
 
 def test_an_end_that_points_elsewhere_tells_nothing_of_its_roll(tmp_path):
     here = cable(tmp_path, 0.3)
-    over = replace(
-        here,
-        **{name: getattr(here, name) * np.float32([1, 1, -1]) for name in ("object_points", "surface_points", "controller_points")},
-    )
-    assert roll_between(here, over) == 0.0
+    assert roll_between(here, scaled(here, (1, 1, -1))) == 0.0

@@ -25,6 +25,7 @@ from neuspring.extensions.spring_gaus.model import (
 )
 from neuspring.extensions.spring_gaus.physics import AnchorSolver, reference_substep
 from neuspring.extensions.spring_gaus.train import FEATURE_WEIGHT, Problem, SpringGausTrainer, load_features, run, silhouette_loss
+from tests.support.devices import DEVICES
 
 FRAME = 1 / 30
 SMALL = SpringGausTraining(anchors=72, neighbors=12, full_neighbors=8, substeps=150, damping=1.0)
@@ -86,6 +87,32 @@ def test_the_order_of_anchors_yaw_and_which_way_is_up_change_nothing_else():
     assert float((moved[-1] - moved[0]).norm(dim=1).mean()) > 0.03, "there is a motion to compare"
     np.testing.assert_allclose(mixed.numpy(), moved.numpy()[:, order], atol=2e-4)
     np.testing.assert_allclose(turned.numpy(), moved.numpy() @ turn.T, atol=2e-4)
+
+
+def on(device: str, model: SpringGausModel, hands: np.ndarray) -> list[torch.Tensor]:
+    """Positions over all frames, and gradients of the first one by everything that is trained, on a device."""
+    moved, reason = roll_out(model, hands, device)
+    assert not reason
+    values = {name: tensor.requires_grad_() for name, tensor in model.tensors(device).items()}
+    # Away from rest: springs as good as unstretched exert no force, and rounding would choose which.
+    noise = np.random.default_rng(1).normal(size=(2, *model.anchors.shape))
+    x = torch.tensor(model.anchors + 0.002 * noise[0], dtype=torch.float32, device=device).requires_grad_()
+    v = torch.tensor(0.1 * noise[1], dtype=torch.float32, device=device)
+    begin, end = torch.tensor(hands[:2], dtype=torch.float32, device=device)
+    after, speed = AnchorSolver(model, model, model.substeps, device).frame(model.parameters(values), x, v, begin, end)
+    (100 * after.square().sum() + (speed * torch.arange(3, device=device)).sum()).backward()
+    return [moved.cpu(), *(tensor.grad.cpu() for tensor in (x, *values.values()) if tensor.grad is not None)]
+
+
+@pytest.mark.parametrize("gpu", DEVICES[1:])
+def test_a_gpu_moves_a_lifted_bar_as_the_cpu_does(gpu):
+    anchors = bar(height=0.05)
+    hands = (anchors[:3] + 0.004)[None] + 0.01 * np.arange(12)[:, None, None] * np.array([0.3, 0.2, 1.0])
+    (found, *gradients), (wanted, *expected) = (on(device, model_of(anchors, hands[0]), hands) for device in (gpu, "cpu"))
+    # Where the state of every frame was moved by 1e-6 of itself on the CPU: 5e-7 m, and 2e-3 of the largest entry.
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-5)
+    for gradient, own in zip(gradients, expected, strict=True):
+        torch.testing.assert_close(gradient, own, rtol=0, atol=5e-3 * float(own.abs().max()))
 
 
 def test_springs_are_directed():
@@ -255,7 +282,7 @@ def test_a_failure_keeps_the_parameters_of_the_last_complete_iteration():
 
 
 def test_a_killed_training_continues_to_the_same_model(tmp_path, monkeypatch):
-    monkeypatch.setattr("neuspring.baselines.results.CHECKPOINT_EVERY", 1)
+    monkeypatch.setattr("neuspring.core.checkpoint.CHECKPOINT_EVERY", 1)
     monkeypatch.setattr("neuspring.extensions.spring_gaus.train.SUBSTEPS_RAISED", (1,))
     hands = swing(6)
     start = model_of(bar(), hands[0])

@@ -15,7 +15,7 @@ from tests.support import stores
 
 
 def test_a_killed_and_continued_sweep_finds_what_one_in_a_single_go_finds(tmp_path, finished, monkeypatch):
-    monkeypatch.setattr("neuspring.twin.fit.CHECKPOINT_EVERY", 1)
+    monkeypatch.setattr("neuspring.core.checkpoint.CHECKPOINT_EVERY", 1)
     whole, tune = finished
     folder = furnish(tmp_path)
     epochs, run_epoch = 0, TwinFit.epoch
