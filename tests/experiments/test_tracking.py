@@ -320,12 +320,15 @@ def test_an_unreachable_server_costs_seconds_and_no_run(results: Path, capsys: p
     assert not records[1].with_name("mlflow.txt").exists()
 
 
-@pytest.mark.parametrize("damage", ["text", "postgres"])
+@pytest.mark.parametrize("damage", ["text", "folder", "postgres"])
 def test_a_damaged_database_or_absent_host_fails_at_once(results: Path, damage: str) -> None:
     """MLflow itself would retry these for about two minutes."""
     settings = SETTINGS
     if damage == "text":
         (results / "mlflow.db").write_text("not a database " * 100)
+    elif damage == "folder":
+        (results / "mlflow.db").unlink()
+        (results / "mlflow.db").mkdir()
     else:
         settings = Tracking(uri="postgresql://secret@127.0.0.1:9/mlflow")
     start = time.monotonic()

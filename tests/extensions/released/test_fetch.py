@@ -333,6 +333,16 @@ def test_an_archive_with_an_unsafe_member_is_refused_as_a_whole(server: StandIn,
     assert files(tmp_path) == {}
 
 
+def test_an_encrypted_member_is_refused(server: StandIn, tmp_path: Path) -> None:
+    content = bytearray(server.files["data.zip"])
+    # The flags lie 38 bytes before the name, in the table of contents at the end.
+    content[content.rindex(FINAL_DATA.encode()) - 38] |= 1
+    server.files["data.zip"] = bytes(content)
+    with pytest.raises(InputError, match="plain files at relative paths only, no links, and none encrypted"):
+        fetch(tmp_path, [CASE], endpoint=server.endpoint)
+    assert files(tmp_path) == {}
+
+
 @pytest.mark.parametrize("prefix", ["", "release/v1/data/"], ids=["bare", "deeper"])
 def test_other_folders_around_the_cases_are_found_out(server: StandIn, tmp_path: Path, prefix: str) -> None:
     stream = io.BytesIO(repack(server.files["data.zip"], lambda name: prefix + name.removeprefix("data/")))
