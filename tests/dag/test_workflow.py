@@ -55,22 +55,15 @@ def test_a_configuration_becomes_a_table_with_every_run_in_mlflow(tiny_run):
     assert {word: len(names) for word, names in tracking.sync(results, config.Tracking()).items()} == {"already logged": 2}
 
 
-def test_the_search_is_shared_and_nothing_reruns_without_a_change(tiny_run):
+def test_the_search_is_shared_and_changed_settings_rerun_the_stages_that_use_them_and_no_others(tiny_run):
     project, output = tiny_run
     assert jobs_in(output)["search"] == 1
-    assert plan(project) == {}
     # How candidates are simulated changes no result; the report states it, as the whole configuration.
     assert plan(project, {"twins_per_launch": 3}, "--set-threads", "search=2") == {"report": 1, "all": 1}
-
-
-def test_changed_settings_rerun_the_stages_that_use_them_and_no_others(tiny_run):
-    project, _ = tiny_run
-    # Both runs go to another experiment of MLflow; what is fitted is made again.
-    fitted = dict.fromkeys(["fit", "rollout", "score", "tables", "report", "all"], 1)
-    changes = {"fit": {"epochs": 4}, "tracking": {"experiment": "other"}}
-    assert plan(project, changes) == fitted | {"track_init": 1, "log_run": 2}
-    both_seeds = plan(project, {"seeds": [0, 1]})
-    assert both_seeds == {"search": 1, "fit": 1, "rollout": 2, "score": 2, "log_run": 2, "tables": 1, "report": 1, "all": 1}
+    # Both runs go to another experiment of MLflow; what is fitted is made again, and all of another seed is made.
+    expected = dict.fromkeys(["track_init", "search", "tables", "report", "all"], 1)
+    expected |= {"fit": 2, "rollout": 3, "score": 3, "log_run": 4}
+    assert plan(project, {"fit": {"epochs": 4}, "tracking": {"experiment": "other"}, "seeds": [0, 1]}) == expected
 
 
 def test_what_results_were_made_with_is_read_from_their_records_and_from_nothing_that_stays_behind(tiny_run, tmp_path):
@@ -79,21 +72,13 @@ def test_what_results_were_made_with_is_read_from_their_records_and_from_nothing
     shutil.rmtree(project / ".snakemake")
     (project / "results").rename(project / "kept")
     assert plan(project, {"results": "kept"}) == {}
-    output = run(project, {"results": "kept", "fit": {"epochs": 4}}, "--dry-run", "--quiet", "rules")
+    changes = {"results": "kept", "fit": {"epochs": 4}, "compare_with": "search_only"}
+    output = run(project, changes, "--dry-run", "--quiet", "rules")
     assert jobs_in(output) == dict.fromkeys(["fit", "rollout", "score", "log_run", "tables", "report", "all"], 1)
     assert "  fit (baseline, 1 job): fit.epochs 3 -> 4\n" in output
-    assert "To keep what is there, give another folder: --config results=" in output
-    # A target of a table brings its rows, which this configuration does not name.
-    planned = plan(project, {"results": "kept"}, "--", "table3")
-    assert (planned["fit"], planned["score"], planned["search"], planned["table3"]) == (3, 3, 1, 1)
-    assert plan(project, {"results": "kept", "toy": {"frames": 9}}, "--rerun-triggers", "mtime") == {}
-    # Of an older version, whose code is not on record; of a stage whose product is no record; of rules that are no stages.
-    path = project / "kept" / SCENE / "search-uniform" / "0" / "search.json"
-    path.write_text(json.dumps({name: value for name, value in json.loads(path.read_text()).items() if name != "code"}))
-    output = run(project, {"results": "kept", "toy": {"frames": 9}, "compare_with": "search_only"}, "--dry-run", "--quiet", "rules")
-    assert "  observe (1 job): toy.frames 8 -> 9\n" in output
-    assert "  search (uniform, 1 job): code (an older version)\n" in output
     assert "  tables (1 job): what it was told, or its code\n" in output
+    assert "To keep what is there, give another folder: --config results=" in output
+    assert plan(project, {"results": "kept", "toy": {"frames": 9}}, "--rerun-triggers", "mtime") == {}
 
 
 @pytest.mark.slow

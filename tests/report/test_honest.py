@@ -12,7 +12,6 @@ from neuspring.report.notes import honest_notes
 from neuspring.scores.runs import Collected
 from tests.support.report_tree import make
 from tests.support.runs import run_record
-from tests.support.study_runs import summary
 
 GOOD = {
     "search.result.springs": 100,
@@ -68,13 +67,6 @@ def test_a_method_no_better_than_static_is_named():
 
 def test_other_sources_have_no_such_notes():
     assert honest_notes(collected({"static": 0.01, "ours": 0.02}, GOOD, source="synthetic")) == []
-
-
-def test_notes_stand_below_the_summary_s_tables():
-    seen = collected({"static": 0.0170, "ours": 0.0171}, GOOD)
-    columns = {"reason": "", "images": "null", "run_key": "", "oracle": False, "floors": "{}"}
-    text = summary(replace(seen, runs=seen.runs.assign(**columns)), "static")
-    assert "Of your own recordings:\n\n- bear / ours: on future frames no better than static" in text
 
 
 def test_the_report_shows_findings_and_notes(tmp_path):

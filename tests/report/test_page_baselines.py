@@ -1,6 +1,5 @@
 """The report shows methods without a search: their steps, settings, curves, times and splats."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,7 +9,6 @@ import pytest
 from neuspring import config
 from neuspring.core.artifacts import Observations
 from neuspring.core.records import StageRecord
-from neuspring.core.run_record import RunRecord
 from neuspring.report.page import Options, write
 from neuspring.scores.paper import Study
 from tests.support import report_tree
@@ -119,22 +117,3 @@ def test_what_does_not_apply_is_no_run(results):
     assert "Left out: spring_gaus on cable: it needs images." in section(page, "details")
     assert "empty: does not apply" in section(page, "failures")
     assert "2 of 4 runs have not finished." in section(report(results, **studied), "verdict")
-
-
-def test_failures_have_both_averages_in_the_report(tmp_path):
-    folder = report_tree.make(
-        tmp_path / "results", ["rope", "cloth"], ["baseline", "spring_gaus"], [0], pictures=False, curves=False
-    )
-    place = folder / "rope" / "spring_gaus" / "0"
-    run = RunRecord.load(place / "run.json")
-    (place / "held.parquet").write_bytes((place / "scores.parquet").read_bytes())
-    failed = replace(run, status="failed", reason="it diverged")
-    replace(failed, held_file="held.parquet").save(place / "run.json")
-    settings = config.Config(studies=("systems",), scenarios=("rope", "cloth"), methods=("baseline", "spring_gaus"), seeds=(0,))
-    page = report(folder, studies={"systems": SYSTEMS}, settings=settings)
-    assert "spring_gaus 1 (1 by its failures alone)" in section(page, "scores")
-    text = section(page, "details")
-    assert "spring_gaus 1/2 its successes" in text and "all, failures held" in text and "baseline 2/2 all" in text
-    assert "SG 1/2 its successes" in section(page, "studies")
-    failed.save(place / "run.json")
-    assert "spring_gaus: 1 of 1 failed runs have no scores of a held prediction" in section(report(folder), "details")

@@ -14,15 +14,13 @@ from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
 from neuspring.data.capture import Capture
 from neuspring.data.results import Masks
-from neuspring.intake import phystwin
 from neuspring.scenes.synthetic.make import outlines
 from neuspring.stages.capture import capture
 from neuspring.stages.lift import lift
 from neuspring.stages.observe import observe
 from neuspring.stages.segment import segment
 from tests.support.filmed import FLIP, FRAMES, SIZE, STEP, film, write_raw
-from tests.support.perceived import ROW, SETTINGS, final_data, perceived
-from tests.support.phystwin_case import dump, write_json
+from tests.support.perceived import ROW, SETTINGS, perceived
 
 
 @pytest.fixture(scope="module")
@@ -110,17 +108,6 @@ def test_phystwin_s_raw_layout_gives_the_same_observations(tmp_path):
     assert np.median(motion_error(found, FLIP[:3, :3])) < 0.003
     for name in ("object_points", "object_visibility", "object_motion_valid", "controller_points", "surface_points", "tracks"):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-9, err_msg=name)
-
-
-def test_what_was_perceived_can_be_written_as_a_processed_case_and_read_back(tmp_path):
-    observations = perceived(film(tmp_path / "capture", cameras=2, up="-z"), tmp_path)
-    case = tmp_path / "different_types" / "film"
-    dump(case / "final_data.pkl", final_data(observations))
-    write_json(case / "split.json", {"frame_len": FRAMES, "train": [0, 4], "test": [4, FRAMES]})
-    dump(case / "gt_track_3d.pkl", observations.tracks.astype(float))
-    read = phystwin.read(replace(ROW, source="phystwin", path=str(case)), case)
-    for name in ("object_points", "object_visibility", "object_motion_valid", "controller_points", "surface_points"):
-        np.testing.assert_array_equal(getattr(read, name), getattr(observations, name), err_msg=name)
 
 
 def test_given_masks_must_be_there(tmp_path):

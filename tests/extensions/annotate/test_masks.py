@@ -1,7 +1,6 @@
 """Marks of the page become masks by `neuspring.perception.marks`, at the frames where they were drawn."""
 
 import json
-import re
 
 import cv2
 import numpy as np
@@ -80,17 +79,8 @@ def test_a_camera_without_frame_0_has_masks_too(tmp_path):
     assert page.saved_cameras() == ["0"]
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        (None, "a JSON object is required"),
-        ({"format": 1, "cameras": {}, "more": 1}, "more: unknown key"),
-        (marks(box(0), camera="7"), "cameras.7: the capture must have this camera; received ['0', 'covered']"),
-        (marks(box(1)), "marks must lie on frames that the camera has; received 1"),
-        (marks(box(0, kind="click", points=[[float("inf"), 0]])), "cameras.0.0.points"),
-    ],
-)
-def test_bad_marks_are_refused(capture, values, message):
+def test_bad_marks_are_refused(capture):
     """All that a file may not say either is tested beside it: marks/test_marks.py."""
-    with pytest.raises(InputError, match=re.escape(message)):
-        page_of(capture).write("none", values)
+    for values, message in ((None, "a JSON object is required"), (marks(box(0), camera="7"), "cameras.7: the capture must have")):
+        with pytest.raises(InputError, match=message):
+            page_of(capture).write("none", values)

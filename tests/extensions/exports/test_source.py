@@ -103,7 +103,6 @@ BROKEN = {
     ),
     "no twin": (lambda folder: (folder / "twin.npz").unlink(), "Delete .*fit.json and run again"),
     "no record of the twin": (lambda folder: (folder / "fit.json").unlink(), "the record of its model must lie in"),
-    "no trajectory": (lambda folder: (folder / "trajectory.npz").unlink(), "Delete .*rollout.json and run again"),
     "no observations": (
         lambda folder: (folder.parents[1] / "observations.npz").unlink(),
         "the observations of the run must be there",

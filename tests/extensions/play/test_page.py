@@ -16,7 +16,7 @@ from neuspring.cli.main import main
 from neuspring.core.artifacts import SplatCenters, Trajectory
 from neuspring.core.files import read_npz, write_npz
 from neuspring.core.records import digest_file
-from neuspring.extensions.play.layers import SPLAT_UNIT, SplatLayer, covariances
+from neuspring.extensions.play.layers import SPLAT_UNIT, SplatLayer
 from neuspring.extensions.play.page import Page
 from neuspring.extensions.play.player import Player
 from neuspring.report.shown import find
@@ -267,19 +267,6 @@ def test_damaged_splats_are_a_note_and_the_run_is_shown(scenario, server):
     player.display.splats = True
     player.apply()
     assert player._bodies["baseline/0"].splats is None
-
-
-def test_they_turn_with_the_body(scenario, server):
-    assert find([scenario]).runs[0].splats is None
-    splats, run = dressed(scenario), find([scenario]).runs[0]
-    nodes = run.trajectory.positions[0]
-    assert np.array_equal(run.splats.means, splats.means)
-    turn, shift = Rotation.from_rotvec([0.3, -0.8, 1.1]), np.array([0.5, 0.1, -0.2])
-    layer = SplatLayer(server.scene, "turned", splats, nodes)
-    means, quaternions = layer.carried(turn.apply(nodes) + shift)
-    assert means == pytest.approx(turn.apply(splats.means) + shift, abs=1e-5)
-    expected = turn.as_matrix() @ covariances(splats.quaternions, np.exp(splats.log_scales)) @ turn.as_matrix().T
-    assert covariances(quaternions, np.exp(splats.log_scales)) == pytest.approx(expected, abs=1e-8)
 
 
 def test_what_the_browser_gets_are_their_colors_and_sizes(scenario, server):
