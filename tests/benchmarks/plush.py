@@ -13,7 +13,7 @@ import numpy as np
 from neuspring import config
 from neuspring.core.artifacts import Observations
 from neuspring.twin.candidates import SearchProblem
-from tests.support import scenarios
+from tests.support import scenarios, small
 
 FRAMES, RATE = 31, 30.0
 TRACKED, SURFACE, NODES, HANDS = 300, 150, 650, 30
@@ -25,14 +25,7 @@ LIFT = 0.1
 
 def problem(rollouts: int, device: str) -> SearchProblem:
     """A search with the settings of the released code and as many substeps as are safe."""
-    return SearchProblem(
-        observations=observations(),
-        search=config.Search(rollouts=rollouts),
-        simulation=config.SimulationSettings(),
-        losses=config.Losses(),
-        quirks=config.ReleasedQuirks(),
-        device=device,
-    )
+    return small.search_problem(observations(), search=config.Search(rollouts=rollouts), device=device)
 
 
 @functools.cache

@@ -48,7 +48,7 @@ def trajectory(**changes: Any) -> Trajectory:
 MAKERS: dict[str, Any] = {
     "scenario": lambda: scenario(provenance={"file": "a.pkl", "digest": "0f"}, ground=False, up="-z"),
     "observations": lambda: observations(tracks=np.where(np.arange(10).reshape(5, 2, 1) % 3, 1 / 3, np.nan).repeat(3, axis=2)),
-    "topology": topology,
+    "topology": lambda: topology(controller_rest="first_frame"),
     "material": material,
     "twin": twin,
     "trajectory": trajectory,

@@ -361,7 +361,8 @@ def test_twins_of_cables_move_only_where_all_have_as_many_nodes(tmp_path: Path) 
 
 def pooled(folder: Path, **changes: object) -> Benchmark:
     """A method on the pool of a rope, and the same alone."""
-    write(folder / "pooled.yaml", METHODS + "one: {search: uniform, fit: springs, pool: all, description: x}\n")
+    row = "search: uniform, fit: springs, pool: all, description: x"
+    write(folder / "pooled.yaml", f"{METHODS}one: {{{row}}}\noracle: {{{row}, oracle: true}}\n")
     toys = "".join(f"{name}\ttoy\trope\trope/lift/smooth\tfalse\ttrue\n" for name in ("a", "b", "c"))
     write(folder / "toys.tsv", HEADER + toys + "cloth\ttoy\tcloth\tcloth/lift/smooth\tfalse\ttrue\n")
     chosen: dict[str, object] = {"scenario_table": "toys.tsv", "method_table": "pooled.yaml", "pools": {"rope": ["a", "b", "c"]}}
@@ -419,10 +420,7 @@ def in_step(made: Benchmark, scenario: str) -> list[tuple[str, int]]:
 
 
 def test_oracles_on_a_pool_have_fits_of_their_own_over_all_frames(tmp_path: Path) -> None:
-    pooled(tmp_path)
-    oracle = "oracle: {search: uniform, fit: springs, pool: all, oracle: true, description: x}\n"
-    write(tmp_path / "more.yaml", (tmp_path / "pooled.yaml").read_text() + oracle)
-    made = pooled(tmp_path, method_table="more.yaml", methods=["one", "oracle"])
+    made = pooled(tmp_path, methods=["one", "oracle"])
     assert list(made.searches) == ["uniform-all"], "no search alone is needed"
     graph = Graph(made)
     assert graph.owners["fit"] == {"one": "one", "oracle": "oracle"}

@@ -11,9 +11,10 @@ import numpy as np
 
 from neuspring.core.artifacts import ImageObservations, Observations
 from neuspring.data.camera import Camera
-from neuspring.data.capture import HANDS, OBJECT, Capture, Description, Writer
+from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
 from neuspring.perception.color import silhouettes
 from tests.support import small
+from tests.support.captures import describe
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 180.0
 UP, DOWN = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])
@@ -77,17 +78,8 @@ def paint(folder: Path, category: str = "cloth", frames: int = 8, spoiled: bool 
     rng = np.random.default_rng(0)
     speckles = cv2.GaussianBlur(rng.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8), (0, 0), 1.0)
     cloth = cv2.GaussianBlur(rng.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8), (0, 0), 1.5)
-    description = Description(
-        format=1,
-        name="painted",
-        category=category,
-        frame_count=frames,
-        frame_rate=30.0,
-        cameras=(view.entry(),),
-        depth="none",
-        train_end=frames - 3,
-        masks=True,
-    )
+    own = {"name": "painted", "category": category, "frame_count": frames, "train_end": frames - 3}
+    description = describe(**own, cameras=(view.entry(),), depth="none")
     writer = Writer(folder, description)
     corners = np.array([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [-0.1, 0.1, 0]])
     for frame in range(frames):

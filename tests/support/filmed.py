@@ -11,11 +11,12 @@ import numpy as np
 import trimesh
 
 from neuspring.data.camera import CameraEntry
-from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture, Description, Writer
+from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture, Writer
 from neuspring.scenes.synthetic.make import looking
 from neuspring.scenes.synthetic.meshes import capsule, smooth_union, sphere, surface
 from neuspring.scenes.synthetic.render import Part, Renderer, quantized
 from neuspring.scenes.synthetic.scenes import SKIN_COLOR
+from tests.support.captures import describe
 from tests.support.phystwin_case import dump, write_json
 
 FRAMES = 6
@@ -75,8 +76,8 @@ def film(
         )
         for k, (pose, size) in enumerate(zip(poses, sizes, strict=False))
     )
-    plain = {"format": 1, "name": "film", "category": "toy", "frame_count": FRAMES, "frame_rate": 30.0, "masks": True}
-    writer = Writer(folder, Description(**(plain | {"cameras": entries, "up": up} | changes)))
+    plain = {"name": "film", "category": "toy", "frame_count": FRAMES, "cameras": entries, "up": up}
+    writer = Writer(folder, describe(**(plain | changes)))
     upright = {entry.name: (entry, pose) for entry, pose in zip(entries, poses, strict=True)}
     for frame in range(FRAMES):
         rise = frame * STEP + np.array([0, 0, stand])

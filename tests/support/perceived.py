@@ -27,27 +27,15 @@ SETTINGS = Config(
 def perceived(capture: Capture, folder: Path, row: ScenarioRow = ROW, settings: Config = SETTINGS) -> Observations:
     """What perception finds in a capture; its records and files are in the folder."""
     masks, tracks = [], []
+    own = {"capture": capture.folder / "capture.json", "settings": settings}
     for camera in capture.cameras:
         masks.append(folder / camera / "masks.json")
         tracks.append(folder / camera / "tracks.json")
         masks[-1].parent.mkdir(parents=True)
-        segment(capture=capture.folder / "capture.json", camera=camera, settings=settings, device="cpu", output=masks[-1])
-        track(
-            capture=capture.folder / "capture.json",
-            camera=camera,
-            masks=masks[-1],
-            settings=settings,
-            device="cpu",
-            output=tracks[-1],
-        )
-    lift(capture=capture.folder / "capture.json", masks=masks, tracks=tracks, settings=settings, output=folder / "lifted.json")
-    observe(
-        scenario=row,
-        settings=settings,
-        output=folder / "observations.npz",
-        capture=capture.folder / "capture.json",
-        lifted=folder / "lifted.json",
-    )
+        segment(**own, camera=camera, device="cpu", output=masks[-1])
+        track(**own, camera=camera, masks=masks[-1], device="cpu", output=tracks[-1])
+    lift(**own, masks=masks, tracks=tracks, output=folder / "lifted.json")
+    observe(**own, scenario=row, output=folder / "observations.npz", lifted=folder / "lifted.json")
     return Observations.load(folder / "observations.npz")
 
 

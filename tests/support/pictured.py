@@ -30,20 +30,13 @@ class Scene:
         self.capture, self.folder = capture, folder
         self.observations = perceived(capture, folder)
         self.masks = [folder / camera / "masks.json" for camera in capture.cameras]
+        self.before = {"capture": capture.folder / "capture.json", "masks": self.masks}
         self.appearance = folder / "appearance" / "appearance.json"
 
     def learn(self, chosen: Config, seed: int = 0) -> StageRecord:
         self.appearance.parent.mkdir(exist_ok=True)
-        lifted = self.folder / "lifted.json"
-        appearance(
-            capture=self.capture.folder / "capture.json",
-            masks=self.masks,
-            settings=chosen,
-            seed=seed,
-            device="cpu",
-            output=self.appearance,
-            lifted=lifted,
-        )
+        before = self.before | {"lifted": self.folder / "lifted.json"}
+        appearance(**before, settings=chosen, seed=seed, device="cpu", output=self.appearance)
         return StageRecord.load(self.appearance)
 
     def roll(self, step: np.ndarray, name: str, frames: int = FRAMES) -> object:
@@ -60,14 +53,7 @@ class Scene:
 
     def render(self, rollout, chosen: Config) -> tuple[StageRecord, pd.DataFrame]:
         output = rollout.with_name("render.json")
-        before = {"masks": self.masks, "appearance": self.appearance, "rollout": rollout}
-        render(
-            capture=self.capture.folder / "capture.json",
-            observations=self.folder / "observations.npz",
-            settings=chosen,
-            device="cpu",
-            output=output,
-            **before,
-        )
+        before = self.before | {"appearance": self.appearance, "rollout": rollout}
+        render(**before, observations=self.folder / "observations.npz", settings=chosen, device="cpu", output=output)
         record = StageRecord.load(output)
         return record, pd.read_parquet(record.file("frames", output)) if "frames" in record.files else None

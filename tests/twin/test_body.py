@@ -10,7 +10,6 @@ import pytest
 import neuspring
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
-from neuspring.core.provenance import imported_modules
 from neuspring.physics.rod_nodes import RodFrames
 from neuspring.physics.solver import FrameSolver
 from neuspring.twin import body as module
@@ -36,17 +35,6 @@ def test_no_room_above_tells_a_rod_from_a_lattice():
     lines = [(path.relative_to(PACKAGE), line) for path in places for line in path.read_text().splitlines()]
     found = [f"{path}: {line.strip()}" for path, line in lines if TOLD_APART.search(line)]
     assert not found, "\n".join(found)
-
-
-def test_files_of_the_twin_and_the_simulator_import_in_one_direction():
-    """Lazy and type-only imports included."""
-    paths = [path for room in ("physics", "twin") for path in (PACKAGE / room).rglob("*.py") if path.name != "__init__.py"]
-    names = {".".join(["neuspring", *path.relative_to(PACKAGE).with_suffix("").parts]) for path in paths}
-    left = {name: imported_modules(name) & names - {name} for name in names}
-    while free := [name for name, below in left.items() if not below & left.keys()]:
-        for name in free:
-            del left[name]
-    assert not left, sorted(left)
 
 
 def test_every_body_answers_for_its_twin(twins):

@@ -34,12 +34,11 @@ def in_unit(factor: float, kind: str, losses: config.Losses, **settings: object)
     problem = small.fit_problem(kind=kind, fit=fit, losses=losses)
     topology, material, simulation = problem.twin.topology, problem.twin.material, problem.twin.simulation
     scaled = {name: getattr(topology, name) * np.float32(factor) for name in ("nodes", "controllers", "rest_lengths")}
+    stiffness = material.stiffness * np.float32(factor)
     twin = replace(
         problem.twin,
         topology=replace(topology, **scaled),
-        material=replace(
-            material, stiffness=material.stiffness * np.float32(factor), contact_distance=material.contact_distance * factor
-        ),
+        material=replace(material, stiffness=stiffness, contact_distance=material.contact_distance * factor),
         simulation=replace(simulation, gravity=simulation.gravity * factor, ground=False),
     )
     return replace(problem, observations=seen, twin=twin)

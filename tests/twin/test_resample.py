@@ -44,16 +44,10 @@ def twin_of(seen: Observations, spacing: float) -> Twin:
     """A twin whose stiffness grows fourfold along x."""
     topology = uniform_topology(seen.nodes, seen.controller_points[0], 2.3 * spacing, 30, 0.06, 50)
     middle = topology.canonical[topology.springs].mean(axis=1)
-    material = Material(
-        stiffness=2e3 * 2.0 ** (middle[:, 0] / 0.15),
-        dashpot=np.full(len(topology.springs), 2.0),
-        drag=1.0,
-        ground_elasticity=0.5,
-        ground_friction=0.3,
-        contact_elasticity=0.5,
-        contact_friction=0.3,
-        contact_distance=0.02,
-    )
+    scalars = dict.fromkeys(("ground_elasticity", "contact_elasticity"), 0.5) | {"drag": 1.0, "contact_distance": 0.02}
+    scalars |= dict.fromkeys(("ground_friction", "contact_friction"), 0.3)
+    stiffness, dashpot = 2e3 * 2.0 ** (middle[:, 0] / 0.15), np.full(len(topology.springs), 2.0)
+    material = Material(stiffness=stiffness, dashpot=dashpot, **scalars)
     twin = Twin(topology=topology, material=material, simulation=Simulation(frame_time=1 / RATE, substeps=1, ground=False))
     count = stability.smallest_safe_substeps(stability.twin_spectrum(twin), 1 / RATE, 0.8)
     return replace(twin, simulation=replace(twin.simulation, substeps=count))

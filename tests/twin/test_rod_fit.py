@@ -109,16 +109,9 @@ def test_what_a_rod_cannot_be_fitted_to_is_refused():
     with pytest.raises(InputError, match=r"markers along the line.*rod_single"):
         search_rod(rope, [rope], ropes.SETTINGS)
     twin = rod_twin(cable("one", 0), SETTINGS, AXIS)
+    settings = {name: getattr(SETTINGS, name) for name in ("fit", "simulation", "losses")} | {"quirks": SETTINGS.released_quirks}
     with pytest.raises(InputError, match="a rod is fitted as rod; received field"):
-        FitProblem(
-            observations=cable("one", 0),
-            twin=twin,
-            fit=SETTINGS.fit,
-            simulation=SETTINGS.simulation,
-            losses=SETTINGS.losses,
-            quirks=SETTINGS.released_quirks,
-            kind="field",
-        )
+        FitProblem(observations=cable("one", 0), twin=twin, kind="field", **settings)
 
 
 def test_slopes_are_derivatives_of_rollouts():

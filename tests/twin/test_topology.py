@@ -12,19 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from neuspring.core.errors import InputError
-from neuspring.twin.topology import (
-    MIN_LENGTH,
-    REPAIR_SPRINGS,
-    controller_reach,
-    controller_springs,
-    distances,
-    joined,
-    node_spacing,
-    object_springs,
-    piecewise_topology,
-    regions,
-    uniform_topology,
-)
+from neuspring.twin import topology as graphs
 from tests.support.clips import NAMES, clip
 
 LENGTH = 2e-7
@@ -46,7 +34,7 @@ def undirected(springs: np.ndarray) -> set[tuple[int, int]]:
 
 def same(nodes: np.ndarray, radius: float, neighbors: int) -> np.ndarray:
     """Object springs with one radius and neighbor count."""
-    return object_springs(nodes, np.full(len(nodes), radius), np.full(len(nodes), neighbors))
+    return graphs.object_springs(nodes, np.full(len(nodes), radius), np.full(len(nodes), neighbors))
 
 
 def test_springs_and_rest_lengths_are_those_of_the_rest_shape() -> None:
@@ -54,8 +42,8 @@ def test_springs_and_rest_lengths_are_those_of_the_rest_shape() -> None:
     shape = np.concatenate([cloud(3, 12), cloud(4, 2)])
     labels = (np.arange(12) % 2).astype(np.int32)
     rules = (labels, [0.4, 0.6], [4, 5], 0.5, 3)
-    straight = piecewise_topology(nodes, hands, *rules, rest_shape=shape)
-    other = piecewise_topology(shape[:12], shape[12:], *rules)
+    straight = graphs.piecewise_topology(nodes, hands, *rules, rest_shape=shape)
+    other = graphs.piecewise_topology(shape[:12], shape[12:], *rules)
     np.testing.assert_array_equal(straight.springs, other.springs)
     np.testing.assert_array_equal(straight.rest_lengths, other.rest_lengths)
     np.testing.assert_array_equal(straight.canonical, other.canonical)
@@ -71,7 +59,7 @@ def test_golden_springs(name: str) -> None:
     """The same set of springs as the released code builds from the same points, and the same rest lengths."""
     c = clip(name)
     recorded = c.twin.topology
-    topology = uniform_topology(recorded.nodes, c.controllers[0], *c.topology_params)
+    topology = graphs.uniform_topology(recorded.nodes, c.controllers[0], *c.topology_params)
     assert undirected(topology.springs) == undirected(recorded.springs)
     assert topology.object_spring_count == c.object_springs
     order = {tuple(sorted(pair)): length for pair, length in zip(topology.springs.tolist(), topology.rest_lengths, strict=True)}
@@ -92,7 +80,7 @@ def brute(nodes: np.ndarray, radius: np.ndarray, neighbors: np.ndarray) -> set[t
     for i, node in enumerate(nodes):
         distance = np.linalg.norm(nodes - node, axis=1)
         for j in np.argsort(distance, kind="stable")[: neighbors[i]]:
-            if j != i and MIN_LENGTH < distance[j] < radius[i]:
+            if j != i and graphs.MIN_LENGTH < distance[j] < radius[i]:
                 pairs.add((min(i, int(j)), max(i, int(j))))
     return pairs
 
@@ -103,20 +91,20 @@ def test_object_springs_are_the_union_of_what_nodes_ask_for(seed: int, count: in
     """Also with a radius and a count of its own for every node, as piecewise topologies have."""
     rng, nodes = np.random.default_rng(seed), cloud(seed, count)
     radius, neighbors = rng.uniform(0.05, 0.8, count), rng.integers(1, 12, count)
-    assert undirected(object_springs(nodes, radius, neighbors)) == brute(nodes, radius, neighbors)
+    assert undirected(graphs.object_springs(nodes, radius, neighbors)) == brute(nodes, radius, neighbors)
 
 
 def test_the_radius_is_strict() -> None:
     nodes = np.array([[0.0, 0, 0], [0.5, 0, 0]])
     assert len(same(nodes, 0.5, 5)) == 0
     assert len(same(nodes, np.nextafter(0.5, 1), 5)) == 1
-    assert len(controller_springs(nodes[:1], nodes[1:], 0.5, 5)) == 0
-    assert len(controller_springs(nodes[:1], nodes[1:], np.nextafter(0.5, 1), 5)) == 1
+    assert len(graphs.controller_springs(nodes[:1], nodes[1:], 0.5, 5)) == 0
+    assert len(graphs.controller_springs(nodes[:1], nodes[1:], np.nextafter(0.5, 1), 5)) == 1
 
 
 def test_springs_must_be_longer_than_the_minimum() -> None:
     """Nearly coincident nodes get no spring between them, and the node itself uses up one of its neighbors."""
-    nodes = np.array([[0.0, 0, 0], [MIN_LENGTH / 2, 0, 0], [0.3, 0, 0]])
+    nodes = np.array([[0.0, 0, 0], [graphs.MIN_LENGTH / 2, 0, 0], [0.3, 0, 0]])
     assert undirected(same(nodes, 1.0, 3)) == {(0, 2), (1, 2)}
     assert undirected(same(nodes, 1.0, 1)) == set()
 
@@ -128,21 +116,21 @@ def test_duplicate_nodes_are_not_joined(copies: int) -> None:
 
 
 def test_controllers_ask_for_nodes_only_and_without_a_minimum_length() -> None:
-    nodes, hands = np.array([[0.0, 0, 0], [0.2, 0, 0], [9, 0, 0]]), np.array([[MIN_LENGTH / 2, 0, 0], [0.01, 0, 0]])
-    springs = controller_springs(nodes, hands, 1.0, 5)
+    nodes, hands = np.array([[0.0, 0, 0], [0.2, 0, 0], [9, 0, 0]]), np.array([[graphs.MIN_LENGTH / 2, 0, 0], [0.01, 0, 0]])
+    springs = graphs.controller_springs(nodes, hands, 1.0, 5)
     assert springs.tolist() == [[3, 0], [3, 1], [4, 0], [4, 1]]
-    assert controller_springs(nodes, hands, 1.0, 1).tolist() == [[3, 0], [4, 0]]
-    assert controller_springs(nodes, hands, 1e-6, 5).shape == (0, 2)
+    assert graphs.controller_springs(nodes, hands, 1.0, 1).tolist() == [[3, 0], [4, 0]]
+    assert graphs.controller_springs(nodes, hands, 1e-6, 5).shape == (0, 2)
 
 
 def test_a_controller_on_a_node_is_refused() -> None:
     nodes = np.array([[0.0, 0, 0], [0.2, 0, 0]])
     with pytest.raises(InputError, match=r"controller may not coincide.*zero-length spring \[2, 1\]"):
-        uniform_topology(nodes, nodes[1:], 0.5, 5, 0.5, 5)
+        graphs.uniform_topology(nodes, nodes[1:], 0.5, 5, 0.5, 5)
 
 
 def test_a_topology_may_have_no_springs() -> None:
-    topology = uniform_topology(np.array([[0.0, 0, 0]]), np.array([[5.0, 0, 0]]), 0.1, 5, 0.1, 5)
+    topology = graphs.uniform_topology(np.array([[0.0, 0, 0]]), np.array([[5.0, 0, 0]]), 0.1, 5, 0.1, 5)
     assert topology.springs.shape == (0, 2)
     assert topology.object_spring_count == 0
 
@@ -158,13 +146,13 @@ def blocks(counts: tuple[int, ...] = (6, 9, 4)) -> np.ndarray:
 
 
 def test_regions_are_found_and_numbered_by_centroid() -> None:
-    labels = regions(blocks(), 3)
+    labels = graphs.regions(blocks(), 3)
     assert labels.tolist() == [2] * 4 + [1] * 9 + [0] * 6
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 25])
 def test_every_region_has_a_node_and_numbers_have_no_gaps(count: int) -> None:
-    labels = regions(cloud(1), count)
+    labels = graphs.regions(cloud(1), count)
     assert (labels.shape, labels.dtype) == ((25,), np.int32)
     assert np.unique(labels).tolist() == list(range(count))
 
@@ -173,20 +161,20 @@ def test_equal_coordinates_of_centroids_are_ties() -> None:
     """Groups whose centroids differ in x by rounding alone are ordered by y, then by z."""
     corner = np.array([[0.0, 0, 0], [0.01, 0, 0], [0, 0.01, 0]])
     places = np.array([[0.1, 1, 0], [0.1 + 1e-9, 0, 1], [0.1, 0, 0]])
-    labels = regions(np.concatenate([corner + place for place in places]), 3)
+    labels = graphs.regions(np.concatenate([corner + place for place in places]), 3)
     assert labels.tolist() == [2] * 3 + [1] * 3 + [0] * 3
 
 
 def test_more_regions_than_nodes_are_refused() -> None:
     with pytest.raises(InputError, match=r"search\.clusters: .* need at least 5 nodes; received 4 nodes"):
-        regions(cloud(0, 4), 5)
-    regions(cloud(0, 5), 5)
+        graphs.regions(cloud(0, 4), 5)
+    graphs.regions(cloud(0, 5), 5)
 
 
 @pytest.mark.parametrize("count", [0, -1])
 def test_less_than_one_region_is_refused(count: int) -> None:
     with pytest.raises(InputError, match=r"search\.clusters"):
-        regions(cloud(0), count)
+        graphs.regions(cloud(0), count)
 
 
 # Piecewise ------------------------------------------------------------------------------------------------------------
@@ -196,9 +184,9 @@ def test_less_than_one_region_is_refused(count: int) -> None:
 @given(seed=seeds, count=st.integers(2, 5))
 def test_equal_regions_are_the_uniform_topology(seed: int, count: int) -> None:
     nodes, hands = cloud(seed), cloud(seed + 1, 2) + 0.3
-    labels = regions(nodes, count)
-    pieces = piecewise_topology(nodes, hands, labels, [0.3] * count, [6] * count, 0.5, 4)
-    whole = uniform_topology(nodes, hands, 0.3, 6, 0.5, 4)
+    labels = graphs.regions(nodes, count)
+    pieces = graphs.piecewise_topology(nodes, hands, labels, [0.3] * count, [6] * count, 0.5, 4)
+    whole = graphs.uniform_topology(nodes, hands, 0.3, 6, 0.5, 4)
     np.testing.assert_array_equal(pieces.springs, whole.springs)
     np.testing.assert_array_equal(pieces.rest_lengths, whole.rest_lengths)
     np.testing.assert_array_equal(pieces.labels, labels)
@@ -213,8 +201,8 @@ def test_node_order_permutes_labels_and_springs_and_changes_nothing_else(seed: i
     values = [0.35, 0.3, 0.05], [7, 4, 3], 0.4, 3
 
     def graph(points: np.ndarray) -> tuple[np.ndarray, dict[tuple[int, int], float], int]:
-        labels = regions(points, 3)
-        topology = piecewise_topology(points, hands, labels, *values, repair=repair)
+        labels = graphs.regions(points, 3)
+        topology = graphs.piecewise_topology(points, hands, labels, *values, repair=repair)
         pairs = [tuple(sorted(pair)) for pair in topology.springs.tolist()]
         return labels, dict(zip(pairs, topology.rest_lengths.tolist(), strict=True)), topology.object_spring_count
 
@@ -233,7 +221,7 @@ def test_a_spring_across_a_border_exists_if_either_side_asks() -> None:
     labels = np.array([0, 0, 1, 1], np.int32)
 
     def springs(radius: list[float], neighbors: list[int]) -> set[tuple[int, int]]:
-        return undirected(piecewise_topology(nodes, nobody, labels, radius, neighbors, 0.1, 1).springs)
+        return undirected(graphs.piecewise_topology(nodes, nobody, labels, radius, neighbors, 0.1, 1).springs)
 
     assert springs([0.15, 0.01], [5, 5]) == {(0, 1), (1, 2)}, "the left region asks"
     assert springs([0.01, 0.15], [5, 5]) == {(1, 2), (2, 3)}, "the right region asks"
@@ -249,20 +237,22 @@ def test_calibrated_controller_springs_rest_in_frame_0_and_body_springs_in_the_r
     nodes, hands, one = cloud(3), cloud(4, 3), np.zeros(25, np.int32)
     rest_shape = np.concatenate([cloud(5), cloud(6, 3)])
     plain, calibrated = (
-        piecewise_topology(nodes, hands, one, [0.5], [6], 0.6, 4, rest_shape=rest_shape, controller_rest=rest)
+        graphs.piecewise_topology(nodes, hands, one, [0.5], [6], 0.6, 4, rest_shape=rest_shape, controller_rest=rest)
         for rest in ("rest_shape", "first_frame")
     )
     np.testing.assert_array_equal(calibrated.springs, plain.springs)
     body, frame0 = plain.object_spring_count, np.concatenate([nodes, hands])
     assert 0 < body < len(plain.springs)
     np.testing.assert_array_equal(calibrated.rest_lengths[:body], plain.rest_lengths[:body])
-    np.testing.assert_allclose(plain.rest_lengths, distances(rest_shape, plain.springs), rtol=LENGTH)
-    np.testing.assert_allclose(calibrated.rest_lengths[body:], distances(frame0, plain.springs[body:]), rtol=LENGTH)
+    np.testing.assert_allclose(plain.rest_lengths, graphs.distances(rest_shape, plain.springs), rtol=LENGTH)
+    np.testing.assert_allclose(calibrated.rest_lengths[body:], graphs.distances(frame0, plain.springs[body:]), rtol=LENGTH)
 
 
 def test_another_place_of_rest_is_refused() -> None:
     with pytest.raises(InputError, match=r"rest_shape.*first_frame.*'hands'"):
-        replace(piecewise_topology(cloud(3), cloud(4, 3), np.zeros(25, np.int32), [0.5], [6], 0.6, 4), controller_rest="hands")
+        replace(
+            graphs.piecewise_topology(cloud(3), cloud(4, 3), np.zeros(25, np.int32), [0.5], [6], 0.6, 4), controller_rest="hands"
+        )
 
 
 # One piece ------------------------------------------------------------------------------------------------------------
@@ -277,10 +267,10 @@ def pieces(count: int, springs: np.ndarray) -> int:
 
 def test_a_node_without_a_spring_asks_for_its_nearest_nodes_behind_the_springs_that_are_there() -> None:
     nodes = np.array([[0.0, 0, 0], [1, 0, 0], [2.1, 0, 0], [4.6, 0, 0]])
-    mended = joined(nodes, TWO)
+    mended = graphs.joined(nodes, TWO)
     assert mended.tolist() == [[0, 1], [2, 1], [3, 2], [3, 1], [3, 0]]
-    assert len(mended) - len(TWO) == REPAIR_SPRINGS
-    np.testing.assert_array_equal(joined(nodes[:3], TWO), TWO, err_msg="it is one piece")
+    assert len(mended) - len(TWO) == graphs.REPAIR_SPRINGS
+    np.testing.assert_array_equal(graphs.joined(nodes[:3], TWO), TWO, err_msg="it is one piece")
 
 
 def test_a_part_behind_a_gap_is_joined_along_its_seam() -> None:
@@ -291,13 +281,13 @@ def test_a_part_behind_a_gap_is_joined_along_its_seam() -> None:
     nodes = np.concatenate([large, small])
     torn = same(nodes, 1.2, 9)
     assert pieces(len(nodes), torn) == 2
-    mended = joined(nodes, torn)
+    mended = graphs.joined(nodes, torn)
     np.testing.assert_array_equal(mended[: len(torn)], torn)
     seam = mended[len(torn) :]
     assert pieces(len(nodes), mended) == 1
     assert set(seam[:, 0].tolist()) == set(range(len(large), len(nodes))), "the smaller part asks, all along"
     assert set(nodes[seam[:, 1], 1]) == {2.0}, "for the row that is nearest"
-    assert len(seam) == REPAIR_SPRINGS * len(small)
+    assert len(seam) == graphs.REPAIR_SPRINGS * len(small)
 
 
 def test_a_seam_is_no_longer_than_the_part_that_is_near() -> None:
@@ -305,25 +295,25 @@ def test_a_seam_is_no_longer_than_the_part_that_is_near() -> None:
     body = np.stack(np.meshgrid(np.arange(4.0), np.arange(4.0), [0.0], indexing="ij"), -1).reshape(-1, 3)
     row = np.array([[6.0 + k, 0, 0] for k in range(5)])
     nodes = np.concatenate([body, row])
-    mended = joined(nodes, same(nodes, 1.2, 5))
+    mended = graphs.joined(nodes, same(nodes, 1.2, 5))
     assert pieces(len(nodes), mended) == 1
-    long = mended[distances(nodes, mended) > 1.2]
+    long = mended[graphs.distances(nodes, mended) > 1.2]
     assert set(long.ravel().tolist()) & set(range(16, 21)) == {16, 17}
 
 
 def test_many_parts_become_one_whatever_is_near_to_what() -> None:
     """Pairs that are nearer to each other than to the body join first, and then the body."""
     nodes = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [20, 0, 0], [21, 0, 0], [23, 0, 0], [24, 0, 0]])
-    mended = joined(nodes, np.array([[0, 1], [1, 2], [2, 3], [4, 5], [6, 7]]))
+    mended = graphs.joined(nodes, np.array([[0, 1], [1, 2], [2, 3], [4, 5], [6, 7]]))
     assert pieces(8, mended) == 1
-    assert pieces(6, joined(nodes[:6], np.zeros((0, 2), int))) == 1, "from no spring at all"
+    assert pieces(6, graphs.joined(nodes[:6], np.zeros((0, 2), int))) == 1, "from no spring at all"
 
 
 def test_repair_joins_what_hangs_on_a_hand_alone() -> None:
     nodes, hands = np.array([[0.0, 0, 0], [0.1, 0, 0], [1, 0, 0], [2, 0, 0]]), np.array([[2.0, 0.05, 0]])
     one, values = np.zeros(4, np.int32), ([0.2], [5], 0.1, 5)
-    assert undirected(piecewise_topology(nodes, hands, one, *values).springs) == {(0, 1), (3, 4)}
-    mended = piecewise_topology(nodes, hands, one, *values, repair=True)
+    assert undirected(graphs.piecewise_topology(nodes, hands, one, *values).springs) == {(0, 1), (3, 4)}
+    mended = graphs.piecewise_topology(nodes, hands, one, *values, repair=True)
     assert undirected(mended.springs) == {(0, 1), (3, 4), (1, 2), (2, 3), (0, 2), (0, 3), (1, 3)}
     assert mended.object_spring_count == 6
 
@@ -332,7 +322,7 @@ def test_repair_joins_what_hangs_on_a_hand_alone() -> None:
 def test_nodes_at_the_same_place_are_no_partners(copies: int) -> None:
     nodes = np.concatenate([np.zeros((copies, 3)), np.eye(3), 2 * np.eye(3)])
     chain = np.array([[copies + i, copies + j] for i in range(6) for j in range(i)])
-    mended = joined(nodes, chain)
+    mended = graphs.joined(nodes, chain)
     assert undirected(mended) == undirected(chain) | {(i, copies + j) for i in range(copies) for j in range(3)}
 
 
@@ -352,7 +342,7 @@ def rings(count: int, of: int, apart: float, radius: float) -> np.ndarray:
 
 @pytest.mark.parametrize("counts", [(40, 1, 1), (15, 15, 1), (9, 8, 7)])
 def test_a_grid_has_the_spacing_of_its_nodes(counts):
-    assert node_spacing(0.018 * lattice(*counts)) == pytest.approx(0.018, rel=DOUBLE)
+    assert graphs.node_spacing(0.018 * lattice(*counts)) == pytest.approx(0.018, rel=DOUBLE)
 
 
 @pytest.mark.parametrize("of", [3, 4, 8])
@@ -360,34 +350,34 @@ def test_rings_of_near_nodes_have_the_distance_of_the_rings(of):
     cable = rings(40, of, apart=0.025, radius=0.006)
     nearest = np.linalg.norm(cable[1:of] - cable[0], axis=1).min()
     assert nearest < 0.025 / 2
-    assert node_spacing(cable) == pytest.approx(0.025, rel=DOUBLE)
+    assert graphs.node_spacing(cable) == pytest.approx(0.025, rel=DOUBLE)
 
 
 def test_it_scales_with_the_body_and_forgets_the_order_of_its_nodes():
     rng = np.random.default_rng(0)
     nodes = lattice(12, 12, 1) + 0.3 * rng.random((144, 3))
-    expected = node_spacing(nodes)
-    assert node_spacing(1000 * nodes) == pytest.approx(1000 * expected, rel=DOUBLE)
-    assert node_spacing(nodes[rng.permutation(144)]) == pytest.approx(expected, rel=DOUBLE)
+    expected = graphs.node_spacing(nodes)
+    assert graphs.node_spacing(1000 * nodes) == pytest.approx(1000 * expected, rel=DOUBLE)
+    assert graphs.node_spacing(nodes[rng.permutation(144)]) == pytest.approx(expected, rel=DOUBLE)
 
 
 def test_holes_and_nodes_at_the_same_place_do_not_count():
     rope = lattice(60, 1, 1)
     holes = np.delete(rope, [10, 11, 30], axis=0)
-    assert node_spacing(holes) == pytest.approx(1.0, rel=DOUBLE)
-    assert node_spacing(np.concatenate([rope, rope[::3]])) == pytest.approx(1.0, rel=DOUBLE)
+    assert graphs.node_spacing(holes) == pytest.approx(1.0, rel=DOUBLE)
+    assert graphs.node_spacing(np.concatenate([rope, rope[::3]])) == pytest.approx(1.0, rel=DOUBLE)
 
 
 def test_parts_that_lie_farther_than_any_neighbor_are_a_forest():
     body = lattice(8, 8, 1)
-    assert node_spacing(np.concatenate([body, body + 1000])) == pytest.approx(1.0, rel=DOUBLE)
+    assert graphs.node_spacing(np.concatenate([body, body + 1000])) == pytest.approx(1.0, rel=DOUBLE)
 
 
 def test_one_place_has_no_spacing():
     with pytest.raises(InputError, match="two nodes at different places"):
-        node_spacing(np.ones((3, 3)))
+        graphs.node_spacing(np.ones((3, 3)))
 
 
 def test_the_reach_is_that_of_the_nearest_controller():
     hands = np.array([[0.0, 0.0, 2.0], [3.0, 0.0, 0.5], [0.0, 0.0, 9.0]])
-    assert controller_reach(lattice(5, 5, 1), hands) == 0.5
+    assert graphs.controller_reach(lattice(5, 5, 1), hands) == 0.5

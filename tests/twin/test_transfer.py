@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from neuspring import config
-from neuspring.core.artifacts import Observations, Twin
+from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.scenes import mocap
 from neuspring.twin.candidates import candidate
@@ -135,12 +135,6 @@ def test_a_twin_on_other_nodes_keeps_where_its_hands_touch():
     assert topology.rest_lengths[topology.pushes].max() <= touch * (1 + SINGLE)
 
 
-def test_a_twin_remembers_where_its_grips_rest(tmp_path):
-    _, twin, _ = calibrated()
-    twin.save(tmp_path / "twin.npz")
-    assert Twin.load(tmp_path / "twin.npz").topology.controller_rest == "first_frame"
-
-
 def test_more_substeps_where_the_new_distances_need_them():
     problem = small.fit_problem()
     seen = problem.observations
@@ -206,9 +200,7 @@ def test_a_pool_whose_rings_are_turned_about_the_cable_is_refused(tmp_path):
         here.nodes, here.controller_points[0], np.zeros(len(here.nodes), int), [0.07], [20], 0.02, 5, repair=True
     )
     assert corresponds(topology, turned), "lengths of springs do not tell"
-    with pytest.raises(
-        InputError, match=r"pool of cable_0\.3: node i of a cable.*; received \d+ degrees in cable_0\.45.*mocap\.roll"
-    ):
+    with pytest.raises(InputError, match=r"pool of cable_0\.3: node i .*; received \d+ degrees in cable_0\.45.*mocap\.roll"):
         require_pool(here, [turned])
     # Nodes around the line are the lattice's affair: a rod follows the markers alone.
     settings = config.Config()
