@@ -129,10 +129,11 @@ def _short(value: Any) -> str:
     return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 3]}..."
 
 
-def stamp_of(results: str, told: Iterable[str], *modules: str) -> str:
-    """A digest of what a job of no stage is told, wherever the results folder lies, and of the code of its modules."""
-    # As a path of its own, and as a setting in JSON.
+def stamp_of(results: str, root: Path, told: Iterable[str], *modules: str) -> str:
+    """A digest of what a job of no stage is told, wherever results and project `root` lie, and of the code of its modules."""
+    # As a path of its own, and as a setting in JSON; before the root, in which the results may lie.
     words = [re.sub(rf"^{re.escape(results)}(?=/|$)", ".", word.replace(f": {json.dumps(results)}", ': "."')) for word in told]
+    words = [word.replace(f"{root}/", "") for word in words]
     return hashlib.sha256(json.dumps([words, code_digest(*modules)]).encode()).hexdigest()[:16]
 
 

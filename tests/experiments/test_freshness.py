@@ -150,9 +150,14 @@ def test_what_is_made_again_is_said_once_for_jobs_alike():
 
 def test_a_stamp_follows_words_and_code_and_not_the_place_of_the_results(tmp_path):
     words = ["--results", "a/b", "--output", "a/b/tables", "--methods", "a", "--settings", '{"results": "a/b", "seeds": [0]}']
-    moved = [word.replace("a/b", "c") for word in words]
-    assert stamp_of("a/b", words, "neuspring.core.text") == stamp_of("c", moved, "neuspring.core.text")
-    assert stamp_of("a/b", words, "neuspring.core.text") != stamp_of("a/b", [*words, "b"], "neuspring.core.text")
+    words.append("/project/config/studies.yaml")
+
+    def stamp(results: str, root: str = "/project") -> str:
+        told = [word.replace("a/b", results).replace("/project", root) for word in words]
+        return stamp_of(results, Path(root), told, "neuspring.core.text")
+
+    assert stamp("a/b") == stamp("c") == stamp("/project/res ults") == stamp("/elsewhere", "/moved") == stamp("/moved/c", "/moved")
+    assert stamp("a/b") != stamp_of("a/b", Path("/project"), [*words, "b"], "neuspring.core.text")
     log = tmp_path / "logs" / "tables" / "tables.log"
     assert not stamped(tmp_path, log, "x")
     of_log = JobRecord.of_log(tmp_path, log)

@@ -219,9 +219,7 @@ def stamped_job(rule, name, output, told, *modules):
     """
 
     def stamp(wildcards):
-        # Wherever the project lies.
-        words = [word.replace(f"{ROOT}/", "") for word in told(wildcards)]
-        return stamp_of(RESULTS, words, *modules)
+        return stamp_of(RESULTS, ROOT, told(wildcards), *modules)
 
     log = log_of(rule, name)
     return log, compared_with_stamp(log, output, stamp), stamp
