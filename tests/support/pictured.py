@@ -30,8 +30,12 @@ class Scene:
         self.capture, self.folder = capture, folder
         self.observations = perceived(capture, folder)
         self.masks = [folder / camera / "masks.json" for camera in capture.cameras]
-        self.before = {"capture": capture.folder / "capture.json", "masks": self.masks}
         self.appearance = folder / "appearance" / "appearance.json"
+
+    @property
+    def before(self) -> dict[str, object]:
+        """Inputs of both steps; tests put other parts into the scene."""
+        return {"capture": self.capture.folder / "capture.json", "masks": self.masks}
 
     def learn(self, chosen: Config, seed: int = 0) -> StageRecord:
         self.appearance.parent.mkdir(exist_ok=True)
