@@ -4,7 +4,7 @@
     predicted = ns.roll_out(run.twin, run.observations)
     print(ns.score(predicted, run.observations))
 
-The workflow's stages call the same functions with the same defaults, so that results are equal.
+The workflow's stages call the same functions, so that results are equal.
 """
 
 from __future__ import annotations
@@ -91,7 +91,8 @@ def search(
     from neuspring.twin.body import BODIES, SearchOptions
 
     read, device = read_settings(settings), resolve_device(device)
-    options = SearchOptions(clusters=clusters or read.clusters, seed=seed, device=device, threads=threads, record=record)
+    regions = read.clusters if clusters is None else clusters
+    options = SearchOptions(clusters=regions, seed=seed, device=device, threads=threads, record=record)
     return BODIES[body].search(observations, (), read, options)
 
 

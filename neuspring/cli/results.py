@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from neuspring.scores.paper import Study
     from neuspring.scores.runs import Collected
 
+OnDisk = Annotated[tuple[str, ...], arg(help="all on disk by default")]
 Names = Annotated[tuple[str, ...], arg(help="those of the settings, else all on disk, by default")]
 Scores = Annotated[Path | None, arg(help="instead of run records: a scores.csv that tables wrote, on any machine")]
 LeftOut = Annotated[str, arg(help="JSON: methods and the scenarios to which they do not apply, with reasons")]
@@ -32,8 +33,8 @@ Tables = Annotated[str, arg(help="folder of tables in the results folder")]
 def tables(
     output: Folder,
     results: Results = Path("results"),
-    scenarios: Names = (),
-    methods: Names = (),
+    scenarios: OnDisk = (),
+    methods: OnDisk = (),
     seeds: tuple[int, ...] = (),
     transfers: Transfers = (),
     baseline: Annotated[str | None, arg(help="method that others are compared with; the first by default")] = None,
@@ -180,6 +181,8 @@ def explain(
         print(known(results, folder))
         return 0
     if runs := runs_of(what, results):
+        if json:
+            raise InputError("--json", "is for a number", what, "The records of a run are JSON themselves: its run.json.")
         found = [run_text(path) for path in runs]
         print("\n\n".join(lines for lines, _ in found))
         return 0 if all(good for _, good in found) else 1
@@ -259,7 +262,7 @@ def log(
 
 
 def sync(results: Results = Path("results"), settings: Settings = "{}") -> int:
-    """Send to MLflow what is missing there, and close runs that were killed; 1 where something could not be sent."""
+    """Send to MLflow what is missing there; 1 where something could not be sent."""
     from neuspring.experiments.tracking import log
 
     outcomes = log.sync(results, read_settings(settings).tracking, progress=print)

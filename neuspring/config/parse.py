@@ -106,6 +106,8 @@ def read_rows(kind: type[T], path: Path, what: str) -> dict[str, T]:
     table: dict[str, Any] = {}
     for name, row in read_yaml(path).items():
         values = row.pop("each", None) if isinstance(row, dict) else None
+        if values is not None and not (isinstance(values, list) and values):
+            raise InputError(f"{path}, {what} {name}", "each: a list of at least one value is required", values)
         for value in [None] if values is None else values:
             table[str(name).replace("{each}", str(value))] = row if value is None else _filled(row, str(value))
     return {name: parse(kind, _extended(table, name, path, what, ()), f"{path}, {what} {name}") for name in table}
@@ -118,6 +120,8 @@ def _extended(table: Mapping[str, Any], name: str, path: Path, what: str, below:
     row = table[name]
     if not isinstance(row, dict) or "extends" not in row:
         return row
+    if not isinstance(row["extends"], str):
+        raise InputError(f"{path}, {what} {name}", "extends: the name of a row is required", row["extends"])
     whole = copy.deepcopy(_extended(table, row["extends"], path, what, (*below, name)))
     merge(whole, {key: value for key, value in row.items() if key != "extends"})
     return whole

@@ -208,7 +208,7 @@ class Scenario(Artifact):
     kind: ClassVar[str] = "scenario"
     name: str
     source: str
-    """The kind of its data, a name of `SOURCES` (data/sources.py)."""
+    """The kind of its data, a name of `SOURCES` (scenes/sources.py)."""
     category: str
     frame_count: int
     train_end: int
@@ -251,7 +251,7 @@ class Scenario(Artifact):
 class ImageObservations(Artifact):
     """Observations of one calibrated camera without depth: the object in training frames, the hands in all frames.
 
-    A capture that brings hands in space (data/points.py) has none here: H = 0, and `hand_of` is empty.
+    A capture that brings hands in space (intake/points.py) has none here: H = 0, and `hand_of` is empty.
 
     Pixel centers lie at whole coordinates, x right, y down (data/capture.py).
     """

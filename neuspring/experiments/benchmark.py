@@ -194,6 +194,11 @@ class Benchmark:
     def _whole(self, given: Config, rows: Mapping[str, ScenarioRow]) -> Config:
         """The configuration with all methods that stand in it by a study or by its data."""
         _require_known("studies", given.studies, self.studies, given.study_table)
+        if absent := [name for name in given.methods if name not in self.table]:
+            row = read_rows(Method, self.root / given.method_table, "method").get(absent[0])
+            if row and row.model in BASELINES.left_out:
+                remedy = "Restore its folder in neuspring/extensions, or leave the method out."
+                raise InputError(f"method {absent[0]}, model", "the extension that brings it was left out", row.model, remedy)
         _require_known("methods", given.methods, self.table, given.method_table)
         # The methods in the rows of its studies come too. If they add any, all are in the order of the method table.
         implied = {method for study in given.studies for method in rows_of(self.studies, study) if method in self.table}

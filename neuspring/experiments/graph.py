@@ -155,11 +155,6 @@ class Graph:
         """Files that say that a run is in MLflow; none where tracking is off."""
         return [path.replace("run.json", "mlflow.txt") for path in self.runs(methods) if self.config.tracking.enabled]
 
-    def study_runs(self, name: str) -> list[str]:
-        """The records that a study is made of."""
-        moved = self.transfers() if self.benchmark.studies[name].clips else ()
-        return [*self.runs(self.benchmark.methods_of(name)), *moved]
-
     def behind(self, stage: Stage, job: Any, known: set[str] | None = None) -> Iterator[tuple[Stage, Any]]:
         """The jobs behind a job, and then itself; not those of one camera."""
         known = set() if known is None else known
@@ -358,10 +353,10 @@ class Graph:
         studies = ["--studies", *self.whole.studies, *self._study_table()] if self.whole.studies else []
         return [*self._runs(output or self.folder), *self._transfers(), *compared, *objects, *aims, *studies, *settings]
 
-    def study(self, name: str) -> list[str]:
-        """Options of `neuspring study`."""
-        place = ["--results", self.results, "--tables", self.config.tables]
-        return ["--study", name, *place, "--output", f"{self.folder}/studies"]
+    def study(self, name: str, part: str = "") -> list[str]:
+        """Options of `neuspring study`, of the folder of tables or a part of it."""
+        tables = "/".join(word for word in (self.config.tables, part) if word)
+        return ["--study", name, "--results", self.results, "--tables", tables, "--output", f"{self.results}/{tables}/studies"]
 
     def _study_table(self) -> list[str]:
         return ["--table", str(self.root / self.config.study_table)]

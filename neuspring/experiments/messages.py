@@ -110,7 +110,10 @@ def failed(graph: Graph) -> None:
         # In a folder of their own: otherwise Snakemake would take the tables as finished.
         command, page = [sys.executable, "-m", "neuspring"], f"{graph.folder}/so_far/report.html"
         subprocess.run([*command, "tables", *graph.tables(f"{graph.folder}/so_far"), "--brief"], check=False)
-        subprocess.run([*command, "report", *graph.report(page)], check=False, stdout=subprocess.DEVNULL)
+        quiet: Any = {"check": False, "stdout": subprocess.DEVNULL}
+        for study in graph.whole.studies:
+            subprocess.run([*command, "study", *graph.study(study, "so_far")], **quiet)
+        subprocess.run([*command, "report", *graph.report(page)], **quiet)
         print(f"Report so far: {page}")
     lines = failure_lines(own, results) + damaged
     print("\n".join(["Failed:", *(f"  {line}" for line in lines)] if lines else []))
@@ -129,7 +132,9 @@ def finished(graph: Graph, seconds: float) -> None:
     if summary.exists():
         print(f"\n{headline(summary.read_text())}\n")
         tell_findings(Path(config.results), config.scenarios)
-        print(f"Open in a browser: {folder}/report.html (everything), {folder}/pictures.html (films of every method)")
+        pages = {f"{folder}/report.html": "everything", f"{folder}/pictures.html": "films of every method"}
+        there = [f"{page} ({what})" for page, what in pages.items() if Path(page).exists()]
+        print(f"Open in a browser: {', '.join(there)}" if there else "The report is made by the target `all`.")
         print(f"All tables: {summary}. Scores, trajectories, plots: {config.results}/<scenario>/<method>/<seed>/")
     for study in graph.benchmark.studies:
         path = Path(folder) / "studies" / f"{study}.md"

@@ -1,4 +1,4 @@
-"""Nodes of frame 0 that a capture brings (data/points.py) take the place of a supposed shape: they say how deep what the camera
+"""Nodes of frame 0 that a capture brings (intake/points.py) take the place of a supposed shape: they say how deep what the camera
 sees is, and are the nodes of the twin."""
 
 from __future__ import annotations

@@ -193,7 +193,7 @@ def known(results: Path, folder: Path) -> str:
         numbers = Numbers.load(folder, results)
         names = [" | ".join(dict.fromkeys(numbers.averages[column])) for column in ("method", "task", "metric")]
         lines += [f"A number of {folder}/summary.md: METHOD/TASK/METRIC, of\n  " + "\n  ".join(names)] if names[0] else []
-        lines += [f"A study: {name}/ROW/TASK/METRIC" for name in numbers.by_study]
+        lines += [f"A study: {name}/ROW/TASK/METRIC" for name, one in numbers.by_study.items() if isinstance(one, StudyNumbers)]
     more = [f"and {len(runs) - MOST_EXPLAINED} more"] if len(runs) > MOST_EXPLAINED else []
     return "\n".join([*lines, "A run: " + "\n       ".join([*runs[:MOST_EXPLAINED], *more])])
 

@@ -199,10 +199,14 @@ class Numbers:
         return {"": self, **({"moved": self.moved} if self.moved else {}), **self.by_study}
 
     def save(self, folder: Path) -> None:
-        """Write numbers.json."""
+        """Write numbers.json. Studies that it has and that are not made now stay in it, as their tables beside it do."""
+        earlier = read_json(folder / NUMBERS, NUMBERS_FORMAT) if (folder / NUMBERS).is_file() else {"shown": []}
+        kept = [name for name in earlier["shown"] if name not in self.studies]
         tables = {name: {table: _as_json(getattr(part, table)) for table in part.TABLES} for name, part in self._parts.items()}
         values = {"format": NUMBERS_FORMAT, "key": self.key, "baseline": self.baseline, "left_out": self.everything.left_out}
-        values |= {"studies": {name: asdict(study) for name, study in self.known_studies.items()}, "shown": list(self.studies)}
+        tables |= {name: earlier["tables"][name] for name in kept}
+        values |= {"studies": {name: asdict(study) for name, study in self.known_studies.items()}, "shown": [*kept, *self.studies]}
+        values["studies"] = {name: earlier["studies"][name] for name in kept} | values["studies"]
         values |= {"runs": _as_json(self.everything.runs), "tables": tables}
         write_text(folder / NUMBERS, json.dumps(values, ensure_ascii=False) + "\n")
 
@@ -212,9 +216,10 @@ class Numbers:
             return self
         values = read_json(folder / NUMBERS, NUMBERS_FORMAT)
         if values["key"] == self.key:
-            known = {name: asdict(study) for name, study in self.known_studies.items()}
+            known = json.loads(json.dumps({name: asdict(study) for name, study in self.known_studies.items()}))
             for name, part in self._parts.items():
-                if name not in self.studies or json.loads(json.dumps(known)) == values["studies"]:
+                of = [name, self.studies[name].beside] if name in self.studies else []
+                if all(known.get(one) == values["studies"].get(one) for one in of):
                     vars(part).update({table: _of_json(value) for table, value in values["tables"].get(name, {}).items()})
         return self
 

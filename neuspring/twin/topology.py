@@ -73,12 +73,12 @@ def regions(nodes: np.ndarray, count: int) -> np.ndarray:
     Raises InputError if there are fewer nodes than regions.
     """
     if count < 1:
-        raise InputError("search.clusters", "at least one region is required", count)
+        raise InputError("clusters", "at least one region is required", count, "Choose 1 or more.")
     if count == 1:
         return np.zeros(len(nodes), np.int32)
     if len(nodes) < count:
         rule = f"{count} regions need at least {count} nodes"
-        raise InputError("search.clusters", rule, f"{len(nodes)} nodes", "Choose fewer regions.")
+        raise InputError("clusters", rule, f"{len(nodes)} nodes", "Choose fewer regions.")
     # Imported here: it takes longer than most commands that need a topology.
     from sklearn.cluster import AgglomerativeClustering
 

@@ -1,7 +1,13 @@
 # A sweep: workers share one Optuna study; each is a job, and the sweep is as long as the configuration says, however many there are.
 SWEEP = GRAPH.sweep_folder
 if CONFIG.tune:
-    from neuspring.extensions.tuning import jobs
+    try:
+        from neuspring.extensions.tuning import jobs
+    except ModuleNotFoundError as error:
+        raise WorkflowError(
+            "configuration, tune: a sweep needs the extension neuspring/extensions/tuning, which was left out. "
+            "Restore its folder, or leave tune out."
+        ) from error
 
     or_workflow_error(jobs.check, BENCHMARK, cluster=CLUSTER)
     TUNED, SWEPT = (

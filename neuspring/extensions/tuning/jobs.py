@@ -23,7 +23,7 @@ def check(benchmark: Benchmark, *, cluster: bool) -> None:
 
 def settings(benchmark: Benchmark) -> str:
     """Settings of a sweep's workers, as JSON; its tables of methods and searches are found wherever a job runs."""
-    values = select(benchmark.config, ("simulation", "losses", "search", "fit", "released_quirks", "tune"))
+    values = select(benchmark.config, ("clusters", "simulation", "losses", "search", "fit", "released_quirks", "tune"))
     tables = {name: str(benchmark.root / getattr(benchmark.config, name)) for name in ("method_table", "search_table")}
     return json.dumps(values | tables | {"scenarios": list(benchmark.whole.scenarios)}, sort_keys=True)
 

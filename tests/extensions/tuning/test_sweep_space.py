@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from neuspring import config
+from neuspring.config.settings import read_settings
 from neuspring.config.tuning import Tune
 from neuspring.core.errors import InputError
 from neuspring.experiments.benchmark import Benchmark
@@ -139,6 +140,14 @@ def test_the_shipped_sweep_is_valid(data):
         config.merge(values, config.read_yaml(ROOT / "config" / f"{name}.yaml"))
     parsed = config.parse(config.Config, values, "shipped")
     assert Plan.of(parsed, parsed.tune, ROOT)
+
+
+def test_a_worker_varies_the_method_that_the_workflow_planned():
+    values = config_with({"clusters": 8, "tune": {"study": "s", "method": "neuspring", "space": {"fit.epochs": RANGE}}})
+    made = Benchmark(values, ROOT)
+    told = read_settings(jobs.settings(made))
+    planned = Plan.of(made.config, made.config.tune, ROOT)
+    assert planned.row.clusters == 8 and Plan.of(told, told.tune, ROOT) == planned
 
 
 def test_workers_on_several_machines_need_a_database_that_locks_across_them():
