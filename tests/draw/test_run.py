@@ -9,7 +9,7 @@ from matplotlib import image
 from matplotlib import pyplot as plt
 from matplotlib.colors import LogNorm
 
-from neuspring.core.artifacts import Observations, Trajectory, Twin
+from neuspring.core.artifacts import Trajectory, Twin
 from neuspring.draw import run as figures
 from neuspring.draw.scene import ShownRun, chosen_frames
 from neuspring.draw.sheet import sample
@@ -36,14 +36,6 @@ def closed():
     assert not left, "figures must be closed"
 
 
-def observed() -> Observations:
-    return small.observations()
-
-
-def truth() -> Twin:
-    return small.scene().truth
-
-
 def predicted(shift: float = 0.01) -> Trajectory:
     """The true motion, off by `shift` along y in all frames but the first."""
     motion = small.scene().motion.copy()
@@ -53,7 +45,7 @@ def predicted(shift: float = 0.01) -> Trajectory:
 
 def regional(count: int) -> Twin:
     """The true twin with a topology of `count` regions."""
-    seen, twin = observed(), truth()
+    seen, twin = small.observations(), small.scene().truth
     labels = regions(seen.nodes, count)
     radius = list(np.linspace(0.03, 0.045, count))
     topology = piecewise_topology(seen.nodes, seen.controller_points[0], labels, radius, [12] * count, 0.03, 8)
@@ -78,34 +70,36 @@ def check_pictures(paths) -> set[str]:
 
 
 def test_a_full_run_has_every_picture(tmp_path):
-    paths = figures.run_figures(observed(), predicted(), HISTORIES, "m", tmp_path / "plots", twin=regional(3), searched=3e3)
+    paths = figures.run_figures(
+        small.observations(), predicted(), HISTORIES, "m", tmp_path / "plots", twin=regional(3), searched=3e3
+    )
     assert check_pictures(paths) == NAMES == set(figures.RUN_FIGURES)
     assert sorted(paths) == sorted((tmp_path / "plots").iterdir())
 
 
 def test_a_run_without_twin_and_trajectory_has_its_losses_alone(tmp_path):
     (tmp_path / "topology.png").write_text("of an earlier run")
-    assert check_pictures(figures.run_figures(observed(), None, HISTORIES, "m", tmp_path)) == {"losses.png"}
+    assert check_pictures(figures.run_figures(small.observations(), None, HISTORIES, "m", tmp_path)) == {"losses.png"}
     assert not (tmp_path / "topology.png").exists()
-    assert figures.run_figures(observed(), None, {}, "m", tmp_path) == []
+    assert figures.run_figures(small.observations(), None, {}, "m", tmp_path) == []
 
 
 def test_a_diverged_rollout_is_drawn_as_far_as_it_went(tmp_path):
     positions = small.scene().motion[:4].astype(np.float32)
     positions[3, 5] = 90.0
     diverged = Trajectory(positions=positions, frame_count=small.FRAMES, diverged_frame=4, reason="far away")
-    assert check_pictures(figures.run_figures(observed(), diverged, {}, "m", tmp_path)) == {"errors.png", "motion.png"}
-    figure = figures.motion_figure(observed(), diverged, "m")
+    assert check_pictures(figures.run_figures(small.observations(), diverged, {}, "m", tmp_path)) == {"errors.png", "motion.png"}
+    figure = figures.motion_figure(small.observations(), diverged, "m")
     words = {text.get_text() for axis in figure.axes for text in axis.texts} | {text.get_text() for text in figure.texts}
     assert {"diverged", "frame 3, 0.10 s", "observed", "m"} <= words
     plt.close(figure)
 
 
 def test_the_motion_picture_says_how_far_nodes_are_from_their_points():
-    figure = figures.motion_figure(observed(), predicted(), "m")
+    figure = figures.motion_figure(small.observations(), predicted(), "m")
     assert [text.get_text() for axis in figure.axes for text in axis.texts if text.get_text().endswith("mm")] == [
         "0.0 mm",
-        *["10.0 mm"] * (len(chosen_frames(observed().scenario, small.FRAMES)) - 1),
+        *["10.0 mm"] * (len(chosen_frames(small.observations().scenario, small.FRAMES)) - 1),
     ]
     plt.close(figure)
 
@@ -122,14 +116,14 @@ def test_the_motion_picture_says_how_far_nodes_are_from_their_points():
     ],
 )
 def test_the_frames_of_the_motion_picture(train_end, frames, expected):
-    scenario = replace(observed().scenario, frame_count=100, train_end=train_end)
+    scenario = replace(small.observations().scenario, frame_count=100, train_end=train_end)
     assert chosen_frames(scenario, frames) == expected
 
 
 @pytest.mark.parametrize("values", [5e3, 0.0, 1e-30, 1e5])
 def test_equal_stiffness_is_one_bar_and_one_color(tmp_path, values):
-    twin = with_stiffness(truth(), values)
-    paths = figures.run_figures(observed(), None, {}, "m", tmp_path, twin=twin, searched=values)
+    twin = with_stiffness(small.scene().truth, values)
+    paths = figures.run_figures(small.observations(), None, {}, "m", tmp_path, twin=twin, searched=values)
     assert check_pictures(paths) == {"topology.png", "stiffness.png"}
     low, high = stiffness_limits(twin.material.stiffness)
     assert 0 < low < high <= 10 * low
@@ -153,25 +147,25 @@ def test_the_color_range_holds_most_springs_and_not_the_outliers():
 
 def test_the_searched_stiffness_is_marked():
     twin = regional(2)
-    figure = figures.stiffness_figure(observed(), ShownRun("m", twin.topology.nodes[None], twin), 3e3)
+    figure = figures.stiffness_figure(small.observations(), ShownRun("m", twin.topology.nodes[None], twin), 3e3)
     axis = next(axis for axis in figure.axes if "3,000 N" in axis.get_xlabel())
     assert [float(line.get_xdata()[0]) for line in axis.lines] == [3e3]
     plt.close(figure)
 
 
 def test_a_twin_without_object_springs_has_no_stiffness_picture(tmp_path):
-    twin = truth()
+    twin = small.scene().truth
     kept = slice(twin.topology.object_spring_count, None)
     topology = replace(twin.topology, springs=twin.topology.springs[kept], rest_lengths=twin.topology.rest_lengths[kept])
     material = replace(twin.material, stiffness=twin.material.stiffness[kept], dashpot=twin.material.dashpot[kept])
     bare = replace(twin, topology=topology, material=material)
-    assert check_pictures(figures.run_figures(observed(), None, {}, "m", tmp_path, twin=bare)) == {"topology.png"}
+    assert check_pictures(figures.run_figures(small.observations(), None, {}, "m", tmp_path, twin=bare)) == {"topology.png"}
 
 
 @pytest.mark.parametrize("count", [1, 2, 10, 14])
 def test_regions_are_counted_and_have_colors_of_their_own(count):
     twin = regional(count)
-    body = figures._from_two_sides(observed(), ShownRun("m", twin.topology.nodes[None], twin), "m", "region")
+    body = figures._from_two_sides(small.observations(), ShownRun("m", twin.topology.nodes[None], twin), "m", "region")
     figure = figures.twin_figure(body, figures.RUN_WIDTH, figures.COUNTED_LEGEND)
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     nodes = [int(name.split(": ")[1].split(" nodes")[0]) for name in names if "nodes" in name]

@@ -9,20 +9,12 @@ from PIL import Image
 from neuspring.core.errors import InputError
 from neuspring.draw.film import HOLD, film_pictures, write_film
 from neuspring.draw.sheet import FUTURE, TRAINING
-from neuspring.extensions.figures.drawing import film
-from neuspring.extensions.figures.options import FilmOptions
-from tests.support.played import results
-from tests.support.shown import METHODS, filmed, painter
+from tests.support.shown import painter
 
 ALL = range(8)
 RATE = 30.0
 COLOR_DIFFERENCE = 12
 """Of 255, what H.264 changes in a plain area."""
-
-
-@pytest.fixture(scope="module")
-def video(tmp_path_factory):
-    return filmed(tmp_path_factory.mktemp("video"))
 
 
 def gif(path) -> tuple[list[np.ndarray], list[int], int]:
@@ -89,23 +81,9 @@ def test_a_film_that_is_too_large_is_made_coarser_or_refused(video, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["small.gif", "whole.gif"]
 
 
-def test_a_scene_without_video_is_filmed_as_points(tmp_path):
-    paints = painter(results(tmp_path, METHODS), (0, 4, 7))
+def test_a_scene_without_video_is_filmed_as_points(plain):
+    paints = painter(plain, (0, 4, 7))
     pictures = list(film_pictures(paints, (0, 4, 7), 300))
     assert len(pictures) == 3 and all(side % 2 == 0 for side in pictures[0].shape[:2])
     blue = (np.abs(pictures[0].astype(int) - [31, 119, 180]).max(axis=2) < 30)[40:, :100]
     assert blue.any()
-
-
-@pytest.mark.parametrize(
-    ("values", "text"),
-    [
-        ({"width": 40}, "--width: must be 160 to 1920; received 40"),
-        ({"width": 300, "speed": 0.0}, "--speed: must be 0.05 to 8"),
-        ({"width": 300, "megabytes": 0.0}, "--megabytes: must be 0.001 to 100"),
-        ({"width": 300, "megabytes": float("nan")}, "--megabytes"),
-    ],
-)
-def test_sizes_that_no_film_has(video, tmp_path, values, text):
-    with pytest.raises(InputError, match=text):
-        film(FilmOptions(results=(video,), output=tmp_path / "film.gif", **values))

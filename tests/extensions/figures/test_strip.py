@@ -13,28 +13,11 @@ from neuspring.draw.painter import DRAWN_MM, ERROR_COLORS, distances
 from neuspring.draw.strip import rows_of, strip_figure
 from neuspring.extensions.figures.drawing import caption
 from neuspring.extensions.figures.filmed import FilmedScene, PhotoPainter
-from tests.support.played import results
 from tests.support.shown import METHODS, filmed, observed, painter, takes
 
 FRAMES = (0, 3, 5, 7)
 EXACT = 1e-3
 """mm: the first method is the scene's own twin, simulated in single precision."""
-
-
-@pytest.fixture(scope="module")
-def plain(tmp_path_factory):
-    return results(tmp_path_factory.mktemp("plain"), METHODS)
-
-
-@pytest.fixture(scope="module")
-def video(tmp_path_factory):
-    return filmed(tmp_path_factory.mktemp("video"))
-
-
-@pytest.fixture(autouse=True)
-def closed():
-    yield
-    plt.close("all")
 
 
 def grid(figure, rows: int, columns: int) -> np.ndarray:

@@ -13,21 +13,10 @@ from neuspring.draw.twin import CROSSING, TwinPicture, region_colors, twin_figur
 from neuspring.extensions.figures.filmed import SurfacePicture, finer
 from neuspring.report.shown import find
 from neuspring.twin.body import body_of, lines_of
-from tests.support.played import results, rod_results
-from tests.support.shown import METHODS, filmed, painter
+from tests.support.played import rod_results
+from tests.support.shown import painter
 
 LUMA = np.array([0.2126, 0.7152, 0.0722])
-
-
-@pytest.fixture(scope="module")
-def plain(tmp_path_factory):
-    return results(tmp_path_factory.mktemp("plain"), METHODS)
-
-
-@pytest.fixture(autouse=True)
-def closed():
-    yield
-    plt.close("all")
 
 
 def uneven(scenario):
@@ -104,9 +93,8 @@ def test_columns_of_methods_rows_of_quantities_and_a_legend_for_each(plain):
     assert len(lines.get_segments()) == takes[0].twin.topology.object_spring_count
 
 
-def test_a_surface_has_the_colors_of_its_nodes(tmp_path):
-    scenario = filmed(tmp_path)
-    scene, takes = uneven(scenario)
+def test_a_surface_has_the_colors_of_its_nodes(video):
+    scene, takes = uneven(video)
     axis = plt.figure().add_axes((0, 0, 1, 1))
     SurfacePicture([(scene, take) for take in takes], 4, ("region",), style="splats").paint(axis, scene, takes[0], "region")
     shown = np.asarray(axis.images[0].get_array())

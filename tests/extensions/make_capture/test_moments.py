@@ -14,7 +14,7 @@ from neuspring.extensions.make_capture.film import looked_at
 from neuspring.extensions.make_capture.formats import open_images
 from neuspring.extensions.make_capture.formats.folder import ImageFolder
 from neuspring.extensions.make_capture.formats.video import VideoFile
-from neuspring.extensions.make_capture.moments import Evenness, Series, matched, spans
+from neuspring.extensions.make_capture.moments import Evenness, Series, matched
 from neuspring.extensions.make_capture.poses import choose
 
 FILM = list(range(45))
@@ -67,7 +67,6 @@ def test_images_that_lack_their_partner_are_named(tmp_path):
         (range(45), range(23), "none missing in between, as if one had 1.96 times the rate"),
         (range(100, 144), range(1, 41), "44 pictures with the numbers 100 to 143 and 40 pictures with the numbers 1 to 40, none"),
         (without(10), range(500, 544), "0 numbers are common"),
-        (without(10), [500 + number for number in without(30)], "0 numbers are common"),
     ],
 )  # fmt: skip
 def test_counters_of_their_own_are_refused(tmp_path, color, depth, words):
@@ -262,8 +261,3 @@ def test_an_image_that_exif_data_turn_is_refused_in_a_folder(tmp_path, ending):
         InputError, match=r"must be stored upright, with EXIF orientation 1; received 6\. .*mogrify -auto-orient .*exiftool"
     ):
         list(ImageFolder(tmp_path, "color").read([2]))
-
-
-def test_numbers_in_few_words():
-    assert spans([6, 13, 20, 21, 22]) == "6, 13, 20 to 22"
-    assert spans(range(0, 40, 2)) == "0, 2, 4, 6, 8, 10 and 14 more"

@@ -1,24 +1,24 @@
-"""Folders and videos of images: their order, their numbers, what is refused, and which frames are kept."""
+"""Folders and videos of images: their order, their numbers, what is refused, which frames are kept; a form that a package adds."""
+
+import re
+from importlib.metadata import EntryPoint
 
 import cv2
 import numpy as np
 import pytest
 
+from neuspring import registry
+from neuspring.cli.main import main
 from neuspring.core.errors import InputError
-from neuspring.extensions.make_capture.feeds import pairs
+from neuspring.data.capture import Capture
+from neuspring.extensions.make_capture import formats
+from neuspring.extensions.make_capture.feeds import Paired, pairs
 from neuspring.extensions.make_capture.film import looked_at
+from neuspring.extensions.make_capture.formats import CaptureFormat, Recorded
 from neuspring.extensions.make_capture.formats.folder import ImageFolder
 from neuspring.extensions.make_capture.formats.video import VideoFile
 from neuspring.extensions.make_capture.poses import choose, chosen
-from tests.support.desk import FRAMES, camera, counts, seen, write_folders, write_video
-
-
-def test_numbers_sort_as_numbers_and_count_from_the_names(tmp_path):
-    root = write_folders(tmp_path, frames=12, first=5)
-    folder = ImageFolder(root / "color_0", "color")
-    assert folder.series.numbers == list(range(5, 17))
-    assert [path.stem for path in folder.paths][-1] == "frame_16"
-    np.testing.assert_array_equal(next(folder.read([10])), seen(camera(), 10)[0])
+from tests.support.desk import write_folders, write_video
 
 
 def test_names_without_a_common_form_count_from_zero(tmp_path):
@@ -50,18 +50,8 @@ def image_of(value, ending=".png"):
 )  # fmt: skip
 def test_what_is_no_folder_of_images_is_refused(tmp_path, write, kind, message):
     write(tmp_path)
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=re.escape(message)):
         list(ImageFolder(tmp_path, kind).read(range(len(ImageFolder(tmp_path, kind).series.numbers))))
-    assert message in str(caught.value)
-
-
-def test_a_depth_video_keeps_every_count(tmp_path):
-    depths = [counts(seen(camera(), frame)[1]) for frame in range(4)]
-    film = VideoFile(write_video(tmp_path / "depth.mkv", depths, "ffv1", "gray16le"), "depth")
-    assert film.series.numbers == [0, 1, 2, 3]
-    for found, depth in zip(film.read([1, 3]), [depths[1], depths[3]], strict=True):
-        np.testing.assert_array_equal(found, depth)
-    assert film.series.rate == pytest.approx(15, rel=0.01)
 
 
 @pytest.mark.parametrize(
@@ -89,23 +79,6 @@ def test_a_damaged_video_is_refused(tmp_path):
     (tmp_path / "color.mp4").write_bytes(b"no video")
     with pytest.raises(InputError, match="this file must be a readable video"):
         list(VideoFile(tmp_path / "color.mp4", "color").series)
-
-
-def test_color_and_depth_pair_by_their_numbers_and_else_by_their_order(tmp_path):
-    root = write_folders(tmp_path, first=10)
-    (root / "depth_0" / "frame_12.png").unlink()
-    view = pairs([root / "color_0"], [root / "depth_0"])[0]
-    assert view.series.numbers == [10, 11, 13, 14, 15, 16]
-    assert view.alone == {"color": [12], "depth": []}
-    color, depth = next(view.read([2]))
-    np.testing.assert_array_equal(depth, counts(seen(camera(), 3)[1]))
-    np.testing.assert_array_equal(color, seen(camera(), 3)[0])
-    for path in sorted((root / "depth_0").iterdir()):
-        path.rename(path.with_name(f"frame_{500 + int(path.stem[6:])}.png"))
-    with pytest.raises(
-        InputError, match=r"camera 0: color and depth must show the same moments; received 7 pic.* 10 to 16 and 6 .* 510, 511, 513"
-    ):
-        list(pairs([root / "color_0"], [root / "depth_0"])[0].series.numbers)
 
 
 @pytest.mark.parametrize(
@@ -136,15 +109,6 @@ def test_a_stride_and_a_jump_are_known(tmp_path):
         choose(views, "0-2")
 
 
-def test_a_frame_that_a_camera_lacks_is_missing(tmp_path):
-    root = write_folders(tmp_path, cameras=2)
-    for kind in ("color", "depth"):
-        (root / f"{kind}_1" / "frame_4.png").unlink()
-    choice = choose(pairs([root / "color_0", root / "color_1"], [root / "depth_0", root / "depth_1"]))
-    assert (choice.missing("0"), choice.missing("1")) == ((), (4,))
-    assert choice.places["1"][5] == 4 and len(choice.numbers) == FRAMES
-
-
 def test_a_camera_without_the_first_frame_is_refused(tmp_path):
     root = write_folders(tmp_path, cameras=2)
     for kind in ("color", "depth"):
@@ -153,3 +117,38 @@ def test_a_camera_without_the_first_frame_is_refused(tmp_path):
         InputError, match=r"camera 1 must have the first of the chosen frames, number 0.*begin where all have a frame: --frames 1-"
     ):
         choose(pairs([root / "color_0", root / "color_1"], [root / "depth_0", root / "depth_1"]))
+
+
+def _twin_folders(paths, cameras):
+    names = cameras or tuple(map(str, range(len(paths))))
+    pairs = zip(names, paths, strict=True)
+    return Recorded(
+        views=[Paired(name, ImageFolder(p / "color_0", "color"), ImageFolder(p / "depth_0", "depth")) for name, p in pairs]
+    )
+
+
+MINE = CaptureFormat(
+    about="a folder of two",
+    recognizes=lambda path: (path / "color_0").is_dir() and (path / "depth_0").is_dir(),
+    recording=_twin_folders,
+)
+
+
+@pytest.mark.parametrize("named", [(), ("--format", "mine")])
+def test_a_package_adds_a_capture_format(tmp_path, monkeypatch, named):
+    point = EntryPoint(name="mine", value=f"{__name__}:MINE", group="neuspring.capture_formats")
+    others = registry.entry_points
+    monkeypatch.setattr(registry, "entry_points", lambda group: [point] if group == point.group else others(group=group))
+    own = registry.modules(formats.__name__, "capture_format")
+    monkeypatch.setattr(formats, "FORMATS", registry.Registry("capture_formats", own, CaptureFormat))
+    root = write_folders(tmp_path)
+    words = ["--recording", str(root), *named, "--intrinsics", str(root / "intrinsics.json"), "--rate", "30", "--category", "ball"]
+    assert main(["make-capture", *words, "--output", str(tmp_path / "made")]) == 0
+    made = Capture.load(tmp_path / "made")
+    assert [*made.cameras] == ["0"] and made.frame_count > 4
+
+
+def test_a_path_of_no_format_is_refused_with_the_names(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4), np.uint8))
+    with pytest.raises(InputError, match=r"--format: must be one of bag, phystwin_raw; received none that reads"):
+        formats.open_recording([tmp_path])
