@@ -142,6 +142,15 @@ def test_what_cannot_be_trained_or_drawn_is_recorded_and_passed_on(scene, tmp_pa
     assert "splats are not finite" in rendered.reason
 
 
+def drawn_from(path, scene: Scene, rollout) -> StageRecord:
+    """The record of pictures that are compared with another capture."""
+    output = rollout.with_name("render.json")
+    before = {"masks": scene.masks, "appearance": scene.appearance, "rollout": rollout}
+    seen = scene.folder / "observations.npz"
+    render(capture=path, observations=seen, settings=settings(video=False), device="cpu", output=output, **before)
+    return StageRecord.load(output)
+
+
 def test_a_frame_with_nothing_to_compare_has_no_psnr_and_is_counted(scene, tmp_path):
     """Hands all over frame 1 leave black on both sides."""
     for path in sorted((scene.capture.folder / "mask" / "0").iterdir()):
@@ -151,16 +160,7 @@ def test_a_frame_with_nothing_to_compare_has_no_psnr_and_is_counted(scene, tmp_p
     for kind in ("color", "depth", "tracks.json", "capture.json"):
         (tmp_path / kind).symlink_to(scene.capture.folder / kind)
     rollout = scene.roll(STEP, "covered")
-    before = {"masks": scene.masks, "appearance": scene.appearance, "rollout": rollout}
-    render(
-        capture=tmp_path / "capture.json",
-        observations=scene.folder / "observations.npz",
-        settings=settings(video=False),
-        device="cpu",
-        output=rollout.with_name("render.json"),
-        **before,
-    )
-    record = StageRecord.load(rollout.with_name("render.json"))
+    record = drawn_from(tmp_path / "capture.json", scene, rollout)
     assert record.facts["empty_frames"] == 1
     table = pd.read_parquet(record.file("frames", rollout.with_name("render.json")))
     scores = metrics.score_images(table, scene.observations.scenario, FRAMES, "m", 0).set_index(["task", "metric"])
@@ -239,16 +239,8 @@ def spoiled(scene: Scene, folder, **changes: object) -> Capture:
 
 
 def learn_from(scene: Scene, capture: Capture, tmp_path, masks=None) -> None:
-    lifted = scene.folder / "lifted.json"
-    appearance(
-        capture=capture.folder / "capture.json",
-        masks=masks or scene.masks,
-        settings=settings(appearance=SHORT),
-        seed=0,
-        device="cpu",
-        output=tmp_path / "appearance.json",
-        lifted=lifted,
-    )
+    given = {"masks": masks or scene.masks, "lifted": scene.folder / "lifted.json", "settings": settings(appearance=SHORT)}
+    appearance(capture=capture.folder / "capture.json", **given, seed=0, device="cpu", output=tmp_path / "appearance.json")
 
 
 def test_a_camera_inside_the_object_is_named(scene, tmp_path):
@@ -282,17 +274,8 @@ def test_captures_of_another_length_are_named_with_both_files(scene, tmp_path):
     shorter = spoiled(scene, tmp_path / "shorter")
     values = json.loads((shorter.folder / "capture.json").read_text())
     (shorter.folder / "capture.json").write_text(json.dumps(values | {"frame_count": 5}))
-    rollout = scene.roll(STEP, "length")
-    before = {"masks": scene.masks, "appearance": scene.appearance, "rollout": rollout}
     with pytest.raises(InputError, match=r"capture\.json: must have as many frames as the observations: 6.*received 5.*enabled"):
-        render(
-            capture=shorter.folder / "capture.json",
-            observations=scene.folder / "observations.npz",
-            settings=settings(),
-            device="cpu",
-            output=rollout.with_name("render.json"),
-            **before,
-        )
+        drawn_from(shorter.folder / "capture.json", scene, scene.roll(STEP, "length"))
 
 
 def test_named_lpips_weights_that_are_missing_are_an_error_before_drawing(scene, tmp_path):
@@ -303,16 +286,8 @@ def test_named_lpips_weights_that_are_missing_are_an_error_before_drawing(scene,
 
 def test_processed_data_need_no_lifted_points(scene, tmp_path):
     """As of PhysTwin's released cases: masks are lifted, surface points of the observations stand for the shape prior."""
-    output, seen = tmp_path / "appearance.json", scene.folder / "observations.npz"
-    appearance(
-        capture=scene.capture.folder / "capture.json",
-        masks=scene.masks,
-        settings=settings(),
-        seed=0,
-        device="cpu",
-        output=output,
-        observations=seen,
-    )
+    output, given = tmp_path / "appearance.json", {"masks": scene.masks, "observations": scene.folder / "observations.npz"}
+    appearance(capture=scene.capture.folder / "capture.json", **given, settings=settings(), seed=0, device="cpu", output=output)
     facts = StageRecord.load(output).facts
     assert facts["unseen_surface"] is None
     assert all(facts[f"psnr_{name}"] > 25 for name in scene.capture.cameras)

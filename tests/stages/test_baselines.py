@@ -69,7 +69,10 @@ def test_every_model_passes_through_every_stage(seen, model):
     if trained:
         history = pd.read_parquet(run.with_name("history.parquet"))
         assert list(history.columns) == ["step", "metric", "value"] and "loss" in set(history["metric"])
-        assert StageRecord.load(run.with_name("train.json")).settings["model"] == model
+        # All that training reads is in its record.
+        found = StageRecord.load(run.with_name("train.json")).settings
+        assert found["model"] == model and found["baselines"][model] == config.plain(settings())["baselines"][model]
+        assert model == "gs_dynamics" or (found["simulation"]["gravity"], found["losses"]["track"]) == (9.8, 1.0)
         assert not run.with_name("train.partial.npz").exists()
 
 
@@ -89,15 +92,8 @@ def test_a_network_moves_to_another_recording(seen, tmp_path):
     other = small.scene("rope/shake/smooth").observations
     other.save(target)
     train(observations=seen, model="gs_dynamics", settings=settings(), seed=0, device="cpu", output=out / "train.json")
-    transfer(
-        targets=[target],
-        learned=out / "train.json",
-        method="gs_dynamics",
-        seed=0,
-        settings=settings(),
-        device="cpu",
-        output=out / "transfer.json",
-    )
+    given = {"method": "gs_dynamics", "seed": 0, "settings": settings(), "device": "cpu"}
+    transfer(targets=[target], learned=out / "train.json", **given, output=out / "transfer.json")
     scores = pd.read_parquet(out / "transfer.parquet")
     model = GsDynamicsModel.load(out / "model.npz")
     frames = {"transfer": range(1, other.scenario.frame_count)}
@@ -127,17 +123,8 @@ def test_a_training_that_breaks_is_a_failure_whose_run_is_held_and_counted(seen,
 def test_splats_that_failed_and_too_few_anchors_are_failures_that_are_counted(seen, tmp_path, monkeypatch):
     learned = tmp_path / "appearance.json"
     Recorder("appearance", learned).save(failure="appearance: step 3 removed the last splat")
-    pictures = {"appearance": learned}
-    out = seen.with_name("train.json")
-    train(
-        observations=seen,
-        model="spring_gaus",
-        settings=settings(spring_gaus=MASKS),
-        seed=0,
-        device="cpu",
-        output=out,
-        **pictures,
-    )
+    out, given = seen.with_name("train.json"), {"model": "spring_gaus", "settings": settings(spring_gaus=MASKS)}
+    train(observations=seen, appearance=learned, **given, seed=0, device="cpu", output=out)
     found = StageRecord.load(out)
     assert (found.status, found.files) == ("failed", {}) and "removed the last splat" in found.reason
     lonely = SpringGausTraining(supervision="points", anchors=60, iterations=2, neighbors=500)
@@ -148,30 +135,14 @@ def test_splats_that_failed_and_too_few_anchors_are_failures_that_are_counted(se
     assert set(pd.read_parquet(run.with_name(record["held_file"]))["task"]) == {"reconstruction", "future"}
 
 
-def test_all_that_training_reads_is_in_its_record(seen):
-    out = seen.with_name("train.json")
-    train(observations=seen, model="spring_gaus", settings=settings(), seed=0, device="cpu", output=out)
-    found = StageRecord.load(out).settings
-    assert found["simulation"]["gravity"] == 9.8 and found["losses"]["track"] == 1.0
-    assert found["baselines"]["spring_gaus"]["anchors"] == 60
-
-
 def test_what_is_missing_is_named(seen):
+    given = {"observations": seen, "device": "cpu", "output": seen.with_name("train.json")}
     with pytest.raises(InputError, match="only spring_gaus, gs_dynamics are trained"):
-        train(observations=seen, model="static", settings=settings(), seed=0, device="cpu", output=seen.with_name("train.json"))
+        train(model="static", settings=settings(), seed=0, **given)
     with pytest.raises(InputError, match="supervision: masks needs --capture"):
-        train(
-            observations=seen,
-            model="spring_gaus",
-            settings=settings(spring_gaus=MASKS),
-            seed=0,
-            device="cpu",
-            output=seen.with_name("train.json"),
-        )
+        train(model="spring_gaus", settings=settings(spring_gaus=MASKS), seed=0, **given)
     with pytest.raises(InputError, match="model gs_dynamics is trained first"):
-        predict(
-            observations=seen, model="gs_dynamics", train=None, appearance=None, device="cpu", output=seen.with_name("rollout.json")
-        )
+        predict(model="gs_dynamics", train=None, appearance=None, **given)
 
 
 @pytest.fixture(scope="module")
@@ -191,14 +162,8 @@ def test_silhouettes_train_and_both_outputs_are_written(filmed):
     trained = StageRecord.load(out / "train.json")
     assert trained.status == "ok" and trained.facts["vgg16"].startswith("no VGG16 weights")
     assert {"masks0", "appearance", "observations"} <= set(trained.inputs)
-    predict(
-        observations=seen,
-        model="spring_gaus",
-        train=out / "train.json",
-        appearance=filmed.appearance,
-        device="cpu",
-        output=out / "rollout.json",
-    )
+    given = {"train": out / "train.json", "appearance": filmed.appearance, "device": "cpu"}
+    predict(observations=seen, model="spring_gaus", **given, output=out / "rollout.json")
     record = StageRecord.load(out / "rollout.json")
     centers = SplatCenters.load(record.file("centers", out / "rollout.json")).positions
     trajectory = Trajectory.load(record.file("trajectory", out / "rollout.json"))

@@ -37,14 +37,8 @@ def started(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("started")
     observe(scenario=small.row(), settings=SETTINGS, output=folder / "observations.npz")
     for seed in (0, 1):
-        search(
-            observations=folder / "observations.npz",
-            settings=SETTINGS,
-            clusters=1,
-            seed=seed,
-            device="cpu",
-            output=folder / f"search-{seed}" / "search.json",
-        )
+        seen, output = folder / "observations.npz", folder / f"search-{seed}" / "search.json"
+        search(observations=seen, settings=SETTINGS, clusters=1, seed=seed, device="cpu", output=output)
     return folder
 
 
@@ -103,13 +97,8 @@ def assert_same(got: Path, wanted: Path) -> None:
 @pytest.mark.parametrize("most", [0, 3])
 def test_what_ran_together_is_continued_to_the_same_end(started: Path, alone: Path, tmp_path: Path, most: int) -> None:
     rows = rows_of(started, tmp_path)
-    fits(
-        observations=started / "observations.npz",
-        rows=as_json(rows),
-        device="cpu",
-        output=tmp_path / "fits.json",
-        twins_per_launch=most or "auto",
-    )
+    seen, output = started / "observations.npz", tmp_path / "fits.json"
+    fits(observations=seen, rows=as_json(rows), device="cpu", output=output, twins_per_launch=most or "auto")
     record = StageRecord.load(tmp_path / "fits.json")
     sizes = [len(batch) for batch in record.facts["batches"]]
     # Four of one horizon and two of another; of three at most, one would be alone, and is left to itself.

@@ -19,6 +19,8 @@ from neuspring.stages import FLOW, LEARNED, STAGES
 from neuspring.stages.stage import MayFail, Written, stage
 from tests.support import small
 
+ROW = config.ScenarioRow(scenario="a", source="toy", category="rope", path="rope/lift/smooth", self_collision=False, ground=True)
+
 
 @stage(output="{scenario}/{method}/{seed}/weigh.json", reads=("toy.frames",), minutes=1)
 def weigh(
@@ -59,14 +61,11 @@ def test_a_record_holds_digests_of_inputs_settings_that_are_read_and_options(giv
 
 
 def test_every_record_names_the_code_and_a_product_that_is_no_record_has_one_beside_it(tmp_path):
-    row = config.ScenarioRow(
-        scenario="a", source="toy", category="rope", path="rope/lift/smooth", self_collision=False, ground=True
-    )
     settings = Config(toy=config.Toy(frames=4))
-    STAGES["observe"](scenario=row, settings=settings, output=tmp_path / "observations.npz")
+    STAGES["observe"](scenario=ROW, settings=settings, output=tmp_path / "observations.npz")
     record = StageRecord.load(STAGES["observe"].record_of(tmp_path / "observations.npz"))
-    assert record.settings["scenario"] == config.plain(row) and record.settings["toy"]["frames"] == 4
-    assert record.code == STAGES["observe"].code_of(settings, {"scenario": row}) and len(record.code) == 16
+    assert record.settings["scenario"] == config.plain(ROW) and record.settings["toy"]["frames"] == 4
+    assert record.code == STAGES["observe"].code_of(settings, {"scenario": ROW}) and len(record.code) == 16
     assert STAGES["fit"].record_of(tmp_path / "fit.json") == tmp_path / "fit.json"
 
 
@@ -94,12 +93,8 @@ def test_a_command_line_says_what_was_given():
     values = {"observations": "o.npz", "search": "s.json", "pool": ["a", "b"], "scale": 0.25, "heavy": True}
     read = weigh.parse([*weigh.words(values), "--output", "w.json", "--settings", '{"toy": {"frames": 9}}'])
     assert read["settings"].toy.frames == 9
-    assert {name: read[name] for name in values} == {
-        **values,
-        "observations": Path("o.npz"),
-        "search": Path("s.json"),
-        "pool": [Path("a"), Path("b")],
-    }
+    paths = {"observations": Path("o.npz"), "search": Path("s.json"), "pool": [Path("a"), Path("b")]}
+    assert {name: read[name] for name in values} == values | paths
     assert read["fit"] is None and read["device"] == "auto"
     with pytest.raises(SystemExit):
         weigh.parse(["--observations", "o.npz"])
@@ -118,14 +113,7 @@ def test_every_stage_has_a_command_and_tells_its_inputs_from_earlier_stages(name
 
 
 def test_options_of_the_workflow_survive_the_command_line():
-    row = {
-        "scenario": "a",
-        "source": "toy",
-        "category": "rope",
-        "path": "rope/lift/smooth",
-        "self_collision": False,
-        "ground": True,
-    }
+    row = config.plain(ROW)
     read = STAGES["observe"].parse([*STAGES["observe"].words({"scenario": row}), "--output", "x.npz"])
     assert config.plain(read["scenario"]) == row
     variant = {"search": "uniform", "clusters": 5}

@@ -9,21 +9,21 @@ import pytest
 
 from neuspring import config
 from neuspring.core.artifacts import Observations, Trajectory, Twin
-from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.errors import InputError
 from neuspring.core.files import read_npz
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.experiments.tracking import log as tracking
 from neuspring.physics import stability
-from neuspring.report.summary import write as write_summary
 from neuspring.scores import metrics
-from neuspring.scores.numbers import Numbers
-from neuspring.scores.runs import collect
 from neuspring.stages.fit import fit
 from neuspring.stages.observe import observe
 from neuspring.stages.rollout import rollout
 from neuspring.stages.score import _notes, score
 from neuspring.stages.search import search
 from neuspring.stages.transfer import transfer
+from neuspring.twin.candidates import CMAES
+from neuspring.twin.polish import SLOPES
+from neuspring.twin.search import at_ends
 from neuspring.twin.topology import node_spacing
 from tests.support import small
 
@@ -113,16 +113,8 @@ def test_stages_that_simulate_count_their_spring_updates(finished, tmp_path):
     assert facts["fit"]["spring_updates"] == 2 * train * per_frame
     frames = seen.scenario.frame_count - 1
     assert StageRecord.load(run.with_name("rollout.json")).facts["spring_updates"] == frames * per_frame
-    observations = folder / "small" / "observations.npz"
-    transfer(
-        targets=[observations, observations],
-        learned=fitted,
-        method="phystwin",
-        seed=0,
-        settings=SETTINGS,
-        device="cpu",
-        output=tmp_path / "transfer.json",
-    )
+    targets, given = [folder / "small" / "observations.npz"] * 2, {"method": "phystwin", "settings": SETTINGS, "device": "cpu"}
+    transfer(targets=targets, learned=fitted, seed=0, **given, output=tmp_path / "transfer.json")
     moved = StageRecord.load(tmp_path / "transfer.json").facts["spring_updates"]
     # Substeps are added where the other recording's distances need more.
     assert moved >= 2 * frames * per_frame and moved % (2 * frames * facts["fit"]["springs"]) == 0
@@ -194,48 +186,35 @@ def test_a_fit_that_its_settings_held_says_so_in_the_notes():
     assert _notes({"rollout": StageRecord(stage="rollout", status="ok"), "fit": free}) == []
 
 
-def test_a_larger_budget_costs_only_the_difference(finished, tmp_path):
+LARGER = replace(SETTINGS, search=replace(SETTINGS.search, rollouts=14))
+
+
+def searched(finished, folder, settings=SETTINGS, **how):
+    """The record and the trace of a search on the finished scene."""
+    output = folder / "search.json"
     seen = finished[0] / "small" / "observations.npz"
-    larger = replace(SETTINGS, search=replace(SETTINGS.search, rollouts=14))
-    search(observations=seen, settings=SETTINGS, clusters=1, seed=0, device="cpu", output=tmp_path / "search.json")
-    before = pd.read_parquet(tmp_path / "trace.parquet")
-    search(observations=seen, settings=larger, clusters=1, seed=0, device="cpu", output=tmp_path / "search.json")
-    record, after = StageRecord.load(tmp_path / "search.json"), pd.read_parquet(tmp_path / "trace.parquet")
+    search(observations=seen, settings=settings, clusters=1, seed=0, device="cpu", output=output, **how)
+    return StageRecord.load(output), pd.read_parquet(folder / "trace.parquet")
+
+
+def test_a_larger_budget_costs_only_the_difference(finished, tmp_path):
+    _, before = searched(finished, tmp_path)
+    record, after = searched(finished, tmp_path, LARGER)
     assert (record.attempts, record.facts["rollouts"], len(after)) == (2, 14, 14)
     # Candidates that were there are not evaluated again: not even their times change.
     pd.testing.assert_frame_equal(after[: len(before)], before, check_exact=True)
     assert record.file("trace", tmp_path / "search.json").exists()
     # Everything else does start a search afresh.
-    other = replace(larger, losses=config.Losses(track=2.0))
-    search(observations=seen, settings=other, clusters=1, seed=0, device="cpu", output=tmp_path / "search.json")
-    assert StageRecord.load(tmp_path / "search.json").attempts == 1
+    assert searched(finished, tmp_path, replace(LARGER, losses=config.Losses(track=2.0)))[0].attempts == 1
 
 
 def test_how_candidates_are_simulated_is_no_setting(finished, tmp_path):
     """Neither the record nor the key of what is continued knows it."""
-    seen = finished[0] / "small" / "observations.npz"
-    records, traces = [], []
-    for name, how in (("one", {"twins_per_launch": 1}), ("many", {"twins_per_launch": "auto", "threads": 2})):
-        search(
-            observations=seen, settings=SETTINGS, clusters=1, seed=0, device="cpu", output=tmp_path / name / "search.json", **how
-        )
-        records.append(StageRecord.load(tmp_path / name / "search.json"))
-        traces.append(pd.read_parquet(tmp_path / name / "trace.parquet"))
-    assert records[0].settings == records[1].settings
-    assert records[0].facts == records[1].facts
-    assert records[0].files["twin"] == records[1].files["twin"]
-    assert traces[0].attrs["key"] == traces[1].attrs["key"]
-    larger = replace(SETTINGS, search=replace(SETTINGS.search, rollouts=14))
-    search(
-        observations=seen,
-        settings=larger,
-        clusters=1,
-        seed=0,
-        device="cpu",
-        output=tmp_path / "one" / "search.json",
-        twins_per_launch=5,
-    )
-    assert StageRecord.load(tmp_path / "one" / "search.json").attempts == 2
+    hows = {"one": {"twins_per_launch": 1}, "many": {"twins_per_launch": "auto", "threads": 2}}
+    (one, first), (many, second) = (searched(finished, tmp_path / name, **how) for name, how in hows.items())
+    assert (one.settings, one.facts, one.files["twin"]) == (many.settings, many.facts, many.files["twin"])
+    assert first.attrs["key"] == second.attrs["key"]
+    assert searched(finished, tmp_path / "one", LARGER, twins_per_launch=5)[0].attempts == 2
 
 
 def test_the_same_results_have_the_same_key(finished, tmp_path):
@@ -255,25 +234,6 @@ def test_a_missing_or_changed_artifact_is_an_error_that_says_what_to_do(finished
     twin.write_bytes(b"other")
     with pytest.raises(InputError, match="other content"):
         StageRecord.load(record).file("twin", record)
-
-
-def test_a_numerical_failure_is_a_result_that_the_table_shows(tmp_path, monkeypatch):
-    def fails(*_arguments, **_options):
-        raise NumericalFailure("every candidate diverged")
-
-    monkeypatch.setattr("neuspring.twin.search.search", fails)
-    run_all(tmp_path, "bad")
-    monkeypatch.undo()
-    run_all(tmp_path, "good")
-    collected = collect(tmp_path, ["bad", "good"], ["phystwin"], [0])
-    by_name = collected.runs.set_index("scenario")
-    assert by_name.loc["bad", "status"] == "failed"
-    assert by_name.loc["bad", "reason"] == "fit: search: every candidate diverged"
-    text = write_summary(Numbers(everything=collected, baseline="phystwin"), tmp_path / "tables")
-    assert "1/2 (1 failed)" in text
-    assert "phystwin, bad / seed 0: failed: fit: search: every candidate diverged" in text
-    assert "nan" not in text.lower()
-    assert tracking.RunRecord.load(tmp_path / "bad" / "phystwin" / "0" / "run.json").status == "failed"
 
 
 def test_only_a_body_that_can_meet_itself_is_predicted_with_more_substeps(tmp_path, finished):
@@ -306,19 +266,79 @@ def test_only_a_body_that_can_meet_itself_is_predicted_with_more_substeps(tmp_pa
 def test_a_diverging_rollout_is_a_result(tmp_path, finished, monkeypatch):
     folder, _, _ = finished
     monkeypatch.setattr("neuspring.twin.rollout.FAR_AWAY", 0.5)  # the rope's far end lies at 0.6 m
-    found = folder / "small" / "search-uniform" / "0" / "search.json"
-    rollout(observations=folder / "small" / "observations.npz", learned=found, device="cpu", output=tmp_path / "rollout.json")
+    seen, found = folder / "small" / "observations.npz", folder / "small" / "search-uniform" / "0" / "search.json"
+    rollout(observations=seen, learned=found, device="cpu", output=tmp_path / "rollout.json")
     record = StageRecord.load(tmp_path / "rollout.json")
-    assert record.status == "failed"
-    assert "left the scene in frame" in record.reason
+    assert record.status == "failed" and "left the scene in frame" in record.reason
     records = {"search": found, "rollout": tmp_path / "rollout.json"}
-    score(
-        observations=folder / "small" / "observations.npz",
-        **records,
-        method="search_only",
-        variant={},
-        seed=0,
-        output=tmp_path / "run.json",
-    )
+    score(observations=seen, **records, method="search_only", variant={}, seed=0, output=tmp_path / "run.json")
     assert json.loads((tmp_path / "run.json").read_text())["status"] == "failed"
     assert len(pd.read_parquet(tmp_path / "scores.parquet")) < 4
+
+
+POOLED = config.Config(
+    search=small.released(rollouts=6, start={"object_radius": 0.045, "stiffness": 1e4}),
+    fit=config.Fit(epochs=2, learning_rate=5e-2, checkpoint_every=1),
+)
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory):
+    """Observations of one rope, moved in two ways."""
+    folder = tmp_path_factory.mktemp("pool")
+    paths = {name: folder / f"{name}.npz" for name in ("lift", "shake")}
+    for name, path in paths.items():
+        small.scene(f"rope/{name}/smooth").observations.save(path)
+    return paths
+
+
+def run_pool(seen, folder, **pool):
+    """Search and fit of the lifted rope."""
+    found, fitted = folder / "search.json", folder / "fit" / "fit.json"
+    search(observations=seen["lift"], settings=POOLED, clusters=1, seed=0, device="cpu", output=found, **pool)
+    fit(observations=seen["lift"], search=found, settings=POOLED, kind="springs", device="cpu", output=fitted, **pool)
+    return StageRecord.load(found), StageRecord.load(fitted)
+
+
+def test_records_name_the_pool_and_count_its_frames(seen, tmp_path):
+    alone = run_pool(seen, tmp_path / "alone")
+    pooled = run_pool(seen, tmp_path / "pooled", pool=[seen["shake"]])
+    for one, both in zip(alone, pooled, strict=True):
+        assert "pool0" not in one.inputs
+        assert both.inputs["pool0"] == digest_file(seen["shake"])
+        assert one.status == both.status == "ok"
+    ratio = [both.facts["spring_updates"] / (both.facts["springs"] * both.facts["substeps"]) for both in (alone[1], pooled[1])]
+    assert ratio[1] == 2 * ratio[0]
+    stiffness = [
+        Twin.load(record.file("twin", tmp_path / name / "fit" / "fit.json")).material.stiffness
+        for name, (_, record) in (("alone", alone), ("pooled", pooled))
+    ]
+    assert not np.array_equal(stiffness[0], stiffness[1])
+
+
+def test_a_search_on_another_pool_starts_afresh(seen, tmp_path, capsys):
+    record = tmp_path / "search.json"
+    search(observations=seen["lift"], settings=POOLED, clusters=1, seed=0, device="cpu", output=record)
+    search(observations=seen["lift"], settings=POOLED, clusters=1, seed=0, device="cpu", output=record, pool=[seen["shake"]])
+    assert "made with other inputs or settings" in capsys.readouterr().out
+    first = pd.read_parquet(tmp_path / "trace.parquet")
+    search(observations=seen["lift"], settings=POOLED, clusters=1, seed=0, device="cpu", output=record, pool=[seen["shake"]])
+    assert "continuing the search after 6 rollouts" in capsys.readouterr().out
+    pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "trace.parquet"), first)
+
+
+VARIABLES = ("stiffness", "dashpot", "drag", "contact_friction")
+
+
+def trace_of(*rows: tuple[str, float, float, float, float, float]) -> pd.DataFrame:
+    """Rows of stage, cost, and the normalized variables."""
+    return pd.DataFrame(rows, columns=["stage", "cost", *(f"normalized.{name}" for name in VARIABLES)])
+
+
+def test_variables_at_the_ends_of_their_ranges_are_named():
+    best = (CMAES, 1.0, 0.995, 0.5, 0.002, 1.0)
+    assert at_ends(trace_of((CMAES, 2.0, 0.5, 1.0, 0.5, 0.5), best), VARIABLES) == ["stiffness", "drag"], "contact is left out"
+
+
+def test_a_candidate_for_slopes_is_never_the_best():
+    assert at_ends(trace_of((CMAES, 2.0, 0.5, 0.5, 0.5, 0.5), (SLOPES, 1.0, 1.0, 1.0, 1.0, 1.0)), VARIABLES) == []
