@@ -1,4 +1,4 @@
-"""Color alone through the real workflow: a painted cloth that a hand lifts, one camera, no depth."""
+"""Captures of color alone and of points in space alone through the real workflow; hands that change make it run again."""
 
 import json
 
@@ -6,10 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from neuspring.core.artifacts import Observations
+from neuspring.core.artifacts import Observations, Twin
 from neuspring.data.capture import POINTS
+from neuspring.intake.points import Hands, write
+from tests.support import spaced as scene
 from tests.support.colored import paint
-from tests.support.project import add_scenario, copy_workflow, run
+from tests.support.project import add_scenario, copy_workflow, plan, run
+from tests.support.spaced import spaced
 
 CHANGES = {
     "scenarios": ["painted"],
@@ -46,3 +49,28 @@ def test_color_alone_becomes_scores_of_pictures_and_marked_points(tmp_path):
     assert (folder / "perception" / "hands.png").exists()
     summaries = [path.read_text() for path in project.rglob("summary.md")]
     assert any("Points marked in images" in text for text in summaries)
+
+
+POINTS_ALONE = {"scenarios": ["lifted"], "methods": ["search_only"], "images": {"video": False}, "tracking": {"enabled": False}}
+
+
+@pytest.mark.slow
+def test_points_alone_become_scores_and_changed_hands_are_noticed(project, tmp_path):
+    capture = spaced(tmp_path / "data" / "lifted")
+    changes = POINTS_ALONE | {"data_root": str(tmp_path / "data")}
+    run(project, changes)
+    folder = next(project.rglob("observations.npz")).parent
+    seen = Observations.load(folder / "observations.npz")
+    assert seen.scenario.source == "points"
+    assert len(Twin.load(next(folder.glob("search-*/0/twin.npz"))).topology.nodes) == len(seen.nodes)
+    scores = pd.read_parquet(folder / "search_only" / "0" / "scores.parquet")
+    # The points rise by 5 mm a frame; what the hands hold follows them, and what is frozen does not.
+    mine = scores[scores["metric"] == "track_error"].set_index("task")["value"]
+    frozen = pd.read_parquet(folder / "static" / "0" / "scores.parquet")
+    still = frozen[frozen["metric"] == "track_error"].set_index("task")["value"]
+    assert set(mine.index) == set(still.index) == {"reconstruction", "future"}
+    assert (mine < still).all()
+    assert not set(scores["metric"]) & {"psnr", "iou", "image_error"}
+    assert plan(project, changes) == {}
+    write(capture.folder, Hands(scene.risen(scene.GRIP, 8) + 0.001, np.zeros((0, 0), bool), np.zeros(0, int)), scene.NODES)
+    assert plan(project, changes).keys() >= {"observe", "search", "score"}

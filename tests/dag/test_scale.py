@@ -127,13 +127,8 @@ def test_the_whole_benchmark_is_planned_with_its_jobs(project, tmp_path):
         (tmp_path / "data" / "different_types" / name).mkdir(parents=True)
     command = [sys.executable, "-m", "snakemake", "--profile", "workflow/profiles/default"]
     command += ["--cores", "8", "--dry-run", "--quiet", "rules"]
-    command += [
-        "--configfile",
-        "config/data/phystwin.yaml",
-        "--config",
-        f"data_root={tmp_path}",
-        f"scenarios={json.dumps(scenarios)}",
-    ]
+    command += ["--configfile", "config/data/phystwin.yaml", "--config", f"data_root={tmp_path}"]
+    command += [f"scenarios={json.dumps(scenarios)}"]
     output = output_of(start(command, project, **{gpus.VISIBLE: ""}))
     # Of the baselines' models Spring-Gaus needs images, which these folders do not have.
     twins, models = 3 * 20 * 3, 3 * 3 * 3

@@ -32,19 +32,12 @@ def slurm_run(tmp_path_factory):
     overlay = config_with({"device": "auto", "fit": {"epochs": 40}})
     (project / "overlay.yaml").write_text(yaml.safe_dump(overlay))
     output = project / "output.txt"
+    command = [sys.executable, "-m", "snakemake", "--profile", "workflow/profiles/slurm"]
+    command += ["--default-resources", "slurm_partition=main", "--slurm-init-seconds-before-status-checks", "2"]
+    command += ["--configfile", "config/data/demo.yaml", "overlay.yaml"]
     try:
         with slurm.one_node(), output.open("w") as file:
-            process = subprocess.Popen(
-                [
-                    *(sys.executable, "-m", "snakemake", "--profile", "workflow/profiles/slurm"),
-                    *("--default-resources", "slurm_partition=main", "--slurm-init-seconds-before-status-checks", "2"),
-                    *("--configfile", "config/data/demo.yaml", "overlay.yaml"),
-                ],
-                cwd=project,
-                env=environment(),
-                stdout=file,
-                stderr=subprocess.STDOUT,
-            )
+            process = subprocess.Popen(command, cwd=project, env=environment(), stdout=file, stderr=subprocess.STDOUT)
             try:
                 before = cancel_fit_in_the_middle(project, process)
                 process.wait(timeout=PATIENCE)

@@ -18,25 +18,14 @@ from neuspring import config
 from neuspring.core.artifacts import Twin
 from neuspring.experiments.tracking import log as tracking
 from neuspring.scores.metrics import TASKS
-from tests.support.project import (
-    ROOT,
-    SCENE,
-    arguments,
-    copy_project,
-    copy_workflow,
-    environment,
-    jobs_in,
-    output_of,
-    plan,
-    run,
-    start,
-)
+from tests.support import project as workflow
+from tests.support.project import ROOT, SCENE, arguments, copy_project, environment, jobs_in, output_of, plan, run, start
 
 
 @pytest.fixture(scope="module")
 def tiny_run(tmp_path_factory):
     """The project folder of a run of two methods, and what the run said."""
-    project = copy_workflow(tmp_path_factory.mktemp("dag") / "project")
+    project = workflow.copy_workflow(tmp_path_factory.mktemp("dag") / "project")
     return project, run(project)
 
 
@@ -55,20 +44,11 @@ def test_a_configuration_becomes_a_table_with_every_run_in_mlflow(tiny_run):
     assert {word: len(names) for word, names in tracking.sync(results, config.Tracking()).items()} == {"already logged": 2}
 
 
-def test_the_search_is_shared_and_nothing_reruns_without_a_change(tiny_run):
+def test_the_search_is_shared_and_changes_rerun_the_stages_that_use_them_and_no_others(tiny_run):
     project, output = tiny_run
     assert jobs_in(output)["search"] == 1
-    assert plan(project) == {}
     # How candidates are simulated changes no result; the report states it, as the whole configuration.
     assert plan(project, {"twins_per_launch": 3}, "--set-threads", "search=2") == {"report": 1, "all": 1}
-
-
-def test_changed_settings_rerun_the_stages_that_use_them_and_no_others(tiny_run):
-    project, _ = tiny_run
-    # Both runs go to another experiment of MLflow; what is fitted is made again.
-    fitted = dict.fromkeys(["fit", "rollout", "score", "tables", "report", "all"], 1)
-    changes = {"fit": {"epochs": 4}, "tracking": {"experiment": "other"}}
-    assert plan(project, changes) == fitted | {"track_init": 1, "log_run": 2}
     both_seeds = plan(project, {"seeds": [0, 1]})
     assert both_seeds == {"search": 1, "fit": 1, "rollout": 2, "score": 2, "log_run": 2, "tables": 1, "report": 1, "all": 1}
 
@@ -79,8 +59,11 @@ def test_what_results_were_made_with_is_read_from_their_records_and_from_nothing
     shutil.rmtree(project / ".snakemake")
     (project / "results").rename(project / "kept")
     assert plan(project, {"results": "kept"}) == {}
-    output = run(project, {"results": "kept", "fit": {"epochs": 4}}, "--dry-run", "--quiet", "rules")
-    assert jobs_in(output) == dict.fromkeys(["fit", "rollout", "score", "log_run", "tables", "report", "all"], 1)
+    # Both runs go to another experiment of MLflow; what is fitted is made again.
+    changes = {"results": "kept", "fit": {"epochs": 4}, "tracking": {"experiment": "other"}}
+    output = run(project, changes, "--dry-run", "--quiet", "rules")
+    fitted = dict.fromkeys(["fit", "rollout", "score", "tables", "report", "all"], 1)
+    assert jobs_in(output) == fitted | {"track_init": 1, "log_run": 2}
     assert "  fit (baseline, 1 job): fit.epochs 3 -> 4\n" in output
     assert "To keep what is there, give another folder: --config results=" in output
     # A target of a table brings its rows, which this configuration does not name.
@@ -104,14 +87,8 @@ def test_a_killed_run_continues_in_the_middle_of_the_fit_and_ends_the_same(tiny_
     undisturbed, project = (copy_project(tiny_run[0], tmp_path / name) for name in ("undisturbed", "killed"))
     assert jobs_in(run(undisturbed, changes, "--", target)) == {"fit": 1}
 
-    process = subprocess.Popen(
-        arguments(project, changes, "--", target),
-        cwd=project,
-        env=environment(),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
+    options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
+    process = subprocess.Popen(arguments(project, changes, "--", target), cwd=project, env=environment(), **options)
     folder = project / "results" / SCENE / "baseline" / "0"
     deadline = time.monotonic() + 120
     while not (folder / "fit.partial.npz").exists():
