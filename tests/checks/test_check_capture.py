@@ -1,17 +1,23 @@
-"""check-data on capture folders: a good one has measurements only, and every other finding is provoked once."""
+"""check-data on capture folders: a good one has measurements only, every other finding is provoked once; checks as data."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
+from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from neuspring import checks, registry
 from neuspring.checks import examine
+from neuspring.checks.masks import Shown
 from neuspring.checks.table import on_table
 from neuspring.checks.things import Sample
+from neuspring.core.checks import Check
 from neuspring.core.geometry import rigid_inverse
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, Writer
 from neuspring.intake.check import check_layout
@@ -79,29 +85,42 @@ def test_a_good_film_has_measurements_only(filmed, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "level", "words"),
+    ("change", "name", "level", "value", "limit"),
     [
-        (moved(shifted(z=0.05)), "warning", ("cameras.0.camera_to_world", "50 mm above z = 0", "--level")),
-        (moved(shifted(tilt=5.0)), "warning", ("tilted by 5.0 degrees",)),
-        (moved(shifted(tilt=40.0)), "error", ("must be z = 0", "tilted by 40.0 degrees")),
-        (lambda values: values.update(up="-z"), "error", ("up", "received -z", "400 mm below the table")),
-        (moved(rigid_inverse), "error", ("what looks like a world-to-camera matrix. Invert it",)),
-        (moved(lambda pose: pose @ OPENGL), "error", ("what looks like a matrix for OpenGL's axes",)),
-        (moved(lambda pose: rigid_inverse(pose @ OPENGL)), "error", ("a world-to-camera matrix for OpenGL",)),
-        (lambda values: values.update(depth_unit=0.01), "error", ("depth_unit", "10 times as far", "Plausible would be 0.001")),
-        (lambda values: values.update(depth_unit=1.0), "error", ("depth_unit", "between 0.1 and 10 m")),
-        (enlarged, "warning", ("at most 3 m above the table", "received 4.00 m")),
-        (enlarged, "warning", ("implausible size: 13",)),
-        (enlarged, "warning", ("object high above the table",)),
-        (lambda values: values.update(frame_rate=3000.0), "error", ("frame_rate", "received 3000")),
-        (lambda values: values.update(frame_rate=0.033), "error", ("frame_rate", "received 0.033")),
-        (moved(shifted(z=-0.08)), "warning", ("object below the table", "4.5 cm")),
-        (lambda values: values["cameras"][0]["camera_to_world"][0].__setitem__(0, 3.0), "error", ("must be a rotation",)),
+        (moved(shifted(z=0.05)), "table elsewhere", "warning", 0.05, None),
+        (moved(shifted(tilt=5.0)), "table elsewhere", "warning", 0.01444, None),
+        (moved(shifted(tilt=40.0)), "table elsewhere", "error", 0.1064, None),
+        (lambda values: values.update(depth_unit=1.0), "depth unit", "error", 768.0, (0.1, 10.0)),
+        (enlarged, "high camera", "warning", 4.0, (0.0, 3.0)),
+        (enlarged, "implausible size", "warning", 1.322, None),
+        (enlarged, "object high above the table", "warning", 1.358, (None, 1.2)),
+        (lambda values: values.update(frame_rate=3000.0), "frame rate", "error", 3000.0, (1.0, 240.0)),
+        (lambda values: values.update(frame_rate=0.033), "frame rate", "error", 0.033, (1.0, 240.0)),
+        (moved(shifted(z=-0.08)), "object below the table", "warning", -0.0448, (-0.02, None)),
+        (lambda values: values.update(category="Cloth"), "category", "warning", "cloth", None),
     ],
 )
-def test_a_description_that_contradicts_the_images(capture, change, level, words):
+def test_a_description_that_contradicts_the_images(capture, change, name, level, value, limit):
     edit(capture, change)
-    assert holds(check_layout(capture.folder), level, CAPTURE, *words)
+    (found,) = (one for one in check_layout(capture.folder) if one.name == name)
+    assert (Path(found.where).name, found.level, found.limit) == (CAPTURE, level, limit)
+    assert found.value == (value if isinstance(value, str) else pytest.approx(value, rel=0.005))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda values: values.update(up="-z"), "up: must be the side of the table on which the cameras are: +z"),
+        (moved(rigid_inverse), "what looks like a world-to-camera matrix. Invert it"),
+        (moved(lambda pose: pose @ OPENGL), "what looks like a matrix for OpenGL's axes"),
+        (moved(lambda pose: rigid_inverse(pose @ OPENGL)), "a world-to-camera matrix for OpenGL"),
+        (lambda values: values.update(depth_unit=0.01), "Plausible would be 0.001"),
+        (lambda values: values["cameras"][0]["camera_to_world"][0].__setitem__(0, 3.0), "must be a rotation"),
+    ],
+)
+def test_a_description_whose_fault_is_known_is_explained(capture, change, words):
+    edit(capture, change)
+    assert holds(check_layout(capture.folder), "error", CAPTURE, words)
 
 
 def second(labels, frame):
@@ -122,27 +141,25 @@ def hand_elsewhere(labels, frame):
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "name", "value"),
     [
-        (lambda labels, _: np.where(labels == OBJECT, 0, labels), ("no object in frame 0",)),
-        (lambda labels, _: np.where(labels == HANDS, 0, labels), ("no hand in frame 0",)),
-        (second, ("two objects", "2 pieces")),
-        (
-            lambda labels, frame: np.where((labels == OBJECT) & (frame > 3), 0, labels),
-            ("object missing", "2 frames, first in"),
-        ),
-        (extended, ("object at the border", "6 frames")),
-        (lambda labels, _: np.where(labels == 0, HANDS, labels), ("hands too large", "less than 1200 cm² and 12 times")),
-        (hand_elsewhere, ("hand far from the object",)),
+        (lambda labels, _: np.where(labels == OBJECT, 0, labels), "no object in frame 0", 0),
+        (lambda labels, _: np.where(labels == HANDS, 0, labels), "no hand in frame 0", 0),
+        (second, "two objects", 2),
+        (lambda labels, frame: np.where((labels == OBJECT) & (frame > 3), 0, labels), "object missing", 2),
+        (extended, "object at the border", 6),
+        (lambda labels, _: np.where(labels == 0, HANDS, labels), "hands too large", 0.694),
+        (hand_elsewhere, "hand far from the object", 0.212),
     ],
 )
-def test_masks_that_show_something_else(capture, change, words):
+def test_masks_that_show_something_else(capture, change, name, value):
     for frame in range(capture.frame_count):
         labels = change(capture.mask("0", frame).copy(), frame)
         cv2.imwrite(str(capture.path("mask", "0", frame)), labels.astype(np.uint8))
     found = check_layout(capture.folder)
     assert of_level(found, "error") == []
-    assert any(holds(found, "warning", file, "camera 0", *words) for file in (CAPTURE, "0"))
+    (one,) = (one for one in found if one.name == name)
+    assert one.level == "warning" and one.value == pytest.approx(value, rel=0.005)
 
 
 def test_what_is_wrong_with_every_mask_is_said_once(capture):
@@ -192,9 +209,7 @@ def test_an_object_on_something_is_said_with_the_box_to_add(tmp_path, up):
     capture = film(tmp_path / "film", cameras=1, up=up, stand=0.08)
     found = [one.message for one in check_layout(capture.folder) if one.level == "warning"]
     assert len(found) == 1
-    assert (
-        "object above the table: what is seen of it in frame 0 begins 11 cm above the table, on something 8.0 cm high" in found[0]
-    )
+    assert "object above the table: " in found[0] and "on something 8.0 cm high" in found[0]
     box = json.loads(found[0].split('"obstacles": ')[1].split(". Or mark")[0])
     sign = 1.0 if up == "+z" else -1.0
     # The box of the film, as far as it is seen: two of its sides end behind the object.
@@ -271,3 +286,60 @@ def test_times_with_one_constant_grip_are_proposed(tmp_path):
     found = check_layout(writer.finish().folder)
     words = ("hands within 6 cm of the object, by frames: 0-19: 2, 20-59: 1.", "--frames 20-59 or --frames 0-19 --output")
     assert holds(found, "note", CAPTURE, *words)
+
+
+def test_frames_are_numbers_too():
+    shown = Shown(6, (40, 30))
+    for frame in range(6):
+        labels = np.zeros((30, 40), np.uint8)
+        labels[10:30, 10:16] = OBJECT if frame < 4 else 0
+        shown.see(frame, labels)
+    found = {one.name: one for one in examine("masks", "camera 0", shown)}
+    assert found["object missing"].frames == (4, 5)
+    assert found["object at the border"].frames == (0, 1, 2, 3)
+    assert (found["no hand in frame 0"].value, found["no hand in frame 0"].level) == (0.0, "warning")
+
+
+def test_a_cable_whose_marker_jumps(tmp_path):
+    positions = np.zeros((8, 3, 7))
+    positions[:, 0] = np.linspace(0, 0.6, 7)
+    positions[5, 1, 3] = 0.3
+    (found,) = (one for one in examine("cable", tmp_path, positions) if one.name == "stretched cable")
+    assert (found.level, found.frames) == ("warning", (5,)) and found.value > 2 and found.limit[1] == 0.5
+
+
+def test_no_check_is_named_twice_for_one_subject_without_another_measure():
+    every = [check for name in checks.CHECKS for check in (checks.CHECKS[name] if isinstance(checks.CHECKS[name], tuple) else ())]
+    assert len({(check.name, check.of, check.measure) for check in every}) == len(every) > 80
+
+
+def test_every_kind_of_subject_that_is_examined_has_a_check():
+    every = [check for member in checks.CHECKS.values() for check in (member if isinstance(member, tuple) else (member,))]
+    package = Path(checks.__file__).parents[1]
+    asked = {kind for path in package.rglob("*.py") for kind in re.findall(r'\bexamine\("([^"]+)"', path.read_text())}
+    assert asked - {"cases"} == {check.of for check in every} - {"cases"}  # cases: released results alone, an extension
+
+
+RED = Check(
+    "red object",
+    "object and hands",
+    lambda camera, samples, least: float(np.mean([s.color[s.mask == OBJECT][..., 0].mean() for s in samples.values()])),
+    (0, 1),
+    "note",
+    "red of {value:.0f} in camera {0.name}; up to {high} is usual.",
+)
+
+
+def brought(monkeypatch, group, value):
+    """As if an installed package brought a member of a group."""
+    point = EntryPoint(name="mine", value=value, group=f"neuspring.{group}")
+    real = registry.entry_points
+    monkeypatch.setattr(registry, "entry_points", lambda group: [point] if group == point.group else real(group=group))
+
+
+def test_a_package_adds_a_check(capture, monkeypatch):
+    brought(monkeypatch, "checks", "tests.checks.test_check_capture:RED")
+    own = registry.modules(checks.__name__, "checks")
+    monkeypatch.setattr(checks, "CHECKS", registry.Registry("checks", own, (Check, tuple)))
+    (found,) = (one for one in check_layout(capture.folder) if one.name == "red object")
+    assert found.level == "note" and found.value > 1 and found.message.startswith("camera 0: red object: red of ")

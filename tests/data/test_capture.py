@@ -28,11 +28,8 @@ def test_what_is_written_is_read(tmp_path, form):
     read = Capture.load(tmp_path)
     assert read.description == written.description
     rng = np.random.default_rng(0)
-    depth, color, mask = (
-        rng.integers(500, 900, (24, 32)),
-        rng.integers(0, 256, (24, 32, 3), np.uint8),
-        rng.integers(0, 3, (24, 32), np.uint8),
-    )
+    depth, color = rng.integers(500, 900, (24, 32)), rng.integers(0, 256, (24, 32, 3), np.uint8)
+    mask = rng.integers(0, 3, (24, 32), np.uint8)
     np.testing.assert_array_equal(read.color("0", 0), color)
     np.testing.assert_allclose(read.depth("0", 0), depth / 1000)
     np.testing.assert_array_equal(read.mask("0", 0), mask)
@@ -70,6 +67,7 @@ def test_cameras_may_differ_in_size_and_miss_frames(tmp_path):
 SKEWED = [list(row) for row in POSE]
 SKEWED[0][0] = 1.01
 BOX = {"shape": "box", "center": [0, 0, 0]}
+TWICE = [TypeAdapter(CameraEntry).dump_python(entry(), mode="json")] * 2
 MIRRORED = [list(row) for row in POSE]
 MIRRORED[0][0] = -1.0
 
@@ -83,7 +81,6 @@ MIRRORED[0][0] = -1.0
         ({"intrinsics": [[40.0, 0.0, 99.0], [0.0, 40.0, 12.0], [0.0, 0.0, 1.0]]}, r"\(cx, cy\) must lie in the 32 x 24 image"),
         ({"missing": [0]}, r"missing: frame 0 is where every twin starts"),
         ({"missing": [7]}, r"frames must lie below 5; received 7"),
-        ({"width": "32"}, r"cameras\.0\.width"),
     ],
 )
 def test_bad_cameras_are_refused(tmp_path, change, message):
@@ -97,15 +94,11 @@ def test_bad_cameras_are_refused(tmp_path, change, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"fps": 30}, "fps: unknown key"),
         ({"train_end": 9}, "train_end: must be at most frame_count = 5; received 9"),
         ({"frame_count": 2}, "frame_count"),
         ({"format": 2}, "format"),
         ({"cameras": []}, "cameras"),
-        (
-            {"cameras": [TypeAdapter(CameraEntry).dump_python(entry(), mode="json")] * 2},
-            r"names must differ; received \['0', '0'\]",
-        ),
+        ({"cameras": TWICE}, r"names must differ; received \['0', '0'\]"),
         ({"obstacles": [BOX]}, r"obstacles\[0\].half_sizes: three positive half sizes are required"),
         ({"obstacles": [{"shape": "sphere", "center": [0, 0, 0], "size": 1}]}, r"obstacles.*size"),
         ({"obstacles": [BOX | {"half_sizes": [1, 1, 1], "rotation": [[1, 1, 0], [0, 1, 0], [0, 0, 1]]}]}, "must be a rotation"),

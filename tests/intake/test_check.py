@@ -102,14 +102,8 @@ def trust_hidden(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         (lambda d: d | {"interior_points": "text"}, "error", ("interior_points", "received str")),
         (lambda d: {k: v for k, v in d.items() if k != "controller_points"}, "error", ("controller_points", "missing")),
         (lambda _: [1, 2], "error", ("dict of arrays", "list")),
-        (set_entry("controller_points", (5, 4, 2), -np.inf), "error", ("controller_points", "-inf at frame 5, point 4")),
-        (
-            lambda d: d | {"object_visibilities": d["object_visibilities"].astype(np.uint8)},
-            "error",
-            ("dtype must be bool", "uint8"),
-        ),
+        (lambda d: d | {"object_visibilities": d["object_visibilities"].astype(int)}, "error", ("dtype must be bool",)),
         (lambda d: d | {"object_points": d["object_points"].astype(int)}, "error", ("object_points", "floating")),
-        (lambda d: d | {"object_points": d["object_points"].tolist()}, "error", ("object_points", "received list")),
     ],
 )
 def test_findings_of_final_data(tmp_path: Path, change: Callable[[Any], Any], level: str, words: tuple[str, ...]) -> None:
@@ -127,7 +121,6 @@ def test_findings_of_final_data(tmp_path: Path, change: Callable[[Any], Any], le
         ({"frame_len": 10, "train": [0, 7]}, "error", ("test", "whole numbers")),
         ({"train": [-1, 7], "test": [7, 10]}, "error", ("train", "[-1, 7]")),
         ({"train": [0, 1], "test": [1, 10]}, "error", ("train", "one frame after frame 0")),
-        ({"train": [0, 7.0], "test": [7, 10]}, "error", ("train", "whole numbers")),
         ([0, 7], "error", ("JSON object", "list")),
     ],
 )
@@ -141,11 +134,9 @@ def test_findings_of_the_split(tmp_path: Path, split: Any, level: str, words: tu
     ("cameras", "words"),
     [
         ([np.eye(4)] * 2, ("list of 2",)),
-        (np.eye(4), ("ndarray",)),
         ([np.eye(4), np.eye(3), np.eye(4)], ("camera 1", "(3, 3)")),
         ([np.eye(4), np.eye(4), np.diag([1.0, 1.0, 2.0, 1.0])], ("camera 2", "rigid", "deviation of 3")),
         ([np.diag([1.0, 1.0, -1.0, 1.0]), np.eye(4), np.eye(4)], ("camera 0", "rigid")),
-        ([np.full((4, 4), np.nan), np.eye(4), np.eye(4)], ("camera 0", "deviation of nan")),
     ],
 )
 def test_findings_of_the_calibration(tmp_path: Path, cameras: Any, words: tuple[str, ...]) -> None:
@@ -165,7 +156,6 @@ K = [[60.0, 0.0, 30.0], [0.0, 60.0, 20.0], [0.0, 0.0, 1.0]]
         ({"intrinsics": [K] * 3, "WH": [64, 48], "fps": 30, "frame_num": 3}, "warning", ("frame_num", "3")),
         ({"intrinsics": [K] * 3, "WH": [64], "fps": 30}, "error", ("WH", "[64]")),
         ({"intrinsics": [K] * 2, "WH": [64, 48], "fps": 30}, "error", ("intrinsics", "(2, 3, 3)")),
-        ({"intrinsics": "K", "WH": [64, 48], "fps": 30}, "error", ("intrinsics",)),
         ({"intrinsics": [np.transpose(K).tolist()] * 3, "WH": [64, 48], "fps": 30}, "error", ("intrinsics", "fx")),
         ([1], "error", ("JSON object",)),
     ],
@@ -210,17 +200,8 @@ def test_all_findings_are_reported_at_once(tmp_path: Path) -> None:
     write_json(folder / "split.json", {"train": [0, 70], "test": [7, 10]})
     (folder / "calibrate.pkl").write_bytes(b"cos\nsystem\n(S'true'\ntR.")
     text = render(check_layout(folder))
-    for word in (
-        "nan at frame 3, point 0 (3 in all)",
-        "[0, 70]",
-        "global os.system",
-        "30 controllers",
-    ):
-        assert word in text
+    assert all(word in text for word in ("nan at frame 3, point 0 (3 in all)", "[0, 70]", "global os.system", "30 controllers"))
     assert text.splitlines()[-1] == "3 errors, 1 warning"
-
-
-# --- which folders ------------------------------------------------------------------------------------------------------
 
 
 def test_a_case_a_folder_of_cases_and_a_root(tmp_path: Path) -> None:

@@ -20,14 +20,13 @@ from tests.support.captures import FRAMES, describe, entry
 from tests.support.still import tracked
 
 SIZE = (90, 120)
+CAMERA = replace(entry(width=SIZE[1], height=SIZE[0]), intrinsics=((150.0, 0.0, 59.5), (0.0, 150.0, 44.5), (0.0, 0.0, 1.0)))
 
 
 @pytest.fixture
 def capture(tmp_path):
     """A camera with depth everywhere."""
-    intrinsics = ((150.0, 0.0, 59.5), (0.0, 150.0, 44.5), (0.0, 0.0, 1.0))
-    camera = replace(entry(width=SIZE[1], height=SIZE[0]), intrinsics=intrinsics)
-    writer = Writer(tmp_path, describe(cameras=(camera,)))
+    writer = Writer(tmp_path, describe(cameras=(CAMERA,)))
     for frame in range(FRAMES):
         writer.frame("0", frame, np.zeros((*SIZE, 3), np.uint8), np.full(SIZE, 800, np.uint16))
     return writer.finish()
@@ -106,13 +105,6 @@ def test_masks_that_cannot_be_right_are_said(capture, spoil, name):
     assert f"warning: {name}" in said(looked_at(capture, labels))
 
 
-def test_a_finding_says_where_value_limit_and_next_move(capture):
-    labels = scene()
-    tiny(labels)
-    text = "warning: camera 0: small object: 100 pixels of object in frame 0; at least 200 are expected. Film from nearer by."
-    assert text in map(str, looked_at(capture, labels))
-
-
 LONG, LEFT, TOP, SIDE = 30, 20, 30, 30
 """A film of LONG frames in which a square of SIDE pixels goes right, a pixel per frame."""
 
@@ -123,8 +115,7 @@ def moving(tmp_path_factory):
     rng = np.random.default_rng(0)
     grain = cv2.GaussianBlur(rng.normal(0, 1, (2 * SIDE, SIDE, 3)), (0, 0), 1.5)
     grain = np.clip(128 + 60 * grain / grain.std(), 0, 255)
-    camera = replace(entry(width=SIZE[1], height=SIZE[0]), intrinsics=((150.0, 0.0, 59.5), (0.0, 150.0, 44.5), (0.0, 0.0, 1.0)))
-    writer = Writer(tmp_path_factory.mktemp("moving"), describe(frame_count=LONG, cameras=(camera,)))
+    writer = Writer(tmp_path_factory.mktemp("moving"), describe(frame_count=LONG, cameras=(CAMERA,)))
     for frame in range(LONG):
         image = np.full((*SIZE, 3), 90.0)
         image[TOP : TOP + SIDE, LEFT + frame : LEFT + frame + SIDE] = grain[:SIDE]
@@ -151,8 +142,7 @@ def test_what_moves_at_the_object_and_lies_in_no_mask_is_said(moving):
     lost = both_squares()
     lost[4:] = np.where(both_squares(0)[4:] == 0, 0, OBJECT)
     [found] = [one for one in looked_at(moving, lost) if one.name == name]
-    assert found.level == "warning" and "of the times that were looked at, first in frame 4, more than 25%" in found.text
-    assert "a part of the object, or a hand that came in, lies in no mask" in found.text
+    assert found.level == "warning" and "first in frame 4, more than 25%" in found.text
 
 
 def test_newly_covered_parts_that_a_mask_loses_are_said(moving):
@@ -270,20 +260,13 @@ def test_volume_and_invented_surface_are_said():
 
 
 @pytest.mark.parametrize(
-    ("backend", "raised", "level", "words"),
-    [
-        ("body", 0.4, "warning", "it reaches 55 cm behind its nearest point and is 30 cm wide, so 40% of it is supposed to rise"),
-        ("body", 0.0, "note", 'Write "pose": "lying" or "standing"'),
-        ("body, standing", 0.4, "note", "standing, as capture.json says; 40% of it rises"),
-        ("round", 0.0, None, ""),
-    ],
+    ("backend", "raised", "levels"),
+    [("body", 0.4, ["warning"]), ("body", 0.0, ["note"]), ("body, standing", 0.4, ["note"]), ("round", 0.0, [])],
 )
-def test_how_a_body_lies_or_stands_is_said(backend, raised, level, words):
+def test_how_a_body_lies_or_stands_is_said(backend, raised, levels):
     facts = {"shape_longest": 0.55, "shape_across": 0.3, "shape_raised": raised}
     found = look_at_lifted(replace(tracked(BOX), backend=f"color alone, {backend}", facts=facts), no_prior(), 1.0)
-    poses = [one for one in found if one.name == "pose"]
-    assert [one.level for one in poses] == ([level] if level else [])
-    assert all(words in one.text for one in poses)
+    assert [one.level for one in found if one.name == "pose"] == levels
 
 
 VISIBLE = np.ones((FRAMES, 200), bool)
@@ -308,9 +291,7 @@ def test_a_hand_on_the_object_without_controllers_is_said(count, frames, level):
     many |= {"object_motion_valid": np.ones((frames, len(BOX)), bool), "controller_points": np.zeros((frames, 3, 3))}
     long = replace(short, **many, facts={"stray_hand_frames": float(count), "stray_hand_first": 2.0})
     [found] = [one for one in look_at_lifted(long, no_prior(), 1.0) if one.name == "hand without controllers"]
-    assert found.level == level
-    assert f"in {count} training frames, first in frame 2, a hand is on the object that no controller follows" in found.text
-    assert "End the capture before frame 2, or begin it when all hands are in view (make-capture --frames)." in found.text
+    assert found.level == level and f"in {count} training frames, first in frame 2" in found.text
 
 
 def observed(hand: np.ndarray, step: np.ndarray, rate: float = 30.0, follows: bool = True) -> Observations:
@@ -333,13 +314,10 @@ def observed(hand: np.ndarray, step: np.ndarray, rate: float = 30.0, follows: bo
 ABOVE, SLOW = np.array([0.05, 0.05, 0.11]), np.array([0.0, 0.0, 0.01])
 
 
-def test_a_good_grip_has_no_findings():
-    assert look_at_observations(observed(ABOVE, SLOW)) == []
-
-
 @pytest.mark.parametrize(
     ("observations", "name"),
     [
+        (observed(ABOVE, SLOW), None),
         (observed(ABOVE + np.array([0, 0, 0.06]), SLOW), "controllers hold nothing"),
         (observed(ABOVE, 0.0 * SLOW), "controllers stand still"),
         (observed(ABOVE, SLOW, follows=False), "object stands still"),
@@ -347,7 +325,8 @@ def test_a_good_grip_has_no_findings():
     ],
 )
 def test_implausible_hands_are_said(observations, name):
-    assert f"warning: {name}" in said(look_at_observations(observations))
+    found = said(look_at_observations(observations))
+    assert f"warning: {name}" in found if name else not found
 
 
 def test_a_hand_that_never_comes_near_is_refused():

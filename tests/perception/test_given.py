@@ -106,9 +106,8 @@ def test_given_nodes_and_annotated_points_are_those_of_the_twin(tmp_path):
 
 def test_hands_and_nodes_beside_depth_take_the_place_of_what_is_chosen_and_supposed(tmp_path):
     ball = sphere((0, 0, 0.05), 0.05)
-    capture, masks, *_ = still(
-        tmp_path / "film", ball, ((-0.07, -0.07, -0.01), (0.07, 0.07, 0.12)), [(0.4, -0.3, 0.3)], (0, 0, 0.05)
-    )
+    around = ((-0.07, -0.07, -0.01), (0.07, 0.07, 0.12))
+    capture, masks, *_ = still(tmp_path / "film", ball, around, [(0.4, -0.3, 0.3)], (0, 0, 0.05))
     rise = np.arange(capture.frame_count)[:, None, None] * np.array([0.004, 0.002, 0.006])
     hands = np.array([[-0.02, 0.0, 0.11], [-0.01, 0.01, 0.115]]) + rise
     grid = np.stack(np.meshgrid(*[np.arange(-0.04, 0.05, 0.02)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.05 * UP
@@ -153,18 +152,9 @@ def test_hidden_nodes_say_nothing_of_depth():
 def test_a_pixel_between_nodes_is_as_deep_as_they_are():
     view: Camera = camera(np.zeros(3), elevation=40.0)
     slope = NODES * [1, 1, 0] + NODES[:, :1] * [0, 0, 0.5] + 0.08 * UP
-    frame = GivenFrame(
-        camera=view,
-        up=1.0,
-        kind="given nodes",
-        filled=np.zeros((1, 1), bool),
-        heights=np.zeros((1, 1)),
-        lower=np.zeros((1, 1)),
-        facts={},
-        pixel_size=0.004,
-        front=facing(view, slope),
-        apart=spacing(slope),
-    )
+    nothing = {"filled": np.zeros((1, 1), bool), "heights": np.zeros((1, 1)), "lower": np.zeros((1, 1)), "facts": {}}
+    known = {"front": facing(view, slope), "apart": spacing(slope), "pixel_size": 0.004}
+    frame = GivenFrame(camera=view, up=1.0, kind="given nodes", **nothing, **known)
     places = np.random.default_rng(0).uniform(-0.08, 0.08, (40, 2))
     exact = np.column_stack([places, 0.5 * places[:, 0] + 0.08])
     found = frame.points(view.project(exact)[0])

@@ -6,6 +6,7 @@ import pickle
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from neuspring.config.perception import PointTracking
 from neuspring.core.errors import InputError
@@ -146,8 +147,6 @@ class StandIn:
         return self
 
     def __call__(self, video_chunk, is_first_step=False, queries=None):
-        import torch
-
         assert video_chunk.dtype == torch.float32
         assert video_chunk.shape[1] == 2 * self.step
         if is_first_step:
@@ -174,11 +173,9 @@ def test_cotracker_is_called_as_its_online_predictor_wants(video):
 
 
 def test_cotracker_without_weights_says_where_they_would_be(monkeypatch, tmp_path):
-    import torch
-
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     with pytest.raises(
-        InputError, match=r"CoTracker3's code and checkpoints/scaled_online\.pth must be in the torch\.hub cache.*download: true"
+        InputError, match=r"code and checkpoints/scaled_online\.pth must be in the torch\.hub cache.*download: true"
     ):
         track_cotracker.load(PointTracking())
 
@@ -198,14 +195,10 @@ def cotracker3_online(*, pretrained=True):
 
 def test_cotracker_s_weights_are_read_as_tensors_alone(monkeypatch, tmp_path):
     """A stand-in hub folder: plain weights are loaded, a pickle that would run something is refused."""
-    import torch
-
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     monkeypatch.setattr(torch.hub, "_hub_dir", None)
-    code, weights = (
-        tmp_path / "hub" / "facebookresearch_co-tracker_main",
-        tmp_path / "hub" / "checkpoints" / track_cotracker.WEIGHTS,
-    )
+    code = tmp_path / "hub" / "facebookresearch_co-tracker_main"
+    weights = tmp_path / "hub" / "checkpoints" / track_cotracker.WEIGHTS
     code.mkdir(parents=True)
     weights.parent.mkdir()
     (code / "hubconf.py").write_text(HUB)

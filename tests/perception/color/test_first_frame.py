@@ -11,6 +11,7 @@ import pytest
 from neuspring.config.perception import ColorSettings, Perception, Sampling
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
+from neuspring.data.camera import Camera
 from neuspring.data.capture import HANDS, OBJECT
 from neuspring.data.results import Masks, PixelTracks
 from neuspring.perception import color
@@ -23,8 +24,8 @@ PIXEL = 0.005
 """m: the width of a pixel at 0.8 m."""
 
 
-def capture_of(category: str, up: str = "+z", pose: str | None = None) -> SimpleNamespace:
-    view = camera(np.zeros(3))
+def capture_of(category: str, up: str = "+z", pose: str | None = None, view: Camera | None = None) -> SimpleNamespace:
+    view = view or camera(np.zeros(3))
     described = SimpleNamespace(up_sign=up_sign(up), category=category, pose=pose)
     return SimpleNamespace(folder=Path("painted"), cameras={"0": view}, description=described, frame_count=1, train_end=1)
 
@@ -144,8 +145,7 @@ def test_a_long_body_that_points_away_lies_only_if_the_capture_says_so():
 @pytest.mark.parametrize(("size", "elevation"), [((0.15, 0.18, 0.10), 50.0), ((0.20, 0.24, 0.06), 60.0)])
 def test_a_compact_box_does_not_rise(size, elevation):
     """Its outline is one disc, which is as wide as it is."""
-    capture = capture_of("toy")
-    capture.cameras = {"0": camera(np.zeros(3), elevation=elevation)}
+    capture = capture_of("toy", view=camera(np.zeros(3), elevation=elevation))
     assert FirstFrame.of(capture, filled_outline(box(*size), elevation), ColorSettings()).facts["raised"] == 0
 
 
@@ -154,8 +154,7 @@ def test_a_camera_above_the_table_that_looks_straight_down_sees_a_shape(category
     """It has no direction in which a body could reach away from it."""
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = 0.6
-    capture = capture_of(category)
-    capture.cameras = {"0": replace(camera(np.zeros(3)), camera_to_world=pose)}
+    capture = capture_of(category, view=replace(camera(np.zeros(3)), camera_to_world=pose))
     labels = np.zeros((HEIGHT, WIDTH), np.uint8)
     labels[20:70, 78:98] = OBJECT
     frame = FirstFrame.of(capture, labels, ColorSettings())
@@ -165,19 +164,16 @@ def test_a_camera_above_the_table_that_looks_straight_down_sees_a_shape(category
 
 
 def test_nothing_rises_below_a_steep_camera():
-    view = camera(np.zeros(3), elevation=80.0)
     labels = np.zeros((HEIGHT, WIDTH), np.uint8)
     labels[20:70, 78:84] = OBJECT
-    capture = capture_of("toy")
-    capture.cameras = {"0": view}
+    capture = capture_of("toy", view=camera(np.zeros(3), elevation=80.0))
     assert FirstFrame.of(capture, labels, ColorSettings()).facts["raised"] == 0
 
 
 def test_up_may_be_minus_z():
     view = camera(np.zeros(3))
     turn = np.diag([1.0, -1.0, -1.0, 1.0])
-    capture = capture_of("zebra", "-z")
-    capture.cameras = {"0": replace(view, camera_to_world=turn @ view.camera_to_world)}
+    capture = capture_of("zebra", "-z", view=replace(view, camera_to_world=turn @ view.camera_to_world))
     first = FirstFrame.of(capture, shown(SQUARE), ColorSettings())
     assert object_points(first)[:, 2].max() <= 0
     assert object_points(first)[:, 2].min() < -0.05
@@ -199,13 +195,10 @@ def test_what_a_hand_hides_between_parts_of_the_object_belongs_to_it():
 def test_an_object_above_the_horizon_is_refused():
     labels = np.zeros((HEIGHT, WIDTH), np.uint8)
     labels[:5] = OBJECT
-    capture = capture_of("cloth")
-    view = capture.cameras["0"]
-    level = view.camera_to_world.copy()
+    level = camera(np.zeros(3)).camera_to_world.copy()
     level[:3, :3] = np.stack([[1, 0, 0], [0, 0, -1], [0, 1, 0]], axis=1)
-    capture.cameras = {"0": replace(view, camera_to_world=level)}
     with pytest.raises(InputError, match="must look at the table"):
-        FirstFrame.of(capture, labels, ColorSettings())
+        FirstFrame.of(capture_of("cloth", view=replace(camera(np.zeros(3)), camera_to_world=level)), labels, ColorSettings())
     with pytest.raises(InputError, match="must be in view"):
         FirstFrame.of(capture_of("cloth"), 0 * labels, ColorSettings())
 

@@ -235,22 +235,11 @@ def test_nothing_of_the_object_is_read_in_future_frames(tmp_path):
     for name, spoiled in (("plain", False), ("spoiled", True)):
         capture = paint(tmp_path / name, spoiled=spoiled)
         out = tmp_path / f"{name}_out"
-        segment(capture=capture.folder / "capture.json", camera="0", settings=Config(), device="cpu", output=out / "masks.json")
-        track(
-            capture=capture.folder / "capture.json",
-            camera="0",
-            masks=out / "masks.json",
-            settings=Config(),
-            device="cpu",
-            output=out / "tracks.json",
-        )
-        lift(
-            capture=capture.folder / "capture.json",
-            masks=[out / "masks.json"],
-            tracks=[out / "tracks.json"],
-            settings=Config(),
-            output=out / "lifted.json",
-        )
+        given = {"capture": capture.folder / "capture.json", "settings": Config()}
+        one = given | {"camera": "0", "device": "cpu"}
+        segment(output=out / "masks.json", **one)
+        track(masks=out / "masks.json", output=out / "tracks.json", **one)
+        lift(masks=[out / "masks.json"], tracks=[out / "tracks.json"], output=out / "lifted.json", **given)
         made.append({file: np.load(out / file) for file in ("image.npz", "lifted.npz")})
     # The painted hand rises by 4 mm per frame; its middle is painted at a whole pixel, 4 mm wide.
     hands = made[0]["lifted.npz"]["controller_points"].mean(axis=1)
