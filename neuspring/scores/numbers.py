@@ -148,15 +148,8 @@ class Numbers:
         rival = self.baseline if self.baseline in others else next(iter(others), "")
         part = self.finished[self.finished["method"].isin([best, rival]) & (self.finished["task"] == key[0])]
         found = statistics.ratios(part[part["metric"] == key[1]], rival, self.objects).to_dict("records")
-        row = {
-            "method": best,
-            "baseline": rival,
-            "task": key[0],
-            "metric": key[1],
-            "ratio": np.nan,
-            "n": 0,
-            "objects": self.objects,
-        }
+        row: dict[str, Any] = {"method": best, "baseline": rival, "task": key[0], "metric": key[1]}
+        row |= {"ratio": np.nan, "n": 0, "objects": self.objects}
         return pd.DataFrame([row | {"verdict": statistics.TOO_FEW} | (found[0] if found else {})])  # type: ignore[arg-type]
 
     def means(self, task: str, metric: str) -> dict[str, float]:
@@ -203,7 +196,8 @@ class Numbers:
         earlier = read_json(folder / NUMBERS, NUMBERS_FORMAT) if (folder / NUMBERS).is_file() else {"shown": []}
         kept = [name for name in earlier["shown"] if name not in self.studies]
         tables = {name: {table: _as_json(getattr(part, table)) for table in part.TABLES} for name, part in self._parts.items()}
-        values = {"format": NUMBERS_FORMAT, "key": self.key, "baseline": self.baseline, "left_out": self.everything.left_out}
+        values: dict[str, Any] = {"format": NUMBERS_FORMAT, "key": self.key, "baseline": self.baseline}
+        values["left_out"] = self.everything.left_out
         tables |= {name: earlier["tables"][name] for name in kept}
         values |= {"studies": {name: asdict(study) for name, study in self.known_studies.items()}, "shown": [*kept, *self.studies]}
         values["studies"] = {name: earlier["studies"][name] for name in kept} | values["studies"]

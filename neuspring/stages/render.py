@@ -31,13 +31,7 @@ def _weights(rows: Rows) -> str:
 
 @stage(
     output="{scenario}/{method}/{seed}/render.json",
-    reads=(
-        "images.backend",
-        "images.views",
-        "images.video",
-        "images.released_quirks",
-        "images.corner_pixels",
-    ),
+    reads=("images.backend", "images.views", "images.video", "images.released_quirks", "images.corner_pixels"),
     gpu=True,
     memory_mb=8000,
     minutes=120,

@@ -77,13 +77,7 @@ def train(
     checkpoint = run.output.with_name("train.partial.npz")
     result = BASELINES[model].train(
         TrainingRequest(
-            observations=observations,
-            settings=settings,
-            seed=seed,
-            device=device,
-            partial=checkpoint,
-            key=key,
-            pictures=pictures,
+            observations=observations, settings=settings, seed=seed, device=device, partial=checkpoint, key=key, pictures=pictures
         )
     )
     files = run.beside(model="model.npz", history="history.parquet")

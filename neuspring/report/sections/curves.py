@@ -23,13 +23,7 @@ from neuspring.scores.metrics import METRICS, bound_track_errors, track_errors
 LINE_COLORS = ("#2f7ed8", "#d9731a", "#2a9d5c", "#a05cc4", "#c94f7c", "#8a7a2e", "#1f9aa8", "#8d6a57")
 LINE_DASHES = ("", "7 3", "2 2", "8 3 2 3")
 """Dash patterns, px. Each is used with all colors before the next one."""
-STYLE: Any = {
-    "svg.fonttype": "none",
-    "font.size": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.linewidth": 0.7,
-}
+STYLE: Any = {"svg.fonttype": "none", "font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.7}
 PANEL, FRAME = (3.3, 2.1), (0.16, 0.11, 0.77, 0.83)
 """Size, inches, and place of the axes in a panel, which is fixed because a computed layout takes most of the time."""
 DIVERGED_COST = 1e3
@@ -50,11 +44,7 @@ PLOTS = (
         "track_error_bound",
         "The same for points that move with the nodes around them, in mm: it begins at 0.",
     ),
-    (
-        "Search: best cost",
-        "search",
-        "Over candidate rollouts; thin: other seeds. Methods that share a search have one curve.",
-    ),
+    ("Search: best cost", "search", "Over candidate rollouts; thin: other seeds. Methods that share a search have one curve."),
     ("Fit: loss", "fit", "In mm², over epochs; thin: other seeds. Losses of methods with other horizons differ in height."),
     (
         "Training of baselines: loss",
