@@ -13,7 +13,7 @@ from neuspring.config import parse
 from neuspring.config.settings import Aim
 from neuspring.core.errors import InputError
 from neuspring.scores.metrics import SCORE_COLUMNS
-from neuspring.scores.statistics import judged_aims, ratios, seed_spread, t_interval
+from neuspring.scores.statistics import interval, judged_aims, ratios, seed_spread, t_interval
 
 
 def table(values: dict[tuple[str, str, int], float], category: str = "", task: str = "future") -> pd.DataFrame:
@@ -78,6 +78,10 @@ def test_only_the_two_methods_of_a_ratio_must_have_finished():
 
 def test_an_error_of_zero_has_no_ratio():
     assert ratios(table(logs({name: [-0.2] for name in "abc"}) | {("c", "y", 0): 0.0}), "x").empty
+
+
+def test_an_interval_of_resampled_means_holds_95_per_cent():
+    assert interval(np.linspace(0.0, 1.0, 1001)) == pytest.approx((0.025, 0.975), abs=1e-12)
 
 
 def test_the_t_interval_holds_its_level_with_few_objects():
