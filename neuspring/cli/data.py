@@ -52,7 +52,8 @@ def mask(
             raise InputError("--masks, --hands", rule, f"{len(masks)} and {len(hands)}")
         for name, folder, held in zip(named, masks, hands or [None] * len(named), strict=True):
             read.require_camera(name)
-            print(f"camera {name}: masks are in {store.import_masks(read, name, folder, held)}")
+            written, how = store.import_masks(read, name, folder, held)
+            print(f"camera {name}: masks, by {how}, are in {written}")
         print(f"next:\n  neuspring check-data {capture}")
         return
     marked = Marks.load(path)

@@ -20,6 +20,11 @@ Row3: TypeAlias = tuple[Finite, Finite, Finite]
 Row4: TypeAlias = tuple[Finite, Finite, Finite, Finite]
 
 
+def depth_noise(depth: np.ndarray) -> np.ndarray:
+    """Standard deviation, m, of depth z, m: 0.0012 + 0.0019 (z - 0.4)^2 (Nguyen et al. 2012, structured light)."""
+    return np.asarray(0.0012 + 0.0019 * (depth - 0.4) ** 2)
+
+
 @dataclass(frozen=True, eq=False)
 class Camera:
     """A calibrated camera."""

@@ -6,7 +6,7 @@ What cannot work is an error, what is only unusual a warning with the next move;
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -20,6 +20,7 @@ from neuspring.checks.case import FINAL_DATA, Case, whole
 from neuspring.checks.masks import Shown
 from neuspring.checks.table import CameraAlone, TableSeen, object_on_table
 from neuspring.checks.things import HAND_LEAST, INSIDE, Sample, hands_on, lifted, outline, place_of, sampled
+from neuspring.checks.timing import Streams, Watched, in_space, measure, of_cameras, on_images
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
@@ -28,7 +29,7 @@ from neuspring.data.capture import CAPTURE, NODES, OBJECT, POINTS, Capture, desc
 from neuspring.data.unpickle import load_pickle
 from neuspring.intake import phystwin
 from neuspring.intake.depth import cloud, planes
-from neuspring.intake.points import look
+from neuspring.intake.points import InSpace, look
 
 LEAST_AROUND = 0.1
 """Share of the image that must have depth, beside object and hands, before the table is looked for."""
@@ -47,20 +48,43 @@ def check_capture(folder: Path) -> list[Finding]:
     findings += examine("category", path, description.category)
     capture, calibrated = Capture(folder, description), not any(one.level == "error" for one in findings)
     grips = np.zeros(capture.frame_count, int)
-    samples = {}
+    samples, watched = {}, {name: Watched(capture.frame_count) for name in capture.cameras}
     for name in capture.cameras:
-        samples[name], of_camera = _check_camera(capture, name, calibrated, grips)
+        samples[name], of_camera = _check_camera(capture, name, calibrated, grips, watched[name])
         findings += of_camera
     findings += examine("grips", path, grips, description.frame_rate, folder)
     if calibrated and len(samples) > 1:
         first = {name: found[0].depth for name, found in samples.items() if 0 in found}
         findings += examine("views", path, list(pairs(capture.cameras, first, description.up)))
-    findings += look(capture)[1]
+    space, of_space = look(capture)
+    findings += of_space
+    if calibrated:
+        findings += examine("streams", path, list(_streams(capture, watched, space)))
     for name in capture.cameras:
         _read(findings, folder / POINTS, lambda _, name=name: capture.points(name))  # type: ignore[misc]
     if capture.cameras and not description.masks:
         findings.append(note(path, f"no masks yet (masks: false). Draw them: `neuspring annotate {folder}`; then check again"))
     return findings
+
+
+def _streams(capture: Capture, watched: Mapping[str, Watched], space: InSpace) -> Iterator[Streams]:
+    """Every two streams of a capture that show one motion."""
+    again = "Make the capture again, with `make-capture --shift {}={{frames}}`."
+    masks = "Mask {frames} is that of frame 0.", "Mask 0 is that of frame {back}."
+    rows = "Row {frames} is frame 0: leave out the rows before it.", "Row 0 is frame {back}: fill in rows before it."
+    maps = in_space(watched, capture.cameras) if len(watched) > 1 else {}
+    shifts = of_cameras(maps) if maps else {}
+    files = {"controllers": None if space.hands is None else space.hands.points, "annotated points": space.annotated}
+    for name, one in watched.items():
+        if capture.has_depth:
+            yield Streams(f"color {name}", f"depth {name}", measure(one.color, one.depth), again.format(f"{name}.depth"))
+        if capture.description.masks:
+            yield Streams(f"color {name}", f"masks {name}", measure(one.color, one.masks), *masks)
+        if name in shifts:
+            yield Streams(f"camera {next(iter(watched))}", f"camera {name}", shifts[name], again.format(name))
+        for what, points in files.items():
+            if points is not None and points.size:
+                yield Streams(f"camera {name}", f"{what} in camera {name}", measure(one.color, on_images(points, capture.cameras[name])), *rows)
 
 
 def _read(findings: list[Finding], path: Path, reader: Callable[[Path], Any], skipped: str = "") -> Any:
@@ -80,8 +104,11 @@ def at(file: Path, findings: Iterable[Finding]) -> list[Finding]:
     return [replace(one, where=str(file), title=f"{one.where}: {one.name}") for one in findings]
 
 
-def _check_camera(capture: Capture, name: str, calibrated: bool, grips: np.ndarray) -> tuple[dict[int, Sample], list[Finding]]:
-    """A few frames of a camera, and all findings about its images and these. `grips` [T] counts hands at the object."""
+def _check_camera(
+    capture: Capture, name: str, calibrated: bool, grips: np.ndarray, watched: Watched
+) -> tuple[dict[int, Sample], list[Finding]]:
+    """A few frames of a camera, and all findings about its images and these. `grips` [T] counts hands at the object, and `watched`
+    sees all frames."""
     view, path, described = capture.cameras[name], capture.folder / CAPTURE, capture.description
     medians, shown = list[float](), Shown(capture.frame_count, (view.width, view.height))
     samples: dict[int, Sample] = {}
@@ -100,6 +127,7 @@ def _check_camera(capture: Capture, name: str, calibrated: bool, grips: np.ndarr
                 shown.see(frame, mask)
                 if capture.has_depth:
                     grips[frame] = max(grips[frame], hands_on(view, Sample(depth, mask)))
+            watched.see(frame, color, depth if capture.has_depth else None, mask if described.masks else None)
             if frame in wanted:
                 samples[frame] = Sample(depth, mask, color)
         except InputError as error:

@@ -2,7 +2,7 @@
 
 A plane is n . x + h = 0 in the coordinates of the camera (OpenCV: x right, y down, z forward, m). Its unit normal n points to the
 camera, so that h > 0 is the camera's height above it. It is found by RANSAC, then by weighted least squares: residuals count in
-units of the sensor's noise, which grows with depth as 0.0012 + 0.0019 (z - 0.4)^2 m (Nguyen et al. 2012, structured light).
+units of the sensor's noise, which grows with depth (`camera.depth_noise`).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from neuspring.data.camera import Plane
+from neuspring.data.camera import Plane, depth_noise
 
 HYPOTHESES = 2000
 """Triples of points per search: a plane with a tenth of the points is hit twice."""
@@ -51,7 +51,7 @@ def noise(points: np.ndarray, height: float | np.ndarray) -> np.ndarray:
     Depth is measured along the ray, which meets the plane at an angle: the part of its noise across the plane is height / z.
     """
     depth = points[:, 2]
-    return np.asarray(np.hypot((0.0012 + 0.0019 * (depth - 0.4) ** 2) * np.abs(height) / depth, FLATNESS))
+    return np.asarray(np.hypot(depth_noise(depth) * np.abs(height) / depth, FLATNESS))
 
 
 def planes(points: np.ndarray, most: int = PLANES) -> list[Plane]:

@@ -62,6 +62,8 @@ class InSpace:
     """[N, 3], m; none: not given."""
     tracks: np.ndarray
     """[T, K, 3], m, NaN where not annotated: those that teach the twin; K = 0 where they are for scoring only."""
+    annotated: np.ndarray
+    """[T, K, 3], m, NaN where not annotated: all of them."""
 
 
 def given(folder: Path, names: tuple[str, ...]) -> Path | None:
@@ -119,7 +121,7 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
         if file is not None and points.size:
             findings += examine("points", file, points.reshape(-1, 3), ground, what == "nodes")
     if any(one.level == "error" for one in findings):
-        return InSpace(hands, nodes, tracks), findings
+        return InSpace(hands, nodes, tracks, annotated), findings
     if (body := files.get("nodes")) is not None:
         findings += examine("nodes", body, nodes)
     if len(nodes):
@@ -129,7 +131,7 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
         start = held(hands, annotated, capture.train_end)[0]
         holding = Holding(grouped, hands.held(capture.train_end), start, nodes, np.concatenate([nodes, first]))
         findings += examine("holding", file, holding)
-    return InSpace(hands, nodes, tracks), findings
+    return InSpace(hands, nodes, tracks, annotated), findings
 
 
 def read_hands(path: Path, frames: int | None = None) -> Hands:

@@ -12,7 +12,7 @@ import numpy as np
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Lens
 from neuspring.extensions.make_capture.formats import CameraFeed, ImageSource, Pair, open_images
-from neuspring.extensions.make_capture.moments import Series, matched
+from neuspring.extensions.make_capture.moments import Match, Series, matched
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +27,8 @@ class Paired:
     pose: np.ndarray | None = None
     numbered: bool = False
     """True where numbers in names are known to count the same moments everywhere."""
+    late: int = 0
+    """Pictures of depth that come before the first that belongs to one of color, beyond what `moments` says."""
 
     @property
     def path(self) -> Path:
@@ -34,17 +36,18 @@ class Paired:
         return self.color.path
 
     @cached_property
-    def match(self) -> tuple[dict[int, int], str]:
-        """Number of color -> place of depth, and what decided; nothing of color alone. Raises InputError; see `moments`."""
+    def match(self) -> Match:
+        """Number of color -> place of depth; nothing of color alone. Raises InputError; see `moments`."""
         if self.depth is None:
-            return {}, ""
+            return Match({}, "")
         names = (f"camera {self.name}: color", "depth")
-        return matched(self.depth.path, names, self.color.series, self.depth.series, self.numbered)
+        found = matched(self.depth.path, names, self.color.series, self.depth.series, self.numbered)
+        return found.moved(self.late, len(self.depth.series.numbers))
 
     @cached_property
     def _pairs(self) -> list[tuple[int, int]]:
         """(place of color, place of depth)."""
-        numbers, of = self.color.series.numbers, self.match[0]
+        numbers, of = self.color.series.numbers, self.match.places
         if self.depth is None:
             return [(place, place) for place in range(len(numbers))]
         return [(place, of[number]) for place, number in enumerate(numbers) if number in of]

@@ -6,7 +6,7 @@ import hashlib
 import json
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from neuspring.checks import examine
+from neuspring.checks.timing import in_space
 from neuspring.config import parse
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
@@ -25,8 +26,8 @@ from neuspring.data import capture
 from neuspring.data.camera import Camera, CameraEntry, Lens
 from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Capture, Description, Writer, description_findings
 from neuspring.extensions.make_capture.feeds import Paired, pairs
-from neuspring.extensions.make_capture.film import looked_at
-from neuspring.extensions.make_capture.formats import Recorded, open_recording
+from neuspring.extensions.make_capture.film import cameras_in_step, in_step, looked_at, watch
+from neuspring.extensions.make_capture.formats import CameraFeed, Recorded, open_recording
 from neuspring.extensions.make_capture.lenses import Board, Straightener, read_lenses, read_poses
 from neuspring.extensions.make_capture.options import FILM_OPTIONS, SPACE_OPTIONS, Intake
 from neuspring.extensions.make_capture.poses import (
@@ -70,7 +71,7 @@ def opened(intake: Intake) -> Recorded:
     return Recorded(views=pairs(intake.color, intake.depth, intake.cameras) if intake.color else ())
 
 
-OF_FILM = ("frames", "depth_unit", "intrinsics", "poses", "board", "board_images", "level", "top_down", "table_at", "pose")
+OF_FILM = ("frames", "shift", "depth_unit", "intrinsics", "poses", "board", "board_images", "level", "top_down", "table_at", "pose")
 """Options that say nothing of points in space alone."""
 
 
@@ -98,7 +99,10 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
         option = "--tracks" if intake.tracks else "--teach"
         remedy = "Leave it out. To learn from the case's own, write tracks: train in capture.json then."
         raise InputError(option, "a case in PhysTwin's raw layout brings annotated points of its own", "both", remedy)
-    choice = choose(views, intake.frames)
+    late = shifts(intake.shift, views)
+    views = [replace(view, late=late.get(f"{view.name}.depth", 0)) if isinstance(view, Paired) else view for view in views]
+    film = replace(film, views=views)
+    choice = choose(views, intake.frames, late)
     findings = looked_at(views, choice)
     refuse_errors(findings)
     film.require_masks({name: [choice.numbers[frame] for frame in places] for name, places in choice.places.items()})
@@ -107,11 +111,17 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     names = [view.name for view in views]
     listed = read_lenses(intake.intrinsics, names) if intake.intrinsics else {}
     seen, unit = look(views, choice, listed, intake.intrinsics, intake.depth_unit)
+    watched = watch(views, choice, seen, unit)
+    findings += in_step(views, watched, late)
+    refuse_errors(findings)
     for name, view in seen.items():
         beside = examine("edges", view.path, list(zip(view.colors, view.depths, strict=False)))
         findings += [replace(one, title=f"camera {name}: {one.name}") for one in beside]
     findings += examine("category", intake.output, intake.category)
     placed, how = _place(intake, film, board, seen, unit)
+    cameras = {name: Camera(name, *view.size, view.lens.matrix, placed.poses[name]) for name, view in seen.items()}
+    findings += cameras_in_step(views, choice, in_space(watched, cameras), late)
+    refuse_errors(findings)
     made = _describe(intake, film, choice, rate, unit, seen, placed, how)
     if intake.brought and (intake.level or not (intake.poses or intake.board)):
         rule = "points in space need the world of the cameras: --poses or --board, without --level"
@@ -140,6 +150,22 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
         f"training frames: 0 to {training - 1}; future frames: {training} to {made.frame_count - 1}",
     ]
     return Capture.load(intake.output), lines
+
+
+SHIFT_FORM = re.compile(r"(.+)=([+-]?\d{1,5})")
+
+
+def shifts(given: Sequence[str], views: Sequence[CameraFeed]) -> dict[str, int]:
+    """Pictures that streams are late, by name, of options such as `0.depth=1`. Raises InputError."""
+    names = [view.name for view in views]
+    known = [*(f"{view.name}.depth" for view in views if isinstance(view, Paired) and view.depth is not None), *names[1:]]
+    late = {}
+    for text in given:
+        match = SHIFT_FORM.fullmatch(text)
+        if not match or match[1] not in known:
+            raise InputError("--shift", f"STREAM=PICTURES is required, with a stream of {' '.join(known) or 'none'}", text)
+        late[match[1]] = int(match[2])
+    return late
 
 
 def _require_for_color_alone(intake: Intake) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,8 @@ MISSING_SHARE = 0.05
 """This part of the pictures may be missing."""
 JITTER, ROUNDED = 0.1, 0.001
 """Intervals that differ by less than this part and these seconds are one rate: time stamps may be whole milliseconds."""
+OVERLAP = 0.5
+"""Two cameras' own clocks are one if this part of the shorter series lies within the other."""
 PAIRING_REMEDY = (
     "Numbers that each source counts for itself pair nothing. If one only ended early, remove the last pictures of the other. "
     "Else name the images of both by the camera's own frame numbers, or by time stamps (s, ms, us or ns since 1970)."
@@ -38,7 +41,7 @@ class Series:
     times: np.ndarray | None = None
     """s, ascending; None: unknown."""
     clock: str = ""
-    """Start of the times: `wall`, a file with several tracks, or, empty, the source's first picture."""
+    """Start of the times: `wall`, a camera's own (`device`), a file with several tracks, or, empty, the source's first picture."""
 
     @property
     def _steps(self) -> np.ndarray:
@@ -73,18 +76,38 @@ class Series:
         return f"{len(self.numbers)} pictures{known}"
 
 
-def matched(where: Path, names: tuple[str, str], one: Series, other: Series, numbered: bool = False) -> tuple[dict[int, int], str]:
-    """The pictures of `other` that show the moments of `one`: the nearest time stamps, else equal numbers in names, else the order.
+class Match(NamedTuple):
+    """Pictures of two sources that show the same moments."""
 
-    `numbered`: their numbers are known to count the same moments. Returns number of a picture of one -> place in the other, where
-    numbers decide also those that one lacks, and what decided. Raises InputError naming `where` and the two `names` where nothing
-    can be trusted.
+    places: dict[int, int]
+    """Number of a picture of one -> place in the other; where numbers decide also those that one lacks."""
+    by: str
+    """What decided."""
+    rival: int = 0
+    """Places by which another reading of the same names would move the other, where nothing in them says which is right."""
+
+    def moved(self, late: int, count: int) -> Match:
+        """The same with the other moved by `late` of its `count` pictures."""
+        if not late:
+            return self
+        places = {number: place + late for number, place in self.places.items() if 0 <= place + late < count}
+        return Match(places, f"{self.by}, moved by {late}", self.rival)
+
+
+def matched(where: Path, names: tuple[str, str], one: Series, other: Series, numbered: bool = False) -> Match:
+    """The pictures of `other` that show the moments of `one`: the nearest time stamps, else numbers in names, else the order.
+
+    Numbers decide where they have gaps or begin alike; as many pictures with the same gaps are paired by order. `numbered`: their
+    numbers are known to count the same moments. Raises InputError naming `where` and the two `names` where nothing can be trusted.
     """
     rule, counts = f"{names[0]} and {names[1]} must show the same moments", (len(one.numbers), len(other.numbers))
     received, alike = f"{one.text()} and {other.text()}", counts[0] == counts[1]
     unlike = f", none missing in between, as if one had {max(counts) / max(min(counts), 1):.2f} times the rate"
     if one.times is not None and other.times is not None:
-        absolute, largest = one.clock == other.clock != "", max(one.step, other.step)
+        largest = max(one.step, other.step)
+        within = min(one.times[-1], other.times[-1]) - max(one.times[0], other.times[0])
+        shared = within >= OVERLAP * min(np.ptp(one.times), np.ptp(other.times))
+        absolute = one.clock == other.clock != "" and (one.clock != "device" or shared)
         left, right = one.times - (0 if absolute else one.times[0]), other.times - (0 if absolute else other.times[0])
         if not absolute and one.whole and other.whole and abs(left[-1] - right[-1]) > MISSING_GAP * largest:
             raise InputError(where, rule, received + unlike, PAIRING_REMEDY)
@@ -94,20 +117,30 @@ def matched(where: Path, names: tuple[str, str], one: Series, other: Series, num
         if mutual.sum() < COMMON * min(counts):
             raise InputError(where, rule, f"{received}; {mutual.sum()} are within half a frame of each other", PAIRING_REMEDY)
         places = {one.numbers[k]: int(forth[k]) for k in np.flatnonzero(mutual)}
-        return places, f"time stamps, at most {1e3 * apart[mutual].max():.0f} ms apart"
+        clocks = "" if absolute else ", each from its first picture"
+        return Match(places, f"time stamps{clocks}, at most {1e3 * apart[mutual].max():.3g} ms apart")
+    by_numbers = Match({number: place for place, number in enumerate(other.numbers)}, "the numbers in their names")
+    begin = other.numbers[0] - one.numbers[0] if alike else 0
     if numbered or (one.named and other.named):
         common = len({*one.numbers} & {*other.numbers})
+        same_gaps = alike and [number + begin for number in one.numbers] == other.numbers
         # A counter of its own has no gaps and begins at its own start: it says nothing of moments.
         begins = not common or abs(one.numbers[0] - other.numbers[0]) <= one.step
         ends = one.numbers[-1] != other.numbers[-1]
         own = one.whole and other.whole and one.step == other.step and begins and ends and not alike
-        if numbered or (common >= COMMON * max(counts) and not own):
-            return {number: place for place, number in enumerate(other.numbers)}, "the numbers in their names"
-        if [number + other.numbers[0] - one.numbers[0] for number in one.numbers] != other.numbers:
+        trusted = common >= COMMON * max(counts)
+        if numbered or (trusted and not own and not (same_gaps and begin)):
+            return by_numbers
+        if not same_gaps:
             raise InputError(where, rule, received + (unlike if own else f"; {common} numbers are common"), PAIRING_REMEDY)
-    elif not alike:
+        # Neither says whether both counters begin with the same moment, or count the same moments.
+        both = min({*one.numbers} & {*other.numbers}) if trusted else None
+        rival = 0 if both is None else other.numbers.index(both) - one.numbers.index(both)
+        by_order = f"order, from {one.numbers[0]} and {other.numbers[0]}"
+        return Match({number: place for place, number in enumerate(one.numbers)}, by_order, rival)
+    if not alike:
         raise InputError(where, rule, received, PAIRING_REMEDY)
-    return {number: place for place, number in enumerate(one.numbers)}, "order"
+    return Match({number: place for place, number in enumerate(one.numbers)}, "order")
 
 
 def _nearest(times: np.ndarray, among: np.ndarray) -> np.ndarray:
@@ -125,6 +158,8 @@ class Evenness:
     """Frames: the farthest from where the clock has it."""
     missing: int
     """Pictures that are missing in between."""
+    gaps: list[int]
+    """Pictures after which some are missing."""
     runs: list[tuple[int, int]]
     """First and last picture of each part with one rate."""
 
@@ -137,7 +172,8 @@ class Evenness:
         breaks = np.abs(np.diff(steps)) > JITTER * steps[1:] + ROUNDED
         label = np.concatenate([[0], np.cumsum(breaks)])
         runs = [list(part) for _, part in groupby(range(len(steps)), key=lambda k: label[k])]
-        return cls(steps, float(np.ptp(rest) / 2 / steps.mean()), int(counted.sum()), [(part[0], part[-1] + 1) for part in runs])
+        even, gaps = [(part[0], part[-1] + 1) for part in runs], np.flatnonzero(counted).tolist()
+        return cls(steps, float(np.ptp(rest) / 2 / steps.mean()), int(counted.sum()), gaps, even)
 
     @property
     def bad(self) -> bool:
@@ -152,7 +188,7 @@ class Evenness:
     def text(self) -> str:
         """The intervals."""
         first, last = 1e3 * self.steps.min(), 1e3 * self.steps.max()
-        lost = f"about {self.missing} lost pictures, " if self.missing else ""
+        lost = f"about {self.missing} lost pictures (after {spans(self.gaps)} of {len(self.steps) + 1}), " if self.missing else ""
         return f"intervals of {first:.0f} to {last:.0f} ms, {lost}up to {self.departure:.1f} frames off an even clock"
 
 

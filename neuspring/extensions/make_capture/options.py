@@ -41,6 +41,8 @@ class Intake:
     """frames per second at which it was filmed; that of the video by default"""
     frames: str = ""
     """what is kept, by number: 250-335, 0-300/2, 1,5,9-20"""
+    shift: tuple[str, ...] = ()
+    """pictures that a stream is late, by name: 0.depth=1 moves depth of camera 0, 1=-2 moves camera 1"""
     train_end: int | None = None
     """training frames end before this frame; the first 70 percent by default"""
     poses: Path | None = None

@@ -23,7 +23,7 @@ from neuspring.data.capture import FEWEST_FRAMES
 from neuspring.extensions.make_capture.feeds import Paired
 from neuspring.extensions.make_capture.formats import CameraFeed, Pair, open_images
 from neuspring.extensions.make_capture.lenses import Board, Straightener, depth_ratio, require_lens, sight
-from neuspring.extensions.make_capture.moments import matched
+from neuspring.extensions.make_capture.moments import MISSING_GAP, Match, matched
 from neuspring.extensions.make_capture.table import Unit, common_plane, find_table, find_unit, levelling, pose_on
 from neuspring.intake.depth import cloud, planes
 
@@ -42,8 +42,8 @@ class FrameChoice:
     """Every so many frames of the source are kept; the rate falls by it."""
     jumps: list[int]
     """Numbers after which more are left out than elsewhere: there time jumps."""
-    pairing: dict[str, str]
-    """Cameras -> by what their frames belong together."""
+    pairing: dict[str, Match]
+    """Camera -> by what its frames belong to those of the first."""
 
     def missing(self, camera: str) -> tuple[int, ...]:
         """Frames that the camera lacks."""
@@ -73,18 +73,20 @@ def chosen(wanted: str, numbers: Sequence[int]) -> list[int]:
     return sorted(kept)
 
 
-def choose(views: Sequence[CameraFeed], wanted: str = "") -> FrameChoice:
-    """The frames of all cameras that are kept, numbered as those of the first.
+def choose(views: Sequence[CameraFeed], wanted: str = "", late: Mapping[str, int] | None = None) -> FrameChoice:
+    """The frames of all cameras that are kept, numbered as those of the first; with cameras moved that are `late`, in frames.
 
     See `moments.matched` for which frames of others belong to them. A number that one camera has and another lacks is a missing
     frame of that one. Raises InputError for too few frames, or where cameras have no moments in common.
     """
     first = views[0]
-    where, pairing = {first.name: {number: place for place, number in enumerate(first.series.numbers)}}, dict[str, str]()
+    where, pairing = {first.name: {number: place for place, number in enumerate(first.series.numbers)}}, dict[str, Match]()
     for view in views[1:]:
         numbered = isinstance(view, Paired) and view.numbered
         names = f"camera {first.name}", f"camera {view.name}"
-        where[view.name], pairing[" and ".join(names)] = matched(view.path, names, first.series, view.series, numbered)
+        found = matched(view.path, names, first.series, view.series, numbered)
+        pairing[view.name] = found.moved((late or {}).get(view.name, 0), len(view.series.numbers))
+        where[view.name] = pairing[view.name].places
     numbers = sorted({number for of in where.values() for number in of})
     kept = chosen(wanted, numbers)
     received = f"{len(kept)} of the numbers {numbers[0]} to {numbers[-1]}" if numbers else "none"
@@ -95,14 +97,14 @@ def choose(views: Sequence[CameraFeed], wanted: str = "") -> FrameChoice:
     for view in views:
         if len(places[view.name]) < len(kept) / 2 or 0 not in places[view.name]:
             rule = f"camera {view.name} must have the first of the chosen frames, number {kept[0]}, and half of the others"
-            remedy = "Name the images of all cameras by the same frame numbers"
-            remedy += "." if start in (None, kept[0]) else f", or begin where all have a frame: --frames {start}-"
+            remedy = "Name the images of all cameras by the same frame numbers, or name other --frames"
+            remedy += f": all have number {start}." if start not in (None, kept[0]) else "."
             raise InputError(view.path, rule, f"{len(places[view.name])} of {len(kept)}", remedy)
     # The rate is that of the files that are there; a number that is not there is a moment that is missing.
     order = {number: place for place, number in enumerate(numbers)}
     step = min(order[after] - order[before] for before, after in pairwise(kept))
     gaps = [after - before for before, after in pairwise(kept)]
-    jumps = [number for number, gap in zip(kept, gaps, strict=False) if gap != min(gaps)]
+    jumps = [number for number, gap in zip(kept, gaps, strict=False) if gap > MISSING_GAP * min(gaps)]
     return FrameChoice(kept, places, step, jumps, pairing)
 
 

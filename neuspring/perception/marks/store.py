@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -19,6 +20,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
+from neuspring.checks.timing import Shift, Watched, measure
 from neuspring.config import parse, plain
 from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
@@ -87,22 +89,68 @@ def save_masks(capture: Capture, camera: str, labels: np.ndarray) -> Path:
     return capture.folder / "mask" / camera
 
 
-def import_masks(capture: Capture, camera: str, masks: Path, hands: Path | None = None) -> Path:
-    """Save the masks of other tools as those of a camera: folders of <frame>.png, see `capture.read_labels`.
+def import_masks(capture: Capture, camera: str, masks: Path, hands: Path | None = None) -> tuple[Path, str]:
+    """Save the masks of other tools as those of a camera: folders of <number>.png, see `capture.read_labels`.
 
-    With `hands` all but 0 counts: in `masks` as the object, in `hands` as hands, who lie before it. Raises InputError.
+    Numbers count the frames of the capture, or those of the film that it was cut from; what moves decides where both can be. With
+    `hands` all but 0 counts: in `masks` as the object, in `hands` as hands, who lie before it. Returns the folder and what was
+    decided. Raises InputError.
     """
-    view = capture.cameras[camera]
-    labels = np.zeros((capture.frame_count, view.height, view.width), np.uint8)
-    for folder, label in ((masks, OBJECT), (hands, HANDS)):
-        files = _numbered(folder) if folder is not None else {}
-        for frame in frames_of(capture, camera) if files else []:
-            if frame not in files:
-                rule = f"a mask of frame {frame} of camera {camera} is required, with its number as the name: {frame:05d}.png"
-                raise InputError(folder, rule, f"frames {min(files)} to {max(files)}, {len(files)} in all")
-            found = read_labels(files[frame], view, binary=hands is not None)
-            labels[frame] = np.where(found > 0, np.where(hands is None, found, label), labels[frame])
-    return save_masks(capture, camera, labels)
+    view, frames = capture.cameras[camera], frames_of(capture, camera)
+    folders = [(_numbered(folder), label) for folder, label in ((masks, OBJECT), (hands, HANDS)) if folder is not None]
+
+    def read(numbers: Sequence[int]) -> np.ndarray:
+        labels = np.zeros((capture.frame_count, view.height, view.width), np.uint8)
+        for files, label in folders:
+            for frame, number in zip(frames, numbers, strict=True):
+                found = read_labels(files[number], view, binary=hands is not None)
+                labels[frame] = np.where(found > 0, np.where(hands is None, found, label), labels[frame])
+        return labels
+
+    there = sorted(set.intersection(*(set(files) for files, _ in folders)))
+    readings = {what: numbers for what, numbers in _readings(capture, frames, there).items() if set(numbers) <= set(there)}
+    if not readings:
+        lacking = next(frame for frame in frames if frame not in there)
+        rule = f"a mask of frame {lacking} of camera {camera} is required, with its number as the name: {lacking:05d}.png"
+        raise InputError(masks, rule, f"frames {min(there, default='-')} to {max(there, default='-')}, {len(there)} in all")
+    read_as = {what: read(numbers) for what, numbers in readings.items()}
+    shifts = {what: _shift(capture, camera, labels) for what, labels in read_as.items()}
+    fitting = [what for what, shift in shifts.items() if shift and shift.known and not shift.wrong]
+    if len(readings) > 1 and len(fitting) != 1:
+        alike = "; ".join(f"{what}: frame {frames[0]} is {numbers[0]:05d}.png" for what, numbers in readings.items())
+        remedy = f"Name them by the frames of the capture, from {frames[0]:05d}.png, and remove the others."
+        raise InputError(masks, "the numbers of masks must have one meaning, and what moves does not tell", alike, remedy)
+    chosen = fitting[0] if fitting else next(iter(readings))
+    if (shift := shifts[chosen]) and shift.wrong:
+        rule = f"masks of camera {camera} must be of the frames of the film"
+        raise InputError(masks, rule, shift.text("the film", "masks"), "Name each by its frame: 00000.png is the first.")
+    left = sorted(set(there) - set(readings[chosen]))
+    unused = f"; {len(left)} of {len(there)} are of no frame: {left[0]:05d}.png to {left[-1]:05d}.png" if left else ""
+    return save_masks(capture, camera, read_as[chosen]), f"{chosen}{unused}"
+
+
+SOURCE_FRAMES = re.compile(r"numbers (\d+) to (\d+) of the source(?:, one in (\d+))?")
+"""The frames of the film in capture.json's provenance, as make-capture and cut-capture say them."""
+
+
+def _readings(capture: Capture, frames: Sequence[int], there: Sequence[int]) -> dict[str, list[int]]:
+    """Numbers of the masks of `frames`, by what numbers may count; each once."""
+    readings = {"frames of the capture": list(frames)}
+    if match := SOURCE_FRAMES.search(capture.description.provenance.get("frames", "")):
+        source = range(int(match[1]), int(match[2]) + 1, int(match[3] or 1))
+        if len(source) == capture.frame_count:
+            readings["frames of the film that the capture was made of"] = [source[frame] for frame in frames]
+    if len(there) == len(frames):
+        readings["order"] = list(there)
+    return {what: numbers for k, (what, numbers) in enumerate(readings.items()) if numbers not in [*readings.values()][:k]}
+
+
+def _shift(capture: Capture, camera: str, labels: np.ndarray) -> Shift | None:
+    """The shift in time of masks [T, H, W] against the film."""
+    watched = Watched(capture.frame_count)
+    for frame in frames_of(capture, camera):
+        watched.see(frame, capture.color(camera, frame), mask=labels[frame])
+    return measure(watched.color, watched.masks)
 
 
 def has_masks(capture: Capture, cameras: Sequence[str] = ()) -> bool:

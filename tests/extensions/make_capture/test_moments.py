@@ -131,7 +131,7 @@ def test_names_that_are_times_are_paired_by_the_nearest(tmp_path, write, offset)
     assert any("about 2 lost pictures, up to" in line and "warning" in line for line in lines)
 
 
-@pytest.mark.parametrize(("form", "step"), [("1681234567123_{}.png", 1), ("2026013112305{:03d}.png", 3), ("{:010d}.png", 1)])
+@pytest.mark.parametrize(("form", "step"), [("1681234567123_{}.png", 1), ("20260131_{:03d}.png", 3), ("{:010d}.png", 1)])
 def test_digits_that_are_no_time_count(tmp_path, form, step):
     """The start of a session, a date, and a counter with ten digits."""
     folder = ImageFolder(named(tmp_path, "color", range(0, 45 * step, step), form), "color")

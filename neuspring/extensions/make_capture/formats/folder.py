@@ -15,11 +15,7 @@ from neuspring.core.errors import InputError
 from neuspring.data.images import read_npy, read_picture
 from neuspring.extensions.make_capture.formats import ENDINGS, CaptureFormat, Kind, require_kind
 from neuspring.extensions.make_capture.moments import Series
-
-STAMP = re.compile(r"(?<![0-9])([0-9]{10,19})(\.[0-9]+)?(?![0-9])")
-STAMP_SECONDS = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}
-"""s per count of a time since 1970 with so many digits before the point."""
-
+from neuspring.extensions.make_capture.stamps import times_of
 
 @dataclass(frozen=True)
 class ImageFolder:
@@ -36,18 +32,18 @@ class ImageFolder:
         if len(endings) != 1:
             rule = f"{self.kind} images of one format are required ({' '.join(ENDINGS[self.kind])})"
             raise InputError(self.path, rule, " and ".join(endings) or "none", "Color and depth need a folder of their own each.")
-        stamps = {path: _stamp(path) or 0.0 for path in found}
         # re.split with a group alternates text and digits.
         words = {path: [(p.isdigit(), int(p) if p.isdigit() else 0, p) for p in re.split(r"([0-9]+)", path.stem)] for path in found}
-        return sorted(found, key=lambda path: (stamps[path] if all(stamps.values()) else 0.0, words[path]))
+        told = times_of([path.stem for path in found])
+        times = dict(zip(found, told[0].tolist(), strict=True)) if told else {}
+        return sorted(found, key=lambda path: (times.get(path, 0.0), words[path]))
 
     @cached_property
     def series(self) -> Series:
-        """Times since 1970 in the names, with places as numbers; else the only number in which names differ; else places."""
+        """Times in the names, with places as numbers; else the only number in which names differ; else places."""
         stems = [path.stem for path in self.paths]
-        times = np.array([_stamp(path) for path in self.paths], dtype=float)
-        if np.isfinite(times).all() and (np.diff(times) > 0).all():
-            return Series(list(range(len(stems))), times=times, clock="wall")
+        if told := times_of(stems):
+            return Series(list(range(len(stems))), times=told[0], clock=told[1])
         words = [re.split(r"([0-9]+)", stem) for stem in stems]
         counts = list(zip(*(word[1::2] for word in words), strict=True)) if len({tuple(word[::2]) for word in words}) == 1 else []
         moving = [column for column in counts if len(set(column)) > 1]
@@ -66,15 +62,6 @@ class ImageFolder:
     def files(self, places: Sequence[int]) -> list[Path]:
         """One per picture."""
         return [self.paths[place] for place in places]
-
-
-def _stamp(path: Path) -> float | None:
-    """s since 1970 of a name with such a time, in s with a fraction, ms, us or ns."""
-    found = STAMP.search(path.stem)
-    if not found or len(found[1]) not in STAMP_SECONDS or not (found[2] or len(found[1]) > min(STAMP_SECONDS)):
-        return None
-    time = (int(found[1]) + float(found[2] or 0)) * STAMP_SECONDS[len(found[1])]
-    return time if 1e9 < time < 2e9 else None  # From 2e9 on digits are a date: 20260131...
 
 
 def holds_images(path: Path) -> bool:

@@ -1,0 +1,263 @@
+"""Time between two streams of one scene, measured: what moves, moves in both at the same moments.
+
+A stream is motion per step and cell, a [T, n]: row t says how much changed from frame t - 1 to t, in n cells that both streams
+share: parts of the image for color, depth and masks of a camera, parts of space for two cameras. With m(s) the mean over cells and
+the steps that both have, the agreement after a shift by s frames is the correlation
+
+    c(s) = sum (a_t - m) (b_{t+s} - m) / sqrt(sum (a_t - m)^2 sum (b_{t+s} - m)^2)
+
+and the shift is where it is greatest, with a fraction by the parabola through three values. It is clear if it stays where it is
+when any quarter of the time is left out. No name, number or time stamp is read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import Any
+
+import cv2
+import numpy as np
+
+from neuspring.core.checks import Check
+from neuspring.data.camera import Camera, depth_noise
+
+WIDE, CELLS = 320, (24, 14)
+"""Width, pixels, at which pictures are compared, and cells across and down."""
+COLOR_NOISE, COLOR_MOST = 6.0, 30.0
+"""Change of a color value that is noise, and beyond which more says nothing."""
+DEPTH_NOISE = 4.0
+"""Change of depth that is noise, in standard deviations of a sensor; beyond 5 times as much more says nothing."""
+FEWEST = 8
+"""Steps that both streams must have."""
+AGREE = 0.25
+"""Correlation from which two streams show the same motion. Real and rendered recordings have 0.5 to 0.85, two cameras 0.4."""
+HALF, WHOLE = 0.5, 0.75
+"""Frames: a shift that is a finding, as is how far a clear one may move without a quarter of the time; and one that whole frames
+mend."""
+QUARTERS = 4
+SPACE_CELLS, CELL = 9, (0.02, 0.25)
+"""Cells across what moves in space, and the least and greatest side of one, m."""
+
+
+@dataclass(frozen=True)
+class Shift:
+    """Shift in time of a stream against another."""
+
+    frames: float
+    """How many frames later the second shows what the first shows."""
+    agreement: float
+    """c at the shift."""
+    spread: float
+    """Frames: the most that it moves without a quarter of the time."""
+
+    @property
+    def known(self) -> bool:
+        """True where both streams show one motion, so that their time is measured."""
+        return self.agreement >= AGREE and self.spread < HALF
+
+    @property
+    def wrong(self) -> bool:
+        """True where time is clearly off by half a frame or more."""
+        return self.known and abs(self.frames) >= max(HALF, 2 * self.spread)
+
+    def text(self, one: str, other: str) -> str:
+        """The shift in words."""
+        side = "later" if self.frames > 0 else "earlier"
+        return f"what moves, moves {abs(self.frames):.1f} frames {side} in {other} than in {one}"
+
+
+def measure(one: np.ndarray, other: np.ndarray, most: int | None = None) -> Shift | None:
+    """The shift of `other` [T2, n] against `one` [T1, n], by at most `most` frames; NaN rows are unknown.
+
+    None where too little moves.
+    """
+    a, b = (np.sqrt(rows.reshape(len(rows), -1)) for rows in (one, other))
+    reach = min(most or max(len(a), len(b)), max(len(a), len(b)) - FEWEST)
+    known = [np.isfinite(rows).all(axis=1) for rows in (a, b)]
+    if reach < 1 or min(np.nansum(a), np.nansum(b)) <= 0 or min(map(np.sum, known)) < FEWEST:
+        return None
+    shifts = np.arange(-reach, reach + 1)
+    whole = _peak(a, b, shifts, np.ones(len(a), bool))
+    if whole is None:
+        return None
+    parts = []
+    for part in np.array_split(np.flatnonzero(known[0] & (np.nansum(a, axis=1) > 0)), QUARTERS):
+        kept = np.ones(len(a), bool)
+        kept[part] = False
+        parts.append(_peak(a, b, shifts[np.abs(shifts - round(whole[0])) <= 3], kept))
+    spread = max(np.inf if part is None else abs(part[0] - whole[0]) for part in parts)
+    return Shift(*whole, float(spread))
+
+
+def _peak(a: np.ndarray, b: np.ndarray, shifts: np.ndarray, kept: np.ndarray) -> tuple[float, float] | None:
+    """The shift with the greatest agreement, and that, over the rows of `a` that are `kept`."""
+    values = np.array([_agreement(a, b, int(shift), kept) for shift in shifts])
+    if not np.isfinite(values).any():
+        return None
+    k = int(np.nanargmax(values))
+    fraction = 0.0
+    if 0 < k < len(values) - 1 and np.isfinite(values[k - 1 : k + 2]).all():
+        before, here, after = values[k - 1 : k + 2]
+        fraction = 0.5 * (before - after) / min(before - 2 * here + after, -1e-12)
+    return float(shifts[k] + np.clip(fraction, -0.5, 0.5)), float(values[k])
+
+
+def _agreement(a: np.ndarray, b: np.ndarray, shift: int, kept: np.ndarray) -> float:
+    """c(shift) over the rows of `a` that are `kept`; NaN of too few."""
+    first, last = max(0, -shift), min(len(a), len(b) - shift)
+    if last - first < FEWEST:
+        return np.nan
+    x, y = a[first:last], b[first + shift : last + shift]
+    both = kept[first:last] & np.isfinite(x[:, 0]) & np.isfinite(y[:, 0])
+    if both.sum() < FEWEST:
+        return np.nan
+    x, y = x[both] - x[both].mean(axis=0), y[both] - y[both].mean(axis=0)
+    size = np.sqrt((x * x).sum() * (y * y).sum())
+    return float((x * y).sum() / size) if size > 0 else np.nan
+
+
+@dataclass(eq=False)
+class Watched:
+    """Motion in the pictures of one camera, frame by frame."""
+
+    frames: int
+    """Frames of the capture."""
+    color: np.ndarray = field(init=False)
+    """[T, n] by cell of the image, as `depth` and `masks`; NaN where the frame or the one before it is unknown."""
+    depth: np.ndarray = field(init=False)
+    masks: np.ndarray = field(init=False)
+    moving: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    """Frame -> pixels (x, y) [m, 2] that moved there, and their depth [m], m."""
+
+    def __post_init__(self) -> None:
+        self.color, self.depth, self.masks = (np.full((self.frames, CELLS[0] * CELLS[1]), np.nan) for _ in range(3))
+        self._last: tuple[int, np.ndarray, np.ndarray | None, np.ndarray | None] | None = None
+
+    def see(self, frame: int, color: np.ndarray, depth: np.ndarray | None = None, mask: np.ndarray | None = None) -> None:
+        """The next frame: RGB [H, W, 3] uint8, depth [H, W], m, 0: none, labels [H, W]."""
+        scale = min(1.0, WIDE / color.shape[1])
+        size = round(scale * color.shape[1]), round(scale * color.shape[0])
+        picture = cv2.resize(np.ascontiguousarray(color), size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        picture = cv2.GaussianBlur(picture, (0, 0), 1.0)
+        near = None if depth is None else cv2.resize(depth.astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
+        labels = None if mask is None else cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
+        last, self._last = self._last, (frame, picture, near, labels)
+        if last is None or last[0] != frame - 1:
+            return
+        change = np.clip(np.abs(picture - last[1]).max(axis=-1) - COLOR_NOISE, 0, COLOR_MOST)
+        self.color[frame] = _cells(change)
+        if near is not None and last[2] is not None:
+            both, noise = (near > 0) & (last[2] > 0), DEPTH_NOISE * depth_noise(np.maximum(near, 0.1))
+            moved = np.where(both, np.clip(np.abs(near - last[2]) / noise - 1, 0, 5), 0).astype(np.float32)
+            self.depth[frame] = _cells(cv2.medianBlur(moved, 3))
+            y, x = np.nonzero((change > 0) & (near > 0))
+            y, x = y[::2], x[::2]
+            self.moving[frame] = np.stack([x, y], axis=1) / scale, near[y, x]
+        if labels is not None and last[3] is not None:
+            self.masks[frame] = _cells((labels != last[3]).astype(np.float32))
+
+
+def _cells(change: np.ndarray) -> np.ndarray:
+    """Means [n] of a picture [h, w] in CELLS."""
+    return cv2.resize(change, CELLS, interpolation=cv2.INTER_AREA).ravel()
+
+
+def in_space(watched: Mapping[str, Watched], cameras: Mapping[str, Camera]) -> dict[str, np.ndarray]:
+    """Motion of each camera by cells of space [T, n], which all share; nothing where too little moves."""
+    placed = {
+        name: {frame: cameras[name].lift(*there) for frame, there in one.moving.items()} for name, one in watched.items()
+    }
+    points = [points for one in placed.values() for points in one.values() if len(points)]
+    if not points:
+        return {}
+    low, high = np.quantile(np.concatenate(points), (0.02, 0.98), axis=0)
+    side = float(np.clip((high - low).max() / SPACE_CELLS, *CELL))
+    shape = np.floor((high - low) / side).astype(int) + 1
+    maps = {}
+    for name, one in placed.items():
+        rows = np.full((watched[name].frames, int(np.prod(shape))), np.nan)
+        for frame, there in one.items():
+            cell = np.floor((there - low) / side).astype(int)
+            inside = ((cell >= 0) & (cell < shape)).all(axis=1)
+            area = watched[name].moving[frame][1][inside] ** 2  # of a pixel
+            rows[frame] = np.bincount(np.ravel_multi_index(tuple(cell[inside].T), tuple(shape)), area, len(rows[frame]))
+        maps[name] = rows
+    return maps
+
+
+def of_cameras(maps: Mapping[str, np.ndarray]) -> dict[str, Shift | None]:
+    """The shift of every camera but the first against it, by motion in space; through another camera where they share none."""
+    first, *others = maps
+    direct = {(a, b): measure(maps[a], maps[b]) for a, b in combinations(maps, 2)}
+    found = {name: direct[first, name] for name in others}
+    for a, b in ((a, b) for a, b in direct if a != first):
+        via, of = (a, b) if (there := found[a]) and there.known else (b, a)
+        step, there, own = direct[a, b], found[via], found[of]
+        if step and step.known and there and there.known and not (own and own.known):
+            frames = there.frames + (step.frames if via == a else -step.frames)
+            found[of] = Shift(frames, min(step.agreement, there.agreement), step.spread + there.spread)
+    return found
+
+
+def on_images(points: np.ndarray, camera: Camera) -> np.ndarray:
+    """Motion of points [T, K, 3], m, NaN: unknown, in the cells of a camera's image [T, n]; NaN where none is known."""
+    pixels, depth = camera.project(points)
+    rows = np.full((len(points), CELLS[0] * CELLS[1]), np.nan)
+    for frame in range(1, len(points)):
+        both = (depth[frame - 1 : frame + 1] > 0).all(axis=0) & np.isfinite(pixels[frame - 1 : frame + 1]).all(axis=(0, 2))
+        both[both] &= camera.sees(pixels[frame, both])
+        if both.any():
+            speed = np.linalg.norm(pixels[frame, both] - pixels[frame - 1, both], axis=1)
+            cell = np.clip(pixels[frame, both] / (camera.width, camera.height) * CELLS, 0, np.array(CELLS) - 1).astype(int)
+            rows[frame] = np.bincount(cell[:, 1] * CELLS[0] + cell[:, 0], speed, rows.shape[1])
+    return rows
+
+
+@dataclass(frozen=True, eq=False)
+class Streams:
+    """Two streams of one scene, and their shift."""
+
+    one: str
+    other: str
+    shift: Shift | None
+    """None where too little moves."""
+    late: str = ""
+    """The next move where the second is late; {frames} stands for whole frames."""
+    early: str = ""
+    """The next move where it is early, {back} for whole frames; the same by default."""
+    moved: int = 0
+    """Frames by which the second is moved already."""
+
+
+def out_of_step(pairs: Sequence[Streams]) -> Iterator[dict[str, Any]]:
+    """Frames by which a second stream is clearly late, half a frame or more."""
+    for streams in pairs:
+        if streams.shift is None or not streams.shift.wrong:
+            continue
+        frames, whole = streams.shift.frames, streams.moved + round(streams.shift.frames)
+        next_move = (streams.late if frames > 0 else streams.early or streams.late).format(frames=whole, back=-whole)
+        told = {"value": round(frames, 2), "text": streams.shift.text(streams.one, streams.other)}
+        if abs(frames) < WHOLE:
+            told |= {"level": "warning"}
+            next_move = "Whole frames do not mend it: synchronize the streams when they are filmed."
+        yield told | {"next": next_move}
+
+
+def in_step(pairs: Sequence[Streams]) -> dict[str, Any] | None:
+    """The greatest shift of all pairs, frames; and those of which time is not known."""
+    known = [streams for streams in pairs if streams.shift and streams.shift.known]
+    told = [f"{streams.other} {round(streams.shift.frames, 1) + 0.0:+.1f}" for streams in known if streams.shift]
+    left = [f"{streams.other} against {streams.one}" for streams in pairs if streams not in known]
+    text = f"frames that streams are late, by what moves: {', '.join(told)}" if told else ""
+    text += ("; " if told and left else "") + (f"too little of one motion to check {', '.join(left)}" if left else "")
+    most = max((abs(streams.shift.frames) for streams in known if streams.shift), default=None)
+    return {"value": most, "text": text} if pairs else None
+
+
+# fmt: off
+checks = (
+    Check("out of step", "streams", out_of_step, None, "error", "{text}; less than half a frame is required.", "{next}", title="time"),
+    Check("in step", "streams", in_step, None, "note", "{text}", title="time"),
+)
