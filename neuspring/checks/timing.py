@@ -166,9 +166,7 @@ def _cells(change: np.ndarray) -> np.ndarray:
 
 def in_space(watched: Mapping[str, Watched], cameras: Mapping[str, Camera]) -> dict[str, np.ndarray]:
     """Motion of each camera by cells of space [T, n], which all share; nothing where too little moves."""
-    placed = {
-        name: {frame: cameras[name].lift(*there) for frame, there in one.moving.items()} for name, one in watched.items()
-    }
+    placed = {name: {frame: cameras[name].lift(*there) for frame, there in one.moving.items()} for name, one in watched.items()}
     points = [points for one in placed.values() for points in one.values() if len(points)]
     if not points:
         return {}

@@ -115,7 +115,7 @@ def refuse_errors(findings: Iterable[Finding]) -> None:
     """Raise InputError with the first finding that is an error."""
     for one in findings:
         if one.level == "error":
-            raise InputError(one.where, f"{one.name}: {one.text.rstrip('.')}")
+            raise InputError(one.where, one.message.rstrip("."))
 
 
 def warnings_of(results: Path, scenarios: Iterable[str]) -> tuple[tuple[str, Finding], ...]:

@@ -91,7 +91,7 @@ class Plane:
     share: float
     """Its part of the points with depth."""
     inliers: int
-    """Its points, of at most `intake.depth.POINTS`."""
+    """Its points, of at most `planes.CLOUD_POINTS`."""
     points: np.ndarray
     """They themselves [n, 3], m, in the coordinates of the camera."""
 

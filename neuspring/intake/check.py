@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from neuspring.checks import examine
-from neuspring.checks.cameras import pairs
 from neuspring.checks.case import FINAL_DATA, Case, whole
 from neuspring.checks.masks import Shown
-from neuspring.checks.table import CameraAlone, TableSeen, object_on_table
+from neuspring.checks.rig import CameraAlone, Judged, Rig
+from neuspring.checks.table import object_on_table
 from neuspring.checks.things import HAND_LEAST, INSIDE, Sample, hands_on, lifted, outline, place_of, sampled
 from neuspring.checks.timing import Streams, Watched, in_space, measure, of_cameras, on_images
 from neuspring.core.artifacts import up_sign
@@ -28,7 +28,6 @@ from neuspring.core.findings import Finding, note, refusal, unusual
 from neuspring.data.capture import CAPTURE, NODES, OBJECT, POINTS, Capture, description_findings, read_description
 from neuspring.data.unpickle import load_pickle
 from neuspring.intake import phystwin
-from neuspring.intake.depth import cloud, planes
 from neuspring.intake.points import InSpace, look
 
 LEAST_AROUND = 0.1
@@ -50,12 +49,13 @@ def check_capture(folder: Path) -> list[Finding]:
     grips = np.zeros(capture.frame_count, int)
     samples, watched = {}, {name: Watched(capture.frame_count) for name in capture.cameras}
     for name in capture.cameras:
-        samples[name], of_camera = _check_camera(capture, name, calibrated, grips, watched[name])
+        sampled_here, of_camera = _check_camera(capture, name, calibrated, grips, watched[name])
         findings += of_camera
+        if sampled_here:
+            samples[name] = sampled_here
     findings += examine("grips", path, grips, description.frame_rate, folder)
-    if calibrated and len(samples) > 1:
-        first = {name: found[0].depth for name, found in samples.items() if 0 in found}
-        findings += examine("views", path, list(pairs(capture.cameras, first, description.up)))
+    if calibrated and capture.has_depth and samples:
+        findings += _rig(capture, samples)
     space, of_space = look(capture)
     findings += of_space
     if calibrated:
@@ -84,7 +84,12 @@ def _streams(capture: Capture, watched: Mapping[str, Watched], space: InSpace) -
             yield Streams(f"camera {next(iter(watched))}", f"camera {name}", shifts[name], again.format(name))
         for what, points in files.items():
             if points is not None and points.size:
-                yield Streams(f"camera {name}", f"{what} in camera {name}", measure(one.color, on_images(points, capture.cameras[name])), *rows)
+                yield Streams(
+                    f"camera {name}",
+                    f"{what} in camera {name}",
+                    measure(one.color, on_images(points, capture.cameras[name])),
+                    *rows,
+                )
 
 
 def _read(findings: list[Finding], path: Path, reader: Callable[[Path], Any], skipped: str = "") -> Any:
@@ -141,29 +146,37 @@ def _check_camera(
     findings += wrong
     if calibrated and not wrong:
         findings += (_with_depth if capture.has_depth else _color_alone)(capture, name, samples)
-    return samples, findings + at(capture.folder / "mask" / name, examine("masks", f"camera {name}", shown))
+    return {} if wrong else samples, findings + at(capture.folder / "mask" / name, examine("masks", f"camera {name}", shown))
 
 
 def _with_depth(capture: Capture, name: str, samples: dict[int, Sample]) -> list[Finding]:
     """The table, and object and hands in the masks, of one camera."""
     path, camera, described, up = capture.folder / CAPTURE, capture.cameras[name], capture.description, capture.description.up
-    unit = described.depth_unit if described.depth_format == "png" else None
-    # Object and hands are no table; what is left must be enough of the image to tell one.
-    around = [np.where(sample.mask == 0, sample.depth, 0.0) for sample in samples.values()]
-    enough = around and np.mean([(depth > 0).mean() for depth in around]) >= LEAST_AROUND
-    tables = planes(cloud(around, camera.intrinsics)) if enough else []
     bodies = {frame: lifted(camera, sample, OBJECT) for frame, sample in samples.items()}
     pictures = [(s.mask if s.mask.any() else s.color, s.depth) for s in samples.values() if s.color is not None]
     where, sign = f"camera {name}", up_sign(up)
     found = examine("edges", where, pictures) + examine("object and hands", where, camera, samples, 0.0)
     found += examine("hands", where, camera, samples)
     found += examine("object", f"{where}, object", place_of(list(bodies.values()), sign))
-    findings = examine("table", path, TableSeen(name, tables, camera.camera_to_world, up, unit))
     if 0 not in bodies:
-        return findings + at(path, found)
+        return at(path, found)
     found += examine("support", f"{where}, object", camera, samples[0], sign, described.obstacles)
     found += examine("sheet", f"{where}, object", bodies[0], sign, described.category)
-    return findings + at(path, found) + examine("obstacles", path, described.obstacles, bodies[0])
+    return at(path, found) + examine("obstacles", path, described.obstacles, bodies[0])
+
+
+def _rig(capture: Capture, samples: Mapping[str, Mapping[int, Sample]]) -> list[Finding]:
+    """All cameras with depth together: table, unit, lenses and poses, and whether they agree."""
+    described, path = capture.description, capture.folder / CAPTURE
+    # Object and hands are no table; what is left must be enough of the image to tell one.
+    around = {name: [np.where(one.mask == 0, one.depth, 0.0) for one in some.values()] for name, some in samples.items()}
+    enough = {n: bool(some) and np.mean([(depth > 0).mean() for depth in some]) >= LEAST_AROUND for n, some in around.items()}
+    depths = {name: some if enough[name] else [] for name, some in around.items()}
+    first = {name: some[0].depth for name, some in samples.items() if 0 in some}
+    rig = Rig({name: capture.cameras[name] for name in samples}, depths, first, described.up)
+    unit = described.depth_unit if described.depth_format == "png" else None
+    judged = Judged.of(rig, dict.fromkeys(samples, unit))
+    return examine("rig", path, judged) + (examine("views", path, rig.views) if len(samples) > 1 else [])
 
 
 def _color_alone(capture: Capture, name: str, samples: dict[int, Sample]) -> list[Finding]:

@@ -107,8 +107,7 @@ def read_poses(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
 def require_lens(where: Path, name: str, lens: Lens, size: tuple[int, int]) -> None:
     """Raise InputError unless intrinsics fit images of `size` (width, height)."""
     if lens.size is not None and lens.size != size:
-        factor = size[0] / lens.size[0]
-        remedy = f"Scale fx and cx by {factor:.4g}, fy and cy by {size[1] / lens.size[1]:.4g}, if the images were only resized."
+        remedy = "If the images were only resized since: --take lens_resized."
         rule = f"camera {name}: width and height must be those of its images, {size[0]} x {size[1]}"
         raise InputError(where, rule, f"{lens.size[0]} x {lens.size[1]}", remedy)
     refuse(intrinsics_findings(where, f"intrinsics of camera {name}", lens.matrix, size))

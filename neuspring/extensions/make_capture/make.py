@@ -48,6 +48,7 @@ from neuspring.extensions.make_capture.poses import (
     straightened,
 )
 from neuspring.extensions.make_capture.table import Unit, find_rate
+from neuspring.extensions.make_capture.takes import Takes
 from neuspring.intake import points
 
 NAME_FORM = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
@@ -71,7 +72,20 @@ def opened(intake: Intake) -> Recorded:
     return Recorded(views=pairs(intake.color, intake.depth, intake.cameras) if intake.color else ())
 
 
-OF_FILM = ("frames", "shift", "depth_unit", "intrinsics", "poses", "board", "board_images", "level", "top_down", "table_at", "pose")
+OF_FILM = (
+    "frames",
+    "shift",
+    "take",
+    "depth_unit",
+    "intrinsics",
+    "poses",
+    "board",
+    "board_images",
+    "level",
+    "top_down",
+    "table_at",
+    "pose",
+)
 """Options that say nothing of points in space alone."""
 
 
@@ -110,7 +124,8 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     rate, rate_text = find_rate(film.rate if intake.rate is None else intake.rate, known, choice.step)
     names = [view.name for view in views]
     listed = read_lenses(intake.intrinsics, names) if intake.intrinsics else {}
-    seen, unit = look(views, choice, listed, intake.intrinsics, intake.depth_unit)
+    takes = Takes.read(intake.take, names)
+    seen, unit = look(views, choice, listed, intake.intrinsics, intake.depth_unit, takes)
     watched = watch(views, choice, seen, unit)
     findings += in_step(views, watched, late)
     refuse_errors(findings)
@@ -118,7 +133,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
         beside = examine("edges", view.path, list(zip(view.colors, view.depths, strict=False)))
         findings += [replace(one, title=f"camera {name}: {one.name}") for one in beside]
     findings += examine("category", intake.output, intake.category)
-    placed, how = _place(intake, film, board, seen, unit)
+    placed, how = _place(intake, film, board, seen, unit, takes)
     cameras = {name: Camera(name, *view.size, view.lens.matrix, placed.poses[name]) for name, view in seen.items()}
     findings += cameras_in_step(views, choice, in_space(watched, cameras), late)
     refuse_errors(findings)
@@ -129,7 +144,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     made = replace(made, tracks="train" if intake.teach else "score")
     space = brought_by(intake.output, intake.brought, made)
     writer, begun = _begin(intake.output, made, intake.force, {name: view.lens for name, view in seen.items()})
-    _write(writer, begun, film, choice, unit, seen)
+    _write(writer, begun, film, choice, unit, seen, takes)
     tracks = _bring(writer, space, intake.tracks)
     if film.tracks is not None:
         tracks = film.tracks[choice.numbers] @ placed.motion[:3, :3].T + placed.motion[:3, 3]
@@ -182,11 +197,12 @@ def _require_for_color_alone(intake: Intake) -> None:
 
 
 def _place(
-    intake: Intake, film: Recorded, board: Board | None, seen: Mapping[str, SampledCamera], unit: Unit | None
+    intake: Intake, film: Recorded, board: Board | None, seen: Mapping[str, SampledCamera], unit: Unit | None, takes: Takes
 ) -> tuple[Placed, str]:
     """Poses of all cameras, and where they come from. Raises InputError."""
     names, level, top_down = list(seen), intake.level, intake.top_down
     given = {view.name: view.pose for view in film.views if view.pose is not None}
+    given = takes.poses(given) if len(given) == len(names) else given
     if intake.poses is not None and intake.board is not None:
         raise InputError("--poses, --board", "one of the two is required", "both")
     if intake.table_at is not None and (len(names) > 1 or intake.poses or intake.board or given):
@@ -194,16 +210,16 @@ def _place(
     if intake.board_images and intake.board is None:
         raise InputError("--board", "the board of --board-images must be described", "none")
     if intake.poses is not None and unit is None:
-        return given_alone(read_poses(intake.poses, names), seen, intake.poses), f"of {intake.poses.name}"
+        return given_alone(takes.poses(read_poses(intake.poses, names)), seen, intake.poses), f"of {intake.poses.name}"
     if intake.poses is not None:
-        poses = read_poses(intake.poses, names)
+        poses = takes.poses(read_poses(intake.poses, names))
         return stand(poses, seen, level=level, top_down=top_down, file=intake.poses), f"of {intake.poses.name}"
     if board is not None:
         shown = dict(seen)
         if not intake.board_images:
             for view in film.views:
                 first = list(view.read(range(min(BOARD_FRAMES, len(view.series.numbers)))))
-                shown[view.name] = straightened(view, first, seen[view.name].lens, unit)
+                shown[view.name] = straightened(view, first, seen[view.name].lens, unit, takes)
         poses, lines = by_board(board, shown, intake.board_images)
         if unit is None:
             placed = given_alone(poses, seen, film.views[0].path)
@@ -241,7 +257,7 @@ def _describe(
     provenance = {"source": "make-capture", "files": f"sha256:{digest.hexdigest()}", "frames": choice.text()}
     if unit is not None:
         provenance["depth unit"] = unit.text()
-    provenance |= {"poses": how, "table": placed.table}
+    provenance |= {"poses": how, "table": placed.table} | ({"taken as": " ".join(intake.take)} if intake.take else {})
     files = {"intrinsics": intake.intrinsics, "poses file": intake.poses}
     provenance |= digests({option: path for option, path in files.items() if path is not None}, "")
     entries = {
@@ -279,7 +295,13 @@ def _begin(folder: Path, made: Description, force: bool, lenses: Mapping[str, Le
 
 
 def _write(
-    writer: Writer, begun: bool, film: Recorded, choice: FrameChoice, unit: Unit | None, seen: Mapping[str, SampledCamera]
+    writer: Writer,
+    begun: bool,
+    film: Recorded,
+    choice: FrameChoice,
+    unit: Unit | None,
+    seen: Mapping[str, SampledCamera],
+    takes: Takes,
 ) -> None:
     """The images that are not there yet."""
     made, done = writer.capture.description, 0
@@ -299,7 +321,7 @@ def _write(
                 kind = stored_as(depth)
                 if kind != made.depth_format:
                     raise InputError(view.path, f"depth of camera {view.name} must be of one kind", f"another in frame {frame}")
-                stored = straight.depth(plain(depth))
+                stored = takes.depth(view.name, straight.depth(plain(depth)), seen[view.name].lens.matrix)
                 stored = stored if kind == "png" else meters_of(stored, unit)
             mask = film.labels(view.name, choice.numbers[frame]) if film.labels is not None else None
             writer.frame(view.name, frame, straight.color(color), stored, mask)

@@ -45,6 +45,8 @@ class Intake:
     """pictures that a stream is late, by name: 0.depth=1 moves depth of camera 0, 1=-2 moves camera 1"""
     train_end: int | None = None
     """training frames end before this frame; the first 70 percent by default"""
+    take: tuple[str, ...] = ()
+    """another meaning of lens, depth or poses, as a message names it: distance, lens_resized, inverse+opengl:0, order=2,1,0"""
     poses: Path | None = None
     """JSON: camera_to_world or world_to_camera; one camera with depth needs none: the table gives its pose"""
     board: str | None = None

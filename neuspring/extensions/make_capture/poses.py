@@ -7,25 +7,26 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise, product
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from neuspring.checks import examine
-from neuspring.checks.table import CameraAlone, TableSeen
+from neuspring.checks.rig import CameraAlone, Judged, Rig, common_plane, levelling
 from neuspring.checks.things import sampled
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
-from neuspring.core.findings import Finding, refuse
+from neuspring.core.findings import refuse_errors
 from neuspring.data.camera import Camera, Lens, Plane
 from neuspring.data.capture import FEWEST_FRAMES
+from neuspring.data.planes import cloud
 from neuspring.extensions.make_capture.feeds import Paired
 from neuspring.extensions.make_capture.formats import CameraFeed, Pair, open_images
 from neuspring.extensions.make_capture.lenses import Board, Straightener, depth_ratio, require_lens, sight
 from neuspring.extensions.make_capture.moments import MISSING_GAP, Match, matched
-from neuspring.extensions.make_capture.table import Unit, common_plane, find_table, find_unit, levelling, pose_on
-from neuspring.intake.depth import cloud, planes
+from neuspring.extensions.make_capture.table import Unit, find_table, find_unit, pose_on
+from neuspring.extensions.make_capture.takes import Takes
 
 RANGE_FORM = re.compile(r"(\d+)(?:(-)(\d*))?(?:/(\d+))?")
 
@@ -125,7 +126,12 @@ class SampledCamera:
 
 
 def look(
-    views: Sequence[CameraFeed], choice: FrameChoice, listed: Mapping[str, Lens], file: Path | None, given_unit: float | None
+    views: Sequence[CameraFeed],
+    choice: FrameChoice,
+    listed: Mapping[str, Lens],
+    file: Path | None,
+    given_unit: float | None,
+    takes: Takes,
 ) -> tuple[dict[str, SampledCamera], Unit | None]:
     """A few of the chosen frames of every camera, with intrinsics, and the unit of depth, which is one for all; None without any.
 
@@ -141,9 +147,9 @@ def look(
         if lens is None:
             remedy = "Give a JSON file with fx, fy, cx, cy."
             raise InputError("--intrinsics", f"intrinsics of camera {view.name} are required", "none", remedy)
-        lenses[view.name] = lens
         color, depth = samples[view.name][0]
         require_aligned(view.path, view.name, color, depth)
+        lenses[view.name] = lens = takes.lens(view.name, lens, (color.shape[1], color.shape[0]))
         require_lens(file or view.path, view.name, lens, (color.shape[1], color.shape[0]))
     depths = [depth for pairs in samples.values() for _, depth in pairs if depth is not None]
     if len({stored_as(depth) for depth in depths}) > 1:
@@ -152,10 +158,10 @@ def look(
     if len(known) > 1 and given_unit is None:
         raise InputError("--depth-unit", "all cameras must have one unit of depth", " and ".join(sorted(map(str, known))))
     unit = find_unit(views[0].path, depths, given_unit, known.pop() if len(known) == 1 else None) if depths else None
-    return {view.name: straightened(view, samples[view.name], lenses[view.name], unit) for view in views}, unit
+    return {view.name: straightened(view, samples[view.name], lenses[view.name], unit, takes) for view in views}, unit
 
 
-def straightened(view: CameraFeed, pairs: Sequence[Pair], lens: Lens, unit: Unit | None) -> SampledCamera:
+def straightened(view: CameraFeed, pairs: Sequence[Pair], lens: Lens, unit: Unit | None, takes: Takes) -> SampledCamera:
     """Pairs of one camera, without distortion and in meters; `unit` is None with color alone. Raises InputError where their sizes
     differ."""
     size = (pairs[0][0].shape[1], pairs[0][0].shape[0])
@@ -166,7 +172,7 @@ def straightened(view: CameraFeed, pairs: Sequence[Pair], lens: Lens, unit: Unit
     if unit is None:
         return SampledCamera(view.path, size, lens, colors, [], None)
     depths = [depth for _, depth in pairs if depth is not None]
-    meters = [meters_of(straight.depth(plain(depth)), unit) for depth in depths]
+    meters = [meters_of(takes.depth(view.name, straight.depth(plain(depth)), lens.matrix), unit) for depth in depths]
     return SampledCamera(view.path, size, lens, colors, meters, unit.meters if stored_as(depths[0]) == "png" else None)
 
 
@@ -220,8 +226,23 @@ def by_table(name: str, seen: SampledCamera, *, top_down: bool, at: tuple[float,
     """The pose of the only camera: the table is z = 0. Raises InputError where it is not found; see `depth.find_table`."""
     points = cloud(seen.depths, seen.lens.matrix)
     table, remarks = find_table(seen.path, points, top_down=top_down, at=None if at is None else _point(seen, at))
-    lines = (f"table: {table.text()}", *(f"warning: {remark}" for remark in remarks))
-    return Placed(poses={name: pose_on(table, points, seen.size, seen.lens.matrix)}, table=table.text(), lines=lines)
+    pose = pose_on(table, points, seen.size, seen.lens.matrix)
+    judged = examine("rig", seen.path, Judged.of(rig_of({name: seen}, {name: pose}, posed=False), units_of({name: seen})))
+    refuse_errors(judged)
+    lines = (f"table: {table.text()}", *(f"warning: {remark}" for remark in remarks), *map(in_report, judged))
+    return Placed(poses={name: pose}, table=table.text(), lines=lines)
+
+
+def rig_of(seen: Mapping[str, SampledCamera], poses: Mapping[str, np.ndarray], posed: bool = True) -> Rig:
+    """The cameras together."""
+    cameras = {name: Camera(name, *view.size, view.lens.matrix, poses[name]) for name, view in seen.items()}
+    depths = {name: view.depths for name, view in seen.items()}
+    return Rig(cameras, depths, {name: listed[0] for name, listed in depths.items()}, posed=posed)
+
+
+def units_of(seen: Mapping[str, SampledCamera]) -> dict[str, float | None]:
+    """m per count of depth of every camera."""
+    return {name: view.unit for name, view in seen.items()}
 
 
 def by_board(board: Board, seen: Mapping[str, SampledCamera], images: Sequence[Path]) -> tuple[dict[str, np.ndarray], list[str]]:
@@ -284,13 +305,11 @@ def stand(
         turn = float(np.degrees(np.arccos(np.clip((np.trace(motion[:3, :3]) - 1) / 2, -1, 1))))
         rise = f"its plane was {100 * abs(point[2]):.1f} cm from z = 0 there, {1e3 * rms:.1f} mm rms over all cameras"
         lines.append(f"leveled: the world was turned by {turn:.1f} degrees; {rise}")
-    found = {name: planes(points) for name, points in clouds.items()}
-    judged: dict[str, list[Finding]] = {side: [] for side in ([up] if up else ["+z", "-z"])}
-    for (side, listed), (name, view) in product(judged.items(), seen.items()):
-        listed += examine("table", file or view.path, TableSeen(name, found[name], moved[name], side, view.unit))
-    side = min(judged, key=lambda key: sum(d.level == "error" for d in judged[key]))
-    refuse(one for one in judged[side] if one.level == "error")
-    lines += [in_report(one) for one in judged[side]]
+    rig = rig_of(seen, moved)
+    side = up or min(("+z", "-z"), key=lambda each: sum(rig.with_up(each).standing.values()))
+    judged = examine("rig", file or next(iter(seen.values())).path, Judged.of(rig.with_up(side), units_of(seen), of_file=False))
+    refuse_errors(judged)
+    lines += [in_report(one) for one in judged]
     text = "; ".join(f"camera {name}: {plane.text()}" for name, plane in tables.items())
     return Placed(poses=moved, up=side, motion=motion, table=text or "not found", lines=tuple(lines))
 
@@ -303,7 +322,7 @@ def given_alone(poses: Mapping[str, np.ndarray], seen: Mapping[str, SampledCamer
     (name, view), pose = next(iter(seen.items())), next(iter(poses.values()))
     up = "+z" if pose[2, 3] > 0 else "-z"
     judged = examine("camera alone", where, CameraAlone(Camera(name, *view.size, view.lens.matrix, pose), up))
-    refuse(one for one in judged if one.level == "error")
+    refuse_errors(judged)
     return Placed(poses=dict(poses), up=up, table="z = 0 as given", lines=tuple(map(in_report, judged)))
 
 

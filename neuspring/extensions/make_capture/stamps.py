@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 
 import numpy as np
 
@@ -79,10 +79,10 @@ def _dates(joined: Sequence[str], widths: Sequence[int]) -> Iterator[tuple[np.nd
     if len({digits[length:] for digits in joined}) == 1:
         return  # Of whole seconds, digits that follow are of something else.
     try:
-        moments = [datetime.strptime(digits[:length], form).replace(tzinfo=timezone.utc) for digits in joined]
+        moments = [datetime.strptime(digits[:length], form).replace(tzinfo=UTC) for digits in joined]
     except ValueError:
         return
-    start = datetime(1970 if length == 14 else 1900, 1, 1, tzinfo=timezone.utc)
+    start = datetime(1970 if length == 14 else 1900, 1, 1, tzinfo=UTC)
     fractions = [float(f"0.{digits[length:] or 0}") for digits in joined]
     yield np.array([(m - start).total_seconds() + part for m, part in zip(moments, fractions, strict=True)]), 0.0
 

@@ -3,15 +3,14 @@ here too."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from neuspring.core.errors import InputError
 from neuspring.data.camera import FAR, FASTEST, NEAR, ROLL, SLOWEST, Plane
-from neuspring.intake.depth import planes
+from neuspring.data.planes import planes
 
 LIKELY = (0.2, 3.0)
 """m. A guessed unit must bring the median depth into this range."""
@@ -183,22 +182,3 @@ def pose_on(table: Plane, points: np.ndarray, size: tuple[int, int], intrinsics:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = axes, -axes @ origin
     return pose
-
-
-def common_plane(tables: Mapping[str, Plane], poses: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, float]:
-    """Normal [3], towards the cameras, a point [3] and rms, m, of the plane through the table's points that all cameras
-    see, in the world."""
-    points = np.concatenate([plane.points @ poses[name][:3, :3].T + poses[name][:3, 3] for name, plane in tables.items()])
-    center = points.mean(axis=0)
-    normal = np.linalg.svd((points - center).T @ (points - center))[0][:, -1]
-    eyes = np.mean([poses[name][:3, 3] for name in tables], axis=0)
-    normal = normal if normal @ (eyes - center) > 0 else -normal
-    return normal, center, float(np.sqrt(np.mean(((points - center) @ normal) ** 2)))
-
-
-def levelling(normal: np.ndarray, point: np.ndarray, up: float) -> np.ndarray:
-    """The motion [4, 4] of the world that puts a plane at z = 0, its normal along `up` z: the least turn, about a level axis."""
-    motion = np.eye(4)
-    motion[:3, :3] = Rotation.align_vectors([[0.0, 0.0, up]], [normal])[0].as_matrix()
-    motion[2, 3] = -(motion[:3, :3] @ point)[2]
-    return motion

@@ -5,7 +5,7 @@ import pytest
 
 from neuspring.core.errors import InputError
 from neuspring.extensions.make_capture.table import common_plane, find_table, levelling, pose_on
-from neuspring.intake.depth import cloud, planes
+from neuspring.data.planes import cloud, planes
 from tests.support.desk import RADIUS, SIZE, TARGET, K, camera, looking, seen
 
 NOISE = 0.001

@@ -17,6 +17,7 @@ from neuspring.extensions.make_capture.formats import ENDINGS, CaptureFormat, Ki
 from neuspring.extensions.make_capture.moments import Series
 from neuspring.extensions.make_capture.stamps import times_of
 
+
 @dataclass(frozen=True)
 class ImageFolder:
     """Images in one folder, in the order of their names, in which runs of digits count as numbers: 10 comes after 9."""
