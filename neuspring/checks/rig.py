@@ -49,6 +49,8 @@ SAME_SIZE = 0.06
 """Part by which the sizes of an image, as a principal point tells them, may differ from the true proportion."""
 FLATTER, FLAT_SHARE = 1.15, 0.05
 """A table is flat where it was bent before if it covers so many times as many pixels, and this part of all more."""
+FLAT_POINTS = 5000
+"""Points of a camera by which that is told."""
 MOST_ORDERED = 4
 """Cameras of which every order of poses is tried."""
 FACTORS = (0.1, 10.0, 0.001, 1000.0)
@@ -141,11 +143,6 @@ HYPOTHESES = {one.name: one for one in (*LENSES, DISTANCE, *POSES)}
 """What --take applies, by name."""
 
 
-def scaled(factor: float) -> Hypothesis:
-    """Depth in a unit that makes the scene `factor` times as large."""
-    return Hypothesis(name="", looks=f"{factor:g} times", depth=lambda depth, _: depth / factor)
-
-
 @dataclass(frozen=True, eq=False)
 class Rig:
     """Cameras, and what they measured in a few frames."""
@@ -221,7 +218,8 @@ class Rig:
 
     def flat(self) -> float:
         """Share of the pixels on the largest plane, mean over the cameras; 0 without any."""
-        return float(np.mean([max((plane.share for plane in listed), default=0.0) for listed in self.planes.values()] or [0.0]))
+        clouds = [cloud(depths, self.cameras[name].intrinsics, FLAT_POINTS) for name, depths in self.depths.items()]
+        return float(np.mean([max((plane.share for plane in planes(points, 1)), default=0.0) for points in clouds] or [0.0]))
 
     def taken(self, hypothesis: Hypothesis, names: Sequence[str] | None = None) -> Rig | None:
         """The rig if cameras `names`, all by default, are as the hypothesis says; None where that cannot be."""
@@ -240,6 +238,14 @@ class Rig:
         rig = replace(self, cameras=cameras, depths=depths, first=first)
         if change is None and hypothesis.lens is None:
             rig.__dict__["planes"] = self.planes  # They are in the coordinates of the cameras, which did not change.
+        return rig
+
+    def scaled(self, factor: float, names: Sequence[str]) -> Rig:
+        """The rig if the unit of depth makes the scene of cameras `names` so many times as large."""
+        part = {name: factor if name in names else 1.0 for name in self.cameras}
+        depths = {name: [depth / part[name] for depth in listed] for name, listed in self.depths.items()}
+        rig = replace(self, depths=depths, first={name: depth / part[name] for name, depth in self.first.items()})
+        rig.__dict__["planes"] = {name: [plane.scaled(1 / part[name]) for plane in listed] for name, listed in self.planes.items()}
         return rig
 
     def with_poses(self, poses: Mapping[str, np.ndarray]) -> Rig:
@@ -308,8 +314,7 @@ def _candidates(rig: Rig) -> Iterator[tuple[Explained, Rig]]:
         some = "" if names == every else ":" + ",".join(names)
         if rig.posed and any(rig.depths.values()):
             for factor in FACTORS:
-                if other := rig.taken(scaled(factor), names):
-                    yield Explained("unit", names, f"{factor:g} times", "--depth-unit", factor), other
+                yield Explained("unit", names, f"{factor:g} times", "--depth-unit", factor), rig.scaled(factor, names)
         for hypothesis in (*LENSES, *(POSES if rig.posed else ())):
             off = hypothesis.lens is None or any(rig.off_center[name] > 1 for name in names)
             if off and (other := rig.taken(hypothesis, names)):

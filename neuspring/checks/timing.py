@@ -152,9 +152,11 @@ class Watched:
             both, noise = (near > 0) & (last[2] > 0), DEPTH_NOISE * depth_noise(np.maximum(near, 0.1))
             moved = np.where(both, np.clip(np.abs(near - last[2]) / noise - 1, 0, 5), 0).astype(np.float32)
             self.depth[frame] = _cells(cv2.medianBlur(moved, 3))
-            y, x = np.nonzero((change > 0) & (near > 0))
+            # What is uncovered lies behind what moved.
+            nearest = np.where(both, np.minimum(near, last[2]), 0.0)
+            y, x = np.nonzero((change > 0) & both)
             y, x = y[::2], x[::2]
-            self.moving[frame] = np.stack([x, y], axis=1) / scale, near[y, x]
+            self.moving[frame] = np.stack([x, y], axis=1) / scale, nearest[y, x]
         if labels is not None and last[3] is not None:
             self.masks[frame] = _cells((labels != last[3]).astype(np.float32))
 
@@ -208,7 +210,8 @@ def on_images(points: np.ndarray, camera: Camera) -> np.ndarray:
         both[both] &= camera.sees(pixels[frame, both])
         if both.any():
             speed = np.linalg.norm(pixels[frame, both] - pixels[frame - 1, both], axis=1)
-            cell = np.clip(pixels[frame, both] / (camera.width, camera.height) * CELLS, 0, np.array(CELLS) - 1).astype(int)
+            middle = pixels[frame - 1 : frame + 1, both].mean(axis=0)  # A change of the picture shows both places.
+            cell = np.clip(middle / (camera.width, camera.height) * CELLS, 0, np.array(CELLS) - 1).astype(int)
             rows[frame] = np.bincount(cell[:, 1] * CELLS[0] + cell[:, 0], speed, rows.shape[1])
     return rows
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, TypeAlias
 
 import numpy as np
@@ -94,6 +94,10 @@ class Plane:
     """Its points, of at most `planes.CLOUD_POINTS`."""
     points: np.ndarray
     """They themselves [n, 3], m, in the coordinates of the camera."""
+
+    def scaled(self, factor: float) -> Plane:
+        """The same in a scene that is `factor` times as large."""
+        return replace(self, height=factor * self.height, rms=factor * self.rms, points=factor * self.points)
 
     @property
     def elevation(self) -> float:

@@ -98,8 +98,8 @@ def choose(views: Sequence[CameraFeed], wanted: str = "", late: Mapping[str, int
     for view in views:
         if len(places[view.name]) < len(kept) / 2 or 0 not in places[view.name]:
             rule = f"camera {view.name} must have the first of the chosen frames, number {kept[0]}, and half of the others"
-            remedy = "Name the images of all cameras by the same frame numbers, or name other --frames"
-            remedy += f": all have number {start}." if start not in (None, kept[0]) else "."
+            remedy = "Name the images of all cameras by the same frame numbers"
+            remedy += f"; the first that all have is {start}." if start not in (None, kept[0]) else "."
             raise InputError(view.path, rule, f"{len(places[view.name])} of {len(kept)}", remedy)
     # The rate is that of the files that are there; a number that is not there is a moment that is missing.
     order = {number: place for place, number in enumerate(numbers)}

@@ -98,7 +98,7 @@ def test_intrinsics_that_cannot_be_read(tmp_path, content, message):
 @pytest.mark.parametrize(
     ("lens", "message"),
     [
-        (Lens(matrix=MATRIX, size=(160, 120)), "Scale fx and cx by 0.5, fy and cy by 0.5"),
+        (Lens(matrix=MATRIX, size=(160, 120)), "--take lens_resized"),
         (Lens(matrix=MATRIX @ np.diag([0.027, 0.027, 1])), "Focal lengths are in pixels of these images, not in millimeters"),
         (Lens(matrix=MATRIX, distortion=np.array(BENT), model="ftheta"), "one of opencv brown_conrady"),
         (

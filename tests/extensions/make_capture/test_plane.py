@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.extensions.make_capture.table import common_plane, find_table, levelling, pose_on
+from neuspring.checks.rig import common_plane, levelling
+from neuspring.extensions.make_capture.table import find_table, pose_on
 from neuspring.data.planes import cloud, planes
 from tests.support.desk import RADIUS, SIZE, TARGET, K, camera, looking, seen
 

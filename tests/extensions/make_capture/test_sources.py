@@ -118,6 +118,6 @@ def test_a_camera_without_the_first_frame_is_refused(tmp_path):
     for kind in ("color", "depth"):
         (root / f"{kind}_1" / "frame_0.png").unlink()
     with pytest.raises(
-        InputError, match=r"camera 1 must have the first of the chosen frames, number 0.*begin where all have a frame: --frames 1-"
+        InputError, match=r"camera 1 must have the first of the chosen frames, number 0.*the first that all have is 1"
     ):
         choose(pairs([root / "color_0", root / "color_1"], [root / "depth_0", root / "depth_1"]))

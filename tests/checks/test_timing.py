@@ -1,0 +1,89 @@
+"""Time of two streams by what moves: the shift in closed form, and on films of a desk that were put together wrongly."""
+
+import numpy as np
+import pytest
+
+from neuspring.checks import examine
+from neuspring.checks.timing import CELLS, Streams, Watched, in_space, measure, of_cameras, on_images
+from neuspring.data.camera import Camera
+from tests.support import desk
+from tests.support.desk import RADIUS, TARGET, K, seen
+
+FRAMES, STRIDE = 24, 3
+"""Pictures, and frames of the desk from one to the next: its ball moves by 15 mm."""
+
+
+def bumps(shift=0.0, count=40, cells=60):
+    """A bump that runs over cells with changing speed [T, n], seen `shift` frames late."""
+    time = np.arange(count) - shift
+    place = 30 + 20 * np.sin(time / 5) + 0.2 * time
+    return np.exp(-0.5 * ((np.arange(cells) - place[:, None]) / 3) ** 2)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.25, -0.75, 1.0, -3.5, 12.0])
+def test_a_shift_is_measured_to_a_tenth_of_a_frame(shift):
+    found = measure(bumps(), bumps(shift))
+    assert found.known and found.frames == pytest.approx(shift, abs=0.1)
+    assert found.wrong == (abs(shift) >= 0.5)
+
+
+def test_unknown_frames_do_not_count_and_stillness_says_nothing():
+    gaps = bumps(1.0)
+    gaps[[7, 8, 20]] = np.nan
+    assert measure(bumps(), gaps).frames == pytest.approx(1.0, abs=0.1)
+    assert measure(bumps(), np.zeros((40, 60))) is None
+    rng = np.random.default_rng(0)
+    other = measure(bumps(), rng.random((40, 60)))
+    assert not other.known and not other.wrong
+
+
+def camera(index=0):
+    """A camera before the desk with finer pictures."""
+    pose = desk.looking(np.array(((0.05, -0.5, 0.35), (0.3, -0.4, 0.4))[index]), TARGET)
+    return Camera(str(index), 240, 180, np.diag([3.0, 3.0, 1.0]) @ K, pose)
+
+
+def film(index=0, late=0, still=False):
+    """What a camera of the desk shows, with depth `late` frames later than color."""
+    watched = Watched(FRAMES)
+    for frame in range(FRAMES):
+        depth = seen(camera(index), 0 if still else STRIDE * (frame - late) + 9)[1]
+        watched.see(frame, seen(camera(index), 0 if still else STRIDE * frame + 9)[0], depth)
+    return watched
+
+
+@pytest.mark.parametrize(("late", "level"), [(0, "note"), (1, "error"), (-2, "error")])
+def test_depth_of_other_moments_is_found(late, level):
+    one = film(late=late)
+    shift = measure(one.color, one.depth)
+    (found,) = [f for f in examine("streams", "x", [Streams("color", "depth", shift, "--shift 0.depth={frames}")]) if f.level == level]
+    assert found.value == pytest.approx(late, abs=0.3)
+    assert (found.remedy == f"--shift 0.depth={late}") == (level == "error")
+
+
+def test_a_film_in_which_nothing_moves_says_that_time_was_not_checked():
+    one = film(still=True)
+    (found,) = examine("streams", "x", [Streams("color", "depth", measure(one.color, one.depth))])
+    assert (found.name, found.level, found.value) == ("in step", "note", None)
+    assert "too little of one motion to check depth against color" in found.text
+
+
+def test_cameras_of_other_moments_are_found_in_space():
+    watched = {"0": film(0), "1": film(1)}
+    cameras = {name: camera(int(name)) for name in watched}
+    maps = in_space(watched, cameras)
+    assert abs(of_cameras(maps)["1"].frames) < 0.4
+    early = {"0": maps["0"][:-1], "1": maps["1"][1:]}
+    shift = of_cameras(early)["1"]
+    assert shift.wrong and shift.frames == pytest.approx(-1, abs=0.4)
+
+
+def test_points_in_space_are_compared_with_the_film():
+    around = np.random.default_rng(0).normal(size=(1, 500, 3))
+    around *= RADIUS / np.linalg.norm(around, axis=2, keepdims=True)
+    points = TARGET + (0, 0, RADIUS) + around + (0.005, 0, 0) * (STRIDE * np.arange(FRAMES)[:, None, None] + 9)
+    one = film()
+    assert on_images(points, camera()).shape == (FRAMES, CELLS[0] * CELLS[1])
+    assert abs(measure(one.color, on_images(points, camera())).frames) < 0.5
+    late = measure(one.color[2:], on_images(points, camera())[:-2])
+    assert late.wrong and late.frames == pytest.approx(2, abs=0.5)
