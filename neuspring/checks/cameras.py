@@ -153,7 +153,8 @@ checks = (
     Check("views disagree", "views", lambda views: [one for one in views if one["value"] is not None], (0, MOST_FLOATING),
           "warning",
           "cameras {one} and {two} should see the same surfaces above the table in the same place; received {value:.0%} of the "
-          "points of one float before what the other saw: a pose, an order of cameras, a lens or a moment is wrong", title="cameras"),
+          "points of one float before what the other saw: a pose, an order of cameras, a lens or a moment is wrong",
+          title="cameras"),
     Check("depth not aligned to color", "edges", misplaced, None, "warning",
           f"edges of depth fit those of color when depth is {{ways}}; as it is they must fit within {ALIGNED:.1%} of the width.",
           "Let the camera's software align depth to color (RealSense: rs.align; ROS: aligned_depth_to_color)."),

@@ -447,7 +447,9 @@ def explanation(judged: Judged) -> list[dict[str, Any]]:
     return [words | {"value": one.what, "next": next_move} for words in told]
 
 
-TRIED = "units of depth, distances in place of depth, inverse poses, other axes, y up, exchanged cameras, lenses of other sizes, another world"
+TRIED = (
+    "units of depth, distances in place of it, inverse poses, other axes, y up, exchanged cameras, lenses of other sizes, a turn"
+)
 
 
 def elsewhere(judged: Judged) -> list[dict[str, Any]]:

@@ -146,7 +146,7 @@ class Watched:
         last, self._last = self._last, (frame, picture, near, labels)
         if last is None or last[0] != frame - 1:
             return
-        change = np.clip(np.abs(picture - last[1]).max(axis=-1) - COLOR_NOISE, 0, COLOR_MOST)
+        change = np.clip(np.abs(picture - last[1]).max(axis=-1) - COLOR_NOISE, 0, COLOR_MOST).astype(np.float32)
         self.color[frame] = _cells(change)
         if near is not None and last[2] is not None:
             both, noise = (near > 0) & (last[2] > 0), DEPTH_NOISE * depth_noise(np.maximum(near, 0.1))
@@ -259,6 +259,7 @@ def in_step(pairs: Sequence[Streams]) -> dict[str, Any] | None:
 
 # fmt: off
 checks = (
-    Check("out of step", "streams", out_of_step, None, "error", "{text}; less than half a frame is required.", "{next}", title="time"),
+    Check("out of step", "streams", out_of_step, None, "error", "{text}; less than half a frame is required.", "{next}",
+          title="time"),
     Check("in step", "streams", in_step, None, "note", "{text}", title="time"),
 )

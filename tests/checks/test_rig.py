@@ -37,7 +37,8 @@ def with_lenses(rig, change):
 
 def with_depth(rig, change):
     depths = {name: [change(depth, rig.cameras[name]) for depth in listed] for name, listed in rig.depths.items()}
-    return Rig(rig.cameras, depths, {name: change(depth, rig.cameras[name]) for name, depth in rig.first.items()}, rig.up, rig.posed)
+    first = {name: change(depth, rig.cameras[name]) for name, depth in rig.first.items()}
+    return Rig(rig.cameras, depths, first, rig.up, rig.posed)
 
 
 def test_a_right_rig_needs_no_explanation(right):

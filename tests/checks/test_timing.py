@@ -56,7 +56,8 @@ def film(index=0, late=0, still=False):
 def test_depth_of_other_moments_is_found(late, level):
     one = film(late=late)
     shift = measure(one.color, one.depth)
-    (found,) = [f for f in examine("streams", "x", [Streams("color", "depth", shift, "--shift 0.depth={frames}")]) if f.level == level]
+    findings = examine("streams", "x", [Streams("color", "depth", shift, "--shift 0.depth={frames}")])
+    (found,) = (one for one in findings if one.level == level)
     assert found.value == pytest.approx(late, abs=0.3)
     assert (found.remedy == f"--shift 0.depth={late}") == (level == "error")
 

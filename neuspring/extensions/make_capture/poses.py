@@ -17,7 +17,7 @@ from neuspring.checks.rig import CameraAlone, Judged, Rig, common_plane, levelli
 from neuspring.checks.things import sampled
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
-from neuspring.core.findings import refuse_errors
+from neuspring.core.findings import Finding, refuse_errors
 from neuspring.data.camera import Camera, Lens, Plane
 from neuspring.data.capture import FEWEST_FRAMES
 from neuspring.data.planes import cloud

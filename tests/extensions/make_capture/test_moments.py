@@ -199,7 +199,8 @@ def test_an_even_rate_passes_without_a_word_and_a_small_unevenness_is_said():
     jitter = Evenness.of((np.arange(300) + 0.2 * rough) / 30, range(300))
     assert jitter.odd and not jitter.bad
     lost = Evenness.of(np.delete(np.arange(300) / 30, 100), range(299))
-    assert not lost.bad and lost.text() == "intervals of 33 to 67 ms, about 1 lost pictures (after 99 of 299), up to 0.5 frames off an even clock"
+    words = "intervals of 33 to 67 ms, about 1 lost pictures (after 99 of 299), up to 0.5 frames off an even clock"
+    assert not lost.bad and lost.text() == words
     every_second = Evenness.of(np.arange(0, 300, 2) / 30, range(0, 300, 2))
     assert not every_second.odd and every_second.steps[0] == pytest.approx(1 / 30)
 

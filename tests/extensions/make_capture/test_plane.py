@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from neuspring.core.errors import InputError
 from neuspring.checks.rig import common_plane, levelling
-from neuspring.extensions.make_capture.table import find_table, pose_on
+from neuspring.core.errors import InputError
 from neuspring.data.planes import cloud, planes
+from neuspring.extensions.make_capture.table import find_table, pose_on
 from tests.support.desk import RADIUS, SIZE, TARGET, K, camera, looking, seen
 
 NOISE = 0.001
