@@ -140,7 +140,7 @@ def _readings(capture: Capture, frames: Sequence[int], there: Sequence[int]) -> 
         source = range(int(match[1]), int(match[2]) + 1, int(match[3] or 1))
         if len(source) == capture.frame_count:
             readings["frames of the film that the capture was made of"] = [source[frame] for frame in frames]
-    if len(there) == len(frames):
+    if len(there) == len(frames) and len(set(np.diff(there))) <= 1:
         readings["order"] = list(there)
     return {what: numbers for k, (what, numbers) in enumerate(readings.items()) if numbers not in [*readings.values()][:k]}
 
