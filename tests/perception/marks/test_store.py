@@ -81,14 +81,14 @@ def test_masks_of_another_tool_that_do_not_fit(folder, capsys):
     assert "a mask of frame 4 of camera 0 is required, with its number as the name: 00004.png; received" in capsys.readouterr().err
 
 
-SOURCE = range(12, 40, 2)
+SOURCE = range(12, 52, 2)
 """Pictures of a film that a capture has."""
 
 
 def moving(still=False):
     """Color and labels of a film: a square with a pattern that runs to and fro."""
     pattern = np.random.default_rng(0).integers(0, 255, (20, 20, 3)).astype(np.uint8)
-    for k in range(50):
+    for k in range(60):
         color, labels = np.full((60, 120, 3), 90, np.uint8), np.zeros((60, 120), np.uint8)
         x = 50 if still else round(50 + 45 * np.sin(k / 6))
         color[20:40, x : x + 20], labels[20:40, x : x + 20] = pattern, OBJECT
@@ -97,7 +97,7 @@ def moving(still=False):
 
 def cut(root, numbers, still=False):
     """A capture of the pictures SOURCE, and a folder of the masks with these numbers: mask k is of picture numbers[k]."""
-    said = {"frames": "14 frames, numbers 12 to 38 of the source, one in 2"}
+    said = {"frames": "20 frames, numbers 12 to 50 of the source, one in 2"}
     about = describe(frame_count=len(SOURCE), cameras=(entry(width=120, height=60),), depth="none", masks=False, provenance=said)
     writer, film = Writer(root / "capture", about), [*moving(still)]
     for frame, number in enumerate(SOURCE):
@@ -112,7 +112,7 @@ def cut(root, numbers, still=False):
 @pytest.mark.parametrize(
     ("numbers", "how"),
     [
-        ({k: k for k in range(40)}, "by frames of the film that the capture was made of; 26 of 40 are of no frame"),
+        ({k: k for k in range(60)}, "by frames of the film that the capture was made of; 40 of 60 are of no frame"),
         ({k: k for k in SOURCE}, "by frames of the film that the capture was made of, are"),
         (dict(enumerate(SOURCE)), "by frames of the capture, are"),
         ({k + 1: number for k, number in enumerate(SOURCE)}, "by order, are"),
@@ -130,8 +130,8 @@ def test_numbers_of_masks_are_those_of_the_film_or_of_the_capture(tmp_path, caps
 @pytest.mark.parametrize(
     ("numbers", "still", "words"),
     [
-        ({k: k for k in range(40)}, True, "frames of the capture: frame 0 is 00000.png; frames of the film"),
-        ({k: 2 * k + 18 for k in range(14)}, False, "must be of the frames of the film; received what moves, moves"),
+        ({k: k for k in range(60)}, True, "frames of the capture: frame 0 is 00000.png; frames of the film"),
+        ({k: 2 * k + 18 for k in range(20)}, False, "must be of the frames of the film; received what moves, moves"),
     ],
 )
 def test_masks_of_other_moments_are_refused(tmp_path, capsys, numbers, still, words):
