@@ -104,7 +104,7 @@ def not_by_numbers(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator
     """The order in which frames belong together, where numbers in names do not say it."""
     own = {f"camera {view.name}, color and depth": view.match for view in views if isinstance(view, Paired)}
     for names, match in (own | {f"cameras {views[0].name} and {name}": match for name, match in choice.pairing.items()}).items():
-        if match.by and "numbers" not in match.by:
+        if match.by and not match.by.endswith("numbers in their names"):
             yield {"where": names, "value": match.by}
 
 
