@@ -220,6 +220,8 @@ class Scenario(Artifact):
     ground: bool = True
     obstacles: tuple[Obstacle, ...] = field(default=(), metadata=OMITTED)
     """Boxes and spheres that stand in the scene and do not move."""
+    mass: float | None = field(default=None, metadata=OMITTED)
+    """Mass of the object, kg, to which exports are scaled; None: not known. Motion depends on forces per mass alone."""
     provenance: dict[str, str] = field(default_factory=dict)
     """Files with digests, and options, that the reader used, as text."""
 
@@ -245,6 +247,8 @@ class Scenario(Artifact):
             )
         if self.up not in ("+z", "-z"):
             raise InputError(f"scenario {self.name}, up", "must be '+z' or '-z'", repr(self.up))
+        if self.mass is not None and not 0 < self.mass < np.inf:
+            raise InputError(f"scenario {self.name}, mass", "a positive number of kg is required", self.mass)
 
 
 @dataclass(frozen=True, kw_only=True)

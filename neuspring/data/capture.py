@@ -52,6 +52,8 @@ FEWEST_FRAMES = 5
 """Frames of a capture."""
 THIN = ("cloth", "package")
 """Categories of which no volume is made; those of all other words are filled."""
+LEFT_OUT = ("obstacles", "depth", "tracks", "pose", "mass")
+"""Fields of capture.json that are not written where they have their default."""
 TEXT_TOLERANCE = 1e-4
 """Allowed deviation from R^T R = 1 in JSON, where matrices may have five digits."""
 
@@ -93,6 +95,8 @@ class Description:
     obstacles: tuple[Obstacle, ...] = ()
     """Things that stand in the scene and do not move, besides the table, m: {"shape": "box", "center": [x, y, z], "half_sizes":
     [a, b, c], "rotation": [3 rows; own axes to world]} or {"shape": "sphere", "center": [x, y, z], "radius": r}."""
+    mass: Positive | None = None
+    """Mass of the object, kg, for exports, which are of 1 kg per node without it."""
     provenance: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -270,14 +274,9 @@ class Writer:
         if points is not None:
             write_text(folder / POINTS, json.dumps({name: _listed(one) for name, one in points.items()}) + "\n")
         plain = TypeAdapter(Description).dump_python(description, mode="json")
-        if not description.obstacles:
-            del plain["obstacles"]
-        if self.capture.has_depth:
-            del plain["depth"]
-        if description.tracks == "score":
-            del plain["tracks"]
-        if description.pose is None:
-            del plain["pose"]
+        for name in LEFT_OUT:
+            if getattr(description, name) == getattr(Description, name):
+                del plain[name]
         write_text(folder / CAPTURE, json.dumps(plain, indent=1) + "\n")
         return Capture(folder, description)
 

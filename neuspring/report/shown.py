@@ -133,7 +133,7 @@ def find(paths: Sequence[Path]) -> Found:
     if not runs:
         raise InputError(folder, "must have at least one run <method>/<seed>", _content(folder), "Run the benchmark first.")
     shown = tuple(run.name for run in runs if run.folder in named) or _first(runs)
-    return Found(folder, observations, runs, shown, _capture(folder, observations, notes), tuple(notes))
+    return Found(folder, observations, runs, shown, capture_of(folder, observations, notes), tuple(notes))
 
 
 def _is_run(path: Path) -> bool:
@@ -176,8 +176,8 @@ def _run(folder: Path, scenario_folder: Path) -> Run:
     return Run(folder, tuple(notes), paths)
 
 
-def _capture(folder: Path, observations: Observations, notes: list[str]) -> Capture | None:
-    """The capture in the scenario's folder, or the user's own that its record names, if it can be used."""
+def capture_of(folder: Path, observations: Observations, notes: list[str]) -> Capture | None:
+    """The capture in a scenario's folder, or the user's own that its record names; why one cannot be used goes to `notes`."""
     path = folder / "capture" / CAPTURE
     try:
         if not path.is_file():

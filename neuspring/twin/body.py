@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -109,6 +109,8 @@ class Body(ABC):
     """Name of the plain export's format."""
     about: str
     """The body, in the plain export."""
+    convention = "1 kg per node"
+    """Masses of its twins where nobody weighed the object."""
     equations: str
     """A step of its simulation, in the plain export; a paragraph each."""
 
@@ -205,3 +207,27 @@ def body_of(twin: Twin) -> Body:
 def lines_of(twin: Twin) -> Lines:
     """All lines of a twin."""
     return body_of(twin).lines(twin)
+
+
+def with_mass(twin: Twin, total: float) -> Twin:
+    """The twin with so much mass in all, kg, that moves as before: all that is in N or kg is multiplied by the same factor.
+
+    Drags are per mass, and collisions change velocities by ratios of masses.
+    """
+    masses = lines_of(twin).masses
+    own = masses[: len(twin.topology.nodes)]
+    if own.all():
+        twin = replace(twin, material=replace(twin.material, mass=own))
+    scaled: Twin = _scaled(twin, total / float(masses.sum(dtype=np.float64)))
+    return scaled
+
+
+def _scaled(part: Any, factor: float) -> Any:
+    changed: dict[str, Any] = {}
+    for spec in fields(part):
+        value = getattr(part, spec.name)
+        if isinstance(value, Artifact):
+            changed[spec.name] = _scaled(value, factor)
+        elif spec.metadata.get("unit", "").partition(" ")[0] in ("N", "kg"):
+            changed[spec.name] = value * factor
+    return replace(part, **changed)

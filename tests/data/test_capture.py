@@ -98,6 +98,7 @@ def test_bad_cameras_are_refused(tmp_path, change, message):
         ({"frame_count": 2}, "frame_count"),
         ({"format": 2}, "format"),
         ({"cameras": []}, "cameras"),
+        ({"mass": 0.0}, "mass"),
         ({"cameras": TWICE}, r"names must differ; received \['0', '0'\]"),
         ({"obstacles": [BOX]}, r"obstacles\[0\].half_sizes: three positive half sizes are required"),
         ({"obstacles": [{"shape": "sphere", "center": [0, 0, 0], "size": 1}]}, r"obstacles.*size"),

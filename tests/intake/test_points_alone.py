@@ -9,7 +9,9 @@ import pytest
 import trimesh
 
 from neuspring.config import Config
+from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
+from neuspring.core.files import read_npz
 from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, TRACKS, Capture, write_tracks
 from neuspring.intake.check import check_layout
 from neuspring.intake.points import Hands, held, observe, read, standing, write
@@ -52,6 +54,16 @@ def csv(capture, change=lambda rows: rows, header="frame,point,x,y,z,holds,hand"
     ]
     lines = [",".join(map(str, row)) for row in change(rows)]
     (capture.folder / CONTROLLERS[1]).write_text("\n".join([header, *lines]) + "\n")
+
+
+def test_a_mass_is_kept_and_one_that_is_not_known_is_in_no_file(capture):
+    path = capture.folder / CAPTURE
+    plain = json.loads(path.read_text())
+    observed(capture).save(capture.folder / "observations.npz")
+    assert "mass" not in plain and "mass" not in read_npz(capture.folder / "observations.npz")[1]["fields"]["scenario"]
+    path.write_text(json.dumps(plain | {"mass": 0.35}))
+    observed(capture).save(capture.folder / "observations.npz")
+    assert Observations.load(capture.folder / "observations.npz").scenario.mass == 0.35
 
 
 def test_annotated_points_are_the_first_nodes_and_the_given_nodes_follow(original):

@@ -1,21 +1,22 @@
 """The body of a twin is asked, never told apart: lattice, rod, and what a package brings."""
 
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import neuspring
-from neuspring.core.artifacts import Twin
+from neuspring.core.artifacts import Artifact, Observations, Twin
 from neuspring.core.errors import InputError
 from neuspring.physics.rod_nodes import RodFrames
 from neuspring.physics.solver import FrameSolver
 from neuspring.twin import body as module
 from neuspring.twin.bodies.lattice import Lattice
-from neuspring.twin.body import BODIES, body_of, lines_of
+from neuspring.twin.body import BODIES, body_of, lines_of, with_mass
 from neuspring.twin.rod import rod_twin
+from neuspring.twin.rollout import roll_out
 from tests.support import ropes, small
 
 PACKAGE = Path(neuspring.__file__).parent
@@ -54,6 +55,71 @@ def test_every_body_answers_for_its_twin(twins):
     assert isinstance(body_of(twins["lattice"]).solver(twins["lattice"]), FrameSolver)
     assert isinstance(body_of(twins["rod"]).solver(twins["rod"]), RodFrames)
     assert body_of(twins["rod"]).load(twins["rod"]) == 0.0 < body_of(twins["lattice"]).load(twins["lattice"])
+
+
+HEAVY = {
+    "lattice": {"material.stiffness", "material.dashpot", "material.mass"},
+    "rod": {"material.stiffness", "material.dashpot", "rod.mass", "rod.bending", "rod.twisting", "rod.stretching"},
+}
+"""Fields that a mass scales."""
+
+
+def differing(before, after, prefix=""):
+    """Fields whose values differ, by name."""
+    found = set()
+    for spec in fields(before):
+        old, new = getattr(before, spec.name), getattr(after, spec.name)
+        if isinstance(old, Artifact):
+            found |= differing(old, new, f"{prefix}{spec.name}.")
+        elif not np.array_equal(old, new):
+            found.add(prefix + spec.name)
+    return found
+
+
+@pytest.mark.parametrize("name", HEAVY)
+def test_a_mass_scales_forces_and_masses_and_nothing_else(twins, name):
+    weighed = with_mass(twins[name], 0.35)
+    assert lines_of(weighed).masses.sum(dtype=float) == pytest.approx(0.35, rel=1e-6)
+    assert differing(twins[name], weighed) == HEAVY[name]
+
+
+def crowded() -> tuple[Twin, np.ndarray]:
+    """A rope on the ground, its nodes nearer than their contacts, and its hand [F, C, 3]."""
+    problem = small.fit_problem()
+    twin = problem.twin
+    material = replace(twin.material, contact_distance=1.2 * twin.material.contact_distance)
+    crowd = replace(twin, material=material, simulation=replace(twin.simulation, self_collision=True))
+    return crowd, problem.observations.controller_points
+
+
+def apart(twin: Twin) -> Twin:
+    return replace(twin, simulation=replace(twin.simulation, self_collision=False))
+
+
+def led(seen: Observations) -> tuple[Twin, np.ndarray]:
+    return ropes.twin(seen), seen.controller_points
+
+
+MOVING = {
+    "lattice": crowded,
+    "rope": lambda: led(ropes.rope(frames=8, move=(0, 0.002, 0.004), height=0.02)),
+    "cable": lambda: led(ropes.cable(frames=8, move=(0, 0.002, 0.004))),
+}
+
+
+@pytest.mark.parametrize("name", MOVING)
+def test_a_mass_changes_no_motion(name):
+    """By a power of two not a bit: springs, drag, ground, collisions, hands, clamps. Contacts amplify any rounding."""
+    twin, hands = MOVING[name]()
+    total = float(lines_of(twin).masses.sum(dtype=float))
+    here = roll_out(twin, hands).positions
+    assert np.abs(here[-1] - here[0]).max() > 0.02
+    if name == "lattice":
+        assert np.abs(roll_out(apart(twin), hands).positions - here).max() > 0.001, "collisions matter"
+        assert here[..., 2].min() < 1e-4, "it lies on the ground"
+    assert np.array_equal(roll_out(with_mass(twin, total / 1024), hands).positions, here)
+    near = [roll_out(one, hands).positions for one in (apart(twin), with_mass(apart(twin), 0.035))]
+    assert np.abs(near[1] - near[0]).max() < 1e-6
 
 
 class Marked(Lattice):

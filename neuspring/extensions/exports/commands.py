@@ -16,6 +16,9 @@ def export(
     to: Annotated[str, arg(help=f"format: {', '.join(EXPORTS)}")],
     output: Annotated[Path | None, arg(help="file or folder to write; by default it is named after the run")] = None,
     frames: Annotated[str | None, arg(help="FIRST, FIRST:STOP or FIRST:STOP:STEP; all by default, or 0 for ply")] = None,
+    mass: Annotated[
+        float | None, arg(help="kg in all, to which masses and forces are scaled; by default as capture.json says")
+    ] = None,
     rate: Annotated[float | None, arg(help="time codes per second (usd); the capture's frames per second by default")] = None,
 ) -> None:
     """A twin -> a file of another tool, by format."""
@@ -28,10 +31,11 @@ def export(
     if own and not _takes_rate(format):
         takers = ", ".join(name for name, other in EXPORTS.items() if _takes_rate(other))
         raise InputError("--rate", f"is for {takers}", f"--to {to}", "Leave it out: the files say the time of each frame.")
-    source = read_source(twin)
+    source = read_source(twin, mass)
     target = output or Path("export") / format.name.format(name=source.name)
     for path in format.write(source, chosen_frames(frames, source, format.frames), target, **own):
         print(f"Wrote {path}")
+    print(f"Mass: {source.weight}")
 
 
 def _takes_rate(format: Export) -> bool:

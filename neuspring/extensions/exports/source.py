@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from neuspring.config.images import Images
-from neuspring.core.artifacts import Twin
+from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
 from neuspring.core.run_folder import RunFolder
 from neuspring.splats.draw import prune_by_opacity, skinned_frames
 from neuspring.splats.model import Splats
-from neuspring.twin.body import body_of, lines_of
+from neuspring.twin.body import body_of, lines_of, with_mass
 from neuspring.twin.rollout import initial_velocity
 
 SOURCE_REMEDY = "Name results/<scenario>/<method>/<seed> of a run with a twin, or a twin.npz."
@@ -43,6 +43,12 @@ class ExportSource:
     """File name -> SHA-256."""
     frames: np.ndarray = field(default_factory=lambda: np.zeros(1, np.int64))
     """The frame of each row of positions, hands and holds [F]."""
+    seen: Observations | None = None
+    """Observations of the recording."""
+    scenario_folder: Path | None = None
+    """Folder of the results of the recording, where its motion is known."""
+    is_weighed: bool = False
+    """True where somebody has said the object's mass."""
 
     @property
     def times(self) -> np.ndarray:
@@ -53,6 +59,20 @@ class ExportSource:
     def masses(self) -> np.ndarray:
         """Masses of the nodes [N], kg; 0 where others of the body's points have the mass."""
         return lines_of(self.twin).masses[: len(self.twin.topology.nodes)]
+
+    @property
+    def total_mass(self) -> float:
+        """Mass of all nodes, or of all other points of the body, kg."""
+        return float(lines_of(self.twin).masses.sum(dtype=float))
+
+    @property
+    def weight(self) -> str:
+        """The total mass in words, and what to do where nobody has said it."""
+        text = f"{self.total_mass:.4g} kg in all"
+        if self.is_weighed or len(self.twin.material.mass):
+            return text
+        remedy = "Motion depends on forces per mass alone: give --mass KG, or mass in capture.json, to scale masses and forces."
+        return f"{text}, by convention ({body_of(self.twin).convention}). {remedy}"
 
     def only(self, frames: Sequence[int]) -> ExportSource:
         """The same with these of its frames alone."""
@@ -77,11 +97,22 @@ class ExportSource:
         return self.splats
 
 
-def read_source(path: Path) -> ExportSource:
+def read_source(path: Path, mass: float | None = None) -> ExportSource:
     """A run's folder (results/<scenario>/<method>/<seed>), or a twin.npz, which is known in frame 0 alone.
 
-    Raises InputError for a folder without a twin, one that is incomplete, and a run that failed before it had a twin.
+    The twin is scaled to a mass in all, kg: the given one, else that of the run's capture, if it has one. Raises InputError for a
+    folder without a twin, one that is incomplete, and a run that failed before it had a twin.
     """
+    if mass is not None and not 0 < mass < np.inf:
+        raise InputError("--mass", "must be a positive number of kg", mass)
+    source = _read(path)
+    if mass is None and source.seen is not None:
+        mass = source.seen.scenario.mass
+    return source if mass is None else replace(source, twin=with_mass(source.twin, mass), is_weighed=True)
+
+
+def _read(path: Path) -> ExportSource:
+    """The source with the masses of the stored twin."""
     if path.is_file():
         return _at_rest(path.parent.name or "twin", Twin.load(path), {path.name: digest_file(path)})
     if not path.is_dir():
@@ -94,9 +125,9 @@ def read_source(path: Path) -> ExportSource:
         raise InputError(path, "must be the run of a method that makes a twin", found, SOURCE_REMEDY)
     twin_name, digest = run.stages[run.learning[-1]].record.files["twin"]
     made_from = {twin_name: digest}
-    if run.trajectory is None:
-        return _at_rest(name, twin, made_from)
     trajectory, observations = run.trajectory, run.observations
+    if trajectory is None:
+        return replace(_at_rest(name, twin, made_from), seen=observations)
     if trajectory.diverged_frame is not None:
         raise InputError(
             path,
@@ -120,6 +151,8 @@ def read_source(path: Path) -> ExportSource:
         splats=None if splats is None else Splats.load(splats),
         made_from=made_from | {entry[0]: entry[1] for entry in run.stages["rollout"].record.files.values()},
         frames=np.arange(count),
+        seen=observations,
+        scenario_folder=run.scenario_folder,
     )
 
 

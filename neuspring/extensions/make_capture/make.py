@@ -274,6 +274,7 @@ def _describe(
         "up": placed.up,
         "train_end": film.train_end if intake.train_end is None and not intake.frames else intake.train_end,
         "masks": film.labels is not None,
+        "mass": intake.mass,
         "provenance": provenance | digests(intake.brought),
     }
     return _parsed(entries)
@@ -349,7 +350,7 @@ def _of_points(intake: Intake) -> tuple[Capture, list[str]]:
         raise InputError("make-capture", "a row per frame is required in both files", value, "Cut or resample one of them.")
     named = {"format": 1, "name": intake.called, "category": intake.category, "frame_count": frames, "frame_rate": rate}
     alone = {"cameras": (), "depth": "none", "tracks": "train", "up": intake.up, "train_end": intake.train_end}
-    made = _parsed(named | alone | {"ground": not intake.no_table, "provenance": digests(brought)})
+    made = _parsed(named | alone | {"ground": not intake.no_table, "mass": intake.mass, "provenance": digests(brought)})
     space = brought_by(folder, brought, made)
     writer, _ = _begin(folder, made, intake.force, {})
     writer.finish(_bring(writer, space, intake.tracks))

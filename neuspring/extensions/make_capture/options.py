@@ -73,6 +73,8 @@ class Intake:
     """up of points in space alone"""
     no_table: bool = False
     """points in space alone: no table is below the object"""
+    mass: float | None = None
+    """mass of the object, kg, for exports; motion does not depend on it"""
     force: bool = False
     """replace the images of a capture that is there"""
 

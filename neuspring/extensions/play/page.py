@@ -81,7 +81,8 @@ class Page:
         server.on_client_disconnect(lambda client: self._left())
         gui.add_html(FIT)
         gui.add_markdown(
-            f"**{scenario.name}** ({scenario.category}): {scenario.frame_count} frames at {scenario.frame_rate:g} per second"
+            f"**{scenario.name}** ({scenario.category}): {scenario.frame_count} frames at {scenario.frame_rate:g} per second. "
+            "Forces are of 1 kg per node, or per m of a cable; `neuspring export` scales them to the object's mass."
         )
         self.quantity: Any = gui.add_dropdown("Springs by", QUANTITIES, initial_value=self._before[0])
         self.legend = gui.add_html("")

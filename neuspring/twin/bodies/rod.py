@@ -26,6 +26,7 @@ class RodBody(Body):
     reads = ("rod", "fit.rod")
     format = "neuspring-rod"
     about = "A rod: nodes that follow an elastic center line"
+    convention = "1 kg per m of a cable between clamps, 1 kg per node of a rope"
     equations = """
 A discrete elastic rod (Bergou et al. 2008, 2010). Vertices x_0 .. x_E, edges e_j = x_(j+1) - x_j with tangents t_j and unit
 directors m1_j, m2_j = t_j x m1_j. The curvature binormal of inner vertex i is kb = 2 t_(i-1) x t_i / (1 + t_(i-1) . t_i), its

@@ -65,9 +65,12 @@ def test_every_array_is_described_as_it_is(tmp_path):
     assert all({"value", "unit", "about"} == set(entry) for entry in said["settings"].values())
 
 
-def test_masses_of_one_kilogram_are_written_out(tmp_path):
+def test_masses_of_one_kilogram_are_written_out_and_said_to_be_a_convention(tmp_path, capsys):
     twin = exported.rope()
     replace(twin, material=replace(twin.material, mass=np.zeros(0))).save(tmp_path / "twin.npz")
     assert main(["export", str(tmp_path / "twin.npz"), "--to", "npz", "--output", str(tmp_path / "out")]) == 0
-    arrays = np.load(tmp_path / "out" / npz.ARRAYS_FILE)
+    said, arrays, _ = exported.described(tmp_path / "out")
     assert arrays["mass"].tolist() == [1.0] * exported.NODES and arrays["positions"].shape[0] == 1
+    assert said["mass"]["value"] == exported.NODES
+    for text in (capsys.readouterr().out, said["mass"]["about"]):
+        assert re.search("6 kg in all, by convention .1 kg per node.*--mass KG", text)

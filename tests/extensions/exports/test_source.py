@@ -50,6 +50,47 @@ def test_a_twin_alone_is_known_in_frame_0(folder, tmp_path):
             source.require_splats()
 
 
+TOTAL = 0.35
+"""kg."""
+
+
+def weighed(mass=TOTAL):
+    """A change of observations: their capture says the mass."""
+    return lambda seen: replace(seen, scenario=replace(seen.scenario, mass=mass))
+
+
+@pytest.mark.parametrize(("known", "given"), [(TOTAL, []), (None, ["--mass", str(TOTAL)]), (5.0, ["--mass", str(TOTAL)])])
+def test_every_format_holds_the_mass_of_the_capture_or_the_given_one(tmp_path, capsys, known, given):
+    """What is given goes before what the capture says."""
+    mujoco = pytest.importorskip("mujoco", reason="mujoco-core is not installed (extra `export`)")
+    usd = pytest.importorskip("pxr.Usd", reason="usd-core is not installed (extra `export`)")
+    folder, out = exported.run_folder(tmp_path / "results", with_splats=False, change=weighed(known)), tmp_path / "out"
+    for to, output in (("npz", "plain"), ("mujoco", "mujoco"), ("usd", "twin.usda")):
+        assert main(["export", str(folder), "--to", to, "--output", str(out / output), *given]) == 0
+    assert capsys.readouterr().out.count("Mass: 0.35 kg in all\n") == 3
+    described, arrays, _ = exported.described(out / "plain")
+    assert described["mass"]["value"] == pytest.approx(TOTAL, rel=1e-6)
+    stage = usd.Stage.Open(str(out / "twin.usda"))
+    stored = stage.GetPrimAtPath("/Twin/Nodes").GetAttribute("primvars:mass").Get()
+    for masses in (arrays["mass"], mujoco.MjModel.from_xml_path(str(out / "mujoco" / "twin.xml")).body_mass, np.array(stored)):
+        assert masses.sum(dtype=float) == pytest.approx(TOTAL, rel=1e-6)
+    stiffness = exported.rope().material.stiffness
+    factor = TOTAL / exported.rope().material.mass.sum(dtype=float)
+    np.testing.assert_allclose(arrays["stiffness"], stiffness * factor, rtol=1e-6)
+
+
+def test_a_run_without_a_prediction_has_the_mass_too(tmp_path):
+    folder = exported.run_folder(tmp_path, change=weighed())
+    (folder / "rollout.json").unlink()
+    assert read_source(folder).total_mass == pytest.approx(TOTAL, rel=1e-6)
+
+
+@pytest.mark.parametrize("mass", ["0", "-1", "nan", "inf"])
+def test_a_mass_that_is_none_is_refused(folder, tmp_path, capsys, mass):
+    assert main(["export", str(folder), "--to", "npz", f"--mass={mass}", "--output", str(tmp_path / "out")]) == 2
+    assert "--mass: must be a positive number of kg" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("words", "frames"), [(None, list(range(7))), ("2", [2]), ("1:4", [1, 2, 3]), ("0:7:3", [0, 3, 6])], ids=str
 )

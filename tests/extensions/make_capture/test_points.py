@@ -35,7 +35,7 @@ def filmed(root, depth=False, **changes):
 def test_points_alone_become_a_capture(tmp_path, capsys):
     files = brought(tmp_path / "files", 8)
     options = [part for name, path in files.items() for part in (f"--{name}", str(path))]
-    command = ["make-capture", *options, "--category", "toy", "--rate", "25", "--train-end", "5"]
+    command = ["make-capture", *options, "--category", "toy", "--rate", "25", "--train-end", "5", "--mass", "0.35"]
     command += ["--output", str(tmp_path / "made")]
     assert main(command) == 0
     said = capsys.readouterr().out
@@ -44,6 +44,7 @@ def test_points_alone_become_a_capture(tmp_path, capsys):
     assert "neuspring annotate" not in said
     made = Capture.load(tmp_path / "made")
     assert (made.frame_count, made.train_end, made.description.frame_rate, made.description.tracks) == (8, 5, 25.0, "train")
+    assert made.description.mass == 0.35
     assert serious(check_layout(made.folder)) == []
     np.testing.assert_allclose(read(made).hands.points, scene.risen(scene.GRIP, 8))
     assert made.description.provenance["nodes file"].startswith("sha256:")

@@ -77,6 +77,7 @@ def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Pat
         "name": source.name,
         "made_from_sha256": source.made_from,
         "about": f"{body.about}, and moved by controllers.",
+        "mass": {"value": source.total_mass, "unit": "kg", "about": source.weight},
         "units": "SI: m, kg, s, N. Coordinates are right-handed; z is vertical.",
         "sizes": SIZE_MEANINGS,
         "arrays": described,
