@@ -129,7 +129,7 @@ def _with_depth(capture: Capture, name: str, samples: dict[int, Sample]) -> list
     where, sign = f"camera {name}", up_sign(up)
     found = examine("edges", where, pictures) + examine("object and hands", where, camera, samples, 0.0)
     found += examine("hands", where, camera, samples)
-    found += examine("object", f"{where}, object", place_of(list(bodies.values()), sign))
+    found += examine("object", f"{where}, object", place_of(bodies, sign))
     findings = examine("table", path, TableSeen(name, tables, camera.camera_to_world, up, unit))
     if 0 not in bodies:
         return findings + at(path, found)
