@@ -168,8 +168,8 @@ def strays(camera: Camera, samples: Samples, least: float) -> dict[str, Any] | N
         found += zip(away.tolist(), [frame] * len(away), x[~own].tolist(), y[~own].tolist(), strict=True)
     if not found:
         return None
-    away, frame, x, y = max(found)
-    told = {"value": len(found), "total": total, "cm": 100 * away, "x": x, "y": y, "frame": frame}
+    most, first, column, row = max(found)
+    told = {"value": len(found), "total": total, "cm": 100 * most, "x": column, "y": row, "frame": first}
     return told | {"frames": sorted({frame for _, frame, *_ in found})}
 
 
@@ -210,12 +210,12 @@ def size(place: Place | None) -> dict[str, Any] | None:
 
 def lowest(place: Place | None) -> dict[str, Any] | None:
     """Lowest height of the object above the table, m."""
-    return place and _extreme(place, place.low[:, 2], int(place.low[:, 2].argmin()))
+    return None if place is None else _extreme(place, place.low[:, 2], int(place.low[:, 2].argmin()))
 
 
 def highest(place: Place | None) -> dict[str, Any] | None:
     """Highest height of the object above the table, m."""
-    return place and _extreme(place, place.high[:, 2], int(place.high[:, 2].argmax()))
+    return None if place is None else _extreme(place, place.high[:, 2], int(place.high[:, 2].argmax()))
 
 
 def _extreme(place: Place, heights: np.ndarray, at: int) -> dict[str, Any]:
