@@ -173,24 +173,13 @@ def strays(camera: Camera, samples: Samples, least: float) -> dict[str, Any] | N
     return told | {"frames": sorted({frame for _, frame, *_ in found})}
 
 
-@dataclass(frozen=True, eq=False)
-class Place:
-    """The object above the table in some frames."""
-
-    frames: tuple[int, ...]
-    low: np.ndarray
-    """[F, 3], m: its lowest coordinates, the third upwards from the table."""
-    high: np.ndarray
-    """[F, 3], m: its highest."""
+Place = Mapping[int, np.ndarray]
+"""Lowest and highest coordinates of the object [2, 3], m, by frame; the third are heights above the table."""
 
 
-def place_of(bodies: Mapping[int, np.ndarray], up: float) -> Place | None:
-    """Place of the object by its points in some frames, [n, 3] each, m, in the world; `up` is +1 or -1. None of too few points."""
-    found = {frame: extents(points * (1, 1, up)) for frame, points in bodies.items() if len(points) >= FEWEST_POINTS}
-    if not found:
-        return None
-    ranges = np.array([*found.values()])
-    return Place((*found,), ranges[:, 0], ranges[:, 1])
+def place_of(bodies: Mapping[int, np.ndarray], up: float) -> Place:
+    """Place of the object by its points [n, 3], m, in the world, by frame; `up` is +1 or -1. Too few points are left out."""
+    return {frame: extents(points * (1, 1, up)) for frame, points in bodies.items() if len(points) >= FEWEST_POINTS}
 
 
 def in_cm(sides: Iterable[float]) -> str:
@@ -198,28 +187,22 @@ def in_cm(sides: Iterable[float]) -> str:
     return " x ".join(f"{100 * side:.{0 if side >= 0.01 else 1}f}" for side in sides)
 
 
-def size(place: Place | None) -> dict[str, Any] | None:
+def size(place: Place) -> dict[str, Any] | None:
     """Sides of the object and its heights above the table, in the first frame that shows it."""
-    if place is None:
+    for frame, (low, high) in place.items():
+        text = in_cm(high - low)
+        heights = f"from {100 * low[2]:.1f} to {100 * high[2]:.1f} cm above the table"
+        return {"value": text, "text": f"{text} cm, {heights} in frame {frame}", "frames": (frame,)}
+    return None
+
+
+def height(place: Place, end: int) -> dict[str, Any] | None:
+    """Lowest (`end` 0) or highest (1) height of the object above the table, m, and its frame."""
+    if not place:
         return None
-    low, high, frame = place.low[0], place.high[0], place.frames[0]
-    text = in_cm(high - low)
-    heights = f"from {100 * low[2]:.1f} to {100 * high[2]:.1f} cm above the table"
-    return {"value": text, "text": f"{text} cm, {heights} in frame {frame}", "frames": (frame,)}
-
-
-def lowest(place: Place | None) -> dict[str, Any] | None:
-    """Lowest height of the object above the table, m."""
-    return None if place is None else _extreme(place, place.low[:, 2], int(place.low[:, 2].argmin()))
-
-
-def highest(place: Place | None) -> dict[str, Any] | None:
-    """Highest height of the object above the table, m."""
-    return None if place is None else _extreme(place, place.high[:, 2], int(place.high[:, 2].argmax()))
-
-
-def _extreme(place: Place, heights: np.ndarray, at: int) -> dict[str, Any]:
-    return {"value": float(heights[at]), "cm": -100 * heights[at], "frame": place.frames[at], "frames": (place.frames[at],)}
+    frame = (min, max)[end](place, key=lambda frame: float(place[frame][end, 2]))
+    value = float(place[frame][end, 2])
+    return {"value": value, "cm": -100 * value, "frame": frame, "frames": (frame,)}
 
 
 def outline(camera: Camera, mask: np.ndarray) -> list[float]:
@@ -398,11 +381,11 @@ checks = (
     Check("size of the object", "object", size, None, "note", "{text}; as its pixels with depth show it.",
           "Is that what was filmed?"),
     Check("implausible size", "object",
-          lambda place: place and longest(float(np.median(place.high - place.low, axis=0).max())), None, "warning",
-          f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE_REMEDY),
-    Check("object below the table", "object", lowest, (-SUNK, np.inf), "warning",
+          lambda place: longest(float(np.median(np.ptp([*place.values()], axis=1), axis=0).max())) if place else None, None,
+          "warning", f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE_REMEDY),
+    Check("object below the table", "object", lambda place: height(place, 0), (-SUNK, np.inf), "warning",
           f"it reaches {{cm:.1f}} cm below the table in frame {{frame}}; at most {100 * SUNK:g} cm are noise.", TABLE),
-    Check("object high above the table", "object", highest, (-np.inf, HIGHEST_OBJECT), "warning",
+    Check("object high above the table", "object", lambda place: height(place, 1), (-np.inf, HIGHEST_OBJECT), "warning",
           "it is up to {value:.2f} m above it in frame {frame}; at most {high:g} m is expected; walls and people in the mask are "
           "no object.", TABLE),
     Check("size of the object", "outline", lambda sides: sides and {"text": in_cm(sides)}, None, "note",
