@@ -63,7 +63,7 @@ def look_at_observations(observations: Observations, moves: float = 0.0) -> list
 
 def look_at_lifted(lifted: LiftedTracks, prior: ShapePrior, up: float, image: ImageObservations | None = None) -> list[Finding]:
     """Findings about points in the world and the shape; `up` is +1 or -1. `image`: the evidence of color alone."""
-    found = examine("object", "object in frame 0", place_of([lifted.cloud], up))
+    found = examine("object", "object of all cameras", place_of({0: lifted.cloud}, up))
     if image is None and prior.backend.startswith("visual_hull"):
         found += examine("sheet", "object in frame 0", lifted.cloud, up)
     found += examine("pose", "shape", lifted) + examine("shape", "shape", prior)

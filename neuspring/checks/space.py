@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from neuspring.checks.table import FAR_OFF
-from neuspring.checks.things import HAND_REACH, HIGHEST_OBJECT, LARGE, SCALE_REMEDY, SMALL, SUNK, WITHIN, longest
+from neuspring.checks.things import HAND_REACH, HIGHEST_OBJECT, LARGE, SCALE_REMEDY, SMALL, SUNK, extents, longest
 from neuspring.core.checks import Check
 from neuspring.data.camera import FAR
 from neuspring.data.capture import CAPTURE
@@ -36,7 +36,7 @@ def off_table(points: np.ndarray, up: float | None, is_body: bool) -> dict[str, 
     """Heights of points that are not on or above the table, and what explains them; `up` is +1 or -1, None without a table."""
     if up is None or np.abs(points).max() > FAR:
         return None
-    low, high = np.quantile(up * points[:, 2], WITHIN)
+    low, high = extents(points * (1, 1, up))[:, 2]
     # A body may hang in the air, and need not.
     if low >= -SUNK and high <= HIGHEST_OBJECT and not (is_body and low > FAR_OFF):
         return None

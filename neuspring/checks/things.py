@@ -13,6 +13,8 @@ from typing import Any
 import cv2
 import numpy as np
 from scipy.ndimage import median_filter
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -28,8 +30,11 @@ SMALL, LARGE = 0.02, 1.2
 """m. Objects whose longest side is another are a wrong mask or a wrong unit of depth."""
 SUNK, HIGHEST_OBJECT = 0.02, 1.2
 """m. An object lower than SUNK below the table, or higher than HIGHEST_OBJECT above it, stands in another world than the table."""
-WITHIN = (0.05, 0.95)
-"""Quantiles between which a body lies: beyond them are pixels of its outline with the depth of something else."""
+WITHIN = (0.01, 0.99)
+"""Quantiles between which a body lies: beyond them are pixels of its outline whose depth is between it and what is behind it."""
+APART, SPARSE, PIECE = 0.2, 4.0, 0.02
+"""Gaps of this part of a body's size, and of so many distances between its points, part it into pieces; pieces with a smaller share
+of its points are no part of it. Where hands or a fold hide a part, the others are larger."""
 USUAL_HOLES, BAD_HOLES = 0.4, 0.8
 """Share of the object's pixels without depth from which twins suffer, and from which little is left to lift. Outlines have none: a
 tenth of a cloth or a toy in the synthetic scenes, and a third of a rope."""
@@ -68,12 +73,34 @@ def sampled(frames: int) -> set[int]:
     return set(np.linspace(0, frames - 1, SAMPLED).astype(int).tolist())
 
 
+def of_body(points: np.ndarray) -> np.ndarray:
+    """True for points [n, 3], m, of a body [n]; not for strays, pieces that are small and apart: see `APART`."""
+    if not len(points):
+        return np.zeros(0, bool)
+    low, high = np.quantile(points, (0.05, 0.95), axis=0)
+    spacing = np.median(KDTree(points).query(points, k=min(2, len(points)))[0][..., -1])
+    gap = max(APART * float(np.linalg.norm(high - low)), SPARSE * float(spacing), 1e-9)
+    cells, cell = np.unique(np.floor(points / gap).astype(np.int64), axis=0, return_inverse=True)
+    # Cells that touch at a corner are joined.
+    pairs = KDTree(cells).query_pairs(1.8, output_type="ndarray")
+    joined = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells),) * 2)
+    piece = connected_components(joined, directed=False)[1][cell.ravel()]
+    sizes = np.bincount(piece)
+    return np.asarray(sizes[piece] >= min(max(FEWEST_POINTS, PIECE * len(points)), sizes.max()))
+
+
+def extents(points: np.ndarray) -> np.ndarray:
+    """Lowest and highest coordinates [2, 3] of a body by its points [n, 3], m, without strays: what sizes and heights are of."""
+    return np.asarray(np.quantile(points[of_body(points)], WITHIN, axis=0))
+
+
 def lifted(camera: Camera, sample: Sample, label: int) -> np.ndarray:
-    """World points [n, 3], m, of the pixels with a label and depth; at most COMPARED_POINTS."""
+    """World points [n, 3], m, of the pixels with a label and depth; at most COMPARED_POINTS, and no strays of the object."""
     y, x = np.nonzero((sample.mask == label) & (sample.depth > 0))
     step = -(-len(x) // COMPARED_POINTS) or 1
     y, x = y[::step], x[::step]
-    return camera.lift(np.stack([x, y], axis=-1).astype(float), sample.depth[y, x])
+    points = camera.lift(np.stack([x, y], axis=-1).astype(float), sample.depth[y, x])
+    return points[of_body(points)] if label == OBJECT else points
 
 
 Samples = Mapping[int, Sample]
@@ -130,31 +157,52 @@ def gap(camera: Camera, samples: Samples) -> dict[str, Any] | None:
     return {"value": min(gaps), "cm": 100 * min(gaps), "count": len(gaps)} if gaps else None
 
 
-Place = tuple[np.ndarray, float, float]
-"""Sides [3] of the object, and its lowest and highest height above the table, m."""
-
-
-def place_of(bodies: Sequence[np.ndarray], up: float) -> Place | None:
-    """Place of the object by its points in some frames, [n, 3] each, m, in the world; `up` is +1 or -1. None of too few points."""
-    whole = [points * (1, 1, up) for points in bodies if len(points) >= FEWEST_POINTS]
-    ranges = np.array([np.quantile(points, WITHIN, axis=0) for points in whole])
-    if not len(ranges):
+def strays(camera: Camera, samples: Samples, least: float) -> dict[str, Any] | None:
+    """Pixels of the object that are apart from it in space."""
+    found, total = list[tuple[float, int, int, int]](), 0
+    for frame, sample in samples.items():
+        y, x = np.nonzero((sample.mask == OBJECT) & (sample.depth > 0))
+        points = camera.lift(np.stack([x, y], axis=-1).astype(float), sample.depth[y, x])
+        own, total = of_body(points), total + len(points)
+        away = KDTree(points[own]).query(points[~own])[0] if not own.all() else np.zeros(0)
+        found += zip(away.tolist(), [frame] * len(away), x[~own].tolist(), y[~own].tolist(), strict=True)
+    if not found:
         return None
-    return np.median(np.ptp(ranges, axis=1), axis=0), float(ranges[:, 0, 2].min()), float(ranges[:, 1, 2].max())
+    most, first, column, row = max(found)
+    told = {"value": len(found), "total": total, "cm": 100 * most, "x": column, "y": row, "frame": first}
+    return told | {"frames": sorted({frame for _, frame, *_ in found})}
+
+
+Place = Mapping[int, np.ndarray]
+"""Lowest and highest coordinates of the object [2, 3], m, by frame; the third are heights above the table."""
+
+
+def place_of(bodies: Mapping[int, np.ndarray], up: float) -> Place:
+    """Place of the object by its points [n, 3], m, in the world, by frame; `up` is +1 or -1. Too few points are left out."""
+    return {frame: extents(points * (1, 1, up)) for frame, points in bodies.items() if len(points) >= FEWEST_POINTS}
 
 
 def in_cm(sides: Iterable[float]) -> str:
-    """Sides, m, as `12 x 9`, cm."""
-    return " x ".join(f"{100 * side:.0f}" for side in sides)
+    """Sides, m, as `12 x 9`, cm; those of less than 1 cm with a digit more."""
+    return " x ".join(f"{100 * side:.{0 if side >= 0.01 else 1}f}" for side in sides)
 
 
-def size(place: Place | None) -> dict[str, Any] | None:
-    """Sides of the object and its heights above the table."""
-    if place is None:
+def size(place: Place) -> dict[str, Any] | None:
+    """Sides of the object and its heights above the table, in the first frame that shows it."""
+    for frame, (low, high) in place.items():
+        text = in_cm(high - low)
+        heights = f"from {100 * low[2]:.1f} to {100 * high[2]:.1f} cm above the table"
+        return {"value": text, "text": f"{text} cm, {heights} in frame {frame}", "frames": (frame,)}
+    return None
+
+
+def height(place: Place, end: int) -> dict[str, Any] | None:
+    """Lowest (`end` 0) or highest (1) height of the object above the table, m, and its frame."""
+    if not place:
         return None
-    sides, low, high = place
-    text = in_cm(sides)
-    return {"value": text, "text": f"{text} cm, from {100 * low:.1f} to {100 * high:.1f} cm above the table"}
+    frame = (min, max)[end](place, key=lambda frame: float(place[frame][end, 2]))
+    value = float(place[frame][end, 2])
+    return {"value": value, "cm": -100 * value, "frame": frame, "frames": (frame,)}
 
 
 def outline(camera: Camera, mask: np.ndarray) -> list[float]:
@@ -164,6 +212,7 @@ def outline(camera: Camera, mask: np.ndarray) -> list[float]:
     """
     own = object_on_table(camera, mask)
     own = own[np.isfinite(own[:, 0])]
+    own = own[of_body(own)]
     return [] if len(own) < FEWEST_POINTS else sorted(cv2.minAreaRect(own[:, :2].astype(np.float32))[1], reverse=True)
 
 
@@ -206,7 +255,11 @@ def flat(points: np.ndarray, up: float, category: str = "") -> dict[str, Any] | 
     if sides[1] < SHEET_SIDE or len(np.unique(level // cell, axis=0)) * cell**2 < SHEET_COVERED * outline:
         return None
     rule = f"the category {category!r} makes a filled body of it" if category else "a filled hull was made of it"
-    return {"value": high, "text": f"{100 * sides[0]:.0f} x {100 * sides[1]:.0f} cm, {1e3 * high:.0f} mm high", "rule": rule}
+    return {
+        "value": high,
+        "text": f"{100 * sides[0]:.0f} x {100 * sides[1]:.0f} cm, nine tenths of it below {1e3 * high:.0f} mm",
+        "rule": rule,
+    }
 
 
 RAISED, AIR = 0.025, (0.05, 0.3)
@@ -228,7 +281,7 @@ def height_in_air(camera: Camera, sample: Sample, up: float, obstacles: Sequence
     own = lifted(camera, sample, OBJECT) * (1, 1, up)
     if len(own) < FEWEST_POINTS:
         return None
-    low, high = np.quantile(own[:, 2], WITHIN)
+    low, high = extents(own)[:, 2]
     foot, away = own[own[:, 2] < low + LEVEL], max(AIR[0], AIR[1] * (high - low))
     if low < RAISED or any((one.depth((foot - (0, 0, away)) * (1, 1, up)) > 0).any() for one in obstacles):
         return None
@@ -313,6 +366,9 @@ def constant_grips(counts: np.ndarray, rate: float, folder: Path) -> dict[str, A
 checks = (
     Check("depth holes", "object and hands", holes, None, "warning",
           "{value:.0%} of the object's pixels have no depth (frame {frame}: {worst:.0%}); {rule}.", "{next}"),
+    Check("stray pixels", "object and hands", strays, None, "note",
+          "{value} of {total} pixels of the object are apart from it in space, by {cm:.1f} cm at x {x}, y {y} of frame "
+          "{frame}; sizes and heights are without them.", "Is something else in the mask there?"),
     Check("hands too small", "object and hands", small_hands, None, "warning",
           f"hands (label {HANDS}) of {{cm:.2g}} cm²; at least {1e4 * HAND_LEAST:g} cm² are expected.", SCALE_REMEDY),
     Check("hands too large", "object and hands", large_hands, None, "warning",
@@ -324,13 +380,14 @@ checks = (
           "can move it.", "Look at the masks for a hand that is something else, or for the wrong object."),
     Check("size of the object", "object", size, None, "note", "{text}; as its pixels with depth show it.",
           "Is that what was filmed?"),
-    Check("implausible size", "object", lambda place: place and longest(float(place[0].max())), None, "warning",
-          f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE_REMEDY),
-    Check("object below the table", "object", lambda place: place and {"value": place[1], "cm": -100 * place[1]}, (-SUNK, np.inf),
-          "warning", f"it reaches {{cm:.1f}} cm below the table; at most {100 * SUNK:g} cm are noise.", TABLE),
-    Check("object high above the table", "object", lambda place: place and {"value": place[2]}, (-np.inf, HIGHEST_OBJECT),
-          "warning",
-          "it is up to {value:.2f} m above it; at most {high:g} m is expected; walls and people in the mask are no object.", TABLE),
+    Check("implausible size", "object",
+          lambda place: longest(float(np.median(np.ptp([*place.values()], axis=1), axis=0).max())) if place else None, None,
+          "warning", f"{{cm:.3g}} cm long; {100 * SMALL:g} to {100 * LARGE:g} cm are expected.", SCALE_REMEDY),
+    Check("object below the table", "object", lambda place: height(place, 0), (-SUNK, np.inf), "warning",
+          f"it reaches {{cm:.1f}} cm below the table in frame {{frame}}; at most {100 * SUNK:g} cm are noise.", TABLE),
+    Check("object high above the table", "object", lambda place: height(place, 1), (-np.inf, HIGHEST_OBJECT), "warning",
+          "it is up to {value:.2f} m above it in frame {frame}; at most {high:g} m is expected; walls and people in the mask are "
+          "no object.", TABLE),
     Check("size of the object", "outline", lambda sides: sides and {"text": in_cm(sides)}, None, "note",
           "color alone: table z = 0 as given, object size on the table {text} cm; by its mask of frame 0.",
           "Is that what was filmed?"),

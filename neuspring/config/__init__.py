@@ -12,7 +12,7 @@ Nothing here imports torch, Warp or MLflow, because the workflow reads the confi
 """
 
 from neuspring.config.data import Mocap, Synthetic, Toy
-from neuspring.config.parse import merge, parse, plain, read_text, read_yaml, typed
+from neuspring.config.parse import merge, of_command_line, parse, plain, read_text, read_yaml
 from neuspring.config.rod import RodSettings
 from neuspring.config.rows import Method, ScenarioRow, SearchRow
 from neuspring.config.search import Search, SearchVariables, Variable
@@ -39,9 +39,9 @@ __all__ = [
     "Tracking",
     "Variable",
     "merge",
+    "of_command_line",
     "parse",
     "plain",
     "read_text",
     "read_yaml",
-    "typed",
 ]

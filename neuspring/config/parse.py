@@ -133,8 +133,17 @@ def _filled(row: Any, value: str) -> Any:
     return typed(row.replace("{each}", value)) if isinstance(row, str) and "{each}" in row else row
 
 
+def of_command_line(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of `--config` as YAML has them: Snakemake leaves true, false and null as text, inside mappings numbers too.
+
+    Lists stay as they are: their entries may be names, such as 0.
+    """
+    spelled = ("true", "false", "null")
+    return {key: typed(value) if isinstance(value, Mapping) or value in spelled else value for key, value in values.items()}
+
+
 def typed(value: Any) -> Any:
-    """A mapping or list of `--config` as YAML has it: inside it Snakemake leaves numbers, true, false and null as text."""
+    """A text as YAML has it, or a mapping or list of such."""
     if isinstance(value, Mapping):
         return {key: typed(each) for key, each in value.items()}
     if isinstance(value, list):

@@ -55,13 +55,6 @@ def _seed_list(value: Any) -> Any:
     return tuple(entries)
 
 
-def _transfers(value: Any) -> Any:
-    """`--config transfers=null` arrives as text; pools too."""
-    if isinstance(value, dict):
-        return {source: tuple(targets) if isinstance(targets, list) else targets for source, targets in value.items()}
-    return None if value == "null" else value
-
-
 Seeds = Annotated[tuple[Annotated[int, Field(ge=0)], ...], BeforeValidator(_seed_list)]
 
 
@@ -131,9 +124,9 @@ class Config(SettingsSection):
     studies: tuple[Name, ...] = ()
     """Rows of the study table (the paper's tables) that are made, with the methods in their rows; each is also a target by its
     name."""
-    transfers: Annotated[dict[Name, tuple[Name, ...]] | None, BeforeValidator(_transfers)] = None
+    transfers: dict[Name, tuple[Name, ...]] | None = None
     """Scenario -> other recordings of the same object, on which its twins are rolled out as well; null: none."""
-    pools: Annotated[dict[Name, tuple[Name, ...]] | None, BeforeValidator(_transfers)] = None
+    pools: dict[Name, tuple[Name, ...]] | None = None
     """Name -> scenarios that are recordings of one object, with the same nodes, for methods with `pool`; null: none."""
     results: Annotated[
         str, StringConstraints(pattern=r"^[^{}\n]+$"), AfterValidator(lambda path: os.path.normpath(os.path.expanduser(path)))

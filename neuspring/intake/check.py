@@ -157,7 +157,7 @@ def _with_depth(capture: Capture, name: str, samples: dict[int, Sample]) -> list
     where, sign = f"camera {name}", up_sign(up)
     found = examine("edges", where, pictures) + examine("object and hands", where, camera, samples, 0.0)
     found += examine("hands", where, camera, samples)
-    found += examine("object", f"{where}, object", place_of(list(bodies.values()), sign))
+    found += examine("object", f"{where}, object", place_of(bodies, sign))
     if 0 not in bodies:
         return at(path, found)
     found += examine("support", f"{where}, object", camera, samples[0], sign, described.obstacles)

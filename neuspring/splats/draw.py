@@ -18,7 +18,7 @@ from neuspring.data.camera import Camera
 from neuspring.splats.model import Gaussians, Splats
 from neuspring.splats.rasterize import Backend
 from neuspring.splats.skinning import Skin
-from neuspring.splats.view import View
+from neuspring.splats.view import View, rotations, turned_harmonics
 
 OBJECT_COVERAGE = 128
 """Coverage, of 255, from which a pixel counts as object: a half."""
@@ -43,11 +43,15 @@ def prune_by_opacity(splats: Splats) -> Splats:
 
 
 def skinned_frames(splats: Splats, positions: np.ndarray, images: Images, device: str) -> Iterator[Gaussians]:
-    """The splats in every frame of a trajectory [F, N, 3], m."""
+    """The splats in every frame of a trajectory [F, N, 3], m; colors that depend on the direction turn with them."""
     start = Gaussians.of(splats, device)
+    unturned = rotations(start.quaternions).mT
     skin = Skin(positions[0], device=device, released_degeneracy="degenerate_skinning" in images.released_quirks)
-    for means, quaternions in skin.carry(positions, start.means, start.quaternions):
-        yield Gaussians(means, quaternions, start.log_scales, start.opacity_logits, start.harmonics)
+    for frame, (means, quaternions) in enumerate(skin.carry(positions, start.means, start.quaternions)):
+        harmonics = start.harmonics
+        if frame and "unturned_harmonics" not in images.released_quirks:
+            harmonics = turned_harmonics(harmonics, rotations(quaternions) @ unturned)
+        yield Gaussians(means, quaternions, start.log_scales, start.opacity_logits, harmonics)
 
 
 def frames_from_centers(splats: Splats, centers: np.ndarray, device: str) -> Iterator[Gaussians]:

@@ -175,7 +175,7 @@ def radii(projected: Projected) -> torch.Tensor:
 
 
 def basis(directions: torch.Tensor, degree: int) -> torch.Tensor:
-    """Y_k [N, (degree + 1)^2] in unit directions [N, 3]."""
+    """Y_k [..., (degree + 1)^2] in unit directions [..., 3]."""
     x, y, z = directions.unbind(-1)
     rows = [torch.full_like(x, C0)]
     if degree > 0:
@@ -195,6 +195,28 @@ def basis(directions: torch.Tensor, degree: int) -> torch.Tensor:
             -a * x * (x * x - 3 * y * y),
         ]
     return torch.stack(rows, dim=-1)
+
+
+TURN_SAMPLES = 24
+"""Directions in which a color is compared before and after a turn; 15 coefficients above the first are fitted to them."""
+
+
+def turned_harmonics(coefficients: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
+    """Coefficients [N, K, 3] of splats that are turned by `turns` [N, 3, 3] with their colors: color'(d) = color(R^T d).
+
+    A turned harmonic is a sum of harmonics of its band, so least squares over a few fixed directions are exact.
+    """
+    degree = math.isqrt(coefficients.shape[1]) - 1
+    if not coefficients[:, 1:].any():
+        return coefficients
+    # Spread evenly by the golden angle, at heights between which the sphere has equal areas.
+    step = torch.arange(TURN_SAMPLES, dtype=torch.float64)
+    height, angle = 1 - (2 * step + 1) / TURN_SAMPLES, step * math.pi * (3 - math.sqrt(5))
+    level = torch.sqrt(1 - height**2)
+    directions = torch.stack([level * torch.cos(angle), level * torch.sin(angle), height], dim=-1)
+    fit = torch.linalg.pinv(basis(directions, degree)[:, 1:]).to(coefficients)
+    turned_back = basis(directions.to(coefficients) @ turns.to(coefficients), degree)[..., 1:]
+    return torch.cat([coefficients[:, :1], fit @ (turned_back @ coefficients[:, 1:])], dim=1)
 
 
 def harmonic_colors(coefficients: torch.Tensor, offsets: torch.Tensor, degree: int) -> torch.Tensor:

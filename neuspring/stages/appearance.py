@@ -155,8 +155,8 @@ class _Surface:
     """[Q, 3] m, on the surface that a shape prior guesses."""
     reach: float
     """m: points of the prior this near to a seen one add nothing."""
-    uniform: bool
-    """True where the prior's points are uniform over its surface, so that their share is one of area."""
+    hidden: float | None
+    """Part of the surface that no camera saw, as perception's record has it; None where no prior says what the whole is."""
 
     def first(self, start: Literal["seen", "shape_prior"]) -> tuple[np.ndarray, np.ndarray]:
         """First centers of splats, [R, 3] m, and their RGB [R, 3]."""
@@ -173,13 +173,6 @@ class _Surface:
         from neuspring.splats.train import SCALE_NEIGHBORS
 
         return len(self.prior) > SCALE_NEIGHBORS
-
-    @property
-    def hidden(self) -> float | None:
-        """Part of the surface that no camera saw; None where no prior says what the whole is."""
-        if not (self.uniform and len(self.prior)):
-            return None
-        return float((self._to_cloud[0] > self.reach).mean())
 
     @cached_property
     def _to_cloud(self) -> tuple[np.ndarray, np.ndarray]:
@@ -206,7 +199,13 @@ def _surface(
     if before is not None:
         lifted, prior = LiftedTracks.load(before.file("lifted")), ShapePrior.load(before.file("shape"))
         apart = max(settings.images.appearance.spacing, 1.0) * width
-        return _Surface(lifted.cloud, lifted.cloud_colors, _surface_points(prior, apart, seed), NEAR_SEEN * width, True)
+        return _Surface(
+            lifted.cloud,
+            lifted.cloud_colors,
+            _surface_points(prior, apart, seed),
+            NEAR_SEEN * width,
+            prior.facts.get("invented_share"),
+        )
     if observations is None:
         raise InputError("--lifted, --observations", "one of the two is required", "neither")
     require_length(capture, observations)
@@ -215,7 +214,7 @@ def _surface(
     if not len(cloud):
         remedy = "perception.lift has depth_range, neighborhood and outlier_neighbors."
         raise InputError(capture.folder, "the object's masks of frame 0 must hold pixels with usable depth", "none", remedy)
-    return _Surface(cloud, colors, observations.surface_points, NEAR_SEEN * width, False)
+    return _Surface(cloud, colors, observations.surface_points, NEAR_SEEN * width, None)
 
 
 def _surface_points(prior: ShapePrior, apart: float, seed: int) -> np.ndarray:

@@ -7,6 +7,7 @@ training loss (losses.py).
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -267,6 +268,9 @@ def evaluate(
             rows[k]["seconds"] += share
             if result.diverged_frame:
                 rows[k]["reason"] = f"a node left the scene in frame {result.diverged_frame}"
+            elif math.isnan(result.cost):
+                # CMA-ES would rank it in the middle, in silence.
+                rows[k]["reason"] = "its cost is not a number"
             else:
                 rows[k]["cost"] = min(result.cost, PENALTY)
 

@@ -119,7 +119,7 @@ def products(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(costs [1 + V], J'J [V, V], J'r [V]) of the rollouts [F, 1 + V, N, 3] of a base and its neighbors, `steps` [V] away.
 
-    A rollout that is not `fine` (it left the scene) costs infinity and has no slope.
+    A rollout that is not `fine` (it left the scene), or whose residuals are no numbers, costs infinity and has no slope.
     """
     costs, none = np.full(1 + len(steps), np.inf), (np.zeros((len(steps), len(steps))), np.zeros(len(steps)))
     if not fine[0]:
@@ -128,11 +128,14 @@ def products(
     x, v = positions.double(), velocities.double()
     near = [loss.assigned(frame, nodes) for frame, nodes in enumerate(x[:, 0], start=1)]
     base = residuals(loss, velocity, x[:, 0], v[:, 0], near)
+    if not np.isfinite(base).all():
+        return costs, *none
     jacobian, costs[0] = np.zeros((len(steps), len(base))), base @ base
     for k in np.flatnonzero(fine[1:]):
         neighbor = residuals(loss, velocity, x[:, k + 1], v[:, k + 1], near)
-        costs[k + 1] = neighbor @ neighbor
-        jacobian[k] = (neighbor - base) / steps[k]
+        if np.isfinite(neighbor).all():
+            costs[k + 1] = neighbor @ neighbor
+            jacobian[k] = (neighbor - base) / steps[k]
     return costs, jacobian @ jacobian.T, jacobian @ base
 
 

@@ -65,11 +65,16 @@ REPAIR_SPRINGS = 3
 """Springs given to a node of a seam: the fewest that can hold a point in space."""
 
 
+REGION_STEP = 1 / 128
+"""Node spacings to which places of nodes are rounded where regions are made: more than float32 loses, less than matters. Places on
+half a step would be rounded by chance; those of lattices lie on simple fractions of a spacing."""
+
+
 def regions(nodes: np.ndarray, count: int) -> np.ndarray:
     """Region of each node [N], 0 .. count - 1, by agglomerative clustering (Ward) of nodes [N, 3], m.
 
-    Regions are numbered by their centroids (x, then y, then z), so that the order of the nodes does not matter (unless
-    distances tie, as on a lattice).
+    Regions are numbered by their centroids (x, then y, then z). Neither unit nor order of the nodes matters, on lattices too, where
+    nearly all merges are ties: nodes are clustered by whole steps of `REGION_STEP`, in the order of their places.
     Raises InputError if there are fewer nodes than regions.
     """
     if count < 1:
@@ -83,9 +88,12 @@ def regions(nodes: np.ndarray, count: int) -> np.ndarray:
     from sklearn.cluster import AgglomerativeClustering
 
     points = np.asarray(nodes, np.float64)
-    clusters = AgglomerativeClustering(n_clusters=count, linkage="ward").fit_predict(points)
-    # Micrometers: far below any distance between regions, far above rounding, so ties between equal coordinates are seen as ties.
-    centroids = np.round([points[clusters == label].mean(axis=0) for label in range(count)], 6)
+    places = np.round((points - points.min(axis=0)) / (REGION_STEP * node_spacing(points)))
+    order = np.lexsort(places.T[::-1])
+    clusters = np.empty(len(places), np.int64)
+    clusters[order] = AgglomerativeClustering(n_clusters=count, linkage="ward").fit_predict(places[order])
+    # Far below any distance between regions, far above rounding, so ties between equal coordinates are seen as ties.
+    centroids = np.round([places[clusters == label].mean(axis=0) for label in range(count)], 6)
     number = np.empty(count, np.int32)
     number[np.lexsort(centroids.T[::-1])] = np.arange(count)
     return np.asarray(number[clusters])

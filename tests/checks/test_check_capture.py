@@ -16,7 +16,7 @@ from neuspring import checks, registry
 from neuspring.checks import examine
 from neuspring.checks.masks import Shown
 from neuspring.checks.table import on_table
-from neuspring.checks.things import Sample
+from neuspring.checks.things import Sample, extents, in_cm, lifted, of_body
 from neuspring.core.checks import Check
 from neuspring.core.geometry import rigid_inverse
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, Writer
@@ -92,11 +92,11 @@ def test_a_good_film_has_measurements_only(filmed, tmp_path):
         (moved(shifted(tilt=40.0)), "table elsewhere", "error", 0.1064, None),
         (lambda values: values.update(depth_unit=1.0), "depth unit", "error", 768.0, (0.1, 10.0)),
         (enlarged, "high camera", "warning", 4.0, (0.0, 3.0)),
-        (enlarged, "implausible size", "warning", 1.322, None),
-        (enlarged, "object high above the table", "warning", 1.358, (None, 1.2)),
+        (enlarged, "implausible size", "warning", 1.510, None),
+        (enlarged, "object high above the table", "warning", 1.392, (None, 1.2)),
         (lambda values: values.update(frame_rate=3000.0), "frame rate", "error", 3000.0, (1.0, 240.0)),
         (lambda values: values.update(frame_rate=0.033), "frame rate", "error", 0.033, (1.0, 240.0)),
-        (moved(shifted(z=-0.08)), "object below the table", "warning", -0.0448, (-0.02, None)),
+        (moved(shifted(z=-0.08)), "object below the table", "warning", -0.0533, (-0.02, None)),
         (lambda values: values.update(category="Cloth"), "category", "warning", "cloth", None),
     ],
 )
@@ -226,11 +226,69 @@ def test_an_object_in_the_air_needs_a_hand_that_holds_it(filmed):
     lifted = view.camera_to_world.copy()
     lifted[2, 3] += 0.08
     depth, mask = filmed.depth("0", 0), filmed.mask("0", 0)
-    for labels, words in (((OBJECT,), "begins 12 cm above the table, and no hand is near"), ((OBJECT, HANDS), "")):
+    for labels, words in (((OBJECT,), "begins 11 cm above the table, and no hand is near"), ((OBJECT, HANDS), "")):
         sample = Sample(np.where(np.isin(mask, labels), depth, 0.0), mask)
         found = examine("support", "object", replace(view, camera_to_world=lifted), sample, 1.0, ())
         assert [words in one.text for one in found] == ([True] if words else [])
         assert examine("support", "object", view, sample, 1.0, ()) == []
+
+
+def places(capture):
+    """The findings about the object's size and place of a capture's only camera, by name."""
+    names = ("size of the object", "implausible size", "object below the table", "stray pixels", "object above the table")
+    return {one.name: one for one in check_layout(capture.folder) if one.name in names}
+
+
+def far_behind(capture, frames, pixels, kept=None):
+    """Give the last pixels of the object the depth of something 1.2 m behind the table; of its others only `kept` stay measured."""
+    marked = []
+    for frame in frames:
+        path = capture.path("depth", "0", frame)
+        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        y, x = np.nonzero((capture.mask("0", frame) == OBJECT) & (depth > 0))
+        if kept is not None:
+            depth[y[kept:-pixels], x[kept:-pixels]] = 0
+        depth[y[-pixels:], x[-pixels:]] += 1200
+        marked.append(list(zip(x[-pixels:].tolist(), y[-pixels:].tolist(), strict=True)))
+        cv2.imwrite(str(path), depth)
+    return marked
+
+
+@pytest.mark.parametrize("kept", [None, 40])
+def test_stray_pixels_are_named_and_change_neither_size_nor_height(capture, kept):
+    """Four pixels of the mask show something far below the table; where little of the object is measured they are a tenth of it."""
+    before = places(capture)
+    assert set(before) == {"size of the object"}
+    marked = far_behind(capture, (0,), 4, kept)
+    after = places(capture)
+    stray = after["stray pixels"]
+    assert set(after) == {"size of the object", "stray pixels"}
+    assert (stray.level, stray.value, stray.frames) == ("note", 4, (0,))
+    assert any(f"x {x}, y {y} of frame 0" in stray.text for x, y in marked[0])
+    if kept is None:
+        assert after["size of the object"].value == before["size of the object"].value
+
+
+def test_sizes_and_heights_are_those_of_frame_0_and_not_of_the_way(capture):
+    """In the film the hand pushes the body; what it reaches later makes it no longer."""
+    own = lifted(capture.cameras["0"], Sample(capture.depth("0", 0), capture.mask("0", 0)), OBJECT)
+    low, high = extents(own)
+    found = places(capture)["size of the object"]
+    assert found.value == in_cm(high - low) and found.frames == (0,)
+    assert f"from {100 * low[2]:.1f} to {100 * high[2]:.1f} cm above the table" in found.text
+
+
+def test_a_body_in_parts_and_one_of_few_points_keep_all_of_them():
+    rng = np.random.default_rng(0)
+    body = rng.uniform(0, 0.1, (400, 3))
+    parted = np.concatenate([body, body[:40] + np.array([0.4, 0, 0])])
+    few = np.array([[0.05, 0.02, 0], [0.06, 0.02, 0], [0.3, 0.1, 0], [0.5, 0.4, 0], [0.2, 0.3, 0.1]])
+    sparse = np.argwhere(np.ones((6, 5, 1))) * 0.06
+    strays = np.concatenate([body, [[0.0, 0, -0.7], [0.01, 0, -0.7], [0, 0.01, -0.71], [0, 0, 2.0]]])
+    for unit in (1.0, 20.0, 1000.0):
+        assert all(of_body(unit * points).all() for points in (body, parted, sparse, few[2:], body[:1]))
+        assert of_body(unit * strays).tolist() == [True] * 400 + [False] * 4
+    assert of_body(body[:0]).tolist() == []
 
 
 def sheet(view):

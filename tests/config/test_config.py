@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 import functools
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from snakemake.cli import parse_config
 
 from neuspring import config
 from neuspring.config import Config, parse, plain
@@ -63,8 +65,7 @@ def test_seeds_may_be_text_as_the_command_line_hands_them_over(text: str, seeds:
     assert load(f"seeds: {text}\n").seeds == seeds
 
 
-def test_no_transfers_may_be_asked_for_on_the_command_line() -> None:
-    assert load("transfers: 'null'\n").transfers is None
+def test_transfers_are_names() -> None:
     assert load("transfers: {rope: [other]}\n").transfers == {"rope": ("other",)}
 
 
@@ -182,13 +183,27 @@ def test_configuration_and_artifacts_agree_on_names(name: str) -> None:
     assert accepted == bool(artifacts.SAFE_NAME.fullmatch(name))
 
 
-def test_values_inside_a_mapping_or_list_of_the_command_line_are_what_yaml_says():
-    """Snakemake hands `--config 'fit={epochs: 60}'` over with the number as text."""
-    given = {"epochs": "60", "field": {"triplane": "false", "hidden": "8"}, "learning_rate": "5.0e-5", "damping": "fixed"}
-    typed = config.typed(given)
-    assert typed == {"epochs": 60, "field": {"triplane": False, "hidden": 8}, "learning_rate": 5e-5, "damping": "fixed"}
-    assert config.parse(config.Config, {"fit": typed}, "--config").fit.epochs == 60
-    assert config.typed(["0", "rope", "2020-01-01", "[", None]) == [0, "rope", "2020-01-01", "[", None]
+def commanded(*entries: str) -> dict[str, Any]:
+    """What the workflow reads of `--config`, by Snakemake's own parser."""
+    return config.of_command_line(parse_config(entries))
+
+
+def test_values_of_the_command_line_are_what_yaml_says() -> None:
+    """Snakemake hands `--config 'fit={epochs: 60}'` over with the number as text, and true, false and null everywhere."""
+    values = commanded("fit={epochs: 60, field: {triplane: false, hidden: 8}, learning_rate: 5.0e-5, loss_unit: m}")
+    assert values == {"fit": {"epochs": 60, "field": {"triplane": False, "hidden": 8}, "learning_rate": 5e-5, "loss_unit": "m"}}
+    entries = ["transfers=null", "data_root=null", "compare_with=null", "tune=null", "scenarios=[0, rope, 2020-01-01]", "seeds=0,1"]
+    made = parse(Config, commanded(*entries), "--config")
+    assert (made.transfers, made.data_root, made.compare_with, made.tune) == (None, None, None, None)
+    assert (made.scenarios, made.seeds) == (("0", "rope", "2020-01-01"), (0, 1))
+    assert commanded("search={ranges: {drag: [0, null]}}") == {"search": {"ranges": {"drag": [0, None]}}}
+
+
+@pytest.mark.parametrize("entry", ["images=true", "images=True", "images=null", "results=null", "device=false", "clusters=null"])
+def test_a_word_that_a_setting_cannot_have_is_named_as_it_is_read(entry: str) -> None:
+    key, _, word = entry.partition("=")
+    with pytest.raises(InputError, match=rf"--config: \s*{key}: .*received {yaml.safe_load(word)}"):
+        parse(Config, commanded(entry), "--config")
 
 
 def test_the_home_folder_may_be_written_as_a_tilde(monkeypatch):

@@ -13,8 +13,12 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from neuspring.config.images import Images
 from neuspring.core.errors import InputError
+from neuspring.splats.draw import skinned_frames
+from neuspring.splats.model import Splats
 from neuspring.splats.skinning import Skin
+from neuspring.splats.view import harmonic_colors, turned_harmonics
 from tests.support.devices import DEVICES
 
 FOLDER = Path(__file__).parents[1] / "golden"
@@ -120,3 +124,38 @@ def test_a_handful_of_nodes_carries_splats_too(count):
     assert np.abs(turned.numpy() - [1, 0, 0, 0]).max() < COMPONENTS
     with pytest.raises(InputError, match=r"nodes.*finite"):
         Skin(np.full((count, 3), np.nan))
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10_000), degree=st.integers(0, 3))
+def test_turned_splats_show_the_colors_of_directions_turned_back(seed, degree):
+    rng, count = np.random.default_rng(seed), 30
+    turns, directions = Rotation.random(count, random_state=seed), as_tensor(rng.normal(size=(count, 3)))
+    coefficients = as_tensor(rng.normal(size=(count, (degree + 1) ** 2, 3)) * 0.05)
+    turned = turned_harmonics(coefficients, as_tensor(turns.as_matrix()))
+    expected = harmonic_colors(coefficients, as_tensor(turns.inv().apply(directions)), degree)
+    assert expected.min() > 0 and np.abs(harmonic_colors(turned, directions, degree) - expected).max() < 2e-6
+    assert torch.equal(turned[:, 0], coefficients[:, 0])
+
+
+def test_colors_turn_with_the_body_and_stay_as_released():
+    """Red from +x; a quarter turn about z takes that side to +y. Half red is what the base color has from all sides."""
+    nodes, angles = np.random.default_rng(0).uniform(0, 0.1, (60, 3)).astype(np.float32), np.linspace(0, 90, 7)
+    film = np.array([Rotation.from_euler("z", angle, degrees=True).apply(nodes) for angle in angles], np.float32)
+    red = np.zeros((4, 16, 3), np.float32)
+    red[:, 3, 0] = -1.0
+    turns = Rotation.random(4, random_state=1).as_quat(scalar_first=True)
+    splats = Splats(
+        means=nodes[:4], quaternions=3 * turns, log_scales=np.full((4, 1), -4), opacity_logits=np.full(4, 3), harmonics=red
+    )
+
+    def seen(images: Images, frame: int, direction: list[float]) -> np.ndarray:
+        gaussians = list(skinned_frames(splats, film, images, "cpu"))[frame]
+        return harmonic_colors(gaussians.harmonics, as_tensor([direction] * 4), 3)[:, 0].numpy()
+
+    side = 0.5 + np.sqrt(3 / (4 * np.pi))
+    for frame, along_x, along_y in ((0, side, 0.5), (6, 0.5, side)):
+        assert np.allclose(seen(Images(), frame, [1, 0, 0]), along_x, atol=1e-5)
+        assert np.allclose(seen(Images(), frame, [0, 1, 0]), along_y, atol=1e-5)
+    released = Images(released_quirks=("unturned_harmonics",))
+    assert np.allclose(seen(released, 6, [1, 0, 0]), side) and np.allclose(seen(released, 6, [0, 1, 0]), 0.5)

@@ -67,8 +67,10 @@ def test_splats_show_frame_0_and_say_what_they_could_not_see(scene):
     record = StageRecord.load(scene.appearance)
     assert record.status == "ok"
     assert all(record.facts[f"psnr_{name}"] > 28 for name in scene.capture.cameras)
-    # Below, no camera looks.
+    # Below, no camera looks. The share is that which perception says.
     assert 0.05 < record.facts["unseen_surface"] < 0.6
+    lifted = StageRecord.load(scene.folder / "lifted.json")
+    assert record.facts["unseen_surface"] == lifted.facts["shape_invented_share"]
     assert record.inputs.keys() == {"capture", "images", "masks0", "masks1", "masks2", "lifted"}
     assert record.facts["backend"] == "warp"
     assert {"splats", "history", "picture"} == set(record.files)

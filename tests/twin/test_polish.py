@@ -100,6 +100,10 @@ def test_a_rollout_that_left_has_no_slope():
     assert not matrix[1].any()
     assert gradient[1] == 0
     assert not products(loss, start, x, v, [False, True, True], np.full(2, 0.01))[2].any()
+    # Residuals that are no numbers of a rollout that seems fine.
+    again = products(loss, start, x, v, [True, True, True], np.full(2, 0.01))
+    assert all(np.array_equal(one, other) for one, other in zip(again, (costs, matrix, gradient), strict=True))
+    assert np.isinf(products(loss, start, x[:, [2, 0, 1]], v, [True, True, True], np.full(2, 0.01))[0]).all()
 
 
 # Steps ----------------------------------------------------------------------------------------------------------------

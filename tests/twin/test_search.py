@@ -605,6 +605,21 @@ def test_candidates_of_every_fate_in_one_generation(monkeypatch):
         assert ((rows["substeps"] == 60) == (kind in ("left", "fine"))).all()
 
 
+@pytest.mark.parametrize("first", [0, 3])
+def test_a_cost_that_is_no_number_is_penalized_and_never_the_best(monkeypatch, first):
+    simulate = candidates.outcomes
+    lost = iter(range(1000))
+
+    def spoiled(*arguments):
+        return [replace(one, cost=float("nan")) if next(lost) % 4 == first else one for one in simulate(*arguments)]
+
+    monkeypatch.setattr(candidates, "outcomes", spoiled)
+    result = search(small.search_problem(search=small.released(rollouts=12)), seed=0)
+    named = result.trace["reason"] == "its cost is not a number"
+    assert named.sum() == 3 and (result.trace["cost"][named] == PENALTY).all()
+    assert result.cost == result.trace["cost"][~named].min() < PENALTY
+
+
 def stand_in(substeps: int) -> Any:
     """Attributes of a twin that `groups` reads."""
     return SimpleNamespace(simulation=SimpleNamespace(substeps=substeps))

@@ -61,15 +61,7 @@ def or_workflow_error(check, *arguments, **named):
         raise WorkflowError(str(error)) from None
 
 
-# `--config 'fit={epochs: 60}'`: Snakemake leaves the number as text.
-settings.merge(
-    config,
-    {
-        key: settings.typed(value)
-        for key, value in workflow.config_settings.config.items()
-        if isinstance(value, dict)
-    },
-)
+settings.merge(config, settings.of_command_line(workflow.config_settings.config))
 # A target that is a study chooses methods. Snakemake knows the targets only when the rules are there, so they are read from the command
 # line. Jobs of a cluster are not told them, but what follows from them.
 TARGETS = (

@@ -66,6 +66,8 @@ def test_pxr_reads_positions_as_they_are(tmp_path, suffix):
         assert np.array_equal(np.array(springs.GetPointsAttr().Get(frame)).reshape(-1, 2, 3), both[twin.topology.springs])
         assert np.array_equal(splats.GetPositionsAttr().Get(frame), moved[frame].means)
         assert np.array_equal(stand_in.GetPointsAttr().Get(frame), moved[frame].means)
+        shades = np.array(splats.GetRadianceSphericalHarmonicsCoefficientsAttr().Get(frame)).reshape(moved[0].harmonics.shape)
+        assert np.array_equal(shades, moved[frame].harmonics)
     ours = moved[3].quaternions / np.linalg.norm(moved[3].quaternions, axis=1, keepdims=True)
     theirs = np.array([[turn.GetReal(), *turn.GetImaginary()] for turn in splats.GetOrientationsAttr().Get(3)])
     assert np.abs(ours - theirs).max() < 1e-6

@@ -135,11 +135,15 @@ class _Shapes:
                 field.CreateOpacitiesAttr(opacities)
                 degree = round(splats.harmonics.shape[1] ** 0.5) - 1
                 field.CreateRadianceSphericalHarmonicsDegreeAttr(degree)
-                field.CreateRadianceSphericalHarmonicsCoefficientsAttr(self._vectors(splats.harmonics.reshape(-1, 3)))
+                coefficients = field.CreateRadianceSphericalHarmonicsCoefficientsAttr(
+                    self._vectors(splats.harmonics.reshape(-1, 3))
+                )
                 stand_in.CreateWidthsAttr(self._vt.FloatArray.FromNumpy((2 * scales.mean(axis=1)).astype(np.float32)))
                 shade = np.clip(0.5 + C0 * splats.harmonics[:, 0], 0, 1)
                 self._primvar(stand_in, "displayColor", "color3f[]", self._vectors(shade), token.vertex)
                 self._primvar(stand_in, "displayOpacity", "float[]", opacities, token.vertex)
+            if splats.harmonics[:, 1:].any():  # They turn with the splats.
+                coefficients.Set(self._vectors(splats.harmonics.reshape(-1, 3)), codes[frame])
             turns = splats.quaternions / np.linalg.norm(splats.quaternions, axis=1, keepdims=True)
             quaternions = [self._gf.Quatf(*map(float, turn)) for turn in turns]
             field.CreateOrientationsAttr().Set(self._vt.QuatfArray(quaternions), codes[frame])
