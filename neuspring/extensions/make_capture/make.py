@@ -27,6 +27,7 @@ from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Capture, Description
 from neuspring.extensions.make_capture.feeds import Paired, pairs
 from neuspring.extensions.make_capture.film import looked_at
 from neuspring.extensions.make_capture.formats import Recorded, open_recording
+from neuspring.extensions.make_capture.formats.bag import open_bags
 from neuspring.extensions.make_capture.lenses import Board, Straightener, read_lenses, read_poses
 from neuspring.extensions.make_capture.options import FILM_OPTIONS, SPACE_OPTIONS, Intake
 from neuspring.extensions.make_capture.poses import (
@@ -62,7 +63,7 @@ def opened(intake: Intake) -> Recorded:
         rule += "--tracks"
         raise InputError("make-capture", rule, " ".join(given) or "none")
     if intake.bag:
-        return open_recording(intake.bag, "bag", intake.cameras)
+        return open_bags(intake.bag, intake.cameras, intake.topics)
     if intake.phystwin_raw:
         return open_recording((intake.phystwin_raw,), "phystwin_raw", intake.cameras)
     if intake.recording:
@@ -80,6 +81,11 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     All is checked before the first image is written. An interrupted call goes on where it was. Raises InputError naming the option
     or file, the rule, what was received and the next move.
     """
+    for option, value in (("--output", intake.output != Path()), ("--category", intake.category)):
+        if not value:
+            raise InputError(option, "is required", "none", "neuspring make-capture --help has all options.")
+    if intake.topics and not intake.bag:
+        raise InputError("--topics", "is for --bag", "none", "Give --bag FILE.")
     film, board = opened(intake), Board.of(intake.board) if intake.board else None
     views = film.views
     if not views:
