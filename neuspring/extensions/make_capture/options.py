@@ -63,11 +63,11 @@ class Intake:
     table_at: tuple[float, float] | None = None
     """a pixel of the table, where another plane is larger"""
     controllers: Path | None = None
-    """hands in space: .npz or .csv, m, a row per frame of the capture"""
+    """hands in space: .npz or .csv, m, a row per frame of the capture; or markers of a C3D file, FILE.c3d#LABEL,LABEL"""
     nodes: Path | None = None
     """the body of frame 0: .npz or .ply, m"""
     tracks: Path | None = None
-    """annotated points in space: JSON, m"""
+    """annotated points in space: JSON, m; or markers of a C3D file"""
     teach: bool = False
     """annotated points of training frames teach the twin; without color they always do"""
     up: Up = "+z"
