@@ -75,7 +75,9 @@ class Recording:
 def recorded(path: Path, form: str = "mcap") -> Iterator[Recording]:
     """A recording at a path, .bag for ROS 1."""
     if form == "ros1":
-        with rosbag1.Writer(path) as writer:
+        writer = rosbag1.Writer(path)
+        writer.set_compression(writer.CompressionFormat.LZ4)  # as librealsense does
+        with writer:
             yield Recording(writer, True)
         return
     with rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[form.upper()]) as writer:

@@ -54,6 +54,8 @@ ENCODINGS = {
 DECODED = {("uint8", 1): "mono8", ("uint8", 3): "bgr8", ("uint8", 4): "bgra8", ("uint16", 1): "16uc1"}
 """What OpenCV makes of JPEG and PNG: type and channels -> encoding."""
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+READ = (IMAGE, COMPRESSED, "sensor_msgs/msg/CameraInfo", "geometry_msgs/msg/Transform", "std_msgs/msg/Float32")
+"""Types of messages."""
 TRANSPORT = struct.Struct("<iff")
 """What compressedDepth has before its PNG: a number, and A and B of depth = A / (count - B), for floating point."""
 GAP = 0.3
@@ -105,6 +107,21 @@ def _unread(where: Path, encoding: str) -> InputError:
     return InputError(where, "images of an encoding that is read are required", repr(encoding), remedy)
 
 
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """A topic in short."""
+
+    kind: str
+    """Type of its messages."""
+    count: int
+    rate: float
+    """Messages per second of the recording."""
+    first: Any
+    """Its first message, if it is one of `READ`; else None."""
+    more: bytes
+    """What the definition of the first leaves over."""
+
+
 @dataclass(frozen=True)
 class Bag:
     """A recording with its topics."""
@@ -133,54 +150,64 @@ class Bag:
             raise
         except Exception as error:  # rosbags and its codecs raise whatever a damaged file leads them to
             rule = "a ROS 1 .bag, a ROS 2 folder with metadata.yaml, an .mcap or a .db3 file is required"
-            remedy = "If the recording was cut off: rosbag reindex FILE (ROS 1), ros2 bag reindex FOLDER (ROS 2)."
-            raise InputError(self.path, rule, f"{type(error).__name__}: {error}", remedy) from error
+            remedy = "If it was cut off: rosbag reindex FILE (ROS 1), ros2 bag reindex FOLDER (ROS 2), mcap recover FILE (.mcap)."
+            raise InputError(self.path, rule, f"{type(error).__name__}: {error}".rstrip("."), remedy) from error
 
     @cached_property
-    def topics(self) -> dict[str, tuple[str, int, float]]:
-        """Type, number and messages per second of the topics, by name. Raises InputError."""
+    def topics(self) -> dict[str, Summary]:
+        """What is known of the topics, by name. Raises InputError."""
         with self._opened() as reader:
-            known = sorted(reader.topics.items())
-            return {name: (one.msgtype or "", one.msgcount, 1e9 * one.msgcount / max(reader.duration, 1)) for name, one in known}
+            seconds = max(reader.duration, 1) / 1e9
+            return {
+                name: Summary(
+                    one.msgtype or "",
+                    one.msgcount,
+                    one.msgcount / seconds,
+                    *next(self._all(reader, name) if one.msgtype in READ else iter(()), (None, b"")),
+                )
+                for name, one in sorted(reader.topics.items())
+            }
 
     def messages(self, topic: str) -> Iterator[tuple[Any, bytes]]:
         """Its messages, and what their definition leaves over. Raises InputError."""
         with self._opened() as reader:
-            connections = [one for one in reader.connections if one.topic == topic]
-            for connection, _, raw in reader.messages(connections) if connections else ():
-                if self._new:
-                    yield self._types.deserialize_cdr(raw, connection.msgtype), b""
-                    continue
-                # Not deserialize_ros1, which refuses bytes that are left over.
-                definition = self._types.get_msgdef(connection.msgtype)
-                message, end = definition.deserialize_ros1(raw, 0, definition.cls, self._types)
-                yield message, raw[end:]
+            yield from self._all(reader, topic)
 
-    def first(self, suffix: str, beside: str) -> Any:
-        """The first message of the topic that ends so and begins with `beside`; None without any."""
-        named = (name for name, (_, count, _) in self.topics.items() if count and name.startswith(beside))
-        topic = next((name for name in named if name.lower().replace("_", " ").endswith(suffix)), None)
-        return None if topic is None else next(self.messages(topic))[0]
+    def _all(self, reader: Any, topic: str) -> Iterator[tuple[Any, bytes]]:
+        for connection, _, raw in reader.messages([one for one in reader.connections if one.topic == topic]):
+            if self._new:
+                yield self._types.deserialize_cdr(raw, connection.msgtype), b""
+                continue
+            # Not the store's own deserialize_ros1, which refuses bytes that are left over.
+            definition = self._types.get_msgdef(connection.msgtype)
+            message, end = definition.deserialize_ros1(raw, 0, definition.cls, self._types)
+            yield message, raw[end:]
+
+    def first(self, beside: str, suffix: str) -> Any:
+        """The first message of the topic that begins and ends so; None without any."""
+        named = (one.first for name, one in self.topics.items() if name.startswith(beside) and name.lower().endswith(suffix))
+        return next(named, None)
 
     @cached_property
     def images(self) -> dict[str, tuple[str, str]]:
         """Topics of images: the encoding, empty if it is not read, and the first image in words. Raises InputError."""
         found = {}
-        for topic in [name for name, (kind, count, _) in self.topics.items() if kind in (IMAGE, COMPRESSED) and count]:
-            message, _ = next(self.messages(topic))
+        for topic, one in self.topics.items():
+            if one.kind not in (IMAGE, COMPRESSED) or one.first is None:
+                continue
             try:
-                name, image = decoded(self.path, message)
+                name, image = decoded(self.path, one.first)
                 found[topic] = name, f"{ENCODINGS[name].kind}, {name}, {image.shape[1]} x {image.shape[0]}"
             except InputError:
-                found[topic] = "", f"images that are not read, {getattr(message, 'format', '') or message.encoding}"
+                found[topic] = "", f"images that are not read, {getattr(one.first, 'format', '') or one.first.encoding}"
         return found
 
     def text(self) -> str:
         """All topics, a line each."""
         lines = []
-        for name, (kind, count, rate) in self.topics.items():
+        for name, one in self.topics.items():
             told = self.images[name][1] if name in self.images else "not images"
-            lines.append(f"  {name}: {kind}, {count} messages, {rate:.3g} Hz: {told}")
+            lines.append(f"  {name}: {one.kind}, {one.count} messages, {one.rate:.3g} Hz: {told}")
         return "\n".join([f"{self.path}:", *lines])
 
     def pair(self, topics: Sequence[str]) -> tuple[str, str]:
@@ -205,10 +232,9 @@ class Bag:
         """The lens by the camera_info beside a topic of images, or one level above; None without any, or uncalibrated."""
         near = topic.rpartition("/")[0]
         places = [f"{folder}{inside}/camera_info" for folder in (near, near.rpartition("/")[0]) for inside in ("", "/info")]
-        there = next((name for name in places if self.topics.get(name, ("", 0, 0))[1]), None)
-        if there is None:
+        message = next((self.topics[name].first for name in places if name in self.topics), None)
+        if message is None:
             return None
-        message = next(self.messages(there))[0]
         said = {name.lower(): value for name, value in vars(message).items()}  # K of ROS 1 is k of ROS 2
         rectified = "rect" in topic.rpartition("/")[2] or "rect" in near.rpartition("/")[2]
         matrix = np.array(said["p"]).reshape(3, 4)[:, :3] if rectified else np.array(said["k"]).reshape(3, 3)
@@ -243,7 +269,7 @@ class Topic:
         """Stamp, ns, and place in the log, in the order of stamps: each is one image. Without stamps, 0 and that of the log."""
         stamps = [message.header.stamp for message, _ in self.bag.messages(self.name)]
         listed = [(stamp.sec * 10**9 + stamp.nanosec, place) for place, stamp in enumerate(stamps)]
-        if min(stamp for stamp, _ in listed) <= 0:
+        if max(stamp for stamp, _ in listed) <= 0:
             return [(0, place) for _, place in listed]
         return sorted({stamp: (stamp, place) for stamp, place in reversed(listed)}.values())
 
@@ -252,9 +278,9 @@ class Topic:
         """By the stamps."""
         times = np.array([stamp for stamp, _ in self._order]) * 1e-9
         numbers = list(range(len(times)))
-        if not times[0]:
+        if not times.any():
             return Series(numbers)
-        return Series(numbers, times=times, clock="wall" if times[0] > SINCE_1970 else str(self.bag.path))
+        return Series(numbers, times=times, clock="wall" if times[-1] > SINCE_1970 else str(self.bag.path))
 
     def read(self, places: Sequence[int]) -> Iterator[np.ndarray]:
         """As a folder, in one pass; only what the log has too early is held. Raises InputError."""
@@ -273,12 +299,12 @@ class Topic:
 
     def files(self, places: Sequence[int]) -> list[Path]:
         """The recording."""
-        return sorted(self.bag.path.iterdir()) if self.bag.path.is_dir() else [self.bag.path]
+        return sorted(filter(Path.is_file, self.bag.path.iterdir())) if self.bag.path.is_dir() else [self.bag.path]
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """Depth of one camera as another one would see it, whose view it is moved into: every pixel is an area, the nearest counts."""
+    """Moves depth into the view of another camera: every pixel is an area there, and the nearest counts."""
 
     source: Lens
     target: Lens
@@ -301,7 +327,7 @@ class Registration:
         return (np.round(counts) if depth.dtype.kind == "u" else counts).astype(depth.dtype)
 
     def _nearest(self, left: np.ndarray, right: np.ndarray, far: np.ndarray) -> np.ndarray:
-        """The least depth [n] of the areas, from `left` to `right` [n, 2], that have a pixel's center in them; infinite: none."""
+        """The least depth of the areas, from `left` to `right` [n, 2], that a pixel's center [H, W] lies in; infinite: none."""
         assert self.target.size is not None, "the lens is of a camera_info"
         seen = np.full(self.target.size[::-1], np.inf)
         first, end = np.ceil(left).astype(int), np.ceil(right).astype(int)
@@ -316,6 +342,9 @@ class Registration:
         """Pixels [n, 2] and depth [n], m, in the other view."""
         rays = np.stack([x, y, np.ones_like(meters)], axis=1) @ np.linalg.inv(self.source.matrix).T
         points = (rays * meters[:, None]) @ self.motion[:3, :3].T + self.motion[:3, 3]
+        if not self.target.distortion.any():
+            flat = points @ self.target.matrix.T
+            return flat[:, :2] / flat[:, 2:], points[:, 2]
         still = np.zeros(3)
         # librealsense reads the coefficients so whatever it calls the model.
         pixels, _ = cv2.projectPoints(points.reshape(-1, 1, 3), still, still, self.target.matrix, self.target.distortion)
@@ -327,12 +356,11 @@ def _camera(bag: Bag, topics: Sequence[str], name: str) -> Paired:
     color, depth = bag.pair(topics)
     lens, encoding = bag.lens(color), ENCODINGS.get(bag.images[depth][0])
     streams = [topic.removesuffix("/image/data") for topic in (color, depth)]
-    said = bag.first("/option/depth units/value", streams[1].rpartition("/")[0] + "/option/")
-    _, more = next(bag.messages(depth))
+    said, more = bag.first(streams[1].rpartition("/")[0] + "/option/", "/depth units/value"), bag.topics[depth].more
     told = struct.unpack("<f", more)[0] if len(more) == 4 else said.data if said else 0.0
     # A float of 32 bits: 0.001 is 0.0010000000475.
     unit = round(float(told), 9) or (encoding.unit if encoding else None)
-    motions = [_motion(bag.first("/tf/0", f"{stream}/tf/")) for stream in streams]
+    motions = [_motion(bag.first(f"{stream}/tf/", "0")) for stream in streams]
     onto, deep = None, bag.lens(depth)
     if lens is not None and deep is not None and unit and all(motion is not None for motion in motions):
         if deep.distortion.any():
