@@ -39,6 +39,7 @@ from neuspring.core.findings import Finding, broken, refuse
 from neuspring.core.geometry import Obstacle
 from neuspring.core.records import digest_file
 from neuspring.core.section import STRICT, Name, Positive
+from neuspring.data.c3d import Markers, is_c3d
 from neuspring.data.camera import Camera, CameraEntry
 from neuspring.data.images import make_way, read_array, read_image, require_size, write_image
 
@@ -194,8 +195,16 @@ class Capture:
         return f"List the frame in cameras.{camera}.missing of {CAPTURE} if the camera does not have it."
 
     def tracks(self, path: Path | None = None) -> np.ndarray:
-        """Annotated tracks [T, K, 3], m, NaN where not annotated; K = 0 without tracks.json (or `path`). Raises InputError."""
+        """Annotated tracks [T, K, 3], m, NaN where not annotated; K = 0 without tracks.json. Raises InputError.
+
+        `path`: another file, JSON or C3D.
+        """
         path = path or self.folder / TRACKS
+        if is_c3d(path):
+            points = Markers.read(path).points
+            if len(points) != self.frame_count:
+                raise InputError(path, f"every track needs {self.frame_count} entries", len(points))
+            return points
         return _read_tracks(path, load_json(path) if path.exists() else [], self.frame_count, 3)
 
     def points(self, camera: str) -> np.ndarray:

@@ -27,6 +27,7 @@ from neuspring.core.files import NPZ_FAULTS, write_atomically
 from neuspring.core.findings import Finding, broken, refusal, refuse
 from neuspring.core.geometry import on_table
 from neuspring.core.records import digest_file
+from neuspring.data.c3d import Markers, is_c3d
 from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, TRACKS, Capture
 
 CSV_COLUMNS = ("frame", "point", "x", "y", "z", "holds", "hand")
@@ -135,8 +136,11 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
 
 
 def read_hands(path: Path, frames: int | None = None) -> Hands:
-    """controllers.npz or controllers.csv, of so many frames, if given. Raises InputError."""
-    arrays = _rows(path) if path.suffix == ".csv" else _arrays(path, ("points", "holds", "hand"))
+    """controllers.npz, controllers.csv or markers of a C3D file, of so many frames, if given. Raises InputError."""
+    if is_c3d(path):
+        arrays = {"points": Markers.read(path).whole(path)}
+    else:
+        arrays = _rows(path) if path.suffix == ".csv" else _arrays(path, ("points", "holds", "hand"))
     points = _places(path, arrays["points"], 3)
     count, number = points.shape[:2]
     if frames is not None and count != frames:

@@ -14,6 +14,13 @@ def make_capture(intake: Intake) -> None:
     """Color and depth of a camera, or points in space -> a capture folder. What was found is printed, and the next command."""
     from neuspring.extensions.make_capture.make import make_capture as make
 
+    if intake.list_topics:
+        from neuspring.extensions.make_capture.formats.bag import Bag
+
+        if not intake.bag:
+            raise InputError("--list", "is for --bag", "none", "Give --bag FILE.")
+        print("\n".join(Bag(path).text() for path in intake.bag))
+        return
     capture, report = make(intake)
     print("\n".join(report))
     print(f"written: {capture.folder}\nnext:")

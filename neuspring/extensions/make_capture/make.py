@@ -23,11 +23,13 @@ from neuspring.core.findings import refuse, refuse_errors
 from neuspring.core.records import digest_file
 from neuspring.core.text import Progress
 from neuspring.data import capture
+from neuspring.data.c3d import Markers, is_c3d, plain_file
 from neuspring.data.camera import Camera, CameraEntry, Lens
 from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Capture, Description, Writer, description_findings
 from neuspring.extensions.make_capture.feeds import Paired, pairs
 from neuspring.extensions.make_capture.film import cameras_in_step, in_step, looked_at, watch
 from neuspring.extensions.make_capture.formats import CameraFeed, Recorded, open_recording
+from neuspring.extensions.make_capture.formats.bag import open_bags
 from neuspring.extensions.make_capture.lenses import Board, Straightener, read_lenses, read_poses
 from neuspring.extensions.make_capture.options import FILM_OPTIONS, SPACE_OPTIONS, Intake
 from neuspring.extensions.make_capture.poses import (
@@ -64,7 +66,7 @@ def opened(intake: Intake) -> Recorded:
         rule += "--tracks"
         raise InputError("make-capture", rule, " ".join(given) or "none")
     if intake.bag:
-        return open_recording(intake.bag, "bag", intake.cameras)
+        return open_bags(intake.bag, intake.cameras, intake.topics)
     if intake.phystwin_raw:
         return open_recording((intake.phystwin_raw,), "phystwin_raw", intake.cameras)
     if intake.recording:
@@ -95,6 +97,11 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     All is checked before the first image is written. An interrupted call goes on where it was. Raises InputError naming the option
     or file, the rule, what was received and the next move.
     """
+    for option, value in (("--output", intake.output != Path()), ("--category", intake.category)):
+        if not value:
+            raise InputError(option, "is required", "none", "neuspring make-capture --help has all options.")
+    if intake.topics and not intake.bag:
+        raise InputError("--topics", "is for --bag", "none", "Give --bag FILE.")
     film, board = opened(intake), Board.of(intake.board) if intake.board else None
     views = film.views
     if not views:
@@ -122,6 +129,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     film.require_masks({name: [choice.numbers[frame] for frame in places] for name, places in choice.places.items()})
     known = [view.rate([*choice.places[view.name].values()]) for view in views]
     rate, rate_text = find_rate(film.rate if intake.rate is None else intake.rate, known, choice.step)
+    _require_rate(intake.brought, rate)
     names = [view.name for view in views]
     listed = read_lenses(intake.intrinsics, names) if intake.intrinsics else {}
     takes = Takes.read(intake.take, names)
@@ -341,10 +349,14 @@ def _of_points(intake: Intake) -> tuple[Capture, list[str]]:
             rule = "is for film, and there is none"
             remedy = "Leave it out. Cut or resample the files themselves: a row is a frame."
             raise InputError(f"--{option.replace('_', '-')}", rule, str(value), remedy)
-    rate, _ = find_rate(intake.rate, [], 1)
+    rate, _ = find_rate(intake.rate, [Markers.read(path).rate for path in brought.values() if is_c3d(path)], 1)
+    _require_rate(brought, rate)
     frames = len(points.read_hands(brought["controllers"]).points)
-    marked = load_json(brought["tracks"])
-    rows = {len(track) for track in marked if isinstance(track, list)} if isinstance(marked, list) else set()
+    if is_c3d(brought["tracks"]):
+        rows = {len(Markers.read(brought["tracks"]).points)}
+    else:
+        marked = load_json(brought["tracks"])
+        rows = {len(track) for track in marked if isinstance(track, list)} if isinstance(marked, list) else set()
     if rows and rows != {frames}:
         value = f"{frames} rows of --controllers, {', '.join(map(str, sorted(rows)))} of --tracks"
         raise InputError("make-capture", "a row per frame is required in both files", value, "Cut or resample one of them.")
@@ -358,6 +370,20 @@ def _of_points(intake: Intake) -> tuple[Capture, list[str]]:
     hands = 0 if space.hands is None else space.hands.points.shape[1]
     text = f"{hands} controllers, {len(space.nodes)} nodes, {space.tracks.shape[1]} annotated points, {made.frame_count} frames"
     return Capture.load(folder), [f"points in space alone: {text}"]
+
+
+RATE_APART = 0.005
+"""Markers and frames whose rates differ by more than this part are not of the same moments."""
+
+
+def _require_rate(brought: Mapping[str, Path], rate: float) -> None:
+    """Raise InputError where a C3D file has another rate than the capture, frames per second."""
+    for name, path in brought.items():
+        if is_c3d(path) and abs((told := Markers.read(path).rate) - rate) > RATE_APART * rate:
+            remedy = "Leave --rate out, or resample the markers to the rate of the film."
+            raise InputError(
+                f"--{name}", f"{path} must have the capture's rate, a row per frame", f"{told:g} Hz, not {rate:g}", remedy
+            )
 
 
 def brought_by(folder: Path, brought: Mapping[str, Path], made: Description) -> points.InSpace:
@@ -375,7 +401,7 @@ def _bring(writer: Writer, space: points.InSpace, tracks: Path | None) -> np.nda
 
 def digests(files: Mapping[str, Path], what: str = " file") -> dict[str, str]:
     """Digests of files that a user brings, for the provenance."""
-    return {f"{name}{what}": f"sha256:{digest_file(path)}" for name, path in files.items()}
+    return {f"{name}{what}": f"sha256:{digest_file(plain_file(path))}" for name, path in files.items()}
 
 
 PRECIOUS = ("mask", "marks.json", "annotations.json", TRACKS, POINTS, *capture.CONTROLLERS, *capture.NODES)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
+from neuspring.cli.options import arg
 from neuspring.core.artifacts import Up
 
 
@@ -13,10 +14,10 @@ from neuspring.core.artifacts import Up
 class Intake:
     """The parts of a capture: the options of `neuspring make-capture`."""
 
-    output: Path
-    """the capture folder to write"""
-    category: str
-    """kind of object: cloth, rope, package, or any other word"""
+    output: Path = Path()
+    """required: the capture folder to write"""
+    category: str = ""
+    """required, the kind of object: cloth, rope, package, or any other word"""
     name: str | None = None
     """name of the capture; that of the folder by default"""
     color: tuple[Path, ...] = ()
@@ -24,7 +25,11 @@ class Intake:
     depth: tuple[Path, ...] = ()
     """per camera: a folder, or a 16-bit gray video; none: color alone, of one camera with --intrinsics and --poses"""
     bag: tuple[Path, ...] = ()
-    """instead of color: per camera a RealSense .bag file"""
+    """instead of color: recordings of ROS 1, ROS 2 or a RealSense camera; one may hold all cameras"""
+    topics: tuple[str, ...] = ()
+    """of --bag: COLOR DEPTH of each camera; the only ones by default"""
+    list_topics: Annotated[bool, arg(name="list")] = False
+    """print the topics of --bag and what can be read of them, and end"""
     phystwin_raw: Path | None = None
     """instead of color: a case in PhysTwin's raw layout"""
     recording: tuple[Path, ...] = ()
@@ -62,11 +67,11 @@ class Intake:
     table_at: tuple[float, float] | None = None
     """a pixel of the table, where another plane is larger"""
     controllers: Path | None = None
-    """hands in space: .npz or .csv, m, a row per frame of the capture"""
+    """hands in space: .npz or .csv, m, a row per frame of the capture; or markers of a C3D file, FILE.c3d#LABEL,LABEL"""
     nodes: Path | None = None
     """the body of frame 0: .npz or .ply, m"""
     tracks: Path | None = None
-    """annotated points in space: JSON, m"""
+    """annotated points in space: JSON, m; or markers of a C3D file"""
     teach: bool = False
     """annotated points of training frames teach the twin; without color they always do"""
     up: Up = "+z"

@@ -1,7 +1,6 @@
 """make-capture from end to end: every source ends in a capture that check-data accepts; what cannot be is refused at once."""
 
 import json
-import sys
 
 import cv2
 import numpy as np
@@ -15,11 +14,8 @@ from neuspring.extensions.make_capture.make import Intake, make_capture
 from neuspring.intake.check import check_layout
 from neuspring.scenes.sources import SOURCES
 from tests.extensions.make_capture.board import BOARD, LENS, board_image, depth_of_table
-from tests.support import realsense
 from tests.support.desk import FRAMES, SIZE, K, camera, counts, looking, seen, write_folders, write_json, write_poses, write_video
 from tests.support.findings import serious
-
-ABOUT = {"width": 80, "height": 60, "fx": 70.0, "fy": 70.0, "ppx": 39.5, "ppy": 29.5, "coeffs": [0.0] * 5}
 
 
 def intake(root, cameras=1, **changes):
@@ -185,35 +181,6 @@ def test_a_replacement_that_stops_early_takes_no_image_of_the_old_capture(tmp_pa
         make.prepare(tmp_path, {"rate": 15}, force=False)
 
 
-def stand_in(monkeypatch, tmp_path, **options):
-    pictures = [seen(camera(), frame) for frame in range(FRAMES)]
-    kind = options.pop("order", "rgb8")
-    colors = [color if kind == "rgb8" else color[..., ::-1] for color, _ in pictures]
-    made = realsense.module(colors, [counts(depth, 0.0001) for _, depth in pictures], kind=kind, scale=0.0001, **options)
-    monkeypatch.setitem(sys.modules, "pyrealsense2", made)
-    (tmp_path / "a.bag").touch()
-    return ["make-capture", "--bag", str(tmp_path / "a.bag"), "--category", "ball", "--output", str(tmp_path / "capture")]
-
-
-@pytest.mark.parametrize("order", ["rgb8", "bgr8"])
-def test_a_realsense_recording_says_all_but_the_category(tmp_path, monkeypatch, capsys, order):
-    assert main(stand_in(monkeypatch, tmp_path, intrinsics=ABOUT, order=order, repeated=True)) == 0
-    capture = Capture.load(tmp_path / "capture")
-    assert (capture.frame_count, capture.description.frame_rate, capture.description.depth_unit) == (FRAMES, 30.0, 0.0001)
-    np.testing.assert_array_equal(capture.color("0", 4), seen(camera(), 4)[0])
-    np.testing.assert_allclose(capture.depth("0", 4), seen(camera(), 4)[1], atol=6e-5)
-    assert "as the source says" in capsys.readouterr().out
-
-
-def test_a_recording_whose_lens_has_two_meanings_is_refused(tmp_path, monkeypatch, capsys):
-    words = stand_in(monkeypatch, tmp_path, intrinsics=ABOUT | {"coeffs": [0.1, 0, 0, 0, 0]})
-    assert main(words) == 2
-    assert "a.bag: camera 0: inverse_brown_conrady has two meanings" in capsys.readouterr().err
-    said = write_json(tmp_path / "k.json", ABOUT | {"coeffs": [0.1, 0, 0, 0, 0], "model": "brown_conrady"})
-    assert main([*words, "--intrinsics", str(said)]) == 0
-    assert "distortion, camera 0: removed, up to" in capsys.readouterr().out
-
-
 BENT = np.array([-0.3, 0.1, 0.0, 0.0, 0.0])
 
 
@@ -253,14 +220,6 @@ def test_depth_of_a_sensor_that_stands_elsewhere(tmp_path):
         "pixels to the left; as it is they must fit within 1.5% of the width. Let the camera's software align depth to color"
         in line
     )
-
-
-def test_without_pyrealsense2_the_command_names_it(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    (tmp_path / "a.bag").touch()
-    words = ["make-capture", "--bag", str(tmp_path / "a.bag"), "--category", "ball", "--output", str(tmp_path / "capture")]
-    assert main(words) == 2
-    assert "Run `pip install pyrealsense2`" in capsys.readouterr().err
 
 
 BOARD_POSES = [looking(np.array(eye), np.array([0.1, -0.14, 0])) for eye in ((0.1, -0.55, 0.45), (0.5, -0.1, 0.5))]

@@ -1,6 +1,5 @@
-"""The commands of the page's section run as they stand, on a film written out as plain folders; the recipe for ROS is code."""
+"""The commands of the page's section run as they stand, on a film written out as plain folders, and on a bag."""
 
-import ast
 import re
 import shlex
 from pathlib import Path
@@ -13,7 +12,8 @@ from neuspring.cli.main import main
 from neuspring.data import capture as capture_module
 from neuspring.data.capture import Capture
 from neuspring.intake.points import read
-from tests.support.desk import write_json
+from tests.support.bags import desk, recorded
+from tests.support.desk import FRAMES, write_json
 from tests.support.filmed import film
 
 PAGE = Path(capture_module.__file__).with_name("README.md").read_text()
@@ -44,11 +44,16 @@ def test_the_commands_of_the_page(tmp_path, monkeypatch, capsys):
     assert abs(made.cameras["0"].camera_to_world[2, 3] - view.camera_to_world[2, 3]) < 1e-3
 
 
-def test_the_recipe_for_ros_is_python():
-    """Its run needs a package of its own; see the page for what it was run on."""
-    recipe = re.search(r"### ROS bags.*?```python\n(.*?)```", SECTION, re.DOTALL)[1]
-    names = {node.id for node in ast.walk(ast.parse(recipe)) if isinstance(node, ast.Name)}
-    assert {"AnyReader", "image", "depths"} <= names
+def test_the_commands_for_ros_bags(tmp_path, monkeypatch, capsys):
+    (tmp_path / "FILES").mkdir()
+    with recorded(tmp_path / "FILES" / "film") as bag:
+        desk(bag)
+    monkeypatch.chdir(tmp_path)
+    commands = re.search(r"### ROS bags.*?```\n(.*?)```", SECTION, re.DOTALL)[1].replace("\\\n", " ").splitlines()
+    for command in commands:
+        assert main(shlex.split(command)[1:]) == 0, capsys.readouterr()
+    assert "depth, 16uc1, 80 x 60" in capsys.readouterr().out
+    assert Capture.load(tmp_path / "captures" / "plush").frame_count == FRAMES
 
 
 def test_the_recipe_for_a_gripper_makes_a_capture(tmp_path, monkeypatch):

@@ -13,6 +13,7 @@ from neuspring.extensions.make_capture.make import Intake, make_capture
 from neuspring.intake.check import check_layout
 from neuspring.intake.points import Hands, read, write
 from tests.support import spaced as scene
+from tests.support.c3d_files import write_c3d
 from tests.support.desk import FRAMES, write_folders, write_poses
 from tests.support.findings import serious
 
@@ -79,6 +80,70 @@ def test_both_counts_of_rows_are_named(tmp_path):
     np.savez(files["controllers"], points=hands[:6])
     with pytest.raises(InputError, match=r"a row per frame.*received 6 rows of --controllers, 8 of --tracks"):
         make_capture(Intake(output=tmp_path / "made", name="m", category="toy", rate=30.0, **files))
+
+
+def mocap(folder, rate=30.0, frames=8, unit="mm", lost=None):
+    """The hand and the markers of `brought` in one C3D file, and the nodes."""
+    files = brought(folder, frames)
+    together = 1000 * np.concatenate([scene.risen(scene.GRIP, frames), scene.risen(scene.MARKED, frames)], axis=1)
+    labels = [f"{name}{k}" for name, count in (("hand", len(scene.GRIP)), ("toy", len(scene.MARKED))) for k in range(count)]
+    path = write_c3d(folder / "take.c3d", together, labels, unit, rate, lost)
+    hand, toy = (",".join(label for label in labels if label.startswith(name)) for name in ("hand", "toy"))
+    return {"controllers": Path(f"{path}#{hand}"), "nodes": files["nodes"], "tracks": Path(f"{path}#{toy}")}
+
+
+def test_motion_capture_alone_becomes_a_capture(tmp_path):
+    lost = np.zeros((8, len(scene.GRIP) + len(scene.MARKED)), bool)
+    lost[5:, -1] = True
+    files = mocap(tmp_path / "files", 100.0, lost=lost)
+    options = [part for name, path in files.items() for part in (f"--{name}", str(path))]
+    command = ["make-capture", *options, "--category", "toy", "--output", str(tmp_path / "made")]
+    assert main(command) == 0
+    made = Capture.load(tmp_path / "made")
+    assert (made.frame_count, made.description.frame_rate) == (8, 100.0)
+    space = read(made)
+    np.testing.assert_allclose(space.hands.points, scene.risen(scene.GRIP, 8), atol=1e-6)
+    right = scene.risen(scene.MARKED, 8)
+    right[5:, -1] = np.nan
+    np.testing.assert_allclose(space.tracks, right, atol=1e-6)
+    assert json.loads((made.folder / TRACKS).read_text())[-1][5:] == [None] * 3
+    assert made.description.provenance["controllers file"] == made.description.provenance["tracks file"]
+    assert serious(check_layout(made.folder)) == []
+    assert main([*command, "--force", "--rate", "30"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("given", "changes", "words"),
+    [
+        (
+            {"rate": 100.0},
+            {"rate": 30.0},
+            r"--controllers: .*take\.c3d#hand0.* must have the capture's rate.*received 100 Hz, not 30\. Leave",
+        ),
+        ({"unit": ""}, {}, r"POINT:UNITS must be one of m cm mm.*Say it, .*take\.c3d#unit=mm,hand0"),
+        ({"frames": 9}, {"tracks": None}, r"--controllers, --nodes and --tracks are required; received no --tracks"),
+        ({"lost": 0}, {}, r"hand0: a controller must be seen in every frame; received lost in 2 frames, first in 3\. Fill"),
+    ],
+)
+def test_motion_capture_that_does_not_fit_is_refused_before_anything_is_written(tmp_path, given, changes, words):
+    if "lost" in given:
+        lost = np.zeros((8, len(scene.GRIP) + len(scene.MARKED)), bool)
+        lost[3:5, given["lost"]] = True
+        given = {"lost": lost}
+    files = mocap(tmp_path / "files", **given)
+    with pytest.raises(InputError, match=words):
+        make_capture(Intake(**({"output": tmp_path / "made", "category": "toy"} | files | changes)))
+    assert not (tmp_path / "made").exists()
+
+
+def test_motion_capture_beside_film_has_its_frames_and_its_rate(tmp_path):
+    root = write_folders(tmp_path)
+    made, _ = make_capture(filmed(root, **mocap(root / "files", frames=FRAMES)))
+    assert made.tracks().shape == (FRAMES, 4, 3)
+    for number, (given, words) in enumerate((({"rate": 120.0}, "120 Hz, not 30"), ({"frames": FRAMES + 1}, f"{FRAMES} "))):
+        with pytest.raises(InputError, match=words):
+            make_capture(filmed(root, output=root / "other", **mocap(root / f"{number}", **({"frames": FRAMES} | given))))
+    assert not (root / "other").exists()
 
 
 def test_what_hangs_has_no_table(tmp_path):

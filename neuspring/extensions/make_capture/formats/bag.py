@@ -1,114 +1,402 @@
-"""A RealSense .bag file, one per camera."""
+"""A recording of ROS: a ROS 1 .bag, as librealsense writes them too, a ROS 2 folder, or one .mcap or .db3 file, read by rosbags.
+
+Pictures are those of a topic, in the order of the stamps in their headers, which alone say when they were taken: the times of the
+log say when they arrived. Messages are read by ROS's own definitions, not by the bag's: some bags define a part of their types, and
+librealsense's images have four bytes more than the bag defines, their unit of depth.
+"""
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Iterator, Sequence
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from neuspring.core.errors import InputError
+from neuspring.core.extras import needed
 from neuspring.data.camera import Lens
-from neuspring.extensions.make_capture.formats import CaptureFormat, Pair, Recorded, picked
+from neuspring.extensions.make_capture.feeds import Paired
+from neuspring.extensions.make_capture.formats import CaptureFormat, Kind, Recorded, require_kind
 from neuspring.extensions.make_capture.moments import Series
 
-MODULE = "pyrealsense2"
-BAG_PATIENCE = 5000
-"""ms until the next frames of a file; none within it: the file ends."""
+
+@dataclass(frozen=True)
+class Encoding:
+    """One way to store pixels."""
+
+    kind: Kind
+    channels: int = 1
+    form: str = "u1"
+    to_rgb: int | None = None
+    """OpenCV's code."""
+    unit: float | None = None
+    """m per count of depth, as ROS has it."""
 
 
+# fmt: off
+ENCODINGS = {
+    "rgb8": Encoding("color", 3), "bgr8": Encoding("color", 3, to_rgb=cv2.COLOR_BGR2RGB),
+    "rgba8": Encoding("color", 4, to_rgb=cv2.COLOR_RGBA2RGB), "bgra8": Encoding("color", 4, to_rgb=cv2.COLOR_BGRA2RGB),
+    **dict.fromkeys(("yuv422", "uyvy"), Encoding("color", 2, to_rgb=cv2.COLOR_YUV2RGB_UYVY)),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), Encoding("color", 2, to_rgb=cv2.COLOR_YUV2RGB_YUYV)),
+    **dict.fromkeys(("mono8", "8uc1"), Encoding("color", to_rgb=cv2.COLOR_GRAY2RGB)),
+    **dict.fromkeys(("16uc1", "mono16"), Encoding("depth", form="u2", unit=0.001)), "32fc1": Encoding("depth", form="f4", unit=1.0),
+}
+"""Names of ROS and librealsense, in small letters."""
+# fmt: on
+DECODED = {("uint8", 1): "mono8", ("uint8", 3): "bgr8", ("uint8", 4): "bgra8", ("uint16", 1): "16uc1"}
+"""What OpenCV makes of JPEG and PNG: type and channels -> encoding."""
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+READ = (IMAGE, COMPRESSED, "sensor_msgs/msg/CameraInfo", "geometry_msgs/msg/Transform", "std_msgs/msg/Float32")
+"""Types of messages."""
+TRANSPORT = struct.Struct("<iff")
+"""What compressedDepth has before its PNG: a number, and A and B of depth = A / (count - B), for floating point."""
+GAP = 0.3
+"""Pixels. Noise of depth parts areas that are neighbors in another view: a gap is filled from as far as this."""
+SINCE_1970 = 1e9
+"""s. Stamps below it are those of a device's clock."""
+
+
+def decoded(where: Path, message: Any) -> tuple[str, np.ndarray]:
+    """The encoding of an image message, and its pixels: RGB [H, W, 3] uint8, or depth [H, W]. Raises InputError for another one."""
+    if hasattr(message, "format"):
+        name, image = _decompressed(where, message)
+    else:
+        name = message.encoding.lower()
+        if name not in ENCODINGS:
+            raise _unread(where, message.encoding)
+        form = np.dtype(ENCODINGS[name].form).newbyteorder(">" if message.is_bigendian else "<")
+        length = message.width * ENCODINGS[name].channels * form.itemsize
+        if message.step < length or message.data.size != message.height * message.step:
+            rule = f"{message.height} rows of {message.step} bytes, {length} of them pixels, are required"
+            raise InputError(where, rule, f"{message.data.size} bytes", "Leave these frames out with --frames.")
+        rows = message.data.reshape(message.height, message.step)[:, :length]
+        image = np.ascontiguousarray(rows).view(form).astype(ENCODINGS[name].form).reshape(message.height, message.width, -1)
+    if (code := ENCODINGS[name].to_rgb) is not None:
+        return name, cv2.cvtColor(image, code)
+    return name, image if image.shape[2] == 3 else image[..., 0]
+
+
+def _decompressed(where: Path, message: Any) -> tuple[str, np.ndarray]:
+    source, data, deep = message.format, message.data, "compressedDepth" in message.format
+    packed = data[TRANSPORT.size if deep else 0 :]
+    image = cv2.imdecode(packed, cv2.IMREAD_UNCHANGED) if packed.size else None
+    image = None if image is None else image.reshape(*image.shape[:2], -1)
+    if image is None or (image.dtype.name, image.shape[2]) not in DECODED:
+        raise _unread(where, source)
+    name = DECODED[image.dtype.name, image.shape[2]]
+    if deep and source.startswith("32FC1"):
+        _, scale, shift = TRANSPORT.unpack(data[: TRANSPORT.size].tobytes())
+        return "32fc1", np.where(image > 0, scale / np.maximum(image.astype(float) - shift, 1e-6), 0).astype(np.float32)
+    # ROS's transport names the order in which it gave the channels to the codec; without any it is that of OpenCV.
+    if ";" in source and "compressed bgr" not in source:
+        name = name.replace("bgr", "rgb")
+    return name, image
+
+
+def _unread(where: Path, encoding: str) -> InputError:
+    read = f"Read are {' '.join(ENCODINGS)}, JPEG and PNG, and compressedDepth as PNG. "
+    remedy = read + "Record it so, or convert it with ROS's image_transport (republish)."
+    return InputError(where, "images of an encoding that is read are required", repr(encoding), remedy)
+
+
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """A topic in short."""
+
+    kind: str
+    """Type of its messages."""
+    count: int
+    rate: float
+    """Messages per second of the recording."""
+    first: Any
+    """Its first message, if it is one of `READ`; else None."""
+    more: bytes
+    """What the definition of the first leaves over."""
+
+
+@dataclass(frozen=True)
 class Bag:
-    """One camera's recording in a RealSense file. Every pass plays the file once; the first, here, counts its frames."""
+    """A recording with its topics."""
 
-    pose = None
+    path: Path
 
-    def __init__(self, name: str, path: Path) -> None:
-        """Raises InputError."""
-        self.name, self.path = name, path
-        count = 0
-        for profile, _, _ in self._play(True):
-            if not count:
-                stream = profile.get_stream(_library().stream.color)
-                self._rate = float(stream.fps())
-                self.unit = float(profile.get_device().first_depth_sensor().get_depth_scale())
-                about = stream.as_video_stream_profile().get_intrinsics()
-                coefficients, model = np.array(about.coeffs, dtype=float), str(about.model).rpartition(".")[2]
-                matrix = np.array([[about.fx, 0, about.ppx], [0, about.fy, about.ppy], [0, 0, 1.0]])
-                self.lens = Lens(matrix=matrix, distortion=coefficients, model=model, size=(int(about.width), int(about.height)))
-            count += 1
-        if not count:
-            raise InputError(path, "pairs of color and depth are required", "none", "Record both streams.")
-        self.series = Series(list(range(count)))
+    @cached_property
+    def _new(self) -> bool:
+        """True for ROS 2."""
+        return self.path.suffix.lower() != ".bag"
 
-    def rate(self, places: Sequence[int]) -> float:
-        """Frames per second that were set."""
-        return self._rate
+    @cached_property
+    def _types(self) -> Any:
+        """ROS's own definitions."""
+        types = needed("rosbags.typesys")
+        return types.get_typestore(types.Stores.ROS2_HUMBLE if self._new else types.Stores.ROS1_NOETIC)
 
-    def read(self, places: Sequence[int]) -> Iterator[Pair]:
-        """Color with depth that is aligned to it. Raises InputError where the file ends early."""
-        return picked(self.path, ((color, depth) for _, color, depth in self._play(False)), places)
+    @contextmanager
+    def _opened(self) -> Iterator[Any]:
+        """The reader of rosbags. Raises InputError."""
+        library = needed("rosbags.rosbag2" if self._new else "rosbags.rosbag1")
+        try:
+            with library.Reader(self.path) as reader:
+                yield reader
+        except InputError:
+            raise
+        except Exception as error:  # rosbags and its codecs raise whatever a damaged file leads them to
+            rule = "a ROS 1 .bag, a ROS 2 folder with metadata.yaml, an .mcap or a .db3 file is required"
+            remedy = "If it was cut off: rosbag reindex FILE (ROS 1), ros2 bag reindex FOLDER (ROS 2), mcap recover FILE (.mcap)."
+            raise InputError(self.path, rule, f"{type(error).__name__}: {error}".rstrip("."), remedy) from error
+
+    @cached_property
+    def topics(self) -> dict[str, Summary]:
+        """What is known of the topics, by name. Raises InputError."""
+        with self._opened() as reader:
+            seconds = max(reader.duration, 1) / 1e9
+            return {
+                name: Summary(
+                    one.msgtype or "",
+                    one.msgcount,
+                    one.msgcount / seconds,
+                    *next(self._all(reader, name) if one.msgtype in READ else iter(()), (None, b"")),
+                )
+                for name, one in sorted(reader.topics.items())
+            }
+
+    def messages(self, topic: str) -> Iterator[tuple[Any, bytes]]:
+        """Its messages, and what their definition leaves over. Raises InputError."""
+        with self._opened() as reader:
+            yield from self._all(reader, topic)
+
+    def _all(self, reader: Any, topic: str) -> Iterator[tuple[Any, bytes]]:
+        for connection, _, raw in reader.messages([one for one in reader.connections if one.topic == topic]):
+            if self._new:
+                yield self._types.deserialize_cdr(raw, connection.msgtype), b""
+                continue
+            # Not the store's own deserialize_ros1, which refuses bytes that are left over.
+            definition = self._types.get_msgdef(connection.msgtype)
+            message, end = definition.deserialize_ros1(raw, 0, definition.cls, self._types)
+            yield message, raw[end:]
+
+    def first(self, beside: str, suffix: str) -> Any:
+        """The first message of the topic that begins and ends so; None without any."""
+        named = (one.first for name, one in self.topics.items() if name.startswith(beside) and name.lower().endswith(suffix))
+        return next(named, None)
+
+    @cached_property
+    def images(self) -> dict[str, tuple[str, str]]:
+        """Topics of images: the encoding, empty if it is not read, and the first image in words. Raises InputError."""
+        found = {}
+        for topic, one in self.topics.items():
+            if one.kind not in (IMAGE, COMPRESSED) or one.first is None:
+                continue
+            try:
+                name, image = decoded(self.path, one.first)
+                found[topic] = name, f"{ENCODINGS[name].kind}, {name}, {image.shape[1]} x {image.shape[0]}"
+            except InputError:
+                found[topic] = "", f"images that are not read, {getattr(one.first, 'format', '') or one.first.encoding}"
+        return found
+
+    def text(self) -> str:
+        """All topics, a line each."""
+        lines = []
+        for name, one in self.topics.items():
+            told = self.images[name][1] if name in self.images else "not images"
+            lines.append(f"  {name}: {one.kind}, {one.count} messages, {one.rate:.3g} Hz: {told}")
+        return "\n".join([f"{self.path}:", *lines])
+
+    def pair(self, topics: Sequence[str]) -> tuple[str, str]:
+        """The topics of color and depth that are named, or the only ones. Raises InputError that lists those that are there."""
+        listed = "; ".join(f"{name} ({text})" for name, (_, text) in self.images.items()) or "none"
+        for name in topics:
+            if name not in self.images:
+                raise InputError(self.path, "--topics: topics of images are required", name, f"There are: {listed}.")
+        if topics:
+            return topics[0], topics[1]
+        of = {name: ENCODINGS[encoding] for name, (encoding, _) in self.images.items() if encoding}
+        color = [name for name, one in of.items() if one.kind == "color" and one.channels > 1]
+        depth = [name for name, one in of.items() if one.kind == "depth"]
+        if len(color) != 1 or len(depth) != 1:
+            rule = "without --topics one topic of color and one of depth are required"
+            raise InputError(
+                self.path, rule, f"{len(color)} and {len(depth)}", f"Name them, --topics COLOR DEPTH. There are: {listed}."
+            )
+        return color[0], depth[0]
+
+    def lens(self, topic: str) -> Lens | None:
+        """The lens by the camera_info beside a topic of images, or one level above; None without any, or uncalibrated."""
+        near = topic.rpartition("/")[0]
+        places = [f"{folder}{inside}/camera_info" for folder in (near, near.rpartition("/")[0]) for inside in ("", "/info")]
+        message = next((self.topics[name].first for name in places if name in self.topics), None)
+        if message is None:
+            return None
+        said = {name.lower(): value for name, value in vars(message).items()}  # K of ROS 1 is k of ROS 2
+        rectified = "rect" in topic.rpartition("/")[2] or "rect" in near.rpartition("/")[2]
+        matrix = np.array(said["p"]).reshape(3, 4)[:, :3] if rectified else np.array(said["k"]).reshape(3, 3)
+        if not matrix[0, 0]:
+            return None
+        roi, binned = said["roi"], np.maximum([said["binning_x"], said["binning_y"]], 1)
+        whole = (roi.width, roi.height) if roi.width else (said["width"], said["height"])
+        matrix[:2, 2] -= [roi.x_offset, roi.y_offset]
+        matrix[:2] /= binned[:, None]
+        size = (int(whole[0] // binned[0]), int(whole[1] // binned[1]))
+        model = said["distortion_model"].lower().replace(" ", "_")
+        return Lens(matrix=matrix, distortion=np.zeros(0) if rectified else np.array(said["d"]), model=model or "opencv", size=size)
+
+
+@dataclass(frozen=True, eq=False)
+class Topic:
+    """The images of a topic."""
+
+    bag: Bag
+    name: str
+    kind: Kind
+    onto: Callable[[np.ndarray], np.ndarray] | None = None
+    """Moves depth into the view of color."""
+
+    @property
+    def path(self) -> Path:
+        """The recording and the topic."""
+        return Path(f"{self.bag.path}#{self.name}")
+
+    @cached_property
+    def _order(self) -> list[tuple[int, int]]:
+        """Stamp, ns, and place in the log, in the order of stamps: each is one image. Without stamps, 0 and that of the log."""
+        stamps = [message.header.stamp for message, _ in self.bag.messages(self.name)]
+        listed = [(stamp.sec * 10**9 + stamp.nanosec, place) for place, stamp in enumerate(stamps)]
+        if max(stamp for stamp, _ in listed) <= 0:
+            return [(0, place) for _, place in listed]
+        return sorted({stamp: (stamp, place) for stamp, place in reversed(listed)}.values())
+
+    @cached_property
+    def series(self) -> Series:
+        """By the stamps."""
+        times = np.array([stamp for stamp, _ in self._order]) * 1e-9
+        numbers = list(range(len(times)))
+        if not times.any():
+            return Series(numbers)
+        return Series(numbers, times=times, clock="wall" if times[-1] > SINCE_1970 else str(self.bag.path))
+
+    def read(self, places: Sequence[int]) -> Iterator[np.ndarray]:
+        """As a folder, in one pass; only what the log has too early is held. Raises InputError."""
+        wanted = {self._order[place][1]: turn for turn, place in enumerate(places)}
+        early: dict[int, np.ndarray] = {}
+        turn = 0
+        for place, (message, _) in enumerate(self.bag.messages(self.name) if wanted else ()):
+            if place in wanted:
+                image = require_kind(self.path, self.kind, decoded(self.path, message)[1])
+                early[wanted[place]] = image if self.onto is None else self.onto(image)
+            while turn in early:
+                yield early.pop(turn)
+                turn += 1
+            if turn == len(wanted):
+                return
 
     def files(self, places: Sequence[int]) -> list[Path]:
         """The recording."""
-        return [self.path]
-
-    def _play(self, only_count: bool) -> Iterator[tuple[Any, np.ndarray, np.ndarray]]:
-        """Profile, RGB and aligned depth of every pair whose color is new; empty images where they are only counted."""
-        library = _library()
-        if not self.path.is_file():
-            raise InputError(self.path, "a RealSense .bag file is required", "nothing there")
-        pipeline, settings = library.pipeline(), library.config()
-        settings.enable_device_from_file(str(self.path), repeat_playback=False)
-        try:
-            profile = pipeline.start(settings)
-        except RuntimeError as error:
-            raise InputError(self.path, "this file must be a RealSense recording", str(error)) from error
-        try:
-            profile.get_device().as_playback().set_real_time(False)
-            align, last = library.align(library.stream.color), -1
-            while True:
-                there, frames = pipeline.try_wait_for_frames(BAG_PATIENCE)
-                if not there:
-                    return
-                color, depth = frames.get_color_frame(), frames.get_depth_frame()
-                if not color or not depth or color.get_frame_number() == last:
-                    continue
-                last = color.get_frame_number()
-                if only_count:
-                    yield profile, np.zeros(0), np.zeros(0)
-                    continue
-                frames = align.process(frames)
-                color, depth = frames.get_color_frame(), frames.get_depth_frame()
-                image, kind = np.array(color.get_data()), str(color.get_profile().format()).rpartition(".")[2]
-                if kind == "bgr8":
-                    image = image[..., ::-1]
-                elif kind == "yuyv":
-                    image = cv2.cvtColor(image.view(np.uint8).reshape(*image.shape[:2], 2), cv2.COLOR_YUV2RGB_YUYV)
-                elif kind != "rgb8":
-                    raise InputError(self.path, "color must be rgb8, bgr8 or yuyv", kind)
-                yield profile, image, np.array(depth.get_data())
-        finally:
-            pipeline.stop()
+        return sorted(filter(Path.is_file, self.bag.path.iterdir())) if self.bag.path.is_dir() else [self.bag.path]
 
 
-def _library() -> Any:
-    try:
-        return importlib.import_module(MODULE)
-    except ImportError as error:
-        remedy = f"Run `pip install {MODULE}`, or export the recording to folders (rs-convert) and use --color and --depth."
-        raise InputError("--bag", f"the package {MODULE} is required to read a .bag file", "not installed", remedy) from error
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """Moves depth into the view of another camera: every pixel is an area there, and the nearest counts."""
+
+    source: Lens
+    target: Lens
+    motion: np.ndarray
+    """[4, 4], from the one to the other, m."""
+    unit: float
+
+    def __call__(self, depth: np.ndarray) -> np.ndarray:
+        """In the size of the other camera, in the same unit."""
+        assert self.target.size is not None, "the lens is of a camera_info"
+        y, x = np.nonzero(depth)
+        if not len(x):
+            return np.zeros(self.target.size[::-1], depth.dtype)
+        meters = depth[y, x] * self.unit
+        (one, _), (other, _), (_, far) = (self._moved(x + side, y + side, meters) for side in (-0.5, 0.5, 0.0))
+        left, right = np.minimum(one, other), np.maximum(one, other)
+        plain, wide = (self._nearest(left - more, right + more, far) for more in (0.0, GAP))
+        seen = np.where(np.isfinite(plain), plain, wide)
+        counts = np.where(np.isfinite(seen), seen / self.unit, 0.0)
+        return (np.round(counts) if depth.dtype.kind == "u" else counts).astype(depth.dtype)
+
+    def _nearest(self, left: np.ndarray, right: np.ndarray, far: np.ndarray) -> np.ndarray:
+        """The least depth of the areas, from `left` to `right` [n, 2], that a pixel's center [H, W] lies in; infinite: none."""
+        assert self.target.size is not None, "the lens is of a camera_info"
+        seen = np.full(self.target.size[::-1], np.inf)
+        first, end = np.ceil(left).astype(int), np.ceil(right).astype(int)
+        for across, down in np.ndindex(*(end - first).max(axis=0, initial=0)):
+            column, row = first[:, 0] + across, first[:, 1] + down
+            inside = (column < end[:, 0]) & (row < end[:, 1]) & (far > 0)
+            inside &= (column >= 0) & (row >= 0) & (column < seen.shape[1]) & (row < seen.shape[0])
+            np.minimum.at(seen, (row[inside], column[inside]), far[inside])
+        return seen
+
+    def _moved(self, x: np.ndarray, y: np.ndarray, meters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels [n, 2] and depth [n], m, in the other view."""
+        rays = np.stack([x, y, np.ones_like(meters)], axis=1) @ np.linalg.inv(self.source.matrix).T
+        points = (rays * meters[:, None]) @ self.motion[:3, :3].T + self.motion[:3, 3]
+        if not self.target.distortion.any():
+            flat = points @ self.target.matrix.T
+            return flat[:, :2] / flat[:, 2:], points[:, 2]
+        still = np.zeros(3)
+        # librealsense reads the coefficients so whatever it calls the model.
+        pixels, _ = cv2.projectPoints(points.reshape(-1, 1, 3), still, still, self.target.matrix, self.target.distortion)
+        return pixels.reshape(-1, 2), points[:, 2]
 
 
-def _recording(paths: Sequence[Path], cameras: Sequence[str]) -> Recorded:
-    names = cameras or tuple(map(str, range(len(paths))))
-    if len(set(names)) != len(paths):
-        raise InputError("--cameras", f"{len(paths)} different names are required", " ".join(names))
-    return Recorded(views=[Bag(camera, path) for camera, path in zip(names, paths, strict=True)])
+def _camera(bag: Bag, topics: Sequence[str], name: str) -> Paired:
+    """One camera. What librealsense records is not aligned: it is moved into the view of color. Raises InputError."""
+    color, depth = bag.pair(topics)
+    lens, encoding = bag.lens(color), ENCODINGS.get(bag.images[depth][0])
+    streams = [topic.removesuffix("/image/data") for topic in (color, depth)]
+    said, more = bag.first(streams[1].rpartition("/")[0] + "/option/", "/depth units/value"), bag.topics[depth].more
+    told = struct.unpack("<f", more)[0] if len(more) == 4 else said.data if said else 0.0
+    # A float of 32 bits: 0.001 is 0.0010000000475.
+    unit = round(float(told), 9) or (encoding.unit if encoding else None)
+    motions = [_motion(bag.first(f"{stream}/tf/", "0")) for stream in streams]
+    onto, deep = None, bag.lens(depth)
+    if lens is not None and deep is not None and unit and all(motion is not None for motion in motions):
+        if deep.distortion.any():
+            remedy = "Align it with librealsense (rs.align), and give folders."
+            raise InputError(bag.path, f"depth of {depth} must be without distortion to be aligned", deep.model, remedy)
+        onto = Registration(deep, lens, motions[0] @ np.linalg.inv(motions[1]), unit)
+    return Paired(name, Topic(bag, color, "color"), Topic(bag, depth, "depth", onto), unit=unit, lens=lens)
 
 
-capture_format = CaptureFormat(
-    about="a RealSense .bag file", recognizes=lambda path: path.suffix.lower() == ".bag", recording=_recording
-)
+def _motion(message: Any) -> Any:
+    """[4, 4] of a transform; None of none."""
+    if message is None:
+        return None
+    motion, turn, shift = np.eye(4), message.rotation, message.translation
+    motion[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+    motion[:3, 3] = shift.x, shift.y, shift.z
+    return motion
+
+
+def open_bags(paths: Sequence[Path], cameras: Sequence[str] = (), topics: Sequence[str] = ()) -> Recorded:
+    """Cameras by pairs of topics, all of one recording or one of each, or by the only pair of each. Raises InputError."""
+    pairs = [topics[k : k + 2] for k in range(0, len(topics), 2)] or [()]
+    if len(topics) % 2 or (len(pairs) != len(paths) and min(len(pairs), len(paths)) > 1):
+        rule = f"pairs COLOR DEPTH are required, one or as many as recordings, {len(paths)}"
+        raise InputError("--topics", rule, f"{len(topics)} topics", "--list prints them.")
+    bags = [Bag(path) for path in paths]
+    chosen = list(zip(bags * len(pairs) if len(bags) == 1 else bags, pairs * len(bags) if len(pairs) == 1 else pairs, strict=True))
+    names = cameras or tuple(map(str, range(len(chosen))))
+    if len(set(names)) != len(chosen) or len(names) != len(chosen):
+        raise InputError("--cameras", f"{len(chosen)} different names are required", " ".join(names))
+    return Recorded(views=[_camera(bag, pair, name) for (bag, pair), name in zip(chosen, names, strict=True)])
+
+
+def is_bag(path: Path) -> bool:
+    """True for a recording of ROS."""
+    return path.suffix.lower() in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file()
+
+
+capture_format = CaptureFormat(about="a ROS bag", recognizes=is_bag, recording=open_bags)
