@@ -1,13 +1,16 @@
 """Files of viewers, read back: PLY by plyfile and USD by pxr, bit for bit."""
 
+import re
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from neuspring.cli.main import main
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
 from neuspring.extensions.exports.formats import usd
-from neuspring.extensions.exports.source import read_source
+from neuspring.extensions.exports.source import ExportSource, read_source
 from neuspring.splats.model import Splats
 from tests.extensions.exports import exported
 
@@ -34,8 +37,12 @@ def test_plyfile_reads_the_graph_as_it_is_and_splats_are_those_that_pictures_sho
     strain = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) / twin.topology.rest_lengths - 1
     assert np.abs(np.ravel(edge["strain"]) - strain).max() < 1e-6 and np.abs(strain).max() > 0.01
     splats, expected = Splats.load(written / "splats_00003.ply"), dict(source.moved_splats([3]))[3]
-    for name in ("means", "quaternions", "log_scales", "opacity_logits", "harmonics"):
+    for name in ("means", "log_scales", "opacity_logits", "harmonics"):
         assert np.array_equal(getattr(splats, name), getattr(expected, name))
+    lengths = np.linalg.norm(expected.quaternions, axis=1, keepdims=True)
+    assert np.ptp(lengths) > 1, "not all readers bring them to norm 1"
+    np.testing.assert_allclose(np.linalg.norm(splats.quaternions, axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(splats.quaternions * lengths, expected.quaternions, atol=1e-6)
 
 
 def opened(path):
@@ -78,6 +85,81 @@ def test_pxr_reads_positions_as_they_are(tmp_path, suffix):
     assert np.array_equal(primvars.GetPrimvar("stiffness").Get(), twin.material.stiffness)
     assert primvars.GetPrimvar("stiffness").GetInterpolation() == "uniform"
     assert UsdGeom.Imageable(splats).GetPurposeAttr().Get() == "render" and len(splats.GetOpacitiesAttr().Get()) == len(ours)
+
+
+@pytest.fixture
+def stage(tmp_path):
+    """All frames of the rope with its splats, and the source."""
+    pytest.importorskip("pxr", reason="usd-core is not installed (extra `export`)")
+    source = read_source(exported.run_folder(tmp_path))
+    usd.write(source, range(exported.FRAMES), tmp_path / "twin.usdc")
+    return opened(tmp_path / "twin.usdc"), source
+
+
+def test_bounds_hold_what_is_drawn_in_every_frame_and_no_more(stage):
+    """Down to 1 / 255 of an opaque splat, in many directions, and half a width around points."""
+    from pxr import UsdGeom
+
+    layer, source = stage
+    directions = np.random.default_rng(0).normal(size=(5000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    for frame, splats in source.moved_splats(range(exported.FRAMES)):
+        bounds = UsdGeom.BBoxCache(frame, [UsdGeom.Tokens.default_, UsdGeom.Tokens.render])
+        turns = Rotation.from_quat(splats.quaternions, scalar_first=True)
+        scales = np.exp(splats.log_scales) * np.sqrt(2 * np.log(255))
+        shells = [turn.apply(directions * size) for turn, size in zip(turns, scales, strict=True)] + splats.means[:, None]
+        width = UsdGeom.Points.Get(layer, "/Twin/Nodes").GetWidthsAttr().Get()[0] / 2
+        nodes = source.positions[frame]
+        for name, points in {"Splats": shells.reshape(-1, 3), "Nodes": np.concatenate([nodes - width, nodes + width])}.items():
+            box = bounds.ComputeWorldBound(layer.GetPrimAtPath(f"/Twin/{name}")).ComputeAlignedRange()
+            np.testing.assert_allclose([box.GetMin(), box.GetMax()], [points.min(axis=0), points.max(axis=0)], atol=5e-4)
+
+
+def test_newton_reads_the_splats_of_frame_0_where_no_time_is_asked_for(stage):
+    newton = pytest.importorskip("newton", reason="newton is not installed (extra `synthetic`)")
+    layer, source = stage
+    first = dict(source.moved_splats([0]))[0]
+    read = newton.Gaussian.create_from_usd(layer.GetPrimAtPath("/Twin/Splats"))
+    assert np.array_equal(read.positions, first.means)
+    np.testing.assert_allclose(read.scales, np.exp(first.log_scales), rtol=1e-6)
+    for prim in layer.Traverse():
+        sampled = [attribute for attribute in prim.GetAttributes() if attribute.GetNumTimeSamples()]
+        assert all(attribute.Get() == attribute.Get(0) for attribute in sampled)
+
+
+def test_newton_imports_the_stage(stage):
+    newton = pytest.importorskip("newton", reason="newton is not installed (extra `synthetic`)")
+    pytest.importorskip("newton_usd_schemas", reason="newton-usd-schemas is not installed (pip; no extra has it)")
+    builder = newton.ModelBuilder()
+    builder.add_usd(stage[0])
+    assert builder.shape_label == ["/Twin/Splats"]
+
+
+def test_arrays_of_splats_have_a_value_per_splat(stage):
+    """pxr and UsdValidation take any lengths."""
+    from pxr import UsdGeom, UsdVol
+
+    layer, _ = stage
+    field = UsdVol.ParticleField3DGaussianSplat.Get(layer, "/Twin/Splats")
+    stand_in = UsdGeom.Points.Get(layer, "/Twin/SplatPoints")
+    for attribute in (field.GetOpacitiesAttr(), field.GetRadianceSphericalHarmonicsCoefficientsAttr(), stand_in.GetWidthsAttr()):
+        usd.require_lengths(field, stand_in, 0)
+        whole = attribute.Get()
+        attribute.Set(whole[:-1])
+        with pytest.raises(InputError, match=re.escape(str(attribute.GetPath()))):
+            usd.require_lengths(field, stand_in, 0)
+        attribute.Set(whole)
+
+
+def test_frames_of_other_splats_are_not_written(tmp_path, monkeypatch):
+    pytest.importorskip("pxr", reason="usd-core is not installed (extra `export`)")
+    source = read_source(exported.run_folder(tmp_path))
+    moved = dict(source.moved_splats([0, 1]))
+    fewer = {name: values[1:] for name, values in vars(moved[1]).items()}
+    monkeypatch.setattr(ExportSource, "moved_splats", lambda *_: [(0, moved[0]), (1, Splats(**fewer))])
+    with pytest.raises(InputError, match=f"{len(moved[0].means) - 1} splats; received {len(moved[0].means)}"):
+        usd.write(source, [0, 1], tmp_path / "twin.usdc")
+    assert not (tmp_path / "twin.usdc").exists()
 
 
 def test_a_rate_changes_codes_and_no_seconds_up_is_up_and_bad_names_and_rates_are_refused(tmp_path):

@@ -19,6 +19,8 @@ from neuspring.twin.body import body_of
 from neuspring.twin.rollout import FAR_AWAY
 
 MODEL = "twin.xml"
+GROUND_TIME = 4
+"""Time constant of contacts with the ground, in time steps; MuJoCo takes 2 or more."""
 
 
 def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Path]:
@@ -32,8 +34,12 @@ def mjcf(source: ExportSource) -> str:
     """Nodes as bodies on three slides, springs as spatial tendons, controllers as mocap bodies, with our time step.
 
     A tendon's force is stiffness (l - springlength) + damping dl/dt, so it is our spring with stiffness / rest length. One that
-    only pushes has no stiffness beyond its rest length; its damping stays. Slides damp as our drag does. MuJoCo's ground is soft.
+    only pushes has no stiffness beyond its rest length; its damping stays. Slides damp as our drag does.
     Bodies and sites are node0, node1, ..., hand0, ..., tendons spring0, ...
+
+    Of two geoms of equal priority MuJoCo takes the greater friction (1.0 where none is given) and the mean solref, so that of the
+    ground acts by priority alone. It is as hard as the time step allows. The cone of friction is round, since the pyramid that is
+    MuJoCo's default brakes otherwise along the diagonals.
 
     Of a rod, nodes are sites of a cable (cable.py), and the time step is `cable.STEP` at most.
     """
@@ -45,16 +51,18 @@ def mjcf(source: ExportSource) -> str:
     rod = body_of(twin).center_line(twin)
     radius = max(radius_of(rod), cable.THICKNESS) if rod else radius
     step, integrator = (min(simulation.substep, cable.CABLE_STEP), "implicitfast") if rod else (simulation.substep, "Euler")
-    ET.SubElement(root, "option", timestep=text(step), integrator=integrator, gravity=text(*gravity))
+    ET.SubElement(root, "option", timestep=text(step), integrator=integrator, gravity=text(*gravity), cone="elliptic")
     world = ET.SubElement(root, "worldbody")
     if simulation.ground:
         # Nodes are points for us and balls here, which touch a plane that is lower by their radius.
         height, turn = -radius * simulation.up_sign, "0 0 0" if simulation.up == "+z" else "180 0 0"
         friction = text(material.ground_friction, 0.005, 0.0001)
         kind: dict[str, Any] = {"type": "plane", "size": "5 5 0.1", "contype": "1", "conaffinity": "0", "friction": friction}
+        kind |= {"priority": "1", "solref": text(GROUND_TIME * step, 1)}
         ET.SubElement(world, "geom", name="ground", pos=text(0, 0, height), euler=turn, **kind)
     # The plane meets nodes; nodes meet each other only with self-collision.
     meets: dict[str, Any] = {"contype": "1" if simulation.self_collision else "0", "conaffinity": "1"}
+    meets["friction"] = text(material.contact_friction, 0.005, 0.0001)
     if rod:
         cable.add(rod, root, world, meets)
     for index, (place, mass) in enumerate(zip(topology.nodes, source.masses, strict=True) if not rod else ()):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from neuspring.core.files import write_atomically
 from neuspring.extensions.exports import Export
 from neuspring.extensions.exports.source import ExportSource
+from neuspring.splats.model import Splats
 from neuspring.twin.body import lines_of
 
 VERTEX = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("mass", "<f4"), ("region", "<i4"), ("controller", "u1"), ("stiffness", "<f4")]
@@ -30,8 +32,13 @@ def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Pat
     if source.splats is not None:
         for frame, splats in source.moved_splats(frames):
             made.append(output / f"splats_{frame:05d}.ply")
-            splats.save(made[-1])
+            replace(splats, quaternions=unit_quaternions(splats)).save(made[-1])
     return made
+
+
+def unit_quaternions(splats: Splats) -> np.ndarray:
+    """Orientations of norm 1 [N, 4], w first: not every reader brings them there."""
+    return splats.quaternions / np.linalg.norm(splats.quaternions, axis=1, keepdims=True)
 
 
 def points(source: ExportSource, frame: int) -> np.ndarray:

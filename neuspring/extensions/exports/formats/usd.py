@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from neuspring.core.artifacts import Rod
 from neuspring.core.errors import InputError
@@ -23,11 +24,13 @@ SUFFIXES = (".usdc", ".usda", ".usd")
 ROOT_PRIM = "/Twin"
 SPRING_WIDTH, NODE_WIDTH = 0.1, 0.3
 """Width of springs and of nodes, in median rest lengths."""
+SPLAT_REACH = float(np.sqrt(2 * np.log(255)))
+"""Standard deviations from the center to where 1 / 255 is left of an opaque splat, which is as far as it is drawn."""
 
 
 def write(source: ExportSource, frames: Sequence[int], output: Path, rate: float | None = None) -> list[Path]:
     """Write one file. Its time codes per second are `rate`, or one per frame of the twin; seconds stay what they are."""
-    Gf, Usd, UsdGeom, Vt = (needed(f"pxr.{name}") for name in ("Gf", "Usd", "UsdGeom", "Vt"))
+    Usd, UsdGeom, Vt = (needed(f"pxr.{name}") for name in ("Usd", "UsdGeom", "Vt"))
     if output.suffix not in SUFFIXES:
         raise InputError("--output", f"must end with {', '.join(SUFFIXES)}", output.name)
     if rate is not None and not (np.isfinite(rate) and rate > 0):
@@ -45,7 +48,7 @@ def write(source: ExportSource, frames: Sequence[int], output: Path, rate: float
     stage.SetDefaultPrim(root.GetPrim())
     if source.twin.simulation.up == "-z":
         root.AddRotateXOp().Set(180.0)  # USD has no axis that points down.
-    shapes = _Shapes(stage, UsdGeom, Vt, Gf)
+    shapes = _Shapes(stage, UsdGeom, Vt)
     shapes.graph(source, codes)
     if source.splats is not None:
         shapes.splats(source, codes)
@@ -70,11 +73,27 @@ def colors(stiffness: np.ndarray) -> np.ndarray:
     return np.stack([share, np.full(len(logs), 0.2), 1 - share], axis=1)
 
 
+def require_lengths(field: Any, stand_in: Any, code: float) -> None:
+    """Raise InputError unless each array of splats has a value per splat at this time: UsdValidation has no rule for them."""
+    count = len(field.GetPositionsAttr().Get(code))
+    values = dict.fromkeys(
+        (field.GetOrientationsAttr(), field.GetScalesAttr(), field.GetOpacitiesAttr(), stand_in.GetPointsAttr()), 1
+    )
+    values |= dict.fromkeys((stand_in.GetWidthsAttr(), stand_in.GetDisplayColorAttr(), stand_in.GetDisplayOpacityAttr()), 1)
+    coefficients = field.GetRadianceSphericalHarmonicsCoefficientsAttr()
+    values[coefficients] = (field.GetRadianceSphericalHarmonicsDegreeAttr().Get() + 1) ** 2
+    for attribute, each in values.items():
+        received = len(attribute.Get(code) or ())
+        if received != each * count:
+            rule = f"{each * count} values are required at time {code:g}, for {count} splats"
+            raise InputError(attribute.GetPath(), rule, received, "Delete appearance/<seed>/appearance.json and run again.")
+
+
 class _Shapes:
     """Prims of a stage. pxr's modules are given, because they are optional."""
 
-    def __init__(self, stage: Any, geom: Any, vt: Any, gf: Any) -> None:
-        self._stage, self._geom, self._vt, self._gf = stage, geom, vt, gf
+    def __init__(self, stage: Any, geom: Any, vt: Any) -> None:
+        self._stage, self._geom, self._vt = stage, geom, vt
 
     def graph(self, source: ExportSource, codes: dict[int, float]) -> None:
         """Nodes, controllers and springs; of a rod, its center line."""
@@ -101,7 +120,7 @@ class _Shapes:
             if rod:
                 shown[line] = both[-len(rod.vertices) :]
             for prim, points in shown.items():
-                self._place(prim, prim.CreatePointsAttr(), points, code)
+                self._place(prim, prim.CreatePointsAttr(), points, prim.GetWidthsAttr().Get()[0] / 2, code)
 
     def _line(self, rod: Rod) -> Any:
         """A curve through the vertices, as thick as the nodes are far, with what the rod is made of."""
@@ -119,7 +138,7 @@ class _Shapes:
         """Splats for renderers that know Gaussians, and points (purpose proxy) for those that do not."""
         from pxr import UsdVol
 
-        token, fields = self._geom.Tokens, None
+        token = self._geom.Tokens
         field = UsdVol.ParticleField3DGaussianSplat.Define(self._stage, f"{ROOT_PRIM}/Splats")
         stand_in = self._geom.Points.Define(self._stage, f"{ROOT_PRIM}/SplatPoints")
         image, proxy = self._geom.Imageable(field.GetPrim()), self._geom.Imageable(stand_in.GetPrim())
@@ -127,9 +146,9 @@ class _Shapes:
         proxy.CreatePurposeAttr(token.proxy)
         image.SetProxyPrim(stand_in.GetPrim())
         for frame, splats in source.moved_splats(list(codes)):
-            if fields is None:
-                fields = splats
-                scales = np.exp(np.broadcast_to(splats.log_scales, (len(splats.means), 3)))
+            code, means, turns = codes[frame], splats.means, ply.unit_quaternions(splats)
+            scales = np.exp(np.broadcast_to(splats.log_scales, means.shape))
+            if not field.GetScalesAttr().HasAuthoredValue():
                 opacities = self._vt.FloatArray.FromNumpy(1 / (1 + np.exp(-splats.opacity_logits)))
                 field.CreateScalesAttr(self._vectors(scales))
                 field.CreateOpacitiesAttr(opacities)
@@ -143,12 +162,13 @@ class _Shapes:
                 self._primvar(stand_in, "displayColor", "color3f[]", self._vectors(shade), token.vertex)
                 self._primvar(stand_in, "displayOpacity", "float[]", opacities, token.vertex)
             if splats.harmonics[:, 1:].any():  # They turn with the splats.
-                coefficients.Set(self._vectors(splats.harmonics.reshape(-1, 3)), codes[frame])
-            turns = splats.quaternions / np.linalg.norm(splats.quaternions, axis=1, keepdims=True)
-            quaternions = [self._gf.Quatf(*map(float, turn)) for turn in turns]
-            field.CreateOrientationsAttr().Set(self._vt.QuatfArray(quaternions), codes[frame])
-            field.CreatePositionsAttr().Set(self._vectors(splats.means), codes[frame])
-            self._place(stand_in, stand_in.CreatePointsAttr(), splats.means, codes[frame])
+                self._sample(coefficients, self._vectors(splats.harmonics.reshape(-1, 3)), code)
+            # pxr keeps the real part last.
+            self._sample(field.CreateOrientationsAttr(), self._vt.QuatfArray.FromNumpy(np.roll(turns, -1, axis=1)), code)
+            axes = Rotation.from_quat(turns, scalar_first=True).as_matrix() * scales[:, None]
+            self._place(field, field.CreatePositionsAttr(), means, SPLAT_REACH * np.linalg.norm(axes, axis=2), code)
+            self._place(stand_in, stand_in.CreatePointsAttr(), means, scales.mean(axis=1, keepdims=True), code)
+            require_lengths(field, stand_in, code)
 
     def _points(self, name: str, width: float, color: tuple[float, float, float]) -> Any:
         prim = self._geom.Points.Define(self._stage, f"{ROOT_PRIM}/{name}")
@@ -157,10 +177,18 @@ class _Shapes:
         self._primvar(prim, "displayColor", "color3f[]", [color], self._geom.Tokens.constant)
         return prim
 
-    def _place(self, prim: Any, attribute: Any, points: np.ndarray, code: float) -> None:
-        attribute.Set(self._vectors(points), code)
+    def _place(self, prim: Any, attribute: Any, points: np.ndarray, reach: np.ndarray | float, code: float) -> None:
+        """Points with their extent, `reach` beyond each: no plugin of USD computes that of splats and of points of one width."""
+        self._sample(attribute, self._vectors(points), code)
         if len(points):
-            prim.CreateExtentAttr().Set(self._vectors(np.stack([points.min(axis=0), points.max(axis=0)])), code)
+            corners = np.stack([(points - reach).min(axis=0), (points + reach).max(axis=0)])
+            self._sample(self._geom.Boundable(prim.GetPrim()).CreateExtentAttr(), self._vectors(corners), code)
+
+    def _sample(self, attribute: Any, value: Any, code: float) -> None:
+        """The value at a time; the first is the default value too, since importers without a time (Newton's) read nothing else."""
+        if not attribute.HasAuthoredValue():
+            attribute.Set(value)
+        attribute.Set(value, code)
 
     def _vectors(self, values: np.ndarray) -> Any:
         return self._vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, np.float32))
