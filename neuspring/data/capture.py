@@ -54,6 +54,8 @@ THIN = ("cloth", "package")
 """Categories of which no volume is made; those of all other words are filled."""
 TEXT_TOLERANCE = 1e-4
 """Allowed deviation from R^T R = 1 in JSON, where matrices may have five digits."""
+ROUNDED = 0.03
+"""That of a matrix with two decimals."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -364,9 +366,12 @@ def pose_findings(file: Path, key: str, pose: np.ndarray, tolerance: float) -> l
     findings = []
     rotation = pose[:3, :3]
     error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if not error <= tolerance or np.linalg.det(rotation) < 0 or not np.isfinite(pose).all():
+    mirrored = np.linalg.det(rotation) < 0
+    if not error <= tolerance or mirrored or not np.isfinite(pose).all():
         rule = f"the upper left 3 x 3 block must be a rotation (rigid: orthonormal, right-handed) within {tolerance:g}"
-        findings.append(broken(file, key, rule, f"a deviation of {error:.3g} from R^T R = 1, or a mirror image"))
+        seems = ", of too few digits: write six decimals" if error < ROUNDED else ""
+        seems = ", and a mirror image" if mirrored else seems
+        findings.append(broken(file, key, rule, f"a deviation of {error:.3g} from R^T R = 1{seems}"))
     if not np.array_equal(pose[3], [0, 0, 0, 1]):
         findings.append(broken(file, key, "the last row must be [0, 0, 0, 1]", pose[3].tolist()))
     return findings
