@@ -27,6 +27,8 @@ BORDER_PIXELS = 3
 """Pixels of the object on the image border from which it may go on outside."""
 CUT = 0.1
 """Share of the frames from which an object at the border counts as cut off; frame 0 alone does, where its shape is taken."""
+ENTERS = 0.5
+"""Share of the frames in which an arm enters the image; in real films and synthetic scenes it is 0.6 to 1."""
 BORDERED = 0.1
 """Part of the image's border that is object, median over frames, from which the mask shows the background or a person."""
 AREA_JUMP = 2.0
@@ -49,8 +51,8 @@ class Shown:
         """Objects in frame 0."""
         self.areas = np.full((3, frames), np.nan)
         """Pixels of each label [3, T]; NaN without a mask."""
-        self.rims = np.full(frames, np.nan)
-        """Pixels of the object on the image border [T]."""
+        self.borders = np.full((3, frames), np.nan)
+        """Pixels of each label on the image border [3, T]; NaN without a mask."""
 
     @classmethod
     def of(cls, capture: Capture, camera: str, labels: np.ndarray) -> Shown:
@@ -63,15 +65,21 @@ class Shown:
     def see(self, frame: int, labels: np.ndarray) -> None:
         """Count the mask [H, W] of a frame."""
         self.areas[:, frame] = np.bincount(labels.ravel(), minlength=3)[:3]
-        own = labels == OBJECT
-        self.rims[frame] = own[0].sum() + own[-1].sum() + own[1:-1, 0].sum() + own[1:-1, -1].sum()
+        border = np.concatenate([labels[0], labels[-1], labels[1:-1, 0], labels[1:-1, -1]])
+        self.borders[:, frame] = np.bincount(border, minlength=3)[:3]
         if frame == 0:
+            own = labels == OBJECT
             # Pieces count as one object if they meet when they are grown by half of PIECES_APART.
             reach = max(int(0.5 * PIECES_APART * max(labels.shape)), 1)
             disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2)
             count, pieces = cv2.connectedComponents(cv2.dilate(own.astype(np.uint8), disk))
             sizes = np.bincount(pieces[own], minlength=count)[1:]
             self.objects = int((sizes >= SECOND_PIECE * sizes.max()).sum()) if len(sizes) else 0
+
+    @property
+    def rims(self) -> np.ndarray:
+        """Pixels of the object on the image border [T]."""
+        return self.borders[OBJECT]
 
     @property
     def frames(self) -> np.ndarray:
@@ -113,6 +121,14 @@ def at_border(shown: Shown) -> dict[str, Any] | None:
     cut = shown.frames[shown.rims[shown.frames] >= BORDER_PIXELS]
     cut_off = len(cut) and (cut[0] == 0 or len(cut) >= CUT * len(shown.frames))
     return _of_frames(cut) if cut_off and shown.bordered <= BORDERED else None
+
+
+def exchanged(shown: Shown) -> dict[str, Any] | None:
+    """Share of its frames in which the object is at the image border, where arms should enter, and the hands stay inside."""
+    at_it, there = shown.borders >= BORDER_PIXELS, shown.areas > 0
+    object_in, hands_in = (np.sum(at_it[label]) / max(np.sum(there[label]), 1) for label in (OBJECT, HANDS))
+    enough = there[HANDS].sum() >= ENTERS * len(shown.frames)
+    return {"value": float(object_in), "hands": hands_in} if enough and object_in >= ENTERS and hands_in < CUT else None
 
 
 def jumps(shown: Shown) -> dict[str, Any] | None:
@@ -348,6 +364,10 @@ checks = (
     Check("background in the mask", "masks", lambda shown: shown.bordered, (0, BORDERED), "warning",
           "{value:.0%} of the image's border is object; at most {high:.0%} is expected; the mask holds the table, a sleeve or a "
           "person.", MARK_REMEDY),
+    Check("labels exchanged", "masks", exchanged, None, "warning",
+          f"the object (label {OBJECT}) reaches the image border in {{value:.0%}} of its frames, the hands (label {HANDS}) in "
+          "{hands:.0%} of theirs; arms enter there, and the object does not.",
+          f"If they are exchanged, write {OBJECT} for the object and {HANDS} for hands."),
     Check("object at the border", "masks", at_border, None, "warning",
           "the object touches the image border in {count} frames, first in frame {first}; what is outside is neither seen nor "
           "carved.",

@@ -40,7 +40,7 @@ from neuspring.core.geometry import Obstacle
 from neuspring.core.records import digest_file
 from neuspring.core.section import STRICT, Name, Positive
 from neuspring.data.camera import Camera, CameraEntry
-from neuspring.data.images import make_way, read_array, read_image, require_size, write_image
+from neuspring.data.images import make_way, read_array, read_image, write_image
 
 CAPTURE, TRACKS, POINTS = "capture.json", "tracks.json", "points.json"
 CONTROLLERS, NODES = ("controllers.npz", "controllers.csv"), ("nodes.npz", "nodes.ply")
@@ -391,8 +391,10 @@ def read_labels(path: Path, camera: Camera | None = None, remedy: str = "", *, b
             labels = np.asarray(image)
     except (OSError, SyntaxError, ValueError) as error:
         raise InputError(path, "this file must be a readable PNG", "a damaged file") from error
-    if camera is not None:
-        require_size(path, labels, camera)
+    if camera is not None and labels.shape[:2] != (camera.height, camera.width):
+        next_move = "Make them of these images, or bring them to their size without interpolation (nearest neighbor)."
+        rule = f"masks must have the size of the images of camera {camera.name}, {camera.width} x {camera.height}"
+        raise InputError(path, rule, f"{labels.shape[1]} x {labels.shape[0]}", next_move)
     if labels.ndim != 2:
         next_move = "Write the label of each pixel as its gray value, or a palette image whose indices are the labels."
         raise InputError(path, "masks are gray, palette or one-bit images", f"{labels.shape[2]} channels of color", next_move)
