@@ -57,7 +57,7 @@ TELLING = re.compile(
     r"dist|coef|lens|model|skew|fish|radial|tang|focal|princip|camera|proj|^f+[xy_]|^c[xy_]|^[a-z]_?\d+$", re.IGNORECASE
 )
 """A key like this may be of the lens, as may one with several numbers."""
-IDLE = re.compile(r"err|rms|name|serial|note|comment|date|time", re.IGNORECASE)
+IDLE = re.compile(r"(^|_)(errors?|rms|serial)(_|$)", re.IGNORECASE)
 """A key like this is not."""
 CONVERSIONS = {
     "camera_angle_x": "An angle of view, with the width of the images: fx = fy = 0.5 width / tan(0.5 camera_angle_x). ",
@@ -125,8 +125,8 @@ def read_lenses(path: Path, names: Sequence[str]) -> dict[str, Lens]:
                 raise InputError(path, rule, f"{loose[0]!r} beside the cameras")
         sizes = {key: value for outer in around for key, value in outer.items() if _side(key)}
         lenses[name] = _lens(path, name, sizes | entry if isinstance(entry, dict) else entry, unit)
-        if (where := [str(key) for key in place if key not in ("cameras", name)]) and isinstance(place[-1], str):
-            lenses[name] = replace(lenses[name], told=(f"those of {'.'.join(where)}", *lenses[name].told))
+        if place and name not in place and isinstance(place[-1], str):
+            lenses[name] = replace(lenses[name], told=(f"those of {'.'.join(map(str, place))}", *lenses[name].told))
     return lenses
 
 
@@ -222,7 +222,7 @@ def _of_cameras(path: Path, what: str, content: Any, names: Sequence[str], is_pa
         if len(parts) == len(names) and all(isinstance(place[-1], int) for place, _ in parts if place):
             return dict(zip(names, parts, strict=True))
     keys = [".".join(map(str, place)) for place, _ in parts] or (sorted(content) if isinstance(content, dict) else [])
-    received = f"list of {len(content)}" if isinstance(content, list) else keys if keys else type(content).__name__
+    received = f"list of {len(content)}" if isinstance(content, list) else keys[:9] or type(content).__name__
     remedy = "".join(text for key, text in CONVERSIONS.items() if key in keys)
     if chosen := [place[-1] for place, _ in parts if place and isinstance(place[-1], str)]:
         like = sorted(map(str, chosen), key=lambda key: not re.search("color|rgb", key, re.IGNORECASE))[: len(names)]
@@ -292,13 +292,10 @@ def _lens(path: Path, name: str, entry: Any, unit: float | None) -> Lens:
     if "K" in said:
         matrices.append(_numbers(path, f"{where}: K", _plain(said["K"]), ((3, 3), (9,), (4,))))
     for number, k in enumerate(matrices):
-        if k.size == 4:
-            fx, fy, cx, cy = k
-            matrices[number] = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-        else:
-            by_columns = not np.array_equal(k.reshape(3, 3)[2], [0, 0, 1]) and np.array_equal(k.reshape(3, 3)[:, 2], [0, 0, 1])
-            matrices[number] = k.reshape(3, 3).T if by_columns else k.reshape(3, 3)
-            told += ["K by columns"] if by_columns and _spelled(entry, "intrinsic_matrix") is None else []
+        k = np.array([[k[0], 0, k[2]], [0, k[1], k[3]], [0, 0, 1.0]]) if k.size == 4 else k.reshape(3, 3)
+        by_columns = np.array_equal(k[:, 2], [0, 0, 1]) and not np.array_equal(k[2], [0, 0, 1])
+        matrices[number] = k.T if by_columns else k
+        told += ["K by columns"] if by_columns else []
     if not np.allclose(matrices[0], matrices[-1], rtol=1e-3):
         raise InputError(path, f"{where}: fx, fy, cx, cy and K must agree", f"{matrices[-1].tolist()}", "Remove the wrong one.")
     model = _model(path, where, said, told)
@@ -311,7 +308,7 @@ def _model(path: Path, where: str, said: dict[str, Any], told: list[str]) -> str
     """The name of the distortion's model; opencv where there is none. Raises InputError for two."""
     models = set()
     for key in ("model", "distortion_model", "camera_model"):
-        word = str(said.get(key, "")).lower()
+        word = str(said.get(key, "")).lower().removesuffix(".0")
         if word in [str(number) for number in range(len(REALSENSE_MODELS))]:
             word = REALSENSE_MODELS[int(word)]
             told.append(f"{key} {said[key]} is {word}, by librealsense's numbers")

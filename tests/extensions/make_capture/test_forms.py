@@ -9,7 +9,7 @@ from neuspring.core.geometry import rigid_inverse
 from neuspring.data.camera import Lens
 from neuspring.extensions.make_capture.forms import read_lenses, read_poses
 from neuspring.extensions.make_capture.lenses import Straightener, require_lens
-from tests.extensions.make_capture.test_lenses import BENT, MATRIX, PLAIN
+from tests.extensions.make_capture.board import BENT, MATRIX, PLAIN
 from tests.support.desk import looking, write_json
 
 
@@ -89,6 +89,7 @@ def test_spellings_of_distortion_mean_the_same(tmp_path, said):
         ({"0": PLAIN, "1": {"note": 1}}, "intrinsics of camera 1: fx, fy, cx, cy are required, or K [3, 3]"),
         (PLAIN | {"distortion_coef": [0.1]}, "'distortion_coef'. Is distortion_coeffs meant? Remove it if it says nothing about"),
         (PLAIN | {"k9": 0.1}, "the keys that are read are fx fl_x"),
+        (PLAIN | {"model_name": "ftheta"}, "received 'model_name'"),
         (PLAIN | {"fl_x": 71}, "one spelling of a key is required; received fx and fl_x"),
         (PLAIN | {"model": "radtan", "camera_model": "fisheye"}, "one model is required; received fisheye and radtan"),
         (PLAIN | {"k1": 0.1, "dist": [0.1, 0, 0, 0]}, "coefficients are required in a list or by name, not both"),

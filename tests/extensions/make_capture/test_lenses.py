@@ -8,15 +8,8 @@ from neuspring.core.errors import InputError
 from neuspring.data.camera import Lens
 from neuspring.extensions.make_capture.forms import read_lenses
 from neuspring.extensions.make_capture.lenses import Board, Straightener, depth_ratio, require_lens, sight
-from tests.extensions.make_capture.board import BOARD, LENS, board_image, depth_of_table
+from tests.extensions.make_capture.board import BENT, BOARD, LENS, MATRIX, PLAIN, board_image, depth_of_table
 from tests.support.desk import looking, write_json
-
-PLAIN = {"fx": 70, "fy": 71, "cx": 39.5, "cy": 29.5}
-MATRIX = np.array([[70.0, 0, 39.5], [0, 71.0, 29.5], [0, 0, 1]])
-
-
-BENT = [-0.25, 0.12, 0.001, -0.002, 0.03]
-"""k1, k2, p1, p2, k3."""
 
 
 @pytest.mark.parametrize(
