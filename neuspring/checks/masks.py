@@ -77,19 +77,14 @@ class Shown:
             self.objects = int((sizes >= SECOND_PIECE * sizes.max()).sum()) if len(sizes) else 0
 
     @property
-    def rims(self) -> np.ndarray:
-        """Pixels of the object on the image border [T]."""
-        return self.borders[OBJECT]
-
-    @property
     def frames(self) -> np.ndarray:
         """Frames with a mask."""
-        return np.flatnonzero(np.isfinite(self.rims))
+        return np.flatnonzero(np.isfinite(self.borders[OBJECT]))
 
     @property
     def bordered(self) -> float:
         """Part of the image's border that is object, median over frames."""
-        return float(np.median(self.rims[self.frames])) / (2 * sum(self.size) - 4) if len(self.frames) else 0.0
+        return float(np.median(self.borders[OBJECT, self.frames])) / (2 * sum(self.size) - 4) if len(self.frames) else 0.0
 
     def ratios(self) -> dict[int, float]:
         """Ratio of the object's areas, 1 or more, in a frame and the one before it; of frames that follow each other."""
@@ -118,7 +113,7 @@ def missing(shown: Shown) -> dict[str, Any] | None:
 
 def at_border(shown: Shown) -> dict[str, Any] | None:
     """Frames in which the object, and not the background with it, is cut off by the image."""
-    cut = shown.frames[shown.rims[shown.frames] >= BORDER_PIXELS]
+    cut = shown.frames[shown.borders[OBJECT, shown.frames] >= BORDER_PIXELS]
     cut_off = len(cut) and (cut[0] == 0 or len(cut) >= CUT * len(shown.frames))
     return _of_frames(cut) if cut_off and shown.bordered <= BORDERED else None
 
