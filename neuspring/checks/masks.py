@@ -27,6 +27,8 @@ BORDER_PIXELS = 3
 """Pixels of the object on the image border from which it may go on outside."""
 CUT = 0.1
 """Share of the frames from which an object at the border counts as cut off; frame 0 alone does, where its shape is taken."""
+ENTERS = 0.5
+"""Share of the frames in which an arm enters the image; in real films and synthetic scenes it is 0.6 to 1."""
 BORDERED = 0.1
 """Part of the image's border that is object, median over frames, from which the mask shows the background or a person."""
 AREA_JUMP = 2.0
@@ -49,8 +51,8 @@ class Shown:
         """Objects in frame 0."""
         self.areas = np.full((3, frames), np.nan)
         """Pixels of each label [3, T]; NaN without a mask."""
-        self.rims = np.full(frames, np.nan)
-        """Pixels of the object on the image border [T]."""
+        self.borders = np.full((3, frames), np.nan)
+        """Pixels of each label on the image border [3, T]; NaN without a mask."""
 
     @classmethod
     def of(cls, capture: Capture, camera: str, labels: np.ndarray) -> Shown:
@@ -63,9 +65,10 @@ class Shown:
     def see(self, frame: int, labels: np.ndarray) -> None:
         """Count the mask [H, W] of a frame."""
         self.areas[:, frame] = np.bincount(labels.ravel(), minlength=3)[:3]
-        own = labels == OBJECT
-        self.rims[frame] = own[0].sum() + own[-1].sum() + own[1:-1, 0].sum() + own[1:-1, -1].sum()
+        border = np.concatenate([labels[0], labels[-1], labels[1:-1, 0], labels[1:-1, -1]])
+        self.borders[:, frame] = np.bincount(border, minlength=3)[:3]
         if frame == 0:
+            own = labels == OBJECT
             # Pieces count as one object if they meet when they are grown by half of PIECES_APART.
             reach = max(int(0.5 * PIECES_APART * max(labels.shape)), 1)
             disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2)
@@ -76,12 +79,12 @@ class Shown:
     @property
     def frames(self) -> np.ndarray:
         """Frames with a mask."""
-        return np.flatnonzero(np.isfinite(self.rims))
+        return np.flatnonzero(np.isfinite(self.borders[OBJECT]))
 
     @property
     def bordered(self) -> float:
         """Part of the image's border that is object, median over frames."""
-        return float(np.median(self.rims[self.frames])) / (2 * sum(self.size) - 4) if len(self.frames) else 0.0
+        return float(np.median(self.borders[OBJECT, self.frames])) / (2 * sum(self.size) - 4) if len(self.frames) else 0.0
 
     def ratios(self) -> dict[int, float]:
         """Ratio of the object's areas, 1 or more, in a frame and the one before it; of frames that follow each other."""
@@ -110,9 +113,17 @@ def missing(shown: Shown) -> dict[str, Any] | None:
 
 def at_border(shown: Shown) -> dict[str, Any] | None:
     """Frames in which the object, and not the background with it, is cut off by the image."""
-    cut = shown.frames[shown.rims[shown.frames] >= BORDER_PIXELS]
+    cut = shown.frames[shown.borders[OBJECT, shown.frames] >= BORDER_PIXELS]
     cut_off = len(cut) and (cut[0] == 0 or len(cut) >= CUT * len(shown.frames))
     return _of_frames(cut) if cut_off and shown.bordered <= BORDERED else None
+
+
+def exchanged(shown: Shown) -> dict[str, Any] | None:
+    """Share of its frames in which the object is at the image border, where arms should enter, and the hands stay inside."""
+    at_it, there = shown.borders >= BORDER_PIXELS, shown.areas > 0
+    object_in, hands_in = (np.sum(at_it[label]) / max(np.sum(there[label]), 1) for label in (OBJECT, HANDS))
+    enough = there[HANDS].sum() >= ENTERS * len(shown.frames)
+    return {"value": float(object_in), "hands": hands_in} if enough and object_in >= ENTERS and hands_in < CUT else None
 
 
 def jumps(shown: Shown) -> dict[str, Any] | None:
@@ -348,6 +359,10 @@ checks = (
     Check("background in the mask", "masks", lambda shown: shown.bordered, (0, BORDERED), "warning",
           "{value:.0%} of the image's border is object; at most {high:.0%} is expected; the mask holds the table, a sleeve or a "
           "person.", MARK_REMEDY),
+    Check("labels exchanged", "masks", exchanged, None, "warning",
+          f"the object (label {OBJECT}) reaches the image border in {{value:.0%}} of its frames, the hands (label {HANDS}) in "
+          "{hands:.0%} of theirs; arms enter there, and the object does not.",
+          f"If they are exchanged, write {OBJECT} for the object and {HANDS} for hands."),
     Check("object at the border", "masks", at_border, None, "warning",
           "the object touches the image border in {count} frames, first in frame {first}; what is outside is neither seen nor "
           "carved.",

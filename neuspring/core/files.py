@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import tempfile
 import zipfile
 import zlib
@@ -129,6 +130,39 @@ def read_head(path: Path) -> tuple[dict[str, tuple[int, ...]], dict[str, Any]]:
     return shapes, mapping
 
 
+FOREIGN = (
+    (
+        rb"\x76\x2f\x31\x01",
+        "an OpenEXR image",
+        "OpenCV's wheels do not read it. Make .npy of it, in meters: pip install OpenEXR; python -c \"import OpenEXR, numpy, sys; "
+        "[numpy.save(f[:-4], numpy.atleast_3d(next(iter(OpenEXR.File(f).channels().values())).pixels)[..., 0]) "
+        'for f in sys.argv[1:]]" *.exr',
+    ),
+    (
+        rb"glTF",
+        "a binary glTF model (GLB)",
+        "Make a PLY file of it: python -c \"import trimesh; trimesh.load('a.glb', force='mesh').export('nodes.ply')\"; y is up in "
+        "glTF, so turn the points into the world of the capture.",
+    ),
+    (
+        rb"[\x01-\x7f]\x50",
+        "a C3D file of a motion capture system",
+        "Read it by ezc3d (pip install ezc3d) and write the points in meters; a marker with a residual below 0 was not seen.",
+    ),
+)
+"""First bytes of files of other programs that are given in place of ours, what they are, and how they are converted."""
+
+
+def foreign(path: Path) -> tuple[str, str]:
+    """The name of a file of `FOREIGN`, and its conversion; "" of any other."""
+    try:
+        with path.open("rb") as stream:
+            first = stream.read(16)
+    except OSError:
+        return "", ""
+    return next(((name, remedy) for begin, name, remedy in FOREIGN if re.match(begin, first)), ("", ""))
+
+
 def load_json(path: Path) -> Any:
     """Parse a JSON file of the data set. Raises InputError."""
     try:
@@ -136,4 +170,5 @@ def load_json(path: Path) -> Any:
     except OSError as error:
         raise InputError(path, "this file must be readable", error.strerror) from error
     except (ValueError, RecursionError) as error:
-        raise InputError(path, "this file must be JSON", str(error)) from error
+        name, remedy = foreign(path)
+        raise InputError(path, "this file must be JSON", name or str(error), remedy) from error

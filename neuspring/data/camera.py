@@ -74,8 +74,10 @@ class Lens:
     """Model of the distortion, as the source says it; see `lenses.MODELS`."""
     size: tuple[int, int] | None = None
     """(width, height) for which it holds, where it is said."""
-    unread: tuple[str, ...] = ()
-    """Keys beside them that were not read."""
+    unit: float | None = None
+    """m per count of depth, where the file of the intrinsics says it."""
+    told: tuple[str, ...] = ()
+    """How the file was read, where that is not plain."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,7 +41,7 @@ from neuspring.core.records import digest_file
 from neuspring.core.section import STRICT, Name, Positive
 from neuspring.data.c3d import Markers, is_c3d
 from neuspring.data.camera import Camera, CameraEntry
-from neuspring.data.images import make_way, read_array, read_image, require_size, write_image
+from neuspring.data.images import make_way, read_array, read_image, write_image
 
 CAPTURE, TRACKS, POINTS = "capture.json", "tracks.json", "points.json"
 CONTROLLERS, NODES = ("controllers.npz", "controllers.csv"), ("nodes.npz", "nodes.ply")
@@ -57,6 +57,8 @@ LEFT_OUT = ("obstacles", "depth", "tracks", "pose", "mass")
 """Fields of capture.json that are not written where they have their default."""
 TEXT_TOLERANCE = 1e-4
 """Allowed deviation from R^T R = 1 in JSON, where matrices may have five digits."""
+ROUNDED = 0.03
+"""That of a matrix with two decimals."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -372,9 +374,12 @@ def pose_findings(file: Path, key: str, pose: np.ndarray, tolerance: float) -> l
     findings = []
     rotation = pose[:3, :3]
     error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if not error <= tolerance or np.linalg.det(rotation) < 0 or not np.isfinite(pose).all():
+    mirrored = np.linalg.det(rotation) < 0
+    if not error <= tolerance or mirrored or not np.isfinite(pose).all():
         rule = f"the upper left 3 x 3 block must be a rotation (rigid: orthonormal, right-handed) within {tolerance:g}"
-        findings.append(broken(file, key, rule, f"a deviation of {error:.3g} from R^T R = 1, or a mirror image"))
+        seems = ", of too few digits: write six decimals" if error < ROUNDED else ""
+        seems = ", and a mirror image" if mirrored else seems
+        findings.append(broken(file, key, rule, f"a deviation of {error:.3g} from R^T R = 1{seems}"))
     if not np.array_equal(pose[3], [0, 0, 0, 1]):
         findings.append(broken(file, key, "the last row must be [0, 0, 0, 1]", pose[3].tolist()))
     return findings
@@ -394,8 +399,10 @@ def read_labels(path: Path, camera: Camera | None = None, remedy: str = "", *, b
             labels = np.asarray(image)
     except (OSError, SyntaxError, ValueError) as error:
         raise InputError(path, "this file must be a readable PNG", "a damaged file") from error
-    if camera is not None:
-        require_size(path, labels, camera)
+    if camera is not None and labels.shape[:2] != (camera.height, camera.width):
+        next_move = "Make them of these images, or bring them to their size without interpolation (nearest neighbor)."
+        rule = f"masks must have the size of the images of camera {camera.name}, {camera.width} x {camera.height}"
+        raise InputError(path, rule, f"{labels.shape[1]} x {labels.shape[0]}", next_move)
     if labels.ndim != 2:
         next_move = "Write the label of each pixel as its gray value, or a palette image whose indices are the labels."
         raise InputError(path, "masks are gray, palette or one-bit images", f"{labels.shape[2]} channels of color", next_move)

@@ -23,7 +23,7 @@ from neuspring.checks.space import SAME, Holding
 from neuspring.config import Config, ScenarioRow
 from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.errors import InputError
-from neuspring.core.files import NPZ_FAULTS, write_atomically
+from neuspring.core.files import NPZ_FAULTS, foreign, write_atomically
 from neuspring.core.findings import Finding, broken, refusal, refuse
 from neuspring.core.geometry import on_table
 from neuspring.core.records import digest_file
@@ -169,7 +169,9 @@ def read_nodes(path: Path) -> np.ndarray:
             body: Any = trimesh.load(path, process=False)
             nodes = np.array(body.vertices)
         except Exception as error:  # trimesh raises whatever a damaged file leads it to
-            raise InputError(path, "vertices of a PLY file are required", f"{type(error).__name__}: {error}") from error
+            name, remedy = foreign(path)
+            received = name or f"{type(error).__name__}: {error}"
+            raise InputError(path, "vertices of a PLY file are required", received, remedy) from error
     nodes = _places(path, nodes, 2)
     if len(nodes) < LEAST_NODES:
         raise InputError(path, f"at least {LEAST_NODES} nodes are required", len(nodes))
@@ -186,7 +188,9 @@ def _arrays(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray]:
         with np.load(path, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
     except (*NPZ_FAULTS, AttributeError) as error:
-        raise InputError(path, "an .npz file without pickle is required", f"{type(error).__name__}: {error}") from error
+        name, remedy = foreign(path)
+        received = name or f"{type(error).__name__}: {error}"
+        raise InputError(path, "an .npz file without pickle is required", received, remedy) from error
     if "points" not in arrays or not arrays.keys() <= set(keys):
         optional = f", optional {' and '.join(keys[1:])}" if keys[1:] else ""
         raise InputError(path, f"the array points is required{optional}", ", ".join(arrays) or "none")

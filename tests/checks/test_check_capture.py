@@ -134,6 +134,13 @@ def extended(labels, frame):
     return labels
 
 
+def reaching(labels, frame):
+    """The hand with its arm, and 1 and 2 exchanged."""
+    row, column = np.argwhere(labels == HANDS).mean(axis=0).astype(int)
+    labels[row : row + 4, column:] = HANDS
+    return np.choose(labels, [0, HANDS, OBJECT])
+
+
 def hand_elsewhere(labels, frame):
     labels[labels == HANDS] = 0
     labels[-20:-2, 4:24] = HANDS
@@ -148,6 +155,7 @@ def hand_elsewhere(labels, frame):
         (second, "two objects", 2),
         (lambda labels, frame: np.where((labels == OBJECT) & (frame > 3), 0, labels), "object missing", 2),
         (extended, "object at the border", 6),
+        (reaching, "labels exchanged", 1.0),
         (lambda labels, _: np.where(labels == 0, HANDS, labels), "hands too large", 0.694),
         (hand_elsewhere, "hand far from the object", 0.212),
     ],

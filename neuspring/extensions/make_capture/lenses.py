@@ -1,16 +1,9 @@
-"""Intrinsics and poses from JSON files of other programs, the removal of distortion, and poses by a ChArUco board that lies still.
-
-Intrinsics: an object with fx, fy, cx, cy or K [3, 3] (intrinsic_matrix has 9 numbers, column by column, as Open3D writes them), and
-optionally width, height, distortion, model. `LENS_KEYS` has the spellings of other programs; another key that may be of the lens is
-an error. For several cameras: a list of such objects in the order of the cameras, or an object of them by name, also under the key
-cameras. One alone is for all.
+"""Intrinsics against the images, the removal of distortion, and poses by a ChArUco board that lies still.
 
 Distortion: with ideal (x, y) = ((u - cx) / fx, (v - cy) / fy) and P the polynomial of OpenCV's coefficients k1, k2, p1, p2, k3, ...
 `opencv` shows (x, y) at P(x, y); `distorted_to_ideal` shows at (x, y) what belongs at P(x, y); `fisheye` is OpenCV's, of 4
 coefficients of the angle. librealsense says inverse_brown_conrady. Its documentation means distorted_to_ideal; its functions, and
 with them aligned depth, apply the coefficients as opencv. So nothing is taken for granted: the file must say which.
-
-Poses: {"camera_to_world": ...} or {"world_to_camera": ...}, [4, 4] or [3, 4] in meters per camera: a list, or an object by name.
 
 A board's coordinates become the world: x along its rows, z up out of its printed side, the origin at its corner. A board that lies
 on the table puts the table at z = minus its thickness.
@@ -18,38 +11,21 @@ on the table puts the table at z = minus its thickness.
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
+from neuspring.checks.rig import OFF_CENTER
 from neuspring.core.errors import InputError
-from neuspring.core.files import load_json
 from neuspring.core.findings import refuse
 from neuspring.core.geometry import rigid_inverse
 from neuspring.data.camera import Lens
-from neuspring.data.capture import TEXT_TOLERANCE, intrinsics_findings, pose_findings
+from neuspring.data.capture import intrinsics_findings
 
-OPEN3D = "intrinsic_matrix"
-COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "taux", "tauy")
-"""In OpenCV's order."""
-SPELLINGS = (
-    "fx fl_x / fy fl_y / cx ppx / cy ppy / K intrinsics camera_matrix / width w image_width / height h image_height / model "
-    "distortion_model / camera_model / distortion D dist coeffs dist_coeffs distortion_coeffs distortion_coefficients"
-)
-LENS_KEYS = {words.split()[0]: words.split() for words in (*SPELLINGS.split(" / "), OPEN3D, *COEFFICIENTS)}
-"""Keys that are read, and their spellings: ours, and those of OpenCV, ROS, librealsense, Open3D, nerfstudio and Kalibr."""
-SILENT = "R P rectification_matrix projection_matrix roi header frames applied_transform camera_name camera_angle_x camera_angle_y"
-"""Keys beside them that say nothing about a lens, or the same once more."""
-TELLING = re.compile(
-    r"dist|coef|lens|model|skew|fish|radial|tang|focal|princip|camera|proj|^f[xy_]|^c[xy_]|^[a-z]_?\d+$", re.IGNORECASE
-)
-"""A key like this may be of the lens, as may one with several numbers."""
 RATIONAL = ("rational_polynomial", "full_opencv")
 """Models of which k4 to k6 are OpenCV's. Other programs have other polynomials with these names."""
 MODELS = {
@@ -65,49 +41,14 @@ UNDISTORT_STEPS = 20
 """Iterations of the solution; each leaves a fifth of the error at the corner of a wide lens."""
 NARROWEST, WIDEST = 10.0, 150.0
 """Degrees. A field of view outside this range is a wrong focal length."""
-FARTHEST_CAMERA = 20.0
-"""m. A camera farther from the world's origin has its position in another unit."""
-POSE_KEYS = ("camera_to_world", "world_to_camera")
-
-
-def read_lenses(path: Path, names: Sequence[str]) -> dict[str, Lens]:
-    """Intrinsics of each camera. Raises InputError naming the file and the key."""
-    content = load_json(path)
-    if isinstance(content, dict) and not _describes(content):
-        loose = [key for key, value in content.items() if not isinstance(value, dict) and key != "cameras" and TELLING.search(key)]
-        if loose and ("cameras" in content or any(name in content for name in names)):
-            raise InputError(path, "what describes a lens belongs into its camera's object", f"{loose[0]!r} beside the cameras")
-        content = content.get("cameras", content)
-    if isinstance(content, dict) and _describes(content):
-        content = dict.fromkeys(names, content)
-    return {name: _lens(path, name, entry) for name, entry in _by_camera(path, "intrinsics", content, names).items()}
-
-
-def read_poses(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Camera to world [4, 4], m, of each camera. Raises InputError naming the file and the key."""
-    content = load_json(path)
-    keys = [key for key in POSE_KEYS if isinstance(content, dict) and key in content]
-    if len(keys) != 1:
-        rule = f"exactly one of the keys {' and '.join(POSE_KEYS)} is required: it says what the matrices do"
-        raise InputError(path, rule, keys or "neither")
-    poses = {}
-    for name, listed in _by_camera(path, keys[0], content[keys[0]], names).items():
-        key = f"{keys[0]}, camera {name}"
-        matrix = _numbers(path, key, listed, ((4, 4), (3, 4)))
-        matrix = np.vstack([matrix[:3], [0.0, 0.0, 0.0, 1.0]]) if len(matrix) == 3 else matrix
-        refuse(pose_findings(path, key, matrix, TEXT_TOLERANCE))
-        poses[name] = matrix if keys[0] == POSE_KEYS[0] else rigid_inverse(matrix)
-        distance = float(np.linalg.norm(matrix[:3, 3]))
-        if distance > FARTHEST_CAMERA:
-            remedy = "Divide the last columns by 1000 if they are millimeters, by 100 if they are centimeters."
-            raise InputError(path, f"{key}: the position must be in meters", f"one {distance:.4g} m from the origin", remedy)
-    return poses
 
 
 def require_lens(where: Path, name: str, lens: Lens, size: tuple[int, int]) -> None:
     """Raise InputError unless intrinsics fit images of `size` (width, height)."""
     if lens.size is not None and lens.size != size:
         remedy = "If the images were only resized since: --take lens_resized."
+        if np.abs(lens.matrix[:2, 2] / size - 0.5).max() < OFF_CENTER:
+            remedy = "(cx, cy) is in the middle of these images: if fx, fy, cx, cy are theirs, correct the size in the file."
         rule = f"camera {name}: width and height must be those of its images, {size[0]} x {size[1]}"
         raise InputError(where, rule, f"{lens.size[0]} x {lens.size[1]}", remedy)
     refuse(intrinsics_findings(where, f"intrinsics of camera {name}", lens.matrix, size))
@@ -184,109 +125,6 @@ def _require_model(where: Path, name: str, lens: Lens, size: tuple[int, int]) ->
     if len(lens.distortion) not in counts:
         wanted = " or ".join(map(str, counts))
         raise InputError(where, f"camera {name}: the model {lens.model} has {wanted} coefficients", len(lens.distortion))
-
-
-def _spelled(entry: dict[str, Any], key: str) -> list[Any]:
-    """The values of a key in all its spellings."""
-    return [entry[word] for word in LENS_KEYS[key] if word in entry]
-
-
-def _describes(entry: dict[str, Any]) -> bool:
-    matrices = (value for value in _spelled(entry, "K") if isinstance(value, list) or (isinstance(value, dict) and "data" in value))
-    return bool(_spelled(entry, "fx") or OPEN3D in entry) or any(True for _ in matrices)
-
-
-def _unread(path: Path, where: str, entry: dict[str, Any]) -> tuple[str, ...]:
-    """The keys that are not read. Raises InputError where one may be of the lens."""
-    read = [word for words in LENS_KEYS.values() for word in words]
-    unread = [key for key in entry if key not in read and key not in SILENT.split()]
-    if telling := [key for key in unread if TELLING.search(key) or isinstance(entry[key], (list, dict))]:
-        close = difflib.get_close_matches(telling[0], read, n=1)
-        remedy = (f"Is {close[0]} meant? " if close else "") + "Remove it if it says nothing about the lens."
-        raise InputError(path, f"{where}: the keys that are read are {' '.join(read)}", repr(telling[0]), remedy)
-    return tuple(unread)
-
-
-def _by_camera(path: Path, key: str, content: Any, names: Sequence[str]) -> dict[str, Any]:
-    if isinstance(content, list) and len(content) == len(names):
-        return dict(zip(names, content, strict=True))
-    if isinstance(content, dict) and all(name in content for name in names):
-        return {name: content[name] for name in names}
-    received = f"{type(content).__name__} of {len(content)}" if isinstance(content, list) else sorted(content)
-    rule = f"{key}: a list for {len(names)} cameras in their order, or an object with the keys {' '.join(names)}"
-    raise InputError(path, rule, received if isinstance(content, (dict, list)) else type(content).__name__)
-
-
-def _lens(path: Path, name: str, entry: Any) -> Lens:
-    where = f"intrinsics of camera {name}"
-    if not isinstance(entry, dict) or not _describes(entry):
-        rule = f"{where}: fx, fy, cx, cy are required, or K [3, 3]"
-        raise InputError(path, rule, sorted(entry) if isinstance(entry, dict) else type(entry).__name__)
-    unread = _unread(path, where, entry)
-    for words in LENS_KEYS.values():
-        if len(twice := [word for word in words if word in entry]) > 1:
-            raise InputError(path, f"{where}: one spelling of a key is required", " and ".join(twice), "Remove the others.")
-    said = {key: values[0] for key in LENS_KEYS if (values := _spelled(entry, key))}
-    if "fx" in said:
-        values = [said.get(key) for key in ("fx", "fy", "cx", "cy")]
-        fx, fy, cx, cy = _numbers(path, f"{where}: fx, fy, cx, cy", values, ((4,),))
-        matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    elif OPEN3D in said:
-        matrix = _numbers(path, f"{where}: {OPEN3D}", said[OPEN3D], ((9,),)).reshape(3, 3).T
-    else:
-        matrix = _numbers(path, f"{where}: K", _plain(said["K"]), ((3, 3), (9,))).reshape(3, 3)
-    named = [str(said[key]).rpartition(".")[2].lower() for key in ("model", "camera_model") if key in said]
-    models = {word.removeprefix("rs2_distortion_") for word in named}
-    models -= {"pinhole"} if len(models) > 1 else set()
-    if len(models) > 1:
-        raise InputError(path, f"{where}: one model is required", " and ".join(sorted(models)))
-    model = models.pop() if models else "opencv"
-    distortion = _coefficients(path, where, said, model)
-    size = (said["width"], said["height"]) if type(said.get("width")) is type(said.get("height")) is int else None
-    return Lens(matrix=matrix, distortion=distortion, model=model, size=size, unread=unread)
-
-
-def _coefficients(path: Path, where: str, said: dict[str, Any], model: str) -> np.ndarray:
-    """Coefficients of a list in OpenCV's order, or by name; none without any."""
-    named = {key: said[key] for key in COEFFICIENTS if key in said}
-    listed = _plain(said.get("distortion", []))
-    if isinstance(listed, dict):
-        if unknown := sorted(listed.keys() - set(COEFFICIENTS)):
-            raise InputError(path, f"{where}: distortion: names {' '.join(COEFFICIENTS)} are required", unknown[0])
-        named, listed = named | listed, []
-    if not named:
-        counts = sorted({0, *(count for counts in COEFFICIENT_COUNTS.values() for count in counts)})
-        return _numbers(path, f"{where}: distortion", listed, tuple((count,) for count in counts))
-    if np.size(listed):
-        rule = f"{where}: coefficients are required in a list or by name, not both"
-        raise InputError(path, rule, f"distortion and {next(iter(named))}")
-    if MODELS.get(model) == "fisheye":
-        order: tuple[str, ...] = ("k1", "k2", "k3", "k4")
-    else:
-        order = COEFFICIENTS[: next(count for count in COEFFICIENT_COUNTS["opencv"] if named.keys() <= set(COEFFICIENTS[:count]))]
-        if any(named.get(key) for key in ("k4", "k5", "k6")) and model not in RATIONAL:
-            rule = f"{where}: k4 to k6 differ between programs: the model must be {' or '.join(RATIONAL)}, OpenCV's"
-            raise InputError(path, rule, model, "Or give OpenCV's coefficients as the list distortion.")
-    return _numbers(path, f"{where}: {' '.join(order)}", [named.get(key, 0.0) for key in order], ((len(order),),))
-
-
-def _plain(value: Any) -> Any:
-    """The numbers of a matrix that OpenCV or ROS wrote with rows, cols and data; the inside of a list of one row or one column."""
-    value = value["data"] if isinstance(value, dict) and "data" in value else value
-    if isinstance(value, list) and value and all(isinstance(row, list) for row in value):
-        return value[0] if len(value) == 1 else [row[0] for row in value] if {len(row) for row in value} == {1} else value
-    return value
-
-
-def _numbers(path: Path, key: str, listed: Any, shapes: Sequence[tuple[int, ...]]) -> np.ndarray:
-    try:
-        array = np.array(listed, dtype=float)
-    except (TypeError, ValueError):
-        array = np.full(99, np.nan)
-    if array.shape not in shapes or not np.isfinite(array).all():
-        wanted = " or ".join(" x ".join(map(str, shape)) for shape in shapes)
-        raise InputError(path, f"{key}: {wanted} finite numbers are required", str(listed)[:80])
-    return array
 
 
 FEWEST_CORNERS = 6

@@ -30,7 +30,8 @@ from neuspring.extensions.make_capture.feeds import Paired, pairs
 from neuspring.extensions.make_capture.film import cameras_in_step, in_step, looked_at, watch
 from neuspring.extensions.make_capture.formats import CameraFeed, Recorded, open_recording
 from neuspring.extensions.make_capture.formats.bag import open_bags
-from neuspring.extensions.make_capture.lenses import Board, Straightener, read_lenses, read_poses
+from neuspring.extensions.make_capture.forms import read_lenses, read_poses
+from neuspring.extensions.make_capture.lenses import Board, Straightener
 from neuspring.extensions.make_capture.options import FILM_OPTIONS, SPACE_OPTIONS, Intake
 from neuspring.extensions.make_capture.poses import (
     FrameChoice,
@@ -162,8 +163,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     depth = "none, color alone" if unit is None else unit.text()
     thin = "thin: no volume is made of it" if intake.category in capture.THIN else "a volume is made of what is seen"
     lines = [f"category: {intake.category}, {thin}", f"cameras: {sizes}"]
-    unread = dict.fromkeys(key for lens in listed.values() for key in lens.unread)
-    lines += [f"intrinsics: not read: {' '.join(unread)}"] if unread else []
+    lines += dict.fromkeys(f"intrinsics: {told}" for lens in listed.values() for told in lens.told)
     lines += [Straightener(view.lens, view.size).text(name) for name, view in seen.items() if view.lens.distortion.any()]
     lines += [f"frames: {choice.text()}; {rate_text}", f"depth: {depth}", f"poses: {how}, up {placed.up}"]
     training = made.train_end or int(0.7 * made.frame_count)
@@ -217,11 +217,12 @@ def _place(
         raise InputError("--table-at", "is for one camera without poses: others have their world", f"{len(names)} cameras")
     if intake.board_images and intake.board is None:
         raise InputError("--board", "the board of --board-images must be described", "none")
-    if intake.poses is not None and unit is None:
-        return given_alone(takes.poses(read_poses(intake.poses, names)), seen, intake.poses), f"of {intake.poses.name}"
     if intake.poses is not None:
-        poses = takes.poses(read_poses(intake.poses, names))
-        return stand(poses, seen, level=level, top_down=top_down, file=intake.poses), f"of {intake.poses.name}"
+        poses, told = read_poses(intake.poses, names)
+        poses = takes.poses(poses)
+        if unit is None:
+            return given_alone(poses, seen, intake.poses), f"of {intake.poses.name}{told}"
+        return stand(poses, seen, level=level, top_down=top_down, file=intake.poses), f"of {intake.poses.name}{told}"
     if board is not None:
         shown = dict(seen)
         if not intake.board_images:

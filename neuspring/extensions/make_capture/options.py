@@ -41,7 +41,7 @@ class Intake:
     intrinsics: Path | None = None
     """JSON: fx, fy, cx, cy or K of each camera, and distortion"""
     depth_unit: float | None = None
-    """meters per count of depth; guessed by default, and said"""
+    """meters per count of depth; depth_scale of --intrinsics, or guessed, by default; said"""
     rate: float | None = None
     """frames per second at which it was filmed; that of the video by default"""
     frames: str = ""

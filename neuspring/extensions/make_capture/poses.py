@@ -157,7 +157,13 @@ def look(
     known = {view.unit for view in views}
     if len(known) > 1 and given_unit is None:
         raise InputError("--depth-unit", "all cameras must have one unit of depth", " and ".join(sorted(map(str, known))))
-    unit = find_unit(views[0].path, depths, given_unit, known.pop() if len(known) == 1 else None) if depths else None
+    stated, source = next((lens.unit for lens in listed.values()), None), known.pop() if len(known) == 1 else None
+    for other, value in (("--depth-unit", given_unit), (views[0].path, source)):
+        if depths and stated and value and not np.isclose(value, stated, rtol=0.01):
+            rule = f"its unit of depth must be that of {other}, {value:g} m per count"
+            raise InputError(file, rule, f"{stated:g} m per count", "Correct the one that is wrong, or leave it out.")
+    where = views[0].path if file is None or stated is None else file
+    unit = find_unit(where, depths, given_unit, stated or source) if depths else None
     return {view.name: straightened(view, samples[view.name], lenses[view.name], unit, takes) for view in views}, unit
 
 

@@ -33,8 +33,8 @@ class Unit:
 
     def text(self) -> str:
         """In one line."""
-        name = f" ({KNOWN[self.meters]})" if self.meters in KNOWN else ""
-        return f"{self.meters:g} m per count{name}, {self.how}"
+        name = KNOWN.get(float(f"{self.meters:.6g}"))  # librealsense says it in single precision
+        return f"{self.meters:g} m per count{f' ({name})' if name else ''}, {self.how}"
 
 
 def find_unit(where: object, depths: Sequence[np.ndarray], given: float | None, known: float | None = None) -> Unit:
@@ -54,7 +54,8 @@ def find_unit(where: object, depths: Sequence[np.ndarray], given: float | None, 
             raise InputError("--depth-unit", "meters per count, above 0, are required", chosen)
         median = count * chosen
         if not NEAR < median < FAR:
-            rule = f"--depth-unit: the median depth must lie between {NEAR:g} and {FAR:g} m"
+            said = "--depth-unit" if given is not None else "the unit that it says"
+            rule = f"{said}: the median depth must lie between {NEAR:g} and {FAR:g} m"
             raise InputError(where, rule, f"{chosen:g} m per count, which makes it {median:.4g} m", _advice(count))
         return Unit(chosen, "given" if given is not None else f"as the source says; median depth {median:.2f} m")
     order = [0.001] if whole else [1.0, 0.001]

@@ -1,4 +1,4 @@
-"""A ChArUco board on a table, as OpenCV prints it, seen by a camera."""
+"""A ChArUco board on a table, as OpenCV prints it, seen by a camera; and a lens."""
 
 from __future__ import annotations
 
@@ -10,6 +10,10 @@ from neuspring.extensions.make_capture.lenses import Board
 
 BOARD = "5x7:0.04:0.03:DICT_5X5_100"
 LENS = np.array([[600, 0, 319.5], [0, 600, 239.5], [0, 0, 1.0]])
+PLAIN = {"fx": 70, "fy": 71, "cx": 39.5, "cy": 29.5}
+MATRIX = np.array([[70.0, 0, 39.5], [0, 71.0, 29.5], [0, 0, 1]])
+BENT = [-0.25, 0.12, 0.001, -0.002, 0.03]
+"""k1, k2, p1, p2, k3."""
 
 
 def board_image(pose, text=BOARD):

@@ -14,6 +14,8 @@ from neuspring.extensions.make_capture import formats
 from neuspring.extensions.make_capture.feeds import Paired
 from neuspring.extensions.make_capture.formats import CaptureFormat, Recorded
 from neuspring.extensions.make_capture.formats.folder import ImageFolder
+from neuspring.extensions.make_capture.forms import read_lenses
+from neuspring.intake.points import read_hands, read_nodes
 from tests.support.desk import write_folders
 
 
@@ -50,3 +52,24 @@ def test_a_path_of_no_format_is_refused_with_the_names(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4), np.uint8))
     with pytest.raises(InputError, match=r"--format: must be one of bag, phystwin_raw; received none that reads"):
         formats.open_recording([tmp_path])
+
+
+EXR, GLB, C3D = b"\x76\x2f\x31\x01\x02\0\0\0", b"glTF\x02\0\0\0", b"\x02\x50" + bytes(510)
+
+
+@pytest.mark.parametrize(
+    ("name", "first", "read", "words"),
+    [
+        ("0.exr", EXR, lambda path: formats.open_images(path.parent, "depth"), ("an OpenEXR image", "pip install OpenEXR")),
+        ("0.exr", EXR, lambda path: formats.open_images(path, "depth"), ("an OpenEXR image", "pip install OpenEXR")),
+        ("body.glb", GLB, read_nodes, ("a binary glTF model", "trimesh.load('a.glb', force='mesh')")),
+        ("body.npz", GLB, read_nodes, ("a binary glTF model", "trimesh.load('a.glb', force='mesh')")),
+        ("hands.c3d", C3D, read_hands, ("a C3D file", "Read it by ezc3d")),
+        ("k.json", C3D, lambda path: read_lenses(path, ["0"]), ("a C3D file", "Read it by ezc3d")),
+    ],
+)
+def test_a_file_of_another_program_is_refused_with_what_it_is_and_its_conversion(tmp_path, name, first, read, words):
+    (tmp_path / name).write_bytes(first)
+    with pytest.raises(InputError) as caught:
+        read(tmp_path / name)
+    assert all(word in str(caught.value) for word in (str(tmp_path), *words))

@@ -1,4 +1,4 @@
-"""Intrinsics and poses from files, distortion, and a ChArUco board."""
+"""Intrinsics against images, distortion, and a ChArUco board."""
 
 import cv2
 import numpy as np
@@ -6,99 +6,17 @@ import pytest
 
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Lens
-from neuspring.extensions.make_capture.lenses import Board, Straightener, depth_ratio, read_lenses, read_poses, require_lens, sight
-from tests.extensions.make_capture.board import BOARD, LENS, board_image, depth_of_table
+from neuspring.extensions.make_capture.forms import read_lenses
+from neuspring.extensions.make_capture.lenses import Board, Straightener, depth_ratio, require_lens, sight
+from tests.extensions.make_capture.board import BENT, BOARD, LENS, MATRIX, PLAIN, board_image, depth_of_table
 from tests.support.desk import looking, write_json
-
-PLAIN = {"fx": 70, "fy": 71, "cx": 39.5, "cy": 29.5}
-MATRIX = np.array([[70.0, 0, 39.5], [0, 71.0, 29.5], [0, 0, 1]])
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        PLAIN,
-        {"fx": 70, "fy": 71, "ppx": 39.5, "ppy": 29.5, "coeffs": [0, 0, 0, 0, 0], "note": "from the maker"},
-        {"K": MATRIX.tolist(), "width": 80, "height": 60},
-        {"intrinsic_matrix": MATRIX.T.ravel().tolist()},
-        [{"K": MATRIX.tolist()}, PLAIN],
-        {"cameras": {"0": PLAIN, "1": PLAIN}},
-        {"0": PLAIN, "1": {"intrinsics": MATRIX.tolist()}},
-        {"camera_matrix": {"rows": 3, "cols": 3, "data": MATRIX.ravel().tolist()}},
-        {
-            "K": MATRIX.ravel().tolist(),
-            "D": [0.0] * 5,
-            "distortion_model": "plumb_bob",
-            "R": np.eye(3).ravel().tolist(),
-            "header": {},
-        },
-        {"fl_x": 70, "fl_y": 71, "cx": 39.5, "cy": 29.5, "w": 80, "h": 60, "camera_model": "OPENCV", "k1": 0.0, "frames": []},
-        PLAIN | {"coeffs": [0.0] * 5, "model": "distortion.inverse_brown_conrady"},
-    ],
-)
-def test_forms_of_intrinsics(tmp_path, content):
-    lenses = read_lenses(write_json(tmp_path / "k.json", content), ["0", "1"])
-    for name in ("0", "1"):
-        np.testing.assert_array_equal(lenses[name].matrix, MATRIX)
-        assert not lenses[name].distortion.any()
-
-
-BENT = [-0.25, 0.12, 0.001, -0.002, 0.03]
-"""k1, k2, p1, p2, k3."""
-
-
-@pytest.mark.parametrize(
-    "said",
-    [
-        {"distortion": BENT},
-        {"dist": [BENT]},
-        {"D": BENT, "distortion_model": "plumb_bob"},
-        {"distortion_coefficients": {"rows": 1, "cols": 5, "data": BENT}},
-        {"distortion_coefficients": [[value] for value in BENT]},
-        {"k1": BENT[0], "k2": BENT[1], "p1": BENT[2], "p2": BENT[3], "k3": BENT[4]},
-        {"distortion": {"k1": BENT[0], "k2": BENT[1], "p1": BENT[2], "p2": BENT[3], "k3": BENT[4]}, "camera_model": "OPENCV"},
-        {"coeffs": BENT, "model": "distortion.brown_conrady"},
-        {"dist_coeffs": BENT, "camera_model": "pinhole", "distortion_model": "radtan"},
-    ],
-)
-def test_spellings_of_distortion_mean_the_same(tmp_path, said):
-    lens = read_lenses(write_json(tmp_path / "k.json", PLAIN | said), ["0"])["0"]
-    require_lens(tmp_path, "0", lens, (80, 60))
-    np.testing.assert_array_equal(lens.distortion, BENT)
-    np.testing.assert_array_equal(
-        Straightener(lens, (80, 60)).maps, Straightener(Lens(matrix=MATRIX, distortion=np.array(BENT)), (80, 60)).maps
-    )
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ({"fx": 70}, "intrinsics of camera 0: fx, fy, cx, cy: 4 finite numbers are required"),
-        ({"focal": 70}, "intrinsics: a list for 2 cameras in their order, or an object with the keys 0 1; received ['focal']"),
-        ([PLAIN], "received list of 1"),
-        (PLAIN | {"distortion": [0.1, 0.2]}, "distortion: 0 or 4 or 5 or 8 or 12 or 14 finite numbers are required"),
-        ({"K": [[1, 0], [0, 1]]}, "K: 3 x 3 or 9 finite numbers are required"),
-        ({"0": PLAIN, "1": {"note": 1}}, "intrinsics of camera 1: fx, fy, cx, cy are required, or K [3, 3]"),
-        (PLAIN | {"distortion_coef": [0.1]}, "'distortion_coef'. Is distortion_coeffs meant? Remove it if it says nothing about"),
-        (PLAIN | {"k9": 0.1}, "the keys that are read are fx fl_x"),
-        (PLAIN | {"fl_x": 71}, "one spelling of a key is required; received fx and fl_x"),
-        (PLAIN | {"model": "radtan", "camera_model": "fisheye"}, "one model is required; received fisheye and radtan"),
-        (PLAIN | {"k1": 0.1, "dist": [0.1, 0, 0, 0]}, "coefficients are required in a list or by name, not both"),
-        (PLAIN | {"k1": 0.1, "k4": 0.2, "camera_model": "OPENCV"}, "k4 to k6 differ between programs: the model must be rational_"),
-        (PLAIN | {"distortion": {"k1": 0.1, "a": 0.2}}, "distortion: names k1 k2 p1"),
-        ({"cameras": [PLAIN, PLAIN], "dist": [0.1] * 5}, "belongs into its camera's object; received 'dist' beside the cameras"),
-    ],
-)
-def test_intrinsics_that_cannot_be_read(tmp_path, content, message):
-    with pytest.raises(InputError) as caught:
-        read_lenses(write_json(tmp_path / "k.json", content), ["0", "1"])
-    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize(
     ("lens", "message"),
     [
-        (Lens(matrix=MATRIX, size=(160, 120)), "--take lens_resized"),
+        (Lens(matrix=np.diag([2.0, 2, 1]) @ MATRIX, size=(160, 120)), "--take lens_resized"),
+        (Lens(matrix=MATRIX, size=(160, 120)), "if fx, fy, cx, cy are theirs, correct the size in the file"),
         (Lens(matrix=MATRIX @ np.diag([0.027, 0.027, 1])), "Focal lengths are in pixels of these images, not in millimeters"),
         (Lens(matrix=MATRIX, distortion=np.array(BENT), model="ftheta"), "one of opencv brown_conrady"),
         (
@@ -186,24 +104,6 @@ def test_a_model_with_two_meanings_is_refused_with_both(tmp_path):
         for m in ("opencv", "distorted_to_ideal")
     )
     assert max(one, two) < apart < one + two + 0.2
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ({"poses": []}, "exactly one of the keys camera_to_world and world_to_camera is required"),
-        ({"camera_to_world": [np.eye(4).tolist()]}, "a list for 2 cameras in their order"),
-        ({"camera_to_world": [np.eye(4).tolist(), np.diag([2.0, 2, 2, 1]).tolist()]}, "must be a rotation"),
-        (
-            {"camera_to_world": [np.eye(4).tolist(), (np.eye(4) + np.outer([1, 0, 0, 0], [0, 0, 0, 540.0])).tolist()]},
-            "the position must be in meters; received one 540 m from the origin. Divide the last columns by 1000",
-        ),
-    ],
-)
-def test_poses_that_cannot_be(tmp_path, content, message):
-    with pytest.raises(InputError) as caught:
-        read_poses(write_json(tmp_path / "poses.json", content), ["0", "1"])
-    assert message in str(caught.value)
 
 
 def test_a_board_gives_the_pose():

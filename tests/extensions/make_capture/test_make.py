@@ -67,6 +67,20 @@ def test_floating_point_depth_keeps_its_digits(tmp_path):
     assert capture.description.depth_format == "npy" and "1 m per count (meters)" in "\n".join(report)
 
 
+@pytest.mark.parametrize("scale", [0.0002500000118743628, 4000])
+def test_the_depth_scale_of_the_intrinsics_is_the_unit(tmp_path, scale):
+    root = write_folders(tmp_path, unit=0.00025)
+    lens = write_json(tmp_path / "k.json", json.loads((root / "intrinsics.json").read_text()) | {"depth_scale": scale})
+    with pytest.raises(InputError, match=r"k\.json: its unit of depth must be that of --depth-unit, 0\.001 m.*received 0\.00025"):
+        make_capture(intake(root, intrinsics=lens, depth_unit=0.001))
+    for given in (None, 0.00025):
+        capture, _ = make_capture(intake(root, intrinsics=lens, depth_unit=given, output=tmp_path / str(given)))
+        assert capture.description.depth_unit == pytest.approx(0.00025, rel=1e-6)
+    wrong = write_json(tmp_path / "k.json", json.loads(lens.read_text()) | {"depth_scale": 1.0})
+    with pytest.raises(InputError, match=r"k\.json: the unit that it says: .*received 1 m per count.*Plausible would be.*0\.00025"):
+        make_capture(intake(root, intrinsics=wrong, output=tmp_path / "wrong"))
+
+
 @pytest.mark.parametrize("key", ["camera_to_world", "world_to_camera"])
 def test_two_cameras_with_poses(tmp_path, key):
     root = write_folders(tmp_path, cameras=2)

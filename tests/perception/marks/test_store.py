@@ -76,6 +76,11 @@ def test_masks_of_another_tool_that_do_not_fit(folder, capsys):
     truth = folder / "truth"
     assert main(["mask", str(folder), "--masks", str(truth / "0")]) == 2
     assert "a folder is required for each of the cameras 0 1; --cameras chooses some; received 1 and 0" in capsys.readouterr().err
+    whole = cv2.imread(str(truth / "0" / "00000.png"), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(truth / "0" / "00000.png"), whole[::2, ::2])
+    assert main(["mask", str(folder), "--masks", str(truth / "0"), "--cameras", "0"]) == 2
+    assert "masks must have the size of the images of camera 0" in capsys.readouterr().err
+    cv2.imwrite(str(truth / "0" / "00000.png"), whole)
     (truth / "0" / "00004.png").rename(truth / "0" / "00044.png")
     assert main(["mask", str(folder), "--masks", str(truth / "0"), "--cameras", "0"]) == 2
     assert "a mask of frame 4 of camera 0 is required, with its number as the name: 00004.png; received" in capsys.readouterr().err

@@ -17,6 +17,7 @@ from typing import Literal, Protocol, TypeAlias, TypeVar
 import numpy as np
 
 from neuspring.core.errors import InputError
+from neuspring.core.files import foreign
 from neuspring.data.camera import Lens
 from neuspring.extensions.make_capture.moments import Series
 from neuspring.registry import Registry, modules
@@ -129,9 +130,10 @@ def open_images(path: Path, kind: Kind) -> ImageSource:
         if format_.pictures is not None and format_.recognizes(path):
             return format_.pictures(path, kind)
     suffix = path.suffix or "plain"
+    name, remedy = foreign(next(iter(sorted(path.iterdir())), path) if path.is_dir() else path)
     received = "a folder without any" if path.is_dir() else f"a {suffix} file" if path.exists() else "nothing there"
     known = " or ".join(format_.about for format_ in FORMATS.values() if format_.pictures is not None)
-    raise InputError(path, known.format(kind=kind, endings=" ".join(ENDINGS[kind])), received)
+    raise InputError(path, known.format(kind=kind, endings=" ".join(ENDINGS[kind])), name or received, remedy)
 
 
 def open_recording(paths: Sequence[Path], name: str | None = None, cameras: Sequence[str] = ()) -> Recorded:
