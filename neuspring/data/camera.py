@@ -77,7 +77,7 @@ class Lens:
     unit: float | None = None
     """m per count of depth, where the file of the intrinsics says it."""
     told: tuple[str, ...] = ()
-    """How the file was read, where that is not plain."""
+    """Lines on how the file was read, where that is not plain."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,7 +57,7 @@ LEFT_OUT = ("obstacles", "depth", "tracks", "pose", "mass")
 """Fields of capture.json that are not written where they have their default."""
 TEXT_TOLERANCE = 1e-4
 """Allowed deviation from R^T R = 1 in JSON, where matrices may have five digits."""
-ROUNDED = 0.03
+FEW_DIGITS = 0.03
 """That of a matrix with two decimals."""
 
 
@@ -377,7 +377,7 @@ def pose_findings(file: Path, key: str, pose: np.ndarray, tolerance: float) -> l
     mirrored = np.linalg.det(rotation) < 0
     if not error <= tolerance or mirrored or not np.isfinite(pose).all():
         rule = f"the upper left 3 x 3 block must be a rotation (rigid: orthonormal, right-handed) within {tolerance:g}"
-        seems = ", of too few digits: write six decimals" if error < ROUNDED else ""
+        seems = ", of too few digits: write six decimals" if error < FEW_DIGITS else ""
         seems = ", and a mirror image" if mirrored else seems
         findings.append(broken(file, key, rule, f"a deviation of {error:.3g} from R^T R = 1{seems}"))
     if not np.array_equal(pose[3], [0, 0, 0, 1]):

@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from neuspring.checks.table import OPENGL
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
 from neuspring.core.findings import refuse
@@ -39,8 +40,8 @@ SPELLINGS = (
 LENS_KEYS = {words.split()[0]: words.split() for words in (*SPELLINGS.split(" / "), *COEFFICIENTS)}
 """Keys that are read, and their spellings: ours, and those of OpenCV, ROS, librealsense, Open3D, nerfstudio and Kalibr."""
 SIZE_KEYS = {"width": "width w cols", "height": "height h rows", "size": "size resolution shape dims dimensions wh hw"}
-"""The same of the size of images; `OF_IMAGES` may stand around them."""
-OF_IMAGES = re.compile(r"^(image|img|im|frame|picture|video|color|rgb|camera|cam|calibration|calib)+|(px|pixels)$")
+"""The same of the size of images; `IMAGE_WORDS` may stand around them."""
+IMAGE_WORDS = re.compile(r"^(image|img|im|frame|picture|video|color|rgb|camera|cam|calibration|calib)+|(px|pixels)$")
 DEPTH_KEYS = (
     "depth_scale depth_unit depth_units depth_factor depth_scale_factor depth_unit_scale_factor depth_to_meters depth_shift "
     "depth_map_factor png_depth_scale"
@@ -57,22 +58,21 @@ TELLING = re.compile(
     r"dist|coef|lens|model|skew|fish|radial|tang|focal|princip|camera|proj|^f+[xy_]|^c[xy_]|^[a-z]_?\d+$", re.IGNORECASE
 )
 """A key like this may be of the lens, as may one with several numbers."""
-IDLE = re.compile(r"(^|_)(errors?|rms|serial)(_|$)", re.IGNORECASE)
+BESIDE_THE_LENS = re.compile(r"(^|_)(errors?|rms|serial)(_|$)", re.IGNORECASE)
 """A key like this is not."""
 CONVERSIONS = {
     "camera_angle_x": "An angle of view, with the width of the images: fx = fy = 0.5 width / tan(0.5 camera_angle_x). ",
     "focal_length": "In millimeters: fx = focal_length / horizontal_aperture * width, in pixels. ",
 }
-"""What keys that are not read say, and how it becomes fx."""
+"""Keys that are not read, with what they say and how it becomes fx."""
 REALSENSE_MODELS = ("none", "modified_brown_conrady", "inverse_brown_conrady", "ftheta", "brown_conrady", "kannala_brandt4")
 """By their numbers in librealsense."""
-PRODUCT = re.compile(
+MAKERS = re.compile(
     r"\bzed|realsense|intel|kinect|k4a|azure|femto|orbbec|gemini|astra|\boak|luxonis|\b[dlt]\d{3}|iphone|ipad|basler|gopro"
 )
 """Names of cameras, which some files give as their model."""
 FARTHEST_CAMERA = 20.0
 """m. A camera farther from the world's origin has its position in another unit."""
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ UNIT_WORDS, QUIET = ({_bare(word) for word in words.split()} for words in (DEPTH
 
 def _side(key: str) -> str | None:
     """The side of a size, or `size`, that a key means."""
-    return SIDES.get(OF_IMAGES.sub("", _bare(key)))
+    return SIDES.get(IMAGE_WORDS.sub("", _bare(key)))
 
 
 def _spelled(entry: dict[str, Any], key: str) -> Any:
@@ -278,7 +278,7 @@ def _lens(path: Path, name: str, entry: Any, unit: float | None) -> Lens:
     # Of a focal length in millimeters, K is the same in pixels.
     unread = [key for key in unread if _bare(key) != "focallength" or _spelled(entry, "horizontal_aperture") is None]
     several = [key for key in unread if isinstance(entry[key], (list, dict))]
-    if telling := [key for key in unread if (TELLING.search(key) or key in several) and not IDLE.search(key)]:
+    if telling := [key for key in unread if (TELLING.search(key) or key in several) and not BESIDE_THE_LENS.search(key)]:
         read = [word for words in LENS_KEYS.values() for word in words]
         close = difflib.get_close_matches(telling[0], read, n=1)
         remedy = CONVERSIONS.get(telling[0], f"Is {close[0]} meant? " if close else "")
@@ -312,7 +312,7 @@ def _model(path: Path, where: str, said: dict[str, Any], told: list[str]) -> str
         if word in [str(number) for number in range(len(REALSENSE_MODELS))]:
             word = REALSENSE_MODELS[int(word)]
             told.append(f"{key} {said[key]} is {word}, by librealsense's numbers")
-        if PRODUCT.search(word):
+        if MAKERS.search(word):
             told.append(f"{key} {said[key]} is a camera and no model of distortion, not read")
         elif word:
             models.add(word.rpartition(".")[2].removeprefix("rs2_distortion_"))
