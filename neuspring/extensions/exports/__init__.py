@@ -1,8 +1,7 @@
 """A twin in the formats of other tools. README.md here is the page for users.
 
 A format is a file of `formats/` with its `export`; an installed package brings one by an entry point of `neuspring.exports`.
-`source`
-is the run or twin that is exported, `cable` a rod as MuJoCo's chain of bodies, `newton_twin` the script that is exported.
+`source` is the run or twin that is exported, `cable` a rod as a chain of rigid edges, `newton_twin` the script that is exported.
 """
 
 from __future__ import annotations

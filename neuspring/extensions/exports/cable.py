@@ -1,4 +1,4 @@
-"""A rod as a chain of MuJoCo's bodies, one per edge. Its plugin for cables has left MuJoCo, and knew one stiffness of the whole.
+"""A rod as a chain of rigid edges, and as MuJoCo's bodies. Its plugin for cables is gone, and knew one stiffness of the whole.
 
 The rest pose of the bodies is the unloaded shape (unloaded curvatures, no twist), the keyframe `start` is frame 0. A body's axes
 are t, m1, m2. Between two edges are three hinges, about t with stiffness GJ / l, about m1 and m2 with EI / l, each with the rod's
@@ -8,7 +8,7 @@ Drag is left out.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -36,10 +36,7 @@ def text(*values: float | np.floating) -> str:
 def add(rod: Rod, root: ET.Element, world: ET.Element, meets: dict[str, Any]) -> None:
     """Add the chain edge0, edge1, ..., a site per node, clamps clamp0 and clamp1, and the keyframe `start` of frame 0."""
     edges, radius = len(rod.lengths), max(radius_of(rod), THICKNESS)
-    spans = (rod.lengths[:-1] + rod.lengths[1:]) / 2
-    bend, twist = rod.bending[1:-1] / spans, rod.twisting[1:-1] / spans
-    frames, rest = _frames(rod), _rest(rod.curvature)
-    share = rod.mass / np.where(np.isin(np.arange(edges + 1), (0, edges)), 1, 2)
+    mass, bend, twist, frames, rest, held = chain_of(rod)
     pose = [*rod.vertices[0], *frames[0].as_quat(scalar_first=True)]
     parent = world
     at: dict[str, Any] = {"pos": text(*rod.vertices[0]), "quat": text(*pose[3:])}
@@ -55,7 +52,7 @@ def add(rod: Rod, root: ET.Element, world: ET.Element, meets: dict[str, Any]) ->
         along: dict[str, Any] = {
             "type": "capsule",
             "fromto": text(0, 0, 0, rod.lengths[j], 0, 0),
-            "mass": text(share[j] + share[j + 1]),
+            "mass": text(mass[j]),
         }
         ET.SubElement(parent, "geom", size=text(radius), **along, **meets)
         for n in np.flatnonzero(rod.edge == j):
@@ -63,11 +60,43 @@ def add(rod: Rod, root: ET.Element, world: ET.Element, meets: dict[str, Any]) ->
             ET.SubElement(parent, "site", name=f"node{n}", pos=text(f * rod.lengths[j], a, b), size=text(radius / 4))
         if j + 1 < edges:
             at = {"pos": text(rod.lengths[j], 0, 0), "quat": text(*rest[j].as_quat(scalar_first=True))}
-    _clamps(rod, root, world, frames)
+    equality = ET.SubElement(root, "equality") if held else root
+    for number, edge in held.items():
+        quat = text(*frames[edge].as_quat(scalar_first=True))
+        ET.SubElement(world, "body", name=f"clamp{number}", pos=text(*rod.vertices[edge]), quat=quat, mocap="true")
+        ET.SubElement(equality, "weld", body1=f"clamp{number}", body2=f"edge{edge}", relpose="0 0 0 1 0 0 0", **WELD)
     ET.SubElement(ET.SubElement(root, "keyframe"), "key", name="start", qpos=text(*pose))
 
 
-def _frames(rod: Rod) -> Rotation:
+class Chain(NamedTuple):
+    """A rod as rigid edges with springs of joints between them."""
+
+    mass: np.ndarray
+    """Of each edge [E], kg: that of its vertices, which others share."""
+    bend: np.ndarray
+    """EI / l of each joint [E - 1], N m."""
+    twist: np.ndarray
+    """GJ / l of each joint [E - 1], N m."""
+    frames: Rotation
+    """Axes t, m1, m2 of each edge in frame 0 [E]."""
+    rest: Rotation
+    """Turn from each edge to the next without moments [E - 1]."""
+    held: dict[int, int]
+    """End that is clamped, 0 or 1 -> its edge."""
+
+
+def chain_of(rod: Rod) -> Chain:
+    """The edges and joints of a rod."""
+    edges = len(rod.lengths)
+    share = rod.mass / np.where(np.isin(np.arange(edges + 1), (0, edges)), 1, 2)
+    spans = rod.spans[1:-1]
+    ends = {0: (0, rod.held[:2]), 1: (edges - 1, rod.held[-2:])}
+    held = {end: edge for end, (edge, hands) in ends.items() if (hands >= 0).all()}
+    bend, twist = rod.bending[1:-1] / spans, rod.twisting[1:-1] / spans
+    return Chain(share[:-1] + share[1:], bend, twist, frames_of(rod), _rest(rod.curvature), held)
+
+
+def frames_of(rod: Rod) -> Rotation:
     """The axes t, m1, m2 of each edge in frame 0."""
     m1, along = frame_zero(rod)[0], np.diff(rod.vertices, axis=0)
     t = along / np.linalg.norm(along, axis=1, keepdims=True)
@@ -79,16 +108,3 @@ def _rest(curvature: np.ndarray) -> Rotation:
     k = np.stack([np.zeros(len(curvature) - 2), -curvature[1:-1, 1], curvature[1:-1, 0]], axis=1)
     size = np.linalg.norm(k, axis=1, keepdims=True)
     return Rotation.from_rotvec(2 * np.arctan(size / 2) * k / np.maximum(size, 1e-12))
-
-
-def _clamps(rod: Rod, root: ET.Element, world: ET.Element, frames: Rotation) -> None:
-    """A mocap body at each end that is held: with the place of the end's first vertex and the axes of its edge."""
-    last = len(rod.lengths) - 1
-    ends = {0: (rod.held[:2] >= 0).all(), last: (rod.held[-2:] >= 0).all()}
-    equality = ET.SubElement(root, "equality") if any(ends.values()) else root
-    for number, (edge, held) in enumerate(ends.items()):
-        if held:
-            quat = text(*frames[edge].as_quat(scalar_first=True))
-            ET.SubElement(world, "body", name=f"clamp{number}", pos=text(*rod.vertices[edge]), quat=quat, mocap="true")
-            pose = "0 0 0 1 0 0 0"
-            ET.SubElement(equality, "weld", body1=f"clamp{number}", body2=f"edge{edge}", relpose=pose, **WELD)

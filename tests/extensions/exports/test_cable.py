@@ -18,28 +18,33 @@ from tests.support.played import rod_results
 
 HANGING = 0.03
 """Of the sag: MuJoCo's edges are rigid bodies with a mass along them, ours have it at their ends, and clamps are soft there.
-Measured: 0.021."""
+Measured: 0.021; in Newton, of the largest motion, 0.007 to 0.018."""
+SWINGING = 0.05
+"""Of the largest motion, in Newton, of a cable whose end is moved. Measured: 0.024."""
 
 
 def source_of(tmp_path, **options):
     return read_source(rod_results(tmp_path, **options) / "rod" / "0")
 
 
-def hanging(tmp_path, **rod):
-    """A cable that swings from a level plane down between its clamps, as a source, and its nodes once it hangs still."""
-    seen = ropes.cable(frames=200, sag=2.0)
+def hanging(tmp_path, frames=200, move=(0.0, 0.0, 0.0), **rod):
+    """A cable that swings from a level plane down between its clamps, one of which moves, as a source with its motion."""
+    seen = ropes.cable(frames=frames, sag=2.0, move=move)
     level = {name: getattr(seen, name)[..., [0, 2, 1]] + [0, 0, 1] for name in ("object_points", "controller_points")}
     seen = replace(seen, **level)
-    settings = replace(ropes.SETTINGS, rod=replace(ropes.ROD, bending=0.002, twisting=0.002, drag=8.0, stretching=1e5, **rod))
-    ropes.twin(seen, settings).save(tmp_path / "twin.npz")
-    source = read_source(tmp_path / "twin.npz")
-    return source, roll_out(source.twin, seen.controller_points).positions[-1]
+    start = {"bending": 0.002, "twisting": 0.002, "drag": 8.0, "stretching": 1e5} | rod
+    twin = ropes.twin(seen, replace(ropes.SETTINGS, rod=replace(ropes.ROD, **start)))
+    twin.save(tmp_path / "twin.npz")
+    hands, positions = seen.controller_points, roll_out(twin, seen.controller_points).positions
+    moved = {"positions": positions, "hands": hands, "holds": np.ones(hands.shape[:2], bool), "frames": np.arange(frames)}
+    return replace(read_source(tmp_path / "twin.npz"), **moved)
 
 
 @pytest.mark.parametrize("rest", ["straight", "first_frame"])
 def test_a_cable_hangs_between_its_clamps_in_mujoco_as_here(tmp_path, rest):
     mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (extra `export`)")
-    source, ours = hanging(tmp_path, rest=rest)
+    source = hanging(tmp_path, rest=rest)
+    ours = source.positions[-1]
     model = mujoco.MjModel.from_xml_string(mujoco_format.mjcf(source))
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
@@ -92,9 +97,45 @@ def test_arrays_are_described_and_the_format_says_that_it_is_a_rod(tmp_path):
     assert sizes["V"] == 10 == sizes["E"] + 1
 
 
-def test_newton_is_refused_with_the_next_move(tmp_path):
-    with pytest.raises(InputError, match=r"nodes and springs.*rod.*mujoco"):
+STIFF = {"bending": 0.2, "twisting": 0.2, "rest": "first_frame"}
+SWINGS = {"drag": 1.0, "rest": "first_frame"}
+
+
+@pytest.mark.parametrize(
+    ("markers", "move", "rod", "limit"),
+    [(7, 0.0, {}, HANGING), (7, 0.0, STIFF, HANGING), (13, 0.0, STIFF, HANGING), (7, 0.002, SWINGS, SWINGING)],
+    ids=["hangs", "stiff", "more edges", "swings"],
+)
+def test_a_cable_hangs_and_swings_in_newton_as_here(tmp_path, monkeypatch, markers, move, rod, limit):
+    """Its solver ends its iterations before joints are stiff, and lets a beam fall, where steps are too long."""
+    pytest.importorskip("newton", reason="newton is not installed (extra `synthetic`)")
+    from neuspring.extensions.exports import newton_twin
+
+    monkeypatch.setattr(ropes, "MARKERS", markers)
+    source = hanging(tmp_path, 31, (-move, move, 2 * move), **rod)
+    newton.write(source, range(31), tmp_path / "out")
+    theirs, ours = newton_twin.simulate(tmp_path / "out", 30), source.positions
+    apart = np.linalg.norm(theirs - ours, axis=2)
+    assert apart[-1].max() < limit * np.abs(ours[-1] - ours[0]).max()
+
+
+def test_bodies_in_newton_weigh_what_the_rod_weighs(tmp_path):
+    """Newton's own capsules have two round ends each, and a rod of more edges would weigh more; what is clamped stays."""
+    pytest.importorskip("newton", reason="newton is not installed (extra `synthetic`)")
+    from neuspring.extensions.exports import newton_twin
+
+    source = hanging(tmp_path, 2)
+    newton.write(source, range(2), tmp_path / "out")
+    mass = np.array(newton_twin.build(tmp_path / "out").body_mass)
+    inner = source.twin.rod.mass[2:-2].sum() + source.twin.rod.mass[[1, -2]].sum() / 2
+    assert mass.sum() == pytest.approx(inner) and mass[[0, -1]].tolist() == [0, 0]
+
+
+def test_what_newton_cannot_do_is_refused_with_the_next_move(tmp_path):
+    with pytest.raises(InputError, match=r"a rod that hands pull by springs.*--to mujoco"):
         newton.write(source_of(tmp_path), range(2), tmp_path / "out")
+    with pytest.raises(InputError, match=r"steps of 0.0001 s or more.*needs .*e-0. s.*--to mujoco"):
+        newton.write(hanging(tmp_path, 3, bending=200.0), range(2), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

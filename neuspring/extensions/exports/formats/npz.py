@@ -85,13 +85,19 @@ def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Pat
         "equations": [" ".join(paragraph.split()) for paragraph in body.equations.strip().split("\n\n")],
     }
 
-    def save(path: Path) -> None:
-        with path.open("wb") as stream:
-            np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
-
-    write_atomically(output / ARRAYS_FILE, save)
+    save_arrays(output / ARRAYS_FILE, arrays)
     write_text(output / DESCRIPTION_FILE, json.dumps(text, indent=1, allow_nan=False) + "\n")
     return [output / DESCRIPTION_FILE, output / ARRAYS_FILE]
+
+
+def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write arrays as a compressed npz, atomically."""
+
+    def save(temporary: Path) -> None:
+        with temporary.open("wb") as stream:
+            np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+
+    write_atomically(path, save)
 
 
 def arrays_of(source: ExportSource, frames: Sequence[int]) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:

@@ -38,7 +38,7 @@ def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Pat
 
 def unit_quaternions(splats: Splats) -> np.ndarray:
     """Orientations of norm 1 [N, 4], w first: not every reader brings them there."""
-    return splats.quaternions / np.linalg.norm(splats.quaternions, axis=1, keepdims=True)
+    return np.asarray(splats.quaternions / np.linalg.norm(splats.quaternions, axis=1, keepdims=True))
 
 
 def points(source: ExportSource, frame: int) -> np.ndarray:
