@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from neuspring.core.errors import InputError
 from neuspring.core.extras import needed
 from neuspring.data.camera import Lens
-from neuspring.extensions.make_capture.feeds import Paired
+from neuspring.extensions.make_capture.feeds import Paired, names_of
 from neuspring.extensions.make_capture.formats import CaptureFormat, Kind, Recorded, require_kind
 from neuspring.extensions.make_capture.moments import Series
 
@@ -412,9 +412,7 @@ def open_bags(paths: Sequence[Path], cameras: Sequence[str] = (), topics: Sequen
         raise InputError("--topics", rule, f"{len(topics)} topics", "--list prints them.")
     bags = [Bag(path) for path in paths]
     chosen = list(zip(bags * len(pairs) if len(bags) == 1 else bags, pairs * len(bags) if len(pairs) == 1 else pairs, strict=True))
-    names = cameras or tuple(map(str, range(len(chosen))))
-    if len(set(names)) != len(chosen) or len(names) != len(chosen):
-        raise InputError("--cameras", f"{len(chosen)} different names are required", " ".join(names))
+    names = names_of(len(chosen), cameras)
     return Recorded(views=[_camera(bag, pair, name) for (bag, pair), name in zip(chosen, names, strict=True)])
 
 
