@@ -90,6 +90,14 @@ class Paired:
         return self.color.files([left for left, _ in pairs]) + deep
 
 
+def names_of(count: int, given: Sequence[str]) -> Sequence[str]:
+    """Names of so many cameras: 0, 1, 2, ... where none is given. Raises InputError."""
+    names = given or tuple(map(str, range(count)))
+    if len(names) != count or len(set(names)) < count:
+        raise InputError("--cameras", f"{count} different names are required", " ".join(names))
+    return names
+
+
 def pairs(colors: Sequence[Path], depths: Sequence[Path], names: Sequence[str] = ()) -> list[CameraFeed]:
     """The views of folders or videos, one of color and one of depth per camera; without depths color alone, of one camera.
 
@@ -101,9 +109,7 @@ def pairs(colors: Sequence[Path], depths: Sequence[Path], names: Sequence[str] =
     if not colors or (depths and len(colors) != len(depths)):
         rule = "as many folders or videos of depth as of color are required, one each per camera"
         raise InputError("--color, --depth", rule, f"{len(colors)} of color, {len(depths)} of depth")
-    names = names or tuple(map(str, range(len(colors))))
-    if len(names) != len(colors) or len(set(names)) < len(names):
-        raise InputError("--cameras", f"{len(colors)} different names are required", " ".join(names))
+    names = names_of(len(colors), names)
     deep: list[ImageSource | None] = [open_images(depth, "depth") for depth in depths]
     return [
         Paired(name, open_images(color, "color"), depth) for name, color, depth in zip(names, colors, deep or [None], strict=True)

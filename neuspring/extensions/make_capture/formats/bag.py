@@ -1,12 +1,15 @@
-"""A recording of ROS: a ROS 1 .bag, as librealsense writes them too, a ROS 2 folder, or one .mcap or .db3 file, read by rosbags.
+"""A recording of ROS: a ROS 1 .bag, a ROS 2 folder, or one .mcap or .db3 file, read by rosbags.
 
 Pictures are those of a topic, in the order of the stamps in their headers, which alone say when they were taken: the times of the
-log say when they arrived. Messages are read by ROS's own definitions, not by the bag's: some bags define a part of their types, and
-librealsense's images have four bytes more than the bag defines, their unit of depth.
+log say when they arrived. Messages are read by ROS's own definitions, not by the bag's: some bags define a part of their types.
+
+librealsense (.bag up to 2.57, then .db3) departs from it: images of a .bag have four bytes more than the bag defines, their unit of
+depth; the stamps of a .db3 are times of the log, and text beside the images has the camera's; depth is not aligned to color.
 """
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -22,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from neuspring.core.errors import InputError
 from neuspring.core.extras import needed
 from neuspring.data.camera import Lens
-from neuspring.extensions.make_capture.feeds import Paired
+from neuspring.extensions.make_capture.feeds import Paired, names_of
 from neuspring.extensions.make_capture.formats import CaptureFormat, Kind, Recorded, require_kind
 from neuspring.extensions.make_capture.moments import Series
 
@@ -54,10 +57,13 @@ ENCODINGS = {
 DECODED = {("uint8", 1): "mono8", ("uint8", 3): "bgr8", ("uint8", 4): "bgra8", ("uint16", 1): "16uc1"}
 """What OpenCV makes of JPEG and PNG: type and channels -> encoding."""
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-READ = (IMAGE, COMPRESSED, "sensor_msgs/msg/CameraInfo", "geometry_msgs/msg/Transform", "std_msgs/msg/Float32")
+INFO, TEXT = "sensor_msgs/msg/CameraInfo", "std_msgs/msg/String"
+READ = (IMAGE, COMPRESSED, INFO, TEXT, "geometry_msgs/msg/Transform", "std_msgs/msg/Float32")
 """Types of messages."""
 TRANSPORT = struct.Struct("<iff")
 """What compressedDepth has before its PNG: a number, and A and B of depth = A / (count - B), for floating point."""
+CAPTURED, NUMBER = re.compile(r"(?:^|;)timestamp=([0-9.]+)"), re.compile(r"-?[0-9.]+(?:e-?[0-9]+)?")
+"""Of librealsense's text: ms of an image, and the numbers of a transform, by columns."""
 GAP = 0.3
 """Pixels. Noise of depth parts areas that are neighbors in another view: a gap is filled from as far as this."""
 SINCE_1970 = 1e9
@@ -183,7 +189,20 @@ class Bag:
             message, end = definition.deserialize_ros1(raw, 0, definition.cls, self._types)
             yield message, raw[end:]
 
-    def first(self, beside: str, suffix: str) -> Any:
+    def stamps(self, topic: str) -> list[int]:
+        """When the images of a topic were taken, ns; 0: not said. Raises InputError."""
+        beside = topic.partition("/image/data")[0] + "/image/metadata"
+        if beside not in self.topics or self.topics[beside].kind != TEXT:
+            stamps = [message.header.stamp for message, _ in self.messages(topic)]
+            return [stamp.sec * 10**9 + stamp.nanosec for stamp in stamps]
+        said = [CAPTURED.search(message.data) for message, _ in self.messages(beside)]
+        times = [round(1e6 * float(one[1])) for one in said if one]
+        if len(times) != self.topics[topic].count:
+            rule = f"a timestamp in {beside} is required for each image, {self.topics[topic].count}"
+            raise InputError(self.path, rule, len(times), "Export it with librealsense, and give folders.")
+        return times
+
+    def first(self, beside: str, suffix: str = "") -> Any:
         """The first message of the topic that begins and ends so; None without any."""
         named = (one.first for name, one in self.topics.items() if name.startswith(beside) and name.lower().endswith(suffix))
         return next(named, None)
@@ -232,7 +251,8 @@ class Bag:
         """The lens by the camera_info beside a topic of images, or one level above; None without any, or uncalibrated."""
         near = topic.rpartition("/")[0]
         places = [f"{folder}{inside}/camera_info" for folder in (near, near.rpartition("/")[0]) for inside in ("", "/info")]
-        message = next((self.topics[name].first for name in places if name in self.topics), None)
+        known = (self.topics[name] for name in places if name in self.topics)
+        message = next((one.first for one in known if one.kind == INFO), None)
         if message is None:
             return None
         said = {name.lower(): value for name, value in vars(message).items()}  # K of ROS 1 is k of ROS 2
@@ -267,8 +287,7 @@ class Topic:
     @cached_property
     def _order(self) -> list[tuple[int, int]]:
         """Stamp, ns, and place in the log, in the order of stamps: each is one image. Without stamps, 0 and that of the log."""
-        stamps = [message.header.stamp for message, _ in self.bag.messages(self.name)]
-        listed = [(stamp.sec * 10**9 + stamp.nanosec, place) for place, stamp in enumerate(stamps)]
+        listed = [(stamp, place) for place, stamp in enumerate(self.bag.stamps(self.name))]
         if max(stamp for stamp, _ in listed) <= 0:
             return [(0, place) for _, place in listed]
         return sorted({stamp: (stamp, place) for stamp, place in reversed(listed)}.values())
@@ -355,12 +374,12 @@ def _camera(bag: Bag, topics: Sequence[str], name: str) -> Paired:
     """One camera. What librealsense records is not aligned: it is moved into the view of color. Raises InputError."""
     color, depth = bag.pair(topics)
     lens, encoding = bag.lens(color), ENCODINGS.get(bag.images[depth][0])
-    streams = [topic.removesuffix("/image/data") for topic in (color, depth)]
-    said, more = bag.first(streams[1].rpartition("/")[0] + "/option/", "/depth units/value"), bag.topics[depth].more
+    streams = [topic.partition("/image/data")[0] for topic in (color, depth)]
+    said, more = bag.first(streams[1].rpartition("/")[0] + "/option/", "units/value"), bag.topics[depth].more
     told = struct.unpack("<f", more)[0] if len(more) == 4 else said.data if said else 0.0
     # A float of 32 bits: 0.001 is 0.0010000000475.
     unit = round(float(told), 9) or (encoding.unit if encoding else None)
-    motions = [_motion(bag.first(f"{stream}/tf/", "0")) for stream in streams]
+    motions = [_motion(bag.first(f"{stream}/tf/")) for stream in streams]
     onto, deep = None, bag.lens(depth)
     if lens is not None and deep is not None and unit and all(motion is not None for motion in motions):
         if deep.distortion.any():
@@ -371,10 +390,15 @@ def _camera(bag: Bag, topics: Sequence[str], name: str) -> Paired:
 
 
 def _motion(message: Any) -> Any:
-    """[4, 4] of a transform; None of none."""
+    """[4, 4] of a transform, as a message or in words; None of none."""
     if message is None:
         return None
-    motion, turn, shift = np.eye(4), message.rotation, message.translation
+    motion = np.eye(4)
+    if hasattr(message, "data"):
+        numbers = [float(number) for number in NUMBER.findall(message.data)]
+        motion[:3, :3], motion[:3, 3] = np.reshape(numbers[:9], (3, 3)).T, numbers[9:]
+        return motion
+    turn, shift = message.rotation, message.translation
     motion[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
     motion[:3, 3] = shift.x, shift.y, shift.z
     return motion
@@ -388,9 +412,7 @@ def open_bags(paths: Sequence[Path], cameras: Sequence[str] = (), topics: Sequen
         raise InputError("--topics", rule, f"{len(topics)} topics", "--list prints them.")
     bags = [Bag(path) for path in paths]
     chosen = list(zip(bags * len(pairs) if len(bags) == 1 else bags, pairs * len(bags) if len(pairs) == 1 else pairs, strict=True))
-    names = cameras or tuple(map(str, range(len(chosen))))
-    if len(set(names)) != len(chosen) or len(names) != len(chosen):
-        raise InputError("--cameras", f"{len(chosen)} different names are required", " ".join(names))
+    names = names_of(len(chosen), cameras)
     return Recorded(views=[_camera(bag, pair, name) for (bag, pair), name in zip(chosen, names, strict=True)])
 
 
