@@ -144,11 +144,11 @@ def test_arrays_of_splats_have_a_value_per_splat(stage):
     stand_in = UsdGeom.Points.Get(layer, "/Twin/SplatPoints")
     for attribute in (field.GetOpacitiesAttr(), field.GetRadianceSphericalHarmonicsCoefficientsAttr(), stand_in.GetWidthsAttr()):
         usd.require_lengths(field, stand_in, 0)
-        whole = attribute.Get()
-        attribute.Set(whole[:-1])
+        whole = attribute.Get(0)
+        attribute.Set(whole[:-1], 0)
         with pytest.raises(InputError, match=re.escape(str(attribute.GetPath()))):
             usd.require_lengths(field, stand_in, 0)
-        attribute.Set(whole)
+        attribute.Set(whole, 0)
 
 
 def test_frames_of_other_splats_are_not_written(tmp_path, monkeypatch):

@@ -15,7 +15,7 @@ from neuspring.extensions.make_capture.feeds import Paired
 from neuspring.extensions.make_capture.formats import CaptureFormat, Recorded
 from neuspring.extensions.make_capture.formats.folder import ImageFolder
 from neuspring.extensions.make_capture.forms import read_lenses
-from neuspring.intake.points import read_hands, read_nodes
+from neuspring.intake.points import read_nodes
 from tests.support.desk import write_folders
 
 
@@ -64,7 +64,6 @@ EXR, GLB, C3D = b"\x76\x2f\x31\x01\x02\0\0\0", b"glTF\x02\0\0\0", b"\x02\x50" + 
         ("0.exr", EXR, lambda path: formats.open_images(path, "depth"), ("an OpenEXR image", "pip install OpenEXR")),
         ("body.glb", GLB, read_nodes, ("a binary glTF model", "trimesh.load('a.glb', force='mesh')")),
         ("body.npz", GLB, read_nodes, ("a binary glTF model", "trimesh.load('a.glb', force='mesh')")),
-        ("hands.c3d", C3D, read_hands, ("a C3D file", "Read it by ezc3d")),
         ("k.json", C3D, lambda path: read_lenses(path, ["0"]), ("a C3D file", "Read it by ezc3d")),
     ],
 )
