@@ -216,6 +216,21 @@ def on_images(points: np.ndarray, camera: Camera) -> np.ndarray:
     return rows
 
 
+def follows(hands: np.ndarray, points: np.ndarray) -> Shift | None:
+    """The shift of points of a body [T, K, 3], m, NaN: unknown, against hands [T, C, 3] that move it, by their mean speeds.
+
+    A body may move later than hands; one that moves before them is of other moments. None where it does not.
+    """
+
+    def speed(places: np.ndarray) -> np.ndarray:
+        steps, known = np.linalg.norm(np.diff(places, axis=0), axis=2), np.full((len(places), 1), np.nan)
+        known[1:, 0] = [np.mean(row[np.isfinite(row)]) if np.isfinite(row).any() else np.nan for row in steps]
+        return known
+
+    shift = measure(speed(hands), speed(points))
+    return shift if shift and shift.frames < 0 else None
+
+
 @dataclass(frozen=True, eq=False)
 class Streams:
     """Two streams of one scene, and their shift."""

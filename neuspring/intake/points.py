@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 
 from neuspring.checks import examine
 from neuspring.checks.space import SAME, Holding
+from neuspring.checks.timing import Streams, follows
 from neuspring.config import Config, ScenarioRow
 from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.errors import InputError
@@ -132,6 +133,9 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
         start = held(hands, annotated, capture.train_end)[0]
         holding = Holding(grouped, hands.held(capture.train_end), start, nodes, np.concatenate([nodes, first]))
         findings += examine("holding", file, holding)
+        if (shift := follows(hands.points, annotated)) and shift.wrong:
+            rows = "Row 0 of the points is row {back} of the hands: leave out the rows before that."
+            findings += examine("streams", marked, [Streams("the hands", "the annotated points", shift, rows)])
     return InSpace(hands, nodes, tracks, annotated), findings
 
 

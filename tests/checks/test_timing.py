@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from neuspring.checks import examine
-from neuspring.checks.timing import CELLS, Streams, Watched, in_space, measure, of_cameras, on_images
+from neuspring.checks.timing import CELLS, Streams, Watched, follows, in_space, measure, of_cameras, on_images
 from neuspring.data.camera import Camera
 from tests.support import desk
 from tests.support.desk import RADIUS, TARGET, K, seen
@@ -88,3 +88,14 @@ def test_points_in_space_are_compared_with_the_film():
     assert abs(measure(one.color, on_images(points, camera())).frames) < 0.5
     late = measure(one.color[2:], on_images(points, camera())[:-2])
     assert late.wrong and late.frames == pytest.approx(2, abs=0.5)
+
+
+@pytest.mark.parametrize(("early", "found"), [(0, None), (12, -12), (-12, None)])
+def test_a_body_that_moves_before_the_hands_is_of_other_moments(early, found):
+    lift = 0.12 * np.clip((np.arange(60)[:, None, None] - 20) / 25, 0, 1) ** 2
+    hands = np.tile((0.2, 0.0, 0.0), (60, 4, 1)) + lift * (0, 0, 1)
+    points = np.linspace(0, 0.2, 6)[None, :, None] * (1, 0, 0) + lift * (0, 0, 1) * np.linspace(0.1, 1, 6)[None, :, None]
+    points = np.roll(points, -early, axis=0)
+    shift = follows(hands, points)
+    assert bool(shift and shift.wrong) == (found is not None)
+    assert found is None or shift.frames == pytest.approx(found, abs=0.5)
