@@ -139,8 +139,8 @@ class Watched:
         """The next frame: RGB [H, W, 3] uint8, depth [H, W], m, 0: none, labels [H, W]."""
         scale = min(1.0, WIDE / color.shape[1])
         size = round(scale * color.shape[1]), round(scale * color.shape[0])
-        picture = cv2.resize(np.ascontiguousarray(color), size, interpolation=cv2.INTER_AREA).astype(np.float32)
-        picture = cv2.GaussianBlur(picture, (0, 0), 1.0)
+        small = cv2.resize(np.ascontiguousarray(color), size, interpolation=cv2.INTER_AREA)
+        picture = cv2.GaussianBlur(small.astype(np.float32), (0, 0), 1.0)
         near = None if depth is None else cv2.resize(depth.astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
         labels = None if mask is None else cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
         last, self._last = self._last, (frame, picture, near, labels)

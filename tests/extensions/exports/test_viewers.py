@@ -129,7 +129,7 @@ def test_newton_reads_the_splats_of_frame_0_where_no_time_is_asked_for(stage):
 
 def test_newton_imports_the_stage(stage):
     newton = pytest.importorskip("newton", reason="newton is not installed (extra `synthetic`)")
-    pytest.importorskip("newton_usd_schemas", reason="newton-usd-schemas is not installed (pip; no extra has it)")
+    pytest.importorskip("newton_usd_schemas", reason="newton-usd-schemas is not installed (extra `dev`)")
     builder = newton.ModelBuilder()
     builder.add_usd(stage[0])
     assert builder.shape_label == ["/Twin/Splats"]
