@@ -200,7 +200,10 @@ class Rig:
 
     @property
     def off_center(self) -> dict[str, float]:
-        """How far principal points are from the centers of images, 1: as far as cameras have them."""
+        """How far principal points are from the centers of images, 1: as far as cameras have them; 0 where several cameras agree."""
+        compared = any(one["value"] is not None for one in self.views) and self.disagreement <= 1
+        if compared and max(self.standing.values(), default=2.0) <= 1:
+            return dict.fromkeys(self.cameras, 0.0)
         return {
             name: float(np.abs(camera.intrinsics[:2, 2] / (camera.width - 1, camera.height - 1) - 0.5).max() / OFF_CENTER)
             for name, camera in self.cameras.items()
@@ -281,11 +284,10 @@ class Explained:
 
 def explain(rig: Rig, sides: Sequence[str] | None = None) -> Explained | None:
     """The one change that makes a rig right; None where it is right, or nothing does. `sides` that may be up, both by default."""
-    flatter = rig.taken(DISTANCE) if rig.depths else None
-    if flatter is not None and flatter.flat() > max(FLATTER * rig.flat(), rig.flat() + FLAT_SHARE):
-        looks = (
-            f"{DISTANCE.looks}: turned into that, one plane has {flatter.flat():.0%} of the pixels, and {rig.flat():.0%} without"
-        )
+    along = rig.taken(DISTANCE)
+    flat, flatter = rig.flat(), along.flat() if along else 0.0
+    if flatter > max(FLATTER * flat, flat + FLAT_SHARE):
+        looks = f"{DISTANCE.looks}: turned into that, one plane has {flatter:.0%} of the pixels, and {flat:.0%} without"
         return Explained("distance", tuple(rig.cameras), looks, f"--take {DISTANCE.name}")
     found = [
         (round(other.cost(), 1), number, replace(one, up="" if side == rig.up else side))

@@ -122,6 +122,18 @@ def test_without_poses_only_lens_and_depth_can_be_told(right):
     assert warned.level == "warning"
 
 
+def test_intrinsics_of_a_part_of_an_image_are_right_where_cameras_agree(right):
+    cameras = {
+        name: replace(one, width=one.width - 60, intrinsics=one.intrinsics - [[0, 0, 60], [0, 0, 0], [0, 0, 0]])
+        for name, one in right.cameras.items()
+    }
+    depths = {name: [depth[:, 60:] for depth in listed] for name, listed in right.depths.items()}
+    part = Rig(cameras, depths, {name: depth[:, 60:] for name, depth in right.first.items()})
+    assert explain(part) is None
+    assert {one.name for one in examine("rig", "x", Judged.of(part, {}))} == {"table"}
+    assert explain(alone(part)).what == "lens"
+
+
 def test_a_resized_lens_keeps_its_view():
     matrix, size = np.array([[600.0, 0, 319.5], [0, 610.0, 179.5], [0, 0, 1]]), (320, 180)
     np.testing.assert_allclose(resized(matrix, size), np.diag([0.5, 0.5, 1]) @ matrix)
