@@ -41,6 +41,8 @@ STRAIGHT_ABOVE = 20.0
 """Degrees from straight above, within which a camera has no upper side."""
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """From OpenCV's axes of a camera to OpenGL's, where y is up and z points backward."""
+ROS_BODY = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""From OpenCV's axes of a camera to those of ROS's camera_link: x forward, y to the left, z up."""
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """From a world with y up to one with z up."""
 OFF_CENTER = 0.12
@@ -122,6 +124,12 @@ TURN = f"ultiply it from the left by {Y_UP.astype(int).tolist()}"
 POSES = (
     Hypothesis(name=INVERSE, looks="a world-to-camera matrix. Invert it", pose=rigid_inverse),
     Hypothesis(name=AXES, looks=f"a matrix for OpenGL's axes (y up, z backward). {SIGNS}", pose=lambda pose: pose @ OPENGL),
+    Hypothesis(
+        name="ros_body",
+        looks="a pose of ROS's camera_link (x forward, y left, z up). Take the optical frame, or multiply it from the right by "
+        f"{ROS_BODY.astype(int).tolist()}",
+        pose=lambda pose: pose @ ROS_BODY,
+    ),
     Hypothesis(
         name=f"{INVERSE}+{AXES}",
         looks=f"a world-to-camera matrix for OpenGL's axes (y up, z backward). Invert it, then c{SIGNS[1:]}",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from neuspring.checks import examine
-from neuspring.checks.rig import HYPOTHESES, OPENGL, Y_UP, Judged, Rig, along_axis, explain, levelling, resized
+from neuspring.checks.rig import HYPOTHESES, OPENGL, ROS_BODY, Y_UP, Judged, Rig, along_axis, explain, levelling, resized
 from neuspring.core.geometry import rigid_inverse
 from tests.support.filmed import film
 
@@ -62,6 +62,7 @@ FAULTS = {
     "inverse+opengl": lambda rig: with_poses(rig, lambda pose: OPENGL @ rigid_inverse(pose)),
     "y_up": lambda rig: with_poses(rig, lambda pose: Y_UP.T @ pose),
     "y_up+opengl": lambda rig: with_poses(rig, lambda pose: Y_UP.T @ pose @ OPENGL),
+    "ros_body": lambda rig: with_poses(rig, lambda pose: pose @ ROS_BODY.T),
     "distance": lambda rig: with_depth(rig, distances),
     "lens_resized": lambda rig: with_lenses(rig, larger(1.5)),
     "lens_turned": lambda rig: with_lenses(rig, lambda matrix: matrix[[1, 0, 2]][:, [1, 0, 2]]),
