@@ -208,7 +208,7 @@ class Rig:
 
     @property
     def off_center(self) -> dict[str, float]:
-        """How far principal points are from the centers of images, 1: as far as cameras have them; 0 where several cameras agree."""
+        """How far principal points are from the centers of images, 1: as far as cameras have them; 0 where cameras agree."""
         compared = any(one["value"] is not None for one in self.views) and self.disagreement <= 1
         if compared and max(self.standing.values(), default=2.0) <= 1:
             return dict.fromkeys(self.cameras, 0.0)
