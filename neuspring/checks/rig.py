@@ -66,7 +66,7 @@ class Hypothesis:
     name: str
     """For `make-capture --take`; empty: another option applies it."""
     looks: str
-    """What the data look like, with the next move."""
+    """The thing that the data look like, with the next move."""
     lens: Callable[[np.ndarray, tuple[int, int]], np.ndarray | None] | None = None
     """K [3, 3] and (width, height) of the images -> the K that is meant; None: this cannot be."""
     depth: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
@@ -112,16 +112,16 @@ def cropped(intrinsics: np.ndarray, size: tuple[int, int]) -> np.ndarray | None:
     return middle if (np.array(lens_of(intrinsics, size)) >= size).all() else None
 
 
-LENSES = (
+LENS_MEANINGS = (
     Hypothesis(name="lens_resized", looks="intrinsics of images of another size, which were only resized", lens=resized),
     Hypothesis(name="lens_turned", looks="intrinsics of an image that was turned by a quarter since", lens=turned),
     Hypothesis(name="lens_cropped", looks="intrinsics of a larger image, of which this is the middle", lens=cropped),
 )
 DISTANCE = Hypothesis(name="distance", looks="the distance to the camera instead of depth along its axis", depth=along_axis)
-INVERSE, AXES, UPRIGHT = "inverse", "opengl", "y_up"
+INVERSE, AXES, Y_UPWARD = "inverse", "opengl", "y_up"
 SIGNS = "Change the signs of its second and third column"
 TURN = f"ultiply it from the left by {Y_UP.astype(int).tolist()}"
-POSES = (
+POSE_MEANINGS = (
     Hypothesis(name=INVERSE, looks="a world-to-camera matrix. Invert it", pose=rigid_inverse),
     Hypothesis(name=AXES, looks=f"a matrix for OpenGL's axes (y up, z backward). {SIGNS}", pose=lambda pose: pose @ OPENGL),
     Hypothesis(
@@ -135,20 +135,20 @@ POSES = (
         looks=f"a world-to-camera matrix for OpenGL's axes (y up, z backward). Invert it, then c{SIGNS[1:]}",
         pose=lambda pose: rigid_inverse(pose) @ OPENGL,
     ),
-    Hypothesis(name=UPRIGHT, looks=f"a pose in a world with y up. M{TURN}", pose=lambda pose: Y_UP @ pose),
+    Hypothesis(name=Y_UPWARD, looks=f"a pose in a world with y up. M{TURN}", pose=lambda pose: Y_UP @ pose),
     Hypothesis(
-        name=f"{UPRIGHT}+{AXES}",
+        name=f"{Y_UPWARD}+{AXES}",
         looks=f"a pose in a world with y up, for OpenGL's axes. {SIGNS}, then m{TURN}",
         pose=lambda pose: Y_UP @ pose @ OPENGL,
     ),
     Hypothesis(
-        name=f"{INVERSE}+{UPRIGHT}",
+        name=f"{INVERSE}+{Y_UPWARD}",
         looks=f"a world-to-camera matrix of a world with y up. Invert it, then m{TURN}",
         pose=lambda pose: Y_UP @ rigid_inverse(pose),
     ),
 )
-HYPOTHESES = {one.name: one for one in (*LENSES, DISTANCE, *POSES)}
-"""What --take applies, by name."""
+MEANINGS = {one.name: one for one in (*LENS_MEANINGS, DISTANCE, *POSE_MEANINGS)}
+"""The hypotheses that --take applies, by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +185,7 @@ class Rig:
 
     @cached_property
     def standing(self) -> dict[str, float]:
-        """How far each camera's table is from level at z = 0, 1: as far as a change that explains a finding may leave it."""
+        """Distance of each camera's table from level at z = 0, 1: as far as a change that explains a finding may leave it."""
         found = {}
         for name, camera in self.cameras.items():
             if name in self.stands:
@@ -208,7 +208,7 @@ class Rig:
 
     @property
     def off_center(self) -> dict[str, float]:
-        """How far principal points are from the centers of images, 1: as far as cameras have them; 0 where cameras agree."""
+        """Distance of principal points from the centers of images, 1: as cameras have them; 0 where cameras agree."""
         compared = any(one["value"] is not None for one in self.views) and self.disagreement <= 1
         if compared and max(self.standing.values(), default=2.0) <= 1:
             return dict.fromkeys(self.cameras, 0.0)
@@ -282,7 +282,7 @@ class Explained:
     """Cameras that it changes."""
     looks: str
     option: str
-    """Of make-capture; empty where there is none."""
+    """An option of make-capture; empty where there is none."""
     factor: float = 1.0
     up: str = ""
     """Up with it, where that is another."""
@@ -325,7 +325,7 @@ def _candidates(rig: Rig) -> Iterator[tuple[Explained, Rig]]:
         if rig.posed and any(rig.depths.values()):
             for factor in FACTORS:
                 yield Explained("unit", names, f"{factor:g} times", "--depth-unit", factor), rig.scaled(factor, names)
-        for hypothesis in (*LENSES, *(POSES if rig.posed else ())):
+        for hypothesis in (*LENS_MEANINGS, *(POSE_MEANINGS if rig.posed else ())):
             off = hypothesis.lens is None or any(rig.off_center[name] > 1 for name in names)
             if off and (other := rig.taken(hypothesis, names)):
                 what = "pose" if hypothesis.lens is None else "lens"
@@ -540,7 +540,7 @@ def wrong_view(view: CameraAlone) -> dict[str, Any] | None:
     rule, received, possible = view.wrong
     alike = [
         f"{one.looks}{'' if up == view.up else ', and set up to ' + up}"
-        for one in POSES
+        for one in POSE_MEANINGS
         for up in (view.up, other_side(view.up))
         for meant in [one.camera(view.camera)]
         if meant and not replace(view, camera=meant, up=up).wrong

@@ -32,7 +32,7 @@ class Stand:
     """Height of its points above z = 0 along up, m."""
 
     def away(self, height: float) -> float:
-        """How far it is from z = 0, 1: as far as EXPLAINED; `height` is the camera's above the plane, m."""
+        """Its distance from z = 0, 1: as far as EXPLAINED; `height` is the camera's above the plane, m."""
         return max(self.tilt / EXPLAINED[0], abs(self.off) / max(EXPLAINED[1], EXPLAINED[1] * height))
 
 

@@ -23,17 +23,17 @@ import numpy as np
 from neuspring.core.checks import Check
 from neuspring.data.camera import Camera, depth_noise
 
-WIDE, CELLS = 320, (24, 14)
+WATCHED_WIDE, CELLS = 320, (24, 14)
 """Width, pixels, at which pictures are compared, and cells across and down."""
-COLOR_NOISE, COLOR_MOST = 6.0, 30.0
+COLOR_STILL, COLOR_MOST = 6.0, 30.0
 """Change of a color value that is noise, and beyond which more says nothing."""
-DEPTH_NOISE = 4.0
+DEPTH_STILL = 4.0
 """Change of depth that is noise, in standard deviations of a sensor; beyond 5 times as much more says nothing."""
 FEWEST = 8
 """Steps that both streams must have."""
 AGREE = 0.25
 """Correlation from which two streams show the same motion. Real and rendered recordings have 0.5 to 0.85, two cameras 0.4."""
-HALF, WHOLE = 0.5, 0.75
+HALF, MENDABLE = 0.5, 0.75
 """Frames: a shift that is a finding, as is how far a clear one may move without a quarter of the time; and one that whole frames
 mend."""
 QUARTERS = 4
@@ -46,7 +46,7 @@ class Shift:
     """Shift in time of a stream against another."""
 
     frames: float
-    """How many frames later the second shows what the first shows."""
+    """Frames by which the second shows what moves later than the first."""
     agreement: float
     """c at the shift."""
     spread: float
@@ -137,7 +137,7 @@ class Watched:
 
     def see(self, frame: int, color: np.ndarray, depth: np.ndarray | None = None, mask: np.ndarray | None = None) -> None:
         """The next frame: RGB [H, W, 3] uint8, depth [H, W], m, 0: none, labels [H, W]."""
-        scale = min(1.0, WIDE / color.shape[1])
+        scale = min(1.0, WATCHED_WIDE / color.shape[1])
         size = round(scale * color.shape[1]), round(scale * color.shape[0])
         small = cv2.resize(np.ascontiguousarray(color), size, interpolation=cv2.INTER_AREA)
         picture = cv2.GaussianBlur(small.astype(np.float32), (0, 0), 1.0)
@@ -146,10 +146,10 @@ class Watched:
         last, self._last = self._last, (frame, picture, near, labels)
         if last is None or last[0] != frame - 1:
             return
-        change = np.clip(np.abs(picture - last[1]).max(axis=-1) - COLOR_NOISE, 0, COLOR_MOST).astype(np.float32)
+        change = np.clip(np.abs(picture - last[1]).max(axis=-1) - COLOR_STILL, 0, COLOR_MOST).astype(np.float32)
         self.color[frame] = _cells(change)
         if near is not None and last[2] is not None:
-            both, noise = (near > 0) & (last[2] > 0), DEPTH_NOISE * depth_noise(np.maximum(near, 0.1))
+            both, noise = (near > 0) & (last[2] > 0), DEPTH_STILL * depth_noise(np.maximum(near, 0.1))
             moved = np.where(both, np.clip(np.abs(near - last[2]) / noise - 1, 0, 5), 0).astype(np.float32)
             self.depth[frame] = _cells(cv2.medianBlur(moved, 3))
             # What is uncovered lies behind what moved.
@@ -255,7 +255,7 @@ def out_of_step(pairs: Sequence[Streams]) -> Iterator[dict[str, Any]]:
         frames, whole = streams.shift.frames, streams.moved + round(streams.shift.frames)
         next_move = (streams.late if frames > 0 else streams.early or streams.late).format(frames=whole, back=-whole)
         told = {"value": round(frames, 2), "text": streams.shift.text(streams.one, streams.other)}
-        if abs(frames) < WHOLE:
+        if abs(frames) < MENDABLE:
             told |= {"level": "warning"}
             next_move = "Whole frames do not mend it: synchronize the streams when they are filmed."
         yield told | {"next": next_move}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from neuspring.checks import examine
-from neuspring.checks.rig import HYPOTHESES, OPENGL, ROS_BODY, Y_UP, Judged, Rig, along_axis, explain, levelling, resized
+from neuspring.checks.rig import MEANINGS, OPENGL, ROS_BODY, Y_UP, Judged, Rig, along_axis, explain, levelling, resized
 from neuspring.core.geometry import rigid_inverse
 from tests.support.filmed import film
 
@@ -75,7 +75,7 @@ def test_a_fault_is_named_with_the_option_that_mends_it(right, name, cameras):
     rig = FAULTS[name](right if cameras == 3 else alone(right))
     found = explain(rig)
     assert found.option == f"--take {name}" and found.names == tuple(rig.cameras)
-    mended = rig.taken(HYPOTHESES[name])
+    mended = rig.taken(MEANINGS[name])
     assert mended.right and explain(mended) is None
 
 

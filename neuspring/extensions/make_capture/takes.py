@@ -1,4 +1,4 @@
-"""What `--take` says that the data of cameras mean: hypotheses of `neuspring.checks.rig`, applied to what is read."""
+"""The option `--take`: hypotheses of `neuspring.checks.rig` on what data of cameras mean, applied to what is read."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from neuspring.checks.rig import HYPOTHESES, Hypothesis
+from neuspring.checks.rig import MEANINGS, Hypothesis
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Lens
 
-ORDER = "order="
+ORDER_TAKEN = "order="
 
 
 @dataclass(frozen=True)
@@ -23,20 +23,26 @@ class Takes:
 
     @classmethod
     def read(cls, given: Sequence[str], names: Sequence[str]) -> Takes:
-        """Of options such as `distance`, `inverse+opengl:0,2`, `order=2,1,0`. Raises InputError."""
+        """From options such as `distance`, `inverse+opengl:0,2`, `order=2,1,0`. Raises InputError."""
         of: dict[str, tuple[Hypothesis, ...]] = dict.fromkeys(names, ())
         order = dict(zip(names, names, strict=True))
         for text in given:
             what, _, listed = text.partition(":")
-            meant = text.removeprefix(ORDER).split(",") if text.startswith(ORDER) else listed.split(",") if listed else list(names)
-            if set(meant) - set(names) or (text.startswith(ORDER) and sorted(meant) != sorted(names)):
+            meant = (
+                text.removeprefix(ORDER_TAKEN).split(",")
+                if text.startswith(ORDER_TAKEN)
+                else listed.split(",")
+                if listed
+                else list(names)
+            )
+            if set(meant) - set(names) or (text.startswith(ORDER_TAKEN) and sorted(meant) != sorted(names)):
                 raise InputError("--take", f"cameras {' '.join(names)} are there", text)
-            if text.startswith(ORDER):
+            if text.startswith(ORDER_TAKEN):
                 order = dict(zip(names, meant, strict=True))
-            elif what in HYPOTHESES:
-                of |= {name: (*of[name], HYPOTHESES[what]) for name in meant}
+            elif what in MEANINGS:
+                of |= {name: (*of[name], MEANINGS[what]) for name in meant}
             else:
-                rule = f"one of {' '.join(HYPOTHESES)} is required, with :CAMERA,... for some alone, or {ORDER}CAMERA,..."
+                rule = f"one of {' '.join(MEANINGS)} is required, with :CAMERA,... for some alone, or {ORDER_TAKEN}CAMERA,..."
                 raise InputError("--take", rule, text)
         return cls(of, order)
 
