@@ -28,16 +28,11 @@ class Takes:
         order = dict(zip(names, names, strict=True))
         for text in given:
             what, _, listed = text.partition(":")
-            meant = (
-                text.removeprefix(ORDER_TAKEN).split(",")
-                if text.startswith(ORDER_TAKEN)
-                else listed.split(",")
-                if listed
-                else list(names)
-            )
-            if set(meant) - set(names) or (text.startswith(ORDER_TAKEN) and sorted(meant) != sorted(names)):
+            ordered = text.startswith(ORDER_TAKEN)
+            meant = text.removeprefix(ORDER_TAKEN).split(",") if ordered else listed.split(",") if listed else list(names)
+            if set(meant) - set(names) or (ordered and sorted(meant) != sorted(names)):
                 raise InputError("--take", f"cameras {' '.join(names)} are there", text)
-            if text.startswith(ORDER_TAKEN):
+            if ordered:
                 order = dict(zip(names, meant, strict=True))
             elif what in MEANINGS:
                 of |= {name: (*of[name], MEANINGS[what]) for name in meant}
