@@ -26,9 +26,9 @@ from neuspring.data import capture
 from neuspring.data.c3d import Markers, is_c3d, plain_file
 from neuspring.data.camera import Camera, CameraEntry, Lens
 from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Capture, Description, Writer, description_findings
-from neuspring.extensions.make_capture.feeds import Paired, pairs
+from neuspring.extensions.make_capture.feeds import Paired, Recorded
 from neuspring.extensions.make_capture.film import cameras_in_step, in_step, looked_at, watch
-from neuspring.extensions.make_capture.formats import CameraFeed, Recorded, open_recording
+from neuspring.extensions.make_capture.formats import open_recording, pairs
 from neuspring.extensions.make_capture.formats.bag import open_bags
 from neuspring.extensions.make_capture.forms import read_lenses, read_poses
 from neuspring.extensions.make_capture.lenses import Board, Straightener
@@ -45,7 +45,6 @@ from neuspring.extensions.make_capture.poses import (
     look,
     meters_of,
     plain,
-    require_aligned,
     stand,
     stored_as,
     straightened,
@@ -113,7 +112,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     for option, name in (("--name", intake.called), *(("--cameras", view.name) for view in views)):
         if not NAME_FORM.fullmatch(name):
             raise InputError(option, "letters, digits, '.', '_' and '-' are required, a letter or digit first", repr(name))
-    if all(isinstance(view, Paired) and view.depth is None for view in views):
+    if all(view.depth is None for view in views):
         _require_for_color_alone(intake)
     elif intake.pose:
         raise InputError("--pose", "is for color alone: depth shows how the object is", intake.pose, "Leave it out.")
@@ -122,7 +121,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
         remedy = "Leave it out. To learn from the case's own, write tracks: train in capture.json then."
         raise InputError(option, "a case in PhysTwin's raw layout brings annotated points of its own", "both", remedy)
     late = shifts(intake.shift, views)
-    views = [replace(view, late=late.get(f"{view.name}.depth", 0)) if isinstance(view, Paired) else view for view in views]
+    views = [replace(view, late=late.get(f"{view.name}.depth", 0)) for view in views]
     film = replace(film, views=views)
     choice = choose(views, intake.frames, late)
     findings = looked_at(views, choice)
@@ -135,7 +134,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     listed = read_lenses(intake.intrinsics, names) if intake.intrinsics else {}
     takes = Takes.read(intake.take, names)
     seen, unit = look(views, choice, listed, intake.intrinsics, intake.depth_unit, takes)
-    watched = watch(views, choice, seen, unit)
+    watched = watch(views, choice, unit)
     findings += in_step(views, watched, late)
     refuse_errors(findings)
     for name, view in seen.items():
@@ -178,10 +177,10 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
 SHIFT_FORM = re.compile(r"(.+)=([+-]?\d{1,5})")
 
 
-def shifts(given: Sequence[str], views: Sequence[CameraFeed]) -> dict[str, int]:
+def shifts(given: Sequence[str], views: Sequence[Paired]) -> dict[str, int]:
     """Pictures that streams are late, by name, of options such as `0.depth=1`. Raises InputError."""
     names = [view.name for view in views]
-    known = [*(f"{view.name}.depth" for view in views if isinstance(view, Paired) and view.depth is not None), *names[1:]]
+    known = [*(f"{view.name}.depth" for view in views if view.depth is not None), *names[1:]]
     late = {}
     for text in given:
         match = SHIFT_FORM.fullmatch(text)
@@ -318,14 +317,13 @@ def _write(
     kinds: tuple[Literal["color", "depth"], ...] = ("color",) if unit is None else ("color", "depth")
     progress = Progress(f"make-capture {made.name}", sum(len(places) for places in choice.places.values()))
     for view in film.views:
-        straight, size = Straightener(seen[view.name].lens, seen[view.name].size), seen[view.name].size
+        straight = Straightener(seen[view.name].lens, seen[view.name].size)
         places = dict(sorted(choice.places[view.name].items()))
         if begun:
             there = [f for f in places if all(writer.capture.path(kind, view.name, f).is_file() for kind in kinds)]
             done += len(there[:-1])  # the last may be half written
             places = {frame: place for frame, place in places.items() if frame not in there[:-1]}
         for frame, (color, depth) in zip(places, view.read(list(places.values())), strict=True):
-            require_aligned(view.path, view.name, color, depth, size)
             stored = None
             if depth is not None and unit is not None:
                 kind = stored_as(depth)

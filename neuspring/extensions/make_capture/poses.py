@@ -21,8 +21,8 @@ from neuspring.core.findings import Finding, refuse_errors
 from neuspring.data.camera import Camera, Lens, Plane
 from neuspring.data.capture import FEWEST_FRAMES
 from neuspring.data.planes import cloud
-from neuspring.extensions.make_capture.feeds import Paired
-from neuspring.extensions.make_capture.formats import CameraFeed, Pair, open_images
+from neuspring.extensions.make_capture.feeds import Pair, Paired
+from neuspring.extensions.make_capture.formats import open_images
 from neuspring.extensions.make_capture.lenses import Board, Straightener, depth_ratio, require_lens, sight
 from neuspring.extensions.make_capture.moments import MISSING_GAP, Match, matched
 from neuspring.extensions.make_capture.table import Unit, find_table, find_unit, pose_on
@@ -74,7 +74,7 @@ def chosen(wanted: str, numbers: Sequence[int]) -> list[int]:
     return sorted(kept)
 
 
-def choose(views: Sequence[CameraFeed], wanted: str = "", late: Mapping[str, int] | None = None) -> FrameChoice:
+def choose(views: Sequence[Paired], wanted: str = "", late: Mapping[str, int] | None = None) -> FrameChoice:
     """The frames of all cameras that are kept, numbered as those of the first; with cameras moved that are `late`, in frames.
 
     See `moments.matched` for which frames of others belong to them. A number that one camera has and another lacks is a missing
@@ -83,9 +83,8 @@ def choose(views: Sequence[CameraFeed], wanted: str = "", late: Mapping[str, int
     first = views[0]
     where, pairing = {first.name: {number: place for place, number in enumerate(first.series.numbers)}}, dict[str, Match]()
     for view in views[1:]:
-        numbered = isinstance(view, Paired) and view.numbered
         names = f"camera {first.name}", f"camera {view.name}"
-        found = matched(view.path, names, first.series, view.series, numbered)
+        found = matched(view.path, names, first.series, view.series, view.numbered)
         pairing[view.name] = found.moved((late or {}).get(view.name, 0), len(view.series.numbers))
         where[view.name] = pairing[view.name].places
     numbers = sorted({number for of in where.values() for number in of})
@@ -126,7 +125,7 @@ class SampledCamera:
 
 
 def look(
-    views: Sequence[CameraFeed],
+    views: Sequence[Paired],
     choice: FrameChoice,
     listed: Mapping[str, Lens],
     file: Path | None,
@@ -147,10 +146,9 @@ def look(
         if lens is None:
             remedy = "Give a JSON file with fx, fy, cx, cy."
             raise InputError("--intrinsics", f"intrinsics of camera {view.name} are required", "none", remedy)
-        color, depth = samples[view.name][0]
-        require_aligned(view.path, view.name, color, depth)
-        lenses[view.name] = lens = takes.lens(view.name, lens, (color.shape[1], color.shape[0]))
-        require_lens(file or view.path, view.name, lens, (color.shape[1], color.shape[0]))
+        size = _size_of(samples[view.name])
+        lenses[view.name] = takes.lens(view.name, lens, size)
+        require_lens(file or view.path, view.name, lenses[view.name], size)
     depths = [depth for pairs in samples.values() for _, depth in pairs if depth is not None]
     if len({stored_as(depth) for depth in depths}) > 1:
         raise InputError("--depth", "all depth images must be of one kind, 16-bit integers or another", "both")
@@ -167,12 +165,9 @@ def look(
     return {view.name: straightened(view, samples[view.name], lenses[view.name], unit, takes) for view in views}, unit
 
 
-def straightened(view: CameraFeed, pairs: Sequence[Pair], lens: Lens, unit: Unit | None, takes: Takes) -> SampledCamera:
-    """Pairs of one camera, without distortion and in meters; `unit` is None with color alone. Raises InputError where their sizes
-    differ."""
-    size = (pairs[0][0].shape[1], pairs[0][0].shape[0])
-    for color, depth in pairs:
-        require_aligned(view.path, view.name, color, depth, size)
+def straightened(view: Paired, pairs: Sequence[Pair], lens: Lens, unit: Unit | None, takes: Takes) -> SampledCamera:
+    """Pairs of one camera, without distortion and in meters; `unit` is None with color alone."""
+    size = _size_of(pairs)
     straight = Straightener(lens, size)
     colors = [straight.color(color) for color, _ in pairs]
     if unit is None:
@@ -182,16 +177,9 @@ def straightened(view: CameraFeed, pairs: Sequence[Pair], lens: Lens, unit: Unit
     return SampledCamera(view.path, size, lens, colors, meters, unit.meters if stored_as(depths[0]) == "png" else None)
 
 
-def require_aligned(
-    where: Path, name: str, color: np.ndarray, depth: np.ndarray | None, size: tuple[int, int] | None = None
-) -> None:
-    """Raise InputError unless depth, where there is any, has the size of color, which is `size`."""
-    if depth is not None and color.shape[:2] != depth.shape:
-        received = f"{depth.shape[1]} x {depth.shape[0]} for {color.shape[1]} x {color.shape[0]}"
-        remedy = "Let the camera's software align depth to color (RealSense: rs.align; ROS: aligned_depth_to_color)."
-        raise InputError(where, f"camera {name}: depth must be aligned to color, pixel by pixel", received, remedy)
-    if size is not None and color.shape[1::-1] != size:
-        raise InputError(where, f"camera {name}: all images must be {size[0]} x {size[1]}", f"{color.shape[1]} x {color.shape[0]}")
+def _size_of(pairs: Sequence[Pair]) -> tuple[int, int]:
+    """(width, height)."""
+    return pairs[0][0].shape[1], pairs[0][0].shape[0]
 
 
 def stored_as(depth: np.ndarray) -> str:

@@ -14,7 +14,7 @@ from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
 from neuspring.core.geometry import rigid_inverse
 from neuspring.data.capture import CAPTURE, OBJECT, Capture
-from neuspring.extensions.make_capture.feeds import pairs
+from neuspring.extensions.make_capture.formats import pairs
 from neuspring.extensions.make_capture.make import Intake, make_capture
 from neuspring.intake.check import check_layout
 from neuspring.perception import segment_opencv

@@ -25,8 +25,8 @@ from scipy.spatial.transform import Rotation
 from neuspring.core.errors import InputError
 from neuspring.core.extras import needed
 from neuspring.data.camera import Lens
-from neuspring.extensions.make_capture.feeds import Paired, names_of
-from neuspring.extensions.make_capture.formats import CaptureFormat, Kind, Recorded, require_kind
+from neuspring.extensions.make_capture.feeds import Kind, Paired, Recorded, names_of
+from neuspring.extensions.make_capture.formats import CaptureFormat, require_kind
 from neuspring.extensions.make_capture.moments import Series
 
 
