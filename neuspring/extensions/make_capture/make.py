@@ -62,10 +62,8 @@ def opened(intake: Intake) -> Recorded:
         raise InputError("make-capture", rule, " ".join(given) or "none")
     if intake.bag:
         return open_bags(intake.bag, intake.cameras, intake.topics)
-    if intake.phystwin_raw:
-        return open_recording((intake.phystwin_raw,), "phystwin_raw", intake.cameras)
-    if intake.recording:
-        return open_recording(intake.recording, intake.format, intake.cameras)
+    if paths := (intake.phystwin_raw,) if intake.phystwin_raw else intake.recording:
+        return open_recording(paths, "phystwin_raw" if intake.phystwin_raw else intake.format, intake.cameras)
     return Recorded(views=pairs(intake.color, intake.depth, intake.cameras) if intake.color else ())
 
 

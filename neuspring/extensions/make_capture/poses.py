@@ -295,7 +295,7 @@ def by_board(board: Board, seen: Seen, images: Sequence[Path]) -> tuple[Poses, l
         pictures = _pictures(path, view) if images else view.colors
         sighting = sight(path, board, pictures, view.lens.matrix)
         poses[name] = sighting.camera_to_world
-        line = f"board, camera {name}: {sighting.corners} corners, {sighting.error:.2f} pixels rms"
+        line = f"board, camera {name}: {len(sighting.pixels)} corners, {sighting.error:.2f} pixels rms"
         if view.depths and not images:
             ratios = [ratio for depth in view.depths if (ratio := depth_ratio(sighting, depth))]
             ratio = float(np.median(ratios)) if ratios else 1.0
