@@ -19,7 +19,7 @@ from neuspring.checks.things import sampled
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.core.findings import Finding, refuse_errors
-from neuspring.data.camera import Camera, Lens, Plane
+from neuspring.data.camera import Camera, Lens
 from neuspring.data.capture import FEWEST_FRAMES
 from neuspring.data.planes import cloud
 from neuspring.extensions.make_capture.feeds import Pair, Paired, Recorded
@@ -314,19 +314,11 @@ def stand(poses: Poses, seen: Seen, file: Path, level: bool, top_down: bool, up:
     `up` is that of the source; None: +z where the world is moved, else the side on which the cameras are. Raises InputError where
     the table is elsewhere, with what explains it; see `plausible`.
     """
-    clouds = {name: cloud(view.depths, view.lens.matrix) for name, view in seen.items()}
-    moved, motion, lines, tables = dict(poses), np.eye(4), list[str](), dict[str, Plane]()
-    for name, view in seen.items():
-        try:
-            # A world that is to be moved may have any axes: up is then that of the image.
-            upright = None if level else poses[name]
-            tables[name] = find_table(view.path, clouds[name], pose=upright, top_down=top_down)[0]
-            lines.append(f"table, camera {name}: {tables[name].text()}")
-        except InputError as error:
-            if level:
-                raise
-            lines.append(f"warning: {error}")
+    moved, motion, lines = poses, np.eye(4), list[str]()
     if level:
+        # A world that is to be moved may have any axes: up is then that of the image.
+        clouds = {name: cloud(view.depths, view.lens.matrix) for name, view in seen.items()}
+        tables = {name: find_table(view.path, clouds[name], top_down=top_down)[0] for name, view in seen.items()}
         normal, point, rms = common_plane(tables, poses)
         up = up or "+z"
         motion = levelling(normal, point, up_sign(up))
@@ -336,8 +328,9 @@ def stand(poses: Poses, seen: Seen, file: Path, level: bool, top_down: bool, up:
         lines.append(f"leveled: the world was turned by {turn:.1f} degrees; {rise}")
     rig = rig_of(seen, moved)
     side = up or min(("+z", "-z"), key=lambda each: sum(rig.with_up(each).standing.values()))
-    lines += _judged("rig", file, Judged.of(rig.with_up(side), units_of(seen), of_file=False))
-    text = "; ".join(f"camera {name}: {plane.text()}" for name, plane in tables.items())
+    rig = rig.with_up(side)
+    lines += _judged("rig", file, Judged.of(rig, units_of(seen), of_file=False))
+    text = "; ".join(f"camera {name}: {plane.text()}" for name, (plane, _) in rig.stands.items())
     return Placed(poses=moved, up=side, motion=motion, table=text or "not found", lines=tuple(lines))
 
 
