@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from neuspring.checks import examine
-from neuspring.checks.timing import Streams, Watched, measure, of_cameras
+from neuspring.checks.timing import Shift, Streams, Watched, measure, of_cameras
 from neuspring.core.checks import Check
 from neuspring.core.errors import InputError
 from neuspring.core.findings import Finding
@@ -45,17 +45,16 @@ def watch(views: Sequence[Paired], choice: FrameChoice, unit: Unit | None) -> di
     return watched
 
 
-def in_step(views: Sequence[Paired], watched: Mapping[str, Watched], given: Collection[str]) -> list[Finding]:
-    """Color against depth of every camera, by what moves. `given` are streams that --shift names.
+def in_step(views: Sequence[Paired], watched: Mapping[str, Watched], late: Mapping[str, int]) -> list[Finding]:
+    """Color against depth of every camera, by what moves. `late` are streams that --shift names.
 
     Raises InputError where names can be read in two ways and nothing moves that says which is right.
     """
     pairs = []
     for view in views:
         if view.depth is not None:
-            shift, stream = measure(watched[view.name].color, watched[view.name].depth), f"{view.name}.depth"
-            pair = Streams(f"color {view.name}", f"depth {view.name}", shift, SHIFT.format(stream), moved=view.late)
-            pairs.append(_required(view.path, pair, view.match, stream, stream in given))
+            shift, names = measure(watched[view.name].color, watched[view.name].depth), (f"color {view.name}", f"depth {view.name}")
+            pairs.append(_streams(view.path, names, f"{view.name}.depth", shift, view.match, late))
     return examine("streams", "--shift", pairs)
 
 
@@ -65,21 +64,19 @@ def cameras_in_step(
     """Cameras against the first, by what moves in space. Raises InputError as `in_step`."""
     shifts, pairs = of_cameras(maps) if maps else {}, []
     for view in views[1:]:
-        own = late.get(view.name, 0)
-        pair = Streams(f"camera {views[0].name}", f"camera {view.name}", shifts.get(view.name), SHIFT.format(view.name), moved=own)
-        pairs.append(_required(view.path, pair, choice.pairing[view.name], view.name, view.name in late))
+        names, match = (f"camera {views[0].name}", f"camera {view.name}"), choice.pairing[view.name]
+        pairs.append(_streams(view.path, names, view.name, shifts.get(view.name), match, late))
     return examine("streams", "--shift", pairs)
 
 
-SHIFT = "Give --shift {}={{frames}}."
-
-
-def _required(where: Path, pair: Streams, match: Match, stream: str, settled: bool) -> Streams:
-    if match.rival and not settled and not (pair.shift and pair.shift.known):
-        rule = f"{pair.one} and {pair.other} have as many pictures with the same gaps, and too little moves to tell which are of "
+def _streams(
+    where: Path, names: tuple[str, str], stream: str, shift: Shift | None, match: Match, late: Mapping[str, int]
+) -> Streams:
+    if match.rival and stream not in late and not (shift and shift.known):
+        rule = f"{names[0]} and {names[1]} have as many pictures with the same gaps, and too little moves to tell which are of "
         remedy = f"Give --shift {stream}=0 for the order, or --shift {stream}={match.rival} for equal numbers."
         raise InputError(where, f"{rule}one moment", match.by, remedy)
-    return pair
+    return Streams(*names, shift, f"Give --shift {stream}={{frames}}.", moved=late.get(stream, 0))
 
 
 def images_alone(views: Sequence[Paired], choice: FrameChoice) -> Iterator[dict[str, Any]]:

@@ -104,8 +104,7 @@ def choose(views: Sequence[Paired], wanted: str = "", late: Mapping[str, int] | 
             remedy += f"; the first that all have is {start}." if start not in (None, kept[0]) else "."
             raise InputError(view.path, rule, f"{len(places[view.name])} of {len(kept)}", remedy)
     # The rate is that of the files that are there; a number that is not there is a moment that is missing.
-    order = {number: place for place, number in enumerate(numbers)}
-    step = min(order[after] - order[before] for before, after in pairwise(kept))
+    step = int(np.diff(np.searchsorted(numbers, kept)).min())
     gaps = [after - before for before, after in pairwise(kept)]
     jumps = [number for number, gap in zip(kept, gaps, strict=False) if gap > MISSING_GAP * min(gaps)]
     return FrameChoice(kept, places, step, jumps, pairing)
