@@ -2,17 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import repeat
 from pathlib import Path
+from typing import Literal, Protocol, TypeAlias
 
 import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Lens
-from neuspring.extensions.make_capture.formats import CameraFeed, ImageSource, Pair, open_images
 from neuspring.extensions.make_capture.moments import Match, Series, matched
+
+Kind = Literal["color", "depth"]
+Pair: TypeAlias = tuple[np.ndarray, np.ndarray | None]
+"""RGB [H, W, 3] uint8, and depth [H, W] as stored; None: color alone."""
+
+
+class ImageSource(Protocol):
+    """Pictures of one kind, in the order of time."""
+
+    @property
+    def path(self) -> Path:
+        """For messages."""
+
+    @property
+    def kind(self) -> Kind:
+        """The kind of all of them."""
+
+    @property
+    def series(self) -> Series:
+        """When every picture was taken."""
+
+    def read(self, places: Sequence[int]) -> Iterator[np.ndarray]:
+        """RGB [H, W, 3] uint8, or depth [H, W] as stored, at ascending places. Raises InputError."""
+
+    def files(self, places: Sequence[int]) -> list[Path]:
+        """The files that hold them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,12 +103,20 @@ class Paired:
         }
 
     def read(self, places: Sequence[int]) -> Iterator[Pair]:
-        """With depth all of them, or none."""
-        pairs = [self._pairs[place] for place in places]
+        """The pairs at ascending places, all of one size, with depth all of them or none. Raises InputError."""
+        pairs, size = [self._pairs[place] for place in places], None
         colors = self.color.read([left for left, _ in pairs])
-        if self.depth is None:
-            return zip(colors, [None] * len(pairs), strict=True)
-        return zip(colors, self.depth.read([right for _, right in pairs]), strict=True)
+        depths = repeat(None, len(pairs)) if self.depth is None else self.depth.read([right for _, right in pairs])
+        for color, depth in zip(colors, depths, strict=True):
+            if depth is not None and color.shape[:2] != depth.shape:
+                received = f"{depth.shape[1]} x {depth.shape[0]} for {color.shape[1]} x {color.shape[0]}"
+                remedy = "Let the camera's software align depth to color (RealSense: rs.align; ROS: aligned_depth_to_color)."
+                raise InputError(self.path, f"camera {self.name}: depth must be aligned to color, pixel by pixel", received, remedy)
+            width, height = size = size or (color.shape[1], color.shape[0])
+            if color.shape[:2] != (height, width):
+                rule = f"camera {self.name}: all images must be {width} x {height}"
+                raise InputError(self.path, rule, f"{color.shape[1]} x {color.shape[0]}")
+            yield color, depth
 
     def files(self, places: Sequence[int]) -> list[Path]:
         """Those of color, then those of depth."""
@@ -98,19 +133,20 @@ def names_of(count: int, given: Sequence[str]) -> Sequence[str]:
     return names
 
 
-def pairs(colors: Sequence[Path], depths: Sequence[Path], names: Sequence[str] = ()) -> list[CameraFeed]:
-    """The views of folders or videos, one of color and one of depth per camera; without depths color alone, of one camera.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Recorded:
+    """All that cameras gave, and what came along."""
 
-    Raises InputError.
-    """
-    if len(colors) > 1 and not depths:
-        rule = "without depth one camera is required: color alone is of one view"
-        raise InputError("--color", rule, len(colors), "Give one folder or video, or --depth for each.")
-    if not colors or (depths and len(colors) != len(depths)):
-        rule = "as many folders or videos of depth as of color are required, one each per camera"
-        raise InputError("--color, --depth", rule, f"{len(colors)} of color, {len(depths)} of depth")
-    names = names_of(len(colors), names)
-    deep: list[ImageSource | None] = [open_images(depth, "depth") for depth in depths]
-    return [
-        Paired(name, open_images(color, "color"), depth) for name, color, depth in zip(names, colors, deep or [None], strict=True)
-    ]
+    views: Sequence[Paired]
+    rate: float | None = None
+    """Frames per second, where it is known apart from the views."""
+    up: Literal["+z", "-z"] | None = None
+    """Up of its poses; None: found by the table."""
+    train_end: int | None = None
+    """End of the training frames, of all its frames."""
+    tracks: np.ndarray | None = None
+    """[T, K, 3], m, in its world: annotated points."""
+    labels: Callable[[str, int], np.ndarray] | None = None
+    """Camera and number of a frame -> mask [H, W] uint8; None: no masks. Raises InputError."""
+    require_masks: Callable[[dict[str, list[int]]], None] = lambda numbers: None
+    """Raises InputError unless there are masks of the frames, by number, of each camera."""

@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from neuspring.checks import examine
-from neuspring.checks.timing import Streams, Watched, measure, of_cameras
+from neuspring.checks.timing import Shift, Streams, Watched, measure, of_cameras
 from neuspring.core.checks import Check
 from neuspring.core.errors import InputError
 from neuspring.core.findings import Finding
 from neuspring.core.text import Progress
 from neuspring.extensions.make_capture.feeds import Paired
-from neuspring.extensions.make_capture.formats import CameraFeed
 from neuspring.extensions.make_capture.formats.video import VideoFile
 from neuspring.extensions.make_capture.moments import DEPARTURE, MISSING_SHARE, Evenness, Match, spans
-from neuspring.extensions.make_capture.poses import FrameChoice, SampledCamera, meters_of, plain, require_aligned
+from neuspring.extensions.make_capture.poses import FrameChoice, meters_of, plain
 from neuspring.extensions.make_capture.table import Unit
 
 
-def looked_at(views: Sequence[CameraFeed], choice: FrameChoice) -> list[Finding]:
+def looked_at(views: Sequence[Paired], choice: FrameChoice) -> list[Finding]:
     """All findings about the feeds of all cameras and the frames that are kept."""
     return [found for check in FILM for found in check.findings("--frames", views, choice)]
 
@@ -31,9 +30,7 @@ MOST_WATCHED = 240
 """Frames of a camera in which motion is looked for."""
 
 
-def watch(
-    views: Sequence[CameraFeed], choice: FrameChoice, seen: Mapping[str, SampledCamera], unit: Unit | None
-) -> dict[str, Watched]:
+def watch(views: Sequence[Paired], choice: FrameChoice, unit: Unit | None) -> dict[str, Watched]:
     """Motion in the first MOST_WATCHED frames of every camera. Raises InputError for images that cannot be read."""
     frames, watched = min(len(choice.numbers), MOST_WATCHED), dict[str, Watched]()
     progress, done = Progress("make-capture: motion", sum(min(len(of), frames) for of in choice.places.values())), 0
@@ -41,7 +38,6 @@ def watch(
         watched[view.name] = Watched(frames)
         places = {frame: place for frame, place in sorted(choice.places[view.name].items()) if frame < frames}
         for frame, (color, depth) in zip(places, view.read([*places.values()]), strict=True):
-            require_aligned(view.path, view.name, color, depth, seen[view.name].size)
             meters = None if depth is None or unit is None else meters_of(plain(depth), unit)
             watched[view.name].see(frame, color, meters)
             done += 1
@@ -49,66 +45,63 @@ def watch(
     return watched
 
 
-def in_step(views: Sequence[CameraFeed], watched: Mapping[str, Watched], given: Collection[str]) -> list[Finding]:
-    """Color against depth of every camera, by what moves. `given` are streams that --shift names.
+def in_step(views: Sequence[Paired], watched: Mapping[str, Watched], late: Mapping[str, int]) -> list[Finding]:
+    """Color against depth of every camera, by what moves. `late` are streams that --shift names.
 
     Raises InputError where names can be read in two ways and nothing moves that says which is right.
     """
     pairs = []
     for view in views:
-        if isinstance(view, Paired) and view.depth is not None:
-            shift, stream = measure(watched[view.name].color, watched[view.name].depth), f"{view.name}.depth"
-            pair = Streams(f"color {view.name}", f"depth {view.name}", shift, SHIFT.format(stream), moved=view.late)
-            pairs.append(_required(view.path, pair, view.match, stream, stream in given))
+        if view.depth is not None:
+            shift, names = measure(watched[view.name].color, watched[view.name].depth), (f"color {view.name}", f"depth {view.name}")
+            pairs.append(_streams(view.path, names, f"{view.name}.depth", shift, view.match, late))
     return examine("streams", "--shift", pairs)
 
 
 def cameras_in_step(
-    views: Sequence[CameraFeed], choice: FrameChoice, maps: Mapping[str, np.ndarray], late: Mapping[str, int]
+    views: Sequence[Paired], choice: FrameChoice, maps: Mapping[str, np.ndarray], late: Mapping[str, int]
 ) -> list[Finding]:
     """Cameras against the first, by what moves in space. Raises InputError as `in_step`."""
     shifts, pairs = of_cameras(maps) if maps else {}, []
     for view in views[1:]:
-        own = late.get(view.name, 0)
-        pair = Streams(f"camera {views[0].name}", f"camera {view.name}", shifts.get(view.name), SHIFT.format(view.name), moved=own)
-        pairs.append(_required(view.path, pair, choice.pairing[view.name], view.name, view.name in late))
+        names, match = (f"camera {views[0].name}", f"camera {view.name}"), choice.pairing[view.name]
+        pairs.append(_streams(view.path, names, view.name, shifts.get(view.name), match, late))
     return examine("streams", "--shift", pairs)
 
 
-SHIFT = "Give --shift {}={{frames}}."
-
-
-def _required(where: Path, pair: Streams, match: Match, stream: str, settled: bool) -> Streams:
-    if match.rival and not settled and not (pair.shift and pair.shift.known):
-        rule = f"{pair.one} and {pair.other} have as many pictures with the same gaps, and too little moves to tell which are of "
+def _streams(
+    where: Path, names: tuple[str, str], stream: str, shift: Shift | None, match: Match, late: Mapping[str, int]
+) -> Streams:
+    if match.rival and stream not in late and not (shift and shift.known):
+        rule = f"{names[0]} and {names[1]} have as many pictures with the same gaps, and too little moves to tell which are of "
         remedy = f"Give --shift {stream}=0 for the order, or --shift {stream}={match.rival} for equal numbers."
         raise InputError(where, f"{rule}one moment", match.by, remedy)
-    return pair
+    return Streams(*names, shift, f"Give --shift {stream}={{frames}}.", moved=late.get(stream, 0))
 
 
-def images_alone(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[dict[str, Any]]:
+def images_alone(views: Sequence[Paired], choice: FrameChoice) -> Iterator[dict[str, Any]]:
     """Color without depth, or depth without color."""
     for view in views:
-        if isinstance(view, Paired) and (alone := [f"{kind} {spans(numbers)}" for kind, numbers in view.alone.items() if numbers]):
+        if alone := [f"{kind} {spans(numbers)}" for kind, numbers in view.alone.items() if numbers]:
             yield {"where": view.path, "camera": view.name, "text": "; ".join(alone)}
 
 
-def missing_frames(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[dict[str, Any]]:
+def missing_frames(views: Sequence[Paired], choice: FrameChoice) -> Iterator[dict[str, Any]]:
     """Frames that some cameras have and others lack."""
     for view in views:
         if missing := [choice.numbers[frame] for frame in choice.missing(view.name)]:
             yield {"where": view.path, "camera": view.name, "text": spans(missing), "value": len(missing), "frames": missing}
 
 
-def not_by_numbers(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[dict[str, Any]]:
+def not_by_numbers(views: Sequence[Paired], choice: FrameChoice) -> Iterator[dict[str, Any]]:
     """The order in which frames belong together, where numbers in names do not say it."""
-    own = {f"camera {view.name}, color and depth": view.match for view in views if isinstance(view, Paired)}
+    own = {f"camera {view.name}, color and depth": view.match for view in views}
     for names, match in (own | {f"cameras {views[0].name} and {name}": match for name, match in choice.pairing.items()}).items():
         if match.by and not match.by.endswith("numbers in their names"):
             yield {"where": names, "value": match.by}
 
 
-def uneven_time(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[dict[str, Any]]:
+def uneven_time(views: Sequence[Paired], choice: FrameChoice) -> Iterator[dict[str, Any]]:
     """Time stamps that follow no even clock, as of a phone in dim light: a capture has one rate."""
     for view in views:
         times, places = view.series.times, choice.places[view.name]
@@ -128,9 +121,9 @@ def uneven_time(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[di
             yield told | {"level": "warning" if found.missing else "note", "rule": ""}
 
 
-def several_tracks(views: Sequence[CameraFeed], choice: FrameChoice) -> Iterator[dict[str, Any]]:
+def several_tracks(views: Sequence[Paired], choice: FrameChoice) -> Iterator[dict[str, Any]]:
     """A file of which one video track of several is read, unnamed."""
-    for images in (images for view in views if isinstance(view, Paired) for images in view.sources):
+    for images in (images for view in views for images in view.sources):
         if isinstance(images, VideoFile) and images.track is None and len(images.tracks) > 1:
             listed = "; ".join(f"{images.path}#{number} is {text}" for number, text in enumerate(images.tracks))
             yield {"where": images.path, "kind": images.kind, "text": listed, "value": len(images.tracks)}

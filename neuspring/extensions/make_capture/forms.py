@@ -14,7 +14,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -22,14 +22,14 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neuspring.checks.rig import OPENGL
+from neuspring.checks.rig import OFF_CENTER, OPENGL
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
 from neuspring.core.findings import refuse
 from neuspring.core.geometry import rigid_inverse
 from neuspring.data.camera import Lens
 from neuspring.data.capture import TEXT_TOLERANCE, pose_findings
-from neuspring.extensions.make_capture.lenses import COEFFICIENT_COUNTS, MODELS, OFF_CENTER, RATIONAL
+from neuspring.extensions.make_capture.lenses import COEFFICIENT_COUNTS, MODELS, RATIONAL
 
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "taux", "tauy")
 """In OpenCV's order."""
@@ -85,7 +85,7 @@ class PoseForm:
     """True for camera to world."""
     told: str = ""
     """Meaning of its keys, where they do not say it themselves."""
-    axes: np.ndarray | None = None
+    axes: np.ndarray = field(default_factory=lambda: np.eye(4))
     """[4, 4]: from our axes of the camera to those of the form."""
 
 
@@ -156,8 +156,7 @@ def read_poses(path: Path, names: Sequence[str]) -> tuple[dict[str, np.ndarray],
         if distance > FARTHEST_CAMERA:
             remedy = "Divide the last columns by 1000 if they are millimeters, by 100 if they are centimeters."
             raise InputError(path, f"{key}: the position must be in meters", f"one {distance:.4g} m from the origin", remedy)
-        matrix = matrix if forms[0].to_world else rigid_inverse(matrix)
-        poses[name] = matrix if forms[0].axes is None else matrix @ forms[0].axes
+        poses[name] = (matrix if forms[0].to_world else rigid_inverse(matrix)) @ forms[0].axes
         told.append(forms[0].told)
     for key, value in _items(content):
         if _bare(key) == "appliedscale" and value != 1:
@@ -187,15 +186,12 @@ def _spelled(entry: dict[str, Any], key: str) -> Any:
     return next((value for word, value in entry.items() if _bare(word) in wanted), None)
 
 
-def _items(content: Any) -> Iterator[tuple[str, Any]]:
+def _items(content: Any) -> list[tuple[str, Any]]:
     """All keys of a file, and their values."""
-    if isinstance(content, dict):
-        yield from content.items()
-    for inner in content.values() if isinstance(content, dict) else content if isinstance(content, list) else ():
-        yield from _items(inner)
+    return [pair for _, entry in _objects(content) for pair in entry.items()]
 
 
-def _objects(content: Any, is_part: IsPart, place: Place = ()) -> Iterator[tuple[Place, dict[str, Any]]]:
+def _objects(content: Any, is_part: IsPart = lambda entry: False, place: Place = ()) -> Iterator[tuple[Place, dict[str, Any]]]:
     """All objects of a file and their places, outer ones first, and none inside of one that is a part."""
     if isinstance(content, dict):
         yield place, content
@@ -265,18 +261,13 @@ def _lens(path: Path, name: str, entry: Any, unit: float | None) -> Lens:
     inner = _spelled(entry, "K")
     if isinstance(inner, dict) and "data" not in inner:
         entry = {key: value for key, value in entry.items() if READ.get(_bare(key)) != "K"} | inner
-    said, unread, told = dict[str, Any](), list[str](), list[str]()
-    for word, value in entry.items():
-        key = READ.get(_bare(word))
-        if key in said:
-            twice = [word for word in entry if READ.get(_bare(word)) == key]
-            raise InputError(path, f"{where}: one spelling of a key is required", " and ".join(twice), "Remove the others.")
-        if key is not None:
-            said[key] = value
-        elif not _side(word) and _bare(word) not in UNIT_WORDS | QUIET:
-            unread.append(word)
+    spelled = {key: [word for word in entry if READ.get(_bare(word)) == key] for key in LENS_KEYS}
+    if twice := next((words for words in spelled.values() if len(words) > 1), None):
+        raise InputError(path, f"{where}: one spelling of a key is required", " and ".join(twice), "Remove the others.")
+    said = {key: entry[words[0]] for key, words in spelled.items() if words}
     # Of a focal length in millimeters, K is the same in pixels.
-    unread = [key for key in unread if _bare(key) != "focallength" or _spelled(entry, "horizontal_aperture") is None]
+    quiet = {*READ, *UNIT_WORDS, *QUIET, *(() if _spelled(entry, "horizontal_aperture") is None else ["focallength"])}
+    unread = [word for word in entry if _bare(word) not in quiet and not _side(word)]
     several = [key for key in unread if isinstance(entry[key], (list, dict))]
     if telling := [key for key in unread if (TELLING.search(key) or key in several) and not BESIDE_THE_LENS.search(key)]:
         read = [word for words in LENS_KEYS.values() for word in words]
@@ -284,8 +275,7 @@ def _lens(path: Path, name: str, entry: Any, unit: float | None) -> Lens:
         remedy = CONVERSIONS.get(telling[0], f"Is {close[0]} meant? " if close else "")
         remedy += "Remove it if it says nothing about the lens."
         raise InputError(path, f"{where}: the keys that are read are {' '.join(read)}", repr(telling[0]), remedy)
-    told += [f"not read: {' '.join(unread)}"] if unread else []
-    matrices = []
+    told, matrices = [f"not read: {' '.join(unread)}"] if unread else [], []
     if "fx" in said:
         values = [said.get(key) for key in ("fx", "fy", "cx", "cy")]
         matrices.append(_numbers(path, f"{where}: fx, fy, cx, cy", values, ((4,),)))
@@ -355,8 +345,7 @@ def _coefficients(path: Path, where: str, said: dict[str, Any], model: str) -> n
             raise InputError(path, f"{where}: distortion: names {' '.join(COEFFICIENTS)} are required", unknown[0])
         named, listed = named | listed, []
     if not named:
-        counts = sorted({0, *(count for counts in COEFFICIENT_COUNTS.values() for count in counts)})
-        return _numbers(path, f"{where}: distortion", listed, tuple((count,) for count in counts))
+        return _numbers(path, f"{where}: distortion", listed, ((0,), *((count,) for count in COEFFICIENT_COUNTS["opencv"])))
     if np.size(listed):
         rule = f"{where}: coefficients are required in a list or by name, not both"
         raise InputError(path, rule, f"distortion and {next(iter(named))}")
@@ -428,14 +417,13 @@ def _is_pose(value: list[Any]) -> bool:
 
 def _pose_matrix(path: Path, key: str, values: Sequence[Any]) -> np.ndarray:
     """[4, 4] of a matrix, or of a rotation and a translation. Raises InputError."""
+    made = np.eye(4)
     if len(values) == 1:
         matrix = _numbers(path, key, values[0], MATRIX_SHAPES)
         matrix = matrix.reshape(-1, 4) if matrix.ndim == 1 else matrix
-        if matrix.shape == (4, 3):
-            matrix = np.column_stack([matrix, [0.0, 0.0, 0.0, 1.0]])
-        return np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]]) if len(matrix) == 3 else matrix
+        made[: len(matrix), : matrix.shape[1]] = matrix
+        return made
     turn = _numbers(path, key, _plain(values[0]), ROTATION_SHAPES)
-    made = np.eye(4)
     if turn.size == 4:
         made[:3, :3] = Rotation.from_quat(np.roll(turn, -1)).as_matrix()
     else:

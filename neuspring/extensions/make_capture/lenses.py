@@ -179,7 +179,6 @@ class Sighting:
 
     camera_to_world: np.ndarray
     """[4, 4], m."""
-    corners: int
     error: float
     """Root mean square reprojection error, pixels."""
     pixels: np.ndarray
@@ -193,8 +192,7 @@ def sight(where: object, board: Board, images: Sequence[np.ndarray], intrinsics:
 
     Raises InputError where too few corners are seen, or they do not fit.
     """
-    found = max((_corners(board, images, legacy) for legacy in (False, True)), key=lambda pair: len(pair[1]))
-    points, pixels = found
+    points, pixels = max((_corners(board, images, legacy) for legacy in (False, True)), key=lambda pair: len(pair[1]))
     if len(pixels) < FEWEST_CORNERS:
         rule = f"at least {FEWEST_CORNERS} corners of the {board.across} x {board.down} board ({board.dictionary}) must be seen"
         remedy = "Check --board (squares across and down, dictionary), light, and that the board fills a part of the image."
@@ -211,7 +209,7 @@ def sight(where: object, board: Board, images: Sequence[np.ndarray], intrinsics:
     depths = (points @ board_to_camera[:3, :3].T + board_to_camera[:3, 3])[:, 2]
     # OpenCV's board has y down and z into the paper.
     to_world = np.diag([1.0, -1.0, -1.0, 1.0])
-    return Sighting(to_world @ rigid_inverse(board_to_camera), len(pixels), error, pixels, depths)
+    return Sighting(to_world @ rigid_inverse(board_to_camera), error, pixels, depths)
 
 
 def depth_ratio(sighting: Sighting, depth: np.ndarray) -> float | None:

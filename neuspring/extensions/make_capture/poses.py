@@ -6,9 +6,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
@@ -18,13 +19,15 @@ from neuspring.checks.things import sampled
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.core.findings import Finding, refuse_errors
-from neuspring.data.camera import Camera, Lens, Plane
+from neuspring.data.camera import Camera, Lens
 from neuspring.data.capture import FEWEST_FRAMES
 from neuspring.data.planes import cloud
-from neuspring.extensions.make_capture.feeds import Paired
-from neuspring.extensions.make_capture.formats import CameraFeed, Pair, open_images
+from neuspring.extensions.make_capture.feeds import Pair, Paired, Recorded
+from neuspring.extensions.make_capture.formats import open_images
+from neuspring.extensions.make_capture.forms import read_poses
 from neuspring.extensions.make_capture.lenses import Board, Straightener, depth_ratio, require_lens, sight
 from neuspring.extensions.make_capture.moments import MISSING_GAP, Match, matched
+from neuspring.extensions.make_capture.options import Intake
 from neuspring.extensions.make_capture.table import Unit, find_table, find_unit, pose_on
 from neuspring.extensions.make_capture.takes import Takes
 
@@ -74,7 +77,7 @@ def chosen(wanted: str, numbers: Sequence[int]) -> list[int]:
     return sorted(kept)
 
 
-def choose(views: Sequence[CameraFeed], wanted: str = "", late: Mapping[str, int] | None = None) -> FrameChoice:
+def choose(views: Sequence[Paired], wanted: str = "", late: Mapping[str, int] | None = None) -> FrameChoice:
     """The frames of all cameras that are kept, numbered as those of the first; with cameras moved that are `late`, in frames.
 
     See `moments.matched` for which frames of others belong to them. A number that one camera has and another lacks is a missing
@@ -83,9 +86,8 @@ def choose(views: Sequence[CameraFeed], wanted: str = "", late: Mapping[str, int
     first = views[0]
     where, pairing = {first.name: {number: place for place, number in enumerate(first.series.numbers)}}, dict[str, Match]()
     for view in views[1:]:
-        numbered = isinstance(view, Paired) and view.numbered
         names = f"camera {first.name}", f"camera {view.name}"
-        found = matched(view.path, names, first.series, view.series, numbered)
+        found = matched(view.path, names, first.series, view.series, view.numbered)
         pairing[view.name] = found.moved((late or {}).get(view.name, 0), len(view.series.numbers))
         where[view.name] = pairing[view.name].places
     numbers = sorted({number for of in where.values() for number in of})
@@ -102,8 +104,7 @@ def choose(views: Sequence[CameraFeed], wanted: str = "", late: Mapping[str, int
             remedy += f"; the first that all have is {start}." if start not in (None, kept[0]) else "."
             raise InputError(view.path, rule, f"{len(places[view.name])} of {len(kept)}", remedy)
     # The rate is that of the files that are there; a number that is not there is a moment that is missing.
-    order = {number: place for place, number in enumerate(numbers)}
-    step = min(order[after] - order[before] for before, after in pairwise(kept))
+    step = int(np.diff(np.searchsorted(numbers, kept)).min())
     gaps = [after - before for before, after in pairwise(kept)]
     jumps = [number for number, gap in zip(kept, gaps, strict=False) if gap > MISSING_GAP * min(gaps)]
     return FrameChoice(kept, places, step, jumps, pairing)
@@ -113,10 +114,12 @@ def choose(views: Sequence[CameraFeed], wanted: str = "", late: Mapping[str, int
 class SampledCamera:
     """A few frames of a camera."""
 
+    name: str
     path: Path
     size: tuple[int, int]
     """(width, height)."""
     lens: Lens
+    straight: Straightener
     colors: list[np.ndarray]
     """[H, W, 3] uint8 RGB, without distortion."""
     depths: list[np.ndarray]
@@ -124,9 +127,17 @@ class SampledCamera:
     unit: float | None
     """m per count of its images; None where they are floating point, or there are none."""
 
+    def camera(self, pose: np.ndarray) -> Camera:
+        """The camera at a pose, camera to world [4, 4], m."""
+        return Camera(self.name, *self.size, self.lens.matrix, pose)
+
+
+Seen: TypeAlias = Mapping[str, SampledCamera]
+Poses: TypeAlias = Mapping[str, np.ndarray]
+
 
 def look(
-    views: Sequence[CameraFeed],
+    views: Sequence[Paired],
     choice: FrameChoice,
     listed: Mapping[str, Lens],
     file: Path | None,
@@ -147,10 +158,9 @@ def look(
         if lens is None:
             remedy = "Give a JSON file with fx, fy, cx, cy."
             raise InputError("--intrinsics", f"intrinsics of camera {view.name} are required", "none", remedy)
-        color, depth = samples[view.name][0]
-        require_aligned(view.path, view.name, color, depth)
-        lenses[view.name] = lens = takes.lens(view.name, lens, (color.shape[1], color.shape[0]))
-        require_lens(file or view.path, view.name, lens, (color.shape[1], color.shape[0]))
+        size = _size_of(samples[view.name])
+        lenses[view.name] = takes.lens(view.name, lens, size)
+        require_lens(file or view.path, view.name, lenses[view.name], size)
     depths = [depth for pairs in samples.values() for _, depth in pairs if depth is not None]
     if len({stored_as(depth) for depth in depths}) > 1:
         raise InputError("--depth", "all depth images must be of one kind, 16-bit integers or another", "both")
@@ -167,31 +177,20 @@ def look(
     return {view.name: straightened(view, samples[view.name], lenses[view.name], unit, takes) for view in views}, unit
 
 
-def straightened(view: CameraFeed, pairs: Sequence[Pair], lens: Lens, unit: Unit | None, takes: Takes) -> SampledCamera:
-    """Pairs of one camera, without distortion and in meters; `unit` is None with color alone. Raises InputError where their sizes
-    differ."""
-    size = (pairs[0][0].shape[1], pairs[0][0].shape[0])
-    for color, depth in pairs:
-        require_aligned(view.path, view.name, color, depth, size)
-    straight = Straightener(lens, size)
-    colors = [straight.color(color) for color, _ in pairs]
-    if unit is None:
-        return SampledCamera(view.path, size, lens, colors, [], None)
-    depths = [depth for _, depth in pairs if depth is not None]
-    meters = [meters_of(takes.depth(view.name, straight.depth(plain(depth)), lens.matrix), unit) for depth in depths]
-    return SampledCamera(view.path, size, lens, colors, meters, unit.meters if stored_as(depths[0]) == "png" else None)
+def straightened(view: Paired, pairs: Sequence[Pair], lens: Lens, unit: Unit | None, takes: Takes) -> SampledCamera:
+    """Pairs of one camera, without distortion and in meters; `unit` is None with color alone."""
+    straight = Straightener(lens, _size_of(pairs))
+    colors, depths = [straight.color(color) for color, _ in pairs], [depth for _, depth in pairs if depth is not None]
+    meters = [
+        meters_of(takes.depth(view.name, straight.depth(plain(one)), lens.matrix), unit) for one in depths if unit is not None
+    ]
+    counted = unit.meters if unit is not None and stored_as(depths[0]) == "png" else None
+    return SampledCamera(view.name, view.path, _size_of(pairs), lens, straight, colors, meters, counted)
 
 
-def require_aligned(
-    where: Path, name: str, color: np.ndarray, depth: np.ndarray | None, size: tuple[int, int] | None = None
-) -> None:
-    """Raise InputError unless depth, where there is any, has the size of color, which is `size`."""
-    if depth is not None and color.shape[:2] != depth.shape:
-        received = f"{depth.shape[1]} x {depth.shape[0]} for {color.shape[1]} x {color.shape[0]}"
-        remedy = "Let the camera's software align depth to color (RealSense: rs.align; ROS: aligned_depth_to_color)."
-        raise InputError(where, f"camera {name}: depth must be aligned to color, pixel by pixel", received, remedy)
-    if size is not None and color.shape[1::-1] != size:
-        raise InputError(where, f"camera {name}: all images must be {size[0]} x {size[1]}", f"{color.shape[1]} x {color.shape[0]}")
+def _size_of(pairs: Sequence[Pair]) -> tuple[int, int]:
+    """(width, height)."""
+    return pairs[0][0].shape[1], pairs[0][0].shape[0]
 
 
 def stored_as(depth: np.ndarray) -> str:
@@ -209,6 +208,8 @@ def meters_of(depth: np.ndarray, unit: Unit) -> np.ndarray:
     return (depth * unit.meters).astype(np.float32)
 
 
+BOARD_FRAMES = 5
+"""Frames of the source, from its beginning, in which a board is looked for where it has no images of its own."""
 RATIO = 0.04
 """Depth may differ by this part from the distance of the board by its printed size."""
 
@@ -217,9 +218,11 @@ RATIO = 0.04
 class Placed:
     """Poses of the cameras."""
 
-    poses: dict[str, np.ndarray]
+    poses: Poses
     """Camera to world [4, 4], m."""
     up: str = "+z"
+    how: str = "by the table's plane"
+    """Origin of the poses, in words."""
     motion: np.ndarray = field(default_factory=lambda: np.eye(4))
     """[4, 4]: from the world of the given poses to this one."""
     table: str = "not found"
@@ -228,30 +231,57 @@ class Placed:
     """Lines of the report."""
 
 
-def by_table(name: str, seen: SampledCamera, *, top_down: bool, at: tuple[float, float] | None) -> Placed:
+def place(intake: Intake, film: Recorded, board: Board | None, seen: Seen, unit: Unit | None, takes: Takes) -> Placed:
+    """Poses of all cameras: by a file, a board, the source, or the table alone. Raises InputError."""
+    poses: Poses = {view.name: view.pose for view in film.views if view.pose is not None}
+    how, where, up, lines = "of the source", film.views[0].path, film.up, list[str]()
+    if intake.poses is not None:
+        poses, told = read_poses(intake.poses, list(seen))
+        how, where, up = f"of {intake.poses.name}{told}", intake.poses, None
+    elif board is not None:
+        shown = dict(seen)
+        for view in () if intake.board_images else film.views:
+            first = list(view.read(range(min(BOARD_FRAMES, len(view.series.numbers)))))
+            shown[view.name] = straightened(view, first, seen[view.name].lens, unit, takes)
+        poses, lines = by_board(board, shown, intake.board_images)
+        how, up = f"by a ChArUco board of {intake.board}", "+z"
+    if len(poses) < len(seen):
+        return by_table(next(iter(seen.values())), intake.top_down, intake.table_at)
+    poses = poses if board is not None else takes.poses(poses)
+    placed = given_alone(poses, seen, where) if unit is None else stand(poses, seen, where, intake.level, intake.top_down, up)
+    return replace(placed, lines=(*lines, *placed.lines), how=how)
+
+
+def by_table(seen: SampledCamera, top_down: bool, at: tuple[float, float] | None) -> Placed:
     """The pose of the only camera: the table is z = 0. Raises InputError where it is not found; see `depth.find_table`."""
     points = cloud(seen.depths, seen.lens.matrix)
     table, remarks = find_table(seen.path, points, top_down=top_down, at=None if at is None else _point(seen, at))
-    pose = pose_on(table, points, seen.size, seen.lens.matrix)
-    judged = examine("rig", seen.path, Judged.of(rig_of({name: seen}, {name: pose}, posed=False), units_of({name: seen})))
-    refuse_errors(judged)
-    lines = (f"table: {table.text()}", *(f"warning: {remark}" for remark in remarks), *map(in_report, judged))
-    return Placed(poses={name: pose}, table=table.text(), lines=lines)
+    poses, known = {seen.name: pose_on(table, points, seen.size, seen.lens.matrix)}, {seen.name: seen}
+    judged = _judged("rig", seen.path, Judged.of(rig_of(known, poses, posed=False), units_of(known)))
+    lines = (f"table: {table.text()}", *(f"warning: {remark}" for remark in remarks), *judged)
+    return Placed(poses=poses, table=table.text(), lines=lines)
 
 
-def rig_of(seen: Mapping[str, SampledCamera], poses: Mapping[str, np.ndarray], posed: bool = True) -> Rig:
+def _judged(kind: str, where: Path, subject: object) -> list[str]:
+    """Lines of the report. Raises InputError with the first finding that is an error."""
+    found = examine(kind, where, subject)
+    refuse_errors(found)
+    return [in_report(one) for one in found]
+
+
+def rig_of(seen: Seen, poses: Poses, posed: bool = True) -> Rig:
     """The cameras together."""
-    cameras = {name: Camera(name, *view.size, view.lens.matrix, poses[name]) for name, view in seen.items()}
     depths = {name: view.depths for name, view in seen.items()}
-    return Rig(cameras, depths, {name: listed[0] for name, listed in depths.items()}, posed=posed)
+    first = {name: listed[0] for name, listed in depths.items()}
+    return Rig({name: view.camera(poses[name]) for name, view in seen.items()}, depths, first, posed=posed)
 
 
-def units_of(seen: Mapping[str, SampledCamera]) -> dict[str, float | None]:
+def units_of(seen: Seen) -> dict[str, float | None]:
     """m per count of depth of every camera."""
     return {name: view.unit for name, view in seen.items()}
 
 
-def by_board(board: Board, seen: Mapping[str, SampledCamera], images: Sequence[Path]) -> tuple[dict[str, np.ndarray], list[str]]:
+def by_board(board: Board, seen: Seen, images: Sequence[Path]) -> tuple[Poses, list[str]]:
     """Poses by a board that lies still: in `images`, an image or a folder of them per camera, else in the frames themselves.
 
     Returns them with lines of the report. Raises InputError where the board is not seen, or depth contradicts its size.
@@ -264,7 +294,7 @@ def by_board(board: Board, seen: Mapping[str, SampledCamera], images: Sequence[P
         pictures = _pictures(path, view) if images else view.colors
         sighting = sight(path, board, pictures, view.lens.matrix)
         poses[name] = sighting.camera_to_world
-        line = f"board, camera {name}: {sighting.corners} corners, {sighting.error:.2f} pixels rms"
+        line = f"board, camera {name}: {len(sighting.pixels)} corners, {sighting.error:.2f} pixels rms"
         if view.depths and not images:
             ratios = [ratio for depth in view.depths if (ratio := depth_ratio(sighting, depth))]
             ratio = float(np.median(ratios)) if ratios else 1.0
@@ -277,33 +307,17 @@ def by_board(board: Board, seen: Mapping[str, SampledCamera], images: Sequence[P
     return poses, lines
 
 
-def stand(
-    poses: Mapping[str, np.ndarray],
-    seen: Mapping[str, SampledCamera],
-    *,
-    level: bool,
-    top_down: bool = False,
-    up: str | None = None,
-    file: Path | None = None,
-) -> Placed:
+def stand(poses: Poses, seen: Seen, file: Path, level: bool, top_down: bool, up: str | None) -> Placed:
     """Given poses, of `file`, against the table that the cameras see; with `level` the world is moved so that it is z = 0.
 
     `up` is that of the source; None: +z where the world is moved, else the side on which the cameras are. Raises InputError where
     the table is elsewhere, with what explains it; see `plausible`.
     """
-    clouds = {name: cloud(view.depths, view.lens.matrix) for name, view in seen.items()}
-    moved, motion, lines, tables = dict(poses), np.eye(4), list[str](), dict[str, Plane]()
-    for name, view in seen.items():
-        try:
-            # A world that is to be moved may have any axes: up is then that of the image.
-            upright = None if level else poses[name]
-            tables[name] = find_table(view.path, clouds[name], pose=upright, top_down=top_down)[0]
-            lines.append(f"table, camera {name}: {tables[name].text()}")
-        except InputError as error:
-            if level:
-                raise
-            lines.append(f"warning: {error}")
+    moved, motion, lines = poses, np.eye(4), list[str]()
     if level:
+        # A world that is to be moved may have any axes: up is then that of the image.
+        clouds = {name: cloud(view.depths, view.lens.matrix) for name, view in seen.items()}
+        tables = {name: find_table(view.path, clouds[name], top_down=top_down)[0] for name, view in seen.items()}
         normal, point, rms = common_plane(tables, poses)
         up = up or "+z"
         motion = levelling(normal, point, up_sign(up))
@@ -313,23 +327,21 @@ def stand(
         lines.append(f"leveled: the world was turned by {turn:.1f} degrees; {rise}")
     rig = rig_of(seen, moved)
     side = up or min(("+z", "-z"), key=lambda each: sum(rig.with_up(each).standing.values()))
-    judged = examine("rig", file or next(iter(seen.values())).path, Judged.of(rig.with_up(side), units_of(seen), of_file=False))
-    refuse_errors(judged)
-    lines += [in_report(one) for one in judged]
-    text = "; ".join(f"camera {name}: {plane.text()}" for name, plane in tables.items())
+    rig = rig.with_up(side)
+    lines += _judged("rig", file, Judged.of(rig, units_of(seen), of_file=False))
+    text = "; ".join(f"camera {name}: {plane.text()}" for name, (plane, _) in rig.stands.items())
     return Placed(poses=moved, up=side, motion=motion, table=text or "not found", lines=tuple(lines))
 
 
-def given_alone(poses: Mapping[str, np.ndarray], seen: Mapping[str, SampledCamera], where: Path) -> Placed:
+def given_alone(poses: Poses, seen: Seen, where: Path) -> Placed:
     """A given pose without depth: the table is z = 0 as it says, and up the side of it on which the camera is.
 
     Raises InputError naming `where` the pose comes from, where the camera does not look at such a table; see `plausible`.
     """
-    (name, view), pose = next(iter(seen.items())), next(iter(poses.values()))
+    view, pose = next(iter(seen.values())), next(iter(poses.values()))
     up = "+z" if pose[2, 3] > 0 else "-z"
-    judged = examine("camera alone", where, CameraAlone(Camera(name, *view.size, view.lens.matrix, pose), up))
-    refuse_errors(judged)
-    return Placed(poses=dict(poses), up=up, table="z = 0 as given", lines=tuple(map(in_report, judged)))
+    judged = _judged("camera alone", where, CameraAlone(view.camera(pose), up))
+    return Placed(poses=poses, up=up, table="z = 0 as given", lines=tuple(judged))
 
 
 def in_report(one: Finding) -> str:
@@ -354,10 +366,10 @@ def _pictures(path: Path, view: SampledCamera) -> list[np.ndarray]:
     places = [k for k, file in enumerate(source.files(range(len(source.series.numbers)))) if path.is_dir() or file == path]
     if not places:
         raise InputError(path, "an image of the board, or a folder of them, is required", "nothing there")
-    straight, pictures = Straightener(view.lens, view.size), []
+    pictures = []
     for picture in source.read(places):
         if picture.shape[1::-1] != view.size:
             rule = f"images of the board must have the size of the camera's images, {view.size[0]} x {view.size[1]}"
             raise InputError(path, rule, f"{picture.shape[1]} x {picture.shape[0]}")
-        pictures.append(straight.color(picture))
+        pictures.append(view.straight.color(picture))
     return pictures

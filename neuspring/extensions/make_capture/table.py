@@ -109,13 +109,13 @@ CENTER_OF_VIEW = 1.0 / 3.0
 
 
 def find_table(
-    where: object, points: np.ndarray, *, top_down: bool = False, at: np.ndarray | None = None, pose: np.ndarray | None = None
+    where: object, points: np.ndarray, *, top_down: bool = False, at: np.ndarray | None = None
 ) -> tuple[Plane, list[str]]:
     """The table among the planes in points [n, 3], m, in the coordinates of a camera, and what the user should know of the choice.
 
-    It is the largest plane whose normal points up in the image; with `at`, the one through this point [3]. With a `pose`, camera to
-    world [4, 4] with z upright, up is that of the world. Raises InputError where there is none: the largest plane is a wall or a
-    ceiling, or a plane that faces the camera without `top_down`, too small a part of the image, or not flat.
+    It is the largest plane whose normal points up in the image; with `at`, the one through this point [3]. Raises InputError
+    where there is none: the largest plane is a wall or a ceiling, or a plane that faces the camera without `top_down`, too small a
+    part of the image, or not flat.
     """
     found = planes(points)
     if not found:
@@ -126,7 +126,7 @@ def find_table(
         away = float(abs(found[0].above(at)))
         if away > 0.02:
             raise InputError("--table-at", "this pixel must lie on a plane", f"one {away:.3f} m from the nearest")
-    reasons = [_objection(plane, top_down, pose) for plane in found]
+    reasons = [_objection(plane, top_down) for plane in found]
     fitting = [plane for plane, reason in zip(found, reasons, strict=True) if not reason]
     if not fitting:
         remedy = "Film the table from above its edge, upright; or give the poses of the cameras (--poses, --board)."
@@ -146,7 +146,7 @@ def find_table(
     return table, remarks
 
 
-def _objection(plane: Plane, top_down: bool, pose: np.ndarray | None) -> str:
+def _objection(plane: Plane, top_down: bool) -> str:
     """Why a plane is not the table; empty if it may be."""
     if plane.share < TABLE_SHARE:
         return f"it has less than {TABLE_SHARE:.0%} of the pixels with depth"
@@ -154,9 +154,6 @@ def _objection(plane: Plane, top_down: bool, pose: np.ndarray | None) -> str:
         return f"it is not flat: more than {1e3 * ROUGH:g} mm rms"
     if plane.height > CAMERA_ABOVE:
         return f"the camera would be more than {CAMERA_ABOVE:g} m above it: is the unit of depth right?"
-    if pose is not None:
-        angle = float(np.degrees(np.arccos(np.clip(abs((pose[:3, :3] @ plane.normal)[2]), 0, 1))))
-        return f"it is a wall: its normal is {angle:.0f} degrees from the vertical of the poses" if angle > ROLL else ""
     if 90.0 - plane.elevation < FRONTAL:
         facing = "it faces the camera: a wall, or a table seen from straight above; --top-down says that it is the table"
         return "" if top_down else facing

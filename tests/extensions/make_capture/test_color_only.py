@@ -14,7 +14,7 @@ from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
 from neuspring.core.geometry import rigid_inverse
 from neuspring.data.capture import CAPTURE, OBJECT, Capture
-from neuspring.extensions.make_capture.feeds import pairs
+from neuspring.extensions.make_capture.formats import pairs
 from neuspring.extensions.make_capture.make import Intake, make_capture
 from neuspring.intake.check import check_layout
 from neuspring.perception import segment_opencv
@@ -157,10 +157,7 @@ MEANT = "up should point up in the image; received a camera that is turned by"
     ("change", "message"),
     [
         (rigid_inverse, "This looks like a world-to-camera matrix. Invert it"),
-        (
-            lambda pose: Y_UP @ pose,
-            "a pose in a world with y up. Multiply it from the left by [[1, 0, 0, 0], [0, 0, -1, 0]",
-        ),
+        (lambda pose: Y_UP @ pose, "a pose in a world with y up. Multiply it from the left by [[1, 0, 0, 0], [0, 0, -1, 0]"),
         (lambda pose: Y_UP @ pose @ FLIP, "a pose in a world with y up, for OpenGL's axes"),
         (lambda pose: pose @ FLIP, "a matrix for OpenGL's axes (y up, z backward). Change"),
         (lambda pose: pose @ np.diag([-1.0, -1, 1, 1]), "If the camera is mounted so, go on"),
@@ -181,8 +178,7 @@ def test_a_pose_of_another_kind_is_named_with_its_file(tmp_path, change, message
 
 
 @pytest.mark.parametrize(
-    ("factor", "words"),
-    [(8.0, "hands too large"), (0.2, "hands too small: hands (label 2) of"), (5.0, "implausible size: 13")],
+    ("factor", "words"), [(8.0, "hands too large"), (0.2, "hands too small: hands (label 2) of"), (5.0, "implausible size: 13")]
 )
 def test_poses_of_another_scale_show_in_the_hands_and_the_size(capture, factor, words):
     def scaled(values):

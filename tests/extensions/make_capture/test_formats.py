@@ -11,8 +11,8 @@ from neuspring.cli.main import main
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
 from neuspring.extensions.make_capture import formats
-from neuspring.extensions.make_capture.feeds import Paired
-from neuspring.extensions.make_capture.formats import CaptureFormat, Recorded
+from neuspring.extensions.make_capture.feeds import Paired, Recorded
+from neuspring.extensions.make_capture.formats import CaptureFormat
 from neuspring.extensions.make_capture.formats.folder import ImageFolder
 from neuspring.extensions.make_capture.forms import read_lenses
 from neuspring.intake.points import read_nodes

@@ -112,8 +112,7 @@ def test_a_distance_in_place_of_depth_is_named_and_taken(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("take", "lens"),
-    [("lens_resized", np.diag([1.5, 1.5, 1.0]) @ LENS), ("lens_turned", LENS[[1, 0, 2]][:, [1, 0, 2]])],
+    ("take", "lens"), [("lens_resized", np.diag([1.5, 1.5, 1.0]) @ LENS), ("lens_turned", LENS[[1, 0, 2]][:, [1, 0, 2]])]
 )
 def test_intrinsics_of_another_image_are_named_and_taken(tmp_path, take, lens):
     root = write(tmp_path)

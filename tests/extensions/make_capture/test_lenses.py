@@ -112,7 +112,7 @@ def test_a_board_gives_the_pose():
     # Half a pixel at this distance is half a millimeter.
     np.testing.assert_allclose(sighting.camera_to_world[:3, 3], pose[:3, 3], atol=2e-3)
     np.testing.assert_allclose(sighting.camera_to_world[:3, :3], pose[:3, :3], atol=4e-3)
-    assert sighting.corners >= 20 and sighting.error < 0.5
+    assert len(sighting.pixels) >= 20 and sighting.error < 0.5
     depth = depth_of_table(pose)
     assert depth_ratio(sighting, depth) == pytest.approx(1.0, abs=0.01)
     assert depth_ratio(sighting, 10 * depth) == pytest.approx(10.0, abs=0.1)

@@ -9,9 +9,8 @@ import pytest
 from PIL import Image
 
 from neuspring.core.errors import InputError
-from neuspring.extensions.make_capture.feeds import pairs
 from neuspring.extensions.make_capture.film import looked_at
-from neuspring.extensions.make_capture.formats import open_images
+from neuspring.extensions.make_capture.formats import open_images, pairs
 from neuspring.extensions.make_capture.formats.folder import ImageFolder
 from neuspring.extensions.make_capture.formats.video import VideoFile
 from neuspring.extensions.make_capture.moments import Evenness, Series, matched, spans

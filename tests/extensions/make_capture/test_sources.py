@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.extensions.make_capture.feeds import pairs
+from neuspring.extensions.make_capture.formats import pairs
 from neuspring.extensions.make_capture.formats.folder import ImageFolder
 from neuspring.extensions.make_capture.formats.video import VideoFile
 from neuspring.extensions.make_capture.poses import choose, chosen

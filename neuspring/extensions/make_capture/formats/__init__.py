@@ -12,99 +12,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol, TypeAlias, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.core.files import foreign
-from neuspring.data.camera import Lens
-from neuspring.extensions.make_capture.moments import Series
+from neuspring.extensions.make_capture.feeds import ImageSource, Kind, Paired, Recorded, names_of
 from neuspring.registry import Registry, modules
 
 T = TypeVar("T")
-Kind = Literal["color", "depth"]
 ENDINGS = {"color": (".png", ".jpg", ".jpeg", ".bmp", ".npy"), "depth": (".png", ".npy", ".tif", ".tiff")}
-Pair: TypeAlias = tuple[np.ndarray, np.ndarray | None]
-"""RGB [H, W, 3] uint8, and depth [H, W] as stored; None: color alone."""
-
-
-class ImageSource(Protocol):
-    """Pictures of one kind, in the order of time."""
-
-    @property
-    def path(self) -> Path:
-        """For messages."""
-
-    @property
-    def kind(self) -> Kind:
-        """The kind of all of them."""
-
-    @property
-    def series(self) -> Series:
-        """When every picture was taken."""
-
-    def read(self, places: Sequence[int]) -> Iterator[np.ndarray]:
-        """RGB [H, W, 3] uint8, or depth [H, W] as stored, at ascending places. Raises InputError."""
-
-    def files(self, places: Sequence[int]) -> list[Path]:
-        """The files that hold them."""
-
-
-class CameraFeed(Protocol):
-    """One camera: color and depth in pairs, or color alone, with what the files say about the camera."""
-
-    @property
-    def name(self) -> str:
-        """The camera's."""
-
-    @property
-    def path(self) -> Path:
-        """For messages."""
-
-    @property
-    def unit(self) -> float | None:
-        """m per count of depth, where the source says it."""
-
-    @property
-    def lens(self) -> Lens | None:
-        """Intrinsics, where the source says them."""
-
-    @property
-    def pose(self) -> np.ndarray | None:
-        """Camera to world [4, 4], m, where the source says it."""
-
-    @property
-    def series(self) -> Series:
-        """When every pair was taken."""
-
-    def rate(self, places: Sequence[int]) -> float | None:
-        """Frames per second, where the files know."""
-
-    def read(self, places: Sequence[int]) -> Iterator[Pair]:
-        """The pairs at ascending places. Raises InputError."""
-
-    def files(self, places: Sequence[int]) -> list[Path]:
-        """The files that hold them."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Recorded:
-    """All that cameras gave, and what came along."""
-
-    views: Sequence[CameraFeed]
-    rate: float | None = None
-    """Frames per second, where it is known apart from the views."""
-    up: Literal["+z", "-z"] | None = None
-    """Up of its poses; None: found by the table."""
-    train_end: int | None = None
-    """End of the training frames, of all its frames."""
-    tracks: np.ndarray | None = None
-    """[T, K, 3], m, in its world: annotated points."""
-    labels: Callable[[str, int], np.ndarray] | None = None
-    """Camera and number of a frame -> mask [H, W] uint8; None: no masks. Raises InputError."""
-    require_masks: Callable[[dict[str, list[int]]], None] = lambda numbers: None
-    """Raises InputError unless there are masks of the frames, by number, of each camera."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,3 +93,21 @@ def require_kind(path: Path, kind: Kind, image: np.ndarray) -> np.ndarray:
         remedy = "8 bits cannot hold it: export the raw depth (16-bit PNG or npy)."
         raise InputError(path, "depth must be integers of at least 16 bits, or floating point", received, remedy)
     return image
+
+
+def pairs(colors: Sequence[Path], depths: Sequence[Path], names: Sequence[str] = ()) -> list[Paired]:
+    """The views of folders or videos, one of color and one of depth per camera; without depths color alone, of one camera.
+
+    Raises InputError.
+    """
+    if len(colors) > 1 and not depths:
+        rule = "without depth one camera is required: color alone is of one view"
+        raise InputError("--color", rule, len(colors), "Give one folder or video, or --depth for each.")
+    if not colors or (depths and len(colors) != len(depths)):
+        rule = "as many folders or videos of depth as of color are required, one each per camera"
+        raise InputError("--color, --depth", rule, f"{len(colors)} of color, {len(depths)} of depth")
+    names = names_of(len(colors), names)
+    deep: list[ImageSource | None] = [open_images(depth, "depth") for depth in depths]
+    return [
+        Paired(name, open_images(color, "color"), depth) for name, color, depth in zip(names, colors, deep or [None], strict=True)
+    ]

@@ -25,8 +25,8 @@ from scipy.spatial.transform import Rotation
 from neuspring.core.errors import InputError
 from neuspring.core.extras import needed
 from neuspring.data.camera import Lens
-from neuspring.extensions.make_capture.feeds import Paired, names_of
-from neuspring.extensions.make_capture.formats import CaptureFormat, Kind, Recorded, require_kind
+from neuspring.extensions.make_capture.feeds import Kind, Paired, Recorded, names_of
+from neuspring.extensions.make_capture.formats import CaptureFormat, require_kind
 from neuspring.extensions.make_capture.moments import Series
 
 
@@ -164,15 +164,11 @@ class Bag:
         """What is known of the topics, by name. Raises InputError."""
         with self._opened() as reader:
             seconds = max(reader.duration, 1) / 1e9
-            return {
-                name: Summary(
-                    one.msgtype or "",
-                    one.msgcount,
-                    one.msgcount / seconds,
-                    *next(self._all(reader, name) if one.msgtype in READ else iter(()), (None, b"")),
-                )
-                for name, one in sorted(reader.topics.items())
-            }
+            found = {}
+            for name, one in sorted(reader.topics.items()):
+                first, more = next(self._all(reader, name) if one.msgtype in READ else iter(()), (None, b""))
+                found[name] = Summary(one.msgtype or "", one.msgcount, one.msgcount / seconds, first, more)
+            return found
 
     def messages(self, topic: str) -> Iterator[tuple[Any, bytes]]:
         """Its messages, and what their definition leaves over. Raises InputError."""
@@ -241,10 +237,8 @@ class Bag:
         color = [name for name, one in of.items() if one.kind == "color" and one.channels > 1]
         depth = [name for name, one in of.items() if one.kind == "depth"]
         if len(color) != 1 or len(depth) != 1:
-            rule = "without --topics one topic of color and one of depth are required"
-            raise InputError(
-                self.path, rule, f"{len(color)} and {len(depth)}", f"Name them, --topics COLOR DEPTH. There are: {listed}."
-            )
+            rule, remedy = "without --topics one topic of color and one of depth are required", "Name them, --topics COLOR DEPTH."
+            raise InputError(self.path, rule, f"{len(color)} and {len(depth)}", f"{remedy} There are: {listed}.")
         return color[0], depth[0]
 
     def lens(self, topic: str) -> Lens | None:

@@ -13,7 +13,8 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.data.images import read_npy, read_picture
-from neuspring.extensions.make_capture.formats import ENDINGS, CaptureFormat, Kind, require_kind
+from neuspring.extensions.make_capture.feeds import Kind
+from neuspring.extensions.make_capture.formats import ENDINGS, CaptureFormat, require_kind
 from neuspring.extensions.make_capture.moments import Series
 from neuspring.extensions.make_capture.stamps import times_of
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from neuspring.checks.case import RELEASED_FRAME_RATE
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Lens
-from neuspring.extensions.make_capture.feeds import Paired
-from neuspring.extensions.make_capture.formats import CaptureFormat, Recorded, open_images
+from neuspring.extensions.make_capture.feeds import Paired, Recorded
+from neuspring.extensions.make_capture.formats import CaptureFormat, open_images
 from neuspring.extensions.make_capture.moments import spans
 from neuspring.intake.phystwin import CALIBRATION, METADATA, annotated, train_end_of
 from neuspring.intake.phystwin_raw import detections, labels_of, read_calibration

@@ -13,7 +13,8 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.core.extras import needed
-from neuspring.extensions.make_capture.formats import CaptureFormat, Kind, picked, require_kind
+from neuspring.extensions.make_capture.feeds import Kind
+from neuspring.extensions.make_capture.formats import CaptureFormat, picked, require_kind
 from neuspring.extensions.make_capture.moments import Series
 
 if TYPE_CHECKING:
