@@ -49,11 +49,7 @@ def add(rod: Rod, root: ET.Element, world: ET.Element, meets: dict[str, Any]) ->
             pose += (rest[j - 1].inv() * frames[j - 1].inv() * frames[j]).as_euler("XYZ").tolist()
         else:
             ET.SubElement(parent, "freejoint", name="joint0")
-        along: dict[str, Any] = {
-            "type": "capsule",
-            "fromto": text(0, 0, 0, rod.lengths[j], 0, 0),
-            "mass": text(mass[j]),
-        }
+        along: dict[str, Any] = {"type": "capsule", "fromto": text(0, 0, 0, rod.lengths[j], 0, 0), "mass": text(mass[j])}
         ET.SubElement(parent, "geom", size=text(radius), **along, **meets)
         for n in np.flatnonzero(rod.edge == j):
             f, a, b = rod.place[n]

@@ -20,7 +20,7 @@ from neuspring.twin.body import body_of, lines_of, with_mass
 from neuspring.twin.rollout import initial_velocity
 
 SOURCE_REMEDY = "Name results/<scenario>/<method>/<seed> of a run with a twin, or a twin.npz."
-FRAME_RANGE = re.compile(r"(\d{1,9})(?::(\d{1,9})(?::(\d{1,9}))?)?")
+FRAME_RANGE = re.compile(r"\d{1,9}(:\d{1,9}(:[1-9]\d{0,8})?)?")
 
 
 @dataclass(frozen=True)
@@ -85,16 +85,12 @@ class ExportSource:
 
         The source must have all frames: the nodes carry splats from each to the next.
         """
-        images, wanted = Images(), set(frames)
-        carried = skinned_frames(prune_by_opacity(self.require_splats()), self.positions[: max(frames) + 1], images, "cpu")
-        return ((frame, gaussians.stored()) for frame, gaussians in enumerate(carried) if frame in wanted)
-
-    def require_splats(self) -> Splats:
-        """The splats of frame 0. Raises InputError if there are none."""
         if self.splats is None:
             rule = "splats are required, of a scenario with images"
             raise InputError(self.name, rule, "none", "Name the folder of a run whose scenario has appearance/<seed>/splats.ply.")
-        return self.splats
+        wanted = set(frames)
+        carried = skinned_frames(prune_by_opacity(self.splats), self.positions[: max(frames) + 1], Images(), "cpu")
+        return ((frame, gaussians.stored()) for frame, gaussians in enumerate(carried) if frame in wanted)
 
 
 def read_source(path: Path, mass: float | None = None) -> ExportSource:
@@ -124,10 +120,10 @@ def _read(path: Path) -> ExportSource:
         found = f"a failure: {failed}" if failed else f"a baseline's model ({run.learning[-1]})" if run.learning else "none"
         raise InputError(path, "must be the run of a method that makes a twin", found, SOURCE_REMEDY)
     twin_name, digest = run.stages[run.learning[-1]].record.files["twin"]
-    made_from = {twin_name: digest}
     trajectory, observations = run.trajectory, run.observations
+    rest = _at_rest(name, twin, {twin_name: digest}, observations)
     if trajectory is None:
-        return replace(_at_rest(name, twin, made_from), seen=observations)
+        return rest
     if trajectory.diverged_frame is not None:
         raise InputError(
             path,
@@ -141,17 +137,16 @@ def _read(path: Path) -> ExportSource:
         raise InputError(path / "trajectory.npz", rule, trajectory.positions.shape, "Delete rollout.json and run again.")
     hands, valid = observations.controller_points[:count], observations.controller_valid
     splats = run.file("appearance", "splats")
-    return ExportSource(
-        name=name,
+    return replace(
+        rest,
         twin=body_of(twin).for_prediction(twin),
         positions=trajectory.positions,
         hands=hands,
         holds=valid[:count] if valid.size else np.ones(hands.shape[:2], bool),
         velocity=initial_velocity(observations, twin.simulation.initial_velocity),
         splats=None if splats is None else Splats.load(splats),
-        made_from=made_from | {entry[0]: entry[1] for entry in run.stages["rollout"].record.files.values()},
+        made_from=rest.made_from | {entry[0]: entry[1] for entry in run.stages["rollout"].record.files.values()},
         frames=np.arange(count),
-        seen=observations,
         scenario_folder=run.scenario_folder,
     )
 
@@ -160,15 +155,14 @@ def chosen_frames(text: str | None, source: ExportSource, default: str) -> list[
     """Frames of FIRST, FIRST:STOP or FIRST:STOP:STEP (STOP is left out); without text `default`, or all where that is empty."""
     count = len(source.positions)
     words = text if text is not None else default or f"0:{count}"
-    found = FRAME_RANGE.fullmatch(words)
-    first, stop, step = (int(word) if word else None for word in found.groups()) if found else (None, None, None)
-    frames = [] if first is None else list(range(first, first + 1 if stop is None else stop, 1 if step is None else step or count))
-    if not frames or step == 0 or frames[-1] >= count:
+    numbers = [int(word) for word in words.split(":")] if FRAME_RANGE.fullmatch(words) else [0, 0]
+    frames = range(*numbers) if len(numbers) > 1 else numbers
+    if not frames or frames[-1] >= count:
         raise InputError("--frames", f"must be FIRST, FIRST:STOP or FIRST:STOP:STEP, with frames of 0 to {count - 1}", words)
-    return frames
+    return list(frames)
 
 
-def _at_rest(name: str, twin: Twin, digests: dict[str, str]) -> ExportSource:
+def _at_rest(name: str, twin: Twin, digests: dict[str, str], seen: Observations | None = None) -> ExportSource:
     topology = twin.topology
     return ExportSource(
         name=name,
@@ -178,6 +172,7 @@ def _at_rest(name: str, twin: Twin, digests: dict[str, str]) -> ExportSource:
         holds=np.ones((1, len(topology.controllers)), bool),
         velocity=np.zeros(topology.nodes.shape),
         made_from=digests,
+        seen=seen,
     )
 
 

@@ -47,7 +47,7 @@ def test_a_twin_alone_is_known_in_frame_0(folder, tmp_path):
         source = read_source(path)
         assert source.positions.shape[0] == 1 and source.splats is None
         with pytest.raises(InputError, match=r"splats are required.*appearance/<seed>/splats.ply"):
-            source.require_splats()
+            source.moved_splats([0])
 
 
 TOTAL = 0.35

@@ -15,10 +15,8 @@ from neuspring.splats.model import Splats
 from neuspring.twin.body import lines_of
 
 VERTEX = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("mass", "<f4"), ("region", "<i4"), ("controller", "u1"), ("stiffness", "<f4")]
-EDGE_DTYPE = [
-    *(("vertex1", "<i4"), ("vertex2", "<i4"), ("stiffness", "<f4"), ("dashpot", "<f4"), ("rest_length", "<f4")),
-    ("strain", "<f4"),
-]
+EDGE_DTYPE = [("vertex1", "<i4"), ("vertex2", "<i4")]
+EDGE_DTYPE += [(name, "<f4") for name in ("stiffness", "dashpot", "rest_length", "strain")]
 PLY_TYPE_NAMES = {"<f4": "float", "<i4": "int", "u1": "uchar"}
 COMMENT = "units m, N, N s/m, kg; stiffness of a vertex: mean of its springs"
 

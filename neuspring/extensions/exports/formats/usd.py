@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neuspring.core.artifacts import Rod
 from neuspring.core.errors import InputError
 from neuspring.core.extras import needed
 from neuspring.core.files import write_atomically
@@ -30,14 +29,14 @@ SPLAT_REACH = float(np.sqrt(2 * np.log(255)))
 
 def write(source: ExportSource, frames: Sequence[int], output: Path, rate: float | None = None) -> list[Path]:
     """Write one file. Its time codes per second are `rate`, or one per frame of the twin; seconds stay what they are."""
-    Usd, UsdGeom, Vt = (needed(f"pxr.{name}") for name in ("Usd", "UsdGeom", "Vt"))
+    Usd, UsdGeom = needed("pxr.Usd"), needed("pxr.UsdGeom")
     if output.suffix not in SUFFIXES:
         raise InputError("--output", f"must end with {', '.join(SUFFIXES)}", output.name)
     if rate is not None and not (np.isfinite(rate) and rate > 0):
         raise InputError("--rate", "must be a positive number of time codes per second", rate)
     rate = rate or 1 / source.twin.simulation.frame_time
     codes = {frame: round(float(source.times[frame]) * rate, 6) for frame in frames}
-    stage = Usd.Stage.CreateInMemory()
+    stage = Usd.Stage.CreateInMemory(f"twin{output.suffix}")  # The suffix chooses the encoding.
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     stage.SetTimeCodesPerSecond(rate)
@@ -48,20 +47,11 @@ def write(source: ExportSource, frames: Sequence[int], output: Path, rate: float
     stage.SetDefaultPrim(root.GetPrim())
     if source.twin.simulation.up == "-z":
         root.AddRotateXOp().Set(180.0)  # USD has no axis that points down.
-    shapes = _Shapes(stage, UsdGeom, Vt)
+    shapes = _Shapes(stage)
     shapes.graph(source, codes)
     if source.splats is not None:
         shapes.splats(source, codes)
-
-    def save(temporary: Path) -> None:
-        whole = temporary.with_suffix(output.suffix)  # The suffix chooses the encoding.
-        try:
-            stage.GetRootLayer().Export(str(whole))
-            whole.replace(temporary)
-        finally:
-            whole.unlink(missing_ok=True)
-
-    write_atomically(output, save)
+    write_atomically(output, lambda temporary: stage.GetRootLayer().Export(str(temporary)))
     return [output]
 
 
@@ -76,12 +66,10 @@ def colors(stiffness: np.ndarray) -> np.ndarray:
 def require_lengths(field: Any, stand_in: Any, code: float) -> None:
     """Raise InputError unless each array of splats has a value per splat at this time: UsdValidation has no rule for them."""
     count = len(field.GetPositionsAttr().Get(code))
-    values = dict.fromkeys(
-        (field.GetOrientationsAttr(), field.GetScalesAttr(), field.GetOpacitiesAttr(), stand_in.GetPointsAttr()), 1
-    )
-    values |= dict.fromkeys((stand_in.GetWidthsAttr(), stand_in.GetDisplayColorAttr(), stand_in.GetDisplayOpacityAttr()), 1)
-    coefficients = field.GetRadianceSphericalHarmonicsCoefficientsAttr()
-    values[coefficients] = (field.GetRadianceSphericalHarmonicsDegreeAttr().Get() + 1) ** 2
+    arrays = [field.GetOrientationsAttr(), field.GetScalesAttr(), field.GetOpacitiesAttr(), stand_in.GetPointsAttr()]
+    arrays += [stand_in.GetWidthsAttr(), stand_in.GetDisplayColorAttr(), stand_in.GetDisplayOpacityAttr()]
+    degree = field.GetRadianceSphericalHarmonicsDegreeAttr().Get()
+    values = dict.fromkeys(arrays, 1) | {field.GetRadianceSphericalHarmonicsCoefficientsAttr(): (degree + 1) ** 2}
     for attribute, each in values.items():
         received = len(attribute.Get(code) or ())
         if received != each * count:
@@ -90,10 +78,11 @@ def require_lengths(field: Any, stand_in: Any, code: float) -> None:
 
 
 class _Shapes:
-    """Prims of a stage. pxr's modules are given, because they are optional."""
+    """Prims of a stage."""
 
-    def __init__(self, stage: Any, geom: Any, vt: Any) -> None:
-        self._stage, self._geom, self._vt = stage, geom, vt
+    def __init__(self, stage: Any) -> None:
+        self._stage = stage
+        self._geom, self._vt, self._sdf = (needed(f"pxr.{name}") for name in ("UsdGeom", "Vt", "Sdf"))
 
     def graph(self, source: ExportSource, codes: dict[int, float]) -> None:
         """Nodes, controllers and springs; of a rod, its center line."""
@@ -101,19 +90,18 @@ class _Shapes:
         unit = float(np.median(topology.rest_lengths)) if len(topology.rest_lengths) else 0.01
         nodes = self._points("Nodes", NODE_WIDTH * unit, (0.8, 0.8, 0.8))
         hands = self._points("Controllers", 2 * NODE_WIDTH * unit, (1.0, 0.6, 0.1))
-        springs = self._geom.BasisCurves.Define(self._stage, f"{ROOT_PRIM}/Springs")
-        springs.CreateTypeAttr(token.linear)
-        springs.CreateCurveVertexCountsAttr([2] * len(topology.springs))
-        springs.CreateWidthsAttr([SPRING_WIDTH * unit])
-        springs.SetWidthsInterpolation(token.constant)
-        self._primvar(springs, "displayColor", "color3f[]", self._vectors(colors(material.stiffness)), token.uniform)
+        springs = self._curves("Springs", [2] * len(topology.springs), SPRING_WIDTH * unit)
+        self._primvar(springs, "displayColor", colors(material.stiffness), token.uniform)
         values = {"stiffness": material.stiffness, "dashpot": material.dashpot, "restLength": topology.rest_lengths}
         for name, value in values.items():
-            self._primvar(springs, name, "float[]", self._vt.FloatArray.FromNumpy(value), token.uniform)
-        rod = body_of(source.twin).center_line(source.twin)
-        line = self._line(rod) if rod else None
+            self._primvar(springs, name, value, token.uniform)
         if source.masses.any():
-            self._primvar(nodes, "mass", "float[]", self._vt.FloatArray.FromNumpy(source.masses), token.vertex)
+            self._primvar(nodes, "mass", source.masses, token.vertex)
+        if rod := body_of(source.twin).center_line(source.twin):
+            thickness = max(radius_of(rod), 0.5 * SPRING_WIDTH * float(rod.lengths.mean()))
+            line = self._curves("CenterLine", [len(rod.vertices)], 2 * thickness)
+            for name, value in {"mass": rod.mass, "bending": rod.bending, "twisting": rod.twisting}.items():
+                self._primvar(line, name, value, token.vertex)
         for frame, code in codes.items():
             both = ply.points(source, frame)
             shown = {nodes: source.positions[frame], hands: source.hands[frame], springs: both[topology.springs].reshape(-1, 3)}
@@ -122,24 +110,10 @@ class _Shapes:
             for prim, points in shown.items():
                 self._place(prim, prim.CreatePointsAttr(), points, prim.GetWidthsAttr().Get()[0] / 2, code)
 
-    def _line(self, rod: Rod) -> Any:
-        """A curve through the vertices, as thick as the nodes are far, with what the rod is made of."""
-        token = self._geom.Tokens
-        curve = self._geom.BasisCurves.Define(self._stage, f"{ROOT_PRIM}/CenterLine")
-        curve.CreateTypeAttr(token.linear)
-        curve.CreateCurveVertexCountsAttr([len(rod.vertices)])
-        curve.CreateWidthsAttr([2 * max(radius_of(rod), 0.5 * SPRING_WIDTH * float(rod.lengths.mean()))])
-        curve.SetWidthsInterpolation(token.constant)
-        for name, value in {"mass": rod.mass, "bending": rod.bending, "twisting": rod.twisting}.items():
-            self._primvar(curve, name, "float[]", self._vt.FloatArray.FromNumpy(value.astype(np.float32)), token.vertex)
-        return curve
-
     def splats(self, source: ExportSource, codes: dict[int, float]) -> None:
         """Splats for renderers that know Gaussians, and points (purpose proxy) for those that do not."""
-        from pxr import UsdVol
-
         token = self._geom.Tokens
-        field = UsdVol.ParticleField3DGaussianSplat.Define(self._stage, f"{ROOT_PRIM}/Splats")
+        field = needed("pxr.UsdVol").ParticleField3DGaussianSplat.Define(self._stage, f"{ROOT_PRIM}/Splats")
         stand_in = self._geom.Points.Define(self._stage, f"{ROOT_PRIM}/SplatPoints")
         image, proxy = self._geom.Imageable(field.GetPrim()), self._geom.Imageable(stand_in.GetPrim())
         image.CreatePurposeAttr(token.render)
@@ -148,21 +122,19 @@ class _Shapes:
         for frame, splats in source.moved_splats(list(codes)):
             code, means, turns = codes[frame], splats.means, ply.unit_quaternions(splats)
             scales = np.exp(np.broadcast_to(splats.log_scales, means.shape))
-            if not field.GetScalesAttr().HasAuthoredValue():
-                opacities = self._vt.FloatArray.FromNumpy(1 / (1 + np.exp(-splats.opacity_logits)))
+            shades = self._vectors(splats.harmonics.reshape(-1, 3))
+            coefficients = field.CreateRadianceSphericalHarmonicsCoefficientsAttr()
+            if not coefficients.HasAuthoredValue():
+                opacities = 1 / (1 + np.exp(-splats.opacity_logits))
                 field.CreateScalesAttr(self._vectors(scales))
-                field.CreateOpacitiesAttr(opacities)
-                degree = round(splats.harmonics.shape[1] ** 0.5) - 1
-                field.CreateRadianceSphericalHarmonicsDegreeAttr(degree)
-                coefficients = field.CreateRadianceSphericalHarmonicsCoefficientsAttr(
-                    self._vectors(splats.harmonics.reshape(-1, 3))
-                )
+                field.CreateOpacitiesAttr(self._vt.FloatArray.FromNumpy(opacities))
+                field.CreateRadianceSphericalHarmonicsDegreeAttr(round(splats.harmonics.shape[1] ** 0.5) - 1)
+                coefficients.Set(shades)
                 stand_in.CreateWidthsAttr(self._vt.FloatArray.FromNumpy((2 * scales.mean(axis=1)).astype(np.float32)))
-                shade = np.clip(0.5 + C0 * splats.harmonics[:, 0], 0, 1)
-                self._primvar(stand_in, "displayColor", "color3f[]", self._vectors(shade), token.vertex)
-                self._primvar(stand_in, "displayOpacity", "float[]", opacities, token.vertex)
+                self._primvar(stand_in, "displayColor", np.clip(0.5 + C0 * splats.harmonics[:, 0], 0, 1), token.vertex)
+                self._primvar(stand_in, "displayOpacity", opacities, token.vertex)
             if splats.harmonics[:, 1:].any():  # They turn with the splats.
-                self._sample(coefficients, self._vectors(splats.harmonics.reshape(-1, 3)), code)
+                self._sample(coefficients, shades, code)
             # pxr keeps the real part last.
             self._sample(field.CreateOrientationsAttr(), self._vt.QuatfArray.FromNumpy(np.roll(turns, -1, axis=1)), code)
             axes = Rotation.from_quat(turns, scalar_first=True).as_matrix() * scales[:, None]
@@ -174,7 +146,15 @@ class _Shapes:
         prim = self._geom.Points.Define(self._stage, f"{ROOT_PRIM}/{name}")
         prim.CreateWidthsAttr([width])
         prim.SetWidthsInterpolation(self._geom.Tokens.constant)
-        self._primvar(prim, "displayColor", "color3f[]", [color], self._geom.Tokens.constant)
+        self._primvar(prim, "displayColor", np.array([color]), self._geom.Tokens.constant)
+        return prim
+
+    def _curves(self, name: str, counts: Sequence[int], width: float) -> Any:
+        prim = self._geom.BasisCurves.Define(self._stage, f"{ROOT_PRIM}/{name}")
+        prim.CreateTypeAttr(self._geom.Tokens.linear)
+        prim.CreateCurveVertexCountsAttr(counts)
+        prim.CreateWidthsAttr([width])
+        prim.SetWidthsInterpolation(self._geom.Tokens.constant)
         return prim
 
     def _place(self, prim: Any, attribute: Any, points: np.ndarray, reach: np.ndarray | float, code: float) -> None:
@@ -193,11 +173,11 @@ class _Shapes:
     def _vectors(self, values: np.ndarray) -> Any:
         return self._vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, np.float32))
 
-    def _primvar(self, prim: Any, name: str, kind: str, value: Any, interpolation: str) -> None:
-        from pxr import Sdf
-
-        made = self._geom.PrimvarsAPI(prim).CreatePrimvar(name, Sdf.ValueTypeNames.Find(kind), interpolation)
-        made.Set(value)
+    def _primvar(self, prim: Any, name: str, values: np.ndarray, interpolation: str) -> None:
+        """Colors [n, 3], or numbers [n]."""
+        kind = self._sdf.ValueTypeNames.Find("float[]" if values.ndim == 1 else "color3f[]")
+        stored = self._vt.FloatArray.FromNumpy(values.astype(np.float32)) if values.ndim == 1 else self._vectors(values)
+        self._geom.PrimvarsAPI(prim).CreatePrimvar(name, kind, interpolation).Set(stored)
 
 
 export = Export(write=write, name="{name}.usdc")
