@@ -20,6 +20,8 @@ AWAY = 0.3
 """m. Hands that never come nearer to the nodes, and nodes that are farther from annotated points, are of another scene."""
 MOST_NODES = 5000
 """Nodes beyond which a warning says that a twin is slow."""
+STEEP = 3.0
+"""A motion that is so many times as large along y as along x and z may be a lift."""
 SAME = 1e-4
 """m: nodes nearer than this are one, and no spring is between them."""
 
@@ -32,8 +34,19 @@ def far(points: np.ndarray) -> dict[str, Any]:
     return {"value": most, "size": size, "next": f"Likely: {', or '.join(fitting)}" if fitting else "Look at its unit"}
 
 
-def off_table(points: np.ndarray, up: float | None, is_body: bool) -> dict[str, Any] | None:
-    """Heights of points that are not on or above the table, and what explains them; `up` is +1 or -1, None without a table."""
+def travel(points: np.ndarray) -> np.ndarray:
+    """The largest mean displacement [3], m, of points [T, K, 3] from their places in frame 0."""
+    moved = points[:, np.isfinite(points[0]).all(axis=1)] - points[0, np.isfinite(points[0]).all(axis=1)]
+    seen = np.isfinite(moved)
+    mean = np.where(seen, moved, 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
+    return np.asarray(mean[np.linalg.norm(mean, axis=1).argmax()])
+
+
+def off_table(points: np.ndarray, up: float | None, is_body: bool, moved: np.ndarray) -> dict[str, Any] | None:
+    """Heights of points that are not on or above the table, and what explains them; `up` is +1 or -1, None without a table.
+
+    `moved` [3], m, is how far the points of the scene go: hands lift more than they push.
+    """
     if up is None or np.abs(points).max() > FAR:
         return None
     low, high = extents(points * (1, 1, up))[:, 2]
@@ -42,14 +55,17 @@ def off_table(points: np.ndarray, up: float | None, is_body: bool) -> dict[str, 
         return None
     sign = "+-" if up > 0 else "-+"
     told = {"value": float(low), "z": "z from {:.3g} to {:.3g} m".format(*np.quantile(points[:, 2], (0, 1)) + 0.0), "sign": sign[0]}
-    rests = [turn for turn in (1, -1) if abs((turn * points[:, 1]).min()) < SUNK]
-    if is_body and rests and abs(high) > SUNK:
-        words = "(x, -z, y)" if rests[0] == up else "(x, z, -y)"
+    other = f"Is up {sign[1]}z? Then write so in {CAPTURE} (make-capture: --up). Without a table: ground: false (--no-table)"
+    rests = is_body and abs(high) > SUNK and next((turn for turn in (1, -1) if abs((turn * points[:, 1]).min()) < SUNK), 0)
+    lifted = low < -SUNK and abs(moved[1]) > max(SUNK, STEEP * np.linalg.norm(moved[[0, 2]])) and np.sign(moved[1])
+    if rises := rests or lifted:
+        words = "(x, -z, y)" if rises == up else "(x, z, -y)"
+        why = "It rests at y = 0" if rests else f"What moves goes along {'+' if rises > 0 else '-'}y"
+        also = f". {other}" if high <= SUNK and not rests else ""
         level = "warning" if low > FAR_OFF else "error"
-        return told | {"level": level, "next": f". It rests at y = 0: if y is up, write {words} in place of (x, y, z)"}
+        return told | {"level": level, "next": f". {why}: if y is up, write {words} in place of (x, y, z){also}"}
     if high <= SUNK:
-        either = f"Is up {sign[1]}z? Then write so in {CAPTURE} (make-capture: --up). Without a table: ground: false (--no-table)"
-        return told | {"next": f". {either}"}
+        return told | {"next": f". {other}"}
     if low > FAR_OFF and high <= HIGHEST_OBJECT:
         remedy = "If it stands on a table, the table must be z = 0; or is another axis up? If it hangs, this is right"
         return told | {"level": "warning", "next": f": {100 * low:.0f} cm above the table. {remedy}"}
@@ -57,7 +73,7 @@ def off_table(points: np.ndarray, up: float | None, is_body: bool) -> dict[str, 
     return told | {"level": "error" if low < -FAR_OFF else "warning", "next": f". {remedy}"}
 
 
-def too_long(points: np.ndarray, up: float | None, is_body: bool) -> dict[str, Any] | None:
+def too_long(points: np.ndarray, up: float | None, is_body: bool, moved: np.ndarray) -> dict[str, Any] | None:
     """Longest side of a body, m, that is that of nothing that hands hold."""
     return longest(float(np.ptp(points, axis=0).max())) if is_body and np.abs(points).max() <= FAR else None
 
@@ -86,6 +102,10 @@ class Holding:
     """[N, 3], m; none where they are not given."""
     body: np.ndarray
     """[n, 3], m: nodes and annotated points of frame 0."""
+    places: np.ndarray
+    """[T, C, 3], m, NaN while they do not hold."""
+    tracks: np.ndarray
+    """Annotated points [T, K, 3], m, NaN where not seen."""
 
 
 def fewest_points(hands: Holding) -> int:
@@ -105,6 +125,21 @@ def doubled(hands: Holding) -> dict[str, Any] | None:
     """Controllers of frame 0 that lie on a node or annotated point."""
     near = KDTree(hands.body).query(hands.start)[0] if len(hands.body) else np.full(1, np.inf)
     return {"value": int(near.argmin()), "count": (near < SAME).sum()} if (near < SAME).any() else None
+
+
+def never_moves(hands: Holding) -> dict[str, Any] | None:
+    """Controllers that are in one place in all frames, and how far the annotated point leaves them that was in reach, m."""
+    still = [k for k, path in enumerate(np.swapaxes(hands.places, 0, 1)) if (path == path[0]).all()]
+    near = np.flatnonzero(np.isfinite(hands.tracks[0]).all(axis=1))
+    gaps = np.linalg.norm(hands.tracks[:, near, None] - hands.places[0, still], axis=3)
+    if not gaps.size:
+        return None
+    first = gaps[0].argmin(axis=0)
+    left = np.nanmax(gaps[:, first, np.arange(len(still))], axis=0)
+    gone = np.flatnonzero((gaps[0].min(axis=0) < HAND_REACH) & (left > 2 * HAND_REACH))
+    return (
+        {"value": float(left[gone].max()), "cm": 100 * left[gone].max(), "which": [still[k] for k in gone]} if len(gone) else None
+    )
 
 
 # fmt: off
@@ -131,6 +166,9 @@ checks = (
     Check("hand far from the nodes", "holding", reach, (0, HAND_REACH), "error",
           f"in some training frame a controller must come within {100 * HAND_REACH:g} cm of a node of frame 0 to move it; "
           "received {cm:.1f} cm at the nearest. Are hands and nodes of one recording, in one world?", title="points"),
+    Check("hand never moves", "holding", never_moves, None, "warning",
+          "controllers that hold should go where the body goes; {which} are in one place in all frames, and the annotated point "
+          f"beside them goes {{cm:.0f}} cm away; {200 * HAND_REACH:g} cm are much. Was the pose of the hand read?", title="points"),
     Check("controllers on nodes", "holding", doubled, None, "error",
           f"controllers must lie {1e3 * SAME:g} mm from nodes and annotated points in frame 0: a spring needs a length; received "
           "controller {value}, {count} in all. Move them off the body, or leave out the nodes below them", title="points"),

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neuspring.core.section import Count, Name, SettingsSection
+from neuspring.core.section import Count, Name, Positive, SettingsSection
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,8 +22,14 @@ class Toy(SettingsSection):
 class Mocap(SettingsSection):
     """Motion capture of cables: end markers control, inner markers are observed, the body is sampled as rings."""
 
+    unit: Positive = 1.0
+    """m per count of a recording."""
+    rate: Positive = 100.0
+    """Samples per second of a recording."""
+    up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] = "+z"
+    """Up in a recording. It is turned so that +z is up; x stays x, but for +x and -x."""
     stride: Count = 2
-    """Stride of samples of the 100 Hz record."""
+    """Stride of samples of the record."""
     start: Annotated[int, Field(ge=0)] = 0
     """Samples left out at the beginning of the record. With at least one, the velocity in frame 0 is known from the sample before
     it (`simulation.initial_velocity: before`)."""
@@ -36,8 +42,8 @@ class Mocap(SettingsSection):
     ring: Annotated[int, Field(ge=3)] = 4
     """Nodes per ring."""
     roll_axis: Literal["x", "y", "z"] = "y"
-    """Direction of the world from which the roll of rings and clamps starts at both ends in frame 0, so that node i is the same
-    node in all recordings of a cable. Neither end may lie along it. y: DEFORM's cables hang about in the plane of x and z."""
+    """Direction of the world (+z up) from which the roll of rings and clamps starts at both ends in frame 0, so that node i is the
+    same node in all recordings of a cable. Neither end may lie along it. y: DEFORM's cables hang about in the plane of x and z."""
     rest_shape: Literal["first_frame", "straight"] = "first_frame"
     """Shape without forces: frame 0, as in the paper, or a straight cable with the arc lengths of frame 0."""
     grip: Literal["markers", "clamp"] = "markers"

@@ -14,13 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from neuspring.checks import examine
+from neuspring.checks import cable, examine
 from neuspring.checks.case import FINAL_DATA, Case, whole
 from neuspring.checks.masks import Shown
 from neuspring.checks.rig import CameraAlone, Judged, Rig
 from neuspring.checks.table import object_on_table
 from neuspring.checks.things import HAND_LEAST, INSIDE, Sample, hands_on, lifted, outline, place_of, sampled
 from neuspring.checks.timing import Streams, Watched, in_space, measure, of_cameras, on_images
+from neuspring.config import Mocap
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
@@ -32,6 +33,8 @@ from neuspring.intake.points import InSpace, look
 
 LEAST_AROUND = 0.1
 """Share of the image that must have depth, beside object and hands, before the table is looked for."""
+DEFORM = Mocap()
+"""Unit, rate and up axis of recordings of cables where nothing else is said."""
 CAMERAS = 3
 """Cameras of every released case."""
 
@@ -206,15 +209,15 @@ def _color_alone(capture: Capture, name: str, samples: dict[int, Sample]) -> lis
     return findings + examine("obstacles", path, described.obstacles, above)
 
 
-def check_layout(folder: Path) -> list[Finding]:
+def check_layout(folder: Path, settings: Mocap = DEFORM) -> list[Finding]:
     """Check a capture or a folder of them, a processed case, a folder of cases, a root with data/different_types, or cable
-    recordings (folder or .pkl file). Returns every finding.
+    recordings (folder or .pkl file), whose unit, rate and up axis are in `settings`. Returns every finding.
 
     Raises InputError only if `folder` does not exist or holds no data of a known layout.
     """
     folder = Path(folder)
     if folder.is_file():
-        return check_recording(folder)
+        return check_recording(folder, settings)
     if not folder.is_dir():
         raise InputError(folder, "a folder or file to check is required", "nothing there")
     if captures := _captures(folder):
@@ -226,14 +229,14 @@ def check_layout(folder: Path) -> list[Finding]:
     if not files:
         rule = "a case with final_data.pkl, a folder of cases, a root with data/different_types, or cable recordings is required"
         raise InputError(folder, rule, "none of them")
-    return [finding for file in files for finding in check_recording(file)]
+    return [finding for file in files for finding in check_recording(file, settings)]
 
 
-def check_recording(file: Path) -> list[Finding]:
+def check_recording(file: Path, settings: Mocap) -> list[Finding]:
     """Every finding of one recording of a cable; nothing is raised for bad content."""
     findings: list[Finding] = []
     raw = _read(findings, Path(file), load_pickle)
-    return findings or examine("cable", file, raw)
+    return findings or cable.look(file, raw, settings)
 
 
 def find_cases(folder: Path) -> list[Case]:

@@ -19,7 +19,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from neuspring.checks import examine
-from neuspring.checks.space import SAME, Holding
+from neuspring.checks.moving import Moving
+from neuspring.checks.space import SAME, Holding, travel
 from neuspring.checks.timing import Streams, follows
 from neuspring.config import Config, ScenarioRow
 from neuspring.core.artifacts import Observations, Scenario
@@ -33,6 +34,11 @@ from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, TRACKS, Capture
 
 CSV_COLUMNS = ("frame", "point", "x", "y", "z", "holds", "hand")
 """Columns of controllers.csv; the last two may be left out."""
+UNSEEN = (
+    "Write null in place of [x, y, z] in the frames in which a point is not seen",
+    "Fill these frames from those before and after, or say in `holds` that nothing is held there",
+)
+"""Remedies for entries of tracks.json and of controllers that are no places."""
 LEAST_NODES = 3
 """Points that say how a body is turned."""
 
@@ -109,6 +115,15 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
     nodes: Any = attempt(read_nodes, files["nodes"]) if files.get("nodes") else None
     annotated, tracks = attempt(capture.tracks, marked), np.zeros((capture.frame_count, 0, 3))
     nodes, annotated = none if nodes is None else nodes, tracks if annotated is None else annotated
+    # A hand may be anywhere while it holds nothing.
+    places = (
+        tracks if hands is None else np.where(hands.holds[..., None], hands.points, np.nan) if hands.holds.size else hands.points
+    )
+    moving = [Moving(points, description.frame_rate) for points in (annotated, places)]
+    for file, one, remedy in zip((marked, files.get("controllers")), moving, UNSEEN, strict=True):
+        findings += examine("moving", file, one, remedy) if one.given.size else []
+    # What is no place says nothing of unit and table.
+    annotated, places = (one.points for one in moving)
     first = annotated[0][np.isfinite(annotated[0]).all(axis=1)]
     if description.tracks == "train":
         tracks = annotated
@@ -116,12 +131,11 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
             rule = f"with tracks: train at least {LEAST_NODES} points must be annotated in frame 0, where the twin starts"
             findings.append(broken(marked, "", rule, f"{len(first)} of {tracks.shape[1]}"))
     ground = description.up_sign if description.ground else None
-    # A hand may be anywhere while it holds nothing.
-    held_at = none if hands is None else hands.held()
-    seen = annotated[np.isfinite(annotated).all(axis=2)]
+    moved = travel(np.concatenate([annotated, places], axis=1))
+    held_at, seen = (points[np.isfinite(points).all(axis=2)] for points in (places, annotated))
     for what, file, points in (("nodes", files.get("nodes"), nodes), ("", marked, seen), ("", files.get("controllers"), held_at)):
         if file is not None and points.size:
-            findings += examine("points", file, points.reshape(-1, 3), ground, what == "nodes")
+            findings += examine("points", file, points.reshape(-1, 3), ground, what == "nodes", moved)
     if any(one.level == "error" for one in findings):
         return InSpace(hands, nodes, tracks, annotated), findings
     if (body := files.get("nodes")) is not None:
@@ -131,7 +145,8 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
     if (file := files.get("controllers")) is not None and hands is not None:
         grouped = hands.hand if hands.hand.size else np.zeros(hands.points.shape[1], int)
         start = held(hands, annotated, capture.train_end)[0]
-        holding = Holding(grouped, hands.held(capture.train_end), start, nodes, np.concatenate([nodes, first]))
+        body = np.concatenate([nodes, first])
+        holding = Holding(grouped, hands.held(capture.train_end), start, nodes, body, places, annotated)
         findings += examine("holding", file, holding)
         if (shift := follows(hands.points, annotated)) and shift.wrong:
             rows = "Row 0 of the points is row {back} of the hands: leave out the rows before that."

@@ -1,6 +1,7 @@
 """Motion capture of cables (DLO data of DEFORM, arXiv 2406.05931) -> Observations.
 
-One pickle is one recording: positions [T, 3, n], float64, meters, 100 Hz, z up; released as nested lists, arrays are accepted too.
+One pickle is one recording: positions [T, 3, n], float64; released as nested lists in meters, 100 Hz, z up. Arrays are accepted
+too, and `mocap.unit`, `mocap.rate` and `mocap.up` name another unit, rate and axis.
 Markers run along the cable. Robots hold the two at either end: they are the controllers, with `grip: clamp` each with a ring of
 points around it. The others are observed. There is no surface, so the body is sampled as rings around a smooth centerline through
 the markers of frame 0.
@@ -28,8 +29,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from neuspring.checks import examine
-from neuspring.checks.cable import MIN_DISTANCE, MIN_FRAMES
+from neuspring.checks.cable import MIN_DISTANCE, MIN_FRAMES, in_space, look
 from neuspring.config import Config, Mocap, ScenarioRow
 from neuspring.core.artifacts import NO_REST_SHAPE, Observations, Scenario
 from neuspring.core.errors import InputError
@@ -84,8 +84,6 @@ def transport(directions: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return normals
 
 
-RECORD_RATE = 100.0
-"""Samples per second of a recording."""
 LARGEST_ALONG = 0.99
 """Cosine of the angle between an end of the cable and the roll axis: nearer to 1 a small turn of the end is a large roll."""
 RING_SPACING = 0.012
@@ -104,20 +102,21 @@ def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Obser
 def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
     """Read one recording; options in `settings` (config, `mocap`). Meters, float32, world with +z up.
 
-    Frame rate 100 Hz / stride, all markers visible, tracks = observed markers. Raises InputError naming the file.
+    Frame rate `mocap.rate` / stride, all markers visible, tracks = observed markers. Raises InputError naming the file.
     """
     file = Path(file)
     raw = load_pickle(file)
-    refuse(examine("cable", file, raw))
-    samples = np.asarray(raw)[settings.start :: settings.stride].transpose(0, 2, 1)
+    refuse(look(file, raw, settings))
+    data = in_space(raw, settings)
+    samples = data[settings.start :: settings.stride].transpose(0, 2, 1)
     markers = samples if settings.frames is None else samples[: settings.frames]
     frames, count, _ = markers.shape
     if frames < MIN_FRAMES:
         rule = f"at least {MIN_FRAMES} frames must remain after mocap.start = {settings.start} and mocap.stride = {settings.stride}"
-        raise InputError(file, rule, f"{frames} of {len(raw)} samples", "Choose a smaller start or stride.")
+        raise InputError(file, rule, f"{frames} of {len(data)} samples", "Choose a smaller start or stride.")
     if settings.frames is not None and frames < settings.frames:
         rule = f"{settings.frames} frames are required after start {settings.start} and stride {settings.stride} (mocap.frames)"
-        raise InputError(file, rule, f"{frames} of {len(raw)} samples", "Leave this recording out, or lower mocap.frames.")
+        raise InputError(file, rule, f"{frames} of {len(data)} samples", "Leave this recording out, or lower mocap.frames.")
     axis = np.eye(3)["xyz".index(settings.roll_axis)]
 
     held = [0, 1, count - 2, count - 1]
@@ -139,11 +138,11 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
         line, rest_body = straightened(markers[0], len(body) // settings.ring, RING_RADIUS, settings.ring)
         rest_shape = np.concatenate([line[2:-2], rest_body, line[held]])
     controllers = markers[:, held]
-    before = np.asarray(raw)[max(settings.start - 1, 0)].T
+    before = data[max(settings.start - 1, 0)].T
     back = np.stack([markers[0], before])[:, held]
     if settings.grip == "clamp":
         # Rings turn at the full rate of the record: the fewer samples, the less of a turn is seen.
-        recorded = np.asarray(raw)[settings.start :].transpose(0, 2, 1)[: (frames - 1) * settings.stride + 1, held]
+        recorded = data[settings.start :].transpose(0, 2, 1)[: (frames - 1) * settings.stride + 1, held]
         grips = normals[[0, -1]], RING_RADIUS, settings.ring, MIN_DISTANCE, str(file)
         controllers = np.concatenate([controllers, clamps(recorded, *grips)[:: settings.stride]], axis=1)
         back = np.concatenate([back, clamps(back, *grips)], axis=1)
@@ -153,7 +152,7 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
     visible = np.ones(observed.shape[:2], dtype=bool)
     motion_valid = visible.copy()
     motion_valid[-1] = False
-    first = np.concatenate([observed[0] - before[2:-2], back[0] - back[1]]) * RECORD_RATE
+    first = np.concatenate([observed[0] - before[2:-2], back[0] - back[1]]) * settings.rate
     nodes = len(observed[0]) + len(body)
     options = ", ".join(f"{name}={getattr(settings, name)}" for name in Mocap.__dataclass_fields__)
     return Observations(
@@ -163,7 +162,7 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
             category=row.category,
             frame_count=frames,
             train_end=int(settings.train_fraction * frames),
-            frame_rate=RECORD_RATE / settings.stride,
+            frame_rate=settings.rate / settings.stride,
             up="+z",
             self_collision=row.self_collision,
             ground=row.ground,

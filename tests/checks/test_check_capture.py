@@ -366,14 +366,6 @@ def test_frames_are_numbers_too():
     assert (found["no hand in frame 0"].value, found["no hand in frame 0"].level) == (0.0, "warning")
 
 
-def test_a_cable_whose_marker_jumps(tmp_path):
-    positions = np.zeros((8, 3, 7))
-    positions[:, 0] = np.linspace(0, 0.6, 7)
-    positions[5, 1, 3] = 0.3
-    (found,) = (one for one in examine("cable", tmp_path, positions) if one.name == "stretched cable")
-    assert (found.level, found.frames) == ("warning", (5,)) and found.value > 2 and found.limit[1] == 0.5
-
-
 def test_no_check_is_named_twice_for_one_subject_without_another_measure():
     every = [check for name in checks.CHECKS for check in (checks.CHECKS[name] if isinstance(checks.CHECKS[name], tuple) else ())]
     assert len({(check.name, check.of, check.measure) for check in every}) == len(every) > 80

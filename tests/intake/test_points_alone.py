@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -192,6 +193,10 @@ def everything(change):
     return lambda folder: [each(change)(folder) for each in (controllers, nodes, tracks)]
 
 
+def hanging_with_y_up(points):
+    return (points + np.array([0, 0.4, 0.5]))[..., [0, 2, 1]] * [1, 1, -1]
+
+
 FAULTS = [
     (controllers(lambda p: p[:7]), CONTROLLERS[0], ("8 frames are required", "received 7", "Cut or resample")),
     (controllers(lambda p: p[0]), CONTROLLERS[0], ("[T, C, 3]", "[4, 3]")),
@@ -221,6 +226,11 @@ FAULTS = [
     (coordinate("NaN"), TRACKS, ("coordinates must be finite", "point 1, frame 1", "null")),
     (coordinate("Infinity"), TRACKS, ("coordinates must be finite", "inf")),
     (lambda f: (f / TRACKS).unlink(), TRACKS, ("at least 3 points", "0 of 0")),
+    (tracks(put(0.0, 3, 2)), TRACKS, ("point 2", "first 3", "Write null")),
+    (tracks(put(9999.0, slice(3, 5), 2)), TRACKS, ("point 2", "first 3", "Write null")),
+    (controllers(put(0.0, slice(3, 5))), CONTROLLERS[0], ("point 0", "2 frames, first 3", "`holds`")),
+    (everything(hanging_with_y_up), NODES[0], ("What moves goes along +y", "(x, -z, y)")),
+    (everything(lambda p: hanging_with_y_up(p) * [-1, -1, 1]), NODES[0], ("What moves goes along -y", "(x, z, -y)")),
     (everything(lambda p: p @ np.array([[1.0, 0, 0], [0, 0, 1], [0, 1, 0]]) - [0, 0, 0.03]), NODES[0], ("It rests at y = 0",)),
 ]
 
@@ -268,6 +278,19 @@ def test_what_is_unlikely_is_said(capture, damage, file, words):
     found = check_layout(capture.folder)
     assert holds(found, "warning", file, *words), found
     assert not [one for one in found if one.level == "error"]
+
+
+def test_a_hand_whose_pose_was_not_read(tmp_path):
+    capture = spaced(tmp_path / "long", 40)
+    assert serious(check_layout(capture.folder)) == []
+    controllers(lambda p: np.repeat(p[:1], 40, axis=0))(capture.folder)
+    (found,) = (one for one in check_layout(capture.folder) if one.level == "warning")
+    assert (found.name, Path(found.where).name) == ("hand never moves", CONTROLLERS[0]) and found.value > 0.15
+
+
+def test_what_is_no_place_is_said_once(capture):
+    tracks(put(9999.0, slice(3, 5), 2))(capture.folder)
+    assert [one.name for one in check_layout(capture.folder)] == ["lost points as numbers"]
 
 
 def test_a_hand_may_be_anywhere_while_it_holds_nothing(capture):

@@ -238,12 +238,10 @@ def test_check_of_files_and_folders(tmp_path: Path) -> None:
     data[30, :, [4, 5]] = data[30, :, [5, 4]]
     path = write(tmp_path, data.tolist())
     for target in (path, tmp_path):
-        findings = check_layout(target)
-        assert [d.level for d in findings] == ["warning"]
-        assert "in frame 30" in findings[0].message
-    assert [d.message for d in check_layout(write(tmp_path, recording(samples=400)))] == [
-        "released recordings have 500 samples; received 400"
-    ]
+        first, second = check_layout(target)
+        assert (first.name, first.level) == ("up of the recording", "warning"), "a helix hangs from nothing"
+        assert (second.name, second.level, second.frames) == ("labels swapped", "warning", (30, 31))
+    assert check_layout(write(tmp_path, recording(samples=400)))[0].message == "released recordings have 500 samples; received 400"
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the released recordings are not part of the repository")
