@@ -118,12 +118,12 @@ LENS_MEANINGS = (
     Hypothesis(name="lens_cropped", looks="intrinsics of a larger image, of which this is the middle", lens=cropped),
 )
 DISTANCE = Hypothesis(name="distance", looks="the distance to the camera instead of depth along its axis", depth=along_axis)
-INVERSE, AXES, Y_UPWARD = "inverse", "opengl", "y_up"
+INVERSE, OPENGL_NAME, Y_UPWARD = "inverse", "opengl", "y_up"
 SIGNS = "Change the signs of its second and third column"
 TURN = f"ultiply it from the left by {Y_UP.astype(int).tolist()}"
 POSE_MEANINGS = (
     Hypothesis(name=INVERSE, looks="a world-to-camera matrix. Invert it", pose=rigid_inverse),
-    Hypothesis(name=AXES, looks=f"a matrix for OpenGL's axes (y up, z backward). {SIGNS}", pose=lambda pose: pose @ OPENGL),
+    Hypothesis(name=OPENGL_NAME, looks=f"a matrix for OpenGL's axes (y up, z backward). {SIGNS}", pose=lambda pose: pose @ OPENGL),
     Hypothesis(
         name="ros_body",
         looks="a pose of ROS's camera_link (x forward, y left, z up). Take the optical frame, or multiply it from the right by "
@@ -131,13 +131,13 @@ POSE_MEANINGS = (
         pose=lambda pose: pose @ ROS_BODY,
     ),
     Hypothesis(
-        name=f"{INVERSE}+{AXES}",
+        name=f"{INVERSE}+{OPENGL_NAME}",
         looks=f"a world-to-camera matrix for OpenGL's axes (y up, z backward). Invert it, then c{SIGNS[1:]}",
         pose=lambda pose: rigid_inverse(pose) @ OPENGL,
     ),
     Hypothesis(name=Y_UPWARD, looks=f"a pose in a world with y up. M{TURN}", pose=lambda pose: Y_UP @ pose),
     Hypothesis(
-        name=f"{Y_UPWARD}+{AXES}",
+        name=f"{Y_UPWARD}+{OPENGL_NAME}",
         looks=f"a pose in a world with y up, for OpenGL's axes. {SIGNS}, then m{TURN}",
         pose=lambda pose: Y_UP @ pose @ OPENGL,
     ),

@@ -17,9 +17,9 @@ from neuspring.core.errors import InputError
 from neuspring.core.extras import needed
 
 FORM = re.compile(r"(?P<file>.+?\.c3d)(#(unit=(?P<unit>\w+)(,|$))?(?P<labels>.*))?", re.IGNORECASE)
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+C3D_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """m per unit."""
-BLOCK = 512
+C3D_BLOCK = 512
 """Bytes: data begin and end at multiples."""
 
 
@@ -58,12 +58,12 @@ class Markers:
         _require_whole(file, content, *points.shape[:2])
         keys = takewhile(lambda key: key in about, (f"LABELS{k}" if k > 1 else "LABELS" for k in count(1)))
         labels = [label.strip() for key in keys for label in about[key]["value"]][: points.shape[1]]
-        said = next(iter(about.get("UNITS", {}).get("value", [])), "").strip().lower()
+        said = next(iter(about.get("C3D_UNITS", {}).get("value", [])), "").strip().lower()
         unit = form["unit"] or said
-        if unit not in UNITS or said not in (unit, ""):
-            rule = f"POINT:UNITS must be one of {' '.join(UNITS)}, or be said if the file does not say it"
+        if unit not in C3D_UNITS or said not in (unit, ""):
+            rule = f"POINT:C3D_UNITS must be one of {' '.join(C3D_UNITS)}, or be said if the file does not say it"
             asked = ",".join(["unit=mm", *filter(None, [form["labels"]])])
-            remedy = f"Say it, {file}#{asked}" if not said else "Leave unit= out." if said in UNITS else "Export it in one of them."
+            remedy = f"Say it, {file}#{asked}" if not said else "Leave unit= out." if said in C3D_UNITS else "Export it in one of them."
             raise InputError(path, rule, f"{said or 'none'} in the file, {form['unit'] or 'none'} given", remedy)
         names = form["labels"].split(",") if form["labels"] else labels
         for name in names if form["labels"] else ():
@@ -71,7 +71,7 @@ class Markers:
                 raise InputError(path, "labels of one marker each are required", repr(name), f"There are: {' '.join(labels)}.")
         rate = float(about["RATE"]["value"][0])
         lost = ~(data["meta_points"]["residuals"][0].T >= 0) | ~np.isfinite(points).all(axis=2)
-        points = np.where(lost[..., None], np.nan, points * UNITS[unit])
+        points = np.where(lost[..., None], np.nan, points * C3D_UNITS[unit])
         chosen = [labels.index(name) for name in names] if form["labels"] else slice(None)
         return cls(points[:, chosen], tuple(names), rate)
 
@@ -92,7 +92,7 @@ def _require_whole(file: Path, content: dict, frames: int, points: int) -> None:
         return
     width = 4 if about["SCALE"]["value"][0] < 0 else 2
     each = width * (4 * points + np.size(data["analogs"]) // frames)
-    held = (file.stat().st_size - BLOCK * (int(about["DATA_START"]["value"][0]) - 1)) // each
-    if (held - frames) * each > BLOCK:
+    held = (file.stat().st_size - C3D_BLOCK * (int(about["DATA_START"]["value"][0]) - 1)) // each
+    if (held - frames) * each > C3D_BLOCK:
         rule = "the frames that the file counts must be all that it holds: its counter ends at 65,535"
         raise InputError(file, rule, f"{frames} of {held}", "Export it in parts.")

@@ -21,8 +21,8 @@ import newton
 import numpy as np
 import warp as wp
 
-ITERATIONS = 10
-"""Of SolverVBD in a step."""
+VBD_ITERATIONS = 10
+"""Iterations of SolverVBD in a step."""
 
 
 def load(folder: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -82,7 +82,7 @@ def _add_rod(builder: newton.ModelBuilder, chain: dict[str, np.ndarray], damping
 def _simulate_rod(folder: str | Path, frames: int, drag: bool, device: str) -> np.ndarray:
     arrays, settings = load(folder)
     model = build(folder).finalize(device=device)
-    solver = newton.solvers.SolverVBD(model, iterations=ITERATIONS)
+    solver = newton.solvers.SolverVBD(model, iterations=VBD_ITERATIONS)
     now: Any = model.state()
     then: Any = model.state()
     control = model.control()
