@@ -73,6 +73,8 @@ class Hypothesis:
     """Depth [H, W] and K -> depth along the optical axis."""
     pose: Callable[[np.ndarray], np.ndarray] | None = None
     """A pose [4, 4] -> camera to world, m."""
+    model: str = ""
+    """The model of the distortion, if it is another."""
 
     def camera(self, camera: Camera) -> Camera | None:
         """The camera that is meant."""
@@ -147,8 +149,22 @@ POSE_MEANINGS = (
         pose=lambda pose: Y_UP @ rigid_inverse(pose),
     ),
 )
-MEANINGS = {one.name: one for one in (*LENS_MEANINGS, DISTANCE, *POSE_MEANINGS)}
+MODEL_MEANINGS = tuple(
+    Hypothesis(name=f"model={model}", looks=f"distortion by {model}", model=model)
+    for model in ("opencv", "distorted_to_ideal", "fisheye")
+)
+MEANINGS = {one.name: one for one in (*LENS_MEANINGS, *MODEL_MEANINGS, DISTANCE, *POSE_MEANINGS)}
 """The hypotheses that --take applies, by name."""
+
+
+def flat_share(depths: Sequence[np.ndarray], intrinsics: np.ndarray) -> float:
+    """Share of the pixels of depth images [H, W], m, that lie on the largest plane; 0 without any."""
+    return max((plane.share for plane in planes(cloud(depths, intrinsics, FLAT_POINTS), 1)), default=0.0)
+
+
+def flatter(share: float, before: float) -> bool:
+    """True where a table is flat by one meaning of the data, and was bent by the one before."""
+    return share > max(FLATTER * before, before + FLAT_SHARE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,8 +245,7 @@ class Rig:
 
     def flat(self) -> float:
         """Share of the pixels on the largest plane, mean over the cameras; 0 without any."""
-        clouds = [cloud(depths, self.cameras[name].intrinsics, FLAT_POINTS) for name, depths in self.depths.items()]
-        return float(np.mean([max((plane.share for plane in planes(points, 1)), default=0.0) for points in clouds] or [0.0]))
+        return float(np.mean([flat_share(depths, self.cameras[name].intrinsics) for name, depths in self.depths.items()] or [0.0]))
 
     def taken(self, hypothesis: Hypothesis, names: Sequence[str] | None = None) -> Rig | None:
         """The rig if cameras `names`, all by default, are as the hypothesis says; None where that cannot be."""
@@ -293,9 +308,9 @@ class Explained:
 def explain(rig: Rig, sides: Sequence[str] | None = None) -> Explained | None:
     """The one change that makes a rig right; None where it is right, or nothing does. `sides` that may be up, both by default."""
     along = rig.taken(DISTANCE)
-    flat, flatter = rig.flat(), along.flat() if along else 0.0
-    if flatter > max(FLATTER * flat, flat + FLAT_SHARE):
-        looks = f"{DISTANCE.looks}: turned into that, one plane has {flatter:.0%} of the pixels, and {flat:.0%} without"
+    before, share = rig.flat(), along.flat() if along else 0.0
+    if flatter(share, before):
+        looks = f"{DISTANCE.looks}: turned into that, one plane has {share:.0%} of the pixels, and {before:.0%} without"
         return Explained("distance", tuple(rig.cameras), looks, f"--take {DISTANCE.name}")
     found = [
         (round(other.cost(), 1), number, replace(one, up="" if side == rig.up else side))
@@ -457,9 +472,17 @@ def explanation(judged: Judged) -> list[dict[str, Any]]:
     return [words | {"value": one.what, "next": next_move} for words in told]
 
 
-TRIED = (
-    "units of depth, distances in place of it, inverse poses, other axes, y up, exchanged cameras, lenses of other sizes, a turn"
-)
+def bent(name: str, model: str, shares: Mapping[str, float]) -> dict[str, Any] | None:
+    """Share of the pixels on one plane with the distortion removed by its `model`, where another one makes more of it flat."""
+    best = max(shares, key=lambda other: shares[other])
+    return (
+        {"value": shares[model], "model": model, "best": best, "share": shares[best]}
+        if flatter(shares[best], shares[model])
+        else None
+    )
+
+
+TRIED = "units of depth, distances in its place, inverse poses, other axes, y up, exchanged cameras, other lenses, a turn"
 
 
 def elsewhere(judged: Judged) -> list[dict[str, Any]]:
@@ -559,6 +582,9 @@ checks = (
           "cameras.{camera}.camera_to_world: a camera should be at most {high:g} m above the table; received {value:.2f} m. "
           "Check depth_unit: ten times too large makes all of the scene so", title=""),
     Check("explained", "rig", explanation, None, "error", "{rule}; received {received}.", "{next}", title="{key}"),
+    Check("lens model", "models", bent, None, "warning",
+          "by the model {model} of the distortion one plane has {value:.0%} of the pixels, by {best} {share:.0%}.",
+          "make-capture --take model={best} takes it so.", title="intrinsics of camera {0}"),
     Check("table elsewhere", "rig", elsewhere, None, "warning",
           "the table that the camera sees {must} be z = 0; received {text}. {next}", title="cameras.{camera}.camera_to_world"),
     Check("principal point", "rig", off_center, (0, OFF_CENTER), "warning",

@@ -58,12 +58,14 @@ class Markers:
         _require_whole(file, content, *points.shape[:2])
         keys = takewhile(lambda key: key in about, (f"LABELS{k}" if k > 1 else "LABELS" for k in count(1)))
         labels = [label.strip() for key in keys for label in about[key]["value"]][: points.shape[1]]
-        said = next(iter(about.get("C3D_UNITS", {}).get("value", [])), "").strip().lower()
+        said = next(iter(about.get("UNITS", {}).get("value", [])), "").strip().lower()
         unit = form["unit"] or said
         if unit not in C3D_UNITS or said not in (unit, ""):
-            rule = f"POINT:C3D_UNITS must be one of {' '.join(C3D_UNITS)}, or be said if the file does not say it"
+            rule = f"POINT:UNITS must be one of {' '.join(C3D_UNITS)}, or be said if the file does not say it"
             asked = ",".join(["unit=mm", *filter(None, [form["labels"]])])
-            remedy = f"Say it, {file}#{asked}" if not said else "Leave unit= out." if said in C3D_UNITS else "Export it in one of them."
+            remedy = (
+                f"Say it, {file}#{asked}" if not said else "Leave unit= out." if said in C3D_UNITS else "Export it in one of them."
+            )
             raise InputError(path, rule, f"{said or 'none'} in the file, {form['unit'] or 'none'} given", remedy)
         names = form["labels"].split(",") if form["labels"] else labels
         for name in names if form["labels"] else ():

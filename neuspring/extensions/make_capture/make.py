@@ -107,6 +107,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     for name, view in seen.items():
         beside = examine("edges", view.path, list(zip(view.colors, view.depths, strict=False)))
         findings += [replace(one, title=f"camera {name}: {one.name}") for one in beside]
+        findings += examine("models", view.path, name, next(iter(view.flat)), view.flat) if view.flat else []
     findings += examine("category", intake.output, intake.category)
     placed = place(intake, film, board, seen, unit, takes)
     cameras = {name: view.camera(placed.poses[name]) for name, view in seen.items()}

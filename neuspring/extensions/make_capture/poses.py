@@ -14,7 +14,7 @@ from typing import TypeAlias
 import numpy as np
 
 from neuspring.checks import examine
-from neuspring.checks.rig import CameraAlone, Judged, Rig, common_plane, levelling
+from neuspring.checks.rig import CameraAlone, Judged, Rig, common_plane, flat_share, levelling
 from neuspring.checks.things import sampled
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
@@ -25,7 +25,15 @@ from neuspring.data.planes import cloud
 from neuspring.extensions.make_capture.feeds import Pair, Paired, Recorded
 from neuspring.extensions.make_capture.formats import open_images
 from neuspring.extensions.make_capture.forms import read_poses
-from neuspring.extensions.make_capture.lenses import Board, Straightener, depth_ratio, require_lens, sight
+from neuspring.extensions.make_capture.lenses import (
+    COEFFICIENT_COUNTS,
+    MODELS,
+    Board,
+    Straightener,
+    depth_ratio,
+    require_lens,
+    sight,
+)
 from neuspring.extensions.make_capture.moments import MISSING_GAP, Match, matched
 from neuspring.extensions.make_capture.options import Intake
 from neuspring.extensions.make_capture.table import Unit, find_table, find_unit, pose_on
@@ -126,6 +134,8 @@ class SampledCamera:
     """[H, W], m, without distortion; none with color alone."""
     unit: float | None
     """m per count of its images; None where they are floating point, or there are none."""
+    flat: dict[str, float]
+    """Model of the distortion, its own first -> share of the pixels with depth that are then on one plane; none without any."""
 
     def camera(self, pose: np.ndarray) -> Camera:
         """The camera at a pose, camera to world [4, 4], m."""
@@ -184,8 +194,14 @@ def straightened(view: Paired, pairs: Sequence[Pair], lens: Lens, unit: Unit | N
     meters = [
         meters_of(takes.depth(view.name, straight.depth(plain(one)), lens.matrix), unit) for one in depths if unit is not None
     ]
+    flat = {}
+    if unit is not None and lens.distortion.any():
+        models = (MODELS[lens.model], *(model for model, counts in COEFFICIENT_COUNTS.items() if len(lens.distortion) in counts))
+        for model in dict.fromkeys(models):
+            other = Straightener(replace(lens, model=model), _size_of(pairs))
+            flat[model] = flat_share([meters_of(other.depth(plain(one)), unit) for one in depths], lens.matrix)
     counted = unit.meters if unit is not None and stored_as(depths[0]) == "png" else None
-    return SampledCamera(view.name, view.path, _size_of(pairs), lens, straight, colors, meters, counted)
+    return SampledCamera(view.name, view.path, _size_of(pairs), lens, straight, colors, meters, counted, flat)
 
 
 def _size_of(pairs: Sequence[Pair]) -> tuple[int, int]:

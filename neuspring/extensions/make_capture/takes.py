@@ -44,6 +44,7 @@ class Takes:
     def lens(self, name: str, lens: Lens, size: tuple[int, int]) -> Lens:
         """The lens that is meant, of images of `size` (width, height). Raises InputError where it cannot be."""
         for one in self.of[name]:
+            lens = replace(lens, model=one.model or lens.model)
             if one.lens is not None:
                 matrix = one.lens(lens.matrix, size)
                 if lens.size is not None and one.name == "lens_resized":

@@ -147,3 +147,20 @@ def test_poses_that_mean_something_else_are_named_and_taken(tmp_path, take, chan
 def test_what_cannot_be_taken_is_refused(tmp_path, text):
     with pytest.raises(InputError, match="--take"):
         make_capture(intake(write(tmp_path), take=(text,)))
+
+
+@pytest.mark.parametrize(("model", "wrong"), [("opencv", "distorted_to_ideal"), ("opencv", "opencv")])
+def test_a_distortion_by_another_model_is_told_by_the_table(tmp_path, model, wrong):
+    coefficients = np.array([-0.35, 0.12, 0.0, 0.0])
+    y, x = np.mgrid[: SIZE[1], : SIZE[0]].astype(np.float32)
+    ideal = cv2.undistortPoints(np.stack([x, y], axis=-1).reshape(-1, 1, 2), LENS, coefficients, P=LENS).reshape(*x.shape, 2)
+    root = write(tmp_path)
+    for path in [*root.glob("color0/*"), *root.glob("depth0/*")]:
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(path), cv2.remap(image, ideal[..., 0], ideal[..., 1], cv2.INTER_NEAREST))
+    write_json(root / "lens.json", {"K": LENS.tolist(), "dist": coefficients.tolist(), "model": wrong})
+    _, report = make_capture(intake(root))
+    told = [line for line in report if "--take model=" in line]
+    assert [f"--take model={model} " in line for line in told] == [True] * (model != wrong)
+    _, report = make_capture(intake(root, take=(f"model={model}",), output=tmp_path / "taken"))
+    assert not [line for line in report if "--take model=" in line]
