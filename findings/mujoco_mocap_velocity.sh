@@ -23,7 +23,8 @@ BOX = '<body name="box" pos="0 0 .15"><freejoint/><geom type="box" size=".1 .1 .
 HELD = f'<body name="hand" mocap="true">{TRAY}</body>{BOX}'
 WELDED = f'<body name="hand" mocap="true"/><body name="plate" gravcomp="1"><freejoint/>{TRAY}</body>{BOX}'
 WELD = '<equality><weld body1="hand" body2="plate" solref="0.01 1"/></equality>'
-NODE = """<body name="node" pos="-0.1 0 0"><joint type="slide" axis="1 0 0"/><geom size=".01" mass="1"/><site name="other"/></body>"""
+NODE = """<body name="node" pos="-0.1 0 0"><joint type="slide" axis="1 0 0"/>
+  <geom size=".01" mass="1"/><site name="other"/></body>"""
 DRAWN = f'<body name="hand" mocap="true"><site name="one"/></body>{NODE}'
 CARRIER = '<body name="plate" gravcomp="1"><freejoint/><geom size=".01" mass="10"/><site name="one"/></body>'
 DRAWN_WELDED = f'<body name="hand" mocap="true"/>{CARRIER}{NODE}'
@@ -56,7 +57,8 @@ for damping in (10, 20):
     )
     here, there = moved(DRAWN, tendon, gravity=0), moved(DRAWN_WELDED, tendon + WELD, gravity=0)
     lag, right, formula = here["hand"] - here["node"] - 0.1, there["plate"] - there["node"] - 0.1, damping * SPEED / STIFFNESS
-    print(f"c = {damping} N s/m: the node stays back by {1e3 * lag:.3f} mm (c v / k = {1e3 * formula:.3f}), welded by {1e3 * right:.3f} mm")
+    told = f"{1e3 * lag:.3f} mm (c v / k = {1e3 * formula:.3f}), welded by {1e3 * right:.3f} mm"
+    print(f"c = {damping} N s/m: the node stays back by {told}")
     holds = holds and abs(lag - formula) < 5e-5 and abs(right) < 5e-5
 raise SystemExit(not holds)
 PYTHON
