@@ -1,4 +1,4 @@
-# make install | demo | test | test-all | lint | bench | gpu: each makes or reuses .venv by itself.
+# make install | demo | test | test-all | lint | bench | gpu: each makes or reuses .venv by itself; make findings needs python3 alone.
 SUITS := -c 'import sys; raise SystemExit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do $$p $(SUITS) && echo $$p && break; done)
 BIN := .venv/bin
@@ -14,7 +14,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(CORES)
 export MLFLOW_DISABLE_TELEMETRY = true
 export DO_NOT_TRACK = true
 
-.PHONY: install demo test test-core test-slow test-all lint format bench gpu clean
+.PHONY: install demo test test-core test-slow test-all lint format bench gpu findings clean
 
 define INSTALL
 @test -n "$(PYTHON)" && $(PYTHON) $(SUITS) || { echo "PYTHON=$(PYTHON): Python 3.11, 3.12 or 3.13 is needed;" \
@@ -85,6 +85,18 @@ bench: $(INSTALLED)
 gpu: $(INSTALLED)
 	$(BIN)/python -m pytest -m cuda $(GPU_OPTIONS) $(shell grep -rlE '\b(DEVICES|WAYS)\b|import CUDA|mark\.cuda' --include='test_*.py' tests)
 	$(BIN)/python -m tests.benchmarks.bench --device cuda:0
+
+# Each script says whether an outside library still behaves as its head says: 0 yes, 1 no, else it could not run.
+findings:
+	@changed=; missed=; for script in findings/*.sh; do \
+		echo "== $$script"; status=0; bash "$$script" || status=$$?; \
+		case $$status in \
+			0) echo holds;; \
+			1) echo CHANGED; changed="$$changed $$script";; \
+			*) echo "could not run"; missed="$$missed $$script";; \
+		esac; \
+	done; \
+	echo "changed:$${changed:- none}; could not run:$${missed:- none}"; test -z "$$changed$$missed"
 
 clean:
 	rm -rf .venv .snakemake
