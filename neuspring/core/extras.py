@@ -15,6 +15,7 @@ EXTRAS = {
     "mujoco": "export",
     "rerun": "rerun",
     "rosbags": "recordings",
+    "backports": "recordings",
     "ezc3d": "recordings",
     "transformers": "perception",
     "torchvision": "perception",

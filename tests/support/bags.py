@@ -45,7 +45,11 @@ class Recording:
             self.topics[topic] = self.writer.add_connection(topic, name, typestore=self.store)
         message = self.made(kind, **fields)
         raw = self.store.serialize_ros1(message, name) if self.old else self.store.serialize_cdr(message, name)
-        self.writer.write(self.topics[topic], log, bytes(raw) + more)
+        self.writer.write(self.topics[topic], log, self.packed(bytes(raw) + more))
+
+    def packed(self, raw: bytes) -> bytes:
+        """A message as it is stored."""
+        return raw
 
     def image(self, topic: str, stamp: int, data: np.ndarray, encoding: str, log: int | None = None, **options: Any) -> None:
         """An image as stored [H, W, ...]; `pad`: bytes at the end of each row; `big`: of big endian."""

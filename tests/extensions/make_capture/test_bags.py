@@ -43,6 +43,18 @@ def test_a_recording_says_all_but_the_category(tmp_path, capsys, form):
     assert "time stamps, at most 2 ms apart" in capsys.readouterr().out
 
 
+def test_messages_that_are_compressed_without_a_word_are_read(tmp_path, monkeypatch):
+    """As librealsense 2.58 records them by default."""
+    zstd = pytest.importorskip("backports.zstd")
+    with recorded(tmp_path / "film", "sqlite3") as bag:
+        monkeypatch.setattr(bag, "packed", zstd.compress, raising=False)
+        desk(bag)
+    (view,) = open_bags([tmp_path / "film"]).views
+    color, depth = next(view.read([2]))
+    np.testing.assert_array_equal(color, seen(camera(), 2)[0])
+    np.testing.assert_array_equal(depth, counts(seen(camera(), 2)[1]))
+
+
 def test_one_mcap_file_holds_two_cameras(tmp_path):
     with recorded(tmp_path / "film") as bag:
         desk(bag)

@@ -64,6 +64,8 @@ TRANSPORT = struct.Struct("<iff")
 """The head of compressedDepth, before its PNG: a number, and A and B of depth = A / (count - B), for floating point."""
 CAPTURED, DECIMAL = re.compile(r"(?:^|;)timestamp=([0-9.]+)"), re.compile(r"-?[0-9.]+(?:e-?[0-9]+)?")
 """Patterns of librealsense's text: ms of an image, and the numbers of a transform, by columns."""
+ZSTANDARD = b"\x28\xb5\x2f\xfd"
+"""First bytes of what Zstandard compressed; rosbags brings it."""
 GAP = 0.3
 """Pixels. Noise of depth parts areas that are neighbors in another view: a gap is filled from as far as this."""
 SINCE_1970 = 1e9
@@ -178,7 +180,9 @@ class Bag:
     def _all(self, reader: Any, topic: str) -> Iterator[tuple[Any, bytes]]:
         for connection, _, raw in reader.messages([one for one in reader.connections if one.topic == topic]):
             if self._new:
-                yield self._types.deserialize_cdr(raw, connection.msgtype), b""
+                # librealsense 2.58 compresses each message, and the file does not say so.
+                plain = needed("backports.zstd").decompress(raw) if bytes(raw[:4]) == ZSTANDARD else raw
+                yield self._types.deserialize_cdr(plain, connection.msgtype), b""
                 continue
             # Not the store's own deserialize_ros1, which refuses bytes that are left over.
             definition = self._types.get_msgdef(connection.msgtype)
