@@ -68,7 +68,7 @@ class Chain(NamedTuple):
     """A rod as rigid edges with springs of joints between them."""
 
     mass: np.ndarray
-    """Of each edge [E], kg: that of its vertices, which others share."""
+    """Mass of each edge [E], kg: that of its vertices, which others share."""
     bend: np.ndarray
     """EI / l of each joint [E - 1], N m."""
     twist: np.ndarray

@@ -21,8 +21,8 @@ import newton
 import numpy as np
 import warp as wp
 
-ITERATIONS = 10
-"""Of SolverVBD in a step."""
+ROD_ITERATIONS = 10
+"""Iterations of SolverVBD in a step."""
 
 
 def load(folder: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -89,7 +89,7 @@ def simulate(folder: str | Path, frames: int, drag: bool = True, device: str = "
     model = build(folder).finalize(device=device)
     model.particle_grid = None  # Else particles push each other away.
     solvers: Any = newton.solvers
-    solver = solvers.SolverVBD(model, iterations=ITERATIONS) if is_rod else solvers.SolverSemiImplicit(model)
+    solver = solvers.SolverVBD(model, iterations=ROD_ITERATIONS) if is_rod else solvers.SolverSemiImplicit(model)
     now: Any = model.state()
     then: Any = model.state()
     control = model.control()
