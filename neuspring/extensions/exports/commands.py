@@ -16,9 +16,7 @@ def export(
     to: Annotated[str, arg(help=f"format: {', '.join(EXPORTS)}")],
     output: Annotated[Path | None, arg(help="file or folder to write; by default it is named after the run")] = None,
     frames: Annotated[str | None, arg(help="FIRST, FIRST:STOP or FIRST:STOP:STEP; all by default, or 0 for ply")] = None,
-    mass: Annotated[
-        float | None, arg(help="kg in all, to which masses and forces are scaled; by default as capture.json says")
-    ] = None,
+    mass: Annotated[float | None, arg(help="kg in all, which masses and forces get; by default as capture.json says")] = None,
     rate: Annotated[float | None, arg(help="time codes per second (usd); the capture's frames per second by default")] = None,
 ) -> None:
     """A twin -> a file of another tool, by format."""

@@ -21,7 +21,7 @@ import newton
 import numpy as np
 import warp as wp
 
-VBD_ITERATIONS = 10
+ROD_ITERATIONS = 10
 """Iterations of SolverVBD in a step."""
 
 
@@ -79,71 +79,55 @@ def _add_rod(builder: newton.ModelBuilder, chain: dict[str, np.ndarray], damping
     builder.color()
 
 
-def _simulate_rod(folder: str | Path, frames: int, drag: bool, device: str) -> np.ndarray:
-    arrays, settings = load(folder)
-    model = build(folder).finalize(device=device)
-    solver = newton.solvers.SolverVBD(model, iterations=VBD_ITERATIONS)
-    now: Any = model.state()
-    then: Any = model.state()
-    control = model.control()
-    steps = int(np.ceil(settings["frame_time"] / arrays["step"]))
-    dt = settings["frame_time"] / steps
-    path = np.concatenate([arrays["clamps"], np.repeat(arrays["clamps"][-1:], max(frames + 1 - len(arrays["clamps"]), 0), axis=0)])
-    result = [arrays["nodes"]]
-    for begin, end in itertools.pairwise(path[: frames + 1]):
-        for step in range(steps):
-            poses, speeds = now.body_q.numpy().copy(), now.body_qd.numpy().copy()
-            poses[arrays["held"]] = begin + (end - begin) * (step + 1) / steps
-            poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
-            if drag:
-                fast = np.linalg.norm(speeds[:, :3], axis=1, keepdims=True)
-                speeds *= np.exp(-dt * (settings["drag"] + settings["drag_quadratic"] * fast))
-            now.body_q.assign(poses)
-            now.body_qd.assign(speeds)
-            now.clear_forces()
-            solver.step(now, then, control, None, dt)
-            now, then = then, now
-        poses = now.body_q.numpy()[arrays["rod_edge"]].astype(float)
-        place = arrays["rod_place"]
-        local = np.stack([place[:, 1], place[:, 2], (place[:, 0] - 0.5) * arrays["rod_lengths"][arrays["rod_edge"]]], axis=1)
-        turned = 2 * np.cross(poses[:, 3:6], local)
-        result.append(poses[:, :3] + local + poses[:, 6:] * turned + np.cross(poses[:, 3:6], turned))
-    return np.stack(result)
-
-
 def simulate(folder: str | Path, frames: int, drag: bool = True, device: str = "cpu") -> np.ndarray:
     """Positions of nodes [frames + 1, N, 3], m, with SolverSemiImplicit and the twin's own time step, from frame 0.
 
-    The hands move as exported, and stay where their last frame is. A rod takes SolverVBD.
+    The hands move as exported, and stay where their last frame is. A rod takes SolverVBD and the step of chain.npz.
     """
     arrays, settings = load(folder)
-    if "rod_vertices" in arrays:
-        return _simulate_rod(folder, frames, drag, device)
+    count, is_rod = len(arrays["nodes"]), "rod_vertices" in arrays
     model = build(folder).finalize(device=device)
     model.particle_grid = None  # Else particles push each other away.
-    solver = newton.solvers.SolverSemiImplicit(model)
+    solvers: Any = newton.solvers
+    solver = solvers.SolverVBD(model, iterations=ROD_ITERATIONS) if is_rod else solvers.SolverSemiImplicit(model)
     now: Any = model.state()
     then: Any = model.state()
-    count, substeps = len(arrays["nodes"]), settings["substeps"]
-    dt = settings["frame_time"] / substeps
-    hands = arrays["hands"]
+    control = model.control()
+    steps = int(np.ceil(settings["frame_time"] / arrays["step"])) if is_rod else settings["substeps"]
+    dt = settings["frame_time"] / steps
+    led, hands = (arrays["held"], arrays["clamps"]) if is_rod else (slice(count, None), arrays["hands"])
     path = np.concatenate([hands, np.repeat(hands[-1:], max(frames + 1 - len(hands), 0), axis=0)]).astype(float)
     result = [arrays["nodes"]]
     for begin, end in itertools.pairwise(path[: frames + 1]):
-        for step in range(substeps):
-            places, speeds = now.particle_q.numpy().copy(), now.particle_qd.numpy().copy()
-            places[count:] = begin + (end - begin) * (step + 1) / substeps
-            speeds[count:] = (end - begin) / settings["frame_time"] * settings["controller_velocity"]
-            now.particle_q.assign(places)
-            now.particle_qd.assign(speeds)
+        for step in range(steps):
+            place, speed = (now.body_q, now.body_qd) if is_rod else (now.particle_q, now.particle_qd)
+            places, speeds = place.numpy().copy(), speed.numpy().copy()
+            places[led] = begin + (end - begin) * (step + 1) / steps
+            if not is_rod:
+                speeds[led] = (end - begin) / settings["frame_time"] * settings["controller_velocity"]
+            else:
+                places[:, 3:] /= np.linalg.norm(places[:, 3:], axis=1, keepdims=True)
+                if drag:
+                    fast = np.linalg.norm(speeds[:, :3], axis=1, keepdims=True)
+                    speeds *= np.exp(-dt * (settings["drag"] + settings["drag_quadratic"] * fast))
+            place.assign(places)
+            speed.assign(speeds)
             now.clear_forces()
-            solver.step(now, then, None, None, dt)
-            if drag:
-                fast = then.particle_qd.numpy()[:count].astype(float)
-                slow = fast * np.exp(-dt * settings["drag"])
+            solver.step(now, then, control, None, dt)
+            if drag and not is_rod:
+                slow = then.particle_qd.numpy()[:count].astype(float) * np.exp(-dt * settings["drag"])
                 speeds[:count], places[:count] = slow, places[:count] + dt * slow
                 then.particle_q.assign(places)
                 then.particle_qd.assign(speeds)
             now, then = then, now
-        result.append(now.particle_q.numpy()[:count].copy())
+        result.append(_along(now.body_q.numpy(), arrays) if is_rod else now.particle_q.numpy()[:count].copy())
     return np.stack(result)
+
+
+def _along(poses: np.ndarray, arrays: dict[str, np.ndarray]) -> np.ndarray:
+    """Nodes [N, 3] where edges have these poses [E, 7]."""
+    edge, place = arrays["rod_edge"], arrays["rod_place"]
+    pose = poses[edge].astype(float)
+    local = np.stack([place[:, 1], place[:, 2], (place[:, 0] - 0.5) * arrays["rod_lengths"][edge]], axis=1)
+    turned = 2 * np.cross(pose[:, 3:6], local)
+    return np.asarray(pose[:, :3] + local + pose[:, 6:] * turned + np.cross(pose[:, 3:6], turned))

@@ -1,4 +1,4 @@
-"""npz + JSON: read and simulated without us, by the script on the page."""
+"""Plain files: npz and JSON, simulated without us by the script on the page, and PLY, read back by plyfile bit for bit."""
 
 import re
 import subprocess
@@ -14,6 +14,7 @@ from neuspring.cli.main import main
 from neuspring.core.artifacts import Twin
 from neuspring.extensions.exports.formats import npz
 from neuspring.extensions.exports.source import read_source
+from neuspring.splats.model import Splats
 from tests.extensions.exports import exported
 
 PAGE = Path(neuspring.extensions.exports.__file__).with_name("README.md")
@@ -74,3 +75,32 @@ def test_masses_of_one_kilogram_are_written_out_and_said_to_be_a_convention(tmp_
     assert said["mass"]["value"] == exported.NODES
     for text in (capsys.readouterr().out, said["mass"]["about"]):
         assert re.search("6 kg in all, by convention .1 kg per node.*--mass KG", text)
+
+
+def test_plyfile_reads_the_graph_as_it_is_and_splats_are_those_that_pictures_show(tmp_path):
+    plyfile = pytest.importorskip("plyfile", reason="plyfile is not installed (extra `dev`)")
+    folder, written = exported.run_folder(tmp_path), tmp_path / "out"
+    assert main(["export", str(folder), "--to", "ply", "--frames", "0:4:3", "--output", str(written)]) == 0
+    names = [f"{kind}_0000{frame}.ply" for kind in ("splats", "springs") for frame in (0, 3)]
+    assert sorted(path.name for path in written.iterdir()) == names
+    source, twin = read_source(folder), Twin.load(folder / "twin.npz")
+    read = plyfile.PlyData.read(written / "springs_00003.ply")
+    vertex, edge = read["vertex"].data, read["edge"].data
+    nodes = exported.NODES
+    placed = np.stack([vertex[axis] for axis in "xyz"], axis=-1).reshape(-1, 3)
+    assert np.array_equal(placed, np.concatenate([source.positions[3], source.hands[3]]))
+    assert np.array_equal(np.ravel(vertex["mass"]), [*twin.material.mass, 0]) and np.ravel(vertex["controller"])[nodes] == 1
+    assert np.ravel(vertex["region"]).tolist() == [0, 0, 0, 1, 1, 1, -1]
+    assert np.array_equal(np.stack([np.ravel(edge["vertex1"]), np.ravel(edge["vertex2"])], axis=1), twin.topology.springs)
+    for name, value in {"stiffness": twin.material.stiffness, "rest_length": twin.topology.rest_lengths}.items():
+        assert np.array_equal(np.ravel(edge[name]), value)
+    ends = placed[twin.topology.springs]
+    strain = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) / twin.topology.rest_lengths - 1
+    assert np.abs(np.ravel(edge["strain"]) - strain).max() < 1e-6 and np.abs(strain).max() > 0.01
+    splats, expected = Splats.load(written / "splats_00003.ply"), dict(source.moved_splats([3]))[3]
+    for name in ("means", "log_scales", "opacity_logits", "harmonics"):
+        assert np.array_equal(getattr(splats, name), getattr(expected, name))
+    lengths = np.linalg.norm(expected.quaternions, axis=1, keepdims=True)
+    assert np.ptp(lengths) > 1, "not all readers bring them to norm 1"
+    np.testing.assert_allclose(np.linalg.norm(splats.quaternions, axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(splats.quaternions * lengths, expected.quaternions, atol=1e-6)

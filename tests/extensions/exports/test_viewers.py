@@ -1,4 +1,4 @@
-"""Files of viewers, read back: PLY by plyfile and USD by pxr, bit for bit."""
+"""USD, read back by pxr bit for bit, and by Newton."""
 
 import re
 
@@ -14,52 +14,16 @@ from neuspring.extensions.exports.source import ExportSource, read_source
 from neuspring.splats.model import Splats
 from tests.extensions.exports import exported
 
-
-def test_plyfile_reads_the_graph_as_it_is_and_splats_are_those_that_pictures_show(tmp_path):
-    plyfile = pytest.importorskip("plyfile", reason="plyfile is not installed (extra `dev`)")
-    folder, written = exported.run_folder(tmp_path), tmp_path / "out"
-    assert main(["export", str(folder), "--to", "ply", "--frames", "0:4:3", "--output", str(written)]) == 0
-    assert sorted(path.name for path in written.iterdir()) == [
-        *("splats_00000.ply", "splats_00003.ply", "springs_00000.ply", "springs_00003.ply")
-    ]
-    source, twin = read_source(folder), Twin.load(folder / "twin.npz")
-    read = plyfile.PlyData.read(written / "springs_00003.ply")
-    vertex, edge = read["vertex"].data, read["edge"].data
-    nodes = exported.NODES
-    placed = np.stack([vertex[axis] for axis in "xyz"], axis=-1).reshape(-1, 3)
-    assert np.array_equal(placed, np.concatenate([source.positions[3], source.hands[3]]))
-    assert np.array_equal(np.ravel(vertex["mass"]), [*twin.material.mass, 0]) and np.ravel(vertex["controller"])[nodes] == 1
-    assert np.ravel(vertex["region"]).tolist() == [0, 0, 0, 1, 1, 1, -1]
-    assert np.array_equal(np.stack([np.ravel(edge["vertex1"]), np.ravel(edge["vertex2"])], axis=1), twin.topology.springs)
-    for name, value in {"stiffness": twin.material.stiffness, "rest_length": twin.topology.rest_lengths}.items():
-        assert np.array_equal(np.ravel(edge[name]), value)
-    ends = placed[twin.topology.springs]
-    strain = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) / twin.topology.rest_lengths - 1
-    assert np.abs(np.ravel(edge["strain"]) - strain).max() < 1e-6 and np.abs(strain).max() > 0.01
-    splats, expected = Splats.load(written / "splats_00003.ply"), dict(source.moved_splats([3]))[3]
-    for name in ("means", "log_scales", "opacity_logits", "harmonics"):
-        assert np.array_equal(getattr(splats, name), getattr(expected, name))
-    lengths = np.linalg.norm(expected.quaternions, axis=1, keepdims=True)
-    assert np.ptp(lengths) > 1, "not all readers bring them to norm 1"
-    np.testing.assert_allclose(np.linalg.norm(splats.quaternions, axis=1), 1, atol=1e-6)
-    np.testing.assert_allclose(splats.quaternions * lengths, expected.quaternions, atol=1e-6)
-
-
-def opened(path):
-    from pxr import Usd
-
-    return Usd.Stage.Open(str(path))
+REASON = "usd-core is not installed (extra `export`)"
+Gf, Usd, UsdGeom, UsdVol = (pytest.importorskip(f"pxr.{name}", reason=REASON) for name in ("Gf", "Usd", "UsdGeom", "UsdVol"))
 
 
 @pytest.mark.parametrize("suffix", usd.SUFFIXES)
 def test_pxr_reads_positions_as_they_are(tmp_path, suffix):
-    pytest.importorskip("pxr", reason="usd-core is not installed (extra `export`)")
-    from pxr import UsdGeom, UsdVol
-
     folder = exported.run_folder(tmp_path)
     path = tmp_path / f"twin{suffix}"
     assert main(["export", str(folder), "--to", "usd", "--output", str(path)]) == 0
-    stage, source, twin = opened(path), read_source(folder), Twin.load(folder / "twin.npz")
+    stage, source, twin = Usd.Stage.Open(str(path)), read_source(folder), Twin.load(folder / "twin.npz")
     assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Z", 1.0)
     assert stage.GetTimeCodesPerSecond() == pytest.approx(30) and stage.GetEndTimeCode() == exported.FRAMES - 1
     assert stage.GetDefaultPrim().GetPath() == usd.ROOT_PRIM
@@ -90,16 +54,13 @@ def test_pxr_reads_positions_as_they_are(tmp_path, suffix):
 @pytest.fixture
 def stage(tmp_path):
     """All frames of the rope with its splats, and the source."""
-    pytest.importorskip("pxr", reason="usd-core is not installed (extra `export`)")
     source = read_source(exported.run_folder(tmp_path))
     usd.write(source, range(exported.FRAMES), tmp_path / "twin.usdc")
-    return opened(tmp_path / "twin.usdc"), source
+    return Usd.Stage.Open(str(tmp_path / "twin.usdc")), source
 
 
 def test_bounds_hold_what_is_drawn_in_every_frame_and_no_more(stage):
     """Down to 1 / 255 of an opaque splat, in many directions, and half a width around points."""
-    from pxr import UsdGeom
-
     layer, source = stage
     directions = np.random.default_rng(0).normal(size=(5000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -137,8 +98,6 @@ def test_newton_imports_the_stage(stage):
 
 def test_arrays_of_splats_have_a_value_per_splat(stage):
     """pxr and UsdValidation take any lengths."""
-    from pxr import UsdGeom, UsdVol
-
     layer, _ = stage
     field = UsdVol.ParticleField3DGaussianSplat.Get(layer, "/Twin/Splats")
     stand_in = UsdGeom.Points.Get(layer, "/Twin/SplatPoints")
@@ -152,7 +111,6 @@ def test_arrays_of_splats_have_a_value_per_splat(stage):
 
 
 def test_frames_of_other_splats_are_not_written(tmp_path, monkeypatch):
-    pytest.importorskip("pxr", reason="usd-core is not installed (extra `export`)")
     source = read_source(exported.run_folder(tmp_path))
     moved = dict(source.moved_splats([0, 1]))
     fewer = {name: values[1:] for name, values in vars(moved[1]).items()}
@@ -163,12 +121,9 @@ def test_frames_of_other_splats_are_not_written(tmp_path, monkeypatch):
 
 
 def test_a_rate_changes_codes_and_no_seconds_up_is_up_and_bad_names_and_rates_are_refused(tmp_path):
-    pytest.importorskip("pxr", reason="usd-core is not installed (extra `export`)")
-    from pxr import Gf, UsdGeom
-
     source = read_source(exported.run_folder(tmp_path, exported.rope(up="-z", ground=False), with_splats=False))
     usd.write(source, [0, 2], tmp_path / "twin.usda", rate=24.0)
-    stage = opened(tmp_path / "twin.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "twin.usda"))
     assert stage.GetTimeCodesPerSecond() == 24 and stage.GetEndTimeCode() == pytest.approx(2 / 30 * 24)
     assert not stage.GetPrimAtPath("/Twin/Splats")
     matrix = UsdGeom.Xformable(stage.GetDefaultPrim()).ComputeLocalToWorldTransform(0)

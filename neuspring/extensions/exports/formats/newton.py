@@ -89,7 +89,7 @@ def chain_arrays(source: ExportSource, rod: Rod, frames: Sequence[int]) -> dict[
 
 
 def _quaternions(frames: Rotation) -> np.ndarray:
-    """Quaternions of the axes m1, m2, t, w last [E, 4]."""
+    """Quaternions of axes m1, m2, t, w last [E, 4]."""
     return np.asarray(Rotation.from_matrix(np.roll(frames.as_matrix(), -1, axis=-1)).as_quat())
 
 

@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from neuspring.core.artifacts import SCALARS, Artifact, Material, Topology
+from neuspring.core.artifacts import SCALARS, Artifact, Material
 from neuspring.core.files import write_atomically, write_text
 from neuspring.core.version import __version__
 from neuspring.extensions.exports import Export
 from neuspring.extensions.exports.source import ExportSource
-from neuspring.splats.model import Splats
 from neuspring.twin.body import body_of
 
 VERSION = 1
@@ -110,8 +109,8 @@ def arrays_of(source: ExportSource, frames: Sequence[int]) -> tuple[dict[str, np
         shape = {"dimensions": dimensions.split(","), "shape": list(value.shape), "dtype": value.dtype.name}
         described[name] = shape | {"unit": unit, "about": about}
 
-    def declared(kind: type[Artifact], values: Artifact, prefix: str = "") -> None:
-        for spec in dataclasses.fields(kind):
+    def declared(values: Artifact, prefix: str = "") -> None:
+        for spec in dataclasses.fields(values):
             value = getattr(values, spec.name)
             if "shape" in spec.metadata and value.size and prefix + spec.name not in MOTION:
                 meta = spec.metadata
@@ -119,10 +118,10 @@ def arrays_of(source: ExportSource, frames: Sequence[int]) -> tuple[dict[str, np
                 sizes = ["G" if prefix == "splat_" and size == "N" else size for size in meta["shape"]]
                 add(prefix + spec.name, ",".join(sizes), meta["unit"], meta["doc"], value)
 
-    declared(Topology, source.twin.topology)
-    declared(Material, source.twin.material)
+    declared(source.twin.topology)
+    declared(source.twin.material)
     for piece in body_of(source.twin).parts(source.twin):
-        declared(type(piece), piece, f"{piece.kind}_")
+        declared(piece, f"{piece.kind}_")
     part = source.only(frames)
     moving = {"frame": part.frames, "time": part.times, "mass": source.masses}
     for name, (dimensions, unit, about) in MOTION.items():
@@ -130,7 +129,7 @@ def arrays_of(source: ExportSource, frames: Sequence[int]) -> tuple[dict[str, np
             continue  # other points of the body have the mass
         add(name, dimensions, unit, about, moving[name] if name in moving else getattr(part, name))
     if source.splats is not None:
-        declared(Splats, source.splats, "splat_")
+        declared(source.splats, "splat_")
     return arrays, described
 
 

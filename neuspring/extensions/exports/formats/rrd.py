@@ -23,12 +23,12 @@ from neuspring.report.shown import capture_of
 from neuspring.scores.metrics import METRICS, errors_per_frame
 from neuspring.twin.body import lines_of
 
-NODE_LOOK, HAND_LOOK, SEEN_LOOK, TRACK_LOOK = (
-    ((204, 204, 204), 2.0),
-    ((255, 153, 25), 4.0),
-    ((0, 150, 90), 1.5),
-    ((150, 0, 200), 4.0),
-)
+LOOKS = {
+    "predicted/nodes": ((204, 204, 204), 2.0),
+    "hands": ((255, 153, 25), 4.0),
+    "recorded/points": ((0, 150, 90), 1.5),
+    "recorded/tracks": ((150, 0, 200), 4.0),
+}
 """Color and radius, in points of the screen."""
 SPRING_RADIUS = 0.5
 RRD_JPEG_QUALITY = 90
@@ -72,25 +72,27 @@ class _Recording:
 
     def _motion(self) -> None:
         rr, part, lines = self._rr, self._part, lines_of(self._part.twin)
-        self._points("predicted/nodes", list(part.positions), *NODE_LOOK)
-        self._points("hands", list(part.hands), *HAND_LOOK)
+        clouds = {"predicted/nodes": list(part.positions), "hands": list(part.hands)}
+        if (seen := part.seen) is not None:
+            places, visible = seen.object_points[part.frames], seen.object_visibility[part.frames]
+            clouds["recorded/points"] = [row[shown] for row, shown in zip(places, visible, strict=True)]
+            clouds["recorded/tracks"] = [row[np.isfinite(row).all(axis=1)] for row in seen.tracks[part.frames]]
+        for name, found in clouds.items():
+            color, radius = LOOKS[name]
+            self._still(f"world/{name}", rr.Points3D.from_fields(colors=[color], radii=rr.Radius.ui_points(radius)))
+            points = rr.Points3D.columns(positions=np.concatenate(found).astype(np.float32))
+            self._over_time(f"world/{name}", points.partition([len(cloud) for cloud in found]))
         ends = [lines.points(nodes, hands)[lines.pairs] for nodes, hands in zip(part.positions, part.hands, strict=True)]
         look = {"colors": colors(lines.stiffness), "radii": rr.Radius.ui_points(SPRING_RADIUS)}
         self._still("world/predicted/springs", rr.LineStrips3D.from_fields(**look))
         strips = rr.LineStrips3D.columns(strips=np.concatenate(ends).astype(np.float32))
         self._over_time("world/predicted/springs", strips.partition([len(lines.pairs)] * len(ends)))
-        if (seen := part.seen) is None:
-            return
-        places, visible = seen.object_points[part.frames], seen.object_visibility[part.frames]
-        self._points("recorded/points", [row[shown] for row, shown in zip(places, visible, strict=True)], *SEEN_LOOK)
-        annotated = [row[np.isfinite(row).all(axis=1)] for row in seen.tracks[part.frames]]
-        self._points("recorded/tracks", annotated, *TRACK_LOOK)
 
     def _errors(self, source: ExportSource) -> None:
         """A curve per metric of positions or marked points, without frames that have no value."""
         if (seen := source.seen) is None:
             return
-        errors = {**errors_per_frame(source.positions, seen), **errors_per_frame(source.positions, seen, "marks")}
+        errors = errors_per_frame(source.positions, seen) | errors_per_frame(source.positions, seen, "marks")
         for name, values in errors.items():
             metric, shown = METRICS[name], METRICS[name].factor * values[self._part.frames]
             known = np.isfinite(shown)
@@ -110,18 +112,10 @@ class _Recording:
                 if not capture.has(name, frame):
                     self._stream.log(place, rr.Clear(recursive=True))
                     continue
-                color = rr.Image(capture.color(name, frame)).compress(jpeg_quality=RRD_JPEG_QUALITY)
-                self._stream.log(f"{place}/color", color)
+                self._stream.log(f"{place}/color", rr.Image(capture.color(name, frame)).compress(RRD_JPEG_QUALITY))
                 if capture.has_depth:
                     counts = np.rint(capture.depth(name, frame) / unit).astype(np.uint16)
                     self._stream.log(f"{place}/depth", rr.DepthImage(counts, meter=1 / unit))
-
-    def _points(self, name: str, clouds: Sequence[np.ndarray], color: tuple[int, int, int], radius: float) -> None:
-        """Points [n, 3] of each frame; those of a frame without any vanish."""
-        rr = self._rr
-        self._still(f"world/{name}", rr.Points3D.from_fields(colors=[color], radii=rr.Radius.ui_points(radius)))
-        places = rr.Points3D.columns(positions=np.concatenate(clouds).astype(np.float32))
-        self._over_time(f"world/{name}", places.partition([len(cloud) for cloud in clouds]))
 
     def _over_time(self, entity: str, columns: Any, known: Any = slice(None)) -> None:
         part, rr = self._part, self._rr
