@@ -181,9 +181,7 @@ def straightened(view: Paired, pairs: Sequence[Pair], lens: Lens, unit: Unit | N
     """Pairs of one camera, without distortion and in meters; `unit` is None with color alone."""
     straight = Straightener(lens, _size_of(pairs))
     colors, depths = [straight.color(color) for color, _ in pairs], [depth for _, depth in pairs if depth is not None]
-    meters = [
-        meters_of(takes.depth(view.name, straight.depth(plain(one)), lens.matrix), unit) for one in depths if unit is not None
-    ]
+    meters = [meters_of(takes.depth(view.name, straight.depth(plain(one)), lens.matrix), unit) for one in depths if unit]
     counted = unit.meters if unit is not None and stored_as(depths[0]) == "png" else None
     return SampledCamera(view.name, view.path, _size_of(pairs), lens, straight, colors, meters, counted)
 

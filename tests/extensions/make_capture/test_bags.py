@@ -345,10 +345,8 @@ def test_what_is_no_recording_says_what_is(tmp_path, monkeypatch, capsys):
     assert 'pip install -c workflow/envs/constraints.txt -e ".[recordings]"' in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("options", "said"), [({"output": None}, "--output"), ({"category": ""}, "--category"), ({"topics": ("/a",)}, "--topics")]
-)
-def test_options_that_are_required_or_of_another_source(tmp_path, options, said):
-    given = {"output": tmp_path / "capture", "category": "ball"} | options
-    with pytest.raises(InputError, match=f"^{said}: is "):
+@pytest.mark.parametrize(("option", "value"), [("output", None), ("category", ""), ("topics", ("/a",))])
+def test_options_that_are_required_or_of_another_source(tmp_path, option, value):
+    given = {"output": tmp_path / "capture", "category": "ball"} | {option: value}
+    with pytest.raises(InputError, match=f"^--{option}: is "):
         make_capture(Intake(**{key: value for key, value in given.items() if value is not None}))

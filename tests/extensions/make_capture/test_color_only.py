@@ -175,7 +175,7 @@ def test_a_pose_of_another_kind_is_named_with_its_file(tmp_path, change, message
 
 
 @pytest.mark.parametrize(
-    ("factor", "words"), [(8.0, "hands too large"), (0.2, "hands too small: hands (label 2) of"), (5.0, "implausible size: 13")]
+    ("factor", "words"), [(8.0, "hands too large"), (0.2, "small: hands (label 2)"), (5.0, "implausible size: 13")]
 )
 def test_poses_of_another_scale_show_in_the_hands_and_the_size(capture, factor, words):
     def scaled(values):

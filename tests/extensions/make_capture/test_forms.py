@@ -67,9 +67,8 @@ def test_spellings_of_distortion_mean_the_same(tmp_path, said):
     lens = read_lenses(write_json(tmp_path / "k.json", PLAIN | said), ["0"])["0"]
     require_lens(tmp_path, "0", lens, (80, 60))
     np.testing.assert_array_equal(lens.distortion, BENT)
-    np.testing.assert_array_equal(
-        Straightener(lens, (80, 60)).maps, Straightener(Lens(matrix=MATRIX, distortion=np.array(BENT)), (80, 60)).maps
-    )
+    right = Straightener(Lens(matrix=MATRIX, distortion=np.array(BENT)), (80, 60))
+    np.testing.assert_array_equal(Straightener(lens, (80, 60)).maps, right.maps)
 
 
 @pytest.mark.parametrize(

@@ -76,9 +76,8 @@ def test_each_model_is_undone_by_its_own_equations(model):
     # The maps say for an ideal pixel where it is seen; linear between whole pixels they are within 0.02 pixels of it.
     ideal, shown = (end, start) if model == "distorted_to_ideal" else (start, end)
     inside = ((ideal > 1) & (ideal < [78, 58])).all(axis=1)
-    found = np.stack(
-        [cv2.remap(one, *ideal[inside].T.astype(np.float32), cv2.INTER_LINEAR).ravel() for one in straight.maps], axis=1
-    )
+    places = ideal[inside].T.astype(np.float32)
+    found = np.stack([cv2.remap(one, *places, cv2.INTER_LINEAR).ravel() for one in straight.maps], axis=1)
     assert inside.sum() > 40
     np.testing.assert_allclose(found, shown[inside], atol=0.05)
     assert straight.most == pytest.approx(np.hypot(*(np.stack(straight.maps) - np.mgrid[:60, :80][::-1])).max(), abs=1e-3)
