@@ -69,9 +69,7 @@ def cameras_in_step(
     return examine("streams", "--shift", pairs)
 
 
-def _streams(
-    where: Path, names: tuple[str, str], stream: str, shift: Shift | None, match: Match, late: Mapping[str, int]
-) -> Streams:
+def _streams(where: Path, names: Sequence[str], stream: str, shift: Shift | None, match: Match, late: Mapping[str, int]) -> Streams:
     if match.rival and stream not in late and not (shift and shift.known):
         rule = f"{names[0]} and {names[1]} have as many pictures with the same gaps, and too little moves to tell which are of "
         remedy = f"Give --shift {stream}=0 for the order, or --shift {stream}={match.rival} for equal numbers."

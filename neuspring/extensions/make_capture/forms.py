@@ -121,8 +121,7 @@ def read_lenses(path: Path, names: Sequence[str]) -> dict[str, Lens]:
         for outer in around:
             beside = [key for key in outer if key not in place and _bare(key) not in QUIET and TELLING.search(key)]
             if loose := [key for key in beside if isinstance(outer[key], (float, list))]:
-                rule = "what describes a lens belongs into its camera's object"
-                raise InputError(path, rule, f"{loose[0]!r} beside the cameras")
+                raise InputError(path, "what describes a lens belongs into its camera's object", f"{loose[0]!r} beside the cameras")
         sizes = {key: value for outer in around for key, value in outer.items() if _side(key)}
         lenses[name] = _lens(path, name, sizes | entry if isinstance(entry, dict) else entry, unit)
         if place and name not in place and isinstance(place[-1], str):

@@ -316,10 +316,9 @@ def _require_rate(brought: Mapping[str, Path], rate: float) -> None:
     """Raise InputError where a C3D file has another rate than the capture, frames per second."""
     for name, path in brought.items():
         if is_c3d(path) and abs((told := Markers.read(path).rate) - rate) > RATE_APART * rate:
+            rule = f"{path} must have the capture's rate, a row per frame"
             remedy = "Leave --rate out, or resample the markers to the rate of the film."
-            raise InputError(
-                f"--{name}", f"{path} must have the capture's rate, a row per frame", f"{told:g} Hz, not {rate:g}", remedy
-            )
+            raise InputError(f"--{name}", rule, f"{told:g} Hz, not {rate:g}", remedy)
 
 
 def digests(files: Mapping[str, Path | None]) -> dict[str, str]:

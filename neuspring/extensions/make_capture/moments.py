@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -169,11 +169,9 @@ class Evenness:
         steps, usual = np.diff(times) / np.diff(places), float(np.median(np.diff(times) / np.diff(places)))
         rest = times - np.polyval(np.polyfit(places, times, 1), places)
         counted = np.where(steps > MISSING_GAP * usual, np.round(steps / usual) - 1, 0) * np.diff(places)
-        breaks = np.abs(np.diff(steps)) > JITTER * steps[1:] + ROUNDED
-        label = np.concatenate([[0], np.cumsum(breaks)])
-        runs = [list(part) for _, part in groupby(range(len(steps)), key=lambda k: label[k])]
-        even, gaps = [(part[0], part[-1] + 1) for part in runs], np.flatnonzero(counted).tolist()
-        return cls(steps, float(np.ptp(rest) / 2 / steps.mean()), int(counted.sum()), gaps, even)
+        breaks = np.flatnonzero(np.abs(np.diff(steps)) > JITTER * steps[1:] + ROUNDED) + 1
+        runs = list(pairwise([0, *breaks.tolist(), len(steps)]))
+        return cls(steps, float(np.ptp(rest) / 2 / steps.mean()), int(counted.sum()), np.flatnonzero(counted).tolist(), runs)
 
     @property
     def bad(self) -> bool:

@@ -191,9 +191,7 @@ def straightened(view: Paired, pairs: Sequence[Pair], lens: Lens, unit: Unit | N
     """Pairs of one camera, without distortion and in meters; `unit` is None with color alone."""
     straight = Straightener(lens, _size_of(pairs))
     colors, depths = [straight.color(color) for color, _ in pairs], [depth for _, depth in pairs if depth is not None]
-    meters = [
-        meters_of(takes.depth(view.name, straight.depth(plain(one)), lens.matrix), unit) for one in depths if unit is not None
-    ]
+    meters = [meters_of(takes.depth(view.name, straight.depth(plain(one)), lens.matrix), unit) for one in depths if unit]
     flat = {}
     if unit is not None and lens.distortion.any():
         models = (MODELS[lens.model], *(model for model, counts in COEFFICIENT_COUNTS.items() if len(lens.distortion) in counts))
@@ -272,8 +270,8 @@ def by_table(seen: SampledCamera, top_down: bool, at: tuple[float, float] | None
     """The pose of the only camera: the table is z = 0. Raises InputError where it is not found; see `depth.find_table`."""
     points = cloud(seen.depths, seen.lens.matrix)
     table, remarks = find_table(seen.path, points, top_down=top_down, at=None if at is None else _point(seen, at))
-    poses, known = {seen.name: pose_on(table, points, seen.size, seen.lens.matrix)}, {seen.name: seen}
-    judged = _judged("rig", seen.path, Judged.of(rig_of(known, poses, posed=False), units_of(known)))
+    poses = {seen.name: pose_on(table, points, seen.size, seen.lens.matrix)}
+    judged = _judged("rig", seen.path, Judged.of(rig_of({seen.name: seen}, poses, posed=False), {seen.name: seen.unit}))
     lines = (f"table: {table.text()}", *(f"warning: {remark}" for remark in remarks), *judged)
     return Placed(poses=poses, table=table.text(), lines=lines)
 
@@ -290,11 +288,6 @@ def rig_of(seen: Seen, poses: Poses, posed: bool = True) -> Rig:
     depths = {name: view.depths for name, view in seen.items()}
     first = {name: listed[0] for name, listed in depths.items()}
     return Rig({name: view.camera(poses[name]) for name, view in seen.items()}, depths, first, posed=posed)
-
-
-def units_of(seen: Seen) -> dict[str, float | None]:
-    """m per count of depth of every camera."""
-    return {name: view.unit for name, view in seen.items()}
 
 
 def by_board(board: Board, seen: Seen, images: Sequence[Path]) -> tuple[Poses, list[str]]:
@@ -344,7 +337,7 @@ def stand(poses: Poses, seen: Seen, file: Path, level: bool, top_down: bool, up:
     rig = rig_of(seen, moved)
     side = up or min(("+z", "-z"), key=lambda each: sum(rig.with_up(each).standing.values()))
     rig = rig.with_up(side)
-    lines += _judged("rig", file, Judged.of(rig, units_of(seen), of_file=False))
+    lines += _judged("rig", file, Judged.of(rig, {name: view.unit for name, view in seen.items()}, of_file=False))
     text = "; ".join(f"camera {name}: {plane.text()}" for name, (plane, _) in rig.stands.items())
     return Placed(poses=moved, up=side, motion=motion, table=text or "not found", lines=tuple(lines))
 

@@ -108,9 +108,7 @@ CENTER_OF_VIEW = 1.0 / 3.0
 """Part of the image, in its center, that is the center of view."""
 
 
-def find_table(
-    where: object, points: np.ndarray, *, top_down: bool = False, at: np.ndarray | None = None
-) -> tuple[Plane, list[str]]:
+def find_table(where: object, points: np.ndarray, top_down: bool = False, at: np.ndarray | None = None) -> tuple[Plane, list[str]]:
     """The table among the planes in points [n, 3], m, in the coordinates of a camera, and what the user should know of the choice.
 
     It is the largest plane whose normal points up in the image; with `at`, the one through this point [3]. Raises InputError

@@ -62,9 +62,8 @@ def test_one_mcap_file_holds_two_cameras(tmp_path):
     file = next((tmp_path / "film").glob("*.mcap"))
     topics = (COLOR, DEPTH, f"/left{COLOR}", f"/left{DEPTH}")
     poses = write_poses(tmp_path / "poses.json")
-    made, _ = make_capture(
-        Intake(output=tmp_path / "capture", category="ball", bag=(file,), topics=topics, poses=poses, cameras=("a", "b"))
-    )
+    said = {"bag": (file,), "topics": topics, "poses": poses, "cameras": ("a", "b")}
+    made, _ = make_capture(Intake(output=tmp_path / "capture", category="ball", **said))
     assert [*made.cameras] == ["a", "b"]
     np.testing.assert_array_equal(made.color("b", 3), seen(camera(1), 3)[0])
     with pytest.raises(InputError, match=r"2 and 2\. Name them, --topics COLOR DEPTH\. There are: .*/left/camera/color/image_raw"):
@@ -224,9 +223,8 @@ def test_compressed_topics_as_most_labs_record_them(tmp_path, form):
         for frame in range(FRAMES):
             color, depth = seen(camera(), frame)
             stamp = START + frame * STEP
-            bag.compressed(
-                f"{COLOR}/compressed", stamp, cv2.imencode(".jpg", color[..., ::-1])[1].tobytes(), "rgb8; jpeg compressed bgr8"
-            )
+            packed = cv2.imencode(".jpg", color[..., ::-1])[1].tobytes()
+            bag.compressed(f"{COLOR}/compressed", stamp, packed, "rgb8; jpeg compressed bgr8")
             bag.compressed(f"{DEPTH}/compressedDepth", stamp, packed_depth(counts(depth)), "16UC1; compressedDepth png")
     assert main(words(path)) == 0
     made = Capture.load(tmp_path / "capture")
@@ -257,9 +255,8 @@ def test_stamps_of_headers_pair_and_not_the_times_of_the_log(tmp_path):
 def test_an_image_that_comes_twice_is_one(tmp_path):
     with recorded(tmp_path / "film") as bag:
         for frame in (0, 1, 1, 2):
-            bag.image(
-                "/image", START + frame * STEP, np.full((2, 2), frame, np.uint16), "16UC1", log=START + len(bag.topics) + frame
-            )
+            log = START + len(bag.topics) + frame
+            bag.image("/image", START + frame * STEP, np.full((2, 2), frame, np.uint16), "16UC1", log=log)
     topic = Topic(Bag(tmp_path / "film"), "/image", "depth")
     assert [image[0, 0] for image in topic.read([0, 1, 2])] == [0, 1, 2] and len(topic.series.numbers) == 3
 
@@ -286,9 +283,8 @@ def test_definitions_of_a_part_of_the_types_are_enough(tmp_path):
 def test_types_that_nobody_knows_are_passed_over(tmp_path):
     with recorded(tmp_path / "film") as bag:
         desk(bag)
-        own = bag.writer.add_connection(
-            "/gripper", "my_lab/msg/Gripper", msgdef="my_lab/Unknown what\n", rihs01="RIHS01_" + 64 * "0"
-        )
+        about = {"msgdef": "my_lab/Unknown what\n", "rihs01": "RIHS01_" + 64 * "0"}
+        own = bag.writer.add_connection("/gripper", "my_lab/msg/Gripper", **about)
         bag.writer.write(own, START, b"\x00\x01\x00\x00")
     assert "/gripper: my_lab/msg/Gripper, 1 messages" in Bag(tmp_path / "film").text()
     assert main(words(tmp_path / "film")) == 0
@@ -335,9 +331,7 @@ def test_a_realsense_recording_that_lacks_a_time_is_refused(tmp_path):
         stored.execute("DELETE FROM messages WHERE id = (SELECT MAX(id) FROM messages)")
     stored.close()
     view = open_bags([path]).views[0]
-    with pytest.raises(
-        InputError, match=rf"a timestamp in /device_0/sensor_0/Depth_0/image/metadata is required.*received {FRAMES - 1}"
-    ):
+    with pytest.raises(InputError, match=rf"a timestamp in /device_0/.*/Depth_0/image/metadata is required.*received {FRAMES - 1}"):
         next(view.read([0]))
 
 
@@ -363,10 +357,8 @@ def test_what_is_no_recording_says_what_is(tmp_path, monkeypatch, capsys):
     assert 'pip install -c workflow/envs/constraints.txt -e ".[recordings]"' in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("options", "said"), [({"output": None}, "--output"), ({"category": ""}, "--category"), ({"topics": ("/a",)}, "--topics")]
-)
-def test_options_that_are_required_or_of_another_source(tmp_path, options, said):
-    given = {"output": tmp_path / "capture", "category": "ball"} | options
-    with pytest.raises(InputError, match=f"^{said}: is "):
+@pytest.mark.parametrize(("option", "value"), [("output", None), ("category", ""), ("topics", ("/a",))])
+def test_options_that_are_required_or_of_another_source(tmp_path, option, value):
+    given = {"output": tmp_path / "capture", "category": "ball"} | {option: value}
+    with pytest.raises(InputError, match=f"^--{option}: is "):
         make_capture(Intake(**{key: value for key, value in given.items() if value is not None}))

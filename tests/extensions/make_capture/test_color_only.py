@@ -1,6 +1,7 @@
 """Captures of color alone: made, checked, and refused by what needs depth."""
 
 import json
+import re
 
 import cv2
 import numpy as np
@@ -109,9 +110,8 @@ def test_what_is_refused_before_anything_is_written(tmp_path, changes, message):
     root = write_folders(tmp_path)
     if callable(changes.get("poses")):
         changes = {"poses": changes["poses"](root)}
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=re.escape(message)):
         make_capture(intake(root, **changes))
-    assert message in str(caught.value)
     assert not (tmp_path / "capture").exists()
 
 
@@ -136,10 +136,7 @@ def test_a_good_capture_says_how_large_the_object_is(capture):
     [
         (lambda pose: FLIP @ pose, "the camera must be above the table z = 0, on the side of it that is up; received"),
         (lambda pose: pose @ FLIP, "the table z = 0 must be 0.1 to 10 m away in the center of the image; received a view past it"),
-        (
-            lambda pose: np.vstack([pose[:2], pose[2] + [0, 0, 0, 40], pose[3]]),
-            "the table z = 0 must be 0.1 to 10 m away in the center of the image; received ",
-        ),
+        (lambda pose: pose + 40 * np.outer([0, 0, 1, 0], [0, 0, 0, 1]), "the table z = 0 must be 0.1 to 10 m away in the center"),
     ],
 )
 def test_a_camera_that_does_not_look_at_the_table(capture, change, message):
@@ -178,7 +175,7 @@ def test_a_pose_of_another_kind_is_named_with_its_file(tmp_path, change, message
 
 
 @pytest.mark.parametrize(
-    ("factor", "words"), [(8.0, "hands too large"), (0.2, "hands too small: hands (label 2) of"), (5.0, "implausible size: 13")]
+    ("factor", "words"), [(8.0, "hands too large"), (0.2, "small: hands (label 2)"), (5.0, "implausible size: 13")]
 )
 def test_poses_of_another_scale_show_in_the_hands_and_the_size(capture, factor, words):
     def scaled(values):

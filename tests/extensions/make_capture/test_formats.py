@@ -23,7 +23,7 @@ def _twin_folders(paths, cameras):
     names = cameras or tuple(map(str, range(len(paths))))
     pairs = zip(names, paths, strict=True)
     return Recorded(
-        views=[Paired(name, ImageFolder(p / "color_0", "color"), ImageFolder(p / "depth_0", "depth")) for name, p in pairs]
+        views=[Paired(one, ImageFolder(p / "color_0", "color"), ImageFolder(p / "depth_0", "depth")) for one, p in pairs]
     )
 
 

@@ -1,6 +1,7 @@
 """make-capture from end to end: every source ends in a capture that check-data accepts; what cannot be is refused at once."""
 
 import json
+import re
 
 import cv2
 import numpy as np
@@ -101,9 +102,8 @@ def test_poses_of_a_world_that_is_elsewhere_need_level(tmp_path):
     assert any(line.startswith("leveled: the world was turned by") for line in report)
     assert serious(check_layout(capture.folder)) == []
     one, two = (view.camera_to_world for view in capture.cameras.values())
-    np.testing.assert_allclose(
-        np.linalg.inv(one) @ two, np.linalg.inv(camera(0).camera_to_world) @ camera(1).camera_to_world, atol=1e-9
-    )
+    right = np.linalg.inv(camera(0).camera_to_world) @ camera(1).camera_to_world
+    np.testing.assert_allclose(np.linalg.inv(one) @ two, right, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -118,9 +118,8 @@ def test_poses_of_a_world_that_is_elsewhere_need_level(tmp_path):
 )
 def test_what_is_refused_before_anything_is_written(tmp_path, changes, message):
     root = write_folders(tmp_path)
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=re.escape(message)):
         make_capture(intake(root, **changes))
-    assert message in str(caught.value)
     assert not (tmp_path / "capture").exists()
 
 
@@ -179,9 +178,8 @@ def test_an_unfinished_capture_is_no_capture_for_anybody(tmp_path):
         with pytest.raises(InputError, match=said):
             refuse(tmp_path / "capture")
     for folder in (tmp_path / "capture", tmp_path):
-        assert [str(one) for one in check_layout(folder)] == [
-            f"error: {tmp_path / 'capture'}: {said}: it goes on where it stopped."
-        ]
+        text = f"error: {tmp_path / 'capture'}: {said}: it goes on where it stopped."
+        assert [str(one) for one in check_layout(folder)] == [text]
     assert make.prepare(tmp_path / "capture", {"frames": 7}, force=False)
 
 
@@ -230,10 +228,7 @@ def test_depth_of_a_sensor_that_stands_elsewhere(tmp_path):
     _, report = make_capture(intake(root, output=tmp_path / "moved", **films))
     line = next(line for line in report if "not aligned" in line)
     assert line.startswith("warning: camera 0: depth not aligned to color: edges of depth fit those of color when depth is ")
-    assert (
-        "pixels to the left; as it is they must fit within 1.5% of the width. Let the camera's software align depth to color"
-        in line
-    )
+    assert "pixels to the left; as it is they must fit within 1.5% of the width. Let the camera's software align depth" in line
 
 
 BOARD_POSES = [looking(np.array(eye), np.array([0.1, -0.14, 0])) for eye in ((0.1, -0.55, 0.45), (0.5, -0.1, 0.5))]
@@ -278,15 +273,9 @@ def test_a_board_of_another_size_contradicts_depth(tmp_path):
     ("words", "message"),
     [
         ([], "--bag, --phystwin-raw is required, or --controllers with --nodes and --tracks; received none"),
-        (
-            ["--color", "{root}/color_0", "--depth", "{root}/depth_0", "{root}/depth_0"],
-            "as many folders or videos of depth as of color are required",
-        ),
+        (["--color", "{root}/color_0", "--depth", "{root}/depth_0", "{root}/depth_0"], "as many folders or videos of depth as of"),
         (["--color", "{root}/color_0", "--depth", "{root}/nothing"], "a folder of depth images (.png .npy .tif .tiff) or a video"),
-        (
-            ["--color", "{root}/color_0", "--depth", "{root}/depth_0", "--cameras", "a", "b"],
-            "--cameras: 1 different names are required",
-        ),
+        (["--color", "{root}/color_0", "--depth", "{root}/depth_0", "--cameras", "a", "b"], "--cameras: 1 different names are"),
     ],
 )
 def test_bad_words_end_with_status_2(tmp_path, capsys, words, message):

@@ -99,14 +99,9 @@ def test_the_number_need_not_stand_at_the_end_of_the_name(tmp_path):
 
 
 def test_cameras_with_unequal_counts_without_gaps_are_refused(tmp_path):
-    views = [
-        pairs([named(tmp_path, f"c{k}", range(n))], [named(tmp_path, f"d{k}", range(n))], [str(k)])[0]
-        for k, n in ((0, 90), (1, 45))
-    ]
-    with pytest.raises(
-        InputError, match=r"c1: camera 0 and camera 1 must show the same moments; received 90 .* 45 .* 2\.00 times the rate"
-    ):
-        choose(views)
+    colors, depths = ([named(tmp_path, f"{kind}{k}", range(n)) for k, n in enumerate((90, 45))] for kind in "cd")
+    with pytest.raises(InputError, match=r"c1: camera 0 and camera 1 must show the same moments; received 90 .* 45 .* 2\.00 times"):
+        choose(pairs(colors, depths))
 
 
 TIMES = 1305031102.175304 + np.arange(45) / 30
@@ -263,9 +258,7 @@ def test_an_image_that_exif_data_turn_is_refused_in_a_folder(tmp_path, ending):
     assert [image.shape for image in ImageFolder(tmp_path, "color").read([0, 1])] == [(4, 6, 3)] * 2
     exif[0x0112] = 6
     picture.save(tmp_path / f"2.{ending}", exif=exif)
-    with pytest.raises(
-        InputError, match=r"must be stored upright, with EXIF orientation 1; received 6\. .*mogrify -auto-orient .*exiftool"
-    ):
+    with pytest.raises(InputError, match=r"upright, with EXIF orientation 1; received 6\. .*mogrify -auto-orient .*exiftool"):
         list(ImageFolder(tmp_path, "color").read([2]))
 
 

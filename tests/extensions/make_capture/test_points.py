@@ -118,7 +118,7 @@ def test_motion_capture_alone_becomes_a_capture(tmp_path):
         (
             {"rate": 100.0},
             {"rate": 30.0},
-            r"--controllers: .*take\.c3d#hand0.* must have the capture's rate.*received 100 Hz, not 30\. Leave",
+            r"--controllers: .*take\.c3d#hand0.* the capture's rate.*received 100 Hz, not 30\. Leave",
         ),
         ({"unit": ""}, {}, r"POINT:UNITS must be one of m cm mm.*Say it, .*take\.c3d#unit=mm,hand0"),
         ({"frames": 9}, {"tracks": None}, r"--controllers, --nodes and --tracks are required; received no --tracks"),

@@ -79,13 +79,9 @@ def test_masks_that_are_missing_and_names_that_are_no_frame_numbers_are_refused(
     for frame in (4, 5, 6, 9):
         (case / "mask" / "1" / "0" / f"{frame}.png").unlink()
     words = f"make-capture --phystwin-raw {case} --category toy --output {tmp_path / 'capture'}"
-    with pytest.raises(
-        InputError, match=r"mask/1/0: a mask of every frame with color is required; received none of 4 to 6, 9\. Make them"
-    ):
+    with pytest.raises(InputError, match=r"mask/1/0: a mask of every frame with color .*received none of 4 to 6, 9\. Make them"):
         open_case(case).require_masks(dict.fromkeys("01", range(12)))
     assert main(words.split()) == 2 and not (tmp_path / "capture").exists()
     (case / "color" / "1" / "11.png").rename(case / "color" / "1" / "12.png")
-    with pytest.raises(
-        InputError, match=r"color/1: names must be frame numbers below frame_num of metadata\.json, 12; received 0 to 10, 12"
-    ):
+    with pytest.raises(InputError, match=r"color/1: names must be frame numbers below .* metadata\.json, 12; received 0 to 10, 12"):
         open_case(case)

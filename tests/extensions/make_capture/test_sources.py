@@ -1,5 +1,7 @@
 """Folders and videos of images: their order, their numbers, what is refused, and which frames are kept."""
 
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -49,9 +51,8 @@ def image_of(value, ending=".png"):
 )  # fmt: skip
 def test_what_is_no_folder_of_images_is_refused(tmp_path, write, kind, message):
     write(tmp_path)
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=re.escape(message)):
         list(ImageFolder(tmp_path, kind).read(range(len(ImageFolder(tmp_path, kind).series.numbers))))
-    assert message in str(caught.value)
 
 
 def test_a_depth_video_keeps_every_count(tmp_path):
@@ -117,7 +118,5 @@ def test_a_camera_without_the_first_frame_is_refused(tmp_path):
     root = write_folders(tmp_path, cameras=2)
     for kind in ("color", "depth"):
         (root / f"{kind}_1" / "frame_0.png").unlink()
-    with pytest.raises(
-        InputError, match=r"camera 1 must have the first of the chosen frames, number 0.*the first that all have is 1"
-    ):
+    with pytest.raises(InputError, match=r"camera 1 must have the first of the chosen frames, number 0.* that all have is 1"):
         choose(pairs([root / "color_0", root / "color_1"], [root / "depth_0", root / "depth_1"]))

@@ -109,5 +109,5 @@ def pairs(colors: Sequence[Path], depths: Sequence[Path], names: Sequence[str] =
     names = names_of(len(colors), names)
     deep: list[ImageSource | None] = [open_images(depth, "depth") for depth in depths]
     return [
-        Paired(name, open_images(color, "color"), depth) for name, color, depth in zip(names, colors, deep or [None], strict=True)
+        Paired(name, open_images(path, "color"), depth) for name, path, depth in zip(names, colors, deep or [None], strict=True)
     ]
