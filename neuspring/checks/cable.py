@@ -172,7 +172,7 @@ def swings(cable: Cable) -> dict[str, Any] | None:
     """The ratio of what turns the cable and what gravity turns it with, and the rate at which it would be 1."""
     spans = [span for span in SPANS if len(cable.points) >= LEAST_SPANS * span]
     ratio = next((ratio for ratio, alike in map(cable.turned, spans) if alike > SWINGS), None)
-    return ratio and {"value": ratio, "fits": float(f"{cable.settings.rate / np.sqrt(ratio):.2g}")}
+    return {"value": ratio, "fits": float(f"{cable.settings.rate / np.sqrt(ratio):.2g}")} if ratio else None
 
 
 # fmt: off

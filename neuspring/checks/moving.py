@@ -142,7 +142,7 @@ class Moving:
     @cached_property
     def stepped(self) -> np.ndarray:
         """[T, K] bool: steps far beyond those around and those of the others, that nothing else explains."""
-        found = self.large & (self.speed > STEP * self.around * np.maximum(self.together, 1.0))
+        found = np.asarray(self.large & (self.speed > STEP * self.around * np.maximum(self.together, 1.0)))
         for group, frames in self.swapped.items():
             found[np.ix_(frames, group)] = False
         for point, _, last in self.held:
