@@ -6,10 +6,8 @@ a marker was lost, a stream stood still, or labels were exchanged.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from functools import cached_property
-from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -18,6 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse.csgraph import minimum_spanning_tree
 
 from neuspring.core.checks import Check
+from neuspring.core.text import listed
 
 AROUND = 4
 """Frames before and after a step with which it is compared; up to two more large steps there do not hide it."""
@@ -42,99 +41,65 @@ LOOKED, NAMED = 50, 3
 """Frames in which neighbors are looked for, and places that a message names."""
 
 
-def last_seen(seen: np.ndarray) -> np.ndarray:
-    """[T, K]: the last earlier frame in which each point is seen; -1: none. `seen` is [T, K] bool."""
-    frames = np.where(seen, np.arange(len(seen))[:, None], -1)
-    return np.concatenate([np.full((1, seen.shape[1]), -1), np.maximum.accumulate(frames, axis=0)[:-1]])
-
-
 def steps(points: np.ndarray, of: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Distances [T, K], m, of each place `of` [T, K, 3] (the points themselves) from where its point was last seen, NaN where it
     was not; and how many frames ago that was."""
-    before = last_seen(np.isfinite(points).all(axis=2))
+    now = np.arange(len(points))[:, None]
+    frames = np.maximum.accumulate(np.where(np.isfinite(points).all(axis=2), now, -1), axis=0)
+    before = np.pad(frames, ((1, 0), (0, 0)), constant_values=-1)[:-1]
     there = np.take_along_axis(points, np.maximum(before, 0)[..., None], axis=0)
     away = np.linalg.norm((points if of is None else of) - there, axis=2)
-    return np.where(before < 0, np.nan, away), np.arange(len(points))[:, None] - before
+    return np.where(before < 0, np.nan, away), now - before
 
 
-def typical(values: np.ndarray) -> np.ndarray:
-    """The median [T, 1] of what is finite in each row; 0 where nothing is."""
-    known = np.isfinite(values).any(axis=1, keepdims=True)
-    return np.asarray(np.nanmedian(np.where(known, values, 0.0), axis=1, keepdims=True))
+def no_places(given: np.ndarray) -> np.ndarray:
+    """[T, K] bool: entries of points [T, K, 3] that are no places: zeros, other equal coordinates, or a value that is there several
+    times to the bit, far from where the point is seen before and after."""
+    seen = np.isfinite(given).all(axis=2)
+    _, which, counts = np.unique(given[seen], axis=0, return_inverse=True, return_counts=True)
+    equal = (given == given[..., :1]).all(axis=2)
+    repeated = equal.copy()
+    repeated[seen] |= (counts > 1)[which.ravel()]
+    others = np.where(repeated[..., None], np.nan, given)
+    away, gap = steps(others)
+    usual = np.nanquantile(np.append(away / gap, 0.0), 0.95)
+    sides = [steps(others, given), [one[::-1] for one in steps(others[::-1], given[::-1])]]
+    far = [np.isnan(away) | (away > np.maximum(LEAST, usual * np.maximum(STEP, gap))) for away, gap in sides]
+    # Where the point is seen on one side alone, the value may be its place, held.
+    known = np.isfinite([away for away, _ in sides]).sum(axis=0) > np.where(equal, 0, 1)
+    found: np.ndarray = repeated & np.all(far, axis=0) & known
+    # What is no place in one frame is none in the middle of a long gap.
+    found[seen] = np.isin(which.ravel(), which.ravel()[found[seen]])
+    return found
 
 
-@dataclass(frozen=True, eq=False)
+def usual_speeds(speed: np.ndarray) -> np.ndarray:
+    """[T, K], m/s: the third largest of `speed` [T, K] within AROUND frames, where there are three, else a high one of all."""
+    windows = sliding_window_view(np.pad(speed, ((AROUND, AROUND), (0, 0)), constant_values=np.nan), 2 * AROUND + 1, axis=0)
+    count = np.isfinite(windows).sum(axis=2)
+    third = np.take_along_axis(np.sort(windows), np.maximum(count - 3, 0)[..., None], axis=2)[..., 0]
+    finite = np.append(speed[np.isfinite(speed)], 0.0)
+    return np.maximum(np.where(count < 3, np.quantile(finite, 0.95), third), max(np.median(finite), SLOW / 10))
+
+
 class Moving:
-    """Trajectories of points."""
+    """Trajectories of points `given` [T, K, 3], m, NaN where not seen, at `rate` frames per second.
 
-    given: np.ndarray
-    """[T, K, 3], m, NaN where not seen."""
-    rate: float
-    """Frames per second."""
+    Of each frame and point, [T, K]: `lost` where an entry is no place (then `points` has NaN too); the distance `away`, m, from
+    where it was last seen, `gap` frames before; its `speed` and that `around`, m/s; `large` where a step is no noise. `together`
+    [T, 1] is how many times as far as around all points step; 0 where there are few.
+    """
 
-    @cached_property
-    def lost(self) -> np.ndarray:
-        """[T, K] bool: entries that are no places: zeros, other equal coordinates, or a value that is there several times to the
-        bit, far from where the point is seen before and after."""
-        seen = np.isfinite(self.given).all(axis=2)
-        _, which, counts = np.unique(self.given[seen], axis=0, return_inverse=True, return_counts=True)
-        equal = (self.given == self.given[..., :1]).all(axis=2)
-        repeated = equal.copy()
-        repeated[seen] |= (counts > 1)[which.ravel()]
-        others = np.where(repeated[..., None], np.nan, self.given)
-        away, gap = steps(others)
-        usual = np.nanquantile(np.append(away / gap, 0.0), 0.95)
-        sides = [steps(others, self.given), [one[::-1] for one in steps(others[::-1], self.given[::-1])]]
-        far = [np.isnan(away) | (away > np.maximum(LEAST, usual * np.maximum(STEP, gap))) for away, gap in sides]
-        # Where the point is seen on one side alone, the value may be its place, held.
-        known = np.isfinite([away for away, _ in sides]).sum(axis=0) > np.where(equal, 0, 1)
-        found = repeated & np.all(far, axis=0) & known
-        # What is no place in one frame is none in the middle of a long gap.
-        found[seen] = np.isin(which.ravel(), which.ravel()[found[seen]])
-        return found
-
-    @cached_property
-    def points(self) -> np.ndarray:
-        """[T, K, 3], m, NaN where lost too."""
-        return np.where(self.lost[..., None], np.nan, self.given)
-
-    @cached_property
-    def away(self) -> np.ndarray:
-        """[T, K], m, from the place where each was last seen."""
-        return steps(self.points)[0]
-
-    @cached_property
-    def gap(self) -> np.ndarray:
-        """[T, K]: how many frames ago that was."""
-        return steps(self.points)[1]
-
-    @cached_property
-    def speed(self) -> np.ndarray:
-        """[T, K], m/s."""
-        return self.away * self.rate / self.gap
-
-    @cached_property
-    def around(self) -> np.ndarray:
-        """[T, K], m/s: the third largest speed within AROUND frames, where there are three, else a high one of all."""
-        edge = np.full((AROUND, self.speed.shape[1]), np.nan)
-        windows = np.sort(sliding_window_view(np.concatenate([edge, self.speed, edge]), 2 * AROUND + 1, axis=0))
-        count = np.isfinite(windows).sum(axis=2)
-        third = np.take_along_axis(windows, np.maximum(count - 3, 0)[..., None], axis=2)[..., 0]
-        finite = np.append(self.speed[np.isfinite(self.speed)], 0.0)
-        return np.maximum(np.where(count < 3, np.quantile(finite, 0.95), third), max(np.median(finite), SLOW / 10))
-
-    @cached_property
-    def large(self) -> np.ndarray:
-        """[T, K] bool: steps that are no noise."""
-        return (self.away > LEAST) & (self.speed > SLOW)
-
-    @cached_property
-    def together(self) -> np.ndarray:
-        """[T]: the factor by which the points together step farther than around; 0: not at all."""
-        if self.points.shape[1] < MANY:
-            return np.zeros(len(self.points))
-        middle = typical(np.where(np.isfinite(self.speed), self.large * self.speed / self.around, np.nan))[:, 0]
-        return np.where(middle > TOGETHER, middle, 0.0)
+    def __init__(self, given: np.ndarray, rate: float) -> None:
+        self.given, self.rate, self.lost = given, rate, no_places(given)
+        self.points = np.where(self.lost[..., None], np.nan, given)
+        self.away, self.gap = steps(self.points)
+        self.speed = self.away * rate / self.gap
+        self.around = usual_speeds(self.speed)
+        self.large = (self.away > LEAST) & (self.speed > SLOW)
+        factors = np.ma.masked_invalid(self.speed / self.around) * self.large
+        many = given.shape[1] >= MANY
+        self.together = np.ma.median(factors, axis=1, keepdims=True).filled(0.0) if many else np.zeros((len(given), 1))
 
     @cached_property
     def held(self) -> list[tuple[int, int, int]]:
@@ -143,29 +108,21 @@ class Moving:
         for point in range(self.points.shape[1]):
             at = np.flatnonzero(np.isfinite(self.points[:, point]).all(axis=1))
             changes = np.flatnonzero((np.diff(self.points[at, point], axis=0) != 0).any(axis=1)) + 1
-            for run in np.split(at, changes):
-                if len(run) < HELD:
-                    continue
-                after = at[at > run[-1]][:1]
-                if self._stepped(run, after[0], point) if len(after) else self._left(run, point):
-                    found.append((point, int(run[0]), int(run[-1])))
+            runs = [run for run in np.split(at, changes) if len(run) >= HELD]
+            found += [(point, int(run[0]), int(run[-1])) for run in runs if self._ends(point, run, at[at > run[-1]])]
         return found
 
-    def _stepped(self, run: np.ndarray, after: int, point: int) -> bool:
-        """True where a point steps in frame `after`, and it or others moved before that."""
-        if not self.large[after, point] or self.speed[after, point] <= HELD_STEP * self.around[after, point]:
-            return False
-        return bool(run[0] or np.nanmax(self.away[run[0] + 1 : run[-1] + 1], initial=0.0) > 0)
-
-    def _left(self, run: np.ndarray, point: int) -> bool:
-        """True where a point stands still to the end, and what was nearest to it goes away."""
-        near = np.linalg.norm(self.points[run[0]] - self.points[run[0], point], axis=1)
-        went = np.linalg.norm(self.points[run[-1]] - self.points[run[0]], axis=1)
-        near[point] = np.nan
-        if not run[0] or not np.isfinite(near + went).any():
-            return False
-        other = np.nanargmin(near + 0 * went)
-        return bool(went[other] > max(LEAST, MAX_STRETCH * near[other]))
+    def _ends(self, point: int, run: np.ndarray, after: np.ndarray) -> bool:
+        """True where a place that was held in the frames `run` ends with a step; or, at the end of all, is left by the nearest."""
+        then = self.points[run[0]]
+        went = np.linalg.norm(self.points[run[-1]] - then, axis=1)
+        if len(after):
+            far = self.large[after[0], point] and self.speed[after[0], point] > HELD_STEP * self.around[after[0], point]
+            return bool(far and (run[0] or np.nanmax(went) > 0))
+        near = np.linalg.norm(then - then[point], axis=1) + 0 * went
+        near[point] = np.inf
+        other = np.nanargmin(near)
+        return bool(run[0] and went[other] > max(LEAST, MAX_STRETCH * near[other]))
 
     @cached_property
     def swapped(self) -> dict[tuple[int, ...], list[int]]:
@@ -185,119 +142,99 @@ class Moving:
     @cached_property
     def stepped(self) -> np.ndarray:
         """[T, K] bool: steps far beyond those around and those of the others, that nothing else explains."""
-        usual = self.around
-        if self.points.shape[1] >= MANY:
-            usual = np.maximum(usual, typical(self.speed))
-        found = self.large & (self.speed > STEP * usual)
+        found = np.asarray(self.large & (self.speed > STEP * self.around * np.maximum(self.together, 1.0)))
         for group, frames in self.swapped.items():
             found[np.ix_(frames, group)] = False
         for point, _, last in self.held:
             found[last + 1 :, point][: np.argmax(np.append(self.large[last + 1 :, point], True)) + 1] = False
         return found
 
-    @cached_property
-    def links(self) -> np.ndarray:
-        """Pairs [P, 2] of neighbors, by their usual distances."""
-        return spanned(apart(self.points, 0.5))
-
     def strained(self) -> dict[str, Any] | None:
         """The largest change of a steady distance of neighbors, as a part of its median, that nothing else explains."""
         named = {point for group in self.swapped for point in group} | {point for point, *_ in self.held}
         named |= set(np.flatnonzero(self.stepped.any(axis=0)).tolist())
-        links = np.array([link for link in self.links.tolist() if not named & set(link)]).reshape(-1, 2)
-        if not links.size:
+        links = [(one, two) for one, two in spanned(apart(self.points, np.nanmedian)).tolist() if not named & {one, two}]
+        if not links:
             return None
-        lengths = np.linalg.norm(self.points[:, links[:, 0]] - self.points[:, links[:, 1]], axis=2)
+        one, two = np.transpose(links)
+        lengths = np.linalg.norm(self.points[:, one] - self.points[:, two], axis=2)
         low, middle, high = np.nanquantile(lengths, (0.2, 0.5, 0.8), axis=0)
-        change = np.where((high - low < STEADY * middle) & (np.abs(lengths - middle) > CHANGED), np.abs(lengths / middle - 1), 0.0)
-        frame, link = (int(i) for i in np.unravel_index(int(np.nan_to_num(change).argmax()), change.shape))
-        told = {"value": float(np.nan_to_num(change).max()), "length": lengths[frame, link], "median": middle[link]}
-        return told | {"frame": frame, "one": links[link, 0], "two": links[link, 1], "frames": (frame,)}
+        told = (high - low < STEADY * middle) & (np.abs(lengths - middle) > CHANGED)
+        change = np.where(told, np.abs(lengths / middle - 1), 0.0)
+        frame, link = (int(i) for i in np.unravel_index(int(change.argmax()), change.shape))
+        words = {"value": float(change.max()), "length": lengths[frame, link], "median": middle[link]}
+        return words | {"frame": frame, "one": one[link], "two": two[link], "frames": (frame,)}
 
 
-def apart(points: np.ndarray, quantile: float) -> np.ndarray:
-    """A quantile over frames of the distances [K, K], m, of each two points [T, K, 3]; 0 where no frame sees both."""
+def apart(points: np.ndarray, of: Callable[..., np.ndarray]) -> np.ndarray:
+    """The largest (np.nanmax) or median distance [K, K], m, of each two points [T, K, 3] in some frames; 0 where none sees both."""
     some = points[np.unique(np.linspace(0, len(points) - 1, LOOKED).astype(int))]
     distances = np.array([np.linalg.norm(at[:, None] - at, axis=2) for at in some])
-    return np.asarray(np.nanquantile(np.where(np.isfinite(distances).any(axis=0), distances, 0.0), quantile, axis=0))
+    return of(np.where(np.isfinite(distances).any(axis=0), distances, 0.0), axis=0)
 
 
 def spanned(distances: np.ndarray) -> np.ndarray:
-    """Pairs [P, 2], lower first, of the shortest tree that joins points by their distances [K, K]."""
-    return np.sort(np.transpose(minimum_spanning_tree(distances).nonzero()), axis=1)
+    """Pairs [P, 2] of the shortest tree that joins points by their distances [K, K]."""
+    return np.transpose(minimum_spanning_tree(distances).nonzero())
 
 
-def listed(entries: Iterable[tuple[int, str]]) -> str:
-    """Points and what happens to them, as far as a message names them."""
-    every = list(entries)
-    more = f" and {len(every) - NAMED} more" if len(every) > NAMED else ""
-    return "; ".join(f"point {point} {what}" for point, what in islice(every, NAMED)) + more
+def told(entries: Sequence[tuple[int, int, str]]) -> dict[str, Any] | None:
+    """Words about points and frames; their number is the value."""
+    text = listed((f"point {point} {what}" for point, _, what in entries), NAMED)
+    return {"value": len(entries), "text": text, "frames": sorted({frame for _, frame, _ in entries})} if entries else None
 
 
 def lost(moving: Moving) -> dict[str, Any] | None:
     """Entries that are no places."""
-    if not moving.lost.any():
-        return None
-    points = np.flatnonzero(moving.lost.any(axis=0)).tolist()
-    frames = {point: np.flatnonzero(moving.lost[:, point]) for point in points}
-    values = {point: moving.given[at[0], point].tolist() for point, at in frames.items()}
-    text = listed((point, f"is {values[point]} in {len(at)} frames, first {at[0]}") for point, at in frames.items())
-    return {"value": int(moving.lost.sum()), "text": text, "frames": np.flatnonzero(moving.lost.any(axis=1))}
+    before = np.pad(moving.lost, ((1, 0), (0, 0)))[:-1]
+    begins = np.argwhere((moving.lost & ~before).T).tolist()
+    words = told([(k, t, f"from frame {t} on is {moving.given[t, k].tolist()}") for k, t in begins])
+    return words and words | {"frames": np.flatnonzero(moving.lost.any(axis=1))}
 
 
-def never_seen(moving: Moving) -> list[dict[str, Any]]:
-    """Points with one value in all frames that is no place: equal coordinates, or that of another point; while others move."""
-    given = moving.given
-    still = ((given == given[0]) | ~np.isfinite(given)).all(axis=(0, 2)) & np.isfinite(given[0]).all(axis=1)
-    if not (np.abs(np.nan_to_num(given - given[0])) > LEAST).any():
-        return []
-    values, which, counts = np.unique(given[0, still], axis=0, return_inverse=True, return_counts=True)
-    no_place = (counts > 1) | (values == values[:, :1]).all(axis=1)
-    points = np.flatnonzero(still)[no_place[which.ravel()]]
-    return [{"value": int(point), "place": given[0, point].tolist()} for point in points]
+def never_seen(moving: Moving) -> dict[str, Any] | None:
+    """Points with the same three equal coordinates in all frames, while others move."""
+    moved = np.nanmax(np.abs(moving.given - moving.given[0]), axis=(0, 2), initial=0.0)
+    equal = (moving.given == moving.given[0, :, :1]).all(axis=(0, 2)) & (moved.max(initial=0.0) > LEAST)
+    return told([(point, 0, f"is {moving.given[0, point].tolist()}") for point in np.flatnonzero(equal).tolist()])
 
 
 def held(moving: Moving) -> dict[str, Any] | None:
-    """Points that stay equal to the bit, and then step or are left behind."""
-    text = listed((point, f"from frame {first} to {last}") for point, first, last in moving.held)
-    longest = max((last - first + 1 for _, first, last in moving.held), default=0)
-    return {"value": longest, "text": text, "frames": sorted({first for _, first, _ in moving.held})} if longest else None
+    """Places that were held."""
+    return told([(point, first, f"from frame {first} to {last}") for point, first, last in moving.held])
 
 
 def swapped(moving: Moving) -> list[dict[str, Any]]:
-    """Points whose labels are exchanged from a frame on."""
-    return [{"points": " and ".join(map(str, group)), "value": at[0], "frames": at} for group, at in moving.swapped.items()]
+    """Points whose labels are exchanged, and the frames."""
+    return [{"points": group, "value": at[0], "frames": at} for group, at in moving.swapped.items()]
 
 
 def stepped(moving: Moving) -> dict[str, Any] | None:
     """Steps of single points."""
-    at = np.argwhere(moving.stepped)
-    if not len(at):
-        return None
-    words = [(point, f"in frame {t} by {100 * moving.away[t, point]:.1f} cm, {moving.speed[t, point]:.2g} m/s") for t, point in at]
-    largest = float((moving.speed / moving.around)[moving.stepped].max())
-    return {"value": largest, "text": listed(words), "frames": np.unique(at[:, 0])}
+    cm, speed = 100 * moving.away, moving.speed
+    at = np.argwhere(moving.stepped).tolist()
+    return told([(k, t, f"in frame {t} by {cm[t, k]:.1f} cm, {speed[t, k]:.2g} m/s") for t, k in at])
 
 
 def together(moving: Moving) -> dict[str, Any] | None:
-    """Steps of all points together."""
-    frames = np.flatnonzero(moving.together)
-    told = {last + 1 for _, _, last in moving.held} | {frame for at in moving.swapped.values() for frame in at}
-    if not len(frames := np.array([frame for frame in frames if frame not in told], int)):
+    """Steps of all points together, and by how many times they are larger than those around."""
+    explained = {last + 1 for *_, last in moving.held} | {frame for at in moving.swapped.values() for frame in at}
+    frames = [t for t in np.flatnonzero(moving.together > TOGETHER).tolist() if t not in explained]
+    if not frames:
         return None
-    worst = frames[moving.together[frames].argmax()]
-    level = "warning" if moving.together[worst] > PAUSE * moving.rate else "note"
-    far = {"value": float(moving.together[worst]), "cm": 100 * np.nanmedian(moving.away[worst])}
-    return far | {"frame": worst, "frames": frames, "level": level}
+    worst = max(frames, key=lambda t: moving.together[t, 0])
+    factor, cm = float(moving.together[worst, 0]), 100 * np.nanmedian(moving.away[worst])
+    level = "warning" if factor > PAUSE * moving.rate else "note"
+    return {"value": factor, "cm": cm, "frame": worst, "frames": frames, "level": level}
 
 
 # fmt: off
 checks = (
     Check("lost points as numbers", "moving", lambda moving, _: lost(moving), None, "error",
-          "a point that is not seen has no place; received the same value to the bit, far from where the point is: {text}. {1}",
-          title=""),
+          "a point that is not seen has no place; received a value that is repeated to the bit, or three equal coordinates, far "
+          "from where it is seen: {text}. {1}", title=""),
     Check("point never seen", "moving", lambda moving, _: never_seen(moving), None, "warning",
-          "point {value} is {place} in every frame while others move. If it was never seen, leave it out", title=""),
+          "{text} in every frame while others move. If it was never seen, leave it out", title=""),
     Check("held value", "moving", lambda moving, _: held(moving), None, "warning",
           "a place that stays equal to the bit, and is then left by a step or by its neighbors, was held; received {text}. Did the "
           "stream stop, or was a gap filled with the last value? {1}", title=""),

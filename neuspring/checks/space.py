@@ -36,9 +36,7 @@ def far(points: np.ndarray) -> dict[str, Any]:
 
 def travel(points: np.ndarray) -> np.ndarray:
     """The largest mean displacement [3], m, of points [T, K, 3] from their places in frame 0."""
-    moved = points[:, np.isfinite(points[0]).all(axis=1)] - points[0, np.isfinite(points[0]).all(axis=1)]
-    seen = np.isfinite(moved)
-    mean = np.where(seen, moved, 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
+    mean = np.nan_to_num(points - points[0]).sum(axis=1) / max(points.shape[1], 1)
     return np.asarray(mean[np.linalg.norm(mean, axis=1).argmax()])
 
 

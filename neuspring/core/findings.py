@@ -86,6 +86,11 @@ def refusal(error: InputError | str) -> Finding:
     return Finding(name="", level="error", where=file, text=message)
 
 
+def refused(findings: Iterable[Finding]) -> bool:
+    """True where some finding is an error."""
+    return any(one.level == "error" for one in findings)
+
+
 def refuse(findings: Iterable[Finding]) -> None:
     """Raise the first error among findings about a data set as InputError, naming file and key; else print warnings."""
     listed = list(findings)

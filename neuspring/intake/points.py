@@ -54,12 +54,6 @@ class Hands:
     hand: np.ndarray
     """[C] int: the hand of each; empty: not grouped."""
 
-    def held(self, end: int | None = None) -> np.ndarray:
-        """Places [n, 3], m, of controllers while they hold, before frame `end`."""
-        points = self.points[:end]
-        places: np.ndarray = points[self.holds[:end]] if self.holds.size else points.reshape(-1, 3)
-        return places
-
 
 @dataclass(frozen=True, eq=False)
 class InSpace:
@@ -116,9 +110,7 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
     annotated, tracks = attempt(capture.tracks, marked), np.zeros((capture.frame_count, 0, 3))
     nodes, annotated = none if nodes is None else nodes, tracks if annotated is None else annotated
     # A hand may be anywhere while it holds nothing.
-    places = (
-        tracks if hands is None else np.where(hands.holds[..., None], hands.points, np.nan) if hands.holds.size else hands.points
-    )
+    places = tracks if hands is None else np.where(hands.holds[..., None] if hands.holds.size else True, hands.points, np.nan)
     moving = [Moving(points, description.frame_rate) for points in (annotated, places)]
     for file, one, remedy in zip((marked, files.get("controllers")), moving, UNSEEN, strict=True):
         findings += examine("moving", file, one, remedy) if one.given.size else []
@@ -145,8 +137,10 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
     if (file := files.get("controllers")) is not None and hands is not None:
         grouped = hands.hand if hands.hand.size else np.zeros(hands.points.shape[1], int)
         start = held(hands, annotated, capture.train_end)[0]
-        body = np.concatenate([nodes, first])
-        holding = Holding(grouped, hands.held(capture.train_end), start, nodes, body, places, annotated)
+        taught = places[: capture.train_end]
+        holding = Holding(
+            grouped, taught[np.isfinite(taught).all(axis=2)], start, nodes, np.concatenate([nodes, first]), places, annotated
+        )
         findings += examine("holding", file, holding)
         if (shift := follows(hands.points, annotated)) and shift.wrong:
             rows = "Row 0 of the points is row {back} of the hands: leave out the rows before that."
