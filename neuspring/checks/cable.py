@@ -23,7 +23,7 @@ MIN_DISTANCE = 1e-4
 """Nodes must be farther apart than this, m; otherwise their spring would have no length."""
 SHORTEST, LONGEST = 0.05, 10.0
 """m. Cables of another length are in another unit. Those of DEFORM are 0.91 to 1.07 m long."""
-UNITS = {"meters": 1.0, "millimeters": 0.001, "centimeters": 0.01, "inches": 0.0254}
+CABLE_UNITS = {"meters": 1.0, "millimeters": 0.001, "centimeters": 0.01, "inches": 0.0254}
 """Units of recordings, m."""
 DETOUR = 1.5
 """Neighbors in the order of the file that are so many times as far apart as the longest step of the way over other markers are no
@@ -36,12 +36,14 @@ SWINGS = 0.9
 """Correlation of what turns a cable about the line of its ends and what gravity turns it with, from which the two are compared."""
 TURNED = (0.5, 3.5)
 """Range of their ratio. DEFORM's cables have 0.90 to 2.57: grips hold stiff ones back."""
-GRAVITY = 9.81
+STANDARD_GRAVITY = 9.81
 """m/s^2."""
 SPANS, LEAST_SPANS = (1, 2, 4, 8), 10
 """Frames, before and after, over which accelerations are measured: the first that noise does not hide; and how many of these a
 recording needs."""
-UNSEEN = "A cable needs a place of every marker in every sample: fill short gaps, or cut the recording (mocap.start, mocap.frames)"
+CABLE_UNSEEN = (
+    "A cable needs a place of every marker in every sample: fill short gaps, or cut the recording (mocap.start, mocap.frames)"
+)
 
 
 def turn(up: str) -> np.ndarray:
@@ -64,7 +66,7 @@ def look(file: Path, raw: Any, settings: Mocap) -> list[Finding]:
         return found
     cable = Cable(Moving(in_space(raw, settings).transpose(0, 2, 1), settings.rate), settings)
     found += examine("cable in space", file, cable)
-    found += [] if refused(found) else examine("moving", file, cable.moving, UNSEEN)
+    found += [] if refused(found) else examine("moving", file, cable.moving, CABLE_UNSEEN)
     return found if refused(found) else found + examine("cable under gravity", file, cable)
 
 
@@ -94,7 +96,7 @@ class Cable:
         second = (self.points[2 * span :] - 2 * places + self.points[: -2 * span]) * (self.settings.rate / span) ** 2
         line = places[:, -1] - places[:, 0]
         arms = (places - places[:, :1])[:, 2:-2] * np.gradient(self.along)[2:-2, None]
-        sums = np.cross(arms, second[:, 2:-2]).sum(axis=1), np.cross(arms.sum(axis=1), (0.0, 0.0, -GRAVITY))
+        sums = np.cross(arms, second[:, 2:-2]).sum(axis=1), np.cross(arms.sum(axis=1), (0.0, 0.0, -STANDARD_GRAVITY))
         moved, pulled = (np.einsum("tc,tc->t", one, line) / np.linalg.norm(line, axis=1) for one in sums)
         # Single large accelerations are jumps.
         usual = np.abs(moved) <= np.quantile(np.abs(moved), 0.95)
@@ -125,15 +127,15 @@ def malformed(raw: Any) -> dict[str, Any] | None:
     if len(bad := np.argwhere(~np.isfinite(data))):
         t, _, marker = bad[0]
         place = f"{data[tuple(bad[0])]} at frame {t}, marker {marker} ({len(bad)} in all)"
-        return {"rule": "every coordinate must be finite", "value": f"{place}. {UNSEEN}", "frames": np.unique(bad[:, 0])}
+        return {"rule": "every coordinate must be finite", "value": f"{place}. {CABLE_UNSEEN}", "frames": np.unique(bad[:, 0])}
     return None
 
 
 def length(cable: Cable) -> dict[str, Any]:
     """The length, m, and the unit by which it would be nearest to one meter."""
     own = cable.along[-1]
-    name = min(UNITS, key=lambda name: abs(np.log(UNITS[name] * own / cable.settings.unit)))
-    return {"value": own, "unit": UNITS[name], "name": name}
+    name = min(CABLE_UNITS, key=lambda name: abs(np.log(CABLE_UNITS[name] * own / cable.settings.unit)))
+    return {"value": own, "unit": CABLE_UNITS[name], "name": name}
 
 
 def too_near(cable: Cable) -> dict[str, Any] | None:

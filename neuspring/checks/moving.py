@@ -30,14 +30,14 @@ HELD = 4
 """Frames from which a place that stays equal to the bit is looked at."""
 EXCHANGED = 0.5
 """Steps after an exchange of labels, as a part of those before it, that show that they were exchanged."""
-STEADY, MAX_STRETCH, CHANGED = 0.1, 0.5, 0.02
-"""Distances of neighbors that vary by less than STEADY of their median, between the quintiles, are kept by what carries them. One
-that changes by more than MAX_STRETCH and CHANGED, m, is wrong. Released cables change by 0.37 of it or by 1.3 cm at most."""
+STEADY_SPAN, MAX_STRETCH, CHANGED_MOST = 0.1, 0.5, 0.02
+"""Distances of neighbors that vary by less than STEADY_SPAN of their median, between the quintiles, are kept by what carries them. One
+that changes by more than MAX_STRETCH and CHANGED_MOST, m, is wrong. Released cables change by 0.37 of it or by 1.3 cm at most."""
 MANY = 4
 """Points from which there is a motion of all."""
 PAUSE = 0.25
 """s. Where so much time is missing, a twin learns another motion."""
-LOOKED, NAMED = 50, 3
+FRAMES_AROUND, NAMED = 50, 3
 """Frames in which neighbors are looked for, and places that a message names."""
 
 
@@ -159,7 +159,7 @@ class Moving:
         one, two = np.transpose(links)
         lengths = np.linalg.norm(self.points[:, one] - self.points[:, two], axis=2)
         low, middle, high = np.nanquantile(lengths, (0.2, 0.5, 0.8), axis=0)
-        told = (high - low < STEADY * middle) & (np.abs(lengths - middle) > CHANGED)
+        told = (high - low < STEADY_SPAN * middle) & (np.abs(lengths - middle) > CHANGED_MOST)
         change = np.where(told, np.abs(lengths / middle - 1), 0.0)
         frame, link = (int(i) for i in np.unravel_index(int(change.argmax()), change.shape))
         words = {"value": float(change.max()), "length": lengths[frame, link], "median": middle[link]}
@@ -168,7 +168,7 @@ class Moving:
 
 def apart(points: np.ndarray, of: Callable[..., np.ndarray]) -> np.ndarray:
     """The largest (np.nanmax) or median distance [K, K], m, of each two points [T, K, 3] in some frames; 0 where none sees both."""
-    some = points[np.unique(np.linspace(0, len(points) - 1, LOOKED).astype(int))]
+    some = points[np.unique(np.linspace(0, len(points) - 1, FRAMES_AROUND).astype(int))]
     distances = np.array([np.linalg.norm(at[:, None] - at, axis=2) for at in some])
     return of(np.where(np.isfinite(distances).any(axis=0), distances, 0.0), axis=0)
 

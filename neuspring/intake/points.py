@@ -34,7 +34,7 @@ from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, TRACKS, Capture
 
 CSV_COLUMNS = ("frame", "point", "x", "y", "z", "holds", "hand")
 """Columns of controllers.csv; the last two may be left out."""
-UNSEEN = (
+UNSEEN_ROW = (
     "Write null in place of [x, y, z] in the frames in which a point is not seen",
     "Fill these frames from those before and after, or say in `holds` that nothing is held there",
 )
@@ -112,7 +112,7 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
     # A hand may be anywhere while it holds nothing.
     places = tracks if hands is None else np.where(hands.holds[..., None] if hands.holds.size else True, hands.points, np.nan)
     moving = [Moving(points, description.frame_rate) for points in (annotated, places)]
-    for file, one, remedy in zip((marked, files.get("controllers")), moving, UNSEEN, strict=True):
+    for file, one, remedy in zip((marked, files.get("controllers")), moving, UNSEEN_ROW, strict=True):
         findings += examine("moving", file, one, remedy) if one.given.size else []
     # What is no place says nothing of unit and table.
     annotated, places = (one.points for one in moving)
