@@ -20,7 +20,7 @@ from neuspring.core.text import listed
 
 AROUND = 4
 """Frames before and after a step with which it is compared; up to two more large steps there do not hide it."""
-STEP, HELD_STEP, TOGETHER = 6.0, 3.0, 4.0
+STEP, HELD_STEP, ALL_TOGETHER = 6.0, 3.0, 4.0
 """Steps so many times as large as those around are no motion: of a point, after it stood still to the bit, of all points together.
 In 350 released recordings of cables one marker steps at most 4.2 times as far as around. Some of them lack samples: there all step
 together, up to 9.9 times as far."""
@@ -30,9 +30,9 @@ HELD = 4
 """Frames from which a place that stays equal to the bit is looked at."""
 EXCHANGED = 0.5
 """Steps after an exchange of labels, as a part of those before it, that show that they were exchanged."""
-STEADY_SPAN, MAX_STRETCH, CHANGED_MOST = 0.1, 0.5, 0.02
+STEADY_SPAN, MAX_STRETCH, CHANGED_MOST = 0.1, 0.5, 0.005
 """Distances of neighbors that vary by less than STEADY_SPAN of their median, between the quintiles, are kept by what carries them. One
-that changes by more than MAX_STRETCH and CHANGED_MOST, m, is wrong. Released cables change by 0.37 of it or by 1.3 cm at most."""
+that changes by more than MAX_STRETCH and CHANGED_MOST, m, is wrong. Released cables change by 0.37 at most, but for one frame of DLO5."""
 MANY = 4
 """Points from which there is a motion of all."""
 PAUSE = 0.25
@@ -219,7 +219,7 @@ def stepped(moving: Moving) -> dict[str, Any] | None:
 def together(moving: Moving) -> dict[str, Any] | None:
     """Steps of all points together, and by how many times they are larger than those around."""
     explained = {last + 1 for *_, last in moving.held} | {frame for at in moving.swapped.values() for frame in at}
-    frames = [t for t in np.flatnonzero(moving.together > TOGETHER).tolist() if t not in explained]
+    frames = [t for t in np.flatnonzero(moving.together > ALL_TOGETHER).tolist() if t not in explained]
     if not frames:
         return None
     worst = max(frames, key=lambda t: moving.together[t, 0])
