@@ -74,7 +74,7 @@ def _streams(where: Path, names: Sequence[str], stream: str, shift: Shift | None
         rule = f"{names[0]} and {names[1]} have as many pictures with the same gaps, and too little moves to tell which are of "
         remedy = f"Give --shift {stream}=0 for the order, or --shift {stream}={match.rival} for equal numbers."
         raise InputError(where, f"{rule}one moment", match.by, remedy)
-    return Streams(*names, shift, f"Give --shift {stream}={{frames}}.", moved=late.get(stream, 0))
+    return Streams(names[0], names[1], shift, f"Give --shift {stream}={{frames}}.", moved=late.get(stream, 0))
 
 
 def images_alone(views: Sequence[Paired], choice: FrameChoice) -> Iterator[dict[str, Any]]:

@@ -137,19 +137,13 @@ Poses: TypeAlias = Mapping[str, np.ndarray]
 
 
 def look(
-    views: Sequence[Paired],
-    choice: FrameChoice,
-    listed: Mapping[str, Lens],
-    file: Path | None,
-    given_unit: float | None,
-    takes: Takes,
+    intake: Intake, views: Sequence[Paired], choice: FrameChoice, listed: Mapping[str, Lens], takes: Takes
 ) -> tuple[dict[str, SampledCamera], Unit | None]:
     """A few of the chosen frames of every camera, with intrinsics, and the unit of depth, which is one for all; None without any.
 
-    `listed` are the intrinsics of `file`; those of the source count where there are none. Raises InputError.
+    `listed` are the intrinsics of --intrinsics; those of the source count where there are none. Raises InputError.
     """
-    samples: dict[str, list[Pair]] = {}
-    lenses: dict[str, Lens] = {}
+    samples, lenses, file, given_unit = dict[str, list[Pair]](), dict[str, Lens](), intake.intrinsics, intake.depth_unit
     for view in views:
         frames = sorted(choice.places[view.name])
         picked = [choice.places[view.name][frames[k]] for k in sorted(sampled(len(frames)))]
