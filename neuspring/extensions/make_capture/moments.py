@@ -82,7 +82,7 @@ class Match(NamedTuple):
     places: dict[int, int]
     """Number of a picture of one -> place in the other; where numbers decide also those that one lacks."""
     by: str
-    """What decided."""
+    """Source of the decision."""
     rival: int = 0
     """Places by which another reading of the same names would move the other, where nothing in them says which is right."""
 

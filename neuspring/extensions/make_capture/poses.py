@@ -245,7 +245,7 @@ def place(intake: Intake, film: Recorded, board: Board | None, seen: Seen, unit:
 
 
 def by_table(seen: SampledCamera, top_down: bool, at: tuple[float, float] | None) -> Placed:
-    """The pose of the only camera: the table is z = 0. Raises InputError where it is not found; see `depth.find_table`."""
+    """The pose of the only camera: the table is z = 0. Raises InputError where it is not found; see `table.find_table`."""
     points = cloud(seen.depths, seen.lens.matrix)
     table, remarks = find_table(seen.path, points, top_down=top_down, at=None if at is None else _point(seen, at))
     poses = {seen.name: pose_on(table, points, seen.size, seen.lens.matrix)}
@@ -298,7 +298,7 @@ def stand(poses: Poses, seen: Seen, file: Path, level: bool, top_down: bool, up:
     """Given poses, of `file`, against the table that the cameras see; with `level` the world is moved so that it is z = 0.
 
     `up` is that of the source; None: +z where the world is moved, else the side on which the cameras are. Raises InputError where
-    the table is elsewhere, with what explains it; see `plausible`.
+    the table is elsewhere, with what explains it; see `checks.rig`.
     """
     moved, motion, lines = poses, np.eye(4), list[str]()
     if level:
@@ -323,7 +323,7 @@ def stand(poses: Poses, seen: Seen, file: Path, level: bool, top_down: bool, up:
 def given_alone(poses: Poses, seen: Seen, where: Path) -> Placed:
     """A given pose without depth: the table is z = 0 as it says, and up the side of it on which the camera is.
 
-    Raises InputError naming `where` the pose comes from, where the camera does not look at such a table; see `plausible`.
+    Raises InputError naming `where` the pose comes from, where the camera does not look at such a table; see `checks.rig`.
     """
     view, pose = next(iter(seen.values())), next(iter(poses.values()))
     up = "+z" if pose[2, 3] > 0 else "-z"

@@ -1,4 +1,4 @@
-"""What `--take` says that the data of cameras mean: hypotheses of `neuspring.checks.rig`, applied to what is read."""
+"""Meanings of the data of cameras by `--take`: hypotheses of `neuspring.checks.rig`, applied to what is read."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Takes:
 
     @classmethod
     def read(cls, given: Sequence[str], names: Sequence[str]) -> Takes:
-        """Of options such as `distance`, `inverse+opengl:0,2`, `order=2,1,0`. Raises InputError."""
+        """Read from options such as `distance`, `inverse+opengl:0,2`, `order=2,1,0`. Raises InputError."""
         of: dict[str, tuple[Hypothesis, ...]] = dict.fromkeys(names, ())
         order = dict(zip(names, names, strict=True))
         for text in given:

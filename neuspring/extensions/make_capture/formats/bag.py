@@ -55,15 +55,15 @@ ENCODINGS = {
 """Names of ROS and librealsense, in small letters."""
 # fmt: on
 DECODED = {("uint8", 1): "mono8", ("uint8", 3): "bgr8", ("uint8", 4): "bgra8", ("uint16", 1): "16uc1"}
-"""What OpenCV makes of JPEG and PNG: type and channels -> encoding."""
+"""Results of OpenCV for JPEG and PNG: type and channels -> encoding."""
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO, TEXT = "sensor_msgs/msg/CameraInfo", "std_msgs/msg/String"
 READ = (IMAGE, COMPRESSED, INFO, TEXT, "geometry_msgs/msg/Transform", "std_msgs/msg/Float32")
 """Types of messages."""
 TRANSPORT = struct.Struct("<iff")
-"""What compressedDepth has before its PNG: a number, and A and B of depth = A / (count - B), for floating point."""
+"""Header of compressedDepth before its PNG: a number, and A and B of depth = A / (count - B), for floating point."""
 CAPTURED, NUMBER = re.compile(r"(?:^|;)timestamp=([0-9.]+)"), re.compile(r"-?[0-9.]+(?:e-?[0-9]+)?")
-"""Of librealsense's text: ms of an image, and the numbers of a transform, by columns."""
+"""Patterns of librealsense's text: ms of an image, and the numbers of a transform, by columns."""
 GAP = 0.3
 """Pixels. Noise of depth parts areas that are neighbors in another view: a gap is filled from as far as this."""
 SINCE_1970 = 1e9
@@ -125,7 +125,7 @@ class Summary:
     first: Any
     """Its first message, if it is one of `READ`; else None."""
     more: bytes
-    """What the definition of the first leaves over."""
+    """Bytes that the definition of the first leaves over."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ class Bag:
 
     @cached_property
     def topics(self) -> dict[str, Summary]:
-        """What is known of the topics, by name. Raises InputError."""
+        """Topics in short, by name. Raises InputError."""
         with self._opened() as reader:
             seconds = max(reader.duration, 1) / 1e9
             found = {}
