@@ -20,7 +20,7 @@ from neuspring.data.camera import FASTEST, SLOWEST
 
 FEWEST_NAMES = 3
 """Names below which steps say nothing."""
-EVEN, MOSTLY = 0.15, 0.8
+EVEN_STEP, MOSTLY = 0.15, 0.8
 """Part of a step by which steps of a camera's own clock may differ, and the share of steps that are so even."""
 COUNTED = 1000
 """A step of so many counts, which is the same exactly, is still a time: nobody keeps one picture in a thousand."""
@@ -98,4 +98,4 @@ def _clock(times: np.ndarray, count: float) -> str | None:
     if count and usual / count < COUNTED and np.ptp(steps) < 0.5 * count:
         return None
     rest = np.abs(steps - np.round(steps / usual) * usual)
-    return "device" if (rest <= max(EVEN * usual, 1.5 * count)).mean() >= MOSTLY else None
+    return "device" if (rest <= max(EVEN_STEP * usual, 1.5 * count)).mean() >= MOSTLY else None

@@ -11,7 +11,7 @@ from neuspring.checks.rig import HYPOTHESES, Hypothesis
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Lens
 
-ORDER = "order="
+POSE_ORDER = "order="
 
 
 @dataclass(frozen=True)
@@ -28,15 +28,21 @@ class Takes:
         order = dict(zip(names, names, strict=True))
         for text in given:
             what, _, listed = text.partition(":")
-            meant = text.removeprefix(ORDER).split(",") if text.startswith(ORDER) else listed.split(",") if listed else list(names)
-            if set(meant) - set(names) or (text.startswith(ORDER) and sorted(meant) != sorted(names)):
+            meant = (
+                text.removeprefix(POSE_ORDER).split(",")
+                if text.startswith(POSE_ORDER)
+                else listed.split(",")
+                if listed
+                else list(names)
+            )
+            if set(meant) - set(names) or (text.startswith(POSE_ORDER) and sorted(meant) != sorted(names)):
                 raise InputError("--take", f"cameras {' '.join(names)} are there", text)
-            if text.startswith(ORDER):
+            if text.startswith(POSE_ORDER):
                 order = dict(zip(names, meant, strict=True))
             elif what in HYPOTHESES:
                 of |= {name: (*of[name], HYPOTHESES[what]) for name in meant}
             else:
-                rule = f"one of {' '.join(HYPOTHESES)} is required, with :CAMERA,... for some alone, or {ORDER}CAMERA,..."
+                rule = f"one of {' '.join(HYPOTHESES)} is required, with :CAMERA,... for some alone, or {POSE_ORDER}CAMERA,..."
                 raise InputError("--take", rule, text)
         return cls(of, order)
 

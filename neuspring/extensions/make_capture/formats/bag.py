@@ -57,12 +57,12 @@ ENCODINGS = {
 DECODED = {("uint8", 1): "mono8", ("uint8", 3): "bgr8", ("uint8", 4): "bgra8", ("uint16", 1): "16uc1"}
 """Results of OpenCV for JPEG and PNG: type and channels -> encoding."""
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-INFO, TEXT = "sensor_msgs/msg/CameraInfo", "std_msgs/msg/String"
-READ = (IMAGE, COMPRESSED, INFO, TEXT, "geometry_msgs/msg/Transform", "std_msgs/msg/Float32")
+INFO, STRING = "sensor_msgs/msg/CameraInfo", "std_msgs/msg/String"
+READ_TYPES = (IMAGE, COMPRESSED, INFO, STRING, "geometry_msgs/msg/Transform", "std_msgs/msg/Float32")
 """Types of messages."""
 TRANSPORT = struct.Struct("<iff")
 """Header of compressedDepth before its PNG: a number, and A and B of depth = A / (count - B), for floating point."""
-CAPTURED, NUMBER = re.compile(r"(?:^|;)timestamp=([0-9.]+)"), re.compile(r"-?[0-9.]+(?:e-?[0-9]+)?")
+CAPTURED, DECIMAL = re.compile(r"(?:^|;)timestamp=([0-9.]+)"), re.compile(r"-?[0-9.]+(?:e-?[0-9]+)?")
 """Patterns of librealsense's text: ms of an image, and the numbers of a transform, by columns."""
 GAP = 0.3
 """Pixels. Noise of depth parts areas that are neighbors in another view: a gap is filled from as far as this."""
@@ -123,7 +123,7 @@ class Summary:
     rate: float
     """Messages per second of the recording."""
     first: Any
-    """Its first message, if it is one of `READ`; else None."""
+    """Its first message, if it is one of `READ_TYPES`; else None."""
     more: bytes
     """Bytes that the definition of the first leaves over."""
 
@@ -166,7 +166,7 @@ class Bag:
             seconds = max(reader.duration, 1) / 1e9
             found = {}
             for name, one in sorted(reader.topics.items()):
-                first, more = next(self._all(reader, name) if one.msgtype in READ else iter(()), (None, b""))
+                first, more = next(self._all(reader, name) if one.msgtype in READ_TYPES else iter(()), (None, b""))
                 found[name] = Summary(one.msgtype or "", one.msgcount, one.msgcount / seconds, first, more)
             return found
 
@@ -188,7 +188,7 @@ class Bag:
     def stamps(self, topic: str) -> list[int]:
         """When the images of a topic were taken, ns; 0: not said. Raises InputError."""
         beside = topic.partition("/image/data")[0] + "/image/metadata"
-        if beside not in self.topics or self.topics[beside].kind != TEXT:
+        if beside not in self.topics or self.topics[beside].kind != STRING:
             stamps = [message.header.stamp for message, _ in self.messages(topic)]
             return [stamp.sec * 10**9 + stamp.nanosec for stamp in stamps]
         said = [CAPTURED.search(message.data) for message, _ in self.messages(beside)]
@@ -316,7 +316,7 @@ class Topic:
 
 
 @dataclass(frozen=True, eq=False)
-class Registration:
+class Alignment:
     """Moves depth into the view of another camera: every pixel is an area there, and the nearest counts."""
 
     source: Lens
@@ -379,7 +379,7 @@ def _camera(bag: Bag, topics: Sequence[str], name: str) -> Paired:
         if deep.distortion.any():
             remedy = "Align it with librealsense (rs.align), and give folders."
             raise InputError(bag.path, f"depth of {depth} must be without distortion to be aligned", deep.model, remedy)
-        onto = Registration(deep, lens, motions[0] @ np.linalg.inv(motions[1]), unit)
+        onto = Alignment(deep, lens, motions[0] @ np.linalg.inv(motions[1]), unit)
     return Paired(name, Topic(bag, color, "color"), Topic(bag, depth, "depth", onto), unit=unit, lens=lens)
 
 
@@ -389,7 +389,7 @@ def _motion(message: Any) -> Any:
         return None
     motion = np.eye(4)
     if hasattr(message, "data"):
-        numbers = [float(number) for number in NUMBER.findall(message.data)]
+        numbers = [float(number) for number in DECIMAL.findall(message.data)]
         motion[:3, :3], motion[:3, 3] = np.reshape(numbers[:9], (3, 3)).T, numbers[9:]
         return motion
     turn, shift = message.rotation, message.translation
