@@ -11,7 +11,7 @@ from neuspring.checks.rig import HYPOTHESES, Hypothesis
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Lens
 
-POSE_ORDER = "order="
+ORDERS = "order="
 
 
 @dataclass(frozen=True)
@@ -29,20 +29,16 @@ class Takes:
         for text in given:
             what, _, listed = text.partition(":")
             meant = (
-                text.removeprefix(POSE_ORDER).split(",")
-                if text.startswith(POSE_ORDER)
-                else listed.split(",")
-                if listed
-                else list(names)
+                text.removeprefix(ORDERS).split(",") if text.startswith(ORDERS) else listed.split(",") if listed else list(names)
             )
-            if set(meant) - set(names) or (text.startswith(POSE_ORDER) and sorted(meant) != sorted(names)):
+            if set(meant) - set(names) or (text.startswith(ORDERS) and sorted(meant) != sorted(names)):
                 raise InputError("--take", f"cameras {' '.join(names)} are there", text)
-            if text.startswith(POSE_ORDER):
+            if text.startswith(ORDERS):
                 order = dict(zip(names, meant, strict=True))
             elif what in HYPOTHESES:
                 of |= {name: (*of[name], HYPOTHESES[what]) for name in meant}
             else:
-                rule = f"one of {' '.join(HYPOTHESES)} is required, with :CAMERA,... for some alone, or {POSE_ORDER}CAMERA,..."
+                rule = f"one of {' '.join(HYPOTHESES)} is required, with :CAMERA,... for some alone, or {ORDERS}CAMERA,..."
                 raise InputError("--take", rule, text)
         return cls(of, order)
 
