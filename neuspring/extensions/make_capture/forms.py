@@ -169,7 +169,7 @@ def _bare(key: object) -> str:
     return re.sub(r"[^a-z0-9]", "", str(key).lower())
 
 
-READ = {_bare(word): key for key, words in LENS_KEYS.items() for word in words}
+READ_AS = {_bare(word): key for key, words in LENS_KEYS.items() for word in words}
 SIDES = {word: side for side, words in SIZE_KEYS.items() for word in words.split()}
 UNIT_WORDS, QUIET = ({_bare(word) for word in words.split()} for words in (DEPTH_KEYS, SILENT))
 
@@ -259,13 +259,13 @@ def _lens(path: Path, name: str, entry: Any, unit: float | None) -> Lens:
         raise InputError(path, rule, sorted(entry) if isinstance(entry, dict) else type(entry).__name__)
     inner = _spelled(entry, "K")
     if isinstance(inner, dict) and "data" not in inner:
-        entry = {key: value for key, value in entry.items() if READ.get(_bare(key)) != "K"} | inner
-    spelled = {key: [word for word in entry if READ.get(_bare(word)) == key] for key in LENS_KEYS}
+        entry = {key: value for key, value in entry.items() if READ_AS.get(_bare(key)) != "K"} | inner
+    spelled = {key: [word for word in entry if READ_AS.get(_bare(word)) == key] for key in LENS_KEYS}
     if twice := next((words for words in spelled.values() if len(words) > 1), None):
         raise InputError(path, f"{where}: one spelling of a key is required", " and ".join(twice), "Remove the others.")
     said = {key: entry[words[0]] for key, words in spelled.items() if words}
     # Of a focal length in millimeters, K is the same in pixels.
-    quiet = {*READ, *UNIT_WORDS, *QUIET, *(() if _spelled(entry, "horizontal_aperture") is None else ["focallength"])}
+    quiet = {*READ_AS, *UNIT_WORDS, *QUIET, *(() if _spelled(entry, "horizontal_aperture") is None else ["focallength"])}
     unread = [word for word in entry if _bare(word) not in quiet and not _side(word)]
     several = [key for key in unread if isinstance(entry[key], (list, dict))]
     if telling := [key for key in unread if (TELLING.search(key) or key in several) and not BESIDE_THE_LENS.search(key)]:

@@ -100,7 +100,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     names = [view.name for view in views]
     listed = read_lenses(intake.intrinsics, names) if intake.intrinsics else {}
     takes = Takes.read(intake.take, names)
-    seen, unit = look(views, choice, listed, intake.intrinsics, intake.depth_unit, takes)
+    seen, unit = look(intake, views, choice, listed, takes)
     watched = watch(views, choice, unit)
     findings += in_step(views, watched, late)
     refuse_errors(findings)

@@ -147,19 +147,13 @@ Poses: TypeAlias = Mapping[str, np.ndarray]
 
 
 def look(
-    views: Sequence[Paired],
-    choice: FrameChoice,
-    listed: Mapping[str, Lens],
-    file: Path | None,
-    given_unit: float | None,
-    takes: Takes,
+    intake: Intake, views: Sequence[Paired], choice: FrameChoice, listed: Mapping[str, Lens], takes: Takes
 ) -> tuple[dict[str, SampledCamera], Unit | None]:
     """A few of the chosen frames of every camera, with intrinsics, and the unit of depth, which is one for all; None without any.
 
-    `listed` are the intrinsics of `file`; those of the source count where there are none. Raises InputError.
+    `listed` are the intrinsics of --intrinsics; those of the source count where there are none. Raises InputError.
     """
-    samples: dict[str, list[Pair]] = {}
-    lenses: dict[str, Lens] = {}
+    samples, lenses, file, given_unit = dict[str, list[Pair]](), dict[str, Lens](), intake.intrinsics, intake.depth_unit
     for view in views:
         frames = sorted(choice.places[view.name])
         picked = [choice.places[view.name][frames[k]] for k in sorted(sampled(len(frames)))]
@@ -267,7 +261,7 @@ def place(intake: Intake, film: Recorded, board: Board | None, seen: Seen, unit:
 
 
 def by_table(seen: SampledCamera, top_down: bool, at: tuple[float, float] | None) -> Placed:
-    """The pose of the only camera: the table is z = 0. Raises InputError where it is not found; see `depth.find_table`."""
+    """The pose of the only camera: the table is z = 0. Raises InputError where it is not found; see `table.find_table`."""
     points = cloud(seen.depths, seen.lens.matrix)
     table, remarks = find_table(seen.path, points, top_down=top_down, at=None if at is None else _point(seen, at))
     poses = {seen.name: pose_on(table, points, seen.size, seen.lens.matrix)}
@@ -320,7 +314,7 @@ def stand(poses: Poses, seen: Seen, file: Path, level: bool, top_down: bool, up:
     """Given poses, of `file`, against the table that the cameras see; with `level` the world is moved so that it is z = 0.
 
     `up` is that of the source; None: +z where the world is moved, else the side on which the cameras are. Raises InputError where
-    the table is elsewhere, with what explains it; see `plausible`.
+    the table is elsewhere, with what explains it; see `checks.rig`.
     """
     moved, motion, lines = poses, np.eye(4), list[str]()
     if level:
@@ -345,7 +339,7 @@ def stand(poses: Poses, seen: Seen, file: Path, level: bool, top_down: bool, up:
 def given_alone(poses: Poses, seen: Seen, where: Path) -> Placed:
     """A given pose without depth: the table is z = 0 as it says, and up the side of it on which the camera is.
 
-    Raises InputError naming `where` the pose comes from, where the camera does not look at such a table; see `plausible`.
+    Raises InputError naming `where` the pose comes from, where the camera does not look at such a table; see `checks.rig`.
     """
     view, pose = next(iter(seen.values())), next(iter(poses.values()))
     up = "+z" if pose[2, 3] > 0 else "-z"
