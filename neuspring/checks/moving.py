@@ -32,7 +32,7 @@ EXCHANGED = 0.5
 """Steps after an exchange of labels, as a part of those before it, that show that they were exchanged."""
 STEADY_SPAN, MAX_STRETCH, CHANGED_MOST = 0.1, 0.5, 0.005
 """Distances of neighbors that vary by less than STEADY_SPAN of their median, between the quintiles, are kept by what carries them.
-One that changes by more than MAX_STRETCH and CHANGED_MOST, m, is wrong. DEFORM's cables change by 0.37 at most, but for one frame."""
+One that changes by more than MAX_STRETCH and CHANGED_MOST, m, is wrong. DEFORM's cables change by 0.37 at most, once by more."""
 MANY = 4
 """Points from which there is a motion of all."""
 PAUSE = 0.25
