@@ -55,7 +55,7 @@ FLAT_POINTS = 5000
 """Points of a camera by which that is told."""
 MOST_ORDERED = 4
 """Cameras of which every order of poses is tried."""
-FACTORS = (0.1, 10.0, 0.001, 1000.0)
+FACTORS = (0.1, 10.0, 0.25, 4.0, 0.2, 5.0, 0.001, 1000.0)
 """Wrong units of depth make the scene so many times as large."""
 
 
@@ -345,15 +345,19 @@ def _candidates(rig: Rig) -> Iterator[tuple[Explained, Rig]]:
             if off and (other := rig.taken(hypothesis, names)):
                 what = "pose" if hypothesis.lens is None else "lens"
                 yield Explained(what, names, hypothesis.looks, f"--take {hypothesis.name}{some}"), other
-    if rig.posed and 1 < len(every) <= MOST_ORDERED:
-        poses = [rig.cameras[name].camera_to_world for name in every]
-        for order in permutations(range(len(every))):
+    if not rig.posed or not 1 < len(every) <= MOST_ORDERED:
+        return
+    for also, turned_so in ((None, rig), *((one, rig.taken(one)) for one in POSE_MEANINGS)):
+        poses = [] if turned_so is None else [turned_so.cameras[name].camera_to_world for name in every]
+        for order in permutations(range(len(poses))):
             moved = [name for k, name in enumerate(every) if order[k] != k]
             if moved:
                 fit = f"the poses of cameras {' and '.join(moved)} exchanged fit" if len(moved) == 2 else ""
                 fit = fit or f"the poses fit in the order {' '.join(every[k] for k in order)}"
+                fit += f", each as {also.looks}" if also else ""
+                option = f"--take {also.name + ' ' if also else ''}order={','.join(every[k] for k in order)}"
                 other = rig.with_poses({name: poses[k] for name, k in zip(every, order, strict=True)})
-                yield Explained("order", tuple(moved), fit, f"--take order={','.join(every[k] for k in order)}"), other
+                yield Explained("order", tuple(moved), fit, option), other
 
 
 def _leveled(rig: Rig) -> Rig | None:
@@ -395,11 +399,19 @@ class Judged:
     """m per count of each camera; None where depth is in meters by its type."""
     of_file: bool = True
     """False where a side that is up is found, and not said."""
+    taken: Callable[[str], str] | None = None
+    """An option, as it is after others that are given already."""
 
     @classmethod
-    def of(cls, rig: Rig, units: Mapping[str, float | None], of_file: bool = True) -> Judged:
+    def of(
+        cls,
+        rig: Rig,
+        units: Mapping[str, float | None],
+        of_file: bool = True,
+        taken: Callable[[str], str] | None = None,
+    ) -> Judged:
         """With the change that makes it right, if there is one."""
-        return cls(rig, explain(rig) if of_file else explain(rig, (rig.up,)) or explain(rig), units, of_file)
+        return cls(rig, explain(rig) if of_file else explain(rig, (rig.up,)) or explain(rig), units, of_file, taken)
 
     def text(self, name: str) -> str:
         """The place of a camera's table, in words."""
@@ -468,7 +480,8 @@ def explanation(judged: Judged) -> list[dict[str, Any]]:
             {"key": f"cameras.{name}.camera_to_world", "rule": rule, "received": f"what looks like {one.looks}{also}"}
             for name in names
         ]
-    next_move = f"make-capture {' or '.join((one.option, *one.rivals))} takes it so." if one.option.startswith("--take") else ""
+    options = (one.option, *one.rivals) if judged.taken is None else tuple(map(judged.taken, (one.option, *one.rivals)))
+    next_move = f"make-capture {' or '.join(options)} takes it so." if one.option.startswith("--take") else ""
     return [words | {"value": one.what, "next": next_move} for words in told]
 
 

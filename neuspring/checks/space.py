@@ -71,6 +71,14 @@ def off_table(points: np.ndarray, up: float | None, is_body: bool, moved: np.nda
     return told | {"level": "error" if low < -FAR_OFF else "warning", "next": f". {remedy}"}
 
 
+def y_upward(points: np.ndarray, up: float | None, is_body: bool, moved: np.ndarray) -> dict[str, Any] | None:
+    """Way along y, m, of a scene without a table whose body rests at y = 0 and is lifted along y."""
+    lifted = abs(moved[1]) > max(SUNK, STEEP * np.linalg.norm(moved[[0, 2]]))
+    if up is not None or not is_body or not lifted or abs((np.sign(moved[1]) * points[:, 1]).min()) > SUNK:
+        return None
+    return {"value": float(moved[1]), "words": "(x, -z, y)" if moved[1] > 0 else "(x, z, -y)"}
+
+
 def too_long(points: np.ndarray, up: float | None, is_body: bool, moved: np.ndarray) -> dict[str, Any] | None:
     """Longest side of a body, m, that is that of nothing that hands hold."""
     return longest(float(np.ptp(points, axis=0).max())) if is_body and np.abs(points).max() <= FAR else None
@@ -149,6 +157,9 @@ checks = (
     Check("off the table", "points", off_table, None, "error",
           f"with up {{sign}}z points must lie between the table, z = 0, and {HIGHEST_OBJECT:g} m above it; received {{z}}{{next}}",
           title="points"),
+    Check("y up", "points", y_upward, None, "warning",
+          "the body rests at y = 0 and is lifted along y by {value:.2f} m, and gravity is along z: if y is up, write {words} in "
+          "place of (x, y, z) in all files", title="points"),
     Check("many nodes", "nodes", len, (0, MOST_NODES), "warning",
           "some hundred nodes are enough, more than {high} are slow; received {value}. Each of them costs time in every substep",
           title="points"),

@@ -65,7 +65,7 @@ class Shift:
     def text(self, one: str, other: str) -> str:
         """The shift in words."""
         side = "later" if self.frames > 0 else "earlier"
-        return f"what moves, moves {abs(self.frames):.1f} frames {side} in {other} than in {one}"
+        return f"{other} is {abs(self.frames):.1f} frames {side} than {one}, by what moves"
 
 
 def measure(one: np.ndarray, other: np.ndarray, most: int | None = None) -> Shift | None:
@@ -257,7 +257,7 @@ def out_of_step(pairs: Sequence[Streams]) -> Iterator[dict[str, Any]]:
         told = {"value": round(frames, 2), "text": streams.shift.text(streams.one, streams.other)}
         if abs(frames) < MENDABLE:
             told |= {"level": "warning"}
-            next_move = "Whole frames do not mend it: synchronize the streams when they are filmed."
+            next_move = "Whole frames do not mend it: synchronize them when filmed, or look at how pictures were paired."
         yield told | {"next": next_move}
 
 
@@ -266,7 +266,7 @@ def in_step(pairs: Sequence[Streams]) -> dict[str, Any] | None:
     known = [streams for streams in pairs if streams.shift and streams.shift.known]
     told = [f"{streams.other} {round(streams.shift.frames, 1) + 0.0:+.1f}" for streams in known if streams.shift]
     left = [f"{streams.other} against {streams.one}" for streams in pairs if streams not in known]
-    text = f"frames that streams are late, by what moves: {', '.join(told)}" if told else ""
+    text = f"in step, by what moves (frames late): {', '.join(told)}" if told else ""
     text += ("; " if told and left else "") + (f"too little of one motion to check {', '.join(left)}" if left else "")
     most = max((abs(streams.shift.frames) for streams in known if streams.shift), default=None)
     return {"value": most, "text": text} if pairs else None

@@ -54,7 +54,7 @@ def mask(
         for name, folder, held in zip(named, masks, hands or [None] * len(named), strict=True):
             read.require_camera(name)
             written, how = store.import_masks(read, name, folder, held)
-            print(f"camera {name}: masks, by {how}, are in {written}")
+            print(f"camera {name}: masks are in {written}, numbered by {how}")
         print(f"next:\n  neuspring check-data {capture}")
         return
     marked = Marks.load(path)

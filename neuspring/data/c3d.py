@@ -17,7 +17,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.extras import needed
 
 FORM = re.compile(r"(?P<file>.+?\.c3d)(#(unit=(?P<unit>\w+)(,|$))?(?P<labels>.*))?", re.IGNORECASE)
-C3D_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+C3D_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "meters": 1.0, "millimeters": 0.001}
 """m per unit."""
 C3D_BLOCK = 512
 """Bytes: data begin and end at multiples."""

@@ -86,7 +86,7 @@ def test_a_fault_of_one_camera_names_that_camera(right, name):
     assert explain(rig).option == f"--take {name}:1"
 
 
-@pytest.mark.parametrize(("factor", "plausible"), [(10.0, 0.0001), (0.1, 0.01)])
+@pytest.mark.parametrize(("factor", "plausible"), [(10.0, 0.0001), (0.1, 0.01), (0.25, 0.004), (5.0, 0.0002)])
 def test_a_wrong_unit_is_told_with_the_right_one(right, factor, plausible):
     rig = with_depth(right, lambda depth, _: factor * depth)
     judged = Judged.of(rig, dict.fromkeys(rig.cameras, 0.001))

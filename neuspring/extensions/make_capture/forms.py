@@ -44,7 +44,7 @@ SIZE_KEYS = {"width": "width w cols", "height": "height h rows", "size": "size r
 IMAGE_WORDS = re.compile(r"^(image|img|im|frame|picture|video|color|rgb|camera|cam|calibration|calib)+|(px|pixels)$")
 DEPTH_KEYS = (
     "depth_scale depth_unit depth_units depth_factor depth_scale_factor depth_unit_scale_factor depth_to_meters depth_shift "
-    "depth_map_factor png_depth_scale"
+    "depth_map_factor png_depth_scale depth_scale_to_m"
 )
 """The same of the unit of depth: meters per count, or counts per meter above 1."""
 UNITS_IN_WORDS = {"m": 1.0, "meter": 1.0, "meters": 1.0, "mm": 0.001, "millimeter": 0.001, "millimeters": 0.001}

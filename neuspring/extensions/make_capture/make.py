@@ -82,6 +82,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
             raise InputError(option, "is required", "none", "neuspring make-capture --help has all options.")
     if intake.topics and not intake.bag:
         raise InputError("--topics", "is for --bag", "none", "Give --bag FILE.")
+    require_free(intake.output, intake.force)
     film, board = opened(intake), Board.of(intake.board) if intake.board else None
     views = film.views
     if not views:
@@ -125,6 +126,8 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     lines += [view.straight.text(name) for name, view in seen.items() if view.lens.distortion.any()]
     lines += [f"frames: {choice.text()}; {rate_text}", f"depth: {depth}", f"poses: {placed.how}, up {placed.up}"]
     training = made.train_end or int(0.7 * made.frame_count)
+    if "; the source says" in rate_text:
+        lines.append(f"warning: --rate: {rate_text}. Leave it out, unless the names or the film are wrong")
     lines += [*placed.lines, *map(in_report, findings)]
     lines.append(f"training frames: 0 to {training - 1}; future frames: {training} to {made.frame_count - 1}")
     return Capture.load(intake.output), lines
@@ -287,7 +290,7 @@ def _of_points(intake: Intake) -> tuple[Capture, list[str]]:
             rule = "is for film, and there is none"
             remedy = "Leave it out. Cut or resample the files themselves: a row is a frame."
             raise InputError(f"--{option.replace('_', '-')}", rule, str(value), remedy)
-    rate, _ = find_rate(intake.rate, [Markers.read(path).rate for path in brought.values() if is_c3d(path)], 1)
+    rate, rate_text = find_rate(intake.rate, [Markers.read(path).rate for path in brought.values() if is_c3d(path)], 1)
     _require_rate(brought, rate)
     frames = len(points.read_hands(brought["controllers"]).points)
     if is_c3d(brought["tracks"]):
@@ -303,9 +306,13 @@ def _of_points(intake: Intake) -> tuple[Capture, list[str]]:
     made = _parsed(named | alone | {"ground": not intake.no_table, "mass": intake.mass, "provenance": digests(brought)})
     with _begun(intake, made, {}) as (_, _, space):
         pass
+    lost = int((~np.isfinite(space.annotated).all(axis=2)).sum())
+    low, high = (space.nodes.min(axis=0), space.nodes.max(axis=0))
+    sides = " x ".join(f"{100 * side:.1f}" for side in high - low)
     hands = 0 if space.hands is None else space.hands.points.shape[1]
     text = f"{hands} controllers, {len(space.nodes)} nodes, {space.tracks.shape[1]} annotated points, {made.frame_count} frames"
-    return Capture.load(intake.output), [f"points in space alone: {text}"]
+    body = f"body: {sides} cm, z from {100 * low[2]:.1f} to {100 * high[2]:.1f} cm; annotated points are unseen {lost} times"
+    return Capture.load(intake.output), [f"points in space alone: {text}", rate_text, body]
 
 
 RATE_APART = 0.005
@@ -331,25 +338,35 @@ PRECIOUS = ("mask", "marks.json", "annotations.json", TRACKS, POINTS, *capture.C
 """Work of people and of hours, which --force does not remove."""
 
 
+def require_free(folder: Path, force: bool) -> None:
+    """Raise InputError for an output folder in which nothing may be written, whatever the input is."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(folder, "--output must be a folder", "a file")
+    made, begun = (folder / CAPTURE).exists(), (folder / capture.RECIPE).exists()
+    if not folder.is_dir() or not any(folder.iterdir()) or (begun and not made):
+        return
+    if not (force and made):
+        remedy = "Choose another folder" + (", or give --force, which replaces its images." if made else ".")
+        raise InputError(folder, "--output must be a new or empty folder", "a capture" if made else "other files", remedy)
+    if kept := [name for name in PRECIOUS if (folder / name).exists()]:
+        rule = "--force does not remove masks, marks, clicks or tracks"
+        raise InputError(folder, rule, " and ".join(kept), "Move them away first.")
+
+
 def prepare(folder: Path, recipe: dict[str, Any], force: bool) -> bool:
     """Make `folder` ready for a capture made by `recipe`; returns whether it holds a part of it already.
 
     Raises InputError for a folder with anything else in it, unless `force` replaces the images of a capture.
     """
     path = folder / capture.RECIPE
-    if folder.exists() and not folder.is_dir():
-        raise InputError(folder, "--output must be a folder", "a file")
-    if path.exists() and not (folder / CAPTURE).exists() and load_json(path) == recipe:
-        return True
+    require_free(folder, force)
+    if path.exists() and not (folder / CAPTURE).exists():
+        if load_json(path) == recipe:
+            return True
+        if not force:
+            remedy = "Choose another folder, or give --force, which replaces its images."
+            raise InputError(folder, "--output must be a new or empty folder", "an unfinished capture from other input", remedy)
     if folder.is_dir() and any(folder.iterdir()):
-        ours = (folder / CAPTURE).exists() or path.exists()
-        what = "a capture" if (folder / CAPTURE).exists() else "an unfinished capture from other input" if ours else "other files"
-        if not (force and ours):
-            remedy = "Choose another folder" + (", or give --force, which replaces its images." if ours else ".")
-            raise InputError(folder, "--output must be a new or empty folder", what, remedy)
-        if kept := [name for name in PRECIOUS if (folder / name).exists()]:
-            rule = "--force does not remove masks, marks, clicks or tracks"
-            raise InputError(folder, rule, " and ".join(kept), "Move them away first.")
         write_text(path, "{}\n")  # Of no input: what is interrupted here is not taken for a part of the new capture.
         (folder / CAPTURE).unlink(missing_ok=True)
         for kind in ("color", "depth"):

@@ -107,7 +107,9 @@ def matched(where: Path, names: tuple[str, str], one: Series, other: Series, num
         largest = max(one.step, other.step)
         within = min(one.times[-1], other.times[-1]) - max(one.times[0], other.times[0])
         shared = within >= OVERLAP * min(np.ptp(one.times), np.ptp(other.times))
-        absolute = one.clock == other.clock != "" and (one.clock != "device" or shared)
+        # As many pictures over as long a time, begun at other times: each has a clock of its own.
+        own_clocks = alike and abs(np.ptp(one.times) - np.ptp(other.times)) < largest < abs(one.times[0] - other.times[0])
+        absolute = one.clock == other.clock != "" and (one.clock != "device" or (shared and not own_clocks))
         left, right = one.times - (0 if absolute else one.times[0]), other.times - (0 if absolute else other.times[0])
         if not absolute and one.whole and other.whole and abs(left[-1] - right[-1]) > MISSING_GAP * largest:
             raise InputError(where, rule, received + unlike, PAIRING_REMEDY)

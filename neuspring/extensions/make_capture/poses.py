@@ -5,7 +5,7 @@ and where the cameras are, by given poses, a ChArUco board or the table alone.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -254,18 +254,23 @@ def place(intake: Intake, film: Recorded, board: Board | None, seen: Seen, unit:
         poses, lines = by_board(board, shown, intake.board_images)
         how, up = f"by a ChArUco board of {intake.board}", "+z"
     if len(poses) < len(seen):
-        return by_table(next(iter(seen.values())), intake.top_down, intake.table_at)
+        return by_table(next(iter(seen.values())), intake.top_down, intake.table_at, takes.with_more)
     poses = poses if board is not None else takes.poses(poses)
-    placed = given_alone(poses, seen, where) if unit is None else stand(poses, seen, where, intake.level, intake.top_down, up)
+    if unit is None:
+        placed = given_alone(poses, seen, where)
+    else:
+        placed = stand(poses, seen, where, intake.level, intake.top_down, up, takes.with_more)
     return replace(placed, lines=(*lines, *placed.lines), how=how)
 
 
-def by_table(seen: SampledCamera, top_down: bool, at: tuple[float, float] | None) -> Placed:
+def by_table(seen: SampledCamera, top_down: bool, at: tuple[float, float] | None, taken: Callable[[str], str]) -> Placed:
     """The pose of the only camera: the table is z = 0. Raises InputError where it is not found; see `table.find_table`."""
     points = cloud(seen.depths, seen.lens.matrix)
     table, remarks = find_table(seen.path, points, top_down=top_down, at=None if at is None else _point(seen, at))
     poses = {seen.name: pose_on(table, points, seen.size, seen.lens.matrix)}
-    judged = _judged("rig", seen.path, Judged.of(rig_of({seen.name: seen}, poses, posed=False), {seen.name: seen.unit}))
+    judged = _judged(
+        "rig", seen.path, Judged.of(rig_of({seen.name: seen}, poses, posed=False), {seen.name: seen.unit}, taken=taken)
+    )
     lines = (f"table: {table.text()}", *(f"warning: {remark}" for remark in remarks), *judged)
     return Placed(poses=poses, table=table.text(), lines=lines)
 
@@ -310,7 +315,7 @@ def by_board(board: Board, seen: Seen, images: Sequence[Path]) -> tuple[Poses, l
     return poses, lines
 
 
-def stand(poses: Poses, seen: Seen, file: Path, level: bool, top_down: bool, up: str | None) -> Placed:
+def stand(poses: Poses, seen: Seen, file: Path, level: bool, top_down: bool, up: str | None, taken: Callable[[str], str]) -> Placed:
     """Given poses, of `file`, against the table that the cameras see; with `level` the world is moved so that it is z = 0.
 
     `up` is that of the source; None: +z where the world is moved, else the side on which the cameras are. Raises InputError where
@@ -331,7 +336,7 @@ def stand(poses: Poses, seen: Seen, file: Path, level: bool, top_down: bool, up:
     rig = rig_of(seen, moved)
     side = up or min(("+z", "-z"), key=lambda each: sum(rig.with_up(each).standing.values()))
     rig = rig.with_up(side)
-    lines += _judged("rig", file, Judged.of(rig, {name: view.unit for name, view in seen.items()}, of_file=False))
+    lines += _judged("rig", file, Judged.of(rig, {name: view.unit for name, view in seen.items()}, False, taken))
     text = "; ".join(f"camera {name}: {plane.text()}" for name, (plane, _) in rig.stands.items())
     return Placed(poses=moved, up=side, motion=motion, table=text or "not found", lines=tuple(lines))
 

@@ -28,6 +28,10 @@ EPOCH = (1e9, 2e9)
 """s since 1970 that are a time of ours; from 2e9 on digits are a date: 20260131..."""
 FRACTIONS = {3: 1e-3, 6: 1e-6, 9: 1e-9}
 """Digits of a fraction of a second -> s per count."""
+FILM_RATES = (24, 25, 30, 48, 50, 60, 100, 120)
+"""Frames per second of time codes, whose last two digits count frames."""
+SECONDS_APART = 0.5
+"""s. Where seconds stand in digits of their own, several pictures share them; else they are a counter."""
 
 
 def times_of(names: Sequence[str]) -> tuple[np.ndarray, str] | None:
@@ -36,10 +40,8 @@ def times_of(names: Sequence[str]) -> tuple[np.ndarray, str] | None:
     if len(names) < FEWEST_NAMES or len({tuple(word[::2]) for word in words}) != 1:
         return None
     columns = list(zip(*(word[1::2] for word in words), strict=True))
-    for times, count in _readings(columns, words[0][2:-1:2]):
-        if (clock := _clock(times, count)) is not None:
-            return times, clock
-    return None
+    read = [(times, clock) for times, count in _readings(columns, words[0][2:-1:2]) if (clock := _clock(times, count))]
+    return min(read, key=lambda one: one[1] != "wall", default=None)
 
 
 def _readings(columns: Sequence[Sequence[str]], between: Sequence[str]) -> Iterator[tuple[np.ndarray, float]]:
@@ -55,12 +57,14 @@ def _readings(columns: Sequence[Sequence[str]], between: Sequence[str]) -> Itera
         if len(set(left)) == 1 or len(set(right)) == 1:
             continue
         seconds, rest = np.array(left, float), np.array(right, float)
+        most = max(len(part) for part in right)
         if separator == ".":
-            yield np.array([float(f"{whole}.{part}") for whole, part in zip(left, right, strict=True)]), 0.0
-        elif (width := {len(part) for part in right}) <= FRACTIONS.keys() and len(width) == 1:
-            yield seconds + rest * FRACTIONS[width.pop()], 0.0
+            found = [(np.array([float(f"{whole}.{part}") for whole, part in zip(left, right, strict=True)]), 0.1**most)]
+        elif most == min(len(part) for part in right) and most in (2, *FRACTIONS):
+            found = [_seconds(seconds, right)]
         else:
-            yield from ((seconds + rest * unit, 0.0) for unit in FRACTIONS.values() if rest.max() < 1 / unit)
+            found = [(seconds + rest * unit, unit) for unit in FRACTIONS.values() if rest.max() < 1 / unit]
+        yield from ((times, count) for times, count in found if np.median(np.diff(np.sort(times))) <= SECONDS_APART)
     for column in columns:
         counts = np.array(column, float)
         yield from ((counts * unit, unit) for unit in FRACTIONS.values())
@@ -83,8 +87,24 @@ def _dates(joined: Sequence[str], widths: Sequence[int]) -> Iterator[tuple[np.nd
     except ValueError:
         return
     start = datetime(1970 if length == 14 else 1900, 1, 1, tzinfo=UTC)
-    fractions = [float(f"0.{digits[length:] or 0}") for digits in joined]
-    yield np.array([(m - start).total_seconds() + part for m, part in zip(moments, fractions, strict=True)]), 0.0
+    seconds = np.array([(moment - start).total_seconds() for moment in moments])
+    times, count = _seconds(seconds, [digits[length:] for digits in joined])
+    if np.median(np.diff(np.sort(times))) <= SECONDS_APART:
+        yield times, count
+
+
+def _seconds(seconds: np.ndarray, digits: Sequence[str]) -> tuple[np.ndarray, float]:
+    """Times [n], s, of whole seconds and the digits behind them, all as many, and the s of one count.
+
+    Two digits that grow by 1 count the frames of a time code.
+    """
+    counts, unit = np.array(digits, float), 0.1 ** len(digits[0])
+    order = np.lexsort([counts, seconds])
+    steps = np.diff(counts[order])[np.diff(seconds[order]) == 0]
+    if len(digits[0]) == 2 and len(steps) and np.median(steps) == 1:
+        rate = next((rate for rate in FILM_RATES if rate > counts.max()), 100) if len(set(seconds)) > 1 else np.nan
+        return seconds + counts / rate, 0.0
+    return seconds + counts * unit, unit
 
 
 def _clock(times: np.ndarray, count: float) -> str | None:

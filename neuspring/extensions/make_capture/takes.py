@@ -20,6 +20,8 @@ class Takes:
 
     of: Mapping[str, tuple[Hypothesis, ...]]
     order: Mapping[str, str]
+    given: Sequence[str] = ()
+    """The options."""
 
     @classmethod
     def read(cls, given: Sequence[str], names: Sequence[str]) -> Takes:
@@ -39,7 +41,18 @@ class Takes:
             else:
                 rule = f"one of {' '.join(MEANINGS)} is required, with :CAMERA,... for some alone, or {ORDER_TAKEN}CAMERA,..."
                 raise InputError("--take", rule, text)
-        return cls(of, order)
+        return cls(of, order, given)
+
+    def with_more(self, option: str) -> str:
+        """An option `--take ...` that holds what is taken already, and one that is found in what came of it."""
+        orders = [text for text in option.split()[1:] if text.startswith(ORDER_TAKEN)]
+        new = [text for text in option.split()[1:] if text not in orders]
+        names = [*self.order]
+        for text in orders:
+            names = [self.order[name] for name in text.removeprefix(ORDER_TAKEN).split(",")]
+        kept = [text for text in self.given if not text.startswith(ORDER_TAKEN)]
+        final = names if orders else [*self.order.values()]
+        return " ".join(["--take", *kept, *new, *([ORDER_TAKEN + ",".join(final)] if final != [*self.order] else [])])
 
     def lens(self, name: str, lens: Lens, size: tuple[int, int]) -> Lens:
         """The lens that is meant, of images of `size` (width, height). Raises InputError where it cannot be."""

@@ -123,10 +123,14 @@ def import_masks(capture: Capture, camera: str, masks: Path, hands: Path | None 
     chosen = fitting[0] if fitting else next(iter(readings))
     if (shift := shifts[chosen]) and shift.wrong:
         rule = f"masks of camera {camera} must be of the frames of the film"
-        raise InputError(masks, rule, shift.text("the film", "masks"), "Name each by its frame: 00000.png is the first.")
-    left = sorted(set(there) - set(readings[chosen]))
-    unused = f"; {len(left)} of {len(there)} are of no frame: {left[0]:05d}.png to {left[-1]:05d}.png" if left else ""
-    return save_masks(capture, camera, read_as[chosen]), f"{chosen}{unused}"
+        late, numbers = round(shift.frames), readings[chosen]
+        at, frame = max(late, 0), frames[max(-late, 0)]
+        remedy = f"Mask {numbers[min(at, len(numbers) - 1)]:05d}.png is that of frame {frame}: name it {frame:05d}.png, and so on."
+        raise InputError(masks, rule, shift.text("the film", "masks"), remedy)
+    left, shift = sorted(set(there) - set(readings[chosen])), shifts[chosen]
+    told = chosen if shift and shift.known else f"{chosen} (too little of one motion to check the time)"
+    told += f"; not used: {len(left)}, {left[0]:05d}.png to {left[-1]:05d}.png" if left else ""
+    return save_masks(capture, camera, read_as[chosen]), told
 
 
 SOURCE_FRAMES = re.compile(r"numbers (\d+) to (\d+) of the source(?:, one in (\d+))?")

@@ -58,7 +58,9 @@ def test_color_counted_from_0_and_depth_from_1_are_paired_by_order(tmp_path):
 @pytest.mark.parametrize("late", [1, -2])
 def test_depth_of_other_moments_is_refused_and_a_shift_mends_it(tmp_path, late):
     root = write(tmp_path, late=late)
-    with pytest.raises(InputError, match=rf"frames {'later' if late > 0 else 'earlier'} in depth 0 .*--shift 0.depth={late}\b"):
+    with pytest.raises(
+        InputError, match=rf"depth 0 is .* frames {'later' if late > 0 else 'earlier'} than color 0.*--shift 0.depth={late}\b"
+    ):
         make_capture(intake(root))
     assert not (tmp_path / "capture").exists()
     capture, report = make_capture(intake(root, shift=(f"0.depth={late}",)))
@@ -86,7 +88,7 @@ def test_a_camera_of_a_rig_that_starts_at_1_is_judged_in_space(tmp_path):
     capture, report = make_capture(intake(root, 2, poses))
     assert capture.frame_count == FRAMES
     assert "pairs: cameras 0 and 1: by order, from 0 and 1" in report
-    with pytest.raises(InputError, match=r"earlier in camera 1 than in camera 0.*--shift 1=0"):
+    with pytest.raises(InputError, match=r"camera 1 is .* earlier than camera 0, by what moves.*--shift 1=0"):
         make_capture(intake(root, 2, poses, shift=("1=1",), output=tmp_path / "other"))
 
 
@@ -139,6 +141,21 @@ def test_poses_that_mean_something_else_are_named_and_taken(tmp_path, take, chan
     with pytest.raises(InputError, match=f"--take {take} takes it so"):
         make_capture(intake(root, 3, change(poses)))
     capture, _ = make_capture(intake(root, 3, change(poses), take=(take,)))
+    for index, view in enumerate(capture.cameras.values()):
+        np.testing.assert_allclose(view.camera_to_world, poses[index], atol=1e-9)
+
+
+def test_an_order_is_told_after_what_is_taken_already(tmp_path):
+    poses = [camera(index).camera_to_world for index in range(3)]
+    root = write(tmp_path, 3)
+    given = [rigid_inverse(poses[index]) for index in (2, 0, 1)]
+    with pytest.raises(InputError, match="--take inverse order=1,2,0 takes it so"):
+        make_capture(intake(root, 3, given, take=("inverse",)))
+    with pytest.raises(InputError, match="--take inverse order=1,2,0 takes it so"):
+        make_capture(intake(root, 3, given))
+    with pytest.raises(InputError, match="--take inverse order=1,2,0 takes it so"):
+        make_capture(intake(root, 3, given, take=("order=1,0,2", "inverse")))
+    capture, _ = make_capture(intake(root, 3, given, take=("inverse", "order=1,2,0")))
     for index, view in enumerate(capture.cameras.values()):
         np.testing.assert_allclose(view.camera_to_world, poses[index], atol=1e-9)
 

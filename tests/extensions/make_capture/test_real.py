@@ -20,7 +20,7 @@ def test_the_table_of_a_real_recording(tmp_path, capsys):
     said = capsys.readouterr().out
     capture = Capture.load(output)
     assert capture.frame_count == 86
-    assert "0.001 m per count (millimeters), guessed" in said
+    assert "0.001 m per count (millimeters), as the source says" in said
     # Depth has steps of 1 to 3 mm; the plane was fitted to 1.6 mm rms by hand, with a threshold of its own.
     rms, share = (float(said.split("table: ")[1].split(word)[0].split()[-1].rstrip("%")) for word in (" mm rms", " of the pixels"))
     assert rms < 2.5 and 35 < share < 60

@@ -36,6 +36,10 @@ def of(seconds, unit):
         (lambda _, s: of(421.733366 + s, 1e-6), "device"),
         (lambda _, s: f"{int(421.9 + s)}_{round((421.9 + s) % 1 * 1e9) % 10**9:09d}", "device"),
         (lambda _, s: f"{int(421.9 + s)}-{int((421.9 + s) % 1 * 1e9)}", "device"),
+        (lambda _, s: f"frame_{round(30 * s):06d}_{of(1714566615.033 + s, 1e-3)}", "wall"),
+        (lambda _, s: f"20240501_{round(30 * s):06d}_{of(1714566615.033 + s, 1e-3)}", "wall"),
+        (lambda _, s: f"{round(30 * s):06d}_{1714566615.033 + s:.3f}", "wall"),
+        (lambda t, s: t.strftime("%H-%M-%S-") + f"{int(30 * (s + 0.433) + 1e-6) % 30:02d}", "device"),  # a time code
     ],
 )
 def test_a_time_in_any_form_is_read(write, clock):
@@ -54,10 +58,21 @@ def test_a_time_in_any_form_is_read(write, clock):
         lambda t, s: t.strftime("%Y%m%d_%H%M%S_") + f"{round(30 * s):04d}",
         lambda _, s: f"{round(30 * s):010d}",
         lambda _, s: f"{(7 * round(30 * s)) ** 2}",
+        lambda _, s: f"{round(30 * s):05d}_031",
+        lambda _, s: f"{round(30 * s):05d}_{31 + round(30 * s) % 3:03d}",  # a counter and an exposure
+        lambda _, s: f"12-30-15-{round(30 * s):02d}",
     ],
 )
 def test_what_counts_pictures_is_no_time(write):
     assert times_of(names(write)) is None
+
+
+@pytest.mark.parametrize("separator", ["-", "_", "."])
+def test_hundredths_of_seconds_are_a_time(separator):
+    written = names(lambda t, _: f"{t:%H-%M-%S}{separator}{t.microsecond // 10000:02d}")
+    times, clock = times_of(written)
+    assert clock == "device"
+    np.testing.assert_allclose(np.diff(times), 1 / 30, atol=0.0101)
 
 
 def test_lost_pictures_and_jitter_leave_a_time_one():

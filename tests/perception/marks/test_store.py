@@ -53,7 +53,7 @@ def polygon(truth, label, name):
 def test_masks_of_another_tool_become_those_of_a_capture(folder, tmp_path, capsys):
     truth = {name: folder / "truth" / name for name in ("0", "1")}
     assert main(["mask", str(folder), "--masks", str(truth["0"]), str(truth["1"])]) == 0
-    assert f"camera 1: masks, by frames of the capture, are in {folder}/mask/1" in capsys.readouterr().out
+    assert f"camera 1: masks are in {folder}/mask/1, numbered by frames of the capture" in capsys.readouterr().out
     capture = Capture.load(folder)
     assert capture.description.masks
     labels = capture.mask("0", 2)
@@ -117,10 +117,10 @@ def cut(root, numbers, still=False):
 @pytest.mark.parametrize(
     ("numbers", "how"),
     [
-        ({k: k for k in range(60)}, "by frames of the film that the capture was made of; 40 of 60 are of no frame"),
-        ({k: k for k in SOURCE}, "by frames of the film that the capture was made of, are"),
-        (dict(enumerate(SOURCE)), "by frames of the capture, are"),
-        ({k + 1: number for k, number in enumerate(SOURCE)}, "by order, are"),
+        ({k: k for k in range(60)}, "by frames of the film that the capture was made of; not used: 40, 00000.png to 00059.png\n"),
+        ({k: k for k in SOURCE}, "by frames of the film that the capture was made of\n"),
+        (dict(enumerate(SOURCE)), "by frames of the capture\n"),
+        ({k + 1: number for k, number in enumerate(SOURCE)}, "by order\n"),
     ],
 )
 def test_numbers_of_masks_are_those_of_the_film_or_of_the_capture(tmp_path, capsys, numbers, how):
@@ -136,7 +136,11 @@ def test_numbers_of_masks_are_those_of_the_film_or_of_the_capture(tmp_path, caps
     ("numbers", "still", "words"),
     [
         ({k: k for k in range(60)}, True, "frames of the capture: frame 0 is 00000.png; frames of the film"),
-        ({k: 2 * k + 18 for k in range(20)}, False, "must be of the frames of the film; received what moves, moves"),
+        (
+            {k: 2 * k + 18 for k in range(20)},
+            False,
+            "masks is 3.0 frames earlier than the film, by what moves. Mask 00000.png is that of frame 3: name it 00003.png",
+        ),
     ],
 )
 def test_masks_of_other_moments_are_refused(tmp_path, capsys, numbers, still, words):

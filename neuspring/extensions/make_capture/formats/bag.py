@@ -151,13 +151,15 @@ class Bag:
     def _opened(self) -> Iterator[Any]:
         """The reader of rosbags. Raises InputError."""
         library = needed("rosbags.rosbag2" if self._new else "rosbags.rosbag1")
+        rule = "a ROS 1 .bag, a ROS 2 folder with metadata.yaml, an .mcap or a .db3 file is required"
         try:
             with library.Reader(self.path) as reader:
                 yield reader
         except InputError:
             raise
+        except FileNotFoundError as error:
+            raise InputError(self.path, rule, "nothing there") from error
         except Exception as error:  # rosbags and its codecs raise whatever a damaged file leads them to
-            rule = "a ROS 1 .bag, a ROS 2 folder with metadata.yaml, an .mcap or a .db3 file is required"
             remedy = "If it was cut off: rosbag reindex FILE (ROS 1), ros2 bag reindex FOLDER (ROS 2), mcap recover FILE (.mcap)."
             raise InputError(self.path, rule, f"{type(error).__name__}: {error}".rstrip("."), remedy) from error
 
@@ -169,7 +171,7 @@ class Bag:
             found = {}
             for name, one in sorted(reader.topics.items()):
                 first, more = next(self._all(reader, name) if one.msgtype in MESSAGES else iter(()), (None, b""))
-                found[name] = Summary(one.msgtype or "", one.msgcount, one.msgcount / seconds, first, more)
+                found[name] = Summary(one.msgtype or "", one.msgcount, max(one.msgcount - 1, 0) / seconds, first, more)
             return found
 
     def messages(self, topic: str) -> Iterator[tuple[Any, bytes]]:
