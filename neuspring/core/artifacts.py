@@ -543,14 +543,22 @@ class Rod(Artifact):
         "inner held vertex of either end from its controller: along t, m1 (without `roll`), m2",
         omitted=True,
     )
-    """Markers lie beside a cable. The outer held vertex follows with the direction between the two controllers. With `tilts` this is
-    the middle of the held edge."""
+    """Markers lie beside a cable. The outer held vertex follows with the direction between the two controllers. With
+    `tilts` the middle of the held edge is there."""
     tilts: np.ndarray = array(
-        "K,2", np.float64, "1", "held edge of either end (K = 2), of its own length: along t + a m1 + b m2; see `clamps`", omitted=True
+        "K,2",
+        np.float64,
+        "1",
+        "held edge of either end (K = 2), of its own length: along t + a m1 + b m2; see `clamps`",
+        omitted=True,
     )
     """They are there where the vertices were laid along the unloaded shape (twin/rod.py)."""
     rolls: np.ndarray = array(
-        "K", np.int32, "1", "controller towards which m1 of either end's edge lies, from the outer held one; -1: `axis`", omitted=True
+        "K",
+        np.int32,
+        "1",
+        "controller towards which m1 of either end's edge lies, from the outer held one; -1: `axis`",
+        omitted=True,
     )
     offsets: np.ndarray = array(
         "V,2", np.float64, "m", "point of the observed line from each free vertex: along m1, m2 of the edge behind it", omitted=True

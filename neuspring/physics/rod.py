@@ -658,7 +658,10 @@ ROD_LANE_FIELDS = ("lengths", "mass", "bending", "twisting", "curvature", "axis"
 
 @dataclass(frozen=True)
 class RodLanes:
-    """Parameters of B rods with as many vertices, float64 on the CPU: those of `Rod` with a leading axis [B]; `axis` of either end."""
+    """Parameters of B rods with as many vertices, float64 on the CPU: those of `Rod` with a leading axis [B].
+
+    `axis` [B, 2, 3] is that of either end.
+    """
 
     lengths: np.ndarray
     mass: np.ndarray
@@ -782,7 +785,7 @@ class RodSolver:
             wp.copy(getattr(self._state, name), getattr(other._state, name))
 
     def start(self, x: torch.Tensor, v: torch.Tensor, axis: torch.Tensor | None = None) -> None:
-        """State of frame 0: positions [B, V, 3], m, velocities [B, V, 3], m/s, and the axes of clamps [B, 2, 3], if not the rods'."""
+        """State of frame 0: positions [B, V, 3], m, velocities [B, V, 3], m/s; axes of clamps [B, 2, 3], if not the rods'."""
         for name, values in (("x", x), ("v", v), ("axis", axis)):
             if values is not None:
                 self._put(getattr(self._state, name), values)

@@ -328,8 +328,8 @@ class RodFrames:
         return torch.stack([y * inverse * acts, 1 / inverse, dashpot * acts], dim=-1)
 
     def start(self, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor) -> None:
-        """Frame 0, with the controllers at `begin` [B, C, 3]. Nodes that were seen are bound to the directors there, which depend on
-        what the rod is made of. Raises InputError for another frame."""
+        """Frame 0, with the controllers at `begin` [B, C, 3]. Nodes are bound to the directors there, which depend on what the
+        rod is made of, unless they have their places. Raises InputError for another frame."""
         if not np.array_equal(x.cpu().numpy(), self._nodes if self.together else self._nodes[0]):
             raise InputError("twin.rod", "a rod begins in frame 0 of its twin", "another state", "Begin at frame 0.")
         for rod in self.rods:
