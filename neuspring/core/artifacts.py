@@ -64,8 +64,9 @@ def array(
 
 
 def number(unit: str, doc: str, **default: float) -> Any:
-    """Declare a number: unit, meaning, and a `default` where it may be left out."""
-    return field(metadata={"unit": unit, "doc": doc}, **default)  # type: ignore[call-overload]
+    """Declare a number: unit, meaning, and a `default` where it may be left out. One of 0 is not in the file where it is 0."""
+    metadata = {"unit": unit, "doc": doc} | (OMITTED if default.get("default") == 0 else {})
+    return field(metadata=metadata, **default)  # type: ignore[call-overload]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,7 +196,7 @@ class Artifact:
 
 def _kept(spec: dataclasses.Field[Any], value: object) -> bool:
     """True where a file has the field; an empty one may be left out."""
-    return bool(value) or spec.metadata != OMITTED
+    return bool(value) or not OMITTED.items() <= spec.metadata.items()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -563,6 +564,17 @@ class Rod(Artifact):
     offsets: np.ndarray = array(
         "V,2", np.float64, "m", "point of the observed line from each free vertex: along m1, m2 of the edge behind it", omitted=True
     )
+    slip: np.ndarray = array(
+        "B,2",
+        np.float64,
+        "1, 1/m",
+        "branches that slip: share of EI and GJ, curvature at which each slips",
+        sign="not negative",
+        omitted=True,
+    )
+    """Friction inside the rod (Prandtl 1928, Iwan 1966): moments are EI / l (k - k0 + damping dk/dt + sum share (k - z)), where z
+    is dragged along, so that |k - z| is at most l times the second number. In frame 0 z = k. Twist has the same branches."""
+    slip_twist: float = number("1", "twist slips at this times the curvatures of `slip`, rad/m; 0: it has no branches", default=0.0)
     stretching: float = number("N", "EA")
     damping: float = number("s", "time of inner damping: moments are EI / l (k - k0 + damping dk/dt)")
     drag_quadratic: float = number("1/m", "deceleration by air is this times speed squared; linear drag is the material's")
@@ -574,9 +586,15 @@ class Rod(Artifact):
             raise InputError(
                 "rod.lengths", "at least 3 vertices, and one length per edge between them", (edges + 1, len(self.lengths))
             )
-        if not (self.stretching > 0 and self.damping >= 0 and self.drag_quadratic >= 0 and np.isfinite(self.roll)):
-            rule = "stretching > 0, damping >= 0, drag_quadratic >= 0 and a finite roll are required"
-            raise InputError("rod", rule, (self.stretching, self.damping, self.drag_quadratic, self.roll))
+        if not (
+            self.stretching > 0
+            and self.damping >= 0
+            and self.drag_quadratic >= 0
+            and self.slip_twist >= 0
+            and np.isfinite(self.roll)
+        ):
+            rule = "stretching > 0, damping, drag_quadratic, slip_twist >= 0 and a finite roll are required"
+            raise InputError("rod", rule, (self.stretching, self.damping, self.drag_quadratic, self.slip_twist, self.roll))
         if self.laid and len(self.tilts) != 2:
             raise InputError("rod.tilts", "one row per end, or none", len(self.tilts))
         if len(self.edge) and not 0 <= self.edge.min() <= self.edge.max() < edges:

@@ -65,6 +65,9 @@ class RodState:
     bending: Scalars
     twisting: Scalars
     curvature: Pairs
+    slip: Pairs
+    """Branches that slip [B, branches], see `Rod.slip`."""
+    slip_twist: Numbers
     stretching: Numbers
     damping: Numbers
     drag: Numbers
@@ -94,6 +97,8 @@ class RodState:
     tension: Scalars
     k: Pairs
     k_before: Pairs
+    z: wp.array3d(dtype=vec3)
+    """k1, k2 and the twist of each joint at which a branch has no moment [B, V, branches]."""
     history: wp.array(dtype=wp.int32)
     """Substeps since the last start or contact."""
     a: wp.array3d(dtype=real)
@@ -173,6 +178,41 @@ def joint_length(s: RodState, lane: int, i: int):
 
 
 @wp.func
+def twist(s: RodState, lane: int, i: int):
+    """Twist of joint i, rad."""
+    return s.theta[lane, i] - s.theta[lane, i - 1] + s.reference[lane, i]
+
+
+@wp.func
+def kept(s: RodState, lane: int, i: int, branch: int, away: vec3):
+    """The parts of a branch's curvature and of its twist, as they would be if it stuck, that are left where it slips."""
+    most = s.slip[lane, branch][1] * joint_length(s, lane, i)
+    bent = most / wp.max(wp.max(wp.length(vec2(away[0], away[1])), most), TINY)
+    most = s.slip_twist[lane] * most
+    return vec2(bent, most / wp.max(wp.max(wp.abs(away[2]), most), TINY))
+
+
+@wp.func
+def slid(e: vec2, move: vec2, most: real):
+    """e = k - z, not longer than `most`, after k has gone straight by `move`: de = dk, where |e| = most less its part along e.
+
+    As it slides, half its angle to the way has a tangent that falls by exp(-way / most).
+    """
+    after = e + move
+    if wp.length(after) <= most:
+        return after
+    way = wp.max(wp.length(move), TINY)
+    u = move / way
+    along = wp.dot(e, u)
+    across = e - along * u
+    begin = wp.sqrt(wp.max(most * most - wp.dot(across, across), real(0.0)))
+    t = wp.tanh((way - begin + along) / wp.max(most, TINY))
+    c = begin / wp.max(most, TINY)
+    after = (most * (c + t) / (real(1.0) + c * t)) * u + (wp.sqrt(real(1.0) - t * t) / (real(1.0) + c * t)) * across
+    return after
+
+
+@wp.func
 def solve_twist(s: RodState, lane: int, edges: int, first_held: bool, last_held: bool):
     """Angles of edges that no clamp holds, from `theta` to a minimum of the energy, by tridiagonal Newton steps."""
     low = wp.where(first_held, 1, 0)
@@ -185,7 +225,7 @@ def solve_twist(s: RodState, lane: int, edges: int, first_held: bool, last_held:
             s.rest[lane, j] = real(0.0)
         for i in range(1, edges):
             joint = joint_length(s, lane, i)
-            m = s.theta[lane, i] - s.theta[lane, i - 1] + s.reference[lane, i]
+            m = twist(s, lane, i)
             y = s.twisting[lane, i] / joint
             e = s.bending[lane, i] / joint
             k = curvature(s, lane, i) - s.curvature[lane, i]
@@ -271,6 +311,8 @@ def begin(s: RodState):
     for i in range(1, edges):
         s.k[lane, i] = curvature(s, lane, i)
         s.k_before[lane, i] = s.k[lane, i]
+        for branch in range(s.slip.shape[1]):
+            s.z[lane, i, branch] = vec3(s.k[lane, i][0], s.k[lane, i][1], twist(s, lane, i))
     for j in range(edges):
         s.tension[lane, j] = real(0.0)
     s.history[lane] = 0
@@ -339,7 +381,11 @@ def slopes(s: RodState, lane: int, i: int, k: vec2):
 
 @wp.func
 def assemble_bending(s: RodState, lane: int, edges: int, rate: real, older: real, oldest: real):
-    """Forces and moments of bending and twist, and their Gauss-Newton matrix. dk/dt = rate k - older k_ + oldest k__."""
+    """Forces and moments of bending and twist, and their Gauss-Newton matrix. dk/dt = rate k - older k_ + oldest k__.
+
+    The matrix of a branch that slips is its secant from z: a parabola that is nowhere below the branch's potential, so that a
+    step never overshoots. Its tangent, 0 along the slip, chatters where modes are fast for a substep.
+    """
     for i in range(1, edges):
         joint = joint_length(s, lane, i)
         e = s.bending[lane, i] / joint
@@ -348,16 +394,25 @@ def assemble_bending(s: RodState, lane: int, edges: int, rate: real, older: real
         k = curvature(s, lane, i)
         change = rate * k - older * s.k[lane, i] + oldest * s.k_before[lane, i]
         moment = e * (k - s.curvature[lane, i] + s.damping[lane] * change)
-        twist = z * (s.theta[lane, i] - s.theta[lane, i - 1] + s.reference[lane, i])
+        m = twist(s, lane, i)
+        torque = z * m
+        stiff = z
+        for branch in range(s.slip.shape[1]):
+            away = vec3(k[0], k[1], m) - s.z[lane, i, branch]
+            part = s.slip[lane, branch][0] * kept(s, lane, i, branch, away)
+            moment = moment + (e * part[0]) * vec2(away[0], away[1])
+            y = y + e * part[0]
+            torque = torque + z * part[1] * away[2]
+            stiff = stiff + z * part[1]
         slopes(s, lane, i, k)
         first = 4 * (i - 1)
         for r in range(JOINT):
             w1 = s.w[lane, 0, r]
             w2 = s.w[lane, 1, r]
             w3 = s.w[lane, 2, r]
-            s.b[lane, first + r] = s.b[lane, first + r] - moment[0] * w1 - moment[1] * w2 - twist * w3
+            s.b[lane, first + r] = s.b[lane, first + r] - moment[0] * w1 - moment[1] * w2 - torque * w3
             for c in range(r + 1):
-                value = y * (w1 * s.w[lane, 0, c] + w2 * s.w[lane, 1, c]) + z * w3 * s.w[lane, 2, c]
+                value = y * (w1 * s.w[lane, 0, c] + w2 * s.w[lane, 1, c]) + stiff * w3 * s.w[lane, 2, c]
                 s.a[lane, first + r, r - c] = s.a[lane, first + r, r - c] + value
         for side in range(2):
             c = 3 + 4 * side
@@ -594,11 +649,19 @@ def advance_frame(
         for i in range(1, edges):
             s.k_before[lane, i] = s.k[lane, i]
             k = curvature(s, lane, i)
+            m = twist(s, lane, i)
             slopes(s, lane, i, k)
             for r in range(JOINT):
                 moved = s.b[lane, 4 * (i - 1) + r]
                 k = k + vec2(s.w[lane, 0, r] * moved, s.w[lane, 1, r] * moved)
+                m = m + s.w[lane, 2, r] * moved
             s.k[lane, i] = k
+            for branch in range(s.slip.shape[1]):
+                away = vec3(k[0], k[1], m) - s.z[lane, i, branch]
+                left = kept(s, lane, i, branch, away)[1] * away[2]
+                move = k - s.k_before[lane, i]
+                bent = slid(vec2(away[0], away[1]) - move, move, s.slip[lane, branch][1] * joint_length(s, lane, i))
+                s.z[lane, i, branch] = vec3(k[0] - bent[0], k[1] - bent[1], m - left)
         for j in range(edges):
             s.theta[lane, j] = s.theta[lane, j] + wp.clamp(s.b[lane, 4 * j + 3], -MAX_TURN, MAX_TURN)
         s.history[lane] = s.history[lane] + 1
@@ -652,7 +715,20 @@ def advance(
             m1[frame, lane, i] = s.m1[lane, i]
 
 
-ROD_LANE_FIELDS = ("lengths", "mass", "bending", "twisting", "curvature", "axis", "stretching", "damping", "drag_quadratic", "roll")
+ROD_LANE_FIELDS = (
+    "lengths",
+    "mass",
+    "bending",
+    "twisting",
+    "curvature",
+    "axis",
+    "stretching",
+    "damping",
+    "drag_quadratic",
+    "roll",
+    "slip",
+    "slip_twist",
+)
 """Fields of a `Rod` that lanes have one value of each."""
 
 
@@ -673,6 +749,8 @@ class RodLanes:
     damping: np.ndarray
     drag_quadratic: np.ndarray
     roll: np.ndarray
+    slip: np.ndarray
+    slip_twist: np.ndarray
     drag: np.ndarray
     """Linear drag, 1/s."""
     held: np.ndarray
@@ -713,6 +791,7 @@ STATE = (
     "tension",
     "k",
     "k_before",
+    "z",
     "history",
 )
 """State that `RodSolver.follow` takes over."""
@@ -741,11 +820,12 @@ class RodSolver:
         self._state = RodState()
         for name, dtype in kinds.items():
             setattr(self._state, name, wp.zeros((count, vertices), dtype=dtype, device=device))
+        self._state.z = wp.zeros((count, vertices, lanes.slip.shape[1]), dtype=vec3, device=device)
         self._state.history = wp.zeros(count, dtype=wp.int32, device=device)
         self._state.a = wp.zeros((count, 4 * vertices, 11), dtype=real, device=device)
         self._state.w = wp.zeros((count, 3, 11), dtype=real, device=device)
         self._state.b = wp.zeros((count, 4 * vertices), dtype=real, device=device)
-        vectors: dict[str, Any] = {"curvature": vec2, "axis": vec3}
+        vectors: dict[str, Any] = {"curvature": vec2, "axis": vec3, "slip": vec2}
         for each in fields(RodLanes):
             kind: Any = wp.int32 if each.name == "held" else vectors.get(each.name, real)
             values = np.ascontiguousarray(getattr(lanes, each.name))
