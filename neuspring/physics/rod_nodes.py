@@ -147,7 +147,7 @@ def hanging(rods: Sequence[Rod], controllers: np.ndarray, simulation: Simulation
     held, axes = Clamps.of(rods).paths(torch.tensor(np.asarray(controllers, np.float64))[None])
     length = max(float(rod.lengths.sum()) for rod in rods)
     step = 0.5 * (length / max(simulation.gravity, TINY_GRAVITY)) ** 0.5
-    plain = [replace(rod, damping=0.0, drag_quadratic=0.0) for rod in rods]
+    plain = [replace(rod, damping=0.0, drag_quadratic=0.0, slip=rod.slip[:0]) for rod in rods]
     still = replace(simulation, frame_time=step, substeps=1, ground=False)
     solver = RodSolver(RodLanes.of(plain, [0.0] * len(rods)), still)
     x = torch.tensor(np.stack([rod.vertices for rod in rods]))

@@ -59,10 +59,15 @@ LANES = 512
 VARIABLE_SCALES = {
     "bending": 1.0, "twisting": 1.0, "damping": 1.0, "drag": 1.0, "drag_quadratic": 1.0, "marker_mass": 1.0, "hands": 1.0,
     "dashpots": 1.0, "roll": 1.0, "curvature": 0.3, "bending_along": 0.5, "twisting_along": 0.5, "clamps": 0.02, "offsets": 0.01,
-    "stretch": 0.01, "tilts": 0.05, "places": 0.01,
+    "stretch": 0.01, "tilts": 0.05, "places": 0.01, "slip_share": 1.0, "slip_yield": 0.7, "slip_twist": 0.5,
 }  # fmt: skip
 """Scale of each kind of variable: of logarithms, rad, curvatures (1), and m."""
-LOGARITHMIC = ("bending", "twisting", "damping", "drag", "drag_quadratic", "marker_mass", "hands", "dashpots")
+LOGARITHMIC = (
+    *("bending", "twisting", "damping", "drag", "drag_quadratic", "marker_mass", "hands", "dashpots"),
+    *("slip_share", "slip_yield", "slip_twist"),
+)
+SLIP_SHARE, SLIP_ANGLES = 0.3, (0.05, 3.0)
+"""Share of each branch that slips where a fit begins, and turns of the whole rod at which the first and the last does, rad."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,6 +98,10 @@ class Variables:
     def of(cls, twin: Twin, settings: RodSteps, tracked: int = 0) -> Variables:
         """The variables of a fit. So many first nodes are tracked points."""
         rod, held = _rod(twin), _rod(twin).held >= 0
+        if settings.slip and not len(rod.slip):
+            yields = np.geomspace(*SLIP_ANGLES, settings.slip) / rod.lengths.sum()
+            rod = replace(rod, slip=np.stack([np.full(settings.slip, SLIP_SHARE), yields], axis=1), slip_twist=1.0)
+            twin = replace(twin, rod=rod)
         joints = len(held) - 2
         along = _basis(rod, {"constant": "none"}.get(settings.stiffness, settings.stiffness), settings.knots)
         bent = _basis(rod, {"straight": "none"}.get(settings.curvature, settings.curvature), settings.knots)
@@ -102,6 +111,7 @@ class Variables:
         ends = int(held[:2].all()) + int(held[-2:].all())
         sizes = dict.fromkeys(("bending", "twisting", "damping", "drag", "drag_quadratic"), 1)
         sizes |= {"marker_mass": tracked if rod.laid else 1} if held.any() else {"hands": 1, "dashpots": 1}
+        sizes |= {"slip_share": settings.slip, "slip_yield": settings.slip, "slip_twist": int(settings.slip > 0)}
         sizes |= {"roll": int(ends == 2), "curvature": 2 * bent.shape[1]}
         sizes |= {"bending_along": along.shape[1], "twisting_along": along.shape[1]}
         if settings.markers and rod.laid:
@@ -138,6 +148,9 @@ class Variables:
         if self.curvature_along.shape[1]:
             coefficients = self.part(q, "curvature").reshape(2, -1)
             changes["curvature"] = start.curvature + (self.curvature_along @ coefficients.T)
+        if "slip_share" in self.sizes:
+            branches = np.stack([factor["slip_share"], factor["slip_yield"]], axis=1)
+            changes |= {"slip": start.slip * branches, "slip_twist": start.slip_twist * float(factor["slip_twist"][0])}
         clamps = start.clamps.copy()
         if "clamps" in self.sizes:
             clamped = [bool((start.held[end] >= 0).all()) for end in (slice(2), slice(-2, None))]
@@ -396,7 +409,7 @@ def search_rod(
     import pandas as pd
 
     require_pool(observations, pool)
-    first = replace(RodSteps(**vars(settings.fit.rod)), stiffness="constant", curvature="constant", markers=False)
+    first = replace(RodSteps(**vars(settings.fit.rod)), stiffness="constant", curvature="constant", markers=False, slip=0)
     first = replace(first, horizons=first.horizons[:1])
     lines = [rods.line_of(each) for each in [observations, *pool] if each.line.size]
     axis = max(np.eye(3)[:2].tolist(), key=lambda axis: sum(np.cos(turn_of(line, np.array(axis))) for line in lines))
