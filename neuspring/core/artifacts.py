@@ -534,7 +534,7 @@ class Rod(Artifact):
     edge: np.ndarray = array("N", np.int32, "1", "the edge that each node of the topology follows")
     place: np.ndarray = array("N,3", np.float64, "1, m, m", "of each node: fraction along its edge, distances along m1 and m2")
     line: np.ndarray = array(
-        "V", np.int32, "1", "the observed line, see `Observations.line`; empty: found among nodes", omitted=True
+        "M", np.int32, "1", "the observed line, see `Observations.line`; empty: found among nodes", omitted=True
     )
     axis: np.ndarray = array("3", np.float64, "1", "direction in the world whose projection is m1 of the first edge")
     clamps: np.ndarray = array(
@@ -544,7 +544,23 @@ class Rod(Artifact):
         "inner held vertex of either end from its controller: along t, m1 (without `roll`), m2",
         omitted=True,
     )
-    """Markers lie beside a cable. The outer held vertex follows with the direction between the two controllers."""
+    """Markers lie beside a cable. The outer held vertex follows with the direction between the two controllers. With
+    `tilts` the middle of the held edge is there."""
+    tilts: np.ndarray = array(
+        "K,2",
+        np.float64,
+        "1",
+        "held edge of either end (K = 2), of its own length: along t + a m1 + b m2; see `clamps`",
+        omitted=True,
+    )
+    """They are there where the vertices were laid along the unloaded shape (twin/rod.py)."""
+    rolls: np.ndarray = array(
+        "K",
+        np.int32,
+        "1",
+        "controller towards which m1 of either end's edge lies, from the outer held one; -1: `axis`",
+        omitted=True,
+    )
     offsets: np.ndarray = array(
         "V,2", np.float64, "m", "point of the observed line from each free vertex: along m1, m2 of the edge behind it", omitted=True
     )
@@ -579,8 +595,15 @@ class Rod(Artifact):
         ):
             rule = "stretching > 0, damping, drag_quadratic, slip_twist >= 0 and a finite roll are required"
             raise InputError("rod", rule, (self.stretching, self.damping, self.drag_quadratic, self.slip_twist, self.roll))
+        if self.laid and len(self.tilts) != 2:
+            raise InputError("rod.tilts", "one row per end, or none", len(self.tilts))
         if len(self.edge) and not 0 <= self.edge.min() <= self.edge.max() < edges:
             raise InputError("rod.edge", f"indices must lie in [0, {edges})", [int(self.edge.min()), int(self.edge.max())])
+
+    @property
+    def laid(self) -> bool:
+        """True where vertices were laid along the unloaded shape: nobody sees them, and nodes keep their places."""
+        return bool(self.tilts.size)
 
     @property
     def spans(self) -> np.ndarray:

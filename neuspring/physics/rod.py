@@ -13,8 +13,8 @@ and x1 = p + d around the extrapolated p = 2 x0 - x_, where forces are evaluated
 c is the drag. Twist is quasi-static: the angles theta have no mass, and moments about the tangents are in balance, those of inner
 damping among them. So d goes on with changes of the angles, extrapolated as p is, and K is the Gauss-Newton matrix of bending,
 damping, twist and stretching by both; the tension of the substep before turns edges. K couples three neighbors, so the system is
-banded and solved by Cholesky. Held vertices follow their paths linearly within a frame, and the directors of clamps are the axis
-projected.
+banded and solved by Cholesky. Held vertices and the axes of clamps follow their paths linearly within a frame, and the directors of
+clamps are the axes projected.
 """
 # No postponed annotations here: Warp reads the evaluated types of the kernels below.
 
@@ -51,6 +51,7 @@ Row: Any = wp.types.vector(length=11, dtype=wp.float64)
 Scalars: Any = wp.array2d(dtype=real)
 Vectors: Any = wp.array2d(dtype=vec3)
 Pairs: Any = wp.array2d(dtype=vec2)
+Paths: Any = wp.array3d(dtype=vec3)
 Numbers: Any = wp.array(dtype=real)
 Indices: Any = wp.array2d(dtype=wp.int32)
 
@@ -72,7 +73,8 @@ class RodState:
     drag: Numbers
     drag_quadratic: Numbers
     roll: Numbers
-    axis: wp.array(dtype=vec3)
+    axis: Vectors
+    """Direction whose projection gives the roll of either end [B, 2], now."""
     held: Indices
     x: Vectors
     v: Vectors
@@ -291,7 +293,7 @@ def begin(s: RodState):
     for j in range(edges):
         s.t[lane, j] = wp.normalize(s.x[lane, j + 1] - s.x[lane, j])
         if j == 0:
-            s.u[lane, j] = projected(s.axis[lane], s.t[lane, j])
+            s.u[lane, j] = projected(s.axis[lane, 0], s.t[lane, j])
         else:
             s.u[lane, j] = transported(s.u[lane, j - 1], s.t[lane, j - 1], s.t[lane, j])
         s.reference[lane, j] = real(0.0)
@@ -299,7 +301,7 @@ def begin(s: RodState):
     end = real(0.0)
     if last_held:
         last = edges - 1
-        end = s.roll[lane] + turn(s.u[lane, last], projected(s.axis[lane], s.t[lane, last]), s.t[lane, last])
+        end = s.roll[lane] + turn(s.u[lane, last], projected(s.axis[lane, 1], s.t[lane, last]), s.t[lane, last])
     along = real(0.0)
     for j in range(edges):
         s.theta[lane, j] = end * along / (total - s.lengths[lane, edges - 1])
@@ -547,11 +549,14 @@ def solve(s: RodState, lane: int, rows: int):
                 s.b[lane, i - q] = s.b[lane, i - q] - s.a[lane, i, q] * value
 
 
-@wp.kernel(enable_backward=False)
-def advance(
+@wp.func
+def advance_frame(
     s: RodState,
+    lane: int,
     held_from: Vectors,
     held_to: Vectors,
+    axis_from: Vectors,
+    axis_to: Vectors,
     hands_from: Vectors,
     hands_to: Vectors,
     ground: bool,
@@ -560,8 +565,7 @@ def advance(
     gravity: real,
     up: real,
 ):
-    """One frame of each lane."""
-    lane = wp.tid()
+    """One frame of a lane."""
     vertices = s.x.shape[1]
     edges = vertices - 1
     first_held = s.held[lane, 0] >= 0 and s.held[lane, 1] >= 0
@@ -591,12 +595,14 @@ def advance(
             s.theta_before[lane, j] = s.theta[lane, j]
             if s.history[lane] > 0:
                 s.theta[lane, j] = real(2.0) * s.theta[lane, j] - before
+        for end in range(2):
+            s.axis[lane, end] = axis_from[lane, end] + part * (axis_to[lane, end] - axis_from[lane, end])
         # The directors of clamps keep to the axis, whatever way the tangents took.
         if first_held:
-            s.theta[lane, 0] = near(turn(s.u[lane, 0], projected(s.axis[lane], s.t[lane, 0]), s.t[lane, 0]), s.theta[lane, 0])
+            s.theta[lane, 0] = near(turn(s.u[lane, 0], projected(s.axis[lane, 0], s.t[lane, 0]), s.t[lane, 0]), s.theta[lane, 0])
         if last_held:
             last = edges - 1
-            angle = s.roll[lane] + turn(s.u[lane, last], projected(s.axis[lane], s.t[lane, last]), s.t[lane, last])
+            angle = s.roll[lane] + turn(s.u[lane, last], projected(s.axis[lane, 1], s.t[lane, last]), s.t[lane, last])
             s.theta[lane, last] = near(angle, s.theta[lane, last])
         set_directors(s, lane, edges)
         for i in range(4 * vertices):
@@ -665,6 +671,50 @@ def advance(
                     touch_ground(s, lane, i, up)
 
 
+@wp.kernel(enable_backward=False)
+def advance(
+    s: RodState,
+    held: Paths,
+    axes: Paths,
+    hands: Paths,
+    ground: bool,
+    still: bool,
+    substeps: int,
+    h: real,
+    gravity: real,
+    up: real,
+    x: Paths,
+    m1: Paths,
+):
+    """Frames of each lane; x and m1 get the positions and directors at the end of each. `still`: each begins at rest."""
+    lane = wp.tid()
+    vertices = s.x.shape[1]
+    for frame in range(x.shape[0]):
+        if still:
+            s.history[lane] = 0
+            for i in range(vertices):
+                s.v[lane, i] = vec3()
+        end = frame + 1
+        advance_frame(
+            s,
+            lane,
+            held[frame],
+            held[end],
+            axes[frame],
+            axes[end],
+            hands[frame],
+            hands[end],
+            ground,
+            substeps,
+            h,
+            gravity,
+            up,
+        )
+        for i in range(vertices):
+            x[frame, lane, i] = s.x[lane, i]
+            m1[frame, lane, i] = s.m1[lane, i]
+
+
 ROD_LANE_FIELDS = (
     "lengths",
     "mass",
@@ -684,7 +734,10 @@ ROD_LANE_FIELDS = (
 
 @dataclass(frozen=True)
 class RodLanes:
-    """Parameters of B rods with as many vertices, float64 on the CPU: those of `Rod` with a leading axis [B]."""
+    """Parameters of B rods with as many vertices, float64 on the CPU: those of `Rod` with a leading axis [B].
+
+    `axis` [B, 2, 3] is that of either end.
+    """
 
     lengths: np.ndarray
     mass: np.ndarray
@@ -706,6 +759,7 @@ class RodLanes:
     def of(cls, rods: Sequence[Rod], drags: Sequence[float]) -> "RodLanes":
         """Lanes of rods and their linear drags, 1/s."""
         values = {name: np.array([getattr(rod, name) for rod in rods], dtype=np.float64) for name in ROD_LANE_FIELDS}
+        values["axis"] = np.repeat(values["axis"][:, None], 2, axis=1)
         return cls(**values, drag=np.array(drags, dtype=np.float64), held=np.array([rod.held for rod in rods], dtype=np.int32))
 
 
@@ -790,39 +844,55 @@ class RodSolver:
             for name, dtype in kinds.items():
                 values = np.ascontiguousarray(getattr(hands, name))
                 setattr(self._state, name, wp.array(values, dtype=dtype, device=self.device))
-        self._ends: Any = (self._state.hands, self._state.hands)
+        self._ends = wp.to_torch(self._state.hands)[None]
 
     def bind(self, edge: torch.Tensor, place: torch.Tensor) -> None:
         """Set where the springs of hands act: on edges [B, S], at places [B, S, 3] as in `Rod.place`."""
         self._put(self._state.spring_edge, edge)
         self._put(self._state.spring_place, place)
 
-    def pull(self, law: torch.Tensor, begin: torch.Tensor, end: torch.Tensor) -> None:
-        """Set how they act in the next frame: stiffness, N/m, rest length, m, and dashpot, N s/m [B, S, 3]; none where both are 0.
+    def pull(self, law: torch.Tensor, hands: torch.Tensor) -> None:
+        """Set how they act in the next frames: stiffness, N/m, rest length, m, and dashpot, N s/m [B, S, 3]; none where both are 0.
 
-        Controllers move linearly from begin to end [B, C, 3], m.
+        Controllers move linearly between rows of hands [F + 1, B, C, 3], m.
         """
         self._put(self._state.law, law)
-        self._ends = self._vectors(begin), self._vectors(end)
+        self._ends = hands
 
     def follow(self, other: "RodSolver") -> None:
         """Take the state of another solver of the same rods."""
         for name in STATE:
             wp.copy(getattr(self._state, name), getattr(other._state, name))
 
-    def start(self, x: torch.Tensor, v: torch.Tensor) -> None:
-        """State of frame 0: positions [B, V, 3], m, and velocities [B, V, 3], m/s."""
-        for name, values in (("x", x), ("v", v)):
-            self._put(getattr(self._state, name), values)
+    def start(self, x: torch.Tensor, v: torch.Tensor, axis: torch.Tensor | None = None) -> None:
+        """State of frame 0: positions [B, V, 3], m, velocities [B, V, 3], m/s; axes of clamps [B, 2, 3], if not the rods'."""
+        for name, values in (("x", x), ("v", v), ("axis", axis)):
+            if values is not None:
+                self._put(getattr(self._state, name), values)
         wp.launch(load(begin, self.device), dim=self.count, inputs=[self._state], device=self.device)
 
-    def frame(self, held_from: torch.Tensor, held_to: torch.Tensor) -> None:
-        """One frame. Held vertices move linearly between rows of [B, V, 3]."""
-        simulation, ends = self.simulation, (self._vectors(held_from), self._vectors(held_to))
+    def frames(
+        self, held: torch.Tensor, axis: torch.Tensor | None = None, *, still: bool = False
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """F frames: positions [F, B, V, 3], m, and m1 of edges [F, B, E, 3] at the end of each.
+
+        Held vertices move linearly between rows of held [F + 1, B, V, 3], and so do the axes of clamps [F + 1, B, 2, 3]; without
+        any they stay. `still`: all velocities are 0 at the begin of each frame, which so is a step down towards equilibrium.
+        """
+        simulation, count = self.simulation, len(held) - 1
+        axes = wp.to_torch(self._state.axis).clone().expand(count + 1, -1, -1, -1) if axis is None else axis
+        paths = [self._vectors(values) for values in (held, axes, self._ends.expand(count + 1, -1, -1, -1))]
+        found = [wp.empty((count, self.count, self.vertices), dtype=vec3, device=self.device) for _ in range(2)]
         gravity = -simulation.up_sign * simulation.gravity
         ground, up = simulation.ground and self.hands is not None, simulation.up_sign
-        inputs = [self._state, *ends, *self._ends, ground, simulation.substeps, simulation.substep, gravity, up]
+        inputs = [self._state, *paths, ground, still, simulation.substeps, simulation.substep, gravity, up, *found]
         wp.launch(load(advance, self.device), dim=self.count, inputs=inputs, device=self.device)
+        x, m1 = (wp.to_torch(values) for values in found)
+        return x, m1[:, :, :-1]
+
+    def frame(self, held_from: torch.Tensor, held_to: torch.Tensor) -> None:
+        """One frame, as `frames`."""
+        self.frames(torch.stack([held_from, held_to]))
 
     def _vectors(self, values: torch.Tensor) -> Any:
         return wp.from_torch(values.to(device=self.device, dtype=torch.float64).contiguous(), dtype=vec3)
