@@ -134,8 +134,8 @@ class Artifact:
                 plain[spec.name] = value._flatten(arrays, f"{prefix}{spec.name}.")
             elif dataclasses.is_dataclass(value) and not isinstance(value, type):
                 parts = dataclasses.fields(value)
-                plain[spec.name] = {f.name: getattr(value, f.name) for f in parts if _kept(f, getattr(value, f.name))}
-            elif _kept(spec, value):
+                plain[spec.name] = {f.name: getattr(value, f.name) for f in parts if kept(f, getattr(value, f.name))}
+            elif kept(spec, value):
                 plain[spec.name] = value
         return plain
 
@@ -194,7 +194,7 @@ class Artifact:
         return cls(**values)
 
 
-def _kept(spec: dataclasses.Field[Any], value: object) -> bool:
+def kept(spec: dataclasses.Field[Any], value: object) -> bool:
     """True where a file has the field; an empty one may be left out."""
     return bool(value) or not OMITTED.items() <= spec.metadata.items()
 
@@ -520,7 +520,8 @@ class Rod(Artifact):
     Edge j joins vertices j and j + 1. Its frame is the unit tangent t and two directors m1, m2 = t x m1. A clamp holds the two
     outer vertices of an end: m1 of edge 0 is `axis` projected, that of the last edge the same turned by `roll` about its tangent.
     Between them the twist is in equilibrium. With kb = 2 t_(i-1) x t_i / (1 + t_(i-1) t_i) the curvatures of joint i are
-    k1 = kb (m2_(i-1) + m2_i) / 2 and k2 = -kb (m1_(i-1) + m1_i) / 2. Nodes of the topology follow the line (`edge`, `place`).
+    k1 = kb (m2_(i-1) + m2_i) / 2 and k2 = -kb (m1_(i-1) + m1_i) / 2. With `by_angle` kb is as long as the angle between the edges,
+    not 2 tan of its half. Nodes of the topology follow the line (`edge`, `place`).
     """
 
     kind: ClassVar[str] = "rod"
@@ -565,7 +566,7 @@ class Rod(Artifact):
         "V,2", np.float64, "m", "point of the observed line from each free vertex: along m1, m2 of the edge behind it", omitted=True
     )
     slip: np.ndarray = array(
-        "B,2",
+        "P,2",
         np.float64,
         "1, 1/m",
         "branches that slip: share of EI and GJ, curvature at which each slips",
@@ -575,6 +576,9 @@ class Rod(Artifact):
     """Friction inside the rod (Prandtl 1928, Iwan 1966): moments are EI / l (k - k0 + damping dk/dt + sum share (k - z)), where z
     is dragged along, so that |k - z| is at most l times the second number. In frame 0 z = k. Twist has the same branches."""
     slip_twist: float = number("1", "twist slips at this times the curvatures of `slip`, rad/m; 0: it has no branches", default=0.0)
+    by_angle: float = number("1", "1: the curvature of a joint is its angle; 0: 2 tan of half the angle", default=0.0)
+    """A moment is EI times the angle per length. 2 tan of the half is stiffer by angle^2 / 3, the more so the fewer vertices there
+    are; rods of markers have it, as their authors do."""
     stretching: float = number("N", "EA")
     damping: float = number("s", "time of inner damping: moments are EI / l (k - k0 + damping dk/dt)")
     drag_quadratic: float = number("1/m", "deceleration by air is this times speed squared; linear drag is the material's")

@@ -25,6 +25,8 @@ SMALLEST_TURN = 1e-12
 """They end where no angle changes more, rad, ..."""
 ROUNDING = 1e-15
 """... or where moments are this part of the largest stiffness: then they are rounding."""
+SMALLEST_SINE = 1e-7
+"""Sine of half an angle between edges below which the angle is as good as its sine."""
 NO_STIFFNESS = 1e-10
 """A turn of the directors that has less than this of the largest stiffness has none: of a straight rod that no clamp holds."""
 
@@ -49,13 +51,16 @@ class Parameters:
     roll: Tensor
     slip: Tensor
     slip_twist: Tensor
+    by_angle: bool
 
     @classmethod
     def of(cls, rod: Rod, drag: float = 0.0) -> Parameters:
         """A rod's numbers; `held` says of each vertex whether a controller sets it."""
         arrays = "vertices lengths mass bending twisting curvature axis stretching damping drag_quadratic roll slip slip_twist"
         numbers = {name: torch.tensor(getattr(rod, name), dtype=torch.float64) for name in arrays.split()}
-        return cls(held=torch.tensor(rod.held >= 0), drag=torch.tensor(drag, dtype=torch.float64), **numbers)
+        return cls(
+            held=torch.tensor(rod.held >= 0), drag=torch.tensor(drag, dtype=torch.float64), by_angle=bool(rod.by_angle), **numbers
+        )
 
     @property
     def spans(self) -> Tensor:
@@ -78,6 +83,8 @@ class Frames(NamedTuple):
     """u [E, 3], perpendicular to them."""
     twist: Tensor
     """Reference twist of each joint [J], rad: from u of the edge before, carried over the joint, to u of the edge behind."""
+    by_angle: bool = False
+    """See `Rod.by_angle`."""
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
@@ -117,7 +124,7 @@ def carried(frames: Frames, x: Tensor) -> Frames:
     t = tangents(x)
     u = transport(frames.directors, frames.tangents, t)
     twist = angle(transport(u[:-1], t[:-1], t[1:]), u[1:], t[1:])
-    return Frames(t, u, frames.twist + torch.remainder(twist - frames.twist + pi, 2 * pi) - pi)
+    return Frames(t, u, frames.twist + torch.remainder(twist - frames.twist + pi, 2 * pi) - pi, frames.by_angle)
 
 
 def start(parameters: Parameters, x: Tensor) -> tuple[Frames, Tensor]:
@@ -126,7 +133,7 @@ def start(parameters: Parameters, x: Tensor) -> tuple[Frames, Tensor]:
     directors = [projected(parameters.axis, t[0])]
     for before, behind in pairwise(t):
         directors.append(transport(directors[-1], before, behind))
-    frames = Frames(t, torch.stack(directors), torch.zeros_like(parameters.spans))
+    frames = Frames(t, torch.stack(directors), torch.zeros_like(parameters.spans), parameters.by_angle)
     end = angle(directors[-1], projected(parameters.axis, t[-1]), t[-1]) + parameters.roll
     along = torch.cat([torch.zeros_like(parameters.spans[:1]), parameters.spans.cumsum(0)]) / parameters.spans.sum()
     return frames, relaxed(parameters, x, frames, end * along)
@@ -148,7 +155,13 @@ def curvatures(frames: Frames, theta: Tensor) -> Tensor:
     t, u = frames.tangents, frames.directors
     m1 = theta.cos()[:, None] * u + theta.sin()[:, None] * torch.linalg.cross(t, u)
     m2 = torch.linalg.cross(t, m1)
-    kb = 2 * torch.linalg.cross(t[:-1], t[1:]) / (1 + dot(t[:-1], t[1:]))[:, None]
+    cosine = dot(t[:-1], t[1:])
+    factor = 2 / (1 + cosine)
+    if frames.by_angle:
+        sine = ((1 - cosine) / 2).clamp(min=0).sqrt().clamp(min=SMALLEST_SINE)
+        # angle / sine of the angle
+        factor = torch.arcsin(sine) / sine / (1 - sine**2).sqrt()
+    kb = factor[:, None] * torch.linalg.cross(t[:-1], t[1:])
     return torch.stack([dot(kb, m2[:-1] + m2[1:]) / 2, -dot(kb, m1[:-1] + m1[1:]) / 2], dim=1)
 
 
@@ -343,7 +356,9 @@ def roll_out(
     p = rod if isinstance(rod, Parameters) else Parameters.of(rod, drag)
     count = steps or steps_needed(p, simulation.frame_time)
     gravity = torch.tensor([0.0, 0.0, -simulation.up_sign * simulation.gravity], dtype=torch.float64)
-    wanted = torch.is_grad_enabled() and any(value.requires_grad for value in (*vars(p).values(), held, velocity))
+    wanted = torch.is_grad_enabled() and any(
+        torch.is_tensor(value) and value.requires_grad for value in (*vars(p).values(), held, velocity)
+    )
     with torch.set_grad_enabled(wanted):
         state = beginning(p, velocity)
         rows = [state.x]
