@@ -66,8 +66,10 @@ LOGARITHMIC = (
     *("bending", "twisting", "damping", "drag", "drag_quadratic", "marker_mass", "hands", "dashpots"),
     *("slip_share", "slip_yield", "slip_twist"),
 )
-SLIP_SHARE, SLIP_ANGLES = 0.3, (0.05, 3.0)
+SLIP_SHARE, SLIP_ANGLES = 0.3, (0.02, 3.0)
 """Share of each branch that slips where a fit begins, and turns of the whole rod at which the first and the last does, rad."""
+SLIP_DAMPING = 0.02
+"""Inner damping there, at most, s: friction takes its place."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +102,8 @@ class Variables:
         rod, held = _rod(twin), _rod(twin).held >= 0
         if settings.slip and not len(rod.slip):
             yields = np.geomspace(*SLIP_ANGLES, settings.slip) / rod.lengths.sum()
-            rod = replace(rod, slip=np.stack([np.full(settings.slip, SLIP_SHARE), yields], axis=1), slip_twist=1.0)
+            branches = np.stack([np.full(settings.slip, SLIP_SHARE), yields], axis=1)
+            rod = replace(rod, slip=branches, slip_twist=1.0, damping=min(rod.damping, SLIP_DAMPING))
             twin = replace(twin, rod=rod)
         joints = len(held) - 2
         along = _basis(rod, {"constant": "none"}.get(settings.stiffness, settings.stiffness), settings.knots)
