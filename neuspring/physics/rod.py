@@ -579,128 +579,6 @@ def solve(s: RodState, lane: int, rows: int):
                 s.b[lane, i - q] = s.b[lane, i - q] - s.a[lane, i, q] * value
 
 
-@wp.func
-def advance_frame(
-    s: RodState,
-    lane: int,
-    held_from: Vectors,
-    held_to: Vectors,
-    axis_from: Vectors,
-    axis_to: Vectors,
-    hands_from: Vectors,
-    hands_to: Vectors,
-    ground: bool,
-    substeps: int,
-    h: real,
-    gravity: real,
-    up: real,
-):
-    """One frame of a lane."""
-    vertices = s.x.shape[1]
-    edges = vertices - 1
-    first_held = s.held[lane, 0] >= 0 and s.held[lane, 1] >= 0
-    last_held = s.held[lane, edges] >= 0 and s.held[lane, edges - 1] >= 0
-    for step in range(substeps):
-        part = real(step + 1) / real(substeps)
-        # BDF2, or backward Euler where there is no substep before.
-        g = h
-        more = real(0.0)
-        if s.history[lane] > 0:
-            g = real(2.0) * h / real(3.0)
-            more = real(1.0) / real(3.0)
-        rate = real(1.0) / g
-        older = (real(1.0) + more) * rate
-        oldest = more * rate
-        for i in range(vertices):
-            if s.held[lane, i] >= 0:
-                s.p[lane, i] = (real(1.0) - part) * held_from[lane, i] + part * held_to[lane, i]
-            elif s.history[lane] > 0:
-                s.p[lane, i] = real(2.0) * s.x[lane, i] - s.x_before[lane, i]
-            else:
-                s.p[lane, i] = s.x[lane, i] + h * s.v[lane, i]
-        set_geometry(s, lane, edges)
-        # Angles go on as they went.
-        for j in range(edges):
-            before = s.theta_before[lane, j]
-            s.theta_before[lane, j] = s.theta[lane, j]
-            if s.history[lane] > 0:
-                s.theta[lane, j] = real(2.0) * s.theta[lane, j] - before
-        for end in range(2):
-            s.axis[lane, end] = axis_from[lane, end] + part * (axis_to[lane, end] - axis_from[lane, end])
-        # The directors of clamps keep to the axis, whatever way the tangents took.
-        if first_held:
-            s.theta[lane, 0] = near(turn(s.u[lane, 0], projected(s.axis[lane, 0], s.t[lane, 0]), s.t[lane, 0]), s.theta[lane, 0])
-        if last_held:
-            last = edges - 1
-            angle = s.roll[lane] + turn(s.u[lane, last], projected(s.axis[lane, 1], s.t[lane, last]), s.t[lane, last])
-            s.theta[lane, last] = near(angle, s.theta[lane, last])
-        set_directors(s, lane, edges)
-        for i in range(4 * vertices):
-            s.b[lane, i] = real(0.0)
-            for q in range(BAND_WIDTH):
-                s.a[lane, i, q] = real(0.0)
-        assemble_bending(s, lane, edges, rate, older, oldest)
-        assemble_stretching(s, lane, edges)
-        for hand in range(s.hands.shape[1]):
-            s.hands[lane, hand] = (real(1.0) - part) * hands_from[lane, hand] + part * hands_to[lane, hand]
-        assemble_hands(s, lane, rate, more)
-        for i in range(vertices):
-            if s.held[lane, i] >= 0:
-                for r in range(3):
-                    set_known(s, lane, 4 * i + r, 4 * vertices)
-            else:
-                m = s.mass[lane, i]
-                c = real(1.0) + g * (s.drag[lane] + s.drag_quadratic[lane] * wp.length(s.v[lane, i]))
-                x = (real(1.0) + more) * s.x[lane, i] - more * s.x_before[lane, i]
-                v = (real(1.0) + more) * s.v[lane, i] - more * s.v_before[lane, i]
-                force = m * (rate * v - (c * rate * rate) * (s.p[lane, i] - x))
-                add_force(s, lane, i, force + vec3(real(0.0), real(0.0), m * gravity))
-                for r in range(3):
-                    s.a[lane, 4 * i + r, 0] = s.a[lane, 4 * i + r, 0] + m * c * rate * rate
-        for j in range(vertices):
-            if j == edges or (j == 0 and first_held) or (j == edges - 1 and last_held):
-                set_known(s, lane, 4 * j + 3, 4 * vertices)
-        solve(s, lane, 4 * vertices)
-        for i in range(vertices):
-            d = vec3(s.b[lane, 4 * i], s.b[lane, 4 * i + 1], s.b[lane, 4 * i + 2])
-            after = s.p[lane, i] + d
-            x = (real(1.0) + more) * s.x[lane, i] - more * s.x_before[lane, i]
-            v = rate * (after - x)
-            if s.held[lane, i] >= 0:
-                v = (held_to[lane, i] - held_from[lane, i]) / (h * real(substeps))
-            s.x_before[lane, i] = s.x[lane, i]
-            s.v_before[lane, i] = s.v[lane, i]
-            s.x[lane, i] = after
-            s.v[lane, i] = v
-        for j in range(edges):
-            d = s.x[lane, j + 1] - s.p[lane, j + 1] - s.x[lane, j] + s.p[lane, j]
-            length = wp.length(s.p[lane, j + 1] - s.p[lane, j]) + wp.dot(s.t[lane, j], d)
-            s.tension[lane, j] = s.stretching[lane] * (length / s.lengths[lane, j] - real(1.0))
-        for i in range(1, edges):
-            s.k_before[lane, i] = s.k[lane, i]
-            k = curvature(s, lane, i)
-            m = twist(s, lane, i)
-            slopes(s, lane, i, k)
-            for r in range(JOINT):
-                moved = s.b[lane, 4 * (i - 1) + r]
-                k = k + vec2(s.w[lane, 0, r] * moved, s.w[lane, 1, r] * moved)
-                m = m + s.w[lane, 2, r] * moved
-            s.k[lane, i] = k
-            for branch in range(s.slip.shape[1]):
-                away = vec3(k[0], k[1], m) - s.z[lane, i, branch]
-                left = kept(s, lane, i, branch, away)[1] * away[2]
-                move = k - s.k_before[lane, i]
-                bent = slid(vec2(away[0], away[1]) - move, move, s.slip[lane, branch][1] * joint_length(s, lane, i))
-                s.z[lane, i, branch] = vec3(k[0] - bent[0], k[1] - bent[1], m - left)
-        for j in range(edges):
-            s.theta[lane, j] = s.theta[lane, j] + wp.clamp(s.b[lane, 4 * j + 3], -MAX_TURN, MAX_TURN)
-        s.history[lane] = s.history[lane] + 1
-        if ground:
-            for i in range(vertices):
-                if s.held[lane, i] < 0:
-                    touch_ground(s, lane, i, up)
-
-
 @wp.kernel(enable_backward=False)
 def advance(
     s: RodState,
@@ -713,36 +591,127 @@ def advance(
     h: real,
     gravity: real,
     up: real,
-    x: Paths,
-    m1: Paths,
+    found: Paths,
+    turned: Paths,
 ):
-    """Frames of each lane; x and m1 get the positions and directors at the end of each. `still`: each begins at rest."""
+    """Frames of each lane; positions and directors at the end of each are `found` and `turned`. `still`: each begins at rest.
+
+    All is one kernel: with a frame as a function of its own, substeps take a fifth longer on a CPU.
+    """
     lane = wp.tid()
     vertices = s.x.shape[1]
-    for frame in range(x.shape[0]):
+    edges = vertices - 1
+    first_held = s.held[lane, 0] >= 0 and s.held[lane, 1] >= 0
+    last_held = s.held[lane, edges] >= 0 and s.held[lane, edges - 1] >= 0
+    for frame in range(found.shape[0]):
         if still:
             s.history[lane] = 0
             for i in range(vertices):
                 s.v[lane, i] = vec3()
-        end = frame + 1
-        advance_frame(
-            s,
-            lane,
-            held[frame],
-            held[end],
-            axes[frame],
-            axes[end],
-            hands[frame],
-            hands[end],
-            ground,
-            substeps,
-            h,
-            gravity,
-            up,
-        )
+        for step in range(substeps):
+            part = real(step + 1) / real(substeps)
+            # BDF2, or backward Euler where there is no substep before.
+            g = h
+            more = real(0.0)
+            if s.history[lane] > 0:
+                g = real(2.0) * h / real(3.0)
+                more = real(1.0) / real(3.0)
+            rate = real(1.0) / g
+            older = (real(1.0) + more) * rate
+            oldest = more * rate
+            for i in range(vertices):
+                if s.held[lane, i] >= 0:
+                    s.p[lane, i] = (real(1.0) - part) * held[frame, lane, i] + part * held[frame + 1, lane, i]
+                elif s.history[lane] > 0:
+                    s.p[lane, i] = real(2.0) * s.x[lane, i] - s.x_before[lane, i]
+                else:
+                    s.p[lane, i] = s.x[lane, i] + h * s.v[lane, i]
+            set_geometry(s, lane, edges)
+            # Angles go on as they went.
+            for j in range(edges):
+                before = s.theta_before[lane, j]
+                s.theta_before[lane, j] = s.theta[lane, j]
+                if s.history[lane] > 0:
+                    s.theta[lane, j] = real(2.0) * s.theta[lane, j] - before
+            for end in range(2):
+                s.axis[lane, end] = axes[frame, lane, end] + part * (axes[frame + 1, lane, end] - axes[frame, lane, end])
+            # The directors of clamps keep to the axis, whatever way the tangents took.
+            if first_held:
+                s.theta[lane, 0] = near(
+                    turn(s.u[lane, 0], projected(s.axis[lane, 0], s.t[lane, 0]), s.t[lane, 0]), s.theta[lane, 0]
+                )
+            if last_held:
+                last = edges - 1
+                angle = s.roll[lane] + turn(s.u[lane, last], projected(s.axis[lane, 1], s.t[lane, last]), s.t[lane, last])
+                s.theta[lane, last] = near(angle, s.theta[lane, last])
+            set_directors(s, lane, edges)
+            for i in range(4 * vertices):
+                s.b[lane, i] = real(0.0)
+                for q in range(BAND_WIDTH):
+                    s.a[lane, i, q] = real(0.0)
+            assemble_bending(s, lane, edges, rate, older, oldest)
+            assemble_stretching(s, lane, edges)
+            for hand in range(s.hands.shape[1]):
+                s.hands[lane, hand] = (real(1.0) - part) * hands[frame, lane, hand] + part * hands[frame + 1, lane, hand]
+            assemble_hands(s, lane, rate, more)
+            for i in range(vertices):
+                if s.held[lane, i] >= 0:
+                    for r in range(3):
+                        set_known(s, lane, 4 * i + r, 4 * vertices)
+                else:
+                    m = s.mass[lane, i]
+                    c = real(1.0) + g * (s.drag[lane] + s.drag_quadratic[lane] * wp.length(s.v[lane, i]))
+                    x = (real(1.0) + more) * s.x[lane, i] - more * s.x_before[lane, i]
+                    v = (real(1.0) + more) * s.v[lane, i] - more * s.v_before[lane, i]
+                    force = m * (rate * v - (c * rate * rate) * (s.p[lane, i] - x))
+                    add_force(s, lane, i, force + vec3(real(0.0), real(0.0), m * gravity))
+                    for r in range(3):
+                        s.a[lane, 4 * i + r, 0] = s.a[lane, 4 * i + r, 0] + m * c * rate * rate
+            for j in range(vertices):
+                if j == edges or (j == 0 and first_held) or (j == edges - 1 and last_held):
+                    set_known(s, lane, 4 * j + 3, 4 * vertices)
+            solve(s, lane, 4 * vertices)
+            for i in range(vertices):
+                d = vec3(s.b[lane, 4 * i], s.b[lane, 4 * i + 1], s.b[lane, 4 * i + 2])
+                after = s.p[lane, i] + d
+                x = (real(1.0) + more) * s.x[lane, i] - more * s.x_before[lane, i]
+                v = rate * (after - x)
+                if s.held[lane, i] >= 0:
+                    v = (held[frame + 1, lane, i] - held[frame, lane, i]) / (h * real(substeps))
+                s.x_before[lane, i] = s.x[lane, i]
+                s.v_before[lane, i] = s.v[lane, i]
+                s.x[lane, i] = after
+                s.v[lane, i] = v
+            for j in range(edges):
+                d = s.x[lane, j + 1] - s.p[lane, j + 1] - s.x[lane, j] + s.p[lane, j]
+                length = wp.length(s.p[lane, j + 1] - s.p[lane, j]) + wp.dot(s.t[lane, j], d)
+                s.tension[lane, j] = s.stretching[lane] * (length / s.lengths[lane, j] - real(1.0))
+            for i in range(1, edges):
+                s.k_before[lane, i] = s.k[lane, i]
+                k = curvature(s, lane, i)
+                m = twist(s, lane, i)
+                slopes(s, lane, i, k)
+                for r in range(JOINT):
+                    moved = s.b[lane, 4 * (i - 1) + r]
+                    k = k + vec2(s.w[lane, 0, r] * moved, s.w[lane, 1, r] * moved)
+                    m = m + s.w[lane, 2, r] * moved
+                s.k[lane, i] = k
+                for branch in range(s.slip.shape[1]):
+                    away = vec3(k[0], k[1], m) - s.z[lane, i, branch]
+                    left = kept(s, lane, i, branch, away)[1] * away[2]
+                    move = k - s.k_before[lane, i]
+                    bent = slid(vec2(away[0], away[1]) - move, move, s.slip[lane, branch][1] * joint_length(s, lane, i))
+                    s.z[lane, i, branch] = vec3(k[0] - bent[0], k[1] - bent[1], m - left)
+            for j in range(edges):
+                s.theta[lane, j] = s.theta[lane, j] + wp.clamp(s.b[lane, 4 * j + 3], -MAX_TURN, MAX_TURN)
+            s.history[lane] = s.history[lane] + 1
+            if ground:
+                for i in range(vertices):
+                    if s.held[lane, i] < 0:
+                        touch_ground(s, lane, i, up)
         for i in range(vertices):
-            x[frame, lane, i] = s.x[lane, i]
-            m1[frame, lane, i] = s.m1[lane, i]
+            found[frame, lane, i] = s.x[lane, i]
+            turned[frame, lane, i] = s.m1[lane, i]
 
 
 ROD_LANE_FIELDS = (
