@@ -48,7 +48,9 @@ balance.
 mass_i dv_i/dt = force - mass_i (gravity up_sign (0, 0, 1) + (drag + drag_quadratic |v_i|) v_i). A vertex with rod_held >= 0 is
 where that controller is. With rod_clamps, the inner held vertex of an end is beside its controller by these distances along t,
 m1 (without roll) and m2, with t along the two controllers, and the outer one follows at the controllers' distance along -t or
-t. The implicit integration is BDF2 with `substeps` steps per frame.
+t. With rod_tilts (a, b) of that end it is the middle of the held edge that is there, and the edge has its length along t + a m1 +
+b m2. With rod_rolls >= 0 the axis is the direction from the outer held controller to that one, now. The implicit integration is
+BDF2 with `substeps` steps per frame.
 
 A node n is at x_j + f e_j + a m1_j + b m2_j with j = rod_edge and (f, a, b) = rod_place. A spring (controller, node) pulls
 there with stiffness (l / rest_length - 1) + dashpot dl/dt; it acts where `holds` is true in this frame and the next. A vertex
