@@ -213,8 +213,8 @@ def _color_alone(capture: Capture, name: str, samples: dict[int, Sample]) -> lis
 
 
 def check_layout(folder: Path, settings: Mocap = DEFORM) -> list[Finding]:
-    """Check a capture or a folder of them, a processed case, a folder of cases, a root with data/different_types, markers (.c3d, with
-    labels or without, or a folder), or cable recordings (folder or .pkl file), whose unit, rate and up axis are in `settings`.
+    """Check a capture or a folder of them, a processed case, a folder of cases, a root with data/different_types, C3D files (or
+    one, with labels or without), or cable recordings (folder or .pkl file), whose unit, rate and up axis are in `settings`.
     Returns every finding.
 
     Raises InputError only if `folder` does not exist or holds no data of a known layout.

@@ -24,7 +24,7 @@ SHIFTS = 1e-3, 10.0
 
 
 def at_rest(twin: Twin) -> Twin:
-    """The twin in equilibrium under gravity: its nodes are that, its rest shape stays, and controllers are where they were in frame 0.
+    """The twin in equilibrium under gravity: such are its nodes. Its rest shape stays, and controllers are where frame 0 has them.
 
     Minimizes sum Y l0 (l / l0 - 1)^2 / 2 - sum m g x by Newton steps (K + shift M) d = force, with a shift where the energy would
     rise. Raises InputError for a rod and for a body that would be below the ground, NumericalFailure where nothing holds a part.
@@ -86,13 +86,13 @@ def elasticity(twin: Twin, density: float) -> np.ndarray:
 def young(twin: Twin, density: float) -> np.ndarray:
     """Young's moduli along x, y and z of the body that a lattice stands for [3], Pa: see `elasticity`.
 
-    Where springs lie in all directions alike, both of Lame's numbers are sum Y l0 / (15 V): E = sum Y l0 / (6 V), Poisson's ratio 1/4.
-    Without resistance in some direction, as of a sheet across itself, its modulus is that of the rest.
+    Where springs lie in all directions alike, both of Lame's numbers are sum Y l0 / (15 V), E is sum Y l0 / (6 V), and Poisson's
+    ratio 1/4. Without resistance in some direction, as of a sheet across itself, its modulus is that of the rest.
     """
     tensor, pairs = elasticity(twin, density), list(zip(*np.triu_indices(3), strict=True))
     # Strains e_ij and e_ji are one unknown, gamma_ij = 2 e_ij.
     compliance = np.linalg.pinv(np.array([[tensor[i + j] for j in pairs] for i in pairs]), rcond=1e-9, hermitian=True)
-    return np.asarray(1 / np.diag(compliance)[[pairs.index((k, k)) for k in range(3)]])
+    return np.asarray([1 / compliance[k, k] for k, (i, j) in enumerate(pairs) if i == j])
 
 
 def _state(twin: Twin, points: np.ndarray, weight: np.ndarray) -> tuple[float, np.ndarray, Any]:

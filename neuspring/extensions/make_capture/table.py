@@ -66,9 +66,7 @@ def find_unit(where: object, depths: Sequence[np.ndarray], given: float | None, 
     return Unit(fitting[0], f"guessed from {kind} with a median of {count:.4g}: median depth {count * fitting[0]:.2f} m")
 
 
-def find_rate(
-    given: float | None, known: Sequence[float | None], step: int, fastest: float = FASTEST
-) -> tuple[float, str]:
+def find_rate(given: float | None, known: Sequence[float | None], step: int, fastest: float = FASTEST) -> tuple[float, str]:
     """Frames per second of the capture and how they are known: `given` or that of the videos, over every `step`-th frame.
 
     Raises InputError where there is none, or one that no camera has; `fastest`: the highest that one has.

@@ -7,9 +7,9 @@ holds the beam, lets go, and it rings and comes to rest. Only unloaded files are
 
 1. **The law.** z'' = -k (z + sum_i s_i (z - q_i)), q_i' = (z - q_i) / T_i, from the held state, is fitted to the heights of the tip
    of all files together: a linear viscoelastic solid with one branch per factor of 5 in time, from the inverse of the ringing's
-   angular frequency to half of the recording. It gives sqrt(k) / 2 pi, the frequency at which a beam of the relaxed modulus would ring.
+   angular frequency to half of the recording. It gives sqrt(k) / 2 pi, at which a beam of the relaxed modulus would ring.
 2. **The modulus.** That of the twin, at which its first frequency is that one. The force of the hand is in neither.
-3. **The hand.** The twin's static pose under its weight less the observed change of pose gives the pose in which the hand held the tip.
+3. **The hand.** The twin's static pose under its weight less the observed change is the pose in which the hand held the tip.
 
 Predicted: the static pose under weight and load less the pose in which the hand held the unloaded tip; the markers turn with
 the tip. The frequency under load is that of the twin with the load, raised by the law. `static` in place of a twin is the usual
@@ -154,7 +154,7 @@ def motion(stiffness: float, shares: np.ndarray, times: np.ndarray) -> np.ndarra
 
 
 def fit_law(recordings: Sequence[Recording]) -> Law:
-    """Least squares over all heights since the release; each recording has its time of release, held height and height at infinity."""
+    """Least squares over all heights since the release; a recording has its own time of release, held height and final height."""
     count = len(BRANCHES)
 
     def residuals(p: np.ndarray) -> np.ndarray:
@@ -194,7 +194,7 @@ def ring(z: np.ndarray, times: np.ndarray, *drift: np.ndarray) -> tuple[float, f
 
 
 def lattice(across: int, load: float, modulus: float = 1e5) -> Twin:
-    """A block of nodes whose springs are alike, with this modulus along it, Pa (`statics.young`); the layer in the clamp is its controllers.
+    """A block of nodes whose springs are alike, with this modulus along it, Pa (`statics.young`); its controllers are in the clamp.
 
     A node stands for the material around it, so the last layer along the beam has half of it, and the load.
     """
@@ -376,7 +376,18 @@ def main() -> None:
 
 def shown(table: pd.DataFrame) -> Table:
     """The table of beam.md."""
-    header = ["twin", "load, g", "take", "E at rest, kPa", "drop seen, mm", "predicted", "error", "markers, mm", "Hz seen", "predicted"]
+    header = [
+        "twin",
+        "load, g",
+        "take",
+        "E at rest, kPa",
+        "drop seen, mm",
+        "predicted",
+        "error",
+        "markers, mm",
+        "Hz seen",
+        "predicted",
+    ]
     forms = {"load": (1e3, ".0f"), "take": None, "modulus": (1e-3, ".0f"), "drop": (1e3, ".2f"), "predicted": (1e3, ".2f")}
     forms |= {"error": (100, "+.1f"), "markers": (1e3, ".2f"), "frequency": (1, ".2f"), "rings": (1, ".2f")}
     rows = []
