@@ -238,7 +238,7 @@ def check_layout(folder: Path, settings: Mocap = DEFORM) -> list[Finding]:
 
 
 def check_markers(path: Path) -> list[Finding]:
-    """What a C3D file, or those of its markers that FILE.c3d#LABEL,LABEL names, has, and every finding about their motion."""
+    """Contents of a C3D file, or those markers of it that FILE.c3d#LABEL,LABEL names, and every finding about their motion."""
     findings: list[Finding] = []
     markers = _read(findings, path, Markers.read)
     if markers is None:

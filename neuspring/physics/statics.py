@@ -6,61 +6,69 @@ A load is mass: `Material.mass` of the nodes that carry it.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError, NumericalFailure
 
-STEPS = 200
-"""Steps of Newton at most. A beam that bends by a quarter of its length takes 8."""
-STILL = 1e-9
-"""Largest move of a node in the last step, over the size of the body."""
-ROUNDING = 1e-13
-"""By this part of weight times size energies of one state may differ."""
-SHIFTS = 1e-3, 10.0
-"""Where the matrix is not good enough, (mass x shift) is added: the first shift over the spread of K / M, and its growth."""
+STEPS_TO_BALANCE = 500
+"""Steps at most. A beam that bends by a quarter of its length takes 12."""
+UNBALANCED = 1e-6
+"""Largest force on a node at rest, over the body's weight. Rounding of the energy leaves about 1e-8."""
 
 
 def at_rest(twin: Twin) -> Twin:
     """The twin in equilibrium under gravity: such are its nodes. Its rest shape stays, and controllers are where frame 0 has them.
 
-    Minimizes sum Y l0 (l / l0 - 1)^2 / 2 - sum m g x by Newton steps (K + shift M) d = force, with a shift where the energy would
-    rise. Raises InputError for a rod and for a body that would be below the ground, NumericalFailure where nothing holds a part.
+    Minimizes sum Y l0 (l / l0 - 1)^2 / 2 - sum m g x by Newton steps in a trust region. Raises InputError for a rod and for a body
+    that would be below the ground, NumericalFailure where nothing holds a part.
     """
+    from scipy.optimize import minimize
+
     if twin.rod is not None:
         raise InputError("twin.rod", "equilibria are found of lattices", "a rod", "Use rod_nodes.hanging.")
-    topology, simulation = twin.topology, twin.simulation
-    mass = masses(twin)
-    weight = np.zeros((len(mass), 3))
-    weight[:, 2] = -simulation.up_sign * simulation.gravity * mass
-    hands = topology.controllers.astype(np.float64)
+    topology, simulation, count = twin.topology, twin.simulation, len(twin.topology.nodes)
+    hands, lengths = topology.controllers.astype(np.float64), topology.rest_lengths.astype(np.float64)
+    weight = np.outer(masses(twin), [0.0, 0.0, -simulation.up_sign * simulation.gravity])
+    first, second = topology.springs.T
 
-    def state(x: np.ndarray) -> tuple[float, np.ndarray, Any]:
-        return _state(twin, np.concatenate([x, hands]), weight)
+    def springs(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Directions [S, 3], lengths, m, and stiffness, N, [S, 1] of springs between nodes at x [3 N]."""
+        points = np.concatenate([x.reshape(-1, 3), hands])
+        along = points[second] - points[first]
+        length = np.linalg.norm(along, axis=1)
+        slack = topology.pushes & (length > lengths) if topology.pushes.size else False
+        return along / length[:, None], length[:, None], np.where(slack, 0.0, twin.material.stiffness.astype(np.float64))[:, None]
 
-    x = topology.nodes.astype(np.float64)
-    size = float(np.ptp(np.concatenate([x, hands]), axis=0).max())
-    energy, force, matrix = state(x)
-    shift, inertia = 0.0, np.repeat(mass, 3)
-    least = SHIFTS[0] * float((matrix.diagonal() / inertia).max())
-    for _ in range(STEPS):
-        move = _solved(matrix, shift * inertia, force)
-        after = state(x + move) if np.isfinite(move).all() else None
-        if after is None or after[0] > energy + ROUNDING * np.abs(weight).sum() * size:
-            shift = max(SHIFTS[1] * shift, least)
-            continue
-        x, (energy, force, matrix) = x + move, after
-        if shift == 0 and np.abs(move).max() < STILL * size:
-            break
-        shift = shift / SHIFTS[1] if shift > least else 0.0
-    else:
-        raise NumericalFailure(f"the twin does not come to rest under gravity in {STEPS} steps: is every part of it held?")
-    if simulation.ground and (simulation.up_sign * x[:, 2]).min() < 0:
+    def at_nodes(values: np.ndarray) -> np.ndarray:
+        """Sums over the springs that end at each node less those that begin there [3 N], of values [S, 3]."""
+        ends = [np.bincount(end, column, count + len(hands)) for column in values.T for end in (second, first)]
+        return (np.stack(ends[::2], axis=1) - np.stack(ends[1::2], axis=1))[:count].ravel()
+
+    def energy(x: np.ndarray) -> tuple[float, np.ndarray]:
+        along, length, stiffness = springs(x)
+        strain = length / lengths[:, None] - 1
+        total = float((stiffness * lengths[:, None] * strain**2).sum() / 2 - weight.ravel() @ x)
+        return total, at_nodes(stiffness * strain * along) - weight.ravel()
+
+    def product(x: np.ndarray, move: np.ndarray) -> np.ndarray:
+        along, length, stiffness = springs(x)
+        moves = np.concatenate([move.reshape(-1, 3), np.zeros_like(hands)])
+        apart = moves[second] - moves[first]
+        longer = (apart * along).sum(axis=1, keepdims=True) * along
+        return at_nodes(stiffness * (longer / lengths[:, None] + (1 / lengths[:, None] - 1 / length) * (apart - longer)))
+
+    scale, start = np.abs(weight).sum(), topology.nodes.astype(np.float64).ravel()
+    options = {"gtol": 1e-3 * UNBALANCED * scale, "maxiter": STEPS_TO_BALANCE}
+    found = minimize(energy, start, jac=True, hessp=product, method="trust-krylov", options=options)
+    if not np.abs(found.jac).max() <= UNBALANCED * scale:
+        raise NumericalFailure(f"the twin is not at rest under gravity after {found.nit} steps: is every part of it held?")
+    nodes = found.x.reshape(-1, 3)
+    if simulation.ground and (lowest := float((simulation.up_sign * nodes[:, 2]).min())) < 0:
         rule = "contacts are no part of an equilibrium, so all nodes must be above it"
-        raise InputError("simulation.ground", rule, f"z = {simulation.up_sign * x[:, 2].min():.3g} m", "Set ground to false.")
-    return replace(twin, topology=replace(topology, nodes=x.astype(np.float32), rest_shape=topology.canonical))
+        raise InputError("simulation.ground", rule, f"z = {lowest:.3g} m", "Set ground to false.")
+    return replace(twin, topology=replace(topology, nodes=nodes.astype(np.float32), rest_shape=topology.canonical))
 
 
 def masses(twin: Twin) -> np.ndarray:
@@ -93,46 +101,3 @@ def young(twin: Twin, density: float) -> np.ndarray:
     # Strains e_ij and e_ji are one unknown, gamma_ij = 2 e_ij.
     compliance = np.linalg.pinv(np.array([[tensor[i + j] for j in pairs] for i in pairs]), rcond=1e-9, hermitian=True)
     return np.asarray([1 / compliance[k, k] for k, (i, j) in enumerate(pairs) if i == j])
-
-
-def _state(twin: Twin, points: np.ndarray, weight: np.ndarray) -> tuple[float, np.ndarray, Any]:
-    """Energy, J, forces [3 N], N, and the stiffness matrix [3 N, 3 N], N/m, of nodes, then controllers, at points [N + C, 3], m."""
-    from scipy.sparse import coo_matrix
-
-    topology, nodes = twin.topology, len(weight)
-    pairs, lengths = topology.springs, topology.rest_lengths.astype(np.float64)
-    along = points[pairs[:, 1]] - points[pairs[:, 0]]
-    length = np.linalg.norm(along, axis=1)
-    n = along / length[:, None]
-    stiffness = twin.material.stiffness.astype(np.float64)
-    if topology.pushes.size:
-        stiffness = np.where(topology.pushes & (length > lengths), 0.0, stiffness)
-    tension = stiffness * (length / lengths - 1)
-    outer = n[:, :, None] * n[:, None, :]
-    across = (tension / length)[:, None, None] * (np.eye(3) - outer)
-    block = (stiffness / lengths)[:, None, None] * outer + across
-    force = np.zeros_like(points)
-    np.add.at(force, pairs[:, 0], tension[:, None] * n)
-    np.add.at(force, pairs[:, 1], -tension[:, None] * n)
-    first, second = pairs.T
-    rows, columns = np.concatenate([first, second, first, second]), np.concatenate([first, second, second, first])
-    values = np.concatenate([block, block, -block, -block])
-    own = (rows < nodes) & (columns < nodes)
-    axes = np.arange(3)
-    row = np.broadcast_to(3 * rows[own, None, None] + axes[:, None], values[own].shape)
-    column = np.broadcast_to(3 * columns[own, None, None] + axes, values[own].shape)
-    matrix = coo_matrix((values[own].ravel(), (row.ravel(), column.ravel())), shape=(3 * nodes, 3 * nodes)).tocsc()
-    energy = float((tension**2 * lengths / np.maximum(stiffness, 1e-300)).sum() / 2 - (weight * points[:nodes]).sum())
-    return energy, (force[:nodes] + weight).ravel(), matrix
-
-
-def _solved(matrix: Any, shift: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """The move of each node [N, 3], m; NaN where the matrix is singular."""
-    from scipy.sparse import diags
-    from scipy.sparse.linalg import splu
-
-    try:
-        move = splu(matrix + diags(shift, format="csc")).solve(force)
-    except RuntimeError:
-        move = np.full_like(force, np.nan)
-    return np.asarray(move.reshape(-1, 3))
