@@ -1,6 +1,20 @@
 """A lattice at rest under gravity, and what its stiffness is in pascals.
 
 A load is mass: `Material.mass` of the nodes that carry it.
+
+Only stiffness over mass shows in a motion, so a modulus needs the density. Twice as many nodes along each side of a body need Y / 4
+with true masses, and 2 Y at 1 kg per node. Central forces make the tensor symmetric in all indices (Cauchy): an isotropic lattice has
+Poisson's ratio 1/4 and the shear modulus E / 2.5, and rubber's 1/2 and E / 3 are out of reach.
+
+Measured on blocks of 10 x 3 x 3 cm, held at one end, springs to 18 neighbors, nodes at the centers of cells (`test_statics.py`):
+
+    nodes across                                        4      6      8
+    young along it / (density sum Y l0 / 6 sum m)    1.31   1.20   1.15
+    stiffness over young, stretched by its weight    1.04   1.05   1.04
+    ... bent by its weight, with 5/6 G A in shear    0.90   0.94   0.96
+    ... with I (1 - 1 / n^2), that of n areas        0.95   0.97   0.98
+
+The rest is surfaces, which have fewer springs: thin lattices are softer in bending than their modulus says.
 """
 
 from __future__ import annotations
