@@ -3,8 +3,8 @@
 A load is mass: `Material.mass` of the nodes that carry it.
 
 Only stiffness over mass shows in a motion, so a modulus needs the density. Twice as many nodes along each side of a body need Y / 4
-with true masses, and 2 Y at 1 kg per node. Central forces make the tensor symmetric in all indices (Cauchy): an isotropic lattice has
-Poisson's ratio 1/4 and the shear modulus E / 2.5, and rubber's 1/2 and E / 3 are out of reach.
+with true masses, and 2 Y at 1 kg per node. Central forces make the tensor symmetric in all indices (Cauchy): an isotropic lattice
+has Poisson's ratio 1/4 and the shear modulus E / 2.5, and rubber's 1/2 and E / 3 are out of reach.
 
 Measured on blocks of 10 x 3 x 3 cm, held at one end, springs to 18 neighbors, nodes at the centers of cells (`test_statics.py`):
 
