@@ -340,7 +340,7 @@ def search_rod(
     recordings = in_order([observations, *pool])
     first = replace(RodSteps(**vars(settings.fit.rod)), stiffness="constant", curvature="constant", markers=False)
     first = replace(first, horizons=first.horizons[:1])
-    start = rods.rod_twin(observations, settings, *_axis([rods.line_of(each) for each in recordings if each.line.size]))
+    start = rods.rod_twin(observations, settings, *choose_axis([rods.line_of(each) for each in recordings if each.line.size]))
     solver = Levenberg(Recordings.of(recordings, start), first, device, threads)
     twin, value, history = solver.lowered(start, Progress(f"search {observations.scenario.name}, rod", first.rounds))
     found = _result(twin, value, history)
@@ -367,7 +367,7 @@ def fit_rod(
     progress = Progress(f"fit {observations.scenario.name}, rod", settings.rounds * len(settings.horizons))
     twin, value, history = solver.lowered(twin, progress)
     if pool:
-        _require_unmirrored(recordings, twin, settings, device)
+        require_unmirrored(recordings, twin, settings, device)
     # Where markers lie beside the line, frame 0 has another line now.
     twin = rods.on_recording(twin, observations)
     found = _result(twin, value, history)
@@ -408,7 +408,7 @@ TURNS_KNOWN = 0.5
 """Mean cosine of the turns between ends from which an axis of the world tells whole turns apart."""
 
 
-def _axis(lines: Sequence[np.ndarray]) -> tuple[np.ndarray, float]:
+def choose_axis(lines: Sequence[np.ndarray]) -> tuple[np.ndarray, float]:
     """`Rod.axis` and `Rod.steady` of the first of several lines [V, 3] in frame 0.
 
     A turn of the last clamp against the first is known but for whole turns, so turns between the ends of the recordings should lie
@@ -432,15 +432,15 @@ def _axis(lines: Sequence[np.ndarray]) -> tuple[np.ndarray, float]:
 
 
 MIRRORED = 0.7
-"""A recording is mirrored if its mirror image has so many times its error. In fits to DEFORM's cables it has 1.6 times at least, and
-that of a mirrored one among others 0.4 to 0.6 times."""
+"""A recording is mirrored if its mirror image has so many times its error. In fits to DEFORM's cables it has 1.6 times at least,
+and that of a mirrored one among others 0.4 to 0.6 times."""
 
 
-def _require_unmirrored(recordings: Recordings, twin: Twin, settings: RodSteps, device: str) -> None:
+def require_unmirrored(recordings: Recordings, twin: Twin, settings: RodSteps, device: str) -> None:
     """Raise InputError, naming all, where mirror images of recordings follow the twin far better than these do.
 
-    Gravity and time are the same in a mirror; the unloaded curvature of a cable, and the side of it that markers are on, are not. So
-    one recording can be told among others, and a whole pool that is mirrored is another cable.
+    Gravity and time are the same in a mirror; the unloaded curvature of a cable, and the side of it that markers are on, are not.
+    So one recording can be told among others, and a whole pool that is mirrored is another cable.
     """
     seen, names = recordings.observations, ("object_points", "surface_points", "controller_points", "velocity_before")
     flip = np.array([1.0, -1.0, 1.0], np.float32)
