@@ -104,7 +104,7 @@ def rigid_inverse(pose: np.ndarray) -> np.ndarray:
 
 PARALLEL = 0.99
 """Cosine to a direction from which a projection normal to it is not worth the name."""
-SAME_WORLD = float(np.radians(70))
+SAME_WORLD = float(np.radians(90))
 """Largest angle between the headings of a cable in recordings of one world. DEFORM's have 60 degrees at most, 8 to 18 as a rule."""
 SIDESTEPS = np.radians([0, 30, -30, 60, -60])
 """Turns about the vertical, of which two directions at most rule out four."""
@@ -129,9 +129,15 @@ def angle_between(here: np.ndarray, there: np.ndarray) -> float:
     return float(np.arctan2(here[0] * there[1] - here[1] * there[0], here @ there))
 
 
-def beside_ends(axis: np.ndarray, line: np.ndarray) -> np.ndarray:
-    """A horizontal `axis` [3], turned about the vertical where it lies along the first or the last edge of a line [V, 3]."""
+def axis_on(axis: np.ndarray, ahead: np.ndarray, line: np.ndarray, steady: float = SAME_WORLD) -> np.ndarray:
+    """A horizontal `axis` [3] that goes with lines of heading `ahead` [3], on another line [V, 3]. There its ends' roll starts.
+
+    Grippers keep to the world, whatever way the cable heads between them. One that heads elsewhere by more than `steady`, rad, was
+    recorded in another world, onto which the headings turn the axis. An axis along the first or the last edge steps aside.
+    """
+    turn = angle_between(ahead, heading(line))
+    start = turned(axis, turn) if abs(turn) > steady else axis
     ends = np.diff(line, axis=0)[[0, -1]]
     ends /= np.linalg.norm(ends, axis=1, keepdims=True)
-    others = (turned(axis, angle) if angle else axis for angle in SIDESTEPS)
-    return next((one for one in others if np.abs(ends @ one).max() <= PARALLEL * np.linalg.norm(one)), axis)
+    others = (turned(start, angle) if angle else start for angle in SIDESTEPS)
+    return next((one for one in others if np.abs(ends @ one).max() <= PARALLEL * np.linalg.norm(one)), start)

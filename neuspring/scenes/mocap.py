@@ -15,7 +15,7 @@ rotation that turns d carries n along, so the ring follows every turn of the end
 did make is not in the data. Half a step of the angle keeps the points away from the body's own ring around the first and the last
 marker.
 
-In frame 0 the roll of both ends is that of one direction, projected (`roll_axis`): y, about normal to a cable that heads along x.
+In frame 0 the roll of both ends is that of one direction, projected (`axis_on`): y, about normal to a cable that heads along x.
 So ring node i is the same node in every recording of a cable, as far as its grippers begin alike. A cable that heads elsewhere
 takes its direction with it.
 """
@@ -35,7 +35,7 @@ from neuspring.config import Config, Mocap, ScenarioRow
 from neuspring.core.artifacts import NO_REST_SHAPE, Observations, Scenario
 from neuspring.core.errors import InputError
 from neuspring.core.findings import refuse
-from neuspring.core.geometry import SAME_WORLD, angle_between, beside_ends, heading, turned
+from neuspring.core.geometry import axis_on
 from neuspring.core.records import digest_file
 from neuspring.data.unpickle import load_pickle
 
@@ -121,7 +121,7 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
     held = [0, 1, count - 2, count - 1]
     observed = markers[:, 2:-2]
     centers, tangents = centerline(markers[0], RING_SPACING, settings.rings)
-    normals = rolled(tangents, roll_axis(markers[0]))
+    normals = rolled(tangents, axis_on(Y, -X, markers[0]))
     body = rings(centers, tangents, normals, RING_RADIUS, settings.ring)
     points = np.concatenate([markers[0], body])
     nearest = float(cKDTree(points).query(points, k=2)[0][:, 1].min())
@@ -183,13 +183,6 @@ def rings(centers: np.ndarray, tangents: np.ndarray, normals: np.ndarray, radius
     """
     nodes: np.ndarray = centers[:, None] + circle(normals, np.cross(tangents, normals), radius, count)
     return nodes.reshape(-1, 3)
-
-
-def roll_axis(line: np.ndarray) -> np.ndarray:
-    """The direction [3] that the roll of a cable with markers [n, 3] starts from: y, turned about the vertical with one that heads
-    elsewhere than -x by more than grippers do, and beside its ends."""
-    turn = angle_between(-X, heading(line))
-    return beside_ends(turned(Y, turn) if abs(turn) > SAME_WORLD else Y, line)
 
 
 def rolled(tangents: np.ndarray, axis: np.ndarray) -> np.ndarray:

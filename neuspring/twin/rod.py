@@ -19,7 +19,7 @@ from neuspring import config
 from neuspring.config.search import VARIABLES
 from neuspring.core.artifacts import Observations, Rod, Simulation, Twin
 from neuspring.core.errors import InputError
-from neuspring.core.geometry import SAME_WORLD, angle_between, beside_ends, heading, turned
+from neuspring.core.geometry import SAME_WORLD, axis_on, heading
 from neuspring.physics.center_line import center_line
 from neuspring.physics.parameters import homogeneous
 from neuspring.physics.rod_nodes import bound, frame_zero, place_on, radius_of, settled
@@ -86,7 +86,7 @@ def rod_twin(
     own = np.convolve(lengths, [0.5, 0.5])
     density = len(nodes) / lengths.sum() if len(pairs) else 1.0
     mass = density * own if len(pairs) else own + start.marker_mass
-    direction = beside_ends(np.array(axis, np.float64), vertices) if (held >= 0).any() else _across(vertices)
+    direction = axis_on(np.array(axis, np.float64), heading(vertices), vertices) if (held >= 0).any() else _across(vertices)
     rod = Rod(
         vertices=vertices,
         held=held,
@@ -160,7 +160,7 @@ def on_recording(twin: Twin, observations: Observations) -> Twin:
         material = replace(material, stiffness=np.full(len(pairs), stiffness), dashpot=np.full(len(pairs), dashpot))
     else:
         topology, vertices = build(nodes, hands, here.springs), line_of(observations)
-        rod = replace(rod, axis=axis_on(twin, vertices))
+        rod = replace(rod, axis=_axis(twin, vertices))
     found = np.linalg.norm(np.diff(vertices, axis=0), axis=1).sum() / rod.lengths.sum()
     if abs(found - 1) > MOST_STRETCH:
         rule = f"the center line must be as long as the twin's within {MOST_STRETCH:.0%}: {rod.lengths.sum():.3f} m"
@@ -169,17 +169,12 @@ def on_recording(twin: Twin, observations: Observations) -> Twin:
     return replace(twin, topology=topology, material=material, rod=_bound(moved, observations))
 
 
-def axis_on(twin: Twin, line: np.ndarray) -> np.ndarray:
-    """`Rod.axis` [3] on a recording with the line [V, 3] in frame 0, of a twin whose line is observed.
-
-    Grippers keep to the world, whatever way the cable heads between them. Where it heads elsewhere by more than grippers move
-    (`Rod.steady`), it was recorded in another world, which the two headings turn onto the twin's.
-    """
-    rod = twin.rod
+def _axis(twin: Twin, line: np.ndarray) -> np.ndarray:
+    """`Rod.axis` [3] on a recording with the line [V, 3] in frame 0, of a twin whose line is observed."""
+    rod, topology = twin.rod, twin.topology
     assert rod is not None
-    own = np.concatenate([twin.topology.nodes, twin.topology.controllers])[rod.line]
-    turn = angle_between(heading(own.astype(np.float64)), heading(line))
-    return beside_ends(turned(rod.axis, turn) if abs(turn) > rod.steady else rod.axis, line)
+    own = np.concatenate([topology.nodes, topology.controllers])[rod.line].astype(np.float64)
+    return axis_on(rod.axis, heading(own), line, rod.steady)
 
 
 def _across(vertices: np.ndarray) -> np.ndarray:
@@ -196,7 +191,7 @@ def of_markers(twin: Twin, observations: Observations) -> Twin:
     edge[line[line < len(nodes)]] = np.flatnonzero(line < len(nodes))
     topology = build(nodes, hands, np.zeros((0, 2), np.int32))
     vertices = line_of(observations)
-    own = replace(rod, vertices=vertices, axis=axis_on(twin, vertices), edge=edge, place=np.zeros((len(nodes), 3)))
+    own = replace(rod, vertices=vertices, axis=_axis(twin, vertices), edge=edge, place=np.zeros((len(nodes), 3)))
     return replace(twin, topology=topology, rod=own)
 
 

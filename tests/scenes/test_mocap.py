@@ -179,9 +179,9 @@ def test_ends_may_point_anywhere(tmp_path: Path, end: tuple[float, float, float]
         np.testing.assert_allclose(clamp @ along, 0, atol=SINGLE)
 
 
-@pytest.mark.parametrize("angle", [75, 90, 127, 180, -100])
+@pytest.mark.parametrize("angle", [95, 127, 180, -100])
 def test_a_cable_that_was_recorded_elsewhere_takes_its_rings_with_it(tmp_path: Path, angle: float) -> None:
-    """It heads along -x within the 70 degrees in which grippers keep to the world, or it does not."""
+    """It heads along -x within the quarter turn in which grippers keep to the world, or it does not."""
     x, turn = np.linspace(0.4, -0.4, 12), Rotation.from_euler("z", angle, degrees=True).as_matrix()
     data = np.repeat(np.stack([x, np.zeros(12), 2 * x**2])[None], 40, axis=0)
     here, there = (mocap.read(ROW, write(tmp_path, each), Mocap(rings=20, grip="clamp")) for each in (data, turn @ data))

@@ -1,5 +1,6 @@
 """The fit of a rod: planted cables are found again, on recordings of several lengths, with markers beside the line."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +10,10 @@ from scipy.spatial.transform import Rotation
 from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError
+from neuspring.data.unpickle import load_pickle
+from neuspring.scenes import mocap
 from neuspring.twin.fit import FitProblem
-from neuspring.twin.rod import RodStart, line_of, rod_twin
+from neuspring.twin.rod import RodStart, line_of, of_markers, rod_twin
 from neuspring.twin.rod_fit import (
     Levenberg,
     Recordings,
@@ -26,7 +29,9 @@ from neuspring.twin.rod_fit import (
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.transfer import move
 from tests.support import ropes, scenarios
+from tests.support.real import FOLDER
 
+REAL = FOLDER / "mocap_dlo"
 SETTINGS = config.Config(
     rod=RodStart(bending=0.02, twisting=0.02), fit=config.Fit(rod=RodSteps(horizons=(0,), rounds=5, every=1, robust=1e-3))
 )
@@ -95,11 +100,11 @@ def changed(seen: Observations, matrix: np.ndarray) -> Observations:
     return replace(seen, **{name: (getattr(seen, name) @ matrix.T).astype(np.float32) for name in names})
 
 
-@pytest.mark.parametrize("angle", [37.0, 90.0, 127.0, 180.0, -100.0])
+@pytest.mark.parametrize("angle", [37.0, 95.0, 127.0, 180.0, -100.0])
 def test_a_cable_that_was_recorded_elsewhere_has_its_axis_there(angle):
     twin, turn = rod_twin(cable("one", 0), SETTINGS, AXIS), Rotation.from_euler("z", angle, degrees=True).as_matrix()
     there = move(twin, changed(cable("one", 0), turn))[0]
-    within = abs(angle) < 70
+    within = abs(angle) < 90
     np.testing.assert_allclose(there.rod.axis, AXIS if within else turn @ AXIS, atol=1e-5)
     if not within:
         # It is the same rod there: nodes have their places, and it moves as here.
@@ -142,6 +147,30 @@ def test_a_recording_from_the_other_end_is_turned_round_and_said(capsys):
     assert capsys.readouterr().out == "note: 2: by the distances between its markers their order is [7, 6, 5, 4, 3, 2, 1, 0]\n"
     with pytest.raises(InputError, match=r"first recording must be in the order of most; received \[7, 6, .*deform\.leave_out"):
         in_order([other, *seen[:2], seen[3]])
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the released recordings are not part of the repository")
+@pytest.mark.parametrize("name", ["DLO1", "DLO2", "DLO3", "DLO4"])
+def test_released_recordings_turned_by_any_angle_and_from_the_other_end_are_laid(name, tmp_path):
+    settings = config.Mocap(start=1, stride=1, rings=24, ring=3, grip="clamp", train_fraction=1.0)
+    files = sorted((REAL / name / "train").glob("*.pkl"), key=lambda file: int(file.stem))[::8]
+    seen, lines = [], []
+    for number, file in enumerate(files):
+        turn = Rotation.from_euler("z", 80 * number, degrees=True).as_matrix()
+        data = turn @ np.asarray(load_pickle(file))
+        lines.append(data[1].T)
+        path = tmp_path / f"{number}.pkl"
+        path.write_bytes(pickle.dumps(data[:, :, ::-1] if number == 3 else data, protocol=4))
+        row = config.ScenarioRow(scenario=file.stem, source="mocap", category=name, path="x", self_collision=False, ground=False)
+        seen.append(mocap.read(row, path, settings))
+    found = in_order(seen)
+    axis, steady = choose_axis([line_of(each) for each in found])
+    twin = rod_twin(found[0], config.Config(), axis, steady)
+    for number, (each, line) in enumerate(zip(found, lines, strict=True)):
+        np.testing.assert_allclose(line_of(each), line, atol=1e-6)
+        own = Rotation.from_euler("z", -80 * number, degrees=True).apply(np.array(of_markers(twin, each).rod.axis))
+        # As the cables head in the recordings as they were: within 60 degrees of each other.
+        assert steady == 0.0 and axis @ own > 0.5
 
 
 def uneven(seen: Observations) -> Observations:
