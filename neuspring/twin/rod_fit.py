@@ -340,7 +340,8 @@ def search_rod(
     recordings = in_order([observations, *pool])
     first = replace(RodSteps(**vars(settings.fit.rod)), stiffness="constant", curvature="constant", markers=False)
     first = replace(first, horizons=first.horizons[:1])
-    start = rods.rod_twin(observations, settings, *choose_axis([rods.line_of(each) for each in recordings if each.line.size]))
+    axis, steady = choose_axis([rods.line_of(each) for each in recordings if each.line.size])
+    start = rods.rod_twin(observations, settings, axis.tolist(), steady)
     solver = Levenberg(Recordings.of(recordings, start), first, device, threads)
     twin, value, history = solver.lowered(start, Progress(f"search {observations.scenario.name}, rod", first.rounds))
     found = _result(twin, value, history)
@@ -387,7 +388,7 @@ def require_pool(here: Observations, pool: Sequence[Observations]) -> None:
 
 
 def in_order(recordings: Sequence[Observations]) -> list[Observations]:
-    """Recordings of a pool, the lines of all in the order of the first; those that are turned round or mended are printed.
+    """Recordings of a pool, the lines of all in the order of the first.
 
     Raises InputError unless they have one center line, and the first is like most.
     """
@@ -398,9 +399,6 @@ def in_order(recordings: Sequence[Observations]) -> list[Observations]:
     if (np.diff(orders[0]) != 1).any():
         rule = "markers of a pool's first recording must be in the order of most"
         raise InputError(f"pool of {recordings[0].scenario.name}", rule, orders[0].tolist(), LEAVE_OUT)
-    for each, order in zip(recordings, orders, strict=True):
-        if (np.diff(order) != 1).any():
-            print(f"note: {each.scenario.name}: by the distances between its markers their order is {order.tolist()}")
     return [replace(each, line=each.line[order]) for each, order in zip(recordings, orders, strict=True)]
 
 

@@ -310,7 +310,7 @@ def along(recordings: Sequence[Observations]) -> list[np.ndarray]:
     """Order [V] of the line of each recording of a cable in which neighbors are as far apart as in most of them.
 
     It is that of the file, that from the other end, or one with the two markers of an end exchanged. Distances are medians over the
-    training frames: those of a single frame change with the cable's bend.
+    training frames: those of a single frame change with the cable's bend. Another order than that of the file is printed.
     """
 
     def apart(each: Observations, order: np.ndarray | slice = slice(None)) -> np.ndarray:
@@ -323,4 +323,8 @@ def along(recordings: Sequence[Observations]) -> list[np.ndarray]:
     orders = [np.arange(count), np.arange(count)[::-1], np.r_[1, 0, 2:count], np.r_[: count - 2, count - 1, count - 2]]
     usual = np.median([apart(each) for each in recordings], axis=0)
     errors = [[np.abs(apart(each, order) - usual).mean() for order in orders] for each in recordings]
-    return [orders[np.argmin(found) if min(found) < BETTER * found[0] else 0] for found in errors]
+    found = [orders[np.argmin(error) if min(error) < BETTER * error[0] else 0] for error in errors]
+    for each, order in zip(recordings, found, strict=True):
+        if order is not orders[0]:
+            print(f"note: {each.scenario.name}: by the distances between its markers their order is {order.tolist()}")
+    return found
