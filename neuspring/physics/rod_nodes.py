@@ -19,6 +19,7 @@ import torch
 
 from neuspring.core.artifacts import Rod, Simulation, Twin
 from neuspring.core.errors import InputError
+from neuspring.core.geometry import PARALLEL
 from neuspring.physics.controllers import ControllerSprings, begins
 from neuspring.physics.parameters import CONTACT_LIMITS
 from neuspring.physics.rod import RodHands, RodLanes, RodSolver
@@ -28,8 +29,6 @@ SMOOTHING_WEIGHT = 1e-6
 SETTLING = 4
 """Rounds in which vertices and directors of frame 0 are made to agree."""
 GROUND_FIELDS = ("ground_elasticity", "ground_friction")
-PARALLEL = 0.99
-"""Cosine to an end's tangent from which `Rod.axis` has no projection worth the name."""
 
 
 def bind(vertices: np.ndarray, directors: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

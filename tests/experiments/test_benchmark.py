@@ -236,6 +236,17 @@ def test_deforms_benchmark_is_a_pool_of_evenly_spaced_recordings_per_cable(tmp_p
     assert found.transfers["DLO7_train_3"] == ("DLO7_eval_1", "DLO7_eval_2")
     assert len(found.transfers["DLO8_train_3"]) == 14
     assert found.applies("one", "DLO8_train_3")
+    # The nearest by number takes the place of one that is left out; the others keep theirs.
+    found = made(cables=["DLO7"], clips=3, leave_out=["DLO7_train_15", "DLO7_eval_1"])
+    assert found.pools["DLO7_train_3"] == ("DLO7_train_12", "DLO7_train_30")
+    assert found.transfers["DLO7_train_3"] == ("DLO7_eval_2",)
+    assert made(cables=["DLO7"], clips=3, leave_out=["DLO7_train_3"]).config.scenarios == ("DLO7_train_6",)
+    with pytest.raises(
+        InputError, match=r"deform\.leave_out: must be.*received DLO7_train_4\. There: DLO7_train_3, .*DLO7_eval_2\."
+    ):
+        made(cables=["DLO7"], clips=3, leave_out=["DLO7_train_4", "DLO7_train_6"])
+    with pytest.raises(InputError, match=r"DLO7: at least 3 recordings.*received 10 and 0.*leave_out"):
+        made(cables=["DLO7"], clips=3, leave_out=["DLO7_eval_1", "DLO7_eval_2"])
     with pytest.raises(InputError, match=r"DLO8: at least 4 recordings.*received 3 and 14.*there: DLO7, DLO8"):
         made(cables=["DLO8"], clips=4)
     with pytest.raises(InputError, match=r"DLO9: at least 2 recordings.*received 0 and 0"):
