@@ -95,7 +95,7 @@ def test_means_are_over_the_frames_of_a_task_that_rivals_show_and_drawn_masks_me
     assert scene.means({0: 9.0, 1: 0.5, 2: 0.7, 4: 0.2}) == {"training": pytest.approx(0.6), "future": pytest.approx(0.2)}
     masks = {2: block(slice(0, 1), slice(0, 1)), 4: block(slice(10, 20), slice(10, 15))}
     assert list(scene.drawn_rows(masks)) == [("drawn", "last", 0.5)]
-    assert Scene("a", ROOT, SimpleNamespace(frame_count=116), ROOT).kept[::4] == [0, 115 // 3, 2 * 115 // 3, 115]
+    assert Scene("a", ROOT, SimpleNamespace(frame_count=116), ROOT).kept[::3] == [0, 115 // 3, 2 * 115 // 3, 115]
 
 
 def test_differences_are_paired_by_scene_and_the_spread_is_of_seeds_with_every_scene():

@@ -42,7 +42,7 @@ from neuspring.scores.pictures import Scored, iou
 from neuspring.scores.statistics import t_interval
 from neuspring.splats.draw import picture
 from neuspring.stages.render import posed
-from results.published.film22.films import NAME, PREFIX, cases_of, film, marks_of, pane, write_captures
+from results.published.film22.films import NAME, PREFIX, cases_of, film, pane, write_captures
 
 ROOT = Path(__file__).parents[3]
 CONFIG = ROOT / "config" / "data" / "film22.yaml"
@@ -57,7 +57,7 @@ DIFFERENT, COLORED, LEAST_PART = 20.0, 9.0, 0.03
 """Gray levels, and part of the silhouette, from which pixels and parts of a render are object (README of the films)."""
 MOST, STEP = 6.0, 0.5
 """Largest shift that is tried, and its step, px."""
-SHOWN = 12
+SHOWN = 9
 """Intervals between the frames of silhouettes.npz; thirds of the film are among them."""
 TASKS = ("training", "future")
 COLUMNS = ["case", "method", "seed", "masks", "part", "value"]
@@ -300,19 +300,21 @@ def main() -> None:
     parser.add_argument("--strips", type=Path, help="folder of film strips")
     a = parser.parse_args()
     films, captures, results = a.data / "phystwin22_films", a.work / "captures", a.work / "results"
-    write_captures(films, captures, cases_of(films))
     if a.cores:
-        command = ["snakemake", "--profile", "workflow/profiles/default", "--quiet", "rules", "--cores", str(a.cores)]
-        command += ["--configfile", str(CONFIG), "--config", f"data_root={captures.resolve()}", f"results={results.resolve()}"]
-        subprocess.run([sys.executable, "-m", *command, *([f"only={a.only}"] if a.only else [])], cwd=ROOT, check=True)
+        write_captures(films, captures, cases_of(films))
+        command = [sys.executable, "-m", "snakemake", "--profile", "workflow/profiles/default", "--quiet", "rules"]
+        command += ["--until", "score", "--cores", str(a.cores), "--configfile", str(CONFIG)]
+        values = {"data_root": captures.resolve(), "results": results.resolve(), "only": a.only}
+        subprocess.run([*command, "--config", *(f"{key}={value}" for key, value in values.items())], cwd=ROOT, check=True)
     methods, kept, notes, rows = read_yaml(CONFIG)["methods"], dict[str, np.ndarray](), list[str](), list[tuple[object, ...]]()
     for case in cases_of(films):
+        if not any((results / f"{PREFIX}{case}").glob(f"*/*/{RUN_RECORD}")):
+            continue
         scene = Scene(case, a.data, Capture.load(captures / f"{PREFIX}{case}"), results / f"{PREFIX}{case}")
-        if any(runs_of(scene, methods)) and marks_of(case, (640, 362)):
-            rows += rows_of(scene, methods, kept, notes)
-            if a.strips:
-                strip(scene, a.strips)
-            print(case, flush=True)
+        rows += rows_of(scene, methods, kept, notes)
+        if a.strips:
+            strip(scene, a.strips)
+        print(case, flush=True)
     if a.output:
         scores = pd.DataFrame(rows, columns=COLUMNS)
         a.output.mkdir(parents=True, exist_ok=True)
