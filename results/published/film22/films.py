@@ -21,7 +21,7 @@ import numpy as np
 
 from neuspring.config.perception import MarksSegmentation
 from neuspring.data.camera import Camera
-from neuspring.data.capture import CAPTURE, Capture, Description, Writer
+from neuspring.data.capture import CAPTURE, THIN, Capture, Description, Writer
 from neuspring.intake.phystwin import released_cases
 from neuspring.perception.marks.carry import carry
 from neuspring.perception.marks.marks import MARKS as MARKS_FILE
@@ -152,6 +152,7 @@ def write_capture(
         pose="lying",
         up="-z",
         train_end=int(row["train_end"]) if row is not None and whole else None,
+        self_collision=category_of(case) in THIN,
         ground=case not in IN_THE_AIR,
         masks=True,
         provenance={"source": "film of PhysTwin's camera 0", "masks": "carried from marks of frame 0"},
