@@ -236,6 +236,17 @@ def test_deforms_benchmark_is_a_pool_of_evenly_spaced_recordings_per_cable(tmp_p
     assert found.transfers["DLO7_train_3"] == ("DLO7_eval_1", "DLO7_eval_2")
     assert len(found.transfers["DLO8_train_3"]) == 14
     assert found.applies("one", "DLO8_train_3")
+    # The nearest by number takes the place of one that is left out; the others keep theirs.
+    found = made(cables=["DLO7"], clips=3, leave_out=["DLO7_train_15", "DLO7_eval_1"])
+    assert found.pools["DLO7_train_3"] == ("DLO7_train_12", "DLO7_train_30")
+    assert found.transfers["DLO7_train_3"] == ("DLO7_eval_2",)
+    assert made(cables=["DLO7"], clips=3, leave_out=["DLO7_train_3"]).config.scenarios == ("DLO7_train_6",)
+    with pytest.raises(
+        InputError, match=r"deform\.leave_out: must be.*received DLO7_train_4\. There: DLO7_train_3, .*DLO7_eval_2\."
+    ):
+        made(cables=["DLO7"], clips=3, leave_out=["DLO7_train_4", "DLO7_train_6"])
+    with pytest.raises(InputError, match=r"DLO7: at least 3 recordings.*received 10 and 0.*leave_out"):
+        made(cables=["DLO7"], clips=3, leave_out=["DLO7_eval_1", "DLO7_eval_2"])
     with pytest.raises(InputError, match=r"DLO8: at least 4 recordings.*received 3 and 14.*there: DLO7, DLO8"):
         made(cables=["DLO8"], clips=4)
     with pytest.raises(InputError, match=r"DLO9: at least 2 recordings.*received 0 and 0"):
@@ -451,7 +462,7 @@ STUDIES = {
     "synthetic": ("", "paper", "headline"),
     "mocap": ("", "baselines", "clusters", "mocap_heldout", "mocap_heldout headline", "paper"),
     "deform": ("",),
-    "color": ("footage",),
+    "film22": ("",),
     "phystwin": ("", "tune"),
 }
 """Files of config/studies that are laid over a file of config/data."""
@@ -468,11 +479,11 @@ STUDIES = {
 def test_every_configuration_that_is_shipped_is_valid(data, studies, tmp_path):
     values = shipped(data, *studies.split())
     for row in read_scenarios(ROOT / "config" / "scenarios.tsv").values():
-        if row.source == "capture" and studies == "footage":
-            paint(tmp_path / row.path, frames=5)
-        elif row.source not in ("capture", "synthetic", "toy"):
+        if row.source not in ("capture", "synthetic", "toy"):
             (tmp_path / row.path).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / row.path).touch()
+    for name in values["scenarios"] if data == "film22" else ():
+        paint(tmp_path / name, frames=5)
     for cable in values.get("deform", {}).get("cables", ()):
         record(tmp_path, cable, 56, 14)
     values |= {"data_root": str(tmp_path)}

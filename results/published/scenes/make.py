@@ -25,7 +25,8 @@ from neuspring.draw.sheet import save
 from neuspring.report.blocks import markdown
 from neuspring.scores.paper import released
 from neuspring.scores.runs import collect
-from results.published.footage.runs import METHODS
+
+METHODS = Path(__file__).parents[3] / "config" / "methods.yaml"
 
 MM = 1e3
 PHYSTWIN = "PhysTwin (released)"

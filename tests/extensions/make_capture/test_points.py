@@ -92,15 +92,16 @@ def mocap(folder, rate=30.0, frames=8, unit="mm", lost=None):
     return {"controllers": Path(f"{path}#{hand}"), "nodes": files["nodes"], "tracks": Path(f"{path}#{toy}")}
 
 
-def test_motion_capture_alone_becomes_a_capture(tmp_path):
+@pytest.mark.parametrize("rate", [100.0, 1000.0])
+def test_motion_capture_alone_becomes_a_capture(tmp_path, rate):
     lost = np.zeros((8, len(scene.GRIP) + len(scene.MARKED)), bool)
     lost[5:, -1] = True
-    files = mocap(tmp_path / "files", 100.0, lost=lost)
+    files = mocap(tmp_path / "files", rate, lost=lost)
     options = [part for name, path in files.items() for part in (f"--{name}", str(path))]
     command = ["make-capture", *options, "--category", "toy", "--output", str(tmp_path / "made")]
     assert main(command) == 0
     made = Capture.load(tmp_path / "made")
-    assert (made.frame_count, made.description.frame_rate) == (8, 100.0)
+    assert (made.frame_count, made.description.frame_rate) == (8, rate)
     space = read(made)
     np.testing.assert_allclose(space.hands.points, scene.risen(scene.GRIP, 8), atol=1e-6)
     right = scene.risen(scene.MARKED, 8)
