@@ -224,7 +224,7 @@ def _on_unloaded(rod: Rod, observations: Observations, marker_mass: float) -> Ro
         others = np.setdiff1d(np.flatnonzero(hand == hand[outer]), held) if hand.size and outer >= 0 else held[:0]
         rolls[end] = others[0] if len(others) else -1
     axis = unloaded[count + rolls[0]] - unloaded[count + held[0]] if rolls[0] >= 0 else rod.axis
-    rod = replace(rod, axis=axis)
+    rod = replace(rod, axis=axis, by_angle=1.0)
     found = replace(bound(rod, unloaded[:count]), curvature=frame_zero(rod)[1])
     tracked = slice(len(observations.object_points[0]))
     mass = rod.mass + marker_shares(found, tracked.stop) @ np.full(tracked.stop, marker_mass)

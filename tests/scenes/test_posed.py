@@ -137,20 +137,20 @@ def test_a_lattice_follows_a_turning_hand(tmp_path: Path) -> None:
 
 def test_a_fit_finds_stiffness_and_slip_of_a_rod_that_swings(tmp_path: Path) -> None:
     first, second = (seen(tmp_path, table(61, seed), f"swing{seed}") for seed in (0, 1))
-    steps = RodSteps(curvature="straight", horizons=(0,), rounds=8, every=2, markers=False, slip=1, robust=1e-3)
+    steps = RodSteps(curvature="straight", horizons=(0,), rounds=12, every=2, markers=False, slip=1, robust=1e-3)
     start = rod_twin(first, Config(rod=ROD))
+    start = replace(start, rod=replace(start.rod, slip=np.array([[0.5, 0.3]]), slip_twist=1.0))
     variables = Variables.of(start, steps, 2)
     names = variables.kinds.tolist()
     q = np.zeros(len(names))
-    for name, value in (("bending", 0.4), ("slip_share", 0.8), ("slip_yield", 1.2)):
+    for name, value in (("bending", 0.4), ("slip_share", 0.5), ("slip_yield", -0.5)):
         q[names.index(name)] = value
     truth = variables.made(q)
     pool = [recorded(truth, each) for each in (first, second)]
     found = fit_rod(pool[0], pool[1:], start, steps).twin
     assert found.rod is not None and truth.rod is not None
     np.testing.assert_allclose(found.rod.bending, truth.rod.bending, rtol=0.1)
-    print(found.rod.slip, truth.rod.slip)
-    np.testing.assert_allclose(found.rod.slip, truth.rod.slip, rtol=0.15)
+    np.testing.assert_allclose(found.rod.slip, truth.rod.slip, rtol=0.05)
     # A search finds the stiffness from far.
     far = search_rod(pool[0], pool[1:], Config(rod=replace(ROD, bending=30.0, twisting=30.0), fit=config.Fit(rod=steps)))
     assert np.median(far.twin.rod.bending) == pytest.approx(float(np.median(truth.rod.bending)), rel=0.5)
