@@ -17,7 +17,7 @@ from torch.nn.functional import embedding_bag
 
 from neuspring.config import SpringFieldSettings as Settings
 
-ALL, NO_POINTS = slice(None), np.zeros((0, 3))
+ALL_SPRINGS, NO_POINTS = slice(None), np.zeros((0, 3))
 PLANE_AXES = ((0, 1), (1, 2), (0, 2))
 """Coordinates that span the planes xy, yz, xz."""
 
@@ -60,7 +60,7 @@ class TriPlane(nn.Module):
         self.register_buffer("indices", torch.from_numpy(inverse.reshape(cells.shape)), persistent=False)
         self.register_buffer("weights", torch.from_numpy(weights.astype(np.float32)), persistent=False)
 
-    def forward(self, part: slice = ALL) -> torch.Tensor:
+    def forward(self, part: slice = ALL_SPRINGS) -> torch.Tensor:
         """Summed features [S, C] of a part of the points."""
         return embedding_bag(self.indices[part], self.texels, per_sample_weights=self.weights[part], mode="sum")
 
@@ -118,13 +118,13 @@ class SpringField(nn.Module):
             for tensor in self.layers[-1].parameters():
                 tensor.zero_()
 
-    def encoded(self, part: slice = ALL) -> torch.Tensor:
+    def encoded(self, part: slice = ALL_SPRINGS) -> torch.Tensor:
         """Inputs of the MLP [S, width]: the plane feature and the coordinates, transformed."""
         here = self.coordinates[part]
         parts = [here] if self.planes is None else [self.planes(part), here]
         return torch.cat([fourier(part, self.settings.bands) for part in parts], dim=1)
 
-    def forward(self, part: slice = ALL) -> torch.Tensor:
+    def forward(self, part: slice = ALL_SPRINGS) -> torch.Tensor:
         """F [S, outputs] of a part of the springs."""
         x = self.encoded(part)
         for layer in self.layers[:-1]:

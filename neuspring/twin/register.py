@@ -34,7 +34,7 @@ STRETCH_NEIGHBORS = 6
 """Nearest points of a point, whose distances tell how much was stretched."""
 BEND_STEPS = 8
 """Steps with each width."""
-WAYS, LONGEST_STEP = 64, 1.3
+PATH_STARTS, PATH_STEP = 64, 1.3
 """Points from which ways to all others are measured, and the longest step of a way, in node spacings."""
 
 
@@ -152,7 +152,7 @@ def _poses(source: np.ndarray, target: np.ndarray) -> list[tuple[np.ndarray, np.
 def _changes_of_ways(source: np.ndarray, target: np.ndarray, ends: Sequence[np.ndarray]) -> list[float]:
     """Mean change, m, of the ways through the target [M, 3] for each end [M, 3], where a point becomes the source's nearest."""
     tree = cKDTree(source)
-    starts = np.arange(0, len(target), -(-len(target) // WAYS))
+    starts = np.arange(0, len(target), -(-len(target) // PATH_STARTS))
     ways, changes = dijkstra(_steps(target), indices=starts), []
     for end in ends:
         image = tree.query(end)[1]
@@ -165,7 +165,7 @@ def _changes_of_ways(source: np.ndarray, target: np.ndarray, ends: Sequence[np.n
 def _steps(points: np.ndarray) -> csr_array:
     """Lengths, m, of the steps between near points of a body [N, 3]."""
     tree = cKDTree(points)
-    return csr_array(tree.sparse_distance_matrix(tree, LONGEST_STEP * node_spacing(points), output_type="coo_matrix"))
+    return csr_array(tree.sparse_distance_matrix(tree, PATH_STEP * node_spacing(points), output_type="coo_matrix"))
 
 
 def _kabsch(points: np.ndarray, onto: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
