@@ -27,8 +27,7 @@ class SearchRow(SettingsSection):
 
 @dataclass(frozen=True, kw_only=True)
 class Method(SettingsSection):
-    """A row of the method table: a twin (which search it starts from, what follows), a baseline's model, or the mean of a row's
-    seeds; how it predicts."""
+    """A row of the method table: a twin (which search it starts from, what follows), a baseline's model, or the mean of seeds."""
 
     description: str
     """A line for people."""
@@ -40,7 +39,7 @@ class Method(SettingsSection):
     model: Name | None = None
     """A baseline, which has neither search nor fit, by its name in `BASELINES`."""
     mean_of: Name | None = None
-    """Another row, which is run too: the prediction is the mean of those of all its seeds."""
+    """Another row, which is run too: the prediction is the mean of those of all its seeds; null: this row predicts itself."""
     settings: dict[str, Any] = field(default_factory=dict)
     """Settings of this method alone, on top of the configuration's: keys of `fit` (for example `horizon: 0`), or of its model's
     section of `baselines`."""
@@ -52,8 +51,8 @@ class Method(SettingsSection):
     fitting could remove at all, and stands outside every comparison. Its records say so, and it shares its fit with other oracles
     only."""
     pool: Literal["all", "others"] | None = None
-    """Recordings of the object (`pools`) that one twin is judged on. all: the scenario's own and the others of its pool; others:
-    those alone, so that nothing of the scenario is seen but frame 0 and the hands; null: the scenario's own."""
+    """Recordings of the object (`pools`) that one twin is judged on: the scenario's own and the others of its pool (all); those
+    alone, so that nothing of the scenario is seen but frame 0 and the hands (others); null: the scenario's own."""
 
     @property
     def searched(self) -> str:
