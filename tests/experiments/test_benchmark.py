@@ -426,12 +426,16 @@ def test_a_mean_reads_the_predictions_of_all_seeds_of_a_row_that_may_leave_its_o
     assert list(alone.whole_left_out["mean"]) == ["cloth"]
 
 
-def test_scenarios_without_a_pool_are_left_out_of_its_methods_which_share_no_launches(tmp_path: Path) -> None:
+def test_scenarios_without_a_pool_are_left_out_of_its_methods(tmp_path: Path) -> None:
     made = pooled(tmp_path, scenarios=["a", "cloth"], seeds=[0, 1, 2], twins_per_launch=8)
     assert made.whole_left_out == {"one": {"cloth": "it learns from a pool of recordings, and this one has none"}}
     assert [path for path in Graph(made).runs() if "cloth" in path] == [f"results/cloth/full/{seed}/run.json" for seed in range(3)]
     assert made.applies("one", "a")
-    assert in_step(made, "a") == [("full", 0), ("full", 1), ("full", 2)]
+    assert in_step(made, "a") == [(name, seed) for name in ("full", "one") for seed in range(3)]
+    pooled_fits = [
+        row for row in json.loads(Graph(made).options(STAGES["fits"], SimpleNamespace(scenario="a"))["rows"]) if row["pool"]
+    ]
+    assert [row["pool"] for row in pooled_fits] == [["results/b/observations.npz", "results/c/observations.npz"]]
     alone = pooled(tmp_path, methods=["full"])
     assert (alone.pools, list(alone.scenarios)) == ({}, ["a"]), "no pool is asked for without such a method"
 

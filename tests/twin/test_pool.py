@@ -11,6 +11,7 @@ from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError
 from neuspring.twin import polish as module
+from neuspring.twin.batch import run_batch
 from neuspring.twin.candidates import PENALTY, SearchProblem, evaluate, made, mean_outcome
 from neuspring.twin.fit import FitProblem, FitResult, PooledFit, fit
 from neuspring.twin.polish import POLISH, SLOPES, Polish
@@ -269,6 +270,16 @@ def test_a_material_of_other_nodes_comes_nearer_to_what_was_seen():
     result = pooled(problem, other_nodes(SHAKEN))
     assert result.facts["rollbacks"] == []
     assert result.history["loss"].iloc[-1] < 0.8 * result.history["loss"].iloc[0]
+
+
+def test_fits_on_a_pool_that_share_launches_have_the_numbers_of_each_alone():
+    problem = replace(problem_of(LIFTED, epochs=2, horizon=2, learning_rate=3e-3), kind="field", pool=[other_nodes(SHAKEN)])
+    problems = [problem, replace(problem, seed=1)]
+    works = [lambda lane, each=each: fit(each, lane=lane) for each in problems]
+    together = run_batch([each.twin for each in problems], "cpu", works)
+    for got, each in zip(together, problems, strict=True):
+        assert not isinstance(got, Exception), got
+        require_equal(got, fit(each))
 
 
 def test_free_springs_and_cables_need_the_same_nodes():
