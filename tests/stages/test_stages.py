@@ -12,9 +12,11 @@ from neuspring.core.artifacts import Observations, Trajectory, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.files import read_npz
 from neuspring.core.records import Recorder, StageRecord
+from neuspring.core.run_record import RunRecord
 from neuspring.experiments.tracking import log as tracking
 from neuspring.physics import stability
 from neuspring.scores import metrics
+from neuspring.stages.average import average
 from neuspring.stages.fit import fit
 from neuspring.stages.observe import observe
 from neuspring.stages.rollout import rollout
@@ -232,6 +234,30 @@ def test_a_missing_or_changed_artifact_is_an_error_that_says_what_to_do(finished
     twin.write_bytes(b"other")
     with pytest.raises(InputError, match="other content"):
         StageRecord.load(record).file("twin", record)
+
+
+def test_the_mean_of_seeds_is_scored_as_any_prediction_and_a_seed_that_failed_fails_it(tmp_path, finished):
+    folder = finished[1].parent
+    seen, one = folder.parents[1] / "observations.npz", Trajectory.load(folder / "trajectory.npz")
+
+    def saved(name: str, shift: float, failure: str = ""):
+        record = Recorder("rollout", tmp_path / name / "rollout.json", inputs={"observations": seen})
+        files = record.beside(trajectory="trajectory.npz")
+        replace(one, positions=one.positions + np.array([shift, 0, 0])).save(files["trajectory"])
+        record.save(files, {}, failure=failure)
+        return record.output
+
+    rollouts, out = [saved(str(k), 0.001 * k) for k in range(3)], tmp_path / "mean" / "0"
+    average(observations=seen, rollout=rollouts, output=out / "rollout.json")
+    record = StageRecord.load(out / "rollout.json")
+    assert [record.facts[f"spread_{task}"] for task in metrics.TASKS] == pytest.approx([0.001, 0.001], rel=1e-3)
+    np.testing.assert_allclose(
+        Trajectory.load(out / "trajectory.npz").positions, one.positions + np.array([0.001, 0, 0]), atol=1e-7
+    )
+    score(observations=seen, rollout=out / "rollout.json", method="mean", variant={"mean_of": "x"}, output=out / "run.json")
+    assert RunRecord.load(out / "run.json").ok
+    average(observations=seen, rollout=[*rollouts[:2], saved("lost", 0.0, "it left the scene")], output=out / "failed.json")
+    assert StageRecord.load(out / "failed.json").status == "failed"
 
 
 def test_only_a_body_that_can_meet_itself_is_predicted_with_more_substeps(tmp_path, finished):
