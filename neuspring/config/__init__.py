@@ -11,7 +11,7 @@
 Nothing here imports torch, Warp or MLflow, because the workflow reads the configuration before any job exists.
 """
 
-from neuspring.config.data import Mocap, Synthetic, Toy
+from neuspring.config.data import Mocap, Posed, Synthetic, Toy
 from neuspring.config.parse import merge, of_command_line, parse, plain, read_text, read_yaml
 from neuspring.config.rod import RodSettings
 from neuspring.config.rows import Method, ScenarioRow, SearchRow
@@ -26,6 +26,7 @@ __all__ = [
     "Losses",
     "Method",
     "Mocap",
+    "Posed",
     "ReleasedQuirks",
     "RodSettings",
     "ScenarioRow",

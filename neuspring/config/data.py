@@ -50,6 +50,36 @@ class Mocap(SettingsSection):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Posed(SettingsSection):
+    """A table with a row per sample: the pose of a hand that holds a long thin body, and markers on it. Meters, seconds, z up."""
+
+    time: str = "t"
+    """Column of the time."""
+    position: tuple[str, str, str] = ("x", "y", "z")
+    """Columns of the hand's position."""
+    rotation: tuple[str, ...] = ("qx", "qy", "qz", "qw")
+    """Columns of its rotation to the world: a quaternion, scalar last, or the three angles that `angles` names."""
+    angles: Literal["", "XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"] = ""
+    """Order of angles, rad, about the axes of the hand as it turns: R = Rz Ry Rx is ZYX. Empty: a quaternion."""
+    markers: tuple[tuple[str, str, str], ...] = ()
+    """Columns of each marker's position, in their order from the hand on. A marker without numbers is not seen in this sample."""
+    unloaded: tuple[tuple[float, float, float], ...] = ()
+    """Place of each marker in the frame of the hand if nothing loads the body, which then runs straight from one to the next."""
+    clamp: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Place of the clamp on the body's line, in the frame of the hand."""
+    radius: Positive = 0.01
+    """Radius of the body."""
+    rings: Annotated[int, Field(ge=2)] = 24
+    """Number of rings of nodes along the body, which lattices are made of."""
+    ring: Annotated[int, Field(ge=3)] = 3
+    """Nodes per ring."""
+    stride: Count = 1
+    """Stride of samples of the table."""
+    train_fraction: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Part of the frames that are for training, the first ones. 1: all, where future frames are those of other recordings."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Deform(SettingsSection):
     """DEFORM's benchmark. For each cable: a pool of training recordings, whose twins go to all evaluation recordings."""
 

@@ -80,7 +80,7 @@ class ScenarioRow(SettingsSection):
     scenario: Name
     """Name of the scenario."""
     source: Name
-    """The kind of its data: phystwin, mocap, toy, synthetic, capture, points, phystwin_raw, or one of a package."""
+    """The kind of its data: phystwin, mocap, posed, toy, synthetic, capture, points, phystwin_raw, or one of a package."""
     category: Name
     """Kind of object, for example rope, cloth, package or sloth."""
     path: str

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, StringConstraints
 
 from neuspring.config.baselines import Baselines
-from neuspring.config.data import Deform, Mocap, Synthetic, Toy
+from neuspring.config.data import Deform, Mocap, Posed, Synthetic, Toy
 from neuspring.config.effort import EFFORTS, Effort, sizes
 from neuspring.config.images import Images
 from neuspring.config.parse import json_value, merge, parse, plain, read_yaml
@@ -159,6 +159,7 @@ class Config(SettingsSection):
     toy: Toy = field(default_factory=Toy)
     mocap: Mocap = field(default_factory=Mocap)
     deform: Deform = field(default_factory=Deform)
+    posed: Posed = field(default_factory=Posed)
     synthetic: Synthetic = field(default_factory=Synthetic)
     perception: Perception = field(default_factory=Perception)
     images: Images = field(default_factory=Images)

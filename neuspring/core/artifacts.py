@@ -64,8 +64,9 @@ def array(
 
 
 def number(unit: str, doc: str, **default: float) -> Any:
-    """Declare a number: unit, meaning, and a `default` where it may be left out."""
-    return field(metadata={"unit": unit, "doc": doc}, **default)  # type: ignore[call-overload]
+    """Declare a number: unit, meaning, and a `default` where it may be left out. One of 0 is not in the file where it is 0."""
+    metadata = {"unit": unit, "doc": doc} | (OMITTED if default.get("default") == 0 else {})
+    return field(metadata=metadata, **default)  # type: ignore[call-overload]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,8 +134,8 @@ class Artifact:
                 plain[spec.name] = value._flatten(arrays, f"{prefix}{spec.name}.")
             elif dataclasses.is_dataclass(value) and not isinstance(value, type):
                 parts = dataclasses.fields(value)
-                plain[spec.name] = {f.name: getattr(value, f.name) for f in parts if _kept(f, getattr(value, f.name))}
-            elif _kept(spec, value):
+                plain[spec.name] = {f.name: getattr(value, f.name) for f in parts if kept(f, getattr(value, f.name))}
+            elif kept(spec, value):
                 plain[spec.name] = value
         return plain
 
@@ -193,9 +194,9 @@ class Artifact:
         return cls(**values)
 
 
-def _kept(spec: dataclasses.Field[Any], value: object) -> bool:
+def kept(spec: dataclasses.Field[Any], value: object) -> bool:
     """True where a file has the field; an empty one may be left out."""
-    return bool(value) or spec.metadata != OMITTED
+    return bool(value) or not OMITTED.items() <= spec.metadata.items()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -519,7 +520,8 @@ class Rod(Artifact):
     Edge j joins vertices j and j + 1. Its frame is the unit tangent t and two directors m1, m2 = t x m1. A clamp holds the two
     outer vertices of an end: m1 of edge 0 is `axis` projected, that of the last edge the same turned by `roll` about its tangent.
     Between them the twist is in equilibrium. With kb = 2 t_(i-1) x t_i / (1 + t_(i-1) t_i) the curvatures of joint i are
-    k1 = kb (m2_(i-1) + m2_i) / 2 and k2 = -kb (m1_(i-1) + m1_i) / 2. Nodes of the topology follow the line (`edge`, `place`).
+    k1 = kb (m2_(i-1) + m2_i) / 2 and k2 = -kb (m1_(i-1) + m1_i) / 2. With `by_angle` kb is as long as the angle between the edges,
+    not 2 tan of its half. Nodes of the topology follow the line (`edge`, `place`).
     """
 
     kind: ClassVar[str] = "rod"
@@ -533,7 +535,7 @@ class Rod(Artifact):
     edge: np.ndarray = array("N", np.int32, "1", "the edge that each node of the topology follows")
     place: np.ndarray = array("N,3", np.float64, "1, m, m", "of each node: fraction along its edge, distances along m1 and m2")
     line: np.ndarray = array(
-        "V", np.int32, "1", "the observed line, see `Observations.line`; empty: found among nodes", omitted=True
+        "M", np.int32, "1", "the observed line, see `Observations.line`; empty: found among nodes", omitted=True
     )
     axis: np.ndarray = array("3", np.float64, "1", "direction in the world whose projection is m1 of the first edge")
     clamps: np.ndarray = array(
@@ -543,10 +545,40 @@ class Rod(Artifact):
         "inner held vertex of either end from its controller: along t, m1 (without `roll`), m2",
         omitted=True,
     )
-    """Markers lie beside a cable. The outer held vertex follows with the direction between the two controllers."""
+    """Markers lie beside a cable. The outer held vertex follows with the direction between the two controllers. With
+    `tilts` the middle of the held edge is there."""
+    tilts: np.ndarray = array(
+        "K,2",
+        np.float64,
+        "1",
+        "held edge of either end (K = 2), of its own length: along t + a m1 + b m2; see `clamps`",
+        omitted=True,
+    )
+    """They are there where the vertices were laid along the unloaded shape (twin/rod.py)."""
+    rolls: np.ndarray = array(
+        "K",
+        np.int32,
+        "1",
+        "controller towards which m1 of either end's edge lies, from the outer held one; -1: `axis`",
+        omitted=True,
+    )
     offsets: np.ndarray = array(
         "V,2", np.float64, "m", "point of the observed line from each free vertex: along m1, m2 of the edge behind it", omitted=True
     )
+    slip: np.ndarray = array(
+        "P,2",
+        np.float64,
+        "1, 1/m",
+        "branches that slip: share of EI and GJ, curvature at which each slips",
+        sign="not negative",
+        omitted=True,
+    )
+    """Friction inside the rod (Prandtl 1928, Iwan 1966): moments are EI / l (k - k0 + damping dk/dt + sum share (k - z)), where z
+    is dragged along, so that |k - z| is at most l times the second number. In frame 0 z = k. Twist has the same branches."""
+    slip_twist: float = number("1", "twist slips at this times the curvatures of `slip`, rad/m; 0: it has no branches", default=0.0)
+    by_angle: float = number("1", "1: the curvature of a joint is its angle; 0: 2 tan of half the angle", default=0.0)
+    """A moment is EI times the angle per length. 2 tan of the half is stiffer by angle^2 / 3, the more so the fewer vertices there
+    are; rods of markers have it, as their authors do."""
     stretching: float = number("N", "EA")
     damping: float = number("s", "time of inner damping: moments are EI / l (k - k0 + damping dk/dt)")
     drag_quadratic: float = number("1/m", "deceleration by air is this times speed squared; linear drag is the material's")
@@ -561,11 +593,24 @@ class Rod(Artifact):
             raise InputError(
                 "rod.lengths", "at least 3 vertices, and one length per edge between them", (edges + 1, len(self.lengths))
             )
-        if not (self.stretching > 0 and self.damping >= 0 and self.drag_quadratic >= 0 and np.isfinite(self.roll)):
-            rule = "stretching > 0, damping >= 0, drag_quadratic >= 0 and a finite roll are required"
-            raise InputError("rod", rule, (self.stretching, self.damping, self.drag_quadratic, self.roll))
+        if not (
+            self.stretching > 0
+            and self.damping >= 0
+            and self.drag_quadratic >= 0
+            and self.slip_twist >= 0
+            and np.isfinite(self.roll)
+        ):
+            rule = "stretching > 0, damping, drag_quadratic, slip_twist >= 0 and a finite roll are required"
+            raise InputError("rod", rule, (self.stretching, self.damping, self.drag_quadratic, self.slip_twist, self.roll))
+        if self.laid and len(self.tilts) != 2:
+            raise InputError("rod.tilts", "one row per end, or none", len(self.tilts))
         if len(self.edge) and not 0 <= self.edge.min() <= self.edge.max() < edges:
             raise InputError("rod.edge", f"indices must lie in [0, {edges})", [int(self.edge.min()), int(self.edge.max())])
+
+    @property
+    def laid(self) -> bool:
+        """True where vertices were laid along the unloaded shape: nobody sees them, and nodes keep their places."""
+        return bool(self.tilts.size)
 
     @property
     def spans(self) -> np.ndarray:

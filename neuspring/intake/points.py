@@ -1,7 +1,9 @@
 """Hands, nodes and annotated points in space, which a capture may bring beside film or without any.
 
-    controllers.npz    points [T, C, 3]; optional: holds [T, C] bool (all hold), hand [C] int (not grouped)
-    controllers.csv    the same as rows, header frame,point,x,y,z[,holds][,hand]; frames from 0, holds 0 or 1
+    controllers.npz    points [T, C, 3]; optional: holds [T, C] bool (all hold), hand [C] int (not grouped); or
+                       poses [T, H, 4, 4], hands to world; optional: jaws [H, C, 3], points that each carries, holds [T, H]
+    controllers.csv    the same as rows, header frame,point,x,y,z[,holds][,hand]; frames from 0, holds 0 or 1; poses with
+                       qx,qy,qz,qw, a row per frame and hand (`point`)
     nodes.npz | .ply   points [N, 3]; or vertices: the body of frame 0
     tracks.json        annotated points (capture.py); with `tracks: train` those of training frames teach the twin
 
@@ -17,6 +19,7 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from neuspring.checks import examine
 from neuspring.checks.moving import Moving
@@ -34,6 +37,14 @@ from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, TRACKS, Capture
 
 CSV_COLUMNS = ("frame", "point", "x", "y", "z", "holds", "hand")
 """Columns of controllers.csv; the last two may be left out."""
+QUATERNION = ("qx", "qy", "qz", "qw")
+"""Further columns, where a row is the pose of a hand."""
+JAWS = 0.03 * np.concatenate([np.zeros((1, 3)), np.eye(3)])
+"""Points that a hand with a pose carries where the file gives none, m in its frame: its origin, and one along each of its axes."""
+FAR_FROM_UNIT = 0.01
+"""Allowed deviation of the length of a quaternion from 1."""
+RIGID = 1e-4
+"""Allowed deviation from R^T R = 1 of a pose."""
 UNSEEN_ROW = (
     "Write null in place of [x, y, z] in the frames in which a point is not seen",
     "Fill these frames from those before and after, or say in `holds` that nothing is held there",
@@ -153,7 +164,9 @@ def read_hands(path: Path, frames: int | None = None) -> Hands:
     if is_c3d(path):
         arrays = {"points": Markers.read(path).whole(path)}
     else:
-        arrays = _rows(path) if path.suffix == ".csv" else _arrays(path, ("points", "holds", "hand"))
+        arrays = _rows(path) if path.suffix == ".csv" else _arrays(path, ("points", "holds", "hand"), ("poses", "jaws", "holds"))
+        if "poses" in arrays:
+            arrays = _of_poses(path, arrays)
     points = _places(path, arrays["points"], 3)
     count, number = points.shape[:2]
     if frames is not None and count != frames:
@@ -196,7 +209,39 @@ def read_nodes(path: Path) -> np.ndarray:
     return nodes
 
 
-def _arrays(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray]:
+def _of_poses(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Points, when they hold and their hands, of hands with poses [T, H, 4, 4], or [T, 4, 4] of one. Raises InputError."""
+    poses, jaws = arrays["poses"], arrays.get("jaws", JAWS)
+    poses = poses[:, None] if poses.ndim == 3 else poses
+    if poses.ndim != 4 or poses.shape[2:] != (4, 4) or poses.dtype.kind not in "fiu" or not np.isfinite(poses).all():
+        rule = "poses: finite numbers [T, 4, 4], or [T, H, 4, 4] of H hands, are required"
+        raise InputError(
+            path, rule, f"{list(arrays['poses'].shape)} {poses.dtype}", "Fill frames without a pose from their neighbors."
+        )
+    hands, turns = poses.shape[1], poses[..., :3, :3]
+    off = np.abs(np.swapaxes(turns, -1, -2) @ turns - np.eye(3)).max(axis=(-1, -2)) + (np.linalg.det(turns) < 0)
+    off = np.maximum(off, np.abs(poses[..., 3, :] - [0, 0, 0, 1]).max(axis=-1))
+    if len(bad := np.argwhere(off > RIGID)):
+        rule = f"poses: the upper left 3 x 3 block must be a rotation within {RIGID:g}, the last row 0, 0, 0, 1"
+        remedy = "Write hand to world, columns the hand's axes, right-handed; of quaternions normalize them first."
+        raise InputError(path, rule, f"a deviation of {off[tuple(bad[0])]:.3g} in frame {bad[0][0]}, hand {bad[0][1]}", remedy)
+    jaws = np.broadcast_to(jaws, (hands, *jaws.shape)) if jaws.ndim == 2 else jaws
+    if jaws.shape[::2] != (hands, 3) or jaws.dtype.kind not in "fiu" or not np.isfinite(jaws).all():
+        rule = f"jaws: finite numbers [C, 3], or [{hands}, C, 3], are required"
+        raise InputError(path, rule, f"{list(arrays['jaws'].shape)} {jaws.dtype}", "Give points of a jaw in the hand's frame, m.")
+    found = {"points": carried(poses, jaws), "hand": np.repeat(np.arange(hands), jaws.shape[1])}
+    if "holds" in arrays:
+        found["holds"] = np.repeat(arrays["holds"].reshape(len(poses), -1), jaws.shape[1], axis=1)
+    return found
+
+
+def carried(poses: np.ndarray, jaws: np.ndarray) -> np.ndarray:
+    """Points [T, H * C, 3], m, that hands with poses [T, H, 4, 4], to the world, carry at jaws [H, C, 3], m in their frames."""
+    points = np.einsum("thij,hcj->thci", poses[..., :3, :3], jaws) + poses[:, :, None, :3, 3]
+    return np.asarray(points.reshape(len(poses), -1, 3))
+
+
+def _arrays(path: Path, keys: tuple[str, ...], other: tuple[str, ...] = ("points",)) -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
@@ -204,9 +249,10 @@ def _arrays(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray]:
         name, remedy = foreign(path)
         received = name or f"{type(error).__name__}: {error}"
         raise InputError(path, "an .npz file without pickle is required", received, remedy) from error
-    if "points" not in arrays or not arrays.keys() <= set(keys):
-        optional = f", optional {' and '.join(keys[1:])}" if keys[1:] else ""
-        raise InputError(path, f"the array points is required{optional}", ", ".join(arrays) or "none")
+    if not any(names[0] in arrays and arrays.keys() <= set(names) for names in (keys, other)):
+        optional = [f"the array {names[0]}" + f", optional {' and '.join(names[1:])}" * (len(names) > 1) for names in (keys, other)]
+        rule = f"{'; or '.join(dict.fromkeys(optional))}: is required"
+        raise InputError(path, rule, ", ".join(arrays) or "none")
     return arrays
 
 
@@ -217,8 +263,9 @@ def _rows(path: Path) -> dict[str, np.ndarray]:
         table = pd.read_csv(path)
     except (OSError, ValueError) as error:
         raise InputError(path, "rows of numbers with one header line are required", str(error)) from error
-    if not set(CSV_COLUMNS[:5]) <= set(table) <= set(CSV_COLUMNS):
-        rule = f"the header must be {','.join(CSV_COLUMNS[:5])}, and may have holds and hand"
+    turned = set(QUATERNION) <= set(table)
+    if not set(CSV_COLUMNS[:5]) <= set(table) <= {*CSV_COLUMNS, *(QUATERNION if turned else ())}:
+        rule = f"the header must be {','.join(CSV_COLUMNS[:5])}, may have holds and hand, and {','.join(QUATERNION)} for poses"
         raise InputError(path, rule, ",".join(map(str, table)))
     for name, column in (table := table.apply(pd.to_numeric, errors="coerce")).items():
         if len(bad := np.flatnonzero(~np.isfinite(column))):
@@ -237,6 +284,17 @@ def _rows(path: Path) -> dict[str, np.ndarray]:
         if (grid["hand"] != grid["hand"][0]).any() or (grid["hand"] % 1).any():
             raise InputError(path, "hand: must be one whole number for each point", "numbers that change")
         arrays["hand"] = grid["hand"][0].astype(int)
+    if turned:
+        quaternions = np.stack([grid[name] for name in QUATERNION], axis=-1)
+        if np.abs(np.linalg.norm(quaternions, axis=-1) - 1).max() > FAR_FROM_UNIT:
+            rule = f"{','.join(QUATERNION)}: quaternions of length 1 within {FAR_FROM_UNIT:g} are required"
+            raise InputError(
+                path, rule, f"{np.linalg.norm(quaternions, axis=-1).min():.3g} to {np.linalg.norm(quaternions, axis=-1).max():.3g}"
+            )
+        poses = np.tile(np.eye(4), (*sizes, 1, 1))
+        poses[..., :3, :3] = Rotation.from_quat(quaternions.reshape(-1, 4)).as_matrix().reshape(*sizes, 3, 3)
+        poses[..., :3, 3] = arrays.pop("points")
+        arrays = {"poses": poses} | {name: value for name, value in arrays.items() if name == "holds"}
     return arrays
 
 

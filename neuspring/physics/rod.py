@@ -13,8 +13,8 @@ and x1 = p + d around the extrapolated p = 2 x0 - x_, where forces are evaluated
 c is the drag. Twist is quasi-static: the angles theta have no mass, and moments about the tangents are in balance, those of inner
 damping among them. So d goes on with changes of the angles, extrapolated as p is, and K is the Gauss-Newton matrix of bending,
 damping, twist and stretching by both; the tension of the substep before turns edges. K couples three neighbors, so the system is
-banded and solved by Cholesky. Held vertices follow their paths linearly within a frame, and the directors of clamps are the axis
-projected.
+banded and solved by Cholesky. Held vertices and the axes of clamps follow their paths linearly within a frame, and the directors of
+clamps are the axes projected.
 """
 # No postponed annotations here: Warp reads the evaluated types of the kernels below.
 
@@ -51,6 +51,7 @@ Row: Any = wp.types.vector(length=11, dtype=wp.float64)
 Scalars: Any = wp.array2d(dtype=real)
 Vectors: Any = wp.array2d(dtype=vec3)
 Pairs: Any = wp.array2d(dtype=vec2)
+Paths: Any = wp.array3d(dtype=vec3)
 Numbers: Any = wp.array(dtype=real)
 Indices: Any = wp.array2d(dtype=wp.int32)
 
@@ -64,12 +65,17 @@ class RodState:
     bending: Scalars
     twisting: Scalars
     curvature: Pairs
+    slip: Pairs
+    """Branches that slip [B, branches], see `Rod.slip`."""
+    slip_twist: Numbers
+    by_angle: Numbers
     stretching: Numbers
     damping: Numbers
     drag: Numbers
     drag_quadratic: Numbers
     roll: Numbers
-    axis: wp.array(dtype=vec3)
+    axis: Vectors
+    """Direction whose projection gives the roll of either end [B, 2], now."""
     held: Indices
     x: Vectors
     v: Vectors
@@ -83,6 +89,7 @@ class RodState:
     m1: Vectors
     m2: Vectors
     kb: Vectors
+    """Curvature binormals, see `Rod.by_angle`."""
     theta: Scalars
     theta_before: Scalars
     w: wp.array3d(dtype=real)
@@ -92,6 +99,8 @@ class RodState:
     tension: Scalars
     k: Pairs
     k_before: Pairs
+    z: wp.array3d(dtype=vec3)
+    """k1, k2 and the twist of each joint at which a branch has no moment [B, V, branches]."""
     history: wp.array(dtype=wp.int32)
     """Substeps since the last start or contact."""
     a: wp.array3d(dtype=real)
@@ -171,6 +180,41 @@ def joint_length(s: RodState, lane: int, i: int):
 
 
 @wp.func
+def twist(s: RodState, lane: int, i: int):
+    """Twist of joint i, rad."""
+    return s.theta[lane, i] - s.theta[lane, i - 1] + s.reference[lane, i]
+
+
+@wp.func
+def kept(s: RodState, lane: int, i: int, branch: int, away: vec3):
+    """The parts of a branch's curvature and of its twist, as they would be if it stuck, that are left where it slips."""
+    most = s.slip[lane, branch][1] * joint_length(s, lane, i)
+    bent = most / wp.max(wp.max(wp.length(vec2(away[0], away[1])), most), TINY)
+    most = s.slip_twist[lane] * most
+    return vec2(bent, most / wp.max(wp.max(wp.abs(away[2]), most), TINY))
+
+
+@wp.func
+def slid(e: vec2, move: vec2, most: real):
+    """e = k - z, not longer than `most`, after k has gone straight by `move`: de = dk, where |e| = most less its part along e.
+
+    As it slides, half its angle to the way has a tangent that falls by exp(-way / most).
+    """
+    after = e + move
+    if wp.length(after) <= most:
+        return after
+    way = wp.max(wp.length(move), TINY)
+    u = move / way
+    along = wp.dot(e, u)
+    across = e - along * u
+    begin = wp.sqrt(wp.max(most * most - wp.dot(across, across), real(0.0)))
+    t = wp.tanh((way - begin + along) / wp.max(most, TINY))
+    c = begin / wp.max(most, TINY)
+    after = (most * (c + t) / (real(1.0) + c * t)) * u + (wp.sqrt(real(1.0) - t * t) / (real(1.0) + c * t)) * across
+    return after
+
+
+@wp.func
 def solve_twist(s: RodState, lane: int, edges: int, first_held: bool, last_held: bool):
     """Angles of edges that no clamp holds, from `theta` to a minimum of the energy, by tridiagonal Newton steps."""
     low = wp.where(first_held, 1, 0)
@@ -183,7 +227,7 @@ def solve_twist(s: RodState, lane: int, edges: int, first_held: bool, last_held:
             s.rest[lane, j] = real(0.0)
         for i in range(1, edges):
             joint = joint_length(s, lane, i)
-            m = s.theta[lane, i] - s.theta[lane, i - 1] + s.reference[lane, i]
+            m = twist(s, lane, i)
             y = s.twisting[lane, i] / joint
             e = s.bending[lane, i] / joint
             k = curvature(s, lane, i) - s.curvature[lane, i]
@@ -224,6 +268,22 @@ def solve_twist(s: RodState, lane: int, edges: int, first_held: bool, last_held:
 
 
 @wp.func
+def bow(s: RodState, lane: int, cosine: real):
+    """Angle over 2 tan of its half, with `Rod.by_angle`, and the derivative of its logarithm by the cosine; else 1 and 0."""
+    if s.by_angle[lane] == real(0.0):
+        return vec2(real(1.0), real(0.0))
+    # By the squared tangent of the half; near 0 by its series.
+    x = wp.max(real(1.0) - cosine, real(0.0)) / (real(1.0) + cosine + TINY)
+    factor = real(1.0) - x / real(3.0) + x * x / real(5.0)
+    slope = real(-1.0) / real(3.0) + real(0.4) * x
+    if x > real(1e-4):
+        root = wp.sqrt(x)
+        factor = wp.atan(root) / root
+        slope = (real(1.0) / (real(1.0) + x) - factor) / (real(2.0) * x)
+    return vec2(factor, real(-0.5) * slope * (real(1.0) + x) * (real(1.0) + x) / factor)
+
+
+@wp.func
 def set_geometry(s: RodState, lane: int, edges: int):
     """Tangents, reference directors, their twist, and curvature binormals at the positions p."""
     for j in range(edges):
@@ -235,7 +295,8 @@ def set_geometry(s: RodState, lane: int, edges: int):
         t = s.t[lane, i]
         w = transported(s.u[lane, i - 1], before, t)
         s.reference[lane, i] = near(turn(w, s.u[lane, i], t), s.reference[lane, i])
-        s.kb[lane, i] = (real(2.0) / (real(1.0) + wp.dot(before, t) + TINY)) * wp.cross(before, t)
+        cosine = wp.dot(before, t)
+        s.kb[lane, i] = (bow(s, lane, cosine)[0] * (real(2.0) / (real(1.0) + cosine + TINY))) * wp.cross(before, t)
 
 
 @wp.kernel(enable_backward=False)
@@ -251,7 +312,7 @@ def begin(s: RodState):
     for j in range(edges):
         s.t[lane, j] = wp.normalize(s.x[lane, j + 1] - s.x[lane, j])
         if j == 0:
-            s.u[lane, j] = projected(s.axis[lane], s.t[lane, j])
+            s.u[lane, j] = projected(s.axis[lane, 0], s.t[lane, j])
         else:
             s.u[lane, j] = transported(s.u[lane, j - 1], s.t[lane, j - 1], s.t[lane, j])
         s.reference[lane, j] = real(0.0)
@@ -259,7 +320,7 @@ def begin(s: RodState):
     end = real(0.0)
     if last_held:
         last = edges - 1
-        end = s.roll[lane] + turn(s.u[lane, last], projected(s.axis[lane], s.t[lane, last]), s.t[lane, last])
+        end = s.roll[lane] + turn(s.u[lane, last], projected(s.axis[lane, 1], s.t[lane, last]), s.t[lane, last])
     along = real(0.0)
     for j in range(edges):
         s.theta[lane, j] = end * along / (total - s.lengths[lane, edges - 1])
@@ -269,6 +330,8 @@ def begin(s: RodState):
     for i in range(1, edges):
         s.k[lane, i] = curvature(s, lane, i)
         s.k_before[lane, i] = s.k[lane, i]
+        for branch in range(s.slip.shape[1]):
+            s.z[lane, i, branch] = vec3(s.k[lane, i][0], s.k[lane, i][1], twist(s, lane, i))
     for j in range(edges):
         s.tension[lane, j] = real(0.0)
     s.history[lane] = 0
@@ -311,13 +374,24 @@ def slopes(s: RodState, lane: int, i: int, k: vec2):
     r1 = real(1.0) / wp.length(s.p[lane, i + 1] - s.p[lane, i])
     kb = s.kb[lane, i]
     half = real(0.5)
+    bowed = bow(s, lane, wp.dot(before, after))
+    n1 = bowed[0] * n1
+    n2 = bowed[0] * n2
     # By the two edges.
     a1 = r0 * (wp.cross(after, n2) - k[0] * middle)
     b1 = r1 * (-k[0] * middle - wp.cross(before, n2))
     a2 = r0 * (-k[1] * middle - wp.cross(after, n1))
     b2 = r1 * (wp.cross(before, n1) - k[1] * middle)
-    a3 = half * r0 * kb
-    b3 = half * r1 * kb
+    if s.by_angle[lane] > real(0.0):
+        cosine = wp.dot(before, after)
+        by_before = (bowed[1] * r0) * (after - cosine * before)
+        by_after = (bowed[1] * r1) * (before - cosine * after)
+        a1 = a1 + k[0] * by_before
+        b1 = b1 + k[0] * by_after
+        a2 = a2 + k[1] * by_before
+        b2 = b2 + k[1] * by_after
+    a3 = (half * r0 / bowed[0]) * kb
+    b3 = (half * r1 / bowed[0]) * kb
     put(s, lane, 0, 0, -a1)
     put(s, lane, 0, 4, a1 - b1)
     put(s, lane, 0, 8, b1)
@@ -337,7 +411,11 @@ def slopes(s: RodState, lane: int, i: int, k: vec2):
 
 @wp.func
 def assemble_bending(s: RodState, lane: int, edges: int, rate: real, older: real, oldest: real):
-    """Forces and moments of bending and twist, and their Gauss-Newton matrix. dk/dt = rate k - older k_ + oldest k__."""
+    """Forces and moments of bending and twist, and their Gauss-Newton matrix. dk/dt = rate k - older k_ + oldest k__.
+
+    The matrix of a branch that slips is its secant from z: a parabola that is nowhere below the branch's potential, so that a
+    step never overshoots. Its tangent, 0 along the slip, chatters where modes are fast for a substep.
+    """
     for i in range(1, edges):
         joint = joint_length(s, lane, i)
         e = s.bending[lane, i] / joint
@@ -346,16 +424,25 @@ def assemble_bending(s: RodState, lane: int, edges: int, rate: real, older: real
         k = curvature(s, lane, i)
         change = rate * k - older * s.k[lane, i] + oldest * s.k_before[lane, i]
         moment = e * (k - s.curvature[lane, i] + s.damping[lane] * change)
-        twist = z * (s.theta[lane, i] - s.theta[lane, i - 1] + s.reference[lane, i])
+        m = twist(s, lane, i)
+        torque = z * m
+        stiff = z
+        for branch in range(s.slip.shape[1]):
+            away = vec3(k[0], k[1], m) - s.z[lane, i, branch]
+            part = s.slip[lane, branch][0] * kept(s, lane, i, branch, away)
+            moment = moment + (e * part[0]) * vec2(away[0], away[1])
+            y = y + e * part[0]
+            torque = torque + z * part[1] * away[2]
+            stiff = stiff + z * part[1]
         slopes(s, lane, i, k)
         first = 4 * (i - 1)
         for r in range(JOINT):
             w1 = s.w[lane, 0, r]
             w2 = s.w[lane, 1, r]
             w3 = s.w[lane, 2, r]
-            s.b[lane, first + r] = s.b[lane, first + r] - moment[0] * w1 - moment[1] * w2 - twist * w3
+            s.b[lane, first + r] = s.b[lane, first + r] - moment[0] * w1 - moment[1] * w2 - torque * w3
             for c in range(r + 1):
-                value = y * (w1 * s.w[lane, 0, c] + w2 * s.w[lane, 1, c]) + z * w3 * s.w[lane, 2, c]
+                value = y * (w1 * s.w[lane, 0, c] + w2 * s.w[lane, 1, c]) + stiff * w3 * s.w[lane, 2, c]
                 s.a[lane, first + r, r - c] = s.a[lane, first + r, r - c] + value
         for side in range(2):
             c = 3 + 4 * side
@@ -495,120 +582,162 @@ def solve(s: RodState, lane: int, rows: int):
 @wp.kernel(enable_backward=False)
 def advance(
     s: RodState,
-    held_from: Vectors,
-    held_to: Vectors,
-    hands_from: Vectors,
-    hands_to: Vectors,
+    held: Paths,
+    axes: Paths,
+    hands: Paths,
     ground: bool,
+    still: bool,
     substeps: int,
     h: real,
     gravity: real,
     up: real,
+    found: Paths,
+    turned: Paths,
 ):
-    """One frame of each lane."""
+    """Frames of each lane; positions and directors at the end of each are `found` and `turned`. `still`: each begins at rest.
+
+    All is one kernel: with a frame as a function of its own, substeps take a fifth longer on a CPU.
+    """
     lane = wp.tid()
     vertices = s.x.shape[1]
     edges = vertices - 1
     first_held = s.held[lane, 0] >= 0 and s.held[lane, 1] >= 0
     last_held = s.held[lane, edges] >= 0 and s.held[lane, edges - 1] >= 0
-    for step in range(substeps):
-        part = real(step + 1) / real(substeps)
-        # BDF2, or backward Euler where there is no substep before.
-        g = h
-        more = real(0.0)
-        if s.history[lane] > 0:
-            g = real(2.0) * h / real(3.0)
-            more = real(1.0) / real(3.0)
-        rate = real(1.0) / g
-        older = (real(1.0) + more) * rate
-        oldest = more * rate
-        for i in range(vertices):
-            if s.held[lane, i] >= 0:
-                s.p[lane, i] = (real(1.0) - part) * held_from[lane, i] + part * held_to[lane, i]
-            elif s.history[lane] > 0:
-                s.p[lane, i] = real(2.0) * s.x[lane, i] - s.x_before[lane, i]
-            else:
-                s.p[lane, i] = s.x[lane, i] + h * s.v[lane, i]
-        set_geometry(s, lane, edges)
-        # Angles go on as they went.
-        for j in range(edges):
-            before = s.theta_before[lane, j]
-            s.theta_before[lane, j] = s.theta[lane, j]
-            if s.history[lane] > 0:
-                s.theta[lane, j] = real(2.0) * s.theta[lane, j] - before
-        # The directors of clamps keep to the axis, whatever way the tangents took.
-        if first_held:
-            s.theta[lane, 0] = near(turn(s.u[lane, 0], projected(s.axis[lane], s.t[lane, 0]), s.t[lane, 0]), s.theta[lane, 0])
-        if last_held:
-            last = edges - 1
-            angle = s.roll[lane] + turn(s.u[lane, last], projected(s.axis[lane], s.t[lane, last]), s.t[lane, last])
-            s.theta[lane, last] = near(angle, s.theta[lane, last])
-        set_directors(s, lane, edges)
-        for i in range(4 * vertices):
-            s.b[lane, i] = real(0.0)
-            for q in range(BAND_WIDTH):
-                s.a[lane, i, q] = real(0.0)
-        assemble_bending(s, lane, edges, rate, older, oldest)
-        assemble_stretching(s, lane, edges)
-        for hand in range(s.hands.shape[1]):
-            s.hands[lane, hand] = (real(1.0) - part) * hands_from[lane, hand] + part * hands_to[lane, hand]
-        assemble_hands(s, lane, rate, more)
-        for i in range(vertices):
-            if s.held[lane, i] >= 0:
-                for r in range(3):
-                    set_known(s, lane, 4 * i + r, 4 * vertices)
-            else:
-                m = s.mass[lane, i]
-                c = real(1.0) + g * (s.drag[lane] + s.drag_quadratic[lane] * wp.length(s.v[lane, i]))
-                x = (real(1.0) + more) * s.x[lane, i] - more * s.x_before[lane, i]
-                v = (real(1.0) + more) * s.v[lane, i] - more * s.v_before[lane, i]
-                force = m * (rate * v - (c * rate * rate) * (s.p[lane, i] - x))
-                add_force(s, lane, i, force + vec3(real(0.0), real(0.0), m * gravity))
-                for r in range(3):
-                    s.a[lane, 4 * i + r, 0] = s.a[lane, 4 * i + r, 0] + m * c * rate * rate
-        for j in range(vertices):
-            if j == edges or (j == 0 and first_held) or (j == edges - 1 and last_held):
-                set_known(s, lane, 4 * j + 3, 4 * vertices)
-        solve(s, lane, 4 * vertices)
-        for i in range(vertices):
-            d = vec3(s.b[lane, 4 * i], s.b[lane, 4 * i + 1], s.b[lane, 4 * i + 2])
-            after = s.p[lane, i] + d
-            x = (real(1.0) + more) * s.x[lane, i] - more * s.x_before[lane, i]
-            v = rate * (after - x)
-            if s.held[lane, i] >= 0:
-                v = (held_to[lane, i] - held_from[lane, i]) / (h * real(substeps))
-            s.x_before[lane, i] = s.x[lane, i]
-            s.v_before[lane, i] = s.v[lane, i]
-            s.x[lane, i] = after
-            s.v[lane, i] = v
-        for j in range(edges):
-            d = s.x[lane, j + 1] - s.p[lane, j + 1] - s.x[lane, j] + s.p[lane, j]
-            length = wp.length(s.p[lane, j + 1] - s.p[lane, j]) + wp.dot(s.t[lane, j], d)
-            s.tension[lane, j] = s.stretching[lane] * (length / s.lengths[lane, j] - real(1.0))
-        for i in range(1, edges):
-            s.k_before[lane, i] = s.k[lane, i]
-            k = curvature(s, lane, i)
-            slopes(s, lane, i, k)
-            for r in range(JOINT):
-                moved = s.b[lane, 4 * (i - 1) + r]
-                k = k + vec2(s.w[lane, 0, r] * moved, s.w[lane, 1, r] * moved)
-            s.k[lane, i] = k
-        for j in range(edges):
-            s.theta[lane, j] = s.theta[lane, j] + wp.clamp(s.b[lane, 4 * j + 3], -MAX_TURN, MAX_TURN)
-        s.history[lane] = s.history[lane] + 1
-        if ground:
+    for frame in range(found.shape[0]):
+        if still:
+            s.history[lane] = 0
             for i in range(vertices):
-                if s.held[lane, i] < 0:
-                    touch_ground(s, lane, i, up)
+                s.v[lane, i] = vec3()
+        for step in range(substeps):
+            part = real(step + 1) / real(substeps)
+            # BDF2, or backward Euler where there is no substep before.
+            g = h
+            more = real(0.0)
+            if s.history[lane] > 0:
+                g = real(2.0) * h / real(3.0)
+                more = real(1.0) / real(3.0)
+            rate = real(1.0) / g
+            older = (real(1.0) + more) * rate
+            oldest = more * rate
+            for i in range(vertices):
+                if s.held[lane, i] >= 0:
+                    s.p[lane, i] = (real(1.0) - part) * held[frame, lane, i] + part * held[frame + 1, lane, i]
+                elif s.history[lane] > 0:
+                    s.p[lane, i] = real(2.0) * s.x[lane, i] - s.x_before[lane, i]
+                else:
+                    s.p[lane, i] = s.x[lane, i] + h * s.v[lane, i]
+            set_geometry(s, lane, edges)
+            # Angles go on as they went.
+            for j in range(edges):
+                before = s.theta_before[lane, j]
+                s.theta_before[lane, j] = s.theta[lane, j]
+                if s.history[lane] > 0:
+                    s.theta[lane, j] = real(2.0) * s.theta[lane, j] - before
+            for end in range(2):
+                s.axis[lane, end] = axes[frame, lane, end] + part * (axes[frame + 1, lane, end] - axes[frame, lane, end])
+            # The directors of clamps keep to the axis, whatever way the tangents took.
+            if first_held:
+                s.theta[lane, 0] = near(
+                    turn(s.u[lane, 0], projected(s.axis[lane, 0], s.t[lane, 0]), s.t[lane, 0]), s.theta[lane, 0]
+                )
+            if last_held:
+                last = edges - 1
+                angle = s.roll[lane] + turn(s.u[lane, last], projected(s.axis[lane, 1], s.t[lane, last]), s.t[lane, last])
+                s.theta[lane, last] = near(angle, s.theta[lane, last])
+            set_directors(s, lane, edges)
+            for i in range(4 * vertices):
+                s.b[lane, i] = real(0.0)
+                for q in range(BAND_WIDTH):
+                    s.a[lane, i, q] = real(0.0)
+            assemble_bending(s, lane, edges, rate, older, oldest)
+            assemble_stretching(s, lane, edges)
+            for hand in range(s.hands.shape[1]):
+                s.hands[lane, hand] = (real(1.0) - part) * hands[frame, lane, hand] + part * hands[frame + 1, lane, hand]
+            assemble_hands(s, lane, rate, more)
+            for i in range(vertices):
+                if s.held[lane, i] >= 0:
+                    for r in range(3):
+                        set_known(s, lane, 4 * i + r, 4 * vertices)
+                else:
+                    m = s.mass[lane, i]
+                    c = real(1.0) + g * (s.drag[lane] + s.drag_quadratic[lane] * wp.length(s.v[lane, i]))
+                    x = (real(1.0) + more) * s.x[lane, i] - more * s.x_before[lane, i]
+                    v = (real(1.0) + more) * s.v[lane, i] - more * s.v_before[lane, i]
+                    force = m * (rate * v - (c * rate * rate) * (s.p[lane, i] - x))
+                    add_force(s, lane, i, force + vec3(real(0.0), real(0.0), m * gravity))
+                    for r in range(3):
+                        s.a[lane, 4 * i + r, 0] = s.a[lane, 4 * i + r, 0] + m * c * rate * rate
+            for j in range(vertices):
+                if j == edges or (j == 0 and first_held) or (j == edges - 1 and last_held):
+                    set_known(s, lane, 4 * j + 3, 4 * vertices)
+            solve(s, lane, 4 * vertices)
+            for i in range(vertices):
+                d = vec3(s.b[lane, 4 * i], s.b[lane, 4 * i + 1], s.b[lane, 4 * i + 2])
+                after = s.p[lane, i] + d
+                x = (real(1.0) + more) * s.x[lane, i] - more * s.x_before[lane, i]
+                v = rate * (after - x)
+                if s.held[lane, i] >= 0:
+                    v = (held[frame + 1, lane, i] - held[frame, lane, i]) / (h * real(substeps))
+                s.x_before[lane, i] = s.x[lane, i]
+                s.v_before[lane, i] = s.v[lane, i]
+                s.x[lane, i] = after
+                s.v[lane, i] = v
+            for j in range(edges):
+                d = s.x[lane, j + 1] - s.p[lane, j + 1] - s.x[lane, j] + s.p[lane, j]
+                length = wp.length(s.p[lane, j + 1] - s.p[lane, j]) + wp.dot(s.t[lane, j], d)
+                s.tension[lane, j] = s.stretching[lane] * (length / s.lengths[lane, j] - real(1.0))
+            for i in range(1, edges):
+                s.k_before[lane, i] = s.k[lane, i]
+                k = curvature(s, lane, i)
+                m = twist(s, lane, i)
+                slopes(s, lane, i, k)
+                for r in range(JOINT):
+                    moved = s.b[lane, 4 * (i - 1) + r]
+                    k = k + vec2(s.w[lane, 0, r] * moved, s.w[lane, 1, r] * moved)
+                    m = m + s.w[lane, 2, r] * moved
+                s.k[lane, i] = k
+                for branch in range(s.slip.shape[1]):
+                    away = vec3(k[0], k[1], m) - s.z[lane, i, branch]
+                    left = kept(s, lane, i, branch, away)[1] * away[2]
+                    move = k - s.k_before[lane, i]
+                    bent = slid(vec2(away[0], away[1]) - move, move, s.slip[lane, branch][1] * joint_length(s, lane, i))
+                    s.z[lane, i, branch] = vec3(k[0] - bent[0], k[1] - bent[1], m - left)
+            for j in range(edges):
+                s.theta[lane, j] = s.theta[lane, j] + wp.clamp(s.b[lane, 4 * j + 3], -MAX_TURN, MAX_TURN)
+            s.history[lane] = s.history[lane] + 1
+            if ground:
+                for i in range(vertices):
+                    if s.held[lane, i] < 0:
+                        touch_ground(s, lane, i, up)
+        for i in range(vertices):
+            found[frame, lane, i] = s.x[lane, i]
+            turned[frame, lane, i] = s.m1[lane, i]
 
 
-ROD_LANE_FIELDS = ("lengths", "mass", "bending", "twisting", "curvature", "axis", "stretching", "damping", "drag_quadratic", "roll")
+ROD_LANE_FIELDS = (
+    "lengths",
+    "mass",
+    "bending",
+    "twisting",
+    "curvature",
+    "axis",
+    "stretching",
+    "damping",
+    "drag_quadratic",
+    "roll",
+    "slip",
+    "slip_twist",
+    "by_angle",
+)
 """Fields of a `Rod` that lanes have one value of each."""
 
 
 @dataclass(frozen=True)
 class RodLanes:
-    """Parameters of B rods with as many vertices, float64 on the CPU: those of `Rod` with a leading axis [B]."""
+    """Parameters of B rods with as many vertices, float64 on the CPU: those of `Rod` with a leading axis [B].
+
+    `axis` [B, 2, 3] is that of either end.
+    """
 
     lengths: np.ndarray
     mass: np.ndarray
@@ -620,6 +749,9 @@ class RodLanes:
     damping: np.ndarray
     drag_quadratic: np.ndarray
     roll: np.ndarray
+    slip: np.ndarray
+    slip_twist: np.ndarray
+    by_angle: np.ndarray
     drag: np.ndarray
     """Linear drag, 1/s."""
     held: np.ndarray
@@ -628,6 +760,7 @@ class RodLanes:
     def of(cls, rods: Sequence[Rod], drags: Sequence[float]) -> "RodLanes":
         """Lanes of rods and their linear drags, 1/s."""
         values = {name: np.array([getattr(rod, name) for rod in rods], dtype=np.float64) for name in ROD_LANE_FIELDS}
+        values["axis"] = np.repeat(values["axis"][:, None], 2, axis=1)
         return cls(**values, drag=np.array(drags, dtype=np.float64), held=np.array([rod.held for rod in rods], dtype=np.int32))
 
 
@@ -659,6 +792,7 @@ STATE = (
     "tension",
     "k",
     "k_before",
+    "z",
     "history",
 )
 """State that `RodSolver.follow` takes over."""
@@ -687,11 +821,12 @@ class RodSolver:
         self._state = RodState()
         for name, dtype in kinds.items():
             setattr(self._state, name, wp.zeros((count, vertices), dtype=dtype, device=device))
+        self._state.z = wp.zeros((count, vertices, lanes.slip.shape[1]), dtype=vec3, device=device)
         self._state.history = wp.zeros(count, dtype=wp.int32, device=device)
         self._state.a = wp.zeros((count, 4 * vertices, 11), dtype=real, device=device)
         self._state.w = wp.zeros((count, 3, 11), dtype=real, device=device)
         self._state.b = wp.zeros((count, 4 * vertices), dtype=real, device=device)
-        vectors: dict[str, Any] = {"curvature": vec2, "axis": vec3}
+        vectors: dict[str, Any] = {"curvature": vec2, "axis": vec3, "slip": vec2}
         for each in fields(RodLanes):
             kind: Any = wp.int32 if each.name == "held" else vectors.get(each.name, real)
             values = np.ascontiguousarray(getattr(lanes, each.name))
@@ -710,39 +845,55 @@ class RodSolver:
             for name, dtype in kinds.items():
                 values = np.ascontiguousarray(getattr(hands, name))
                 setattr(self._state, name, wp.array(values, dtype=dtype, device=self.device))
-        self._ends: Any = (self._state.hands, self._state.hands)
+        self._ends = wp.to_torch(self._state.hands)[None]
 
     def bind(self, edge: torch.Tensor, place: torch.Tensor) -> None:
         """Set where the springs of hands act: on edges [B, S], at places [B, S, 3] as in `Rod.place`."""
         self._put(self._state.spring_edge, edge)
         self._put(self._state.spring_place, place)
 
-    def pull(self, law: torch.Tensor, begin: torch.Tensor, end: torch.Tensor) -> None:
-        """Set how they act in the next frame: stiffness, N/m, rest length, m, and dashpot, N s/m [B, S, 3]; none where both are 0.
+    def pull(self, law: torch.Tensor, hands: torch.Tensor) -> None:
+        """Set how they act in the next frames: stiffness, N/m, rest length, m, and dashpot, N s/m [B, S, 3]; none where both are 0.
 
-        Controllers move linearly from begin to end [B, C, 3], m.
+        Controllers move linearly between rows of hands [F + 1, B, C, 3], m.
         """
         self._put(self._state.law, law)
-        self._ends = self._vectors(begin), self._vectors(end)
+        self._ends = hands
 
     def follow(self, other: "RodSolver") -> None:
         """Take the state of another solver of the same rods."""
         for name in STATE:
             wp.copy(getattr(self._state, name), getattr(other._state, name))
 
-    def start(self, x: torch.Tensor, v: torch.Tensor) -> None:
-        """State of frame 0: positions [B, V, 3], m, and velocities [B, V, 3], m/s."""
-        for name, values in (("x", x), ("v", v)):
-            self._put(getattr(self._state, name), values)
+    def start(self, x: torch.Tensor, v: torch.Tensor, axis: torch.Tensor | None = None) -> None:
+        """State of frame 0: positions [B, V, 3], m, velocities [B, V, 3], m/s; axes of clamps [B, 2, 3], if not the rods'."""
+        for name, values in (("x", x), ("v", v), ("axis", axis)):
+            if values is not None:
+                self._put(getattr(self._state, name), values)
         wp.launch(load(begin, self.device), dim=self.count, inputs=[self._state], device=self.device)
 
-    def frame(self, held_from: torch.Tensor, held_to: torch.Tensor) -> None:
-        """One frame. Held vertices move linearly between rows of [B, V, 3]."""
-        simulation, ends = self.simulation, (self._vectors(held_from), self._vectors(held_to))
+    def frames(
+        self, held: torch.Tensor, axis: torch.Tensor | None = None, *, still: bool = False
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """F frames: positions [F, B, V, 3], m, and m1 of edges [F, B, E, 3] at the end of each.
+
+        Held vertices move linearly between rows of held [F + 1, B, V, 3], and so do the axes of clamps [F + 1, B, 2, 3]; without
+        any they stay. `still`: all velocities are 0 at the begin of each frame, which so is a step down towards equilibrium.
+        """
+        simulation, count = self.simulation, len(held) - 1
+        axes = wp.to_torch(self._state.axis).clone().expand(count + 1, -1, -1, -1) if axis is None else axis
+        paths = [self._vectors(values) for values in (held, axes, self._ends.expand(count + 1, -1, -1, -1))]
+        found = [wp.empty((count, self.count, self.vertices), dtype=vec3, device=self.device) for _ in range(2)]
         gravity = -simulation.up_sign * simulation.gravity
         ground, up = simulation.ground and self.hands is not None, simulation.up_sign
-        inputs = [self._state, *ends, *self._ends, ground, simulation.substeps, simulation.substep, gravity, up]
+        inputs = [self._state, *paths, ground, still, simulation.substeps, simulation.substep, gravity, up, *found]
         wp.launch(load(advance, self.device), dim=self.count, inputs=inputs, device=self.device)
+        x, m1 = (wp.to_torch(values) for values in found)
+        return x, m1[:, :, :-1]
+
+    def frame(self, held_from: torch.Tensor, held_to: torch.Tensor) -> None:
+        """One frame, as `frames`."""
+        self.frames(torch.stack([held_from, held_to]))
 
     def _vectors(self, values: torch.Tensor) -> Any:
         return wp.from_torch(values.to(device=self.device, dtype=torch.float64).contiguous(), dtype=vec3)

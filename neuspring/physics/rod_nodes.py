@@ -1,4 +1,4 @@
-"""Nodes that follow the center line of a rod, and a rod with the calls of a `FrameSolver`: nodes in, nodes out.
+"""Nodes that follow the center line of a rod, clamps that move and turn, and a rod with the calls of a `FrameSolver`.
 
 A node on edge j between vertices x_j and x_(j+1) is at
 
@@ -11,14 +11,14 @@ node acts on the two vertices by 1 - f and f.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 import torch
 
 from neuspring.core.artifacts import Rod, Simulation, Twin
-from neuspring.core.errors import InputError
+from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.geometry import PARALLEL
 from neuspring.physics.controllers import ControllerSprings, begins
 from neuspring.physics.parameters import CONTACT_LIMITS
@@ -28,6 +28,12 @@ SMOOTHING_WEIGHT = 1e-6
 """Weight of second differences along the vertices against nodes: decides where no node is."""
 SETTLING = 4
 """Rounds in which vertices and directors of frame 0 are made to agree."""
+STEPS_TO_REST = 150
+"""Steps towards the equilibrium under gravity."""
+AT_REST = 1e-6
+"""Largest last step of them, of the rod's length."""
+TINY_GRAVITY = 1e-3
+"""m/s^2: without gravity steps are as long as with this."""
 GROUND_FIELDS = ("ground_elasticity", "ground_friction")
 
 
@@ -56,24 +62,101 @@ def frame_zero(rod: Rod) -> tuple[np.ndarray, np.ndarray]:
     return solver.directors()[0].numpy().copy(), solver.curvatures[0].numpy().copy()
 
 
-def clamped(points: torch.Tensor, clamps: torch.Tensor, axis: torch.Tensor, ends: Sequence[bool]) -> torch.Tensor:
-    """Held vertices [B, V, 3], m, of clamps whose controllers are at points [B, V, 3]; other rows stay. See `Rod.clamps` [B, 2, 3].
+@dataclass(frozen=True)
+class Clamps:
+    """Ends of B rods that controllers hold, see `Rod.clamps`, `tilts` and `rolls`."""
 
-    `ends`: whether the first and the last two vertices are held. `axis` [B, 3].
+    ends: tuple[bool, bool]
+    """True for each end that is clamped."""
+    held: torch.Tensor
+    """The controller that sets each vertex [B, V]; 0 where none does."""
+    axes: torch.Tensor
+    """`Rod.axis`, for either end [B, 2, 3]."""
+    clamps: torch.Tensor
+    """[B, 2, 3], m."""
+    lengths: torch.Tensor
+    """Of the edges of both ends [B, 2], m."""
+    tilts: torch.Tensor | None = None
+    """[B, 2, 2]."""
+    rolls: torch.Tensor | None = None
+    """[B, 2]."""
+    beside: bool = False
+    """True where held vertices lie beside their controllers."""
+
+    @classmethod
+    def of(cls, rods: Sequence[Rod], device: str = "cpu") -> Clamps:
+        """Those of rods that are clamped alike."""
+
+        def each(values: Sequence[np.ndarray], dtype: torch.dtype = torch.float64) -> torch.Tensor:
+            return torch.tensor(np.stack(values), dtype=dtype, device=device)
+
+        first = rods[0]
+        held = first.held >= 0
+        return cls(
+            (bool(held[:2].all()), bool(held[-2:].all())),
+            each([np.maximum(rod.held, 0) for rod in rods], torch.long),
+            each([np.stack([rod.axis, rod.axis]) for rod in rods]),
+            each([rod.clamps for rod in rods]),
+            each([rod.lengths[[0, -1]] for rod in rods]),
+            each([rod.tilts for rod in rods]) if first.laid else None,
+            each([rod.rolls for rod in rods], torch.long) if (first.rolls >= 0).any() else None,
+            bool(first.offsets.size) or first.laid,
+        )
+
+    def paths(self, controllers: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Held vertices [F, B, V, 3], m, and axes of both ends [F, B, 2, 3], of controllers [F, B, C, 3], m."""
+        count = len(controllers)
+        index = self.held[None, ..., None].expand(count, -1, -1, 3)
+        points, axes = controllers.gather(2, index), self.axes.expand(count, -1, -1, -1)
+        if self.rolls is not None:
+            towards = controllers.gather(2, self.rolls.clamp(min=0)[None, ..., None].expand(count, -1, -1, 3))
+            axes = torch.where((self.rolls >= 0)[..., None], towards - points[:, :, [0, -1]], axes)
+        return (self.moved(points, axes) if self.beside else points), axes
+
+    def moved(self, points: torch.Tensor, axes: torch.Tensor) -> torch.Tensor:
+        """Held vertices [..., B, V, 3], m, whose controllers are at points [..., B, V, 3]; other rows stay."""
+        result = points.clone()
+        for end, (inner, outer) in enumerate(((1, 0), (-2, -1))):
+            if not self.ends[end]:
+                continue
+            inwards, axis = 1 - 2 * end, axes[..., end, :]
+            along = (points[..., inner, :] - points[..., outer, :]) * inwards
+            length = along.norm(dim=-1, keepdim=True)
+            t = along / length
+            m1 = axis - (axis * t).sum(dim=-1, keepdim=True) * t
+            m1 = m1 / m1.norm(dim=-1, keepdim=True)
+            local = torch.stack([t, m1, torch.linalg.cross(t, m1)], dim=-2)
+            place = points[..., inner, :] + (self.clamps[:, end, :, None] * local).sum(dim=-2)
+            if self.tilts is not None:
+                t = t + (self.tilts[:, end, :, None] * local[..., 1:, :]).sum(dim=-2)
+                along = t / t.norm(dim=-1, keepdim=True) * self.lengths[:, end, None]
+                place = place + inwards * along / 2
+            result[..., inner, :] = place
+            result[..., outer, :] = place - inwards * along
+        return result
+
+
+def hanging(rods: Sequence[Rod], controllers: np.ndarray, simulation: Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rods at rest under gravity: vertices [B, V, 3], m, directors m1 [B, E, 3], and axes of both ends [B, 2, 3].
+
+    They hang from controllers [B, C, 3], m, and are sought from their `vertices`. Each step is one of backward Euler from rest,
+    (M / h^2 + K) d = f, with h so long that what is as soft as a pendulum of the rod's length comes nearer by a fifth. Raises
+    NumericalFailure where they still move.
     """
-    result = points.clone()
-    for end, (inner, outer) in enumerate(((1, 0), (-2, -1))):
-        if not ends[end]:
-            continue
-        along = (points[:, inner] - points[:, outer]) * (1 - 2 * end)
-        length = along.norm(dim=-1, keepdim=True)
-        t = along / length
-        m1 = axis - (axis * t).sum(dim=-1, keepdim=True) * t
-        m1 = m1 / m1.norm(dim=-1, keepdim=True)
-        local = torch.stack([t, m1, torch.linalg.cross(t, m1)], dim=1)
-        result[:, inner] = points[:, inner] + (clamps[:, end, :, None] * local).sum(dim=1)
-        result[:, outer] = result[:, inner] - (1 - 2 * end) * along
-    return result
+    held, axes = Clamps.of(rods).paths(torch.tensor(np.asarray(controllers, np.float64))[None])
+    length = max(float(rod.lengths.sum()) for rod in rods)
+    step = 0.5 * (length / max(simulation.gravity, TINY_GRAVITY)) ** 0.5
+    plain = [replace(rod, damping=0.0, drag_quadratic=0.0, slip=rod.slip[:0]) for rod in rods]
+    still = replace(simulation, frame_time=step, substeps=1, ground=False)
+    solver = RodSolver(RodLanes.of(plain, [0.0] * len(rods)), still)
+    x = torch.tensor(np.stack([rod.vertices for rod in rods]))
+    solver.start(x, torch.zeros_like(x), axes[0])
+    found, _ = solver.frames(held.expand(STEPS_TO_REST + 1, -1, -1, -1), still=True)
+    moved = float((found[-1] - found[-2]).norm(dim=-1).max())
+    if not moved < AT_REST * length:
+        raise NumericalFailure(f"a rod of {length:.3g} m does not come to rest under gravity: its last step is {moved:.2g} m")
+    solver.start(found[-1], torch.zeros_like(x), axes[0])
+    return solver.x.numpy().copy(), solver.directors().numpy().copy(), axes[0].numpy().copy()
 
 
 def settled(rods: Sequence[Rod], lines: np.ndarray) -> np.ndarray:
@@ -82,10 +165,10 @@ def settled(rods: Sequence[Rod], lines: np.ndarray) -> np.ndarray:
     if not rods[0].offsets.size:
         return points.numpy()
     free = rods[0].held < 0
-    clamps, axis = (torch.tensor(np.stack([getattr(rod, name) for rod in rods])) for name in ("clamps", "axis"))
+    clamps = Clamps.of(rods)
     offsets = torch.tensor(np.stack([rod.offsets for rod in rods]))[:, free]
     solver = RodSolver(RodLanes.of(rods, [0.0] * len(rods)), Simulation(frame_time=1.0, substeps=1))
-    x = clamped(points, clamps, axis, _ends(rods[0]))
+    x = clamps.moved(points, clamps.axes)
     edges = np.minimum(np.flatnonzero(free), len(free) - 2)
     for _ in range(SETTLING):
         solver.start(x, torch.zeros_like(x))
@@ -94,12 +177,6 @@ def settled(rods: Sequence[Rod], lines: np.ndarray) -> np.ndarray:
         m2 = torch.linalg.cross(along / along.norm(dim=-1, keepdim=True), m1)
         x[:, free] = points[:, free] - offsets[..., :1] * m1 - offsets[..., 1:] * m2
     return x.numpy()
-
-
-def _ends(rod: Rod) -> tuple[bool, bool]:
-    """True for each end that is clamped."""
-    held = rod.held >= 0
-    return bool(held[:2].all()), bool(held[-2:].all())
 
 
 def turn_of(line: np.ndarray, axis: np.ndarray) -> float:
@@ -146,7 +223,7 @@ def at_vertices(rod: Rod, values: np.ndarray, held: np.ndarray | None = None) ->
     count, nodes = len(rod.vertices), np.arange(len(rod.edge))
     weights = np.zeros((len(nodes), count))
     weights[nodes, rod.edge], weights[nodes, rod.edge + 1] = 1 - rod.place[:, 0], rod.place[:, 0]
-    known = rod.held >= 0 if held is not None else np.zeros(count, bool)
+    known = rod.held >= 0 if held is not None and not rod.laid else np.zeros(count, bool)
     # Where no node is, neighbors decide: of positions, their second differences.
     rows = np.concatenate([weights, SMOOTHING_WEIGHT * np.diff(np.eye(count), n=2, axis=0)])
     given = np.asarray(values, np.float64)
@@ -183,11 +260,9 @@ class RodFrames:
         hands = self._hands(every)
         drags = [twin.material.drag for twin in every]
         self.solver = RodSolver(RodLanes.of(self.rods, drags), simulation, device, hands)
-        held, edge = (np.stack([getattr(rod, name) for rod in self.rods]) for name in ("held", "edge"))
-        self._held, self._edge = (torch.tensor(np.maximum(a, 0), dtype=torch.long, device=device) for a in (held, edge))
+        self._edge = torch.tensor(np.stack([rod.edge for rod in self.rods]), dtype=torch.long, device=device)
         self._place = self._tensor([rod.place for rod in self.rods])
-        beside = bool(self.rods[0].offsets.size)
-        self._clamps = [self._tensor([getattr(rod, name) for rod in self.rods]) for name in ("clamps", "axis")] if beside else None
+        self._clamps = Clamps.of(self.rods, device)
         self._x: torch.Tensor | None = None
         self._lengths: torch.Tensor | None = None
         """Rest lengths of grips that began since the start [B, S]."""
@@ -200,17 +275,24 @@ class RodFrames:
         It goes on from what it returned last, and begins anew where x is frame 0. Raises InputError for other states: nodes do not
         say how a rod is twisted.
         """
+        rows = torch.stack([begin, end]) if self.together else torch.stack([begin, end])[:, None]
         if x is not self._x:
-            self._start(x, v)
-        begin, end = (points if self.together else points[None] for points in (begin, end))
-        ends = [points[..., :3].to(self.device, torch.float64) for points in (begin, end)]
-        self.solver.pull(self._law(begin, end), *ends)
-        paths = [of_edges(points, self._held) for points in ends]
-        if self._clamps:
-            clamps, axis = self._clamps
-            paths = [clamped(path, clamps, axis, _ends(self.rods[0])) for path in paths]
-        self.solver.frame(*paths)
-        return self._state()
+            self.start(x, v, rows[0])
+        self.advance(rows)
+        x, v = (values.to(self.dtype) if self.together else values[0].to(self.dtype) for values in self.nodes())
+        self._x = x
+        return x, v
+
+    def advance(self, rows: torch.Tensor, every: slice = slice(None)) -> torch.Tensor:
+        """Nodes [F', B, N, 3], m, in double precision, in `every` of the next F frames, whose way points are rows [F + 1, B, C, 3].
+
+        Rows with a last column are one frame.
+        """
+        ends = rows[..., :3].to(self.device, torch.float64)
+        self.solver.pull(self._law(rows[0], rows[-1]), ends)
+        x, m1 = (values[every] for values in self.solver.frames(*self._clamps.paths(ends)))
+        edge, place = (values.repeat(len(x), 1, *[1] * (values.dim() - 2)) for values in (self._edge, self._place))
+        return placed(x.flatten(0, 1), m1.flatten(0, 1), edge, place).unflatten(0, x.shape[:2])
 
     def resume(self, rows: torch.Tensor, positions: Sequence[np.ndarray]) -> None:
         """As `FrameSolver.resume`, of one twin."""
@@ -244,29 +326,27 @@ class RodFrames:
             acts = (begin[..., 3] * end[..., 3] > 0).to(self.device, torch.float64)[:, self.grips.leaders]
         return torch.stack([y * inverse * acts, 1 / inverse, dashpot * acts], dim=-1)
 
-    def _start(self, x: torch.Tensor, v: torch.Tensor) -> None:
-        """Frame 0. Nodes are bound to the directors there, which depend on what the rod is made of."""
+    def start(self, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor) -> None:
+        """Frame 0, with the controllers at `begin` [B, C, 3]. Nodes are bound to the directors there, which depend on what the
+        rod is made of, unless they have their places. Raises InputError for another frame."""
         if not np.array_equal(x.cpu().numpy(), self._nodes if self.together else self._nodes[0]):
             raise InputError("twin.rod", "a rod begins in frame 0 of its twin", "another state", "Begin at frame 0.")
         for rod in self.rods:
             require_axis(rod)
         speeds = v.cpu().numpy() if self.together else v[None].cpu().numpy()
         at = self._tensor([at_vertices(rod, own) for rod, own in zip(self.rods, speeds, strict=True)])
-        self.solver.start(self._tensor([rod.vertices for rod in self.rods]), at)
-        turned = self.solver.directors().cpu().numpy()
-        lanes = zip(self.rods, turned, self._nodes, strict=True)
-        self._place = self._tensor([place_on(rod.vertices, m1, nodes, rod.edge) for rod, m1, nodes in lanes])
+        _, axes = self._clamps.paths(begin[None, ..., :3].to(self.device, torch.float64))
+        self.solver.start(self._tensor([rod.vertices for rod in self.rods]), at, axes[0])
+        if not self.rods[0].laid:
+            turned = self.solver.directors().cpu().numpy()
+            lanes = zip(self.rods, turned, self._nodes, strict=True)
+            self._place = self._tensor([place_on(rod.vertices, m1, nodes, rod.edge) for rod, m1, nodes in lanes])
         self._lengths = None
         self._bind()
 
     def _bind(self) -> None:
         """Tell the solver where the springs of hands act."""
         self.solver.bind(self._edge[:, self.grips.nodes], self._place[:, self.grips.nodes])
-
-    def _state(self) -> tuple[torch.Tensor, torch.Tensor]:
-        x, v = (values.to(self.dtype) if self.together else values[0].to(self.dtype) for values in self.nodes())
-        self._x = x
-        return x, v
 
     def nodes(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Nodes and their velocities [B, N, 3] in double precision; what the turn of directors adds to these is left out."""

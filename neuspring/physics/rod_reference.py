@@ -25,6 +25,8 @@ SMALLEST_TURN = 1e-12
 """They end where no angle changes more, rad, ..."""
 ROUNDING = 1e-15
 """... or where moments are this part of the largest stiffness: then they are rounding."""
+SMALLEST_SINE = 1e-7
+"""Sine of half an angle between edges below which the angle is as good as its sine."""
 NO_STIFFNESS = 1e-10
 """A turn of the directors that has less than this of the largest stiffness has none: of a straight rod that no clamp holds."""
 
@@ -47,13 +49,18 @@ class Parameters:
     """Linear drag, 1/s."""
     drag_quadratic: Tensor
     roll: Tensor
+    slip: Tensor
+    slip_twist: Tensor
+    by_angle: bool
 
     @classmethod
     def of(cls, rod: Rod, drag: float = 0.0) -> Parameters:
         """A rod's numbers; `held` says of each vertex whether a controller sets it."""
-        arrays = "vertices lengths mass bending twisting curvature axis stretching damping drag_quadratic roll"
+        arrays = "vertices lengths mass bending twisting curvature axis stretching damping drag_quadratic roll slip slip_twist"
         numbers = {name: torch.tensor(getattr(rod, name), dtype=torch.float64) for name in arrays.split()}
-        return cls(held=torch.tensor(rod.held >= 0), drag=torch.tensor(drag, dtype=torch.float64), **numbers)
+        return cls(
+            held=torch.tensor(rod.held >= 0), drag=torch.tensor(drag, dtype=torch.float64), by_angle=bool(rod.by_angle), **numbers
+        )
 
     @property
     def spans(self) -> Tensor:
@@ -76,6 +83,8 @@ class Frames(NamedTuple):
     """u [E, 3], perpendicular to them."""
     twist: Tensor
     """Reference twist of each joint [J], rad: from u of the edge before, carried over the joint, to u of the edge behind."""
+    by_angle: bool = False
+    """See `Rod.by_angle`."""
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
@@ -115,7 +124,7 @@ def carried(frames: Frames, x: Tensor) -> Frames:
     t = tangents(x)
     u = transport(frames.directors, frames.tangents, t)
     twist = angle(transport(u[:-1], t[:-1], t[1:]), u[1:], t[1:])
-    return Frames(t, u, frames.twist + torch.remainder(twist - frames.twist + pi, 2 * pi) - pi)
+    return Frames(t, u, frames.twist + torch.remainder(twist - frames.twist + pi, 2 * pi) - pi, frames.by_angle)
 
 
 def start(parameters: Parameters, x: Tensor) -> tuple[Frames, Tensor]:
@@ -124,7 +133,7 @@ def start(parameters: Parameters, x: Tensor) -> tuple[Frames, Tensor]:
     directors = [projected(parameters.axis, t[0])]
     for before, behind in pairwise(t):
         directors.append(transport(directors[-1], before, behind))
-    frames = Frames(t, torch.stack(directors), torch.zeros_like(parameters.spans))
+    frames = Frames(t, torch.stack(directors), torch.zeros_like(parameters.spans), parameters.by_angle)
     end = angle(directors[-1], projected(parameters.axis, t[-1]), t[-1]) + parameters.roll
     along = torch.cat([torch.zeros_like(parameters.spans[:1]), parameters.spans.cumsum(0)]) / parameters.spans.sum()
     return frames, relaxed(parameters, x, frames, end * along)
@@ -146,7 +155,13 @@ def curvatures(frames: Frames, theta: Tensor) -> Tensor:
     t, u = frames.tangents, frames.directors
     m1 = theta.cos()[:, None] * u + theta.sin()[:, None] * torch.linalg.cross(t, u)
     m2 = torch.linalg.cross(t, m1)
-    kb = 2 * torch.linalg.cross(t[:-1], t[1:]) / (1 + dot(t[:-1], t[1:]))[:, None]
+    cosine = dot(t[:-1], t[1:])
+    factor = 2 / (1 + cosine)
+    if frames.by_angle:
+        sine = ((1 - cosine) / 2).clamp(min=0).sqrt().clamp(min=SMALLEST_SINE)
+        # angle / sine of the angle
+        factor = torch.arcsin(sine) / sine / (1 - sine**2).sqrt()
+    kb = factor[:, None] * torch.linalg.cross(t[:-1], t[1:])
     return torch.stack([dot(kb, m2[:-1] + m2[1:]) / 2, -dot(kb, m1[:-1] + m1[1:]) / 2], dim=1)
 
 
@@ -163,21 +178,72 @@ def energy(parameters: Parameters, x: Tensor, frames: Frames, theta: Tensor) -> 
     return (p.stretching * (p.lengths * strain.square()).sum() + joints.sum()) / 2  # type: ignore[no-any-return]
 
 
+def strains(frames: Frames, theta: Tensor) -> Tensor:
+    """k1, k2 and the twist of each joint [J, 3]."""
+    return torch.cat([curvatures(frames, theta), (theta[1:] - theta[:-1] + frames.twist)[:, None]], dim=1)
+
+
+def slipping(parameters: Parameters) -> tuple[Tensor, Tensor]:
+    """Largest |k - z| of the curvatures and of the twist of each branch [J, B], 1 and rad."""
+    most = parameters.spans[:, None] * parameters.slip[:, 1]
+    return most, parameters.slip_twist * most
+
+
+def friction(parameters: Parameters, frames: Frames, theta: Tensor, z: Tensor) -> Tensor:
+    """Potential of branches at z [J, B, 3], J, from which their moments share (EI, GJ) / l (k - z) follow with the new z.
+
+    share (EI, GJ) / l times e^2 / 2, where e = |k - z| is at most what it slips at, y, and y (e - y / 2) beyond.
+    """
+    p, away, total = parameters, strains(frames, theta)[:, None] - z, torch.zeros_like(parameters.roll)
+    for stiffness, part, most in zip((p.bending, p.twisting), away.split((2, 1), dim=-1), slipping(p), strict=True):
+        square = part.square().sum(-1)
+        slips = square > most**2
+        size = torch.where(slips, square, 1.0).sqrt()
+        level = torch.where(slips, most * (size - most / 2), square / 2)
+        total = total + (p.slip[:, 0] * level * (stiffness[1:-1] / p.spans)[:, None]).sum()
+    return total
+
+
+def dragged(parameters: Parameters, frames: Frames, theta: Tensor, before: Tensor, z: Tensor) -> Tensor:
+    """z [J, B, 3] after joints have gone straight from the curvatures `before` [J, 2].
+
+    Where e = k - z is as long as it can be, y, de is dk less its part along e. So half the angle from the way u to e has a tangent
+    that falls by exp(-way / y): cos -> (cos + t) / (1 + cos t), sin -> sin (1 - t^2)^(1/2) / (1 + cos t), t = tanh(way / y).
+    """
+    now, (most, turn) = strains(frames, theta)[:, None], slipping(parameters)
+    twisted = (now[..., 2] - z[..., 2]).clamp(-turn, turn)
+    e, move, most = before[:, None] - z[..., :2], now[..., :2] - before[:, None], most[..., None]
+    slips, none = (e + move).square().sum(-1, keepdim=True) > most**2, most <= 0
+    way = torch.where(slips, move.square().sum(-1, keepdim=True), 1.0).sqrt()
+    u, y = move / way, torch.where(none, 1.0, most)
+    along = dot(e, u)[..., None]
+    across = e - along * u
+    begin = torch.where(slips, y**2 - across.square().sum(-1, keepdim=True), 1.0).clamp(min=0).sqrt()
+    cos, t = begin / y, torch.tanh((way - begin + along) / y)
+    slid = (y * (cos + t) * u + (1 - t**2).sqrt() * across) / (1 + cos * t)
+    bent = torch.where(none, 0.0, torch.where(slips, slid, e + move))
+    return now - torch.cat([bent, twisted[..., None]], dim=-1)
+
+
 class Rate(NamedTuple):
-    """Rate at which curvatures change, from those of earlier times: dk/dt = factor k - past [J, 2], 1/s."""
+    """Rate at which curvatures change, from those of earlier times: dk/dt = factor k - past [J, 2], 1/s; and z of branches."""
 
     factor: float
     past: Tensor
+    z: Tensor | None = None
+    """[J, B, 3]; None: there are no branches."""
 
 
 def potential(parameters: Parameters, x: Tensor, frames: Frames, theta: Tensor, rate: Rate | None = None) -> Tensor:
-    """Energy, and what inner damping adds in a step, J: its gradients are minus the forces and the moments about tangents.
+    """Energy, and what damping and branches add in a step, J: its gradients are minus the forces and the moments about tangents.
 
     Moments EI / l (k - k0 + damping dk/dt) are derivatives of energy + sum EI damping / (2 l factor) |dk/dt|^2 by k.
     """
     total = energy(parameters, x, frames, theta)
     if rate is None:
         return total
+    if rate.z is not None:
+        total = total + friction(parameters, frames, theta, rate.z)
     fast = (rate.factor * curvatures(frames, theta) - rate.past).square().sum(1)
     return total + parameters.damping * (parameters.bending[1:-1] * fast / parameters.spans).sum() / (2 * rate.factor)
 
@@ -248,6 +314,8 @@ class State(NamedTuple):
     """Curvatures [J, 2] half a step before; in frame 0 those of frame 0."""
     k_before: Tensor | None = None
     """Curvatures a step before them; none in frame 0."""
+    z: Tensor | None = None
+    """Where branches have no moment [J, B, 3]: k1, k2 and twist; None: there are none."""
 
 
 def advanced(p: Parameters, state: State, h: float, middle: Tensor, end: Tensor, gravity: Tensor) -> State:
@@ -255,13 +323,14 @@ def advanced(p: Parameters, state: State, h: float, middle: Tensor, end: Tensor,
     k, k_before, fixed = state.k, state.k_before, p.held[:, None]
     x = torch.where(fixed, middle, state.x + h / 2 * state.v)
     frames = carried(state.frames, x)
-    rate = Rate(2 / h, 2 / h * k) if k_before is None else Rate(1.5 / h, (2 * k - k_before / 2) / h)
+    rate = Rate(2 / h, 2 / h * k, state.z) if k_before is None else Rate(1.5 / h, (2 * k - k_before / 2) / h, state.z)
     theta = relaxed(p, x, frames, clamped(p, frames, state.theta), rate)
     k_now = curvatures(frames, theta)
     push = forces(p, x, frames, theta, rate) / p.mass[:, None] + gravity
     v = state.v + h * (push - slowed(p, state.v + h / 2 * (push - slowed(p, state.v))))
     # The k of frame 0 lies half a step back: it is continued to a whole one.
-    return State(torch.where(fixed, end, x + h / 2 * v), v, frames, theta, k_now, 2 * k - k_now if k_before is None else k)
+    z = None if state.z is None else dragged(p, frames, theta, state.k, state.z)
+    return State(torch.where(fixed, end, x + h / 2 * v), v, frames, theta, k_now, 2 * k - k_now if k_before is None else k, z)
 
 
 def slowed(p: Parameters, v: Tensor) -> Tensor:
@@ -272,7 +341,8 @@ def slowed(p: Parameters, v: Tensor) -> Tensor:
 def beginning(p: Parameters, v: Tensor) -> State:
     """Frame 0."""
     frames, theta = start(p, p.vertices)
-    return State(p.vertices, v, frames, theta, curvatures(frames, theta))
+    z = strains(frames, theta)[:, None].repeat(1, len(p.slip), 1) if len(p.slip) else None
+    return State(p.vertices, v, frames, theta, curvatures(frames, theta), z=z)
 
 
 def roll_out(
@@ -286,7 +356,9 @@ def roll_out(
     p = rod if isinstance(rod, Parameters) else Parameters.of(rod, drag)
     count = steps or steps_needed(p, simulation.frame_time)
     gravity = torch.tensor([0.0, 0.0, -simulation.up_sign * simulation.gravity], dtype=torch.float64)
-    wanted = torch.is_grad_enabled() and any(value.requires_grad for value in (*vars(p).values(), held, velocity))
+    wanted = torch.is_grad_enabled() and any(
+        torch.is_tensor(value) and value.requires_grad for value in (*vars(p).values(), held, velocity)
+    )
     with torch.set_grad_enabled(wanted):
         state = beginning(p, velocity)
         rows = [state.x]

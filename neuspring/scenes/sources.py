@@ -229,6 +229,7 @@ SOURCES = Registry(
     {
         "toy": Source(module="neuspring.scenes.synthetic.toy", reads=("toy",), needs_data=False),
         "mocap": Source(module="neuspring.scenes.mocap", reads=("data_root", "mocap"), require_alike=_require_rings),
+        "posed": Source(module="neuspring.scenes.posed", reads=("data_root", "posed")),
         "synthetic": Source(
             module="neuspring.scenes.synthetic.make",
             reads=("synthetic",),

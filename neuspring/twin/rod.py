@@ -4,6 +4,9 @@ Where the observations give the line (`Observations.line`: markers of a cable), 
 controller is held by it. Elsewhere the line is found among the nodes of frame 0 (`center_line`), and springs of controllers pull it
 where they pull a lattice.
 
+Where few places of the line are seen, vertices are laid along its unloaded shape (`rod.lay_out`), and frame 0 is the equilibrium of
+what hangs from the clamps. Nodes keep their places on the unloaded line.
+
 Only stiffness over mass matters to the motion, as gravity and drag act per mass. A body that is held by its vertices has 1 kg/m.
 One that springs pull has 1 kg per node, as a lattice has, so that the searched ranges of springs mean the same.
 """
@@ -14,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
 from neuspring import config
 from neuspring.config.search import VARIABLES
@@ -22,7 +26,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.geometry import SAME_WORLD, axis_on, heading
 from neuspring.physics.center_line import center_line
 from neuspring.physics.parameters import homogeneous
-from neuspring.physics.rod_nodes import bound, frame_zero, place_on, radius_of, settled
+from neuspring.physics.rod_nodes import bound, frame_zero, hanging, place_on, placed, radius_of, settled
 from neuspring.twin.topology import build, controller_reach, controller_springs, infer_controller_radius, node_spacing
 
 MOST_STRETCH = 0.1
@@ -79,13 +83,16 @@ def rod_twin(
         pairs = controller_springs(nodes, hands, reach, int(variables.controller_neighbors.start))
     else:
         vertices = line_of(observations)
+        if start.lay_out is not None:
+            vertices, held = laid_out(observations, start.lay_out, held)
     if not len(pairs) and not (held >= 0).any():
         raise InputError(where, "a hand must hold the rod", "none does", "Raise search.variables.controller_radius.start.")
     lengths = np.linalg.norm(np.diff(vertices, axis=0), axis=1)
     # Of a vertex: half of each of its edges.
     own = np.convolve(lengths, [0.5, 0.5])
     density = len(nodes) / lengths.sum() if len(pairs) else 1.0
-    mass = density * own if len(pairs) else own + start.marker_mass
+    laid = start.lay_out is not None and bool(observations.line.size)
+    mass = density * own if len(pairs) or laid else own + start.marker_mass
     direction = axis_on(np.array(axis, np.float64), heading(vertices), vertices) if (held >= 0).any() else _across(vertices)
     rod = Rod(
         vertices=vertices,
@@ -105,9 +112,11 @@ def rod_twin(
         edge=np.zeros(0, np.int32),
         place=np.zeros((0, 3)),
     )
-    if start.rest == "first_frame":
+    if laid:
+        rod = _on_unloaded(rod, observations, start.marker_mass)
+    elif start.rest == "first_frame":
         rod = replace(rod, curvature=frame_zero(rod)[1])
-    rod = _bound(rod, observations)
+    rod = rod if laid else _bound(rod, observations)
     values = {name: float(getattr(variables, name).start) for name in VARIABLES}
     values |= {"drag": start.drag, "contact_distance": max(radius_of(rod), 0.05 * float(lengths.mean()))}
     frame_time, substeps = 1.0 / scenario.frame_rate, settings.simulation.substeps
@@ -122,7 +131,8 @@ def rod_twin(
         initial_velocity=settings.simulation.initial_velocity,
     )
     topology = build(nodes, hands, pairs)
-    return Twin(topology=topology, material=homogeneous(values, len(pairs)), simulation=simulation, rod=rod)
+    twin = Twin(topology=topology, material=homogeneous(values, len(pairs)), simulation=simulation, rod=rod)
+    return hung([twin], [observations])[0] if laid else twin
 
 
 def on_recording(twin: Twin, observations: Observations) -> Twin:
@@ -136,10 +146,13 @@ def on_recording(twin: Twin, observations: Observations) -> Twin:
     rod, where = twin.rod, f"transfer to {observations.scenario.name}"
     assert rod is not None
     nodes, hands, held = observations.nodes, observations.controller_points[0], _line(observations)
-    if (held is None) != (not (rod.held >= 0).any()) or (held is not None and len(held) != len(rod.held)):
+    known = len(rod.line) or len(rod.held)
+    if (held is None) != (not (rod.held >= 0).any()) or (held is not None and len(held) != known):
         found = "no line" if held is None else f"{len(held)} vertices"
-        rule = f"the recording must have the twin's center line of {len(rod.held)} vertices"
+        rule = f"the recording must have the twin's center line of {known} vertices"
         raise InputError(where, rule, found, "Name a recording of the same body.")
+    if rod.laid:
+        return hung([twin], [observations])[0]
     here = twin.topology
     if held is None and np.array_equal(here.nodes, nodes) and np.array_equal(here.controllers, hands):
         return twin  # as it is
@@ -175,6 +188,98 @@ def _axis(twin: Twin, line: np.ndarray) -> np.ndarray:
     assert rod is not None
     own = np.concatenate([topology.nodes, topology.controllers])[rod.line].astype(np.float64)
     return axis_on(rod.axis, heading(own), line, rod.steady)
+
+
+def laid_out(observations: Observations, count: int, held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unloaded vertices [count, 3], m, evenly along the unloaded line, and the controller that sets each; -1: none.
+
+    The line runs straight from each of its places to the next. It ends at the inner controller of a clamp, which is the middle of
+    an edge, or at its last place. `held` [M] are the controllers of its places. Raises InputError where it is not known
+    or not held.
+    """
+    where, ends = f"observations of {observations.scenario.name}, line", ((held[:2] >= 0).all(), (held[-2:] >= 0).all())
+    if not len(observations.rest_shape):
+        remedy = "Leave rod.lay_out null, or add the unloaded shape."
+        raise InputError(where, "with rod.lay_out the unloaded shape must be known", "no rest_shape", remedy)
+    if not ends[0] or (held[2:-2] >= 0).any():
+        rule = "with rod.lay_out the line begins with two controllers, and may end with two"
+        raise InputError(where, rule, f"controllers {held.tolist()}", "Leave rod.lay_out null.")
+    places, arc = _unloaded(observations)
+    edge = (arc[-1 - ends[1]] - arc[1]) / (count - 1.5 - 0.5 * ends[1])
+    at = arc[1] + edge * (np.arange(count) - 0.5)
+    controllers = np.full(count, -1, np.int32)
+    controllers[:2] = held[:2]
+    if ends[1]:
+        controllers[-2:] = held[-2:]
+    return _along(arc, places, at), controllers
+
+
+def _unloaded(observations: Observations) -> tuple[np.ndarray, np.ndarray]:
+    """Places of the line [M, 3], m, without load, and their distances along it [M], m."""
+    places = observations.canonical[observations.line].astype(np.float64)
+    return places, np.concatenate([[0.0], np.linalg.norm(np.diff(places, axis=0), axis=1).cumsum()])
+
+
+def _along(arc: np.ndarray, places: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Points at distances `at` [n], m, on the polyline through places [M, 3] at distances arc [M], m, and on straight beyond it."""
+    edge = np.clip(np.searchsorted(arc, at, side="right") - 1, 0, len(arc) - 2)
+    part = ((at - arc[edge]) / (arc[edge + 1] - arc[edge]))[:, None]
+    return np.asarray((1 - part) * places[edge] + part * places[edge + 1])
+
+
+def _on_unloaded(rod: Rod, observations: Observations, marker_mass: float) -> Rod:
+    """A rod that lies as it was laid out, with clamps, the places of all nodes, and masses at those of the tracked points."""
+    unloaded, count = observations.canonical.astype(np.float64), len(observations.nodes)
+    held, hand = observations.line[observations.line >= count] - count, observations.controller_hand
+    rolls = np.full(2, -1)
+    for end, outer in enumerate((held[0], held[-1] if len(held) > 2 else -1)):
+        # Others of that hand have a direction too.
+        others = np.setdiff1d(np.flatnonzero(hand == hand[outer]), held) if hand.size and outer >= 0 else held[:0]
+        rolls[end] = others[0] if len(others) else -1
+    axis = unloaded[count + rolls[0]] - unloaded[count + held[0]] if rolls[0] >= 0 else rod.axis
+    rod = replace(rod, axis=axis, by_angle=1.0)
+    found = replace(bound(rod, unloaded[:count]), curvature=frame_zero(rod)[1])
+    tracked = slice(len(observations.object_points[0]))
+    mass = rod.mass + marker_shares(found, tracked.stop) @ np.full(tracked.stop, marker_mass)
+    return replace(found, tilts=np.zeros((2, 2)), rolls=rolls.astype(np.int32), mass=mass)
+
+
+def marker_shares(rod: Rod, tracked: int) -> np.ndarray:
+    """The part of the mass of each of the first nodes that each vertex carries [V, tracked]."""
+    shares, nodes = np.zeros((len(rod.mass), tracked)), np.arange(tracked)
+    shares[rod.edge[:tracked], nodes] = 1 - rod.place[:tracked, 0]
+    shares[rod.edge[:tracked] + 1, nodes] += rod.place[:tracked, 0]
+    return shares
+
+
+def of_first(twin: Twin, count: int) -> Twin:
+    """A rod that was laid out, with its first nodes alone."""
+    rod, here = twin.rod, twin.topology
+    assert rod is not None
+    own = replace(rod, edge=rod.edge[:count], place=rod.place[:count])
+    return replace(twin, topology=build(here.nodes[:count], here.controllers, here.springs), rod=own)
+
+
+def hung(twins: Sequence[Twin], recordings: Sequence[Observations]) -> list[Twin]:
+    """Twins whose vertices were laid out, each in frame 0 of a recording: at rest, with the nodes where they are then.
+
+    A twin may have the first nodes alone. Raises NumericalFailure.
+    """
+    rods = []
+    for twin, seen in zip(twins, recordings, strict=True):
+        rod = twin.rod
+        assert rod is not None
+        # Rest is sought from the line that was seen.
+        arc, at = _unloaded(seen)[1], np.concatenate([[0.0], rod.lengths.cumsum()]) - rod.lengths[0] / 2
+        rods.append(replace(rod, vertices=_along(arc - arc[1], line_of(seen), at)))
+    hands = np.stack([seen.controller_points[0] for seen in recordings])
+    vertices, directors, axes = hanging(rods, hands, twins[0].simulation)
+    done = []
+    for twin, rod, hand, x, m1, axis in zip(twins, rods, hands, vertices, directors, axes, strict=True):
+        lanes = [torch.tensor(values)[None] for values in (x, m1, rod.edge.astype(np.int64), rod.place)]
+        topology = build(placed(*lanes)[0].numpy(), hand, twin.topology.springs)
+        done.append(replace(twin, topology=topology, rod=replace(rod, vertices=x, axis=axis[0])))
+    return done
 
 
 def _across(vertices: np.ndarray) -> np.ndarray:

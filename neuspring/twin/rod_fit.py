@@ -8,7 +8,8 @@ Derivatives are finite differences: a rollout per variable and recording, all of
 Positive numbers are varied on logarithmic scales, and those along the arc as fields (`RodFit`) or joint by joint.
 
 Markers lie beside the center line of a cable, by 1 to 2 cm. How far (`Rod.offsets`, `Rod.clamps`) and the unloaded lengths are
-variables too: without them held ends are in a wrong place, and distances between markers change as the cable bends.
+variables too: without them held ends are in a wrong place, and distances between markers change as the cable bends. Where vertices
+were laid out (`rod.lay_out`), these are the clamps' places and tilts, and place and mass of each marker.
 """
 
 from __future__ import annotations
@@ -51,31 +52,36 @@ LEAST_GAIN = 2e-3
 """A step that lowers the objective by less than this part of it is a stage's last."""
 DAMPINGS = (0.1, 1.0, 10.0, 100.0)
 """Factors on the damping, for each step that is tried."""
+LAUNCHED = 16
+"""Frames kept of a launch."""
+STIFFNESS_TRIED = np.arange(-2.0, 9.0, 0.5)
+"""Logarithms of stiffness over that of the start which a search tries in frame 0 of a rod that was laid out."""
 LANES = 512
 """Rollouts that run in one solver at most."""
 VARIABLE_SCALES = {
     "bending": 1.0, "twisting": 1.0, "damping": 1.0, "drag": 1.0, "drag_quadratic": 1.0, "marker_mass": 1.0, "hands": 1.0,
     "dashpots": 1.0, "roll": 1.0, "curvature": 0.3, "bending_along": 0.5, "twisting_along": 0.5, "clamps": 0.02, "offsets": 0.01,
-    "stretch": 0.01,
+    "stretch": 0.01, "tilts": 0.05, "places": 0.01, "slip_share": 1.0, "slip_yield": 0.7, "slip_twist": 0.5,
 }  # fmt: skip
 """Scale of each kind of variable: of logarithms, rad, curvatures (1), and m."""
-LOGARITHMIC = ("bending", "twisting", "damping", "drag", "drag_quadratic", "marker_mass", "hands", "dashpots")
+LOGARITHMIC = (
+    *("bending", "twisting", "damping", "drag", "drag_quadratic", "marker_mass", "hands", "dashpots"),
+    *("slip_share", "slip_yield", "slip_twist"),
+)
+SLIP_SHARE, SLIP_ANGLES = 0.3, (0.02, 3.0)
+"""Share of each branch that slips where a fit begins, and turns of the whole rod at which the first and the last does, rad."""
+SLIP_DAMPING = 0.02
+"""Inner damping there, at most, s: friction takes its place."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RodSteps(RodFit):
     """The settings with the course of the fit."""
 
-    knots: int = 5
-    """Knots of a field along the arc, at least 4."""
     markers: bool = True
     """Fit of how far markers lie beside the center line, and the lengths between them."""
-    horizons: tuple[int, ...] = (60, 150, 0)
-    """Training frames that count, one stage of the fit after the other; 0: all."""
     rounds: int = 8
     """Steps per stage, at most; a stage ends where a step gains less than 0.2 %."""
-    every: int = 4
-    """Stride of the frames that count."""
     robust: float = 0.02
     """Robustness b, m: errors e count as sqrt(e^2 + b^2), so that recordings that flip do not decide."""
 
@@ -85,6 +91,7 @@ class Variables:
     """Variables of a twin, as one vector q [Q], 0 at the start."""
 
     twin: Twin
+    tracked: int
     sizes: dict[str, int]
     stiffness_along: np.ndarray
     """Basis [V, n] of log EI and log GJ along the arc."""
@@ -92,28 +99,41 @@ class Variables:
     """Basis [V, n] of k1 and k2 over the joint's length, along the arc."""
 
     @classmethod
-    def of(cls, twin: Twin, settings: RodSteps) -> Variables:
-        """The variables of a fit."""
+    def of(cls, twin: Twin, settings: RodSteps, tracked: int = 0) -> Variables:
+        """The variables of a fit. So many first nodes are tracked points."""
         rod, held = _rod(twin), _rod(twin).held >= 0
+        if settings.slip and not len(rod.slip):
+            yields = np.geomspace(*SLIP_ANGLES, settings.slip) / rod.lengths.sum()
+            branches = np.stack([np.full(settings.slip, SLIP_SHARE), yields], axis=1)
+            rod = replace(rod, slip=branches, slip_twist=1.0, damping=min(rod.damping, SLIP_DAMPING))
+            twin = replace(twin, rod=rod)
         joints = len(held) - 2
         along = _basis(rod, {"constant": "none"}.get(settings.stiffness, settings.stiffness), settings.knots)
         bent = _basis(rod, {"straight": "none"}.get(settings.curvature, settings.curvature), settings.knots)
         if settings.curvature != "free":
             # A field of the curvature per length.
             bent = bent * (rod.spans / rod.spans[1:-1].mean())[:, None]
-        clamped = bool(held[:2].all() and held[-2:].all())
+        ends = int(held[:2].all()) + int(held[-2:].all())
         sizes = dict.fromkeys(("bending", "twisting", "damping", "drag", "drag_quadratic"), 1)
-        sizes |= {"marker_mass": 1} if held.any() else {"hands": 1, "dashpots": 1}
-        sizes |= {"roll": int(clamped), "curvature": 2 * bent.shape[1]}
+        sizes |= {"marker_mass": tracked if rod.laid else 1} if held.any() else {"hands": 1, "dashpots": 1}
+        sizes |= {"slip_share": settings.slip, "slip_yield": settings.slip, "slip_twist": int(settings.slip > 0)}
+        sizes |= {"roll": int(ends == 2), "curvature": 2 * bent.shape[1]}
         sizes |= {"bending_along": along.shape[1], "twisting_along": along.shape[1]}
-        if settings.markers and clamped:
-            sizes |= {"clamps": 6, "offsets": 2 * int((~held).sum()), "stretch": joints - 1}
-        return cls(twin, {name: size for name, size in sizes.items() if size}, along, bent)
+        if settings.markers and rod.laid:
+            sizes |= {"clamps": 3 * ends, "tilts": 2 * ends, "places": 3 * tracked}
+        elif settings.markers and ends:
+            sizes |= {"clamps": 3 * ends, "offsets": 2 * int((~held).sum()), "stretch": joints - 1}
+        return cls(twin, tracked, {name: size for name, size in sizes.items() if size}, along, bent)
+
+    @property
+    def kinds(self) -> np.ndarray:
+        """Kind of each variable [Q]."""
+        return np.repeat(list(self.sizes), list(self.sizes.values()))
 
     @property
     def scale(self) -> np.ndarray:
         """Scale of each variable [Q]."""
-        return np.concatenate([np.full(size, VARIABLE_SCALES[name]) for name, size in self.sizes.items()])
+        return np.array([VARIABLE_SCALES[name] for name in self.kinds])
 
     def part(self, q: np.ndarray, name: str) -> np.ndarray:
         """The variables of one kind; zeros where they are not varied."""
@@ -123,38 +143,88 @@ class Variables:
     def made(self, q: np.ndarray) -> Twin:
         """The twin of variables q [Q]."""
         start, twin = _rod(self.twin), self.twin
-        factor = {name: float(np.exp(self.part(q, name)[0])) for name in LOGARITHMIC}
+        factor = {name: np.exp(self.part(q, name)) for name in LOGARITHMIC}
         bending, twisting = (start.bending * factor["bending"], start.twisting * factor["twisting"])
         if self.stiffness_along.shape[1]:
             bending = bending * np.exp(self.stiffness_along @ self.part(q, "bending_along"))
             twisting = twisting * np.exp(self.stiffness_along @ self.part(q, "twisting_along"))
         changes: dict[str, Any] = {"bending": bending, "twisting": twisting, "roll": start.roll + float(self.part(q, "roll")[0])}
-        changes |= {name: getattr(start, name) * factor[name] for name in ("damping", "drag_quadratic")}
+        changes |= {name: getattr(start, name) * float(factor[name][0]) for name in ("damping", "drag_quadratic")}
         if self.curvature_along.shape[1]:
             coefficients = self.part(q, "curvature").reshape(2, -1)
             changes["curvature"] = start.curvature + (self.curvature_along @ coefficients.T)
-        lengths = start.lengths.copy()
+        if "slip_share" in self.sizes:
+            branches = np.stack([factor["slip_share"], factor["slip_yield"]], axis=1)
+            changes |= {"slip": start.slip * branches, "slip_twist": start.slip_twist * float(factor["slip_twist"][0])}
+        clamps = start.clamps.copy()
         if "clamps" in self.sizes:
+            clamped = [bool((start.held[end] >= 0).all()) for end in (slice(2), slice(-2, None))]
+            clamps[clamped] += self.part(q, "clamps").reshape(-1, 3)
+            changes["clamps"] = clamps
+        if "tilts" in self.sizes:
+            tilts = start.tilts.copy()
+            tilts[clamped] += self.part(q, "tilts").reshape(-1, 2)
+            changes |= {"tilts": tilts} | self._relaid(q, clamps - start.clamps)
+            # Curvatures per length stay.
+            stretch = changes["lengths"][0] / start.lengths[0]
+            changes["curvature"] = stretch * changes.get("curvature", start.curvature)
+        lengths = changes.get("lengths", start.lengths).copy()
+        if "offsets" in self.sizes:
             free = start.held < 0
             lengths[1:-1] = np.maximum(lengths[1:-1] + self.part(q, "stretch"), 0.1 * lengths[1:-1])
             offsets = np.zeros((len(free), 2)) if not start.offsets.size else start.offsets.copy()
             offsets[free] += self.part(q, "offsets").reshape(-1, 2)
-            clamps = start.clamps + self.part(q, "clamps").reshape(2, 3)
-            changes |= {"lengths": lengths, "offsets": offsets, "clamps": clamps}
+            changes |= {"lengths": lengths, "offsets": offsets}
         if "marker_mass" in self.sizes:
             before, own = (np.convolve(each, [0.5, 0.5]) for each in (start.lengths, lengths))
-            changes["mass"] = own + (start.mass - before) * factor["marker_mass"]
-        material = replace(twin.material, drag=twin.material.drag * factor["drag"])
+            markers = (start.mass - before) * factor["marker_mass"][0]
+            if start.laid:
+                masses = np.linalg.lstsq(rods.marker_shares(start, self.tracked), start.mass - before)[0]
+                markers = rods.marker_shares(replace(start, **changes), self.tracked) @ (masses * factor["marker_mass"])
+            changes["mass"] = own + markers
+        material = replace(twin.material, drag=twin.material.drag * float(factor["drag"][0]))
         if "hands" in self.sizes:
             material = replace(
                 material, stiffness=material.stiffness * factor["hands"], dashpot=material.dashpot * factor["dashpots"]
             )
         return replace(twin, material=material, rod=replace(start, **changes))
 
+    def _relaid(self, q: np.ndarray, moved: np.ndarray) -> dict[str, np.ndarray]:
+        """Lengths and places of nodes of a rod that was laid out, where its clamps go by `moved` [2, 3] along and beside it, m.
+
+        What is between clamps stays where it is on the unloaded line; tracked points go along and beside it by their variables.
+        """
+        start = _rod(self.twin)
+        low, high = free_part(start)
+        ratio = 1 + (moved[1, 0] - moved[0, 0]) / (high - low)
+        lengths = start.lengths * ratio
+        place = start.place.copy()
+        # Distance from the middle of the first edge.
+        at = np.concatenate([[0.0], start.lengths.cumsum()])[start.edge] + place[:, 0] * start.lengths[start.edge]
+        at = at - start.lengths[0] / 2 + lengths[0] / 2 - moved[0, 0]
+        by = self.part(q, "places").reshape(-1, 3)
+        at[: len(by)] += by[:, 0]
+        place[: len(by), 1:] += by[:, 1:]
+        arc = np.concatenate([[0.0], lengths.cumsum()])
+        edge = np.clip(np.searchsorted(arc, at, side="right") - 1, 0, len(lengths) - 1)
+        place[:, 0] = (at - arc[edge]) / lengths[edge]
+        return {"lengths": lengths, "edge": edge.astype(np.int32), "place": place}
+
 
 def _rod(twin: Twin) -> Rod:
     assert twin.rod is not None
     return twin.rod
+
+
+def free_part(rod: Rod) -> tuple[float, float]:
+    """Distances from the first vertex, m, between which fields along the arc have their knots.
+
+    They are those of the joints at the ends, or the ends of what bends where vertices were laid out, whose number is arbitrary.
+    """
+    arc = np.concatenate([[0.0], np.cumsum(rod.lengths)])
+    if not rod.laid:
+        return float(arc[1]), float(arc[-2])
+    return float(arc[1] / 2), float(arc[-1] - (rod.held[-1] >= 0) * rod.lengths[-1] / 2)
 
 
 def _basis(rod: Rod, kind: str, knots: int) -> np.ndarray:
@@ -168,9 +238,8 @@ def _basis(rod: Rod, kind: str, knots: int) -> np.ndarray:
         return np.ones((joints + 2, 1))
     from scipy.interpolate import CubicSpline
 
-    arc = np.concatenate([[0.0], np.cumsum(rod.lengths)])
-    basis = CubicSpline(np.linspace(arc[1], arc[-2], knots), np.eye(knots), bc_type="natural")(np.clip(arc, arc[1], arc[-2]))
-    return np.asarray(basis)
+    arc, (low, high) = np.concatenate([[0.0], np.cumsum(rod.lengths)]), free_part(rod)
+    return np.asarray(CubicSpline(np.linspace(low, high, knots), np.eye(knots), bc_type="natural")(np.clip(arc, low, high)))
 
 
 @dataclass(frozen=True)
@@ -208,6 +277,8 @@ class Recordings:
         pairs = [(twin, each) for twin in twins for each in self.observations]
         if len(twins[0].topology.springs):
             return [rods.on_recording(twin, each) for twin, each in pairs]
+        if _rod(twins[0]).laid:
+            return rods.hung([rods.of_first(twin, self.points.shape[2]) for twin, _ in pairs], [each for _, each in pairs])
         moved = [rods.of_markers(twin, each) for twin, each in pairs]
         vertices = settled([_rod(twin) for twin in moved], np.stack([_rod(twin).vertices for twin in moved]))
         return [replace(twin, rod=replace(_rod(twin), vertices=x)) for twin, x in zip(moved, vertices, strict=True)]
@@ -220,13 +291,14 @@ class Recordings:
         x = torch.tensor(np.stack([body.topology.nodes for body in bodies]))
         nodes = x.shape[1]
         v = torch.tensor(np.stack([v[:nodes] for _ in twins for v in self.velocities]), dtype=torch.float32)
-        kept = []
-        for frame in range(1, frames):
-            begin, end = (self.hands[row].repeat(len(twins), 1, 1) for row in (frame - 1, frame))
-            x, v = solver.forward(x, v, begin, end)
-            if (frame - 1) % every == 0:
-                kept.append(solver.nodes()[0][:, :tracked].cpu())
-        found = torch.stack(kept, dim=1).reshape(len(twins), count, len(kept), tracked, 3).numpy()
+        hands = self.hands.repeat(1, len(twins), 1, 1)
+        solver.start(x, v, hands[0])
+        kept, size = [], LAUNCHED * every if hands.shape[-1] == 3 else 1
+        for first in range(1, frames, size):
+            rows = hands[first - 1 : min(first + size, frames)]
+            # Frames 1, 1 + every, ...
+            kept.append(solver.advance(rows, slice((1 - first) % every, None, every))[:, :, :tracked].cpu())
+        found = torch.cat(kept).transpose(0, 1).reshape(len(twins), count, -1, tracked, 3).numpy()
         return np.asarray(np.nan_to_num(found, nan=LARGEST_ERROR * 10, posinf=LARGEST_ERROR * 10, neginf=-LARGEST_ERROR * 10))
 
 
@@ -270,7 +342,7 @@ class Levenberg:
 
     def lowered(self, twin: Twin, progress: Progress) -> tuple[Twin, float, list[dict[str, Any]]]:
         """The twin after the stages of the settings, the objective of the last one, m, and a row per step."""
-        variables, history = Variables.of(twin, self.settings), list[dict[str, Any]]()
+        variables, history = Variables.of(twin, self.settings, self.recordings.points.shape[2]), list[dict[str, Any]]()
         q, end = np.zeros(len(variables.scale)), self.recordings.points.shape[1]
         for horizon in self.settings.horizons:
             frames = min(horizon + 1, end) if horizon else end
@@ -338,11 +410,17 @@ def search_rod(
     import pandas as pd
 
     recordings = in_order([observations, *pool])
-    first = replace(RodSteps(**vars(settings.fit.rod)), stiffness="constant", curvature="constant", markers=False)
+    first = replace(RodSteps(**vars(settings.fit.rod)), stiffness="constant", curvature="constant", markers=False, slip=0)
     first = replace(first, horizons=first.horizons[:1])
     axis, steady = choose_axis([rods.line_of(each) for each in recordings if each.line.size])
     start = rods.rod_twin(observations, settings, axis.tolist(), steady)
     solver = Levenberg(Recordings.of(recordings, start), first, device, threads)
+    if _rod(start).laid:
+        # What hangs in frame 0 says how stiff it is.
+        variables = Variables.of(start, first, observations.object_points.shape[1])
+        tried = [factor * (variables.kinds == "bending") + factor * (variables.kinds == "twisting") for factor in STIFFNESS_TRIED]
+        found = solver.objective(solver.errors(variables, tried, 2, 1), np.array(tried), variables.scale)
+        start = variables.made(tried[int(found.argmin())])
     twin, value, history = solver.lowered(start, Progress(f"search {observations.scenario.name}, rod", first.rounds))
     found = _result(twin, value, history)
     if record is not None:

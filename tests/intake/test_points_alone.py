@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from neuspring.config import Config
 from neuspring.core.artifacts import Observations
@@ -15,7 +16,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import read_npz
 from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, TRACKS, Capture, write_tracks
 from neuspring.intake.check import check_layout
-from neuspring.intake.points import Hands, held, observe, read, standing, write
+from neuspring.intake.points import JAWS, Hands, carried, held, observe, read, standing, write
 from neuspring.scenes.sources import SOURCES, scenario_rows
 from tests.support import spaced as scene
 from tests.support.filmed import film
@@ -329,3 +330,63 @@ def test_a_capture_without_cameras_says_what_it_is(capture):
     path.write_text(json.dumps({name: value for name, value in json.loads(path.read_text()).items() if name != "tracks"}))
     with pytest.raises(InputError, match=r"cameras: at least one is required.*tracks: train; received none"):
         Capture.load(capture.folder)
+
+
+def posed(frames=8):
+    """Poses [T, 2, 4, 4] of two hands that rise by 5 mm and turn by 0.1 rad a frame, and two jaws each."""
+    poses = np.tile(np.eye(4), (frames, 2, 1, 1))
+    poses[:, 1, :3, :3] = Rotation.from_euler("z", 0.1 * np.arange(frames)[:, None]).as_matrix()
+    poses[..., :3, 3] = [[0, 0, 0.03], [0, 0.06, 0.03]] + 0.005 * np.arange(frames)[:, None, None] * np.array([0, 0, 1.0])
+    return poses, np.array([[0.0, 0, 0], [0.02, 0, 0.01]])
+
+
+def of_poses(capture, **arrays):
+    (capture.folder / CONTROLLERS[0]).unlink()
+    np.savez(capture.folder / CONTROLLERS[0], **arrays)
+    return Capture.load(capture.folder)
+
+
+def test_hands_with_a_pose_carry_their_jaws(capture):
+    poses, jaws = posed()
+    hands = read(of_poses(capture, poses=poses, jaws=jaws)).hands
+    wanted = np.einsum("thij,cj->thci", poses[..., :3, :3], jaws) + poses[:, :, None, :3, 3]
+    np.testing.assert_allclose(hands.points, wanted.reshape(8, 4, 3), atol=1e-12)
+    np.testing.assert_array_equal(hands.hand, [0, 0, 1, 1])
+    # Points of a hand keep their distances.
+    np.testing.assert_allclose(np.linalg.norm(hands.points[:, 3] - hands.points[:, 2], axis=1), np.hypot(0.02, 0.01), atol=1e-12)
+    seen = observed(capture)
+    assert seen.controller_points.shape == (8, 4, 3) and not seen.controller_valid.size
+
+
+def test_poses_as_rows_of_quaternions(capture):
+    poses, _ = posed()
+    poses = poses[:, 1:]
+    (capture.folder / CONTROLLERS[0]).unlink()
+    quaternions = Rotation.from_matrix(poses[:, 0, :3, :3]).as_quat()
+    rows = [",".join(map(str, (t, 0, *poses[t, 0, :3, 3], *quaternions[t], int(t > 1)))) for t in range(8)]
+    header = "frame,point,x,y,z,qx,qy,qz,qw,holds"
+    (capture.folder / CONTROLLERS[1]).write_text("\n".join([header, *rows]) + "\n")
+    hands = read(capture).hands
+    np.testing.assert_allclose(hands.points, carried(poses, JAWS[None]), atol=1e-12)
+    np.testing.assert_array_equal(hands.holds, np.tile(np.arange(8)[:, None] > 1, (1, 4)))
+    (capture.folder / CONTROLLERS[1]).write_text(
+        "\n".join([header, *[row.replace(",0.0,0.0,", ",0.0,0.7,") for row in rows]]) + "\n"
+    )
+    with pytest.raises(InputError, match=r"qx,qy,qz,qw.*length 1"):
+        read(capture)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda poses: {"poses": poses[..., :3, :]}, r"poses: finite numbers \[T, 4, 4\]"),
+        (lambda poses: {"poses": poses * [1, -1, 1, 1]}, r"rotation.*frame 0, hand 0.*right-handed"),
+        (lambda poses: {"poses": np.swapaxes(poses, -1, -2)}, r"last row 0, 0, 0, 1"),
+        (lambda poses: {"poses": poses, "jaws": np.zeros((3, 4, 3))}, r"jaws: finite numbers.*frame, m"),
+        (lambda poses: {"poses": poses, "hand": np.zeros(4, int)}, r"poses, optional jaws and holds"),
+        (lambda poses: {"poses": poses[:5]}, r"8 frames are required"),
+    ],
+)
+def test_poses_that_are_none_are_named(capture, change, message):
+    with pytest.raises(InputError, match=message):
+        read(of_poses(capture, **change(posed()[0])))

@@ -149,11 +149,16 @@ def test_steps_that_are_needed_are_stable_and_few(damping: float) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["lengths", "mass", "bending", "twisting", "curvature", "stretching", "damping", "drag", "drag_quadratic", "roll", "vertices"],
+    [
+        *("lengths", "mass", "bending", "twisting", "curvature", "stretching", "damping", "drag", "drag_quadratic", "roll"),
+        *("vertices", "slip", "slip_twist"),
+    ],
 )
 def test_gradients_of_a_rollout_are_its_differences(name: str) -> None:
     curvature = np.random.default_rng(1).normal(0, 0.3, (5, 2))
-    body = make.rod(make.crooked(5), (0, 1, 3, 4), curvature=curvature, roll=0.5, damping=0.01, drag_quadratic=2.0)
+    slip = np.array([[1.0, 0.05], [0.5, 0.5]])
+    options = {"curvature": curvature, "slip": slip, "slip_twist": 0.3}
+    body = make.rod(make.crooked(5), (0, 1, 3, 4), roll=0.5, damping=0.01, drag_quadratic=2.0, **options)
     p = Parameters.of(body, drag=0.5)
     weights = make.real(np.random.default_rng(5).normal(size=(3, 5, 3)))
     start = getattr(p, name)

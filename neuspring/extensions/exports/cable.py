@@ -3,7 +3,7 @@
 The rest pose of the bodies is the unloaded shape (unloaded curvatures, no twist), the keyframe `start` is frame 0. A body's axes
 are t, m1, m2. Between two edges are three hinges, about t with stiffness GJ / l, about m1 and m2 with EI / l, each with the rod's
 damping times that. Edges keep their lengths, and their mass lies along them. A clamp is a mocap body that the end is welded to.
-Drag is left out.
+Drag is left out. A rod that slips inside is refused: a branch is a spring behind a friction, and hinges have them side by side.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neuspring.core.artifacts import Rod
+from neuspring.core.errors import InputError
 from neuspring.physics.rod_nodes import frame_zero, radius_of
 
 CABLE_STEP = 2e-4
@@ -82,14 +83,17 @@ class Chain(NamedTuple):
 
 
 def chain_of(rod: Rod) -> Chain:
-    """The edges and joints of a rod."""
+    """The edges and joints of a rod. Raises InputError if it slips inside."""
+    if len(rod.slip):
+        rule = "the rod of another engine has no branches that slip inside"
+        raise InputError("--to", rule, f"{len(rod.slip)} (Rod.slip)", "Take --to npz, or fit a rod without: fit.rod.slip = 0.")
     edges = len(rod.lengths)
     share = rod.mass / np.where(np.isin(np.arange(edges + 1), (0, edges)), 1, 2)
     spans = rod.spans[1:-1]
     ends = {0: (0, rod.held[:2]), 1: (edges - 1, rod.held[-2:])}
     held = {end: edge for end, (edge, hands) in ends.items() if (hands >= 0).all()}
     bend, twist = rod.bending[1:-1] / spans, rod.twisting[1:-1] / spans
-    return Chain(share[:-1] + share[1:], bend, twist, frames_of(rod), _rest(rod.curvature), held)
+    return Chain(share[:-1] + share[1:], bend, twist, frames_of(rod), _rest(rod.curvature, bool(rod.by_angle)), held)
 
 
 def frames_of(rod: Rod) -> Rotation:
@@ -99,8 +103,9 @@ def frames_of(rod: Rod) -> Rotation:
     return Rotation.from_matrix(np.stack([t, m1, np.cross(t, m1)], axis=2))
 
 
-def _rest(curvature: np.ndarray) -> Rotation:
-    """The turn from each edge to the next without moments, in the axes of either: about (0, -k2, k1) by 2 atan(|k| / 2)."""
+def _rest(curvature: np.ndarray, by_angle: bool = False) -> Rotation:
+    """The turn from each edge to the next without moments, in the axes of either: about (0, -k2, k1) by 2 atan(|k| / 2), or |k|."""
     k = np.stack([np.zeros(len(curvature) - 2), -curvature[1:-1, 1], curvature[1:-1, 0]], axis=1)
     size = np.linalg.norm(k, axis=1, keepdims=True)
-    return Rotation.from_rotvec(2 * np.arctan(size / 2) * k / np.maximum(size, 1e-12))
+    angle = size if by_angle else 2 * np.arctan(size / 2)
+    return Rotation.from_rotvec(angle * k / np.maximum(size, 1e-12))

@@ -32,11 +32,15 @@ class RodBody(Body):
 A discrete elastic rod (Bergou et al. 2008, 2010). Vertices x_0 .. x_E, edges e_j = x_(j+1) - x_j with tangents t_j and unit
 directors m1_j, m2_j = t_j x m1_j. The curvature binormal of inner vertex i is kb = 2 t_(i-1) x t_i / (1 + t_(i-1) . t_i), its
 curvatures are k1 = kb . (m2_(i-1) + m2_i) / 2 and k2 = -kb . (m1_(i-1) + m1_i) / 2, and l_i is half of the unloaded lengths of
-its edges.
+its edges. With by_angle = 1 kb has the length of the angle between the edges.
 
 Energy: sum_i bending_i |k_i - curvature_i|^2 / (2 l_i) + sum_i twisting_i m_i^2 / (2 l_i) + sum_j stretching (|e_j| / length_j
 - 1)^2 length_j / 2. The twist m_i is the angle from m1_(i-1), parallel-transported to t_i, to m1_i. Inner damping: k_i +
 damping dk_i/dt takes the place of k_i in the moments of bending.
+
+Each row (s, y) of rod_slip is a branch that slips: it adds s bending_i / l_i (k_i - z) to the moments of bending, where z, k_i in
+frame 0, is dragged along, so that |k_i - z| <= y l_i: at the limit d(k - z) = dk less its part along k - z, if that is outwards.
+Twist has the same branches, s twisting_i / l_i (m_i - z) with |m_i - z| <= slip_twist y l_i.
 
 Directors of an end are held where its two outer vertices are: m1 of the first edge is rod_axis projected, that of the last the
 same turned by roll about its tangent. All others are where moments about the tangents, inner damping among them, are in
@@ -45,7 +49,9 @@ balance.
 mass_i dv_i/dt = force - mass_i (gravity up_sign (0, 0, 1) + (drag + drag_quadratic |v_i|) v_i). A vertex with rod_held >= 0 is
 where that controller is. With rod_clamps, the inner held vertex of an end is beside its controller by these distances along t,
 m1 (without roll) and m2, with t along the two controllers, and the outer one follows at the controllers' distance along -t or
-t. The implicit integration is BDF2 with `substeps` steps per frame.
+t. With rod_tilts (a, b) of that end it is the middle of the held edge that is there, and the edge has its length along t + a m1 +
+b m2. With rod_rolls >= 0 the axis is the direction from the outer held controller to that one, now. The implicit integration is
+BDF2 with `substeps` steps per frame.
 
 A node n is at x_j + f e_j + a m1_j + b m2_j with j = rod_edge and (f, a, b) = rod_place. A spring (controller, node) pulls
 there with stiffness (l / rest_length - 1) + dashpot dl/dt; it acts where `holds` is true in this frame and the next. A vertex

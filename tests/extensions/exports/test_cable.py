@@ -70,6 +70,21 @@ def test_a_joint_without_moments_has_the_unloaded_curvatures():
         np.testing.assert_allclose([binormal @ m2 / 2, -binormal @ m1 / 2], [k1, k2], atol=1e-12)
 
 
+def test_a_rod_that_slips_is_only_exported_with_its_law(tmp_path):
+    source = hanging(tmp_path, frames=5)
+    twin = source.twin
+    source = replace(source, twin=replace(twin, rod=replace(twin.rod, slip=np.array([[0.5, 0.1]]), slip_twist=0.7)))
+    for refused in (mujoco_format.mjcf, lambda source: newton.chain_arrays(source, source.twin.rod, range(2))):
+        with pytest.raises(InputError, match=r"no branches that slip.*received 1.*npz.*fit\.rod\.slip = 0"):
+            refused(source)
+    npz.write(source, range(2), tmp_path / "out")
+    said, arrays, _ = described(tmp_path / "out")
+    assert said["version"] == 2
+    assert arrays["rod_slip"].tolist() == [[0.5, 0.1]]
+    assert said["settings"]["slip_twist"]["value"] == 0.7
+    assert any("branch that slips" in law for law in said["equations"])
+
+
 def test_a_rope_with_hands_loads_in_mujoco(tmp_path):
     mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (extra `export`)")
     source = source_of(tmp_path)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from neuspring.core.artifacts import SCALARS, Artifact, Material
+from neuspring.core.artifacts import SCALARS, Artifact, Material, kept
 from neuspring.core.files import write_atomically, write_text
 from neuspring.core.version import __version__
 from neuspring.extensions.exports import Export
@@ -31,6 +31,8 @@ SIZE_MEANINGS = {
     "A": "1 (isotropic) or 3",
     "V": "vertices of a rod's center line",
     "E": "edges between them",
+    "M": "places of a rod's line that are observed",
+    "P": "branches that slip inside a rod",
     "K": "coefficients of spherical harmonics per channel: 1, 4, 9 or 16",
 }
 SETTINGS: dict[str, tuple[str, str]] = {
@@ -60,18 +62,21 @@ def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Pat
     """Write arrays.npz and description.json of these frames to the folder `output`."""
     arrays, described = arrays_of(source, frames)
     twin, body = source.twin, body_of(source.twin)
+    rod = body.center_line(twin)
     values = dataclasses.asdict(twin.simulation) | {"up_sign": int(twin.simulation.up_sign)}
     values |= {name: float(getattr(twin.material, name)) for name in SCALARS}
     settings = dict(SETTINGS)
     for part in body.parts(twin):
-        numbers = [spec for spec in dataclasses.fields(part) if "shape" not in spec.metadata]
+        numbers = [
+            spec for spec in dataclasses.fields(part) if "shape" not in spec.metadata and kept(spec, getattr(part, spec.name))
+        ]
         settings |= {spec.name: (spec.metadata["unit"], spec.metadata["doc"]) for spec in numbers}
         values |= {spec.name: float(getattr(part, spec.name)) for spec in numbers}
     text = {
         # A reader of one body's format would simulate another as that body.
         "format": body.format,
-        # Who does not know springs that only push would let them pull.
-        "version": 2 if twin.topology.pushes.any() else VERSION,
+        # Who does not know springs that only push would let them pull, and a rod that slips inside would ring on.
+        "version": 2 if twin.topology.pushes.any() or (rod and (len(rod.slip) or rod.by_angle)) else VERSION,
         "made_by": f"neuspring {__version__}",
         "name": source.name,
         "made_from_sha256": source.made_from,

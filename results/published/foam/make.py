@@ -1,0 +1,182 @@
+"""The foam cylinder of PRB-Net (arXiv 2307.07975): our twins beside the published rivals, on the test trajectory.
+
+    python -m results.published.foam.make DATA RESULTS --output OUT [--methods rod_slip ...] [--trajectory 8]
+
+DATA has traj{1..8}.csv and rivals/, RESULTS is the folder of `config/data/foam.yaml`. OUT/summary.md has the table, OUT/errors.csv
+a row per model and window, OUT/errors.png the error over time. Errors are distances of the end marker at 250 Hz. A twin is rolled
+out once from the rest of sample 0, by the motion of the base alone, and its way is cut into windows. Rivals begin each anew.
+"""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from scipy.interpolate import CubicSpline
+
+from neuspring.config import Config, ScenarioRow
+from neuspring.config.parse import parse, read_yaml
+from neuspring.core.artifacts import Observations, Rod, Twin
+from neuspring.core.files import write_text
+from neuspring.core.run_folder import RunFolder
+from neuspring.core.table import Table
+from neuspring.draw.sheet import save
+from neuspring.report.blocks import markdown
+from neuspring.scenes import posed
+from neuspring.twin.body import body_of
+from neuspring.twin.rod import marker_shares
+from neuspring.twin.rollout import roll_out
+from neuspring.twin.transfer import move
+
+CM, RATE = 100.0, 250
+WINDOWS = {251: "1 s", 501: "2 s", 1251: "5 s", 2501: "10 s", 5001: "20 s"}
+RIVALS = {
+    "rnn_LFK": "PRB-Net: RNN, physics decoder",
+    "rnn_NN": "RNN, network decoder",
+    "resnet_LFK": "ResNet, physics decoder",
+    "resnet_NN": "ResNet, network decoder",
+    "rfem": "rigid finite elements, first principles",
+}
+STAYS = "the end stays where it was"
+NOTE = """\
+Mean distance of the end marker, cm, at 250 Hz on trajectory {trajectory}, which begins at rest. **20 s is the one window in which
+twins know no more than rivals**: the base's motion, and rest in the first sample. In shorter windows rivals get the end's place and
+velocity at the begin of each, and do not know what was before; twins are rolled out once from the rest, know the base's motion
+since, and nothing of the end. Rivals' errors are computed from their published predictions by the code that scores ours."""
+END = 1
+"""Number of the end marker among the tracked points."""
+
+
+def errors_of(truth: np.ndarray, predicted: np.ndarray, window: int) -> dict[str, float]:
+    """Mean, root mean square and largest distance, cm, of predictions [n, 3], m, in whole windows."""
+    count = len(truth) // window * window
+    apart = CM * np.linalg.norm(truth[:count] - predicted[:count], axis=1)
+    return {"windows": count // window, "mean": apart.mean(), "rms": np.sqrt((apart**2).mean()), "largest": apart.max()}
+
+
+def rival(folder: Path, name: str, window: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Truth and prediction of the end [n, 3], m, windows one after the other; None where there is no file."""
+    path = folder / "rivals" / f"{name}_predictions_{window}steps.csv"
+    if not path.exists():
+        return None
+    table = pd.read_csv(path)
+    seen, predicted = (table[[f"{kind}_{axis}" for axis in "xyz"]].to_numpy() for kind in ("pe", "hat_pe"))
+    return seen, predicted
+
+
+def observed(folder: Path, trajectory: int, settings: Config, stride: int = 1) -> Observations:
+    """A trajectory of the data."""
+    name = f"foam_{trajectory}"
+    row = ScenarioRow(scenario=name, source="posed", category="foam", path="", self_collision=False, ground=False)
+    own = replace(settings, posed=replace(settings.posed, stride=stride))
+    return posed.observe(row, folder / f"traj{trajectory}.csv", own, folder / name)
+
+
+def way(twin: Twin, folder: Path, trajectory: int, settings: Config) -> np.ndarray:
+    """The end [n, 3], m, at 250 Hz as a twin predicts it, at the frame rate that it was fitted at."""
+    stride = round(RATE * twin.simulation.frame_time)
+    here = observed(folder, trajectory, settings, stride)
+    body = body_of(twin)
+    moved = body.for_prediction(move(twin, here)[0])
+    positions = roll_out(moved, here.controller_points).positions[:, END].astype(np.float64)
+    last = stride * (len(positions) - 1)
+    return np.asarray(CubicSpline(np.arange(0, last + 1, stride), positions)(np.arange(last + 1)))
+
+
+def with_vertices(twin: Twin, count: int, tracked: int = 2) -> Twin:
+    """A rod that was laid out, with other vertices and the same body: fields along the arc, places and masses of markers."""
+    rod = twin.rod
+    assert rod is not None
+    length = float(rod.lengths[0] * (len(rod.mass) - 1.5))
+    edge = length / (count - 1.5)
+    old, new = (h * (np.arange(n) - 0.5) for h, n in ((rod.lengths[0], len(rod.mass)), (edge, count)))
+    inner = slice(1, -1)
+
+    def along(values: np.ndarray) -> np.ndarray:
+        return np.asarray(CubicSpline(old[inner], values[inner], bc_type="natural")(np.clip(new, old[1], old[-2])))
+
+    at = old[rod.edge] + rod.place[:, 0] * rod.lengths[rod.edge]
+    edges = np.clip(np.searchsorted(new, at, side="right") - 1, 0, count - 2).astype(np.int32)
+    own = [np.convolve(lengths, [0.5, 0.5]) for lengths in (rod.lengths, np.full(count - 1, edge))]
+    masses = np.linalg.lstsq(marker_shares(rod, tracked), rod.mass - own[0])[0]
+    finer = _laid(
+        rod,
+        count,
+        lengths=np.full(count - 1, edge),
+        bending=along(rod.bending),
+        twisting=along(rod.twisting),
+        curvature=edge * np.stack([along(column / rod.lengths[0]) for column in rod.curvature.T], axis=1),
+        edge=edges,
+        place=np.column_stack([(at - new[edges]) / edge, rod.place[:, 1:]]),
+        mass=own[1],
+    )
+    return replace(twin, rod=replace(finer, mass=own[1] + marker_shares(finer, tracked) @ masses))
+
+
+def _laid(rod: Rod, count: int, **values: np.ndarray) -> Rod:
+    held = np.full(count, -1, np.int32)
+    held[:2] = rod.held[:2]
+    return replace(rod, vertices=np.zeros((count, 3)), held=held, **values)
+
+
+def scored(folder: Path, ways: Mapping[str, np.ndarray], truth: np.ndarray, trajectory: int) -> pd.DataFrame:
+    """A row per model and window: mean, rms and largest error, cm."""
+    rows = []
+    for window in WINDOWS:
+        found = {RIVALS[name]: rival(folder, name, window) for name in RIVALS} if trajectory == 8 else {}
+        found |= {name: (truth, path) for name, path in ways.items()}
+        first = np.arange(len(truth)) // window * window
+        found[STAYS] = (truth, truth[first])
+        rows += [{"model": name, "window": window} | errors_of(*pair, window) for name, pair in found.items() if pair]
+    return pd.DataFrame(rows)
+
+
+def main() -> None:
+    parser = ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("results", type=Path)
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--methods", nargs="+", default=["rod_knots", "rod_slip"])
+    parser.add_argument("--trajectory", type=int, default=8, help="4 validates, 8 tests")
+    parser.add_argument("--settings", type=Path, default=Path("config/data/foam.yaml"))
+    a = parser.parse_args()
+    settings = parse(Config, read_yaml(a.settings), str(a.settings))
+    truth = observed(a.data, a.trajectory, settings).object_points[:, END].astype(np.float64)
+    ways = {}
+    for method in a.methods:
+        run = RunFolder.of(a.results / settings.scenarios[0] / method / "0")
+        twin = Twin.load(run.file(run.learning[-1], "twin"))
+        ways[method] = way(twin, a.data, a.trajectory, settings)
+    table = scored(a.data, ways, truth, a.trajectory)
+    a.output.mkdir(parents=True, exist_ok=True)
+    write_text(a.output / "errors.csv", table.to_csv(index=False, float_format="%.4f"))
+    heads = ["model", *WINDOWS.values(), "20 s: rms", "largest"]
+    rows = []
+    for name, part in table.groupby("model", sort=False):
+        own = part.set_index("window")
+        cells = [f"{own['mean'][window]:.2f}" if window in own.index else "" for window in WINDOWS]
+        rows.append([str(name), *cells, *(f"{own[key][5001]:.2f}" for key in ("rms", "largest"))])
+    note = NOTE.format(trajectory=a.trajectory)
+    write_text(
+        a.output / "summary.md", "# The foam cylinder\n\n" + note + "\n\n" + markdown([Table.of_texts(heads, rows, "")]) + "\n"
+    )
+    figure, axis = plt.subplots(figsize=(9, 3.2), layout="constrained")
+    pairs = {name: (truth, path) for name, path in ways.items()}
+    if a.trajectory == 8:
+        pairs |= {RIVALS[name]: rival(a.data, name, 5001) for name in ("rnn_LFK", "resnet_LFK", "rfem")}
+    for name, (seen, predicted) in pairs.items():
+        apart = CM * np.linalg.norm(seen[:5001] - predicted[:5001], axis=1)
+        axis.plot(np.arange(len(apart)) / RATE, apart, lw=1.2, label=f"{name}: {apart.mean():.2f} cm")
+    axis.set(xlabel="time from rest [s]", ylabel="error of the end [cm]", ylim=(0, 25), xlim=(0, 20))
+    axis.legend(frameon=False, fontsize=8)
+    save(figure, a.output / "errors.png")
+    print(a.output / "summary.md")
+
+
+if __name__ == "__main__":
+    main()
