@@ -1,4 +1,4 @@
-"""The two-material study: its equilibrium is the simulator's, its derivatives are those of differences, and a twisted beam turns evenly."""
+"""The two-material study: equilibrium is the simulator's, derivatives are those of differences, a twisted beam turns evenly."""
 
 from __future__ import annotations
 
