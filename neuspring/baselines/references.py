@@ -1,7 +1,5 @@
 """Two reference points that learn nothing: what is not better than these has learned nothing either."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Files of a processed PhysTwin case: what its reader refuses (errors), and what is not as released and harmless (warnings)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

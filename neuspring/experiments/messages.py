@@ -1,7 +1,5 @@
 """Messages to a user while the workflow runs, and after it."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import shutil

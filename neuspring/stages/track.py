@@ -1,7 +1,5 @@
 """Masks of one camera -> tracks of pixels."""
 
-from __future__ import annotations
-
 from neuspring.config import Config
 from neuspring.core.records import Before, Recorder
 from neuspring.data.capture import Capture

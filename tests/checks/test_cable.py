@@ -1,7 +1,5 @@
 """Recordings of cables as other laboratories write them: unit, rate, up axis, order of markers, branches, lost markers."""
 
-from __future__ import annotations
-
 import pickle
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The pure parts of the studies of color alone: shifts, IoU without hands, means, differences, costs, hands, captures."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Small ropes and cables whose twins are rods."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The verdict on each study, then its tables, as `neuspring study` writes them."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 
