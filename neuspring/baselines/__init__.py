@@ -135,8 +135,6 @@ REFERENCES = ("static", "controller_lbs")
 """Methods that learn nothing: what others must be better than."""
 BASELINES = Registry(
     "baselines",
-    {
-        **{name: Baseline(prediction=f"neuspring.baselines.references:{name}") for name in REFERENCES},
-    },
+    {name: Baseline(prediction=f"neuspring.baselines.references:{name}") for name in REFERENCES},
     Baseline,
 )

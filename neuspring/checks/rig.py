@@ -195,9 +195,7 @@ class Rig:
             for name, listed in self.planes.items()
             if listed and self.posed
         }
-        return {
-            name: min(listed, key=lambda one: one[1].tilt / TILT + abs(one[1].off) / TABLE_OFF) for name, listed in found.items()
-        }
+        return {name: min(each, key=lambda one: one[1].tilt / TILT + abs(one[1].off) / TABLE_OFF) for name, each in found.items()}
 
     @cached_property
     def standing(self) -> dict[str, float]:

@@ -396,9 +396,8 @@ def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
         mesh = trimesh.load_mesh(path, process=True, maintain_order=False)
     except Exception as error:
         # trimesh's readers have no common exception for damaged bytes.
-        raise InputError(
-            path, "this file must be a readable mesh (GLB, PLY, OBJ, STL)", f"{type(error).__name__}: {error}"
-        ) from error
+        told = f"{type(error).__name__}: {error}"
+        raise InputError(path, "this file must be a readable mesh (GLB, PLY, OBJ, STL)", told) from error
     if isinstance(mesh, trimesh.Scene):
         mesh = mesh.to_mesh()
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):

@@ -124,9 +124,8 @@ class FrameSolver:
         """State (x [N, 3] m, v [N, 3] m/s) one frame later; controllers move from begin to end [C, 3] (`controllers.waypoints`)."""
         self.start(x, v)
         self.advance(begin, end)
-        return self._one(self.buffers.get_vectors("x", self.last, self.nodes)), self._one(
-            self.buffers.get_vectors("v", self.last, self.nodes)
-        )
+        x, v = (self.buffers.get_vectors(name, self.last, self.nodes) for name in ("x", "v"))
+        return self._one(x), self._one(v)
 
     def start(self, x: torch.Tensor, v: torch.Tensor) -> None:
         """Put the state at the start of a frame into the buffers."""

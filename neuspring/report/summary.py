@@ -444,7 +444,6 @@ def summary_text(numbers: Numbers) -> str:
     """The verdict, the scores, and the runs that are not among them, in Markdown."""
     blocks: Sequence[Block] = [*verdict(numbers), *score_blocks(numbers), *detail_blocks(numbers)]
     runs = numbers.everything.runs
-    ended = runs.assign(
-        label=runs["method"], counted=runs["status"] == "ok", why=runs["status"] + ": " + runs["reason"].astype(str)
-    )
+    why = runs["status"] + ": " + runs["reason"].astype(str)
+    ended = runs.assign(label=runs["method"], counted=runs["status"] == "ok", why=why)
     return markdown([*blocks, *not_counted(ended)])

@@ -124,9 +124,8 @@ def removed_lines(runs: pd.DataFrame, left_out: LeftOut = EMPTY_MAP, labels: Lab
         if without and len(methods) > 1:
             count = runs["scenario"].nunique() - len(without)
             rest = f"over the other {count}" if count else "empty"
-            lines.append(
-                f"{labels.get(method, method)} does not apply to {', '.join(without)}, so that averages of all methods are {rest}."
-            )
+            rest = f"so that averages of all methods are {rest}."
+            lines.append(f"{labels.get(method, method)} does not apply to {', '.join(without)}, {rest}")
     return lines
 
 

@@ -415,6 +415,5 @@ def released_comparison(own: Collected, method: str) -> pd.DataFrame:
 def _sorted(study: Study, table: pd.DataFrame) -> pd.DataFrame:
     """The table in the order of the study; scenarios or categories keep theirs."""
     first = str(table.columns[0])
-    return metrics.in_order(
-        table, {first: dict.fromkeys(table[first]), "label": study.rows, "task": TASKS, "metric": paper.in_studies()}
-    )
+    ranks: Any = {first: dict.fromkeys(table[first]), "label": study.rows, "task": TASKS, "metric": paper.in_studies()}
+    return metrics.in_order(table, ranks)

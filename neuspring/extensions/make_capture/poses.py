@@ -266,9 +266,8 @@ def by_table(seen: SampledCamera, top_down: bool, at: tuple[float, float] | None
     points = cloud(seen.depths, seen.lens.matrix)
     table, remarks = find_table(seen.path, points, top_down=top_down, at=None if at is None else _point(seen, at))
     poses = {seen.name: pose_on(table, points, seen.size, seen.lens.matrix)}
-    judged = _judged(
-        "rig", seen.path, Judged.of(rig_of({seen.name: seen}, poses, posed=False), {seen.name: seen.unit}, taken=taken)
-    )
+    rig = rig_of({seen.name: seen}, poses, posed=False)
+    judged = _judged("rig", seen.path, Judged.of(rig, {seen.name: seen.unit}, taken=taken))
     lines = (f"table: {table.text()}", *(f"warning: {remark}" for remark in remarks), *judged)
     return Placed(poses=poses, table=table.text(), lines=lines)
 

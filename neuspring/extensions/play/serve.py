@@ -95,9 +95,8 @@ def _require_free(host: str, port: int) -> None:
     try:
         family, kind, proto, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
     except (OSError, UnicodeError) as error:
-        raise InputError(
-            "--host", "must be an address of this machine", f"{host}: {error}", "Leave it out for 127.0.0.1."
-        ) from error
+        rule, told = "must be an address of this machine", f"{host}: {error}"
+        raise InputError("--host", rule, told, "Leave it out for 127.0.0.1.") from error
     with socket.socket(family, kind, proto) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

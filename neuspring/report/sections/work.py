@@ -41,9 +41,8 @@ def work(material: ReportData) -> PageSection:
     jobs = material.jobs
     if not jobs:
         note = Text(text="There are no job records: times are those of finished runs alone.", tone="mute")
-        return PageSection(
-            key="work", title=title, blocks=[note, timing_table(material.collected.runs)] if material.runs else [note]
-        )
+        times = [timing_table(material.collected.runs)] if material.runs else []
+        return PageSection(key="work", title=title, blocks=[note, *times])
     attempts = [attempt for job in jobs for attempt in job.attempts]
     hosts = sorted({a.host for a in attempts if a.host})
     names = sorted({name for a in attempts for name in a.device_names})
