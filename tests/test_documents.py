@@ -47,9 +47,8 @@ def test_links_and_paths_of_a_page_lead_somewhere(page):
 def test_the_page_of_configurations_names_every_file_and_no_other():
     page = (ROOT / "config" / "README.md").read_text()
     named = re.findall(r"^\| `(\w+\.yaml)` \|", page.partition("The tables:")[0], re.MULTILINE)
-    assert sorted(named) == sorted(
-        path.name for folder in ("data", "studies") for path in (ROOT / "config" / folder).glob("*.yaml")
-    )
+    tables = [path.name for folder in ("data", "studies") for path in (ROOT / "config" / folder).glob("*.yaml")]
+    assert sorted(named) == sorted(tables)
 
 
 def test_every_room_has_a_page_or_a_map():

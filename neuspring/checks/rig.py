@@ -17,18 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neuspring.checks.cameras import MOST_FLOATING, pairs
-from neuspring.checks.table import (
-    FAR_OFF,
-    POSE,
-    SMALLEST_PLANE,
-    TABLE_OFF,
-    TILT,
-    TILTED,
-    Stand,
-    on_table,
-    other_side,
-    stand,
-)
+from neuspring.checks.table import FAR_OFF, POSE, SMALLEST_PLANE, TABLE_OFF, TILT, TILTED, Stand, on_table, other_side, stand
 from neuspring.core.artifacts import up_sign
 from neuspring.core.checks import Check
 from neuspring.core.geometry import rigid_inverse
@@ -402,11 +391,7 @@ class Judged:
 
     @classmethod
     def of(
-        cls,
-        rig: Rig,
-        units: Mapping[str, float | None],
-        of_file: bool = True,
-        taken: Callable[[str], str] | None = None,
+        cls, rig: Rig, units: Mapping[str, float | None], of_file: bool = True, taken: Callable[[str], str] | None = None
     ) -> Judged:
         """With the change that makes it right, if there is one."""
         return cls(rig, explain(rig) if of_file else explain(rig, (rig.up,)) or explain(rig), units, of_file, taken)

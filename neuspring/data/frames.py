@@ -90,8 +90,9 @@ def overlay(image: np.ndarray, labels: np.ndarray, tints: Mapping[int, Color]) -
 
 
 def write_png(path: Path, image: np.ndarray) -> Path:
-    """Write an RGB image [H, W, 3], or a mask [H, W], uint8, whole or not at all; a link is replaced, not followed."""
-    ok, png = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1] if image.ndim == 3 else image))
+    """Write RGB [H, W, 3], RGBA [H, W, 4] or a mask [H, W], uint8, whole or not at all; a link is replaced, not followed."""
+    pixels = image[..., [2, 1, 0, 3][: image.shape[2]]] if image.ndim == 3 else image
+    ok, png = cv2.imencode(".png", np.ascontiguousarray(pixels))
     assert ok, "an image can be encoded"
     write_atomically(path, lambda temporary: temporary.write_bytes(png.tobytes()))
     return path

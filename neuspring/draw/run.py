@@ -118,8 +118,7 @@ def losses_figure(histories: Mapping[str, pd.DataFrame], title: str) -> Figure:
     figure, axes = plt.subplots(1, len(histories), figsize=(3.6 * len(histories) + 1, 3.2), layout="constrained", squeeze=False)
     for axis, (stage, history) in zip(axes[0], histories.items(), strict=True):
         for metric, label in SERIES[stage]:
-            rows = history[history["metric"] == metric]
-            if len(rows):
+            if len(rows := history[history["metric"] == metric]):
                 single = "." if metric == "cost" or len(rows) == 1 else ""
                 axis.plot(rows["step"], rows["value"], ls="" if metric == "cost" else "-", marker=single, ms=4, label=label)
         axis.set(title=stage, xlabel=LOSS_AXES[stage][0], ylabel=LOSS_AXES[stage][1])

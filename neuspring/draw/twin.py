@@ -51,8 +51,7 @@ def stiffness_limits(stiffness: np.ndarray) -> tuple[float, float]:
 
     All but the outermost 0.5 % on either side; at least a factor of 2 and at most one of 10^4 apart; positive whatever comes in.
     """
-    positive = stiffness[stiffness > 0]
-    if not len(positive):
+    if not len(positive := stiffness[stiffness > 0]):
         return 1.0, LEAST_RATIO
     low, high = (float(value) for value in np.quantile(positive.astype(np.float64), [0.005, 0.995]))
     return _widened(max(low, high / DEEPEST), high)

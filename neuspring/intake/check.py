@@ -223,8 +223,7 @@ def check_layout(folder: Path, settings: Mocap = DEFORM) -> list[Finding]:
     if cases := find_cases(folder):
         findings = [finding for case in cases for finding in _check_case(case)]
         return findings + examine("cases", folder, folder, cases, findings)
-    files = sorted(folder.rglob("*.pkl"))
-    if not files:
+    if not (files := sorted(folder.rglob("*.pkl"))):
         rule = "a case with final_data.pkl, a folder of cases, a root with data/different_types, or cable recordings is required"
         raise InputError(folder, rule, "none of them")
     return [finding for file in files for finding in check_recording(file, settings)]
@@ -247,8 +246,7 @@ def find_cases(folder: Path) -> list[Case]:
         return []
     below = folder / "data" / "different_types"
     if below.is_dir():
-        paths = _subfolders(below)
-        if not paths:
+        if not (paths := _subfolders(below)):
             raise InputError(folder, "at least one case folder is required", "none")
         return [Case(root=folder, name=path.name) for path in paths]
     cases = []
@@ -305,8 +303,7 @@ def _check_case(case: Case) -> list[Finding]:
     if (poses := _read(found, path, load_pickle, "the calibration check is")) is not None:
         found += examine("calibration", path, poses, CAMERAS)
     path = folder / phystwin.METADATA
-    metadata = _read(found, path, load_json, "the check of intrinsics and frame rate is")
-    if metadata is not None:
+    if (metadata := _read(found, path, load_json, "the check of intrinsics and frame rate is")) is not None:
         found += examine("metadata", path, metadata) + examine("lenses of metadata", path, metadata, CAMERAS)
     if isinstance(metadata, dict):
         if "fps" not in metadata:

@@ -51,7 +51,9 @@ def both_averages(scores: pd.DataFrame, runs: pd.DataFrame, frozen: pd.DataFrame
     for other in means[1:]:
         table = table.merge(other, on=CELL_KEYS, how="outer")
     table = table.reindex(columns=[*CELL_KEYS, *MEAN_NAMES])
-    unknown = _unknown(failed, lost)
+    scored = pd.MultiIndex.from_frame(failed).isin(pd.MultiIndex.from_frame(lost[RUN_KEYS]) if len(lost) else [])
+    # Failed runs without any score, of each method.
+    unknown = failed[~scored].groupby("method").size()
     lacking = _lacking(failed, lost, pd.concat([part for part in (scores, lost) if len(part)]) if len(everything) else scores)
     without = table["method"].isin(unknown[unknown > 0].index) | pd.MultiIndex.from_frame(table[CELL_KEYS]).isin(lacking)
     table.loc[without, ["all", "all_other"]] = np.nan
@@ -70,12 +72,6 @@ def _scores_of(scores: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
 def _means(scores: pd.DataFrame, name: str) -> pd.DataFrame:
     names = {"mean": name, "other": f"{name}_other"}
     return averages(scores)[[*CELL_KEYS, *names]].rename(columns=names)
-
-
-def _unknown(failed: pd.DataFrame, lost: pd.DataFrame) -> pd.Series:
-    """Method to the number of its failed runs without any score."""
-    scored = pd.MultiIndex.from_frame(failed).isin(pd.MultiIndex.from_frame(lost[RUN_KEYS]) if len(lost) else [])
-    return failed[~scored].groupby("method").size()
 
 
 def _lacking(failed: pd.DataFrame, lost: pd.DataFrame, scores: pd.DataFrame) -> pd.MultiIndex:

@@ -68,8 +68,7 @@ def paired_differences(scores: pd.DataFrame, baseline: str) -> pd.DataFrame:
         if baseline not in wide:
             continue
         for method in wide.columns.drop(baseline):
-            both = wide[[method, baseline]].dropna()
-            if not len(both):
+            if not len(both := wide[[method, baseline]].dropna()):
                 continue
             difference, low, high = _mean_interval(both[method] - both[baseline], rng)
             base = both[baseline].groupby("scenario").mean()

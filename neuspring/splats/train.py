@@ -257,8 +257,7 @@ class Statistics:
     @torch.no_grad()
     def add(self, rendered: Rendered, width: int, height: int) -> None:
         """Account for a picture after its backward pass."""
-        gradient = rendered.means.grad
-        if gradient is None:
+        if (gradient := rendered.means.grad) is None:
             return
         if rendered.backend == "gsplat":
             gradient = gradient[0, rendered.index]

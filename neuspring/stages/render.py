@@ -159,7 +159,8 @@ def draw_frames(
     Raises InputError for a camera or frame that is not there, and where there is nothing to draw.
     """
     from neuspring.core.device import resolve_device
-    from neuspring.splats.draw import BLACK, WHITE, picture, save_picture, view_of
+    from neuspring.data.frames import write_png
+    from neuspring.splats.draw import BLACK, WHITE, picture, view_of
     from neuspring.splats.rasterize import choose_backend
 
     device, images, capture = resolve_device(device), settings.images, Capture.load(folder)
@@ -177,5 +178,5 @@ def draw_frames(
     for frame, gaussians in enumerate(frames_of_splats):
         if frame in wanted:
             made.append(output / f"{frame:05d}.png")
-            save_picture(made[-1], picture(gaussians, view, backend, WHITE if background == "white" else BLACK))
+            write_png(made[-1], picture(gaussians, view, backend, WHITE if background == "white" else BLACK))
     return made

@@ -13,8 +13,7 @@ from neuspring.stages.stage import Rows, Written, paths, stage
 
 
 def _reads(settings: Config, given: Any) -> tuple[str, ...]:
-    baseline = BASELINES.get(given["model"])
-    if baseline is None:
+    if (baseline := BASELINES.get(given["model"])) is None:
         return ()
     return (*([f"baselines.{baseline.section}"] if baseline.section else []), *baseline.reads(baseline.settings(settings)))
 

@@ -148,9 +148,8 @@ def test_each_fault_costs_one_job_and_the_same_command_continues(project, tmp_pa
 def mount(folder: Path, size: str):
     """A small file system of its own; skips where that is not allowed."""
     folder.mkdir()
-    result = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)], capture_output=True, text=True, check=False
-    )
+    command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode:
         pytest.skip(f"a file system of a chosen size cannot be mounted here: {result.stderr.strip()}")
 

@@ -376,9 +376,8 @@ def test_methods_on_a_pool_have_searches_and_fits_of_their_own(tmp_path: Path) -
     assert graph.owners["fit"] == {"full": "full", "one": "one"}
     jobs = {name: SimpleNamespace(scenario="a", method=name, seed=0) for name in made.methods}
     found = [graph.inputs(STAGES["fit"])(job) for job in jobs.values()]
-    assert [files["search"] for files in found] == [
-        f"results/a/{name}/0/search.json" for name in ("search-uniform", "search-uniform-all")
-    ]
+    records = [f"results/a/{name}/0/search.json" for name in ("search-uniform", "search-uniform-all")]
+    assert [files["search"] for files in found] == records
     others = ["results/b/observations.npz", "results/c/observations.npz"]
     assert [files.get("pool", []) for files in found] == [[], others]
     searches = [SimpleNamespace(scenario="a", search=name, seed=0) for name in made.searches]

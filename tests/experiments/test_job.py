@@ -107,9 +107,8 @@ def test_a_full_disk_behind_the_output_does_not_end_the_job(results):
 
 
 def test_a_job_that_lost_its_wrapper_is_listed(tmp_path):
-    vanished = JobRecord(
-        rule="fit", name="fit/a", log="logs/fit/a.log", attempts=[Attempt(started="2026-01-01T00:00:00+00:00", host="n1")]
-    )
+    begun = Attempt(started="2026-01-01T00:00:00+00:00", host="n1")
+    vanished = JobRecord(rule="fit", name="fit/a", log="logs/fit/a.log", attempts=[begun])
     (line,) = failure_lines([vanished], tmp_path)
     assert line.startswith("fit/a: its wrapper or machine vanished (attempt 1): on n1")
 

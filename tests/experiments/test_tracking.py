@@ -128,9 +128,8 @@ def test_the_use_of_the_machine_is_logged_where_jobs_recorded_it(results: Path) 
     peaks = {f"{stage}.peak_memory_mb": 64.0 for stage in ("fit", "appearance", "score")}
     whole = {"peak_memory_mb": 512.0, "peak_gpu_memory_mb": 1000.0, "mean_gpu_percent": 50.0}
     last = {"cpu_percent": 110.0, "memory_mb": 500.0, "gpu_percent": 50.0, "gpu_memory_mb": 900.0}
-    assert metrics == peaks | {f"search.{name}": value for name, value in (whole | last).items()}, (
-        "no rollout: it has no job record"
-    )
+    # No rollout: it has no job record.
+    assert metrics == peaks | {f"search.{name}": value for name, value in (whole | last).items()}
     history = client_of(results).get_metric_history(run.info.run_id, "usage/search.memory_mb")
     begin = STARTED_MS - 30 * 60_000
     assert [(m.step, m.value, m.timestamp - begin) for m in history] == [(0, 400.0, 500), (3, 500.0, 2600)]

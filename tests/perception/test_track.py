@@ -174,9 +174,8 @@ def test_cotracker_is_called_as_its_online_predictor_wants(video):
 
 def test_cotracker_without_weights_says_where_they_would_be(monkeypatch, tmp_path):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    with pytest.raises(
-        InputError, match=r"code and checkpoints/scaled_online\.pth must be in the torch\.hub cache.*download: true"
-    ):
+    told = r"code and checkpoints/scaled_online\.pth must be in the torch\.hub cache.*download: true"
+    with pytest.raises(InputError, match=told):
         track_cotracker.load(PointTracking())
 
 

@@ -26,9 +26,8 @@ from tests.support.browser import Browser, chromium
 from tests.support.report_tree import page_section as section
 
 WRITTEN = "2026-01-05T12:00:00+00:00"
-ABLATION = Study(
-    title="Pieces", reference=None, baseline="Baseline", rows={"Baseline": "baseline", "Ours": "neuspring", "Later": "later"}
-)
+NAMED = {"Baseline": "baseline", "Ours": "neuspring", "Later": "later"}
+ABLATION = Study(title="Pieces", reference=None, baseline="Baseline", rows=NAMED)
 SYSTEMS = Study(
     title="Systems",
     reference="table1_comparison",
@@ -188,9 +187,8 @@ def test_a_click_sorts_a_table_and_words_filter_it(many):
             found = browser.run(values)
             assert found == sorted(found)[::order]
             assert len(set(found)) == 8
-        browser.run(
-            "(box => { box.value = 'NEU'; box.dispatchEvent(new Event('input')) })(document.querySelector('#scores input'))"
-        )
+        script = "(box => { box.value = 'NEU'; box.dispatchEvent(new Event('input')) })(document.querySelector('#scores input'))"
+        browser.run(script)
         assert browser.run(names) == ["neuspring"]
 
 

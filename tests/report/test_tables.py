@@ -81,9 +81,8 @@ def with_images(lpips: str = "computed", quirks: tuple[str, ...] = ()) -> Collec
     base = collected({(s, m, 0): 0.01 for s in ("a", "b") for m in ("x", "y")})
     facts = {"backend": "warp", "masks": "given", "views": ["0"], "lpips": lpips, "quirks": list(quirks), "unseen_surface": 0.25}
     runs = base.runs.assign(images=[json.dumps(facts if s == "a" else None) for s in base.runs["scenario"]])
-    values = {"psnr": (30.0, 33.0), "ssim": (0.9, 0.95), "iou": (0.8, 0.9)} | (
-        {"lpips": (0.1, 0.05)} if lpips == "computed" else {}
-    )
+    values = {"psnr": (30.0, 33.0), "ssim": (0.9, 0.95), "iou": (0.8, 0.9)}
+    values |= {"lpips": (0.1, 0.05)} if lpips == "computed" else {}
     rows = [
         ("a", "rope", m, 0, task, metric, pair[k], "1", 10)
         for metric, pair in values.items()

@@ -152,9 +152,8 @@ def write(path, values) -> None:
 
 def test_cost_is_of_the_last_good_attempt_and_follows_the_inputs_of_records(tmp_path):
     def job(name: str, *attempts: tuple[str, float]) -> None:
-        made = [
-            {"started": "2026-01-01T00:00:00+00:00", "outcome": outcome, "cpu_seconds": 60.0 * cpu} for outcome, cpu in attempts
-        ]
+        begun = "2026-01-01T00:00:00+00:00"
+        made = [{"started": begun, "outcome": outcome, "cpu_seconds": 60.0 * cpu} for outcome, cpu in attempts]
         write(tmp_path / "jobs" / f"{name}.json", {"rule": name.split("/")[0], "name": name, "log": "x", "attempts": made})
 
     def record(place: str, more: dict | None = None, **inputs: str) -> str:

@@ -176,9 +176,8 @@ def table(*rows: tuple[str, str, int, float, int]) -> pd.DataFrame:
 
 def test_both_averages() -> None:
     """Equal weights scenarios equally, frames weighs them by length; seeds are averaged within a scenario first."""
-    scores = table(
-        ("ours", "long", 0, 1.0, 30), ("ours", "long", 1, 3.0, 30), ("ours", "short", 0, 5.0, 10), ("ours", "short", 1, 7.0, 10)
-    )
+    long = ("ours", "long", 0, 1.0, 30), ("ours", "long", 1, 3.0, 30)
+    scores = table(*long, ("ours", "short", 0, 5.0, 10), ("ours", "short", 1, 7.0, 10))
     row = metrics.averages(scores).iloc[0]
     assert (row["method"], row["task"], row["metric"]) == ("ours", "future", "chamfer")
     assert row["equal"] == pytest.approx((2 + 6) / 2)

@@ -179,9 +179,8 @@ def test_a_fit_that_its_settings_held_says_so_in_the_notes():
         "fit: 20% of the frames left out of gradients (fit.adjoint_limit)",
         "fit: only 1.2% of the texels moved by a tenth of their first scale",
     ]
-    free = StageRecord(
-        stage="fit", status="ok", facts={"at_bound": 0.05, "texels_moved": 0.05, "frames_left_out": 0.05}, settings=settings
-    )
+    facts = {"at_bound": 0.05, "texels_moved": 0.05, "frames_left_out": 0.05}
+    free = StageRecord(stage="fit", status="ok", facts=facts, settings=settings)
     assert _notes({"rollout": StageRecord(stage="rollout", status="ok"), "fit": free}) == []
 
 

@@ -297,9 +297,8 @@ def pushed(hands: str = "auto", rollouts: int = 26) -> SearchProblem:
     lump = np.tile(corners, (frames, 1, 1))
     lump[:, :, 0] += np.maximum.accumulate(np.maximum(way - 0.01, 0.0))[:, None]
     points = np.array([[-0.03, 0.005, 0.015], [-0.03, 0.025, 0.015]]) + way[:, None, None] * [1.0, 0.0, 0.0]
-    return small.search_problem(
-        scenarios.seen(lump, points), search=config.Search(hands=hands, rollouts=rollouts, lengths="spacing")
-    )
+    settings = config.Search(hands=hands, rollouts=rollouts, lengths="spacing")
+    return small.search_problem(scenarios.seen(lump, points), search=settings)
 
 
 def test_the_first_generation_says_whether_hands_hold_or_push():

@@ -273,10 +273,9 @@ def test_calibrated_controller_springs_rest_in_frame_0_and_body_springs_in_the_r
 
 
 def test_another_place_of_rest_is_refused() -> None:
+    made = graphs.piecewise_topology(cloud(3), cloud(4, 3), np.zeros(25, np.int32), [0.5], [6], 0.6, 4)
     with pytest.raises(InputError, match=r"rest_shape.*first_frame.*'hands'"):
-        replace(
-            graphs.piecewise_topology(cloud(3), cloud(4, 3), np.zeros(25, np.int32), [0.5], [6], 0.6, 4), controller_rest="hands"
-        )
+        replace(made, controller_rest="hands")
 
 
 # One piece ------------------------------------------------------------------------------------------------------------

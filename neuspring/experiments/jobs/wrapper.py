@@ -197,8 +197,7 @@ def execute(
                 _print(line)
         status = process.wait()
     ended = replace(begun, outcome="ok", exit=status, seconds=round(time.monotonic() - start, 3), **watch.facts())
-    fault = faults.diagnose(status, list(tail))
-    if fault is None:
+    if (fault := faults.diagnose(status, list(tail))) is None:
         return ended, None
     again, message = " (may be tried again)" if fault.outcome == "transient" else "", faults.last_words(list(tail))
     say(f"{fault.cause}{again}: {message} {fault.remedy}".rstrip() + f" (log: {log})")

@@ -216,8 +216,7 @@ class SpringGausTrainer:
         if not bool((after.detach().abs() < DIVERGENCE_RADIUS).all() and torch.isfinite(speed.detach()).all()):
             raise UnusableFrame("the anchors left the scene")
         state = after.detach(), (speed - self.values["velocity"]).detach()
-        loss = self.problem.objective(epoch, frame, after)
-        if loss is None:
+        if (loss := self.problem.objective(epoch, frame, after)) is None:
             return *state, None, 0.0
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]

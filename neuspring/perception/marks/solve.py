@@ -88,8 +88,7 @@ def solve(logs: np.ndarray, lab: np.ndarray, smoothness: float = SMOOTHNESS) -> 
     """
     kinds, height, width = logs.shape
     q = _softmax(logs).reshape(kinds, -1)
-    pixels = np.flatnonzero(_open(logs))
-    if not len(pixels):
+    if not len(pixels := np.flatnonzero(_open(logs))):
         return q.reshape(logs.shape)
     flat, color = logs.reshape(kinds, -1)[:, pixels], lab.reshape(-1, 3).astype(np.float32)
     rows, columns = np.divmod(pixels, width)
@@ -365,8 +364,7 @@ class Pass:
         """Take the colors beneath the marks of a frame at once: they say what was not known before."""
         bins = bins_of(lab)
         for label in ALL_LABELS:
-            shown = count(bins, seeds.certain == label)
-            if shown.any():
+            if (shown := count(bins, seeds.certain == label)).any():
                 self.colors[label] = log_density(mixed([(1.0, self.first[label]), (MARKED_WEIGHT, shown)]))
 
     def color_logs(
@@ -421,8 +419,7 @@ class Pass:
         holes = (left > 0) & (top > 0) & (left + width < nothing.shape[1]) & (top + height < nothing.shape[0])
         # The piece 0 is what is not nothing.
         holes &= (np.arange(number) > 0) & (areas < MOST_HOLE * nothing.sum())
-        unseen = holes[pieces] & ~seen
-        if unseen.any():
+        if (unseen := holes[pieces] & ~seen).any():
             ratio = self.colors[OBJECT][bins_of(lab)] - _local_density(lab, nothing & seen)
             gain = np.bincount(pieces[unseen], np.clip(ratio[unseen], -MOST_COLOR, MOST_COLOR), minlength=number)
             count_unseen = np.bincount(pieces[unseen], minlength=number)
@@ -455,8 +452,7 @@ def corrections(place: np.ndarray, seeds: Seeds, reach: float) -> np.ndarray:
     logs = np.where(seeds.possible, seeds.prior, NEVER)
     carried = place.argmax(axis=0)
     for label in ALL_LABELS:
-        wrong = (seeds.certain == label) & (carried != label)
-        if wrong.any():
+        if (wrong := (seeds.certain == label) & (carried != label)).any():
             away = cv2.distanceTransform((~wrong).astype(np.uint8), cv2.DIST_L2, 5)
             logs[label] += CORRECTION * np.exp(-away / (CORRECTED * reach))
     return logs

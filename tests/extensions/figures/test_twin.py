@@ -28,9 +28,8 @@ def uneven(scenario):
         stiffness = np.geomspace(100, 1e4, len(twin.topology.springs)).astype(np.float32)
         order = np.argsort(np.argsort(twin.topology.nodes[:, 0]))
         labels = (3 * order // len(order)).astype(np.int32)
-        changed = replace(
-            twin, material=replace(twin.material, stiffness=stiffness), topology=replace(twin.topology, labels=labels)
-        )
+        material, topology = replace(twin.material, stiffness=stiffness), replace(twin.topology, labels=labels)
+        changed = replace(twin, material=material, topology=topology)
         takes.append(replace(take, twin=changed))
     return paints.scene, takes
 

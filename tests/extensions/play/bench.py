@@ -111,9 +111,8 @@ def grow(nodes: int, frames: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         live, close = running(Hurried, twin, Path(folder))
         begun = time.monotonic()
-        print(
-            f"\n{nodes} nodes as fast as they can; a recording is kept for {MOST_FRAMES} frames\n  frame   memory, MiB", flush=True
-        )
+        print(f"\n{nodes} nodes as fast as they can; a recording is kept for {MOST_FRAMES} frames")
+        print("  frame   memory, MiB", flush=True)
         for wanted in np.linspace(frames / SAMPLES, frames, SAMPLES).astype(int):
             while live.simulator.frame < wanted:
                 pull(live, 0.5)

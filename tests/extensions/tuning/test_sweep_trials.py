@@ -51,12 +51,7 @@ def test_a_trial_is_judged_by_the_twin_that_the_method_would_choose(folder, meth
     training = trial.cut(small.observations(), small.observations().scenario.train_end)
     tailed = dataclasses.replace(base.fit, selection="tail")
     problem = FitProblem(
-        observations=training,
-        twin=twin,
-        fit=tailed,
-        simulation=base.simulation,
-        losses=base.losses,
-        quirks=base.released_quirks,
+        observations=training, twin=twin, fit=tailed, simulation=base.simulation, losses=base.losses, quirks=base.released_quirks
     )
     if method == "search_only":
         assert value == TwinFit(problem).tail_loss()

@@ -19,9 +19,8 @@ def bar(height: float = 0.5, youngs: float = 2e4, viscosity: float = 0.0, fricti
     """A bar of 0.12 x 0.03 x 0.03 m along x, its lower side at `height`."""
     nodes, tetrahedra = block((-0.06, -0.015, height), (0.06, 0.015, height + 0.03), cells)
     skin = boundary(tetrahedra)
-    surface = Surface(
-        rest=nodes, faces=skin, nodes=np.arange(len(nodes))[:, None], weights=np.ones((len(nodes), 1)), colors=nodes * 0
-    )
+    own, one = np.arange(len(nodes))[:, None], np.ones((len(nodes), 1))
+    surface = Surface(rest=nodes, faces=skin, nodes=own, weights=one, colors=nodes * 0)
     count = len(tetrahedra)
     return SoftBody(
         nodes=nodes,
