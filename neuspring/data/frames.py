@@ -49,6 +49,12 @@ def overlap(one: np.ndarray, other: np.ndarray) -> float:
     return float((one & other).sum() / union) if union else float("nan")
 
 
+def at_border(boxes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Pieces [n] bool, by the boxes [n, 5] of `cv2.connectedComponentsWithStats`, that reach the border of an image [H, W]."""
+    left, top, width, height = boxes.T[:4]
+    return np.asarray((left == 0) | (top == 0) | (left + width == shape[1]) | (top + height == shape[0]))
+
+
 def tints_of(image: np.ndarray, labels: np.ndarray) -> dict[int, Color]:
     """The tint, RGB, of each label in pictures of this camera: the usual one if it is seen, else the one that is seen best.
 

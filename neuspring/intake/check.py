@@ -176,7 +176,7 @@ def _rig(capture: Capture, samples: Mapping[str, Mapping[int, Sample]]) -> list[
     first = {name: some[0].depth for name, some in samples.items() if 0 in some}
     rig = Rig({name: capture.cameras[name] for name in samples}, depths, first, described.up)
     unit = described.depth_unit if described.depth_format == "png" else None
-    judged = Judged.of(rig, dict.fromkeys(samples, unit))
+    judged = Judged(rig, dict.fromkeys(samples, unit))
     return examine("rig", path, judged) + (examine("views", path, rig.views) if len(samples) > 1 else [])
 
 

@@ -82,7 +82,15 @@ def shape_prior(
     `cloud` [P, 3], m, is what was seen of the object in frame 0. With one camera, `end` [H, W] is the depth at which the object
     ends, m, where that is supposed otherwise than by `settings.back`.
     """
-    prior = _prior(capture, masks, cloud, settings, end)
+    backend = settings.backend
+    if backend == "auto":
+        backend = "none" if capture.description.category in THIN else "visual_hull"
+    if backend == "mesh":
+        prior = align(capture, masks, cloud, settings)
+    elif backend == "truth":
+        prior = surface(capture)
+    else:
+        prior = visual_hull(capture, masks, cloud, settings, end) if backend == "visual_hull" else no_prior()
     if not len(prior.faces):
         return prior
     was_seen = seen(prior.vertices, capture, masks, SEEN_WITHIN * HULL_VOXEL, prior.faces)
@@ -91,21 +99,6 @@ def shape_prior(
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     share = float((area * (~was_seen[prior.faces]).mean(axis=1)).sum() / area.sum())
     return replace(prior, seen=was_seen, facts={**prior.facts, "invented_share": share})
-
-
-def _prior(
-    capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray, settings: ShapePriorSettings, end: np.ndarray | None
-) -> ShapePrior:
-    backend = settings.backend
-    if backend == "auto":
-        backend = "none" if capture.description.category in THIN else "visual_hull"
-    if backend == "visual_hull":
-        return visual_hull(capture, masks, cloud, settings, end)
-    if backend == "mesh":
-        return align(capture, masks, cloud, settings)
-    if backend == "truth":
-        return surface(capture)
-    return no_prior()
 
 
 def no_prior() -> ShapePrior:
