@@ -81,8 +81,7 @@ def test_unit_rate_and_up_are_held_against_the_data(
     tmp_path: Path, data: np.ndarray, name: str, level: str, value: float, mends: dict[str, Any]
 ) -> None:
     roll = {"roll_axis": mends.get("roll_axis", "y" if mends.get("up") != "+y" else "z")}
-    found = [one for one in checked(tmp_path, data, **roll) if one.name != "markers on one place"]
-    (one,) = found
+    (one,) = [one for one in checked(tmp_path, data, **roll) if one.name != "markers on one place"]
     assert (one.name, one.level) == (name, level)
     assert one.value == pytest.approx(value, rel=0.1, abs=0.05)
     setting = next(iter(mends))

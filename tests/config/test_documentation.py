@@ -55,8 +55,7 @@ def test_shown_defaults_are_accepted_as_they_are_written():
         for name in [] if title == "(top level)" else title.split("."):
             place = place.setdefault(name, {})
         place |= {key.strip("`"): yaml.safe_load(default.strip("`")) for key, default, _, _ in config_page.fields(kind)}
-    made = config.parse(config.Config, written, "the page")
-    assert config.plain(made) == config.plain(config.Config())
+    assert config.plain(config.parse(config.Config, written, "the page")) == config.plain(config.Config())
 
 
 def test_ranges_are_those_that_the_configuration_enforces():

@@ -219,8 +219,7 @@ note('end')"""
     # Snakemake removes the log of a job before it starts it.
     (results / "logs" / f"{NAME}.log").unlink()
     second = start(results, code, "--gpus", "1")
-    line = second.stderr.readline()
-    assert "an earlier run of this job still goes on; waiting for its end" in line
+    assert "an earlier run of this job still goes on; waiting for its end" in second.stderr.readline()
     # While it waits it holds no GPU.
     gpus.acquire(1, ("1",), timeout=0).release()
     end.touch()

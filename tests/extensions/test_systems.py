@@ -71,8 +71,7 @@ def test_every_model_passes_through_every_stage(seen, model):
     assert (record["status"], record["held_file"]) == ("ok", None)
     trained = BASELINES[model].trained
     assert ("train" in record["timings"], "train" in record["histories"]) == (trained, trained)
-    scores = pd.read_parquet(run.with_name("scores.parquet"))
-    assert set(scores["task"]) == {"reconstruction", "future"}
+    assert set(pd.read_parquet(run.with_name("scores.parquet"))["task"]) == {"reconstruction", "future"}
     assert set(collect(seen.parents[1], ["small"], [model], [0]).runs["status"]) == {"ok"}
     if trained:
         history = pd.read_parquet(run.with_name("history.parquet"))

@@ -161,8 +161,7 @@ def test_errors_weigh_scenarios_and_pictures_weigh_frames():
 def test_the_spread_is_that_of_the_averages():
     runs = collected(varied({"baseline": 1.0, "neuspring_one_frame": 0.8}, noise=0.1))
     expected = averages(runs.scores).set_index("method")["seed_std"]
-    found = cells_of("table2", runs)["spread"]
-    assert found[("Baseline", *CD)] == pytest.approx(1e3 * expected["baseline"])
+    assert cells_of("table2", runs)["spread"][("Baseline", *CD)] == pytest.approx(1e3 * expected["baseline"])
     # A seed that lacks a scenario has another mean for that reason alone.
     less = Collected(runs.scores.drop(index=3), runs.runs)
     assert np.isnan(cells_of("table2", less)["spread"][("Baseline", *CD)])

@@ -64,8 +64,7 @@ def test_nearest_nodes_are_those_of_a_tree(seed, count):
     result = skin._nearest(skin._vectors(points), skin._vectors(queries), own=False, wanted=wanted).numpy()
     points, queries = points.astype(np.float32), queries.astype(np.float32)
     distances = np.linalg.norm(points[result] - queries[:, None], axis=2)
-    expected = cKDTree(points).query(queries, k=list(range(1, wanted + 1)))[0]
-    assert np.allclose(distances, expected, atol=1e-5)
+    assert np.allclose(distances, cKDTree(points).query(queries, k=list(range(1, wanted + 1)))[0], atol=1e-5)
     assert all(len(set(row)) == wanted for row in result.tolist())
 
 

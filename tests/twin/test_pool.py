@@ -42,8 +42,7 @@ def seen(path: str) -> Observations:
 
 def polished(own: Observations, **changes) -> SearchProblem:
     """A search of one generation with a polish of one round."""
-    start = {"object_radius": 0.045, "stiffness": 6e3}
-    settings = {"rollouts": ROLLOUTS, "start": start, "polish": 1}
+    settings = {"rollouts": ROLLOUTS, "start": {"object_radius": 0.045, "stiffness": 6e3}, "polish": 1}
     return small.search_problem(own, search=small.released(**settings, **LOGARITHMIC), **changes)
 
 

@@ -29,8 +29,7 @@ def uneven(scenario):
         order = np.argsort(np.argsort(twin.topology.nodes[:, 0]))
         labels = (3 * order // len(order)).astype(np.int32)
         material, topology = replace(twin.material, stiffness=stiffness), replace(twin.topology, labels=labels)
-        changed = replace(twin, material=material, topology=topology)
-        takes.append(replace(take, twin=changed))
+        takes.append(replace(take, twin=replace(twin, material=material, topology=topology)))
     return paints.scene, takes
 
 

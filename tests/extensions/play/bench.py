@@ -160,8 +160,7 @@ def browsed(run: Path, seconds: float) -> str:
 
 def running(kind: type[Live], twin: Twin, folder: Path):
     """A live twin on a server without browsers, and what ends both."""
-    results = written(twin, folder)
-    found = find([results])
+    found = find([written(twin, folder)])
     server = start("127.0.0.1", 0)
     player = Player(server.scene, found)
     player.hide(True)

@@ -96,8 +96,7 @@ def test_losses_of_other_scenarios_do_not_keep_a_trial(monkeypatch):
 
 def test_pruning_waits_for_whole_scenarios():
     for scenarios, steps in ((1, 5), (2, 15), (22, 85)):
-        pruner = worker.pruner_of(scenarios, 10)
-        assert pruner._inner._n_warmup_steps == steps
+        assert worker.pruner_of(scenarios, 10)._inner._n_warmup_steps == steps
 
 
 def test_a_numerical_failure_is_a_failed_trial_with_its_reason(folder):
