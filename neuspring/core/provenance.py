@@ -112,8 +112,7 @@ def _is_text(node: ast.stmt) -> bool:
 @functools.cache
 def _module_code(module: str) -> bytes:
     if _source(module) is None:
-        package = module.partition(".")[0]
-        names = packages_distributions().get(package, [])
+        names = packages_distributions().get(module.partition(".")[0], [])
         return hashlib.sha256(" ".join(f"{name} {version(name)}" for name in names).encode()).digest()
     return hashlib.sha256(_written(_tree(module)).encode()).digest()
 

@@ -131,8 +131,7 @@ def _layout(painter: Painter, width: float) -> tuple[Figure, list[list[Axes]], A
         panels.append([place(figure, left, top - 2 * high - FILM_GAP, across, high) for left in lefts[1:]])
         cax = place(figure, width - FILM_BAR + 0.06, top - 2 * high - FILM_GAP + 0.04, 0.09, high - 0.08)
         color_bar(figure, cax, painter.norm, ERROR_COLORS, painter.error_label, extend="max")
-    clock = place(figure, FILM_EDGE, total - FILM_EDGE - CLOCK, width - 2 * FILM_EDGE, CLOCK)
-    return figure, panels, clock
+    return figure, panels, place(figure, FILM_EDGE, total - FILM_EDGE - CLOCK, width - 2 * FILM_EDGE, CLOCK)
 
 
 def _fill(painter: Painter, panels: list[list[Axes]], frame: int) -> None:

@@ -187,8 +187,7 @@ def _largest_piece(voxels: np.ndarray) -> np.ndarray:
 
 def _surface(voxels: np.ndarray, low: np.ndarray, voxel: float, smoothing: float) -> tuple[np.ndarray, np.ndarray]:
     """Marching cubes of the occupancy, blurred over `smoothing` voxels, padded so that the surface closes."""
-    padded = np.pad(voxels.astype(np.float32), 2)
-    level = 0.5 - ndimage.gaussian_filter(padded, smoothing)
+    level = 0.5 - ndimage.gaussian_filter(np.pad(voxels.astype(np.float32), 2), smoothing)
     values: wp.array = wp.array(level, dtype=wp.float32, device="cpu")
     vertices, indices = IsoSurfaceMarchingCubes.extract_surface_marching_cubes(values, 0.0)  # type: ignore[arg-type]
     faces = indices.numpy().reshape(-1, 3)
@@ -244,8 +243,7 @@ def discs(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Their centers (x, y) [n, 2] lie on the ridges of that distance, which is their radius [n]; the largest is the last.
     """
     distance = cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
-    ridge = mask & (distance >= ndimage.maximum_filter(distance, 3) - 0.5)
-    y, x = np.nonzero(ridge)
+    y, x = np.nonzero(mask & (distance >= ndimage.maximum_filter(distance, 3) - 0.5))
     order = np.argsort(distance[y, x], kind="stable")
     return np.stack([x, y], axis=1)[order], distance[y, x][order], distance
 

@@ -45,8 +45,7 @@ def bound_positions(positions: np.ndarray, points: np.ndarray, neighbors: int = 
     from scipy.spatial import cKDTree
 
     nodes, points = positions.astype(np.float64), points.astype(np.float64)
-    count = min(neighbors, nodes.shape[1])
-    distance, index = cKDTree(nodes[0]).query(points, k=np.arange(1, count + 1))
+    distance, index = cKDTree(nodes[0]).query(points, k=np.arange(1, min(neighbors, nodes.shape[1]) + 1))
     mean = distance.mean(axis=1, keepdims=True)
     inverse = 1.0 / np.maximum(distance, np.maximum(LEAST_DISTANCE * mean, np.finfo(float).tiny))
     weights = inverse / inverse.sum(axis=1, keepdims=True)

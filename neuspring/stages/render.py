@@ -94,8 +94,7 @@ def render(
                     if videos:
                         videos["video"].add(figures.film_frame(scenario, frame, figures.panels(pair)))
             if videos and frame < predicted:
-                angle = 360 * frame / predicted
-                twin = orbit_view(gaussians, scored.views[first], scored.backend, angle)
+                twin = orbit_view(gaussians, scored.views[first], scored.backend, 360 * frame / predicted)
                 videos["turntable"].add(figures.film_frame(scenario, frame, {"twin": twin}))
             progress.update(frame + 1)
     table = pd.DataFrame(rows, columns=["frame", "camera", "metric", "value"])

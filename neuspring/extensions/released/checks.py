@@ -494,8 +494,7 @@ def frame_scores(
     rows = []
     for frame, gaussians in enumerate(skinned_frames(splats, positions, images, device)):
         if frame:
-            rendered = picture(gaussians, view, "warp")
-            values = _scores(case, camera, frame, rendered, lpips, images)
+            values = _scores(case, camera, frame, picture(gaussians, view, "warp"), lpips, images)
             rows += [{"frame": frame, "camera": camera.name, "metric": name, "value": value} for name, value in values.items()]
         progress.update(frame + 1)
     return pd.DataFrame(rows, columns=["frame", "camera", "metric", "value"])

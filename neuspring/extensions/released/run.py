@@ -213,8 +213,7 @@ def _table(findings: Sequence[Comparison]) -> list[str]:
         # Counts are whole.
         given = (f.ours, f.published, f.difference, f.tolerance)
         numbers = ["–" if v is None else f"{v:d}" if isinstance(v, int) else f"{v:.6g}" for v in given]
-        quantity = f"{f.task} {f.quantity}".strip()
-        rows.append([f.scenario, quantity, *numbers, f.unit, f.outcome, f.note])
+        rows.append([f.scenario, f"{f.task} {f.quantity}".strip(), *numbers, f.unit, f.outcome, f.note])
     return Table.of_texts(header, rows).markdown()
 
 

@@ -67,8 +67,7 @@ def build(body: SoftBody, fists: int, moduli: Moduli = stable_moduli, dashpots: 
     else:
         _add_solid(builder, body, moduli, dashpots)
     for _ in range(fists):
-        link = builder.add_body(is_kinematic=True, mass=1.0)
-        builder.add_shape_sphere(link, radius=FIST_RADIUS, cfg=shape)
+        builder.add_shape_sphere(builder.add_body(is_kinematic=True, mass=1.0), radius=FIST_RADIUS, cfg=shape)
     if colored:
         builder.color(include_bending=body.is_sheet)
     model = builder.finalize(device="cpu")
@@ -366,8 +365,7 @@ class FiniteElements:
         """
         frequency = np.sqrt(self._largest("position"))
         if self.body.is_sheet or not self.damping.edges:
-            damping = self._largest("velocity")
-            return SAFETY * _stable(frequency, damping), 0.0
+            return SAFETY * _stable(frequency, self._largest("velocity")), 0.0
         unit = 1e-3
         self._set_dashpots(unit)
         per_dashpot = self._largest("velocity") / unit
