@@ -160,8 +160,7 @@ def empty(axis: Axes, view: Camera, *, framed: bool = True) -> None:
     limits = {"xlim": (-0.5, view.width - 0.5), "ylim": (view.height - 0.5, -0.5)}
     axis.set(xticks=[], yticks=[], **limits, aspect="auto", facecolor="white")
     axis.set_autoscale_on(False)
-    for side in axis.spines.values():
-        side.set(linewidth=0.5, color="0.7", visible=framed)
+    axis.spines[:].set(linewidth=0.5, color="0.7", visible=framed)
 
 
 def hands(axis: Axes, scene: ShownScene, frame: int) -> None:

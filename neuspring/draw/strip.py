@@ -78,8 +78,7 @@ def _head(figure: Figure, painter: Painter, across: float, total: float, bottom:
         start, stop, high = own[0], own[-1] + across, total - 0.05 - TIME_BAND
         band = place(figure, start, high, stop - start, TIME_BAND)
         band.set(xticks=[], yticks=[], facecolor=rgb(color))
-        for side in band.spines.values():
-            side.set_visible(False)
+        band.spines[:].set_visible(False)
         figure.text(start / width, (high - 0.015) / total, name, ha="left", va="top", fontsize=TEXT - 1, color=rgb(color, 0.75))
     first = next((left for left, frame in zip(lefts, frames, strict=True) if frame >= scenario.train_end), None)
     if first is not None and first > lefts[0]:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from neuspring.baselines import BASELINES, without_pictures
+from neuspring.baselines import BASELINES, Pictures, TrainingRequest, without_pictures
 from neuspring.config import Config
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
@@ -55,7 +55,6 @@ def train(
     splats too. A training that ends early is recorded as a failure, with its last usable model; one that cannot begin, without a
     model. Raises InputError where silhouettes are asked for without pictures, and for models that are not trained.
     """
-    from neuspring.baselines import Pictures, TrainingRequest
     from neuspring.core.checkpoint import checkpoint_key
     from neuspring.core.files import write_history
 
