@@ -248,10 +248,10 @@ class Rig:
                 for name, listed in depths.items()
             }
             first = {name: change(depth, cameras[name].intrinsics) if name in names else depth for name, depth in first.items()}
-        changed = {"cameras": cameras, "depths": depths, "first": first}
-        return replace(self, **changed) if change or hypothesis.lens else self._elsewhere(**changed)
+        changed: dict[str, Any] = {"cameras": cameras, "depths": depths, "first": first}
+        return replace(self, **changed) if change or hypothesis.lens else self.elsewhere(**changed)
 
-    def _elsewhere(self, **changes: Any) -> Rig:
+    def elsewhere(self, **changes: Any) -> Rig:
         """The rig with changes that leave its planes, which are in the coordinates of the cameras, as they are."""
         rig = replace(self, **changes)
         rig.__dict__["planes"] = self.planes
@@ -268,7 +268,7 @@ class Rig:
     def with_poses(self, poses: Mapping[str, np.ndarray]) -> Rig:
         """The same with other poses, camera to world [4, 4], m."""
         cameras = {name: replace(one, camera_to_world=poses[name]) for name, one in self.cameras.items()}
-        return self._elsewhere(cameras=cameras)
+        return self.elsewhere(cameras=cameras)
 
 
 @dataclass(frozen=True)
@@ -301,7 +301,7 @@ def explain(rig: Rig, sides: Sequence[str] | None = None) -> Explained | None:
         for number, (one, changed) in enumerate(() if rig.right else _candidates(rig))
         for side in (sides or (rig.up, other_side(rig.up)))
         if one.what != "lens" or side == rig.up
-        for other in [changed._elsewhere(up=side)]
+        for other in [changed.elsewhere(up=side)]
         if other.right
     ]
     if found:

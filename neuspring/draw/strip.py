@@ -69,8 +69,8 @@ def _head(figure: Figure, painter: Painter, across: float, total: float, bottom:
     width, lefts = figure.get_figwidth(), [LABEL + k * (across + STRIP_GAP) for k in range(len(painter.frames))]
     for left, frame in zip(lefts, frames, strict=True):
         text = f"frame {frame}, {frame / scenario.frame_rate:.2f} s" if across > 1.0 else f"{frame}"
-        place = (left + across / 2) / width, (total - STRIP_HEAD + 0.04) / total
-        figure.text(*place, text, ha="center", va="bottom", fontsize=TEXT - 1)
+        at = (left + across / 2) / width, (total - STRIP_HEAD + 0.04) / total
+        figure.text(*at, text, ha="center", va="bottom", fontsize=TEXT - 1)
     for name, color, inside in (("training", TRAINING, False), ("future", FUTURE, True)):
         own = [left for left, frame in zip(lefts, frames, strict=True) if (frame >= scenario.train_end) == inside]
         if not own:

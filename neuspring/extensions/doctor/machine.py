@@ -79,8 +79,8 @@ def _libraries(settings: Config) -> Iterator[MachineCheck]:
         if importlib.util.find_spec(module):
             yield MachineCheck(module, "ok", f"extra {extra}")
         else:
-            state = "broken" if wanted.get(module) else "absent"
-            yield MachineCheck(module, state, f"extra {extra} is not installed", install(extra))
+            told = f"extra {extra} is not installed", install(extra)
+            yield MachineCheck(module, "broken" if wanted.get(module) else "absent", *told)
     if importlib.util.find_spec("av"):
         import av
 

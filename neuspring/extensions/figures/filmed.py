@@ -148,8 +148,8 @@ class PhotoPainter(Painter):
         photo, labels = self.scene.photo(frame), self.scene.mask(frame)
         if photo is None or labels is None:
             return Drawn(self.scene.cut(rgba))
-        masks = (np.where(labels == label, 255, 0).astype(np.uint8) for label in (OBJECT, HANDS))
-        pair = Pair.of(photo, rgba, *masks, OBJECT_COVERAGE)
+        own, hands = (np.where(labels == label, 255, 0).astype(np.uint8) for label in (OBJECT, HANDS))
+        pair = Pair.of(photo, rgba, own, hands, OBJECT_COVERAGE)
         difference = (pair.truth - pair.prediction).abs().mean(0).numpy()
         shows = pair.silhouettes[0] | pair.silhouettes[1]
         cut = self.scene.cut

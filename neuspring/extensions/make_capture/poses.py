@@ -331,8 +331,8 @@ def stand(poses: Poses, seen: Seen, file: Path, level: bool, top_down: bool, up:
         rise = f"its plane was {100 * abs(point[2]):.1f} cm from z = 0 there, {1e3 * rms:.1f} mm rms over all cameras"
         lines.append(f"leveled: the world was turned by {turn:.1f} degrees; {rise}")
     rig = rig_of(seen, moved)
-    side = up or min(("+z", "-z"), key=lambda each: sum(rig.with_up(each).standing.values()))
-    rig = rig.with_up(side)
+    side = up or min(("+z", "-z"), key=lambda each: sum(rig.elsewhere(up=each).standing.values()))
+    rig = rig.elsewhere(up=side)
     lines += _judged("rig", file, Judged(rig, {name: view.unit for name, view in seen.items()}, False, taken))
     text = "; ".join(f"camera {name}: {plane.text()}" for name, (plane, _) in rig.stands.items())
     return Placed(poses=moved, up=side, motion=motion, table=text or "not found", lines=tuple(lines))
