@@ -223,7 +223,8 @@ def check_layout(folder: Path, settings: Mocap = DEFORM) -> list[Finding]:
     if cases := find_cases(folder):
         findings = [finding for case in cases for finding in _check_case(case)]
         return findings + examine("cases", folder, folder, cases, findings)
-    if not (files := sorted(folder.rglob("*.pkl"))):
+    files = sorted(folder.rglob("*.pkl"))
+    if not files:
         rule = "a case with final_data.pkl, a folder of cases, a root with data/different_types, or cable recordings is required"
         raise InputError(folder, rule, "none of them")
     return [finding for file in files for finding in check_recording(file, settings)]

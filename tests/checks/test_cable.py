@@ -1,5 +1,7 @@
 """Recordings of cables as other laboratories write them: unit, rate, up axis, order of markers, branches, lost markers."""
 
+from __future__ import annotations
+
 import pickle
 from pathlib import Path
 from typing import Any
@@ -81,7 +83,8 @@ def test_unit_rate_and_up_are_held_against_the_data(
     tmp_path: Path, data: np.ndarray, name: str, level: str, value: float, mends: dict[str, Any]
 ) -> None:
     roll = {"roll_axis": mends.get("roll_axis", "y" if mends.get("up") != "+y" else "z")}
-    (one,) = [one for one in checked(tmp_path, data, **roll) if one.name != "markers on one place"]
+    found = [one for one in checked(tmp_path, data, **roll) if one.name != "markers on one place"]
+    (one,) = found
     assert (one.name, one.level) == (name, level)
     assert one.value == pytest.approx(value, rel=0.1, abs=0.05)
     setting = next(iter(mends))

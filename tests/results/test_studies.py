@@ -1,5 +1,7 @@
 """The pure parts of the studies of color alone: shifts, IoU without hands, means, differences, costs, hands, captures."""
 
+from __future__ import annotations
+
 import json
 import re
 from dataclasses import replace
@@ -57,7 +59,8 @@ def table(*rows: tuple) -> pd.DataFrame:
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (1.5, -2.5), (-3.0, 2.0)])
 def test_a_shift_is_found_again(shift):
     mask = block(slice(10, 22), slice(15, 40)) | block(slice(20, 31), slice(30, 36))
-    assert fitted_shift(mask, np.where(shifted(mask, shift), OBJECT, 0).astype(np.uint8), most=3.0) == shift
+    labels = np.where(shifted(mask, shift), OBJECT, 0).astype(np.uint8)
+    assert fitted_shift(mask, labels, most=3.0) == shift
 
 
 def test_whole_shifts_move_pixels_and_half_ones_keep_those_covered_by_more_than_a_half():
@@ -151,8 +154,9 @@ def write(path, values) -> None:
 
 def test_cost_is_of_the_last_good_attempt_and_follows_the_inputs_of_records(tmp_path):
     def job(name: str, *attempts: tuple[str, float]) -> None:
-        begun = "2026-01-01T00:00:00+00:00"
-        made = [{"started": begun, "outcome": outcome, "cpu_seconds": 60.0 * cpu} for outcome, cpu in attempts]
+        made = [
+            {"started": "2026-01-01T00:00:00+00:00", "outcome": outcome, "cpu_seconds": 60.0 * cpu} for outcome, cpu in attempts
+        ]
         write(tmp_path / "jobs" / f"{name}.json", {"rule": name.split("/")[0], "name": name, "log": "x", "attempts": made})
 
     def record(place: str, more: dict | None = None, **inputs: str) -> str:
@@ -162,7 +166,8 @@ def test_cost_is_of_the_last_good_attempt_and_follows_the_inputs_of_records(tmp_
 
     search, splats = record("search-uniform/0/search"), record("appearance/0/appearance")
     record("search-other/0/search", observations="another")
-    record("m/0/rollout", fit=record("m/0/fit", search=search))
+    fit = record("m/0/fit", search=search)
+    record("m/0/rollout", fit=fit)
     record("m/0/render", appearance=splats)
     job("track/s/0", ("ok", 1.0))
     job("search/s/uniform/0", ("killed", 50.0), ("ok", 2.0), ("ok", 3.0), ("running", 9.0))
