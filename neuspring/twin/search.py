@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 import torch
 
 from neuspring.config.search import Search
@@ -33,6 +32,7 @@ from neuspring.twin.polish import POLISH, SLOPES, Polish, slope_rows
 
 if TYPE_CHECKING:
     import cma
+    import pandas as pd
 
 
 FIRST_STEP = 1 / 6
@@ -173,6 +173,8 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
 
 def _best(problem: SearchProblem, rows: Sequence[dict[str, Any]], push: bool, attempts: int, earlier: float) -> SearchResult:
     """The result of a search with these rows. Raises InputError, NumericalFailure if none could be simulated."""
+    import pandas as pd
+
     table = pd.DataFrame(rows)
     costs = table["cost"]
     best = _least(table)
@@ -302,6 +304,8 @@ def _threads(count: int) -> Iterator[Map]:
 
 def save_trace(path: Path, key: str, trace: list[dict[str, Any]], attempts: int, seconds: float) -> None:
     """Write the rows of a trace, with what they were made from."""
+    import pandas as pd
+
     table = pd.DataFrame(trace)
     table.attrs |= {"key": key, "attempts": attempts, "seconds": seconds}
     write_atomically(path, lambda p: table.to_parquet(p))
@@ -309,6 +313,8 @@ def save_trace(path: Path, key: str, trace: list[dict[str, Any]], attempts: int,
 
 def recorded_trace(path: Path | None, key: str) -> tuple[list[dict[str, Any]], int, float]:
     """(rows of the trace, attempts, seconds) of a recorded search with this key; (none, 1, 0) if there is none."""
+    import pandas as pd
+
     fresh: tuple[list[dict[str, Any]], int, float] = ([], 1, 0.0)
     if path is None or not path.is_file():
         return fresh

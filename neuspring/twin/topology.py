@@ -11,9 +11,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
-from scipy.spatial import cKDTree
 
 from neuspring.core.artifacts import NO_REST_SHAPE, Topology, canonical_shape
 from neuspring.core.errors import InputError
@@ -33,6 +30,10 @@ def node_spacing(nodes: np.ndarray) -> float:
     ring are near each other. The last tenth of the edges is left out because of holes in what was seen.
     Scales with the nodes and does not depend on their order. Raises InputError if no two nodes lie apart.
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import minimum_spanning_tree
+    from scipy.spatial import cKDTree
+
     points = np.asarray(nodes, np.float64)
     count = min(TREE_NEIGHBORS + 1, len(points))
     distance, partner = cKDTree(points).query(points, k=count)
@@ -51,6 +52,8 @@ def controller_reach(nodes: np.ndarray, controllers: np.ndarray) -> float:
 
     Of a filmed hand most points are on fingers and forearm, far from what it holds, so the mean distance says nothing.
     """
+    from scipy.spatial import cKDTree
+
     return float(cKDTree(np.asarray(nodes, np.float64)).query(np.asarray(controllers, np.float64))[0].min())
 
 
@@ -101,6 +104,10 @@ def joined(nodes: np.ndarray, springs: np.ndarray) -> np.ndarray:
     farther than from the nearest of them, each from its 3 nearest nodes of the rest. So a single node has 3 springs, and a part
     behind a gap a seam.
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
     count, spacing = len(nodes), 0.0
     while True:
         graph = coo_array((np.ones(len(springs)), springs.T), shape=(count, count))
@@ -130,6 +137,8 @@ def object_springs(nodes: np.ndarray, radius: np.ndarray, neighbors: np.ndarray)
 
     Node i asks for its `neighbors[i]` nearest nodes, itself included, at a distance below `radius[i]` [m].
     """
+    from scipy.spatial import cKDTree
+
     count = len(nodes)
     k = int(min(neighbors.max(), count))
     distance, partner = cKDTree(nodes).query(nodes, k=k, distance_upper_bound=float(radius.max()))
@@ -150,6 +159,8 @@ def _first_of_each(pairs: np.ndarray, count: int) -> np.ndarray:
 
 def controller_springs(nodes: np.ndarray, controllers: np.ndarray, radius: float, neighbors: int) -> np.ndarray:
     """Springs from controllers to object nodes, [S, 2] as (N + controller, node)."""
+    from scipy.spatial import cKDTree
+
     k = min(neighbors, len(nodes))
     distance, partner = cKDTree(nodes).query(controllers, k=k, distance_upper_bound=radius)
     distance, partner = distance.reshape(len(controllers), k), partner.reshape(len(controllers), k)
