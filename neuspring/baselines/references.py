@@ -1,7 +1,5 @@
 """Two reference points that learn nothing: what is not better than these has learned nothing either."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np
@@ -42,8 +40,7 @@ def _held(hands: np.ndarray, valid: np.ndarray, nodes: torch.Tensor, unturned: t
     yield nodes
     skin, holding = None, np.zeros(hands.shape[1], dtype=bool)
     for frame in range(1, len(hands)):
-        now = valid[frame - 1] & valid[frame]
-        if now.any():
+        if (now := valid[frame - 1] & valid[frame]).any():
             if skin is None or (now != holding).any():
                 skin, holding = Skin(hands[frame - 1, now], device=device), now
             nodes, _ = skin.step(hands[frame - 1, now], hands[frame, now], nodes, unturned)

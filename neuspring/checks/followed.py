@@ -1,7 +1,5 @@
 """Points that were followed through the video of one camera, with its masks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any

@@ -1,7 +1,5 @@
 """Commands on data: check-data, mask, compare-masks."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

@@ -5,8 +5,6 @@ is a recorded result), 2 bad input (only another input can help), 1 anything els
 imported, after the number of threads is set.
 """
 
-from __future__ import annotations
-
 import argparse
 import difflib
 import errno
@@ -22,10 +20,7 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.version import __version__
 from neuspring.registry import Registry
 
-_OURS = {
-    "data": "check-data mask compare-masks",
-    "results": "tables perception-table study explain report track-init log sync ui",
-}
+_OURS = {"data": "check-data mask compare-masks", "results": "tables perception-table study explain report track-init log sync ui"}
 COMMANDS: Registry[Callable[..., int | None]] = Registry(
     "commands",
     {name: f"neuspring.cli.{module}:{name.replace('-', '_')}" for module, names in _OURS.items() for name in names.split()},

@@ -1,7 +1,5 @@
 """The dial `effort`: the sizes that decide how long a benchmark takes, all turned together."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any, Literal, get_args
 
@@ -34,7 +32,6 @@ def sizes(effort: str) -> dict[str, Any]:
     """The values of an effort, nested as in a configuration file."""
     values: dict[str, Any] = {}
     for path, choices in EFFORT_SIZES.items():
-        merge(
-            values, functools.reduce(lambda inner, name: {name: inner}, reversed(path.split(".")), choices[EFFORTS.index(effort)])
-        )
+        nested = functools.reduce(lambda inner, name: {name: inner}, reversed(path.split(".")), choices[EFFORTS.index(effort)])
+        merge(values, nested)
     return values

@@ -3,8 +3,6 @@
 Unknown keys raise, values are never cast, every problem is listed with its path.
 """
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import difflib

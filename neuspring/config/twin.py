@@ -1,7 +1,5 @@
 """Settings of the training losses and of the first-order fit."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from typing import Annotated, Literal

@@ -3,8 +3,6 @@
 The only module of this package that imports torch and Warp.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import hashlib

@@ -3,8 +3,6 @@
 A step's own finding is implausible, but no reason to stop: it is kept in the record, printed, and reported.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -97,9 +95,8 @@ def refuse(findings: Iterable[Finding]) -> None:
     errors = [one for one in listed if one.level == "error"]
     if errors:
         more = f"{len(errors) - 1} more: " if len(errors) > 1 else ""
-        raise InputError(
-            errors[0].where, errors[0].message.rstrip("."), remedy=f"{more}`neuspring check-data` lists every finding."
-        )
+        remedy = f"{more}`neuspring check-data` lists every finding."
+        raise InputError(errors[0].where, errors[0].message.rstrip("."), remedy=remedy)
     for one in listed:
         if one.level == "warning":
             print(one)

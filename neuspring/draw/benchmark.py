@@ -1,8 +1,6 @@
 """Pictures of a benchmark: every method's error as a ratio to the baseline's, the error against the number of regions K, and over
 time."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from collections.abc import Iterable, Sequence
@@ -48,8 +46,7 @@ def ratios_figure(ratios: pd.DataFrame, note: str) -> Figure | None:
         for index in range(0, len(methods), 2):
             axis.axhspan(index - 0.5, index + 0.5, color="0.96", lw=0)
         for metric, shift in zip(shown, shifts, strict=True):
-            part = rows[(rows["task"] == task) & (rows["metric"] == metric.name)]
-            if len(part):
+            if len(part := rows[(rows["task"] == task) & (rows["metric"] == metric.name)]):
                 place = np.array([methods.index(method) for method in part["method"]]) - shift
                 _intervals(axis, part, place, *styles[metric], metric.title)
         _scale(axis, rows[rows["task"] == task])

@@ -1,7 +1,5 @@
 """Pictures to a video that any browser plays: H.264 (libx264) in MP4, yuv420p, BT.709 colors, through PyAV."""
 
-from __future__ import annotations
-
 import math
 import tempfile
 from fractions import Fraction
@@ -60,9 +58,8 @@ class Video:
         if picture.shape != self._shape:
             raise InputError(where, f"picture {number} of this video must have the size of the first, {self._shape}", picture.shape)
         height, width = self._shape[:2]
-        rgb = self._av.VideoFrame.from_ndarray(
-            np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge"), format="rgb24"
-        )
+        padded = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+        rgb = self._av.VideoFrame.from_ndarray(padded, format="rgb24")
         frame = rgb.reformat(format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG", threads=1)
         self._container.mux(self._stream.encode(frame))
         self._count += 1

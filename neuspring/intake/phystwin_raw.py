@@ -3,8 +3,6 @@
 Images of a scenario are linked where the file system allows it, else copied.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Literal
 

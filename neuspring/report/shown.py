@@ -3,8 +3,6 @@
 Files are not trusted: sizes of arrays are checked before they are read, and names must stay inside the scenario's folder.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import zipfile
@@ -88,8 +86,7 @@ class Run:
         return digest_file(self.paths["twin"]) if "twin" in self.paths else ""
 
     def _read(self, role: str, kind: type[Kind]) -> Kind | None:
-        path = self.paths.get(role)
-        if path is None:
+        if (path := self.paths.get(role)) is None:
             return None
         if kind is not Splats:
             require_modest(path)

@@ -1,7 +1,5 @@
 """Perception of a synthetic capture -> its errors against the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from neuspring.config import Config

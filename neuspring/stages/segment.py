@@ -1,7 +1,5 @@
 """One camera of a capture -> masks of object and hands."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from neuspring.config import Config

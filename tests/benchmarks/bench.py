@@ -7,8 +7,6 @@ changed since the table of the same kind of machine that was kept last. Writes r
 --save results/published/bench/<kind of machine>.json, which is to be committed. Some five minutes on a CPU; on a GPU at most two.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time
@@ -45,8 +43,7 @@ def main(arguments: list[str] | None = None) -> None:
     print(", ".join(f"{name} {value}" for name, value in facts.items() if value))
     print("", table.text(rows, kept), "", table.LEGEND, *dict.fromkeys(notes), sep="\n")
     print(f"compared with commit {kept['machine']['commit']}" if kept else f"no table of {kind} is kept")
-    record = table.as_record(facts, rows, notes)
-    print(table.save(record, kind, committed=options.save).relative_to(table.ROOT))
+    print(table.save(table.as_record(facts, rows, notes), kind, committed=options.save).relative_to(table.ROOT))
 
 
 def devices(chosen: str | None) -> list[str]:

@@ -1,7 +1,5 @@
 """From frames that are ready to run to rows of the table."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 

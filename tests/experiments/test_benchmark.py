@@ -1,7 +1,5 @@
 """The tables of methods, searches and scenarios, and what is checked of a benchmark before any job."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import json
@@ -395,9 +393,8 @@ def test_methods_on_a_pool_have_searches_and_fits_of_their_own(tmp_path: Path) -
     assert graph.owners["fit"] == {"full": "full", "one": "one"}
     jobs = {name: SimpleNamespace(scenario="a", method=name, seed=0) for name in made.methods}
     found = [graph.inputs(STAGES["fit"])(job) for job in jobs.values()]
-    assert [files["search"] for files in found] == [
-        f"results/a/{name}/0/search.json" for name in ("search-uniform", "search-uniform-all")
-    ]
+    records = [f"results/a/{name}/0/search.json" for name in ("search-uniform", "search-uniform-all")]
+    assert [files["search"] for files in found] == records
     others = ["results/b/observations.npz", "results/c/observations.npz"]
     assert [files.get("pool", []) for files in found] == [[], others]
     searches = [SimpleNamespace(scenario="a", search=name, seed=0) for name in made.searches]
@@ -631,8 +628,7 @@ def test_a_target_of_a_table_means_its_rows_and_no_others_with_any_data(overlays
 
 def test_targets_leave_a_part_that_was_asked_for_and_other_targets_as_they_are():
     values = shipped("synthetic") | {"only": "seed=1 method=baseline"}
-    chosen = tables.for_targets(values, ["table2"], ROOT)
-    part = Benchmark(values | chosen, ROOT).config
+    part = Benchmark(values | tables.for_targets(values, ["table2"], ROOT), ROOT).config
     assert (part.methods, part.seeds) == (("baseline",), (1,))
     assert tables.for_targets(values, ["report"], ROOT) == tables.for_targets(values, [], ROOT) == {}
     assert tables.for_targets(shipped("toy"), ["table3", "report"], ROOT) == {"studies": ["table3"]}
@@ -801,8 +797,7 @@ def test_an_oracle_has_a_fit_of_its_own_is_named_in_its_record_and_is_not_transf
 def test_the_graph_asks_stages_and_compares_no_name_of_one() -> None:
     """No `match`, and no comparison of a stage's name with a text: what a stage is like it declares itself."""
     for name in ("graph", "freshness", "needs"):
-        tree = ast.parse((ROOT / "neuspring" / "experiments" / f"{name}.py").read_text())
-        nodes = list(ast.walk(tree))
+        nodes = list(ast.walk(ast.parse((ROOT / "neuspring" / "experiments" / f"{name}.py").read_text())))
         assert not [node for node in nodes if isinstance(node, ast.Match)]
         compared = [ast.unparse(node) for node in nodes if isinstance(node, ast.Compare)]
         assert not [text for text in compared if ".name" in text and re.search(rf"['\"]({'|'.join(STAGES)})['\"]", text)]

@@ -1,7 +1,5 @@
 """Parity with the released PhysTwin simulator, clip by clip (tests/golden/sim_*.npz)."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """The answer in words says what was measured, whether chance explains it, and what the records say of the cause."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -74,8 +72,7 @@ def test_a_lead_that_one_large_error_makes_is_none():
 
 
 def test_as_many_scenarios_as_it_asks_for_do_resolve_it():
-    rng = np.random.default_rng(3)
-    logs = rng.normal(-0.2, 0.3, 5)
+    logs = np.random.default_rng(3).normal(-0.2, 0.3, 5)
     low, high = np.exp(statistics.t_interval(logs))
     count = statistics.needed(low, high, 5)
     shape = np.linspace(-1, 1, count)

@@ -1,7 +1,5 @@
 """Captures of scenes with hands in space: points alone of any folder of that form, film and both where there is a film."""
 
-from __future__ import annotations
-
 import json
 import shutil
 
@@ -41,8 +39,7 @@ def published(case, up=-1):
 
 
 def test_any_folder_of_that_form_is_a_case_and_its_split_is_the_released_one(folder, tmp_path):
-    found = folders_of(tmp_path / "given")
-    assert found == {"single_push_sloth": folder}
+    assert folders_of(tmp_path / "given") == {"single_push_sloth": folder}
     made = write_points(folder, tmp_path / "captures", "single_push_sloth")
     assert serious(check_layout(made.folder)) == []
     assert (made.frame_count, made.train_end) == (FRAMES, int(released_cases()["single_push_sloth"]["train_end"]))

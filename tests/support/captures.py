@@ -1,7 +1,5 @@
 """Small captures: their cameras and descriptions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

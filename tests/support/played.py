@@ -1,7 +1,5 @@
 """A small scenario's results folder with runs that have real twins, as the workflow leaves it: for tests of the playground."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,8 +22,7 @@ def results(folder: Path, methods: tuple[str, ...] = ("baseline", "neuspring")) 
         place = scenario / method / "0"
         twin = softer(problem.truth, 0.7**index)
         twin.save(place / "twin.npz")
-        trajectory = roll_out(twin, seen.controller_points)
-        trajectory.save(place / "trajectory.npz")
+        roll_out(twin, seen.controller_points).save(place / "trajectory.npz")
         record(place)
     return scenario
 

@@ -1,7 +1,5 @@
 """Training losses against golden values (tests/golden/m05) and their rules."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 

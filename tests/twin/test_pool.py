@@ -43,8 +43,7 @@ def seen(path: str) -> Observations:
 
 def polished(own: Observations, **changes) -> SearchProblem:
     """A search of one generation with a polish of one round."""
-    start = {"object_radius": 0.045, "stiffness": 6e3}
-    settings = {"rollouts": ROLLOUTS, "start": start, "polish": 1}
+    settings = {"rollouts": ROLLOUTS, "start": {"object_radius": 0.045, "stiffness": 6e3}, "polish": 1}
     return small.search_problem(own, search=small.released(**settings, **LOGARITHMIC), **changes)
 
 
@@ -175,9 +174,8 @@ def require_equal_twins(one: Twin, other: Twin) -> None:
 
 def test_an_oracle_on_a_pool_reads_the_future_of_what_counts():
     problem, late = problem_of(LIFTED, oracle=True, epochs=1), small.spoiled_future()
-    assert not np.array_equal(
-        pooled(problem, late).twin.material.stiffness, pooled(problem, problem.observations).twin.material.stiffness
-    )
+    one, other = (pooled(problem, seen).twin.material.stiffness for seen in (late, problem.observations))
+    assert not np.array_equal(one, other)
     plain = problem_of(LIFTED, epochs=1)
     require_equal(pooled(plain, late), pooled(plain, plain.observations))
 

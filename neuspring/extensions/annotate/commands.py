@@ -1,7 +1,5 @@
 """The command `annotate`."""
 
-from __future__ import annotations
-
 import os
 import sys
 import webbrowser

@@ -1,7 +1,5 @@
 """The command doctor."""
 
-from __future__ import annotations
-
 from neuspring.cli.options import Settings, read_settings
 
 

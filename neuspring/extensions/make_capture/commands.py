@@ -1,7 +1,5 @@
 """Commands `make-capture` and `cut-capture`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Some frames of a capture as a capture of their own (`neuspring cut-capture`)."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

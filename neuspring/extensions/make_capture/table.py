@@ -1,8 +1,6 @@
 """Depth of make-capture: its unit, the table among its planes, and where the world is: z = 0 on the table. The frame rate is judged
 here too."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -115,8 +113,7 @@ def find_table(where: object, points: np.ndarray, top_down: bool = False, at: np
     where there is none: the largest plane is a wall or a ceiling, or a plane that faces the camera without `top_down`, too small a
     part of the image, or not flat.
     """
-    found = planes(points)
-    if not found:
+    if not (found := planes(points)):
         remedy = "Film more of the table, or give --poses."
         raise InputError(where, "the table must be seen: no plane was found in depth", remedy=remedy)
     if at is not None:

@@ -1,7 +1,5 @@
 """The command `play`."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,7 +8,7 @@ from neuspring.cli.options import Positional, arg
 from neuspring.core.errors import InputError
 
 if TYPE_CHECKING:
-    from neuspring.extensions.play.page import Page
+    pass
 
 
 def play(

@@ -5,8 +5,6 @@ The animals are smooth unions of simple parts, soft filling of uneven stiffness 
 a zebra on its four legs, a dinosaur that sits on its legs and tail. x points to the head.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
@@ -242,8 +240,7 @@ def package(spacing: float, skin_spacing: float) -> SoftBody:
     size = np.array(PACKAGE)
     cells = np.maximum(np.round(size / spacing).astype(int), 4)
     nodes, tetrahedra = block(-size / 2, size / 2, cells.tolist())
-    centers = nodes[tetrahedra].mean(axis=1)
-    outer = (size / 2 - np.abs(centers) < size / cells).any(axis=1)
+    outer = (size / 2 - np.abs(nodes[tetrahedra].mean(axis=1)) < size / cells).any(axis=1)
     nodes[:, 2] += size[2] / 2 + 0.0045
 
     def paint(p: np.ndarray) -> np.ndarray:

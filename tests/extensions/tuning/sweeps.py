@@ -1,7 +1,5 @@
 """A small sweep for tests and benchmarks: its configuration, its tables and observations on disk, its workers and results."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -67,11 +65,7 @@ def plan(folder: Path, tune: Tune, base: config.Config | None = None) -> Plan:
 
 
 def work(
-    folder: Path,
-    tune: Tune,
-    number: int = 0,
-    base: config.Config | None = None,
-    after: Callable[[], object] = lambda: None,
+    folder: Path, tune: Tune, number: int = 0, base: config.Config | None = None, after: Callable[[], object] = lambda: None
 ) -> list[int]:
     """Run a worker and call `after` after each of its trials; returns the trials that it ran."""
     ended: list[int] = []

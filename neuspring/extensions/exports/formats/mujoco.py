@@ -1,7 +1,5 @@
 """MuJoCo: an MJCF file, beside the plain export for the hands' motion."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -88,8 +86,7 @@ def mjcf(source: ExportSource) -> str:
         for end in ends:
             ET.SubElement(tendon, "site", site=names[end])
     if not rod and source.velocity.any():
-        keys = ET.SubElement(root, "keyframe")
-        ET.SubElement(keys, "key", name="start", qvel=text(*source.velocity.ravel()))
+        ET.SubElement(ET.SubElement(root, "keyframe"), "key", name="start", qvel=text(*source.velocity.ravel()))
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
 

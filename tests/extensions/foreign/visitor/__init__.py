@@ -1,7 +1,5 @@
 """One member of each of several kinds, as small as they can be. What computes is imported where it is used."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,6 +73,5 @@ LAG = Baseline(prediction="visitor:lag")
 STACK = CaptureFormat(about="a .npz file with {kind}", recognizes=lambda path: path.suffix == ".npz", pictures=Stack)
 XYZ = Export(write=write_xyz, frames="0")
 SAG = Metric(name="sag", title="sag", heading="Sag", unit="m", shown_unit="mm", factor=1e3, digits=2, function=sag)
-VISIT = ReportSection(
-    order=99, make=lambda material: PageSection(key="visit", title="A visit", blocks=[Text(text="A visitor was here.")])
-)
+_PAGE = PageSection(key="visit", title="A visit", blocks=[Text(text="A visitor was here.")])
+VISIT = ReportSection(order=99, make=lambda material: _PAGE)
