@@ -9,6 +9,8 @@ of the group `neuspring.<kind>`, in its pyproject.toml, and nothing here changes
 A member is an object, or text "module:name" that is imported when it is first asked for, so that listing names imports nothing.
 """
 
+from __future__ import annotations
+
 import functools
 from collections.abc import Iterator, Mapping
 from importlib import import_module

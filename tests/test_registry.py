@@ -1,5 +1,7 @@
 """The registry: names without imports, packages that add members, and what is refused."""
 
+from __future__ import annotations
+
 import importlib.metadata
 from importlib.metadata import EntryPoint
 

@@ -1,5 +1,7 @@
 """The size of the house: lines of code per room against `size.toml`, and what keeps it readable."""
 
+from __future__ import annotations
+
 import ast
 import io
 import re

@@ -1,5 +1,7 @@
 """Two reference points that learn nothing: what is not better than these has learned nothing either."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 
 import numpy as np

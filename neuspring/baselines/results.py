@@ -1,5 +1,7 @@
 """Results of a baseline's training and prediction, and the training loop that baselines share."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

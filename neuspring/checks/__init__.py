@@ -4,6 +4,8 @@ To add a check: a function that measures, and an entry of `checks` in a file her
 of subject, by an entry point of the group `neuspring.checks`.
 """
 
+from __future__ import annotations
+
 from typing import Any
 
 from neuspring.core.checks import Check

@@ -1,5 +1,7 @@
 """A recording of markers along a cable, [T, 3, n]: its form; and in space its length, the order of its markers, and gravity."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Any
 

@@ -5,6 +5,8 @@ is wrong. Less depth is no contradiction: something may hide the point from B. O
 table that is moved along itself looks the same.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
 from typing import Any

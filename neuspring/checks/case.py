@@ -1,5 +1,7 @@
 """Files of a processed PhysTwin case: what its reader refuses (errors), and what is not as released and harmless (warnings)."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Points that were followed through the video of one camera, with its masks."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any

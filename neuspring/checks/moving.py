@@ -4,6 +4,8 @@ Nothing that moves is anywhere twice to the bit, leaves its place for a frame, o
 a marker was lost, a stream stood still, or labels were exchanged.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any

@@ -1,5 +1,7 @@
 """Observations that every method reads: nodes, motion of the object, and controllers. Errors are what no method can work with."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any

@@ -3,6 +3,8 @@
 Limits were chosen so that the synthetic scenes pass, whose perception is known to be good; lengths in m, of things that hands hold.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Any
 

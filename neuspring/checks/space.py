@@ -1,5 +1,7 @@
 """Points in space that a capture brings: units and axes, the body, and hands that must reach it."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Any
 

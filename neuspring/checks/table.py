@@ -1,5 +1,7 @@
 """The table, which must be z = 0: how a plane stands in the world, and where pixels meet it."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Any
 

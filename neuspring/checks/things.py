@@ -1,5 +1,7 @@
 """Object and hands of one camera, by masks and depth: size, height above the table, what they stand on, and whether they meet."""
 
+from __future__ import annotations
+
 import difflib
 import json
 from collections.abc import Iterable, Mapping, Sequence

@@ -10,6 +10,8 @@ and the shift is where it is greatest, with a fraction by the parabola through t
 when any quarter of the time is left out. No name, number or time stamp is read.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations

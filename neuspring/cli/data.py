@@ -1,5 +1,7 @@
 """Commands on data: check-data, mask, compare-masks."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Annotated, Literal
 

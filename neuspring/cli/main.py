@@ -5,6 +5,8 @@ is a recorded result), 2 bad input (only another input can help), 1 anything els
 imported, after the number of threads is set.
 """
 
+from __future__ import annotations
+
 import argparse
 import difflib
 import errno

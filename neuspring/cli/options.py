@@ -1,5 +1,7 @@
 """Types of options that commands share."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Annotated
 

@@ -3,6 +3,8 @@
 Each package that brings a baseline brings its section too, by an entry point of the group `neuspring.baseline_settings`.
 """
 
+from __future__ import annotations
+
 from dataclasses import field, make_dataclass
 from typing import TYPE_CHECKING, Any
 

@@ -1,5 +1,7 @@
 """The dial `effort`: the sizes that decide how long a benchmark takes, all turned together."""
 
+from __future__ import annotations
+
 import functools
 from typing import Any, Literal, get_args
 

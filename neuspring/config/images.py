@@ -1,5 +1,7 @@
 """Settings of appearance: how splats are trained on frame 0, how they are drawn in motion, and how pictures are scored."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 

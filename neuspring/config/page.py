@@ -1,5 +1,7 @@
 """Writes the tables of config/README.md from the settings' own declarations: python -m neuspring.config.page"""
 
+from __future__ import annotations
+
 import ast
 import dataclasses
 import inspect

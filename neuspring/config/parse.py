@@ -3,6 +3,8 @@
 Unknown keys raise, values are never cast, every problem is listed with its path.
 """
 
+from __future__ import annotations
+
 import copy
 import dataclasses
 import difflib

@@ -1,5 +1,7 @@
 """Settings of perception: the steps from raw RGBD video to observations."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 

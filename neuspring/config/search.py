@@ -1,5 +1,7 @@
 """Settings of the zero-order search: its variables, their ranges and scales, and the polish that follows."""
 
+from __future__ import annotations
+
 import dataclasses
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal

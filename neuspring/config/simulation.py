@@ -1,5 +1,7 @@
 """Settings of the simulator, and of the released code's departures from its own description."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Annotated, Literal
 

@@ -1,5 +1,7 @@
 """Settings of a sweep over settings."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Annotated, Any
 

@@ -1,5 +1,7 @@
 """Settings of the training losses and of the first-order fit."""
 
+from __future__ import annotations
+
 import dataclasses
 from dataclasses import dataclass
 from typing import Annotated, Literal

@@ -4,6 +4,8 @@ A subject has a kind, a word, and is what `examine` is given of it: the masks of
 measurement is a function of that.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from math import inf, isfinite

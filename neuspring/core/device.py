@@ -3,6 +3,8 @@
 The only module of this package that imports torch and Warp.
 """
 
+from __future__ import annotations
+
 import contextlib
 import functools
 import hashlib

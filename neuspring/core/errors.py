@@ -1,5 +1,7 @@
 """The errors a caller can cause. Each message names the file or field, the rule, the value received and the next move."""
 
+from __future__ import annotations
+
 
 class InputError(ValueError):
     """Bad input: `where` broke `rule`; we received `value`; do `remedy` next.

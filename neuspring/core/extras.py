@@ -1,5 +1,7 @@
 """Packages that serve one corner of the platform, and the extra of the installation that brings each."""
 
+from __future__ import annotations
+
 import importlib
 from typing import Any
 

@@ -3,6 +3,8 @@
 A step's own finding is implausible, but no reason to stop: it is kept in the record, printed, and reported.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Static obstacles (boxes and spheres that stand in the scene and do not move), choices among points, and how lines run."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal

@@ -7,6 +7,8 @@ With residuals r of the base and their derivatives J, a step d solves
 The best step is taken if it costs less than the base, and the damping follows it. Otherwise shorter steps are tried.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -5,6 +5,8 @@ last as long as its command even if the wrapper dies: `FileLock` unlocks the fil
 forked processes. Here the same kernel lock belongs to an open file.
 """
 
+from __future__ import annotations
+
 import os
 import time
 from pathlib import Path

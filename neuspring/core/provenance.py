@@ -7,6 +7,8 @@ Editing `twin/fit.py` runs fits again; editing a docstring, or a table, runs no 
 to a registry counts like ours, with all that it imports of its own package; one without source by the package's version.
 """
 
+from __future__ import annotations
+
 import ast
 import functools
 import hashlib

@@ -4,6 +4,8 @@ They stand below `neuspring.config`, because the settings of a baseline are decl
 them from there.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 

@@ -1,5 +1,7 @@
 """Text for the terminal: addresses of stores without their passwords, the line of progress of long work."""
 
+from __future__ import annotations
+
 import re
 import sys
 import time

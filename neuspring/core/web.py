@@ -4,6 +4,8 @@ A page of another site can make a browser send requests here, and can point a na
 the Host header must name this machine, and what a browser says about a request's origin must agree with it.
 """
 
+from __future__ import annotations
+
 import ipaddress
 import socket
 from collections.abc import Mapping

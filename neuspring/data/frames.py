@@ -1,5 +1,7 @@
 """Frames of one camera, and masks as pixels: what several steps of perception need."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias, TypeVar

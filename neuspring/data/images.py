@@ -1,5 +1,7 @@
 """Images of a capture's folder: pictures, labels and depth, read with a reason where they cannot be, and written."""
 
+from __future__ import annotations
+
 import contextlib
 from pathlib import Path
 

@@ -5,6 +5,8 @@ camera, so that h > 0 is the camera's height above it. It is found by RANSAC, th
 units of the sensor's noise, which grows with depth (`camera.depth_noise`).
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

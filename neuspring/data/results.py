@@ -1,5 +1,7 @@
 """Results that the steps of perception hand on: one file each, with the backend that made it and its quality numbers."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,6 +1,8 @@
 """Pictures of a benchmark: every method's error as a ratio to the baseline's, the error against the number of regions K, and over
 time."""
 
+from __future__ import annotations
+
 import itertools
 import re
 from collections.abc import Iterable, Sequence

@@ -1,5 +1,7 @@
 """Short films for a README: observed beside predicted, as MP4 or as GIF that loops, within a size."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

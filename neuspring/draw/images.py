@@ -1,5 +1,7 @@
 """Pictures and film of appearance: training views beside splats, prediction beside observation over time."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

@@ -1,5 +1,7 @@
 """Content of one panel: the observed frame, a prediction, or its error."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal

@@ -1,5 +1,7 @@
 """Figures of a run: errors over time, losses, predicted against observed points, and the twin."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

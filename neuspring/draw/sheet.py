@@ -1,5 +1,7 @@
 """Common parts of all pictures: sizes of text, colors, panels placed in inches, color bars, and how files are written."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
 

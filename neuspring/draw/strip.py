@@ -1,5 +1,7 @@
 """Film strips: the observed frames on top, below them each method's prediction and its error; one column per frame."""
 
+from __future__ import annotations
+
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D

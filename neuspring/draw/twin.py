@@ -1,5 +1,7 @@
 """Twins as bodies: springs or surface colored by stiffness, nodes by region, seen by any camera; and a histogram of stiffness."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

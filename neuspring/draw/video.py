@@ -1,5 +1,7 @@
 """Pictures to a video that any browser plays: H.264 (libx264) in MP4, yuv420p, BT.709 colors, through PyAV."""
 
+from __future__ import annotations
+
 import math
 import tempfile
 from fractions import Fraction

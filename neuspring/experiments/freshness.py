@@ -4,6 +4,8 @@ Records travel with the results folder. What Snakemake remembers in `.snakemake`
 `.snakemake` was deleted, counts as finished whatever is asked for.
 """
 
+from __future__ import annotations
+
 import functools
 import hashlib
 import json

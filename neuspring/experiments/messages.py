@@ -1,5 +1,7 @@
 """Messages to a user while the workflow runs, and after it."""
 
+from __future__ import annotations
+
 import json
 import shlex
 import shutil

@@ -4,6 +4,8 @@ Nothing here raises for bad content.
 What cannot work is an error, what is only unusual a warning with the next move; `neuspring.checks` has what is looked for.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import groupby

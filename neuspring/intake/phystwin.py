@@ -6,6 +6,8 @@ prints them all. Of raw cases images are linked where the file system allows it,
 per detection.
 """
 
+from __future__ import annotations
+
 import csv
 from functools import cache
 from importlib import resources

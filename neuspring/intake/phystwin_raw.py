@@ -3,6 +3,8 @@
 Images of a scenario are linked where the file system allows it, else copied.
 """
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Any, Literal
 

@@ -15,6 +15,8 @@ p and l are the depths at which the ray through u(t) meets the upright plane and
 rigid patch: it keeps its shape, is turned by its angle in the image about the ray, and follows z(t) and u(t).
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import cv2

@@ -4,6 +4,8 @@ Controllers are seen throughout and spread over the hands, or lie where hands gr
 again.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

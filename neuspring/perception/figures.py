@@ -1,5 +1,7 @@
 """Pictures of perception to look at: masks and tracks over the video, the lifted points from two sides, the shape prior."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 import cv2

@@ -1,5 +1,7 @@
 """Synthetic captures, whose truth is known: errors of masks, tracks, lifted points, controllers and hull."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import replace
 

@@ -4,6 +4,8 @@ Observed points come first, then points on the prior's surface, then points insi
 with a seed).
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 from itertools import count
 

@@ -1,5 +1,7 @@
 """Masks that the capture brings itself."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from neuspring.core.errors import InputError

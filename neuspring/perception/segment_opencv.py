@@ -7,6 +7,8 @@
    again from the hands that these show. Only pieces of some size are hands.
 """
 
+from __future__ import annotations
+
 import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter

@@ -7,6 +7,8 @@ the released processing, the prompt names object and hand, boxes need a score, a
 With a user's marks (`carry`) SAM 2 starts from the masks of the marked frames, and words are not needed.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -17,6 +17,8 @@ are tried; the best few are refined by ICP with scale against the observed cloud
 is bent, as smoothly as possible, so that its visible part lies where the cameras saw it.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

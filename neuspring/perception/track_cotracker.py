@@ -4,6 +4,8 @@ Code and weights are Meta's, under their own license (non-commercial at the time
 They come from the torch.hub cache, or are downloaded if `download` allows it.
 """
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Perfect tracks and the true surface of a synthetic capture: they measure what perception costs, and are no method's input."""
 
+from __future__ import annotations
+
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation

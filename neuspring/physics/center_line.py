@@ -1,5 +1,7 @@
 """The center line of a long thin body, found among its nodes: distances along the body, then a smooth curve (a principal curve)."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from neuspring.core.errors import InputError

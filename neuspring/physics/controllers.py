@@ -9,6 +9,8 @@ with it the substep that was found stable, stay. Both are functions of the state
 through them, exactly. Springs that only push keep their lengths.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 
 import numpy as np

@@ -4,6 +4,8 @@ Each is declared once, in `PARAMETERS`. Kernels' arguments (arrays.py), buffers,
 from that by name.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, fields
 from typing import Any, Literal, NamedTuple

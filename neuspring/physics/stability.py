@@ -10,6 +10,8 @@ Two estimates, cheap first: Gershgorin's bound per node, valid for any direction
 configuration (Lanczos). Deformation turns directions but hardly raises the eigenvalue; `safety` covers that.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -5,6 +5,8 @@ and seed), _growth.png (mean error of free markers over time), per cable _<cable
 clip of one row. All of it is made of what the stage `transfer` keeps.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

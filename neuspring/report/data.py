@@ -1,5 +1,7 @@
 """Material of a report page: runs, jobs and records of a results folder. Damaged files are listed and stop nothing."""
 
+from __future__ import annotations
+
 import base64
 import io
 import math

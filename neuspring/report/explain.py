@@ -3,6 +3,8 @@
 Everything is read from the file of numbers and from the records on disk, nothing from MLflow.
 """
 
+from __future__ import annotations
+
 import difflib
 import json
 from collections.abc import Mapping, Sequence

@@ -1,5 +1,7 @@
 """pictures.html: the films of every scenario side by side, for one seed, with their scores."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 

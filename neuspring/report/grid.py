@@ -1,5 +1,7 @@
 """Numbers laid out: a table has a line per method, scenario or other group, and a column per task and metric."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any
 

@@ -5,6 +5,8 @@ object frozen in frame 0 (`static`)? Do parameters lie at the ends of what was s
 hold the object at all?
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping
 from typing import Any
 

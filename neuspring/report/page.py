@@ -4,6 +4,8 @@ It needs no network and no script. It is made from what is on disk, also while a
 read.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,5 +1,7 @@
 """Errors of perception on synthetic captures, per category, from the records of its judge (judged.json)."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from pathlib import Path
 

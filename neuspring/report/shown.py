@@ -3,6 +3,8 @@
 Files are not trusted: sizes of arrays are checked before they are read, and names must stay inside the scenario's folder.
 """
 
+from __future__ import annotations
+
 import math
 import re
 import zipfile

@@ -6,6 +6,8 @@ numbers (which runs count, averages without and with failed runs, scenarios, cat
 Tables have the paper's layout: both tasks side by side, the best marked.
 """
 
+from __future__ import annotations
+
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -3,6 +3,8 @@
 `summary.md` and `report.html` show the same.
 """
 
+from __future__ import annotations
+
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path

@@ -3,6 +3,8 @@
 It stands first on the page, in summary.md and on the terminal, and says only what runs measured and recorded.
 """
 
+from __future__ import annotations
+
 import itertools
 import re
 from typing import Any, cast

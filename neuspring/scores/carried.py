@@ -25,6 +25,8 @@ object, at a depth that nobody measured. It moves as the nodes do that are seen 
 where x_i are the projections of a few surface nodes, in pixels. In frame 0 the error is zero, whatever the nodes.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from neuspring.data.camera import Camera

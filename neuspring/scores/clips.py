@@ -1,5 +1,7 @@
 """The numbers of a study of twins on other recordings of the same object, beside published numbers: DEFORM's benchmark."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -4,6 +4,8 @@ scenario and seed are missing from the averages of all methods, and why.
 A failed run is averaged as if its last finite frame were frozen until the end; `stages.score` scores that prediction.
 """
 
+from __future__ import annotations
+
 from collections.abc import Collection, Mapping
 from types import MappingProxyType
 from typing import Any

@@ -1,5 +1,7 @@
 """Settings that differ between the methods of a table."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Iterable, Mapping
 from typing import Any

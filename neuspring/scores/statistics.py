@@ -13,6 +13,8 @@ objects is too narrow (of seven normal values, its 95 % interval holds the mean 
 normal.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterable
 from typing import Any, Literal

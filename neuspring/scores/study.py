@@ -4,6 +4,8 @@ Two questions have two verdicts. Is the value the paper's? That can be asked on 
 the study's baseline go where the paper's goes? That can be asked on any data. All values are in the units of tables.
 """
 
+from __future__ import annotations
+
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum

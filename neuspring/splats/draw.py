@@ -1,5 +1,7 @@
 """Pictures of a twin: its splats in every frame of a trajectory, seen by any camera, RGBA over any background."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import fields, replace
 

@@ -4,6 +4,8 @@ Backends: `warp`, ours, on CPU and CUDA from the same kernels (`blend`), and `gs
 takes gsplat where it works. Results name the backend.
 """
 
+from __future__ import annotations
+
 import functools
 import importlib.util
 from dataclasses import dataclass

@@ -1,5 +1,7 @@
 """A synthetic scene, or PhysTwin's raw layout -> a capture folder."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 from neuspring.config import Config, ScenarioRow

@@ -1,5 +1,7 @@
 """Perception of a synthetic capture -> its errors against the truth."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 from neuspring.config import Config

@@ -1,5 +1,7 @@
 """Masks and tracks of all cameras -> points in the world, and a shape prior."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 from neuspring.config import Config

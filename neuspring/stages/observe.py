@@ -1,5 +1,7 @@
 """A capture, or processed data -> observations.npz."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 from neuspring.config import Config, ScenarioRow

@@ -1,5 +1,7 @@
 """Twin and controllers of all frames -> trajectory."""
 
+from __future__ import annotations
+
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.records import Before, Recorder
 from neuspring.stages.stage import Written, stage

@@ -1,5 +1,7 @@
 """One camera of a capture -> masks of object and hands."""
 
+from __future__ import annotations
+
 import dataclasses
 
 from neuspring.config import Config

@@ -1,5 +1,7 @@
 """Masks of one camera -> tracks of pixels."""
 
+from __future__ import annotations
+
 from neuspring.config import Config
 from neuspring.core.records import Before, Recorder
 from neuspring.data.capture import Capture

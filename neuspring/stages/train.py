@@ -1,5 +1,7 @@
 """Training frames -> the model of a baseline."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any
 

@@ -7,6 +7,8 @@ of them if it costs less than the base. Nothing but the costs and products that 
 polish is replayed from its record.
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

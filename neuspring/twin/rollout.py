@@ -1,5 +1,7 @@
 """Roll a twin out under recorded controller motion, and the velocity with which that begins."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 
 import numpy as np

@@ -8,6 +8,8 @@ which is 1 where neighbors have nothing in common, and near 0 where stiffness is
 at a distance h.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 SIDE_BY_SIDE = 8

@@ -7,6 +7,8 @@ A body is one piece: what no spring joins to the rest, a node or a part behind a
 Radii of a search are in units of the spacing of the nodes.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any
 

@@ -7,6 +7,8 @@ changed since the table of the same kind of machine that was kept last. Writes r
 --save results/published/bench/<kind of machine>.json, which is to be committed. Some five minutes on a CPU; on a GPU at most two.
 """
 
+from __future__ import annotations
+
 import argparse
 import sys
 import time

@@ -5,6 +5,8 @@ ask for gradients. Columns: medians over repeats of the forward pass and of both
 848 x 480 with 100,000 splats, and the same with gsplat where it works. Then skinning: splats and nodes grow together.
 """
 
+from __future__ import annotations
+
 import argparse
 import ctypes
 import time

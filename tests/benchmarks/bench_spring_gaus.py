@@ -3,6 +3,8 @@
 Both in float32, on one CPU thread or on a GPU (`cuda`); states and gradients are compared before the times.
 """
 
+from __future__ import annotations
+
 import sys
 
 import numpy as np

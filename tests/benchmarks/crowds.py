@@ -1,5 +1,7 @@
 """Sections of several twins at once: of one topology, of topologies of their own, and the candidates of a search."""
 
+from __future__ import annotations
+
 import os
 import statistics
 import time

@@ -1,5 +1,7 @@
 """Peaks of memory: of the process on Linux, of torch's tensors on a GPU."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from pathlib import Path
 

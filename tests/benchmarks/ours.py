@@ -1,5 +1,7 @@
 """This project's simulator as the table times it: the only file of the table that knows the engine's interface."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -8,6 +8,8 @@ the trainer does at every frame is timed with it: the state, the hands, the tape
 The loss is the plain one that it has for synthetic data (`simulators.LOSS`): the Chamfer distance is no part of the simulation.
 """
 
+from __future__ import annotations
+
 import importlib
 import shutil
 import sys

@@ -4,6 +4,8 @@ The body and its head are ellipsoids on the ground, filled with points 1 cm apar
 smooth: it need not be any spring's, since a search takes the same time whatever it finds.
 """
 
+from __future__ import annotations
+
 import functools
 
 import numpy as np

@@ -1,5 +1,7 @@
 """From frames that are ready to run to rows of the table."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 

@@ -1,5 +1,7 @@
 """What the benchmarks simulate: boxes of random points, and a sheet folded onto itself."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np

@@ -1,5 +1,7 @@
 """The sections of the table: what is measured, and in which company."""
 
+from __future__ import annotations
+
 import json
 import os
 import subprocess

@@ -1,5 +1,7 @@
 """The rows of the table, its text, its file, its change against the table that was kept last, and what a machine is."""
 
+from __future__ import annotations
+
 import json
 import os
 import platform

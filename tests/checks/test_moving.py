@@ -1,5 +1,7 @@
 """Trajectories of points: what motion capture does to lost markers, labels and streams, and what is only motion."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import numpy as np

@@ -1,5 +1,7 @@
 """The configuration is strict: what is wrong is named with its path, nothing is cast, nothing is ignored."""
 
+from __future__ import annotations
+
 import dataclasses
 import functools
 from pathlib import Path

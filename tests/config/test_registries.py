@@ -1,5 +1,7 @@
 """No type repeats the names of a registry: they are checked where they are read, so that a stranger's package can add to them."""
 
+from __future__ import annotations
+
 import ast
 from collections.abc import Iterator
 from importlib import import_module

@@ -1,5 +1,7 @@
 """Artifacts: what is saved is what is loaded, what is wrong is named, what is interrupted leaves the old file."""
 
+from __future__ import annotations
+
 import dataclasses
 import json
 import os

@@ -1,5 +1,7 @@
 """The restricted unpickler: arrays and plain values pass unchanged; nothing that a file names is imported, called or trusted."""
 
+from __future__ import annotations
+
 import io
 import os
 import pickle

@@ -1,5 +1,7 @@
 """The tables of methods, searches and scenarios, and what is checked of a benchmark before any job."""
 
+from __future__ import annotations
+
 import ast
 import functools
 import json

@@ -1,5 +1,7 @@
 """Results are compared with what would be made now by their own records."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
 from types import SimpleNamespace

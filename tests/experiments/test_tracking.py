@@ -1,5 +1,7 @@
 """The MLflow index: complete, never doubled, never fatal, rebuilt from the files; created once, upgraded, moved, damaged, away."""
 
+from __future__ import annotations
+
 import contextlib
 import json
 import multiprocessing

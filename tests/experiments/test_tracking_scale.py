@@ -3,6 +3,8 @@
 Counts are taken from the store itself. PostgreSQL and the server are started here, on localhost.
 """
 
+from __future__ import annotations
+
 import multiprocessing
 import os
 import shutil

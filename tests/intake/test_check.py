@@ -1,5 +1,7 @@
 """The layout check: a conforming data set has no errors or warnings; every finding is reported at once, with its level."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

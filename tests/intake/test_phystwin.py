@@ -1,5 +1,7 @@
 """The PhysTwin reader: what a conforming case becomes, and that every refusal names the file, the key and the place."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Any
 

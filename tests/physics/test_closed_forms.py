@@ -4,6 +4,8 @@ Symplectic Euler has exact discrete solutions for free fall and for a linear osc
 agreement with the continuous solution is then a matter of order: halving the substep halves the error.
 """
 
+from __future__ import annotations
+
 import numpy as np
 import pytest
 

@@ -1,5 +1,7 @@
 """Collision lists of fixed capacity report what does not fit; diverging rollouts are named results."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,5 +1,7 @@
 """Controllers that hold in a part of the frames, or take hold later: closed forms, the reference, gradients, all ways to run."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from itertools import pairwise
 

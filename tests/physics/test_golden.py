@@ -1,5 +1,7 @@
 """Parity with the released PhysTwin simulator, clip by clip (tests/golden/sim_*.npz)."""
 
+from __future__ import annotations
+
 from functools import cache
 from typing import Any, NamedTuple
 

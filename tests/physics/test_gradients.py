@@ -1,5 +1,7 @@
 """Adjoints of a frame and of several against central finite differences, in float64; those of each term are in test_terms.py."""
 
+from __future__ import annotations
+
 import numpy as np
 import pytest
 import torch

@@ -1,5 +1,7 @@
 """Twins simulated together: each gets, bit for bit, what it gets alone, whatever its company, and however a frame is computed."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache

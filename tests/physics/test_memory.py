@@ -1,5 +1,7 @@
 """Memory does not grow with the horizon, except for the states between frames."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Static obstacles: a box is a ground elsewhere, closed forms of friction and restitution, the reference, gradients, momentum."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from itertools import pairwise
 

@@ -1,5 +1,7 @@
 """The Warp solver against its specification, `neuspring.physics.reference`, on random scenes."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from typing import Any
 

@@ -1,5 +1,7 @@
 """The stability bound: sharp for one oscillator, valid for nets, and reported with node, bound and remedy."""
 
+from __future__ import annotations
+
 import re
 from dataclasses import replace
 

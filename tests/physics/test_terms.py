@@ -4,6 +4,8 @@ Four twins hold different values. Their adjoints are compared with differences o
 of each alone, bit for bit: a lane does not see its neighbors.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from functools import cache
 

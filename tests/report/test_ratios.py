@@ -1,5 +1,7 @@
 """What tables say beside the averages: ratios and aims, floors, oracles, settings that differ, two trainings."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
 

@@ -1,5 +1,7 @@
 """The answer in words says what was measured, whether chance explains it, and what the records say of the cause."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Captures of scenes with hands in space: points alone of any folder of that form, film and both where there is a film."""
 
+from __future__ import annotations
+
 import json
 import shutil
 

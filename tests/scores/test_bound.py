@@ -1,5 +1,7 @@
 """Points bound to nodes: exact under rigid motions, whatever the nodes; stable where nodes leave a turn open."""
 
+from __future__ import annotations
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

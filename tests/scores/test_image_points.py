@@ -1,5 +1,7 @@
 """Points marked in images: exact under shifts parallel to the image, carried by what is seen, silent about what is not marked."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np

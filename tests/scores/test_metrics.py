@@ -1,5 +1,7 @@
 """Reported metrics against golden values (tests/golden/m04, m06), and the rules for rows and averages."""
 
+from __future__ import annotations
+
 import dataclasses
 from importlib.metadata import EntryPoint
 from pathlib import Path

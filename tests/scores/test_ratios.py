@@ -1,5 +1,7 @@
 """The primary figure: ratios over objects, aims, the spread over seeds."""
 
+from __future__ import annotations
+
 import math
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Fits that share launches leave what each would leave alone; what goes wrong with one is its own."""
 
+from __future__ import annotations
+
 import json
 from dataclasses import asdict, replace
 from pathlib import Path

@@ -1,5 +1,7 @@
 """What the record of a search says beside its values."""
 
+from __future__ import annotations
+
 import pandas as pd
 
 from neuspring.twin.candidates import CMAES

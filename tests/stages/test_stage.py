@@ -1,5 +1,7 @@
 """What follows from the signature of a stage: its command, its record, the passing on of failures, its place in the workflow."""
 
+from __future__ import annotations
+
 import json
 import pkgutil
 from collections.abc import Sequence

@@ -1,5 +1,7 @@
 """Recordings of ROS, written message by message: ROS 1, ROS 2 in both storages, and what librealsense writes."""
 
+from __future__ import annotations
+
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,5 +1,7 @@
 """A headless Chromium, driven through its debugging pipe: what a page looks like and complains about, at any width, offline."""
 
+from __future__ import annotations
+
 import base64
 import itertools
 import json

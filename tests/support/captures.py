@@ -1,5 +1,7 @@
 """Small captures: their cameras and descriptions."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Transfers of twins to clips of cables, without the twins: the files that the stage leaves, and the observations of the clips."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from pathlib import Path
 

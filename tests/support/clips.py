@@ -1,5 +1,7 @@
 """The released simulator's recorded clips (tests/golden/sim_*.npz) as twins with targets."""
 
+from __future__ import annotations
+
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace

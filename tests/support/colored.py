@@ -1,5 +1,7 @@
 """Toy scenes as one camera without depth sees them, and painted captures of color alone."""
 
+from __future__ import annotations
+
 import functools
 from dataclasses import replace
 from pathlib import Path

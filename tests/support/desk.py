@@ -1,5 +1,7 @@
 """A small desk by arithmetic alone, for tests of intake: a table, a ball on it, seen by cameras; written as a camera's files."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
 

@@ -1,5 +1,7 @@
 """Central differences, against which adjoints are tested in float64."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any
 

@@ -1,5 +1,7 @@
 """A small film with known motion for tests: a body and a hand's ball above it move together, seen by cameras around them."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

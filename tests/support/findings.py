@@ -1,5 +1,7 @@
 """What a check of data found, for assertions."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 from neuspring.core.findings import Finding

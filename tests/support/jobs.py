@@ -1,5 +1,7 @@
 """Jobs of a test: the real wrapper around a piece of Python."""
 
+from __future__ import annotations
+
 import subprocess
 import sys
 import time

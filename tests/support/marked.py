@@ -1,5 +1,7 @@
 """A film in memory for marks: a textured square and a hand move over a still, uneven table; the truth is known."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import cv2

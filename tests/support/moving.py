@@ -1,5 +1,7 @@
 """A capture with exactly known motion: a textured square moves before a wall, at a known depth, seen by two cameras."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 import cv2

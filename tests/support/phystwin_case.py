@@ -1,5 +1,7 @@
 """A small case in exactly the layout of the released data, for tests: a hanging sheet, held and moved by thirty points."""
 
+from __future__ import annotations
+
 import json
 import pickle
 from pathlib import Path

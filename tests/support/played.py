@@ -1,5 +1,7 @@
 """A small scenario's results folder with runs that have real twins, as the workflow leaves it: for tests of the playground."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 

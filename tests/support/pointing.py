@@ -1,5 +1,7 @@
 """The mouse over a scene that viser draws: where a point is in the window, and drags that are held."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

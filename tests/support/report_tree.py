@@ -1,5 +1,7 @@
 """A results folder as the workflow leaves it, with invented numbers: for tests of the report."""
 
+from __future__ import annotations
+
 import html
 import os
 import re

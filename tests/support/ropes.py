@@ -1,5 +1,7 @@
 """Small ropes and cables whose twins are rods."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Records of runs that never ran."""
 
+from __future__ import annotations
+
 from typing import Any
 
 from neuspring.core.run_record import RunRecord

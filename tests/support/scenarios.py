@@ -1,5 +1,7 @@
 """Small hand-made Observations for tests that need the noun, not a scene."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Any
 

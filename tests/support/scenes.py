@@ -1,5 +1,7 @@
 """Small scenes shared by the physics tests, and the two engines that simulate them: the NumPy reference and Warp."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise

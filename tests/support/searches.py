@@ -1,5 +1,7 @@
 """Searches of several budgets, and what is equal between two of them."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import pandas as pd

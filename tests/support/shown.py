@@ -1,5 +1,7 @@
 """A scenario of `played.results` with splats and a video of them, and what paints it: for tests of pictures for papers."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,5 +1,7 @@
 """Small toy captures and settings, cheap enough for tests that search, fit and run the workflow."""
 
+from __future__ import annotations
+
 import copy
 import functools
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,5 +1,7 @@
 """A small capture of points alone: a block of nodes on the table, a hand of four points that lifts it, annotated points on top."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
 from typing import Any

@@ -1,5 +1,7 @@
 """Films of still bodies of known shape, seen by cameras around them."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

@@ -1,5 +1,7 @@
 """What tests of tracking share: small run records, and PostgreSQL and `mlflow server`, started on localhost and stopped at will."""
 
+from __future__ import annotations
+
 import hashlib
 import importlib.util
 import json

@@ -1,5 +1,7 @@
 """Results of runs without the runs: records, scores and stand-ins for the files that stages leave."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

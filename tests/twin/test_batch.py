@@ -1,5 +1,7 @@
 """Fits in a batch: the same numbers, bit for bit, as each alone, whatever the others do."""
 
+from __future__ import annotations
+
 import time
 from dataclasses import replace
 

@@ -1,5 +1,7 @@
 """Training losses against golden values (tests/golden/m05) and their rules."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 

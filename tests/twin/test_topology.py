@@ -1,5 +1,7 @@
 """Spring graphs: the released simulator's sets, and the rules they follow."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Candidates that are simulated together: each as if it were alone, and judged by the torch losses."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 

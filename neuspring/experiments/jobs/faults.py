@@ -4,6 +4,8 @@ The exit status and the end of the output decide: most causes (CUDA, the system'
 from outside Python.
 """
 
+from __future__ import annotations
+
 import errno
 import re
 import signal

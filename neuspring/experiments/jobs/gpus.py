@@ -8,6 +8,8 @@ The jobs of one run of the workflow also share notes, a file that names the devi
 fail on such a device at once and leave it free for the next one.
 """
 
+from __future__ import annotations
+
 import contextlib
 import itertools
 import os

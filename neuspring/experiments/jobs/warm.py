@@ -9,6 +9,8 @@ started a thread that does not prepare for a fork. Linux alone: elsewhere a fork
 the job's output, its exit status, and its end when the wrapper is killed.
 """
 
+from __future__ import annotations
+
 import contextlib
 import ctypes
 import gc

@@ -1,5 +1,7 @@
 """The command `annotate`."""
 
+from __future__ import annotations
+
 import os
 import sys
 import webbrowser

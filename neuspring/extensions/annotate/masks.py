@@ -1,5 +1,7 @@
 """The masks mode: marks, a preview of one frame, carrying them through the video, and saving what came out."""
 
+from __future__ import annotations
+
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

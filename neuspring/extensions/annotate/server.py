@@ -4,6 +4,8 @@ Requests must name this machine (guard.py), and all beyond the page itself needs
 Every camera and frame is looked up in the capture, so no address leads to another file.
 """
 
+from __future__ import annotations
+
 import errno
 import hmac
 import json

@@ -1,5 +1,7 @@
 """State that all tabs share: a file that each may edit, and one piece of long work at a time."""
 
+from __future__ import annotations
+
 import hashlib
 import logging
 from collections.abc import Callable

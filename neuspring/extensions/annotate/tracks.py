@@ -3,6 +3,8 @@
 Depth lifts a followed pixel, and cameras that see the same point are averaged.
 """
 
+from __future__ import annotations
+
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor

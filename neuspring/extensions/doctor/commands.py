@@ -1,5 +1,7 @@
 """The command doctor."""
 
+from __future__ import annotations
+
 from neuspring.cli.options import Settings, read_settings
 
 

@@ -3,6 +3,8 @@
 broken: the configuration needs it and it is missing. absent: it is missing and not needed.
 """
 
+from __future__ import annotations
+
 import importlib.util
 import sys
 from collections.abc import Callable, Iterator

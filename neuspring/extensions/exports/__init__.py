@@ -4,6 +4,8 @@ A format is a file of `formats/` with its `export`; an installed package brings 
 `source` is the run or twin that is exported, `cable` a rod as a chain of rigid edges, `newton_twin` the script that is exported.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -6,6 +6,8 @@ damping times that. Edges keep their lengths, and their mass lies along them. A 
 Drag is left out. A rod that slips inside is refused: a branch is a spring behind a friction, and hinges have them side by side.
 """
 
+from __future__ import annotations
+
 from typing import Any, NamedTuple
 from xml.etree import ElementTree as ET
 

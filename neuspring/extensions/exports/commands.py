@@ -1,5 +1,7 @@
 """The command `export`."""
 
+from __future__ import annotations
+
 import inspect
 from pathlib import Path
 from typing import Annotated

@@ -10,6 +10,8 @@ A rod is a chain of rigid edges (`newton.Rod`), for SolverVBD: its iterations en
 as `step` in chain.npz. Masses are set here, since Newton would give each edge the mass of a capsule with two round ends.
 """
 
+from __future__ import annotations
+
 import itertools
 import json
 from pathlib import Path

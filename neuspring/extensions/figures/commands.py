@@ -1,5 +1,7 @@
 """The commands `draw strip`, `twin`, `film` and `frames`. Their code is imported when they run."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Annotated, Literal
 

@@ -1,5 +1,7 @@
 """Strips, films and twins: runs are chosen and read here, and what cannot be drawn is refused."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,5 +1,7 @@
 """Options of the commands that draw runs."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal

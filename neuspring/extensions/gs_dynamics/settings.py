@@ -1,5 +1,7 @@
 """Settings of GS-Dynamics, adapted to captures with hands; the defaults are those of the public code where it says anything."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 from neuspring.core.section import Count, Positive, SettingsSection

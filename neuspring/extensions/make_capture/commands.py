@@ -1,5 +1,7 @@
 """Commands `make-capture` and `cut-capture`."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Annotated
 

@@ -1,5 +1,7 @@
 """Some frames of a capture as a capture of their own (`neuspring cut-capture`)."""
 
+from __future__ import annotations
+
 import shutil
 from dataclasses import replace
 from pathlib import Path

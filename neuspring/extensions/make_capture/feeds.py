@@ -1,5 +1,7 @@
 """Color and depth of a camera in pairs: of two folders or videos, or color alone."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property

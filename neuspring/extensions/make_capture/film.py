@@ -1,5 +1,7 @@
 """Checks of the files of the cameras: errors are refused, warnings and notes stand in the report."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -9,6 +9,8 @@ Poses: an object with the keys of one of `POSE_FORMS`, m: [4, 4], [3, 4] or the 
 For several cameras: a list in their order, or an object with their names as keys. Both may lie anywhere in the file.
 """
 
+from __future__ import annotations
+
 import difflib
 import re
 from collections.abc import Callable, Iterator, Sequence

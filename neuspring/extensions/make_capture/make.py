@@ -1,5 +1,7 @@
 """From what cameras gave to a capture folder; never over another one, and from where it was interrupted."""
 
+from __future__ import annotations
+
 import hashlib
 import json
 import re

@@ -1,5 +1,7 @@
 """Options of `neuspring make-capture`; nothing heavy is imported, because every `--help` reads them."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal

@@ -2,6 +2,8 @@
 and where the cameras are, by given poses, a ChArUco board or the table alone.
 """
 
+from __future__ import annotations
+
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

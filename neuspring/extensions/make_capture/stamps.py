@@ -8,6 +8,8 @@
 Numbers that count pictures grow by the same step exactly, and stay numbers.
 """
 
+from __future__ import annotations
+
 import re
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime

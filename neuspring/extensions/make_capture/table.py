@@ -1,6 +1,8 @@
 """Depth of make-capture: its unit, the table among its planes, and where the world is: z = 0 on the table. The frame rate is judged
 here too."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,5 +1,7 @@
 """The command `play`."""
 
+from __future__ import annotations
+
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated

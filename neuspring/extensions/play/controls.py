@@ -1,5 +1,7 @@
 """An interaction as controls: what was pulled where in each frame, and of which twin. Played again, it gives the same motion."""
 
+from __future__ import annotations
+
 import hashlib
 import threading
 from collections.abc import Iterator

@@ -1,5 +1,7 @@
 """Commands `fetch` and `verify-released`."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Annotated, Literal
 

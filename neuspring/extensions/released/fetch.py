@@ -9,6 +9,8 @@ It is tested against a local stand-in server with archives in the described layo
 been met.
 """
 
+from __future__ import annotations
+
 import difflib
 import json
 import os

@@ -4,6 +4,8 @@ They are written to the described layout of the archives and tried on stand-ins 
 key. None runs code that a file holds.
 """
 
+from __future__ import annotations
+
 import zipfile
 import zlib
 from dataclasses import dataclass, replace

@@ -1,5 +1,7 @@
 """Conformance with PhysTwin's release: the checks in their order, `neuspring check-data` and `verify-released`, and the report."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -1,5 +1,7 @@
 """Spring-Gaus as a baseline: what the workflow asks before any job exists, so that nothing heavy is imported."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 from neuspring.baselines import Baseline, OptionalWeights

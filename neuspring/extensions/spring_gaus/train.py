@@ -12,6 +12,8 @@ Silhouettes are white splats on black against the object's mask, in one camera:
 A the drawn coverage, M the mask, c the centroid in pixels, W the picture's width, TV the mean squared difference of neighbors.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path

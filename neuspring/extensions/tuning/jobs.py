@@ -1,5 +1,7 @@
 """Answers to the workflow's rules of a sweep."""
 
+from __future__ import annotations
+
 import json
 
 from neuspring.config import plain

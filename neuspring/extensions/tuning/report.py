@@ -4,6 +4,8 @@ Everything is made from the sweep's storage, of a sweep that is finished or not.
 `optuna-dashboard` draws pictures of the storage.
 """
 
+from __future__ import annotations
+
 import functools
 import json
 import math

@@ -6,6 +6,8 @@ left anew, and its fits continue from their checkpoints. (Optuna's heartbeat wou
 period in which a sweep of one worker has gone on with other trials.)
 """
 
+from __future__ import annotations
+
 import copy
 import hashlib
 import json

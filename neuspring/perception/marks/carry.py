@@ -7,6 +7,8 @@ neighbors of one color like to be the same, settles it. Between two marked frame
 time. A second pass knows the whole film's background.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -1,5 +1,7 @@
 """Curves of errors over time, search costs and losses: a panel per scenario with a line per method, drawn on white as SVG."""
 
+from __future__ import annotations
+
 import io
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Certainty of the scores, with a picture of the ratios."""
 
+from __future__ import annotations
+
 import io
 
 from neuspring.draw.sheet import DPI

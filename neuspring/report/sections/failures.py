@@ -1,5 +1,7 @@
 """Failures: failed jobs and their causes, numerical failures, damaged files; and a table of the runs that there are."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any

@@ -1,5 +1,7 @@
 """Findings of perception: what its steps noticed of their own results."""
 
+from __future__ import annotations
+
 from neuspring.core.findings import Level, findings_of
 from neuspring.core.table import Cell, Chip, Table, Tone
 from neuspring.report.blocks import Block, Fold, PageSection, Text

@@ -1,5 +1,7 @@
 """Perception against the truth of synthetic captures."""
 
+from __future__ import annotations
+
 from neuspring.report.blocks import PageSection
 from neuspring.report.data import ReportData, ReportSection, prose
 

@@ -1,5 +1,7 @@
 """Pictures and films, methods side by side: in the report, made smaller or linked where they do not fit."""
 
+from __future__ import annotations
+
 import io
 import os
 import shlex

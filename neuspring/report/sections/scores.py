@@ -1,5 +1,7 @@
 """The benchmark's own tables, as `neuspring tables` writes them."""
 
+from __future__ import annotations
+
 from neuspring.report.blocks import Block, PageSection, Text
 from neuspring.report.data import ReportData, ReportSection
 from neuspring.report.summary import score_blocks

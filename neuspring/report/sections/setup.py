@@ -1,5 +1,7 @@
 """Settings that differ from the defaults, versions, machines, and files beside the page."""
 
+from __future__ import annotations
+
 import json
 import platform
 from collections import Counter

@@ -1,5 +1,7 @@
 """The verdict on each study, then its tables, as `neuspring study` writes them."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Mapping
 

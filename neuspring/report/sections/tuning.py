@@ -1,5 +1,7 @@
 """The sweeps of a results folder."""
 
+from __future__ import annotations
+
 from neuspring.report.blocks import Block, Fold, PageSection
 from neuspring.report.data import ReportData, ReportSection, prose
 

@@ -1,5 +1,7 @@
 """The verdict in words, first of all."""
 
+from __future__ import annotations
+
 from neuspring.report import verdict as words
 from neuspring.report.blocks import Block, PageSection, Text
 from neuspring.report.data import ReportData, ReportSection, several

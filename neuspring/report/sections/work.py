@@ -1,5 +1,7 @@
 """Hours and memory of jobs, by step and by method."""
 
+from __future__ import annotations
+
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 

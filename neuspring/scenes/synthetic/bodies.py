@@ -5,6 +5,8 @@ The animals are smooth unions of simple parts, soft filling of uneven stiffness 
 a zebra on its four legs, a dinosaur that sits on its legs and tail. x points to the head.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 

@@ -5,6 +5,8 @@ hinge bending, penalty contacts. Substeps follow from the largest eigenvalue of 
 explicit (semi-implicit Euler); `VertexBlockDescent` is a second engine, for a held-out split with other numerics.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -6,6 +6,8 @@
 - A point of a mesh: along a ray, or nearest to a place.
 """
 
+from __future__ import annotations
+
 import warp as wp
 
 

@@ -1,5 +1,7 @@
 """A scene -> a capture folder and its truth: settle, simulate, certify, place cameras, render, pass through the sensor."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass

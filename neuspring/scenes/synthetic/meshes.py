@@ -5,6 +5,8 @@ Distances [...] of points [..., 3], m, are negative inside. The ellipsoid and th
 signs away from the blend, which is all that meshing needs. Meshes are (nodes [N, 3] m, tetrahedra [E, 4] with positive volume).
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np

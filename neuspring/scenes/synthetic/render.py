@@ -6,6 +6,8 @@ Texture is a function of rest coordinates, so it sticks to the material. Pixel c
 forward (OpenCV); the table is the plane z = 0.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 

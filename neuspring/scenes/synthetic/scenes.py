@@ -4,6 +4,8 @@ Names, categories and frame counts are those of the PhysTwin data; bodies, mater
 that follow key frames, hold what they grasp, or push. A hand's origin is where its fingers meet.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal

@@ -5,6 +5,8 @@ shape rope | cloth | blob; motion lift (up and back down) | shake (sideways, gro
 law of the true stiffness. Observation adds noise and occlusion; the truth (a Twin) is kept apart for identifiability studies.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from pathlib import Path
 

@@ -4,6 +4,8 @@ where the material at a place of frame 0 goes, to judge perception by.
 It lies beside the capture's folder, and the capture's provenance holds its digest.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path

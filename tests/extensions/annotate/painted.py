@@ -1,5 +1,7 @@
 """Quick masks for tests of the page: boxes are filled, in all frames alike."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from threading import Event
 

@@ -1,5 +1,7 @@
 """The server of `neuspring annotate` in a thread, and requests to it."""
 
+from __future__ import annotations
+
 import http.client
 import json
 import time

@@ -1,5 +1,7 @@
 """Results folders of a tiny rope, as the workflow leaves them, for tests of exports."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Callable
 from dataclasses import replace

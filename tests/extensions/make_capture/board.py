@@ -1,5 +1,7 @@
 """A ChArUco board on a table, as OpenCV prints it, seen by a camera; and a lens."""
 
+from __future__ import annotations
+
 import cv2
 import numpy as np
 

@@ -12,6 +12,8 @@ effect was handed to viser. No browser is open: what it costs depends on its mac
 software and a mouse pulls their highest node.
 """
 
+from __future__ import annotations
+
 import argparse
 import tempfile
 import time

@@ -3,6 +3,8 @@
 prediction by the float64 reference simulation, pictures by the rasterizer's specification, deprojection written out.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

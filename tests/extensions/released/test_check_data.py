@@ -1,5 +1,7 @@
 """check-data: the layout and checks 1 to 4 against the release, on a case with released results."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 import numpy as np

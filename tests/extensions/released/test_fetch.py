@@ -1,5 +1,7 @@
 """Fetching the released archives, against a stand-in of the hub on this machine. The real hub is never asked."""
 
+from __future__ import annotations
+
 import hashlib
 import io
 import json

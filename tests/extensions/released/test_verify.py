@@ -1,5 +1,7 @@
 """verify-released on small stand-ins of the released results: each check passes on them, and fails when one thing is altered."""
 
+from __future__ import annotations
+
 import shutil
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,5 +1,7 @@
 """A small sweep for tests and benchmarks: its configuration, its tables and observations on disk, its workers and results."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,5 +1,7 @@
 """MuJoCo: an MJCF file, beside the plain export for the hands' motion."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,5 +1,7 @@
 """Newton: a script that makes its model of a twin, beside the plain export."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import accumulate

@@ -1,5 +1,7 @@
 """npz + JSON: every array and setting of a twin, described well enough to be read and simulated without this project."""
 
+from __future__ import annotations
+
 import dataclasses
 import json
 from collections.abc import Sequence

@@ -1,5 +1,7 @@
 """PLY: the spring graph as vertices and edges, and splats in the layout of splat viewers, a file of each per frame."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

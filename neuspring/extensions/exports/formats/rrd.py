@@ -4,6 +4,8 @@ Nothing is shown and no server is asked: the file is written, and `rerun FILE` o
 time. Splats are left out, because Rerun's form of them is not stable yet.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,5 +1,7 @@
 """USD: animated nodes, springs as curves, and splats as Gaussian particle fields with points as their stand-in."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

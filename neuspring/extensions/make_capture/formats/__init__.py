@@ -7,6 +7,8 @@ To add one: a file here with a `CaptureFormat` named capture_format; or a packag
     recording    all that cameras gave (--recording): a bag, PhysTwin's raw layout
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path

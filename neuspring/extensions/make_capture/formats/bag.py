@@ -7,6 +7,8 @@ librealsense (.bag up to 2.57, then .db3) departs from it: images of a .bag have
 depth; the stamps of a .db3 are times of the log, and text beside the images has the camera's; depth is not aligned to color.
 """
 
+from __future__ import annotations
+
 import re
 import struct
 from collections.abc import Callable, Iterator, Sequence

@@ -1,5 +1,7 @@
 """A folder of images."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -1,5 +1,7 @@
 """A case in PhysTwin's raw layout, see `neuspring.intake.phystwin_raw`."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

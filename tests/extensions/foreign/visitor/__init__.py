@@ -1,5 +1,7 @@
 """One member of each of several kinds, as small as they can be. What computes is imported where it is used."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
