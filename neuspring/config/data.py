@@ -41,9 +41,6 @@ class Mocap(SettingsSection):
     """Number of rings, whatever their spacing, so that a twin can move to another recording of the cable; null: one every 12 mm."""
     ring: Annotated[int, Field(ge=3)] = 4
     """Nodes per ring."""
-    roll_axis: Literal["x", "y", "z"] = "y"
-    """Direction of the world (+z up) from which the roll of rings and clamps starts at both ends in frame 0, so that node i is the
-    same node in all recordings of a cable. Neither end may lie along it. y: DEFORM's cables hang about in the plane of x and z."""
     rest_shape: Literal["first_frame", "straight"] = "first_frame"
     """Shape without forces: frame 0, as in the paper, or a straight cable with the arc lengths of frame 0."""
     grip: Literal["markers", "clamp"] = "markers"
@@ -91,6 +88,8 @@ class Deform(SettingsSection):
     and `transfers`."""
     clips: Annotated[int, Field(ge=2)] = 8
     """Training recordings per cable, equally spaced in the order of their numbers. The first of them names the pool's scenario."""
+    leave_out: tuple[Name, ...] = ()
+    """Recordings that are not used, as DLO3_train_15. The place of one for training takes the nearest by number."""
 
 
 @dataclass(frozen=True, kw_only=True)

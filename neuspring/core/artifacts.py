@@ -20,7 +20,7 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.core.files import DamagedFile, read_npz, write_npz
-from neuspring.core.geometry import Obstacle, obstacles_of
+from neuspring.core.geometry import SAME_WORLD, Obstacle, obstacles_of
 
 FORMAT_VERSION = 2
 """Version of the files of all artifacts; files of another version are refused."""
@@ -583,6 +583,9 @@ class Rod(Artifact):
     damping: float = number("s", "time of inner damping: moments are EI / l (k - k0 + damping dk/dt)")
     drag_quadratic: float = number("1/m", "deceleration by air is this times speed squared; linear drag is the material's")
     roll: float = number("rad", "turn of the last edge's directors from `axis` projected")
+    steady: float = number(
+        "rad", "`axis` turns about the vertical with a recording whose line heads elsewhere by more", default=SAME_WORLD
+    )
 
     def check(self) -> None:
         edges = len(self.vertices) - 1

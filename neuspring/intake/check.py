@@ -17,6 +17,7 @@ import numpy as np
 from neuspring.checks import cable, examine
 from neuspring.checks.case import FINAL_DATA, Case, whole
 from neuspring.checks.masks import Shown
+from neuspring.checks.moving import Moving
 from neuspring.checks.rig import CameraAlone, Judged, Rig
 from neuspring.checks.table import object_on_table
 from neuspring.checks.things import HAND_LEAST, INSIDE, Sample, hands_on, lifted, outline, place_of, sampled
@@ -26,6 +27,8 @@ from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
 from neuspring.core.findings import Finding, note, refusal, unusual
+from neuspring.core.text import listed
+from neuspring.data.c3d import Markers, is_c3d, plain_file
 from neuspring.data.capture import CAPTURE, NODES, OBJECT, POINTS, Capture, description_findings, read_description
 from neuspring.data.unpickle import load_pickle
 from neuspring.intake import phystwin
@@ -46,8 +49,8 @@ def check_capture(folder: Path) -> list[Finding]:
         description = read_description(path)
     except InputError as error:
         return [refusal(error)]
-    findings = description_findings(path, description) + examine("frame rate", path, description.frame_rate)
-    findings += examine("category", path, description.category)
+    findings = description_findings(path, description) + examine("category", path, description.category)
+    findings += examine("frame rate", path, description.frame_rate) if description.cameras else []
     capture, calibrated = Capture(folder, description), not any(one.level == "error" for one in findings)
     grips = np.zeros(capture.frame_count, int)
     samples, watched = {}, {name: Watched(capture.frame_count) for name in capture.cameras}
@@ -178,7 +181,7 @@ def _rig(capture: Capture, samples: Mapping[str, Mapping[int, Sample]]) -> list[
     first = {name: some[0].depth for name, some in samples.items() if 0 in some}
     rig = Rig({name: capture.cameras[name] for name in samples}, depths, first, described.up)
     unit = described.depth_unit if described.depth_format == "png" else None
-    judged = Judged.of(rig, dict.fromkeys(samples, unit))
+    judged = Judged(rig, dict.fromkeys(samples, unit))
     return examine("rig", path, judged) + (examine("views", path, rig.views) if len(samples) > 1 else [])
 
 
@@ -210,14 +213,15 @@ def _color_alone(capture: Capture, name: str, samples: dict[int, Sample]) -> lis
 
 
 def check_layout(folder: Path, settings: Mocap = DEFORM) -> list[Finding]:
-    """Check a capture or a folder of them, a processed case, a folder of cases, a root with data/different_types, or cable
-    recordings (folder or .pkl file), whose unit, rate and up axis are in `settings`. Returns every finding.
+    """Check a capture or a folder of them, a processed case, a folder of cases, a root with data/different_types, C3D files (or
+    one, with labels or without), or cable recordings (folder or .pkl file), whose unit, rate and up axis are in `settings`.
+    Returns every finding.
 
     Raises InputError only if `folder` does not exist or holds no data of a known layout.
     """
     folder = Path(folder)
-    if folder.is_file():
-        return check_recording(folder, settings)
+    if plain_file(folder).is_file():
+        return check_markers(folder) if is_c3d(folder) else check_recording(folder, settings)
     if not folder.is_dir():
         raise InputError(folder, "a folder or file to check is required", "nothing there")
     if captures := _captures(folder):
@@ -225,11 +229,29 @@ def check_layout(folder: Path, settings: Mocap = DEFORM) -> list[Finding]:
     if cases := find_cases(folder):
         findings = [finding for case in cases for finding in _check_case(case)]
         return findings + examine("cases", folder, folder, cases, findings)
-    files = sorted(folder.rglob("*.pkl"))
-    if not files:
-        rule = "a case with final_data.pkl, a folder of cases, a root with data/different_types, or cable recordings is required"
-        raise InputError(folder, rule, "none of them")
-    return [finding for file in files for finding in check_recording(file, settings)]
+    marked, files = (sorted(path for path in folder.rglob("*") if path.suffix.lower() == kind) for kind in (".c3d", ".pkl"))
+    if not marked and not files:
+        rule = "a capture, a case with final_data.pkl, a folder of cases, a root with data/different_types, C3D files or cable "
+        raise InputError(folder, f"{rule}recordings are required", "none of them")
+    findings = [finding for file in marked for finding in check_markers(file)]
+    return findings + [finding for file in files for finding in check_recording(file, settings)]
+
+
+def check_markers(path: Path) -> list[Finding]:
+    """Contents of a C3D file, or those markers of it that FILE.c3d#LABEL,LABEL names, and every finding about their motion."""
+    findings: list[Finding] = []
+    markers = _read(findings, path, Markers.read)
+    if markers is None:
+        return findings
+    unseen = np.isnan(markers.points[..., 0]).sum(axis=0)
+    sides = np.ptp(markers.points[np.isfinite(markers.points).all(axis=2)], axis=0) if (unseen < len(markers.points)).any() else []
+    size = " x ".join(f"{100 * side:.1f}" for side in sides)
+    found = f"{len(markers.points)} frames of {markers.rate:g} Hz, within {size or 0} cm, of {len(markers.labels)} markers: "
+    gaps = [f"{label} in {count} frames" for label, count in zip(markers.labels, unseen, strict=True) if count]
+    lost = f"; lost: {listed(gaps)}" if gaps else "; none is ever lost"
+    findings.append(note(path, found + ", ".join(markers.labels) + lost))
+    remedy = "Fill gaps where it was recorded, or leave the marker out: FILE.c3d#LABEL,LABEL"
+    return findings + examine("moving", path, Moving(markers.points, markers.rate), remedy)
 
 
 def check_recording(file: Path, settings: Mocap) -> list[Finding]:
@@ -249,8 +271,7 @@ def find_cases(folder: Path) -> list[Case]:
         return []
     below = folder / "data" / "different_types"
     if below.is_dir():
-        paths = _subfolders(below)
-        if not paths:
+        if not (paths := _subfolders(below)):
             raise InputError(folder, "at least one case folder is required", "none")
         return [Case(root=folder, name=path.name) for path in paths]
     cases = []
@@ -307,8 +328,7 @@ def _check_case(case: Case) -> list[Finding]:
     if (poses := _read(found, path, load_pickle, "the calibration check is")) is not None:
         found += examine("calibration", path, poses, CAMERAS)
     path = folder / phystwin.METADATA
-    metadata = _read(found, path, load_json, "the check of intrinsics and frame rate is")
-    if metadata is not None:
+    if (metadata := _read(found, path, load_json, "the check of intrinsics and frame rate is")) is not None:
         found += examine("metadata", path, metadata) + examine("lenses of metadata", path, metadata, CAMERAS)
     if isinstance(metadata, dict):
         if "fps" not in metadata:

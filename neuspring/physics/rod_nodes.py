@@ -19,6 +19,7 @@ import torch
 
 from neuspring.core.artifacts import Rod, Simulation, Twin
 from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.geometry import PARALLEL
 from neuspring.physics.controllers import ControllerSprings, begins
 from neuspring.physics.parameters import CONTACT_LIMITS
 from neuspring.physics.rod import RodHands, RodLanes, RodSolver
@@ -34,8 +35,6 @@ AT_REST = 1e-6
 TINY_GRAVITY = 1e-3
 """m/s^2: without gravity steps are as long as with this."""
 GROUND_FIELDS = ("ground_elasticity", "ground_friction")
-PARALLEL = 0.99
-"""Cosine to an end's tangent from which `Rod.axis` has no projection worth the name."""
 
 
 def bind(vertices: np.ndarray, directors: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -15,8 +15,9 @@ rotation that turns d carries n along, so the ring follows every turn of the end
 did make is not in the data. Half a step of the angle keeps the points away from the body's own ring around the first and the last
 marker.
 
-In frame 0 the roll of both ends is that of one direction of the world (`mocap.roll_axis`), projected. So ring node i is the same
-node in every recording of a cable, as far as its grippers begin alike.
+In frame 0 the roll of both ends is that of one direction, projected (`axis_on`): y, about normal to a cable that heads along x.
+So ring node i is the same node in every recording of a cable, as far as its grippers begin alike. A cable that heads elsewhere
+takes its direction with it.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from neuspring.config import Config, Mocap, ScenarioRow
 from neuspring.core.artifacts import NO_REST_SHAPE, Observations, Scenario
 from neuspring.core.errors import InputError
 from neuspring.core.findings import refuse
+from neuspring.core.geometry import axis_on
 from neuspring.core.records import digest_file
 from neuspring.data.unpickle import load_pickle
 
@@ -84,8 +86,6 @@ def transport(directions: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return normals
 
 
-LARGEST_ALONG = 0.99
-"""Cosine of the angle between an end of the cable and the roll axis: nearer to 1 a small turn of the end is a large roll."""
 RING_SPACING = 0.012
 """Distance of rings along the center line where `mocap.rings` gives no number of them, m."""
 RING_RADIUS = 0.006
@@ -117,16 +117,11 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
     if settings.frames is not None and frames < settings.frames:
         rule = f"{settings.frames} frames are required after start {settings.start} and stride {settings.stride} (mocap.frames)"
         raise InputError(file, rule, f"{frames} of {len(data)} samples", "Leave this recording out, or lower mocap.frames.")
-    axis = np.eye(3)["xyz".index(settings.roll_axis)]
 
     held = [0, 1, count - 2, count - 1]
     observed = markers[:, 2:-2]
     centers, tangents = centerline(markers[0], RING_SPACING, settings.rings)
-    if (along := np.abs(tangents[[0, -1]] @ axis).max()) > LARGEST_ALONG:
-        rule = "in frame 0 neither end of the cable may lie along mocap.roll_axis, from which the roll of its rings starts"
-        value = f"{np.degrees(np.arccos(min(along, 1.0))):.1f} degrees between an end and {settings.roll_axis}"
-        raise InputError(file, rule, value, "Name the axis that is farthest from the ends in all recordings of the cable.")
-    normals = rolled(tangents, axis)
+    normals = rolled(tangents, axis_on(Y, -X, markers[0]))
     body = rings(centers, tangents, normals, RING_RADIUS, settings.ring)
     points = np.concatenate([markers[0], body])
     nearest = float(cKDTree(points).query(points, k=2)[0][:, 1].min())

@@ -96,21 +96,33 @@ def with_deform(settings: Config) -> Config:
             "configuration, deform", "DEFORM's data need data_root", "null", "Give it: --config data_root=/path/to/data."
         )
     pools, transfers = dict(settings.pools or {}), dict(settings.transfers or {})
+    known: list[str] = []
     for cable in chosen.cables:
         folder = Path(settings.data_root or ".") / cable
-        found = {
-            part: sorted(int(file.stem) for file in folder.glob(f"{part}/*.pkl") if file.stem.isdecimal())
+        train, judged = (
+            [
+                f"{cable}_{part}_{number}"
+                for number in sorted(int(file.stem) for file in folder.glob(f"{part}/*.pkl") if file.stem.isdecimal())
+            ]
             for part in ("train", "eval")
-        }
-        if len(found["train"]) < chosen.clips or not found["eval"]:
+        )
+        known += [*train, *judged]
+        free, judged = ([name for name in names if name not in chosen.leave_out] for names in (train, judged))
+        if len(free) < chosen.clips or not judged:
             rule = f"at least {chosen.clips} recordings train/NUMBER.pkl (deform.clips) and one eval/NUMBER.pkl are required"
             there = listed(sorted({path.parent.parent.name for path in folder.parent.glob("*/eval/*.pkl")})) or "none"
-            received = f"{len(found['train'])} and {len(found['eval'])}"
-            raise InputError(folder, rule, received, f"Correct data_root, deform.cables (there: {there}) or deform.clips.")
-        last = len(found["train"]) - 1
-        picked = [found["train"][i * last // (chosen.clips - 1)] for i in range(chosen.clips)]
-        pools[cable] = tuple(f"{cable}_train_{number}" for number in picked)
-        transfers[pools[cable][0]] = tuple(f"{cable}_eval_{number}" for number in found["eval"])
+            received = f"{len(free)} and {len(judged)}"
+            raise InputError(folder, rule, received, f"Correct data_root, deform.cables (there: {there}), clips or leave_out.")
+        picked = [train[i * (len(train) - 1) // (chosen.clips - 1)] for i in range(chosen.clips)]
+        spare = [name for name in free if name not in picked]
+        for place, name in enumerate(picked):
+            if name not in free:
+                apart = [abs(train.index(other) - train.index(name)) for other in spare]
+                picked[place] = spare.pop(apart.index(min(apart)))
+        pools[cable], transfers[picked[0]] = tuple(picked), tuple(judged)
+    if unknown := [name for name in chosen.leave_out if name not in known]:
+        rule = "must be recordings of deform.cables"
+        raise InputError("configuration, deform.leave_out", rule, listed(unknown), f"There: {listed(known, 200) or 'none'}.")
     scenarios = tuple(dict.fromkeys([*settings.scenarios, *(pools[cable][0] for cable in chosen.cables)]))
     return dataclasses.replace(settings, scenarios=scenarios, pools=pools or None, transfers=transfers or None)
 

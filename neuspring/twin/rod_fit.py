@@ -28,14 +28,16 @@ from neuspring.config.rod import RodFit
 from neuspring.core.artifacts import Observations, Rod, Twin
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_table
+from neuspring.core.geometry import SAME_WORLD, angle_between, heading, turned
 from neuspring.core.levenberg import LevenbergMarquardt
-from neuspring.core.text import Progress
+from neuspring.core.text import Progress, listed
 from neuspring.physics.controllers import waypoints
 from neuspring.physics.rod_nodes import RodFrames, settled, turn_of
 from neuspring.twin import rod as rods
 from neuspring.twin.body import Learned
 from neuspring.twin.losses import frames_seen
 from neuspring.twin.rollout import initial_velocity
+from neuspring.twin.transfer import LEAVE_OUT, along, require_alike
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -404,20 +406,15 @@ def search_rod(
     threads: int = 1,
     record: Path | None = None,
 ) -> RodResult:
-    """The constants of a rod, on the frames of the first horizon; a row per step goes to the file `record`.
-
-    A turn of the last clamp against the first is known but for whole turns. Of the axes x and y that one is taken for which turns
-    in frame 0 of the recordings lie farthest from half a turn, where recordings of one body would be told apart by a whole one.
-    """
+    """The constants of a rod, on the frames of the first horizon; a row per step goes to the file `record`."""
     import pandas as pd
 
-    require_pool(observations, pool)
+    recordings = in_order([observations, *pool])
     first = replace(RodSteps(**vars(settings.fit.rod)), stiffness="constant", curvature="constant", markers=False, slip=0)
     first = replace(first, horizons=first.horizons[:1])
-    lines = [rods.line_of(each) for each in [observations, *pool] if each.line.size]
-    axis = max(np.eye(3)[:2].tolist(), key=lambda axis: sum(np.cos(turn_of(line, np.array(axis))) for line in lines))
-    start = rods.rod_twin(observations, settings, axis)
-    solver = Levenberg(Recordings.of([observations, *pool], start), first, device, threads)
+    axis, steady = choose_axis([rods.line_of(each) for each in recordings if each.line.size])
+    start = rods.rod_twin(observations, settings, axis.tolist(), steady)
+    solver = Levenberg(Recordings.of(recordings, start), first, device, threads)
     if _rod(start).laid:
         # What hangs in frame 0 says how stiff it is.
         variables = Variables.of(start, first, observations.object_points.shape[1])
@@ -444,10 +441,12 @@ def fit_rod(
     threads: int = 1,
 ) -> RodResult:
     """All variables of a rod, stage by stage, from the twin of its search. Raises InputError, NumericalFailure."""
-    recordings, settings = Recordings.of([observations, *pool], twin, oracle), RodSteps(**vars(settings))
+    recordings, settings = Recordings.of(in_order([observations, *pool]), twin, oracle), RodSteps(**vars(settings))
     solver = Levenberg(recordings, settings, device, threads)
     progress = Progress(f"fit {observations.scenario.name}, rod", settings.rounds * len(settings.horizons))
     twin, value, history = solver.lowered(twin, progress)
+    if pool:
+        require_unmirrored(recordings, twin, settings, device)
     # Where markers lie beside the line, frame 0 has another line now.
     twin = rods.on_recording(twin, observations)
     found = _result(twin, value, history)
@@ -457,15 +456,85 @@ def fit_rod(
 
 def require_pool(here: Observations, pool: Sequence[Observations]) -> None:
     """Raise InputError unless recordings have one center line: as many tracked points, hands and vertices."""
-    name, counts = f"pool of {here.scenario.name}", (here.object_points.shape[1], here.controller_points.shape[1])
     if pool and not here.line.size:
         rule = "recordings of a pool must have markers along the line, for a rod"
-        raise InputError(name, rule, "none", "Choose row rod_single.")
-    for there in pool:
-        received = there.object_points.shape[1], there.controller_points.shape[1]
-        if received != counts or len(there.line) != len(here.line):
-            rule = f"recordings of a pool must have as many tracked points, controllers and vertices: {counts}, {len(here.line)}"
-            raise InputError(name, rule, f"{received}, {len(there.line)} in {there.scenario.name}", "Leave this recording out.")
+        raise InputError(f"pool of {here.scenario.name}", rule, "none", "Choose row rod_single.")
+    counted = "tracked points, controllers and vertices"
+    require_alike(
+        [here, *pool], counted, lambda each: (each.object_points.shape[1], each.controller_points.shape[1], len(each.line))
+    )
+
+
+def in_order(recordings: Sequence[Observations]) -> list[Observations]:
+    """Recordings of a pool, the lines of all in the order of the first.
+
+    Raises InputError unless they have one center line, and the first is like most.
+    """
+    require_pool(recordings[0], recordings[1:])
+    if not recordings[0].line.size:
+        return list(recordings)
+    orders = along(recordings)
+    if (np.diff(orders[0]) != 1).any():
+        rule = "markers of a pool's first recording must be in the order of most"
+        raise InputError(f"pool of {recordings[0].scenario.name}", rule, orders[0].tolist(), LEAVE_OUT)
+    return [replace(each, line=each.line[order]) for each, order in zip(recordings, orders, strict=True)]
+
+
+ALIKE = 0.6
+"""Length of the mean heading from which recordings have a world in common. Any eight of DEFORM's cables have 0.85 at least, one of
+eight that is turned by half leaves 0.75."""
+TURNS_KNOWN = 0.5
+"""Mean cosine of the turns between ends from which an axis of the world tells whole turns apart."""
+
+
+def choose_axis(lines: Sequence[np.ndarray]) -> tuple[np.ndarray, float]:
+    """`Rod.axis` and `Rod.steady` of the first of several lines [V, 3] in frame 0.
+
+    A turn of the last clamp against the first is known but for whole turns, so turns between the ends of the recordings should lie
+    far from half a turn. The axis is x or y, where one of these is good enough, or else normal to the lines' mean heading. Where
+    lines head all ways, recordings have no world in common, and the axis turns with each.
+    """
+    if not lines:
+        return np.eye(3)[1], SAME_WORLD
+    ways = np.array([heading(line) for line in lines])
+    steady = SAME_WORLD if np.linalg.norm(ways.mean(axis=0)) > ALIKE else 0.0
+    angles = [angle_between(ways[0], way) for way in ways]
+    angles = [angle if abs(angle) > steady else 0.0 for angle in angles]
+
+    def known(axis: np.ndarray) -> float:
+        return float(np.mean([np.cos(turn_of(line, turned(axis, angle))) for line, angle in zip(lines, angles, strict=True)]))
+
+    axis = max(np.eye(3)[:2], key=known)
+    if known(axis) < TURNS_KNOWN:
+        ahead = np.sum([turned(way, -angle) for way, angle in zip(ways, angles, strict=True)], axis=0)
+        axis = np.cross(ahead, np.eye(3)[2]) / np.linalg.norm(ahead)
+    return axis, steady
+
+
+MIRRORED = 0.7
+"""A recording is mirrored if its mirror image has so many times its error. In fits to DEFORM's cables it has 1.6 times at least,
+and that of a mirrored one among others 0.4 to 0.6 times."""
+
+
+def require_unmirrored(recordings: Recordings, twin: Twin, settings: RodSteps, device: str) -> None:
+    """Raise InputError, naming all, where mirror images of recordings follow the twin far better than these do.
+
+    Gravity and time are the same in a mirror; the unloaded curvature of a cable, and the side of it that markers are on, are not.
+    So one recording can be told among others, and a whole pool that is mirrored is another cable.
+    """
+    seen, names = recordings.observations, ("object_points", "surface_points", "controller_points", "velocity_before")
+    flip = np.array([1.0, -1.0, 1.0], np.float32)
+    images = Recordings.of([replace(each, **{name: getattr(each, name) * flip for name in names}) for each in seen], twin)
+    frames, every = min(settings.horizons[0] or len(recordings.hands), len(recordings.hands) - 1) + 1, settings.every
+    errors = []
+    for each in (recordings, images):
+        apart = each.predicted([twin], frames, every, device)[0] - each.points[:, 1:frames:every]
+        seen_there = each.counts[:, 1:frames:every, :, None]
+        errors.append(1e3 * np.where(seen_there, np.abs(apart), 0.0).mean(axis=(1, 2, 3)))
+    found = [(one.scenario.name, own, image) for one, own, image in zip(seen, *errors, strict=True)]
+    if wrong := [f"{name} ({own:.1f} mm, its mirror image {image:.1f} mm)" for name, own, image in found if image < MIRRORED * own]:
+        rule = "recordings of a pool must not be mirrored"
+        raise InputError(f"pool of {seen[0].scenario.name}", rule, listed(wrong), f"Correct their axes. {LEAVE_OUT}")
 
 
 def _result(twin: Twin, value: float, history: list[dict[str, Any]]) -> RodResult:

@@ -26,6 +26,7 @@ import numpy as np
 
 from neuspring.core.artifacts import Material, Observations, Topology, Twin
 from neuspring.core.errors import InputError
+from neuspring.core.text import listed
 from neuspring.twin.body import body_of
 from neuspring.twin.field import midpoints
 from neuspring.twin.topology import RADIUS_MARGIN, REPAIR_SPRINGS, distances, infer_controller_radius, piecewise_topology, unloaded
@@ -58,14 +59,6 @@ def move(
         self_collision=scenario.self_collision,
     )
     return body.stable(replace(moved, simulation=simulation), safety), registration
-
-
-def in_pool(twin: Twin, observations: Observations, keep_frame_time: bool) -> Twin:
-    """A lattice on the nodes of a recording of its pool, node i on node i. Raises InputError if those are others."""
-    if not corresponds(twin.topology, observations):
-        name = f"pool, {observations.scenario.name}"
-        raise InputError(name, "recordings of a pool must have the same nodes", "others", "Sample all alike (mocap.rings).")
-    return move(twin, observations, keep_frame_time=keep_frame_time)[0]
 
 
 def on_nodes(twin: Twin, observations: Observations) -> tuple[Twin, Registration | None]:
@@ -115,9 +108,10 @@ def _same_nodes(topology: Topology, observations: Observations) -> Topology:
 
 NEAREST_SPRINGS = 8
 """Springs that a spring's values are the mean of."""
-LARGEST_RESIDUAL, LARGEST_STRETCH = 0.12, 0.15
+LARGEST_RESIDUAL, LARGEST_STRETCH = 0.12, 0.2
 """Beyond these shapes do not fit: the residual of the rigid motion, as a fraction of the extent, and the stretch of the bending,
-which could lay any shape onto any other. Filmed recordings of one plush have at most 0.06; another animal of its size has 0.16."""
+which could lay any shape onto any other. Recordings of one plush have at most 0.06 and 0.17; another animal of its size has 0.16
+of the first."""
 
 
 def resampled(twin: Twin, observations: Observations) -> tuple[Twin, Registration]:
@@ -276,47 +270,57 @@ def _means(places: np.ndarray, at: np.ndarray) -> Callable[[np.ndarray], np.ndar
     return mean
 
 
-LARGEST_ROLL = 60.0
-"""Degrees. Recordings of one cable whose rings start alike differ by less, by how their ends point; others by a quarter turn."""
-END_NODES = 8
-"""Nodes at an end of a line whose turn is measured."""
-
-
-def roll_between(here: Observations, there: Observations) -> float:
-    """Turn of the nodes at either end of the line about it, from one recording to the other, degrees, the larger.
-
-    The rotation of the nearest nodes about the end is the smallest one that turns its direction, after a turn about it: the roll.
-    It says nothing, and counts as 0, where the direction turns by more than 60 degrees.
-    """
-    from scipy.spatial.transform import Rotation
-
-    first, other = (np.concatenate([seen.nodes, seen.controller_points[0]]).astype(np.float64) for seen in (here, there))
-    rolls = []
-    for end, inner in (here.line[:2], here.line[:-3:-1]):
-        near = np.argsort(np.linalg.norm(first[: len(here.nodes)] - first[end], axis=1))[:END_NODES]
-        turn, _ = Rotation.align_vectors(other[near] - other[end], first[near] - first[end])
-        along = (first[inner] - first[end]) / np.linalg.norm(first[inner] - first[end])
-        sine, cosine = turn.as_quat(canonical=True)[:3] @ along, turn.as_quat(canonical=True)[3]
-        rolls.append(np.degrees(2 * np.arctan(abs(sine) / cosine)) if along @ turn.apply(along) > 0.5 else 0.0)
-    return float(max(rolls))
-
-
 def require_pool(here: Observations, pool: Sequence[Observations]) -> None:
-    """Raise InputError unless a twin can be judged on the pool: other recordings, with as many nodes and hands, node i on node i.
+    """Raise InputError unless a lattice can be judged on the pool: of a cable, recordings with as many nodes and hands, i on i.
 
-    Along a line neighbors tell nothing of a turn about it, so that is measured (`roll_between`).
+    Rings around a line that is recorded from its other end are others; all such recordings are named. Another body may have other
+    nodes in each recording; its shapes are laid onto each other (`resampled`).
     """
-    name = f"pool of {here.scenario.name}"
-    counts = len(here.nodes), here.controller_points.shape[1]
-    for there in pool:
-        received = len(there.nodes), there.controller_points.shape[1]
-        if received != counts:
-            rule = f"recordings of a pool must have as many nodes and controllers: {counts[0]} and {counts[1]}"
-            value = f"{received[0]} and {received[1]} in {there.scenario.name}"
-            raise InputError(name, rule, value, "Sample all alike (mocap.rings).")
-        if here.line.size and there.line.size and (roll := roll_between(here, there)) > LARGEST_ROLL:
-            rule = (
-                f"node i of a cable must be node i in every recording: its ends may be rolled by {LARGEST_ROLL:g} degrees at most"
-            )
-            remedy = "Name another mocap.roll_axis, or leave this recording out."
-            raise InputError(name, rule, f"{roll:.0f} degrees in {there.scenario.name}", remedy)
+    recordings = [here, *pool]
+    if not any(each.line.size for each in recordings):
+        return
+    require_alike(recordings, "nodes and controllers", lambda each: (len(each.nodes), each.controller_points.shape[1]))
+    orders = along(recordings) if pool and here.line.size else []
+    if turned := [each.scenario.name for each, order in zip(recordings, orders, strict=False) if order[0] > 1]:
+        rule = "node i of a cable must be node i in every recording, so all must run from the same end"
+        raise InputError(f"pool of {here.scenario.name}", rule, f"{listed(turned)} from the other", LEAVE_OUT)
+
+
+def require_alike(recordings: Sequence[Observations], counted: str, counts: Callable[[Observations], tuple[int, ...]]) -> None:
+    """Raise InputError, naming all that differ, unless recordings of a pool have as many of what is `counted`."""
+    here, others = counts(recordings[0]), {each.scenario.name: counts(each) for each in recordings[1:]}
+    if wrong := [f"{received} in {name}" for name, received in others.items() if received != here]:
+        rule = f"recordings of a pool must have as many {counted}: {here}"
+        raise InputError(
+            f"pool of {recordings[0].scenario.name}", rule, listed(wrong), f"Sample all alike (mocap.rings). {LEAVE_OUT}"
+        )
+
+
+LEAVE_OUT = "Leave them out (deform.leave_out, or pools)."
+BETTER = 0.9
+"""Another order must fit distances of neighbors by so many times the error of that of the file. For DEFORM's cables the true order
+is at most 0.8 times the other one."""
+
+
+def along(recordings: Sequence[Observations]) -> list[np.ndarray]:
+    """Order [V] of the line of each recording of a cable in which neighbors are as far apart as in most of them.
+
+    It is that of the file, that from the other end, or one with the two markers of an end exchanged. Distances are medians over the
+    training frames: those of a single frame change with the cable's bend. Another order than that of the file is printed.
+    """
+
+    def apart(each: Observations, order: np.ndarray | slice = slice(None)) -> np.ndarray:
+        tracked, extra = each.object_points.shape[1], len(each.nodes) - each.object_points.shape[1]
+        points = np.concatenate([each.object_points, each.controller_points], axis=1)[: each.scenario.train_end]
+        line = points[:, np.where(each.line < tracked, each.line, each.line - extra)][:, order]
+        return np.asarray(np.median(np.linalg.norm(np.diff(line, axis=1), axis=2), axis=0))
+
+    count = len(recordings[0].line)
+    orders = [np.arange(count), np.arange(count)[::-1], np.r_[1, 0, 2:count], np.r_[: count - 2, count - 1, count - 2]]
+    usual = np.median([apart(each) for each in recordings], axis=0)
+    errors = [[np.abs(apart(each, order) - usual).mean() for order in orders] for each in recordings]
+    found = [orders[np.argmin(error) if min(error) < BETTER * error[0] else 0] for error in errors]
+    for each, order in zip(recordings, found, strict=True):
+        if order is not orders[0]:
+            print(f"note: {each.scenario.name}: by the distances between its markers their order is {order.tolist()}")
+    return found

@@ -14,6 +14,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.findings import broken, note, unusual
 from neuspring.intake import phystwin
 from neuspring.intake.check import check_layout, render
+from tests.support.c3d_files import write_c3d
 from tests.support.findings import holds, of_level, serious
 from tests.support.phystwin_case import dump, edit, stored, write_case, write_json
 
@@ -221,6 +222,22 @@ def test_folders_without_data_are_refused(tmp_path: Path) -> None:
     (tmp_path / "data" / "different_types").mkdir(parents=True)
     with pytest.raises(InputError, match="at least one case"):
         check_layout(tmp_path)
+
+
+def test_markers_of_c3d_files_one_by_one_with_labels_and_as_a_folder(tmp_path: Path) -> None:
+    rest = np.array([[0.0, 0, 0], [300, 0, 0], [300, 200, 0], [0, 200, 100]])
+    way = rest + 50 * np.sin(np.arange(60) / 5)[:, None, None]
+    way[30, 1] += 400
+    lost = np.zeros((60, 4), bool)
+    lost[50:, 2] = True
+    path = write_c3d(tmp_path / "take.c3d", way, ["base", "tip - 1", "tip - 2", "elbow"], rate=100.0, lost=lost)
+    found = check_layout(path)
+    assert holds(found, "note", "take.c3d", "60 frames of 100 Hz, within ", "base, tip - 1, tip - 2, elbow; lost: tip - 2 in 10")
+    assert holds(found, "warning", "take.c3d", "point 1 in frame 30", "leave the marker out: FILE.c3d#LABEL")
+    assert [one.text for one in check_layout(tmp_path)] == [one.text for one in found]
+    (alone,) = check_layout(Path(f"{path}#base,elbow"))
+    assert "of 2 markers: base, elbow; none is ever lost" in alone.text
+    assert holds(check_layout(Path(f"{path}#hand")), "error", "take.c3d#hand", "There are: base")
 
 
 def test_render_groups_by_file() -> None:

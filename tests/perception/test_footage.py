@@ -17,9 +17,9 @@ from neuspring.perception.lift import clean_masks
 from neuspring.perception.marks.carry import carry, frame_mask
 from neuspring.perception.marks.marks import Marks
 from neuspring.perception.shape import shape_prior
-from results.published.footage.film import Points, carried, film, truths
+from results.published.film22.films import carried, film
 from tests.support.captures import describe, entry
-from tests.support.films import Errors, newly_covered, overlaps, stepwise
+from tests.support.films import Errors, Points, newly_covered, overlaps, stepwise, truths
 from tests.support.marked import Painted
 from tests.support.marked import overlap as label_overlap
 from tests.support.real import FOOTAGE, PLUSH

@@ -163,12 +163,30 @@ def test_both_ends_are_rolled_from_one_axis_and_the_twist_between_them_is_even()
     assert abs(sum(steps)) > 0.1
 
 
-def test_an_end_along_the_roll_axis_is_refused_with_the_remedy(tmp_path: Path) -> None:
-    along_y = np.repeat(np.linspace([0.1, 0.2, 0.3], [0.1, 0.9, 0.31], 12).T[None], 40, axis=0)
-    path = write(tmp_path, along_y)
-    with pytest.raises(InputError, match=r"7\.pkl.*mocap\.roll_axis.*degrees between an end and y.*farthest"):
-        mocap.read(ROW, path, Mocap())
-    assert len(mocap.read(ROW, path, Mocap(roll_axis="z")).nodes)
+@pytest.mark.parametrize("end", [(1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0.1, 0.995, 0)], ids=str)
+def test_ends_may_point_anywhere(tmp_path: Path, end: tuple[float, float, float]) -> None:
+    lines = {"straight": np.outer(np.linspace(0, 0.8, 12), end), "bent": helix() - helix()[0]}
+    for name, line in lines.items():
+        if name == "bent":
+            line[:2] = [-0.03 * np.array(end), np.zeros(3)]
+        data = np.repeat(line.T[None], 40, axis=0)
+        seen = mocap.read(ROW, write(tmp_path, data), Mocap(rings=20, ring=3, grip="clamp"))
+        rings = seen.nodes[8:].reshape(20, 3, 3)
+        offsets = rings - rings.mean(axis=1, keepdims=True)
+        np.testing.assert_allclose(np.linalg.norm(offsets, axis=2), 0.006, atol=SINGLE)
+        along = (line[1] - line[0]) / np.linalg.norm(line[1] - line[0])
+        clamp = seen.controller_points[0, 4:7] - seen.controller_points[0, 0]
+        np.testing.assert_allclose(clamp @ along, 0, atol=SINGLE)
+
+
+@pytest.mark.parametrize("angle", [95, 127, 180, -100])
+def test_a_cable_that_was_recorded_elsewhere_takes_its_rings_with_it(tmp_path: Path, angle: float) -> None:
+    """It heads along -x within the quarter turn in which grippers keep to the world, or it does not."""
+    x, turn = np.linspace(0.4, -0.4, 12), Rotation.from_euler("z", angle, degrees=True).as_matrix()
+    data = np.repeat(np.stack([x, np.zeros(12), 2 * x**2])[None], 40, axis=0)
+    here, there = (mocap.read(ROW, write(tmp_path, each), Mocap(rings=20, grip="clamp")) for each in (data, turn @ data))
+    for name in ("surface_points", "controller_points"):
+        np.testing.assert_allclose(getattr(there, name), getattr(here, name) @ turn.T, atol=SINGLE)
 
 
 @pytest.mark.parametrize("grip", ["markers", "clamp"])
@@ -353,7 +371,7 @@ def cable(samples: int = 41, count: int = 12) -> np.ndarray:
 
 
 def read(folder: Path, **settings: object) -> mocap.Observations:
-    return mocap.read(ROW, write(folder, cable()), Mocap(ring=3, roll_axis="z", **settings))  # type: ignore[arg-type]
+    return mocap.read(ROW, write(folder, cable()), Mocap(ring=3, **settings))  # type: ignore[arg-type]
 
 
 def test_clamps_follow_the_markers_among_the_controllers(tmp_path: Path) -> None:

@@ -2,20 +2,47 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 
 from neuspring.config.perception import PointTracking
 from neuspring.data.capture import HANDS, OBJECT
 from neuspring.data.frames import overlap
 from neuspring.perception import track_opencv
-from results.published.footage.film import Points
 
 RIM = 3.0
 """How far beside its mask a point may lie, pixels: points were marked at tips and corners."""
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """tracks/CASE.json: points that were marked by hand."""
+
+    names: list[str]
+    frames: list[int]
+    xy: np.ndarray
+    """[K, F, 2], NaN where hidden."""
+    sure: np.ndarray
+    """[K, F] bool: marked to 1 to 3 pixels here and in frame 0; the others were guessed, under a fingertip for instance."""
+
+    @classmethod
+    def load(cls, path: Path) -> Points:
+        values = json.loads(path.read_text())
+        own = values["points"].values()
+        xy = np.array([[place or (np.nan, np.nan) for place in point["xy"]] for point in own], float)
+        uncertain = np.array([point["uncertain"] for point in own])
+        return cls(list(values["points"]), values["frames"], xy, ~(uncertain | uncertain[:, :1]) & np.isfinite(xy[..., 0]))
+
+
+def truths(folder: Path, case: str) -> dict[int, np.ndarray]:
+    """Drawn masks by frame."""
+    return {int(file.stem): cv2.imread(str(file), 0) for file in sorted((folder / "masks" / case).glob("*.png"))}
 
 
 @dataclass(frozen=True, eq=False)

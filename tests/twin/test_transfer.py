@@ -14,8 +14,7 @@ from neuspring.twin.candidates import candidate
 from neuspring.twin.fit import FitProblem
 from neuspring.twin.rod import rod_twin
 from neuspring.twin.rollout import roll_out
-from neuspring.twin.topology import piecewise_topology
-from neuspring.twin.transfer import corresponds, move, require_pool, roll_between
+from neuspring.twin.transfer import along, corresponds, move, require_pool
 from tests.support import small
 
 # Rest lengths are float32.
@@ -180,7 +179,9 @@ def test_the_same_nodes_in_another_order_make_the_same_motion():
 
 def cable(folder, sag, **settings):
     """A cable that hangs between two grippers, about in the plane of x and z, as recorded."""
-    x = np.linspace(-0.3, 0.3, 12)
+    # Markers are never quite evenly spaced.
+    u = np.linspace(-1, 1, 12)
+    x = 0.3 * u + 0.02 * (u**2 - 1)
     line = np.stack([x, 0.05 * np.sin(5 * x), sag * (x / 0.3) ** 2 + 0.5], axis=1)
     path = folder / f"{sag}.pkl"
     path.write_bytes(pickle.dumps(np.repeat(line.T[None], 5, axis=0), protocol=4))
@@ -190,31 +191,39 @@ def cable(folder, sag, **settings):
     return mocap.read(row, path, config.Mocap(ring=4, rings=12, grip="clamp", stride=1, **settings))
 
 
-def test_a_pool_whose_rings_are_turned_about_the_cable_is_refused(tmp_path):
-    here, there = cable(tmp_path, 0.3), cable(tmp_path, 0.45)
-    require_pool(here, [there])
-    assert 0.0 < roll_between(here, there) < 10.0
-    # As when the roll starts from the axis that is least along the first tangent: y here, x in a steeper recording.
-    turned = cable(tmp_path, 0.45, roll_axis="x")
-    topology = piecewise_topology(
-        here.nodes, here.controller_points[0], np.zeros(len(here.nodes), int), [0.07], [20], 0.02, 5, repair=True
+def from_the_other_end(seen: Observations, name: str) -> Observations:
+    """The recording as if its markers were numbered from the other end."""
+    held = [3, 2, 1, 0, *range(4, seen.controller_points.shape[1])]
+    scenario = replace(seen.scenario, name=name)
+    return replace(
+        seen, object_points=seen.object_points[:, ::-1], controller_points=seen.controller_points[:, held], scenario=scenario
     )
-    assert corresponds(topology, turned), "lengths of springs do not tell"
-    with pytest.raises(InputError, match=r"pool of cable_0\.3: node i .*; received \d+ degrees in cable_0\.45.*mocap\.roll"):
-        require_pool(here, [turned])
+
+
+def test_all_recordings_of_a_pool_that_are_others_are_named_at_once(tmp_path):
+    here, there = cable(tmp_path, 0.3), cable(tmp_path, 0.33)
+    pool = [there, cable(tmp_path, 0.31), cable(tmp_path, 0.32)]
+    require_pool(here, pool)
+    other = [from_the_other_end(pool[0], "one"), from_the_other_end(pool[2], "two")]
+    with pytest.raises(
+        InputError, match=r"pool of cable_0\.3: node i .*; received one, two from the other\. Leave them out \(deform\.l"
+    ):
+        require_pool(here, [*other, pool[1], pool[2], there])
+    with pytest.raises(InputError, match=r"as many nodes and controllers.*in cable_0\.33, .* in cable_0\.31"):
+        require_pool(here, [replace(each, interior_points=np.zeros((2, 3))) for each in pool[:2]])
     # Nodes around the line are the lattice's affair: a rod follows the markers alone.
     settings = config.Config()
     fit = {"fit": settings.fit, "simulation": settings.simulation, "losses": settings.losses, "quirks": settings.released_quirks}
     twin = rod_twin(here, settings, (0.0, 1.0, 0.0))
-    FitProblem(observations=here, pool=[turned], twin=twin, kind="rod", **fit)
+    FitProblem(observations=here, pool=[*other, there], twin=twin, kind="rod", **fit)
     with pytest.raises(InputError, match="as many tracked points, controllers and vertices"):
-        FitProblem(observations=here, pool=[replace(turned, line=turned.line[1:])], twin=twin, kind="rod", **fit)
-    # One end alone, by as much as its ring has room.
-    nodes = there.surface_points.reshape(12, 4, 3).copy()
-    nodes[-3:] = np.roll(nodes[-3:], 1, axis=1)
-    assert roll_between(here, replace(there, surface_points=nodes.reshape(-1, 3))) == pytest.approx(90, abs=10)
+        FitProblem(observations=here, pool=[replace(there, line=there.line[1:])], twin=twin, kind="rod", **fit)
 
 
-def test_an_end_that_points_elsewhere_tells_nothing_of_its_roll(tmp_path):
-    here = cable(tmp_path, 0.3)
-    assert roll_between(here, scaled(here, (1, 1, -1))) == 0.0
+def test_the_order_along_a_cable_is_told_by_the_distances_between_its_markers(tmp_path):
+    pool = [cable(tmp_path, sag) for sag in (0.3, 0.31, 0.32, 0.33)]
+    exchanged = replace(pool[3], controller_points=pool[3].controller_points[:, [0, 1, 3, 2, *range(4, 20)]])
+    pool[1:] = [from_the_other_end(pool[1], "other"), pool[2], exchanged]
+    for each, order in zip(pool, along(pool), strict=True):
+        points = np.concatenate([each.nodes, each.controller_points[0]])
+        assert (np.diff(points[each.line[order], 0]) > 0).all()

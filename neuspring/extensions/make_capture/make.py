@@ -290,7 +290,8 @@ def _of_points(intake: Intake) -> tuple[Capture, list[str]]:
             rule = "is for film, and there is none"
             remedy = "Leave it out. Cut or resample the files themselves: a row is a frame."
             raise InputError(f"--{option.replace('_', '-')}", rule, str(value), remedy)
-    rate, rate_text = find_rate(intake.rate, [Markers.read(path).rate for path in brought.values() if is_c3d(path)], 1)
+    told = [Markers.read(path).rate for path in brought.values() if is_c3d(path)]
+    rate, rate_text = find_rate(intake.rate, told, 1, *([MARKERS_FASTEST] if told else []))
     _require_rate(brought, rate)
     frames = len(points.read_hands(brought["controllers"]).points)
     if is_c3d(brought["tracks"]):
@@ -315,6 +316,8 @@ def _of_points(intake: Intake) -> tuple[Capture, list[str]]:
     return Capture.load(intake.output), [f"points in space alone: {text}", rate_text, body]
 
 
+MARKERS_FASTEST = 2000.0
+"""Frames per second of motion capture, at most."""
 RATE_APART = 0.005
 """Markers and frames whose rates differ by more than this part are not of the same moments."""
 

@@ -66,10 +66,10 @@ def find_unit(where: object, depths: Sequence[np.ndarray], given: float | None, 
     return Unit(fitting[0], f"guessed from {kind} with a median of {count:.4g}: median depth {count * fitting[0]:.2f} m")
 
 
-def find_rate(given: float | None, known: Sequence[float | None], step: int) -> tuple[float, str]:
+def find_rate(given: float | None, known: Sequence[float | None], step: int, fastest: float = FASTEST) -> tuple[float, str]:
     """Frames per second of the capture and how they are known: `given` or that of the videos, over every `step`-th frame.
 
-    Raises InputError where there is none, or one that no camera has.
+    Raises InputError where there is none, or one that no camera has; `fastest`: the highest that one has.
     """
     told = [rate for rate in known if rate is not None]
     if given is None and not told:
@@ -77,8 +77,8 @@ def find_rate(given: float | None, known: Sequence[float | None], step: int) -> 
     if given is None and max(told) > 1.02 * min(told):
         raise InputError("--rate", "all cameras must film at one rate", " and ".join(f"{rate:.3g}" for rate in told))
     rate = given if given is not None else round(told[0], 2)
-    if not (np.isfinite(rate) and SLOWEST <= rate <= FASTEST):
-        rule = f"frames per second of a camera lie between {SLOWEST:g} and {FASTEST:g}"
+    if not (np.isfinite(rate) and SLOWEST <= rate <= fastest):
+        rule = f"frames per second of a camera lie between {SLOWEST:g} and {fastest:g}"
         raise InputError("--rate", rule, f"{rate:g}", "Give the rate at which it was filmed, not a time step.")
     how = "given" if given is not None else "as the source says"
     if given is not None and told and abs(told[0] - given) > 0.02 * given:
@@ -115,8 +115,7 @@ def find_table(where: object, points: np.ndarray, top_down: bool = False, at: np
     where there is none: the largest plane is a wall or a ceiling, or a plane that faces the camera without `top_down`, too small a
     part of the image, or not flat.
     """
-    found = planes(points)
-    if not found:
+    if not (found := planes(points)):
         remedy = "Film more of the table, or give --poses."
         raise InputError(where, "the table must be seen: no plane was found in depth", remedy=remedy)
     if at is not None:

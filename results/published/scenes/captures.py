@@ -9,7 +9,7 @@ then points x y z; 0 0 0 of a landmark: not visible) and rest.txt (a line x y z 
     OUTPUT/CASE_film     color of camera 0 and the hands; annotated points are for scoring alone
     OUTPUT/CASE_both     color, hands, nodes and annotated points
 
-is written, the last two where FOLDER of --films (that of `results.published.footage.captures`) has a film of the case and
+is written, the last two where FOLDER of --films (that of `results.published.film22.films`) has a film of the case and
 tests/data/marks has marks. The world is that of the cameras: z = 0 is the table, up is -z. The split is the released one.
 A capture that is there is left alone without --force.
 """
@@ -27,8 +27,7 @@ from neuspring.core.files import write_text
 from neuspring.data.capture import CAPTURE, Capture, Description, Writer, write_tracks
 from neuspring.intake.phystwin import released_cases
 from neuspring.intake.points import Hands, read, write
-from results.published.footage.captures import RATE, cases_of, category_of, write_capture
-from results.published.footage.film import MARKS
+from results.published.film22.films import CALIBRATED, RATE, cases_of, category_of, marks_of, write_capture
 
 UNIT = 1e-4
 """m per count."""
@@ -127,7 +126,7 @@ def main() -> None:
         parser.error(f"{a.folder} has no case {' '.join(sorted(missing)) if found else ''} with {', '.join(FILES)}")
     films = cases_of(a.films) if a.films else []
     for case in a.cases or found:
-        marked = (MARKS / "phystwin_camera0" / f"{case}.json").exists()
+        marked = bool(marks_of(case, CALIBRATED))
         if a.films and not (case in films and marked):
             print(f"{case}: {'no marks' if case in films else 'no film'}, so points alone", flush=True)
         for row in ("points", *(("film", "both") if case in films and marked else ())):

@@ -14,11 +14,10 @@ from neuspring.data.capture import Capture
 from neuspring.extensions.annotate.clicks import ANNOTATIONS, Annotations, Click, ClickedPoint, GrayImages, Trail, follow
 from neuspring.extensions.annotate.tracks import TracksMode, expected_frames, join, lift_place, notes_of, tracks_of
 from neuspring.extensions.make_capture.make import Intake, make_capture
-from results.published.footage.film import Points
-from results.published.footage.film import film as real_film
+from results.published.film22.films import film as real_film
 from tests.support.desk import write_folders, write_poses
 from tests.support.filmed import film
-from tests.support.films import Errors, Film
+from tests.support.films import Errors, Film, Points
 from tests.support.moving import COVERED, FRAMES, NEAR, moving, truth
 from tests.support.real import FOOTAGE
 

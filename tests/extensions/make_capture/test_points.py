@@ -76,8 +76,7 @@ def test_points_alone_are_refused_before_anything_is_written(tmp_path, changes, 
 
 def test_both_counts_of_rows_are_named(tmp_path):
     files = brought(tmp_path / "files", 8)
-    hands = np.load(files["controllers"])["points"]
-    np.savez(files["controllers"], points=hands[:6])
+    np.savez(files["controllers"], points=np.load(files["controllers"])["points"][:6])
     with pytest.raises(InputError, match=r"a row per frame.*received 6 rows of --controllers, 8 of --tracks"):
         make_capture(Intake(output=tmp_path / "made", name="m", category="toy", rate=30.0, **files))
 
@@ -92,15 +91,16 @@ def mocap(folder, rate=30.0, frames=8, unit="mm", lost=None):
     return {"controllers": Path(f"{path}#{hand}"), "nodes": files["nodes"], "tracks": Path(f"{path}#{toy}")}
 
 
-def test_motion_capture_alone_becomes_a_capture(tmp_path):
+@pytest.mark.parametrize("rate", [100.0, 1000.0])
+def test_motion_capture_alone_becomes_a_capture(tmp_path, rate):
     lost = np.zeros((8, len(scene.GRIP) + len(scene.MARKED)), bool)
     lost[5:, -1] = True
-    files = mocap(tmp_path / "files", 100.0, lost=lost)
+    files = mocap(tmp_path / "files", rate, lost=lost)
     options = [part for name, path in files.items() for part in (f"--{name}", str(path))]
     command = ["make-capture", *options, "--category", "toy", "--output", str(tmp_path / "made")]
     assert main(command) == 0
     made = Capture.load(tmp_path / "made")
-    assert (made.frame_count, made.description.frame_rate) == (8, 100.0)
+    assert (made.frame_count, made.description.frame_rate) == (8, rate)
     space = read(made)
     np.testing.assert_allclose(space.hands.points, scene.risen(scene.GRIP, 8), atol=1e-6)
     right = scene.risen(scene.MARKED, 8)

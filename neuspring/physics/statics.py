@@ -1,0 +1,117 @@
+"""A lattice at rest under gravity, and what its stiffness is in pascals.
+
+A load is mass: `Material.mass` of the nodes that carry it.
+
+Only stiffness over mass shows in a motion, so a modulus needs the density. Twice as many nodes along each side of a body need Y / 4
+with true masses, and 2 Y at 1 kg per node. Central forces make the tensor symmetric in all indices (Cauchy): an isotropic lattice
+has Poisson's ratio 1/4 and the shear modulus E / 2.5, and rubber's 1/2 and E / 3 are out of reach.
+
+Measured on blocks of 10 x 3 x 3 cm, held at one end, springs to 18 neighbors, nodes at the centers of cells (`test_statics.py`):
+
+    nodes across                                        4      6      8
+    young along it / (density sum Y l0 / 6 sum m)    1.31   1.20   1.15
+    stiffness over young, stretched by its weight    1.04   1.05   1.04
+    ... bent by its weight, with 5/6 G A in shear    0.90   0.94   0.96
+    ... with I (1 - 1 / n^2), that of n areas        0.95   0.97   0.98
+
+The rest is surfaces, which have fewer springs: thin lattices are softer in bending than their modulus says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from neuspring.core.artifacts import Twin
+from neuspring.core.errors import InputError, NumericalFailure
+
+STEPS_TO_BALANCE = 500
+"""Steps at most. A beam that bends by a quarter of its length takes 12."""
+UNBALANCED = 1e-6
+"""Largest force on a node at rest, over the body's weight. Rounding of the energy leaves about 1e-8."""
+
+
+def at_rest(twin: Twin) -> Twin:
+    """The twin in equilibrium under gravity: such are its nodes. Its rest shape stays, and controllers are where frame 0 has them.
+
+    Minimizes sum Y l0 (l / l0 - 1)^2 / 2 - sum m g x by Newton steps in a trust region. Raises InputError for a rod and for a body
+    that would be below the ground, NumericalFailure where nothing holds a part.
+    """
+    from scipy.optimize import minimize
+
+    if twin.rod is not None:
+        raise InputError("twin.rod", "equilibria are found of lattices", "a rod", "Use rod_nodes.hanging.")
+    topology, simulation, count = twin.topology, twin.simulation, len(twin.topology.nodes)
+    hands, lengths = topology.controllers.astype(np.float64), topology.rest_lengths.astype(np.float64)
+    weight = np.outer(masses(twin), [0.0, 0.0, -simulation.up_sign * simulation.gravity])
+    first, second = topology.springs.T
+
+    def springs(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Directions [S, 3], lengths, m, and stiffness, N, [S, 1] of springs between nodes at x [3 N]."""
+        points = np.concatenate([x.reshape(-1, 3), hands])
+        along = points[second] - points[first]
+        length = np.linalg.norm(along, axis=1)
+        slack = topology.pushes & (length > lengths) if topology.pushes.size else False
+        return along / length[:, None], length[:, None], np.where(slack, 0.0, twin.material.stiffness.astype(np.float64))[:, None]
+
+    def at_nodes(values: np.ndarray) -> np.ndarray:
+        """Sums over the springs that end at each node less those that begin there [3 N], of values [S, 3]."""
+        ends = [np.bincount(end, column, count + len(hands)) for column in values.T for end in (second, first)]
+        return (np.stack(ends[::2], axis=1) - np.stack(ends[1::2], axis=1))[:count].ravel()
+
+    def energy(x: np.ndarray) -> tuple[float, np.ndarray]:
+        along, length, stiffness = springs(x)
+        strain = length / lengths[:, None] - 1
+        total = float((stiffness * lengths[:, None] * strain**2).sum() / 2 - weight.ravel() @ x)
+        return total, at_nodes(stiffness * strain * along) - weight.ravel()
+
+    def product(x: np.ndarray, move: np.ndarray) -> np.ndarray:
+        along, length, stiffness = springs(x)
+        moves = np.concatenate([move.reshape(-1, 3), np.zeros_like(hands)])
+        apart = moves[second] - moves[first]
+        longer = (apart * along).sum(axis=1, keepdims=True) * along
+        return at_nodes(stiffness * (longer / lengths[:, None] + (1 / lengths[:, None] - 1 / length) * (apart - longer)))
+
+    scale, start = np.abs(weight).sum(), topology.nodes.astype(np.float64).ravel()
+    options = {"gtol": 1e-3 * UNBALANCED * scale, "maxiter": STEPS_TO_BALANCE}
+    found = minimize(energy, start, jac=True, hessp=product, method="trust-krylov", options=options)
+    if not np.abs(found.jac).max() <= UNBALANCED * scale:
+        raise NumericalFailure(f"the twin is not at rest under gravity after {found.nit} steps: is every part of it held?")
+    nodes = found.x.reshape(-1, 3)
+    if simulation.ground and (lowest := float((simulation.up_sign * nodes[:, 2]).min())) < 0:
+        rule = "contacts are no part of an equilibrium, so all nodes must be above it"
+        raise InputError("simulation.ground", rule, f"z = {lowest:.3g} m", "Set ground to false.")
+    return replace(twin, topology=replace(topology, nodes=nodes.astype(np.float32), rest_shape=topology.canonical))
+
+
+def masses(twin: Twin) -> np.ndarray:
+    """Mass of each node [N], kg: 1 where the material says nothing."""
+    own = twin.material.mass
+    return own.astype(np.float64) if len(own) else np.ones(len(twin.topology.nodes))
+
+
+def elasticity(twin: Twin, density: float) -> np.ndarray:
+    """Stiffness tensor of the body that a lattice stands for [3, 3, 3, 3], Pa, if its nodes move as the strain says.
+
+    A spring under the strain e is longer by l0 n e n, n its direction, so C = sum Y l0 n n n n / V over springs between nodes. The
+    volume V is mass / density [kg/m^3], and only forces per mass are in a twin: density times the sum over the masses of the nodes.
+    """
+    topology, count = twin.topology, twin.topology.object_spring_count
+    ends = topology.canonical.astype(np.float64)[topology.springs[:count]]
+    along = ends[:, 1] - ends[:, 0]
+    n = along / np.linalg.norm(along, axis=1, keepdims=True)
+    share = twin.material.stiffness[:count].astype(np.float64) * topology.rest_lengths[:count] * density / masses(twin).sum()
+    return np.asarray(np.einsum("s,si,sj,sk,sl->ijkl", share, n, n, n, n, optimize=True))
+
+
+def young(twin: Twin, density: float) -> np.ndarray:
+    """Young's moduli along x, y and z of the body that a lattice stands for [3], Pa: see `elasticity`.
+
+    Where springs lie in all directions alike, both of Lame's numbers are sum Y l0 / (15 V), E is sum Y l0 / (6 V), and Poisson's
+    ratio 1/4. Without resistance in some direction, as of a sheet across itself, its modulus is that of the rest.
+    """
+    tensor, pairs = elasticity(twin, density), list(zip(*np.triu_indices(3), strict=True))
+    # Strains e_ij and e_ji are one unknown, gamma_ij = 2 e_ij.
+    compliance = np.linalg.pinv(np.array([[tensor[i + j] for j in pairs] for i in pairs]), rcond=1e-9, hermitian=True)
+    return np.asarray([1 / compliance[k, k] for k, (i, j) in enumerate(pairs) if i == j])

@@ -1,0 +1,190 @@
+"""Real films of one calibrated camera, and captures of color alone made of them: camera 0 of PhysTwin's scenarios.
+
+    python -m results.published.film22.films FOLDER OUTPUT [--cases ...] [--force]
+
+FOLDER has observation_30fps/CASE.mp4, whose left third is the film, or videos/combine_tracking__CASE.mp4 (or combine_rendering__),
+whose left half it is. cameras.json, whose camera 0 is that of all films, lies in it or in phystwin_camera0 beside it. Of each case
+with marks (tests/data/marks, drawn on frame 0 alone) a capture OUTPUT/film_CASE is written: the film, masks carried from the marks,
+and the released split. A capture that is there is left alone without --force.
+"""
+
+from __future__ import annotations
+
+import json
+from argparse import ArgumentParser
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from neuspring.config.perception import MarksSegmentation
+from neuspring.data.camera import Camera
+from neuspring.data.capture import CAPTURE, THIN, Capture, Description, Writer
+from neuspring.intake.phystwin import released_cases
+from neuspring.perception.marks.carry import carry
+from neuspring.perception.marks.marks import MARKS as MARKS_FILE
+from neuspring.perception.marks.marks import Mark, Marks
+
+MARKS = Path(__file__).parents[3] / "tests" / "data" / "marks"
+DRAWN = {"phystwin22_films": (640, 362), "phystwin_camera0": (848, 480)}
+"""Folders of marks, and the size, px, of the films on which they were drawn."""
+CALIBRATED = (848, 480)
+"""Size of the pictures of cameras.json, px."""
+FILMS = {"observation_30fps/{}.mp4": 3, "videos/combine_tracking__{}.mp4": 2, "videos/combine_rendering__{}.mp4": 2}
+"""Videos of a case whose leftmost pane is the film, and how many panes they have; the preferred one first."""
+NAME = "0"
+"""The only camera."""
+PREFIX = "film_"
+"""Scenarios of the workflow are named after cases, with this before."""
+RATE = 30.0
+"""Frames per second of the films."""
+WORDS = {"twine": "rope", "toy": "zebra", "dinosor": "dinosaur"}
+"""The paper's words for categories of the released table."""
+SCALE = 0.66
+"""Of films of 640 pixels, which are compressed: as near to drawn masks as at full size (three known scenes), at half the cost."""
+IN_THE_AIR = ("rope_double_hand", "weird_package")
+"""Cases whose object is held above the table in frame 0, as one sees by its shadow there: they have no ground."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Images in memory; implements `Film` of neuspring/perception/marks/carry.py."""
+
+    colors: list[np.ndarray]
+    depths: list[np.ndarray] | None = None
+
+    @property
+    def count(self) -> int:
+        return len(self.colors)
+
+    def color(self, frame: int, /) -> np.ndarray:
+        return self.colors[frame]
+
+    def depth(self, frame: int, /) -> np.ndarray | None:
+        return None if self.depths is None else self.depths[frame]
+
+    def height(self, frame: int, /) -> None:
+        return None
+
+
+def pane(path: Path, place: int, count: int, most: int | None = None) -> list[np.ndarray]:
+    """RGB images of one of `count` panes that stand side by side in a video; of its first `most` frames, all by default."""
+    video, colors = cv2.VideoCapture(str(path)), list[np.ndarray]()
+    while (most is None or len(colors) < most) and (read := video.read())[0]:
+        width = read[1].shape[1] // count
+        colors.append(np.ascontiguousarray(read[1][:, place * width : (place + 1) * width, ::-1]))
+    return colors
+
+
+def film(folder: Path, case: str, most: int | None = None) -> list[np.ndarray]:
+    """RGB images of a case; the first `most`, all by default. Raises FileNotFoundError without a video."""
+    for pattern, count in FILMS.items():
+        if (file := folder / pattern.format(case)).is_file():
+            return pane(file, 0, count, most)
+    raise FileNotFoundError(folder / next(iter(FILMS)).format(case))
+
+
+def cases_of(folder: Path) -> list[str]:
+    """The released cases that have a video."""
+    return [case for case in sorted(released_cases()) if any((folder / pattern.format(case)).is_file() for pattern in FILMS)]
+
+
+def scaled(points: np.ndarray, size: tuple[int, int], to: tuple[int, int]) -> np.ndarray:
+    """Pixels (x, y) [..., 2] of pictures (width, height) in pictures of another size; pixel centers lie at whole coordinates."""
+    return np.asarray((points + 0.5) * np.divide(to, size) - 0.5)
+
+
+def camera_of(folder: Path, size: tuple[int, int]) -> Camera:
+    """Camera 0 of cameras.json, for pictures of a size (width, height)."""
+    path = next(path for place in (folder, folder.parent / "phystwin_camera0") if (path := place / "cameras.json").is_file())
+    listed: list[dict[str, Any]] = json.loads(path.read_text())["cameras"]
+    one = next(entry for entry in listed if str(entry["camera"]) == NAME)
+    matrix = np.array(one["K"], float)
+    matrix[:2, 2] = scaled(matrix[:2, 2], CALIBRATED, size)
+    matrix[[0, 1], [0, 1]] *= np.divide(size, CALIBRATED)
+    return Camera(NAME, *size, matrix, np.array(one["camera_to_world"], float))
+
+
+def marks_of(case: str, size: tuple[int, int]) -> tuple[Mark, ...]:
+    """The committed marks of frame 0 of a case, for pictures of a size (width, height); none where none were drawn."""
+    for folder, drawn in DRAWN.items():
+        if (path := MARKS / folder / f"{case}.json").is_file():
+            marks = Marks.load(path).of(NAME)
+            ratio = size[0] / drawn[0]
+            return tuple(
+                replace(mark, points=tuple(map(tuple, scaled(np.array(mark.points), drawn, size))), radius=ratio * mark.radius)
+                for mark in marks
+            )
+    return ()
+
+
+def carried(colors: list[np.ndarray], case: str, scale: float = 1.0) -> np.ndarray:
+    """Labels [T, H, W] from the committed marks of frame 0, worked out on pictures of `scale` times the film's size."""
+    return carry(Frames(colors), marks_of(case, colors[0].shape[1::-1]), MarksSegmentation(scale=scale)).labels
+
+
+def category_of(case: str) -> str:
+    """The kind of object of a case, in the paper's words."""
+    return WORDS.get(word := released_cases()[case]["category"], word) if case in released_cases() else "other"
+
+
+def write_capture(
+    folder: Path, output: Path, case: str, most: int | None = None, name: str | None = None, scale: float = 1.0
+) -> Capture:
+    """Write OUTPUT/NAME (film_CASE by default), of the first `most` frames, all by default.
+
+    Objects lie in frame 0, as one sees there: `pose: lying`. Raises InputError for a wrong calibration or wrong marks.
+    """
+    name, colors = name or f"{PREFIX}{case}", film(folder, case, most)
+    size = colors[0].shape[1], colors[0].shape[0]
+    row, marks = released_cases().get(case), marks_of(case, size)
+    whole = row is not None and int(row["frames"]) == len(colors)
+    described = Description(
+        format=1,
+        name=name,
+        category=category_of(case),
+        frame_count=len(colors),
+        frame_rate=RATE,
+        cameras=(camera_of(folder, size).entry(),),
+        depth="none",
+        pose="lying",
+        up="-z",
+        train_end=int(row["train_end"]) if row is not None and whole else None,
+        self_collision=category_of(case) in THIN,
+        ground=case not in IN_THE_AIR,
+        masks=True,
+        provenance={"source": "film of PhysTwin's camera 0", "masks": "carried from marks of frame 0"},
+    )
+    writer = Writer(output / name, described)
+    for frame, (color, mask) in enumerate(zip(colors, carried(colors, case, scale), strict=True)):
+        writer.frame(NAME, frame, color, None, mask)
+    Marks(cameras={NAME: marks}).save(output / name / MARKS_FILE)
+    return writer.finish()
+
+
+def write_captures(folder: Path, output: Path, cases: list[str], *, force: bool = False) -> None:
+    """Captures of all cases that have marks; those that are there are left alone without `force`."""
+    for case in cases:
+        if (output / f"{PREFIX}{case}" / CAPTURE).exists() and not force:
+            print(f"{case}: is there", flush=True)
+        elif not marks_of(case, CALIBRATED):
+            print(f"{case}: has no marks", flush=True)
+        else:
+            capture = write_capture(folder, output, case, scale=SCALE)
+            print(f"{case}: {capture.frame_count} frames, training before {capture.train_end}", flush=True)
+
+
+def main() -> None:
+    parser = ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("output", type=Path)
+    parser.add_argument("--cases", nargs="+", help="all that have a video by default")
+    parser.add_argument("--force", action="store_true", help="write captures anew that are there")
+    a = parser.parse_args()
+    write_captures(a.folder, a.output, a.cases or cases_of(a.folder), force=a.force)
+
+
+if __name__ == "__main__":
+    main()
