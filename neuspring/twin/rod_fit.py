@@ -419,8 +419,8 @@ def search_rod(
         # What hangs in frame 0 says how stiff it is.
         variables = Variables.of(start, first, observations.object_points.shape[1])
         tried = [factor * (variables.kinds == "bending") + factor * (variables.kinds == "twisting") for factor in STIFFNESS_TRIED]
-        found = solver.objective(solver.errors(variables, tried, 2, 1), np.array(tried), variables.scale)
-        start = variables.made(tried[int(found.argmin())])
+        values = solver.objective(solver.errors(variables, tried, 2, 1), np.array(tried), variables.scale)
+        start = variables.made(tried[int(values.argmin())])
     twin, value, history = solver.lowered(start, Progress(f"search {observations.scenario.name}, rod", first.rounds))
     found = _result(twin, value, history)
     if record is not None:
