@@ -58,9 +58,8 @@ def test_every_block_runs(text: str, folder: Path, monkeypatch: pytest.MonkeyPat
     for block in blocks(text):
         exec(compile(block, "block", "exec"), names)
     run = names["run"]
-    assert np.allclose(names["predicted"].positions, run.trajectory.positions), (
-        "rolled out again, a twin moves as the workflow says"
-    )
+    # Rolled out again, a twin moves as the workflow says.
+    assert np.allclose(names["predicted"].positions, run.trajectory.positions)
     assert names["pulled"].positions.shape == (46, *run.trajectory.positions.shape[1:])
     assert names["pulled"].positions[-1, :, 2].max() > run.twin.topology.nodes[:, 2].max() + 0.02, "the hands lift it"
     assert len(names["scores"]) == sum(len(ns.load_run(f"results/small/{m}/0").scores) for m in ("baseline", "neuspring"))

@@ -28,9 +28,8 @@ def folder(tmp_path: Path) -> Path:
 
 def install(folder: Path, python: str) -> str:
     clean = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
-    done = subprocess.run(
-        ["make", "install", f"PYTHON={python}"], cwd=folder, env=clean, capture_output=True, text=True, check=False
-    )
+    command = ["make", "install", f"PYTHON={python}"]
+    done = subprocess.run(command, cwd=folder, env=clean, capture_output=True, text=True, check=False)
     assert done.returncode
     return done.stdout
 

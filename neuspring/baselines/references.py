@@ -42,8 +42,7 @@ def _held(hands: np.ndarray, valid: np.ndarray, nodes: torch.Tensor, unturned: t
     yield nodes
     skin, holding = None, np.zeros(hands.shape[1], dtype=bool)
     for frame in range(1, len(hands)):
-        now = valid[frame - 1] & valid[frame]
-        if now.any():
+        if (now := valid[frame - 1] & valid[frame]).any():
             if skin is None or (now != holding).any():
                 skin, holding = Skin(hands[frame - 1, now], device=device), now
             nodes, _ = skin.step(hands[frame - 1, now], hands[frame, now], nodes, unturned)

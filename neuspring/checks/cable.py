@@ -41,9 +41,7 @@ STANDARD_GRAVITY = 9.81
 SPANS, LEAST_SPANS = (1, 2, 4, 8), 10
 """Frames, before and after, over which accelerations are measured: the first that noise does not hide; and how many of these a
 recording needs."""
-CABLE_UNSEEN = (
-    "A cable needs a place of every marker in every sample: fill short gaps, or cut the recording (mocap.start, mocap.frames)"
-)
+CABLE_UNSEEN = "A cable needs a place of every marker in every sample: fill gaps, or cut the recording (mocap.start, mocap.frames)"
 
 
 def turn(up: str) -> np.ndarray:
@@ -165,9 +163,8 @@ def hangs(cable: Cable) -> dict[str, Any] | None:
     in_file = turn(cable.settings.up).T @ sag
     axis = int(np.abs(in_file).argmax())
     down, up = (f"{sign}{'xyz'[axis]}" for sign in ("+-" if in_file[axis] > 0 else "-+"))
-    return (
-        {"value": float(-sag[2] / deep), "cm": 100 * deep, "down": down, "up": up} if deep > LEAST_SAG * cable.along[-1] else None
-    )
+    words = {"value": float(-sag[2] / deep), "cm": 100 * deep, "down": down, "up": up}
+    return words if deep > LEAST_SAG * cable.along[-1] else None
 
 
 def swings(cable: Cable) -> dict[str, Any] | None:

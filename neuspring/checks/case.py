@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,8 @@ BINARY_TOLERANCE = 1e-5
 """Allowed deviation from R^T R = 1 in a pickle of float64 products of OpenCV rotations."""
 RELEASED_CONTROLLERS = 30
 """Controller points of every released case."""
-Words = list[dict[str, Any]]
+Words = dict[str, Any]
+Found = Iterator[Words]
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,10 @@ class ArrayRule:
     """NumPy's letter: f (finite floating point) or b (bool)."""
     required: bool = True
     """True where the reader uses it."""
+
+    def broken(self, rule: str, value: object = None) -> Words:
+        """Words about the array: an error where it is required, else a warning."""
+        return (wrong if self.required else odd)(self.key, rule, value)
 
 
 CASE_ARRAYS = (
@@ -49,12 +55,12 @@ IGNORED = ("controller_mask",)
 KIND_NAMES = {"f": "floating point", "b": "bool"}
 
 
-def wrong(key: str, rule: str, value: object = None, level: Level = "error") -> dict[str, Any]:
+def wrong(key: str, rule: str, value: object = None, level: Level = "error") -> Words:
     """Words about a key: the rule that it breaks, and what was received."""
     return {"key": key, "text": rule if value is None else f"{rule}; received {value}", "level": level}
 
 
-def odd(key: str, rule: str, value: object = None) -> dict[str, Any]:
+def odd(key: str, rule: str, value: object = None) -> Words:
     """The same as a warning."""
     return wrong(key, rule, value, "warning")
 
@@ -75,32 +81,30 @@ class Case:
         return self.loose or self.root / "data" / "different_types" / self.name
 
 
-def structure(data: Any) -> Words:
+def structure(data: Any) -> Found:
     """Faults of keys, types, shapes and dtypes of final_data.pkl. Without errors the content of the arrays can be looked at."""
     if not isinstance(data, dict):
-        return [wrong("", "a dict of arrays is required", type(data).__name__)]
+        yield wrong("", "a dict of arrays is required", type(data).__name__)
+        return
     keys = {rule.key for rule in CASE_ARRAYS} | set(IGNORED)
-    findings = [odd(str(key), "unknown key, not read") for key in data if key not in keys]
+    yield from (odd(str(key), "unknown key, not read") for key in data if key not in keys)
     sizes: dict[str, int] = {}
     """The symbolic dimensions of the file."""
     for rule in CASE_ARRAYS:
-        severity = wrong if rule.required else odd
         shape, value = f"[{', '.join(rule.shape)}]", data.get(rule.key)
         if rule.key not in data:
-            findings.append(severity(rule.key, "this key is missing"))
+            yield rule.broken("this key is missing")
         elif not isinstance(value, np.ndarray):
-            findings.append(severity(rule.key, f"an array {shape} is required", type(value).__name__))
+            yield rule.broken(f"an array {shape} is required", type(value).__name__)
         elif value.ndim != len(rule.shape):
-            findings.append(severity(rule.key, f"the shape must be {shape}", value.shape))
+            yield rule.broken(f"the shape must be {shape}", value.shape)
         else:
             for axis, (symbol, size) in enumerate(zip(rule.shape, value.shape, strict=True)):
                 wanted = int(symbol) if symbol.isdigit() else sizes.setdefault(symbol, size)
                 if size != wanted:
-                    message = f"the shape must be {shape} with {wanted} entries along axis {axis}"
-                    findings.append(severity(rule.key, message, value.shape))
+                    yield rule.broken(f"the shape must be {shape} with {wanted} entries along axis {axis}", value.shape)
             if value.dtype.kind != rule.kind:
-                findings.append(severity(rule.key, f"the dtype must be {KIND_NAMES[rule.kind]}", value.dtype))
-    return findings
+                yield rule.broken(f"the dtype must be {KIND_NAMES[rule.kind]}", value.dtype)
 
 
 def whole(data: Any) -> bool:
@@ -108,35 +112,33 @@ def whole(data: Any) -> bool:
     return not any(one["level"] == "error" for one in structure(data)) and bool(data["object_visibilities"].size)
 
 
-def values(data: Any) -> Words:
+def values(data: Any) -> list[Words]:
     """Finite coordinates, and the rules without which nothing can be simulated."""
-    findings = Words()
-    if not isinstance(data, dict):
-        return findings
-    for rule in CASE_ARRAYS:
+    findings = list[Words]()
+    for rule in CASE_ARRAYS if isinstance(data, dict) else ():
         value = data.get(rule.key)
         if rule.kind != "f" or not isinstance(value, np.ndarray) or value.dtype.kind != "f" or value.ndim != len(rule.shape):
             continue
         if value.dtype != np.float64:
             findings.append(odd(rule.key, "the released dtype is float64", value.dtype))
-        bad = np.argwhere(~np.isfinite(value))
-        if len(bad):
-            severity = wrong if rule.required else odd
-            findings.append(severity(rule.key, "every coordinate must be finite", describe_bad(value, bad)))
+        if len(bad := np.argwhere(~np.isfinite(value))):
+            findings.append(rule.broken("every coordinate must be finite", describe_bad(value, bad)))
     if any(one["level"] == "error" for one in [*findings, *structure(data)]):
         return findings
     frames, points = data["object_visibilities"].shape
-    if points == 0:
-        findings.append(wrong("object_points", "at least one tracked object point is required", "none"))
-    if data["controller_points"].shape[1] == 0:
-        findings.append(wrong("controller_points", "at least one controller point is required", "none"))
-    if frames < 2:
-        findings.append(wrong("object_points", "at least 2 frames are required", frames))
     hidden = np.flatnonzero(~data["object_visibilities"][0]) if frames else np.zeros(0, int)
-    if len(hidden):
-        needed = "every tracked point must be visible in frame 0, which is the rest state"
-        findings.append(wrong("object_visibilities", needed, f"{len(hidden)} of {points} hidden, first: point {hidden[0]}"))
-    return findings
+    required = (
+        (points > 0, "object_points", "at least one tracked object point is required", "none"),
+        (data["controller_points"].shape[1] > 0, "controller_points", "at least one controller point is required", "none"),
+        (frames > 1, "object_points", "at least 2 frames are required", frames),
+        (
+            not len(hidden),
+            "object_visibilities",
+            "every tracked point must be visible in frame 0, which is the rest state",
+            f"{len(hidden)} of {points} hidden, first: point {hidden.min(initial=points)}",
+        ),
+    )
+    return findings + [wrong(key, rule, received) for there, key, rule, received in required if not there]
 
 
 def describe_bad(value: np.ndarray, bad: np.ndarray) -> str:
@@ -146,42 +148,31 @@ def describe_bad(value: np.ndarray, bad: np.ndarray) -> str:
     return f"{value[first]} at {place} ({len(bad)} in all)"
 
 
-def motions(data: Any) -> Words:
+def motions(data: Any) -> Found:
     """Departures from the release that the reader accepts."""
     if not whole(data):
-        return []
-    findings = Words()
+        return
     points, visible, valid = data["object_points"], data["object_visibilities"], data["object_motions_valid"]
-    moved = np.argwhere(~visible & (points != 0).any(axis=2))
-    if len(moved):
-        findings.append(odd("object_points", "(0, 0, 0) is expected where a point is invisible", place(moved)))
-    below = np.argwhere(points[..., 2] > 0)
-    if len(below):
+    if len(moved := np.argwhere(~visible & (points != 0).any(axis=2))):
+        yield odd("object_points", "(0, 0, 0) is expected where a point is invisible", place(moved))
+    if len(below := np.argwhere(points[..., 2] > 0)):
         received = f"z up to {float(np.nanmax(points[..., 2])):.4g} m, {place(below)}"
-        findings.append(odd("object_points", "z <= 0 (on or above the table) is expected", received))
-    empty = np.flatnonzero(~visible.any(axis=1)).tolist()
-    if empty:
+        yield odd("object_points", "z <= 0 (on or above the table) is expected", received)
+    if empty := np.flatnonzero(~visible.any(axis=1)).tolist():
         frames = ", ".join(map(str, empty[:8])) + (f", ... ({len(empty)} in all)" if len(empty) > 8 else "")
-        rule = "a visible point in every frame is expected"
-        findings.append(odd("object_visibilities", rule, f"none in frames {frames}"))
-    if valid[-1].any():
-        rule = "the last row has no next frame and must be all False"
-        findings.append(odd("object_motions_valid", rule, f"{int(valid[-1].sum())} True"))
-    unseen = np.argwhere(valid[:-1] & ~(visible[:-1] & visible[1:]))
-    if len(unseen):
+        yield odd("object_visibilities", "a visible point in every frame is expected", f"none in frames {frames}")
+    if last := int(valid[-1].sum()):
+        yield odd("object_motions_valid", "the last row has no next frame and must be all False", f"{last} True")
+    if len(unseen := np.argwhere(valid[:-1] & ~(visible[:-1] & visible[1:]))):
         rule = "a valid motion from t to t+1 requires the point to be visible in both frames"
-        findings.append(wrong("object_motions_valid", rule, place(unseen)))
+        yield wrong("object_motions_valid", rule, place(unseen))
     rest = points[0]
-    duplicates = len(rest) - len(np.unique(rest, axis=0))  # springs between them would have no length
-    if duplicates:
-        findings.append(odd("object_points", "the points of frame 0 are expected to differ", f"{duplicates} duplicates"))
+    if duplicates := len(rest) - len(np.unique(rest, axis=0)):  # springs between them would have no length
+        yield odd("object_points", "the points of frame 0 are expected to differ", f"{duplicates} duplicates")
     if not np.array_equal(rest[np.lexsort(rest.T[::-1])], rest, equal_nan=True):
-        rule = "columns are expected in lexicographic order of their frame-0 coordinates"
-        findings.append(odd("object_points", rule, "another order"))
-    controllers = data["controller_points"].shape[1]
-    if controllers != RELEASED_CONTROLLERS:
-        findings.append(odd("controller_points", f"released cases have {RELEASED_CONTROLLERS} controllers", controllers))
-    return findings
+        yield odd("object_points", "columns are expected in lexicographic order of their frame-0 coordinates", "another order")
+    if (controllers := data["controller_points"].shape[1]) != RELEASED_CONTROLLERS:
+        yield odd("controller_points", f"released cases have {RELEASED_CONTROLLERS} controllers", controllers)
 
 
 def place(rows: np.ndarray) -> str:
@@ -189,7 +180,7 @@ def place(rows: np.ndarray) -> str:
     return f"frame {rows[0][0]}, point {rows[0][1]} ({len(rows)} in all)"
 
 
-def ranges(split: Any, frames: int) -> Words:
+def ranges(split: Any, frames: int) -> list[Words]:
     """split.json against the number of frames: half-open ranges [start, end) inside [0, frames]."""
     if not isinstance(split, dict):
         return [wrong("", "a JSON object with train and test is required", type(split).__name__)]
@@ -206,90 +197,83 @@ def ranges(split: Any, frames: int) -> Words:
     if findings:
         return findings
     end = int(0.7 * frames)
+    meaning = f"NeuSpring trains on [0, {split['train'][1]}) and predicts [{split['train'][1]}, {frames})"
     for key, wanted in (("train", [0, end]), ("test", [end, frames])):
         if split[key] != wanted:
-            meaning = f"NeuSpring trains on [0, {split['train'][1]}) and predicts [{split['train'][1]}, {frames})"
             findings.append(odd(key, f"the released splits are {wanted} for {frames} frames; {meaning}", split[key]))
     if split.get("frame_len") != frames:
         findings.append(odd("frame_len", f"{FINAL_DATA} has {frames} frames", split.get("frame_len", "nothing")))
     return findings
 
 
-def tracks_of(tracks: Any, frames: int | None) -> Words:
+def tracks_of(tracks: Any, frames: int | None) -> Found:
     """gt_track_3d.pkl: floating point [T, K, 3], NaN rows where not annotated. `frames` None skips the comparison of T."""
     if not isinstance(tracks, np.ndarray):
-        return [wrong("", "an array [T, K, 3] is required", type(tracks).__name__)]
-    if tracks.ndim != 3 or tracks.shape[2] != 3:
-        return [wrong("", "the shape must be [T, K, 3]", tracks.shape)]
-    if tracks.dtype.kind != "f":
-        return [wrong("", "the dtype must be floating point", tracks.dtype)]
-    findings = []
-    if frames is not None and len(tracks) != frames:
-        findings.append(wrong("", f"{FINAL_DATA} has {frames} frames", tracks.shape))
-    if tracks.dtype != np.float64:
-        findings.append(odd("", "the released dtype is float64", tracks.dtype))
-    infinite = np.argwhere(np.isinf(tracks))
-    if len(infinite):
-        findings.append(wrong("", "coordinates must be finite, or NaN where not annotated", describe_bad(tracks, infinite)))
-    missing = np.isnan(tracks)
-    partial = np.argwhere(missing.any(axis=2) & ~missing.all(axis=2))
-    if len(partial):
-        findings.append(odd("", "a point is NaN in all three coordinates or in none", place(partial)))
-    return findings
+        yield wrong("", "an array [T, K, 3] is required", type(tracks).__name__)
+    elif tracks.ndim != 3 or tracks.shape[2] != 3:
+        yield wrong("", "the shape must be [T, K, 3]", tracks.shape)
+    elif tracks.dtype.kind != "f":
+        yield wrong("", "the dtype must be floating point", tracks.dtype)
+    else:
+        if frames is not None and len(tracks) != frames:
+            yield wrong("", f"{FINAL_DATA} has {frames} frames", tracks.shape)
+        if tracks.dtype != np.float64:
+            yield odd("", "the released dtype is float64", tracks.dtype)
+        if len(infinite := np.argwhere(np.isinf(tracks))):
+            yield wrong("", "coordinates must be finite, or NaN where not annotated", describe_bad(tracks, infinite))
+        missing = np.isnan(tracks)
+        if len(partial := np.argwhere(missing.any(axis=2) & ~missing.all(axis=2))):
+            yield odd("", "a point is NaN in all three coordinates or in none", place(partial))
 
 
-def frame_rate(metadata: Any) -> Words:
+def frame_rate(metadata: Any) -> Words | None:
     """The only field of metadata.json that the reader uses: fps, a positive number; 30 where absent."""
     if not isinstance(metadata, dict):
-        return [wrong("", "a JSON object is required", type(metadata).__name__)]
+        return wrong("", "a JSON object is required", type(metadata).__name__)
     fps = metadata.get("fps", RELEASED_FRAME_RATE)
     if type(fps) not in (int, float) or not 0 < fps < MAX_FRAME_RATE:
-        return [wrong("fps", "a positive number of frames per second is required", fps)]
-    if fps != RELEASED_FRAME_RATE:
-        return [odd("fps", f"released recordings have {RELEASED_FRAME_RATE:g} frames per second", fps)]
-    return []
+        return wrong("fps", "a positive number of frames per second is required", fps)
+    rule = f"released recordings have {RELEASED_FRAME_RATE:g} frames per second"
+    return None if fps == RELEASED_FRAME_RATE else odd("fps", rule, fps)
 
 
-def cameras_of(metadata: Any, cameras: int | None) -> Words:
+def cameras_of(metadata: Any, cameras: int | None) -> Found:
     """Image size and intrinsics of metadata.json. `cameras` is the required number of cameras; None allows any but zero."""
-    findings = Words()
     if not isinstance(metadata, dict):
-        return findings
+        return
     size: Any = metadata.get("WH")
     has_size = isinstance(size, list) and len(size) == 2 and all(type(value) is int and value > 0 for value in size)
     if not has_size:
-        findings.append(wrong("WH", "two positive whole numbers [width, height] are required", size))
+        yield wrong("WH", "two positive whole numbers [width, height] are required", size)
     try:
         intrinsics = np.asarray(metadata.get("intrinsics"), dtype=np.float64)
     except (TypeError, ValueError):
         intrinsics = np.zeros(0)
     count = cameras or max(len(intrinsics) if intrinsics.ndim else 0, 1)
     if intrinsics.shape != (count, 3, 3) or not np.isfinite(intrinsics).all():
-        rule = f"{cameras or 'one or more'} finite 3 x 3 matrices are required"
-        return [*findings, wrong("intrinsics", rule, f"shape {intrinsics.shape}")]
+        yield wrong("intrinsics", f"{cameras or 'one or more'} finite 3 x 3 matrices are required", f"shape {intrinsics.shape}")
+        return
     for index, matrix in enumerate(intrinsics):
         key = f"intrinsics, camera {index}"
         of_lens = intrinsics_findings(Path(), key, matrix, (size[0], size[1]) if has_size else None)
-        findings += [wrong(key, one.text) for one in of_lens]
-    return findings
+        yield from (wrong(key, one.text) for one in of_lens)
 
 
-def poses_of(poses: Any, cameras: int | None) -> Words:
+def poses_of(poses: Any, cameras: int | None) -> Found:
     """The matrices of calibrate.pkl. `cameras` is the required number of cameras; None skips the comparison."""
     if not isinstance(poses, (list, tuple)) or (cameras is not None and len(poses) != cameras):
         received = f"{type(poses).__name__} of {len(poses)}" if isinstance(poses, (list, tuple)) else type(poses).__name__
-        return [wrong("", f"a list of {cameras or ''} camera-to-world matrices is required".replace("  ", " "), received)]
-    findings = []
+        yield wrong("", f"a list of {cameras or ''} camera-to-world matrices is required".replace("  ", " "), received)
+        return
     for index, pose in enumerate(poses):
         key = f"camera {index}"
         if not isinstance(pose, np.ndarray) or pose.shape != (4, 4) or pose.dtype.kind != "f":
             received = f"{pose.shape} {pose.dtype}" if isinstance(pose, np.ndarray) else type(pose).__name__
-            findings.append(wrong(key, "a (4, 4) floating point matrix is required", received))
+            yield wrong(key, "a (4, 4) floating point matrix is required", received)
             continue
         if pose.dtype != np.float64:
-            findings.append(odd(key, "the released dtype is float64", pose.dtype))
-        findings += [wrong(key, one.text) for one in pose_findings(Path(), key, pose, BINARY_TOLERANCE)]
-    return findings
+            yield odd(key, "the released dtype is float64", pose.dtype)
+        yield from (wrong(key, one.text) for one in pose_findings(Path(), key, pose, BINARY_TOLERANCE))
 
 
 # fmt: off

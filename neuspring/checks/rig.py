@@ -17,18 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neuspring.checks.cameras import MOST_FLOATING, pairs
-from neuspring.checks.table import (
-    FAR_OFF,
-    POSE,
-    SMALLEST_PLANE,
-    TABLE_OFF,
-    TILT,
-    TILTED,
-    Stand,
-    on_table,
-    other_side,
-    stand,
-)
+from neuspring.checks.table import FAR_OFF, POSE, SMALLEST_PLANE, TABLE_OFF, TILT, TILTED, Stand, on_table, other_side, stand
 from neuspring.core.artifacts import up_sign
 from neuspring.core.checks import Check
 from neuspring.core.geometry import rigid_inverse
@@ -195,9 +184,7 @@ class Rig:
             for name, listed in self.planes.items()
             if listed and self.posed
         }
-        return {
-            name: min(listed, key=lambda one: one[1].tilt / TILT + abs(one[1].off) / TABLE_OFF) for name, listed in found.items()
-        }
+        return {name: min(each, key=lambda one: one[1].tilt / TILT + abs(one[1].off) / TABLE_OFF) for name, each in found.items()}
 
     @cached_property
     def standing(self) -> dict[str, float]:
@@ -261,9 +248,13 @@ class Rig:
                 for name, listed in depths.items()
             }
             first = {name: change(depth, cameras[name].intrinsics) if name in names else depth for name, depth in first.items()}
-        rig = replace(self, cameras=cameras, depths=depths, first=first)
-        if change is None and hypothesis.lens is None:
-            rig.__dict__["planes"] = self.planes  # They are in the coordinates of the cameras, which did not change.
+        changed: dict[str, Any] = {"cameras": cameras, "depths": depths, "first": first}
+        return replace(self, **changed) if change or hypothesis.lens else self.elsewhere(**changed)
+
+    def elsewhere(self, **changes: Any) -> Rig:
+        """The rig with changes that leave its planes, which are in the coordinates of the cameras, as they are."""
+        rig = replace(self, **changes)
+        rig.__dict__["planes"] = self.planes
         return rig
 
     def scaled(self, factor: float, names: Sequence[str]) -> Rig:
@@ -276,15 +267,8 @@ class Rig:
 
     def with_poses(self, poses: Mapping[str, np.ndarray]) -> Rig:
         """The same with other poses, camera to world [4, 4], m."""
-        rig = replace(self, cameras={name: replace(one, camera_to_world=poses[name]) for name, one in self.cameras.items()})
-        rig.__dict__["planes"] = self.planes
-        return rig
-
-    def with_up(self, up: str) -> Rig:
-        """The same with another side up."""
-        rig = replace(self, up=up)
-        rig.__dict__["planes"] = self.planes
-        return rig
+        cameras = {name: replace(one, camera_to_world=poses[name]) for name, one in self.cameras.items()}
+        return self.elsewhere(cameras=cameras)
 
 
 @dataclass(frozen=True)
@@ -317,7 +301,7 @@ def explain(rig: Rig, sides: Sequence[str] | None = None) -> Explained | None:
         for number, (one, changed) in enumerate(() if rig.right else _candidates(rig))
         for side in (sides or (rig.up, other_side(rig.up)))
         if one.what != "lens" or side == rig.up
-        for other in [changed.with_up(side)]
+        for other in [changed.elsewhere(up=side)]
         if other.right
     ]
     if found:
@@ -394,7 +378,6 @@ class Judged:
     """A rig, and what explains it."""
 
     rig: Rig
-    explained: Explained | None
     units: Mapping[str, float | None]
     """m per count of each camera; None where depth is in meters by its type."""
     of_file: bool = True
@@ -402,16 +385,10 @@ class Judged:
     taken: Callable[[str], str] | None = None
     """An option, as it is after others that are given already."""
 
-    @classmethod
-    def of(
-        cls,
-        rig: Rig,
-        units: Mapping[str, float | None],
-        of_file: bool = True,
-        taken: Callable[[str], str] | None = None,
-    ) -> Judged:
-        """With the change that makes it right, if there is one."""
-        return cls(rig, explain(rig) if of_file else explain(rig, (rig.up,)) or explain(rig), units, of_file, taken)
+    @cached_property
+    def explained(self) -> Explained | None:
+        """The change that makes it right, if there is one."""
+        return (None if self.of_file else explain(self.rig, (self.rig.up,))) or explain(self.rig)
 
     def text(self, name: str) -> str:
         """The place of a camera's table, in words."""
@@ -441,58 +418,44 @@ def explanation(judged: Judged) -> list[dict[str, Any]]:
     rig, one = judged.rig, judged.explained
     if one is None or one.what == "level":
         return []
-    names = [name for name in one.names if name in rig.cameras]
-    also = f", and set up to {one.up}" if one.up and judged.of_file else ""
-    told: list[dict[str, Any]]
+    names, level = [name for name in one.names if name in rig.cameras], "error"
+    told: list[tuple[str, str, str]]
     if one.what == "up":
-        below = f"{rig.up}, by which camera {names[0]} is below the table"
-        told = [{"key": "up", "rule": f"must be the side of the table on which the cameras are: {one.up}", "received": below}]
+        rule = f"must be the side of the table on which the cameras are: {one.up}"
+        told = [("up", rule, f"{rig.up}, by which camera {names[0]} is below the table")]
     elif one.what == "unit":
-        unit = judged.units.get(names[0])
-        key, received = f"depth of camera {' and '.join(names)}", one.looks
+        unit, rule = judged.units.get(names[0]), f"the table must be as far from camera {names[0]} as its pose says"
+        told = [(f"depth of camera {' and '.join(names)}", rule, one.looks)]
         if unit is not None:
-            key, received = (
-                "depth_unit",
-                f"{unit:g}, which makes it {one.factor:g} times as far. Plausible would be {unit / one.factor:g}",
-            )
-        told = [{"key": key, "rule": f"the table must be as far from camera {names[0]} as its pose says", "received": received}]
+            plausible = f"Plausible would be {unit / one.factor:g}"
+            told = [("depth_unit", rule, f"{unit:g}, which makes it {one.factor:g} times as far. {plausible}")]
     elif one.what == "order":
-        told = [
-            {
-                "key": "cameras",
-                "rule": "each camera must have its own pose, in the order of the cameras",
-                "received": f"others; {one.looks}",
-            }
-        ]
+        told = [("cameras", "each camera must have its own pose, in the order of the cameras", f"others; {one.looks}")]
+    elif one.what == "distance":
+        told = [("depth", "depth along the optical axis is required", one.looks)]
     elif one.what == "lens":
-        told, level = [], "warning" if max(rig.standing.values(), default=0.0) <= 1 and rig.disagreement <= 1 else "error"
+        level, told = "warning" if max(rig.standing.values(), default=0.0) <= 1 and rig.disagreement <= 1 else "error", []
         for name in names:
             matrix, size = rig.cameras[name].intrinsics, (rig.cameras[name].width, rig.cameras[name].height)
-            at, other = f"({matrix[0, 2]:.0f}, {matrix[1, 2]:.0f})", " x ".join(map(str, lens_of(matrix, size)))
             rule = f"the principal point should lie near the center of its images, {size[0]} x {size[1]}"
-            received = f"{at}, the center of images of {other}: {one.looks}"
-            told.append({"key": f"intrinsics of camera {name}", "rule": rule, "received": received, "level": level})
-    elif one.what == "distance":
-        told = [{"key": "depth", "rule": "depth along the optical axis is required", "received": one.looks}]
+            other = " x ".join(map(str, lens_of(matrix, size)))
+            received = f"({matrix[0, 2]:.0f}, {matrix[1, 2]:.0f}), the center of images of {other}: {one.looks}"
+            told.append((f"intrinsics of camera {name}", rule, received))
     else:
         rule = "camera-to-world is required (x right, y down, z forward): with it the table is z = 0"
-        told = [
-            {"key": f"cameras.{name}.camera_to_world", "rule": rule, "received": f"what looks like {one.looks}{also}"}
-            for name in names
-        ]
-    options = (one.option, *one.rivals) if judged.taken is None else tuple(map(judged.taken, (one.option, *one.rivals)))
-    next_move = f"make-capture {' or '.join(options)} takes it so." if one.option.startswith("--take") else ""
-    return [words | {"value": one.what, "next": next_move} for words in told]
+        received = f"what looks like {one.looks}" + (f", and set up to {one.up}" if one.up and judged.of_file else "")
+        told = [(f"cameras.{name}.camera_to_world", rule, received) for name in names]
+    options = map(judged.taken or str, (one.option, *one.rivals))
+    words = {"value": one.what, "level": level, "next": ""}
+    words |= {"next": f"make-capture {' or '.join(options)} takes it so."} if one.option.startswith("--take") else {}
+    return [words | dict(zip(("key", "rule", "received"), each, strict=True)) for each in told]
 
 
 def bent(name: str, model: str, shares: Mapping[str, float]) -> dict[str, Any] | None:
     """Share of the pixels on one plane with the distortion removed by its `model`, where another one makes more of it flat."""
     best = max(shares, key=lambda other: shares[other])
-    return (
-        {"value": shares[model], "model": model, "best": best, "share": shares[best]}
-        if flatter(shares[best], shares[model])
-        else None
-    )
+    told = {"value": shares[model], "model": model, "best": best, "share": shares[best]}
+    return told if flatter(shares[best], shares[model]) else None
 
 
 TRIED = "units of depth, distances in its place, inverse poses, other axes, y up, exchanged cameras, other lenses, a turn"

@@ -143,9 +143,8 @@ def never_moves(hands: Holding) -> dict[str, Any] | None:
     first = gaps[0].argmin(axis=0)
     left = np.nanmax(gaps[:, first, np.arange(len(still))], axis=0)
     gone = np.flatnonzero((gaps[0].min(axis=0) < HAND_REACH) & (left > 2 * HAND_REACH))
-    return (
-        {"value": float(left[gone].max()), "cm": 100 * left[gone].max(), "which": [still[k] for k in gone]} if len(gone) else None
-    )
+    most = left[gone].max(initial=0.0)
+    return {"value": float(most), "cm": 100 * most, "which": [still[k] for k in gone]} if len(gone) else None
 
 
 # fmt: off

@@ -285,9 +285,8 @@ def height_in_air(camera: Camera, sample: Sample, up: float, obstacles: Sequence
     foot, away = own[own[:, 2] < low + LEVEL], max(AIR[0], AIR[1] * (high - low))
     if low < RAISED or any((one.depth((foot - (0, 0, away)) * (1, 1, up)) > 0).any() for one in obstacles):
         return None
-    y, x = np.nonzero(
-        (cv2.dilate((sample.mask > 0).astype(np.uint8), np.ones((OBJECT_RIM, OBJECT_RIM), np.uint8)) == 0) & (sample.depth > 0)
-    )
+    around = cv2.dilate((sample.mask > 0).astype(np.uint8), np.ones((OBJECT_RIM, OBJECT_RIM), np.uint8))
+    y, x = np.nonzero((around == 0) & (sample.depth > 0))
     seen = camera.lift(np.stack([x, y], axis=1).astype(float), sample.depth[y, x]) * (1, 1, up)
     near = ((seen[:, :2] > foot[:, :2].min(axis=0) - BY) & (seen[:, :2] < foot[:, :2].max(axis=0) + BY)).all(axis=1)
     top = seen[near & (seen[:, 2] > max(RAISED, low - away)) & (seen[:, 2] < low + LEVEL)]

@@ -79,8 +79,7 @@ def measure(one: np.ndarray, other: np.ndarray, most: int | None = None) -> Shif
     if reach < 1 or min(np.nansum(a), np.nansum(b)) <= 0 or min(map(np.sum, known)) < FEWEST:
         return None
     shifts = np.arange(-reach, reach + 1)
-    whole = _peak(a, b, shifts, np.ones(len(a), bool))
-    if whole is None:
+    if (whole := _peak(a, b, shifts, np.ones(len(a), bool))) is None:
         return None
     parts = []
     for part in np.array_split(np.flatnonzero(known[0] & (np.nansum(a, axis=1) > 0)), QUARTERS):

@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from neuspring.cli.options import Positional, Results, Settings, arg, json_value, read_settings
-from neuspring.config import parse
+from neuspring.config import parse, plain
 from neuspring.core.errors import InputError
+from neuspring.core.files import write_text
+from neuspring.scores.paper import Study, read_studies
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from neuspring.scores.paper import Study
     from neuspring.scores.runs import Collected
 
 OnDisk = Annotated[tuple[str, ...], arg(help="all on disk by default")]
@@ -85,8 +86,6 @@ def tables(
 
 def _study(table: Path, name: str) -> tuple[dict[str, Study], Study]:
     """All studies of a table, and one of them. Raises InputError."""
-    from neuspring.scores.paper import read_studies
-
     studies = read_studies(table)
     if name not in studies:
         raise InputError("study", f"must be a row of {table}", name, f"Known: {', '.join(studies)}")
@@ -102,7 +101,6 @@ def _read_scores(path: Path, scenarios: Sequence[str], methods: Sequence[str], s
 
 def _made_otherwise(settings: str, results: Path) -> tuple[str, ...]:
     """Lines on runs that are there but are not what these settings would make."""
-    from neuspring.config import plain
     from neuspring.core.provenance import PACKAGE_FOLDER
     from neuspring.experiments.benchmark import Benchmark
     from neuspring.experiments.freshness import Freshness
@@ -212,7 +210,6 @@ def report(
 ) -> None:
     """Results folder -> one self-contained HTML file."""
     from neuspring.report import page
-    from neuspring.scores.paper import read_studies
 
     options = page.Options(
         scenarios=scenarios,
@@ -241,7 +238,6 @@ def _read_left_out(text: str) -> dict[str, dict[str, str]]:
 
 def track_init(output: Path, results: Results = Path("results"), settings: Settings = "{}") -> None:
     """Prepare the MLflow store, once before any run is logged."""
-    from neuspring.core.files import write_text
     from neuspring.experiments.tracking import log
 
     outcome = log.init(results, read_settings(settings).tracking)
@@ -253,7 +249,6 @@ def log(
     record: Annotated[Path, arg(help="run.json")], output: Path, results: Results = Path("results"), settings: Settings = "{}"
 ) -> None:
     """Log one run.json to MLflow."""
-    from neuspring.core.files import write_text
     from neuspring.experiments.tracking import log
 
     outcome = log.log_run(record, results, read_settings(settings).tracking)

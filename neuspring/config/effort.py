@@ -34,7 +34,6 @@ def sizes(effort: str) -> dict[str, Any]:
     """The values of an effort, nested as in a configuration file."""
     values: dict[str, Any] = {}
     for path, choices in EFFORT_SIZES.items():
-        merge(
-            values, functools.reduce(lambda inner, name: {name: inner}, reversed(path.split(".")), choices[EFFORTS.index(effort)])
-        )
+        nested = functools.reduce(lambda inner, name: {name: inner}, reversed(path.split(".")), choices[EFFORTS.index(effort)])
+        merge(values, nested)
     return values

@@ -94,9 +94,8 @@ def shown_default(spec: dataclasses.Field[Any]) -> str:
 
 def yaml_text(value: Any) -> str:
     """A value in YAML's flow style; floats with a point, as the strict reader wants them."""
-    listed: str = yaml.safe_dump(
-        [json.loads(json.dumps(value, default=vars))], default_flow_style=True, sort_keys=False, width=math.inf
-    )
+    values = [json.loads(json.dumps(value, default=vars))]
+    listed: str = yaml.safe_dump(values, default_flow_style=True, sort_keys=False, width=math.inf)
     return listed.strip()[1:-1]
 
 

@@ -27,7 +27,7 @@ class SearchRow(SettingsSection):
 
 @dataclass(frozen=True, kw_only=True)
 class Method(SettingsSection):
-    """A row of the method table: a twin (which search it starts from, what follows) or a baseline's model; how it predicts."""
+    """A row of the method table: a twin (which search it starts from, what follows), a baseline's model, or the mean of seeds."""
 
     description: str
     """A line for people."""
@@ -38,6 +38,8 @@ class Method(SettingsSection):
     `body: rod`); null: there is no such stage."""
     model: Name | None = None
     """A baseline, which has neither search nor fit, by its name in `BASELINES`."""
+    mean_of: Name | None = None
+    """Another row, which is run too: the prediction is the mean of those of all its seeds; null: this row predicts itself."""
     settings: dict[str, Any] = field(default_factory=dict)
     """Settings of this method alone, on top of the configuration's: keys of `fit` (for example `horizon: 0`), or of its model's
     section of `baselines`."""
@@ -48,9 +50,9 @@ class Method(SettingsSection):
     """Fit of all frames, the future included, from the same search. Such a row predicts nothing: it says how much of an error
     fitting could remove at all, and stands outside every comparison. Its records say so, and it shares its fit with other oracles
     only."""
-    pool: Literal["all"] | None = None
-    """Recordings of the object (`pools`) that one twin is judged on: the scenario's own and the others of its pool (all); null: the
-    scenario's own."""
+    pool: Literal["all", "others"] | None = None
+    """Recordings of the object (`pools`) that one twin is judged on: the scenario's own and the others of its pool (all); those
+    alone, so that nothing of the scenario is seen but frame 0 and the hands (others); null: the scenario's own."""
 
     @property
     def searched(self) -> str:
@@ -58,14 +60,17 @@ class Method(SettingsSection):
         return f"{self.search}-{self.pool}" if self.pool else self.search or ""
 
     def __post_init__(self) -> None:
-        if (self.search is None) == (self.model is None):
-            raise ValueError(f"either search or model is required, received search {self.search} and model {self.model}")
+        kinds = {"search": self.search, "model": self.model, "mean_of": self.mean_of}
+        if sum(value is not None for value in kinds.values()) != 1:
+            received = ", ".join(f"{name} {value}" for name, value in kinds.items() if value is not None)
+            raise ValueError(f"one of {', '.join(kinds)} is required, received {received or 'none'}")
         twins_only = {"fit": self.fit, "pool": self.pool}
         if self.oracle and not self.fit:
             raise ValueError("oracle: an oracle has a fit; received fit null")
         misplaced = [name for name, value in twins_only.items() if value]
-        if self.model and misplaced:
-            raise ValueError(f"{', '.join(misplaced)}: these belong to methods with a search, not to model {self.model}")
+        if not self.search and misplaced:
+            kind = f"model {self.model}" if self.model else f"the mean of {self.mean_of}"
+            raise ValueError(f"{', '.join(misplaced)}: these belong to methods with a search, not to {kind}")
 
 
 @dataclass(frozen=True, kw_only=True)

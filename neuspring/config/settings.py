@@ -127,7 +127,7 @@ class Config(SettingsSection):
     transfers: dict[Name, tuple[Name, ...]] | None = None
     """Scenario -> other recordings of the same object, on which its twins are rolled out as well; null: none."""
     pools: dict[Name, tuple[Name, ...]] | None = None
-    """Name -> scenarios that are recordings of one object, with the same nodes, for methods with `pool`; null: none."""
+    """Name -> scenarios that are recordings of one object, for methods with `pool`; null: none."""
     results: Annotated[
         str, StringConstraints(pattern=r"^[^{}\n]+$"), AfterValidator(lambda path: os.path.normpath(os.path.expanduser(path)))
     ] = "results"

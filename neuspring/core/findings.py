@@ -97,9 +97,8 @@ def refuse(findings: Iterable[Finding]) -> None:
     errors = [one for one in listed if one.level == "error"]
     if errors:
         more = f"{len(errors) - 1} more: " if len(errors) > 1 else ""
-        raise InputError(
-            errors[0].where, errors[0].message.rstrip("."), remedy=f"{more}`neuspring check-data` lists every finding."
-        )
+        remedy = f"{more}`neuspring check-data` lists every finding."
+        raise InputError(errors[0].where, errors[0].message.rstrip("."), remedy=remedy)
     for one in listed:
         if one.level == "warning":
             print(one)

@@ -21,8 +21,8 @@ from pathlib import Path
 
 PACKAGE_NAME = "neuspring"
 PACKAGE_FOLDER = Path(__file__).parents[1]
-NOT_NUMERICS = tuple(
-    f"{PACKAGE_NAME}.{name}"
+DECLARATIONS = tuple(
+    f"{PACKAGE_NAME}.{name}."
     for name in ("config", "core.section", "core.text", "core.records", "core.run_record", "core.run_folder", "stages.stage")
 )
 """Declarations, records and progress: they change no number. Configured values reach a rule as parameters of their own."""
@@ -111,15 +111,10 @@ def _is_text(node: ast.stmt) -> bool:
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
-def _declares(module: str) -> bool:
-    return module in NOT_NUMERICS or module.startswith(tuple(f"{name}." for name in NOT_NUMERICS))
-
-
 @functools.cache
 def _module_code(module: str) -> bytes:
     if _source(module) is None:
-        package = module.partition(".")[0]
-        names = packages_distributions().get(package, [])
+        names = packages_distributions().get(module.partition(".")[0], [])
         return hashlib.sha256(" ".join(f"{name} {version(name)}" for name in names).encode()).digest()
     return hashlib.sha256(_written(_tree(module)).encode()).digest()
 
@@ -138,7 +133,7 @@ def _written(value: object) -> str:
 def code_digest(*modules: str) -> str:
     """A short SHA-256 over the code that the given package modules use."""
     digest = hashlib.sha256()
-    used = {name for module in modules for name in used_modules(module) if not _declares(name)}
+    used = {name for module in modules for name in used_modules(module) if not f"{name}.".startswith(DECLARATIONS)}
     for name in sorted(used):
         digest.update(name.encode())
         digest.update(_module_code(name))

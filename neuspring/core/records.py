@@ -77,9 +77,8 @@ class StageRecord:
 
     def save(self, path: Path) -> None:
         """Write as JSON, atomically."""
-        write_text(
-            Path(path), json.dumps({"format": RECORD_FORMAT, **self.__dict__}, indent=1, sort_keys=True, allow_nan=False) + "\n"
-        )
+        values = {"format": RECORD_FORMAT, **self.__dict__}
+        write_text(Path(path), json.dumps(values, indent=1, sort_keys=True, allow_nan=False) + "\n")
 
     @classmethod
     def load(cls, path: Path) -> StageRecord:

@@ -79,7 +79,10 @@ class Table:
 
     def markdown(self) -> list[str]:
         """Lines in which a row with a first cell alone is a heading, which widens no column."""
-        rows = [[MARKDOWN_MARKS[cell.mark].format(_in_markdown(cell.plain)) for cell in row] for row in self.rows]
+        rows = [
+            [MARKDOWN_MARKS[cell.mark].format(cell.plain.replace("|", "\\|").replace("\n", " ")) for cell in row]
+            for row in self.rows
+        ]
         several = len(self.header) > 1
         alone = [several and bool(row[0]) and not any(row[1:]) for row in rows]
         widening = [self.headings, *(row for row, heading in zip(rows, alone, strict=True) if not heading)]
@@ -123,10 +126,6 @@ class Table:
         caption = f"{self.caption}: {LONG_GROUPS.get(group, group)}"
         rows = [[row[k] for k in kept] for row in self.rows]
         return replace(self, caption=caption, header=[self.header[k] for k in kept], rows=rows, groups=())
-
-
-def _in_markdown(text: str) -> str:
-    return text.replace("|", "\\|").replace("\n", " ")
 
 
 def _markdown_row(cells: Sequence[str], widths: Sequence[int]) -> str:

@@ -36,8 +36,7 @@ def find_file(what: str, given: Path | None, places: Iterable[Path], digest: str
         return given
     faults = []
     for place in places:
-        fault = _fault(place, digest, trusted)
-        if not fault:
+        if not (fault := _fault(place, digest, trusted)):
             return place
         faults.append(f"{_short(place)} {fault}")
     return f"no {what}: {', '.join(faults)}"

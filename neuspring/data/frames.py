@@ -51,6 +51,12 @@ def overlap(one: np.ndarray, other: np.ndarray) -> float:
     return float((one & other).sum() / union) if union else float("nan")
 
 
+def at_border(boxes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Pieces [n] bool, by the boxes [n, 5] of `cv2.connectedComponentsWithStats`, that reach the border of an image [H, W]."""
+    left, top, width, height = boxes.T[:4]
+    return np.asarray((left == 0) | (top == 0) | (left + width == shape[1]) | (top + height == shape[0]))
+
+
 def tints_of(image: np.ndarray, labels: np.ndarray) -> dict[int, Color]:
     """The tint, RGB, of each label in pictures of this camera: the usual one if it is seen, else the one that is seen best.
 
@@ -92,8 +98,9 @@ def overlay(image: np.ndarray, labels: np.ndarray, tints: Mapping[int, Color]) -
 
 
 def write_png(path: Path, image: np.ndarray) -> Path:
-    """Write an RGB image [H, W, 3], or a mask [H, W], uint8, whole or not at all; a link is replaced, not followed."""
-    ok, png = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1] if image.ndim == 3 else image))
+    """Write RGB [H, W, 3], RGBA [H, W, 4] or a mask [H, W], uint8, whole or not at all; a link is replaced, not followed."""
+    pixels = image[..., [2, 1, 0, 3][: image.shape[2]]] if image.ndim == 3 else image
+    ok, png = cv2.imencode(".png", np.ascontiguousarray(pixels))
     assert ok, "an image can be encoded"
     write_atomically(path, lambda temporary: temporary.write_bytes(png.tobytes()))
     return path

@@ -35,8 +35,7 @@ def read_picture(path: Path, flag: int) -> np.ndarray:
                 "Are they those of the sensor? Then remove the mark: exiftool -Orientation= FILES"
             )
             raise InputError(path, "an image must be stored upright, with EXIF orientation 1", turned, remedy)
-    image = cv2.imread(str(path), flag)
-    if image is None:
+    if (image := cv2.imread(str(path), flag)) is None:
         raise InputError(path, "this file must be a readable image", "a damaged file", "Copy it again from where it was made.")
     return image
 

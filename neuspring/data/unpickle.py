@@ -99,9 +99,8 @@ def _array(data: Any, dtype: Any, shape: Any, order: Literal["C", "F"]) -> np.nd
     if wanted != len(content):
         raise _Refused(f"an array of shape {shape} and dtype {kind} ({wanted} bytes) made of {len(content)} bytes")
     # A byte other than 0 or 1 is not a valid bool in memory.
-    flat = (
-        np.frombuffer(content, np.uint8) != 0 if kind.kind == "b" else np.frombuffer(content, kind).astype(kind.newbyteorder("="))
-    )
+    native = kind.newbyteorder("=")
+    flat = np.frombuffer(content, np.uint8) != 0 if kind.kind == "b" else np.frombuffer(content, kind).astype(native)
     result: np.ndarray = flat.reshape(shape, order=order)
     return result
 
@@ -138,9 +137,8 @@ def load_pickle(path: Path) -> Any:
         rule = "a pickle may hold plain values and numeric NumPy arrays only"
         raise InputError(path, rule, str(error), "Nothing in it was run; get the file from its original source.") from error
     except Exception as error:  # The pickle documentation: damaged data may raise any exception.
-        raise InputError(
-            path, "this file must be a complete pickle", f"{type(error).__name__}: {error}", "Copy it again."
-        ) from error
+        told = f"{type(error).__name__}: {error}"
+        raise InputError(path, "this file must be a complete pickle", told, "Copy it again.") from error
 
 
 def _scan(data: bytes) -> None:

@@ -48,8 +48,7 @@ def ratios_figure(ratios: pd.DataFrame, note: str) -> Figure | None:
         for index in range(0, len(methods), 2):
             axis.axhspan(index - 0.5, index + 0.5, color="0.96", lw=0)
         for metric, shift in zip(shown, shifts, strict=True):
-            part = rows[(rows["task"] == task) & (rows["metric"] == metric.name)]
-            if len(part):
+            if len(part := rows[(rows["task"] == task) & (rows["metric"] == metric.name)]):
                 place = np.array([methods.index(method) for method in part["method"]]) - shift
                 _intervals(axis, part, place, *styles[metric], metric.title)
         _scale(axis, rows[rows["task"] == task])

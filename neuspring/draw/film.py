@@ -17,6 +17,7 @@ from PIL import Image
 
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_atomically
+from neuspring.data.frames import spread
 from neuspring.draw.painter import ERROR_COLORS, Painter
 from neuspring.draw.sheet import FUTURE, TEXT, TRAINING, color_bar, place, rgb
 from neuspring.draw.video import Video
@@ -133,8 +134,7 @@ def _layout(painter: Painter, width: float) -> tuple[Figure, list[list[Axes]], A
         panels.append([place(figure, left, top - 2 * high - FILM_GAP, across, high) for left in lefts[1:]])
         cax = place(figure, width - FILM_BAR + 0.06, top - 2 * high - FILM_GAP + 0.04, 0.09, high - 0.08)
         color_bar(figure, cax, painter.norm, ERROR_COLORS, painter.error_label, extend="max")
-    clock = place(figure, FILM_EDGE, total - FILM_EDGE - CLOCK, width - 2 * FILM_EDGE, CLOCK)
-    return figure, panels, clock
+    return figure, panels, place(figure, FILM_EDGE, total - FILM_EDGE - CLOCK, width - 2 * FILM_EDGE, CLOCK)
 
 
 def _fill(painter: Painter, panels: list[list[Axes]], frame: int) -> None:
@@ -165,15 +165,13 @@ def _tell(painter: Painter, clock: Axes, frame: int) -> None:
     if train_end < scenario.frame_count:
         clock.text(train_end + margin, 0.5, "future" if train_end else "predicted", ha="left", **words)
     clock.text(scenario.frame_count - margin, 0.5, f"{frame / scenario.frame_rate:.2f} s", ha="right", **words)
-    for side in clock.spines.values():
-        side.set_visible(False)
+    clock.spines[:].set_visible(False)
 
 
 def _write_gif(path: Path, pictures: Sequence[np.ndarray], rate: float) -> None:
     """A GIF that begins again for ever. Its times are whole hundredths of a second; they add up to those of the film."""
     # One palette for all frames: colors that change from frame to frame flicker, and pixels that stay need no bytes.
-    keys = np.unique(np.linspace(0, len(pictures) - 1, PALETTE_FRAMES).astype(int))
-    palette = Image.fromarray(np.vstack([pictures[k] for k in keys])).quantize(GIF_COLORS, method=Image.Quantize.MAXCOVERAGE)
+    palette = Image.fromarray(np.vstack(spread(pictures, PALETTE_FRAMES))).quantize(GIF_COLORS, method=Image.Quantize.MAXCOVERAGE)
     frames = [Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     ends = np.round(CENTISECOND * np.arange(len(frames) + 1) / rate).astype(int)
     times = 10 * np.maximum(np.diff(ends), SHORTEST_FRAME)

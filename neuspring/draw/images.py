@@ -55,11 +55,7 @@ def appearance_figure(shots: Sequence[Shot], drawn: Mapping[str, np.ndarray], ar
 
 def panels(pair: Pair) -> dict[str, np.ndarray]:
     """Observed, predicted and their difference [H, W, 3] uint8, by name."""
-    return {
-        "observed": pair.observed,
-        "predicted": pair.rendered[..., :3],
-        f"difference, 0 to {WORST:g}": error_picture(pair),
-    }
+    return {"observed": pair.observed, "predicted": pair.rendered[..., :3], f"difference, 0 to {WORST:g}": error_picture(pair)}
 
 
 def pairs_figure(scenario: Scenario, names: Mapping[int, str], pairs: Mapping[int, Pair], path: Path) -> Path:

@@ -50,13 +50,7 @@ def distances(take: ShownRun, observations: Observations, frame: int) -> tuple[n
 class Painter:
     """Paints panels of one scene; all panels share the range of errors."""
 
-    def __init__(
-        self,
-        scene: ShownScene,
-        takes: Sequence[ShownRun],
-        frames: Sequence[int],
-        manner: DrawingStyle,
-    ) -> None:
+    def __init__(self, scene: ShownScene, takes: Sequence[ShownRun], frames: Sequence[int], manner: DrawingStyle) -> None:
         self.scene, self.takes, self.frames, self.manner = scene, takes, tuple(frames), manner
         self.norm = Normalize(0, self._most())
 
@@ -72,7 +66,10 @@ class Painter:
             if frame < len(take.positions)
         ]
         values = np.concatenate(kept) if kept else np.zeros(0)
-        return _rounded(max(DRAWN_MM * float(np.quantile(values, 0.98)) if len(values) else 0.0, LEAST_MM))
+        value = max(DRAWN_MM * float(np.quantile(values, 0.98)) if len(values) else 0.0, LEAST_MM)
+        power = 10.0 ** np.floor(np.log10(value))
+        # The next of these steps times a power of ten.
+        return float(next(step for step in (1, 2, 3, 5, 8, 10) if step * power >= value * (1 - 1e-9)) * power)
 
     error_name, error_label = "distance", "distance [mm]"
     """Name of the rows of errors, and the label of their color bar."""
@@ -165,8 +162,7 @@ def empty(axis: Axes, view: Camera, *, framed: bool = True) -> None:
     limits = {"xlim": (-0.5, view.width - 0.5), "ylim": (view.height - 0.5, -0.5)}
     axis.set(xticks=[], yticks=[], **limits, aspect="auto", facecolor="white")
     axis.set_autoscale_on(False)
-    for side in axis.spines.values():
-        side.set(linewidth=0.5, color="0.7", visible=framed)
+    axis.spines[:].set(linewidth=0.5, color="0.7", visible=framed)
 
 
 def hands(axis: Axes, scene: ShownScene, frame: int) -> None:
@@ -175,9 +171,3 @@ def hands(axis: Axes, scene: ShownScene, frame: int) -> None:
     size = float(np.clip((0.021 * points_across(axis)) ** 2, 3.0, 14.0))
     style: dict[str, Any] = {"marker": "D", "color": CONTROLLER, "edgecolors": "white", "linewidths": 0.25, "zorder": 5}
     axis.scatter(flat[depth > 0, 0], flat[depth > 0, 1], s=size, **style)
-
-
-def _rounded(value: float) -> float:
-    """The next 1, 2, 3, 5 or 8 times a power of ten."""
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(next(step for step in (1, 2, 3, 5, 8, 10) if step * power >= value * (1 - 1e-9)) * power)

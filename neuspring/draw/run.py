@@ -103,9 +103,8 @@ def shade_future(axis: Axes, scenario: Scenario, label: str = "") -> None:
 def image_scores_figure(frames: pd.DataFrame, scenario: Scenario, method: str, folder: Path) -> Path:
     """Draw image_scores.png: every metric of pictures over time, from rows frame, camera, metric, value; returns the file."""
     shown = [metric for metric in metrics_of("pictures") if metric.name in set(frames["metric"])]
-    figure, axes = plt.subplots(
-        len(shown), 1, figsize=(7, 1.5 * len(shown) + 0.8), layout="constrained", sharex=True, squeeze=False
-    )
+    size = (7, 1.5 * len(shown) + 0.8)
+    figure, axes = plt.subplots(len(shown), 1, figsize=size, layout="constrained", sharex=True, squeeze=False)
     for axis, metric in zip(axes[:, 0], shown, strict=True):
         values = frames[frames["metric"] == metric.name].groupby("frame")["value"].mean()
         axis.plot(values.index / scenario.frame_rate, values, color="tab:blue")
@@ -121,8 +120,7 @@ def losses_figure(histories: Mapping[str, pd.DataFrame], title: str) -> Figure:
     figure, axes = plt.subplots(1, len(histories), figsize=(3.6 * len(histories) + 1, 3.2), layout="constrained", squeeze=False)
     for axis, (stage, history) in zip(axes[0], histories.items(), strict=True):
         for metric, label in SERIES[stage]:
-            rows = history[history["metric"] == metric]
-            if len(rows):
+            if len(rows := history[history["metric"] == metric]):
                 single = "." if metric == "cost" or len(rows) == 1 else ""
                 axis.plot(rows["step"], rows["value"], ls="" if metric == "cost" else "-", marker=single, ms=4, label=label)
         axis.set(title=stage, xlabel=LOSS_AXES[stage][0], ylabel=LOSS_AXES[stage][1])

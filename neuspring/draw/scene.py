@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from neuspring.core.artifacts import Observations, Scenario, Twin, Up
+from neuspring.core.artifacts import Observations, Scenario, Twin, Up, up_sign
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Camera
 
@@ -33,7 +33,7 @@ def broad_side(points: np.ndarray, up: Up) -> float:
     x, y = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)[2][-1] if len(flat) > 1 else (0.0, -1.0)
     # Of both ends of that line the one nearer to the front, the side of negative y, so that views of one scene agree.
     x, y = (x, y) if y < 0 else (-x, -y)
-    return math.degrees(math.atan2(_sign(up) * y, x))
+    return math.degrees(math.atan2(up_sign(up) * y, x))
 
 
 def seen_from(points: np.ndarray, up: Up, azimuth: float, elevation: float) -> Camera:
@@ -46,7 +46,7 @@ def seen_from(points: np.ndarray, up: Up, azimuth: float, elevation: float) -> C
         raise InputError("--azimuth", "must be an angle in degrees", azimuth)
     if not abs(elevation) <= STEEPEST:
         raise InputError("--elevation", f"must be {-STEEPEST:g} to {STEEPEST:g} degrees", elevation)
-    points, sign = np.asarray(points, float), _sign(up)
+    points, sign = np.asarray(points, float), up_sign(up)
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     a, e = math.radians(azimuth), math.radians(elevation)
     forward = -np.array([math.cos(e) * math.cos(a), sign * math.cos(e) * math.sin(a), sign * math.sin(e)])
@@ -62,10 +62,6 @@ def seen_from(points: np.ndarray, up: Up, azimuth: float, elevation: float) -> C
     focal = 0.5 * VIEW_SIZE / slope
     half = 0.5 * (VIEW_SIZE - 1)
     return Camera("view", VIEW_SIZE, VIEW_SIZE, np.array([[focal, 0, half], [0, focal, half], [0, 0, 1]]), pose)
-
-
-def _sign(up: Up) -> float:
-    return 1.0 if up == "+z" else -1.0
 
 
 def box_around(pixels: np.ndarray, camera: Camera, *, clip: bool) -> tuple[int, int, int, int]:

@@ -71,9 +71,8 @@ def _head(figure: Figure, painter: Painter, across: float, total: float, bottom:
     width, lefts = figure.get_figwidth(), [LABEL + k * (across + STRIP_GAP) for k in range(len(painter.frames))]
     for left, frame in zip(lefts, frames, strict=True):
         text = f"frame {frame}, {frame / scenario.frame_rate:.2f} s" if across > 1.0 else f"{frame}"
-        figure.text(
-            (left + across / 2) / width, (total - STRIP_HEAD + 0.04) / total, text, ha="center", va="bottom", fontsize=TEXT - 1
-        )
+        at = (left + across / 2) / width, (total - STRIP_HEAD + 0.04) / total
+        figure.text(*at, text, ha="center", va="bottom", fontsize=TEXT - 1)
     for name, color, inside in (("training", TRAINING, False), ("future", FUTURE, True)):
         own = [left for left, frame in zip(lefts, frames, strict=True) if (frame >= scenario.train_end) == inside]
         if not own:
@@ -81,8 +80,7 @@ def _head(figure: Figure, painter: Painter, across: float, total: float, bottom:
         start, stop, high = own[0], own[-1] + across, total - 0.05 - TIME_BAND
         band = place(figure, start, high, stop - start, TIME_BAND)
         band.set(xticks=[], yticks=[], facecolor=rgb(color))
-        for side in band.spines.values():
-            side.set_visible(False)
+        band.spines[:].set_visible(False)
         figure.text(start / width, (high - 0.015) / total, name, ha="left", va="top", fontsize=TEXT - 1, color=rgb(color, 0.75))
     first = next((left for left, frame in zip(lefts, frames, strict=True) if frame >= scenario.train_end), None)
     if first is not None and first > lefts[0]:

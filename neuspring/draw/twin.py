@@ -53,8 +53,7 @@ def stiffness_limits(stiffness: np.ndarray) -> tuple[float, float]:
 
     All but the outermost 0.5 % on either side; at least a factor of 2 and at most one of 10^4 apart; positive whatever comes in.
     """
-    positive = stiffness[stiffness > 0]
-    if not len(positive):
+    if not len(positive := stiffness[stiffness > 0]):
         return 1.0, LEAST_RATIO
     low, high = (float(value) for value in np.quantile(positive.astype(np.float64), [0.005, 0.995]))
     return _widened(max(low, high / DEEPEST), high)
@@ -185,9 +184,8 @@ def _regions(figure: Figure, body: TwinPicture, left: float, middle: float, *, c
         ends = lines.labels[lines.pairs[: lines.inner]]
         springs = [int(((ends == label).all(axis=1)).sum()) for label in labels]
         names = [f"{name}: {n} nodes, {s} {lines.kind}" for name, n, s in zip(names, sizes, springs, strict=True)]
-        extra += [(CONTROLLER, "of hands", joined, "springs")] + (
-            [("white", "without spring", lines.loose, "nodes")] if lines.loose else []
-        )
+        loose = [("white", "without spring", lines.loose, "nodes")] if lines.loose else []
+        extra += [(CONTROLLER, "of hands", joined, "springs"), *loose]
     for color, name, number, what in extra:
         dots.append(Line2D([], [], color=color, linewidth=1.0))
         names.append(f"{name}: {number} {what}" if counted else name)
@@ -207,9 +205,8 @@ def histogram(axis: Axes, stiffness: np.ndarray, norm: LogNorm, searched: float 
     edges = np.geomspace(low * (1 - 1e-6), high * (1 + 1e-6), STIFFNESS_BINS + 1)
     counts, _ = np.histogram(shown, edges)
     middles = np.clip(np.sqrt(edges[1:] * edges[:-1]), norm.vmin, norm.vmax)
-    axis.bar(
-        edges[:-1], counts, np.diff(edges), align="edge", color=colormaps[STIFFNESS_COLORS](norm(middles)), edgecolor="0.4", lw=0.3
-    )
+    colors = colormaps[STIFFNESS_COLORS](norm(middles))
+    axis.bar(edges[:-1], counts, np.diff(edges), align="edge", color=colors, edgecolor="0.4", lw=0.3)
     middle = float(np.median(stiffness))
     text = f"median {_newtons(middle)}"
     if searched:

@@ -60,9 +60,8 @@ class Video:
         if picture.shape != self._shape:
             raise InputError(where, f"picture {number} of this video must have the size of the first, {self._shape}", picture.shape)
         height, width = self._shape[:2]
-        rgb = self._av.VideoFrame.from_ndarray(
-            np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge"), format="rgb24"
-        )
+        padded = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+        rgb = self._av.VideoFrame.from_ndarray(padded, format="rgb24")
         frame = rgb.reformat(format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG", threads=1)
         self._container.mux(self._stream.encode(frame))
         self._count += 1

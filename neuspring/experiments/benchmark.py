@@ -42,6 +42,8 @@ def read_methods(path: Path) -> dict[str, Method]:
             raise InputError(f"{where}, fit", f"must be one of {', '.join(fits)}", repr(method.fit))
         if method.model and method.model not in BASELINES:
             raise InputError(f"{where}, model", f"must be one of {', '.join(BASELINES)}", method.model)
+        if method.mean_of and (method.mean_of not in methods or methods[method.mean_of].mean_of):
+            raise InputError(f"{where}, mean_of", "must be another row, which is no mean itself", method.mean_of)
         if method.settings and method.model and not BASELINES[method.model].section:
             raise InputError(f"{where}, settings", f"model {method.model} has none", sorted(method.settings))
         if method.appearance is not None and not (method.model and BASELINES[method.model].own_splats):
@@ -167,7 +169,9 @@ class Benchmark:
         """The configuration as it was given: what tables are laid out for, whatever part of it is run now."""
         self.config = config = chosen_part(self.whole, rows)
         """With what `only` leaves of scenarios, methods and seeds."""
-        self.methods = {name: self.table[name] for name in config.methods}
+        averaged = (self.table[name].mean_of for name in config.methods)
+        self.methods = {name: self.table[name] for name in dict.fromkeys([*config.methods, *filter(None, averaged)])}
+        """The chosen ones, and those whose predictions they are the means of."""
         self.searches = self._searches(searches)
         """The name of a search, which says on which recordings it is made -> its row."""
         self.pools, self.transfers = self._groups(rows)
@@ -200,8 +204,10 @@ class Benchmark:
                 remedy = "Restore its folder in neuspring/extensions, or leave the method out."
                 raise InputError(f"method {absent[0]}, model", "the extension that brings it was left out", row.model, remedy)
         _require_known("methods", given.methods, self.table, given.method_table)
-        # The methods in the rows of its studies come too. If they add any, all are in the order of the method table.
-        implied = {method for study in given.studies for method in rows_of(self.studies, study) if method in self.table}
+        # The methods in the rows of its studies come too, and those of which rows are means. If they add any, all are in the order
+        # of the method table.
+        implied = {averaged for name in given.methods if (averaged := self.table[name].mean_of)}
+        implied |= {method for study in given.studies for method in rows_of(self.studies, study) if method in self.table}
         if not implied <= set(given.methods):
             union = implied | set(given.methods)
             given = dataclasses.replace(given, methods=tuple(name for name in self.table if name in union))
@@ -328,7 +334,7 @@ class Benchmark:
 
     def why_not(self, method: str, scenario: str) -> str:
         """The reason why a method cannot be run on a scenario; empty where it can."""
-        if self.table[method].pool and scenario not in self.pools:
+        if self.table[self.table[method].mean_of or method].pool and scenario not in self.pools:
             return "it learns from a pool of recordings, and this one has none"
         return "it needs images" if method in self.pictured and not self.has_images(scenario) else ""
 

@@ -91,7 +91,7 @@ class Graph:
         known = self.benchmark
         method = known.table[name] if name else None
         searched = search or (method.searched if method and method.search else None)
-        pooled = any(row.pool and searched == row.searched for row in known.methods.values())
+        kinds = {row.pool for row in known.methods.values() if row.pool and searched == row.searched}
         return Rows(
             config=self._laid(name, searched),
             scenario=known.scenarios[scenario],
@@ -100,7 +100,8 @@ class Graph:
             images=known.has_images(scenario),
             method=method,
             search=known.searches[searched] if searched else None,
-            pool=known.pools.get(scenario, ()) if pooled else (),
+            pool=known.pools.get(scenario, ()) if kinds else (),
+            leave_out="others" in kinds,
             targets=known.transfers.get(scenario, ()),
         )
 
@@ -198,6 +199,10 @@ class Graph:
             return []
         if parameter.many and parameter.type is Observations:
             return [(one, SimpleNamespace(scenario=other)) for one in makers("observations") for other in getattr(rows, name)]
+        if parameter.many and rows.method and rows.method.mean_of:
+            seeds = self.whole.seeds
+            others = [SimpleNamespace(scenario=job.scenario, method=rows.method.mean_of, seed=seed) for seed in seeds]
+            return [(one, other) for other in others for one in makers(name) if one.when(self.rows(other))]
         found = [one for one in makers(name) if one.when(rows)]
         if not found:
             return []

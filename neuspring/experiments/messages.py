@@ -157,8 +157,7 @@ def finished(graph: Graph, seconds: float) -> None:
 
 def tell_findings(results: Path, scenarios: Sequence[str]) -> None:
     """Findings of the steps of perception: warnings of all scenarios; notes are in the report."""
-    found = warnings_of(results, scenarios)
-    if found:
+    if found := warnings_of(results, scenarios):
         print(f"Perception noticed {len(found)} thing{'s' * (len(found) > 1)} that may make results worse:")
         print("\n".join(f"  {name}: {one}" for name, one in found[:MOST_FINDINGS]))
         if len(found) > MOST_FINDINGS:

@@ -181,7 +181,7 @@ def _rig(capture: Capture, samples: Mapping[str, Mapping[int, Sample]]) -> list[
     first = {name: some[0].depth for name, some in samples.items() if 0 in some}
     rig = Rig({name: capture.cameras[name] for name in samples}, depths, first, described.up)
     unit = described.depth_unit if described.depth_format == "png" else None
-    judged = Judged.of(rig, dict.fromkeys(samples, unit))
+    judged = Judged(rig, dict.fromkeys(samples, unit))
     return examine("rig", path, judged) + (examine("views", path, rig.views) if len(samples) > 1 else [])
 
 
@@ -271,8 +271,7 @@ def find_cases(folder: Path) -> list[Case]:
         return []
     below = folder / "data" / "different_types"
     if below.is_dir():
-        paths = _subfolders(below)
-        if not paths:
+        if not (paths := _subfolders(below)):
             raise InputError(folder, "at least one case folder is required", "none")
         return [Case(root=folder, name=path.name) for path in paths]
     cases = []
@@ -329,8 +328,7 @@ def _check_case(case: Case) -> list[Finding]:
     if (poses := _read(found, path, load_pickle, "the calibration check is")) is not None:
         found += examine("calibration", path, poses, CAMERAS)
     path = folder / phystwin.METADATA
-    metadata = _read(found, path, load_json, "the check of intrinsics and frame rate is")
-    if metadata is not None:
+    if (metadata := _read(found, path, load_json, "the check of intrinsics and frame rate is")) is not None:
         found += examine("metadata", path, metadata) + examine("lenses of metadata", path, metadata, CAMERAS)
     if isinstance(metadata, dict):
         if "fps" not in metadata:

@@ -61,8 +61,7 @@ def read(row: ScenarioRow, folder: Path) -> Observations:
     refuse(examine("split", split_path, split, frames))
     used = [data_path, split_path]
 
-    tracks = annotated(folder, frames)
-    if tracks is not None:
+    if (tracks := annotated(folder, frames)) is not None:
         used.append(folder / GT_TRACKS)
     frame_rate = RELEASED_FRAME_RATE
     if (folder / METADATA).exists():

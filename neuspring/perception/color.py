@@ -295,8 +295,7 @@ def _seen_hands(capture: Capture, labels: np.ndarray, first: FirstFrame, control
     """Evidence of the hands in the masks. Raises InputError for none."""
     # A hand above a sheet hides more of it than its fingers hold.
     sizes = (GRIP_REACH, HANDS_APART, GRIP_LENGTH if first.kind == "flat" else np.inf)
-    found = grips(labels[0], first.filled, *(size / first.pixel_size for size in sizes))
-    if not found:
+    if not (found := grips(labels[0], first.filled, *(size / first.pixel_size for size in sizes))):
         remedy = f"Mark the hands in frame 0, or bring them in space ({CONTROLLERS[0]})."
         raise InputError(f"{where}, masks of frame 0", "at least one hand must be in view", "none", remedy)
     motion = follow_hands(capture, first.camera.name, labels, found, HAND_RADIUS / first.pixel_size)

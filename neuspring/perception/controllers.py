@@ -104,8 +104,7 @@ def fill_rigidly(points: np.ndarray, kept: np.ndarray, trusted: np.ndarray | Non
             anchors = trusted[frame, hand]
             if anchors.sum() >= LEAST_FOR_POSE:
                 rotation, shift = rigid_motion(start[anchors], points[frame, hand][anchors])
-            missing = hand[~kept[frame, hand]]
-            if len(missing):
+            if len(missing := hand[~kept[frame, hand]]):
                 result[frame, missing] = rotation.apply(points[0, missing]) + shift
     return result
 
@@ -219,8 +218,7 @@ def _owners(pixels: np.ndarray, known: np.ndarray, hand: np.ndarray) -> np.ndarr
     cells, cell_of = np.unique(np.floor(pixels / HAND_CELL).astype(int), axis=0, return_inverse=True)
     for piece in hands_of(HAND_CELL * cells):
         own = np.isin(cell_of.ravel(), piece)
-        on_it = cKDTree(pixels[own]).query(known)[0] <= HAND_GAP
-        if on_it.any():
+        if (on_it := cKDTree(pixels[own]).query(known)[0] <= HAND_GAP).any():
             owner[own] = hand[on_it][cKDTree(known[on_it]).query(pixels[own])[1]]
     return owner
 

@@ -68,8 +68,7 @@ def track_quality(capture: Capture, truth: Truth, tracks: Mapping[str, PixelTrac
 def lifted_quality(truth: Truth, lifted: LiftedTracks) -> dict[str, float]:
     """Distance in mm of lifted points from the material that they were nearest to in frame 0, and of controllers from the rigid
     motion of their hand."""
-    places = at_points(truth, lifted.object_points[0]).places
-    off = np.linalg.norm(places - lifted.object_points, axis=2)
+    off = np.linalg.norm(at_points(truth, lifted.object_points[0]).places - lifted.object_points, axis=2)
     visible = lifted.object_visibility[1:]
     trusted = lifted.object_motion_valid[:-1] & visible
     facts = _spread("lifted", IN_MM * off[1:][visible], "mm") | _spread("trusted", IN_MM * off[1:][trusted], "mm")

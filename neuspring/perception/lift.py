@@ -178,8 +178,7 @@ def agreeing_motion(seen: Seen, settings: Lift) -> np.ndarray:
     test = _sequential if settings.released else _simultaneous
     valid = np.zeros_like(seen.visible)
     for frame in range(len(seen.points) - 1):
-        moving = np.flatnonzero(seen.visible[frame] & seen.visible[frame + 1])
-        if len(moving):
+        if len(moving := np.flatnonzero(seen.visible[frame] & seen.visible[frame + 1])):
             here = seen.points[frame, moving]
             valid[frame, moving] = test(here, seen.points[frame + 1, moving] - here, settings)
     return valid

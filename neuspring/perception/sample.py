@@ -161,8 +161,7 @@ def on_surface(vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.rand
     corners = vertices[faces].astype(float)
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     face = rng.choice(len(area), count, p=area / area.sum())
-    weights = rng.dirichlet((1.0, 1.0, 1.0), count)
-    return np.asarray(np.einsum("ns,nsc->nc", weights, corners[face]))
+    return np.asarray(np.einsum("ns,nsc->nc", rng.dirichlet((1.0, 1.0, 1.0), count), corners[face]))
 
 
 @wp.kernel(enable_backward=False)  # type: ignore[untyped-decorator]

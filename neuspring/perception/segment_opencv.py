@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter
 from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.data.frames import frames_of, heights, spread
+from neuspring.data.frames import at_border, frames_of, heights, spread
 from neuspring.perception.marks.colors import bins_of, count, lab_of
 
 HISTOGRAM_BINS = (12, 64, 64)
@@ -149,10 +149,7 @@ def _grab(image: np.ndarray, seeds: np.ndarray, ratio: np.ndarray, high: np.ndar
 def _holes(foreground: np.ndarray) -> np.ndarray:
     """Small enclosed pieces of background [H, W] bool."""
     _, pieces, boxes, _ = cv2.connectedComponentsWithStats((~foreground).astype(np.uint8), connectivity=4)
-    left, top, width, height, area = boxes.T
-    rows, columns = foreground.shape
-    at_border = (left == 0) | (top == 0) | (left + width == columns) | (top + height == rows)
-    small = ~at_border & (area <= LARGEST_HOLE * foreground.size)
+    small = ~at_border(boxes, foreground.shape) & (boxes[:, cv2.CC_STAT_AREA] <= LARGEST_HOLE * foreground.size)
     small[0] = False
     return np.asarray(small[pieces])
 

@@ -84,7 +84,15 @@ def shape_prior(
     `cloud` [P, 3], m, is what was seen of the object in frame 0. With one camera, `end` [H, W] is the depth at which the object
     ends, m, where that is supposed otherwise than by `settings.back`.
     """
-    prior = _prior(capture, masks, cloud, settings, end)
+    backend = settings.backend
+    if backend == "auto":
+        backend = "none" if capture.description.category in THIN else "visual_hull"
+    if backend == "mesh":
+        prior = align(capture, masks, cloud, settings)
+    elif backend == "truth":
+        prior = surface(capture)
+    else:
+        prior = visual_hull(capture, masks, cloud, settings, end) if backend == "visual_hull" else no_prior()
     if not len(prior.faces):
         return prior
     was_seen = seen(prior.vertices, capture, masks, SEEN_WITHIN * HULL_VOXEL, prior.faces)
@@ -93,21 +101,6 @@ def shape_prior(
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     share = float((area * (~was_seen[prior.faces]).mean(axis=1)).sum() / area.sum())
     return replace(prior, seen=was_seen, facts={**prior.facts, "invented_share": share})
-
-
-def _prior(
-    capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray, settings: ShapePriorSettings, end: np.ndarray | None
-) -> ShapePrior:
-    backend = settings.backend
-    if backend == "auto":
-        backend = "none" if capture.description.category in THIN else "visual_hull"
-    if backend == "visual_hull":
-        return visual_hull(capture, masks, cloud, settings, end)
-    if backend == "mesh":
-        return align(capture, masks, cloud, settings)
-    if backend == "truth":
-        return surface(capture)
-    return no_prior()
 
 
 def no_prior() -> ShapePrior:
@@ -196,8 +189,7 @@ def _largest_piece(voxels: np.ndarray) -> np.ndarray:
 
 def _surface(voxels: np.ndarray, low: np.ndarray, voxel: float, smoothing: float) -> tuple[np.ndarray, np.ndarray]:
     """Marching cubes of the occupancy, blurred over `smoothing` voxels, padded so that the surface closes."""
-    padded = np.pad(voxels.astype(np.float32), 2)
-    level = 0.5 - ndimage.gaussian_filter(padded, smoothing)
+    level = 0.5 - ndimage.gaussian_filter(np.pad(voxels.astype(np.float32), 2), smoothing)
     values: wp.array = wp.array(level, dtype=wp.float32, device="cpu")
     vertices, indices = IsoSurfaceMarchingCubes.extract_surface_marching_cubes(values, 0.0)  # type: ignore[arg-type]
     faces = indices.numpy().reshape(-1, 3)
@@ -253,8 +245,7 @@ def discs(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Their centers (x, y) [n, 2] lie on the ridges of that distance, which is their radius [n]; the largest is the last.
     """
     distance = cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
-    ridge = mask & (distance >= ndimage.maximum_filter(distance, 3) - 0.5)
-    y, x = np.nonzero(ridge)
+    y, x = np.nonzero(mask & (distance >= ndimage.maximum_filter(distance, 3) - 0.5))
     order = np.argsort(distance[y, x], kind="stable")
     return np.stack([x, y], axis=1)[order], distance[y, x][order], distance
 
@@ -398,9 +389,8 @@ def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
         mesh = trimesh.load_mesh(path, process=True, maintain_order=False)
     except Exception as error:
         # trimesh's readers have no common exception for damaged bytes.
-        raise InputError(
-            path, "this file must be a readable mesh (GLB, PLY, OBJ, STL)", f"{type(error).__name__}: {error}"
-        ) from error
+        told = f"{type(error).__name__}: {error}"
+        raise InputError(path, "this file must be a readable mesh (GLB, PLY, OBJ, STL)", told) from error
     if isinstance(mesh, trimesh.Scene):
         mesh = mesh.to_mesh()
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):

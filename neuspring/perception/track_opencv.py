@@ -73,9 +73,9 @@ def follow(capture: Capture, camera: str, labels: np.ndarray, start: np.ndarray,
     `labels` [T, H, W] are masks; frame 0 must show object or hands.
     """
     own = _labels_at(labels[0], start)
-    beside = own == NOTHING
-    if beside.any():
-        own[beside] = _nearest_label(labels[0], start[beside])
+    if (beside := own == NOTHING).any():
+        y, x = np.nonzero(labels[0])
+        own[beside] = labels[0][y, x][cKDTree(np.stack([x, y], axis=1)).query(start[beside])[1]]
     result = Followed.starting_at(start, capture.frame_count)
     pixels, visible = result.pixels, result.visible
     first = before = equalized(gray(capture, camera, 0))
@@ -156,12 +156,6 @@ def _labels_at(labels: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Labels [n] of the pixels nearest to points (x, y)."""
     x, y = np.round(points).astype(int).T
     return np.asarray(labels[np.clip(y, 0, labels.shape[0] - 1), np.clip(x, 0, labels.shape[1] - 1)])
-
-
-def _nearest_label(labels: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """The label [n], not 0, that is nearest to points (x, y)."""
-    y, x = np.nonzero(labels)
-    return np.asarray(labels[y, x][cKDTree(np.stack([x, y], axis=1)).query(points)[1]])
 
 
 def _held(labels: np.ndarray, points: np.ndarray, own: np.ndarray, rim: float) -> np.ndarray:

@@ -233,9 +233,8 @@ def functions(real: Any, width: int) -> Contacts:
             relative = state.after[inner, j, g] - v
             if closes(offset, relative):
                 meets = meeting(offset, relative, model.near_lanes[i, k, g], distance)
-                push = scaled(
-                    impulse(offset, relative, model.contact_e[g], model.contact_mu[g]), part(light, model.inverse_mass[j, g])
-                )
+                own = impulse(offset, relative, model.contact_e[g], model.contact_mu[g])
+                push = scaled(own, part(light, model.inverse_mass[j, g]))
                 total = total + scaled(push, meets)
                 count = count + meets
         state.met[inner, i, g] = count

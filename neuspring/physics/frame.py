@@ -55,13 +55,7 @@ def kernels(real: Any, width: int, among: bool = False, pushes: bool = False) ->
         """x' and v' of node i; a twin that is at the end of its frame stays."""
         slot = step % model.slots
         x, v = moved(
-            state.x[slot, i, g],
-            moving,
-            model.substep[g],
-            model.up,
-            model.ground_e[g],
-            model.ground_mu[g],
-            model.obstacles,
+            state.x[slot, i, g], moving, model.substep[g], model.up, model.ground_e[g], model.ground_mu[g], model.obstacles
         )
         if step >= model.fewest:
             x = chosen(step, model.counts[g], x, state.x[slot, i, g])
@@ -97,24 +91,13 @@ def kernels(real: Any, width: int, among: bool = False, pushes: bool = False) ->
     @wp.func
     def update(model: Model, state: State, slot: int, i: int, g: int, force: Vector) -> Vector:
         """The velocity of node i after forces and drag."""
-        return updated(
-            state.v[slot, i, g],
-            force,
-            model.gravity,
-            model.substep[g],
-            model.decay[g],
-            model.inverse_mass[i, g],
-        )
+        return updated(state.v[slot, i, g], force, model.gravity, model.substep[g], model.decay[g], model.inverse_mass[i, g])
 
     @wp.func
     def update_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
         """Adjoint of `update`: dL/d(velocity after the forces) -> dL/d(v, force, drag's factor)."""
         adj_v, adj_force, adj_decay = updated_adjoint(
-            state.after[step, i, g],
-            adjoint.after[i, g],
-            model.substep[g],
-            model.decay[g],
-            model.inverse_mass[i, g],
+            state.after[step, i, g], adjoint.after[i, g], model.substep[g], model.decay[g], model.inverse_mass[i, g]
         )
         if step >= model.fewest:
             adj_v = chosen(step, model.counts[g], adj_v, adjoint.v[i, g])

@@ -268,10 +268,8 @@ def solve_twist(s: RodState, lane: int, edges: int, first_held: bool, last_held:
 
 
 @wp.func
-def bow(s: RodState, lane: int, cosine: real):
-    """Angle over 2 tan of its half, with `Rod.by_angle`, and the derivative of its logarithm by the cosine; else 1 and 0."""
-    if s.by_angle[lane] == real(0.0):
-        return vec2(real(1.0), real(0.0))
+def bow(cosine: real):
+    """Angle over 2 tan of its half, and the derivative of its logarithm by the cosine."""
     # By the squared tangent of the half; near 0 by its series.
     x = wp.max(real(1.0) - cosine, real(0.0)) / (real(1.0) + cosine + TINY)
     factor = real(1.0) - x / real(3.0) + x * x / real(5.0)
@@ -296,7 +294,10 @@ def set_geometry(s: RodState, lane: int, edges: int):
         w = transported(s.u[lane, i - 1], before, t)
         s.reference[lane, i] = near(turn(w, s.u[lane, i], t), s.reference[lane, i])
         cosine = wp.dot(before, t)
-        s.kb[lane, i] = (bow(s, lane, cosine)[0] * (real(2.0) / (real(1.0) + cosine + TINY))) * wp.cross(before, t)
+        kb = (real(2.0) / (real(1.0) + cosine + TINY)) * wp.cross(before, t)
+        if s.by_angle[lane] > real(0.0):
+            kb = bow(cosine)[0] * kb
+        s.kb[lane, i] = kb
 
 
 @wp.kernel(enable_backward=False)
@@ -374,24 +375,28 @@ def slopes(s: RodState, lane: int, i: int, k: vec2):
     r1 = real(1.0) / wp.length(s.p[lane, i + 1] - s.p[lane, i])
     kb = s.kb[lane, i]
     half = real(0.5)
-    bowed = bow(s, lane, wp.dot(before, after))
-    n1 = bowed[0] * n1
-    n2 = bowed[0] * n2
+    cosine = wp.dot(before, after)
+    bowed = vec2(real(1.0), real(0.0))
+    if s.by_angle[lane] > real(0.0):
+        bowed = bow(cosine)
+        n1 = bowed[0] * n1
+        n2 = bowed[0] * n2
     # By the two edges.
     a1 = r0 * (wp.cross(after, n2) - k[0] * middle)
     b1 = r1 * (-k[0] * middle - wp.cross(before, n2))
     a2 = r0 * (-k[1] * middle - wp.cross(after, n1))
     b2 = r1 * (wp.cross(before, n1) - k[1] * middle)
+    a3 = half * r0 * kb
+    b3 = half * r1 * kb
     if s.by_angle[lane] > real(0.0):
-        cosine = wp.dot(before, after)
         by_before = (bowed[1] * r0) * (after - cosine * before)
         by_after = (bowed[1] * r1) * (before - cosine * after)
         a1 = a1 + k[0] * by_before
         b1 = b1 + k[0] * by_after
         a2 = a2 + k[1] * by_before
         b2 = b2 + k[1] * by_after
-    a3 = (half * r0 / bowed[0]) * kb
-    b3 = (half * r1 / bowed[0]) * kb
+        a3 = a3 / bowed[0]
+        b3 = b3 / bowed[0]
     put(s, lane, 0, 0, -a1)
     put(s, lane, 0, 4, a1 - b1)
     put(s, lane, 0, 8, b1)

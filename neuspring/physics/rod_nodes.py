@@ -292,8 +292,8 @@ class RodFrames:
         self.solver.pull(self._law(rows[0], rows[-1]), ends)
         x, m1 = (values[every] for values in self.solver.frames(*self._clamps.paths(ends)))
         edge, place = (values.repeat(len(x), 1, *[1] * (values.dim() - 2)) for values in (self._edge, self._place))
-        found: torch.Tensor = placed(x.flatten(0, 1), m1.flatten(0, 1), edge, place).unflatten(0, x.shape[:2])
-        return found
+        nodes: torch.Tensor = placed(x.flatten(0, 1), m1.flatten(0, 1), edge, place).unflatten(0, x.shape[:2])
+        return nodes
 
     def resume(self, rows: torch.Tensor, positions: Sequence[np.ndarray]) -> None:
         """As `FrameSolver.resume`, of one twin."""

@@ -124,9 +124,8 @@ class FrameSolver:
         """State (x [N, 3] m, v [N, 3] m/s) one frame later; controllers move from begin to end [C, 3] (`controllers.waypoints`)."""
         self.start(x, v)
         self.advance(begin, end)
-        return self._one(self.buffers.get_vectors("x", self.last, self.nodes)), self._one(
-            self.buffers.get_vectors("v", self.last, self.nodes)
-        )
+        x, v = (self.buffers.get_vectors(name, self.last, self.nodes) for name in ("x", "v"))
+        return self._one(x), self._one(v)
 
     def start(self, x: torch.Tensor, v: torch.Tensor) -> None:
         """Put the state at the start of a frame into the buffers."""
@@ -203,7 +202,9 @@ class FrameSolver:
         """Adjoints of the last forward frame: of x, of v, and of each parameter that is trained, by name."""
         assert self._held is None, "gradients of a grip need its rest lengths among the parameters: simulate_frame"
         b = self.buffers
-        self.clear_adjoints()
+        for name, tensor in b.tensors.items():
+            if name.startswith("adj_"):
+                tensor.zero_()
         b.set_vectors("adj_x", self._stacked(adj_x))
         b.set_vectors("adj_v", self._stacked(adj_v))
         self._run("backward", self.launch_backward)
@@ -212,12 +213,6 @@ class FrameSolver:
             gradients["springs"] *= self._factor
         x, v = (self._one(b.get_vectors(name, count=self.nodes)) for name in ("adj_x", "adj_v"))
         return x, v, {name: self._one(gradient) for name, gradient in gradients.items()}
-
-    def clear_adjoints(self) -> None:
-        """Set all adjoints to zero."""
-        for name, tensor in self.buffers.tensors.items():
-            if name.startswith("adj_"):
-                tensor.zero_()
 
     @property
     def overflows(self) -> list[int]:

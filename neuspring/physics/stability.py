@@ -60,8 +60,7 @@ def gershgorin(springs: np.ndarray, nodes: int, stiffness: np.ndarray, damping: 
 
     stiffness is Y / l0 [S]. These are the rows of M^-1 K, which has the eigenvalues of M^-1/2 K M^-1/2.
     """
-    inner = (springs < nodes).all(axis=1)
-    weight = np.where(inner, 2.0, 1.0)
+    weight = np.where((springs < nodes).all(axis=1), 2.0, 1.0)
     total = int(max(nodes, springs.max(initial=0) + 1))
 
     def rows(values: np.ndarray) -> np.ndarray:
@@ -93,8 +92,7 @@ def rest_spectrum(
     # Row e of the incidence matrix maps node velocities to the rate of change of spring e's length; K = B^T diag(k) B.
     columns, values, rows = [], [], []
     for end, sign in ((0, -1.0), (1, 1.0)):
-        inside = springs[:, end] < count
-        e = np.flatnonzero(inside)
+        e = np.flatnonzero(springs[:, end] < count)
         rows.append(np.repeat(e, 3))
         columns.append((springs[e, end, None] * 3 + np.arange(3)).ravel())
         scale = 1 / np.sqrt(mass.astype(np.float64)[springs[e, end], None]) if len(mass) else 1.0

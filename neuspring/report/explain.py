@@ -93,13 +93,11 @@ def explain(cell: str, results: Path, folder: Path) -> Explanation:
     labels = {label: label for label in study.rows}
     # Labels may hold a slash.
     label = _choose("/".join(words[1:-2]), {method: label for label, method in study.rows.items()} | labels, "row")
-    task = _choose(
-        words[-2], {theirs: ours for ours, theirs in PAPER_TASKS.items()} | {task: task for task in cells["task"]}, "task"
-    )
+    tasks = {theirs: ours for ours, theirs in PAPER_TASKS.items()} | {task: task for task in cells["task"]}
+    task = _choose(words[-2], tasks, "task")
     known = [METRICS[name] for name in dict.fromkeys(cells["metric"])]
-    metric = _choose(
-        words[-1], {word: one.name for one in known for word in (one.paper_name or one.name, one.heading, one.name)}, "metric"
-    )
+    named = {word: one.name for one in known for word in (one.paper_name or one.name, one.heading, one.name)}
+    metric = _choose(words[-1], named, "metric")
     found = cells[(cells["label"] == label) & (cells["task"] == task) & (cells["metric"] == metric)].to_dict("records")
     if not found:
         raise InputError(f"cell {cell!r}", "must have a value in the table", "none", "`neuspring explain` lists what there is.")

@@ -88,8 +88,7 @@ class Run:
         return digest_file(self.paths["twin"]) if "twin" in self.paths else ""
 
     def _read(self, role: str, kind: type[Kind]) -> Kind | None:
-        path = self.paths.get(role)
-        if path is None:
+        if (path := self.paths.get(role)) is None:
             return None
         if kind is not Splats:
             require_modest(path)

@@ -232,8 +232,7 @@ def study_failures(numbers: StudyNumbers) -> list[Table]:
         return []
     labels = {method: label for method, label in numbers.labels.items() if method in set(failed["method"])}
     table = failure_table("Failures", failed, labels, columns_in(failed.dropna(subset="metric")), scale=False)
-    unknown = unknown_lines(means, numbers.labels)
-    note = " ".join([f"Rows marked {FAILED_MARK} above.", table.note, *unknown])
+    note = " ".join([f"Rows marked {FAILED_MARK} above.", table.note, *unknown_lines(means, numbers.labels)])
     return [replace(table, note=note)]
 
 

@@ -290,8 +290,7 @@ def _image_conditions(facts: Iterable[dict[str, Any]]) -> str:
 def marked_blocks(numbers: Numbers) -> list[Block]:
     """Errors of points that were marked in images; nothing where there are none."""
     scores, runs = numbers.usable, numbers.collected.runs
-    shown = columns(scores, ["marks"])
-    if not shown:
+    if not (shown := columns(scores, ["marks"])):
         return []
     own = scores[scores["metric"].isin([metric.name for _, metric in shown])]
     have, asked = own["scenario"].nunique(), runs["scenario"].nunique()
@@ -407,8 +406,7 @@ def figures(numbers: Numbers) -> Iterator[tuple[str, str, Figure]]:
     """
     usable = numbers.usable
     size = f"{usable['scenario'].nunique()} scenarios, {usable['seed'].nunique()} seed(s)" if len(usable) else ""
-    figure = ratios_figure(numbers.ratios, size)
-    if figure:
+    if figure := ratios_figure(numbers.ratios, size):
         yield "ratios.png", f"Ratio of every method's errors to those of {numbers.baseline}", figure
     collected = numbers.everything
     runs = collected.runs[collected.runs["method"].isin(list(cluster_methods(collected.runs["method"])))]
@@ -446,7 +444,6 @@ def summary_text(numbers: Numbers) -> str:
     """The verdict, the scores, and the runs that are not among them, in Markdown."""
     blocks: Sequence[Block] = [*verdict(numbers), *score_blocks(numbers), *detail_blocks(numbers)]
     runs = numbers.everything.runs
-    ended = runs.assign(
-        label=runs["method"], counted=runs["status"] == "ok", why=runs["status"] + ": " + runs["reason"].astype(str)
-    )
+    why = runs["status"] + ": " + runs["reason"].astype(str)
+    ended = runs.assign(label=runs["method"], counted=runs["status"] == "ok", why=why)
     return markdown([*blocks, *not_counted(ended)])

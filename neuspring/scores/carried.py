@@ -47,8 +47,7 @@ def bound_positions(positions: np.ndarray, points: np.ndarray, neighbors: int = 
     from scipy.spatial import cKDTree
 
     nodes, points = positions.astype(np.float64), points.astype(np.float64)
-    count = min(neighbors, nodes.shape[1])
-    distance, index = cKDTree(nodes[0]).query(points, k=np.arange(1, count + 1))
+    distance, index = cKDTree(nodes[0]).query(points, k=np.arange(1, min(neighbors, nodes.shape[1]) + 1))
     mean = distance.mean(axis=1, keepdims=True)
     inverse = 1.0 / np.maximum(distance, np.maximum(LEAST_DISTANCE * mean, np.finfo(float).tiny))
     weights = inverse / inverse.sum(axis=1, keepdims=True)
@@ -67,8 +66,7 @@ def rotations(carrying: np.ndarray) -> np.ndarray:
     found = np.einsum("fpij,fpj,fpjk->fpik", left, np.stack([*[np.ones_like(signs)] * 2, signs], axis=-1), right)
     # The rotation is unique if the two smaller values do not cancel, with the sign of the last.
     unclear = size[..., 1] + signs * size[..., 2] <= ON_A_LINE * size[..., 0]
-    groups = np.flatnonzero(unclear.any(axis=0))
-    if len(groups):
+    if len(groups := np.flatnonzero(unclear.any(axis=0))):
         found[0, groups] = np.where(unclear[0, groups, None, None], np.eye(3), found[0, groups])
         _carry(found, moments, unclear, groups)
     return np.asarray(found)
@@ -77,8 +75,7 @@ def rotations(carrying: np.ndarray) -> np.ndarray:
 def _carry(found: np.ndarray, moments: np.ndarray, unclear: np.ndarray, groups: np.ndarray) -> None:
     """Replace unclear rotations by those of the frame before, turned by the least angle; in place."""
     for frame in range(1, len(found)):
-        lost = groups[unclear[frame, groups]]
-        if not len(lost):
+        if not len(lost := groups[unclear[frame, groups]]):
             continue
         before = found[frame - 1, lost]
         # From the nodes of frame 0 as the frame before turned them. The largest value belongs to the line.

@@ -54,8 +54,7 @@ class ClipNumbers:
     @cached_property
     def clips(self) -> pd.DataFrame:
         """Every clip, row, source and seed, mm; minutes of search and fit."""
-        table = self._read[0]
-        if not len(table):
+        if not len(table := self._read[0]):
             return pd.DataFrame(columns=CLIP_COLUMNS)
         keys = {"category": "cable", "scenario": "clip", "method": "method", "source": "source", "seed": "seed"}
         clips = 1e3 * table.pivot_table(index=list(keys), columns="metric", values="value", sort=False)

@@ -53,7 +53,9 @@ def both_averages(scores: pd.DataFrame, runs: pd.DataFrame, frozen: pd.DataFrame
     for other in means[1:]:
         table = table.merge(other, on=CELL_KEYS, how="outer")
     table = table.reindex(columns=[*CELL_KEYS, *MEAN_NAMES])
-    unknown = _unknown(failed, lost)
+    scored = pd.MultiIndex.from_frame(failed).isin(pd.MultiIndex.from_frame(lost[RUN_KEYS]) if len(lost) else [])
+    # Failed runs without any score, of each method.
+    unknown = failed[~scored].groupby("method").size()
     lacking = _lacking(failed, lost, pd.concat([part for part in (scores, lost) if len(part)]) if len(everything) else scores)
     without = table["method"].isin(unknown[unknown > 0].index) | pd.MultiIndex.from_frame(table[CELL_KEYS]).isin(lacking)
     table.loc[without, ["all", "all_other"]] = np.nan
@@ -72,12 +74,6 @@ def _scores_of(scores: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
 def _means(scores: pd.DataFrame, name: str) -> pd.DataFrame:
     names = {"mean": name, "other": f"{name}_other"}
     return averages(scores)[[*CELL_KEYS, *names]].rename(columns=names)
-
-
-def _unknown(failed: pd.DataFrame, lost: pd.DataFrame) -> pd.Series:
-    """Method to the number of its failed runs without any score."""
-    scored = pd.MultiIndex.from_frame(failed).isin(pd.MultiIndex.from_frame(lost[RUN_KEYS]) if len(lost) else [])
-    return failed[~scored].groupby("method").size()
 
 
 def _lacking(failed: pd.DataFrame, lost: pd.DataFrame, scores: pd.DataFrame) -> pd.MultiIndex:
@@ -126,9 +122,8 @@ def removed_lines(runs: pd.DataFrame, left_out: LeftOut = EMPTY_MAP, labels: Lab
         if without and len(methods) > 1:
             count = runs["scenario"].nunique() - len(without)
             rest = f"over the other {count}" if count else "empty"
-            lines.append(
-                f"{labels.get(method, method)} does not apply to {', '.join(without)}, so that averages of all methods are {rest}."
-            )
+            rest = f"so that averages of all methods are {rest}."
+            lines.append(f"{labels.get(method, method)} does not apply to {', '.join(without)}, {rest}")
     return lines
 
 

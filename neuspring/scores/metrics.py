@@ -136,8 +136,7 @@ def _table(rows: Iterable[tuple[object, ...]]) -> pd.DataFrame:
 
 def visible_to_surface(nodes: np.ndarray, points: np.ndarray, visible: np.ndarray, surface: int) -> float:
     """Mean L1 distance, m, from the visible points [P, 3] to the first `surface` nodes [N, 3]. NaN where no point is visible."""
-    seen = points[visible].astype(np.float64)
-    if not len(seen):
+    if not len(seen := points[visible].astype(np.float64)):
         return float("nan")
     return float(_tree(nodes[:surface]).query(seen, p=1)[0].mean())
 

@@ -70,8 +70,7 @@ def paired_differences(scores: pd.DataFrame, baseline: str) -> pd.DataFrame:
         if baseline not in wide:
             continue
         for method in wide.columns.drop(baseline):
-            both = wide[[method, baseline]].dropna()
-            if not len(both):
+            if not len(both := wide[[method, baseline]].dropna()):
                 continue
             difference, low, high = _mean_interval(both[method] - both[baseline], rng)
             base = both[baseline].groupby("scenario").mean()
@@ -165,9 +164,8 @@ def judged_aims(scores: pd.DataFrame, transfers: pd.DataFrame, aims: Iterable[Ai
         identity = {"method": aim.method, "baseline": aim.baseline, "task": aim.task, "metric": aim.metric}
         row: dict[Any, Any] = found[0] if found else identity | {"n": 0, "objects": objects, "pairs": 0, "verdict": NOT_RUN}
         reached = bool(found) and row["ratio"] <= aim.ratio and row["ratio_high"] < aim.below
-        rows.append(
-            row | {"aim": aim.ratio, "below": aim.below, "aim_verdict": (REACHED if reached else MISSED) if found else NOT_RUN}
-        )
+        verdict_on_aim = (REACHED if reached else MISSED) if found else NOT_RUN
+        rows.append(row | {"aim": aim.ratio, "below": aim.below, "aim_verdict": verdict_on_aim})
     return pd.DataFrame(rows, columns=[*RATIO_COLUMNS, "aim", "below", "aim_verdict"])
 
 

@@ -190,8 +190,7 @@ def counted(own: Collected) -> pd.DataFrame:
     A method without a finished run takes no part, nor does one without any value of a metric in the averages of that metric.
     Oracles take no part.
     """
-    scores = comparable(own.comparison)
-    if not len(scores):
+    if not len(scores := comparable(own.comparison)):
         return scores
     here = scores.groupby(["task", "metric", "scenario", "seed"])["method"].transform("nunique")
     return scores[here == scores.groupby(["task", "metric"])["method"].transform("nunique")]
@@ -279,16 +278,6 @@ def _resamples(part: pd.DataFrame, metric: Metric) -> dict[str, np.ndarray]:
     return dict(zip(map(str, values.columns), means, strict=True))
 
 
-def columns_of(study: Study, scores: pd.DataFrame) -> list[tuple[str, Metric]]:
-    """The columns of a study's table: the paper's, and metrics of ours that have scores.
-
-    Without a reference: the Chamfer distance and all metrics that have scores.
-    """
-    there = present(scores) if len(scores) else set()
-    ours = {(task, metric) for task, metric in there if metric not in paper.metrics()}
-    return in_order({key[1:] for key in study.values} | ours if study.reference else there | {(task, "chamfer") for task in TASKS})
-
-
 def in_order(columns: Collection[tuple[str, str]]) -> list[tuple[str, Metric]]:
     """Columns in the paper's order."""
     return [(task, metric) for task in TASKS for metric in paper.in_studies().values() if (task, metric.name) in columns]
@@ -298,7 +287,11 @@ def cells(study: Study, own: Collected) -> pd.DataFrame:
     """One row per label, task and metric: the paper's value, ours (`Estimate`), their difference, and both verdicts."""
     scores = counted(own)
     ours = estimates(scores, study.rows[study.baseline]) | _oracle_estimates(own, scores)
-    columns = columns_of(study, scores)
+    there = present(scores) if len(scores) else set()
+    ours_alone = {(task, metric) for task, metric in there if metric not in paper.metrics()}
+    # The paper's, and metrics of ours that have scores. Without a reference: the Chamfer distance, and all that have scores.
+    of_paper = {key[1:] for key in study.values} | ours_alone
+    columns = in_order(of_paper if study.reference else there | {(task, "chamfer") for task in TASKS})
     return pd.DataFrame([_cell(study, own, scores, ours, label, *column) for label in study.rows for column in columns])
 
 
@@ -319,7 +312,9 @@ def _cell(
     estimate = ours.get((method, task, metric.name), Estimate())
     printed, of_base = (study.values.get((name, task, metric.name)) for name in (label, study.baseline))
     part = scores[(scores["task"] == task) & (scores["metric"] == metric.name) & (scores["method"] == method)]
-    foreign, oracle = is_foreign(own.runs, part), method in own.oracles
+    ran = own.runs[(own.runs["source"] == "phystwin") & own.runs["scenario"].isin(paper.scenarios())]
+    # Some of the scores are not of the paper's 22 scenarios, read from the released data.
+    foreign, oracle = bool((~part["scenario"].isin(ran["scenario"])).any()), method in own.oracles
     absent = _absent(own, method, metric.name) if np.isnan(estimate.ours) else None
     verdict = absent or (Verdict.ORACLE if oracle else _verdict(estimate, printed, metric, foreign))
     change = printed.value - of_base.value if printed and of_base else np.nan
@@ -344,12 +339,6 @@ def _cell(
         "direction": Verdict.BASELINE if method == base else lacking or _direction(estimate, change, metric),
         **{name: int(status.get(name, 0)) for name in ("ok", "failed", "missing")},
     }
-
-
-def is_foreign(runs: pd.DataFrame, scores: pd.DataFrame) -> bool:
-    """True where some of the scores are not of the paper's 22 scenarios, read from the released data."""
-    released = runs.loc[(runs["source"] == "phystwin") & runs["scenario"].isin(paper.scenarios()), "scenario"]
-    return bool((~scores["scenario"].isin(released)).any())
 
 
 def _absent(own: Collected, method: str, metric: str) -> Verdict:
@@ -417,6 +406,5 @@ def released_comparison(own: Collected, method: str) -> pd.DataFrame:
 def _sorted(study: Study, table: pd.DataFrame) -> pd.DataFrame:
     """The table in the order of the study; scenarios or categories keep theirs."""
     first = str(table.columns[0])
-    return metrics.in_order(
-        table, {first: dict.fromkeys(table[first]), "label": study.rows, "task": TASKS, "metric": paper.in_studies()}
-    )
+    ranks: Any = {first: dict.fromkeys(table[first]), "label": study.rows, "task": TASKS, "metric": paper.in_studies()}
+    return metrics.in_order(table, ranks)

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import fields, replace
-from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
 from neuspring.config.images import Images
 from neuspring.core.errors import InputError, NumericalFailure
-from neuspring.core.files import write_atomically
 from neuspring.data.camera import Camera
 from neuspring.splats.model import Gaussians, Splats
 from neuspring.splats.rasterize import Backend
@@ -81,10 +78,3 @@ def orbit_view(gaussians: Gaussians, like: View, backend: Backend, angle: float)
     pose[:3, 3] = center + turn.apply(pose[:3, 3] - center)
     view = View.of(pose, like.intrinsics.cpu().numpy(), like.width, like.height, str(like.intrinsics.device), shift=0.0)
     return picture(gaussians, view, backend, WHITE)[..., :3]
-
-
-def save_picture(path: Path, rgba: np.ndarray) -> None:
-    """Write RGBA [H, W, 4] uint8 as PNG, atomically."""
-    ok, data = cv2.imencode(".png", cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA))
-    assert ok, "a picture can be encoded"
-    write_atomically(path, lambda temporary: temporary.write_bytes(data.tobytes()))

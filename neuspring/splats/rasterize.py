@@ -165,8 +165,7 @@ def choose_backend(wanted: Literal["auto", "warp", "gsplat"], device: str) -> Ba
     """`auto` -> gsplat on CUDA where it works, else ours. Raises InputError for gsplat where it cannot work."""
     if wanted == "warp" or (wanted == "auto" and not device.startswith("cuda")):
         return "warp"
-    fault = _gsplat_fault(device)
-    if not fault:
+    if not (fault := _gsplat_fault(device)):
         return "gsplat"
     if wanted == "auto":
         return "warp"

@@ -91,13 +91,11 @@ class Skin:
         rotations = wp.zeros(count, dtype=wp.mat33, device=self._device)
         ranks = wp.zeros(count, dtype=int, device=self._device)
         self._launch(turn_nodes, count, [before, after, self._relations, rotations, ranks])
-        if self._released:
-            poor = np.flatnonzero(ranks.numpy() < 2)
-            if len(poor):
-                values = rotations.numpy()
-                alone = len(poor) == 1 and ranks.numpy()[poor[0]] == 1
-                values[:] = values[poor[0]] if alone else np.eye(3)
-                rotations.assign(values)
+        if self._released and len(poor := np.flatnonzero(ranks.numpy() < 2)):
+            values = rotations.numpy()
+            alone = len(poor) == 1 and ranks.numpy()[poor[0]] == 1
+            values[:] = values[poor[0]] if alone else np.eye(3)
+            rotations.assign(values)
         return rotations
 
     def _nearest(self, points: Any, queries: Any, *, own: bool, wanted: int) -> Any:

@@ -74,9 +74,8 @@ def first_splats(points: np.ndarray, colors: np.ndarray, settings: Appearance, w
         sums = [np.bincount(owner, weights=values) / members for values in (*points.T, *colors.T)]
         points, colors = np.stack(sums[:3], axis=1), np.stack(sums[3:], axis=1)
     if len(points) <= SCALE_NEIGHBORS:
-        raise InputError(
-            "appearance, points of frame 0", f"more than {SCALE_NEIGHBORS} points are needed to begin with", len(points)
-        )
+        rule = f"more than {SCALE_NEIGHBORS} points are needed to begin with"
+        raise InputError("appearance, points of frame 0", rule, len(points))
     scale = np.maximum(cKDTree(points).query(points, k=SCALE_NEIGHBORS + 1)[0][:, 1:].mean(axis=1), LEAST_FIRST_SCALE)
     if settings.fixed_radius is not None:
         scale = np.full(len(points), settings.fixed_radius)
@@ -258,8 +257,7 @@ class Statistics:
     @torch.no_grad()
     def add(self, rendered: Rendered, width: int, height: int) -> None:
         """Account for a picture after its backward pass."""
-        gradient = rendered.means.grad
-        if gradient is None:
+        if (gradient := rendered.means.grad) is None:
             return
         if rendered.backend == "gsplat":
             gradient = gradient[0, rendered.index]

@@ -16,7 +16,7 @@ LEARNED = "learned"
 FLOW = """
     capture segment track lift judge observe
     search fits fit appearance train
-    rollout predict render score transfer
+    rollout predict average render score transfer
 """
 STAGES: Registry[Stage] = Registry("stages", {name: f"{__name__}.{name}:{name}" for name in FLOW.split()}, Stage)
 """In the order in which they read from each other."""

@@ -33,7 +33,7 @@ def _settled(rows: Rows) -> Config:
     memory_mb=8000,
     minutes=480,
     when=lambda rows: bool(rows.method and rows.method.fit),
-    given=lambda rows: {"kind": rows.method.fit, "oracle": rows.method.oracle} if rows.method else {},
+    given=lambda rows: {"kind": rows.method.fit, "oracle": rows.method.oracle, "leave_out": rows.leave_out} if rows.method else {},
     settled=_settled,
     shared=lambda config, row: (row.search, row.pool, row.fit, row.oracle, config.fit) if row.fit else None,
 )
@@ -43,6 +43,7 @@ def fit(
     settings: Config,
     run: Recorder,
     pool: Sequence[Observations] = (),
+    leave_out: Annotated[bool, "fit the pool alone"] = False,
     kind: Annotated[str, "springs: train each spring; field: the neural spring field; rod: all of a rod"] = "springs",
     oracle: Annotated[bool, "fit all frames, the future included: what fitting could reach at best"] = False,
     device: str = "auto",
@@ -51,13 +52,13 @@ def fit(
     """Coarse twin -> fitted twin, by gradients: twin.npz, history.parquet (losses per epoch).
 
     A field's first weights follow the search's seed. An `oracle` fits all frames, the future included, and the record says so. With
-    a `pool` of other recordings the twin is fitted on all. A checkpoint that a killed fit left,
+    a `pool` of other recordings the twin is fitted on all, or with `leave_out` on the others. A checkpoint that a killed fit left,
     or one that ran together with others (`fits`), is continued. A rod has Levenberg-Marquardt in place of gradients, on `threads`
     cores, and begins anew.
     """
     from neuspring.core.files import write_history
 
-    problem, checkpoint, key = prepared(observations, search, settings, run, pool, kind, oracle, device)
+    problem, checkpoint, key = prepared(observations, search, settings, run, pool, leave_out, kind, oracle, device)
     result = body_of(problem.twin).fit(problem, partial=checkpoint, key=key, threads=threads)
     files = run.beside(twin="twin.npz", history="history.parquet")
     result.twin.save(files["twin"])
@@ -73,6 +74,7 @@ def prepared(
     settings: Config,
     run: Recorder,
     pool: Sequence[Observations],
+    leave_out: bool,
     kind: str,
     oracle: bool,
     device: str,
@@ -88,6 +90,7 @@ def prepared(
     problem = FitProblem(
         observations=observations,
         pool=pool,
+        leave_out=leave_out,
         twin=twin,
         fit=settings.fit,
         simulation=settings.simulation,

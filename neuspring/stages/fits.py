@@ -37,6 +37,8 @@ class FitRow:
     kind: str = "springs"
     settings: str = "{}"
     oracle: bool = False
+    pool: tuple[str, ...] = ()
+    leave_out: bool = False
 
 
 @dataclass(frozen=True)
@@ -49,21 +51,22 @@ class FitJob:
     key: str
 
 
-def _in_step(rows: Rows) -> tuple[int, bool] | None:
-    """Frames per step, and True for an oracle, which goes over all frames and not over those before the split alone.
+def _in_step(rows: Rows) -> tuple[int, bool, str | None] | None:
+    """Frames per step, True for an oracle, which goes over all frames and not over those before the split alone, and the pool.
 
-    None for a fit on several recordings, which takes turns between them, and for a body that is fitted without gradients.
+    None for a body that is fitted without gradients.
     """
     row, search = rows.method, rows.search
-    if row is None or row.pool or search is None or not BODIES[search.body].by_gradients:
+    if row is None or search is None or not BODIES[search.body].by_gradients:
         return None
-    return rows.config.fit.horizon, row.oracle
+    return rows.config.fit.horizon, row.oracle, row.pool
 
 
 def _rows(members: Sequence[Member]) -> dict[str, str]:
     rows: dict[str, dict[str, Any]] = {}
     for one in members:
-        row = {"kind": one.options["kind"], "oracle": one.options["oracle"], "settings": one.settings, "fits": {}}
+        row = {name: one.options[name] for name in ("kind", "oracle", "leave_out")} | {"settings": one.settings, "fits": {}}
+        row["pool"] = one.inputs.get("pool", [])
         rows.setdefault(one.method, row)["fits"][one.output] = one.inputs["search"]
     return {"rows": json.dumps(list(rows.values()), sort_keys=True)}
 
@@ -77,7 +80,7 @@ def _rows(members: Sequence[Member]) -> dict[str, str]:
 )
 def fits(
     observations: Observations,
-    rows: Annotated[str, 'JSON list [{"kind": ..., "settings": as of `fit`, "oracle": ..., "fits": {fit.json: search.json}}, ...]'],
+    rows: Annotated[str, 'JSON list [{"fits": {fit.json: search.json}, "settings": as of `fit`, and options of `fit`}, ...]'],
     run: Recorder,
     device: str = "auto",
     twins_per_launch: int | Literal["auto"] = "auto",
@@ -101,8 +104,8 @@ def fits(
         results = run_batch([job.problem.twin for job in batch], device, [partial(_fit, job) for job in batch])
         for job, result in zip(batch, results, strict=True):
             if isinstance(result, FitResult):
-                counts, frames = result.twin.counts, job.problem.frame_end - 1
-                facts["spring_updates"] += result.facts["epochs_together"] * frames * counts["springs"] * counts["substeps"]
+                counts, epochs = result.twin.counts, result.facts["epochs_together"]
+                facts["spring_updates"] += epochs * job.problem.frames * counts["springs"] * counts["substeps"]
             else:
                 facts["errors"][job.output] = f"{type(result).__name__}: {result}"
                 print(f"{job.output}: {facts['errors'][job.output]}; its own job goes on from its last checkpoint")
@@ -110,7 +113,8 @@ def fits(
 
 
 def _jobs(observations: Path, row: FitRow, device: str) -> Iterator[FitJob]:
-    given: dict[str, Any] = {"settings": read_settings(row.settings), "kind": row.kind, "oracle": row.oracle, "device": device}
+    given: dict[str, Any] = {name: getattr(row, name) for name in ("kind", "oracle", "pool", "leave_out")}
+    given |= {"settings": read_settings(row.settings), "device": device}
     for output, search in row.fits.items():
         job = alone.fit.job(output=Path(output), observations=observations, search=Path(search), **given)
         if not (job.failed or _is_done(job)):
@@ -119,11 +123,15 @@ def _jobs(observations: Path, row: FitRow, device: str) -> Iterator[FitJob]:
 
 
 def batched(jobs: Sequence[FitJob], most: int) -> list[list[FitJob]]:
-    """Which fits share launches, at most so many: those of equal horizon and as many frames, which are in step. One alone
-    shares with nobody."""
-    in_step: dict[tuple[int, int], list[FitJob]] = {}
+    """Which fits share launches, at most so many: those of equal horizon, with as many frames and the same pool, are in step.
+
+    One alone shares with nobody.
+    """
+    in_step: dict[tuple[Any, ...], list[FitJob]] = {}
     for job in jobs:
-        in_step.setdefault((job.problem.fit.horizon, job.problem.frame_end), []).append(job)
+        problem = job.problem
+        pool = tuple(seen.scenario.name for seen in problem.pool)
+        in_step.setdefault((problem.fit.horizon, problem.frame_end, pool, problem.leave_out), []).append(job)
     batches = [alike[first : first + most] for alike in in_step.values() for first in range(0, len(alike), most)]
     return [batch for batch in batches if len(batch) > 1]
 

@@ -94,8 +94,7 @@ def render(
                     if videos:
                         videos["video"].add(figures.film_frame(scenario, frame, figures.panels(pair)))
             if videos and frame < predicted:
-                angle = 360 * frame / predicted
-                twin = orbit_view(gaussians, scored.views[first], scored.backend, angle)
+                twin = orbit_view(gaussians, scored.views[first], scored.backend, 360 * frame / predicted)
                 videos["turntable"].add(figures.film_frame(scenario, frame, {"twin": twin}))
             progress.update(frame + 1)
     table = pd.DataFrame(rows, columns=["frame", "camera", "metric", "value"])
@@ -159,7 +158,8 @@ def draw_frames(
     Raises InputError for a camera or frame that is not there, and where there is nothing to draw.
     """
     from neuspring.core.device import resolve_device
-    from neuspring.splats.draw import BLACK, WHITE, picture, save_picture, view_of
+    from neuspring.data.frames import write_png
+    from neuspring.splats.draw import BLACK, WHITE, picture, view_of
     from neuspring.splats.rasterize import choose_backend
 
     device, images, capture = resolve_device(device), settings.images, Capture.load(folder)
@@ -177,5 +177,5 @@ def draw_frames(
     for frame, gaussians in enumerate(frames_of_splats):
         if frame in wanted:
             made.append(output / f"{frame:05d}.png")
-            save_picture(made[-1], picture(gaussians, view, backend, WHITE if background == "white" else BLACK))
+            write_png(made[-1], picture(gaussians, view, backend, WHITE if background == "white" else BLACK))
     return made

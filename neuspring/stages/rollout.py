@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from neuspring.core.artifacts import Observations
+from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.records import Before, Recorder
 from neuspring.stages.stage import Written, stage
 from neuspring.twin.body import body_of, code
@@ -21,7 +21,6 @@ def rollout(observations: Observations, learned: Before, run: Recorder, device: 
     `learned` is the search.json or fit.json that names the twin. A twin that saw the future is called `oracle`. A body that can
     meet itself takes more substeps (`Body.for_prediction`).
     """
-    from neuspring.core.artifacts import Twin
     from neuspring.twin.rollout import initial_velocity, roll_out
 
     if learned.record.settings.get("oracle"):

@@ -47,7 +47,8 @@ def _variant(rows: Rows) -> dict[str, Any]:
         return {}
     own: dict[str, Any] = plain(rows.method)["settings"]
     if rows.search is None:
-        return {"variant": {"model": rows.method.model, **own}}
+        kind = {"mean_of": rows.method.mean_of} if rows.method.mean_of else {"model": rows.method.model}
+        return {"variant": kind | own}
     switches: dict[str, Any] = {"search": rows.method.search, "clusters": rows.search.clusters, "fit": rows.method.fit or "none"}
     switches |= {"pool": rows.method.pool} if rows.method.pool else {}
     # Named only where it is one: runs of other rows are compared with it nowhere.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from neuspring.config import Config, Search
 from neuspring.core.artifacts import Observations
@@ -23,6 +23,12 @@ def _settled(rows: Rows) -> Config:
     return dataclasses.replace(rows.config, search=dataclasses.replace(rows.config.search, tied_rollouts=Search().tied_rollouts))
 
 
+def _given(rows: Rows) -> dict[str, Any]:
+    if rows.search is None:
+        return {}
+    return {"clusters": rows.search.clusters, "body": rows.search.body, "leave_out": rows.leave_out}
+
+
 @stage(
     output="{scenario}/search-{search}/{seed}/search.json",
     reads=lambda settings, given: (*READS, *BODIES[given["body"]].reads),
@@ -31,7 +37,7 @@ def _settled(rows: Rows) -> Config:
     memory_mb=8000,
     minutes=240,
     when=lambda rows: rows.search is not None,
-    given=lambda rows: {"clusters": rows.search.clusters, "body": rows.search.body} if rows.search else {},
+    given=_given,
     settled=_settled,
 )
 def search(
@@ -39,6 +45,7 @@ def search(
     settings: Config,
     run: Recorder,
     pool: Sequence[Observations] = (),
+    leave_out: Annotated[bool, "judge by the pool alone"] = False,
     clusters: int = 1,
     body: Annotated[str, "lattice or rod, or a package's own"] = "lattice",
     seed: int = 0,
@@ -51,8 +58,8 @@ def search(
     `clusters` regions of the topology have values of their own (1: uniform). At most `twins_per_launch` candidates share a launch
     (auto: as many as pay), and `threads` launches run at the same time on a CPU; neither changes a number there. A trace of the
     same search is continued, so a larger `search.rollouts` costs only the difference. With a `pool` of other recordings a
-    candidate's cost is the mean over all. A `body` that is a rod has no topology to search: its
-    constants are found by Levenberg-Marquardt on the first frames (twin/rod_fit.py), and its trace has a row per step.
+    candidate's cost is the mean over all, or with `leave_out` over the others. A `body` that is a rod has no topology to
+    search: its constants are found by Levenberg-Marquardt on the first frames (twin/rod_fit.py), and its trace has a row per step.
     """
     from neuspring.core.checkpoint import checkpoint_key
     from neuspring.core.files import write_history
@@ -65,6 +72,7 @@ def search(
     files = run.beside(twin="twin.npz", trace="trace.parquet", history="history.parquet")
     options = SearchOptions(
         clusters=clusters,
+        leave_out=leave_out,
         seed=seed,
         device=device,
         threads=threads,

@@ -28,8 +28,7 @@ def track(capture: Capture, camera: str, masks: Before, settings: Config, run: R
     capture.require_camera(camera)
     labels = Masks.load(masks.file("masks")).labels
     followed = BACKENDS["track"][section.backend].track(capture, camera, labels, settings.perception, device)
-    count = followed.pixels.shape[1]
-    if not count:
+    if not (count := followed.pixels.shape[1]):
         print(f"camera {camera}: neither object nor hands in frame 0; it is not used", flush=True)
     facts = {"points": float(count), "visible_share": float(followed.visible.mean()) if count else 0.0}
     tracks = PixelTracks(pixels=followed.pixels, visible=followed.visible, backend=section.backend, facts=facts)

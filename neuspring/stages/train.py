@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from neuspring.baselines import BASELINES, without_pictures
+from neuspring.baselines import BASELINES, Pictures, TrainingRequest, without_pictures
 from neuspring.config import Config
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
@@ -15,8 +15,7 @@ from neuspring.stages.stage import Rows, Written, paths, stage
 
 
 def _reads(settings: Config, given: Any) -> tuple[str, ...]:
-    baseline = BASELINES.get(given["model"])
-    if baseline is None:
+    if (baseline := BASELINES.get(given["model"])) is None:
         return ()
     return (*([f"baselines.{baseline.section}"] if baseline.section else []), *baseline.reads(baseline.settings(settings)))
 
@@ -58,7 +57,6 @@ def train(
     splats too. A training that ends early is recorded as a failure, with its last usable model; one that cannot begin, without a
     model. Raises InputError where silhouettes are asked for without pictures, and for models that are not trained.
     """
-    from neuspring.baselines import Pictures, TrainingRequest
     from neuspring.core.checkpoint import checkpoint_key
     from neuspring.core.files import write_history
 

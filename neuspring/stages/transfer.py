@@ -16,7 +16,7 @@ from neuspring.twin.body import body_of, code
 def _moves(rows: Rows) -> bool:
     """True for models that other recordings can take. Oracles concern their own recording alone."""
     row = rows.method
-    return bool(rows.targets and row and not row.oracle and (row.search or BASELINES[row.model or ""].transfers))
+    return bool(rows.targets and row and not row.oracle and (row.search or (row.model and BASELINES[row.model].transfers)))
 
 
 @stage(

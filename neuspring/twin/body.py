@@ -43,6 +43,8 @@ class SearchOptions:
 
     clusters: int = 1
     """Regions of a topology, each with values of its own."""
+    leave_out: bool = False
+    """Judge by the pool alone; of the own recording frame 0 is read, and no other."""
     seed: int = 0
     device: str = "cpu"
     threads: int = 1

@@ -27,7 +27,7 @@ from neuspring.physics.parameters import homogeneous
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.rollout import initial_velocity
 from neuspring.twin.topology import controller_reach, node_spacing, piecewise_topology, regions
-from neuspring.twin.transfer import in_pool, require_pool
+from neuspring.twin.transfer import move, require_pool
 from neuspring.twin.trials import Outcome, outcomes
 
 INTEGERS = ("object_neighbors", "controller_neighbors")
@@ -76,10 +76,13 @@ class SearchProblem:
 
     Its springs are made once, on the nodes of `observations` in frame 0 (or their rest shape), with that body's `spacing` and
     `reach`, and are moved to each recording, node i on node i. Radii measured in each recording's own lengths would join other
-    nodes there, and the material of one topology would be judged on another.
+    nodes there, and the material of one topology would be judged on another. A recording with other nodes has springs of its own
+    (`transfer.resampled`).
     """
+    leave_out: bool = False
+    """Judge candidates by the pool alone: of `observations` the nodes and hands of frame 0 are read, and no other frame."""
     recordings: tuple[Recording, ...] = field(init=False)
-    """The scenario's own and those of the pool; a candidate has a twin on each."""
+    """Those that count: the scenario's own, unless it is left out, and those of the pool; a candidate has a twin on each."""
     labels: np.ndarray = field(init=False)
     """Region of each node [N]."""
     spacing: float = field(init=False)
@@ -91,8 +94,9 @@ class SearchProblem:
         require_pool(self.observations, self.pool)
         canonical, count = self.observations.canonical, len(self.observations.nodes)
         nodes, hands = canonical[:count], canonical[count:]
+        counted = (*(() if self.leave_out else (self.observations,)), *self.pool)
         object.__setattr__(self, "labels", regions(nodes, self.clusters))
-        object.__setattr__(self, "recordings", tuple(self._recording(each) for each in (self.observations, *self.pool)))
+        object.__setattr__(self, "recordings", tuple(map(self._recording, counted)))
         object.__setattr__(self, "spacing", node_spacing(nodes))
         object.__setattr__(self, "reach", controller_reach(nodes, hands))
 
@@ -236,7 +240,8 @@ def made(problem: SearchProblem, normalized: np.ndarray, push: bool = False) -> 
     try:
         twin = candidate(problem, values, push)
         row |= {"springs": len(twin.topology.springs), "substeps": twin.simulation.substeps}
-        family = (twin, *(with_substeps(in_pool(twin, seen, released), settings, released) for seen in problem.pool))
+        moved = (move(twin, seen, keep_frame_time=released)[0] for seen in problem.pool)
+        family = (*(() if problem.leave_out else (twin,)), *(with_substeps(each, settings, released) for each in moved))
     except NumericalFailure as failure:
         row["reason"] = str(failure)
     except stability.Unstable as failure:

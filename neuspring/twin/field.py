@@ -17,6 +17,7 @@ from torch.nn.functional import embedding_bag
 
 from neuspring.config import SpringFieldSettings as Settings
 
+ALL_SPRINGS, NO_POINTS = slice(None), np.zeros((0, 3))
 PLANE_AXES = ((0, 1), (1, 2), (0, 2))
 """Coordinates that span the planes xy, yz, xz."""
 
@@ -59,9 +60,9 @@ class TriPlane(nn.Module):
         self.register_buffer("indices", torch.from_numpy(inverse.reshape(cells.shape)), persistent=False)
         self.register_buffer("weights", torch.from_numpy(weights.astype(np.float32)), persistent=False)
 
-    def forward(self) -> torch.Tensor:
-        """Summed features [S, C]."""
-        return embedding_bag(self.indices, self.texels, per_sample_weights=self.weights, mode="sum")
+    def forward(self, part: slice = ALL_SPRINGS) -> torch.Tensor:
+        """Summed features [S, C] of a part of the points."""
+        return embedding_bag(self.indices[part], self.texels, per_sample_weights=self.weights[part], mode="sum")
 
 
 def bilinear(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
@@ -87,16 +88,20 @@ class SpringField(nn.Module):
 
     coordinates: torch.Tensor
 
-    def __init__(self, points: np.ndarray, settings: Settings, outputs: int, seed: int) -> None:
-        """`points` [S, 3], m: midpoints. Weights depend on `seed`, the settings and S alone, not on the order of springs."""
+    def __init__(self, points: np.ndarray, settings: Settings, outputs: int, seed: int, beside: np.ndarray = NO_POINTS) -> None:
+        """`points` [S, 3], m: midpoints. Weights depend on `seed`, the settings and S alone, not on the order of springs.
+
+        `beside` [P, 3] are midpoints of the same body's springs in other recordings, which follow; planes are no finer for them.
+        """
         super().__init__()
         self.settings = settings
+        count, points = len(points), np.concatenate([points, beside])
         mapped = in_cube(points)
         if settings.shuffled:
             mapped = mapped[np.random.default_rng(seed).permutation(len(mapped))]
         self.register_buffer("coordinates", torch.from_numpy(mapped.astype(np.float32)), persistent=False)
         # At least 2, as bilinear interpolation needs.
-        adaptive = max(round(settings.adaptive_factor * math.sqrt(len(points))), 2)
+        adaptive = max(round(settings.adaptive_factor * math.sqrt(count)), 2)
         self.resolution = adaptive if settings.resolution == "adaptive" else settings.resolution
         generator = torch.Generator().manual_seed(seed)
         self.planes = None
@@ -113,14 +118,15 @@ class SpringField(nn.Module):
             for tensor in self.layers[-1].parameters():
                 tensor.zero_()
 
-    def encoded(self) -> torch.Tensor:
+    def encoded(self, part: slice = ALL_SPRINGS) -> torch.Tensor:
         """Inputs of the MLP [S, width]: the plane feature and the coordinates, transformed."""
-        parts = [self.coordinates] if self.planes is None else [self.planes(), self.coordinates]
+        here = self.coordinates[part]
+        parts = [here] if self.planes is None else [self.planes(part), here]
         return torch.cat([fourier(part, self.settings.bands) for part in parts], dim=1)
 
-    def forward(self) -> torch.Tensor:
-        """F [S, outputs]."""
-        x = self.encoded()
+    def forward(self, part: slice = ALL_SPRINGS) -> torch.Tensor:
+        """F [S, outputs] of a part of the springs."""
+        x = self.encoded(part)
         for layer in self.layers[:-1]:
             x = torch.relu(layer(x))
         result: torch.Tensor = self.layers[-1](x)

@@ -14,8 +14,6 @@ is recorded is in m^2.
 from __future__ import annotations
 
 import contextlib
-import copy
-import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -35,10 +33,11 @@ from neuspring.physics.parameters import Parameters
 from neuspring.physics.solver import AdjointLimit, FrameWindow, simulate_frame, solver_for
 from neuspring.twin.batch import Lane
 from neuspring.twin.body import Learned, body_of
+from neuspring.twin.field import NO_POINTS, midpoints
 from neuspring.twin.losses import FrameLoss, frames_seen
 from neuspring.twin.parameters import TwinParameters, movement, topology_spacing, watched
 from neuspring.twin.rollout import initial_velocity
-from neuspring.twin.transfer import in_pool
+from neuspring.twin.transfer import move
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -79,6 +78,8 @@ class FitProblem:
     """Fit all frames, the future included: no prediction, but what fitting could reach at best."""
     pool: Sequence[Observations] = ()
     """Other recordings of the object, that one material is fitted on together with `observations`."""
+    leave_out: bool = False
+    """Fit the pool alone: of `observations` the nodes and hands of frame 0 are read, and no other frame."""
 
     def __post_init__(self) -> None:
         body = body_of(self.twin)
@@ -92,6 +93,12 @@ class FitProblem:
     def frame_end(self) -> int:
         """Frames that the fit reads, from frame 0 on: those before the split; all of them for an oracle."""
         return frames_seen(self.observations, oracle=self.oracle)
+
+    @property
+    def frames(self) -> int:
+        """Frames that an epoch passes over, on all recordings that count."""
+        counted = (*(() if self.leave_out else (self.observations,)), *self.pool)
+        return sum(frames_seen(one, oracle=self.oracle) - 1 for one in counted)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,10 +161,11 @@ def tail_start(train_end: int) -> int:
 class TwinFit:
     """Runs epochs. The solver is rebuilt only when stiffer springs ask for more substeps."""
 
-    def __init__(self, problem: FitProblem, lane: Lane | None = None) -> None:
+    def __init__(self, problem: FitProblem, lane: Lane | None = None, beside: np.ndarray = NO_POINTS) -> None:
+        """`beside`: as of `TwinParameters`."""
         self.problem, self._lane = problem, lane
         observations, settings = problem.observations, problem.fit
-        self.parameters = TwinParameters(problem.twin, settings, problem.kind, problem.device, problem.seed)
+        self.parameters = TwinParameters(problem.twin, settings, problem.kind, problem.device, problem.seed, beside)
         self.loss = FrameLoss.of(
             *(observations, problem.losses, problem.device),
             frozen_counts=problem.quirks.frozen_loss_denominators,
@@ -181,7 +189,7 @@ class TwinFit:
         self.gradients: list[float] | None = None
         """The median |gradient| of each step is put here, if it is wanted."""
         self.twin = problem.twin
-        self._solver: FrameWindow | Lane | None = None
+        self._solver: FrameWindow | None = None
         self._overflow = 0
         self._known: tuple[stability.Spectrum, np.ndarray, np.ndarray] | None = None
         """The last spectrum that was computed, and for which stiffness and dashpots."""
@@ -193,10 +201,12 @@ class TwinFit:
 
     def solver(self) -> FrameWindow | Lane:
         """The solver for the current number of substeps, or the lane in a shared one."""
+        if self._lane:
+            # The members of a pool take turns in it.
+            return self._lane.of_twin(self.twin, self.horizon)
         if self._solver is None:
             twin, device = self.twin, self.problem.device
-            own = functools.partial(FrameWindow, lambda: solver_for(twin, device), self.horizon)
-            self._solver = self._lane.of_twin(twin, self.horizon) if self._lane else own()
+            self._solver = FrameWindow(lambda: solver_for(twin, device), self.horizon)
         return self._solver
 
     @property
@@ -343,24 +353,35 @@ class PooledFit(TwinFit):
 
     An epoch is one pass over each recording in turn, with the same parameters and the same state of Adam. Stiffness, dashpots, drag
     and contact are shared, and so is an estimated shape, as factors on the distances in each recording's rest shape; its
-    displacement lives in that of the problem's own recording. All recordings take as many substeps per frame as the one that needs
-    most. Losses are means over the recordings, in one unit.
+    displacement lives in that of the problem's own recording. Where a recording has other nodes, its shape is laid onto that of the
+    problem's own, and the field is read at the midpoints of its springs there: the material is one, as a function of the place in
+    the body. All recordings take as many substeps per frame as the one that needs most. Losses are means over the recordings, in
+    one unit.
     """
 
-    def __init__(self, problem: FitProblem) -> None:
-        alone = replace(problem, pool=())
-        super().__init__(alone)
-        moved = [(in_pool(problem.twin, seen, problem.quirks.frame_time_667), seen) for seen in problem.pool]
-        own = (problem.twin, problem.observations)
-        self._members = [self._member(replace(alone, twin=twin, observations=seen)) for twin, seen in [own, *moved]]
+    def __init__(self, problem: FitProblem, lane: Lane | None = None) -> None:
+        alone, released = replace(problem, pool=(), leave_out=False), problem.quirks.frame_time_667
+        moved = [move(problem.twin, seen, keep_frame_time=released) for seen in problem.pool]
+        beside, parts = NO_POINTS, list[slice]()
+        for seen, (twin, laid) in zip(problem.pool, moved, strict=True):
+            if laid and (problem.kind != "field" or problem.fit.field.offsets):
+                rule = "recordings of a pool must have the same nodes where each spring has a number of its own"
+                raise InputError(
+                    f"pool, {seen.scenario.name}", rule, "others", "Choose a field (model_b_pooled), or sample all alike."
+                )
+            first = len(problem.twin.topology.springs) + len(beside) if laid else 0
+            parts.append(slice(first, first + len(twin.topology.springs)))
+            if laid:
+                beside = np.concatenate([beside, midpoints(np.concatenate([laid.points, laid.others]), twin.topology.springs)])
+        super().__init__(alone, lane, beside)
+        own = [] if problem.leave_out else [self._member(alone, self.parameters.part)]
+        others = zip(problem.pool, moved, parts, strict=True)
+        self._members = own + [self._member(replace(alone, twin=it[0], observations=seen), part) for seen, it, part in others]
 
-    def _member(self, problem: FitProblem) -> TwinFit:
+    def _member(self, problem: FitProblem, part: slice) -> TwinFit:
         """The fit of one recording, which trains this one's parameters with this one's optimizer."""
-        member = TwinFit(problem)
-        start = self.parameters.start | {"rest_lengths": member.parameters.start["rest_lengths"]}
-        # The copy has the same trained tensors.
-        member.parameters = copy.copy(self.parameters)
-        member.parameters.start = start
+        member = TwinFit(problem, self._lane)
+        member.parameters = self.parameters.on(member.parameters, part)
         member.optimizer = self.optimizer
         # Frame 0 of each recording has a spacing of its own; a meter must weigh the same in all.
         member.loss_scale = self.loss_scale
@@ -372,7 +393,7 @@ class PooledFit(TwinFit):
     @property
     def collision_overflow(self) -> int:
         """The sum over all recordings."""
-        return sum(member.collision_overflow for member in self._members)
+        return super().collision_overflow if self._lane else sum(member.collision_overflow for member in self._members)
 
     def use_substeps(self, count: int) -> None:
         """Integrate all recordings with `count` substeps per frame from now on."""
@@ -414,7 +435,7 @@ def fit(
     """Fit a twin. `partial` is where checkpoints go; one with the same `key` is continued from.
 
     `on_epoch` is given the history so far after every epoch and before its checkpoint; what it raises ends the fit. With a
-    `lane` the simulation shares launches with other fits (batch.py), unless the problem has a pool. Raises NumericalFailure if no
+    `lane` the simulation shares launches with other fits (batch.py). Raises NumericalFailure if no
     epoch could be completed.
     """
     import pandas as pd
@@ -422,7 +443,7 @@ def fit(
     label = f"{'oracle ' * problem.oracle}fit {problem.observations.scenario.name}, {problem.kind}, seed {problem.seed}"
     share = 1 / len(lane.batch.lanes) if lane else 1.0
     loop = TrainingLoop("the fit", label, problem.fit.epochs, partial, key, share=share)
-    run = PooledFit(problem) if problem.pool else TwinFit(problem, lane)
+    run = (PooledFit if problem.pool else TwinFit)(problem, lane)
     state = _State.of(loop.restored) if loop.restored else _start(run, problem)
     overflow = state.overflow
     run.use_substeps(state.substeps)
@@ -443,8 +464,7 @@ def fit(
     history, figures = pd.DataFrame(loop.history), movement(run.parameters)
     if state.gradient_over_epsilon is not None:
         figures["gradient_over_epsilon"] = state.gradient_over_epsilon
-    frames = sum(frames_seen(one, oracle=problem.oracle) - 1 for one in (problem.observations, *problem.pool))
-    counts = best.counts
+    frames, counts = problem.frames, best.counts
     facts = {
         "best_epoch": state.best_epoch,
         "best_loss": state.best_loss,

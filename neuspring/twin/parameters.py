@@ -11,6 +11,7 @@ dashpots (`damping`). With `controller_factors` the springs of controllers, whic
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable
 from dataclasses import fields, replace
 from typing import Any
@@ -22,7 +23,7 @@ from torch import nn
 from neuspring import config
 from neuspring.core.artifacts import Topology, Twin
 from neuspring.physics.parameters import CONTACT_LIMITS, Parameters, pack, twin_tensors
-from neuspring.twin.field import SpringField, midpoints
+from neuspring.twin.field import NO_POINTS, SpringField, midpoints
 from neuspring.twin.roughness import SIDE_BY_SIDE, neighbors, roughness
 from neuspring.twin.topology import node_spacing
 
@@ -73,7 +74,10 @@ def topology_spacing(topology: Topology) -> float:
 class TwinParameters(nn.Module):
     """The trained tensors of a twin, as a module: `named_parameters` is the checkpoint's content."""
 
-    def __init__(self, twin: Twin, settings: config.Fit, kind: str, device: str, seed: int = 0) -> None:
+    def __init__(
+        self, twin: Twin, settings: config.Fit, kind: str, device: str, seed: int = 0, beside: np.ndarray = NO_POINTS
+    ) -> None:
+        """`beside` [P, 3], m: midpoints of springs of other lattices of the body, in this one's rest shape (`on`)."""
         super().__init__()
         self.settings, self.kind = settings, kind
         self.start = twin_tensors(twin, device)
@@ -82,7 +86,9 @@ class TwinParameters(nn.Module):
         count = len(topology.springs)
         self.on_controller = torch.arange(count, device=device) >= topology.object_spring_count
         self.midpoints = midpoints(topology.canonical, topology.springs)
-        self.field = SpringField(self.midpoints, settings.field, 1, seed) if kind == "field" else None
+        self.part = slice(0, count)
+        """The springs' places among all of the field."""
+        self.field = SpringField(self.midpoints, settings.field, 1, seed, beside) if kind == "field" else None
         own = kind == "springs" or settings.field.offsets
         self.offsets = nn.Parameter(torch.zeros(count, 1)) if own else None
         smooth = kind == "field" and settings.field.smoothness > 0
@@ -99,6 +105,12 @@ class TwinParameters(nn.Module):
         names = ["stiffness"] if s.global_stiffness else []
         names += [name for name in DAMPING_FACTORS if s.damping != "fixed" and bool((self.start[name] > 0).any())]
         return names + [f"controller_{name}" for name in names if s.controller_factors and name in SPRING_FACTORS]
+
+    def on(self, other: TwinParameters, part: slice) -> TwinParameters:
+        """The same trained tensors on the springs of another lattice of the body, with its start: those at `part` of the field."""
+        shared = copy.copy(self)
+        shared.start, shared.on_controller, shared.part = other.start, other.on_controller, part
+        return shared
 
     def groups(self) -> list[dict[str, Any]]:
         """Parameter groups for the optimizer, each with its learning rate (`base_rate` is not changed later)."""
@@ -118,7 +130,7 @@ class TwinParameters(nn.Module):
 
     def deviation(self) -> torch.Tensor:
         """Factor of each spring's stiffness [S], apart from common factors."""
-        parts = [*([] if self.field is None else [self.field()]), *([] if self.offsets is None else [self.offsets])]
+        parts = [*([] if self.field is None else [self.field(self.part)]), *([] if self.offsets is None else [self.offsets])]
         return bounded(sum(parts)[:, 0], self.settings.output_bound).exp()
 
     def _common(self, name: str) -> torch.Tensor | float:
@@ -152,7 +164,7 @@ class TwinParameters(nn.Module):
         s, total = self.settings.field, torch.zeros(())
         if self._near is not None:
             assert self.field is not None
-            values = self.field()[:, 0]
+            values = self.field(self.part)[:, 0]
             total = s.smoothness * (values[:, None] - values[self._near]).square().mean()
         if self.field is not None and self.offsets is not None:
             total = total + s.offset_prior * self.offsets.square().mean()

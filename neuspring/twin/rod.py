@@ -182,6 +182,14 @@ def on_recording(twin: Twin, observations: Observations) -> Twin:
     return replace(twin, topology=topology, material=material, rod=_bound(moved, observations))
 
 
+def _axis(twin: Twin, line: np.ndarray) -> np.ndarray:
+    """`Rod.axis` [3] on a recording with the line [V, 3] in frame 0, of a twin whose line is observed."""
+    rod, topology = twin.rod, twin.topology
+    assert rod is not None
+    own = np.concatenate([topology.nodes, topology.controllers])[rod.line].astype(np.float64)
+    return axis_on(rod.axis, heading(own), line, rod.steady)
+
+
 def laid_out(observations: Observations, count: int, held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Unloaded vertices [count, 3], m, evenly along the unloaded line, and the controller that sets each; -1: none.
 
@@ -272,14 +280,6 @@ def hung(twins: Sequence[Twin], recordings: Sequence[Observations]) -> list[Twin
         topology = build(placed(*lanes)[0].numpy(), hand, twin.topology.springs)
         done.append(replace(twin, topology=topology, rod=replace(rod, vertices=x, axis=axis[0])))
     return done
-
-
-def _axis(twin: Twin, line: np.ndarray) -> np.ndarray:
-    """`Rod.axis` [3] on a recording with the line [V, 3] in frame 0, of a twin whose line is observed."""
-    rod, topology = twin.rod, twin.topology
-    assert rod is not None
-    own = np.concatenate([topology.nodes, topology.controllers])[rod.line].astype(np.float64)
-    return axis_on(rod.axis, heading(own), line, rod.steady)
 
 
 def _across(vertices: np.ndarray) -> np.ndarray:

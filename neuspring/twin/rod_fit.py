@@ -419,15 +419,15 @@ def search_rod(
         # What hangs in frame 0 says how stiff it is.
         variables = Variables.of(start, first, observations.object_points.shape[1])
         tried = [factor * (variables.kinds == "bending") + factor * (variables.kinds == "twisting") for factor in STIFFNESS_TRIED]
-        costs = solver.objective(solver.errors(variables, tried, 2, 1), np.array(tried), variables.scale)
-        start = variables.made(tried[int(costs.argmin())])
+        values = solver.objective(solver.errors(variables, tried, 2, 1), np.array(tried), variables.scale)
+        start = variables.made(tried[int(values.argmin())])
     twin, value, history = solver.lowered(start, Progress(f"search {observations.scenario.name}, rod", first.rounds))
     found = _result(twin, value, history)
     if record is not None:
         write_table(found.history, record)
-    losses = found.history["loss"]
+    costs = found.history["loss"]
     facts = {"cost": value, "rollouts": solver.rollouts, "collision_overflow": 0, **found.facts, **twin.counts}
-    return replace(found, course=pd.DataFrame({"cost": losses, "best_cost": losses.cummin()}), facts=facts)
+    return replace(found, course=pd.DataFrame({"cost": costs, "best_cost": costs.cummin()}), facts=facts)
 
 
 def fit_rod(

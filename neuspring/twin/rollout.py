@@ -26,11 +26,7 @@ class Diverged(Exception):
 
 
 def frames(
-    twin: Twin,
-    solver: FrameSolver,
-    hands: torch.Tensor,
-    velocity: np.ndarray | None = None,
-    positions: np.ndarray | None = None,
+    twin: Twin, solver: FrameSolver, hands: torch.Tensor, velocity: np.ndarray | None = None, positions: np.ndarray | None = None
 ) -> Iterator[tuple[int, torch.Tensor, torch.Tensor]]:
     """Yield (frame, x [N, 3] m, v [N, 3] m/s) for frames 1, 2, ... of hands [T, C, 3] (controllers.waypoints). Raises Diverged.
 

@@ -154,8 +154,7 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
                     trace, other = _ways(judge, population, ways, MUST_MOVE * still_cost(problem.recordings))
                 budget -= len(other)
                 push = bool(trace[0]["push"])
-            fresh = population[max(len(trace) - start, 0) :]
-            if fresh:
+            if fresh := population[max(len(trace) - start, 0) :]:
                 trace += judge(fresh, push, len(other) + len(trace), proposals.generation)
             progress.update(len(other) + len(trace), f"best cost {min(row['cost'] for row in trace):.3e}")
             proposals.tell([row["cost"] for row in trace[start:stop]])

@@ -61,14 +61,6 @@ def move(
     return body.stable(replace(moved, simulation=simulation), safety), registration
 
 
-def in_pool(twin: Twin, observations: Observations, keep_frame_time: bool) -> Twin:
-    """A lattice on the nodes of a recording of its pool, node i on node i. Raises InputError if those are others."""
-    if not corresponds(twin.topology, observations):
-        name = f"pool, {observations.scenario.name}"
-        raise InputError(name, "recordings of a pool must have the same nodes", "others", "Sample all alike (mocap.rings).")
-    return move(twin, observations, keep_frame_time=keep_frame_time)[0]
-
-
 def on_nodes(twin: Twin, observations: Observations) -> tuple[Twin, Registration | None]:
     """A lattice on the nodes and hands of another recording, and how the shapes fitted where the nodes are others.
 
@@ -116,9 +108,10 @@ def _same_nodes(topology: Topology, observations: Observations) -> Topology:
 
 NEAREST_SPRINGS = 8
 """Springs that a spring's values are the mean of."""
-LARGEST_RESIDUAL, LARGEST_STRETCH = 0.12, 0.15
+LARGEST_RESIDUAL, LARGEST_STRETCH = 0.12, 0.2
 """Beyond these shapes do not fit: the residual of the rigid motion, as a fraction of the extent, and the stretch of the bending,
-which could lay any shape onto any other. Filmed recordings of one plush have at most 0.06; another animal of its size has 0.16."""
+which could lay any shape onto any other. Recordings of one plush have at most 0.06 and 0.17; another animal of its size has 0.16
+of the first."""
 
 
 def resampled(twin: Twin, observations: Observations) -> tuple[Twin, Registration]:
@@ -278,11 +271,14 @@ def _means(places: np.ndarray, at: np.ndarray) -> Callable[[np.ndarray], np.ndar
 
 
 def require_pool(here: Observations, pool: Sequence[Observations]) -> None:
-    """Raise InputError unless a lattice can be judged on the pool: recordings with as many nodes and hands, node i on node i.
+    """Raise InputError unless a lattice can be judged on the pool: of a cable, recordings with as many nodes and hands, i on i.
 
-    Rings around a line that is recorded from its other end are others; all such recordings are named.
+    Rings around a line that is recorded from its other end are others; all such recordings are named. Another body may have other
+    nodes in each recording; its shapes are laid onto each other (`resampled`).
     """
     recordings = [here, *pool]
+    if not any(each.line.size for each in recordings):
+        return
     require_alike(recordings, "nodes and controllers", lambda each: (len(each.nodes), each.controller_points.shape[1]))
     orders = along(recordings) if pool and here.line.size else []
     if turned := [each.scenario.name for each, order in zip(recordings, orders, strict=False) if order[0] > 1]:

@@ -45,8 +45,7 @@ def main(arguments: list[str] | None = None) -> None:
     print(", ".join(f"{name} {value}" for name, value in facts.items() if value))
     print("", table.text(rows, kept), "", table.LEGEND, *dict.fromkeys(notes), sep="\n")
     print(f"compared with commit {kept['machine']['commit']}" if kept else f"no table of {kind} is kept")
-    record = table.as_record(facts, rows, notes)
-    print(table.save(record, kind, committed=options.save).relative_to(table.ROOT))
+    print(table.save(table.as_record(facts, rows, notes), kind, committed=options.save).relative_to(table.ROOT))
 
 
 def devices(chosen: str | None) -> list[str]:

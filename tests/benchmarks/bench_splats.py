@@ -83,8 +83,7 @@ def skinning(device: str) -> None:
         means = torch.tensor(np.random.default_rng(2).uniform(-0.1, 0.1, (count, 3)), dtype=torch.float32, device=device)
         turns = torch.zeros(count, 4, device=device)
         turns[:, 0] = 1
-        skin = Skin(nodes, device=device)
-        step = partial(skin.step, nodes, nodes + 0.001, means, turns)
+        step = partial(Skin(nodes, device=device).step, nodes, nodes + 0.001, means, turns)
         median = take_turns({"step": step}, device, rounds=5, least=5)["step"].median
         print(f"{count:>8}{len(nodes):>8}{1e3 * median:>12.2f}{1e9 * median / count:>12.0f}")
 

@@ -131,9 +131,8 @@ def judge_alike(bench: Bench, found: dict[str, SearchResult], alone: str) -> Non
         if not bench.on_gpu:
             assert np.array_equal(costs, wanted), f"{name}: costs differ from those one by one"
         elif name != alone:
-            bench.notes.append(
-                f"search, {name}, {bench.device}: costs within {np.abs(costs / wanted - 1).max():.1e} of those one by one"
-            )
+            apart = np.abs(costs / wanted - 1).max()
+            bench.notes.append(f"search, {name}, {bench.device}: costs within {apart:.1e} of those one by one")
 
 
 def describe(bench: Bench, case: SearchProblem, result: SearchResult, seconds: dict[str, float]) -> None:

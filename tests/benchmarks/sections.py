@@ -175,9 +175,8 @@ def start(bench: Bench) -> list[Row]:
             found["16 jobs at once, no kernels yet"] = Times((seconds,))
             counts = f"{text.count('(compiled)')} kernels compiled, {text.count('(cached)')} found in the cache"
             bench.notes.append(f"16 jobs at once: {counts}")
-    return [
-        Row(section="start", name=name, device="cpu", median=its.median, least=its.least, unit="s") for name, its in found.items()
-    ]
+    more = {"device": "cpu", "unit": "s"}
+    return [Row(section="start", name=name, median=its.median, least=its.least, **more) for name, its in found.items()]
 
 
 def _tiny_rollout(folder: Path) -> list[str]:

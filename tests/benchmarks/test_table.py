@@ -64,8 +64,7 @@ def test_the_kind_of_machine_is_a_file_name_of_processor_cores_and_gpu():
 def test_simulators_take_turns_and_none_is_always_first():
     order = []
     times = take_turns({name: lambda name=name: order.append(name) for name in "abc"}, rounds=5)
-    rounds = ["".join(order[3 * k : 3 * k + 3]) for k in range(6)]
-    assert rounds == ["abc", "bca", "cab", "abc", "bca", "cab"]
+    assert ["".join(order[3 * k : 3 * k + 3]) for k in range(6)] == ["abc", "bca", "cab", "abc", "bca", "cab"]
     # The first round is not timed.
     assert {name: len(its.seconds) for name, its in times.items()} == dict.fromkeys("abc", 5)
 

@@ -287,8 +287,7 @@ def test_sizes_and_heights_are_those_of_frame_0_and_not_of_the_way(capture):
 
 
 def test_a_body_in_parts_and_one_of_few_points_keep_all_of_them():
-    rng = np.random.default_rng(0)
-    body = rng.uniform(0, 0.1, (400, 3))
+    body = np.random.default_rng(0).uniform(0, 0.1, (400, 3))
     parted = np.concatenate([body, body[:40] + np.array([0.4, 0, 0])])
     few = np.array([[0.05, 0.02, 0], [0.06, 0.02, 0], [0.3, 0.1, 0], [0.5, 0.4, 0], [0.2, 0.3, 0.1]])
     sparse = np.argwhere(np.ones((6, 5, 1))) * 0.06

@@ -43,7 +43,7 @@ def with_depth(rig, change):
 
 def test_a_right_rig_needs_no_explanation(right):
     assert explain(right) is None and explain(alone(right, posed=False)) is None
-    assert {one.name for one in examine("rig", "x", Judged.of(right, {}))} == {"table"}
+    assert {one.name for one in examine("rig", "x", Judged(right, {}))} == {"table"}
 
 
 def distances(depth, camera):
@@ -89,7 +89,7 @@ def test_a_fault_of_one_camera_names_that_camera(right, name):
 @pytest.mark.parametrize(("factor", "plausible"), [(10.0, 0.0001), (0.1, 0.01), (0.25, 0.004), (5.0, 0.0002)])
 def test_a_wrong_unit_is_told_with_the_right_one(right, factor, plausible):
     rig = with_depth(right, lambda depth, _: factor * depth)
-    judged = Judged.of(rig, dict.fromkeys(rig.cameras, 0.001))
+    judged = Judged(rig, dict.fromkeys(rig.cameras, 0.001))
     (found,) = (one for one in examine("rig", "x", judged) if one.level == "error")
     assert found.name == "explained" and found.value == "unit" and f"Plausible would be {plausible:g}" in found.text
 
@@ -111,7 +111,7 @@ def test_a_world_that_is_elsewhere_is_leveled_and_no_other_fault_is(right):
     one[:3, 3] += (0.08, 0, 0.05)
     broken = moved.with_poses({name: one if name == "1" else camera.camera_to_world for name, camera in moved.cameras.items()})
     assert explain(broken) is None
-    told = [found for found in examine("rig", "x", Judged.of(broken, {})) if found.name == "table elsewhere"]
+    told = [found for found in examine("rig", "x", Judged(broken, {})) if found.name == "table elsewhere"]
     assert told and all("--level" not in one.text and "Calibrate" not in one.text for one in told)
 
 
@@ -119,7 +119,7 @@ def test_without_poses_only_lens_and_depth_can_be_told(right):
     two = with_lenses(alone(right, posed=False), larger(1.5))
     found = explain(two)
     assert (found.option, found.rivals) == ("--take lens_resized", ("--take lens_cropped",))
-    (warned,) = (one for one in examine("rig", "x", Judged.of(two, {})) if one.name == "explained")
+    (warned,) = (one for one in examine("rig", "x", Judged(two, {})) if one.name == "explained")
     assert warned.level == "warning"
 
 
@@ -131,8 +131,8 @@ def test_intrinsics_of_a_part_of_an_image_are_right_where_cameras_agree(right):
     depths = {name: [depth[:, 60:] for depth in listed] for name, listed in right.depths.items()}
     part = Rig(cameras, depths, {name: depth[:, 60:] for name, depth in right.first.items()})
     assert explain(part) is None
-    assert {one.name for one in examine("rig", "x", Judged.of(part, {}))} == {"table"}
-    found = examine("rig", "x", Judged.of(alone(part), {}))
+    assert {one.name for one in examine("rig", "x", Judged(part, {}))} == {"table"}
+    found = examine("rig", "x", Judged(alone(part), {}))
     assert {(one.name, one.level) for one in found} == {("table", "note"), ("principal point", "warning")}
 
 

@@ -32,8 +32,7 @@ def test_unknown_frames_do_not_count_and_stillness_says_nothing():
     gaps[[7, 8, 20]] = np.nan
     assert measure(bumps(), gaps).frames == pytest.approx(1.0, abs=0.1)
     assert measure(bumps(), np.zeros((40, 60))) is None
-    rng = np.random.default_rng(0)
-    other = measure(bumps(), rng.random((40, 60)))
+    other = measure(bumps(), np.random.default_rng(0).random((40, 60)))
     assert not other.known and not other.wrong
 
 
@@ -71,11 +70,9 @@ def test_a_film_in_which_nothing_moves_says_that_time_was_not_checked():
 
 def test_cameras_of_other_moments_are_found_in_space():
     watched = {"0": film(0), "1": film(1)}
-    cameras = {name: camera(int(name)) for name in watched}
-    maps = in_space(watched, cameras)
+    maps = in_space(watched, {name: camera(int(name)) for name in watched})
     assert abs(of_cameras(maps)["1"].frames) < 0.4
-    early = {"0": maps["0"][:-1], "1": maps["1"][1:]}
-    shift = of_cameras(early)["1"]
+    shift = of_cameras({"0": maps["0"][:-1], "1": maps["1"][1:]})["1"]
     assert shift.wrong and shift.frames == pytest.approx(-1, abs=0.4)
 
 

@@ -25,9 +25,8 @@ def test_the_configuration_page_is_up_to_date_and_complete():
 def test_meanings_begin_with_their_subject():
     for kind in [*config_page.sections().values(), *config_page.ROWS.values()]:
         for key, _, _, meaning in config_page.fields(kind):
-            assert meaning.split()[0] not in {"What", "Whether", "Of", "How", "Where", "Which", "That", "If"}, (
-                f"{kind.__name__}, {key}"
-            )
+            begins = {"What", "Whether", "Of", "How", "Where", "Which", "That", "If"}
+            assert meaning.split()[0] not in begins, f"{kind.__name__}, {key}"
 
 
 def sections(kind: type) -> set[type]:
@@ -56,8 +55,7 @@ def test_shown_defaults_are_accepted_as_they_are_written():
         for name in [] if title == "(top level)" else title.split("."):
             place = place.setdefault(name, {})
         place |= {key.strip("`"): yaml.safe_load(default.strip("`")) for key, default, _, _ in config_page.fields(kind)}
-    made = config.parse(config.Config, written, "the page")
-    assert config.plain(made) == config.plain(config.Config())
+    assert config.plain(config.parse(config.Config, written, "the page")) == config.plain(config.Config())
 
 
 def test_ranges_are_those_that_the_configuration_enforces():

@@ -104,8 +104,7 @@ def test_each_fault_costs_one_job_and_the_same_command_continues(project, tmp_pa
         "corrupt": (["observe", RELEASED], ""),
     }
     process = start(arguments(project, changes), project, **sabotage.variables(**faults))
-    partial = results / SCENE / "baseline" / "0" / "fit.partial.npz"
-    wait_for(partial.exists, process)
+    wait_for((results / SCENE / "baseline" / "0" / "fit.partial.npz").exists, process)
     wrapper = wrapper_of(project, "fit")
     (command,) = wrapper.children()
     wrapper.send_signal(signal.SIGKILL)
@@ -131,8 +130,7 @@ def test_each_fault_costs_one_job_and_the_same_command_continues(project, tmp_pa
     so_far = (results / "tables" / "so_far" / "summary.md").read_text()
     assert f"baseline, {RELEASED} / seed 0: missing" in so_far
     assert "have not finished" in output
-    report = (results / "tables" / "so_far" / "report.html").read_text()
-    assert "bad input" in report
+    assert "bad input" in (results / "tables" / "so_far" / "report.html").read_text()
 
     # With the data repaired the same command does what is missing, and nothing twice. The tables so far are not the tables.
     calls = {name: sabotage.count(name) for name in ("memory", "killed")}
@@ -148,9 +146,8 @@ def test_each_fault_costs_one_job_and_the_same_command_continues(project, tmp_pa
 def mount(folder: Path, size: str):
     """A small file system of its own; skips where that is not allowed."""
     folder.mkdir()
-    result = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)], capture_output=True, text=True, check=False
-    )
+    command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode:
         pytest.skip(f"a file system of a chosen size cannot be mounted here: {result.stderr.strip()}")
 

@@ -81,8 +81,7 @@ def test_a_study_is_a_target_and_explain_names_its_runs(two_gpu_run):
     assert "Model-A (PT)" in page
     assert "not run" not in page, "the rows that the configuration does not name are made too"
     command = [sys.executable, "-m", "neuspring", "explain", "table2/Baseline/future/chamfer", "--results", "results"]
-    explanation = output_of(start(command, project))
-    assert f"results/{SCENE}/baseline/0/run.json" in explanation
+    assert f"results/{SCENE}/baseline/0/run.json" in output_of(start(command, project))
 
 
 @pytest.mark.slow

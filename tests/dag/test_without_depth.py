@@ -37,8 +37,7 @@ def test_color_alone_becomes_scores_of_pictures_and_marked_points(project, tmp_p
     run(project, COLOR | {"data_root": str(tmp_path / "data")})
     folder = project / "results" / "demo" / "painted"
     folder = folder if folder.is_dir() else project / "results" / "painted"
-    observations = Observations.load(folder / "observations.npz")
-    assert observations.image is not None
+    assert Observations.load(folder / "observations.npz").image is not None
     scores = pd.read_parquet(folder / "neuspring" / "0" / "scores.parquet")
     # Without depth there is nothing in space to compare with.
     assert set(scores["metric"]) >= {"iou", "psnr", "ssim", "image_error"}

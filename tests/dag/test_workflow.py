@@ -46,8 +46,7 @@ def test_a_configuration_becomes_a_table_with_every_run_in_mlflow(tiny_run):
     assert "| baseline " in output
     assert "neuspring ui --results results" in output
     scores = pd.read_csv(results / "tables" / "scores.csv")
-    kinds = scores[["method", "task", "metric"]].drop_duplicates()
-    assert len(kinds) == len(scores) == 2 * len(TASKS) * 3
+    assert len(scores[["method", "task", "metric"]].drop_duplicates()) == len(scores) == 2 * len(TASKS) * 3
     assert set(scores["metric"]) == {"chamfer", "track_error", "track_error_bound"}
     assert np.isfinite(scores["value"]).all()
     assert {path.read_text().strip() for path in results.glob("*/*/*/mlflow.txt")} == {"logged"}

@@ -122,8 +122,7 @@ def test_the_motion_picture_says_how_far_nodes_are_from_their_points():
     ],
 )
 def test_the_frames_of_the_motion_picture(train_end, frames, expected):
-    scenario = replace(observed().scenario, frame_count=100, train_end=train_end)
-    assert chosen_frames(scenario, frames) == expected
+    assert chosen_frames(replace(observed().scenario, frame_count=100, train_end=train_end), frames) == expected
 
 
 @pytest.mark.parametrize("values", [5e3, 0.0, 1e-30, 1e5])

@@ -344,12 +344,17 @@ def test_springs_may_not_start_beyond_their_clamp(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ("{description: x}", "either search or model is required, received search None and model None"),
+        ("{description: x}", "one of search, model, mean_of is required, received none"),
         ("{search: uniform, oracle: true, description: x}", "an oracle has a fit"),
         ("{search: uniform, fit: field, oracle: true, description: x, settings: {selection: tail}}", "and holds none back"),
-        ("{model: static, search: uniform, description: x}", "either search or model is required"),
+        (
+            "{model: static, search: uniform, description: x}",
+            "is required, received search uniform, model static",
+        ),
         ("{model: static, fit: field, pool: all, description: x}", "fit, pool: these belong to methods"),
         ("{model: static, appearance: {}, description: x}", "draws with splats of its own"),
+        ("{mean_of: nobody, description: x}", "mean_of: must be another row, which is no mean itself"),
+        ("{mean_of: full, fit: field, description: x}", "fit: these belong to methods with a search, not to the mean of full"),
         ("{model: static, settings: {epochs: 1}, description: x}", r"model static has none; received \['epochs'\]"),
         ("{model: spring_gauss, description: x}", "model: must be one of static"),
     ],
@@ -373,7 +378,8 @@ def test_twins_of_cables_move_only_where_all_have_as_many_nodes(tmp_path: Path) 
 def pooled(folder: Path, **changes: object) -> Benchmark:
     """A method on the pool of a rope, and the same alone."""
     row = "search: uniform, fit: springs, pool: all, description: x"
-    write(folder / "pooled.yaml", f"{METHODS}one: {{{row}}}\noracle: {{{row}, oracle: true}}\n")
+    others = "unseen: {extends: one, pool: others}\nmean: {mean_of: unseen, description: x}\n"
+    write(folder / "pooled.yaml", f"{METHODS}one: {{{row}}}\noracle: {{{row}, oracle: true}}\n{others}")
     toys = "".join(f"{name}\ttoy\trope\trope/lift/smooth\tfalse\ttrue\n" for name in ("a", "b", "c"))
     write(folder / "toys.tsv", HEADER + toys + "cloth\ttoy\tcloth\tcloth/lift/smooth\tfalse\ttrue\n")
     chosen: dict[str, object] = {"scenario_table": "toys.tsv", "method_table": "pooled.yaml", "pools": {"rope": ["a", "b", "c"]}}
@@ -389,9 +395,8 @@ def test_methods_on_a_pool_have_searches_and_fits_of_their_own(tmp_path: Path) -
     assert graph.owners["fit"] == {"full": "full", "one": "one"}
     jobs = {name: SimpleNamespace(scenario="a", method=name, seed=0) for name in made.methods}
     found = [graph.inputs(STAGES["fit"])(job) for job in jobs.values()]
-    assert [files["search"] for files in found] == [
-        f"results/a/{name}/0/search.json" for name in ("search-uniform", "search-uniform-all")
-    ]
+    records = [f"results/a/{name}/0/search.json" for name in ("search-uniform", "search-uniform-all")]
+    assert [files["search"] for files in found] == records
     others = ["results/b/observations.npz", "results/c/observations.npz"]
     assert [files.get("pool", []) for files in found] == [[], others]
     searches = [SimpleNamespace(scenario="a", search=name, seed=0) for name in made.searches]
@@ -416,12 +421,31 @@ def test_a_new_stage_s_options_have_their_defaults_and_a_required_one_is_a_wildc
         graph.options(extent, SimpleNamespace(scenario="rope"))
 
 
-def test_scenarios_without_a_pool_are_left_out_of_its_methods_which_share_no_launches(tmp_path: Path) -> None:
+def test_a_mean_reads_the_predictions_of_all_seeds_of_a_row_that_may_leave_its_own_recording_out(tmp_path: Path) -> None:
+    made = pooled(tmp_path, methods=["mean"], seeds=[0, 1], only="seed=1 method=mean")
+    assert made.whole.methods == ("unseen", "mean"), "the row is run and shown too"
+    graph, job = Graph(made), SimpleNamespace(scenario="a", method="mean", seed=1)
+    assert graph.runs() == ["results/a/mean/1/run.json"]
+    assert graph.inputs(STAGES["average"])(job)["rollout"] == [f"results/a/unseen/{seed}/rollout.json" for seed in (0, 1)]
+    assert graph.inputs(STAGES["score"])(job)["rollout"] == "results/a/mean/1/rollout.json"
+    assert variant(graph, job) == {"mean_of": "unseen"}
+    words = {stage.name: graph.options(stage, behind) for stage, behind in graph.behind(STAGES["score"], job)}
+    assert words["search"]["leave_out"] is words["fit"]["leave_out"] is True
+    assert re.fullmatch(graph.constraints(STAGES["fit"])["method"], "unseen")
+    alone = pooled(tmp_path, methods=["mean"], scenarios=["a", "cloth"])
+    assert list(alone.whole_left_out["mean"]) == ["cloth"]
+
+
+def test_scenarios_without_a_pool_are_left_out_of_its_methods(tmp_path: Path) -> None:
     made = pooled(tmp_path, scenarios=["a", "cloth"], seeds=[0, 1, 2], twins_per_launch=8)
     assert made.whole_left_out == {"one": {"cloth": "it learns from a pool of recordings, and this one has none"}}
     assert [path for path in Graph(made).runs() if "cloth" in path] == [f"results/cloth/full/{seed}/run.json" for seed in range(3)]
     assert made.applies("one", "a")
-    assert in_step(made, "a") == [("full", 0), ("full", 1), ("full", 2)]
+    assert in_step(made, "a") == [(name, seed) for name in ("full", "one") for seed in range(3)]
+    pooled_fits = [
+        row for row in json.loads(Graph(made).options(STAGES["fits"], SimpleNamespace(scenario="a"))["rows"]) if row["pool"]
+    ]
+    assert [row["pool"] for row in pooled_fits] == [["results/b/observations.npz", "results/c/observations.npz"]]
     alone = pooled(tmp_path, methods=["full"])
     assert (alone.pools, list(alone.scenarios)) == ({}, ["a"]), "no pool is asked for without such a method"
 
@@ -563,9 +587,10 @@ def jobs_of(graph: Graph, files: list[str]) -> Counter[str]:
     counts, waiting, seen = Counter(), [*files], set()
     while waiting:
         path = waiting.pop().removeprefix(f"{graph.results}/")
-        # Twins and baselines write the same rollout.json.
+        # Twins, baselines and means write the same rollout.json.
         method = graph.benchmark.methods.get(path.split("/")[1])
-        others = {"rollout" if method and method.model else "predict"}
+        own = "rollout" if method and method.search else "average" if method and method.mean_of else "predict"
+        others = {"rollout", "predict", "average"} - {own}
         found = [(STAGES[name], match) for name in STAGES.keys() - others if (match := patterns[name].fullmatch(path))]
         if path in seen or not found:
             continue
@@ -605,8 +630,7 @@ def test_a_target_of_a_table_means_its_rows_and_no_others_with_any_data(overlays
 
 def test_targets_leave_a_part_that_was_asked_for_and_other_targets_as_they_are():
     values = shipped("synthetic") | {"only": "seed=1 method=baseline"}
-    chosen = tables.for_targets(values, ["table2"], ROOT)
-    part = Benchmark(values | chosen, ROOT).config
+    part = Benchmark(values | tables.for_targets(values, ["table2"], ROOT), ROOT).config
     assert (part.methods, part.seeds) == (("baseline",), (1,))
     assert tables.for_targets(values, ["report"], ROOT) == tables.for_targets(values, [], ROOT) == {}
     assert tables.for_targets(shipped("toy"), ["table3", "report"], ROOT) == {"studies": ["table3"]}
@@ -775,8 +799,7 @@ def test_an_oracle_has_a_fit_of_its_own_is_named_in_its_record_and_is_not_transf
 def test_the_graph_asks_stages_and_compares_no_name_of_one() -> None:
     """No `match`, and no comparison of a stage's name with a text: what a stage is like it declares itself."""
     for name in ("graph", "freshness", "needs"):
-        tree = ast.parse((ROOT / "neuspring" / "experiments" / f"{name}.py").read_text())
-        nodes = list(ast.walk(tree))
+        nodes = list(ast.walk(ast.parse((ROOT / "neuspring" / "experiments" / f"{name}.py").read_text())))
         assert not [node for node in nodes if isinstance(node, ast.Match)]
         compared = [ast.unparse(node) for node in nodes if isinstance(node, ast.Compare)]
         assert not [text for text in compared if ".name" in text and re.search(rf"['\"]({'|'.join(STAGES)})['\"]", text)]

@@ -61,8 +61,7 @@ def test_success_is_no_fault_whatever_was_printed():
 
 def test_only_the_end_of_the_output_names_a_cause():
     long_ago = ["warning: Connection refused, trying again"] + ["epoch"] * faults.CAUSE_LINES + ["ValueError: no"]
-    fault = faults.diagnose(1, long_ago)
-    assert fault == faults.UNKNOWN_FAULT
+    assert faults.diagnose(1, long_ago) == faults.UNKNOWN_FAULT
 
 
 def test_last_words_are_the_error_or_else_the_last_line():

@@ -78,8 +78,7 @@ def test_settings_that_differ_are_named_at_the_stages_that_read_them(results, ch
 
 def test_a_setting_that_is_gone_or_empty_now_is_named(results):
     made = graph(results)
-    settings = made.recorded(STAGES["fit"], JOB)
-    record(made, "fit", settings=settings | {"boxes": {"0": [1, 2]}})
+    record(made, "fit", settings=made.recorded(STAGES["fit"], JOB) | {"boxes": {"0": [1, 2]}})
     assert Freshness(made).look(STAGES["fit"], JOB) == ("boxes.0 [1, 2] -> null",)
     record(made, "fit").with_name("fit.json").write_text('{"format": 2, "settings": {}, "inputs": {}}')
     assert Freshness(made).look(STAGES["fit"], JOB) == ("no record of how it was made",)

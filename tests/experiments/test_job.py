@@ -107,9 +107,8 @@ def test_a_full_disk_behind_the_output_does_not_end_the_job(results):
 
 
 def test_a_job_that_lost_its_wrapper_is_listed(tmp_path):
-    vanished = JobRecord(
-        rule="fit", name="fit/a", log="logs/fit/a.log", attempts=[Attempt(started="2026-01-01T00:00:00+00:00", host="n1")]
-    )
+    begun = Attempt(started="2026-01-01T00:00:00+00:00", host="n1")
+    vanished = JobRecord(rule="fit", name="fit/a", log="logs/fit/a.log", attempts=[begun])
     (line,) = failure_lines([vanished], tmp_path)
     assert line.startswith("fit/a: its wrapper or machine vanished (attempt 1): on n1")
 
@@ -220,8 +219,7 @@ note('end')"""
     # Snakemake removes the log of a job before it starts it.
     (results / "logs" / f"{NAME}.log").unlink()
     second = start(results, code, "--gpus", "1")
-    line = second.stderr.readline()
-    assert "an earlier run of this job still goes on; waiting for its end" in line
+    assert "an earlier run of this job still goes on; waiting for its end" in second.stderr.readline()
     # While it waits it holds no GPU.
     gpus.acquire(1, ("1",), timeout=0).release()
     end.touch()

@@ -73,8 +73,7 @@ def test_parameters_are_what_has_not_its_default_under_the_names_of_the_configur
     settings = config.plain(Config())
     params = {"fit.fit.epochs": 60, "fit.fit.horizon": settings["fit"]["horizon"], "fit.kind": "field", "long": "x" * 900}
     params |= {"search.search.rollouts": 11, "search.seed": 0, "search.result.cost": 0.5, "method.clusters": 4}
-    path = write_run(results, params=params)
-    found = tracking.params_of(RunRecord.load(path))
+    found = tracking.params_of(RunRecord.load(write_run(results, params=params)))
     assert found.pop("settings") and len(found.pop("long")) == 900
     variant = {"search": "uniform", "fit": "springs", "clusters": 4, "frozen": False}
     assert found == variant | {"fit.epochs": 60, "fit.kind": "field", "search.rollouts": 11, "search.seed": 0}
@@ -130,9 +129,8 @@ def test_the_use_of_the_machine_is_logged_where_jobs_recorded_it(results: Path) 
     peaks = {f"{stage}.peak_memory_mb": 64.0 for stage in ("fit", "appearance", "score")}
     whole = {"peak_memory_mb": 512.0, "peak_gpu_memory_mb": 1000.0, "mean_gpu_percent": 50.0}
     last = {"cpu_percent": 110.0, "memory_mb": 500.0, "gpu_percent": 50.0, "gpu_memory_mb": 900.0}
-    assert metrics == peaks | {f"search.{name}": value for name, value in (whole | last).items()}, (
-        "no rollout: it has no job record"
-    )
+    # No rollout: it has no job record.
+    assert metrics == peaks | {f"search.{name}": value for name, value in (whole | last).items()}
     history = client_of(results).get_metric_history(run.info.run_id, "usage/search.memory_mb")
     begin = STARTED_MS - 30 * 60_000
     assert [(m.step, m.value, m.timestamp - begin) for m in history] == [(0, 400.0, 500), (3, 500.0, 2600)]
@@ -281,8 +279,7 @@ def test_init_twice_and_by_two_processes_at_once(tmp_path: Path) -> None:
 def test_a_moved_results_folder_is_refused_with_a_way_out(results: Path, tmp_path: Path) -> None:
     """Its index would write artifacts to the old place."""
     tracking.log_run(write_run(results), results, SETTINGS)
-    moved = results.rename(tmp_path / "moved")
-    ((word, _),) = tracking.sync(moved, SETTINGS).items()
+    ((word, _),) = tracking.sync(results.rename(tmp_path / "moved"), SETTINGS).items()
     assert word.startswith("unreachable: ") and "has moved" in word
     assert not results.exists()
 
@@ -352,6 +349,5 @@ import mlflow.telemetry.client
 print(os.environ["MLFLOW_DISABLE_TELEMETRY"], os.environ["DO_NOT_TRACK"], os.environ["MLFLOW_HTTP_REQUEST_TIMEOUT"],
       mlflow.telemetry.client.get_telemetry_client())
 """
-    process = python(code, results, stderr=subprocess.PIPE)
-    text, errors = process.communicate(timeout=240)
+    text, errors = python(code, results, stderr=subprocess.PIPE).communicate(timeout=240)
     assert (text.split(), errors) == (["true", "true", "7", "None"], "")

@@ -79,9 +79,8 @@ def killed_under_load(server: stores.Server, results: Path) -> None:
     # A run whose last tag arrived, but not the answer, is said to be unreachable and is there.
     assert synced["logged"] + synced["already logged"] == WRITERS * EACH and synced["already logged"] >= outcomes["logged"]
     runs = all_runs(results, settings)
-    assert Counter(run.info.run_name for run in runs) == Counter(
-        f"s{i}/ours/{seed}" for i in range(WRITERS) for seed in range(EACH)
-    )
+    wanted = Counter(f"s{i}/ours/{seed}" for i in range(WRITERS) for seed in range(EACH))
+    assert Counter(run.info.run_name for run in runs) == wanted
     for run in runs:
         assert (run.data.tags["logged"], run.info.status) == ("complete", "FINISHED")
         assert run.data.params["fit.epochs"] == "3" and run.data.metrics["future.chamfer"] == 0.005

@@ -71,8 +71,7 @@ def test_every_model_passes_through_every_stage(seen, model):
     assert (record["status"], record["held_file"]) == ("ok", None)
     trained = BASELINES[model].trained
     assert ("train" in record["timings"], "train" in record["histories"]) == (trained, trained)
-    scores = pd.read_parquet(run.with_name("scores.parquet"))
-    assert set(scores["task"]) == {"reconstruction", "future"}
+    assert set(pd.read_parquet(run.with_name("scores.parquet"))["task"]) == {"reconstruction", "future"}
     assert set(collect(seen.parents[1], ["small"], [model], [0]).runs["status"]) == {"ok"}
     if trained:
         history = pd.read_parquet(run.with_name("history.parquet"))
@@ -138,13 +137,7 @@ def test_splats_that_failed_and_too_few_anchors_are_failures_that_are_counted(se
     pictures = {"appearance": learned}
     out = seen.with_name("train.json")
     train(
-        observations=seen,
-        model="spring_gaus",
-        settings=settings(spring_gaus=MASKS),
-        seed=0,
-        device="cpu",
-        output=out,
-        **pictures,
+        observations=seen, model="spring_gaus", settings=settings(spring_gaus=MASKS), seed=0, device="cpu", output=out, **pictures
     )
     found = StageRecord.load(out)
     assert (found.status, found.files) == ("failed", {}) and "removed the last splat" in found.reason
@@ -176,10 +169,9 @@ def test_what_is_missing_is_named(seen):
             device="cpu",
             output=seen.with_name("train.json"),
         )
+    out = seen.with_name("rollout.json")
     with pytest.raises(InputError, match="model gs_dynamics is trained first"):
-        predict(
-            observations=seen, model="gs_dynamics", train=None, appearance=None, device="cpu", output=seen.with_name("rollout.json")
-        )
+        predict(observations=seen, model="gs_dynamics", train=None, appearance=None, device="cpu", output=out)
 
 
 @pytest.fixture(scope="module")
@@ -241,9 +233,8 @@ def test_rows_with_settings_that_cannot_be(row: str, message: str, tmp_path: Pat
 def test_what_is_trained_on_silhouettes_needs_images_and_is_left_out_elsewhere(tmp_path: Path) -> None:
     names = ["spring_gaus", "spring_gaus_points", "gs_dynamics", "static", "spring_gaus_few"]
     rows = config.read_yaml(ROOT / "config" / "methods.yaml")
-    (tmp_path / "methods.yaml").write_text(
-        yaml.safe_dump(rows | {"spring_gaus_few": rows["spring_gaus"] | {"settings": {"anchors": 100}}})
-    )
+    few = rows["spring_gaus"] | {"settings": {"anchors": 100}}
+    (tmp_path / "methods.yaml").write_text(yaml.safe_dump(rows | {"spring_gaus_few": few}))
     values = config.read_yaml(ROOT / "config" / "data" / "demo.yaml") | {"methods": names}
     values["method_table"] = str(tmp_path / "methods.yaml")
     values |= {"scenarios": ["synthetic_single_lift_rope", "toy_rope_lift_smooth"]}

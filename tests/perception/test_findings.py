@@ -205,8 +205,7 @@ def test_an_object_that_folds_is_not_said_to_stand_still(moving):
     """Its followed points do not move; its picture does."""
     still = observed(ABOVE, SLOW, follows=False)
     assert "warning: object stands still" in said(look_at_observations(still))
-    moves = mask_facts(moving, "0", both_squares())["object_moves"]
-    found = look_at_observations(still, moves)
+    found = look_at_observations(still, mask_facts(moving, "0", both_squares())["object_moves"])
     assert said(found) == {"warning: object not followed"} and "static" not in found[0].text
     assert mask_facts(moving, "0", both_squares(HANDS))["object_moves"] == 0.0
 

@@ -67,8 +67,7 @@ def test_given_hands_are_the_controllers(tmp_path):
     assert not seen.object_visibility[1:].any()
     np.testing.assert_allclose(seen.tracks, tracks, atol=1e-6)
     assert np.isfinite(metrics.errors_per_frame(np.repeat(seen.nodes[None], 8, axis=0), seen)["track_error"]).all()
-    searched = small.search_problem(seen)
-    begun = searched.recordings[0].hands
+    begun = small.search_problem(seen).recordings[0].hands
     np.testing.assert_allclose(begun[:, :, :3], hands[: seen.scenario.train_end], atol=1e-6)
     strip = hands_strip(capture, seen.image, lifted.controller_points, tmp_path / "hands.png")
     assert (cv2.imread(str(strip)) == (60, 60, 255)).all(axis=2).any()
@@ -95,8 +94,7 @@ def test_given_nodes_and_annotated_points_are_those_of_the_twin(tmp_path):
     assert all(tuple(row) in given for row in seen.surface_points.round(5).tolist())
     assert abs(len(tracked) + len(seen.surface_points) - len(NODES)) < 0.35 * len(NODES)
     assert not len(seen.interior_points)
-    loss = FrameLoss.of(seen, Config().losses, "cpu")
-    terms = loss.terms(2, torch.tensor(seen.nodes))
+    terms = FrameLoss.of(seen, Config().losses, "cpu").terms(2, torch.tensor(seen.nodes))
     assert all(float(terms[name]) > 0 for name in ("track", "chamfer", "image_track"))
     # Annotated points rise by half of what the hand rises, and nodes are frozen: the nearest is no farther than their own.
     assert 0 < float(terms["chamfer"]) <= 0.004**2

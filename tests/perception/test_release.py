@@ -92,8 +92,7 @@ def test_a_hand_that_comes_back_to_the_same_place_takes_hold_again():
 def test_a_hand_may_let_go_and_take_hold_twice():
     away = np.zeros(FRAMES)
     away[5:12] = away[18:24] = 0.3
-    valid = held(away)
-    np.testing.assert_array_equal(valid[:, 0], away == 0)
+    np.testing.assert_array_equal(held(away)[:, 0], away == 0)
 
 
 def test_it_takes_hold_of_the_part_that_has_turned_to_it_only_if_that_is_the_same():
@@ -156,8 +155,7 @@ def test_pixels_apart_from_what_is_followed_of_a_hand_are_its_own_where_its_cont
 def test_a_hand_out_of_view_lets_go_after_some_frames():
     seen = np.ones((FRAMES, 8), bool)
     seen[12:] = False
-    in_view = np.arange(FRAMES) < 12
-    valid = held(np.zeros(FRAMES), seen=seen, in_view=in_view)
+    valid = held(np.zeros(FRAMES), seen=seen, in_view=np.arange(FRAMES) < 12)
     # Five frames: 12 to 16.
     assert valid[:16].all()
     assert not valid[16:].any()

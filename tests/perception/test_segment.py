@@ -129,8 +129,7 @@ def test_masks_that_cannot_be_right_are_found(tmp_path):
 
 def test_a_single_frame_is_no_error(tmp_path):
     capture, labels = scene(tmp_path)
-    one = Capture(capture.folder, replace(capture.description, frame_count=1))
-    assert wrong(one, labels[:1]) == []
+    assert wrong(Capture(capture.folder, replace(capture.description, frame_count=1)), labels[:1]) == []
     camera = replace(capture.description.cameras[0], missing=tuple(range(PIECES)))
     none = Capture(capture.folder, replace(capture.description, cameras=(camera,)))
     assert look_at_masks(none, "0", labels, mask_facts(none, "0", labels)) == []

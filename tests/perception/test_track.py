@@ -21,8 +21,7 @@ NEVER = 2.0
 
 
 def texture(size: int = 300) -> np.ndarray:
-    noise = np.random.default_rng(0).normal(size=(size, size))
-    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    smooth = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(size, size)), (0, 0), 2.0)
     return cv2.normalize(smooth, None, 20, 235, cv2.NORM_MINMAX).astype(np.uint8)
 
 
@@ -46,8 +45,7 @@ def video(tmp_path):
             if frame not in camera.missing:
                 writer.frame(camera.name, frame, image, np.full((96, 128), 800, np.uint16), labels)
         labels0 = labels if labels0 is None else labels0
-    capture = writer.finish()
-    return capture, np.repeat(labels0[None], 8, axis=0)
+    return writer.finish(), np.repeat(labels0[None], 8, axis=0)
 
 
 def error(tracks: track_opencv.Followed, frame: int) -> np.ndarray:
@@ -97,8 +95,7 @@ def test_points_start_in_the_mask_and_follow_the_seed(video):
 
 def test_an_empty_mask_has_no_points(video):
     capture, labels = video
-    tracks = track_opencv.track(capture, "0", np.zeros_like(labels), PointTracking(), 0)
-    assert tracks.pixels.shape == (8, 0, 2)
+    assert track_opencv.track(capture, "0", np.zeros_like(labels), PointTracking(), 0).pixels.shape == (8, 0, 2)
 
 
 def test_points_come_back_after_a_frame_without_a_mask(video, monkeypatch):
@@ -174,9 +171,8 @@ def test_cotracker_is_called_as_its_online_predictor_wants(video):
 
 def test_cotracker_without_weights_says_where_they_would_be(monkeypatch, tmp_path):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    with pytest.raises(
-        InputError, match=r"code and checkpoints/scaled_online\.pth must be in the torch\.hub cache.*download: true"
-    ):
+    told = r"code and checkpoints/scaled_online\.pth must be in the torch\.hub cache.*download: true"
+    with pytest.raises(InputError, match=told):
         track_cotracker.load(PointTracking())
 
 

@@ -37,8 +37,7 @@ def test_free_fall_is_the_discrete_closed_form(engine: Engine, drag: float, up: 
     body = scene(1, drag=drag, gravity=G, up=up, substeps=substeps, frame_time=0.1)
     x, v = engine(body, np.array([[0.1, 0.0, 3.0]]), np.array([[0.7, 0.0, 2.0]]), no_hands(4))
     dt, gravity = 0.1 / substeps, -sign(up) * G * 0.1 / substeps
-    delta = np.exp(-dt * drag)
-    powers = delta ** np.arange(1, 4 * substeps + 1)
+    powers = np.exp(-dt * drag) ** np.arange(1, 4 * substeps + 1)
     partial = np.cumsum(powers)
     for frame in range(1, 5):
         n = frame * substeps

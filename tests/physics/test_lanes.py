@@ -58,8 +58,7 @@ def member(number: int, variant: str) -> Member:
     shift = [amount * rng.uniform(-1.0, 1.0, values.shape) for amount, values in ((5e-3, x), (0.3, v), (0.01, hands))]
     if np.ndim(body.mass):
         body = replace(body, mass=body.mass * rng.uniform(0.5, 2.0, body.nodes))
-    places = waypoints(torch.tensor(hands + shift[2])).numpy()
-    return Member(body, x + shift[0], v + shift[1], places)
+    return Member(body, x + shift[0], v + shift[1], waypoints(torch.tensor(hands + shift[2])).numpy())
 
 
 Results = dict[str, np.ndarray]

@@ -141,8 +141,7 @@ def test_rollouts_lanes_and_files_carry_obstacles(tmp_path):
     judged, _ = motions([twin, loaded], torch.tensor(hands, dtype=torch.float32), torch.tensor(v, dtype=torch.float32), "cpu")
     for lane in range(2):
         np.testing.assert_array_equal(judged[:, lane].numpy(), alone[1:])
-    bare = replace(twin, simulation=replace(twin.simulation, obstacles=()))
-    bare.save(tmp_path / "bare.npz")
+    replace(twin, simulation=replace(twin.simulation, obstacles=())).save(tmp_path / "bare.npz")
     with np.load(tmp_path / "bare.npz") as file:
         assert "obstacles" not in str(file["meta"])
     assert Twin.load(tmp_path / "bare.npz").simulation.obstacles == ()

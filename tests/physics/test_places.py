@@ -60,6 +60,5 @@ def test_a_force_with_one_trained_parameter_has_few_places() -> None:
         if any(word in text for word in wanted) and words(text) & wanted:
             found.add(name)
     # An extension may have been left out.
-    there = {name for name in PLACES if (PACKAGE / name).exists()}
-    assert found - VALUES.keys() - OTHERS - RODS == there
+    assert found - VALUES.keys() - OTHERS - RODS == {name for name in PLACES if (PACKAGE / name).exists()}
     assert len(PLACES) <= MOST

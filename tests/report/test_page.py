@@ -26,9 +26,8 @@ from tests.support.browser import Browser, chromium
 from tests.support.report_tree import page_section as section
 
 WRITTEN = "2026-01-05T12:00:00+00:00"
-ABLATION = Study(
-    title="Pieces", reference=None, baseline="Baseline", rows={"Baseline": "baseline", "Ours": "neuspring", "Later": "later"}
-)
+NAMED = {"Baseline": "baseline", "Ours": "neuspring", "Later": "later"}
+ABLATION = Study(title="Pieces", reference=None, baseline="Baseline", rows=NAMED)
 SYSTEMS = Study(
     title="Systems",
     reference="table1_comparison",
@@ -188,9 +187,8 @@ def test_a_click_sorts_a_table_and_words_filter_it(many):
             found = browser.run(values)
             assert found == sorted(found)[::order]
             assert len(set(found)) == 8
-        browser.run(
-            "(box => { box.value = 'NEU'; box.dispatchEvent(new Event('input')) })(document.querySelector('#scores input'))"
-        )
+        script = "(box => { box.value = 'NEU'; box.dispatchEvent(new Event('input')) })(document.querySelector('#scores input'))"
+        browser.run(script)
         assert browser.run(names) == ["neuspring"]
 
 
@@ -275,8 +273,7 @@ def test_an_answer_claims_no_more_than_its_cells(counts, words, tone):
 
 
 def test_an_empty_folder_says_so(tmp_path):
-    text = report(tmp_path)
-    assert f"Nothing to report yet: {tmp_path.name} holds no run" in section(text, "verdict")
+    assert f"Nothing to report yet: {tmp_path.name} holds no run" in section(report(tmp_path), "verdict")
     with pytest.raises(InputError, match="must exist"):
         write(tmp_path / "absent", tmp_path / "report.html", Options())
 
@@ -348,15 +345,13 @@ def test_gpu_hours_count_every_attempt_of_every_job(small):
         made = [report_tree.attempt(start, s, outcome=how, devices=["0", "1"]) for start, s, how in attempts]
         report_tree.save_job(small, name, made)
     report_tree.save_job(small, "score/rope/baseline/0", [report_tree.attempt(0, 3600, devices=[], device_names=[])])
-    page = report(small)
-    text = section(page, "work")
+    text = section(report(small), "work")
     assert "fit 1 0 1 90.0 min 90.0 min 3.0" in text
     assert "search uniform 1" in text
 
 
 def test_without_job_records_times_are_those_of_the_runs(small):
-    page = report(small)
-    text = section(page, "work")
+    text = section(report(small), "work")
     assert "There are no job records" in text and "Time and memory (medians) Method" in text and "baseline" in text
 
 

@@ -38,8 +38,7 @@ def test_an_oracle_stands_outside_every_comparison(tmp_path):
     values = {(s, m, 0): v * (1 + 0.1 * i) for i, s in enumerate("abcd") for m, v in (("x", 0.01), ("y", 0.008))}
     without = summary_of(collected(values))
     oracle = {("a", "oracle", 0): 0.001, ("b", "oracle", 0): 0.003}
-    text = summary_of(with_oracle(values | oracle))
-    lines = text.splitlines()
+    lines = summary_of(with_oracle(values | oracle)).splitlines()
     place = next(index for index, line in enumerate(lines) if ORACLE_LINE in line)
     assert lines[place + 1].startswith("| oracle") and "2.00" in lines[place + 1]
     assert [line for line in lines if "oracle" not in line] == without.splitlines()
@@ -47,8 +46,7 @@ def test_an_oracle_stands_outside_every_comparison(tmp_path):
     summary.write(numbers, tmp_path)
     for table in (numbers.differences, numbers.ratios, numbers.seeds):
         assert "oracle" not in set(table["method"])
-    again = read_scores(tmp_path / "scores.csv")
-    assert again.oracles == ("oracle",)
+    assert read_scores(tmp_path / "scores.csv").oracles == ("oracle",)
 
 
 def test_an_oracle_in_a_study_is_never_marked():
@@ -60,8 +58,7 @@ def test_an_oracle_in_a_study_is_never_marked():
     assert found.loc[("O", "track_error"), ["verdict", "direction"]].tolist() == [Verdict.ORACLE] * 2
     table = tables_study.main_table(study, cells(study, restricted(study, runs)))
     assert ORACLE_LINE in rows_of(table)
-    marked = [row[0].text for row in table.rows if any(cell.mark for cell in row)]
-    assert marked == ["y"]
+    assert [row[0].text for row in table.rows if any(cell.mark for cell in row)] == ["y"]
 
 
 def test_records_say_which_method_is_an_oracle_and_what_the_floor_is(tmp_path):
@@ -73,15 +70,13 @@ def test_records_say_which_method_is_an_oracle_and_what_the_floor_is(tmp_path):
     found = collect(tmp_path, ["a", "b"], ["x", "o"], [0])
     assert found.oracles == ("o",)
     assert set(found.comparison.runs["method"]) == {"x"}
-    text = summary_of(found)
-    assert "Floor in frame 0: CD 7.00 mm, TE 3.50 mm; TE bound 0 by construction." in text
+    assert "Floor in frame 0: CD 7.00 mm, TE 3.50 mm; TE bound 0 by construction." in summary_of(found)
     floors = Numbers(everything=found, baseline="x").floors.set_index("metric")["value"]
     assert floors.to_dict() == {"chamfer": 0.007, "track_error": 0.0035}
 
 
 def test_the_new_metric_is_left_out_where_no_run_has_it():
-    values = {(s, m, 0): 0.01 for s in "abc" for m in "xy"}
-    old = collected(values)
+    old = collected({(s, m, 0): 0.01 for s in "abc" for m in "xy"})
     assert "TE bound" not in summary_of(old)
     new = Collected(pd.concat([old.scores, old.scores.assign(metric="track_error_bound", value=0.004)]), old.runs)
     text = summary_of(new)
@@ -136,8 +131,7 @@ def test_settings_that_differ_are_those_of_the_records():
         record("z", fit={"fit": {"horizon": 10, "epochs": 20}, "seed": 2}, **same),
         record("alone", variant={"search": "uniform"}, **same),
     ]
-    labels = {"x": "X", "y": "Y", "z": "Z", "alone": "Search"}
-    found = differing(records, labels)
+    found = differing(records, {"x": "X", "y": "Y", "z": "Z", "alone": "Search"})
     assert found.pop("method.search") == "–: X, Y, Z; uniform: Search"
     assert found == {"stages": "search + fit: X, Y, Z; search: Search", "fit.horizon": "1: X; 10: Y, Z"}
 
@@ -151,8 +145,7 @@ def test_settings_of_scenarios_are_no_difference_between_methods():
 
 def test_the_footnote_is_in_markdown_and_latex(tmp_path):
     for method, horizon in (("baseline", 1), ("model_a", 10)):
-        settings = {"fit": {"horizon": horizon}}
-        write_run(tmp_path, "cable_0", method, 0, BOTH, source="mocap", settings=settings)
+        write_run(tmp_path, "cable_0", method, 0, BOTH, source="mocap", settings={"fit": {"horizon": horizon}})
     out = tmp_path / "out"
     text = study_text("table2", STUDIES["table2"], tmp_path, NAMES[:1], [0], ["baseline", "model_a"], out)
     assert "## Settings that differ" in text
@@ -165,8 +158,7 @@ def test_aims_reach_the_summary_and_its_file(tmp_path):
     config = parse(Config, {"aims": [{"method": "y", "baseline": "x", "ratio": r} for r in (0.85, 0.5)]}, "here")
     assert json.loads(json.dumps(plain(config)["aims"]))[0]["below"] == 1.0
     aims = tuple(parse(Aim, row, "here") for row in plain(config)["aims"])
-    numbers = Numbers(everything=collected(values), baseline="x", aims=aims)
-    text = summary.write(numbers, tmp_path)
+    text = summary.write(Numbers(everything=collected(values), baseline="x", aims=aims), tmp_path)
     aimed = Numbers.load(tmp_path).aimed
     assert aimed["aim_verdict"].tolist() == ["reached", "missed"]
     assert [row[-1].plain for row in summary.aim_table(aimed)[0].rows] == ["reached", "missed"]

@@ -43,10 +43,7 @@ def test_folders_that_cannot_be_shown_are_refused_with_the_next_move(scenario, t
 
 @pytest.mark.parametrize(
     ("old", "new", "note"),
-    [
-        ('"format": 2', '"format": 1', "reads records of format 2"),
-        ('"trajectory.npz"', '"../../../secret.npz"', "must lie beside"),
-    ],
+    [('"format": 2', '"format": 1', "reads records of format 2"), ('"trajectory.npz"', '"../../../secret.npz"', "must lie beside")],
 )
 def test_a_record_of_another_format_or_of_a_file_elsewhere_is_not_followed(scenario, tmp_path, old, new, note):
     (tmp_path / "secret.npz").write_bytes(b"secret")

@@ -161,8 +161,7 @@ def test_errors_weigh_scenarios_and_pictures_weigh_frames():
 def test_the_spread_is_that_of_the_averages():
     runs = collected(varied({"baseline": 1.0, "neuspring_one_frame": 0.8}, noise=0.1))
     expected = averages(runs.scores).set_index("method")["seed_std"]
-    found = cells_of("table2", runs)["spread"]
-    assert found[("Baseline", *CD)] == pytest.approx(1e3 * expected["baseline"])
+    assert cells_of("table2", runs)["spread"][("Baseline", *CD)] == pytest.approx(1e3 * expected["baseline"])
     # A seed that lacks a scenario has another mean for that reason alone.
     less = Collected(runs.scores.drop(index=3), runs.runs)
     assert np.isnan(cells_of("table2", less)["spread"][("Baseline", *CD)])
@@ -246,9 +245,8 @@ def test_a_pair_that_one_method_failed_is_left_out_for_all_and_listed():
 
 
 def test_a_score_that_one_method_lacks_is_left_out_for_all():
-    values = everywhere("baseline", {CD: 0.01, PSNR: 30.0}, ["a", "b"]) | everywhere(
-        "neuspring_one_frame", {CD: 0.02, PSNR: 20.0}, ["a"]
-    )
+    values = everywhere("baseline", {CD: 0.01, PSNR: 30.0}, ["a", "b"])
+    values |= everywhere("neuspring_one_frame", {CD: 0.02, PSNR: 20.0}, ["a"])
     values |= everywhere("neuspring_one_frame", {CD: 0.04}, ["b"])
     values["b", "baseline", 0] = {CD: 0.01, PSNR: 90.0}
     found = cells_of("table2", collected(values))
@@ -384,9 +382,8 @@ def test_a_table_can_be_made_from_scores_alone(tmp_path, capsys):
         assert (tmp_path / "scores" / name).read_text() == (tmp_path / "records" / name).read_text()
     assert "released PhysTwin" not in (tmp_path / "scores" / "table2.md").read_text(), "none of these is a released scenario"
     # Of a run that diverged the errors of one task remain, with or without the file that says so.
-    write_run(
-        tmp_path, "cable_6", "neuspring_one_frame", 0, {("reconstruction", "chamfer"): 9.0}, status="failed", reason="diverged"
-    )
+    one = {("reconstruction", "chamfer"): 9.0}
+    write_run(tmp_path, "cable_6", "neuspring_one_frame", 0, one, status="failed", reason="diverged")
     tables.write(Numbers(everything=collect(tmp_path, names, methods, [0]), baseline="baseline"), tmp_path / "tables")
     scores = pd.read_csv(tmp_path / "tables" / "scores.csv")
     other = scores[scores["task"] == "future"].assign(task="reconstruction")
@@ -398,9 +395,8 @@ def test_a_table_can_be_made_from_scores_alone(tmp_path, capsys):
     alone = ["tables", "--scores", str(tmp_path / "tables" / "scores.csv"), "--output", str(tmp_path / "some"), "--scenarios"]
     assert main([*alone, *names[:3], "--methods", "baseline"]) == 0
     kept = pd.read_csv(tmp_path / "some" / "scores.csv")
-    assert (set(kept["scenario"]), set(kept["method"])) == (set(names[:3]), {"baseline"}), (
-        "a scores.csv is read in part as runs are"
-    )
+    # A scores.csv is read in part as runs are.
+    assert (set(kept["scenario"]), set(kept["method"])) == (set(names[:3]), {"baseline"})
     assert main([*alone, "cable_9"]) == 2
     assert "--scenarios: must be in the file of --scores" in capsys.readouterr().err
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")

@@ -154,10 +154,8 @@ def test_the_film_shows_the_best_the_median_and_the_worst_clip_of_the_chosen_row
         "Rod, best: DLO3_eval_a, L1 2.0 mm",
         "Rod, worst: DLO3_eval_b, L1 6.0 mm",
     ]
-    seen = painters[1].scene.observations
-    np.testing.assert_allclose(
-        painters[1].takes[0].positions - seen.object_points, np.tile([0, 0, 0.018], (FRAMES, 3, 1)), atol=1e-6
-    )
+    moved = painters[1].takes[0].positions - painters[1].scene.observations.object_points
+    np.testing.assert_allclose(moved, np.tile([0, 0, 0.018], (FRAMES, 3, 1)), atol=1e-6)
 
 
 def test_the_page_shows_the_same_tables_once_the_study_was_made(tmp_path):

@@ -81,9 +81,8 @@ def with_images(lpips: str = "computed", quirks: tuple[str, ...] = ()) -> Collec
     base = collected({(s, m, 0): 0.01 for s in ("a", "b") for m in ("x", "y")})
     facts = {"backend": "warp", "masks": "given", "views": ["0"], "lpips": lpips, "quirks": list(quirks), "unseen_surface": 0.25}
     runs = base.runs.assign(images=[json.dumps(facts if s == "a" else None) for s in base.runs["scenario"]])
-    values = {"psnr": (30.0, 33.0), "ssim": (0.9, 0.95), "iou": (0.8, 0.9)} | (
-        {"lpips": (0.1, 0.05)} if lpips == "computed" else {}
-    )
+    values = {"psnr": (30.0, 33.0), "ssim": (0.9, 0.95), "iou": (0.8, 0.9)}
+    values |= {"lpips": (0.1, 0.05)} if lpips == "computed" else {}
     rows = [
         ("a", "rope", m, 0, task, metric, pair[k], "1", 10)
         for metric, pair in values.items()
@@ -109,8 +108,7 @@ def test_pictures_have_a_table_of_their_own():
 
 def test_what_was_not_computed_is_said_and_never_a_number():
     runs = with_images("no AlexNet weights: x is not there", ("any_alpha",))
-    found = tables_in(score_blocks(Numbers(everything=runs, baseline="x")))
-    table = found["Scores of pictures"]
+    table = tables_in(score_blocks(Numbers(everything=runs, baseline="x")))["Scores of pictures"]
     assert not any("LPIPS" in heading for heading in table.header)
     assert "released quirks: any_alpha" in table.note
     assert "LPIPS not computed: no AlexNet weights: x is not there" in summary(runs)
@@ -149,15 +147,13 @@ def test_many_missing_runs_are_counted_and_failures_named(tmp_path):
 
 
 def test_many_notes_are_counted_by_kind_with_the_range_of_their_numbers():
-    keys = [(f"s{i}", method, 0) for i in range(9) for method in ("x", "y")]
-    found = collected(dict.fromkeys(keys, 0.010))
+    found = collected(dict.fromkeys([(f"s{i}", method, 0) for i in range(9) for method in ("x", "y")], 0.010))
     of_x = found.runs["method"] == "x"
     found.runs["notes"] = [
         f"fit: {10 + i}% of the springs lie at the bound; search: at an end of its range: dashpot" if x else ""
         for i, x in enumerate(of_x)
     ]
-    few = summary(found)
-    assert "- s0 / x / seed 0: fit: 10% of the springs" in few
+    assert "- s0 / x / seed 0: fit: 10% of the springs" in summary(found)
     found.runs.loc[~of_x, "notes"] = "fit: no epoch was better than the search"
     many = summary(found)
     assert "- x, 9 of 9 runs: fit: 10 to 26% of the springs lie at the bound" in many

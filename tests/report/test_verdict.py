@@ -74,8 +74,7 @@ def test_a_lead_that_one_large_error_makes_is_none():
 
 
 def test_as_many_scenarios_as_it_asks_for_do_resolve_it():
-    rng = np.random.default_rng(3)
-    logs = rng.normal(-0.2, 0.3, 5)
+    logs = np.random.default_rng(3).normal(-0.2, 0.3, 5)
     low, high = np.exp(statistics.t_interval(logs))
     count = statistics.needed(low, high, 5)
     shape = np.linspace(-1, 1, count)

@@ -41,8 +41,7 @@ def published(case, up=-1):
 
 
 def test_any_folder_of_that_form_is_a_case_and_its_split_is_the_released_one(folder, tmp_path):
-    found = folders_of(tmp_path / "given")
-    assert found == {"single_push_sloth": folder}
+    assert folders_of(tmp_path / "given") == {"single_push_sloth": folder}
     made = write_points(folder, tmp_path / "captures", "single_push_sloth")
     assert serious(check_layout(made.folder)) == []
     assert (made.frame_count, made.train_end) == (FRAMES, int(released_cases()["single_push_sloth"]["train_end"]))

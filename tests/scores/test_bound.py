@@ -59,8 +59,7 @@ def test_any_rigid_motion_scores_zero(body, neighbors):
         # Three nodes of a row are on a line, where a turn about it cannot be seen.
         turns = Rotation.identity(len(shifts))
     tracks = moved(points, turns, shifts)
-    errors = bound_track_errors(moved(nodes, turns, shifts), tracks, neighbors)
-    assert errors.max() < ROUND_OFF
+    assert bound_track_errors(moved(nodes, turns, shifts), tracks, neighbors).max() < ROUND_OFF
     # The published error has a floor here.
     assert track_errors(moved(nodes, turns, shifts), tracks).min() > 1e-3
 
@@ -102,8 +101,7 @@ def line(count: int = 30) -> np.ndarray:
 
 
 def test_points_on_a_straight_line_of_nodes_are_exact_under_any_rigid_motion():
-    rng = np.random.default_rng(4)
-    turns, shifts = random_motion(rng)
+    turns, shifts = random_motion(np.random.default_rng(4))
     points = np.array([[0.123, 0, 0], [0.05, 0, 0], [0.31, 0, 0]])
     assert bound_track_errors(moved(line(), turns, shifts), moved(points, turns, shifts)).max() < ROUND_OFF
 
@@ -131,20 +129,17 @@ def test_roll_of_a_line_is_not_seen_and_noise_does_not_roll_it():
 
 
 def test_a_line_that_turns_around_at_once_is_finite_and_proper():
-    flipped = np.stack([line(), line() * [-1, 1, 1], line()])
-    turn = rotations(flipped[:, None])
+    turn = rotations(np.stack([line(), line() * [-1, 1, 1], line()])[:, None])
     np.testing.assert_allclose(turn @ turn.transpose(0, 1, 3, 2), np.tile(np.eye(3), (3, 1, 1, 1)), atol=ROUND_OFF)
     np.testing.assert_allclose(np.linalg.det(turn), 1)
     np.testing.assert_allclose(turn[1, 0] @ X, -X, atol=ROUND_OFF)
 
 
 def test_a_body_that_collapses_to_a_line_keeps_its_last_rotation():
-    rng = np.random.default_rng(7)
-    nodes = solid(rng)
+    nodes = solid(np.random.default_rng(7))
     turn = Rotation.from_rotvec([0, 0, 0.5])
     flat = turn.apply(nodes) @ np.outer(X, X)
-    frames = np.stack([nodes, turn.apply(nodes), flat, flat])
-    found = rotations(frames[:, None])
+    found = rotations(np.stack([nodes, turn.apply(nodes), flat, flat])[:, None])
     np.testing.assert_allclose(found[1, 0], turn.as_matrix(), atol=ROUND_OFF)
     np.testing.assert_allclose(found[3, 0], found[2, 0], atol=ROUND_OFF)
     np.testing.assert_allclose(np.linalg.det(found), 1)
@@ -159,8 +154,7 @@ def test_unannotated_tracks_are_treated_as_in_the_published_error():
     tracks = np.full((5, 3, 3), np.nan)
     tracks[[0, 1, 3], 0] = [0.0, 0, 6.5]
     tracks[1:, 1] = [1.0, 0, 0]
-    nodes = np.array([[0.0, 0, 0], [0, 5, 0], [0, 0, 7], [2, 1, 0]])
-    positions = np.tile(nodes, (5, 1, 1))
+    positions = np.tile(np.array([[0.0, 0, 0], [0, 5, 0], [0, 0, 7], [2, 1, 0]]), (5, 1, 1))
     positions[1:] += [0.3, 0.4, 0]
     np.testing.assert_allclose(bound_track_errors(positions, tracks), [0, 0.5, 0, 0.5, 0], atol=ROUND_OFF)
     tracks[0] = np.nan
@@ -168,8 +162,7 @@ def test_unannotated_tracks_are_treated_as_in_the_published_error():
 
 
 def test_floors_are_the_errors_of_frame_zero():
-    tracks = np.tile([[0.0, 0, 6.5], [0, 5, 0.3]], (5, 1, 1))
-    given = observations(tracks=tracks)
+    given = observations(tracks=np.tile([[0.0, 0, 6.5], [0, 5, 0.3]], (5, 1, 1)))
     found = floors(given)
     assert found["track_error"] == pytest.approx((0.5 + 0.3) / 2)
     assert found["track_error_bound"] < ROUND_OFF

@@ -95,8 +95,7 @@ def test_a_method_that_failed_everywhere_has_the_mean_of_held_predictions():
     row = means(found)["y"]
     assert (row["succeeded"], row["attempted"]) == (0, 1)
     assert math.isnan(row["own"]) and row["all"] == pytest.approx(0.2)
-    nothing = collected({}, failed=(("a", "y", 0),))
-    assert means(nothing)["y"]["attempted"] == 1
+    assert means(collected({}, failed=(("a", "y", 0),)))["y"]["attempted"] == 1
 
 
 def test_summary_and_csv_have_both_averages(tmp_path):
@@ -107,8 +106,7 @@ def test_summary_and_csv_have_both_averages(tmp_path):
     section = text.partition("## Failures")[2]
     assert "| y      | 1/2       | its successes" in section and "| 4.00 (4.00)" in section and "52.00 (52.00)" in section
     assert "| x      | 2/2       | all " in section
-    table = Numbers.load(tmp_path).held.set_index("method")
-    assert table.loc["y", "all"] == pytest.approx(0.052)
+    assert Numbers.load(tmp_path).held.set_index("method").loc["y", "all"] == pytest.approx(0.052)
     assert "Failures" not in tables.write(Numbers(everything=collected(VALUES), baseline="x"), tmp_path)
     assert not len(Numbers.load(tmp_path).held), "nothing is left over from the earlier run"
 

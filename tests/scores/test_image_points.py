@@ -130,9 +130,8 @@ def test_scores_of_color_alone_have_the_errors_of_marked_points():
     found = rows[rows["metric"] == "image_error"].set_index("task")
     assert found["value"].to_dict() == pytest.approx({"reconstruction": 5.0, "future": 12.0}, abs=1e-3)
     assert set(found["unit"]) == {"px"}
-    assert not len(
-        metrics.score(Trajectory(positions=still, frame_count=len(still)), seen, "m", 0).query("metric == 'image_error'")
-    )
+    scores = metrics.score(Trajectory(positions=still, frame_count=len(still)), seen, "m", 0)
+    assert not len(scores.query("metric == 'image_error'"))
     runs = pd.DataFrame({"method": ["still"], "scenario": ["small"], "seed": [0], "status": ["ok"]})
     (table,) = marked_blocks(Numbers(everything=Collected(rows, runs), baseline="still"))
     assert rows_of(table)["still"]["Future Marked"].text == "12.0"

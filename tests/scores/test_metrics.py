@@ -178,10 +178,8 @@ def table(*rows: tuple[str, str, int, float, int]) -> pd.DataFrame:
 
 def test_both_averages() -> None:
     """Equal weights scenarios equally, frames weighs them by length; seeds are averaged within a scenario first."""
-    scores = table(
-        ("ours", "long", 0, 1.0, 30), ("ours", "long", 1, 3.0, 30), ("ours", "short", 0, 5.0, 10), ("ours", "short", 1, 7.0, 10)
-    )
-    row = metrics.averages(scores).iloc[0]
+    long = ("ours", "long", 0, 1.0, 30), ("ours", "long", 1, 3.0, 30)
+    row = metrics.averages(table(*long, ("ours", "short", 0, 5.0, 10), ("ours", "short", 1, 7.0, 10))).iloc[0]
     assert (row["method"], row["task"], row["metric"]) == ("ours", "future", "chamfer")
     assert row["equal"] == pytest.approx((2 + 6) / 2)
     assert row["frames"] == pytest.approx((2 * 30 + 6 * 10) / 40)
@@ -216,8 +214,7 @@ def test_averages_of_nothing_are_empty() -> None:
 
 
 def test_every_metric_of_the_papers_tables_is_declared_once() -> None:
-    printed = {metric for name in paper.tables() for _, _, metric in paper.table(name)}
-    assert printed == set(paper.metrics())
+    assert {metric for name in paper.tables() for _, _, metric in paper.table(name)} == set(paper.metrics())
     assert list(paper.metrics()) == ["chamfer", "track_error", "iou", "psnr", "ssim", "lpips"]
     assert list(paper.in_studies()) == [*paper.metrics(), "track_error_bound"]
     assert len({metric.column for metric in metrics.METRICS.values()}) == len(metrics.METRICS)

@@ -108,8 +108,7 @@ def aim(**changes: object) -> Aim:
 )
 def test_an_aim_needs_its_mean_and_its_interval(center, spread, changes, verdict):
     values = logs({name: [center + spread * (-1) ** index] for index, name in enumerate("abcdef")})
-    row = judged_aims(table(values), table({}), [aim(**changes)]).iloc[0]
-    assert row["aim_verdict"] == verdict
+    assert judged_aims(table(values), table({}), [aim(**changes)]).iloc[0]["aim_verdict"] == verdict
 
 
 def test_an_aim_of_transfers_is_judged_by_transfers():

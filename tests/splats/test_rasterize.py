@@ -131,8 +131,7 @@ def test_nothing_in_view_is_an_empty_picture_with_zero_gradients():
 
 def test_a_camera_among_the_splats_gives_a_finite_picture_and_finite_gradients():
     splats = random_splats(1, 300, torch.float32)
-    centered = [splats[0] - torch.tensor([0.0, 0.0, 1.0]), *splats[1:]]
-    picture = rasterize(*centered, small_view())
+    picture = rasterize(*[splats[0] - torch.tensor([0.0, 0.0, 1.0]), *splats[1:]], small_view())
     (picture.rgb.sum() + picture.depth.sum()).backward()
     assert torch.isfinite(picture.rgb).all()
     assert all(torch.isfinite(tensor.grad).all() for tensor in splats)

@@ -64,8 +64,7 @@ def test_nearest_nodes_are_those_of_a_tree(seed, count):
     result = skin._nearest(skin._vectors(points), skin._vectors(queries), own=False, wanted=wanted).numpy()
     points, queries = points.astype(np.float32), queries.astype(np.float32)
     distances = np.linalg.norm(points[result] - queries[:, None], axis=2)
-    expected = cKDTree(points).query(queries, k=list(range(1, wanted + 1)))[0]
-    assert np.allclose(distances, expected, atol=1e-5)
+    assert np.allclose(distances, cKDTree(points).query(queries, k=list(range(1, wanted + 1)))[0], atol=1e-5)
     assert all(len(set(row)) == wanted for row in result.tolist())
 
 
@@ -145,9 +144,8 @@ def test_colors_turn_with_the_body_and_stay_as_released():
     red = np.zeros((4, 16, 3), np.float32)
     red[:, 3, 0] = -1.0
     turns = Rotation.random(4, random_state=1).as_quat(scalar_first=True)
-    splats = Splats(
-        means=nodes[:4], quaternions=3 * turns, log_scales=np.full((4, 1), -4), opacity_logits=np.full(4, 3), harmonics=red
-    )
+    logits = {"log_scales": np.full((4, 1), -4), "opacity_logits": np.full(4, 3)}
+    splats = Splats(means=nodes[:4], quaternions=3 * turns, harmonics=red, **logits)
 
     def seen(images: Images, frame: int, direction: list[float]) -> np.ndarray:
         gaussians = list(skinned_frames(splats, film, images, "cpu"))[frame]

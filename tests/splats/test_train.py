@@ -190,8 +190,7 @@ def test_the_first_splats_follow_the_points_the_extent_the_cameras_and_faint_one
     points, colors = rng.uniform(0, 0.1, (500, 3)), rng.uniform(0, 1, (500, 3))
     every = first_splats(points, colors, Appearance(), 0.002)
     assert np.allclose(every.means, points)
-    shown_colors = harmonic_colors(torch.tensor(every.harmonics), torch.ones(500, 3), 3)
-    assert np.allclose(shown_colors, colors, atol=1e-5)
+    assert np.allclose(harmonic_colors(torch.tensor(every.harmonics), torch.ones(500, 3), 3), colors, atol=1e-5)
     fewer = first_splats(points, colors, Appearance(spacing=10), 0.002)
     assert 60 < len(fewer.means) <= 216
     assert fewer.log_scales.mean() > every.log_scales.mean()

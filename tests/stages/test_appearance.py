@@ -121,12 +121,10 @@ def test_another_camera_s_intrinsics_make_another_picture(tmp_path):
 
 def test_one_camera_that_misses_frames_and_z_down(tmp_path):
     made = Scene(film(tmp_path / "capture", cameras=1, missing={0: (2,)}, up="-z"), tmp_path)
-    record = made.learn(settings(appearance=SHORT))
-    assert record.facts["unseen_surface"] > 0.2
+    assert made.learn(settings(appearance=SHORT)).facts["unseen_surface"] > 0.2
     rendered, table = made.render(made.roll(FLIP[:3, :3] @ STEP, "one"), settings(video=False))
     assert sorted(table["frame"].unique()) == [0, 1, 3, 4, 5]
-    scores = metrics.score_images(table, made.observations.scenario, FRAMES, "m", 0)
-    assert set(scores["frames"]) == {2}
+    assert set(metrics.score_images(table, made.observations.scenario, FRAMES, "m", 0)["frames"]) == {2}
     assert rendered.status == "ok"
     with pytest.raises(InputError, match="needs a second camera"):
         made.render(made.roll(STEP, "two"), settings(released_quirks=("second_camera_intrinsics",)))
@@ -194,8 +192,7 @@ def test_a_method_that_moves_splats_itself_is_drawn_with_them(scene):
 
 
 def test_pictures_of_any_camera_and_frame(scene, tmp_path):
-    rollout = scene.roll(STEP, "drawn")
-    common = (scene.capture.folder, Before.load(scene.appearance), Before.load(rollout))
+    common = (scene.capture.folder, Before.load(scene.appearance), Before.load(scene.roll(STEP, "drawn")))
     made = draw_frames(*common, "2", [1, 4], "white", settings(), "cpu", tmp_path)
     assert [path.name for path in made] == ["00001.png", "00004.png"]
     white = cv2.imread(str(made[0]), cv2.IMREAD_UNCHANGED)

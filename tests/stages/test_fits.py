@@ -92,9 +92,8 @@ def assert_same(got: Path, wanted: Path) -> None:
     for name in ROWS:
         for seed in ("0", "1"):
             one, other = (folder / name / seed for folder in (got, wanted))
-            pd.testing.assert_frame_equal(
-                pd.read_parquet(one / "history.parquet"), pd.read_parquet(other / "history.parquet"), check_exact=True
-            )
+            histories = (pd.read_parquet(folder / "history.parquet") for folder in (one, other))
+            pd.testing.assert_frame_equal(*histories, check_exact=True)
             twins = [Twin.load(folder / "twin.npz") for folder in (one, other)]
             assert twins[0].simulation == twins[1].simulation
             for array in ("stiffness", "dashpot"):
@@ -159,8 +158,7 @@ def test_an_error_of_one_is_named_and_holds_nobody_up(
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
-    [("{", "must be JSON"), ("{}", "must be a JSON list"), ('[{"kind": "x"}]', "entry 0")],
+    ("given", "message"), [("{", "must be JSON"), ("{}", "must be a JSON list"), ('[{"kind": "x"}]', "entry 0")]
 )
 def test_bad_rows(started: Path, tmp_path: Path, given: str, message: str) -> None:
     with pytest.raises(InputError, match=message):

@@ -56,13 +56,11 @@ def test_points_and_controllers_move_as_filmed(whole):
 
 def test_each_step_names_its_backend_and_draws_a_picture(whole):
     _, observations, folder = whole
-    masks = StageRecord.load(folder / "0" / "masks.json")
-    assert masks.settings["perception"]["segment"]["backend"] == "given"
+    assert StageRecord.load(folder / "0" / "masks.json").settings["perception"]["segment"]["backend"] == "given"
     tracks = StageRecord.load(folder / "0" / "tracks.json")
     assert tracks.settings["perception"]["track"]["backend"] == "opencv"
     assert 0 < tracks.facts["visible_share"] <= 1
-    lifted = StageRecord.load(folder / "lifted.json")
-    assert lifted.facts["controllers"] == 10
+    assert StageRecord.load(folder / "lifted.json").facts["controllers"] == 10
     for path, role in ((folder / "0" / "masks.json", "picture"), (folder / "lifted.json", "picture")):
         assert StageRecord.load(path).file(role, path).stat().st_size > 5000
     assert observations.scenario.provenance["shape prior"] == "visual_hull"
@@ -78,8 +76,7 @@ def test_cameras_may_differ_in_size_and_miss_frames(tmp_path):
 
 def test_opencv_finds_what_the_given_masks_show(tmp_path, whole):
     settings = replace(SETTINGS, perception=replace(SETTINGS.perception, segment=Segmentation(backend="opencv")))
-    observations = perceived(whole[0], tmp_path, settings=settings)
-    assert np.median(motion_error(observations)) < 0.003
+    assert np.median(motion_error(perceived(whole[0], tmp_path, settings=settings))) < 0.003
     assert StageRecord.load(tmp_path / "0" / "masks.json").settings["perception"]["segment"]["backend"] == "opencv"
 
 

@@ -110,8 +110,7 @@ def test_every_stage_has_a_command_and_tells_its_inputs_from_earlier_stages(name
     declared = STAGES[name]
     assert declared.name == name and declared.about and " -> " in declared.about
     earlier = {other.product for other in list(STAGES.values())[: list(STAGES).index(name)]}
-    elsewhere = {"pool", "targets", LEARNED}
-    assert set(declared.inputs) - {declared.product} <= earlier | elsewhere
+    assert set(declared.inputs) - {declared.product} <= earlier | {"pool", "targets", LEARNED}
     with pytest.raises(SystemExit) as ended:
         declared.parse(["--help"])
     assert ended.value.code == 0

@@ -12,9 +12,11 @@ from neuspring.core.artifacts import Observations, Trajectory, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.files import read_npz
 from neuspring.core.records import Recorder, StageRecord
+from neuspring.core.run_record import RunRecord
 from neuspring.experiments.tracking import log as tracking
 from neuspring.physics import stability
 from neuspring.scores import metrics
+from neuspring.stages.average import average
 from neuspring.stages.fit import fit
 from neuspring.stages.observe import observe
 from neuspring.stages.rollout import rollout
@@ -91,8 +93,7 @@ def test_every_step_leaves_what_its_record_names(finished):
 def test_scores_are_the_metrics_of_the_trajectory(finished):
     folder, run, _ = finished
     observations = Observations.load(folder / "small" / "observations.npz")
-    trajectory = Trajectory.load(run.with_name("trajectory.npz"))
-    expected = metrics.score(trajectory, observations, "phystwin", 0)
+    expected = metrics.score(Trajectory.load(run.with_name("trajectory.npz")), observations, "phystwin", 0)
     pd.testing.assert_frame_equal(pd.read_parquet(run.with_name("scores.parquet")), expected)
     pairs = [(task, metric) for task in metrics.TASKS for metric in ("chamfer", "track_error", "track_error_bound")]
     assert sorted(zip(expected["task"], expected["metric"], strict=True)) == sorted(pairs)
@@ -131,8 +132,7 @@ def test_a_transfer_keeps_the_course_of_errors_and_the_line(finished, tmp_path):
     frames = seen.scenario.frame_count
     assert course.groupby(["scenario", "metric"])["frame"].apply(list).map(lambda each: each == list(range(frames))).all()
     means = course[course["frame"] > 0].groupby(["scenario", "metric"])["value"].mean()
-    expected = scores.set_index(["scenario", "metric"])["value"]
-    pd.testing.assert_series_equal(means, expected, check_like=True)
+    pd.testing.assert_series_equal(means, scores.set_index(["scenario", "metric"])["value"], check_like=True)
     lines, _ = read_npz(record.file("lines", tmp_path / "transfer.json"))
     trajectory = Trajectory.load(run.with_name("trajectory.npz"))
     assert list(lines) == ["other"] and lines["other"].dtype == np.float32, "the other target has no line"
@@ -164,8 +164,7 @@ def test_regions_and_a_field_pass_through_every_stage(tmp_path):
     fitted = Twin.load(run.with_name("twin.npz"))
     assert np.unique(fitted.topology.labels).tolist() == [0, 1, 2]
     np.testing.assert_array_equal(fitted.topology.springs, coarse.topology.springs)
-    history = pd.read_parquet(run.with_name("history.parquet"))
-    counts = history["metric"].value_counts().to_dict()
+    counts = pd.read_parquet(run.with_name("history.parquet"))["metric"].value_counts().to_dict()
     assert counts == {"loss": 2, "tail_loss": 2, "gradient_norm": 2, "learning_rate": 2}
 
 
@@ -179,9 +178,8 @@ def test_a_fit_that_its_settings_held_says_so_in_the_notes():
         "fit: 20% of the frames left out of gradients (fit.adjoint_limit)",
         "fit: only 1.2% of the texels moved by a tenth of their first scale",
     ]
-    free = StageRecord(
-        stage="fit", status="ok", facts={"at_bound": 0.05, "texels_moved": 0.05, "frames_left_out": 0.05}, settings=settings
-    )
+    facts = {"at_bound": 0.05, "texels_moved": 0.05, "frames_left_out": 0.05}
+    free = StageRecord(stage="fit", status="ok", facts=facts, settings=settings)
     assert _notes({"rollout": StageRecord(stage="rollout", status="ok"), "fit": free}) == []
 
 
@@ -234,10 +232,33 @@ def test_a_missing_or_changed_artifact_is_an_error_that_says_what_to_do(finished
         StageRecord.load(record).file("twin", record)
 
 
+def test_the_mean_of_seeds_is_scored_as_any_prediction_and_a_seed_that_failed_fails_it(tmp_path, finished):
+    folder = finished[1].parent
+    seen, one = folder.parents[1] / "observations.npz", Trajectory.load(folder / "trajectory.npz")
+
+    def saved(name: str, shift: float, failure: str = ""):
+        record = Recorder("rollout", tmp_path / name / "rollout.json", inputs={"observations": seen})
+        files = record.beside(trajectory="trajectory.npz")
+        replace(one, positions=one.positions + np.array([shift, 0, 0])).save(files["trajectory"])
+        record.save(files, {}, failure=failure)
+        return record.output
+
+    rollouts, out = [saved(str(k), 0.001 * k) for k in range(3)], tmp_path / "mean" / "0"
+    average(observations=seen, rollout=rollouts, output=out / "rollout.json")
+    record = StageRecord.load(out / "rollout.json")
+    assert [record.facts[f"spread_{task}"] for task in metrics.TASKS] == pytest.approx([0.001, 0.001], rel=1e-3)
+    np.testing.assert_allclose(
+        Trajectory.load(out / "trajectory.npz").positions, one.positions + np.array([0.001, 0, 0]), atol=1e-7
+    )
+    score(observations=seen, rollout=out / "rollout.json", method="mean", variant={"mean_of": "x"}, output=out / "run.json")
+    assert RunRecord.load(out / "run.json").ok
+    average(observations=seen, rollout=[*rollouts[:2], saved("lost", 0.0, "it left the scene")], output=out / "failed.json")
+    assert StageRecord.load(out / "failed.json").status == "failed"
+
+
 def test_only_a_body_that_can_meet_itself_is_predicted_with_more_substeps(tmp_path, finished):
     folder, _, _ = finished
-    found = folder / "small" / "search-uniform" / "0" / "search.json"
-    twin = Twin.load(found.with_name("twin.npz"))
+    twin = Twin.load((folder / "small" / "search-uniform" / "0" / "search.json").with_name("twin.npz"))
     counts = {}
     for meets in (False, True):
         for released in (True, False):

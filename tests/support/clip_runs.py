@@ -50,16 +50,14 @@ def write_transfer(
         courses += [pd.DataFrame(course | {"metric": name, "value": error * (frames > 0)}) for name, error in errors.items()]
         nodes = np.concatenate([seen.object_points, np.repeat(seen.nodes[None, 3:], FRAMES, axis=0)], axis=1)
         lines[clip] = seen.on_line(nodes + np.array([0.0, 0.0, 3 * value])).astype(np.float32)
-    paths = {
-        role: record.with_name(f"transfer{suffix}") for role, suffix in (("scores", ".parquet"), ("frames", "_frames.parquet"))
-    }
+    endings = {"scores": ".parquet", "frames": "_frames.parquet"}
+    paths = {role: record.with_name(f"transfer{suffix}") for role, suffix in endings.items()}
     write_table(pd.DataFrame(rows, columns=list(SCORE_COLUMNS)), paths["scores"])
     write_table(pd.concat(courses), paths["frames"])
     if line:
         paths["lines"] = record.with_name("transfer_lines.npz")
         write_npz(paths["lines"], lines, "{}", compress=True)
     files = {role: [path.name, digest_file(path)] for role, path in paths.items()}
-    StageRecord(
-        stage="transfer", status="ok", files=files, facts={"diverged": list(diverged), "targets": len(l1) + len(diverged)}
-    ).save(record)
+    facts = {"diverged": list(diverged), "targets": len(l1) + len(diverged)}
+    StageRecord(stage="transfer", status="ok", files=files, facts=facts).save(record)
     return record

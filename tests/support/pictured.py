@@ -47,8 +47,7 @@ class Scene:
         """The record of a rollout that moves all nodes by `step` a frame, and diverges after `frames`."""
         path = self.folder / name / "rollout.json"
         path.parent.mkdir(exist_ok=True)
-        nodes = self.observations.nodes
-        positions = nodes + np.arange(frames)[:, None, None] * step
+        positions = self.observations.nodes + np.arange(frames)[:, None, None] * step
         ended = {} if frames == FRAMES else {"diverged_frame": frames, "reason": "test"}
         Trajectory(positions=positions, frame_count=FRAMES, **ended).save(path.with_name("trajectory.npz"))
         failure = "" if frames == FRAMES else "rollout: test"

@@ -24,8 +24,7 @@ def results(folder: Path, methods: tuple[str, ...] = ("baseline", "neuspring")) 
         place = scenario / method / "0"
         twin = softer(problem.truth, 0.7**index)
         twin.save(place / "twin.npz")
-        trajectory = roll_out(twin, seen.controller_points)
-        trajectory.save(place / "trajectory.npz")
+        roll_out(twin, seen.controller_points).save(place / "trajectory.npz")
         record(place)
     return scenario
 

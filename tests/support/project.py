@@ -71,9 +71,8 @@ def environment(**variables: str) -> dict[str, str]:
 
 def start(command: list[str], project: Path, **variables: str) -> subprocess.Popen[str]:
     """Start a run; its output is that of stdout and stderr."""
-    return subprocess.Popen(
-        command, cwd=project, env=environment(**variables), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
+    told = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    return subprocess.Popen(command, cwd=project, env=environment(**variables), **told)
 
 
 def output_of(process: subprocess.Popen[str], fails: bool = False) -> str:

@@ -131,9 +131,8 @@ def write_jobs(
             for seed in seeds:
                 gpu = ends.index(min(ends))
                 attempts = []
-                outcomes = (
-                    ["permanent"] if count % never == never - 1 else ["transient", "ok"] if count % again == again - 1 else ["ok"]
-                )
+                again_then_ok = ["transient", "ok"] if count % again == again - 1 else ["ok"]
+                outcomes = ["permanent"] if count % never == never - 1 else again_then_ok
                 for outcome in outcomes:
                     seconds = 200.0 + 37 * (count % 7)
                     attempts.append(attempt(ends[gpu], seconds, outcome=outcome, devices=[str(gpu)]))

@@ -46,8 +46,7 @@ def cable(frames: int = 4, move: Any = (0.0, 0.0, 0.0), sag: float = 0.5, **chan
     """Markers on z = 0.5 + sag (x - 0.2)^2, m, the two at either end held; the last two move by `move` per frame."""
     x = np.linspace(0, LENGTH, MARKERS)
     line = np.stack([x, np.zeros(MARKERS), 0.5 + sag * (x - 0.2) ** 2], axis=1)
-    held = np.array([0, 1, MARKERS - 2, MARKERS - 1])
-    nodes, hands = line[2:-2], line[held]
+    nodes, hands = line[2:-2], line[np.array([0, 1, MARKERS - 2, MARKERS - 1])]
     path = np.tile(hands, (frames, 1, 1))
     path[:, 2:] += np.arange(frames)[:, None, None] * np.asarray(move)
     count = len(nodes)

@@ -42,9 +42,8 @@ def write_run(results: Path, scenario: str = "rope", seed: int = 0, **changes: A
     scores = pandas.DataFrame(rows, columns=["task", "metric", "value", "unit"])
     scores.assign(scenario=scenario, category="toy", method="ours", seed=seed, frames=18).to_parquet(folder / "scores.parquet")
     pandas.DataFrame({"step": range(STEPS), "metric": "loss", "value": 1.0}).to_parquet(folder / "fit.parquet")
-    pandas.DataFrame({"step": [0, 1, 1], "metric": ["best", "best", "sigma"], "value": [3.0, 2.0, 0.5]}).to_parquet(
-        search / "history.parquet"
-    )
+    steps = {"step": [0, 1, 1], "metric": ["best", "best", "sigma"], "value": [3.0, 2.0, 0.5]}
+    pandas.DataFrame(steps).to_parquet(search / "history.parquet")
     (folder / "twin.npz").write_bytes(b"twin")
     (search / "coarse.npz").write_bytes(b"coarse")
     path = folder / "run.json"
@@ -115,9 +114,8 @@ class Postgres:
         self._run("initdb", "-D", "data", "-U", "neuspring", "--auth=trust", "--no-sync")
         command = ["-D", "data", "-c", "listen_addresses=127.0.0.1", "-c", f"unix_socket_directories={self.folder}"]
         with (self.folder / "log").open("a") as log:
-            self.process = subprocess.Popen(
-                [self._program("postgres"), *command, "-p", str(self.port)], stdout=log, stderr=log, **self._who
-            )
+            words = [self._program("postgres"), *command, "-p", str(self.port)]
+            self.process = subprocess.Popen(words, stdout=log, stderr=log, **self._who)
         wait_until(self._answers, self.process, "PostgreSQL")
 
     def stop(self) -> None:
@@ -184,9 +182,8 @@ class Server:
         command += ["--backend-store-uri", self.backend, "--artifacts-destination", str(self.folder / "artifacts")]
         with (self.folder / "server.log").open("a") as log:
             # A session of its own: its worker must die with it.
-            self.process = subprocess.Popen(
-                command, cwd=self.folder, env=os.environ | off, stdout=log, stderr=log, start_new_session=True
-            )
+            told = {"env": os.environ | off, "stdout": log, "stderr": log, "start_new_session": True}
+            self.process = subprocess.Popen(command, cwd=self.folder, **told)
         wait_until(self._answers, self.process, "mlflow server")
 
     def kill(self) -> None:

@@ -44,8 +44,7 @@ def test_every_body_answers_for_its_twin(twins):
         body = body_of(twin)
         assert body is BODIES[name] and body.name == name
         lines, nodes, hands = lines_of(twin), twin.topology.nodes, twin.topology.controllers
-        points = lines.points(nodes, hands)
-        assert len(points) == len(lines.labels) == len(lines.masses) > lines.pairs.max()
+        assert len(lines.points(nodes, hands)) == len(lines.labels) == len(lines.masses) > lines.pairs.max()
         assert len(lines.pairs) == len(lines.stiffness) == len(lines.rest_lengths) >= lines.inner > 0
         assert body.node_stiffness(twin).shape == (len(nodes),)
         assert lines.masses.sum() > 0 and body.mass_at(twin, 0) > 0

@@ -85,9 +85,8 @@ def test_gradients_are_those_of_the_loss_in_its_unit():
         row = run.epoch()
         first[unit] = (run.parameters.offsets.grad.numpy(), row["loss"])
     spacing = topology_spacing(small.fit_problem().twin.topology)
-    np.testing.assert_allclose(
-        first["spacing"][0], first["meter"][0] / spacing**2, rtol=SINGLE, atol=SINGLE * np.abs(first["spacing"][0]).max()
-    )
+    atol = SINGLE * np.abs(first["spacing"][0]).max()
+    np.testing.assert_allclose(first["spacing"][0], first["meter"][0] / spacing**2, rtol=SINGLE, atol=atol)
     assert first["spacing"][1] == first["meter"][1], "recorded in m^2"
 
 

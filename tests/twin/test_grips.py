@@ -49,9 +49,8 @@ def test_a_fit_simulates_what_a_rollout_does():
 
 def test_a_fit_lowers_its_loss_and_does_not_read_the_future():
     settings = config.Fit(epochs=3, learning_rate=5e-2, horizon=0)
-    first, second = (
-        fit(small.fit_problem(regripped(seen), fit=settings)) for seen in (small.observations(), small.spoiled_future())
-    )
+    seen_by = (small.observations(), small.spoiled_future())
+    first, second = (fit(small.fit_problem(regripped(seen), fit=settings)) for seen in seen_by)
     pd.testing.assert_frame_equal(first.history, second.history, check_exact=True)
     np.testing.assert_array_equal(first.twin.material.stiffness, second.twin.material.stiffness)
     assert first.history["loss"].iloc[-1] < first.history["loss"].iloc[0]
@@ -72,6 +71,5 @@ def test_a_grip_after_the_split_does_not_read_the_body_there():
     twin, known = small.scene().truth, regripped(seen, end + 1)
     points = seen.object_points.copy()
     points[end:] += 1.0
-    spoiled = replace(known, object_points=points)
-    np.testing.assert_array_equal(outcome(twin, known), outcome(twin, spoiled))
+    np.testing.assert_array_equal(outcome(twin, known), outcome(twin, replace(known, object_points=points)))
     assert np.isfinite(outcome(twin, known)).all()

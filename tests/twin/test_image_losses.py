@@ -83,8 +83,7 @@ def test_nodes_that_leave_object_and_hands_cost_their_distance():
 
 @pytest.mark.parametrize("name", ["image_track", "silhouette"])
 def test_gradients_through_the_projection(name):
-    weights = Losses(**{"image_track": 0.0, "silhouette": 0.0} | {name: 1.0})
-    loss = loss_of(weights)
+    loss = loss_of(Losses(**{"image_track": 0.0, "silhouette": 0.0} | {name: 1.0}))
     rng = np.random.default_rng(0)
     x = (nodes_of(3) + 0.004 * torch.tensor(rng.normal(size=nodes_of(3).shape))).requires_grad_()
     # Large numbers, so that gradcheck's absolute tolerance says something.

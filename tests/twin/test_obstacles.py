@@ -29,8 +29,7 @@ def test_search_fit_rollout_and_transfer_carry_the_obstacles_of_a_scenario(tmp_p
     found = search(small.search_problem(seen), 0)
     assert found.twin.simulation.obstacles == (SHELF,)
     assert found.cost != search(small.search_problem(), 0).cost
-    problem = small.fit_problem(seen, fit=config.Fit(epochs=2, learning_rate=5e-2))
-    trained = fit(problem).twin
+    trained = fit(small.fit_problem(seen, fit=config.Fit(epochs=2, learning_rate=5e-2))).twin
     assert trained.simulation.obstacles == (SHELF,)
     positions = roll_out(trained, seen.controller_points).positions
     free = replace(trained, simulation=replace(trained.simulation, obstacles=()))

@@ -234,8 +234,7 @@ def test_stiffness_of_zero_can_grow():
     """It is raised to a floor first: no factor brings zero to life."""
     start = twin()
     dead = replace(start, material=replace(start.material, stiffness=np.zeros_like(start.material.stiffness)))
-    trained = offsets(parameters("springs", dead), 1.0)
-    assert trained.physical()["stiffness"].min() > 1e-3
+    assert offsets(parameters("springs", dead), 1.0).physical()["stiffness"].min() > 1e-3
 
 
 # Training -------------------------------------------------------------------------------------------------------------

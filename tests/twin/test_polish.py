@@ -91,8 +91,7 @@ def test_slopes_are_those_of_the_cost():
 
 def test_a_rollout_that_left_has_no_slope():
     problem = polished()
-    twin = candidate(problem, problem.decode(problem.encode()))
-    x, v, loss, start = rollouts_of(problem, [twin] * 3)
+    x, v, loss, start = rollouts_of(problem, [candidate(problem, problem.decode(problem.encode()))] * 3)
     x[:, 2] = float("nan")
     costs, matrix, gradient = products(loss, start, x, v, [True, True, False], np.full(2, 0.01))
     assert np.isinf(costs[2])
@@ -181,8 +180,7 @@ def test_stiffness_and_drag_of_a_toy_twin_are_recovered():
     judge, slopes = partial(evaluate, problem), partial(slope_rows, problem)
     rows = judge([problem.encode()], False, 0, 0)
     ends = list(module._polished(problem.search, problem.variables, rows, [], 0, judge, slopes, False))[-1]
-    tried = [row for row in ends if row["stage"] == POLISH]
-    best = min(tried, key=lambda row: row["cost"])
+    best = min([row for row in ends if row["stage"] == POLISH], key=lambda row: row["cost"])
     assert best["cost"] < 1e-3 * rows[0]["cost"]
     # The dashpots, which move this rope by less than rounding, end 40 % off.
     for name, accuracy in (("stiffness", 0.01), ("drag", 0.03)):

@@ -50,6 +50,22 @@ def test_a_bent_body_is_straightened_and_hands_follow():
     assert abs(np.corrcoef(flat[order, 0], np.arange(len(order)))[0, 1]) > 0.98
 
 
+def test_limbs_that_lie_otherwise_are_told_apart_by_the_ways_through_the_body():
+    """A head and four limbs, which swing by up to half a radian: without ways another limb comes to lie on the head."""
+
+    def animal(*swings: float) -> np.ndarray:
+        parts = []
+        for length, angle, swing in zip((0.12, 0.2, 0.2, 0.2, 0.2), (0, 1.1, 2.3, -2.3, -1.1), swings, strict=True):
+            axes = np.arange(0, length, 0.015), (-0.015, 0.0, 0.015), (0.0, 0.015)
+            part = np.stack([a.ravel() for a in np.meshgrid(*axes)], axis=1)
+            parts.append(part @ Rotation.from_euler("z", angle + swing).as_matrix().T)
+        return np.concatenate(parts)
+
+    here, there = animal(0, 0, 0, 0, 0), animal(0, 0.2, 0.5, -0.1, 0.5)
+    found = register(here, there, there[:1])
+    assert np.median(np.linalg.norm(found.points - here, axis=1)) < 0.015, "node i is node i within a spacing"
+
+
 def test_residual_and_spacing_of_a_grid():
     grid = np.stack([a.ravel() for a in np.meshgrid(*[np.arange(5) * 0.1] * 3, indexing="ij")], axis=1)
     assert spacing(grid) == pytest.approx(0.1)

@@ -221,8 +221,7 @@ def test_isolated_nodes_are_repaired_or_left():
     values = small.start_values() | {"object_radius": 0.005}
     count = len(small.observations().nodes)
     left = candidate(loosely(isolated_nodes="allow"), values)
-    alone = np.setdiff1d(np.arange(count), left.topology.springs)
-    assert 0 < len(alone) < count
+    assert 0 < len(np.setdiff1d(np.arange(count), left.topology.springs)) < count
     assert left.topology.object_spring_count == 0
     seen = small.observations()
     released = uniform_topology(seen.nodes, seen.controller_points[0], 0.005, 18, values["controller_radius"], 50)
@@ -297,9 +296,8 @@ def pushed(hands: str = "auto", rollouts: int = 26) -> SearchProblem:
     lump = np.tile(corners, (frames, 1, 1))
     lump[:, :, 0] += np.maximum.accumulate(np.maximum(way - 0.01, 0.0))[:, None]
     points = np.array([[-0.03, 0.005, 0.015], [-0.03, 0.025, 0.015]]) + way[:, None, None] * [1.0, 0.0, 0.0]
-    return small.search_problem(
-        scenarios.seen(lump, points), search=config.Search(hands=hands, rollouts=rollouts, lengths="spacing")
-    )
+    settings = config.Search(hands=hands, rollouts=rollouts, lengths="spacing")
+    return small.search_problem(scenarios.seen(lump, points), search=settings)
 
 
 def test_the_first_generation_says_whether_hands_hold_or_push():

@@ -118,8 +118,7 @@ def test_duplicate_nodes_are_not_joined(copies: int) -> None:
 
 def test_controllers_ask_for_nodes_only_and_without_a_minimum_length() -> None:
     nodes, hands = np.array([[0.0, 0, 0], [0.2, 0, 0], [9, 0, 0]]), np.array([[graphs.MIN_LENGTH / 2, 0, 0], [0.01, 0, 0]])
-    springs = graphs.controller_springs(nodes, hands, 1.0, 5)
-    assert springs.tolist() == [[3, 0], [3, 1], [4, 0], [4, 1]]
+    assert graphs.controller_springs(nodes, hands, 1.0, 5).tolist() == [[3, 0], [3, 1], [4, 0], [4, 1]]
     assert graphs.controller_springs(nodes, hands, 1.0, 1).tolist() == [[3, 0], [4, 0]]
     assert graphs.controller_springs(nodes, hands, 1e-6, 5).shape == (0, 2)
 
@@ -147,8 +146,7 @@ def blocks(counts: tuple[int, ...] = (6, 9, 4)) -> np.ndarray:
 
 
 def test_regions_are_found_and_numbered_by_centroid() -> None:
-    labels = graphs.regions(blocks(), 3)
-    assert labels.tolist() == [2] * 4 + [1] * 9 + [0] * 6
+    assert graphs.regions(blocks(), 3).tolist() == [2] * 4 + [1] * 9 + [0] * 6
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 25])
@@ -275,10 +273,9 @@ def test_calibrated_controller_springs_rest_in_frame_0_and_body_springs_in_the_r
 
 
 def test_another_place_of_rest_is_refused() -> None:
+    made = graphs.piecewise_topology(cloud(3), cloud(4, 3), np.zeros(25, np.int32), [0.5], [6], 0.6, 4)
     with pytest.raises(InputError, match=r"rest_shape.*first_frame.*'hands'"):
-        replace(
-            graphs.piecewise_topology(cloud(3), cloud(4, 3), np.zeros(25, np.int32), [0.5], [6], 0.6, 4), controller_rest="hands"
-        )
+        replace(made, controller_rest="hands")
 
 
 # One piece ------------------------------------------------------------------------------------------------------------
@@ -319,8 +316,7 @@ def test_a_part_behind_a_gap_is_joined_along_its_seam() -> None:
 def test_a_seam_is_no_longer_than_the_part_that_is_near() -> None:
     """A row that leads away from the body is joined by its end alone."""
     body = np.stack(np.meshgrid(np.arange(4.0), np.arange(4.0), [0.0], indexing="ij"), -1).reshape(-1, 3)
-    row = np.array([[6.0 + k, 0, 0] for k in range(5)])
-    nodes = np.concatenate([body, row])
+    nodes = np.concatenate([body, np.array([[6.0 + k, 0, 0] for k in range(5)])])
     mended = graphs.joined(nodes, same(nodes, 1.2, 5))
     assert pieces(len(nodes), mended) == 1
     long = mended[graphs.distances(nodes, mended) > 1.2]
@@ -330,8 +326,7 @@ def test_a_seam_is_no_longer_than_the_part_that_is_near() -> None:
 def test_many_parts_become_one_whatever_is_near_to_what() -> None:
     """Pairs that are nearer to each other than to the body join first, and then the body."""
     nodes = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [20, 0, 0], [21, 0, 0], [23, 0, 0], [24, 0, 0]])
-    mended = graphs.joined(nodes, np.array([[0, 1], [1, 2], [2, 3], [4, 5], [6, 7]]))
-    assert pieces(8, mended) == 1
+    assert pieces(8, graphs.joined(nodes, np.array([[0, 1], [1, 2], [2, 3], [4, 5], [6, 7]]))) == 1
     assert pieces(6, graphs.joined(nodes[:6], np.zeros((0, 2), int))) == 1, "from no spring at all"
 
 
@@ -374,8 +369,7 @@ def test_a_grid_has_the_spacing_of_its_nodes(counts):
 @pytest.mark.parametrize("of", [3, 4, 8])
 def test_rings_of_near_nodes_have_the_distance_of_the_rings(of):
     cable = rings(40, of, apart=0.025, radius=0.006)
-    nearest = np.linalg.norm(cable[1:of] - cable[0], axis=1).min()
-    assert nearest < 0.025 / 2
+    assert np.linalg.norm(cable[1:of] - cable[0], axis=1).min() < 0.025 / 2
     assert graphs.node_spacing(cable) == pytest.approx(0.025, rel=DOUBLE)
 
 
@@ -389,8 +383,7 @@ def test_it_scales_with_the_body_and_forgets_the_order_of_its_nodes():
 
 def test_holes_and_nodes_at_the_same_place_do_not_count():
     rope = lattice(60, 1, 1)
-    holes = np.delete(rope, [10, 11, 30], axis=0)
-    assert graphs.node_spacing(holes) == pytest.approx(1.0, rel=DOUBLE)
+    assert graphs.node_spacing(np.delete(rope, [10, 11, 30], axis=0)) == pytest.approx(1.0, rel=DOUBLE)
     assert graphs.node_spacing(np.concatenate([rope, rope[::3]])) == pytest.approx(1.0, rel=DOUBLE)
 
 

@@ -294,8 +294,7 @@ def test_springs_that_a_twin_lacks_have_no_strength_in_it(each):
     """Its own stand where the union says."""
     rng = np.random.default_rng(0)
     pairs, places = union([topology(springs) for springs in each])
-    problem = small.search_problem()
-    one = packed(candidate(problem, small.start_values()))
+    one = packed(candidate(small.search_problem(), small.start_values()))
     own = [one | {"springs": torch.tensor(rng.uniform(1.0, 2.0, (len(springs), 3)))} for springs in each]
     for parameters, springs, got in zip(own, each, stacked(own, places, len(pairs))["springs"], strict=True):
         values = {frozenset(pair): row for pair, row in zip(springs.tolist(), parameters["springs"].tolist(), strict=True)}

@@ -46,9 +46,8 @@ JOB_POLL = 0.2
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status (1 if a signal ended it)."""
-    parser = argparse.ArgumentParser(
-        prog="python -m neuspring.experiments.jobs.wrapper", description="Run one job of the workflow."
-    )
+    program = "python -m neuspring.experiments.jobs.wrapper"
+    parser = argparse.ArgumentParser(prog=program, description="Run one job of the workflow.")
     parser.add_argument("--log", type=Path, required=True, help="its log, under <results>/logs/<rule>/")
     parser.add_argument("--gpus", type=int, default=0, help="GPUs that it needs")
     parser.add_argument("--scenario", default="", help="its scenario")
@@ -198,8 +197,7 @@ def execute(
                 _print(line)
         status = process.wait()
     ended = replace(begun, outcome="ok", exit=status, seconds=round(time.monotonic() - start, 3), **watch.facts())
-    fault = faults.diagnose(status, list(tail))
-    if fault is None:
+    if (fault := faults.diagnose(status, list(tail))) is None:
         return ended, None
     again, message = " (may be tried again)" if fault.outcome == "transient" else "", faults.last_words(list(tail))
     say(f"{fault.cause}{again}: {message} {fault.remedy}".rstrip() + f" (log: {log})")

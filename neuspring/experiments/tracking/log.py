@@ -235,9 +235,8 @@ def _table(run_json: Path, name: str, by: str) -> list[tuple[Any, ...]]:
 
     path, columns = _require_file(run_json, run_json.parent / name), [by, "metric", "value"]
     try:
-        table = pandas.read_parquet(path, columns=columns).astype(
-            {"value": "float64"} | ({"step": "int64"} if by == "step" else {})
-        )
+        types = {"value": "float64"} | ({"step": "int64"} if by == "step" else {})
+        table = pandas.read_parquet(path, columns=columns).astype(types)
     except (OSError, ValueError, TypeError, KeyError) as error:
         rule = f"must be a Parquet table with the columns {', '.join(columns)}"
         reason = f"{type(error).__name__}: {error}".partition("\n")[0][:300]

@@ -272,9 +272,8 @@ def _look(source: np.ndarray, target: np.ndarray, point: np.ndarray, guess: np.n
     if not inside(guess[None], target.shape)[0]:
         return None
     here, there = _corner(point, source.shape), _corner(guess, target.shape)
-    place, ok = lucas_kanade(
-        _part(source, here), _part(target, there), (point - here)[None], (guess - there)[None], FLOW_WINDOW, levels
-    )
+    parts = _part(source, here), _part(target, there)
+    place, ok = lucas_kanade(*parts, (point - here)[None], (guess - there)[None], FLOW_WINDOW, levels)
     found = place[0].astype(float) + there
     return found if ok[0] and inside(found[None], target.shape)[0] else None
 
@@ -292,8 +291,7 @@ def _part(image: np.ndarray, corner: np.ndarray) -> np.ndarray:
 
 def _alike(source: np.ndarray, target: np.ndarray, point: np.ndarray, place: np.ndarray) -> float:
     """Correlation of the patches around two places."""
-    one, other = (
-        cv2.getRectSubPix(image, (SURROUND, SURROUND), tuple(map(float, at))) for image, at in ((source, point), (target, place))
-    )
+    size = (SURROUND, SURROUND)
+    one, other = (cv2.getRectSubPix(image, size, tuple(map(float, at))) for image, at in ((source, point), (target, place)))
     middle = np.full((1, 2), SURROUND // 2)
     return float(likeness(one, other, middle, middle)[0])

@@ -81,9 +81,8 @@ def _libraries(settings: Config) -> Iterator[MachineCheck]:
         if importlib.util.find_spec(module):
             yield MachineCheck(module, "ok", f"extra {extra}")
         else:
-            yield MachineCheck(
-                module, "broken" if wanted.get(module) else "absent", f"extra {extra} is not installed", install(extra)
-            )
+            told = f"extra {extra} is not installed", install(extra)
+            yield MachineCheck(module, "broken" if wanted.get(module) else "absent", *told)
     if importlib.util.find_spec("av"):
         import av
 
@@ -128,7 +127,7 @@ def _weights(settings: Config) -> Iterator[MachineCheck]:
         "LPIPS (AlexNet)": (
             lpips.find_weights,
             f"{DOWNLOAD} {hub / lpips.BACKBONE} {lpips.BACKBONE_ADDRESS}; .venv/bin/pip install --no-deps lpips",
-        ),
+        )
     }
     for baseline in BASELINES.values():
         if weights := baseline.weights:
@@ -141,10 +140,7 @@ def _weights(settings: Config) -> Iterator[MachineCheck]:
             yield MachineCheck(subject, "ok", "checksum is right")
     # Weights of perception, which their libraries keep in caches of their own.
     segment, track = settings.perception.segment, settings.perception.track
-    for subject, name in {
-        "GroundingDINO": segment_sam2.DETECTOR,
-        "SAM 2": segment_sam2.VIDEO_MODEL,
-    }.items():
+    for subject, name in {"GroundingDINO": segment_sam2.DETECTOR, "SAM 2": segment_sam2.VIDEO_MODEL}.items():
         there = isinstance(try_to_load_from_cache(name, "config.json"), str)
         wanted = segment.backend == "grounded_sam2" and not segment.grounded_sam2.download
         remedy = f".venv/bin/hf download {name}, or perception.segment.grounded_sam2.download: true"

@@ -83,9 +83,8 @@ def twin(picture: TwinOptions) -> None:
             rule = "must have a twin"
             raise InputError(f"--methods {run.name}", rule, "; ".join(run.notes) or "none", "Name methods with a search.")
         if picture.frame >= len(take.positions):
-            raise InputError(
-                "--frame", f"{run.name} is predicted up to frame {len(take.positions) - 1}, then it diverged", picture.frame
-            )
+            rule = f"{run.name} is predicted up to frame {len(take.positions) - 1}, then it diverged"
+            raise InputError("--frame", rule, picture.frame)
     if picture.style == "splats":
         _require_splats(chosen, "Leave out --as splats to draw springs.")
     scene = _scene(picture, chosen, [picture.frame], chosen.takes)

@@ -129,13 +129,7 @@ class PhotoPainter(Painter):
     takes: Sequence[SplatRun]
 
     def __init__(
-        self,
-        scene: FilmedScene,
-        takes: Sequence[SplatRun],
-        frames: Sequence[int],
-        manner: PhotoStyle,
-        images: Images,
-        device: str,
+        self, scene: FilmedScene, takes: Sequence[SplatRun], frames: Sequence[int], manner: PhotoStyle, images: Images, device: str
     ) -> None:
         super().__init__(scene, takes, frames, manner)
         self._drawn = [self._splats(take, images, device) if manner.style == "splats" else {} for take in takes]
@@ -154,7 +148,8 @@ class PhotoPainter(Painter):
         photo, labels = self.scene.photo(frame), self.scene.mask(frame)
         if photo is None or labels is None:
             return Drawn(self.scene.cut(rgba))
-        pair = Pair.of(photo, rgba, *object_and_hands(labels), OBJECT_COVERAGE)
+        own, hands = (np.where(labels == label, 255, 0).astype(np.uint8) for label in (OBJECT, HANDS))
+        pair = Pair.of(photo, rgba, own, hands, OBJECT_COVERAGE)
         difference = (pair.truth - pair.prediction).abs().mean(0).numpy()
         shows = pair.silhouettes[0] | pair.silhouettes[1]
         cut = self.scene.cut
@@ -195,8 +190,7 @@ class PhotoPainter(Painter):
         return faded(photo) if photo is not None and self.manner.ground == "image" else None
 
     def _below(self, axis: Axes, frame: int) -> None:
-        below = self._pale(frame)
-        if below is None:
+        if (below := self._pale(frame)) is None:
             super()._below(axis, frame)
         else:
             self._image(axis, below)
@@ -299,9 +293,3 @@ def faded(photo: np.ndarray) -> np.ndarray:
     """A photo that a drawing can be read on: gray, and mostly white."""
     gray = photo.astype(float).mean(axis=2, keepdims=True)
     return np.asarray(np.repeat((1 - FADE) * gray + FADE * 255, 3, axis=2), np.uint8)
-
-
-def object_and_hands(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Masks [H, W] uint8, 0 or 255, of the object and of hands."""
-    first, second = (np.where(labels == label, 255, 0).astype(np.uint8) for label in (OBJECT, HANDS))
-    return first, second

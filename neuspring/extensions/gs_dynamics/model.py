@@ -387,9 +387,8 @@ def turns(graph: ParticleGraph, before: torch.Tensor, after: torch.Tensor) -> to
     neighbors = np.repeat(np.arange(count, dtype=np.int32)[:, None], int(slot.max(initial=0)) + 1, axis=1)
     neighbors[receivers, slot] = senders
     # With a hundred particles the CPU is as fast as any device.
-    positions: list[Any] = [
-        wp.array(points.cpu().numpy().astype(np.float32), dtype=wp.vec3, device="cpu") for points in (before, after)
-    ]
+    arrays = [points.cpu().numpy().astype(np.float32) for points in (before, after)]
+    positions: list[Any] = [wp.array(points, dtype=wp.vec3, device="cpu") for points in arrays]
     table: Any = wp.array(neighbors, dtype=int, device="cpu")
     rotations, ranks = wp.zeros(count, dtype=wp.mat33, device="cpu"), wp.zeros(count, dtype=int, device="cpu")
     wp.launch(load(turn_nodes, "cpu"), count, [*positions, table, rotations, ranks], device="cpu")

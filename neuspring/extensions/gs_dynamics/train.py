@@ -243,8 +243,7 @@ def unroll(dynamics: Dynamics, batch: Batch) -> tuple[torch.Tensor, torch.Tensor
     state, tools = batch.history[:, :particles], batch.history[:, particles:]
     position, length = state.new_zeros(()), state.new_zeros(())
     for i, recorded in enumerate(batch.tools):
-        moves = dynamics(batch.graph, torch.cat([state, tools], dim=1), recorded - tools[-1])
-        after = state[-1] + moves
+        after = state[-1] + dynamics(batch.graph, torch.cat([state, tools], dim=1), recorded - tools[-1])
         position = position + position_loss(after, batch.targets[i], batch.known[i])
         length = length + length_loss(batch.graph, after, state[0].detach())
         state = torch.cat([state[1:], after[None]])
@@ -295,8 +294,7 @@ class GsDynamicsTrainer:
 
     def update(self, generator: torch.Generator, where: str) -> list[float]:
         """One optimizer step; returns the loss, the position loss and the length loss before its weight, m^2."""
-        batch = draw(self.windows, self.rules, self.recipe, generator)
-        position, length = unroll(self.network, batch)
+        position, length = unroll(self.network, draw(self.windows, self.rules, self.recipe, generator))
         loss = position + self.recipe.length_weight * length
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]

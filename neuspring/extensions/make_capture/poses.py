@@ -268,9 +268,8 @@ def by_table(seen: SampledCamera, top_down: bool, at: tuple[float, float] | None
     points = cloud(seen.depths, seen.lens.matrix)
     table, remarks = find_table(seen.path, points, top_down=top_down, at=None if at is None else _point(seen, at))
     poses = {seen.name: pose_on(table, points, seen.size, seen.lens.matrix)}
-    judged = _judged(
-        "rig", seen.path, Judged.of(rig_of({seen.name: seen}, poses, posed=False), {seen.name: seen.unit}, taken=taken)
-    )
+    rig = rig_of({seen.name: seen}, poses, posed=False)
+    judged = _judged("rig", seen.path, Judged(rig, {seen.name: seen.unit}, taken=taken))
     lines = (f"table: {table.text()}", *(f"warning: {remark}" for remark in remarks), *judged)
     return Placed(poses=poses, table=table.text(), lines=lines)
 
@@ -334,9 +333,9 @@ def stand(poses: Poses, seen: Seen, file: Path, level: bool, top_down: bool, up:
         rise = f"its plane was {100 * abs(point[2]):.1f} cm from z = 0 there, {1e3 * rms:.1f} mm rms over all cameras"
         lines.append(f"leveled: the world was turned by {turn:.1f} degrees; {rise}")
     rig = rig_of(seen, moved)
-    side = up or min(("+z", "-z"), key=lambda each: sum(rig.with_up(each).standing.values()))
-    rig = rig.with_up(side)
-    lines += _judged("rig", file, Judged.of(rig, {name: view.unit for name, view in seen.items()}, False, taken))
+    side = up or min(("+z", "-z"), key=lambda each: sum(rig.elsewhere(up=each).standing.values()))
+    rig = rig.elsewhere(up=side)
+    lines += _judged("rig", file, Judged(rig, {name: view.unit for name, view in seen.items()}, False, taken))
     text = "; ".join(f"camera {name}: {plane.text()}" for name, (plane, _) in rig.stands.items())
     return Placed(poses=moved, up=side, motion=motion, table=text or "not found", lines=tuple(lines))
 

@@ -115,8 +115,7 @@ def find_table(where: object, points: np.ndarray, top_down: bool = False, at: np
     where there is none: the largest plane is a wall or a ceiling, or a plane that faces the camera without `top_down`, too small a
     part of the image, or not flat.
     """
-    found = planes(points)
-    if not found:
+    if not (found := planes(points)):
         remedy = "Film more of the table, or give --poses."
         raise InputError(where, "the table must be seen: no plane was found in depth", remedy=remedy)
     if at is not None:

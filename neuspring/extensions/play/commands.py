@@ -10,7 +10,7 @@ from neuspring.cli.options import Positional, arg
 from neuspring.core.errors import InputError
 
 if TYPE_CHECKING:
-    from neuspring.extensions.play.page import Page
+    pass
 
 
 def play(

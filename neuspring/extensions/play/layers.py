@@ -262,8 +262,7 @@ class TrackOverlay:
         """Show a frame with nodes [N, 3], m."""
         annotated = self._tracks[min(frame, len(self._tracks) - 1)]
         seen = np.isfinite(annotated).all(axis=1)
-        predicted = nodes[self._nodes][seen]
-        pairs = np.stack([predicted, annotated[seen]], axis=1).astype(np.float32)
+        pairs = np.stack([nodes[self._nodes][seen], annotated[seen]], axis=1).astype(np.float32)
         self.error = float(np.linalg.norm(pairs[:, 0] - pairs[:, 1], axis=1).mean()) if len(pairs) else None
         if self._points.visible:
             self._points.points, self._lines.points = pairs[:, 0], pairs

@@ -182,8 +182,7 @@ class Live:
         """A frame: controls, simulation, drawing."""
         simulator = self.simulator
         before = simulator.grabbed
-        controls = self._controls(frame_time)
-        if controls is None:
+        if (controls := self._controls(frame_time)) is None:
             return
         x = simulator.step(*controls)
         if self.recording.add((*controls[:3], simulator.holds), x):
@@ -200,8 +199,7 @@ class Live:
             if simulator.grabbed != before:
                 self.body.mark(simulator.grabbed if simulator.grabbed >= 0 else None)
         self.strain, self.over = float(strain.max(initial=0.0)), int((strain > self.most).sum())
-        delay = self.grab.drawn()
-        if delay is not None:
+        if (delay := self.grab.drawn()) is not None:
             self._latencies.append(delay)
             self.latency = sum(self._latencies) / len(self._latencies)
 

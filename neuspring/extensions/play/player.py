@@ -107,9 +107,8 @@ class Player:
         self.limit: float | None = None
         """Strain at the end of the colors of a live twin; None: the recording is shown."""
         seen = found.observations
-        hands = (
-            seen.controller_points[seen.controller_valid] if seen.controller_valid.size else seen.controller_points.reshape(-1, 3)
-        )
+        all_hands, holds = seen.controller_points, seen.controller_valid
+        hands = all_hands[holds] if holds.size else all_hands.reshape(-1, 3)
         everything = np.concatenate([seen.object_points[seen.object_visibility], seen.nodes, hands])
         self.low, self.high = everything.min(axis=0), everything.max(axis=0)
         self.size = max(float(np.linalg.norm(self.high - self.low)), 0.05)

@@ -20,11 +20,7 @@ if TYPE_CHECKING:
 SERVER_LABEL = "NeuSpring"
 VISIT = re.compile(r"/(?:\?frame=([0-9]{1,9})(?:&scenario=([A-Za-z0-9_.-]{1,200}))?)?")
 """The page, and a frame of it, perhaps of a scenario that must be the one that is shown."""
-FILE_HEADERS = {
-    "X-Content-Type-Options": "nosniff",
-    "X-Frame-Options": "DENY",
-    "Referrer-Policy": "no-referrer",
-}
+FILE_HEADERS = {"X-Content-Type-Options": "nosniff", "X-Frame-Options": "DENY", "Referrer-Policy": "no-referrer"}
 """Headers of every file of the page."""
 PAGE_HEADERS = {"Cache-Control": "no-store"}
 """Headers of the page itself: a browser that kept it for its button "back" would keep its connection, and with it what is held."""
@@ -95,9 +91,8 @@ def _require_free(host: str, port: int) -> None:
     try:
         family, kind, proto, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
     except (OSError, UnicodeError) as error:
-        raise InputError(
-            "--host", "must be an address of this machine", f"{host}: {error}", "Leave it out for 127.0.0.1."
-        ) from error
+        rule, told = "must be an address of this machine", f"{host}: {error}"
+        raise InputError("--host", rule, told, "Leave it out for 127.0.0.1.") from error
     with socket.socket(family, kind, proto) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -139,8 +134,7 @@ def _guarded(host: str, asked: Callable[[int], object], scenario: str | None) ->
                 return connection.respond(refused.status, f"{refused}\n")
             if frame is not None:
                 asked(frame)
-            answer = process_request(connection, request)
-            if answer is not None:
+            if (answer := process_request(connection, request)) is not None:
                 answer.headers.update(FILE_HEADERS)
                 if answer.headers.get("Content-Type", "").startswith("text/html"):
                     answer.headers.update(PAGE_HEADERS)

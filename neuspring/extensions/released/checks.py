@@ -279,8 +279,7 @@ def topology(case: Released, observations: Observations, _: Tools) -> list[Compa
         ("springs", len(rebuilt.springs), len(checkpoint.stiffness), "the checkpoint"),
         ("object springs", rebuilt.object_spring_count, checkpoint.object_springs, "the checkpoint"),
     ]
-    row = released_cases().get(case.name)
-    if row is not None:
+    if (row := released_cases().get(case.name)) is not None:
         counts.append(("springs", len(rebuilt.springs), int(row["springs"]), "the table of released cases"))
         counts.append(("best epoch", case.epoch, int(row["best_epoch"]), "the table of released cases"))
     return [
@@ -452,8 +451,7 @@ def deprojection(case: Released, observations: Observations, _: Tools) -> list[C
     raw = {c.name: (visible_pixels(case.pixel_tracks(c.name)), depth_image(case.first_depth(c.name), c)) for c in cameras}
     residuals = {}
     for convention, used in ((TRUE, cameras), (MIRRORED, [mirrored(c) for c in cameras])):
-        lifted = np.concatenate([gated_lift(camera, *raw[camera.name]) for camera in used])
-        if not len(lifted):
+        if not len(lifted := np.concatenate([gated_lift(camera, *raw[camera.name]) for camera in used])):
             raise Absent("no tracked pixel of frame 0 has a depth within the gate")
         residuals[convention] = float(np.median(cKDTree(lifted).query(observations.object_points[0])[0]))
     if max(residuals.values()) <= LIFTED:
@@ -496,8 +494,7 @@ def frame_scores(
     rows = []
     for frame, gaussians in enumerate(skinned_frames(splats, positions, images, device)):
         if frame:
-            rendered = picture(gaussians, view, "warp")
-            values = _scores(case, camera, frame, rendered, lpips, images)
+            values = _scores(case, camera, frame, picture(gaussians, view, "warp"), lpips, images)
             rows += [{"frame": frame, "camera": camera.name, "metric": name, "value": value} for name, value in values.items()]
         progress.update(frame + 1)
     return pd.DataFrame(rows, columns=["frame", "camera", "metric", "value"])

@@ -117,9 +117,8 @@ def fetch(
         plans: list[tuple[RepoSibling, zipfile.ZipFile, dict[str, zipfile.ZipInfo]]] = []
         for name in dict.fromkeys(archive for archive, contents in TREES.values() if chosen & set(contents)):
             if name not in files:
-                raise InputError(
-                    f"{REPOSITORY} at {info.sha}", f"{name} is required", ", ".join(files), "Choose another --revision."
-                )
+                rule = f"{name} is required"
+                raise InputError(f"{REPOSITORY} at {info.sha}", rule, ", ".join(files), "Choose another --revision.")
             path = f"datasets/{REPOSITORY}@{info.sha}/{name}"
             remote = stack.enter_context(system.open(path, block_size=BLOCK, cache_type="readahead"))
             _require_ranges(remote, build_hf_headers(token=token), files[name].size or 0)

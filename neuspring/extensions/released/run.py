@@ -188,7 +188,12 @@ def _text(findings: Sequence[Comparison], names: Sequence[str], published: Publi
         lines += ["", "## Means over scenarios", "", *_table(means)]
     for check, title in RELEASED_CHECKS.items():
         if own := [finding for finding in done if finding.check == check and finding.scenario != MEAN]:
-            lines += ["", f"## {check}: {title}", "", *_table(own), *(_conventions(own) if check == 4 else [])]
+            lines += ["", f"## {check}: {title}", "", *_table(own)]
+            # How many scenarios follow each convention.
+            notes = Counter(finding.note for finding in own if finding.note) if check == 4 else Counter()
+            lines += [""] * (check == 4) + [
+                f"- {note}: {count} of {notes.total()} scenarios" for note, count in sorted(notes.items())
+            ]
     if reasons := _reasons(findings):
         lines += ["", "## Skipped", "", *reasons]
     return "\n".join([*lines, "", _verdict(findings), ""])
@@ -207,20 +212,11 @@ def _table(findings: Sequence[Comparison]) -> list[str]:
     header = ["Scenario", "Quantity", "Ours", "Published", "Difference", "Tolerance", "Unit", "Outcome", "Note"]
     rows = []
     for f in findings:
-        numbers = [_number(value) for value in (f.ours, f.published, f.difference, f.tolerance)]
-        quantity = f"{f.task} {f.quantity}".strip()
-        rows.append([f.scenario, quantity, *numbers, f.unit, f.outcome, f.note])
+        # Counts are whole.
+        given = (f.ours, f.published, f.difference, f.tolerance)
+        numbers = ["–" if v is None else f"{v:d}" if isinstance(v, int) else f"{v:.6g}" for v in given]
+        rows.append([f.scenario, f"{f.task} {f.quantity}".strip(), *numbers, f.unit, f.outcome, f.note])
     return Table.of_texts(header, rows).markdown()
-
-
-def _conventions(findings: Sequence[Comparison]) -> list[str]:
-    """Number of scenarios that follow each convention."""
-    counts = Counter(finding.note for finding in findings if finding.note)
-    return ["", *(f"- {note}: {count} of {counts.total()} scenarios" for note, count in sorted(counts.items()))]
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:d}" if isinstance(value, int) else f"{value:.6g}"
 
 
 def _reasons(findings: Sequence[Comparison]) -> list[str]:

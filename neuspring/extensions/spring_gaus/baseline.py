@@ -40,9 +40,6 @@ SPRING_GAUS = Baseline(
         "links": (lambda fact: fact == 0, "no anchor lies near a controller in frame 0, so the hands move nothing"),
     },
     weights=OptionalWeights(
-        what="VGG16 (Spring-Gaus' features)",
-        file=VGG16,
-        address=f"https://download.pytorch.org/models/{VGG16}",
-        find=find_vgg16,
+        what="VGG16 (Spring-Gaus' features)", file=VGG16, address=f"https://download.pytorch.org/models/{VGG16}", find=find_vgg16
     ),
 )

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch.nn import Conv2d, MaxPool2d, ReLU, Sequential
 
 from neuspring.baselines import Pictures, TrainingRequest
 from neuspring.baselines.results import DIVERGENCE_RADIUS, Trained, TrainingStopped, run_epochs
@@ -218,8 +219,7 @@ class SpringGausTrainer:
         if not bool((after.detach().abs() < DIVERGENCE_RADIUS).all() and torch.isfinite(speed.detach()).all()):
             raise UnusableFrame("the anchors left the scene")
         state = after.detach(), (speed - self.values["velocity"]).detach()
-        loss = self.problem.objective(epoch, frame, after)
-        if loss is None:
+        if (loss := self.problem.objective(epoch, frame, after)) is None:
             return *state, None, 0.0
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
@@ -290,9 +290,6 @@ def total_variation(picture: torch.Tensor) -> torch.Tensor:
 
 def load_features(path: Path, device: str) -> Callable[[torch.Tensor], torch.Tensor]:
     """Pictures [B, 3, H, W] in 0..1 -> features [B, 128, H / 2, W / 2], differentiably. Raises InputError for a damaged file."""
-    import torch
-    from torch.nn import Conv2d, MaxPool2d, ReLU, Sequential
-
     # Layers without memory: the tensors of the file become their parameters.
     with torch.device("meta"):
         layers = Sequential(

@@ -33,8 +33,7 @@ SECTIONS_OF_NO_ROW = ("simulation", "losses", "released_quirks")
 
 def state(trial: FrozenTrial) -> str:
     """complete, pruned, failed or running; one that is to be continued is running."""
-    words = {TrialState.FAIL: "failed", TrialState.WAITING: "running"}
-    return words.get(trial.state, trial.state.name.lower())
+    return {TrialState.FAIL: "failed", TrialState.WAITING: "running"}.get(trial.state, trial.state.name.lower())
 
 
 def best_of(trials: Sequence[FrozenTrial]) -> FrozenTrial | None:

@@ -109,16 +109,14 @@ class Plan:
         """True where a setting takes whole numbers only."""
         value, dimension = self.baseline[name], self.tune.space[name]
         # A word (auto) may stand where a whole number can, null where any number can.
-        return isinstance(value, int) or (
-            isinstance(value, str) and isinstance(dimension.low, int) and isinstance(dimension.high, int)
-        )
+        ends = isinstance(dimension.low, int) and isinstance(dimension.high, int)
+        return isinstance(value, int) or (isinstance(value, str) and ends)
 
     def _require_setting(self, name: str) -> None:
         where, section = f"tune.space, {name}", name.partition(".")[0]
         if name != CLUSTERS and section not in SECTIONS:
-            raise InputError(
-                where, f"must begin with {', '.join(SECTIONS)}, or be {CLUSTERS}", None, _suggestion(section, SECTIONS)
-            )
+            rule = f"must begin with {', '.join(SECTIONS)}, or be {CLUSTERS}"
+            raise InputError(where, rule, None, _suggestion(section, SECTIONS))
         inside: Any = self.base
         for part in name.split("."):
             known = inside if isinstance(inside, dict) else {}

@@ -56,12 +56,6 @@ WRITER_PATIENCE = 60.0
 """Seconds that SQLite waits for another writer."""
 
 
-def lock_of(folder: Path) -> FileLock:
-    """Holds the sweep in `folder` against its other workers; the death of the holder frees it."""
-    folder.mkdir(parents=True, exist_ok=True)
-    return FileLock(folder / ".lock")
-
-
 def study_of(folder: Path, tune: Tune, facts: Mapping[str, Any], *, begin: bool = False) -> Study:
     """A sweep, which is kept in SQLite in its folder, or in PostgreSQL. `begin`: make it if there is none.
 
@@ -74,7 +68,8 @@ def study_of(folder: Path, tune: Tune, facts: Mapping[str, Any], *, begin: bool 
     engine = {"pool_pre_ping": True} if tune.storage else {"connect_args": {"timeout": WRITER_PATIENCE}}
     if begin or tune.storage or path.is_file():
         # Several processes must not create the tables at once.
-        with lock_of(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        with FileLock(folder / ".lock"):
             try:
                 storage = RDBStorage(uri, engine_kwargs=engine)
             except ImportError as error:

@@ -122,17 +122,11 @@ class Background:
             self.depth[measured] += 0.2 * (depth[measured] - self.depth[measured])
             self.depth[new] = depth[new]
 
-    def usual_density(self, lab: np.ndarray, gain: np.ndarray) -> np.ndarray:
-        """Log density [H, W] per unit of (L, a, b) of a frame's colors, if the pixel shows the background or a shadow on it.
-
-        `gain` [3] is what the whole image has become lighter by. Meaningless where `seen` is 0.
-        """
-        return shaded_density(lab.astype(np.float32) - self.mean - gain, np.sqrt(self.variance + LEAST_SPREAD**2))
-
     def explain(self, logs: np.ndarray, lab: np.ndarray, gain: np.ndarray) -> np.ndarray:
         """Log densities [H, W] of the background: from `logs`, those of its colors anywhere, and the usual color of each pixel."""
         known = np.clip(self.seen / SURE_AFTER, 0, 1) * USUAL
-        usual = self.usual_density(lab, gain)
+        # Of the background or a shadow on it, per unit of (L, a, b); meaningless where `seen` is 0.
+        usual = shaded_density(lab.astype(np.float32) - self.mean - gain, np.sqrt(self.variance + LEAST_SPREAD**2))
         for place, look in self.guests:
             there = place & _alike(lab, look)
             own = shaded_density(lab.astype(np.float32) - look - gain, 2 * LEAST_SPREAD)

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from neuspring.data.capture import HANDS, NOTHING, OBJECT
+from neuspring.data.frames import at_border
 from neuspring.perception.marks.colors import Background, apart, bins_of, count, log_density, mixed, shaded_density
 from neuspring.perception.marks.marks import ODDS_FALL, UNMARKED_PIXEL, Seeds
 
@@ -88,8 +89,7 @@ def solve(logs: np.ndarray, lab: np.ndarray, smoothness: float = SMOOTHNESS) -> 
     """
     kinds, height, width = logs.shape
     q = _softmax(logs).reshape(kinds, -1)
-    pixels = np.flatnonzero(_open(logs))
-    if not len(pixels):
+    if not len(pixels := np.flatnonzero(_open(logs))):
         return q.reshape(logs.shape)
     flat, color = logs.reshape(kinds, -1)[:, pixels], lab.reshape(-1, 3).astype(np.float32)
     rows, columns = np.divmod(pixels, width)
@@ -365,8 +365,7 @@ class Pass:
         """Take the colors beneath the marks of a frame at once: they say what was not known before."""
         bins = bins_of(lab)
         for label in ALL_LABELS:
-            shown = count(bins, seeds.certain == label)
-            if shown.any():
+            if (shown := count(bins, seeds.certain == label)).any():
                 self.colors[label] = log_density(mixed([(1.0, self.first[label]), (MARKED_WEIGHT, shown)]))
 
     def color_logs(
@@ -396,12 +395,11 @@ class Pass:
         for label in (OBJECT, HANDS):
             number, pieces, boxes, _ = cv2.connectedComponentsWithStats((labels == label).astype(np.uint8))
             support = np.bincount(pieces.ravel(), place[label].ravel() > BROUGHT_FROM, minlength=number)
-            left, top, width, height, areas = boxes.T
+            areas = boxes[:, cv2.CC_STAT_AREA]
             drop = (support < 0.05 * areas) | (areas < 4)
             if label == HANDS:
-                left, top = left + (window[1].start or 0), top + (window[0].start or 0)
-                entering = (left == 0) | (top == 0) | (left + width == columns) | (top + height == rows)
-                drop &= ~(entering & (areas > LEAST_ENTERING * rows * columns))
+                in_image = np.add(boxes, [window[1].start or 0, window[0].start or 0, 0, 0, 0])
+                drop &= ~(at_border(in_image, (rows, columns)) & (areas > LEAST_ENTERING * rows * columns))
             if seeds is not None:
                 drop[np.unique(pieces[seeds.certain == label])] = False
             drop[0] = False
@@ -417,12 +415,10 @@ class Pass:
             return
         nothing, seen = probability.argmax(axis=0) == NOTHING, self.background.part(window).seen > 0
         number, pieces, boxes, _ = cv2.connectedComponentsWithStats(nothing.astype(np.uint8), connectivity=4)
-        left, top, width, height, areas = boxes.T
-        holes = (left > 0) & (top > 0) & (left + width < nothing.shape[1]) & (top + height < nothing.shape[0])
+        areas = boxes[:, cv2.CC_STAT_AREA]
         # The piece 0 is what is not nothing.
-        holes &= (np.arange(number) > 0) & (areas < MOST_HOLE * nothing.sum())
-        unseen = holes[pieces] & ~seen
-        if unseen.any():
+        holes = ~at_border(boxes, nothing.shape) & (np.arange(number) > 0) & (areas < MOST_HOLE * nothing.sum())
+        if (unseen := holes[pieces] & ~seen).any():
             ratio = self.colors[OBJECT][bins_of(lab)] - _local_density(lab, nothing & seen)
             gain = np.bincount(pieces[unseen], np.clip(ratio[unseen], -MOST_COLOR, MOST_COLOR), minlength=number)
             count_unseen = np.bincount(pieces[unseen], minlength=number)
@@ -455,8 +451,7 @@ def corrections(place: np.ndarray, seeds: Seeds, reach: float) -> np.ndarray:
     logs = np.where(seeds.possible, seeds.prior, NEVER)
     carried = place.argmax(axis=0)
     for label in ALL_LABELS:
-        wrong = (seeds.certain == label) & (carried != label)
-        if wrong.any():
+        if (wrong := (seeds.certain == label) & (carried != label)).any():
             away = cv2.distanceTransform((~wrong).astype(np.uint8), cv2.DIST_L2, 5)
             logs[label] += CORRECTION * np.exp(-away / (CORRECTED * reach))
     return logs
@@ -478,9 +473,6 @@ def _entering(changed: np.ndarray) -> np.ndarray:
     """Pieces of what changed [H, W] bool that reach the border of the image and are not small."""
     opened = cv2.morphologyEx(changed.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     _, pieces, boxes, _ = cv2.connectedComponentsWithStats(opened)
-    left, top, width, height, area = boxes.T
-    rows, columns = changed.shape
-    keep = (left == 0) | (top == 0) | (left + width == columns) | (top + height == rows)
-    keep &= area > LEAST_ENTERING * changed.size
+    keep = at_border(boxes, changed.shape) & (boxes[:, cv2.CC_STAT_AREA] > LEAST_ENTERING * changed.size)
     keep[0] = False
     return np.asarray(keep[pieces])

@@ -74,9 +74,8 @@ def _jobs(caption: str, jobs: Sequence[JobRecord], material: ReportData) -> Tabl
 
 def _numerical(broken: pd.DataFrame) -> Table:
     runs: list[Any] = list(broken.head(MOST_ROWS).itertuples())
-    rows = [
-        [*(Cell(text=str(one)) for one in (row.scenario, row.method, row.seed)), Cell(text=row.reason, wrap=True)] for row in runs
-    ]
+    stubs = [[Cell(text=str(one)) for one in (row.scenario, row.method, row.seed)] for row in runs]
+    rows = [[*stub, Cell(text=row.reason, wrap=True)] for stub, row in zip(stubs, runs, strict=True)]
     note = "Results, not crashes: the simulation left its physical range, or the record is damaged." + _rest(len(broken))
     header = ["Scenario", "Method", "Seed", "Reason"]
     return Table(caption="Failed runs", header=header, rows=rows, stub=2, sortable=True, note=note)

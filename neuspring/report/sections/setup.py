@@ -44,7 +44,9 @@ def setup(material: ReportData) -> PageSection:
     """Configuration, versions, machines, files."""
     blocks: list[Block] = [_commits(material.runs)] if material.runs else []
     blocks += _settings(material.choice)
-    blocks.append(_versions())
+    installed = {found.name: found.version for found in metadata.distributions() if found.name in PACKAGES}
+    rows = [("python", platform.python_version()), *((name, installed[name]) for name in PACKAGES if name in installed)]
+    blocks.append(Table.of_texts(["Package", "Version"], rows, "Versions where this page was written"))
     if machines := Counter(f"{run.machine}; {run.device}" for run in material.runs):
         rows = [(name, str(count)) for name, count in sorted(machines.items())]
         blocks.append(Table.of_texts(["Machine; device", "Runs"], rows, "Machines of the runs"))
@@ -84,12 +86,6 @@ def _settings(choice: Options) -> list[Block]:
     text = yaml.safe_dump(settings, sort_keys=False, allow_unicode=True, width=120)
     whole = Fold(summary="Full configuration", blocks=[Code(text=text)])
     return [table if rows else Text(text="All settings have their defaults."), whole]
-
-
-def _versions() -> Table:
-    installed = {found.name: found.version for found in metadata.distributions() if found.name in PACKAGES}
-    rows = [("python", platform.python_version()), *((name, installed[name]) for name in PACKAGES if name in installed)]
-    return Table.of_texts(["Package", "Version"], rows, "Versions where this page was written")
 
 
 section = ReportSection(order=110, make=setup)

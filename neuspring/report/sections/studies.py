@@ -66,8 +66,7 @@ def answer_card(numbers: StudyNumbers) -> Answer:
 def answer(counts: Mapping[str, int], total: int) -> tuple[str, Tone]:
     """The answer that the counts of verdicts on values give, in words, with its tone; it claims no more than its cells."""
     agree, worse = (sum(counts.get(name, 0) for name in names) for names in ((Kind.WITHIN, Kind.BETTER), (Kind.WORSE,)))
-    answered = agree + worse
-    if not answered:
+    if not (answered := agree + worse):
         if counts.get(Kind.OTHER_DATA):
             return "Cannot be said: these are not the paper's data.", "mute"
         return ("Cannot be said yet: no interval.", "warn") if counts.get(Kind.NO_INTERVAL) else ("Not run yet.", "mute")

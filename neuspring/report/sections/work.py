@@ -32,20 +32,14 @@ def _owner(job: JobRecord) -> str:
     return parts[2] if job.rule in (*METHOD_RULES, "transfer") else ""
 
 
-def gpu_hours(jobs: Sequence[JobRecord]) -> float:
-    """GPU-hours of jobs, failed attempts included."""
-    return sum(attempt.seconds * len(attempt.devices) for job in jobs for attempt in job.attempts) / 3600
-
-
 def work(material: ReportData) -> PageSection:
     """Tables of hours."""
     title = "Time and hardware"
     jobs = material.jobs
     if not jobs:
         note = Text(text="There are no job records: times are those of finished runs alone.", tone="mute")
-        return PageSection(
-            key="work", title=title, blocks=[note, timing_table(material.collected.runs)] if material.runs else [note]
-        )
+        times = [timing_table(material.collected.runs)] if material.runs else []
+        return PageSection(key="work", title=title, blocks=[note, *times])
     attempts = [attempt for job in jobs for attempt in job.attempts]
     hosts = sorted({a.host for a in attempts if a.host})
     names = sorted({name for a in attempts for name in a.device_names})
@@ -80,7 +74,8 @@ def _cost(name: str, jobs: Sequence[JobRecord]) -> list[Cell]:
     attempts = [attempt for job in jobs for attempt in job.attempts]
     failed, retries = sum(job.failed for job in jobs), sum(len(job.attempts) - 1 for job in jobs)
     seconds = [job.seconds for job in jobs]
-    on_gpu, on_cpu, waited = 3600 * gpu_hours(jobs), sum(a.cpu_seconds for a in attempts), sum(a.waited for a in attempts)
+    on_gpu = sum(attempt.seconds * len(attempt.devices) for attempt in attempts)
+    on_cpu, waited = sum(a.cpu_seconds for a in attempts), sum(a.waited for a in attempts)
     peak = max((a.peak_memory_mb for a in attempts), default=0.0)
     gpu_peak = max((a.peak_gpu_memory_mb for a in attempts if a.peak_gpu_memory_mb is not None), default=None)
     used = [(a.gpu_utilization, a.seconds * len(a.devices)) for a in attempts if a.gpu_utilization is not None and a.seconds > 0]

@@ -242,8 +242,7 @@ def package(spacing: float, skin_spacing: float) -> SoftBody:
     size = np.array(PACKAGE)
     cells = np.maximum(np.round(size / spacing).astype(int), 4)
     nodes, tetrahedra = block(-size / 2, size / 2, cells.tolist())
-    centers = nodes[tetrahedra].mean(axis=1)
-    outer = (size / 2 - np.abs(centers) < size / cells).any(axis=1)
+    outer = (size / 2 - np.abs(nodes[tetrahedra].mean(axis=1)) < size / cells).any(axis=1)
     nodes[:, 2] += size[2] / 2 + 0.0045
 
     def paint(p: np.ndarray) -> np.ndarray:

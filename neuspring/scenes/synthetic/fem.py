@@ -69,8 +69,7 @@ def build(body: SoftBody, fists: int, moduli: Moduli = stable_moduli, dashpots: 
     else:
         _add_solid(builder, body, moduli, dashpots)
     for _ in range(fists):
-        link = builder.add_body(is_kinematic=True, mass=1.0)
-        builder.add_shape_sphere(link, radius=FIST_RADIUS, cfg=shape)
+        builder.add_shape_sphere(builder.add_body(is_kinematic=True, mass=1.0), radius=FIST_RADIUS, cfg=shape)
     if colored:
         builder.color(include_bending=body.is_sheet)
     model = builder.finalize(device="cpu")
@@ -246,7 +245,9 @@ class FiniteElements:
         share = body.viscosity[0]
         if body.is_sheet or not share:
             return None
-        rest, deformed = (_spans(positions, body.tetrahedra) for positions in (body.nodes, self.start))
+        corners = (positions[body.tetrahedra] for positions in (body.nodes, self.start))
+        # Edge matrices [E, 3, 3]: columns from corner 0 to the others.
+        rest, deformed = (np.swapaxes(each[:, 1:] - each[:, :1], 1, 2) for each in corners)
         inverse = np.linalg.inv(rest)
         gradient = deformed @ inverse
         strain = 0.5 * (np.swapaxes(gradient, 1, 2) @ gradient - np.eye(3))
@@ -366,8 +367,7 @@ class FiniteElements:
         """
         frequency = np.sqrt(self._largest("position"))
         if self.body.is_sheet or not self.damping.edges:
-            damping = self._largest("velocity")
-            return SAFETY * _stable(frequency, damping), 0.0
+            return SAFETY * _stable(frequency, self._largest("velocity")), 0.0
         unit = 1e-3
         self._set_dashpots(unit)
         per_dashpot = self._largest("velocity") / unit
@@ -439,12 +439,6 @@ def certify(engine: FiniteElements, clip: Clip, frames: int) -> tuple[float, flo
     trials = (engine.again(frames, engine.start, 2 * clip.substeps), engine.again(frames, nudged, clip.substeps))
     moved = [np.linalg.norm(e.run().positions - clip.positions[:frames], axis=2).mean(axis=1).max() for e in trials]
     return float(moved[0]), float(moved[1])
-
-
-def _spans(positions: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """Edge matrices [E, 3, 3]: columns from corner 0 to the others."""
-    corners = positions[tetrahedra]
-    return np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
 
 
 def _stable(frequency: float, damping: float) -> float:

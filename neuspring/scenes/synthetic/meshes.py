@@ -62,8 +62,7 @@ def smooth_union(parts: Iterable[Sdf], blend: float) -> Sdf:
 
 def gradient(sdf: Sdf, points: np.ndarray, step: float = 1e-4) -> np.ndarray:
     """Unit outward direction [..., 3] by central differences."""
-    differences = [sdf(points + step * axis) - sdf(points - step * axis) for axis in np.eye(3)]
-    slope = np.stack(differences, axis=-1)
+    slope = np.stack([sdf(points + step * axis) - sdf(points - step * axis) for axis in np.eye(3)], axis=-1)
     return np.asarray(slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-12))
 
 
@@ -78,8 +77,7 @@ def surface(sdf: Sdf, low: Sequence[float], high: Sequence[float], spacing: floa
     vertices, faces = first + spacing * points.numpy().astype(float), indices.numpy().reshape(-1, 3)
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    centers = corners.mean(axis=1)
-    outward = (gradient(sdf, centers) * normals).sum(axis=-1).mean() > 0
+    outward = (gradient(sdf, corners.mean(axis=1)) * normals).sum(axis=-1).mean() > 0
     return vertices, faces if outward else faces[:, ::-1].copy()
 
 

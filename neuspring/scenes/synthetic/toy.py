@@ -61,8 +61,7 @@ def rope() -> Shape:
     ring = 0.008 * np.stack([np.zeros(4), np.cos(angle), np.sin(angle)], axis=1)
     center = np.stack([np.linspace(0, 0.6, 31), np.zeros(31), np.full(31, 0.008)], axis=1)
     nodes = (center[:, None] + ring).reshape(-1, 3)
-    top = ring[:, 2] > 0
-    upper = np.tile(top, len(center))
+    upper = np.tile(ring[:, 2] > 0, len(center))
     hands = np.array([[0.0, 0.0, 0.012], [0.01, 0.006, 0.008], [0.01, -0.006, 0.008]])
     return Shape(nodes[upper], nodes[~upper], np.zeros((0, 3)), hands, 0.05, 18, 1.2e4, np.array([1.0, 0.0, 0.0]))
 
@@ -100,8 +99,7 @@ FIELDS = ("smooth", "two_region")
 
 def hand_motion(kind: str, hands: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Controller positions [T, C, 3], starting at rest. lift: 20 cm up and half way back; shake: sideways, growing to 8 cm."""
-    span = times[-1]
-    phase = times / span
+    phase = times / times[-1]
     move = np.zeros((len(times), 3))
     if kind == "lift":
         move[:, 2] = 0.2 * np.sin(np.pi * np.minimum(1.5 * phase, 1.5) / 2) ** 2
@@ -151,8 +149,7 @@ def make(row: ScenarioRow, settings: ToyObservation) -> ToyScene:
         raise InputError(f"scenario {row.scenario}, path", rule, repr(row.path))
     shape = SHAPES[parts[0]]()
     truth = _true_twin(row, shape, parts[2])
-    times = np.arange(settings.frames) / TOY_FRAME_RATE
-    hands = hand_motion(parts[1], shape.hands, times)
+    hands = hand_motion(parts[1], shape.hands, np.arange(settings.frames) / TOY_FRAME_RATE)
     rest = truth.topology.nodes.astype(np.float64)
     motion, _ = reference.rollout(reference.ReferenceTwin.of(truth), rest, np.zeros_like(rest), hands)
     return ToyScene(_observe(row, shape, motion, hands, settings), truth, motion)

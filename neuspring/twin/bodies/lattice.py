@@ -74,6 +74,7 @@ and it goes on for the rest of dt.
             losses=settings.losses,
             quirks=settings.released_quirks,
             clusters=options.clusters,
+            leave_out=options.leave_out,
             device=options.device,
             threads=options.threads,
             together=options.together,

@@ -10,6 +10,7 @@ import numpy as np
 
 from neuspring.config import Config
 from neuspring.core.artifacts import Artifact, Observations, Rod, Twin
+from neuspring.core.errors import InputError
 from neuspring.twin.body import Body, Lines, SearchOptions
 
 if TYPE_CHECKING:
@@ -67,6 +68,9 @@ v_x, c v_y, -ground_elasticity v_z), c = max(0, 1 - ground_friction (1 + ground_
         """The constants of a rod; see `rod_fit.search_rod`. It has no regions and no chance, and begins anew."""
         from neuspring.twin.rod_fit import search_rod
 
+        if options.leave_out:
+            name = f"pool of {observations.scenario.name}"
+            raise InputError(name, "a rod is judged on its own recording too", "pool: others", "Choose pool: all, or transfers.")
         device, threads = options.device, options.threads
         return search_rod(observations, pool, settings, device=device, threads=threads, record=options.record)
 

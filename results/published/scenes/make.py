@@ -40,7 +40,8 @@ METRICS = {"track_error": "track error", "track_error_bound": "bound track error
 TASKS = {"reconstruction": "training", "future": "future"}
 NOTE = """\
 Track errors in mm, as PhysTwin's evaluation measures them (the nearest node in frame 0), and bound to the nodes around (0 for every
-rigid motion). ±: standard deviation over seeds. PhysTwin had three RGBD cameras and dense tracks. Its numbers are those of its
+rigid motion). ±: standard deviation over seeds. Rows `..._pooled` saw the training frames of all scenes; `..._unseen` those
+of the others, and of this one frame 0 and the hands. PhysTwin had three RGBD cameras and dense tracks. Its numbers are those of its
 released evaluation of these frames. Nobody has compared our nine annotated points with the released file."""
 UNLEARNED = ("static", "controller_lbs")
 """They learn nothing; their errors would flatten the pictures."""

@@ -101,8 +101,7 @@ def test_two_boxes_a_camera_become_masks_and_three_clicks_a_track(filmed, addres
         ours = np.stack([saved.mask(camera, frame) for frame in range(saved.frame_count)])
         for label in (OBJECT, HANDS):
             assert overlap(ours, labels, label) > IOU
-    distance = np.linalg.norm(saved.tracks()[:, 0] - vertex, axis=1)
-    assert distance.max() < 0.004
+    assert np.linalg.norm(saved.tracks()[:, 0] - vertex, axis=1).max() < 0.004
 
 
 def seen_vertex(capture: Capture) -> np.ndarray:

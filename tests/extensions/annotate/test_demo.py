@@ -88,8 +88,7 @@ def go(browser: Browser, frame: int, of: int) -> None:
 @pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome is installed")
 @pytest.mark.parametrize("scenario", DEMO["scenarios"])
 def test_five_marks_a_camera_give_the_masks_of_the_demo(browser, tmp_path, scenario):
-    row = read_scenarios(ROOT / "config" / "scenarios.tsv")[scenario]
-    capture, _ = make(row, SIZES, tmp_path / "capture")
+    capture, _ = make(read_scenarios(ROOT / "config" / "scenarios.tsv")[scenario], SIZES, tmp_path / "capture")
     frames = capture.frame_count
     truths = {camera: np.stack([capture.mask(camera, frame) for frame in range(frames)]) for camera in capture.cameras}
     # A user's capture has no masks.

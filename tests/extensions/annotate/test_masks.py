@@ -62,8 +62,7 @@ def test_masks_are_saved_with_what_they_were_made_from_and_found_again(capture):
     assert page.job.plain()["state"] == "done", page.job.plain()
     assert page.save() == ["0"]
     assert (capture.folder / "mask_0.png").exists()
-    later = page_of(capture).plain()
-    assert len(later["saved"]["0"]) == FRAMES
+    assert len(page_of(capture).plain()["saved"]["0"]) == FRAMES
     assert MasksFile.of(capture).cameras["0"].backend == "marks"
     assert not capture.path("mask", "0", MISSING[0]).exists()
     assert overlap(capture.mask("0", 5) == 1, square(5)) > 0.85

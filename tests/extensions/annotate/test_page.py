@@ -44,9 +44,8 @@ class Page:
 
     def press(self, choice: str) -> None:
         """Press a button of a message."""
-        self.browser.run(
-            f"[...document.querySelectorAll('#messages button')].find((one) => one.textContent === '{choice}').click()"
-        )
+        found = f"[...document.querySelectorAll('#messages button')].find((one) => one.textContent === '{choice}')"
+        self.browser.run(f"{found}.click()")
 
     def shown(self, selector: str, text: str) -> None:
         """Wait until an element has a text."""

@@ -107,8 +107,7 @@ def test_marks_are_carried_looked_at_and_saved(client, capture):
     assert masks["carried"]["0"]["doubt"] == pytest.approx(np.linspace(0, 1, FRAMES), abs=1e-3)
     assert (masks["carried"]["0"]["stale"], masks["carried"]["0"]["saved"]) == (False, False)
     assert masks["job"]["message"] == "Carried camera 0; 6 very doubtful frames. Look at the frames that are listed, then save."
-    overlay = client.image("/api/overlay/carried/0/2")
-    assert (overlay[..., 3] > 0).sum() == 21 * 21
+    assert (client.image("/api/overlay/carried/0/2")[..., 3] > 0).sum() == 21 * 21
     assert client.raw("GET", "/api/overlay/carried/0/4")[0] == 404
     status, answer = client.post("/api/masks/save")
     assert (status, answer) == (200, {"cameras": ["0"]})

@@ -88,8 +88,7 @@ def test_a_rod_that_slips_is_only_exported_with_its_law(tmp_path):
 def test_a_rope_with_hands_loads_in_mujoco(tmp_path):
     mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (extra `export`)")
     source = source_of(tmp_path)
-    made = mujoco_format.write(source, range(3), tmp_path / "out")
-    model = mujoco.MjModel.from_xml_path(str(made[0]))
+    model = mujoco.MjModel.from_xml_path(str(mujoco_format.write(source, range(3), tmp_path / "out")[0]))
     assert (model.ntendon, model.nmocap) == (len(source.twin.topology.springs), 3)
     assert model.body_mass.sum() == pytest.approx(source.twin.rod.mass.sum())
     data = mujoco.MjData(model)

@@ -35,14 +35,12 @@ def script() -> str:
     ids=["plain", "-z up", "hand velocity", "bounces"],
 )
 def test_the_script_on_the_page_simulates_the_first_frame(tmp_path, options):
-    twin = exported.stretched(exported.rope(**options), 1.1)
-    folder = exported.run_folder(tmp_path, twin)
+    folder = exported.run_folder(tmp_path, exported.stretched(exported.rope(**options), 1.1))
     assert main(["export", str(folder), "--to", "npz", "--output", str(tmp_path / "out")]) == 0
     path = tmp_path / "first_frame.py"
     path.write_text(script())
     run = subprocess.run([sys.executable, "-I", str(path), str(tmp_path / "out")], capture_output=True, text=True, check=True)
-    error = float(run.stdout.split()[-1])
-    assert error < ERROR
+    assert float(run.stdout.split()[-1]) < ERROR
     arrays = np.load(tmp_path / "out" / npz.ARRAYS_FILE)
     assert np.abs(arrays["positions"][1] - arrays["positions"][0]).max() > 100 * ERROR, "the body moves"
     if "gravity" in options:

@@ -84,8 +84,7 @@ def test_a_film_that_is_too_large_is_made_coarser_or_refused(video, tmp_path):
 
 
 def test_a_scene_without_video_is_filmed_as_points(plain):
-    paints = painter(plain, (0, 4, 7))
-    pictures = list(film_pictures(paints, (0, 4, 7), 300))
+    pictures = list(film_pictures(painter(plain, (0, 4, 7)), (0, 4, 7), 300))
     assert len(pictures) == 3 and all(side % 2 == 0 for side in pictures[0].shape[:2])
     blue = (np.abs(pictures[0].astype(int) - [31, 119, 180]).max(axis=2) < 30)[40:, :100]
     assert blue.any()

@@ -35,8 +35,7 @@ def test_a_row_for_what_was_observed_and_each_method_and_a_column_per_frame(plai
     figure = strip_figure(paints, 6.0)
     panels = grid(figure, rows, len(FRAMES))
     assert figure.get_figwidth() == pytest.approx(6.0)
-    lefts = {round(axis.get_position().x0, 6) for axis in panels.ravel()}
-    assert len(lefts) == len(FRAMES)
+    assert len({round(axis.get_position().x0, 6) for axis in panels.ravel()}) == len(FRAMES)
     # No panel leaves the page, and none lies over another.
     boxes = [axis.get_position() for axis in panels.ravel()]
     assert all(min(box.x0, box.y0) >= 0 and max(box.x1, box.y1) <= 1 for box in boxes)
@@ -59,8 +58,7 @@ def test_distances_are_those_of_points_that_are_seen(plain):
     visible = seen.object_visibility.copy()
     visible[5:, 2] = False
     take = takes(plain)[1]
-    hidden = replace(seen, object_visibility=visible)
-    nodes, values = distances(take, hidden, 5)
+    nodes, values = distances(take, replace(seen, object_visibility=visible), 5)
     assert 2 not in nodes and len(nodes) == visible.shape[1] - 1
     assert values[2] == pytest.approx(np.linalg.norm(take.positions[5, 3].astype(float) - seen.object_points[5, 3]))
 
@@ -83,8 +81,7 @@ def test_one_range_for_all_panels_and_darker_is_farther(plain):
 def test_pictures_that_agree_have_no_difference(video):
     paints = painter(video, (0, 4, 7), style="splats", error="color")
     same, other = (paints._drawn[which][7] for which in (0, 1))
-    inside = ~np.isnan(same.difference)
-    assert inside.sum() > 50 and np.nanmax(same.difference) == 0
+    assert (~np.isnan(same.difference)).sum() > 50 and np.nanmax(same.difference) == 0
     assert np.nanmax(other.difference) > 0.1
     # Pixels outside of the object are left out of the row; they count in the PSNR, as in the tables.
     assert same.psnr > other.psnr

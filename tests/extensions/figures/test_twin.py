@@ -28,10 +28,8 @@ def uneven(scenario):
         stiffness = np.geomspace(100, 1e4, len(twin.topology.springs)).astype(np.float32)
         order = np.argsort(np.argsort(twin.topology.nodes[:, 0]))
         labels = (3 * order // len(order)).astype(np.int32)
-        changed = replace(
-            twin, material=replace(twin.material, stiffness=stiffness), topology=replace(twin.topology, labels=labels)
-        )
-        takes.append(replace(take, twin=changed))
+        material, topology = replace(twin.material, stiffness=stiffness), replace(twin.topology, labels=labels)
+        takes.append(replace(take, twin=replace(twin, material=material, topology=topology)))
     return paints.scene, takes
 
 

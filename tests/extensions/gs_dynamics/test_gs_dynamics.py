@@ -344,8 +344,7 @@ def test_a_killed_training_continues_to_the_same_model(tmp_path):
     noisy = replace(PLAIN, noise=0.002, yaw=True, length_weight=0.1, future=2)
     seen, partial = capture(points, tools), tmp_path / "partial.npz"
     whole = train(seen, noisy, 3)
-    again = train(seen, noisy, 3)
-    np.testing.assert_array_equal(again.model.weights, whole.model.weights)
+    np.testing.assert_array_equal(train(seen, noisy, 3).model.weights, whole.model.weights)
     assert (train(seen, noisy, 4).model.weights != whole.model.weights).any()
     train(seen, replace(noisy, epochs=2), 3, partial)
     continued = train(seen, noisy, 3, partial)

@@ -158,8 +158,7 @@ def test_a_table_of_one_size_is_read_and_said(tmp_path):
     ],
 )
 def test_models_by_number_and_names_of_cameras(tmp_path, said, model, told):
-    path = write_json(tmp_path / "k.json", PLAIN | {"dist": BENT} | said)
-    lens = read_lenses(path, ["0"])["0"]
+    lens = read_lenses(write_json(tmp_path / "k.json", PLAIN | {"dist": BENT} | said), ["0"])["0"]
     assert (lens.model, bool(lens.told)) == (model, told)
 
 

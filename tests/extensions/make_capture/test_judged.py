@@ -58,9 +58,8 @@ def test_color_counted_from_0_and_depth_from_1_are_paired_by_order(tmp_path):
 @pytest.mark.parametrize("late", [1, -2])
 def test_depth_of_other_moments_is_refused_and_a_shift_mends_it(tmp_path, late):
     root = write(tmp_path, late=late)
-    with pytest.raises(
-        InputError, match=rf"depth 0 is .* frames {'later' if late > 0 else 'earlier'} than color 0.*--shift 0.depth={late}\b"
-    ):
+    side = "later" if late > 0 else "earlier"
+    with pytest.raises(InputError, match=rf"depth 0 is .* frames {side} than color 0.*--shift 0.depth={late}\b"):
         make_capture(intake(root))
     assert not (tmp_path / "capture").exists()
     capture, report = make_capture(intake(root, shift=(f"0.depth={late}",)))

@@ -61,9 +61,8 @@ def through(lens, model):
         k1, k2, p1, p2, k3 = lens.distortion
         (x, y), square = rays.T, (rays**2).sum(axis=1)
         scale = 1 + k1 * square + k2 * square**2 + k3 * square**3
-        rays = np.stack(
-            [x * scale + 2 * p1 * x * y + p2 * (square + 2 * x * x), y * scale + p1 * (square + 2 * y * y) + 2 * p2 * x * y], axis=1
-        )
+        one = x * scale + 2 * p1 * x * y + p2 * (square + 2 * x * x)
+        rays = np.stack([one, y * scale + p1 * (square + 2 * y * y) + 2 * p2 * x * y], axis=1)
     return pixels, rays * np.diag(lens.matrix)[:2] + lens.matrix[:2, 2]
 
 

@@ -27,8 +27,7 @@ def intake(root, cameras=1, **changes):
 
 
 def test_folders_of_one_camera_become_a_capture(tmp_path):
-    root = write_folders(tmp_path, frames=12, first=3)
-    capture, report = make_capture(intake(root, frames="3-13/2"))
+    capture, report = make_capture(intake(write_folders(tmp_path, frames=12, first=3), frames="3-13/2"))
     about = Capture.load(capture.folder).description
     assert (about.frame_count, about.frame_rate, about.up, about.depth_unit, about.masks) == (6, 15.0, "+z", 0.001, False)
     assert capture.train_end == 4

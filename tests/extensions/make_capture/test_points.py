@@ -76,8 +76,7 @@ def test_points_alone_are_refused_before_anything_is_written(tmp_path, changes, 
 
 def test_both_counts_of_rows_are_named(tmp_path):
     files = brought(tmp_path / "files", 8)
-    hands = np.load(files["controllers"])["points"]
-    np.savez(files["controllers"], points=hands[:6])
+    np.savez(files["controllers"], points=np.load(files["controllers"])["points"][:6])
     with pytest.raises(InputError, match=r"a row per frame.*received 6 rows of --controllers, 8 of --tracks"):
         make_capture(Intake(output=tmp_path / "made", name="m", category="toy", rate=30.0, **files))
 

@@ -15,8 +15,7 @@ from tests.support.desk import camera, counts, seen, write_folders, write_video
 
 
 def test_numbers_sort_as_numbers_and_count_from_the_names(tmp_path):
-    root = write_folders(tmp_path, frames=12, first=5)
-    folder = ImageFolder(root / "color_0", "color")
+    folder = ImageFolder(write_folders(tmp_path, frames=12, first=5) / "color_0", "color")
     assert folder.series.numbers == list(range(5, 17))
     assert [path.stem for path in folder.paths][-1] == "frame_16"
     np.testing.assert_array_equal(next(folder.read([10])), seen(camera(), 10)[0])

@@ -69,14 +69,12 @@ def test_what_counts_pictures_is_no_time(write):
 
 @pytest.mark.parametrize("separator", ["-", "_", "."])
 def test_hundredths_of_seconds_are_a_time(separator):
-    written = names(lambda t, _: f"{t:%H-%M-%S}{separator}{t.microsecond // 10000:02d}")
-    times, clock = times_of(written)
+    times, clock = times_of(names(lambda t, _: f"{t:%H-%M-%S}{separator}{t.microsecond // 10000:02d}"))
     assert clock == "device"
     np.testing.assert_allclose(np.diff(times), 1 / 30, atol=0.0101)
 
 
 def test_lost_pictures_and_jitter_leave_a_time_one():
     rough = np.random.default_rng(0).uniform(-20e-6, 20e-6, 40)
-    written = [of(77.1 + k / 30 + rough[k], 1e-6) for k in range(40) if k not in (5, 6, 20)]
-    times, clock = times_of(written)
+    times, clock = times_of([of(77.1 + k / 30 + rough[k], 1e-6) for k in range(40) if k not in (5, 6, 20)])
     assert clock == "device" and np.round(np.diff(times) * 30).max() == 3

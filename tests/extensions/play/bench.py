@@ -113,9 +113,8 @@ def grow(nodes: int, frames: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         live, close = running(Hurried, twin, Path(folder))
         begun = time.monotonic()
-        print(
-            f"\n{nodes} nodes as fast as they can; a recording is kept for {MOST_FRAMES} frames\n  frame   memory, MiB", flush=True
-        )
+        print(f"\n{nodes} nodes as fast as they can; a recording is kept for {MOST_FRAMES} frames")
+        print("  frame   memory, MiB", flush=True)
         for wanted in np.linspace(frames / SAMPLES, frames, SAMPLES).astype(int):
             while live.simulator.frame < wanted:
                 pull(live, 0.5)
@@ -163,8 +162,7 @@ def browsed(run: Path, seconds: float) -> str:
 
 def running(kind: type[Live], twin: Twin, folder: Path):
     """A live twin on a server without browsers, and what ends both."""
-    results = written(twin, folder)
-    found = find([results])
+    found = find([written(twin, folder)])
     server = start("127.0.0.1", 0)
     player = Player(server.scene, found)
     player.hide(True)

@@ -115,8 +115,7 @@ def test_one_browser_holds_at_a_time_and_a_closed_tab_lets_go():
     one.release(1)
     assert one.node == -1 and one.take(2, "node", 3, (0, 0, 0))
     # The node nearest to the mouse's ray is the one that is taken.
-    points = np.array([[0.0, 0, 1], [0.1, 0, 5], [0.3, 0, 1]])
-    assert nearest_to_ray(points, (0, 0, 0), (0.021, 0, 1)) == 1
+    assert nearest_to_ray(np.array([[0.0, 0, 1], [0.1, 0, 5], [0.3, 0, 1]]), (0, 0, 0), (0.021, 0, 1)) == 1
 
 
 def test_hands_are_those_that_the_capture_groups_and_else_those_that_are_near():

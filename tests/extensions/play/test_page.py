@@ -271,11 +271,9 @@ def test_damaged_splats_are_a_note_and_the_run_is_shown(scenario, server):
 
 def test_what_the_browser_gets_are_their_colors_and_sizes(scenario, server):
     splats, run = dressed(scenario, degree=2), find([scenario]).runs[0]
-    layer = SplatLayer(server.scene, "colors", splats, run.trajectory.positions[0])
-    handle = layer.handle
+    handle = SplatLayer(server.scene, "colors", splats, run.trajectory.positions[0]).handle
     assert handle.centers * SPLAT_UNIT == pytest.approx(splats.means, abs=1e-6)
-    gaussians = Gaussians.of(splats)
-    scales = torch.diag_embed(gaussians.scales).numpy()
+    scales = torch.diag_embed(Gaussians.of(splats).scales).numpy()
     turns = Rotation.from_quat(splats.quaternions, scalar_first=True).as_matrix()
     expected = turns @ scales @ scales @ turns.transpose(0, 2, 1)
     assert handle.covariances * SPLAT_UNIT**2 == pytest.approx(expected, abs=ROUNDING * np.abs(expected).max())

@@ -15,14 +15,7 @@ import torch
 
 from neuspring.core.errors import InputError
 from neuspring.extensions.released.checks import AS_RELEASED, MEAN, Comparison, Published, frame_scores, of_means
-from neuspring.extensions.released.files import (
-    Released,
-    depth_image,
-    gated_lift,
-    read_checkpoint,
-    read_parameters,
-    visible_pixels,
-)
+from neuspring.extensions.released.files import Released, depth_image, gated_lift, read_checkpoint, read_parameters, visible_pixels
 from neuspring.extensions.released.run import RELEASED_CHECKS, Report, read_observations, verify_released
 from neuspring.intake.phystwin import released_cases
 from neuspring.intake.phystwin_raw import read_calibration
@@ -72,9 +65,8 @@ def published(conforming: Path) -> Published:
 
 
 def verify(case: Released, published: Published, *checks: int) -> Report:
-    return verify_released(
-        case.root, case.root.parent / "out", checks=checks or tuple(RELEASED_CHECKS), device="cpu", published=published
-    )
+    out, chosen = case.root.parent / "out", checks or tuple(RELEASED_CHECKS)
+    return verify_released(case.root, out, checks=chosen, device="cpu", published=published)
 
 
 def of(report: Report, outcome: str) -> set[int]:
@@ -89,9 +81,8 @@ def test_a_conforming_case_passes_every_check(conforming, published, tmp_path):
     # Without weights LPIPS is named as not computed; nothing else is left out.
     assert [f.quantity for f in report.findings if f.outcome == "skipped"] == ["lpips"]
     means = {(f.task, f.quantity) for f in report.findings if f.scenario == MEAN and f.outcome == "passed"}
-    assert means == {
-        (task, metric) for task in ("reconstruction", "future") for metric in ("chamfer", "track_error", "psnr", "iou")
-    }
+    metrics = ("chamfer", "track_error", "psnr", "iou")
+    assert means == {(task, metric) for task in ("reconstruction", "future") for metric in metrics}
 
 
 def drop_spring(case: Released) -> None:
@@ -273,8 +264,7 @@ def test_a_check_without_its_files_is_skipped_and_says_which(case, published, ch
     assert of(report, "skipped") == {check}
     assert report.status == 2
     assert "Nothing could be compared" in report.text
-    named = path.replace(NAME, "<case>").rpartition("/")[2]
-    assert named in report.text.partition("## Skipped")[2]
+    assert path.replace(NAME, "<case>").rpartition("/")[2] in report.text.partition("## Skipped")[2]
 
 
 def test_without_annotated_tracks_the_rest_is_still_scored(case, published):

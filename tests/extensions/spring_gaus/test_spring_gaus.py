@@ -56,8 +56,7 @@ def test_the_soft_vector_at_its_start():
 def test_nothing_moves_at_rest_without_gravity():
     anchors = bar()
     model = model_of(anchors, anchors[:3] + 0.005, gravity=0.0)
-    still = np.repeat((anchors[:3] + 0.005)[None], 5, axis=0)
-    moved, reason = roll_out(model, still, "cpu")
+    moved, reason = roll_out(model, np.repeat((anchors[:3] + 0.005)[None], 5, axis=0), "cpu")
     assert not reason
     # Elongations below the slack exert nothing: what is left is rounding of the links' lengths.
     assert float((moved - moved[0]).abs().max()) < 1e-6
@@ -197,8 +196,7 @@ def test_anchors_lie_in_different_cells_of_the_coarsest_grid_that_has_enough():
     points = np.random.default_rng(0).uniform(0, 0.05, (4000, 3))
     few = choose_anchors(points, 50, np.random.default_rng(1))
     assert len(few) == 50 and len(np.unique(np.floor(few / 0.01), axis=0)) == 50
-    many = choose_anchors(points, 500, np.random.default_rng(1))
-    assert len(np.unique(many, axis=0)) == 500
+    assert len(np.unique(choose_anchors(points, 500, np.random.default_rng(1)), axis=0)) == 500
     # There are no more cells than points.
     assert len(choose_anchors(points[:10], 50, np.random.default_rng(1))) <= 10
     with pytest.raises(NumericalFailure, match=r"more anchors than neighbors \(20\) are required, and there are 3"):

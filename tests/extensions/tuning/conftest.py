@@ -18,8 +18,7 @@ def folder(tmp_path: Path) -> Path:
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Tune]:
     """A sweep of four trials, reported. Tests leave its trials as they are."""
     folder = sweeps.furnish(tmp_path_factory.mktemp("tune"))
-    space = sweeps.FAST | {"fit.damping": {"choices": ["fixed", "homogeneous"]}}
-    tune = sweeps.sweep(trials=4, space=space)
+    tune = sweeps.sweep(trials=4, space=sweeps.FAST | {"fit.damping": {"choices": ["fixed", "homogeneous"]}})
     sweeps.work(folder, tune)
     sweeps.report(folder, tune)
     return folder, tune

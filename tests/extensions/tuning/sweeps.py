@@ -67,11 +67,7 @@ def plan(folder: Path, tune: Tune, base: config.Config | None = None) -> Plan:
 
 
 def work(
-    folder: Path,
-    tune: Tune,
-    number: int = 0,
-    base: config.Config | None = None,
-    after: Callable[[], object] = lambda: None,
+    folder: Path, tune: Tune, number: int = 0, base: config.Config | None = None, after: Callable[[], object] = lambda: None
 ) -> list[int]:
     """Run a worker and call `after` after each of its trials; returns the trials that it ran."""
     ended: list[int] = []

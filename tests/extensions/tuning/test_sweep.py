@@ -49,8 +49,7 @@ def test_the_best_overlay_makes_the_best_trial_a_method_row(finished):
     values = BASE | {"scenarios": ["toy_rope_lift_smooth"], "methods": ["search_only"]}
     config.merge(values, config.read_yaml(folder / "best.yaml"))
     bench = benchmark.Benchmark(values, Path(__file__).parents[3])
-    by_number = trials(folder, tune)
-    best = min(by_number.values(), key=lambda one: one.value)
+    best = min(trials(folder, tune).values(), key=lambda one: one.value)
     tuned = benchmark.with_method(bench.config, bench.methods["baseline_small"], "baseline_small").fit
     assert list(bench.methods) == ["baseline", "baseline_small"]
     assert (tuned.learning_rate, tuned.horizon, tuned.damping) == tuple(best.params[f"fit.{n}"] for n in NAMES)
@@ -66,8 +65,7 @@ def test_varied_search_settings_and_clusters_get_a_search_row(folder):
     work(folder, tune)
     report(folder, tune)
     assert len(list(folder.glob("search-*/search.json"))) == 2
-    best = min(trials(folder, tune).values(), key=lambda one: one.value)
-    values = best.user_attrs["values"]
+    values = min(trials(folder, tune).values(), key=lambda one: one.value).user_attrs["values"]
     row = config.read_yaml(folder / "searches.yaml")["search_only_small"]
     assert row["clusters"] == values["clusters"]
     assert row["settings"] == {"polish": values["search.polish"]}

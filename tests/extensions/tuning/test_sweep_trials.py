@@ -51,12 +51,7 @@ def test_a_trial_is_judged_by_the_twin_that_the_method_would_choose(folder, meth
     training = trial.cut(small.observations(), small.observations().scenario.train_end)
     tailed = dataclasses.replace(base.fit, selection="tail")
     problem = FitProblem(
-        observations=training,
-        twin=twin,
-        fit=tailed,
-        simulation=base.simulation,
-        losses=base.losses,
-        quirks=base.released_quirks,
+        observations=training, twin=twin, fit=tailed, simulation=base.simulation, losses=base.losses, quirks=base.released_quirks
     )
     if method == "search_only":
         assert value == TwinFit(problem).tail_loss()
@@ -101,8 +96,7 @@ def test_losses_of_other_scenarios_do_not_keep_a_trial(monkeypatch):
 
 def test_pruning_waits_for_whole_scenarios():
     for scenarios, steps in ((1, 5), (2, 15), (22, 85)):
-        pruner = worker.pruner_of(scenarios, 10)
-        assert pruner._inner._n_warmup_steps == steps
+        assert worker.pruner_of(scenarios, 10)._inner._n_warmup_steps == steps
 
 
 def test_a_numerical_failure_is_a_failed_trial_with_its_reason(folder):

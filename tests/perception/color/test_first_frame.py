@@ -204,8 +204,7 @@ def test_an_object_above_the_horizon_is_refused():
 
 
 def test_rays_beyond_the_horizon_never_meet_the_table():
-    view = camera(np.zeros(3), elevation=5.0)
-    assert np.isinf(camera_depth(view, np.array([[80.0, 0.0]]), 0.0)).all()
+    assert np.isinf(camera_depth(camera(np.zeros(3), elevation=5.0), np.array([[80.0, 0.0]]), 0.0)).all()
 
 
 @pytest.mark.parametrize("category", ["cloth", "rope", "zebra"])

@@ -67,9 +67,8 @@ def test_a_hand_is_followed_with_its_turn_and_size():
 
 def test_only_pixels_of_hands_are_read():
     film, other = Film(), Film()
-    other.colors = [
-        np.where(labels[..., None] == HANDS, color, 255 - color) for color, labels in zip(film.colors, film.labels, strict=True)
-    ]
+    pairs = zip(film.colors, film.labels, strict=True)
+    other.colors = [np.where(labels[..., None] == HANDS, color, 255 - color) for color, labels in pairs]
     grip = np.array([[120, 125]])
     one, two = (follow_hands(each, "0", np.stack(film.labels), [grip], radius=60) for each in (film, other))  # type: ignore[arg-type]
     np.testing.assert_array_equal(one.centers, two.centers)

@@ -79,8 +79,7 @@ def test_what_a_hand_uncovers_of_a_cloth_is_object():
             image[place] = np.clip(color + 25 * grain[place], 0, 255)
     outline, arm = [(25, 24), (94, 24), (94, 67), (25, 67)], [(50, 0), (69, 0), (69, 51), (50, 51)]
     marks = [mark("object", "polygon", outline, radius=2.0), mark("hand", "polygon", arm, radius=2.0)]
-    labels = carry(made, marks, SETTINGS).labels
-    assert (labels[-1][fold] == OBJECT).mean() > 0.7
+    assert (carry(made, marks, SETTINGS).labels[-1][fold] == OBJECT).mean() > 0.7
 
 
 def test_an_ignored_hand_that_leaves_does_not_make_the_table_object():
@@ -101,8 +100,7 @@ def test_an_ignored_hand_that_leaves_does_not_make_the_table_object():
 def test_a_mark_corrects_what_was_carried():
     film = painted(5, hand=False)
     there = mark("ignore", "polygon", [(32, 24), (60, 24), (60, 56), (32, 56)], frame=4, radius=1.0)
-    carried = carry(film, [SQUARE[0], there], SETTINGS)
-    assert not (carried.labels[4][26:54, 34:58] == OBJECT).any()
+    assert not (carry(film, [SQUARE[0], there], SETTINGS).labels[4][26:54, 34:58] == OBJECT).any()
 
 
 def test_half_the_size_is_coarser_and_of_the_same_shape():

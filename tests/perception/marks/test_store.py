@@ -229,16 +229,14 @@ def test_masks_that_do_not_fit_are_refused(folder, labels, message):
 
 
 def test_frames_have_heights_above_the_table(folder):
-    images = CameraFilm(Capture.load(folder), "0")
-    height = images.height(0)
+    height = CameraFilm(Capture.load(folder), "0").height(0)
     truth = cv2.imread(str(folder / "truth" / "0" / "00000.png"), cv2.IMREAD_UNCHANGED)
     assert abs(np.nanmedian(height[truth == 0])) < 0.003
     assert np.nanmedian(height[truth == OBJECT]) > 0.03
 
 
 def test_a_camera_without_marks_and_damaged_files_are_named(folder, capsys):
-    marks = Marks.load(folder / "marks.json")
-    Marks(cameras={"0": marks.of("0")}).save(folder / "one.json")
+    Marks(cameras={"0": Marks.load(folder / "marks.json").of("0")}).save(folder / "one.json")
     assert main(["mask", str(folder), "--marks", str(folder / "one.json"), "--cameras", "1"]) == 2
     assert "camera 1 needs marks; received ['0']" in capsys.readouterr().err
     (folder / "masks.json").write_text("[]")

@@ -19,9 +19,8 @@ def bar(height: float = 0.5, youngs: float = 2e4, viscosity: float = 0.0, fricti
     """A bar of 0.12 x 0.03 x 0.03 m along x, its lower side at `height`."""
     nodes, tetrahedra = block((-0.06, -0.015, height), (0.06, 0.015, height + 0.03), cells)
     skin = boundary(tetrahedra)
-    surface = Surface(
-        rest=nodes, faces=skin, nodes=np.arange(len(nodes))[:, None], weights=np.ones((len(nodes), 1)), colors=nodes * 0
-    )
+    own, one = np.arange(len(nodes))[:, None], np.ones((len(nodes), 1))
+    surface = Surface(rest=nodes, faces=skin, nodes=own, weights=one, colors=nodes * 0)
     count = len(tetrahedra)
     return SoftBody(
         nodes=nodes,
@@ -81,8 +80,7 @@ def test_the_maxwell_branch_damps_and_leaves_rigid_motion_alone():
         body = bar(height=3.0, viscosity=viscosity)
         start = body.nodes.copy()
         start[:, 0] *= 1.02
-        clip = FiniteElements(body, (), 31, RATE, NO_DAMPING, start=start).run()
-        x = clip.positions[20:, :, 0]
+        x = FiniteElements(body, (), 31, RATE, NO_DAMPING, start=start).run().positions[20:, :, 0]
         return float(np.ptp(np.ptp(x, axis=1)))
 
     assert swing(1.0) < 0.5 * swing(0.0)

@@ -116,6 +116,5 @@ def test_a_hand_reaches_its_keys_and_carries_its_mesh_rigidly():
     hand = Hand(((0.0, (0, 0, 0), (0, 0, 0)), (1.0, (0.1, 0, 0.2), (0, 0, np.pi / 2)), (2.0, (0, 0, 0), (0, 0, 0))))
     poses = hand.poses(np.array([0.0, 0.5, 1.0, 2.0, 3.0]))
     np.testing.assert_allclose(poses[:, :3], [[0, 0, 0], [0.05, 0, 0.1], [0.1, 0, 0.2], [0, 0, 0], [0, 0, 0]], atol=1e-12)
-    corners = np.array([[0.01, 0, 0], [0, 0.02, 0.0], [0, 0, 0.03]])
-    moved = place(corners, poses)
+    moved = place(np.array([[0.01, 0, 0], [0, 0.02, 0.0], [0, 0, 0.03]]), poses)
     np.testing.assert_allclose(moved[2], [[0.1, 0.01, 0.2], [0.08, 0, 0.2], [0.1, 0, 0.23]], atol=1e-12)

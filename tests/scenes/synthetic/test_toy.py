@@ -17,8 +17,7 @@ def test_every_scene_is_a_valid_capture_with_its_truth(path):
     assert nodes.shape == scene.truth.topology.nodes.shape
     # Without noise the observed rest state is the true one.
     np.testing.assert_array_equal(nodes, scene.truth.topology.nodes)
-    log_stiffness = np.log2(scene.truth.material.stiffness)
-    assert np.ptp(log_stiffness) == pytest.approx(2.0, abs=0.02)
+    assert np.ptp(np.log2(scene.truth.material.stiffness)) == pytest.approx(2.0, abs=0.02)
     # Every node hangs on a spring, and the hands hold the body.
     assert set(range(len(nodes))) <= set(scene.truth.topology.springs.ravel().tolist())
     assert scene.truth.topology.object_spring_count < len(scene.truth.topology.springs)

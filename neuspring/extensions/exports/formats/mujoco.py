@@ -88,8 +88,7 @@ def mjcf(source: ExportSource) -> str:
         for end in ends:
             ET.SubElement(tendon, "site", site=names[end])
     if not rod and source.velocity.any():
-        keys = ET.SubElement(root, "keyframe")
-        ET.SubElement(keys, "key", name="start", qvel=text(*source.velocity.ravel()))
+        ET.SubElement(ET.SubElement(root, "keyframe"), "key", name="start", qvel=text(*source.velocity.ravel()))
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
 

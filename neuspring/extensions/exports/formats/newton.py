@@ -37,8 +37,7 @@ def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Pat
         rule = "Newton's springs pull as well as push"
         raise InputError("--to newton", rule, f"{source.name}, whose hands only push", "Take --to mujoco or npz.")
     made = [output / SCRIPT.name]
-    rod = body_of(source.twin).center_line(source.twin)
-    if rod:
+    if rod := body_of(source.twin).center_line(source.twin):
         if len(springs.springs):
             rule = "Newton has no springs between particles and bodies"
             raise InputError("--to newton", rule, f"{source.name}, a rod that hands pull by springs", "Take --to mujoco.")

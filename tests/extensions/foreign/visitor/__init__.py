@@ -75,6 +75,5 @@ LAG = Baseline(prediction="visitor:lag")
 STACK = CaptureFormat(about="a .npz file with {kind}", recognizes=lambda path: path.suffix == ".npz", pictures=Stack)
 XYZ = Export(write=write_xyz, frames="0")
 SAG = Metric(name="sag", title="sag", heading="Sag", unit="m", shown_unit="mm", factor=1e3, digits=2, function=sag)
-VISIT = ReportSection(
-    order=99, make=lambda material: PageSection(key="visit", title="A visit", blocks=[Text(text="A visitor was here.")])
-)
+_PAGE = PageSection(key="visit", title="A visit", blocks=[Text(text="A visitor was here.")])
+VISIT = ReportSection(order=99, make=lambda material: _PAGE)
