@@ -179,7 +179,8 @@ class Graph:
                 files[name] = paths if parameter.many else paths[0] if paths else None
             also = [str(path) for path in stage.also(self.rows(wildcards))]
             members = [one.inputs for one in self.members(stage, wildcards)]
-            also += dict.fromkeys(path for one in members for name, path in one.items() if name not in stage.inputs)
+            others = [paths for one in members for name, paths in one.items() if name not in stage.inputs]
+            also += dict.fromkeys(path for paths in others for path in ([paths] if isinstance(paths, str) else paths))
             return {name: paths for name, paths in (files | {"also": also}).items() if paths}
 
         return found

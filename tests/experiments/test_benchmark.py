@@ -442,10 +442,10 @@ def test_scenarios_without_a_pool_are_left_out_of_its_methods(tmp_path: Path) ->
     assert [path for path in Graph(made).runs() if "cloth" in path] == [f"results/cloth/full/{seed}/run.json" for seed in range(3)]
     assert made.applies("one", "a")
     assert in_step(made, "a") == [(name, seed) for name in ("full", "one") for seed in range(3)]
-    pooled_fits = [
-        row for row in json.loads(Graph(made).options(STAGES["fits"], SimpleNamespace(scenario="a"))["rows"]) if row["pool"]
-    ]
-    assert [row["pool"] for row in pooled_fits] == [["results/b/observations.npz", "results/c/observations.npz"]]
+    job, others = SimpleNamespace(scenario="a"), ["results/b/observations.npz", "results/c/observations.npz"]
+    rows = json.loads(Graph(made).options(STAGES["fits"], job)["rows"])
+    assert [row["pool"] for row in rows] == [[], others]
+    assert set(others) < set(Graph(made).inputs(STAGES["fits"])(job)["also"])
     alone = pooled(tmp_path, methods=["full"])
     assert (alone.pools, list(alone.scenarios)) == ({}, ["a"]), "no pool is asked for without such a method"
 
