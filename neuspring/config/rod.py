@@ -12,7 +12,7 @@ from neuspring.core.section import Count, SettingsSection
 
 @dataclass(frozen=True, kw_only=True)
 class RodSettings(SettingsSection):
-    """A long thin body as a rod (twin/rod.py)."""
+    """A long thin body as a rod (rods/made.py)."""
 
     rest: Literal["straight", "first_frame"] = "straight"
     """The shape without moments: straight, or as in frame 0; with `lay_out` the unloaded one that the recording knows."""

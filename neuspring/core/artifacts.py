@@ -554,7 +554,7 @@ class Rod(Artifact):
         "held edge of either end (K = 2), of its own length: along t + a m1 + b m2; see `clamps`",
         omitted=True,
     )
-    """They are there where the vertices were laid along the unloaded shape (twin/rod.py)."""
+    """They are there where the vertices were laid along the unloaded shape (rods/made.py)."""
     rolls: np.ndarray = array(
         "K",
         np.int32,

@@ -21,10 +21,10 @@ from neuspring.core.artifacts import Twin
 from neuspring.draw.painter import empty, hands
 from neuspring.draw.scene import ShownRun, ShownScene
 from neuspring.draw.sheet import CONTROLLER, TEXT, color_bar, place, points_across, sample
+from neuspring.physics.topology import node_spacing
 from neuspring.twin.body import Lines, body_of, lines_of
 from neuspring.twin.field import midpoints
 from neuspring.twin.roughness import roughness, variogram
-from neuspring.twin.topology import node_spacing
 
 Quantity = Literal["stiffness", "region"]
 STIFFNESS_COLORS = "viridis"

@@ -6,6 +6,6 @@
 | a term each, with its adjoint | `springs`, `motion`, `collision`, `obstacles` |
 | numbers of several twins, arrays, a frame as kernels | `lanes`, `arrays`, `frame` |
 | a frame of one twin or of several, for torch | `solver`, `controllers` |
-| rods: a frame, nodes that follow the line, the line among nodes | `rod`, `rod_nodes`, `center_line` |
+| points to regions, regions to springs | `topology` |
 | the specification; whether the substep is small enough | `reference`, `stability` |
 """

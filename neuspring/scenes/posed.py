@@ -19,7 +19,7 @@ from neuspring.core.records import digest_file
 from neuspring.intake.points import carried, in_both, taught_by
 from neuspring.scenes.mocap import centerline, circle, rings, transport
 
-GRIP = 0.05
+HAND_GRIP = 0.05
 """Distance of the two points of a hand on the line, m."""
 UNEVEN = 0.01
 """Largest deviation of a step in time from their median, relative."""
@@ -34,7 +34,7 @@ def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Obser
     along = (unloaded[0] - clamp) / np.linalg.norm(unloaded[0] - clamp)
     side = np.eye(3)[np.abs(along).argmin()]
     normal = transport(along[None], side)[0]
-    ends = np.stack([clamp - GRIP * along, clamp])
+    ends = np.stack([clamp - HAND_GRIP * along, clamp])
     around = circle(normal, np.cross(along, normal), settings.radius, settings.ring, 0.5)
     jaws = np.concatenate([ends, *(end + around for end in ends)])
     controllers = carried(poses[:, None], jaws[None])

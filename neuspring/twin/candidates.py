@@ -24,9 +24,9 @@ from neuspring.physics import stability
 from neuspring.physics.controllers import waypoints
 from neuspring.physics.lanes import LANE_WIDTHS
 from neuspring.physics.parameters import homogeneous
+from neuspring.physics.topology import controller_reach, node_spacing, piecewise_topology, regions
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.rollout import initial_velocity
-from neuspring.twin.topology import controller_reach, node_spacing, piecewise_topology, regions
 from neuspring.twin.transfer import move, require_pool
 from neuspring.twin.trials import Outcome, outcomes
 

@@ -23,9 +23,9 @@ from torch import nn
 from neuspring import config
 from neuspring.core.artifacts import Topology, Twin
 from neuspring.physics.parameters import CONTACT_LIMITS, Parameters, pack, twin_tensors
+from neuspring.physics.topology import node_spacing
 from neuspring.twin.field import NO_POINTS, SpringField, midpoints
 from neuspring.twin.roughness import SIDE_BY_SIDE, neighbors, roughness
-from neuspring.twin.topology import node_spacing
 
 CONTACT_SCALARS = tuple(CONTACT_LIMITS)
 DAMPING_FACTORS = ("drag", "dashpot")

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from neuspring.twin.topology import node_spacing
+from neuspring.physics.topology import node_spacing
 
 ICP_STEPS = 40
 MOST_POINTS = 1500

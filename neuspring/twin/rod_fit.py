@@ -32,8 +32,8 @@ from neuspring.core.geometry import SAME_WORLD, angle_between, heading, turned
 from neuspring.core.levenberg import LevenbergMarquardt
 from neuspring.core.text import Progress, listed
 from neuspring.physics.controllers import waypoints
-from neuspring.physics.rod_nodes import RodFrames, settled, turn_of
-from neuspring.twin import rod as rods
+from neuspring.rods import made as rods
+from neuspring.rods.nodes import RodFrames, settled, turn_of
 from neuspring.twin.body import Learned
 from neuspring.twin.losses import frames_seen
 from neuspring.twin.rollout import initial_velocity
@@ -480,7 +480,7 @@ def in_order(recordings: Sequence[Observations]) -> list[Observations]:
     return [replace(each, line=each.line[order]) for each, order in zip(recordings, orders, strict=True)]
 
 
-ALIKE = 0.6
+ALIKE_HEADINGS = 0.6
 """Length of the mean heading from which recordings have a world in common. Any eight of DEFORM's cables have 0.85 at least, one of
 eight that is turned by half leaves 0.75."""
 TURNS_KNOWN = 0.5
@@ -497,7 +497,7 @@ def choose_axis(lines: Sequence[np.ndarray]) -> tuple[np.ndarray, float]:
     if not lines:
         return np.eye(3)[1], SAME_WORLD
     ways = np.array([heading(line) for line in lines])
-    steady = SAME_WORLD if np.linalg.norm(ways.mean(axis=0)) > ALIKE else 0.0
+    steady = SAME_WORLD if np.linalg.norm(ways.mean(axis=0)) > ALIKE_HEADINGS else 0.0
     angles = [angle_between(ways[0], way) for way in ways]
     angles = [angle if abs(angle) > steady else 0.0 for angle in angles]
 
@@ -511,7 +511,7 @@ def choose_axis(lines: Sequence[np.ndarray]) -> tuple[np.ndarray, float]:
     return axis, steady
 
 
-MIRRORED = 0.7
+MIRROR_ERROR = 0.7
 """A recording is mirrored if its mirror image has so many times its error. In fits to DEFORM's cables it has 1.6 times at least,
 and that of a mirrored one among others 0.4 to 0.6 times."""
 
@@ -532,7 +532,9 @@ def require_unmirrored(recordings: Recordings, twin: Twin, settings: RodSteps, d
         seen_there = each.counts[:, 1:frames:every, :, None]
         errors.append(1e3 * np.where(seen_there, np.abs(apart), 0.0).mean(axis=(1, 2, 3)))
     found = [(one.scenario.name, own, image) for one, own, image in zip(seen, *errors, strict=True)]
-    if wrong := [f"{name} ({own:.1f} mm, its mirror image {image:.1f} mm)" for name, own, image in found if image < MIRRORED * own]:
+    if wrong := [
+        f"{name} ({own:.1f} mm, its mirror image {image:.1f} mm)" for name, own, image in found if image < MIRROR_ERROR * own
+    ]:
         rule = "recordings of a pool must not be mirrored"
         raise InputError(f"pool of {seen[0].scenario.name}", rule, listed(wrong), f"Correct their axes. {LEAVE_OUT}")
 

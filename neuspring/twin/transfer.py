@@ -27,9 +27,16 @@ import numpy as np
 from neuspring.core.artifacts import Material, Observations, Topology, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.text import listed
+from neuspring.physics.topology import (
+    RADIUS_MARGIN,
+    REPAIR_SPRINGS,
+    distances,
+    infer_controller_radius,
+    piecewise_topology,
+    unloaded,
+)
 from neuspring.twin.body import body_of
 from neuspring.twin.field import midpoints
-from neuspring.twin.topology import RADIUS_MARGIN, REPAIR_SPRINGS, distances, infer_controller_radius, piecewise_topology, unloaded
 
 if TYPE_CHECKING:
     from neuspring.twin.register import Registration
@@ -297,7 +304,7 @@ def require_alike(recordings: Sequence[Observations], counted: str, counts: Call
 
 
 LEAVE_OUT = "Leave them out (deform.leave_out, or pools)."
-BETTER = 0.9
+BETTER_ORDER = 0.9
 """Another order must fit distances of neighbors by so many times the error of that of the file. For DEFORM's cables the true order
 is at most 0.8 times the other one."""
 
@@ -319,7 +326,7 @@ def along(recordings: Sequence[Observations]) -> list[np.ndarray]:
     orders = [np.arange(count), np.arange(count)[::-1], np.r_[1, 0, 2:count], np.r_[: count - 2, count - 1, count - 2]]
     usual = np.median([apart(each) for each in recordings], axis=0)
     errors = [[np.abs(apart(each, order) - usual).mean() for order in orders] for each in recordings]
-    found = [orders[np.argmin(error) if min(error) < BETTER * error[0] else 0] for error in errors]
+    found = [orders[np.argmin(error) if min(error) < BETTER_ORDER * error[0] else 0] for error in errors]
     for each, order in zip(recordings, found, strict=True):
         if order is not orders[0]:
             print(f"note: {each.scenario.name}: by the distances between its markers their order is {order.tolist()}")

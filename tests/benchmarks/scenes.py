@@ -8,7 +8,7 @@ import numpy as np
 
 from neuspring.core.artifacts import Material, Simulation, Topology, Twin
 from neuspring.physics import stability
-from neuspring.twin.topology import uniform_topology
+from neuspring.physics.topology import uniform_topology
 
 HANDS = 8
 FRAME_TIME = 1 / 30

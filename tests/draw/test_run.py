@@ -14,7 +14,7 @@ from neuspring.draw import run as figures
 from neuspring.draw.scene import ShownRun, chosen_frames
 from neuspring.draw.sheet import sample
 from neuspring.draw.twin import histogram, region_colors, stiffness_limits
-from neuspring.twin.topology import piecewise_topology, regions
+from neuspring.physics.topology import piecewise_topology, regions
 from tests.support import small
 
 HISTORIES = {

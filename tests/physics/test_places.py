@@ -30,11 +30,11 @@ OTHERS = {"scenes/synthetic/fem.py", "scenes/synthetic/kernels.py", "extensions/
 """Drag of another simulator; dragging with a mouse."""
 RODS = {
     "config/rod.py",
-    "physics/rod.py",
-    "physics/rod_nodes.py",
-    "physics/rod_reference.py",
+    "rods/solver.py",
+    "rods/nodes.py",
+    "rods/reference.py",
     "twin/bodies/rod.py",
-    "twin/rod.py",
+    "rods/made.py",
     "twin/rod_fit.py",
 }
 """Rods are a simulator of their own."""

@@ -12,9 +12,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from neuspring.core.artifacts import Rod
-from neuspring.physics import rod_reference
-from neuspring.physics.rod import RodLanes, RodSolver
-from neuspring.physics.rod_reference import Parameters
+from neuspring.rods import reference as rod_reference
+from neuspring.rods.reference import Parameters
+from neuspring.rods.solver import RodLanes, RodSolver
 from tests.support import rods as make
 
 # Sums of some hundred numbers in float64, through a few hundred substeps.

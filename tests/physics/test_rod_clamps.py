@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from neuspring.core.artifacts import Rod
 from neuspring.core.errors import NumericalFailure
-from neuspring.physics.rod import RodLanes, RodSolver
-from neuspring.physics.rod_nodes import Clamps, hanging
+from neuspring.rods.nodes import Clamps, hanging
+from neuspring.rods.solver import RodLanes, RodSolver
 from tests.support import rods as make
 
 LENGTH = 0.5

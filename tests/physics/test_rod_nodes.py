@@ -9,7 +9,7 @@ import torch
 
 from neuspring.core.artifacts import Material, Simulation, Topology, Twin
 from neuspring.core.errors import InputError
-from neuspring.physics.rod_nodes import RodFrames, at_vertices, bind, placed
+from neuspring.rods.nodes import RodFrames, at_vertices, bind, placed
 from neuspring.twin.rollout import roll_out
 from tests.support.rods import rod
 from tests.support.scenes import SCALARS

@@ -13,8 +13,8 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from neuspring.core.artifacts import Rod
-from neuspring.physics import rod_reference as reference
-from neuspring.physics.rod_reference import Frames, Parameters, Rate
+from neuspring.rods import reference
+from neuspring.rods.reference import Frames, Parameters, Rate
 from tests.support import rods as make
 
 # Central differences over STEP: rounding of 1e-16 / STEP, and STEP^2 / 6 times third derivatives of about 3 EA / L^2 = 1e3 N/m^2.

@@ -14,8 +14,8 @@ from scipy.integrate import solve_bvp
 
 from neuspring.core.artifacts import Rod
 from neuspring.core.errors import InputError
-from neuspring.physics import rod_reference
-from neuspring.physics.rod import RodLanes, RodSolver
+from neuspring.rods import reference as rod_reference
+from neuspring.rods.solver import RodLanes, RodSolver
 from tests.support import rods as make
 
 NONE = np.zeros((0, 2))

@@ -10,8 +10,8 @@ import pytest
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.physics.statics import at_rest, elasticity, young
+from neuspring.physics.topology import object_springs
 from neuspring.twin.rollout import roll_out
-from neuspring.twin.topology import object_springs
 from tests.support import rods
 from tests.support.scenes import scene, twin_of
 

@@ -14,9 +14,9 @@ from neuspring import config
 from neuspring.config import Config, Posed, ScenarioRow, parse
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError
+from neuspring.rods.made import RodStart, rod_twin
 from neuspring.scenes import posed
 from neuspring.twin.bodies.lattice import body as lattice
-from neuspring.twin.rod import RodStart, rod_twin
 from neuspring.twin.rod_fit import RodSteps, Variables, fit_rod, search_rod
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.transfer import move

@@ -15,6 +15,7 @@ from neuspring.core.records import Recorder, StageRecord
 from neuspring.core.run_record import RunRecord
 from neuspring.experiments.tracking import log as tracking
 from neuspring.physics import stability
+from neuspring.physics.topology import node_spacing
 from neuspring.scores import metrics
 from neuspring.stages.average import average
 from neuspring.stages.fit import fit
@@ -23,7 +24,6 @@ from neuspring.stages.rollout import rollout
 from neuspring.stages.score import _notes, score
 from neuspring.stages.search import search
 from neuspring.stages.transfer import transfer
-from neuspring.twin.topology import node_spacing
 from tests.support import small
 
 SETTINGS = config.Config(search=config.Search(rollouts=11), fit=config.Fit(epochs=2), toy=config.Toy(frames=8), device="cpu")

@@ -87,7 +87,7 @@ def write_results(folder: Path) -> None:
     """Write the released result files of the case `folder`: a prediction equal to its rest state, parameters, a checkpoint."""
     import torch
 
-    from neuspring.twin.topology import uniform_topology
+    from neuspring.physics.topology import uniform_topology
 
     root, name = folder.parents[2], folder.name
     data = pickle.loads((folder / "final_data.pkl").read_bytes())

@@ -8,7 +8,7 @@ import numpy as np
 
 from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
-from neuspring.twin.rod import RodStart, rod_twin
+from neuspring.rods.made import RodStart, rod_twin
 from tests.support import scenarios
 
 RADIUS, LENGTH, HEIGHT = 0.01, 0.4, 0.1

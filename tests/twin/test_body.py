@@ -10,12 +10,12 @@ import pytest
 import neuspring
 from neuspring.core.artifacts import Artifact, Observations, Twin
 from neuspring.core.errors import InputError
-from neuspring.physics.rod_nodes import RodFrames
 from neuspring.physics.solver import FrameSolver
+from neuspring.rods.made import rod_twin
+from neuspring.rods.nodes import RodFrames
 from neuspring.twin import body as module
 from neuspring.twin.bodies.lattice import Lattice
 from neuspring.twin.body import BODIES, body_of, lines_of, with_mass
-from neuspring.twin.rod import rod_twin
 from neuspring.twin.rollout import roll_out
 from tests.support import ropes, small
 
@@ -32,7 +32,7 @@ def twins() -> dict[str, Twin]:
 def test_no_room_above_tells_a_rod_from_a_lattice():
     """Outside physics and twin; the pattern finds what it looks for."""
     assert all(TOLD_APART.search(text) for text in ("if twin.rod is None", 'if body == "rod":', "isinstance(solver, RodFrames)"))
-    places = [path for path in PACKAGE.rglob("*.py") if path.relative_to(PACKAGE).parts[0] not in ("physics", "twin")]
+    places = [path for path in PACKAGE.rglob("*.py") if path.relative_to(PACKAGE).parts[0] not in ("physics", "rods", "twin")]
     lines = [(path.relative_to(PACKAGE), line) for path in places for line in path.read_text().splitlines()]
     found = [f"{path}: {line.strip()}" for path, line in lines if TOLD_APART.search(line)]
     assert not found, "\n".join(found)

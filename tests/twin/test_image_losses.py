@@ -13,7 +13,7 @@ from neuspring.twin.fit import TwinFit
 from neuspring.twin.losses import BETA, FrameLoss
 from neuspring.twin.polish import POLISH, products
 from neuspring.twin.search import search
-from neuspring.twin.transfer import in_pool
+from neuspring.twin.transfer import move
 from neuspring.twin.trials import motions
 from tests.support import colored, small
 from tests.support.searches import assert_same_trace
@@ -156,7 +156,7 @@ def test_recordings_of_color_alone_form_a_pool():
     each = (alone, replace(alone, pool=(other,)))
     one, mean = (evaluate(problem, [alone.encode()], False, 0, 0)[0]["cost"] for problem in each)
     # The cost of the other recording is its own error in the image.
-    twin = in_pool(candidate(alone, alone.decode(alone.encode())), other, keep_frame_time=False)
+    twin = move(candidate(alone, alone.decode(alone.encode())), other, keep_frame_time=False)[0]
     moved = small.judge(small.search_problem(other), [twin], FrameLoss.of(other, ALL, "cpu"))[0].cost
     assert mean == pytest.approx((one + moved) / 2, rel=1e-12)
     assert moved != one

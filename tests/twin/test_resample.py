@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 from neuspring.core.artifacts import Material, Observations, Simulation, Twin
 from neuspring.core.errors import InputError
 from neuspring.physics import stability
+from neuspring.physics.topology import distances, infer_controller_radius, piecewise_topology, uniform_topology
 from neuspring.twin.rollout import roll_out
-from neuspring.twin.topology import distances, infer_controller_radius, piecewise_topology, uniform_topology
 from neuspring.twin.transfer import infer_radii, move, resampled, scale_between
 from tests.support import scenarios
 

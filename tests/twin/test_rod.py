@@ -7,8 +7,8 @@ import pytest
 
 from neuspring import config
 from neuspring.core.errors import InputError
-from neuspring.physics.center_line import center_line
-from neuspring.twin.rod import rod_twin
+from neuspring.rods.center_line import center_line
+from neuspring.rods.made import rod_twin
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.transfer import move
 from tests.support import colored, ropes

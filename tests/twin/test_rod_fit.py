@@ -11,9 +11,9 @@ from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError
 from neuspring.data.unpickle import load_pickle
+from neuspring.rods.made import RodStart, line_of, of_markers, rod_twin
 from neuspring.scenes import mocap
 from neuspring.twin.fit import FitProblem
-from neuspring.twin.rod import RodStart, line_of, of_markers, rod_twin
 from neuspring.twin.rod_fit import (
     Levenberg,
     Recordings,

@@ -22,11 +22,11 @@ from neuspring.config.search import LENGTHS
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.physics import stability
 from neuspring.physics.lanes import LANE_WIDTHS
+from neuspring.physics.topology import distances, regions, uniform_topology
 from neuspring.twin import candidates
 from neuspring.twin.candidates import PENALTY, SearchProblem, candidate, groups, made, still_cost
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.search import FREED_SIGMA, search
-from neuspring.twin.topology import distances, regions, uniform_topology
 from neuspring.twin.trials import Outcome
 from tests.support import scenarios, small
 from tests.support.searches import assert_same_trace, budget

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from neuspring.core.errors import InputError
-from neuspring.twin import topology as graphs
+from neuspring.physics import topology as graphs
 from tests.support.clips import NAMES, clip
 
 LENGTH = 2e-7

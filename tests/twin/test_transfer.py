@@ -9,10 +9,10 @@ import pytest
 from neuspring import config
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
+from neuspring.rods.made import rod_twin
 from neuspring.scenes import mocap
 from neuspring.twin.candidates import candidate
 from neuspring.twin.fit import FitProblem
-from neuspring.twin.rod import rod_twin
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.transfer import along, corresponds, move, require_pool
 from tests.support import small

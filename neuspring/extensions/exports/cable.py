@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from neuspring.core.artifacts import Rod
 from neuspring.core.errors import InputError
-from neuspring.physics.rod_nodes import frame_zero, radius_of
+from neuspring.rods.nodes import frame_zero, radius_of
 
 CABLE_STEP = 2e-4
 """s, at most: springs of joints are explicit there."""

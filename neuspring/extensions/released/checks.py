@@ -38,6 +38,7 @@ from neuspring.intake import phystwin
 from neuspring.intake.phystwin import CALIBRATION, released_cases
 from neuspring.intake.phystwin_raw import read_calibration
 from neuspring.physics.stability import RELEASED_FRAME_TIME, RELEASED_SUBSTEPS
+from neuspring.physics.topology import uniform_topology
 from neuspring.scores import metrics
 from neuspring.scores.lpips import Lpips
 from neuspring.scores.metrics import METRICS, TASKS, averages
@@ -45,7 +46,6 @@ from neuspring.scores.pictures import Pair, picture_scores
 from neuspring.splats.draw import OBJECT_COVERAGE, picture, prune_by_opacity, skinned_frames, view_of
 from neuspring.splats.model import Splats
 from neuspring.twin.rollout import roll_out
-from neuspring.twin.topology import uniform_topology
 
 Outcome = Literal["passed", "failed", "measured", "skipped"]
 """measured: there is no published number to compare with."""

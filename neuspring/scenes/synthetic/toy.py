@@ -17,7 +17,7 @@ from neuspring.core.artifacts import Material, Observations, Scenario, Simulatio
 from neuspring.core.errors import InputError
 from neuspring.intake.points import in_both
 from neuspring.physics import reference, stability
-from neuspring.twin.topology import uniform_topology
+from neuspring.physics.topology import uniform_topology
 
 TRAIN_FRACTION = 0.7
 TOY_FRAME_RATE = 30.0

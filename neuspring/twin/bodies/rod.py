@@ -14,7 +14,7 @@ from neuspring.core.errors import InputError
 from neuspring.twin.body import Body, Lines, SearchOptions
 
 if TYPE_CHECKING:
-    from neuspring.physics.rod_nodes import RodFrames
+    from neuspring.rods.nodes import RodFrames
     from neuspring.twin.fit import FitProblem
     from neuspring.twin.rod_fit import RodResult
 
@@ -89,18 +89,18 @@ v_x, c v_y, -ground_elasticity v_z), c = max(0, 1 - ground_friction (1 + ground_
 
     def on_recording(self, twin: Twin, observations: Observations) -> tuple[Twin, None]:
         """The rod on the line of frame 0; see `rod.on_recording`."""
-        from neuspring.twin.rod import on_recording
+        from neuspring.rods.made import on_recording
 
         return on_recording(twin, observations), None
 
     def solver(self, twin: Twin, device: str = "cpu") -> RodFrames:
-        from neuspring.physics.rod_nodes import RodFrames
+        from neuspring.rods.nodes import RodFrames
 
         return RodFrames(twin, device)
 
     def lines(self, twin: Twin) -> Lines:
         """The edges of the center line, then the springs of hands."""
-        from neuspring.physics.rod_nodes import at_vertices
+        from neuspring.rods.nodes import at_vertices
 
         topology, rod = twin.topology, self.center_line(twin)
         points = len(topology.nodes) + len(topology.controllers)

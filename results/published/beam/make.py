@@ -38,11 +38,11 @@ from neuspring.core.errors import InputError
 from neuspring.core.table import Cell, Table
 from neuspring.data.c3d import Markers
 from neuspring.physics.parameters import homogeneous
-from neuspring.physics.rod import RodLanes, RodSolver
 from neuspring.physics.statics import at_rest, young
+from neuspring.physics.topology import build, object_springs
+from neuspring.rods.solver import RodLanes, RodSolver
 from neuspring.twin.body import body_of
 from neuspring.twin.rollout import roll_out
-from neuspring.twin.topology import build, object_springs
 
 NAME = re.compile(r"(?:gravity|load(?P<grams>\d+))_V2_(?P<take>\w+)\.c3d")
 LENGTH, WIDTH, DENSITY, GRAVITY = 0.1, 0.03, 1070.0, 9.81

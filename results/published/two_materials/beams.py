@@ -20,9 +20,9 @@ from neuspring.core.artifacts import Simulation, Twin
 from neuspring.core.errors import NumericalFailure
 from neuspring.physics.parameters import homogeneous
 from neuspring.physics.reference import ReferenceTwin, incidence, spring_forces
+from neuspring.physics.topology import build, object_springs
 from neuspring.scores.pictures import iou
 from neuspring.twin.losses import FrameLoss, ImageEvidence
-from neuspring.twin.topology import build, object_springs
 
 CM = 0.01
 TO_MARKER = np.array([-9.15, -3.5, -1.75])

@@ -32,9 +32,9 @@ from neuspring.core.artifacts import Rod, Simulation, Twin
 from neuspring.core.files import write_text
 from neuspring.core.table import Table
 from neuspring.physics.parameters import homogeneous
-from neuspring.physics.rod_nodes import RodFrames, bound
+from neuspring.physics.topology import build
+from neuspring.rods.nodes import RodFrames, bound
 from neuspring.twin.parameters import TwinParameters
-from neuspring.twin.topology import build
 from results.published.two_materials.beams import (
     CELLS,
     CM,

@@ -20,11 +20,11 @@ from neuspring.extensions.released.checks import Published
 from neuspring.extensions.released.files import Released
 from neuspring.physics import reference as simulation
 from neuspring.physics.reference import ReferenceTwin
+from neuspring.physics.topology import uniform_topology
 from neuspring.splats.model import Splats
 from neuspring.splats.rasterize import reference
 from neuspring.splats.skinning import Skin
 from neuspring.splats.view import C0, View
-from neuspring.twin.topology import uniform_topology
 from tests.support.phystwin_case import dump, edit, stored, write_case, write_json
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0

@@ -14,7 +14,7 @@ from neuspring.extensions.exports import Export, cable
 from neuspring.extensions.exports.cable import HINGE_AXES, text
 from neuspring.extensions.exports.formats import npz
 from neuspring.extensions.exports.source import ExportSource, require_start
-from neuspring.physics.rod_nodes import radius_of
+from neuspring.rods.nodes import radius_of
 from neuspring.twin.body import body_of
 from neuspring.twin.rollout import FAR_AWAY
 

@@ -15,7 +15,7 @@ from neuspring.core.files import write_atomically
 from neuspring.extensions.exports import Export
 from neuspring.extensions.exports.formats import ply
 from neuspring.extensions.exports.source import ExportSource
-from neuspring.physics.rod_nodes import radius_of
+from neuspring.rods.nodes import radius_of
 from neuspring.splats.view import C0
 from neuspring.twin.body import body_of
 

@@ -1,6 +1,6 @@
 """Discrete elastic rods (Bergou et al. 2008, 2010) in lanes: many rods of as many vertices advance together, one thread each.
 
-`rod_reference.py` is the specification: energies, and forces as their gradients. Here the same forces are written out, and a
+`reference.py` is the specification: energies, and forces as their gradients. Here the same forces are written out, and a
 substep is implicit, so that it stays stable for the stiffest cable. With BDF2 (backward Euler in the first substep and after a
 contact)
 

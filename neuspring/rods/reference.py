@@ -1,6 +1,6 @@
 """The specification of a rod: a slow, readable float64 simulation of one discrete elastic rod (Bergou et al. 2008, 2010).
 
-Forces are gradients of the energy by automatic differentiation. The fast solver (`rod.py`) must agree. There is no contact here.
+Forces are gradients of the energy by automatic differentiation. The fast solver (`solver.py`) must agree. There is no contact here.
 Everything can be differentiated with respect to `Parameters`, also through a rollout.
 """
 
@@ -315,7 +315,7 @@ class State(NamedTuple):
     k_before: Tensor | None = None
     """Curvatures a step before them; none in frame 0."""
     z: Tensor | None = None
-    """Where branches have no moment [J, B, 3]: k1, k2 and twist; None: there are none."""
+    """k1, k2 and twist [J, B, 3] at which branches have no moment; None: there are none."""
 
 
 def advanced(p: Parameters, state: State, h: float, middle: Tensor, end: Tensor, gravity: Tensor) -> State:

@@ -22,7 +22,7 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.geometry import PARALLEL
 from neuspring.physics.controllers import ControllerSprings, begins
 from neuspring.physics.parameters import CONTACT_LIMITS
-from neuspring.physics.rod import RodHands, RodLanes, RodSolver
+from neuspring.rods.solver import RodHands, RodLanes, RodSolver
 
 SMOOTHING_WEIGHT = 1e-6
 """Weight of second differences along the vertices against nodes: decides where no node is."""
@@ -75,7 +75,7 @@ class Clamps:
     clamps: torch.Tensor
     """[B, 2, 3], m."""
     lengths: torch.Tensor
-    """Of the edges of both ends [B, 2], m."""
+    """Edges of both ends [B, 2], m."""
     tilts: torch.Tensor | None = None
     """[B, 2, 2]."""
     rolls: torch.Tensor | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from neuspring.core.errors import InputError
-from neuspring.physics.rod_nodes import bind
+from neuspring.rods.nodes import bind
 
 LEAST_SLENDERNESS = 8.0
 """Length over radius below which a body is no rod: bending would shear it as much."""

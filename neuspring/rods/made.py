@@ -24,10 +24,10 @@ from neuspring.config.search import VARIABLES
 from neuspring.core.artifacts import Observations, Rod, Simulation, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.geometry import SAME_WORLD, axis_on, heading
-from neuspring.physics.center_line import center_line
 from neuspring.physics.parameters import homogeneous
-from neuspring.physics.rod_nodes import bound, frame_zero, hanging, place_on, placed, radius_of, settled
-from neuspring.twin.topology import build, controller_reach, controller_springs, infer_controller_radius, node_spacing
+from neuspring.physics.topology import build, controller_reach, controller_springs, infer_controller_radius, node_spacing
+from neuspring.rods.center_line import center_line
+from neuspring.rods.nodes import bound, frame_zero, hanging, place_on, placed, radius_of, settled
 
 MOST_STRETCH = 0.1
 """Relative difference in length of the center lines of two recordings of one body, at most."""
