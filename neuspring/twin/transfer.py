@@ -33,6 +33,11 @@ from neuspring.twin.topology import RADIUS_MARGIN, REPAIR_SPRINGS, distances, in
 if TYPE_CHECKING:
     from neuspring.twin.register import Registration
 
+
+class OutOfReach(InputError):
+    """No hand of a recording is as near to the body as those of the twin, which may hold it on another."""
+
+
 LENGTH_SPREAD = 0.2
 """Cables bent in frame 0 reach 0.02; nodes in another order lie above 0.5."""
 LEAST_LENGTH = 1e-9
@@ -123,20 +128,10 @@ def resampled(twin: Twin, observations: Observations) -> tuple[Twin, Registratio
     """
     from scipy.spatial import cKDTree
 
-    from neuspring.twin.register import register
-
     old, name = twin.topology, f"transfer to {observations.scenario.name}"
     nodes, count = len(old.nodes), len(observations.nodes)
     there = observations.canonical
-    laid = register(old.canonical[:nodes], there[:count], there[count:])
-    found = laid.rigid_residual / laid.extent
-    if found > LARGEST_RESIDUAL or laid.stretch > LARGEST_STRETCH:
-        rule = (
-            f"other nodes ({count}, the twin has {nodes}) must be of the same object: within {LARGEST_RESIDUAL:.0%} of its size"
-            f" after a rigid motion, and a bending that stretches by {LARGEST_STRETCH:.0%} at most"
-        )
-        value = f"{found:.1%} of {laid.extent:.3g} m, and {laid.stretch:.0%}"
-        raise InputError(name, rule, value, "Name a recording of this object, in a like pose in frame 0, or sample both alike.")
+    laid = laid_onto(old.canonical[:nodes], observations)
     factor = scale_between(old, there[:count])
     _, nearest = cKDTree(old.canonical[:nodes]).query(laid.points)
     labels = old.labels[nearest]
@@ -156,10 +151,28 @@ def resampled(twin: Twin, observations: Observations) -> tuple[Twin, Registratio
     )
     if old.object_spring_count < len(old.springs) and new.object_spring_count == len(new.springs):
         rule = f"a hand must be within {reach:.3g} m of a node, as the twin's hands are"
-        raise InputError(name, rule, "none is", "Check the controllers of frame 0.")
+        raise OutOfReach(name, rule, "none is", "Check the controllers of frame 0.")
     mass = twin.material.mass[nearest] if len(twin.material.mass) else twin.material.mass
     material = replace(twin.material, contact_distance=twin.material.contact_distance * factor, mass=mass)
     return _carried(twin, new, material, np.concatenate([laid.points, laid.others])), laid
+
+
+def laid_onto(nodes: np.ndarray, observations: Observations) -> Registration:
+    """The shape of a recording laid onto nodes [N, 3], m, of another sampling. Raises InputError if the shapes do not fit."""
+    from neuspring.twin.register import register
+
+    there, count = observations.canonical, len(observations.nodes)
+    laid = register(nodes, there[:count], there[count:])
+    found = laid.rigid_residual / laid.extent
+    if found > LARGEST_RESIDUAL or laid.stretch > LARGEST_STRETCH:
+        rule = (
+            f"other nodes ({count}, the twin has {len(nodes)}) must be of the same object: within {LARGEST_RESIDUAL:.0%} of its"
+            f" size after a rigid motion, and a bending that stretches by {LARGEST_STRETCH:.0%} at most"
+        )
+        value = f"{found:.1%} of {laid.extent:.3g} m, and {laid.stretch:.0%}"
+        remedy = "Name a recording of this object, in a like pose in frame 0, or sample both alike."
+        raise InputError(f"transfer to {observations.scenario.name}", rule, value, remedy)
+    return laid
 
 
 def scale_between(topology: Topology, nodes: np.ndarray) -> float:
@@ -298,14 +311,16 @@ def require_pool(here: Observations, pool: Sequence[Observations]) -> None:
     """Raise InputError unless a twin can be judged on the pool: of a cable, recordings with as many nodes and hands, i on i.
 
     Along a line neighbors tell nothing of a turn about it, so that is measured (`roll_between`). Another body may have other nodes
-    in each recording; its shapes are laid onto each other (`resampled`).
+    in each recording; its shapes must fit onto each other (`laid_onto`).
     """
     name = f"pool of {here.scenario.name}"
     counts = len(here.nodes), here.controller_points.shape[1]
     for there in pool:
-        if not (here.line.size or there.line.size):
-            continue
         received = len(there.nodes), there.controller_points.shape[1]
+        if not (here.line.size or there.line.size):
+            if received[0] != counts[0]:
+                laid_onto(here.canonical[: counts[0]], there)
+            continue
         if received != counts:
             rule = f"recordings of a pool must have as many nodes and controllers: {counts[0]} and {counts[1]}"
             value = f"{received[0]} and {received[1]} in {there.scenario.name}"
