@@ -27,7 +27,7 @@ from neuspring.physics.parameters import homogeneous
 from neuspring.physics.topology import controller_reach, node_spacing, piecewise_topology, regions
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.rollout import initial_velocity
-from neuspring.twin.transfer import move, require_pool
+from neuspring.twin.transfer import OutOfReach, move, require_pool
 from neuspring.twin.trials import Outcome, outcomes
 
 INTEGERS = ("object_neighbors", "controller_neighbors")
@@ -242,7 +242,7 @@ def made(problem: SearchProblem, normalized: np.ndarray, push: bool = False) -> 
         row |= {"springs": len(twin.topology.springs), "substeps": twin.simulation.substeps}
         moved = (move(twin, seen, keep_frame_time=released)[0] for seen in problem.pool)
         family = (*(() if problem.leave_out else (twin,)), *(with_substeps(each, settings, released) for each in moved))
-    except NumericalFailure as failure:
+    except (NumericalFailure, OutOfReach) as failure:
         row["reason"] = str(failure)
     except stability.Unstable as failure:
         # The candidate is too stiff for a fixed number of substeps.

@@ -41,6 +41,11 @@ from neuspring.twin.field import midpoints
 if TYPE_CHECKING:
     from neuspring.twin.register import Registration
 
+
+class OutOfReach(InputError):
+    """No hand of a recording is as near to the body as those of the twin, which may hold it on another."""
+
+
 LENGTH_SPREAD = 0.2
 """Cables bent in frame 0 reach 0.02; nodes in another order lie above 0.5."""
 LEAST_LENGTH = 1e-9
@@ -131,20 +136,10 @@ def resampled(twin: Twin, observations: Observations) -> tuple[Twin, Registratio
     """
     from scipy.spatial import cKDTree
 
-    from neuspring.twin.register import register
-
     old, name = twin.topology, f"transfer to {observations.scenario.name}"
     nodes, count = len(old.nodes), len(observations.nodes)
     there = observations.canonical
-    laid = register(old.canonical[:nodes], there[:count], there[count:])
-    found = laid.rigid_residual / laid.extent
-    if found > LARGEST_RESIDUAL or laid.stretch > LARGEST_STRETCH:
-        rule = (
-            f"other nodes ({count}, the twin has {nodes}) must be of the same object: within {LARGEST_RESIDUAL:.0%} of its size"
-            f" after a rigid motion, and a bending that stretches by {LARGEST_STRETCH:.0%} at most"
-        )
-        value = f"{found:.1%} of {laid.extent:.3g} m, and {laid.stretch:.0%}"
-        raise InputError(name, rule, value, "Name a recording of this object, in a like pose in frame 0, or sample both alike.")
+    laid = laid_onto(old.canonical[:nodes], observations)
     factor = scale_between(old, there[:count])
     _, nearest = cKDTree(old.canonical[:nodes]).query(laid.points)
     labels = old.labels[nearest]
@@ -164,10 +159,28 @@ def resampled(twin: Twin, observations: Observations) -> tuple[Twin, Registratio
     )
     if old.object_spring_count < len(old.springs) and new.object_spring_count == len(new.springs):
         rule = f"a hand must be within {reach:.3g} m of a node, as the twin's hands are"
-        raise InputError(name, rule, "none is", "Check the controllers of frame 0.")
+        raise OutOfReach(name, rule, "none is", "Check the controllers of frame 0.")
     mass = twin.material.mass[nearest] if len(twin.material.mass) else twin.material.mass
     material = replace(twin.material, contact_distance=twin.material.contact_distance * factor, mass=mass)
     return _carried(twin, new, material, np.concatenate([laid.points, laid.others])), laid
+
+
+def laid_onto(nodes: np.ndarray, observations: Observations) -> Registration:
+    """The shape of a recording laid onto nodes [N, 3], m, of another sampling. Raises InputError if the shapes do not fit."""
+    from neuspring.twin.register import register
+
+    there, count = observations.canonical, len(observations.nodes)
+    laid = register(nodes, there[:count], there[count:])
+    found = laid.rigid_residual / laid.extent
+    if found > LARGEST_RESIDUAL or laid.stretch > LARGEST_STRETCH:
+        rule = (
+            f"other nodes ({count}, the twin has {len(nodes)}) must be of the same object: within {LARGEST_RESIDUAL:.0%} of its"
+            f" size after a rigid motion, and a bending that stretches by {LARGEST_STRETCH:.0%} at most"
+        )
+        value = f"{found:.1%} of {laid.extent:.3g} m, and {laid.stretch:.0%}"
+        remedy = "Name a recording of this object, in a like pose in frame 0, or sample both alike."
+        raise InputError(f"transfer to {observations.scenario.name}", rule, value, remedy)
+    return laid
 
 
 def scale_between(topology: Topology, nodes: np.ndarray) -> float:
@@ -281,10 +294,13 @@ def require_pool(here: Observations, pool: Sequence[Observations]) -> None:
     """Raise InputError unless a lattice can be judged on the pool: of a cable, recordings with as many nodes and hands, i on i.
 
     Rings around a line that is recorded from its other end are others; all such recordings are named. Another body may have other
-    nodes in each recording; its shapes are laid onto each other (`resampled`).
+    nodes in each recording; its shapes must fit onto each other (`laid_onto`).
     """
     recordings = [here, *pool]
     if not any(each.line.size for each in recordings):
+        for there in pool:
+            if len(there.nodes) != len(here.nodes):
+                laid_onto(here.canonical[: len(here.nodes)], there)
         return
     require_alike(recordings, "nodes and controllers", lambda each: (len(each.nodes), each.controller_points.shape[1]))
     orders = along(recordings) if pool and here.line.size else []

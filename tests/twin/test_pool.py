@@ -125,6 +125,16 @@ def test_springs_and_radii_are_the_same_on_all_recordings():
     np.testing.assert_allclose(there.topology.rest_lengths, 1.1 * here.topology.rest_lengths, rtol=SINGLE_POSITIONS)
 
 
+def test_a_candidate_whose_hands_reach_one_recording_alone_costs_the_penalty():
+    problem, other = small.search_problem(seen(LIFTED)), other_nodes(SHAKEN)
+    away = replace(other, controller_points=other.controller_points + np.float32(0.3))
+    rows = evaluate(replace(problem, pool=(away,)), [problem.encode()], False, 0, 0)
+    assert (rows[0]["cost"], "a hand must be within" in rows[0]["reason"]) == (PENALTY, True)
+    giant = replace(other, surface_points=3 * other.surface_points)
+    with pytest.raises(InputError, match="must be of the same object"):
+        replace(problem, pool=(giant,))
+
+
 def test_threads_and_launches_change_nothing_in_a_pool():
     pd.testing.assert_frame_equal(searched(LIFTED, SHAKEN, threads=2, together=3), searched(LIFTED, SHAKEN))
 
