@@ -62,7 +62,7 @@ def test_a_hand_carries_its_points_and_the_unloaded_body_hangs_straight_from_it(
     own = np.stack([turns.inv().apply(hand[:, point]) for point in range(hand.shape[1])], axis=1)
     np.testing.assert_allclose(own, np.broadcast_to(own[0], own.shape), atol=SINGLE)
     along = np.array(UNLOADED[0]) / np.linalg.norm(UNLOADED[0])
-    np.testing.assert_allclose(own[0, :2], [-posed.GRIP * along, [0, 0, 0]], atol=SINGLE)
+    np.testing.assert_allclose(own[0, :2], [-posed.HAND_GRIP * along, [0, 0, 0]], atol=SINGLE)
     assert here.scenario.frame_rate == pytest.approx(50)
     assert here.line.tolist() == [20, 21, 0, 1]
     assert here.rest_shape.shape == (20 + 8, 3) and here.controller_hand.tolist() == [0] * 8
