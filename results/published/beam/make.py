@@ -22,6 +22,7 @@ is at the tip. Writes beam.csv (a row per recording and twin), law.csv (the fit 
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
 from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -218,16 +219,16 @@ def lattice(across: int, load: float, modulus: float = 1e5) -> Twin:
     return replace(twin, material=replace(material, stiffness=material.stiffness * (modulus / own), mass=mass))
 
 
-class Beam:
+class Beam(ABC):
     """A kind of twin of the beam, per pascal of its modulus."""
 
+    @abstractmethod
     def static(self, modulus: float, load: float) -> np.ndarray:
         """Change of the tip's pose from the unloaded shape, as `Recording.change`."""
-        raise NotImplementedError
 
+    @abstractmethod
     def frequency(self, load: float) -> float:
         """First frequency at 1e5 Pa, Hz; it goes with the root of the modulus."""
-        raise NotImplementedError
 
 
 class LatticeBeam(Beam):
