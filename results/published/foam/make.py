@@ -3,8 +3,8 @@
     python -m results.published.foam.make DATA RESULTS --output OUT [--methods rod_slip ...] [--trajectory 8]
 
 DATA has traj{1..8}.csv and rivals/, RESULTS is the folder of `config/data/foam.yaml`. OUT/summary.md has the table, OUT/errors.csv
-a row per model and window, OUT/errors.png the error over time. Errors are distances of the end marker at 250 Hz. A twin is rolled
-out once from the rest of sample 0, by the motion of the base alone, and its way is cut into windows. Rivals begin each anew.
+a row per model and window, OUT/ways.png ways and errors over time. Errors are distances of the end marker at 250 Hz. A twin is
+rolled out once from the rest of sample 0, by the motion of the base alone, and its way is cut into windows. Rivals begin each anew.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 from scipy.interpolate import CubicSpline
 
 from neuspring.config import Config, ScenarioRow
@@ -34,7 +35,9 @@ from neuspring.twin.rollout import roll_out
 from neuspring.twin.transfer import move
 
 CM, RATE = 100.0, 250
-WINDOWS = {251: "1 s", 501: "2 s", 1251: "5 s", 2501: "10 s", 5001: "20 s"}
+WINDOW = 5001
+"""Samples of 20 s."""
+WINDOWS = {251: "1 s", 501: "2 s", 1251: "5 s", 2501: "10 s", WINDOW: "20 s"}
 RIVALS = {
     "rnn_LFK": "PRB-Net: RNN, physics decoder",
     "rnn_NN": "RNN, network decoder",
@@ -136,6 +139,24 @@ def scored(folder: Path, ways: Mapping[str, np.ndarray], truth: np.ndarray, traj
     return pd.DataFrame(rows)
 
 
+def drawn(truth: np.ndarray, pairs: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
+    """Ways of the end, seen and predicted (pairs of [n, 3], m), by coordinate, and errors below."""
+    figure, (*panels, errors) = plt.subplots(4, 1, figsize=(9, 8), sharex=True, layout="constrained")
+    panels[0].set_title("gray: seen", fontsize=9, loc="left")
+    time = np.arange(WINDOW) / RATE
+    for k, panel in enumerate(panels):
+        panel.plot(time, truth[:WINDOW, k], color="0.75", lw=4)
+        panel.set_ylabel(f"end, {'xyz'[k]} [m]")
+    for name, (seen, predicted) in pairs.items():
+        apart = CM * np.linalg.norm(seen[:WINDOW] - predicted[:WINDOW], axis=1)
+        [line] = errors.plot(time, apart, lw=1.2, label=f"{name}: {apart.mean():.2f} cm")
+        for k, panel in enumerate(panels):
+            panel.plot(time, predicted[:WINDOW, k], color=line.get_color(), lw=1.0)
+    errors.set(xlabel="time from rest [s]", ylabel="error of the end [cm]", ylim=(0, 25), xlim=(0, 20))
+    errors.legend(fontsize=8, framealpha=0.9)
+    return figure
+
+
 def main() -> None:
     parser = ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
@@ -160,21 +181,15 @@ def main() -> None:
     for name, part in table.groupby("model", sort=False):
         own = part.set_index("window")
         cells = [f"{own['mean'][window]:.2f}" if window in own.index else "" for window in WINDOWS]
-        rows.append([str(name), *cells, *(f"{own[key][5001]:.2f}" for key in ("rms", "largest"))])
+        rows.append([str(name), *cells, *(f"{own[key][WINDOW]:.2f}" for key in ("rms", "largest"))])
     note = NOTE.format(trajectory=a.trajectory)
     write_text(
         a.output / "summary.md", "# The foam cylinder\n\n" + note + "\n\n" + markdown([Table.of_texts(heads, rows, "")]) + "\n"
     )
-    figure, axis = plt.subplots(figsize=(9, 3.2), layout="constrained")
     pairs = {name: (truth, path) for name, path in ways.items()}
     if a.trajectory == 8:
-        pairs |= {RIVALS[name]: rival(a.data, name, 5001) for name in ("rnn_LFK", "resnet_LFK", "rfem")}
-    for name, (seen, predicted) in pairs.items():
-        apart = CM * np.linalg.norm(seen[:5001] - predicted[:5001], axis=1)
-        axis.plot(np.arange(len(apart)) / RATE, apart, lw=1.2, label=f"{name}: {apart.mean():.2f} cm")
-    axis.set(xlabel="time from rest [s]", ylabel="error of the end [cm]", ylim=(0, 25), xlim=(0, 20))
-    axis.legend(frameon=False, fontsize=8)
-    save(figure, a.output / "errors.png")
+        pairs |= {RIVALS[name]: rival(a.data, name, WINDOW) for name in ("rnn_LFK", "resnet_LFK", "rfem")}
+    save(drawn(truth, pairs), a.output / "ways.png")
     print(a.output / "summary.md")
 
 
