@@ -61,6 +61,12 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
         near: lists
         near_lanes: lists
         near_count: table
+        pair_rows: table
+        pair_other: table
+        pair_lanes: table
+        closing: table
+        bits: numbers
+        alike: int
         obstacles: reals
 
     @wp.struct
@@ -123,6 +129,8 @@ class Buffers:
         self.tensors: dict[str, torch.Tensor] = {}
         self.views: dict[str, Any] = {}
         self.indices: dict[str, torch.Tensor] = {}
+        self.alike = False
+        """True where all nodes of a twin have the same mass: impulses are then shared in halves."""
         self.constants: dict[str, torch.Tensor] = {}
         self.history = self.substeps if differentiable else 1
         self.slots = self.substeps + 1 if differentiable else 2 if threads else 1
@@ -166,6 +174,12 @@ class Buffers:
         for name, array in values.items():
             self.indices[name] = torch.tensor(np.ascontiguousarray(array, np.int32), device=self.device)
             self.views[name] = wp.from_torch(self.indices[name], dtype=wp.int32)
+
+    def set_table(self, name: str, shape: tuple[int, ...]) -> None:
+        """Make an array of integers, zero at first, in the place of an earlier one of this name."""
+        self.indices[name] = torch.zeros(shape, dtype=torch.int32, device=self.device)
+        self.views[name] = wp.from_torch(self.indices[name], dtype=wp.int32)
+        self.__dict__.pop("arguments", None)
 
     def set_vectors(self, name: str, values: torch.Tensor, slot: int | None = None) -> None:
         """Take [B, P, 3] as the first P points of an array, of one slot where it has slots."""
@@ -243,6 +257,7 @@ class Buffers:
             "history": self.history,
             "collide": int(sim.self_collision),
             "capacity": sim.collision_capacity,
+            "alike": int(self.alike),
             "up": sim.up_sign if sim.ground else 0.0,
             "gravity": self.lanes.Vector(*[0.0] * (2 * self.width), *[-sim.gravity * sim.up_sign] * self.width),
         }

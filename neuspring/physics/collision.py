@@ -6,7 +6,8 @@ motion.py, of which m_j / (m_i + m_j) is its share: a pair that meets nobody els
 Partners are listed once per frame, from a hash grid with cells as wide as the contact distance, so that the cost grows with the
 nodes. A list is in node order; where a node has more than `collision_capacity`, those with the lowest indices stay, and the others
 do not meet it.
-The twins of a group share a list: a bit per lane says whose partner a node is.
+The twins of a group share a list: a bit per lane says whose partner a node is. One thread that goes through all nodes has each pair
+once, at its lower node, rows one after the other; threads have each pair at both of its nodes.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
@@ -23,21 +24,35 @@ from neuspring.physics.motion import APPROACH, MIN_TANGENT
 
 GRID_CELLS = 64
 """Cells of the hash grid along each axis; farther cells share them."""
+FIRST_PAIRS = 4
+"""Pairs per node that there is room for at first; a frame with more doubles it."""
+MOST_APART = 0.5
+"""Twins of a group whose nodes are farther than this many contact distances from the first one's, but for a shift of the whole body,
+do not share a search. At 0.5 a node's neighborhood holds eight times as many."""
+MARGIN = 1e-3
+"""Of the contact distance, for rounding."""
 
 
 def allocate(b: Buffers) -> None:
     """Allocate the lists of partners and the velocities after collisions, with self-collision alone."""
     if not b.simulation.self_collision:
         return
-    capacity, twins = b.simulation.collision_capacity, b.groups * b.width
-    # Room for the partners of all lanes, so that no twin takes another's. On a CPU, memory that no list reaches costs nothing.
-    room = min(b.width * capacity, b.nodes)
+    twins = b.groups * b.width
     device: dict[str, Any] = {"dtype": torch.int32, "device": b.device}
-    tables = {name: torch.zeros((b.nodes, room, b.groups), **device) for name in ("near", "near_lanes")}
-    tables |= {"near_count": torch.zeros((b.nodes, b.groups), **device)}
-    tables |= {"overflow": torch.zeros((b.nodes, b.groups, b.width), **device)}
-    b.indices |= tables
-    b.views |= {name: wp.from_torch(tensor, dtype=wp.int32) for name, tensor in tables.items()}
+    b.set_table("overflow", (b.nodes, b.groups, b.width))
+    if b.threads:
+        # A thread is of one twin: lists of different lanes do not share.
+        for name in ("near", "near_lanes"):
+            b.set_table(name, (b.nodes, min(b.simulation.collision_capacity, b.nodes), b.groups))
+        b.set_table("near_count", (b.nodes, b.groups))
+    else:
+        b.set_table("pair_rows", (b.groups, b.nodes + 1))
+        b.add_numbers(lower=b.nodes)
+        b.set_table("closing", (b.groups, b.nodes))
+        _make_room(b, FIRST_PAIRS * b.nodes)
+    b.add_numbers(bits=1 << b.width)
+    bits = (torch.arange(1 << b.width)[:, None] >> torch.arange(b.width)) & 1
+    b.tensors["bits"].copy_(bits[:, None])
     b.add_vectors(moving=(b.history, b.nodes), adj_moving=(b.nodes,))
     b.add_numbers(met=(b.history, b.nodes))
     groups = torch.arange(twins, **device).repeat_interleave(b.nodes)
@@ -55,91 +70,91 @@ def overflow(b: Buffers) -> torch.Tensor:
     return b.indices["overflow"].sum(dim=0).reshape(-1)[: b.twins].cpu()
 
 
+def _make_room(b: Buffers, pairs: int) -> None:
+    for name in ("pair_other", "pair_lanes"):
+        b.set_table(name, (b.groups, pairs))
+
+
 def find_candidates(b: Buffers, reach: float) -> None:
     """List the partners of every node at the start of the frame; `reach` is the largest contact distance, m."""
-    place, find, agree = (load(kernel, b.device) for kernel in kernels(b.real, b.width))
+    place, find, agree, find_pairs = (load(kernel, b.device) for kernel in kernels(b.real, b.width))
     views, size = b.views, (b.nodes, b.groups)
     model, state, _ = b.arguments
-    b.launch(place, size, model, state, views["grid_points"])
-    views["grid"].build(views["grid_points"], reach, groups=views["grid_groups"])
-    b.launch(find, size, model, state, views["grid"].id, views["overflow"])
-    b.launch(agree, size, model, views["overflow"])
+    spread = _apart(b)
+    looks = 1 if spread <= MOST_APART * reach else b.width
+    # A pair that is near in some lane is at most this much wider in the first.
+    wider = 2 * spread + MARGIN * reach if looks < b.width else 0.0
+    b.launch(place, size, model, state, looks, views["grid_points"])
+    count = b.groups * looks * b.nodes
+    views["grid"].build(views["grid_points"][:count], reach + wider, groups=views["grid_groups"][:count])
+    if b.threads:
+        b.launch(find, size, model, state, views["grid"].id, views["overflow"])
+        b.launch(agree, size, model, views["overflow"])
+        return
+    listed, known = b.indices["pair_rows"][:, -1], b.indices["overflow"].clone()
+    while True:
+        b.launch(find_pairs, b.groups, b.arguments[0], state, views["grid"].id, looks, wider, views["lower"], views["overflow"])
+        if (listed >= 0).all():
+            return
+        b.indices["overflow"].copy_(known)
+        _make_room(b, 2 * b.indices["pair_other"].shape[1])
+
+
+def _apart(b: Buffers) -> float:
+    """The largest distance of a node in any lane from that in the first, but for a shift of the whole body, m."""
+    if b.width == 1:
+        return 0.0
+    ways = b.tensors["x"][0, : b.nodes]
+    ways = ways - ways[..., :1]
+    return float((ways - ways.mean(dim=0)).norm(dim=2).max())
 
 
 @functools.cache
-def kernels(real: Any, width: int) -> tuple[Any, Any, Any]:
-    """(place, find, agree): kernels for a scalar type, wp.float32 or wp.float64, and a number of lanes."""
+def kernels(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
+    """(place, find, agree, find_pairs): kernels for a scalar type, wp.float32 or wp.float64, and a number of lanes."""
     lane = lanes(real, width)
+    Number, Vector = lane.Number, lane.Vector
     Model, State, _ = structs(real, width)
-    column = lane.column
+    column, dot, root = lane.column, lane.dot, lane.root
+    numbers: Any = wp.array2d(dtype=Number)
+    zero, one = wp.constant(real(0.0)), wp.constant(real(1.0))
     points: Any = wp.array(dtype=wp.types.vector(3, real))
     counts: Any = wp.array3d(dtype=int)
 
-    @wp.func
-    def inserted(model: Model, i: int, g: int, j: int, q: int, count: int) -> int:
-        """Make j a partner of node i in lane q; the new length of the sorted list."""
-        p = count
-        while p > 0 and model.near[i, p - 1, g] > j:
-            p = p - 1
-        if p > 0 and model.near[i, p - 1, g] == j:
-            model.near_lanes[i, p - 1, g] = model.near_lanes[i, p - 1, g] | (1 << q)
-            return count
-        k = count
-        while k > p:
-            model.near[i, k, g] = model.near[i, k - 1, g]
-            model.near_lanes[i, k, g] = model.near_lanes[i, k - 1, g]
-            k = k - 1
-        model.near[i, p, g] = j
-        model.near_lanes[i, p, g] = 1 << q
-        return count + 1
-
-    @wp.func
-    def dropped(model: Model, i: int, g: int, k: int, q: int, count: int) -> int:
-        """Take entry k from lane q, and out of the list where no other lane has it; the new length."""
-        model.near_lanes[i, k, g] = model.near_lanes[i, k, g] & ~(1 << q)
-        if model.near_lanes[i, k, g] != 0:
-            return count
-        for later in range(k + 1, count):
-            model.near[i, later - 1, g] = model.near[i, later, g]
-            model.near_lanes[i, later - 1, g] = model.near_lanes[i, later, g]
-        return count - 1
-
-    def place(model: Model, state: State, grid_points: points):
+    def place(model: Model, state: State, looks: int, grid_points: points):
         i, g = wp.tid()
-        for q in range(width):
-            grid_points[(g * width + q) * model.nodes + i] = column(state.x[0, i, g], q)
+        for q in range(looks):
+            grid_points[(g * looks + q) * model.nodes + i] = column(state.x[0, i, g], q)
 
     def find(model: Model, state: State, grid: wp.uint64, overflow: counts):
+        """The sorted list of a node, by a thread of its own, which has one lane."""
         i, g = wp.tid()
         count = wp.int32(0)
-        for q in range(width):
-            reach = model.distance[g][q]
-            here = column(state.x[0, i, g], q)
-            own = wp.int32(0)
-            query = wp.hash_grid_query(grid, here, reach, g * width + q)
-            candidate = wp.int32(0)
-            while wp.hash_grid_query_next(query, candidate):
-                j = candidate - (g * width + q) * model.nodes
-                if j != i and wp.length(column(state.x[0, j, g], q) - here) < reach:
-                    keep = True
-                    if own == model.capacity:
-                        # The twin's last partner makes room for one that comes before it.
-                        overflow[i, g, q] = overflow[i, g, q] + 1
-                        last = count - 1
-                        while (model.near_lanes[i, last, g] >> q) & 1 == 0:
-                            last = last - 1
-                        keep = j < model.near[i, last, g]
-                        if keep:
-                            count = dropped(model, i, g, last, q, count)
-                    else:
-                        own = own + 1
-                    if keep:
-                        count = inserted(model, i, g, j, q, count)
+        here = column(state.x[0, i, g], 0)
+        query = wp.hash_grid_query(grid, here, model.distance[g][0], g)
+        candidate = wp.int32(0)
+        while wp.hash_grid_query_next(query, candidate):
+            j = candidate - g * model.nodes
+            if j != i and wp.length(column(state.x[0, j, g], 0) - here) < model.distance[g][0]:
+                keep = True
+                if count == model.capacity:
+                    # The last partner makes room for one that comes before it.
+                    overflow[i, g, 0] = overflow[i, g, 0] + 1
+                    keep = j < model.near[i, count - 1, g]
+                    count = wp.where(keep, count - 1, count)
+                if keep:
+                    k = count
+                    while k > 0 and model.near[i, wp.max(k - 1, 0), g] > j:
+                        model.near[i, k, g] = model.near[i, k - 1, g]
+                        k = k - 1
+                    model.near[i, k, g] = j
+                    model.near_lanes[i, k, g] = 1
+                    count = count + 1
         model.near_count[i, g] = count
 
     @wp.func
     def listed(model: Model, i: int, g: int, j: int) -> int:
-        """The lanes in which j is a partner of node i."""
+        """1 if j is a partner of node i, else 0."""
         for k in range(model.near_count[i, g]):
             if model.near[i, k, g] == j:
                 return model.near_lanes[i, k, g]
@@ -150,14 +165,105 @@ def kernels(real: Any, width: int) -> tuple[Any, Any, Any]:
         i, g = wp.tid()
         for k in range(model.near_count[i, g]):
             j = model.near[i, k, g]
-            full = wp.int32(0)
-            for q in range(width):
-                full = full + overflow[j, g, q]
-            if full > 0:
+            if overflow[j, g, 0] > 0:
                 model.near_lanes[i, k, g] = model.near_lanes[i, k, g] & listed(model, j, g, i)
 
+    @wp.func
+    def within(offset: Vector, distance: Number, own: Number) -> Number:
+        """1 in the lanes in which a pair is near, of those in which `own` is 1."""
+        length = root(dot(offset, offset))
+        near = Number()
+        for q in range(width):
+            near[q] = wp.where(length[q] < distance[q], own[q], zero)
+        return near
+
+    @wp.func
+    def paired(model: Model, g: int, first: int, count: int, j: int, mask: int) -> int:
+        """Make j a partner in the lanes of a mask of the node whose row begins at `first`; the new length of the sorted row."""
+        p = count
+        while p > 0 and model.pair_other[g, first + p - 1] > j:
+            p = p - 1
+        if p > 0 and model.pair_other[g, first + p - 1] == j:
+            model.pair_lanes[g, first + p - 1] = model.pair_lanes[g, first + p - 1] | mask
+            return count
+        k = first + count
+        while k > first + p:
+            model.pair_other[g, k] = model.pair_other[g, k - 1]
+            model.pair_lanes[g, k] = model.pair_lanes[g, k - 1]
+            k = k - 1
+        model.pair_other[g, k] = j
+        model.pair_lanes[g, k] = mask
+        return count + 1
+
+    @wp.func
+    def parted(model: Model, g: int, first: int, count: int, q: int) -> int:
+        """Take the last partner in lane q out of the row that begins at `first`; the new length."""
+        k = first + count - 1
+        while (model.pair_lanes[g, k] >> q) & 1 == 0:
+            k = k - 1
+        model.pair_lanes[g, k] = model.pair_lanes[g, k] & ~(1 << q)
+        if model.pair_lanes[g, k] != 0:
+            return count
+        for later in range(k + 1, first + count):
+            model.pair_other[g, later - 1] = model.pair_other[g, later]
+            model.pair_lanes[g, later - 1] = model.pair_lanes[g, later]
+        return count - 1
+
+    def find_pairs(model: Model, state: State, grid: wp.uint64, looks: int, wider: real, lower: numbers, overflow: counts):
+        """The rows of a group, by a look around each node in each lane, or a wider one in the first for all; -1 for the end of the
+        last row where there was no room.
+
+        `lower` counts partners before a node: as rows ascend it is the rank, among the other's, of the node whose row is made.
+        """
+        g = wp.tid()
+        room = model.pair_other.shape[1]
+        distance = model.distance[g]
+        capacity = real(model.capacity)
+        first = wp.int32(0)
+        for i in range(model.nodes):
+            lower[i, g] = Number()
+        for i in range(model.nodes):
+            model.pair_rows[g, i] = first
+            count = wp.int32(0)
+            x = state.x[0, i, g]
+            before = lower[i, g]
+            more = Number()
+            own = Number()
+            for look in range(looks):
+                reach = wp.where(looks == 1, wp.max(distance), distance[look]) + wider
+                here = column(x, look)
+                lanes_seen = wp.where(looks == 1, (1 << width) - 1, 1 << look)
+                query = wp.hash_grid_query(grid, here, reach, g * looks + look)
+                candidate = wp.int32(0)
+                while wp.hash_grid_query_next(query, candidate):
+                    j = candidate - (g * looks + look) * model.nodes
+                    if j > i and wp.length(column(state.x[0, j, g], look) - here) < reach:
+                        near = within(state.x[0, j, g] - x, distance, model.bits[lanes_seen, g])
+                        rank = lower[j, g]
+                        lower[j, g] = rank + near
+                        more = more + near
+                        mask = wp.int32(0)
+                        for q in range(width):
+                            fits = near[q] > zero and rank[q] < capacity and before[q] < capacity
+                            mask = mask | wp.where(fits, 1 << q, 0)
+                        if mask != 0:
+                            if first + count == room:
+                                model.pair_rows[g, model.nodes] = -1
+                                return
+                            count = paired(model, g, first, count, j, mask)
+                            own = own + model.bits[mask, g]
+                            if wp.max(before + own) > capacity:
+                                for q in range(width):
+                                    if before[q] + own[q] > capacity:
+                                        count = parted(model, g, first, count, q)
+                                        own[q] = own[q] - one
+            for q in range(width):
+                overflow[i, g, q] = overflow[i, g, q] + wp.max(int(before[q] + more[q]) - model.capacity, 0)
+            first = first + count
+        model.pair_rows[g, model.nodes] = first
+
     unique = wp.kernel(**UNFUSED)
-    return unique(place), unique(find), unique(agree)
+    return unique(place), unique(find), unique(agree), unique(find_pairs)
 
 
 class Contacts(NamedTuple):
@@ -166,18 +272,20 @@ class Contacts(NamedTuple):
     collided: Any
     add_pairs: Any
     after_pairs: Any
-    adjoint: Any
+    collided_adjoint: Any
+    add_pairs_adjoint: Any
 
 
 @functools.cache
 def functions(real: Any, width: int) -> Contacts:
     """The functions for a scalar type, wp.float32 or wp.float64, and a number of lanes."""
     lane = lanes(real, width)
-    Number, Vector = lane.Number, lane.Vector
+    Number, Vector, plain = lane.Number, lane.Vector, lane.plain
     Model, State, Adjoint = structs(real, width)
     dot, root, scaled, divided = lane.dot, lane.root, lane.scaled, lane.divided
     zero, one = wp.constant(real(0.0)), wp.constant(real(1.0))
     approach, floor = wp.constant(real(APPROACH)), wp.constant(real(MIN_TANGENT))
+    half = wp.constant(Number(*[real(0.5)] * width))
 
     @wp.func
     def whole(value: real) -> Number:
@@ -193,18 +301,30 @@ def functions(real: Any, width: int) -> Contacts:
         return wp.min(dot(offset, relative)) < -approach
 
     @wp.func
-    def meeting(offset: Vector, relative: Vector, mask: int, distance: Number) -> Number:
-        """1 in the lanes in which a pair meets."""
+    def meeting(offset: Vector, relative: Vector, own: Number, distance: Number) -> Number:
+        """1 in the lanes in which a pair meets, of those in which it is listed (`own` is 1)."""
         length = root(dot(offset, offset))
         closing = dot(offset, relative)
         meets = Number()
         for q in range(width):
-            meets[q] = wp.where((mask >> q) & 1 == 1 and length[q] < distance[q] and closing[q] < -approach, one, zero)
+            meets[q] = wp.where(length[q] < distance[q] and closing[q] < -approach, own[q], zero)
         return meets
 
     @wp.func
-    def part(own: Number, other: Number) -> Number:
+    def closing_pairs(model: Model, state: State, slot: int, inner: int, i: int, g: int, x: Vector, v: Vector) -> int:
+        """Put the pairs of a row that come closer into `closing`; their number. A branch for each would be guessed wrong too often."""
+        count = wp.int32(0)
+        for k in range(model.pair_rows[g, i], model.pair_rows[g, i + 1]):
+            j = plain(model.pair_other[g, plain(k)])
+            model.closing[g, plain(count)] = k
+            count = count + wp.where(closes(state.x[slot, j, g] - x, state.after[inner, j, g] - v), 1, 0)
+        return count
+
+    @wp.func
+    def part(model: Model, own: Number, other: Number) -> Number:
         """m_j / (m_i + m_j) of the inverse masses of i and j."""
+        if model.alike != 0:
+            return half
         return wp.cw_div(own, own + other)
 
     @wp.func
@@ -232,9 +352,9 @@ def functions(real: Any, width: int) -> Contacts:
             offset = state.x[slot, j, g] - x
             relative = state.after[inner, j, g] - v
             if closes(offset, relative):
-                meets = meeting(offset, relative, model.near_lanes[i, k, g], distance)
+                meets = meeting(offset, relative, model.bits[model.near_lanes[i, k, g], g], distance)
                 own = impulse(offset, relative, model.contact_e[g], model.contact_mu[g])
-                push = scaled(own, part(light, model.inverse_mass[j, g]))
+                push = scaled(own, part(model, light, model.inverse_mass[j, g]))
                 total = total + scaled(push, meets)
                 count = count + meets
         state.met[inner, i, g] = count
@@ -249,19 +369,18 @@ def functions(real: Any, width: int) -> Contacts:
         count = state.met[inner, i, g]
         distance = model.distance[g]
         light = model.inverse_mass[i, g]
-        for k in range(model.near_count[i, g]):
-            j = model.near[i, k, g]
-            if j > i:
-                offset = state.x[slot, j, g] - x
-                relative = state.after[inner, j, g] - v
-                if closes(offset, relative):
-                    meets = meeting(offset, relative, model.near_lanes[i, k, g], distance)
-                    push = impulse(offset, relative, model.contact_e[g], model.contact_mu[g])
-                    total = total + scaled(scaled(push, part(light, model.inverse_mass[j, g])), meets)
-                    count = count + meets
-                    back = scaled(scaled(push, part(model.inverse_mass[j, g], light)), meets)
-                    state.moving[inner, j, g] = state.moving[inner, j, g] - back
-                    state.met[inner, j, g] = state.met[inner, j, g] + meets
+        for place in range(closing_pairs(model, state, slot, inner, i, g, x, v)):
+            k = plain(model.closing[g, plain(place)])
+            j = plain(model.pair_other[g, k])
+            offset = state.x[slot, j, g] - x
+            relative = state.after[inner, j, g] - v
+            meets = meeting(offset, relative, model.bits[model.pair_lanes[g, k], g], distance)
+            push = impulse(offset, relative, model.contact_e[g], model.contact_mu[g])
+            total = total + scaled(scaled(push, part(model, light, model.inverse_mass[j, g])), meets)
+            count = count + meets
+            back = scaled(scaled(push, part(model, model.inverse_mass[j, g], light)), meets)
+            state.moving[inner, j, g] = state.moving[inner, j, g] - back
+            state.met[inner, j, g] = state.met[inner, j, g] + meets
         state.moving[inner, i, g] = total
         state.met[inner, i, g] = count
 
@@ -307,6 +426,23 @@ def functions(real: Any, width: int) -> Contacts:
         return scaled(hn - scaled(n, dot(hn, n)), inverse), hu, he, hmu
 
     @wp.func
+    def add_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int, j: int, mask: int, own: Vector):
+        """Add to the adjoints of x and velocities of a pair, `own` being that of the mean impulse of i; return those of e, mu."""
+        offset = state.x[step, j, g] - state.x[step, i, g]
+        relative = state.after[step, j, g] - state.after[step, i, g]
+        light = model.inverse_mass[i, g]
+        beside = model.inverse_mass[j, g]
+        meets = meeting(offset, relative, model.bits[mask, g], model.distance[g])
+        other = divided(adjoint.moving[j, g], wp.max(state.met[step, j, g], whole(one)))
+        share = scaled(other, part(model, beside, light)) - scaled(own, part(model, light, beside))
+        hx, hu, he, hmu = pair_adjoint(offset, relative, model.contact_e[g], model.contact_mu[g], scaled(share, meets))
+        wp.atomic_add(adjoint.x, j, g, hx)
+        wp.atomic_sub(adjoint.x, i, g, hx)
+        wp.atomic_add(adjoint.after, j, g, hu)
+        wp.atomic_sub(adjoint.after, i, g, hu)
+        return he, hmu
+
+    @wp.func
     def collided_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
         """Adjoint of `collided`, of node i and its later pairs: dL/d(velocities after impulses) -> dL/d(those before, x, e, mu)."""
         h = adjoint.moving[i, g]
@@ -319,28 +455,35 @@ def functions(real: Any, width: int) -> Contacts:
         own = divided(h, wp.max(count, whole(one)))
         e = adjoint.contact_e[i, g]
         mu = adjoint.contact_mu[i, g]
-        distance = model.distance[g]
-        light = model.inverse_mass[i, g]
         for k in range(model.near_count[i, g]):
             j = model.near[i, k, g]
-            if j > i:
-                offset = state.x[step, j, g] - x
-                relative = state.after[step, j, g] - v
-                if closes(offset, relative):
-                    meets = meeting(offset, relative, model.near_lanes[i, k, g], distance)
-                    other = divided(adjoint.moving[j, g], wp.max(state.met[step, j, g], whole(one)))
-                    share = scaled(
-                        scaled(other, part(model.inverse_mass[j, g], light)) - scaled(own, part(light, model.inverse_mass[j, g])),
-                        meets,
-                    )
-                    hx, hu, he, hmu = pair_adjoint(offset, relative, model.contact_e[g], model.contact_mu[g], share)
-                    wp.atomic_add(adjoint.x, j, g, hx)
-                    wp.atomic_sub(adjoint.x, i, g, hx)
-                    wp.atomic_add(adjoint.after, j, g, hu)
-                    wp.atomic_sub(adjoint.after, i, g, hu)
-                    e = e + he
-                    mu = mu + hmu
+            if j > i and closes(state.x[step, j, g] - x, state.after[step, j, g] - v):
+                he, hmu = add_adjoint(model, state, adjoint, step, i, g, j, model.near_lanes[i, k, g], own)
+                e = e + he
+                mu = mu + hmu
         adjoint.contact_e[i, g] = e
         adjoint.contact_mu[i, g] = mu
 
-    return Contacts(collided, add_pairs, after_pairs, collided_adjoint)
+    @wp.func
+    def add_pairs_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
+        """The same by one thread for all."""
+        h = adjoint.moving[i, g]
+        wp.atomic_add(adjoint.after, i, g, h)
+        count = state.met[step, i, g]
+        if wp.max(count) == zero:
+            return
+        x = state.x[step, i, g]
+        v = state.after[step, i, g]
+        own = divided(h, wp.max(count, whole(one)))
+        e = adjoint.contact_e[i, g]
+        mu = adjoint.contact_mu[i, g]
+        for place in range(closing_pairs(model, state, step, step, i, g, x, v)):
+            k = plain(model.closing[g, plain(place)])
+            j = plain(model.pair_other[g, k])
+            he, hmu = add_adjoint(model, state, adjoint, step, i, g, j, model.pair_lanes[g, k], own)
+            e = e + he
+            mu = mu + hmu
+        adjoint.contact_e[i, g] = e
+        adjoint.contact_mu[i, g] = mu
+
+    return Contacts(collided, add_pairs, after_pairs, collided_adjoint, add_pairs_adjoint)

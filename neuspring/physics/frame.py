@@ -47,7 +47,7 @@ def kernels(real: Any, width: int, among: bool = False, pushes: bool = False) ->
     Model, State, Adjoint = structs(real, width)
     move_controller, updated, updated_adjoint = motion.velocity(real, width)
     moved, moved_adjoint = (obstacles if among else motion).position(real, width)
-    collided, add_pairs, after_pairs, collided_adjoint = collision.functions(real, width)
+    collided, add_pairs, after_pairs, collided_adjoint, add_pairs_adjoint = collision.functions(real, width)
     add_row, add_row_adjoint, gathered, gathered_adjoint = springs.functions(real, width, pushes)
 
     @wp.func
@@ -142,7 +142,7 @@ def kernels(real: Any, width: int, among: bool = False, pushes: bool = False) ->
                 for i in range(model.nodes):
                     adjoint.after[i, g] = Vector()
                 for i in range(model.nodes):
-                    collided_adjoint(model, state, adjoint, step, i, g)
+                    add_pairs_adjoint(model, state, adjoint, step, i, g)
             for i in range(model.nodes):
                 update_adjoint(model, state, adjoint, step, i, g)
             for i in range(model.nodes):

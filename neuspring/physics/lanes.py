@@ -49,6 +49,8 @@ class Lanes(NamedTuple):
     """(step, counts, Vector, Vector) -> the first where a lane is still moving (step < count), else the second."""
     chosen_number: Any
     """The same for Numbers."""
+    plain: Any
+    """An index -> the same, plainly not negative: Warp looks at the sign of every other one, a sixth of a spring's time."""
 
 
 @functools.cache
@@ -112,4 +114,8 @@ def lanes(real: Any, width: int) -> Lanes:
                 moving[lane] = resting[lane]
         return moving
 
-    return Lanes(real, width, Number, Vector, dot, scaled, root, divided, floored, column, put, chosen, chosen_number)
+    @wp.func
+    def plain(index: int) -> int:
+        return index & 0x7FFFFFFF
+
+    return Lanes(real, width, Number, Vector, dot, scaled, root, divided, floored, column, put, chosen, chosen_number, plain)

@@ -117,6 +117,9 @@ class FrameSolver:
         self._plain, self._factor, self._held = values["springs"].detach(), None, None
         if self.simulation.self_collision:
             self._reach = float(values["distance"].max())
+            mass = values["inverse_mass"]
+            self.buffers.alike = bool((mass == mass[:, :1]).all())
+            self.buffers.arguments[0].alike = int(self.buffers.alike)
 
     def forward(
         self, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor, end: torch.Tensor

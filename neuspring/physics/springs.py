@@ -52,12 +52,8 @@ def functions(real: Any, width: int, pushes: bool = False) -> tuple[Any, Any, An
     Number, Vector = lane.Number, lane.Vector
     Model, State, Adjoint = structs(real, width)
     dot, scaled, root, divided, floored = lane.dot, lane.scaled, lane.root, lane.divided, lane.floored
+    plain = lane.plain
     one = wp.constant(Number(*[real(1.0)] * width))
-
-    @wp.func
-    def place(index: int) -> int:
-        """An index that is plainly not negative: Warp looks at the sign of every other one, a sixth of a spring's time."""
-        return index & 0x7FFFFFFF
 
     @wp.func
     def force(offset: Vector, relative: Vector, p: Vector) -> Vector:
@@ -144,8 +140,8 @@ def functions(real: Any, width: int, pushes: bool = False) -> tuple[Any, Any, An
         v = state.v[slot, i, g]
         total = state.force[i, g]
         for each in range(model.rows[i], model.rows[i + 1]):
-            e = place(each)
-            j = place(model.partners[e])
+            e = plain(each)
+            j = plain(model.partners[e])
             f = pull(model, state, slot, e, j, g, x, v)
             total = total + f
             state.force[j, g] = state.force[j, g] - f
@@ -160,8 +156,8 @@ def functions(real: Any, width: int, pushes: bool = False) -> tuple[Any, Any, An
         adj_x = adjoint.x[i, g]
         adj_v = adjoint.v[i, g]
         for each in range(model.rows[i], model.rows[i + 1]):
-            e = place(each)
-            j = place(model.partners[e])
+            e = plain(each)
+            j = plain(model.partners[e])
             c = adj_force - adjoint.force[turn, j, g]
             offset, relative, parameters = pull_adjoint(model, state, slot, e, j, g, x, v, c)
             adj_x = adj_x - offset
@@ -179,9 +175,9 @@ def functions(real: Any, width: int, pushes: bool = False) -> tuple[Any, Any, An
         v = state.v[slot, i, g]
         total = Vector()
         for each in range(model.links[i], model.links[i + 1]):
-            k = place(each)
-            j = place(model.link_partners[k])
-            e = place(model.link_springs[k])
+            k = plain(each)
+            j = plain(model.link_partners[k])
+            e = plain(model.link_springs[k])
             total = total + pull(model, state, slot, e, j, g, x, v)
         return total
 
@@ -194,9 +190,9 @@ def functions(real: Any, width: int, pushes: bool = False) -> tuple[Any, Any, An
         adj_x = adjoint.x[i, g]
         adj_v = adjoint.v[i, g]
         for each in range(model.links[i], model.links[i + 1]):
-            k = place(each)
-            j = place(model.link_partners[k])
-            e = place(model.link_springs[k])
+            k = plain(each)
+            j = plain(model.link_partners[k])
+            e = plain(model.link_springs[k])
             c = adj_force - adjoint.force[turn, j, g]
             offset, relative, parameters = pull_adjoint(model, state, slot, e, j, g, x, v, c)
             adj_x = adj_x - offset
