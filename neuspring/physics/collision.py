@@ -148,7 +148,7 @@ def kernels(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
                         model.near[i, k, g] = model.near[i, k - 1, g]
                         k = k - 1
                     model.near[i, k, g] = j
-                    model.near_lanes[i, k, g] = 1
+                    model.near_lanes[i, count, g] = 1
                     count = count + 1
         model.near_count[i, g] = count
 
@@ -254,7 +254,7 @@ def kernels(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
                             own = own + model.bits[mask, g]
                             if wp.max(before + own) > capacity:
                                 for q in range(width):
-                                    if before[q] + own[q] > capacity:
+                                    if (mask >> q) & 1 == 1 and before[q] + own[q] > capacity:
                                         count = parted(model, g, first, count, q)
                                         own[q] = own[q] - one
             for q in range(width):

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from neuspring.core.artifacts import Trajectory, Twin
 from neuspring.core.errors import InputError
 from neuspring.physics import reference
+from neuspring.physics.solver import FrameSolver
 from neuspring.twin import rollout
 from tests.support.scenes import DEVICES, no_hands, random_scene, scene, solver_for, twin_of
 
@@ -40,34 +41,49 @@ def lists(x: np.ndarray, capacity: int, frames: int, device: str) -> tuple[list[
     body = scene(len(x), self_collision=True, contact_distance=DISTANCE, collision_capacity=capacity)
     solver = solver_for(body, 0, device)
     state, nobody = torch.tensor(x, device=device), torch.zeros(0, 3, dtype=torch.float64, device=device)
-    tables = solver.buffers.indices
-    tables["near"].fill_(-1)
+    if solver.buffers.threads:
+        solver.buffers.indices["near"].fill_(-1)
     for _ in range(frames):
         after, _ = solver.forward(state, 0 * state, nobody, nobody)
         np.testing.assert_array_equal(after.cpu().numpy(), x)
-    # One twin: one group, whose only lane every partner is listed for.
-    partners, lanes, count = (tables[name][..., 0].cpu().numpy() for name in ("near", "near_lanes", "near_count"))
-    assert partners.shape == (len(x), min(capacity, len(x)))
-    assert (count <= capacity).all()
-    # Slots behind a list stay untouched, also the first slot of the empty list behind a full one.
-    beyond = np.arange(partners.shape[1]) >= count[:, None]
-    assert (partners[beyond] == -1).all()
-    found = [row[:n].tolist() for row, n in zip(partners, count, strict=True)]
-    # A pair is one for both nodes.
-    both = [[int(i in found[j]) for j in own] for i, own in enumerate(found)]
-    assert [row[:n].tolist() for row, n in zip(lanes, count, strict=True)] == both
-    return found, solver.collision_overflow
+    if solver.buffers.threads:
+        near, count = (solver.buffers.indices[name][..., 0].cpu().numpy() for name in ("near", "near_count"))
+        assert near.shape == (len(x), min(capacity, len(x)))
+        assert (count <= capacity).all()
+        # Slots behind a list stay untouched, also the first slot of the empty list behind a full one.
+        assert (near[np.arange(near.shape[1]) >= count[:, None]] == -1).all()
+    return listed(solver, 0), solver.collision_overflow
+
+
+def listed(solver: FrameSolver, twin: int) -> list[list[int]]:
+    """The partners of each node of a twin: of rows that have each pair once, or of lists at both of its nodes."""
+    b = solver.buffers
+    group, lane = divmod(twin, b.width)
+    tables = {name: tensor.cpu().numpy() for name, tensor in b.indices.items()}
+    if b.threads:
+        rows = zip(tables["near"][..., group], tables["near_lanes"][..., group], tables["near_count"][:, group], strict=True)
+        return [row[:count][bits[:count] == 1].tolist() for row, bits, count in rows]
+    found: list[list[int]] = [[] for _ in range(b.nodes)]
+    ends = tables["pair_rows"][group]
+    for i in range(b.nodes):
+        row = slice(ends[i], ends[i + 1])
+        others = tables["pair_other"][group, row]
+        assert (np.diff(others, prepend=i) > 0).all()
+        for j in others[tables["pair_lanes"][group, row] >> lane & 1 == 1].tolist():
+            found[i].append(j)
+            found[j].append(i)
+    return [sorted(row) for row in found]
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("capacity", [1, 2, 5, 500])
 def test_full_lists_are_reported_and_never_overrun(capacity: int, device: str) -> None:
-    """Every list holds the first `capacity` partners in node order, whatever its neighbors' lists hold."""
+    """Every list holds those of the first `capacity` partners in node order who list the node as well."""
     x = clump(7, 4)
     partners, overflow = lists(x, capacity, frames=3, device=device)
     wanted = expected(x, DOUBLE, DISTANCE)
     assert sorted(len(row) for row in wanted) == [0] * 15 + [1] * 8 + [6] * 7
-    assert partners == [row[:capacity] for row in wanted]
+    assert partners == mutual([row[:capacity] for row in wanted])
     assert overflow == 3 * 7 * max(6 - capacity, 0)
 
 
@@ -111,14 +127,7 @@ def partners(clouds: Sequence[np.ndarray], dtype: torch.dtype, capacity: int, di
     solver = solver_for([scene(len(cloud), **options) for cloud in clouds], 0, dtype=dtype)
     x, nobody = torch.tensor(np.stack(clouds), dtype=dtype), torch.zeros(len(clouds), 0, 3, dtype=dtype)
     solver.forward(x, 0 * x, nobody, nobody)
-    b = solver.buffers
-    near, lanes, counts = (b.indices[name].numpy() for name in ("near", "near_lanes", "near_count"))
-    lists = []
-    for twin in range(len(clouds)):
-        group, lane = divmod(twin, b.width)
-        rows = zip(near[..., group], lanes[..., group] >> lane & 1, counts[:, group], strict=True)
-        lists.append([row[:count][bits[:count] == 1].tolist() for row, bits, count in rows])
-    return lists, solver.overflows
+    return [listed(solver, twin) for twin in range(len(clouds))], solver.overflows
 
 
 def expected(cloud: np.ndarray, dtype: torch.dtype, distance: float) -> list[list[int]]:
@@ -204,10 +213,22 @@ def test_contact_distances_are_those_of_each_twin() -> None:
     solver, nobody = solver_for(scenes, 0), torch.zeros(3, 0, 3, dtype=DOUBLE)
     stacked = torch.tensor(np.stack([x] * 3))
     solver.forward(stacked, 0 * stacked, nobody, nobody)
-    found = solver.buffers.indices["near_lanes"][..., 0]
-    listed = torch.arange(found.shape[1]) < solver.buffers.indices["near_count"]
-    counts = [int(((found >> lane & 1) * listed).sum()) for lane in range(3)]
+    counts = [sum(map(len, listed(solver, lane))) for lane in range(3)]
     assert counts == [len(reference.candidates(x, distance)) for distance in (0.005, 0.02, 0.011)]
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.2, 0.49, 0.51, 3.0])
+@pytest.mark.parametrize("dtype", [SINGLE, DOUBLE])
+def test_twins_that_are_alike_share_a_search(dtype: torch.dtype, apart: float) -> None:
+    """Nodes up to `apart` contact distances from those of the first twin, and whole bodies anywhere: each twin's pairs are all found."""
+    rng = np.random.default_rng(5)
+    x = cloud("around the origin")
+    ways = rng.normal(size=(9, *x.shape))
+    ways -= ways.mean(axis=1, keepdims=True)
+    clouds = [x + rng.uniform(-5, 5, 3) + apart * DISTANCE * way / np.linalg.norm(way, axis=1).max() for way in ways]
+    lists, overflow = partners(clouds, dtype, 500, DISTANCE)
+    assert lists == [expected(x, dtype, DISTANCE) for x in clouds]
+    assert overflow == [0] * 9
 
 
 # Rollouts -------------------------------------------------------------------------------------------------------------

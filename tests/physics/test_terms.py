@@ -216,18 +216,25 @@ def crowd_buffers(width: int) -> Buffers:
 
 
 def fill_crowd(values: Arrays) -> Buffers:
-    """Lists of all lanes' partners; a lane's bit says who is listed for it."""
+    """Lists of all lanes' partners, and rows of pairs; a lane's bit says who is listed for it."""
     b, listed = crowd_buffers(len(values["x"])), values["listed"]
     b.set_vectors("x", torch.tensor(values["x"]), slot=0)
     b.set_vectors("after", torch.tensor(values["v"]), slot=0)
     for name in ("e", "mu"):
         b.set_numbers(f"contact_{name}", torch.tensor(values[name]))
     bits = (listed << np.arange(b.width)[:, None, None]).sum(axis=0)
+    for name, shape in {"near": (6, 6, 1), "near_lanes": (6, 6, 1), "near_count": (6, 1)}.items():
+        b.set_table(name, shape)
+    pairs = []
     for i, row in enumerate(bits):
         partners = np.flatnonzero(row)
         b.indices["near"][i, : len(partners), 0] = torch.tensor(partners, dtype=torch.int32)
         b.indices["near_lanes"][i, : len(partners), 0] = torch.tensor(row[partners], dtype=torch.int32)
         b.indices["near_count"][i, 0] = len(partners)
+        pairs += [(j, row[j]) for j in partners if j > i]
+        b.indices["pair_rows"][0, i + 1] = len(pairs)
+    for k, name in enumerate(("pair_other", "pair_lanes")):
+        b.indices[name][0, : len(pairs)] = torch.tensor([pair[k] for pair in pairs], dtype=torch.int32)
     return b
 
 
@@ -242,6 +249,14 @@ def collided(values: Arrays) -> np.ndarray:
 
 
 def collided_adjoints(values: Arrays, weight: np.ndarray) -> Arrays:
+    """Those of a thread per node and of one for all pairs, which are the same."""
+    by_node, by_pair = (adjoints_by(name, values, weight) for name in ("collide_adjoint", "collide_pairs_adjoint"))
+    for name, gathered in by_node.items():
+        np.testing.assert_array_equal(by_pair[name], gathered)
+    return by_node
+
+
+def adjoints_by(kernel: str, values: Arrays, weight: np.ndarray) -> Arrays:
     b = fill_crowd(values)
     # The adjoint reads how many partners were met.
     launch(terms.kernels(b.width).collide, (6, 1), *b.arguments[:2])
@@ -249,7 +264,7 @@ def collided_adjoints(values: Arrays, weight: np.ndarray) -> Arrays:
         if name.startswith("adj_"):
             tensor.zero_()
     b.set_vectors("adj_moving", torch.tensor(weight))
-    launch(terms.kernels(b.width).collide_adjoint, (6, 1), *b.arguments)
+    launch(getattr(terms.kernels(b.width), kernel), (6, 1) if kernel == "collide_adjoint" else 1, *b.arguments)
     e, mu = (b.get_numbers(f"adj_contact_{name}").sum(dim=1).numpy() for name in ("e", "mu"))
     return {"x": b.get_vectors("adj_x", count=b.nodes).numpy(), "v": b.get_vectors("adj_after").numpy(), "e": e, "mu": mu}
 

@@ -28,7 +28,7 @@ def kernels(width: int) -> SimpleNamespace:
     add_row, add_row_adjoint, gathered, gathered_adjoint = springs.functions(real, width)
     _, updated, updated_adjoint = velocity(real, width)
     moved, moved_adjoint = position(real, width)
-    collided, add_pairs, after_pairs, collided_adjoint = collision.functions(real, width)
+    collided, add_pairs, after_pairs, collided_adjoint, add_pairs_adjoint = collision.functions(real, width)
 
     def rows(model: Model, state: State):
         g = wp.tid()
@@ -122,9 +122,15 @@ def kernels(width: int) -> SimpleNamespace:
         i, g = wp.tid()
         collided_adjoint(model, state, adjoint, 0, i, g)
 
+    def collide_pairs_adjoint(model: Model, state: State, adjoint: Adjoint):
+        g = wp.tid()
+        for i in range(model.nodes):
+            add_pairs_adjoint(model, state, adjoint, 0, i, g)
+
     made = wp.kernel(module=f"tests.support.terms.{width}", enable_backward=False)
     terms = (rows, rows_adjoint, links, links_adjoint, speed, speed_adjoint, motion, motion_adjoint)
-    return SimpleNamespace(**{term.__name__: made(term) for term in (*terms, collide, collide_pairs, collide_adjoint)})
+    impulses = (collide, collide_pairs, collide_adjoint, collide_pairs_adjoint)
+    return SimpleNamespace(**{term.__name__: made(term) for term in (*terms, *impulses)})
 
 
 def launch(kernel: Any, size: int | tuple[int, int], *arguments: Any) -> None:
