@@ -2,7 +2,8 @@
 
 `serial`: one thread goes through all nodes and all substeps, each spring once, the way of a CPU, whose width is in the lanes.
 `threads`: a thread per node of each twin and a launch per substep, each spring gathered at both ends without atomics, the way of
-a GPU. Both sum a node's forces in the same order.
+a GPU. `blocks`: the same work by a block of threads per twin, which goes through all substeps of a frame in one launch and waits for
+its threads in between. All sum a node's forces in the same order.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
@@ -14,6 +15,16 @@ import warp as wp
 from neuspring.physics import collision, motion, obstacles, springs
 from neuspring.physics.arrays import UNFUSED, structs
 from neuspring.physics.lanes import lanes
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+#endif
+""")
+def wait_for_all() -> None:
+    """What the threads of a block have written is there for all of them; on a CPU a block has one thread."""
+    ...
 
 
 class Kernels(NamedTuple):
@@ -36,6 +47,9 @@ class Kernels(NamedTuple):
     """Adjoint of the impulses."""
     slow: Any
     """Adjoint of the velocity update, after `hit`."""
+    block_forward: Any
+    """A frame by a block per twin."""
+    block_backward: Any
 
 
 @functools.cache
@@ -152,8 +166,9 @@ def kernels(real: Any, width: int, among: bool = False, pushes: bool = False) ->
         c, g = wp.tid()
         move_controller(model, state, 0, 0, c, g)
 
-    def substep(model: Model, state: State, step: int):
-        i, g = wp.tid()
+    @wp.func
+    def go(model: Model, state: State, step: int, i: int, g: int):
+        """A substep of a point; with self-collision without its second half."""
         slot = step % model.slots
         if i >= model.nodes:
             # The controllers' place in the next substep, which nobody reads in this one.
@@ -166,20 +181,39 @@ def kernels(real: Any, width: int, among: bool = False, pushes: bool = False) ->
         if model.collide == 0:
             advance(model, state, step, i, g, after)
 
-    def collide(model: Model, state: State, step: int):
-        i, g = wp.tid()
+    @wp.func
+    def meet(model: Model, state: State, step: int, i: int, g: int):
+        """The second half: impulses, motion."""
         inner = step % model.history
         moving = collided(model, state, step % model.slots, inner, i, g)
         state.moving[inner, i, g] = moving
         advance(model, state, step, i, g, moving)
 
-    def settle(model: Model, state: State, adjoint: Adjoint, step: int):
-        i, g = wp.tid()
+    @wp.func
+    def settled(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
         advance_adjoint(model, state, adjoint, step, i, g)
         if model.collide == 0:
             update_adjoint(model, state, adjoint, step, i, g)
         else:
             adjoint.after[i, g] = Vector()
+
+    @wp.func
+    def pulled(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
+        gathered_adjoint(model, state, adjoint, step, step % 2, i, g)
+        if model.collide == 0 and step > 0:
+            settled(model, state, adjoint, step - 1, i, g)
+
+    def substep(model: Model, state: State, step: int):
+        i, g = wp.tid()
+        go(model, state, step, i, g)
+
+    def collide(model: Model, state: State, step: int):
+        i, g = wp.tid()
+        meet(model, state, step, i, g)
+
+    def settle(model: Model, state: State, adjoint: Adjoint, step: int):
+        i, g = wp.tid()
+        settled(model, state, adjoint, step, i, g)
 
     def hit(model: Model, state: State, adjoint: Adjoint, step: int):
         i, g = wp.tid()
@@ -191,10 +225,49 @@ def kernels(real: Any, width: int, among: bool = False, pushes: bool = False) ->
 
     def pull(model: Model, state: State, adjoint: Adjoint, step: int):
         i, g = wp.tid()
-        gathered_adjoint(model, state, adjoint, step, step % 2, i, g)
-        if model.collide == 0 and step > 0:
-            advance_adjoint(model, state, adjoint, step - 1, i, g)
-            update_adjoint(model, state, adjoint, step - 1, i, g)
+        pulled(model, state, adjoint, step, i, g)
+
+    def block_forward(model: Model, state: State):
+        g, t = wp.tid()
+        size = wp.block_dim()
+        count = int(model.counts[g][0])
+        for c in range(t, model.controllers, size):
+            move_controller(model, state, 0, 0, c, g)
+        wait_for_all()
+        for step in range(count):
+            for i in range(t, model.nodes + model.controllers, size):
+                go(model, state, step, i, g)
+            wait_for_all()
+            if model.collide != 0:
+                for i in range(t, model.nodes, size):
+                    meet(model, state, step, i, g)
+                wait_for_all()
+        # Another twin may have more substeps, and all have their end in the same slot.
+        for i in range(t, model.nodes, size):
+            state.x[model.substeps % model.slots, i, g] = state.x[count % model.slots, i, g]
+            state.v[model.substeps % model.slots, i, g] = state.v[count % model.slots, i, g]
+
+    def block_backward(model: Model, state: State, adjoint: Adjoint):
+        g, t = wp.tid()
+        size = wp.block_dim()
+        count = int(model.counts[g][0])
+        for done in range(count):
+            step = count - 1 - done
+            if model.collide != 0 or done == 0:
+                for i in range(t, model.nodes, size):
+                    settled(model, state, adjoint, step, i, g)
+                wait_for_all()
+            if model.collide != 0:
+                for i in range(t, model.nodes, size):
+                    collided_adjoint(model, state, adjoint, step, i, g)
+                wait_for_all()
+                for i in range(t, model.nodes, size):
+                    update_adjoint(model, state, adjoint, step, i, g)
+                wait_for_all()
+            for i in range(t, model.nodes, size):
+                pulled(model, state, adjoint, step, i, g)
+            wait_for_all()
 
     made = wp.kernel(**UNFUSED)
-    return Kernels(*map(made, (forward, backward, begin, substep, collide, settle, pull, hit, slow)))
+    kept = (forward, backward, begin, substep, collide, settle, pull, hit, slow, block_forward, block_backward)
+    return Kernels(*map(made, kept))

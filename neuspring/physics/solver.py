@@ -53,7 +53,8 @@ class FrameSolver:
     simulations (else InputError); then every tensor has a leading axis [B]. A twin's numbers are the same, bit for bit, alone and
     in company.
 
-    `threads` chooses how a frame is computed (frame.py): by a thread per node, as on CUDA, or by one thread, as on a CPU.
+    `threads` chooses how a frame is computed (frame.py): by a thread per node, as on CUDA, or by one thread, as on a CPU. `block`
+    threads go through a twin's nodes instead, in one launch for all substeps; 0: a launch for each.
     """
 
     def __init__(
@@ -67,12 +68,14 @@ class FrameSolver:
         dtype: torch.dtype = torch.float32,
         differentiable: bool = True,
         threads: bool | None = None,
+        block: int = 0,
     ) -> None:
+        self.block = block
         self.together = not isinstance(simulation, Simulation)
         simulations = [simulation] if isinstance(simulation, Simulation) else list(simulation)
         _check(simulations)
         self.nodes, self.simulation, self.device, self.dtype = nodes, simulations[0], device, dtype
-        threads = device != "cpu" if threads is None else threads
+        threads = device != "cpu" or block > 0 if threads is None else threads
         self.buffers = Buffers(nodes, controllers, simulations, device, dtype, differentiable=differentiable, threads=threads)
         self.buffers.add_parameters(len(spring_pairs))
         springs.allocate(self.buffers, spring_pairs)
@@ -235,7 +238,7 @@ class FrameSolver:
         return values if self.together else values[0]
 
     def _run(self, name: str, launch: Callable[[], None]) -> None:
-        if self.buffers.threads:
+        if self.buffers.threads and not self.block:
             self._graphs.run(name, self._needed(name), launch)
             return
         # One launch needs no graph. Warp would record it with whatever other threads of the process launch meanwhile.
@@ -246,6 +249,8 @@ class FrameSolver:
     def _needed(self, name: str) -> Iterator[Any]:
         """The kernels of a frame forward or backward."""
         k, b = self._kernels, self.buffers
+        if self.block:
+            return iter([k.block_forward if name == "forward" else k.block_backward])
         if not b.threads:
             return iter([k.forward if name == "forward" else k.backward])
         if name == "forward":
@@ -256,6 +261,9 @@ class FrameSolver:
         """A frame (`frame.py`)."""
         b, k = self.buffers, self._kernels
         model, state, _ = b.arguments
+        if self.block:
+            b.launch(k.block_forward, (b.groups, self.block), model, state, block=self.block)
+            return
         if not b.threads:
             b.launch(k.forward, b.groups, model, state)
             return
@@ -269,6 +277,9 @@ class FrameSolver:
         """The adjoint of a frame."""
         b, k = self.buffers, self._kernels
         arguments, size = b.arguments, (b.nodes, b.groups)
+        if self.block:
+            b.launch(k.block_backward, (b.groups, self.block), *arguments, block=self.block)
+            return
         if not b.threads:
             b.launch(k.backward, b.groups, *arguments)
             return

@@ -18,7 +18,7 @@ from neuspring.physics.controllers import waypoints
 from neuspring.physics.parameters import pack
 from neuspring.physics.reference import ReferenceTwin
 from neuspring.physics.solver import FrameSolver, simulate_frame
-from tests.support.scenes import VARIANTS, WAYS, random_scene, solver_for, tensors
+from tests.support.scenes import DEVICES, VARIANTS, WAYS, random_scene, solver_for, tensors
 
 SINGLE, DOUBLE = torch.float32, torch.float64
 ROUNDING = 1e-5
@@ -165,6 +165,20 @@ def test_a_thread_per_node_gives_what_it_gives_alone_and_what_one_thread_gives(v
         assert_same_by_threads(of(got, number), alone(one, SINGLE, **options), variant)
     if device == "cpu":
         assert_same_by_threads(got, together(members, SINGLE), variant)
+
+
+@pytest.mark.parametrize("dtype", [SINGLE, DOUBLE])
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_block_per_twin_gives_what_launches_give(device: str, variant: str, dtype: torch.dtype) -> None:
+    """All substeps in one launch, of twins that have different numbers of them: the same bits, without atomics at least."""
+    members = [member(number, variant) for number in range(5)]
+    got = together(members, dtype, device=device, block=64 if device != "cpu" else 1)
+    wanted = together(members, dtype, device=device, threads=True)
+    if device == "cpu":
+        assert_same(got, wanted, variant)
+    for number in range(5):
+        assert_same_by_threads(of(got, number), of(wanted, number), variant)
 
 
 @pytest.mark.parametrize("broken", [0, 3])

@@ -117,9 +117,10 @@ def solver_for(
     *,
     differentiable: bool = True,
     threads: bool | None = None,
+    block: int = 0,
 ) -> FrameSolver:
     """A FrameSolver with the scene's parameters set, or one of several scenes on the graph of the first."""
-    options: dict[str, Any] = {"device": device, "dtype": dtype, "differentiable": differentiable, "threads": threads}
+    options: dict[str, Any] = {"device": device, "dtype": dtype, "differentiable": differentiable, "threads": threads, "block": block}
     if isinstance(scene, ReferenceTwin):
         solver = FrameSolver(scene.springs, scene.nodes, controllers, scene.simulation, **options)
         solver.set_parameters(packed(scene, device, dtype))
