@@ -10,14 +10,18 @@ to a registry counts like ours, with all that it imports of its own package; one
 from __future__ import annotations
 
 import ast
+import contextlib
 import functools
 import hashlib
+import json
 import re
 import subprocess
+import sys
 from collections.abc import Iterator
 from importlib.metadata import packages_distributions, version
-from importlib.util import find_spec, resolve_name
+from importlib.util import cache_from_source, find_spec, resolve_name
 from pathlib import Path
+from typing import NamedTuple
 
 PACKAGE_NAME = "neuspring"
 PACKAGE_FOLDER = Path(__file__).parents[1]
@@ -26,6 +30,10 @@ DECLARATIONS = tuple(
     for name in ("config", "core.section", "core.text", "core.records", "core.run_record", "core.run_folder", "stages.stage")
 )
 """Declarations, records and progress: they change no number. Configured values reach a rule as parameters of their own."""
+
+
+FORMAT = b"1"
+"""Of what is kept of a module; another one where `_written` or `_names` change."""
 
 
 def _root(package: str) -> Path | None:
@@ -47,12 +55,9 @@ def _source(module: str) -> Path | None:
     return next((file for file in (path.with_suffix(".py"), path / "__init__.py") if file.is_file()), None)
 
 
-@functools.cache
-def _tree(module: str) -> ast.Module:
+def _tree(text: bytes) -> ast.Module:
     """The syntax of a module, without its documentation."""
-    path = _source(module)
-    assert path is not None, module
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = ast.parse(text)
     for node in _statements(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
             # Any bare string is documentation: docstrings, and the notes under fields and constants.
@@ -76,23 +81,58 @@ def _statements(tree: ast.Module) -> Iterator[ast.AST]:
         ]
 
 
+class ModuleCode(NamedTuple):
+    """A module's text, read once."""
+
+    digest: str
+    """SHA-256 of its syntax without documentation."""
+    names: tuple[str, ...]
+    """Whatever it imports, or may import where a name of a package is a module."""
+
+
 @functools.cache
-def imported_modules(module: str) -> frozenset[str]:
-    """Modules of our package, and of its own, that `module` imports directly, anywhere in its text."""
+def _code(module: str) -> ModuleCode:
+    """Kept beside the module's bytecode, where it can be, since syntax trees take longer than a small job."""
+    path = _source(module)
+    assert path is not None, module
+    text = path.read_bytes()
+    key = hashlib.sha256(FORMAT + text).hexdigest()
+    kept = Path(cache_from_source(str(path))).with_suffix(".json")
+    with contextlib.suppress(OSError, ValueError, TypeError):
+        own, digest, *names = json.loads(kept.read_text(encoding="utf-8"))
+        if own == key:
+            return ModuleCode(digest, tuple(names))
+    tree = _tree(text)
+    code = ModuleCode(hashlib.sha256(_written(tree).encode()).hexdigest(), tuple(sorted(_names(module, path, tree))))
+    if not sys.dont_write_bytecode:
+        # What is cut off is no JSON, and is made again.
+        with contextlib.suppress(OSError):
+            kept.parent.mkdir(exist_ok=True)
+            kept.write_text(json.dumps([key, code.digest, *code.names]), encoding="utf-8")
+    return code
+
+
+def _names(module: str, path: Path, tree: ast.Module) -> set[str]:
     found: set[str] = set()
-    path, own = _source(module), {PACKAGE_NAME, module.partition(".")[0]}
-    here = module if path and path.name == "__init__.py" else module.rpartition(".")[0]
-    for node in _statements(_tree(module)) if path else ():
+    here = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    for node in _statements(tree):
         if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
+            found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             base = resolve_name("." * node.level + (node.module or ""), here) if node.level else node.module or ""
             # `from package import name` may name a module or something in one.
-            names = [base, *(f"{base}.{alias.name}" for alias in node.names)]
-        else:
-            continue
-        found |= {name for name in names if name.split(".")[0] in own and name != PACKAGE_NAME and _source(name) is not None}
-    return frozenset(found)
+            found |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
+    return found
+
+
+@functools.cache
+def imported_modules(module: str) -> frozenset[str]:
+    """Modules of our package, and of its own, that `module` imports directly, anywhere in its text."""
+    if _source(module) is None:
+        return frozenset()
+    own = {PACKAGE_NAME, module.partition(".")[0]} - {""}
+    names = (name for name in _code(module).names if name.partition(".")[0] in own and name != PACKAGE_NAME)
+    return frozenset(name for name in names if _source(name) is not None)
 
 
 def used_modules(module: str) -> list[str]:
@@ -116,7 +156,7 @@ def _module_code(module: str) -> bytes:
     if _source(module) is None:
         names = packages_distributions().get(module.partition(".")[0], [])
         return hashlib.sha256(" ".join(f"{name} {version(name)}" for name in names).encode()).digest()
-    return hashlib.sha256(_written(_tree(module)).encode()).digest()
+    return bytes.fromhex(_code(module).digest)
 
 
 def _written(value: object) -> str:
@@ -137,8 +177,6 @@ def code_digest(*modules: str) -> str:
     for name in sorted(used):
         digest.update(name.encode())
         digest.update(_module_code(name))
-    # What was taken from them is kept; a job need not carry the trees through its run.
-    _tree.cache_clear()
     return digest.hexdigest()[:16]
 
 
