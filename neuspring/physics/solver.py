@@ -416,10 +416,15 @@ def simulate_frame(
 
 
 def solver_for(
-    twins: Twin | Sequence[Twin], device: str = "cpu", dtype: torch.dtype = torch.float32, *, differentiable: bool = True
+    twins: Twin | Sequence[Twin],
+    device: str = "cpu",
+    dtype: torch.dtype = torch.float32,
+    *,
+    differentiable: bool = True,
+    block: int = 0,
 ) -> FrameSolver:
     """A solver with parameters set: of a lattice, or of several of the same nodes and controllers: tensors have an axis [B]."""
-    options: dict[str, Any] = {"device": device, "dtype": dtype, "differentiable": differentiable}
+    options: dict[str, Any] = {"device": device, "dtype": dtype, "differentiable": differentiable, "block": block}
     first = twins.topology if isinstance(twins, Twin) else twins[0].topology
     if isinstance(twins, Twin):
         solver = FrameSolver(first.springs, len(first.nodes), len(first.controllers), twins.simulation, **options)

@@ -35,11 +35,6 @@ def softer(twin: Twin, count: int) -> list[Twin]:
     return [replace(twin, material=material) for material in materials]
 
 
-def together(bench: Bench, twin: Twin, hands: np.ndarray, count: int, *, gradient: bool) -> Frame:
-    """`count` twins of one topology in one call."""
-    return bench.ours.together(softer(twin, count), hands, gradient=gradient)
-
-
 def by_batch(bench: Bench) -> list[Row]:
     """More twins in a call, on the small box."""
     twin, hands = box(*CASES["a"])
@@ -47,7 +42,7 @@ def by_batch(bench: Bench) -> list[Row]:
     for kind, gradient in KINDS:
         entries: list[Entry] = []
         for count in (1, 16) if bench.quick else (1, 4, 8, 16, 64):
-            made = together(bench, twin, hands, count, gradient=gradient)
+            made = bench.ours.together(softer(twin, count), hands, gradient=gradient)
             entries.append(Entry(f"{count} together, {kind}", twin, made, entries[0].name if entries else "", count))
         rows += timed(bench, "batch", entries)
     return rows
@@ -70,6 +65,9 @@ def by_topologies(bench: Bench) -> list[Row]:
             Entry(first, twins[0], one_by_one(bench, twins, hands, gradient), "", count, own),
             Entry(second, twins[0], crowd, first, count, own),
         ]
+        if bench.on_gpu:
+            blocks = bench.blocks.together(twins, hands, gradient=gradient)
+            entries.append(Entry(f"{count} topologies, a block each, {kind}", twins[0], blocks, first, count, own))
         rows += timed(bench, "topologies", entries)
         agree(bench, entries)
     return rows

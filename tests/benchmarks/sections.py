@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from neuspring.core.artifacts import Twin
-from tests.benchmarks.crowds import by_batch, by_topologies, of_search, together
+from tests.benchmarks.crowds import by_batch, by_topologies, of_search, softer
 from tests.benchmarks.memory import growth
 from tests.benchmarks.ours import Ours, reference_frame
 from tests.benchmarks.rows import KINDS, Bench, Entry, agree, frame_of, timed
@@ -28,6 +28,8 @@ from tests.benchmarks.simulators import Simulator, Times, distances
 from tests.benchmarks.table import Row
 
 TOGETHER = 16
+EVERY_MULTIPROCESSOR = 132
+"""Twins, of an H100 or H200."""
 """Twins of one call in the first section: the lanes of a vector."""
 TALKING = """import sys
 from neuspring.cli.main import main
@@ -54,8 +56,13 @@ def _company(bench: Bench, case: str, twin: Twin, hands: np.ndarray) -> Iterator
     for kind, gradient in KINDS:
         alone = f"{case}: {kind}"
         yield Entry(alone, twin, frame_of(bench.ours, twin, hands, gradient))
-        crowd = together(bench, twin, hands, TOGETHER, gradient=gradient)
+        crowd = bench.ours.together(softer(twin, TOGETHER), hands, gradient=gradient)
         yield Entry(f"{alone}, {TOGETHER} together", twin, crowd, alone, TOGETHER)
+        if bench.on_gpu:
+            yield Entry(f"{alone}, a block", twin, frame_of(bench.blocks, twin, hands, gradient), alone)
+            for count in (TOGETHER, EVERY_MULTIPROCESSOR):
+                crowd = bench.blocks.together(softer(twin, count), hands, gradient=gradient)
+                yield Entry(f"{alone}, {count} blocks", twin, crowd, alone, count)
         if bench.peer:
             yield Entry(f"{alone}, {bench.peer.name}", twin, frame_of(bench.peer, twin, hands, gradient), alone)
 
