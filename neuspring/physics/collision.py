@@ -27,8 +27,8 @@ GRID_CELLS = 64
 FIRST_PAIRS = 4
 """Pairs per node that there is room for at first; a frame with more doubles it."""
 MOST_APART = 0.5
-"""Twins of a group whose nodes are farther than this many contact distances from the first one's, but for a shift of the whole body,
-do not share a search. At 0.5 a node's neighborhood holds eight times as many."""
+"""Twins of a group do not share a search if nodes are farther than this many contact distances from those of the first one, but for
+a shift of the whole body. At 0.5 a node's neighborhood holds eight times as many."""
 MARGIN = 1e-3
 """Of the contact distance, for rounding."""
 
@@ -312,7 +312,7 @@ def functions(real: Any, width: int) -> Contacts:
 
     @wp.func
     def closing_pairs(model: Model, state: State, slot: int, inner: int, i: int, g: int, x: Vector, v: Vector) -> int:
-        """Put the pairs of a row that come closer into `closing`; their number. A branch for each would be guessed wrong too often."""
+        """Put the pairs of a row that come closer into `closing`; their number. A branch for each is guessed wrong too often."""
         count = wp.int32(0)
         for k in range(model.pair_rows[g, i], model.pair_rows[g, i + 1]):
             j = plain(model.pair_other[g, plain(k)])

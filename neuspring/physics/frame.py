@@ -2,8 +2,8 @@
 
 `serial`: one thread goes through all nodes and all substeps, each spring once, the way of a CPU, whose width is in the lanes.
 `threads`: a thread per node of each twin and a launch per substep, each spring gathered at both ends without atomics, the way of
-a GPU. `blocks`: the same work by a block of threads per twin, which goes through all substeps of a frame in one launch and waits for
-its threads in between. All sum a node's forces in the same order.
+a GPU. `blocks`: the same by a block of threads per twin, which goes through all substeps of a frame in one launch and waits for its
+threads in between. All sum a node's forces in the same order.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 

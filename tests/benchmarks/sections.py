@@ -28,9 +28,9 @@ from tests.benchmarks.simulators import Simulator, Times, distances
 from tests.benchmarks.table import Row
 
 TOGETHER = 16
-EVERY_MULTIPROCESSOR = 132
-"""Twins, of an H100 or H200."""
 """Twins of one call in the first section: the lanes of a vector."""
+EVERY_MULTIPROCESSOR = 132
+"""Twins of one call that fill an H100 or H200 with blocks."""
 TALKING = """import sys
 from neuspring.cli.main import main
 from neuspring.core import device

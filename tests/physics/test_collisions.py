@@ -220,7 +220,7 @@ def test_contact_distances_are_those_of_each_twin() -> None:
 @pytest.mark.parametrize("apart", [0.0, 0.2, 0.49, 0.51, 3.0])
 @pytest.mark.parametrize("dtype", [SINGLE, DOUBLE])
 def test_twins_that_are_alike_share_a_search(dtype: torch.dtype, apart: float) -> None:
-    """Nodes up to `apart` contact distances from those of the first twin, and whole bodies anywhere: each twin's pairs are all found."""
+    """Nodes up to `apart` contact distances from those of the first twin, and whole bodies anywhere: all pairs are found."""
     rng = np.random.default_rng(5)
     x = cloud("around the origin")
     ways = rng.normal(size=(9, *x.shape))

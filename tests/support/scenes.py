@@ -120,7 +120,8 @@ def solver_for(
     block: int = 0,
 ) -> FrameSolver:
     """A FrameSolver with the scene's parameters set, or one of several scenes on the graph of the first."""
-    options: dict[str, Any] = {"device": device, "dtype": dtype, "differentiable": differentiable, "threads": threads, "block": block}
+    options: dict[str, Any] = {"device": device, "dtype": dtype, "differentiable": differentiable}
+    options |= {"threads": threads, "block": block}
     if isinstance(scene, ReferenceTwin):
         solver = FrameSolver(scene.springs, scene.nodes, controllers, scene.simulation, **options)
         solver.set_parameters(packed(scene, device, dtype))
