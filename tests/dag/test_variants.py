@@ -11,6 +11,8 @@ from neuspring.experiments.tracking import log as tracking
 from tests.support.extensions import with_extensions
 from tests.support.project import SCENE, plan, run
 
+OTHER = "toy_cloth_lift_smooth"
+
 
 @pytest.mark.slow
 def test_variants_end_in_one_table_and_a_larger_budget_continues_the_search(project):
@@ -112,6 +114,9 @@ def test_fits_that_share_launches_end_as_they_would_one_by_one(project):
     output = run(project, changes | {"methods": ["baseline", "model_b"]}, "--dry-run")
     planned = {words[0]: words[1] for words in map(str.split, output.splitlines()) if len(words) == 2}
     assert planned["fits"] == "1" and planned["fit"] == "3" and planned["all"] == "1"
+    # Nothing of another scene is overlooked where a part of the seeds of this one is asked for.
+    both = changes | {"scenarios": [SCENE, OTHER], "only": "seed=0"}
+    assert plan(project, both)["observe"] == plan(project, both)["search"] == 1
     for path in targets:
         (project / path).unlink()
     output = run(project, changes | {"twins_per_launch": 1}, "--", *targets)

@@ -162,7 +162,13 @@ def compared_with_records(stage):
     find = GRAPH.inputs(stage)
 
     def found(wildcards):
-        made_again(GRAPH.output_of(stage, wildcards), FRESH.look(stage, wildcards))
+        output = GRAPH.output_of(stage, wildcards)
+        made_again(output, FRESH.look(stage, wildcards))
+        if stage.together and workflow.is_main_process:
+            # Launches are shared again if some job that takes part is to be done, and in no other case.
+            member = STAGES[stage.together.stage]
+            if any(unfinished(member, one) for one in GRAPH.in_step(stage, wildcards.scenario)):
+                workflow.dag.forcefiles.add(output)
         return find(wildcards)
 
     return found
