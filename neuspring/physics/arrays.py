@@ -42,6 +42,7 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
     class Model:
         nodes: int
         controllers: int
+        first: int
         substeps: int
         fewest: int
         slots: int
@@ -125,7 +126,7 @@ class Buffers:
         self.groups = -(-self.twins // self.width)
         self.lanes = lanes(self.real, self.width)
         self.counts = [simulation.substeps for simulation in simulations]
-        self.substeps = max(self.counts)
+        self.first, self.substeps = 0, max(self.counts)
         self.tensors: dict[str, torch.Tensor] = {}
         self.views: dict[str, Any] = {}
         self.indices: dict[str, torch.Tensor] = {}
@@ -179,6 +180,11 @@ class Buffers:
         """Make an array of integers, zero at first, in the place of an earlier one of this name."""
         self.indices[name] = torch.zeros(shape, dtype=torch.int32, device=self.device)
         self.views[name] = wp.from_torch(self.indices[name], dtype=wp.int32)
+        self.__dict__.pop("arguments", None)
+
+    def set_span(self, first: int, substeps: int) -> None:
+        """Simulate of a frame the substeps from `first` on, up to `substeps`."""
+        self.first, self.substeps = first, substeps
         self.__dict__.pop("arguments", None)
 
     def set_vectors(self, name: str, values: torch.Tensor, slot: int | None = None) -> None:
@@ -251,6 +257,7 @@ class Buffers:
         plain = {
             "nodes": self.nodes,
             "controllers": self.controllers,
+            "first": self.first,
             "substeps": self.substeps,
             "fewest": min(self.counts),
             "slots": self.slots,

@@ -121,7 +121,7 @@ def kernels(real: Any, width: int, among: bool = False, pushes: bool = False) ->
 
     def forward(model: Model, state: State):
         g = wp.tid()
-        for step in range(model.substeps):
+        for step in range(model.first, model.substeps):
             slot = step % model.slots
             inner = step % model.history
             for c in range(model.controllers):  #  x_c = begin + (end - begin) (k + 1) / n

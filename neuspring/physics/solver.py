@@ -26,10 +26,13 @@ from neuspring.core.errors import InputError
 from neuspring.physics import collision, frame, obstacles, springs
 from neuspring.physics.arrays import Buffers, Graphs
 from neuspring.physics.controllers import ControllerSprings, begins, begun
+from neuspring.physics.lanes import LANE_WIDTHS
 from neuspring.physics.parameters import PARAMETERS, Parameters, packed
 
 FRAME_WINDOW_BYTES = 1 << 30
 """Bytes that a `FrameWindow` may take."""
+WORTH_NARROWING = 0.9
+"""Part of the largest number of substeps, below which the others' largest makes it worth while to go on in fewer lanes."""
 PER_TWIN = ("frame_time", "substeps", "initial_velocity")
 """Fields that may differ between the simulations of one solver; it does not read the last."""
 
@@ -92,6 +95,8 @@ class FrameSolver:
         self._factor: torch.Tensor | None = None
         """Factors on the springs in this frame [B, S, 3], where some controller does not hold."""
         self._reach = 0.0
+        self.narrower: FrameSolver | None = None
+        """A solver of the first twins, in which they end their frames."""
         self.frame_token = 0
         """Number of frames simulated: tells whether the buffers still hold a given one."""
 
@@ -140,12 +145,40 @@ class FrameSolver:
 
     def advance(self, begin: torch.Tensor, end: torch.Tensor) -> None:
         """Simulate a frame from the state in slot 0; it ends in slot `last`."""
-        b = self.buffers
-        self._lead(self._stacked(begin), self._stacked(end))
-        if self.simulation.self_collision:
-            collision.find_candidates(b, self._reach)
-        self._run("forward", self.launch_forward)
+        self._prepare(self._stacked(begin), self._stacked(end))
+        self._simulate()
         self.frame_token += 1
+
+    def _prepare(self, begin: torch.Tensor, end: torch.Tensor) -> None:
+        """Take grips, and partners for self-collision, from the start of a frame."""
+        self._lead(begin, end)
+        if self.simulation.self_collision:
+            collision.find_candidates(self.buffers, self._reach)
+        if self.narrower:
+            if self.simulation.self_collision or begin.shape[-1] == 4:
+                self._hand_over(self.narrower)
+            count = self.narrower.buffers.twins
+            self.narrower._prepare(begin[:count], end[:count])
+
+    def _simulate(self) -> None:
+        self._run("forward", self.launch_forward)
+        if self.narrower:
+            self._hand_over(self.narrower)
+            self.narrower._simulate()
+            self._hand_over(self.narrower, back=True)
+
+    def narrow(self, other: FrameSolver) -> None:
+        """Let the first twins end their frames in `other`, a solver of them, from where all others have ended theirs."""
+        self.narrower, until = other, self.buffers.counts[other.buffers.twins]
+        self.buffers.set_span(self.buffers.first, until)
+        other.buffers.set_span(until, other.buffers.substeps)
+
+    def _hand_over(self, other: FrameSolver, *, back: bool = False) -> None:
+        """Copy the state of the other's twins there, or back."""
+        count = other.buffers.twins
+        for name in ("x", "v"):
+            own, others = (solver.buffers.tensors[name][..., :count] for solver in (self, other))
+            (own if back else others).copy_(others if back else own)
 
     def _lead(self, begin: torch.Tensor, end: torch.Tensor) -> None:
         """Take where controllers are at the begin and the end of a frame: rows of `controllers.waypoints` [B, C, 3 or 4]."""
@@ -433,6 +466,33 @@ def solver_for(
     pairs, places = union([twin.topology for twin in twins])
     solver = FrameSolver(pairs, len(first.nodes), len(first.controllers), [twin.simulation for twin in twins], **options)
     solver.set_parameters(stacked([packed(twin, device, dtype) for twin in twins], places, len(pairs)))
+    return solver
+
+
+def narrowing_solver(twins: Sequence[Twin], device: str) -> FrameSolver:
+    """A solver without gradients of several twins; on a CPU the first, if they come slowest first, end frames in fewer lanes.
+
+    Lanes cost the same whoever still moves in them, and few candidates of a search need several times the substeps of the others.
+    """
+    topologies, counts = [twin.topology for twin in twins], [twin.simulation.substeps for twin in twins]
+    pairs, places = union(topologies)
+    every = stacked([packed(twin, device) for twin in twins], places, len(pairs))
+
+    def made(count: int) -> FrameSolver:
+        own = {name: values[:count] for name, values in every.items()}
+        kept = (own["springs"][..., 1] != 0).any(dim=0)
+        own["springs"], size = own["springs"][:, kept], (len(topologies[0].nodes), len(topologies[0].controllers))
+        simulations = [twin.simulation for twin in twins[:count]]
+        solver = FrameSolver(pairs[kept.cpu().numpy()], *size, simulations, device=device, differentiable=False)
+        solver.set_parameters(own)
+        return solver
+
+    solver = narrowest = made(len(twins))
+    if device == "cpu" and len(twins) <= LANE_WIDTHS[-1] and counts == sorted(counts, reverse=True):
+        for width in reversed(LANE_WIDTHS):
+            if width < narrowest.buffers.width and counts[width] < WORTH_NARROWING * counts[0]:
+                wider, narrowest = narrowest, made(width)
+                wider.narrow(narrowest)
     return solver
 
 

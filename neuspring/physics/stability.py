@@ -27,6 +27,8 @@ MAX_SUBSTEPS = 2000
 RELEASED_SUBSTEPS = 667
 RELEASED_FRAME_TIME = RELEASED_SUBSTEPS * 5e-5
 """s, whatever the frame rate (released_quirks.frame_time_667)."""
+TOLERANCE = 1e-3
+"""Relative residual of the eigenvalues of a spectrum."""
 ONE_KG = np.zeros(0)
 """Masses of no nodes, which stand for 1 kg each."""
 
@@ -82,40 +84,16 @@ def rest_spectrum(
     mass: np.ndarray = ONE_KG,
 ) -> Spectrum:
     """Largest eigenvalues in the rest configuration. stiffness is Y / l0 [S], damping gamma [S], mass [N], kg, or empty: 1 each."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
+    from neuspring.physics import lanczos
 
-    ends = np.concatenate([nodes, controllers]).astype(np.float64)[springs]
+    ends = np.concatenate([nodes, controllers]).astype(np.float64)[springs.reshape(-1, 2)]
     offset = ends[:, 1] - ends[:, 0]
     direction = offset / np.maximum(np.linalg.norm(offset, axis=1, keepdims=True), 1e-12)
-    count = len(nodes)
-    # Row e of the incidence matrix maps node velocities to the rate of change of spring e's length; K = B^T diag(k) B.
-    columns, values, rows = [], [], []
-    for end, sign in ((0, -1.0), (1, 1.0)):
-        e = np.flatnonzero(springs[:, end] < count)
-        rows.append(np.repeat(e, 3))
-        columns.append((springs[e, end, None] * 3 + np.arange(3)).ravel())
-        scale = 1 / np.sqrt(mass.astype(np.float64)[springs[e, end], None]) if len(mass) else 1.0
-        values.append(sign * (direction[e] * scale).ravel())
-    shape = (len(springs), 3 * count)
-    incidence = coo_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape).tocsr()
-    transpose = incidence.T.tocsr()
-
-    def largest(weights: np.ndarray) -> tuple[float, int]:
-
-        if not weights.any():
-            return 0.0, 0
-        operator = LinearOperator((3 * count, 3 * count), matvec=lambda u: transpose @ (weights * (incidence @ u)))  # type: ignore[call-arg]
-        start = np.random.default_rng(0).standard_normal(3 * count)
-        try:
-            value, vector = eigsh(operator, k=1, which="LA", tol=1e-3, v0=start, maxiter=2000, rng=np.random.default_rng(0))
-        except ArpackNoConvergence:
-            bound = gershgorin(springs, count, weights, weights, mass)
-            return bound.stiffness, bound.node
-        return float(value[0]), int(np.argmax(np.linalg.norm(vector[:, 0].reshape(-1, 3), axis=1)))
-
-    (k, node), (c, _) = largest(stiffness), largest(damping)
-    return Spectrum(k, c, node)
+    scale = np.append(1 / np.sqrt(mass.astype(np.float64)) if len(mass) else np.ones(len(nodes)), np.zeros(len(controllers)))
+    k, c = lanczos.largest(springs, direction, scale, (stiffness, damping), TOLERANCE)
+    if k is None or c is None:
+        return gershgorin(springs, len(nodes), stiffness, damping, mass)
+    return Spectrum(k[0], c[0], k[1])
 
 
 def twin_spectrum(twin: Twin) -> Spectrum:

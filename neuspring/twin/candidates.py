@@ -214,16 +214,17 @@ def still_cost(recordings: Sequence[Recording]) -> float:
 
 
 def groups(twins: Sequence[Twin], device: str, together: int, threads: int) -> list[list[int]]:
-    """Candidates that are simulated together, the slowest group first; see `SearchProblem.together`.
+    """Candidates that are simulated together, each group and the groups slowest first; see `SearchProblem.together`.
 
-    On a CPU lanes wait for their group's largest number of substeps, so alike ones are put together, and every thread has a group.
+    On a CPU lanes wait for slower ones, so alike ones are put together. Where every thread has one group they are dealt out, so
+    that all end at about the same time.
     """
-    if device != "cpu":
-        order, size = list(range(len(twins))), together or len(twins)
-    else:
-        order = sorted(range(len(twins)), key=lambda k: -twins[k].simulation.substeps)
-        size = min(together or LANE_WIDTHS[-1], LANE_WIDTHS[-1], -(-len(twins) // threads))
-    return [order[first : first + size] for first in range(0, len(twins), size)]
+    order, size = list(range(len(twins))), together or len(twins)
+    if device == "cpu":
+        order.sort(key=lambda k: -twins[k].simulation.substeps)
+        size = min(size, LANE_WIDTHS[-1], -(-len(twins) // threads))
+    count = -(-len(twins) // size)
+    return [order[k::count] if count <= threads else order[k * size : (k + 1) * size] for k in range(count)]
 
 
 def made(problem: SearchProblem, normalized: np.ndarray, push: bool = False) -> tuple[dict[str, Any], tuple[Twin, ...]]:

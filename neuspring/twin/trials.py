@@ -18,7 +18,7 @@ import warp as wp
 from neuspring.core.artifacts import Twin
 from neuspring.core.device import load
 from neuspring.physics.lanes import lanes
-from neuspring.physics.solver import FrameSolver, solver_for
+from neuspring.physics.solver import FrameSolver, narrowing_solver, solver_for
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.rollout import FAR_AWAY
 
@@ -44,7 +44,7 @@ def outcomes(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor,
 
     hands are the controllers' positions [T, C, 3], or `controllers.waypoints` of them.
     """
-    solver = solver_for(twins, device, differentiable=False)
+    solver = narrowing_solver(twins, device)
     sums = LossSums(solver, loss, velocity)
     for frame in _frames(solver, twins, hands, velocity):
         sums.add(frame)

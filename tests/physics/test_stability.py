@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.sparse.linalg import eigsh
 
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
@@ -158,6 +159,26 @@ def test_a_prediction_keeps_the_sign_of_a_damped_mode(load: float) -> None:
 def test_a_prediction_leaves_bodies_that_cannot_meet_themselves() -> None:
     twin = random_twin(0, substeps=3, frame_time=1e-3)
     assert stability.for_prediction(twin) is twin
+
+
+def test_a_spectrum_that_does_not_converge_is_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stability, "TOLERANCE", -1.0)
+    twin = random_twin(0)
+    t, m = twin.topology, twin.material
+    bound = stability.gershgorin(
+        t.springs, len(t.nodes), m.stiffness.astype(np.float64) / t.rest_lengths, m.dashpot.astype(np.float64)
+    )
+    assert stability.twin_spectrum(twin) == bound
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_spectrum_is_arpack_s(seed: int) -> None:
+    """Not only near it: the number of substeps of a candidate hangs on its last digits."""
+    twin = random_twin(seed)
+    for matrix, value in zip(matrices(twin), vars(stability.twin_spectrum(twin)).values(), strict=False):
+        start = np.random.default_rng(0).standard_normal(len(matrix))
+        wanted = eigsh(matrix, k=1, which="LA", tol=stability.TOLERANCE, v0=start, return_eigenvectors=False)
+        assert value == pytest.approx(wanted[0], rel=1e-12)
 
 
 def test_masses_change_the_spectrum() -> None:

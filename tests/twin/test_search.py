@@ -629,8 +629,13 @@ def test_groups_are_a_partition_by_substeps_with_one_for_each_thread(substeps, t
     order = [k for members in made for k in members]
     assert sorted(order) == list(range(len(substeps)))
     assert all(1 <= len(members) <= min(together or LANE_WIDTHS[-1], LANE_WIDTHS[-1]) for members in made)
-    # Those with the most substeps begin.
-    assert [substeps[k] for k in order] == sorted(substeps, reverse=True)
+    # Those with the most substeps begin, in every group and among groups.
+    for slowest in ([substeps[k] for k in members] for members in (*made, [members[0] for members in made])):
+        assert slowest == sorted(slowest, reverse=True)
+    if len(made) > threads:
+        assert [substeps[k] for k in order] == sorted(substeps, reverse=True)
+    else:
+        assert max(map(len, made)) - min(map(len, made)) <= 1
     assert len(made) >= len(substeps) // -(-len(substeps) // threads)
 
 

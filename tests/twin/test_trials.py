@@ -13,12 +13,13 @@ from hypothesis import strategies as st
 
 from neuspring import config
 from neuspring.core.artifacts import Observations, Topology, Twin
+from neuspring.physics.controllers import waypoints
 from neuspring.physics.parameters import packed
-from neuspring.physics.solver import solver_for, stacked, union
+from neuspring.physics.solver import FrameSolver, narrowing_solver, solver_for, stacked, union
 from neuspring.twin.candidates import SearchProblem, candidate
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.rollout import FAR_AWAY, Diverged, frames
-from neuspring.twin.trials import LossSums, Outcome
+from neuspring.twin.trials import LossSums, Outcome, outcomes
 from tests.support import small
 
 FLOAT32_SUMS = 1e-5
@@ -88,6 +89,24 @@ def test_candidates_fare_together_as_alone(count, crowded):
     together = small.judge(problem, twins, loss)
     assert together == alone(problem, twins, loss)
     assert len({outcome.cost for outcome in together}) == min(count, 6)
+
+
+@pytest.mark.parametrize("crowded", [False, True], ids=["free", "self-collision"])
+def test_slow_candidates_end_their_frames_in_fewer_lanes_as_alone(crowded):
+    """In eight lanes, then in four, then in one; a hand lets go and takes hold again."""
+    problem = colliding(small.observations()) if crowded else small.search_problem()
+    hands, loss = hands_of(problem), loss_of(problem)
+    holds = np.ones(hands.shape[:2], dtype=bool)
+    holds[1:3, 0] = False
+    twins = sorted(candidates(problem), key=lambda twin: -twin.simulation.substeps)
+    assert [part.buffers.width for part in parts_of(narrowing_solver(twins, "cpu"))] == [8, 4, 1]
+    given = waypoints(hands, holds), problem.recordings[0].velocity, loss, "cpu"
+    assert outcomes(twins, *given) == [outcomes([twin], *given)[0] for twin in twins]
+
+
+def parts_of(solver: FrameSolver | None) -> list[FrameSolver]:
+    """A solver and the narrower ones behind it."""
+    return [solver, *parts_of(solver.narrower)] if solver else []
 
 
 def test_the_crowded_candidates_do_collide():
