@@ -48,7 +48,7 @@ class Registry(Mapping[str, T], Generic[T]):
             found[point.name] = point
         return dict(sorted(found.items()))
 
-    @property
+    @functools.cached_property
     def left_out(self) -> set[str]:
         """Names that our own extensions would bring, whose folders were removed."""
         return {point.name for point in entry_points(group=f"{OURS}.{self.kind}") if _left_out(point)}

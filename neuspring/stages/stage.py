@@ -220,12 +220,12 @@ class Stage:
         """Its products and inputs, in a line."""
         return (inspect.getdoc(self.function) or "").partition("\n")[0].partition(": ")[0].rstrip(".")
 
-    @property
+    @functools.cached_property
     def product(self) -> str:
         """The name under which later stages take what it writes."""
         return Path(self.output).stem
 
-    @property
+    @functools.cached_property
     def wildcards(self) -> tuple[str, ...]:
         """Names that tell its jobs apart."""
         return tuple(re.findall(r"{(\w+)}", self.output))
@@ -270,7 +270,7 @@ class Stage:
         """Parameters beside files and settings."""
         return {n: p for n, p in self.parameters.items() if not p.is_input and n not in (*PLACES, "output")}
 
-    @property
+    @functools.cached_property
     def places(self) -> tuple[str, ...]:
         """Those of `PLACES` that it takes."""
         return tuple(name for name in PLACES if name in self.parameters)

@@ -19,22 +19,28 @@ import numpy as np
 import torch
 
 from neuspring.core.artifacts import Twin
-from tests.benchmarks.crowds import by_batch, by_topologies, of_search, softer
+from neuspring.twin.fit import fit
+from neuspring.twin.search import search
+from tests.benchmarks.crowds import GENERATION, by_batch, by_topologies, of_search, softer
 from tests.benchmarks.memory import growth
 from tests.benchmarks.ours import Ours, reference_frame
+from tests.benchmarks.plush import observations, problem
 from tests.benchmarks.rows import KINDS, Bench, Entry, agree, frame_of, timed
 from tests.benchmarks.scenes import CASES, box, sheet, shortened
 from tests.benchmarks.simulators import Simulator, Times, distances
 from tests.benchmarks.table import Row
+from tests.benchmarks.tracking import by_runs
+from tests.support import small
 
 TOGETHER = 16
 """Twins of one call in the first section: the lanes of a vector."""
 EVERY_MULTIPROCESSOR = 132
 """Twins of one call that fill an H100 or H200 with blocks."""
-TALKING = """import sys
+TALKING = """import logging, sys
 from neuspring.cli.main import main
 from neuspring.core import device
-device.quiet = lambda: None
+device.start_warp()
+device.wp.config.log_level = logging.INFO
 sys.exit(main())"""
 """The program whose Warp says which modules it compiled and which it found."""
 
@@ -139,7 +145,39 @@ def memory(bench: Bench) -> list[Row]:
     first, second = f"gradient of {count} frames", f"gradient of {count} frames, every substep kept"
     common: dict[str, Any] = {"section": "memory", "device": bench.device, "nodes": nodes, "springs": springs, "substeps": substeps}
     rows = [Row(name=name, median=rise, least=rise, unit="MiB", **common) for name, rise in ((first, between), (second, every))]
-    return [rows[0], replace(rows[1], ratio=every / between, reference=first)] if between > 0 else rows
+    rows = [rows[0], replace(rows[1], ratio=every / between, reference=first)] if between > 0 else rows
+    for name, run in () if bench.quick else WORKS.items():
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+            rise, nodes = process.submit(run, bench.device).result()
+        rows.append(Row(section="memory", name=name, device=bench.device, nodes=nodes, median=rise, least=rise, unit="MiB"))
+    return rows
+
+
+def memory_of_search(device: str) -> tuple[float, int]:
+    """MiB by which memory rises during a search of the plush, and its nodes."""
+    case = problem(4 * GENERATION, device)
+    return growth(lambda: search(case, 0), device), len(case.labels)
+
+
+def memory_of_fit(device: str) -> tuple[float, int]:
+    """The same of a fit of the plush, three epochs."""
+    case = small.fit_problem(observations(), device=device)
+    return growth(lambda: fit(case), device), len(case.twin.topology.nodes)
+
+
+def memory_of_cloths(device: str) -> tuple[float, int]:
+    """The same of a frame and its gradient of TOGETHER cloths of full size with self-collision."""
+    twin, hands = sheet(8_600, 67)
+    ours, twins = Ours(device), softer(twin, TOGETHER)
+    return growth(lambda: ours.together(twins, hands, gradient=True).run(), device), len(twin.topology.nodes)
+
+
+WORKS = {
+    "search of a plush": memory_of_search,
+    "fit of a plush": memory_of_fit,
+    f"gradient of a frame of {TOGETHER} cloths": memory_of_cloths,
+}
+"""Work whose memory is measured, each in a process of its own."""
 
 
 def rises(device: str, count: int) -> tuple[float, float]:
@@ -161,7 +199,7 @@ def rises(device: str, count: int) -> tuple[float, float]:
 
 
 def start(bench: Bench) -> list[Row]:
-    """A rollout of a tiny scene from start to end, whose own work is negligible: alone, and 16 at once with an empty kernel cache.
+    """A rollout of a tiny scene from start to end, whose own work is negligible: alone, and 16 at once, first without kernels.
 
     On the CPU alone.
     """
@@ -178,10 +216,11 @@ def start(bench: Bench) -> list[Row]:
             times.append(time.perf_counter() - begin)
         found = {"a job alone": Times(tuple(times))}
         if not bench.quick:
-            seconds, text = _crowd(folder, command, 16)
-            found["16 jobs at once, no kernels yet"] = Times((seconds,))
-            counts = f"{text.count('(compiled)')} kernels compiled, {text.count('(cached)')} found in the cache"
-            bench.notes.append(f"16 jobs at once: {counts}")
+            for name in ("16 jobs at once, no kernels yet", "16 jobs at once"):
+                seconds, text = _crowd(folder, command, 16)
+                found[name] = Times((seconds,))
+                counts = f"{text.count('(compiled)')} kernels compiled, {text.count('(cached)')} found in the cache"
+                bench.notes.append(f"{name}: {counts}")
     more = {"device": "cpu", "unit": "s"}
     return [Row(section="start", name=name, median=its.median, least=its.least, **more) for name, its in found.items()]
 
@@ -225,6 +264,7 @@ SECTIONS: dict[str, Callable[[Bench], list[Row]]] = {
     "collision": by_contacts,
     "memory": memory,
     "start": start,
+    "tracking": by_runs,
 }
 ON_CUDA = ("frame", "batch", "topologies", "search", "collision")
 """Sections of a run on CUDA, which is to end within two minutes; the others on demand."""

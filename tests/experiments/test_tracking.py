@@ -86,6 +86,9 @@ def test_the_page_opens_with_scores_as_columns_and_says_what_is_missing(results:
     assert place == f"#/experiments/{experiment}/runs?viewStateShareKey=scores"
     view = json.loads(client.get_experiment(experiment).tags["mlflow.sharedViewState.scores"])
     assert "metrics.`future.chamfer`" in view["selectedColumns"]
+    with contextlib.closing(sqlite3.connect(results / "mlflow.db")) as connection:
+        counted = {table for (table,) in connection.execute("SELECT tbl FROM sqlite_stat1")}
+    assert {"runs", "latest_metrics"} <= counted, "SQLite plans with statistics"
     for missing in ("mlartifacts", "mlflow.db"):
         (results / missing).rename(tmp_path / missing)
         with pytest.raises(InputError, match=r"must hold mlflow\.db and mlartifacts.* delete mlflow\.db and run `neuspring sync"):
