@@ -2,6 +2,8 @@
 
 import ast
 import shutil
+import sys
+from importlib.util import cache_from_source
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -29,7 +31,7 @@ def copy(tmp_path, monkeypatch):
 
 
 def clear():
-    cached = (provenance._source, provenance._tree, provenance.imported_modules, provenance._module_code, provenance.code_digest)
+    cached = (provenance._source, provenance._code, provenance.imported_modules, provenance._module_code, provenance.code_digest)
     for function in cached:
         function.cache_clear()
 
@@ -131,3 +133,20 @@ def test_modules_of_other_packages_count_with_what_they_import_of_their_own(tmp_
     assert digest("elsewhere.model") == before
     edit(package / "rates.py", "1.0", "2.0")
     assert digest("elsewhere.model") != before
+
+
+def test_what_is_taken_from_a_module_is_kept_beside_its_bytecode_and_holds_for_its_text_alone(copy, monkeypatch):
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    monkeypatch.setattr(sys, "pycache_prefix", None)
+    before, path = digest("neuspring.twin.fit"), copy / "twin" / "fit.py"
+    kept = Path(cache_from_source(str(path))).with_suffix(".json")
+    assert digest("neuspring.twin.fit") == before
+    monkeypatch.setattr(provenance, "_tree", lambda text: pytest.fail("read again"))
+    assert digest("neuspring.twin.fit") == before
+    monkeypatch.undo()
+    monkeypatch.setattr(provenance, "PACKAGE_FOLDER", copy)
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    kept.write_text(kept.read_text()[:-5])
+    assert digest("neuspring.twin.fit") == before
+    edit(path, "MAX_ROLLBACKS = 5", "MAX_ROLLBACKS = 6")
+    assert digest("neuspring.twin.fit") != before
