@@ -33,7 +33,7 @@ DECLARATIONS = tuple(
 
 
 FORMAT = b"1"
-"""Of what is kept of a module; another one where `_written` or `_names` change."""
+"""Version of what is kept of a module; another one where `_written` or `_names` change."""
 
 
 def _root(package: str) -> Path | None:

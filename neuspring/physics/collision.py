@@ -30,7 +30,7 @@ MOST_APART = 0.5
 """Twins of a group do not share a search if nodes are farther than this many contact distances from those of the first one, but for
 a shift of the whole body. At 0.5 a node's neighborhood holds eight times as many."""
 MARGIN = 1e-3
-"""Of the contact distance, for rounding."""
+"""Part of the contact distance that is added, for rounding."""
 
 
 def allocate(b: Buffers) -> None:

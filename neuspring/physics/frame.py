@@ -23,7 +23,7 @@ from neuspring.physics.lanes import lanes
 #endif
 """)
 def wait_for_all() -> None:
-    """What the threads of a block have written is there for all of them; on a CPU a block has one thread."""
+    """Wait until all threads of a block have written what they write; on a CPU a block has one."""
     ...
 
 
