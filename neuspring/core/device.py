@@ -13,6 +13,7 @@ import os
 import re
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,8 @@ from neuspring.core.errors import InputError
 
 DEVICES = re.compile(r"auto|cpu|cuda(:\d+)?")
 _loaded: set[tuple[int, str]] = set()
+# Warp makes the code of one module at a time in a process; fits that share launches are threads.
+_loading = threading.Lock()
 
 
 @functools.cache
@@ -99,7 +102,7 @@ def load(kernel: Any, device: Any) -> Any:
         folder = Path(wp.config.kernel_cache_dir)
         folder.mkdir(parents=True, exist_ok=True)
         name = hashlib.sha256(f"{kernel.module.name} {kernel.key}".encode()).hexdigest()[:16]
-        with FileLock(folder / f"{name}.lock"):
+        with _loading, FileLock(folder / f"{name}.lock"):
             wp.load_module(kernel.module, device=device)
         # Kernels live as long as the process: each module caches its own.
         _loaded.add(key)
