@@ -167,7 +167,10 @@ def compared_with_records(stage):
         if stage.together and workflow.is_main_process:
             # Launches are shared again if some job that takes part is to be done, and in no other case.
             member = STAGES[stage.together.stage]
-            if any(unfinished(member, one) for one in GRAPH.in_step(stage, wildcards.scenario)):
+            if any(
+                unfinished(member, one)
+                for one in GRAPH.in_step(stage, wildcards.scenario)
+            ):
                 workflow.dag.forcefiles.add(output)
         return find(wildcards)
 
