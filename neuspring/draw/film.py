@@ -72,7 +72,7 @@ def write_film(
             films = [film_pictures(each, painter.frames[::every], across) for each in (painter, *beside)]
             pictures = [_beside(each) for each in zip(*films, strict=True)]
             if gif:
-                _write_gif(made, pictures, rate / every)
+                write_gif(made, pictures, rate / every)
             else:
                 with Video(made, rate / every, FILM_QUALITY) as video:
                     for picture in pictures:
@@ -168,7 +168,7 @@ def _tell(painter: Painter, clock: Axes, frame: int) -> None:
     clock.spines[:].set_visible(False)
 
 
-def _write_gif(path: Path, pictures: Sequence[np.ndarray], rate: float) -> None:
+def write_gif(path: Path, pictures: Sequence[np.ndarray], rate: float) -> None:
     """A GIF that begins again for ever. Its times are whole hundredths of a second; they add up to those of the film."""
     # One palette for all frames: colors that change from frame to frame flicker, and pixels that stay need no bytes.
     palette = Image.fromarray(np.vstack(spread(pictures, PALETTE_FRAMES))).quantize(GIF_COLORS, method=Image.Quantize.MAXCOVERAGE)
