@@ -1,7 +1,7 @@
 """Pictures of the playground for its page: `python -m results.published.play.make RESULTS/SCENARIO OUTPUT [--pulled GIF]`.
 
 A headless Chromium opens the page as a user does. The scenario should be synthetic, with splats, and have runs of `neuspring` and
-`baseline`; pictures of real footage are not for this repository. With --pulled a film of a twin that the mouse pulls is made instead.
+`baseline`; pictures of real footage are not for this repository. With --pulled a film of a twin that is pulled is made.
 """
 
 from __future__ import annotations
