@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 
 from neuspring.core.files import write_atomically
-from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.data.capture import HANDS, OBJECT, PERSON, Capture
 
 T = TypeVar("T")
 Color: TypeAlias = tuple[int, int, int]
 """RGB."""
-TINTS = {OBJECT: (40, 220, 60), HANDS: (70, 110, 255)}
-"""RGB of labels in pictures of masks: green and blue, where the picture has other colors."""
+TINTS = {OBJECT: (40, 220, 60), HANDS: (70, 110, 255), PERSON: (150, 150, 150)}
+"""RGB of labels in pictures of masks: green, blue and gray, where the picture has other colors."""
 OTHERS = ((255, 140, 0), (240, 50, 220), (250, 230, 30))
 """Tints in their place."""
 CLEAR, TINT_AROUND = 20.0, 15

@@ -131,7 +131,7 @@ def _shots(
     for name, camera in capture.cameras.items():
         labels = masks[name].labels[0]
         margin = HAND_MARGIN * camera.width / REFERENCE_WIDTH
-        seen = (capture.color(name, 0), labels == OBJECT, labels == HANDS, depths.get(name, capture.depth(name, 0)))
+        seen = (capture.color(name, 0), labels == OBJECT, labels >= HANDS, depths.get(name, capture.depth(name, 0)))
         if (shot := Shot.of(name, view_of(camera, images, device), *seen, margin)) is None:
             print(f"camera {name}: the object is not in view in frame 0; it does not train the appearance", flush=True)
         else:

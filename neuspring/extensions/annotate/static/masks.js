@@ -10,7 +10,7 @@ import { row, swatch } from "./rows.js";
 
 const find = (id) => document.getElementById(id);
 const KINDS = { b: "box", c: "click", s: "scribble", p: "polygon" };
-const LABELS = { 1: "object", 2: "hand", 3: "ignore" };
+const LABELS = { 1: "object", 2: "hand", 3: "ignore", 4: "person", 5: "obstacle" };
 const HINTS = {
   box: "Drag a box around the {label}.",
   click: "Click on the {label}.",
@@ -98,7 +98,7 @@ export class MasksMode {
     this.refresh();
     this.preview = null;
     if (!sent) this.app.showMasks();
-    else if (find("live").checked && this.here().some((mark) => mark.label !== "ignore")) this.showPreview(false);
+    else if (find("live").checked && this.here().some((mark) => ["object", "hand"].includes(mark.label))) this.showPreview(false);
     else this.app.showMasks();
     if (sent) this.reread();
   }
@@ -268,7 +268,7 @@ export class MasksMode {
   }
 
   legend() {
-    return [[COLORS.object, "object"], [COLORS.hand, "hand"], [COLORS.ignore, "ignore"], [doubtColor(1), "doubt"]];
+    return [...Object.entries(COLORS).map(([label, color]) => [color, label]), [doubtColor(1), "doubt"]];
   }
 
   key(event) {
