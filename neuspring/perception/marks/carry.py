@@ -21,7 +21,7 @@ import numpy as np
 from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, NOTHING, OBJECT, PERSON, Capture
-from neuspring.data.frames import frames_of, heights, overlap, spread
+from neuspring.data.frames import frames_of, heights, overlap, spread, without_islands
 from neuspring.perception.marks.colors import (
     DIFFERENT,
     Background,
@@ -211,7 +211,7 @@ def over_capture(
     view = capture.cameras[camera]
     labels, doubt = np.zeros((capture.frame_count, view.height, view.width), np.uint8), np.zeros(capture.frame_count)
     labels[film.frames], doubt[film.frames] = carried.labels, carried.doubt
-    return Carried(labels, doubt)
+    return Carried(without_islands(capture, camera, labels), doubt)
 
 
 class _Work:
