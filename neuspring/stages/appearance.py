@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from neuspring.data.results import Masks, ShapePrior
     from neuspring.splats.losses import Shot
 
-BESIDE_HANDS, SAME_SURFACE = 12, 0.02
-"""Side of the square, pixels in an image of `losses.REFERENCE_WIDTH`, by which hands are dilated: points within have their colors,
-since the borders of masks are off by pixels. And m by which the depth of a pixel may differ from a point that it shows."""
+BESIDE_HANDS, SAME_SURFACE = 6, 0.02
+"""Pixels beside hands in an image of `losses.REFERENCE_WIDTH` whose points may have a hand's color, since the borders of masks are
+off by pixels; and m by which the depth of a pixel may differ from a point that it shows."""
 NEAR_SEEN = 1.5
 """Widths of a pixel: points of the shape prior this near to a seen one add nothing."""
 
@@ -134,7 +134,7 @@ def beside_hands(capture: Capture, masks: Mapping[str, Masks], points: np.ndarra
 
     found = np.zeros(len(points), bool)
     for name, camera in capture.cameras.items():
-        side = max(round(BESIDE_HANDS * camera.width / REFERENCE_WIDTH), 3)
+        side = 2 * max(round(BESIDE_HANDS * camera.width / REFERENCE_WIDTH), 1) + 1
         near = cv2.dilate((masks[name].labels[0] >= HANDS).astype(np.uint8), np.ones((side, side), np.uint8)) > 0
         pixels, distance = camera.project(points.astype(float))
         shown = camera.sees(pixels) & (distance > 0)

@@ -175,8 +175,8 @@ class Seeds:
         prior = np.zeros((kinds, *size), np.float32)
         for label in (OBJECT, HANDS):
             own = [mark for mark in marks if mark.value == label]
-            areas = [_drawn(mark, size, scale, grown=1) for mark in own if mark.kind in ("box", "polygon")]
-            lines = [_drawn(mark, size, scale) for mark in own if mark.kind in ("click", "scribble")]
+            areas = [drawn(mark, size, scale, grown=1) for mark in own if mark.kind in ("box", "polygon")]
+            lines = [drawn(mark, size, scale) for mark in own if mark.kind in ("click", "scribble")]
             if not own:
                 possible[label] = carried
             elif areas and all((line & np.any(areas, axis=0)).any() for line in lines):
@@ -187,7 +187,7 @@ class Seeds:
                 prior[label] = np.maximum(-far / (ODDS_FALL * max(size)), -MOST_ODDS)
             for mark in own:
                 if mark.kind == "polygon":
-                    inside = _drawn(mark, size, scale, grown=0)
+                    inside = drawn(mark, size, scale, grown=0)
                     away = [cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, 5) for part in (inside, ~inside)]
                     slope = (away[0] - away[1]) / max(POLYGON_SLOPE * mark.radius * scale, 0.5)
                     prior[label] = np.maximum(prior[label], np.clip(slope, -MOST_ODDS, MOST_ODDS) * (possible[label]))
@@ -195,7 +195,7 @@ class Seeds:
             for mark in sorted(marks, key=lambda mark: (OBJECT, HANDS, PERSON, NOTHING).index(mark.value)):
                 # A box of a label says where it can be, not where it is.
                 if mark.kind in shapes and (mark.kind != "box" or mark.label in FILLED_MARKS):
-                    certain[_drawn(mark, size, scale)] = mark.value
+                    certain[drawn(mark, size, scale)] = mark.value
         known = certain != UNMARKED_PIXEL
         possible[:, known] = False
         for label in range(kinds):
@@ -212,7 +212,7 @@ class Seeds:
         return Seeds(self.certain[window], self.possible[(slice(None), *window)], self.prior[(slice(None), *window)])
 
 
-def _drawn(mark: Mark, size: tuple[int, int], scale: float, *, grown: int = -1) -> np.ndarray:
+def drawn(mark: Mark, size: tuple[int, int], scale: float, *, grown: int = -1) -> np.ndarray:
     """The pixels [H, W] bool that a mark covers: a polygon without its uncertain border (-1), as it is (0), or grown by it (1)."""
     image: np.ndarray = np.zeros(size, np.uint8)
     # Pixel centers lie at whole coordinates, so the image begins at -0.5.

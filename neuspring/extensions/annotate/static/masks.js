@@ -45,6 +45,7 @@ export class MasksMode {
     find("carry-all").onclick = guard(() => this.carry(app.cameras().filter((name) => this.marksOf(name).length)));
     find("stop").onclick = guard(() => post("/api/stop"));
     find("save-masks").onclick = guard(() => this.save());
+    find("measure").onclick = guard(() => this.measure());
     this.setLabel("object");
     this.setTool("box");
     this.setRadius(3);
@@ -181,6 +182,11 @@ export class MasksMode {
     say(`Saved masks of camera ${cameras.join(", ")}.`, "good");
   }
 
+  async measure() {
+    await this.edits.sending;
+    say((await post("/api/obstacles")).text, "good");
+  }
+
   // The panel.
   setLabel(label) {
     this.label = label;
@@ -225,6 +231,7 @@ export class MasksMode {
       app.chip(frame, `${frame} · ${Math.round(100 * doubt)} %`, doubt > HIGH ? "high" : "mid")));
     find("doubtful").dataset.empty = this.doubt().length ? "none: all frames are sure" : "known once masks are carried";
     const unsaved = Object.keys(results.carried).filter((name) => !results.carried[name].saved);
+    find("measure").disabled = !Object.values(this.edits.value?.cameras ?? {}).flat().some((mark) => mark.label === "obstacle");
     find("save-masks").disabled = running || !unsaved.length;
     const list = (names) => names.join(", ");
     find("masks-note").textContent =
