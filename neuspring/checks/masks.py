@@ -216,7 +216,7 @@ class Motion:
     @cached_property
     def stirred(self) -> bool:
         """True where the picture is another where the object was in frame 0 and no hand is, or where it seems to be since."""
-        own = self.since & self.begin & ~grown((self.labels >= HANDS).any(axis=0), MASK_RIM)
+        own = self.since & self.begin & ~grown(np.any(self.labels >= HANDS, axis=0), MASK_RIM)
         return bool(own.sum() + self.newly[1] > STIRRED * max(self.begin.sum(), 1))
 
 

@@ -384,7 +384,9 @@ class _Work:
     def colors(self) -> tuple[np.ndarray, ...]:
         """Colors of each label in all marked frames so far, and of the person in all of them."""
         counts = [mixed([(1.0, own.counts[label]) for own in self.starts.values()]) for label in range(self.kinds)]
-        return (*counts[:PERSON], *(mixed([(1.0, part), (1.0, self.person)]) for part in counts[PERSON:]))
+        if self.person is not None:
+            counts[PERSON] = mixed([(1.0, counts[PERSON]), (1.0, self.person)])
+        return tuple(counts)
 
     def tick(self) -> None:
         """Tell the progress: the first pass solves all frames but its start, the second one all that are not marked."""
