@@ -202,7 +202,7 @@ class Motion:
         """
         now, first = self.labels[0], self.labels[2]
         new = cv2.morphologyEx((self.since & ~self.shaded).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
-        new &= ~grown((first > 0) | (now == HANDS), MASK_RIM)
+        new &= ~grown((first > 0) | (now >= HANDS), MASK_RIM)
         around = grown((first == OBJECT) | (now == OBJECT), 2 * MASK_RIM)
         pieces = cv2.connectedComponents((new | around).astype(np.uint8))[1]
         new &= np.isin(pieces, np.unique(pieces[around]))
@@ -216,7 +216,7 @@ class Motion:
     @cached_property
     def stirred(self) -> bool:
         """True where the picture is another where the object was in frame 0 and no hand is, or where it seems to be since."""
-        own = self.since & self.begin & ~grown((self.labels == HANDS).any(axis=0), MASK_RIM)
+        own = self.since & self.begin & ~grown(np.any(self.labels >= HANDS, axis=0), MASK_RIM)
         return bool(own.sum() + self.newly[1] > STIRRED * max(self.begin.sum(), 1))
 
 

@@ -4,7 +4,7 @@
     color/<camera>/<frame>.png         8-bit RGB
     depth/<camera>/<frame>.png | .npy  uint16 in units of `depth_unit` m (png, npy) or float meters (npy); along the optical axis,
                                        0: none; not there with `depth: none`
-    mask/<camera>/<frame>.png          optional: 8-bit, 0 nothing, 1 object, 2 hands
+    mask/<camera>/<frame>.png          optional: 8-bit, 0 nothing, 1 object, 2 hands, 3 person
     tracks.json                        optional: [K][T] of [x, y, z] m in the world, or null where not annotated; see `tracks`
     controllers.npz|csv, nodes.npz|ply optional: hands in all frames and the body of frame 0, m in the world (points.py)
     points.json                        optional, for scoring alone: {camera: [K][T] of [x, y] pixels, or null where not marked}
@@ -47,7 +47,7 @@ CAPTURE, TRACKS, POINTS = "capture.json", "tracks.json", "points.json"
 CONTROLLERS, NODES = ("controllers.npz", "controllers.csv"), ("nodes.npz", "nodes.ply")
 RECIPE = ".make-capture.json"
 """Recipe of a folder that make-capture has not finished. It is removed at the end."""
-NOTHING, OBJECT, HANDS = 0, 1, 2
+NOTHING, OBJECT, HANDS, PERSON = 0, 1, 2, 3
 """Labels of masks."""
 FEWEST_FRAMES = 5
 """Frames of a capture."""
@@ -187,7 +187,7 @@ class Capture:
         return values * self.description.depth_unit
 
     def mask(self, camera: str, frame: int) -> np.ndarray:
-        """Labels [H, W] uint8: 0 nothing, 1 object, 2 hands. Raises InputError."""
+        """Labels [H, W] uint8: 0 nothing, 1 object, 2 hands, 3 person. Raises InputError."""
         return read_labels(self.path("mask", camera, frame), self.cameras[camera], self._absent(camera))
 
     def _image(self, what: Literal["color", "depth"], camera: str, frame: int, flag: int) -> np.ndarray:
@@ -270,7 +270,7 @@ class Writer:
             shutil.copyfile(source, path)
 
     def mask(self, camera: str, frame: int, labels: np.ndarray) -> None:
-        """Labels uint8 [H, W]: 0 nothing, 1 object, 2 hands."""
+        """Labels uint8 [H, W]: 0 nothing, 1 object, 2 hands, 3 person."""
         write_image(self.capture.path("mask", camera, frame), labels)
 
     def finish(
@@ -409,7 +409,7 @@ def read_labels(path: Path, camera: Camera | None = None, remedy: str = "", *, b
     found = set(np.unique(labels).tolist())
     if found <= {0, 255} or binary:
         labels = labels > 0
-    elif max(found) > HANDS:
+    elif max(found) > PERSON:
         next_move = "Of two folders, of the object and of hands, `neuspring mask --masks FOLDER --hands FOLDER` makes masks."
-        raise InputError(path, "labels must be 0 (nothing), 1 (object) or 2 (hands)", f"label {max(found)}", next_move)
+        raise InputError(path, "labels must be 0 (nothing), 1 (object), 2 (hands) or 3 (person)", f"label {max(found)}", next_move)
     return labels.astype(np.uint8)

@@ -8,19 +8,24 @@ from typing import TypeAlias, TypeVar
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from neuspring.core.files import write_atomically
-from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.data.capture import HANDS, NOTHING, OBJECT, PERSON, Capture
 
 T = TypeVar("T")
 Color: TypeAlias = tuple[int, int, int]
 """RGB."""
-TINTS = {OBJECT: (40, 220, 60), HANDS: (70, 110, 255)}
-"""RGB of labels in pictures of masks: green and blue, where the picture has other colors."""
+TINTS = {OBJECT: (40, 220, 60), HANDS: (70, 110, 255), PERSON: (150, 150, 150)}
+"""RGB of labels in pictures of masks: green, blue and gray, where the picture has other colors."""
 OTHERS = ((255, 140, 0), (240, 50, 220), (250, 230, 30))
 """Tints in their place."""
 CLEAR, TINT_AROUND = 20.0, 15
 """Difference in a and b of Lab from which a tint is seen, and how far around a label it is compared, pixels."""
+
+ISLAND_SHARE, ISLAND_GAP, ISLAND_AWAY, CRACK = 0.05, 0.03, 0.04, 5
+"""Largest island of an object's mask, as part of its largest piece; how far from the rest it is at least, as part of the image's
+width and, where its depth was measured, in m; and pixels between labels over which they still touch."""
 
 
 def frames_of(capture: Capture, camera: str) -> list[int]:
@@ -55,6 +60,46 @@ def at_border(boxes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Pieces [n] bool, by the boxes [n, 5] of `cv2.connectedComponentsWithStats`, that reach the border of an image [H, W]."""
     left, top, width, height = boxes.T[:4]
     return np.asarray((left == 0) | (top == 0) | (left + width == shape[1]) | (top + height == shape[0]))
+
+
+def without_islands(capture: Capture, camera: str, labels: np.ndarray) -> np.ndarray:
+    """Labels [T, H, W] of a camera without islands of the object: small pieces, far from the rest of it; the log says which.
+
+    What touches the rest, or reaches it by hands or a person, is no island.
+    """
+    result, gone = labels.copy(), list[tuple[int, int]]()
+    for frame in frames_of(capture, camera):
+        count, pieces, boxes, _ = cv2.connectedComponentsWithStats((labels[frame] == OBJECT).astype(np.uint8))
+        if count <= 2:
+            continue
+        areas = boxes[:, cv2.CC_STAT_AREA] * (np.arange(count) > 0)
+        grown = cv2.dilate((labels[frame] != NOTHING).astype(np.uint8), np.ones((CRACK, CRACK), np.uint8))
+        touching = cv2.connectedComponents(grown)[1]
+        islands = [piece for piece in range(1, count) if areas[piece] <= ISLAND_SHARE * areas.max()]
+        rest = np.isin(touching, np.unique(touching[(pieces > 0) & ~np.isin(pieces, islands)]))
+        while near := [piece for piece in islands if not _is_apart(capture, camera, frame, pieces == piece, rest & (pieces > 0))]:
+            islands = [piece for piece in islands if piece not in near]
+            rest |= np.isin(pieces, near)
+        result[frame][np.isin(pieces, islands)] = NOTHING
+        gone += [(frame, int(areas[piece])) for piece in islands]
+    if gone:
+        where = f"{len(gone)} in frames {gone[0][0]} to {gone[-1][0]}, the largest of {max(area for _, area in gone)} pixels"
+        print(f"camera {camera}: small pieces of the object's mask, far from the rest of it, went: {where}", flush=True)
+    return result
+
+
+def _is_apart(capture: Capture, camera: str, frame: int, piece: np.ndarray, rest: np.ndarray) -> bool:
+    """True where a piece [H, W] bool is far from the rest in the image and, where both have depth, in space."""
+    away = cv2.distanceTransform((~rest).astype(np.uint8), cv2.DIST_L2, 5)
+    if away[piece].min() <= ISLAND_GAP * rest.shape[1]:
+        return False
+    view, there = capture.cameras[camera], capture.path("depth", camera, frame).exists()
+    depth = capture.depth(camera, frame) if there else np.zeros(rest.shape)
+    points = []
+    for part in (rest, piece):
+        y, x = np.nonzero(part & (depth > 0))
+        points.append(view.lift(np.stack([x, y], axis=1).astype(float), depth[y, x]))
+    return not all(map(len, points)) or float(cKDTree(points[0]).query(points[1])[0].min()) > ISLAND_AWAY
 
 
 def tints_of(image: np.ndarray, labels: np.ndarray) -> dict[int, Color]:

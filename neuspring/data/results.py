@@ -26,7 +26,7 @@ class Masks(_Result):
     """The pixels of one camera that show the object and the hands."""
 
     kind: ClassVar[str] = "masks"
-    labels: np.ndarray = array("T,H,W", np.uint8, "1", "0 nothing, 1 object, 2 hands; all 0 in frames that the camera missed")
+    labels: np.ndarray = array("T,H,W", np.uint8, "1", "0 nothing, 1 object, 2 hands, 3 person; 0 in frames that the camera missed")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -55,7 +55,7 @@ class Backend:
         import_module(self.module).require(capture)
 
     def segment(self, capture: Capture, camera: str, settings: Perception, device: str) -> np.ndarray:
-        """Labels [T, H, W] uint8 of one camera: 0 table, 1 object, 2 hands (`data.capture.OBJECT`, `HANDS`)."""
+        """Labels [T, H, W] uint8 of one camera: 0 table, 1 object, 2 hands, 3 person (`data.capture.OBJECT`, ...)."""
         own = (getattr(settings.segment, self.section),) if self.section else ()
         labels: np.ndarray = self._call("segment", (capture, camera, *own), device)
         return labels

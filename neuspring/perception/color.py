@@ -214,7 +214,7 @@ def beneath_hands(labels: np.ndarray, reach: float) -> np.ndarray:
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2)
     padded = np.pad((labels == OBJECT).astype(np.uint8), radius)
     closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc)[radius:-radius, radius:-radius] > 0
-    return np.asarray((labels == OBJECT) | (closed & (labels == HANDS)))
+    return np.asarray((labels == OBJECT) | (closed & (labels >= HANDS)))
 
 
 def lift_color(

@@ -86,7 +86,7 @@ def carry(
 
     def work(film: CameraFilm, own: list[Mark]) -> Carried:
         networks = models or load(settings, device, words=False)
-        frames = sorted({mark.frame for mark in own if mark.label != "ignore"})
+        frames = sorted({mark.frame for mark in own if mark.value in (OBJECT, HANDS)})
         starts = {frame: frame_mask(film, frame, own, MarksSegmentation()) for frame in frames}
         images = [film.color(index) for index in range(film.count)]
         labels = np.zeros((film.count, *images[0].shape[:2]), np.uint8)

@@ -38,7 +38,7 @@ from warp.geometry import IsoSurfaceMarchingCubes
 from neuspring.config.perception import ShapePriorSettings
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Camera
-from neuspring.data.capture import HANDS, OBJECT, THIN, Capture
+from neuspring.data.capture import HANDS, NOTHING, OBJECT, THIN, Capture
 from neuspring.data.results import Masks, ShapePrior
 from neuspring.perception.sample import on_surface
 from neuspring.perception.truth import surface
@@ -165,7 +165,7 @@ def one_sided(
 def _consistent(
     grid: np.ndarray, camera: Camera, labels: np.ndarray, depth: np.ndarray, end: np.ndarray | None, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Voxels [nx, ny, nz] bool that one camera admits, and those where it shows the object there, not a hand before it.
+    """Voxels [nx, ny, nz] bool that one camera admits, and those where it shows the object there, not a hand or a person before it.
 
     It admits nothing behind the object's `end` [H, W], m, if there is a guess of that.
     """
@@ -177,7 +177,7 @@ def _consistent(
     behind = (measured <= 0) | (distance[ahead] >= measured - tolerance)
     if end is not None:
         behind &= (label != OBJECT) | (distance[ahead] <= end[y, x])
-    admitted[ahead] = behind & ((label == OBJECT) | (label == HANDS))
+    admitted[ahead] = behind & (label != NOTHING)
     shows[ahead] = behind & (label == OBJECT)
     return admitted.reshape(grid.shape[:-1]), shows.reshape(grid.shape[:-1])
 
@@ -220,8 +220,7 @@ def back(labels: np.ndarray, seen: np.ndarray, focal: float, how: Literal["symme
         # Beyond the edge as at the edge, so that the median of a rim's pixel is one of the object.
         extended = front(np.ones_like(mask), np.where(mask, seen, 0.0), 0.0, np.inf)
         smooth = cv2.medianBlur(extended.astype(np.float32), 5).astype(float)
-        open_side = (labels != OBJECT) & (labels != HANDS)
-        rim = mask & _grown(open_side, MASK_BORDER) & ~_grown(labels == HANDS, MASK_BORDER + 1)
+        rim = mask & _grown(labels == NOTHING, MASK_BORDER) & ~_grown(labels >= HANDS, MASK_BORDER + 1)
         if not rim.any():
             rim = mask & _grown(~mask, MASK_BORDER)
         thickness = 2.0 * (_spanned(smooth + 0.5 * chord, rim, mask) - smooth)

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from neuspring.config.perception import PointTracking
-from neuspring.data.capture import NOTHING, Capture
+from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture
 from neuspring.data.frames import gray
 
 LEVELS = 3
@@ -74,7 +74,7 @@ def follow(capture: Capture, camera: str, labels: np.ndarray, start: np.ndarray,
     """
     own = _labels_at(labels[0], start)
     if (beside := own == NOTHING).any():
-        y, x = np.nonzero(labels[0])
+        y, x = np.nonzero(np.isin(labels[0], (OBJECT, HANDS)))
         own[beside] = labels[0][y, x][cKDTree(np.stack([x, y], axis=1)).query(start[beside])[1]]
     result = Followed.starting_at(start, capture.frame_count)
     pixels, visible = result.pixels, result.visible
@@ -100,7 +100,7 @@ def follow(capture: Capture, camera: str, labels: np.ndarray, start: np.ndarray,
 
 def choose(labels: np.ndarray, count: int, seed: int) -> np.ndarray:
     """At most `count` random pixels (x, y) [Q, 2] of object and hands."""
-    y, x = np.nonzero(labels)
+    y, x = np.nonzero(np.isin(labels, (OBJECT, HANDS)))
     pixels = np.stack([x, y], axis=1).astype(np.float32)
     if len(pixels) <= count:
         return pixels

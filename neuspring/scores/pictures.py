@@ -183,6 +183,6 @@ class Scored:
     def pair(self, name: str, frame: int, gaussians: Gaussians) -> Pair:
         """Observed and predicted picture of one camera in one frame."""
         labels = self.masks[name][frame] if self.masks else self.capture.mask(name, frame)
-        mask, hands = (np.where(labels == label, 255, 0).astype(np.uint8) for label in (OBJECT, HANDS))
+        mask, hands = (np.where(own, 255, 0).astype(np.uint8) for own in (labels == OBJECT, labels >= HANDS))
         rendered = picture(gaussians, self.views[name], self.backend)
         return Pair.of(self.capture.color(name, frame), rendered, mask, hands, self.covered)

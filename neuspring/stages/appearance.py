@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from neuspring.data.results import Masks, ShapePrior
     from neuspring.splats.losses import Shot
 
+BESIDE_HANDS, SAME_SURFACE = 6, 0.02
+"""Pixels beside hands in an image of `losses.REFERENCE_WIDTH` whose points may have a hand's color, since the borders of masks are
+off by pixels; and m by which the depth of a pixel may differ from a point that it shows."""
 NEAR_SEEN = 1.5
 """Widths of a pixel: points of the shape prior this near to a seen one add nothing."""
 
@@ -72,6 +75,11 @@ def appearance(
     shots = _shots(capture, masks_of, images, device, depths)
     width = float(np.nanmedian([shot.pixel_width for shot in shots]))
     surface = _surface(capture, masks_of, settings, seed, width, lifted, observations)
+    beside = beside_hands(capture, masks_of, surface.cloud)
+    # Where all lies at hands there is nothing else to begin with.
+    if 0 < beside.sum() < len(beside):
+        print(f"{beside.sum()} of {len(beside)} points beside hands become no splats", flush=True)
+        surface = replace(surface, cloud=surface.cloud[~beside], colors=surface.colors[~beside])
     _require_outside(capture, np.concatenate([surface.cloud, surface.prior]))
     start = images.appearance.start
     points, colors = surface.first(start)
@@ -87,6 +95,7 @@ def appearance(
     facts: dict[str, Any] = {
         "splats": len(trained.splats.means),
         "first_splats": trained.first,
+        "points_beside_hands": int(beside.sum()),
         "start": "seen: no shape prior" if start == "shape_prior" and not surface.has_prior else start,
         "iterations": images.appearance.iterations,
         "loss": trained.history["loss"][-1],
@@ -117,6 +126,24 @@ def _guessed_depth(capture: Capture, before: Before) -> dict[str, np.ndarray]:
     return depths
 
 
+def beside_hands(capture: Capture, masks: Mapping[str, Masks], points: np.ndarray) -> np.ndarray:
+    """True for points [P, 3], m, that some camera shows in frame 0 beside or beneath the mask of a hand or a person."""
+    import cv2
+
+    from neuspring.splats.losses import REFERENCE_WIDTH
+
+    found = np.zeros(len(points), bool)
+    for name, camera in capture.cameras.items():
+        side = 2 * max(round(BESIDE_HANDS * camera.width / REFERENCE_WIDTH), 1) + 1
+        near = cv2.dilate((masks[name].labels[0] >= HANDS).astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+        pixels, distance = camera.project(points.astype(float))
+        shown = camera.sees(pixels) & (distance > 0)
+        x, y = np.round(pixels[shown]).astype(int).T
+        own = np.abs(capture.depth(name, 0)[y, x] - distance[shown]) < SAME_SURFACE if capture.has_depth else True
+        found[shown] |= near[y, x] & own
+    return found
+
+
 def _shots(
     capture: Capture, masks: Mapping[str, Masks], images: Images, device: str, depths: Mapping[str, np.ndarray]
 ) -> list[Shot]:
@@ -131,7 +158,7 @@ def _shots(
     for name, camera in capture.cameras.items():
         labels = masks[name].labels[0]
         margin = HAND_MARGIN * camera.width / REFERENCE_WIDTH
-        seen = (capture.color(name, 0), labels == OBJECT, labels == HANDS, depths.get(name, capture.depth(name, 0)))
+        seen = (capture.color(name, 0), labels == OBJECT, labels >= HANDS, depths.get(name, capture.depth(name, 0)))
         if (shot := Shot.of(name, view_of(camera, images, device), *seen, margin)) is None:
             print(f"camera {name}: the object is not in view in frame 0; it does not train the appearance", flush=True)
         else:

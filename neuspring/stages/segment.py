@@ -35,13 +35,14 @@ def segment(capture: Capture, camera: str, settings: Config, run: Recorder, devi
     from neuspring.checks.masks import mask_facts
     from neuspring.checks.perceived import WRONG, look_at_masks
     from neuspring.core.findings import findings_as_facts
+    from neuspring.data.frames import without_islands
     from neuspring.data.results import Masks
     from neuspring.perception import figures
 
     section = settings.perception.segment
     capture.require_camera(camera)
     backend = segmentation(section.backend, capture)
-    labels = BACKENDS["segment"][backend].segment(capture, camera, settings.perception, device)
+    labels = without_islands(capture, camera, BACKENDS["segment"][backend].segment(capture, camera, settings.perception, device))
     facts = mask_facts(capture, camera, labels)
     findings = look_at_masks(capture, camera, labels, facts)
     wrong = [one for one in findings if one.name in WRONG]

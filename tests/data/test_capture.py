@@ -130,7 +130,9 @@ def test_missing_and_damaged_files_and_unknown_labels_are_refused(tmp_path):
     with pytest.raises(InputError, match="masks are gray, palette or one-bit images; received 3 channels of color"):
         capture.mask("0", 1)
     cv2.imwrite(str(capture.path("mask", "0", 2)), np.full((24, 32), 7, np.uint8))
-    with pytest.raises(InputError, match=r"labels must be 0 \(nothing\), 1 \(object\) or 2 \(hands\); received label 7"):
+    with pytest.raises(
+        InputError, match=r"labels must be 0 \(nothing\), 1 \(object\), 2 \(hands\) or 3 \(person\); received label 7"
+    ):
         capture.mask("0", 2)
     capture.path("mask", "0", 3).write_bytes(b"no picture")
     with pytest.raises(InputError, match=r"00003\.png: this file must be a readable PNG"):

@@ -15,14 +15,14 @@ import torch
 from neuspring.core.artifacts import SplatCenters
 from neuspring.core.errors import InputError
 from neuspring.core.records import Before, Recorder, StageRecord
-from neuspring.data.capture import HANDS, Capture
+from neuspring.data.capture import HANDS, OBJECT, PERSON, Capture
 from neuspring.data.results import Masks
 from neuspring.scores import metrics
 from neuspring.splats import draw
 from neuspring.splats.draw import orbit_view
 from neuspring.splats.model import Gaussians, Splats
 from neuspring.splats.view import View
-from neuspring.stages.appearance import appearance
+from neuspring.stages.appearance import appearance, beside_hands
 from neuspring.stages.render import draw_frames
 from tests.support.filmed import FLIP, FRAMES, SIZE, STEP, film
 from tests.support.pictured import IMAGES, Scene
@@ -256,6 +256,31 @@ def test_masks_of_another_size_and_empty_ones_are_named(scene, tmp_path, capsys)
     made.masks = made.masks[:1] * 3
     with pytest.raises(InputError, match="at least one camera must have the object in view"):
         made.learn(short)
+
+
+@pytest.mark.parametrize("label", [HANDS, PERSON])
+def test_points_beside_a_hand_or_a_person_become_no_splats(scene, tmp_path, capsys, label):
+    """The borders of masks are off by pixels: what a mask of the object has there may be a finger."""
+    capture = scene.capture
+    masks = {}
+    for name in capture.cameras:
+        own = np.stack([capture.mask(name, 0)] * FRAMES)
+        masks[name] = Masks(labels=np.where(own == HANDS, label, own).astype(np.uint8), backend="given")
+    camera, labels = capture.cameras["0"], masks["0"].labels
+    y, x = np.nonzero(labels[0] == OBJECT)
+    away = cv2.distanceTransform((labels[0] != label).astype(np.uint8), cv2.DIST_L2, 5)[y, x]
+    points = camera.lift(np.stack([x, y], axis=1).astype(float), capture.depth("0", 0)[y, x])
+    one = Capture(capture.folder, dataclasses.replace(capture.description, cameras=capture.description.cameras[:1]))
+    found = beside_hands(one, masks, points)
+    assert found[away <= 1].all() and found.any()
+    assert not found[away > 3].any()
+    # What the camera sees something else before is not judged by that pixel.
+    behind = camera.lift(np.stack([x, y], axis=1).astype(float), capture.depth("0", 0)[y, x] + 0.05)
+    assert not beside_hands(one, masks, behind).any()
+    made = changed(scene, appearance=tmp_path / "appearance.json")
+    made.masks = with_masks(scene, tmp_path / "masks", labels)
+    assert made.learn(settings(appearance=SHORT)).facts["points_beside_hands"] > 0
+    assert "points beside hands become no splats" in capsys.readouterr().out
 
 
 def test_captures_of_another_length_are_named_with_both_files(scene, tmp_path):

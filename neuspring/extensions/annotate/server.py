@@ -31,7 +31,7 @@ from starlette.staticfiles import StaticFiles
 from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.core.web import Refused, check_host, check_origin
-from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.data.capture import HANDS, OBJECT, PERSON, Capture
 from neuspring.extensions.annotate.clicks import Annotations
 from neuspring.extensions.annotate.masks import MasksMode
 from neuspring.extensions.annotate.shared import Busy, Stale
@@ -51,7 +51,7 @@ ANNOTATE_HEADERS = {
     "Cache-Control": "no-store",
 }
 """Headers of every answer."""
-LABEL_COLORS = {OBJECT: (0, 200, 160), HANDS: (255, 140, 0)}
+LABEL_COLORS = {OBJECT: (0, 200, 160), HANDS: (255, 140, 0), PERSON: (150, 160, 255)}
 """RGB of a label; the legend of the page has the same."""
 INSIDE_OPACITY, BORDER_OPACITY = 90, 255
 """Opacity inside a mask and on its border, of 255."""
@@ -93,6 +93,7 @@ class Server:
                 Route("/api/carry", self._carry, methods=["POST"]),
                 Route("/api/stop", self._stop, methods=["POST"]),
                 Route("/api/masks/save", lambda _: JSONResponse({"cameras": self.masks.save()}), methods=["POST"]),
+                Route("/api/obstacles", lambda _: JSONResponse({"text": self.masks.measure()}), methods=["POST"]),
                 Route("/api/clicks", lambda asked: self._write(asked, self.tracks, "annotations"), methods=["POST"]),
                 Route("/api/tracks/save", self._save_tracks, methods=["POST"]),
                 Mount("/", StaticFiles(directory=STATIC_FOLDER, html=True)),

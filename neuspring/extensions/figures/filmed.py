@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations
 from neuspring.data.camera import Camera
-from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture
+from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.draw.painter import ERROR_COLORS, DrawingStyle, Painter, empty, hands
 from neuspring.draw.scene import ShownRun, ShownScene, box_around, shown_points
 from neuspring.draw.twin import Quantity, TwinPicture
@@ -148,7 +148,7 @@ class PhotoPainter(Painter):
         photo, labels = self.scene.photo(frame), self.scene.mask(frame)
         if photo is None or labels is None:
             return Drawn(self.scene.cut(rgba))
-        own, hands = (np.where(labels == label, 255, 0).astype(np.uint8) for label in (OBJECT, HANDS))
+        own, hands = (np.where(part, 255, 0).astype(np.uint8) for part in (labels == OBJECT, labels >= HANDS))
         pair = Pair.of(photo, rgba, own, hands, OBJECT_COVERAGE)
         difference = (pair.truth - pair.prediction).abs().mean(0).numpy()
         shows = pair.silhouettes[0] | pair.silhouettes[1]
@@ -285,7 +285,7 @@ def over_white(rgba: np.ndarray, below: np.ndarray | None = None) -> np.ndarray:
 def masked(photo: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """The photo with white where there is neither the object nor a hand."""
     picture = photo.copy()
-    picture[labels == NOTHING] = 255
+    picture[~np.isin(labels, (OBJECT, HANDS))] = 255
     return picture
 
 

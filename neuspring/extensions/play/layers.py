@@ -30,6 +30,10 @@ if TYPE_CHECKING:
 NODE_COLOR, HAND_COLOR, GRABBED_COLOR = (70, 90, 120), (214, 39, 40), (255, 200, 0)
 SEEN_COLOR, TRACK_COLOR, CAMERA_COLOR = (0, 150, 90), (150, 0, 200), (60, 60, 60)
 PREDICTED_COLOR, APART_COLOR = (230, 120, 0), (90, 90, 90)
+UNSEEN_COLOR = (150, 150, 150)
+UNSEEN_REACH = 3.5
+"""Distance from all points that were seen, in median distances between them, from which nobody saw a part of the body. Of points
+that are spread at random over a surface, one in a thousand places is farther from its nearest point."""
 LINE_WIDTH = 2.0
 """Pixels of a spring, and of the line from a predicted point to the annotated one."""
 SIZE = 0.3
@@ -70,7 +74,16 @@ class Display:
 class BodyLayer:
     """The nodes, springs and hands of a run."""
 
-    def __init__(self, scene: viser.SceneApi, name: str, twin: Twin | None, nodes: np.ndarray, hands: np.ndarray) -> None:
+    def __init__(
+        self,
+        scene: viser.SceneApi,
+        name: str,
+        twin: Twin | None,
+        nodes: np.ndarray,
+        hands: np.ndarray,
+        seen: np.ndarray | None = None,
+    ) -> None:
+        """Nodes that lie far from all points `seen` [m, 3] in frame 0 are gray."""
         self.twin, self.name, self._scene = twin, name, scene
         count = len(lines_of(twin).pairs) if twin else 0
         self.parts = Springs.of(twin, sample(count)) if twin and count else None
@@ -82,6 +95,8 @@ class BodyLayer:
         self.overlay: TrackOverlay | None = None
         self._handles: Any = None
         self._colors = node_colors(twin) if twin else np.tile(np.array(NODE_COLOR, np.uint8), (len(nodes), 1))
+        # Live twins may start in another frame.
+        self._colors[unseen(twin.topology.nodes if twin else nodes, seen)] = UNSEEN_COLOR
         self.nodes = _balls(scene, f"/{name}/nodes", nodes, radius, self._colors)
         self.hands = _balls(scene, f"/{name}/hands", hands, 1.3 * radius, HAND_COLOR)
         self.springs: Any = None
@@ -152,6 +167,13 @@ class BodyLayer:
         self.root.remove()
 
 
+def unseen(points: np.ndarray, seen: np.ndarray | None) -> np.ndarray:
+    """True for points [n, 3] far from all that were seen in the same frame [m, 3], m; none is where that is not known."""
+    if seen is None:
+        return np.zeros(len(points), bool)
+    return np.asarray(cKDTree(seen).query(points)[0] > UNSEEN_REACH * spacing(seen))
+
+
 def spacing(nodes: np.ndarray) -> float:
     """Median distance of a node to its nearest neighbor, m; 0.01 for one node."""
     if len(nodes) < 2:
@@ -180,11 +202,17 @@ class SplatLayer:
 
     The nodes of the shown frame carry them from that frame in one step, instead of from frame to frame as for pictures
     (splats/skinning.py), so that any frame can be shown after any other. Of the color only the part is shown that does not depend
-    on the direction.
+    on the direction. Those farther than UNSEEN_REACH from all points `seen` [m, 3] in that frame are gray.
     """
 
     def __init__(
-        self, scene: viser.SceneApi, name: str, splats: Splats, nodes: np.ndarray, centers: SplatCenters | None = None
+        self,
+        scene: viser.SceneApi,
+        name: str,
+        splats: Splats,
+        nodes: np.ndarray,
+        centers: SplatCenters | None = None,
+        seen: np.ndarray | None = None,
     ) -> None:
         chosen = np.arange(len(splats.means))
         if len(chosen) > MOST_DRAWN_SPLATS:
@@ -194,6 +222,9 @@ class SplatLayer:
         scales = np.exp(splats.log_scales[chosen].astype(float)) / SPLAT_UNIT
         self._scales = np.minimum(np.broadcast_to(scales, (len(chosen), 3)), WIDEST_SPLAT).astype(np.float32)
         colors = np.clip(0.5 + C0 * splats.harmonics[chosen, 0], 0, 1)
+        # Half their own light: a plain gray would show no shape.
+        hidden = unseen(splats.means[chosen], seen)
+        colors[hidden] = 0.5 * (np.array(UNSEEN_COLOR) / 255 + colors[hidden].mean(axis=1, keepdims=True))
         opacities = 1 / (1 + np.exp(-splats.opacity_logits[chosen, None]))
         self._skin = Skin(self._nodes, frozen=True)
         self.handle: Any = scene.add_gaussian_splats(

@@ -59,7 +59,7 @@ class Live:
         self._latencies: deque[float] = deque(maxlen=AVERAGED_FRAMES)
         self._splat_seconds = 0.0
         self._again, self._stop = threading.Event(), threading.Event()
-        self.body = BodyLayer(server.scene, f"live {run.name}", twin, self.simulator.positions, hands)
+        self.body = BodyLayer(server.scene, f"live {run.name}", twin, self.simulator.positions, hands, player.seen)
         if played is None:
             self._listen()
         self._thread = threading.Thread(target=self._run, name="live", daemon=True)

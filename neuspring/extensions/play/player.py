@@ -23,6 +23,8 @@ ROOM = 1.08
 """The first view shows so much of what the runs fill."""
 WAY = (1.0, -0.35, 0.45)
 """Direction of the first view: across the row of runs, from above."""
+STEEPEST = 0.02
+"""Least level part of the first view's direction, of its vertical part."""
 RANGE_SAMPLES = 12
 """Frames that the range of strain and force is taken from."""
 MOST_RUNS_SHOWN = 8
@@ -107,6 +109,10 @@ class Player:
         self.limit: float | None = None
         """Strain at the end of the colors of a live twin; None: the recording is shown."""
         seen = found.observations
+        cameras = list(found.capture.cameras.values()) if found.capture else []
+        self.seen = seen.object_points[0] if cameras else None
+        """Points that cameras saw in frame 0 [m, 3], m; None: there are no images."""
+        self._eye = cameras[0].camera_to_world[:3, 3] if len(cameras) == 1 else None
         all_hands, holds = seen.controller_points, seen.controller_valid
         hands = all_hands[holds] if holds.size else all_hands.reshape(-1, 3)
         everything = np.concatenate([seen.object_points[seen.object_visibility], seen.nodes, hands])
@@ -148,7 +154,7 @@ class Player:
         try:
             if run.splats is not None and run.trajectory is not None:
                 nodes = run.trajectory.positions[0]
-                body.splats = SplatLayer(self._scene, body.name, run.splats, nodes, run.centers)
+                body.splats = SplatLayer(self._scene, body.name, run.splats, nodes, run.centers, self.seen)
         except (InputError, NumericalFailure) as error:
             self.notes[run.name] = "; ".join(filter(None, [self.notes.get(run.name, ""), f"no splats: {error}"]))
 
@@ -160,8 +166,22 @@ class Player:
             self.apply()
 
     def offset(self, index: int) -> tuple[float, float, float]:
-        """Shift of a run, m: it stands beside the others along y, the first one where it was observed."""
-        return (0.0, index * self.display.gap * max(float(self.high[1] - self.low[1]), 0.5 * self.size), 0.0)
+        """Shift of a run, m: it stands beside the others, across the view, along x or y; the first one where it was observed."""
+        right = np.cross((0.0, 0.0, self.found.observations.scenario.up_sign), self._way())
+        axis = int(np.abs(right[1]) >= np.abs(right[0]))
+        wide = max(float(self.high[axis] - self.low[axis]), 0.5 * self.size)
+        shift = index * self.display.gap * wide * float(np.sign(right[axis]))
+        return (0.0, shift, 0.0) if axis else (shift, 0.0, 0.0)
+
+    def _way(self) -> np.ndarray:
+        """Unit direction [3] from the body to the first view: where the only camera stood, which did not see the back, else WAY."""
+        way = np.array(WAY) * (1.0, 1.0, self.found.observations.scenario.up_sign)
+        if self._eye is not None:
+            way = self._eye - 0.5 * (self.low + self.high)
+        # Straight from above nothing says which side is up.
+        if np.linalg.norm(way[:2]) < STEEPEST * abs(way[2]):
+            way[0] += STEEPEST * abs(way[2])
+        return np.asarray(way / np.linalg.norm(way))
 
     def view(
         self, opening: float, aspect: float = 1.0, covered: float = 0.0, count: int = MOST_RUNS_SHOWN
@@ -175,7 +195,7 @@ class Player:
         corners = np.array(list(itertools.product(*zip(self.low, self.high, strict=True))))
         points = (corners + shifts[:, None]).reshape(-1, 3)
         middle, up = 0.5 * (points.min(axis=0) + points.max(axis=0)), np.array([0.0, 0.0, sign])
-        way = np.array(WAY) * (1.0, 1.0, sign) / np.linalg.norm(WAY)
+        way = self._way()
         right = np.cross(up, way) / np.linalg.norm(np.cross(up, way))
         top, half = np.cross(way, right), math.tan(opening / 2)
         x, y, z = np.stack([right, top, way]) @ (points - middle).T
@@ -233,7 +253,7 @@ class Player:
                     twin = None
             except InputError as error:
                 notes.append(f"no springs: {error}")
-            body = self._bodies[run.name] = BodyLayer(self._scene, run.name, twin, nodes, hands)
+            body = self._bodies[run.name] = BodyLayer(self._scene, run.name, twin, nodes, hands, self.seen)
             body.overlay = TrackOverlay(self._scene, run.name, seen.tracks, nodes, 1.2 * body.radius)
         except InputError as error:
             notes.append(str(error))

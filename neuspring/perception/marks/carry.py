@@ -20,11 +20,21 @@ import numpy as np
 
 from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
-from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture
-from neuspring.data.frames import frames_of, heights, overlap, spread
-from neuspring.perception.marks.colors import DIFFERENT, Background, apart, lab_of, mixed
+from neuspring.data.capture import HANDS, NOTHING, OBJECT, PERSON, Capture
+from neuspring.data.frames import frames_of, heights, overlap, spread, without_islands
+from neuspring.perception.marks.colors import (
+    DIFFERENT,
+    Background,
+    apart,
+    bins_of,
+    count,
+    depth_odds,
+    lab_of,
+    log_density,
+    mixed,
+)
 from neuspring.perception.marks.marks import Mark, Seeds, require_marks
-from neuspring.perception.marks.solve import ALL_LABELS, CarriedFrame, MarkedFrame, Pass, start
+from neuspring.perception.marks.solve import CarriedFrame, MarkedFrame, Pass, start
 
 MEDIAN_AROUND = 4
 """Frames before and after with whose median an area is compared."""
@@ -40,6 +50,8 @@ BACKGROUND_FRAMES = 60
 """Number of frames that the background of the whole film is learned from."""
 LATER, GONE = 12, 0.2
 """Number of later frames that say whether what is ignored leaves, and the share of them that must show another thing there."""
+STRANGE = 1.0
+"""Log ratio, to the background's, from which a color is one of a person that is marked, and teaches no background."""
 LEARNED_APART = 4
 """Pixels around object and hands that teach no background."""
 Progress: TypeAlias = Callable[[int, int], None]
@@ -66,7 +78,7 @@ WHOLE = Cues(disagreement=0.35, flow=0.8, misfit=0.5, unsure=0.5)
 def cues_of(step: CarriedFrame, other: np.ndarray) -> Cues:
     """Doubts about a frame's labels, with those [h, w] that it was given otherwise."""
     labels = step.probability.argmax(axis=0)
-    shown = labels > 0
+    shown = np.isin(labels, (OBJECT, HANDS))
     disagreement = max(1 - np.nan_to_num(overlap(labels == label, other == label), nan=1.0) for label in (OBJECT, HANDS))
     if not shown.any():
         return Cues(disagreement)
@@ -148,7 +160,7 @@ class Carried:
     """Labels of every frame."""
 
     labels: np.ndarray
-    """[T, H, W] uint8: 0 nothing, 1 object, 2 hands."""
+    """[T, H, W] uint8: 0 nothing, 1 object, 2 hands, 3 person."""
     doubt: np.ndarray
     """[T] float, 0 (sure) to 1."""
 
@@ -156,7 +168,7 @@ class Carried:
 def frame_mask(film: Film, frame: int, marks: Sequence[Mark], settings: MarksSegmentation) -> np.ndarray:
     """Labels [H, W] uint8 of one frame from the marks on it alone. Raises InputError where it has no object or hand marked."""
     own = [mark for mark in marks if mark.frame == frame]
-    if not any(mark.label != "ignore" for mark in own):
+    if not any(mark.value in (OBJECT, HANDS) for mark in own):
         raise InputError(f"frame {frame}", "an object or a hand must be marked on it", sorted({mark.label for mark in own}))
     work = _Work(film, own, settings, whole=False)
     return work.full_labels(work.start(frame).probability)
@@ -199,7 +211,7 @@ def over_capture(
     view = capture.cameras[camera]
     labels, doubt = np.zeros((capture.frame_count, view.height, view.width), np.uint8), np.zeros(capture.frame_count)
     labels[film.frames], doubt[film.frames] = carried.labels, carried.doubt
-    return Carried(labels, doubt)
+    return Carried(without_islands(capture, camera, labels), doubt)
 
 
 class _Work:
@@ -222,6 +234,9 @@ class _Work:
         self.marks: dict[int, list[Mark]] = {}
         for mark in marks:
             self.marks.setdefault(mark.frame, []).append(mark)
+        self.kinds = PERSON + any(mark.label == "person" for mark in marks)
+        """Number of labels: a person is one where it is marked in any frame."""
+        self.person = self._person() if self.kinds > PERSON else None
         self.starts: dict[int, MarkedFrame] = {}
         self.background: Background | None = None
         self.done = 0
@@ -236,7 +251,7 @@ class _Work:
 
     def seeds(self, frame: int, *, carried: bool = False) -> Seeds:
         """The marks on a frame, drawn."""
-        return Seeds.of(self.marks[frame], self.size, self.scale, carried=carried)
+        return Seeds.of(self.marks[frame], self.size, self.scale, carried=carried, kinds=self.kinds)
 
     def resized(self, values: np.ndarray | None) -> np.ndarray | None:
         """Depth or heights [h, w], which are not averaged over borders."""
@@ -253,7 +268,7 @@ class _Work:
 
     def start(self, frame: int) -> MarkedFrame:
         """A frame, solved from its marks."""
-        return start(self.lab(frame), self.seeds(frame), self.resized(self.film.height(frame)), self.background)
+        return start(self.lab(frame), self.seeds(frame), self.resized(self.film.height(frame)), self.background, self.person)
 
     def step(self, walk: Pass, frame: int, seeds: Seeds | None = None) -> CarriedFrame:
         """A frame, solved from the one beside it."""
@@ -265,7 +280,7 @@ class _Work:
         labels = np.zeros((count, *self.size), np.uint8)
         self.starts[begin] = self.start(begin)
         labels[begin] = self.starts[begin].labels
-        self.background = Background.empty(self.size, self.guests()) if self.settings.background else None
+        self.background = Background.empty(self.size, self.guests(), self.strangers()) if self.settings.background else None
         for frames in (range(begin + 1, count), range(begin - 1, -1, -1)):
             walk = self.walk_from(begin, learns=True)
             for frame in frames:
@@ -283,7 +298,7 @@ class _Work:
         count = self.film.count
         if self.background is not None:
             # The background of the whole film, from frames where their labels say nothing.
-            self.background = Background.empty(self.size, self.background.guests)
+            self.background = Background.empty(self.size, self.background.guests, self.background.strangers)
             for frame in spread(range(count), BACKGROUND_FRAMES):
                 self.background.learn(self.lab(frame), apart(first[frame], LEARNED_APART), self.resized(self.film.depth(frame)))
             # What was uncovered later shows where the object ended at first.
@@ -329,6 +344,26 @@ class _Work:
                 found.append((place, look))
         return tuple(found)
 
+    def _person(self) -> np.ndarray:
+        """Colors [bins] of the person in all frames in which one is marked."""
+        frames = [frame for frame, marks in self.marks.items() if any(mark.label == "person" for mark in marks)]
+        return mixed([(1.0, count(bins_of(self.lab(frame)), self.seeds(frame).certain == PERSON)) for frame in frames])
+
+    def person_depth(self) -> np.ndarray | None:
+        """Log ratio [bins] of the depths of the person to those of object and hands, from the marked frames so far."""
+        own, others = [np.zeros(0)], [np.zeros(0)]
+        for frame, known in self.starts.items() if self.person is not None else ():
+            if (depth := self.resized(self.film.depth(frame))) is not None:
+                own.append(depth[known.labels == PERSON])
+                others.append(depth[np.isin(known.labels, (OBJECT, HANDS))])
+        return depth_odds(np.concatenate(own), np.concatenate(others)) if len(own) > 1 else None
+
+    def strangers(self) -> np.ndarray | None:
+        """Colors [bins] bool that a person has and the background of the first marked frame has not."""
+        if self.person is None:
+            return None
+        return np.asarray(log_density(self.person) - log_density(self.starts[self.begin].counts[NOTHING]) > STRANGE)
+
     @property
     def begin(self) -> int:
         """The first frame with an object marked on."""
@@ -340,14 +375,18 @@ class _Work:
             lab=self.lab(key),
             probability=self.starts[key].probability,
             first=self.colors(),
+            person_depth=self.person_depth(),
             background=self.background,
             learns=learns,
             reach=BORDER_MOVES * max(self.size) / CARRY_WIDTH,
         )
 
     def colors(self) -> tuple[np.ndarray, ...]:
-        """Colors of nothing, object and hands in all marked frames so far."""
-        return tuple(mixed([(1.0, own.counts[label]) for own in self.starts.values()]) for label in ALL_LABELS)
+        """Colors of each label in all marked frames so far, and of the person in all of them."""
+        counts = [mixed([(1.0, own.counts[label]) for own in self.starts.values()]) for label in range(self.kinds)]
+        if self.person is not None:
+            counts[PERSON] = mixed([(1.0, counts[PERSON]), (1.0, self.person)])
+        return tuple(counts)
 
     def tick(self) -> None:
         """Tell the progress: the first pass solves all frames but its start, the second one all that are not marked."""

@@ -40,6 +40,8 @@ DEPTH_NOISE = (0.003, 0.008)
 """Spread of depth: m, and per m."""
 IN_FRONT = 0.5
 """Distance of things in front of the background, m; anywhere up to there."""
+DEPTH_BIN, DEPTH_BINS, DEPTH_BLUR, UNSEEN_DEPTH = 0.02, 256, 1.5, 0.1
+"""m, number, blur in bins of histograms of depth, and the part of the probability that any depth has."""
 MOST_DEPTH = 3.0
 """Largest log ratio that a pixel's depth counts; depth is off by pixels at borders."""
 
@@ -91,13 +93,17 @@ class Background:
     guests: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
     """Places [H, W] bool and looks, Lab [H, W, 3], of what is ignored and leaves. While it is there it is nothing by its own look,
     and teaches none of what it hides."""
+    strangers: np.ndarray | None = None
+    """[bins] bool: colors of a person, which teach nothing."""
 
     @classmethod
-    def empty(cls, size: tuple[int, int], guests: tuple[tuple[np.ndarray, np.ndarray], ...] = ()) -> Background:
+    def empty(
+        cls, size: tuple[int, int], guests: tuple[tuple[np.ndarray, np.ndarray], ...] = (), strangers: np.ndarray | None = None
+    ) -> Background:
         """Nothing is known."""
         color = (*size, 3)
         mean, variance, seen, depth = (np.zeros(shape, np.float32) for shape in (color, color, size, size))
-        return cls(mean, variance, seen, depth, guests)
+        return cls(mean, variance, seen, depth, guests, strangers)
 
     def part(self, window: tuple[slice, slice]) -> Background:
         """A window of it, without a copy."""
@@ -108,6 +114,8 @@ class Background:
         """Take a frame's pixels [H, W, 3] where it shows the background [H, W] bool, and their depth [H, W], m, 0 none."""
         for place, look in self.guests:
             where = where & ~(place & _alike(lab, look))
+        if self.strangers is not None:
+            where = where & ~self.strangers[bins_of(lab)]
         self.seen += where
         weight = np.where(where, np.maximum(1.0 / np.maximum(self.seen, 1.0), FORGET), 0.0).astype(np.float32)[..., None]
         step = lab.astype(np.float32) - self.mean
@@ -154,6 +162,22 @@ class Background:
         same = -0.5 * ((depth - self.depth) / spread) ** 2 - np.log(np.sqrt(2 * np.pi) * spread)
         ratio = np.clip(same + np.log(IN_FRONT), -MOST_DEPTH, MOST_DEPTH)
         return np.where((depth > 0) & (self.depth > 0), ratio, 0.0).astype(np.float32)
+
+
+def depth_bins(depth: np.ndarray) -> np.ndarray:
+    """The bin [...] of depth [...], m; 0 where nothing was measured."""
+    return np.clip(depth / DEPTH_BIN, 0, DEPTH_BINS - 1).astype(int)
+
+
+def depth_odds(own: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Log ratio [bins] of depths [n] of one thing to those of others [m], m; 0 where neither was seen, or nothing measured."""
+    shares = []
+    for part in (own[own > 0], others[others > 0]):
+        counts = gaussian_filter(np.bincount(depth_bins(part), minlength=DEPTH_BINS).astype(float), DEPTH_BLUR)
+        shares.append((1 - UNSEEN_DEPTH) * counts / max(len(part), 1) + UNSEEN_DEPTH / DEPTH_BINS)
+    odds = np.clip(np.log(shares[0] / shares[1]), -MOST_DEPTH, MOST_DEPTH)
+    odds[0] = 0.0
+    return np.asarray(odds, np.float32)
 
 
 def _alike(lab: np.ndarray, look: np.ndarray) -> np.ndarray:

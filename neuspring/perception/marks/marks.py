@@ -5,11 +5,12 @@ what they say about the pixels of a frame.
 
 | kind | points | what it says |
 |---|---|---|
-| `box` | two opposite corners | the label's pixels of this frame lie in its boxes; `ignore`: what is inside is neither |
+| `box` | two opposite corners | the label's pixels of this frame lie in its boxes; the last three labels: they fill it |
 | `click` | one | the disk of `radius` has this label |
 | `scribble` | one or more | the line of half width `radius` has this label |
-| `polygon` | three or more | the label fills it, up to `radius` at its border; `ignore`: what is inside is neither |
+| `polygon` | three or more | the label fills it, up to `radius` at its border; the last three labels: exactly |
 
+Labels are `object`, `hand`, `ignore` (neither), `person` (neither in any frame, nor background) and `obstacle`.
 Points are pixels (x, y), pixel centers at whole coordinates, as in data/capture.py.
 """
 
@@ -30,12 +31,14 @@ from neuspring.config import parse, plain
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
 from neuspring.core.section import STRICT, Finite, Name
-from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture
+from neuspring.data.capture import HANDS, NOTHING, OBJECT, PERSON, Capture
 
 MARKS = "marks.json"
 """Its name in a capture's folder."""
-MARK_VALUES = {"object": OBJECT, "hand": HANDS, "ignore": NOTHING}
-"""Label in a mask of a mark's word."""
+MARK_VALUES = {"object": OBJECT, "hand": HANDS, "ignore": NOTHING, "person": PERSON, "obstacle": NOTHING}
+"""Label in a mask of a mark's word. An obstacle is background whose shape is measured (extensions/annotate)."""
+FILLED_MARKS = ("ignore", "person", "obstacle")
+"""Labels whose boxes and polygons are filled: all that is inside has the label."""
 LEAST_POINTS = {"box": 2, "click": 1, "scribble": 1, "polygon": 3}
 EXACT_POINTS = ("box", "click")
 UNMARKED_PIXEL = 255
@@ -54,7 +57,7 @@ class Mark:
 
     __pydantic_config__ = STRICT
     frame: Annotated[int, Field(ge=0)]
-    label: Literal["object", "hand", "ignore"]
+    label: Literal["object", "hand", "ignore", "person", "obstacle"]
     kind: Literal["box", "click", "scribble", "polygon"]
     points: tuple[tuple[Finite, Finite], ...]
     """(x, y), pixels."""
@@ -74,7 +77,7 @@ class Mark:
 
     @property
     def value(self) -> int:
-        """Its label in a mask: 1 object, 2 hands, 0 neither."""
+        """Its label in a mask: 1 object, 2 hands, 3 person, 0 none of them."""
         return MARK_VALUES[self.label]
 
 
@@ -156,24 +159,24 @@ class Seeds:
     certain: np.ndarray
     """[H, W] uint8: the label, or UNMARKED_PIXEL."""
     possible: np.ndarray
-    """[3, H, W] bool: where nothing, object and hands can be."""
+    """[K, H, W] bool: where nothing, object and hands can be; K = 4 with a person."""
     prior: np.ndarray
-    """[3, H, W] float32: log odds that the marks' places alone give; 0 where they say nothing."""
+    """[K, H, W] float32: log odds that the marks' places alone give; 0 where they say nothing."""
 
     @classmethod
-    def of(cls, marks: Sequence[Mark], size: tuple[int, int], scale: float, *, carried: bool = False) -> Seeds:
+    def of(cls, marks: Sequence[Mark], size: tuple[int, int], scale: float, *, carried: bool = False, kinds: int = PERSON) -> Seeds:
         """Evidence of the marks on one frame, drawn into an image of `size` (height, width) that is `scale` times the camera's.
 
         Boxes and polygons bound a label, unless it is also clicked or scribbled outside of them. Hands lie over objects, what is
         ignored over both, and clicks and scribbles over polygons. With `carried` the place of labels is also known from the frame
-        before: then a label without marks can be anywhere.
+        before: then a label without marks can be anywhere, as a person can. `kinds` is K.
         """
-        certain, possible = np.full(size, UNMARKED_PIXEL, np.uint8), np.ones((3, *size), bool)
-        prior = np.zeros((3, *size), np.float32)
+        certain, possible = np.full(size, UNMARKED_PIXEL, np.uint8), np.ones((kinds, *size), bool)
+        prior = np.zeros((kinds, *size), np.float32)
         for label in (OBJECT, HANDS):
             own = [mark for mark in marks if mark.value == label]
-            areas = [_drawn(mark, size, scale, grown=1) for mark in own if mark.kind in ("box", "polygon")]
-            lines = [_drawn(mark, size, scale) for mark in own if mark.kind in ("click", "scribble")]
+            areas = [drawn(mark, size, scale, grown=1) for mark in own if mark.kind in ("box", "polygon")]
+            lines = [drawn(mark, size, scale) for mark in own if mark.kind in ("click", "scribble")]
             if not own:
                 possible[label] = carried
             elif areas and all((line & np.any(areas, axis=0)).any() for line in lines):
@@ -184,18 +187,18 @@ class Seeds:
                 prior[label] = np.maximum(-far / (ODDS_FALL * max(size)), -MOST_ODDS)
             for mark in own:
                 if mark.kind == "polygon":
-                    inside = _drawn(mark, size, scale, grown=0)
+                    inside = drawn(mark, size, scale, grown=0)
                     away = [cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, 5) for part in (inside, ~inside)]
                     slope = (away[0] - away[1]) / max(POLYGON_SLOPE * mark.radius * scale, 0.5)
                     prior[label] = np.maximum(prior[label], np.clip(slope, -MOST_ODDS, MOST_ODDS) * (possible[label]))
-        for kinds in (("polygon", "box"), ("scribble", "click")):
-            for mark in sorted(marks, key=lambda mark: (OBJECT, HANDS, NOTHING).index(mark.value)):
+        for shapes in (("polygon", "box"), ("scribble", "click")):
+            for mark in sorted(marks, key=lambda mark: (OBJECT, HANDS, PERSON, NOTHING).index(mark.value)):
                 # A box of a label says where it can be, not where it is.
-                if mark.kind in kinds and (mark.kind != "box" or mark.label == "ignore"):
-                    certain[_drawn(mark, size, scale)] = mark.value
+                if mark.kind in shapes and (mark.kind != "box" or mark.label in FILLED_MARKS):
+                    certain[drawn(mark, size, scale)] = mark.value
         known = certain != UNMARKED_PIXEL
         possible[:, known] = False
-        for label in (NOTHING, OBJECT, HANDS):
+        for label in range(kinds):
             possible[label, certain == label] = True
         return cls(certain, possible, prior)
 
@@ -209,7 +212,7 @@ class Seeds:
         return Seeds(self.certain[window], self.possible[(slice(None), *window)], self.prior[(slice(None), *window)])
 
 
-def _drawn(mark: Mark, size: tuple[int, int], scale: float, *, grown: int = -1) -> np.ndarray:
+def drawn(mark: Mark, size: tuple[int, int], scale: float, *, grown: int = -1) -> np.ndarray:
     """The pixels [H, W] bool that a mark covers: a polygon without its uncertain border (-1), as it is (0), or grown by it (1)."""
     image: np.ndarray = np.zeros(size, np.uint8)
     # Pixel centers lie at whole coordinates, so the image begins at -0.5.
@@ -222,7 +225,7 @@ def _drawn(mark: Mark, size: tuple[int, int], scale: float, *, grown: int = -1) 
     whole = np.round(points).astype(np.int32)[:, None]
     if mark.kind == "polygon":
         cv2.fillPoly(image, [whole], 1)
-        if mark.label != "ignore" and grown:
+        if mark.label not in FILLED_MARKS and grown:
             ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * round(radius) + 1,) * 2)
             # Outside of the image the polygon goes on: a hand is not uncertain where the image ends.
             eroded = cv2.erode(image, ellipse, borderType=cv2.BORDER_REPLICATE)

@@ -12,9 +12,18 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from neuspring.data.capture import HANDS, NOTHING, OBJECT
+from neuspring.data.capture import HANDS, NOTHING, OBJECT, PERSON
 from neuspring.data.frames import at_border
-from neuspring.perception.marks.colors import Background, apart, bins_of, count, log_density, mixed, shaded_density
+from neuspring.perception.marks.colors import (
+    Background,
+    apart,
+    bins_of,
+    count,
+    depth_bins,
+    log_density,
+    mixed,
+    shaded_density,
+)
 from neuspring.perception.marks.marks import ODDS_FALL, UNMARKED_PIXEL, Seeds
 
 SMOOTHNESS = 1.5
@@ -29,7 +38,8 @@ DECIDED = 10.0
 TURNS = 5
 NEVER = -40.0
 """Log odds of what marks exclude."""
-ALL_LABELS = (NOTHING, OBJECT, HANDS)
+UNMARKED_PERSON = -2.0
+"""Log odds of a person in a frame in which none is marked."""
 BACKGROUND_SHADES = (0.88, 0.76)
 """Factors that darken the colors of the background near the object: its shadow."""
 SHADED = 0.1
@@ -52,9 +62,9 @@ COLOR_AT_START, COLOR = 0.6, 0.5
 """Weights of the log densities of colors, in a marked frame and in one beside it: neighboring pixels are not independent."""
 MOST_COLOR = 6.0
 """Largest log ratio that a pixel's color counts."""
-ANYWHERE = (0.01, 0.004, 0.015)
-"""Probability that a pixel becomes nothing, object or hand where the flow carries none: things uncover the table or come out of
-hiding, hands come in. Without it for nothing, the shadow of an object that left stays its part for good."""
+ANYWHERE = (0.01, 0.004, 0.015, 0.015)
+"""Probability that a pixel becomes nothing, object, hand or person where the flow carries none: things uncover the table or come
+out of hiding, hands and persons come in. Without it for nothing, the shadow of an object that left stays its part for good."""
 CHANGED = 12.0
 """Difference of L, a, b, from which the flow is doubted."""
 MOST_HOLE, FILLED = 0.2, 2.0
@@ -136,15 +146,15 @@ class MarkedFrame:
     """A marked frame that is solved."""
 
     probability: np.ndarray
-    """[3, H, W] float32."""
+    """[K, H, W] float32; K = 4 where a person is marked in the film, else 3."""
     counts: tuple[np.ndarray, ...]
-    """Counts of the colors of nothing, object and hands, [bins] each."""
+    """Counts of the colors of nothing, object, hands and person, [bins] each."""
 
     @classmethod
     def of(cls, lab: np.ndarray, probability: np.ndarray, seeds: Seeds) -> MarkedFrame:
         """From probabilities that are known: counts the colors."""
         labels = probability.argmax(axis=0).astype(np.uint8)
-        return cls(probability, tuple(counts_of(lab, bins_of(lab), labels, seeds.certain)))
+        return cls(probability, tuple(counts_of(lab, bins_of(lab), labels, seeds)))
 
     @property
     def labels(self) -> np.ndarray:
@@ -152,14 +162,25 @@ class MarkedFrame:
         return np.asarray(self.probability.argmax(axis=0), dtype=np.uint8)
 
 
-def start(lab: np.ndarray, seeds: Seeds, height: np.ndarray | None = None, background: Background | None = None) -> MarkedFrame:
-    """Labels and colors of a frame, Lab [H, W, 3], from its marks; with heights above the table [H, W], m, and the background."""
+def start(
+    lab: np.ndarray,
+    seeds: Seeds,
+    height: np.ndarray | None = None,
+    background: Background | None = None,
+    person: np.ndarray | None = None,
+) -> MarkedFrame:
+    """Labels and colors of a frame, Lab [H, W, 3], from its marks; with heights above the table [H, W], m, the background, and the
+    colors [bins] of a person that is marked in any frame."""
     bins, labels = bins_of(lab), _first(lab, seeds)
     place = np.where(seeds.possible, seeds.prior, NEVER).astype(np.float32)
+    if person is not None and not (seeds.certain == PERSON).any():
+        place[PERSON] += UNMARKED_PERSON
     if height is not None:
         place[NOTHING] -= np.where(np.nan_to_num(height) > RISEN_HEIGHT, RISEN_LOGS, 0.0)
     for _ in range(TURNS):
-        counts = counts_of(lab, bins, labels, seeds.certain)
+        counts = counts_of(lab, bins, labels, seeds)
+        if person is not None:
+            counts[PERSON] = mixed([(1.0, counts[PERSON]), (1.0, person)])
         logs = np.stack([log_density(own)[bins] if own.sum() else np.full(bins.shape, NEVER) for own in counts])
         near = np.log(LOCAL_BACKGROUND) + _local_density(lab, labels == NOTHING)
         logs[NOTHING] = np.logaddexp(near, np.log(1 - LOCAL_BACKGROUND) + logs[NOTHING])
@@ -168,14 +189,14 @@ def start(lab: np.ndarray, seeds: Seeds, height: np.ndarray | None = None, backg
         logs = place + COLOR_AT_START * logs
         probability = solve(logs.astype(np.float32), lab)
         labels = tidy(probability.argmax(axis=0).astype(np.uint8), seeds)
-    probability[:, labels != probability.argmax(axis=0)] = np.array([1.0, 0.0, 0.0])[:, None]
+    probability[:, labels != probability.argmax(axis=0)] = np.eye(len(probability))[NOTHING][:, None]
     return MarkedFrame.of(lab, probability, seeds)
 
 
-def counts_of(lab: np.ndarray, bins: np.ndarray, labels: np.ndarray, certain: np.ndarray) -> list[np.ndarray]:
-    """Colors [bins] of nothing, object and hands: of a mask [H, W], of what is certain, and of shadows on the background."""
+def counts_of(lab: np.ndarray, bins: np.ndarray, labels: np.ndarray, seeds: Seeds) -> list[np.ndarray]:
+    """Colors [bins] of each label: of a mask [H, W], of what is certain, and of shadows on the background."""
     counts = []
-    for label in ALL_LABELS:
+    for label in range(len(seeds.possible)):
         own = labels == label
         core = cv2.erode(own.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
         # A thin rope has no core.
@@ -188,7 +209,7 @@ def counts_of(lab: np.ndarray, bins: np.ndarray, labels: np.ndarray, certain: np
                 darker[..., 0] = (shade * lab[..., 0]).astype(np.uint8)
                 parts.append((SHADED, count(bins_of(darker), near)))
         else:
-            parts.append((CERTAIN_WEIGHT, count(bins, certain == label)))
+            parts.append((CERTAIN_WEIGHT, count(bins, seeds.certain == label)))
         counts.append(mixed(parts))
     return counts
 
@@ -237,7 +258,7 @@ def _first(lab: np.ndarray, seeds: Seeds) -> np.ndarray:
 def tidy(labels: np.ndarray, seeds: Seeds) -> np.ndarray:
     """Pieces that no mark touches and that are small against the largest are nothing."""
     result = labels.copy()
-    for label in (OBJECT, HANDS):
+    for label in range(OBJECT, len(seeds.possible)):
         number, pieces, boxes, _ = cv2.connectedComponentsWithStats((labels == label).astype(np.uint8))
         if number <= 2:
             continue
@@ -258,7 +279,7 @@ class CarriedFrame:
     """A frame that is solved."""
 
     probability: np.ndarray
-    """[3, H, W]."""
+    """[K, H, W]."""
     flow_doubt: np.ndarray
     """[H, W], 0 to 1."""
     misfit: np.ndarray
@@ -272,16 +293,18 @@ class Pass:
     lab: np.ndarray
     """The last frame, Lab [H, W, 3]."""
     probability: np.ndarray
-    """Probabilities of the last frame [3, H, W]."""
+    """Probabilities of the last frame [K, H, W]."""
     first: tuple[np.ndarray, ...]
-    """Colors of the marked frames: counts [bins] of nothing, object, hands."""
+    """Colors of the marked frames: counts [bins] of nothing, object, hands, person."""
+    person_depth: np.ndarray | None
+    """Log ratio [bins] of the depths of a person to those of object and hands."""
     background: Background | None
     learns: bool
     """True where the background is learned on the way."""
     reach: float
     running: list[np.ndarray] = field(init=False)
     colors: list[np.ndarray] = field(init=False)
-    """Log densities [bins] of nothing, object and hands."""
+    """Log densities [bins] of each label."""
     explained: np.ndarray = field(init=False)
     """[H, W] bool: where the background explains the last frame's colors best."""
     steps: int = 0
@@ -336,7 +359,7 @@ class Pass:
         return places[0], places[1]
 
     def place(self, lab: np.ndarray, last: np.ndarray, probability: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Probabilities [3, h, w] by what the flow brings, and how far the flow [h, w] is doubted, 0 to 1."""
+        """Probabilities [K, h, w] by what the flow brings, and how far the flow [h, w] is doubted, 0 to 1."""
         flow = flow_between(lab[..., 0], last[..., 0])
         height, width = lab.shape[:2]
         grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
@@ -351,7 +374,7 @@ class Pass:
         moved = np.stack([brought(part) for part in probability], axis=-1)
         narrow, wide = (cv2.GaussianBlur(moved, (0, 0), width * self.reach) for width in (0.35, 2.0))
         place = ((1 - doubt)[..., None] * narrow + doubt[..., None] * wide).transpose(2, 0, 1)
-        for label in ALL_LABELS:
+        for label in range(len(place)):
             if self.first[label].sum():
                 place[label] += ANYWHERE[label]
         place = place + np.float32(1e-6)
@@ -359,19 +382,19 @@ class Pass:
 
     def _new(self, seeds: Seeds) -> list[int]:
         """Labels that are marked on a frame and were on none before."""
-        return [label for label in (OBJECT, HANDS) if not self.first[label].any() and (seeds.certain == label).any()]
+        return [label for label in range(OBJECT, len(self.first)) if not self.first[label].any() and (seeds.certain == label).any()]
 
     def _show(self, lab: np.ndarray, seeds: Seeds) -> None:
         """Take the colors beneath the marks of a frame at once: they say what was not known before."""
         bins = bins_of(lab)
-        for label in ALL_LABELS:
+        for label in range(len(self.first)):
             if (shown := count(bins, seeds.certain == label)).any():
                 self.colors[label] = log_density(mixed([(1.0, self.first[label]), (MARKED_WEIGHT, shown)]))
 
     def color_logs(
         self, lab: np.ndarray, probability: np.ndarray, window: tuple[slice, slice], depth: np.ndarray | None
     ) -> np.ndarray:
-        """Weighted log densities [3, h, w] of a frame's colors, and of its depth against the background's."""
+        """Weighted log densities [K, h, w] of a frame's colors, and of its depth against the background's."""
         bins = bins_of(lab)
         logs = np.stack([own[bins] for own in self.colors])
         nearer = np.zeros(lab.shape[:2], np.float32)
@@ -386,24 +409,27 @@ class Pass:
         self.explained[window] = logs[NOTHING] > logs[1:].max(axis=0)
         logs = COLOR * np.maximum(logs - logs.max(axis=0), -MOST_COLOR / COLOR)
         logs[NOTHING] += nearer
+        if self.person_depth is not None and depth is not None:
+            logs[PERSON] += self.person_depth[depth_bins(depth)]
         return np.asarray(logs, dtype=np.float32)
 
     def tidy(self, probability: np.ndarray, place: np.ndarray, window: tuple[slice, slice], seeds: Seeds | None) -> np.ndarray:
-        """Pieces that nothing brought are nothing, unless they are marked; hands may come in from the image's border."""
+        """Pieces that nothing brought are nothing, unless they are marked; hands and persons may come in from the
+        image's border."""
         labels = probability.argmax(axis=0)
         rows, columns = self.lab.shape[:2]
-        for label in (OBJECT, HANDS):
+        for label in range(OBJECT, len(probability)):
             number, pieces, boxes, _ = cv2.connectedComponentsWithStats((labels == label).astype(np.uint8))
             support = np.bincount(pieces.ravel(), place[label].ravel() > BROUGHT_FROM, minlength=number)
             areas = boxes[:, cv2.CC_STAT_AREA]
             drop = (support < 0.05 * areas) | (areas < 4)
-            if label == HANDS:
+            if label != OBJECT:
                 in_image = np.add(boxes, [window[1].start or 0, window[0].start or 0, 0, 0, 0])
                 drop &= ~(at_border(in_image, (rows, columns)) & (areas > LEAST_ENTERING * rows * columns))
             if seeds is not None:
                 drop[np.unique(pieces[seeds.certain == label])] = False
             drop[0] = False
-            probability[:, drop[pieces]] = np.array([0.98, 0.01, 0.01], np.float32)[:, None]
+            probability[:, drop[pieces]] = self._nearly(NOTHING)
         return probability
 
     def fill(self, probability: np.ndarray, lab: np.ndarray, window: tuple[slice, slice]) -> None:
@@ -423,7 +449,11 @@ class Pass:
             gain = np.bincount(pieces[unseen], np.clip(ratio[unseen], -MOST_COLOR, MOST_COLOR), minlength=number)
             count_unseen = np.bincount(pieces[unseen], minlength=number)
             holes &= (gain > FILLED * count_unseen) & (count_unseen > 0.5 * areas)
-            probability[:, holes[pieces]] = np.array([0.01, 0.98, 0.01], np.float32)[:, None]
+            probability[:, holes[pieces]] = self._nearly(OBJECT)
+
+    def _nearly(self, label: int) -> np.ndarray:
+        """Probabilities [K, 1] of a pixel that is surely of a label."""
+        return np.where(np.arange(len(self.first)) == label, 0.98, 0.01).astype(np.float32)[:, None]
 
     def _learn(self, depth: np.ndarray | None) -> None:
         """Colors, from each fourth frame, and the background."""
@@ -433,7 +463,7 @@ class Pass:
         if self.steps % LEARN_EVERY:
             return
         bins = bins_of(self.lab)
-        for label in ALL_LABELS:
+        for label in range(len(self.first)):
             sure = self.probability[label] > CONFIDENT
             if label != NOTHING:
                 core = cv2.erode(sure.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
@@ -447,10 +477,10 @@ class Pass:
 
 
 def corrections(place: np.ndarray, seeds: Seeds, reach: float) -> np.ndarray:
-    """Log odds [3, h, w] of marks on a frame to which labels were carried: what contradicts them there fades with the distance."""
+    """Log odds [K, h, w] of marks on a frame to which labels were carried: what contradicts them there fades with the distance."""
     logs = np.where(seeds.possible, seeds.prior, NEVER)
     carried = place.argmax(axis=0)
-    for label in ALL_LABELS:
+    for label in range(len(logs)):
         if (wrong := (seeds.certain == label) & (carried != label)).any():
             away = cv2.distanceTransform((~wrong).astype(np.uint8), cv2.DIST_L2, 5)
             logs[label] += CORRECTION * np.exp(-away / (CORRECTED * reach))

@@ -27,7 +27,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
 from neuspring.core.records import canonical, digest_file
 from neuspring.core.section import STRICT, Name
-from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, images_digest, read_labels
+from neuspring.data.capture import CAPTURE, HANDS, OBJECT, PERSON, Capture, images_digest, read_labels
 from neuspring.data.frames import Color, frames_of, overlap, overlay, spread, tints_of, write_png
 from neuspring.perception.marks.carry import Carried, carry_camera
 from neuspring.perception.marks.marks import MARKS, Mark, Marks, marks_digest
@@ -73,8 +73,10 @@ def save_masks(capture: Capture, camera: str, labels: np.ndarray) -> Path:
     shape = (capture.frame_count, view.height, view.width)
     if labels.shape != shape or labels.dtype != np.uint8:
         raise InputError(f"masks of camera {camera}", f"labels must be uint8 of shape {shape}", f"{labels.dtype} {labels.shape}")
-    if labels.max(initial=0) > HANDS:
-        raise InputError(f"masks of camera {camera}", "labels must be 0 (nothing), 1 (object) or 2 (hands)", int(labels.max()))
+    if labels.max(initial=0) > PERSON:
+        raise InputError(
+            f"masks of camera {camera}", "labels must be 0 (nothing), 1 (object), 2 (hands) or 3 (person)", int(labels.max())
+        )
     # From here on the masks are no longer what masks.json says, also if this is interrupted.
     _write_made(capture, {name: made for name, made in MasksFile.of(capture).cameras.items() if name != camera})
     for frame in frames_of(capture, camera):

@@ -7,6 +7,7 @@ pytest.importorskip("viser", reason="the extra [play] is not installed")
 
 import json
 import time
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -16,13 +17,16 @@ from neuspring.cli.main import main
 from neuspring.core.artifacts import SplatCenters, Trajectory
 from neuspring.core.files import read_npz, write_npz
 from neuspring.core.records import digest_file
-from neuspring.extensions.play.layers import SPLAT_UNIT, SplatLayer
+from neuspring.data.capture import Capture
+from neuspring.extensions.play.colors import linear
+from neuspring.extensions.play.layers import SPLAT_UNIT, UNSEEN_COLOR, SplatLayer, unseen
 from neuspring.extensions.play.page import Page
 from neuspring.extensions.play.player import Player
 from neuspring.report.shown import find
 from neuspring.scores.metrics import track_errors
 from neuspring.splats.model import Gaussians
 from neuspring.splats.view import C0
+from tests.support.captures import describe, entry
 from tests.support.played import dressed, record, rod_results, softer, spoil
 
 RUN = "baseline/0"
@@ -127,6 +131,67 @@ def test_the_first_view_holds_all_runs_and_no_more_room_than_needed(opened, scen
     # The lower part of the window is covered.
     assert np.abs(x).max() <= 1 and y.max() <= 1 and y.min() >= 2 * covered - 1
     assert max(np.abs(x).max(), (np.abs(y - covered) / (1 - covered)).max()) > 0.85
+
+
+def looked_at(scenario, folder, *eyes: tuple[float, float, float]):
+    """The scenario as cameras at `eyes`, m from the body's middle, saw it."""
+    found = find([scenario])
+    middle = found.observations.nodes.mean(axis=0)
+    poses = [np.vstack([np.column_stack([np.eye(3), middle + eye]), [0, 0, 0, 1]]) for eye in eyes]
+    cameras = tuple(replace(entry(str(k)), camera_to_world=tuple(map(tuple, pose.tolist()))) for k, pose in enumerate(poses))
+    return replace(found, capture=Capture(folder, describe(cameras=cameras)))
+
+
+@pytest.mark.parametrize("eye", [(1.0, 0.2, 0.3), (0.1, -1.0, 0.4), (0.0, 0.0, 1.0)])
+def test_a_twin_of_one_camera_opens_from_where_that_camera_stood(scenario, server, tmp_path, eye):
+    player = Player(server.scene, looked_at(scenario, tmp_path, eye))
+    _, look_at, position = player.view(0.8)
+    back = (position - look_at) / np.linalg.norm(position - look_at)
+    player.display.runs = player.display.runs[:1]
+    _, look_at, position = player.view(0.8)
+    middle = 0.5 * (player.low + player.high)
+    seen = player._eye - middle
+    assert back @ seen / np.linalg.norm(seen) > 0.999
+    # With one run, its middle is what is looked at.
+    assert look_at == pytest.approx(middle)
+    # Runs stand beside each other, and not one behind the other.
+    assert abs(np.array(player.offset(1)) @ back) < 0.75 * np.linalg.norm(player.offset(1))
+    server.scene.reset()
+
+
+def test_several_cameras_leave_the_view_as_it_was(scenario, server, tmp_path):
+    plain, rig = Player(server.scene, find([scenario])), Player(server.scene, looked_at(scenario, tmp_path, (1, 0, 0), (0, 1, 0)))
+    assert all(np.array_equal(a, b) for a, b in zip(plain.view(0.8), rig.view(0.8), strict=True))
+    server.scene.reset()
+
+
+def test_parts_that_nobody_saw_are_gray(scenario, server, tmp_path):
+    splats, found = dressed(scenario), looked_at(scenario, tmp_path, (1.0, 0.2, 0.3))
+    nodes = found.observations.nodes
+    seen = nodes[nodes[:, 0] < np.median(nodes[:, 0])]
+    assert not unseen(nodes, None).any()
+    assert not unseen(seen, seen).any()
+    hidden = unseen(nodes, seen)
+    assert hidden[nodes[:, 0] > nodes[:, 0].max() - 0.01].all()
+    half = replace(found.observations, **half_seen(found.observations, hidden))
+    player = Player(server.scene, replace(found, observations=half))
+    body = player._bodies["baseline/0"]
+    assert (body.nodes.batched_colors[unseen(nodes, player.seen)] == linear(np.array(UNSEEN_COLOR, np.uint8))).all()
+    assert (body.nodes.batched_colors[~unseen(nodes, player.seen)] != linear(np.array(UNSEEN_COLOR, np.uint8))).any(axis=1).all()
+    colors, gray = body.splats.handle.rgbs / 255, unseen(splats.means, player.seen)
+    assert gray.any() and not gray.all()
+    assert (np.ptp(colors[gray], axis=1) < 0.01).all()
+    own = np.clip(0.5 + C0 * splats.harmonics[:, 0], 0, 1)
+    assert colors[~gray] == pytest.approx(own[~gray], abs=1 / 255)
+    server.scene.reset()
+
+
+def half_seen(observations, hidden: np.ndarray) -> dict[str, np.ndarray]:
+    """Fields of observations whose `hidden` nodes [N] bool were never tracked: they are further nodes of the surface."""
+    count = observations.object_points.shape[1]
+    tracked = ~hidden[:count]
+    kept = {name: getattr(observations, name)[:, tracked] for name in ("object_points", "object_visibility", "object_motion_valid")}
+    return kept | {"surface_points": np.concatenate([observations.object_points[0][~tracked], observations.surface_points])}
 
 
 def test_a_stretch_above_the_limit_is_red_and_said(opened, scenario):

@@ -1,13 +1,16 @@
 """Marks carried through films whose masks are known."""
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 import pytest
 
 from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
-from neuspring.data.capture import HANDS, OBJECT
+from neuspring.data.capture import HANDS, OBJECT, PERSON
 from neuspring.perception.marks.carry import carry, frame_mask
+from neuspring.perception.marks.colors import LAB_BINS, Background, bins_of
 from tests.support.marked import SIZE, SQUARE, Painted, mark, overlap, painted, rope
 
 SETTINGS = MarksSegmentation()
@@ -95,6 +98,58 @@ def test_an_ignored_hand_that_leaves_does_not_make_the_table_object():
     # Without the hand 121 pixels at the pale square are wrong in the last frame; 470 were with it.
     assert ((labels[-1] > 0) & (made.truth[-1] == 0)).sum() < 250
     assert all((labels[frame, :26, 46:] == 0).all() for frame in range(5)), "while it is there it is neither"
+
+
+def visited(color: tuple[int, int, int]) -> tuple[Painted, np.ndarray]:
+    """A film into which a sleeve comes from the right in frame 2; and where it is [T, H, W] bool."""
+    made, (rows, columns) = painted(8), np.indices(SIZE)
+    grain = cv2.GaussianBlur(np.random.default_rng(7).normal(0, 1, SIZE), (0, 0), 1.5)[..., None]
+    sleeve = np.zeros(made.truth.shape, bool)
+    for frame, image in enumerate(made.frames):
+        sleeve[frame] = (columns > 112 - 10 * max(frame - 1, 0)) & (rows >= 36) & (rows < 60)
+        image[sleeve[frame]] = np.clip(color + 30 * grain[sleeve[frame]], 0, 255)
+        made.truth[frame][sleeve[frame]] = 0
+    return made, sleeve
+
+
+SLEEVE = mark("person", "scribble", [(70, 48), (108, 48)], frame=6, radius=4.0)
+
+
+def test_a_person_that_is_marked_once_is_neither_object_nor_hand_in_any_frame():
+    """Its sleeve has nearly the color of the hands, and counted as one."""
+    film, sleeve = visited((180, 110, 92))
+    plain, known = (carry(film, marks, SETTINGS).labels for marks in (SQUARE, [*SQUARE, SLEEVE]))
+    assert np.isin(plain[sleeve], (OBJECT, HANDS)).mean() > 0.5
+    assert np.isin(known[sleeve], (OBJECT, HANDS)).mean() < 0.05
+    assert all((known[frame][sleeve[frame]] == PERSON).mean() > 0.7 for frame in (4, 5, 6, 7))
+    assert overlap(known[7], film.truth[7], OBJECT) > 0.85
+
+
+def test_a_person_s_depth_tells_it_from_hands_of_its_color():
+    film, sleeve = visited((190, 120, 95))
+
+    @dataclass(frozen=True, eq=False)
+    class Deep(Painted):
+        def depth(self, frame: int, /) -> np.ndarray:
+            near = np.where(self.truth[frame] > 0, 0.6, 1.0)
+            return np.where(sleeve[frame], 0.8, near).astype(np.float32)
+
+    flat, deep = (carry(kind(film.frames, film.truth), [*SQUARE, SLEEVE], SETTINGS).labels for kind in (Painted, Deep))
+    wrong = [np.isin(found[sleeve], (OBJECT, HANDS)).mean() for found in (flat, deep)]
+    assert wrong[1] < 0.05
+    assert overlap(deep[3], film.truth[3], HANDS) > max(0.75, overlap(flat[3], film.truth[3], HANDS) - 0.05)
+
+
+def test_colors_of_a_person_teach_no_background():
+    place = np.ones((4, 4), bool)
+    lab = np.full((4, 4, 3), 120, np.uint8)
+    strangers = np.zeros(int(np.prod(LAB_BINS)), bool)
+    strangers[bins_of(lab)] = True
+    background = Background.empty((4, 4), strangers=strangers)
+    background.learn(lab, place)
+    assert not background.seen.any()
+    background.learn(lab + 60, place)
+    assert background.seen.all()
 
 
 def test_a_mark_corrects_what_was_carried():

@@ -219,7 +219,7 @@ def test_masks_that_are_half_written_are_not_taken_for_those_before(folder, monk
     ("labels", "message"),
     [
         (np.zeros((FRAMES, 90, 161), np.uint8), r"labels must be uint8 of shape \(6, 90, 160\)"),
-        (np.full((FRAMES, 90, 160), 3, np.uint8), "labels must be 0 .* received 3"),
+        (np.full((FRAMES, 90, 160), 4, np.uint8), "labels must be 0 .* received 4"),
     ],
 )
 def test_masks_that_do_not_fit_are_refused(folder, labels, message):

@@ -10,7 +10,7 @@ import { row, swatch } from "./rows.js";
 
 const find = (id) => document.getElementById(id);
 const KINDS = { b: "box", c: "click", s: "scribble", p: "polygon" };
-const LABELS = { 1: "object", 2: "hand", 3: "ignore" };
+const LABELS = { 1: "object", 2: "hand", 3: "ignore", 4: "person", 5: "obstacle" };
 const HINTS = {
   box: "Drag a box around the {label}.",
   click: "Click on the {label}.",
@@ -45,6 +45,7 @@ export class MasksMode {
     find("carry-all").onclick = guard(() => this.carry(app.cameras().filter((name) => this.marksOf(name).length)));
     find("stop").onclick = guard(() => post("/api/stop"));
     find("save-masks").onclick = guard(() => this.save());
+    find("measure").onclick = guard(() => this.measure());
     this.setLabel("object");
     this.setTool("box");
     this.setRadius(3);
@@ -98,7 +99,7 @@ export class MasksMode {
     this.refresh();
     this.preview = null;
     if (!sent) this.app.showMasks();
-    else if (find("live").checked && this.here().some((mark) => mark.label !== "ignore")) this.showPreview(false);
+    else if (find("live").checked && this.here().some((mark) => ["object", "hand"].includes(mark.label))) this.showPreview(false);
     else this.app.showMasks();
     if (sent) this.reread();
   }
@@ -181,6 +182,11 @@ export class MasksMode {
     say(`Saved masks of camera ${cameras.join(", ")}.`, "good");
   }
 
+  async measure() {
+    await this.edits.sending;
+    say((await post("/api/obstacles")).text, "good");
+  }
+
   // The panel.
   setLabel(label) {
     this.label = label;
@@ -225,6 +231,7 @@ export class MasksMode {
       app.chip(frame, `${frame} · ${Math.round(100 * doubt)} %`, doubt > HIGH ? "high" : "mid")));
     find("doubtful").dataset.empty = this.doubt().length ? "none: all frames are sure" : "known once masks are carried";
     const unsaved = Object.keys(results.carried).filter((name) => !results.carried[name].saved);
+    find("measure").disabled = !Object.values(this.edits.value?.cameras ?? {}).flat().some((mark) => mark.label === "obstacle");
     find("save-masks").disabled = running || !unsaved.length;
     const list = (names) => names.join(", ");
     find("masks-note").textContent =
@@ -268,7 +275,7 @@ export class MasksMode {
   }
 
   legend() {
-    return [[COLORS.object, "object"], [COLORS.hand, "hand"], [COLORS.ignore, "ignore"], [doubtColor(1), "doubt"]];
+    return [...Object.entries(COLORS).map(([label, color]) => [color, label]), [doubtColor(1), "doubt"]];
   }
 
   key(event) {
