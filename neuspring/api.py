@@ -129,8 +129,8 @@ def show(
     """A picture of a run, a twin or a prediction; as the last value of a notebook's cell it is shown there.
 
     A twin is colored by stiffness. A prediction is drawn in a few frames, beside what was seen where `observations` are given;
-    those of a run are known. With `film` all frames move (GIF). `output` is a file to write: .png, .jpg, .svg, .pdf, or a film .gif, .mp4.
-    Raises InputError.
+    those of a run are known. With `film` all frames move (GIF). `output` is a file to write: a picture .png, .jpg, .svg, .pdf, or a
+    film .gif, .mp4. Raises InputError.
     """
     from neuspring.draw.show import show as drawn
 
