@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import multiprocessing
+import os
 import re
 import socket
 import sqlite3
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 
 from neuspring import config
+from neuspring.cli.results import ui
 from neuspring.config import Config, Tracking
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import Attempt, JobRecord
@@ -26,7 +28,7 @@ from neuspring.experiments.tracking import store as tracking_store
 from neuspring.experiments.tracking.log import _usage
 from neuspring.experiments.tracking.store import score_name
 from neuspring.scores.metrics import METRICS, TASKS
-from tests.support.stores import STEPS, client_of, python, runs_of, write_run
+from tests.support.stores import STEPS, client_of, free_port, python, runs_of, write_run
 
 ROOT = Path(__file__).resolve().parents[2]
 SETTINGS = Tracking()
@@ -370,3 +372,13 @@ print(os.environ["MLFLOW_DISABLE_TELEMETRY"], os.environ["DO_NOT_TRACK"], os.env
 """
     text, errors = python(code, results, stderr=subprocess.PIPE).communicate(timeout=240)
     assert (text.split(), errors) == (["true", "true", "7", "None"], "")
+
+
+def test_the_pages_are_served_by_one_process_on_this_machine_alone(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tracking.log_run(write_run(results), results, SETTINGS)
+    asked: list[list[str]] = []
+    monkeypatch.setattr(os, "execve", lambda program, words, environment: asked.append(words))
+    ui(results, port=free_port())
+    (words,) = asked
+    given = dict(zip(words[4::2], words[5::2], strict=True))
+    assert (given["--workers"], given["--host"]) == ("1", "127.0.0.1")
