@@ -8,9 +8,25 @@ from typing import TYPE_CHECKING, Any
 from neuspring.core.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from neuspring.api import Observations, Topology, Trajectory, Twin, fit, load_run, roll_out, score, search
+    from neuspring.api import (
+        Observations,
+        Topology,
+        Trajectory,
+        Twin,
+        fit,
+        load_run,
+        roll_out,
+        score,
+        search,
+        show,
+        twin_from_capture,
+        with_mass,
+    )
 
-__all__ = ["Observations", "Topology", "Trajectory", "Twin", "fit", "load_run", "roll_out", "score", "search"]
+__all__ = [
+    "Observations", "Topology", "Trajectory", "Twin",
+    "fit", "load_run", "roll_out", "score", "search", "show", "twin_from_capture", "with_mass",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -1,14 +1,15 @@
 """Functions for researchers in Python: `import neuspring as ns`.
 
     run = ns.load_run("results/synthetic_single_lift_sloth/neuspring/0")
-    predicted = ns.roll_out(run.twin, run.observations)
-    print(ns.score(predicted, run.observations))
+    print(run.summary())
+    ns.show(ns.roll_out(run.twin, run.observations), run.observations)
 
 The workflow's stages call the same functions, so that results are equal.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,15 +19,19 @@ import numpy as np
 from neuspring.config import Config, parse
 from neuspring.config.settings import read_settings as settings_of
 from neuspring.core.artifacts import Observations, Topology, Trajectory, Twin
-from neuspring.core.errors import InputError
+from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.run_folder import RunFolder
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from neuspring.draw.show import Shown
     from neuspring.twin.body import Learned
 
-__all__ = ["Observations", "Topology", "Trajectory", "Twin", "fit", "load_run", "roll_out", "score", "search"]
+__all__ = [
+    "Observations", "Topology", "Trajectory", "Twin",
+    "fit", "load_run", "roll_out", "score", "search", "show", "twin_from_capture", "with_mass",
+]  # fmt: skip
 Settings = Config | Mapping[str, Any] | Path | str | None
 """An object, values as in a YAML file (`{"fit": {"epochs": 60}}`), YAML files (with commas between them), or none: the defaults."""
 
@@ -41,6 +46,95 @@ def load_run(folder: Path | str) -> RunFolder:
         remedy = "Name results/<scenario>/<method>/<seed>; `make demo` makes some."
         raise InputError(folder, "must be the folder of a run", "no record of a stage", remedy)
     return run
+
+
+def twin_from_capture(
+    folder: Path | str,
+    settings: Settings = None,
+    *,
+    output: Path | str = "results/python",
+    mass: float | None = None,
+    clusters: int | None = None,
+    body: str = "lattice",
+    kind: str | None = None,
+    seed: int = 0,
+    device: str = "auto",
+    threads: int = 1,
+) -> RunFolder:
+    """A capture folder -> the run with its fitted `twin`: perceive, search, fit, predict and score, by the workflow's stages.
+
+    Files lie as the workflow's, and the run in `output`/<name of the folder>/python/<seed>; a search that was stopped goes on.
+    `config/data/own.yaml` has settings for a laptop. The twin has `mass`, kg, where it is given (`with_mass`); `clusters`, `body`
+    and `kind` are those of `search` and `fit`. Raises InputError, and NumericalFailure where search or fit fails.
+    """
+    from neuspring.core.records import StageRecord
+    from neuspring.data.capture import CAPTURE
+    from neuspring.data.capture import Capture as CaptureFolder
+    from neuspring.scenes.sources import row_of_capture
+    from neuspring.stages import STAGES
+
+    folder = Path(folder).absolute()
+    row, cameras = row_of_capture(folder / CAPTURE), tuple(CaptureFolder.load(folder).cameras)
+    read = dataclasses.replace(read_settings(settings), data_root=str(folder.parent))
+    regions, method = read.clusters if clusters is None else clusters, "python"
+    kind = kind or ("rod" if body == "rod" else "field")
+    own = {"capture": folder / CAPTURE, "scenario": row, "clusters": regions, "body": body, "kind": kind, "method": method}
+    own |= {"seed": seed, "device": device, "threads": threads}
+    own |= {"variant": {"search": body, "clusters": regions, "fit": kind}}
+
+    def made(stage: str, **given: Any) -> Path:
+        one = STAGES[stage]
+        words = {"scenario": row.scenario, "search": method, "method": method, "seed": seed, **given}
+        path: Path = Path(output) / one.output.format(**words)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        one(output=path, settings=read, **{name: value for name, value in (own | given).items() if name in one.parameters})
+        if stage in ("search", "fit") and (record := StageRecord.load(path)).status == "failed":
+            raise NumericalFailure(record.reason)
+        return path
+
+    lifted: dict[str, Path] = {}
+    if cameras:
+        masks = [made("segment", camera=camera) for camera in cameras]
+        tracks = [made("track", camera=camera, masks=path) for camera, path in zip(cameras, masks, strict=True)]
+        lifted = {"lifted": made("lift", masks=masks, tracks=tracks)}
+    seen = {"observations": made("observe", **lifted)}
+    found = {"search": made("search", **seen)}
+    found |= {"fit": made("fit", **seen, **found)}
+    run = made("score", **seen, **found, rollout=made("rollout", **seen, learned=found["fit"])).parent
+    loaded = load_run(run)
+    if mass is not None and loaded.twin is not None:
+        vars(loaded)["twin"] = with_mass(loaded.twin, mass)
+    return loaded
+
+
+def with_mass(twin: Twin, mass: float) -> Twin:
+    """The twin with so much `mass` in all, kg, which moves as before; without it a node has 1 kg, since no film shows a weight.
+
+    All that is in N or kg is multiplied by the same factor. Raises InputError unless the mass is positive.
+    """
+    from neuspring.twin.body import with_mass as weighed
+
+    if not 0 < mass < np.inf:
+        raise InputError("mass", "a positive number of kg is required", mass)
+    return weighed(twin, mass)
+
+
+def show(
+    what: RunFolder | Twin | Trajectory,
+    observations: Observations | None = None,
+    output: Path | str | None = None,
+    *,
+    film: bool = False,
+) -> Shown:
+    """A picture of a run, a twin or a prediction; as the last value of a notebook's cell it is shown there.
+
+    A twin is colored by stiffness. A prediction is drawn in a few frames, beside what was seen where `observations` are given;
+    those of a run are known. With `film` all frames move (GIF). `output` is a file to write: a picture .png, .jpg, .svg, .pdf, or a
+    film .gif, .mp4. Raises InputError.
+    """
+    from neuspring.draw.show import show as drawn
+
+    return drawn(what, observations, None if output is None else Path(output), film)
 
 
 def roll_out(twin: Twin, hands: Observations | np.ndarray, device: str = "auto") -> Trajectory:
@@ -105,13 +199,14 @@ def fit(
     seed: int = 0,
     device: str = "auto",
     checkpoint: Path | None = None,
+    mass: float | None = None,
 ) -> Learned:
     """Train a twin's stiffness by gradients through the simulation, as a neural spring `field` or each of the `springs` apart.
 
     A rod is fitted as `kind="rod"`, in everything that is unknown of it.
 
-    The result has the best `twin` and the `history` of losses. With a `checkpoint`, a fit that was stopped goes on. Raises
-    InputError, NumericalFailure.
+    The result has the best `twin`, of this `mass`, kg, where it is given (`with_mass`), and the `history` of losses. With a
+    `checkpoint`, a fit that was stopped goes on. Raises InputError, NumericalFailure.
     """
     from neuspring.core.device import resolve_device
     from neuspring.twin.body import body_of
@@ -129,7 +224,8 @@ def fit(
         kind=kind,
         seed=seed,
     )
-    return body_of(twin).fit(problem, partial=checkpoint)
+    learned = body_of(twin).fit(problem, partial=checkpoint)
+    return learned if mass is None else dataclasses.replace(learned, twin=with_mass(learned.twin, mass))
 
 
 def read_settings(settings: Settings) -> Config:

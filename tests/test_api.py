@@ -1,31 +1,38 @@
 """`import neuspring as ns`: the page's blocks run, and give what the workflow gives."""
 
 import importlib
+import importlib.util
+import io
 import json
+import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
+import pandas as pd
 import pytest
+from PIL import Image
 
 import neuspring as ns
 from neuspring.baselines import BASELINES, Baseline
-from neuspring.config import Fit, Losses
+from neuspring.config import Fit, Losses, Search
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_table
 from neuspring.scores import metrics
 from neuspring.twin import losses
 from neuspring.twin.candidates import candidate
 from neuspring.twin.fit import TwinFit
-from tests.support import played, small
+from tests.support import perceived, played, small
+from tests.support.filmed import film
 
 PAGE = Path(ns.__file__).parent / "README.md"
 NOTEBOOK = PAGE.with_name("tutorial.ipynb")
-DEMO = "results/synthetic_single_lift_sloth/neuspring/0"
+PACKAGED, OWN = "ns.load_run()", "results/small/neuspring/0"
 CODE = re.compile(r"```python\n(.*?)```", re.DOTALL)
 
 
@@ -42,7 +49,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def blocks(text: str) -> list[str]:
-    return CODE.findall(text.replace(DEMO, "results/small/neuspring/0"))
+    return CODE.findall(text.replace(PACKAGED, f'ns.load_run("{OWN}")'))
 
 
 def of_notebook() -> str:
@@ -63,7 +70,79 @@ def test_every_block_runs(text: str, folder: Path, monkeypatch: pytest.MonkeyPat
     assert names["pulled"].positions.shape == (46, *run.trajectory.positions.shape[1:])
     assert names["pulled"].positions[-1, :, 2].max() > run.twin.topology.nodes[:, 2].max() + 0.02, "the hands lift it"
     assert len(names["scores"]) == sum(len(ns.load_run(f"results/small/{m}/0").scores) for m in ("baseline", "neuspring"))
-    assert "'springs': " in capsys.readouterr().out
+    assert "e+0" not in capsys.readouterr().out, "numbers are for reading"
+
+
+def test_the_notebook_opens_with_errors_in_mm_of_the_packages_run() -> None:
+    first, second = blocks(of_notebook())[:2]
+    assert OWN in first and first.splitlines()[-1] == "run.summary()" and "ns.show(" in second
+
+
+def test_a_summary_has_lengths_in_mm_and_four_digits(folder: Path) -> None:
+    run = ns.load_run(folder / OWN)
+    vars(run)["scores"] = pd.concat([run.scores, run.scores.head(1).assign(metric="psnr", unit="dB", value=31.23456)])
+    found, errors = run.summary(), run.scores.set_index(["metric", "task"])["value"]
+    assert list(found.columns) == list(metrics.TASKS) and found.index[0] == (run.scores["metric"].iloc[0], "mm")
+    for (metric, unit), row in found.iterrows():
+        for task, value in row.dropna().items():
+            assert value == pytest.approx((1e3 if unit == "mm" else 1) * errors[metric, task], rel=6e-4)
+    assert found.loc[("psnr", "dB"), "reconstruction"] == 31.23 and np.isnan(found.loc[("psnr", "dB"), "future"])
+
+
+def test_what_is_shown_is_in_the_cell_and_in_the_file(folder: Path, tmp_path: Path) -> None:
+    run = ns.load_run(folder / OWN)
+    assert run.trajectory and run.twin
+    short = ns.Trajectory(positions=run.trajectory.positions[:3], frame_count=3)
+    for what, name in ((run, "run.png"), (run.twin, "twin.svg"), (run.trajectory, "motion.png"), (short, "short.gif")):
+        shown, kind = ns.show(what, output=tmp_path / name), name.rpartition(".")[2]
+        assert (tmp_path / name).read_bytes() == shown.data
+        assert f'<img src="data:image/{kind}' in shown._repr_html_()
+    with Image.open(tmp_path / "short.gif") as film:
+        alone = film.size
+    with Image.open(io.BytesIO(ns.show(short, run.observations, film=True).data)) as film:
+        assert film.format == "GIF" and film.size[0] > 1.5 * alone[0], "observed beside predicted"
+    with pytest.raises(InputError, match=r"twin\.gif: a film is of a trajectory; received a twin"):
+        ns.show(run.twin, output=tmp_path / "twin.gif")
+    with pytest.raises(InputError, match=r"run\.doc: must end in one of \.png"):
+        ns.show(run, output="run.doc")
+    longer = ns.Trajectory(positions=np.repeat(run.trajectory.positions, 2, axis=0), frame_count=2 * len(run.trajectory.positions))
+    with pytest.raises(InputError, match="Show a trajectory under other hands without them"):
+        ns.show(longer, run.observations, film=True)
+
+
+def test_pictures_leave_a_notebooks_backend_alone() -> None:
+    code = "import matplotlib; import neuspring.draw.sheet; print(matplotlib.get_backend())"
+    for backend in ("module://matplotlib_inline.backend_inline", ""):
+        environment = {name: value for name, value in os.environ.items() if name != "MPLBACKEND"}
+        environment |= {"MPLBACKEND": backend} if backend and importlib.util.find_spec("matplotlib_inline") else {}
+        ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+        assert ("inline" if "MPLBACKEND" in environment else "agg") in ran.stdout.lower()
+
+
+def test_a_mass_changes_forces_and_no_motion(folder: Path) -> None:
+    run = ns.load_run(folder / OWN)
+    heavy = ns.with_mass(run.twin, 0.35)
+    assert heavy.material.mass.sum() == pytest.approx(0.35, rel=1e-5)
+    assert np.allclose(ns.roll_out(heavy, run.observations).positions, ns.roll_out(run.twin, run.observations).positions, atol=1e-5)
+    fitted = ns.fit(run.observations, run.twin, {"fit": {"epochs": 1}}, kind="springs", mass=2.0)
+    assert fitted.twin.material.mass.sum() == pytest.approx(2.0, rel=1e-5)
+    for wrong in (0.0, -1.0, np.inf):
+        with pytest.raises(InputError, match="mass: a positive number of kg"):
+            ns.with_mass(run.twin, wrong)
+
+
+def test_a_capture_becomes_a_run_with_its_twin(tmp_path: Path) -> None:
+    taken = film(tmp_path / "captures" / "ball", cameras=1)
+    settings = replace(perceived.SETTINGS, search=Search(rollouts=8), fit=Fit(epochs=1))
+    run = ns.twin_from_capture(taken.folder, settings, output=tmp_path / "results", mass=0.2, clusters=1, device="cpu")
+    assert run.folder == tmp_path / "results" / "ball" / "python" / "0"
+    assert set(run.stages) == {"search", "fit", "rollout"} and run.observations.scenario.name == "ball"
+    assert run.twin and run.twin.material.mass.sum() == pytest.approx(0.2, rel=1e-5)
+    assert {"chamfer", "track_error"} <= set(run.summary().index.get_level_values("metric"))
+    # The same folder is one of the workflow's, which tables and commands read.
+    assert json.loads((run.folder / "run.json").read_text())["scenario"] == "ball"
+    with pytest.raises(InputError, match=r"capture\.json"):
+        ns.twin_from_capture(tmp_path)
 
 
 def test_the_name_alone_loads_nothing_heavy() -> None:
@@ -76,7 +155,7 @@ def test_the_name_alone_loads_nothing_heavy() -> None:
 
 
 def test_clear_errors(folder: Path) -> None:
-    run = ns.load_run(folder / "results/small/neuspring/0")
+    run = ns.load_run(folder / OWN)
     count = len(run.twin.topology.controllers)
     with pytest.raises(InputError, match=rf"hands: must be observations, or positions \[T, {count}, 3\] in meters.*\(5, 3\)"):
         ns.roll_out(run.twin, np.zeros((5, 3)))

@@ -280,4 +280,6 @@ def ui(results: Results = Path("results"), settings: Settings = "{}", host: str 
         raise InputError("--port", "must be free", f"{port} ({error.strerror})", f"Give another: --port {port + 1}.") from error
     print(f"MLflow UI: http://{host}:{port}/{place} (stop with Ctrl-C)", flush=True)
     command = [sys.executable, "-m", "mlflow", "ui", "--backend-store-uri", uri, "--host", host, "--port", str(port)]
+    # Each of MLflow's four processes imports all of it, and opens the index anew for the page that asks it first.
+    command += ["--workers", "1"]
     os.execve(sys.executable, command, ENVIRONMENT | {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"} | os.environ)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from neuspring.core.artifacts import Observations, Trajectory, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.records import Before, StageRecord, digest_file
+from neuspring.core.text import readable
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -111,6 +112,18 @@ class RunFolder:
         if not path.is_file():
             raise InputError(path, "the scores of the run must be there", "no such file", "Run the workflow again.")
         return pd.read_parquet(path)
+
+    def summary(self) -> pd.DataFrame:
+        """Errors for reading: a row per metric and unit, a column per task; lengths in mm, with four significant digits.
+
+        Raises InputError if there are no scores.
+        """
+        scores = self.scores
+        value, unit = zip(*map(readable, scores["value"], scores["unit"]), strict=True) if len(scores) else ((), ())
+        table = scores.assign(value=value, unit=unit)
+        rows = dict.fromkeys(zip(table["metric"], table["unit"], strict=True))
+        wide = table.pivot(index=["metric", "unit"], columns="task", values="value")
+        return wide.reindex(index=list(rows), columns=list(dict.fromkeys(table["task"])))
 
     @cached_property
     def observations(self) -> Observations:

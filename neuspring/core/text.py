@@ -19,6 +19,12 @@ def listed(names: Iterable[object], most: int = 12) -> str:
     return ", ".join(texts) if len(texts) <= most else f"{', '.join(texts[:most])} and {len(texts) - most} more"
 
 
+def readable(value: float, unit: str) -> tuple[float, str]:
+    """A value and its unit for reading: four significant digits, lengths in mm."""
+    value, unit = (1e3 * value, "mm") if unit == "m" else (value, unit)
+    return float(f"{value:.4g}"), unit
+
+
 def refuse_password(key: str, uri: str, instead: str) -> None:
     """Raise ValueError if a URI holds a password: command lines and logs of jobs would show it."""
     if ":" in uri.partition("://")[2].partition("/")[0].rpartition("@")[0]:

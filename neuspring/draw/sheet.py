@@ -8,7 +8,9 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-matplotlib.use("Agg")
+# A notebook's own backend stays: it shows the user's figures.
+if "inline" not in str(matplotlib.get_backend(auto_select=False)):
+    matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable

@@ -144,16 +144,21 @@ def scenario_rows(settings: Config, root: Path = Path(), also: Iterable[str] = (
         name = path.parent.name
         try:
             if name not in rows:
-                own = capture.read_description(path)
-                touches = own.category == "cloth" if own.self_collision is None else own.self_collision
-                source = "capture" if own.cameras else "points"
-                values = {"scenario": name, "source": source, "category": own.category, "path": name}
-                rows[name] = parse(ScenarioRow, values | {"self_collision": touches, "ground": own.ground}, str(path))
+                rows[name] = row_of_capture(path)
         except InputError:
             # Another capture that is damaged is no reason to stop.
             if name in settings.scenarios:
                 raise
     return rows
+
+
+def row_of_capture(path: Path) -> ScenarioRow:
+    """The row that a capture.json stands for, where the table has none. Raises InputError."""
+    own, name = capture.read_description(path), path.absolute().parent.name
+    touches = own.category == "cloth" if own.self_collision is None else own.self_collision
+    source = "capture" if own.cameras else "points"
+    values = {"scenario": name, "source": source, "category": own.category, "path": name}
+    return parse(ScenarioRow, values | {"self_collision": touches, "ground": own.ground}, str(path))
 
 
 def read_scenarios(path: Path) -> dict[str, ScenarioRow]:

@@ -6,8 +6,7 @@ Both follow the released evaluation of PhysTwin. The track error has a floor, it
 its points move with the nodes around them (`carried`). DEFORM's L1 error is that of its evaluation, of markers along a cable.
 Metrics of pictures are computed in `pictures` and `lpips`.
 
-A metric is one member of `METRICS` and carries its function: it is computed wherever runs are scored, and stands in all tables. An
-installed package adds one by an entry point of the group `neuspring.metrics`, whose object is a `Metric`.
+A metric is one member of `METRICS` and carries its function: it is computed wherever runs are scored, and stands in all tables.
 
 pandas and SciPy are imported where they are used, because the workflow reads the declarations at its start.
 """

@@ -40,7 +40,10 @@ def by_runs(bench: Bench) -> list[Row]:
         client, experiment = connect(results, settings)
         # Statistics are made when the pages are opened.
         page(results, settings)
-        best, of_scenario = ["metrics.`future.chamfer` ASC"], f"tags.scenario = 'scene{count // 2}' and params.fit = 'springs'"
+        best, of_scenario = (
+            ["metrics.`scores/future.chamfer_mm` ASC"],
+            f"tags.scenario = 'scene{count // 2}' and params.fit = 'springs'",
+        )
         assert len(client.search_runs([experiment], max_results=PAGE, order_by=best)) == PAGE
         assert len(client.search_runs([experiment], of_scenario)) == 1
         extra = iter(range(count, count + 9))

@@ -3,10 +3,13 @@
 import importlib.util
 import json
 import os
+import re
 import subprocess
 import sys
+import tomllib
 
 import pytest
+import yaml
 
 from neuspring.core.job_records import read_jobs
 from tests.support.project import ROOT, SCENE, arguments, environment, output_of, start
@@ -86,3 +89,19 @@ def test_names_alone_are_jobs_to_cancel(tmp_path):
     variables = environment(**kubectl(tmp_path / "bin", f'echo "$@" > "{calls}"'))
     subprocess.run([sys.executable, str(PODS), "a", "b"], env=variables, check=True)
     assert calls.read_text() == "delete job --wait=false --ignore-not-found a b\n"
+
+
+def test_the_image_is_built_of_files_and_extras_that_there_are():
+    """No test builds it: a job of CI does, from these names."""
+    copied = re.findall(r"^COPY (.+) /source\S*$", (ROOT / "workflow" / "envs" / "Dockerfile").read_text(), re.MULTILINE)
+    assert {"neuspring", "pyproject.toml"} <= {name for line in copied for name in line.split()}
+    text = (ROOT / ".github" / "workflows" / "image.yml").read_text()
+    job = yaml.safe_load(text)
+    # YAML reads the key `on` as true.
+    named = [*job[True]["push"]["paths"], *re.findall(r"(?:--file|--profile|--configfile) (\S+)", text)]
+    assert [name for name in (*(name for line in copied for name in line.split()), *named) if not (ROOT / name).exists()] == []
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    (chosen,) = re.findall(r"EXTRAS=(\S+)", text)
+    # Those that `make demo` installs, among others.
+    wanted = re.findall(r"INSTALL,(\w+)\$\(COMMA\)(\w+)", (ROOT / "Makefile").read_text())[0]
+    assert set(wanted) <= set(chosen.split(",")) <= extras.keys()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import multiprocessing
+import os
 import re
 import socket
 import sqlite3
@@ -13,9 +14,11 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from neuspring import config
+from neuspring.cli.results import ui
 from neuspring.config import Config, Tracking
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import Attempt, JobRecord
@@ -23,7 +26,9 @@ from neuspring.core.run_record import RunRecord
 from neuspring.experiments.tracking import log as tracking
 from neuspring.experiments.tracking import store as tracking_store
 from neuspring.experiments.tracking.log import _usage
-from tests.support.stores import STEPS, client_of, python, runs_of, write_run
+from neuspring.experiments.tracking.store import score_name
+from neuspring.scores.metrics import METRICS, TASKS
+from tests.support.stores import STEPS, client_of, free_port, python, runs_of, write_run
 
 ROOT = Path(__file__).resolve().parents[2]
 SETTINGS = Tracking()
@@ -56,14 +61,16 @@ def test_a_run_is_logged_completely_and_once(results: Path) -> None:
     assert len(run.data.params) == 60, "run.json has all 122"
     assert (run.data.params["fit.p7"], run.data.params["clusters"], len(run.data.params["settings"])) == ("7", "4", 16)
     # Scores come first, here as on MLflow's page.
-    assert list(run.data.metrics)[:2] == ["future.track_error", "future.chamfer"]
+    assert list(run.data.metrics)[:2] == ["scores/future.track_error_mm", "scores/future.chamfer_mm"]
+    assert list(dict.fromkeys(sorted(name.partition("/")[0] for name in run.data.metrics))) == ["scores", "training", "usage"]
 
     metrics = run.data.metrics
-    assert metrics["future.track_error"] == 0.0125 and metrics["future.chamfer"] == 0.005 and metrics["seconds.fit"] == 12.5
-    assert metrics["train.chamfer"] != metrics["train.chamfer"], "a gap stays a gap"
+    assert metrics["scores/future.track_error_mm"] == 12.35, "four digits"
+    assert metrics["scores/future.chamfer_mm"] == 5.0 and metrics["usage/fit.seconds"] == 12.5
+    assert np.isnan(metrics["scores/train.chamfer_mm"]), "a gap stays a gap"
     client = client_of(results)
-    assert sorted(m.step for m in client.get_metric_history(run.info.run_id, "fit.loss")) == list(range(STEPS))
-    assert {m.step: m.value for m in client.get_metric_history(run.info.run_id, "search.best")} == {0: 3.0, 1: 2.0}
+    assert sorted(m.step for m in client.get_metric_history(run.info.run_id, "training/fit.loss")) == list(range(STEPS))
+    assert {m.step: m.value for m in client.get_metric_history(run.info.run_id, "training/search.best")} == {0: 3.0, 1: 2.0}
     folder = results / "mlartifacts" / SETTINGS.experiment / run.info.run_id / "artifacts"
     sent = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     assert sent == {"run.json", "twin/twin.npz", "search/coarse.npz"}
@@ -85,7 +92,17 @@ def test_the_page_opens_with_scores_as_columns_and_says_what_is_missing(results:
     client, experiment = tracking_store.connect(results, SETTINGS)
     assert place == f"#/experiments/{experiment}/runs?viewStateShareKey=scores"
     view = json.loads(client.get_experiment(experiment).tags["mlflow.sharedViewState.scores"])
-    assert "metrics.`future.chamfer`" in view["selectedColumns"]
+    shown = view["selectedColumns"]
+    assert shown[:4] == [
+        "tags.`method`",
+        "tags.`scenario`",
+        "tags.`seed`",
+        f"metrics.`{score_name(TASKS[0], next(iter(METRICS)), 'm')}`",
+    ]
+    assert view["columnOrder"][2:] == shown and view["columnWidths"].keys() == set(shown)
+    (run,) = runs_of(results)
+    scores = {f"metrics.`{name}`" for name in run.data.metrics if name.startswith("scores/future.")}
+    assert scores < set(shown) and len(scores) == 2, "names of the view are those that are logged"
     with contextlib.closing(sqlite3.connect(results / "mlflow.db")) as connection:
         counted = {table for (table,) in connection.execute("SELECT tbl FROM sqlite_stat1")}
     assert {"runs", "latest_metrics"} <= counted, "SQLite plans with statistics"
@@ -129,6 +146,7 @@ def test_the_use_of_the_machine_is_logged_where_jobs_recorded_it(results: Path) 
 
     (run,) = runs_of(results)
     metrics = {name.removeprefix("usage/"): value for name, value in run.data.metrics.items() if name.startswith("usage/")}
+    assert metrics.pop("fit.seconds") == 12.5
     peaks = {f"{stage}.peak_memory_mb": 64.0 for stage in ("fit", "appearance", "score")}
     whole = {"peak_memory_mb": 512.0, "peak_gpu_memory_mb": 1000.0, "mean_gpu_percent": 50.0}
     last = {"cpu_percent": 110.0, "memory_mb": 500.0, "gpu_percent": 50.0, "gpu_memory_mb": 900.0}
@@ -166,7 +184,7 @@ def test_a_failed_run_is_logged_as_failed(results: Path) -> None:
     assert tracking.log_run(record, results, SETTINGS) == "already logged"
     (run,) = runs_of(results)
     assert (run.info.status, run.data.tags["reason"], run.data.tags["status"]) == ("FAILED", "diverged at frame 3", "failed")
-    assert set(run.data.metrics) == {"seconds.fit"}
+    assert set(run.data.metrics) == {"usage/fit.seconds"}
 
 
 def test_a_killed_logger_leaves_one_complete_run(results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -354,3 +372,13 @@ print(os.environ["MLFLOW_DISABLE_TELEMETRY"], os.environ["DO_NOT_TRACK"], os.env
 """
     text, errors = python(code, results, stderr=subprocess.PIPE).communicate(timeout=240)
     assert (text.split(), errors) == (["true", "true", "7", "None"], "")
+
+
+def test_the_pages_are_served_by_one_process_on_this_machine_alone(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tracking.log_run(write_run(results), results, SETTINGS)
+    asked: list[list[str]] = []
+    monkeypatch.setattr(os, "execve", lambda program, words, environment: asked.append(words))
+    ui(results, port=free_port())
+    (words,) = asked
+    given = dict(zip(words[4::2], words[5::2], strict=True))
+    assert (given["--workers"], given["--host"]) == ("1", "127.0.0.1")

@@ -168,4 +168,5 @@ def test_floors_are_the_errors_of_frame_zero():
     assert found["track_error_bound"] < ROUND_OFF
     first = errors_per_frame(np.tile(given.nodes, (5, 1, 1)), given)
     assert found == pytest.approx({name: values[0] for name, values in first.items()})
-    assert set(floors(observations())) == {"chamfer"}
+    without = floors(observations())
+    assert "chamfer" in without and not {"track_error", "track_error_bound"} & without.keys(), "there are no tracks"

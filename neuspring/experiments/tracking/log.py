@@ -24,8 +24,8 @@ from neuspring.core.files import write_text
 from neuspring.core.job_records import FOLDER as JOBS
 from neuspring.core.job_records import JobRecord
 from neuspring.core.run_record import RUN_RECORD, RunRecord, flat, key_of
-from neuspring.core.text import masked
-from neuspring.experiments.tracking.store import connect, default_uri, explained, lock
+from neuspring.core.text import masked, readable
+from neuspring.experiments.tracking.store import connect, default_uri, explained, lock, score_name
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -177,24 +177,27 @@ def _tags(record: RunRecord, folder: Path) -> dict[str, str]:
 
 
 def _metrics(record: RunRecord, run_json: Path) -> Iterator[Metric]:
-    """Scores as `{task}.{metric}`, timings as `seconds.{stage}`, histories as `{history}.{metric}` by step."""
+    """Scores as `scores/{task}.{metric}`, histories as `training/{history}.{metric}` by step, timings as `usage/{stage}.seconds`.
+
+    MLflow's pages of curves have a section for each word before `/`, in the order of the alphabet, and what has none comes last.
+    """
     from mlflow.entities import Metric
 
     end = milliseconds(record.ended)
     if record.scores_file:
-        for task, metric, value in _table(run_json, record.scores_file, "task"):
-            yield Metric(f"{task}.{metric}", value, end, 0)
-    for stage, seconds in record.timings.items():
-        yield Metric(f"seconds.{stage}", seconds, end, 0)
+        for task, metric, value, unit in _table(run_json, record.scores_file, "task", "unit"):
+            yield Metric(score_name(task, metric, unit), readable(value, unit)[0], end, 0)
     for history, name in record.histories.items():
         for step, metric, value in _table(run_json, name, "step"):
-            yield Metric(f"{history}.{metric}", value, end, int(step))
+            yield Metric(f"training/{history}.{metric}", value, end, int(step))
+    for stage, seconds in record.timings.items():
+        yield Metric(f"usage/{stage}.seconds", seconds, end, 0)
 
 
 def _usage(record: RunRecord, run_json: Path, results: Path) -> Iterator[Metric]:
     """Use of processor, memory and GPU as `usage/{stage}.{what}`; steps are seconds.
 
-    Not under `system/`: MLflow's page shows what is named so before everything else, and scores come first.
+    Not under `system/`: MLflow's table of a run shows what is named so before everything else, and scores come first.
 
     They are those of each job's last attempt, which made the result. A stage that was run by hand has no job record and no such
     metrics.
@@ -229,11 +232,11 @@ def _jobs(record: RunRecord, run_json: Path, results: Path) -> dict[str, Path]:
     return jobs
 
 
-def _table(run_json: Path, name: str, by: str) -> list[tuple[Any, ...]]:
-    """(`by`, metric, value) of each row of a Parquet file beside a record. Raises InputError."""
+def _table(run_json: Path, name: str, by: str, *more: str) -> list[tuple[Any, ...]]:
+    """(`by`, metric, value, and `more`) of each row of a Parquet file beside a record. Raises InputError."""
     import pandas
 
-    path, columns = _require_file(run_json, run_json.parent / name), [by, "metric", "value"]
+    path, columns = _require_file(run_json, run_json.parent / name), [by, "metric", "value", *more]
     try:
         types = {"value": "float64"} | ({"step": "int64"} if by == "step" else {})
         table = pandas.read_parquet(path, columns=columns).astype(types)

@@ -10,11 +10,11 @@ import os
 import sqlite3
 from contextlib import closing, nullcontext, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from neuspring.config import Tracking
 from neuspring.core.errors import InputError
-from neuspring.core.text import masked
+from neuspring.core.text import masked, readable
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
@@ -35,10 +35,11 @@ DATABASE_RETRIES = 2
 """In place of MLflow's ten, which take two minutes where nobody is at the address."""
 ARTIFACTS = "mlartifacts"
 VIEW = "scores"
-"""Name of the view of the table of runs that has scores as columns; a tag of the experiment holds it, as its page would."""
-LOGGED_COLUMNS = [
-    f"metrics.`{task}.{metric}`" for task in ("reconstruction", "future") for metric in ("chamfer", "track_error", "psnr")
-]
+"""Name of the view of the table of runs, names and scores first; a tag of the experiment holds it, as its page would."""
+NAMED = ("method", "scenario", "seed")
+"""Tags that are the first columns of the table of runs."""
+NARROW, WIDE = 70, 200
+"""Widths of a column of seeds, and of others, pixels."""
 LOCK_PATIENCE = 600.0
 """Seconds to wait for another process that logs the same record or creates the database."""
 
@@ -98,14 +99,30 @@ def _count_rows(database: Path) -> None:
         db.commit()
 
 
+def score_name(task: str, metric: str, unit: str) -> str:
+    """A score's name in the index, which says the unit of lengths."""
+    return f"scores/{task}.{metric}" + ("_mm" if readable(0.0, unit)[1] == "mm" else "")
+
+
+def _view() -> dict[str, Any]:
+    """The state of MLflow's table of runs: method, scenario, seed, then every score; columns that no run has are not shown."""
+    from neuspring.scores.metrics import METRICS, TASKS
+
+    tags = [f"tags.`{name}`" for name in NAMED]
+    scores = [f"metrics.`{score_name(task, metric.name, metric.unit)}`" for task in TASKS for metric in METRICS.values()]
+    widths = dict.fromkeys((*tags, *scores), WIDE) | {"tags.`seed`": NARROW}
+    order = ["attributes.`Run Name`", "runDateAndNestInfo", *tags, *scores]
+    return {"selectedColumns": [*tags, *scores], "columnOrder": order, "columnWidths": widths}
+
+
 def page(results: Path, settings: Tracking) -> str:
-    """The place in MLflow's pages where the runs are, with the scores as columns. Raises InputError where it cannot be shown."""
+    """The place in MLflow's pages where the runs are, names and scores first. Raises InputError where it cannot be shown."""
     if settings.uri is None and not all((Path(results) / name).exists() for name in ("mlflow.db", ARTIFACTS)):
         remedy = f"Name a folder with runs (--results), or delete mlflow.db and run `neuspring sync --results {results}`."
         raise InputError(results, f"must hold mlflow.db and {ARTIFACTS}, the index of its runs", "not both", remedy)
     try:
         client, experiment = connect(results, settings)
-        client.set_experiment_tag(experiment, f"mlflow.sharedViewState.{VIEW}", json.dumps({"selectedColumns": LOGGED_COLUMNS}))
+        client.set_experiment_tag(experiment, f"mlflow.sharedViewState.{VIEW}", json.dumps(_view()))
         if settings.uri is None:
             _count_rows(Path(results).resolve() / "mlflow.db")
     except Exception as error:

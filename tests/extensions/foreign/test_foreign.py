@@ -1,6 +1,7 @@
-"""A stranger's package is installed, and its members are in the help, in the graph of jobs, in the tables and in the report."""
+"""Strangers' packages, that of the page of extensions among them, are installed: help, jobs, tables and report have them."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -13,18 +14,23 @@ from tests.support import project
 from tests.support.desk import FRAMES, SIZE, camera, counts, seen, write_json
 
 HERE = Path(__file__).parent
+PAGE = project.ROOT / "neuspring" / "extensions" / "README.md"
 METHOD = "\nvisiting: {model: lag, description: The mean of the hands.}\n"
 
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory) -> dict[str, str]:
-    """The package, installed by pip beside NeuSpring; the environment in which both are found."""
+    """The packages, installed by pip beside NeuSpring; the environment in which all are found."""
     folder = tmp_path_factory.mktemp("foreign")
-    source = folder / "source"
+    source, quoted = folder / "source", folder / "quoted"
+    quoted.mkdir()
+    for name, text in re.findall(r"^`([\w.]+)`:\n\n```\w+\n(.*?)```", PAGE.read_text(), re.M | re.S):
+        (quoted / name).write_text(text)
+    assert {path.name for path in quoted.iterdir()} == {"pyproject.toml", "my_springs.py"}
     shutil.copytree(HERE, source, ignore=shutil.ignore_patterns("__pycache__", "*.py"), dirs_exist_ok=True)
     shutil.copytree(HERE / "visitor", source / "visitor", dirs_exist_ok=True)
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
-    subprocess.run([*pip, "--target", str(folder / "site"), str(source)], check=True, capture_output=True)
+    subprocess.run([*pip, "--target", str(folder / "site"), str(source), str(quoted)], check=True, capture_output=True)
     return {"PYTHONPATH": os.pathsep.join([str(folder / "site"), str(project.ROOT)])}
 
 

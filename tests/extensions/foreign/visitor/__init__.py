@@ -15,12 +15,6 @@ from neuspring.extensions.make_capture.formats import CaptureFormat
 from neuspring.extensions.make_capture.moments import Series
 from neuspring.report.blocks import PageSection, Text
 from neuspring.report.data import ReportSection
-from neuspring.scores.metrics import Metric
-
-
-def greet(name: str = "world") -> None:
-    """Say hello."""
-    print(f"hello {name}")
 
 
 def write_xyz(source: Any, frames: Sequence[int], output: Path) -> list[Path]:
@@ -39,11 +33,6 @@ def lag(model: None, observations: Any, splats: np.ndarray | None, device: str) 
     moved = observations.controller_points.mean(axis=1) - observations.controller_points[0].mean(axis=0)
     positions = (observations.nodes[None] + moved[:, None]).astype(np.float32)
     return Prediction(Trajectory(positions=positions, frame_count=observations.scenario.frame_count))
-
-
-def sag(positions: np.ndarray, observations: Any) -> np.ndarray:
-    """Fall of the mean node since frame 0, m, in each frame."""
-    return np.abs(positions.mean(axis=1)[:, 2] - positions[0].mean(axis=0)[2])
 
 
 @dataclass(frozen=True)
@@ -74,6 +63,5 @@ class Stack:
 LAG = Baseline(prediction="visitor:lag")
 STACK = CaptureFormat(about="a .npz file with {kind}", recognizes=lambda path: path.suffix == ".npz", pictures=Stack)
 XYZ = Export(write=write_xyz, frames="0")
-SAG = Metric(name="sag", title="sag", heading="Sag", unit="m", shown_unit="mm", factor=1e3, digits=2, function=sag)
 _PAGE = PageSection(key="visit", title="A visit", blocks=[Text(text="A visitor was here.")])
 VISIT = ReportSection(order=99, make=lambda material: _PAGE)
