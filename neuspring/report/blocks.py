@@ -136,6 +136,8 @@ def markdown(blocks: Sequence[Block], level: str = "##") -> str:
         elif isinstance(block, Items):
             parts += [f"{block.title}:"] if block.title else []
             parts.append("\n".join(f"- {item}" for item in block.items))
+        elif isinstance(block, Code):
+            parts.append(f"```sh\n{block.text}\n```")
         elif isinstance(block, Fold):
             parts.append(markdown(block.blocks, level).rstrip("\n"))
         else:

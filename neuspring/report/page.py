@@ -13,13 +13,14 @@ from neuspring.config import Config
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from neuspring.core.findings import warnings_of
+from neuspring.core.job_records import asked
 from neuspring.core.records import now
 from neuspring.core.text import listed
 from neuspring.registry import Registry, modules
 from neuspring.report.blocks import PageSection, html_page
 from neuspring.report.data import Options, ReportData, ReportSection, damaged_files, job_records, several, traces
 from neuspring.scores.numbers import Numbers, kept_studies
-from neuspring.scores.runs import Collected, collect, collect_transfers
+from neuspring.scores.runs import Collected, as_asked, collect, collect_transfers
 
 __all__ = ["REPORT_SECTIONS", "Options", "write"]
 REPORT_SECTIONS: Registry[ReportSection] = Registry(
@@ -68,7 +69,8 @@ def gather(results: Path, output: Path, options: Options) -> ReportData:
     """Read what the report is about."""
     jobs, messages = job_records(results)
     choice = _filled(results, options, traces(results, jobs))
-    collected = collect(results, choice.scenarios, choice.methods, choice.seeds, choice.left_out)
+    everything = collect(results, choice.scenarios, choice.methods, choice.seeds, choice.left_out)
+    collected, part = as_asked(everything, asked(results))
     transfers = collect_transfers(results, choice.transfers, choice.methods, choice.seeds)
     damaged, config = damaged_files(results, collected, transfers, messages), choice.settings or Config()
     kept = kept_studies(output.parent)
@@ -81,6 +83,8 @@ def gather(results: Path, output: Path, options: Options) -> ReportData:
         studies={name: one for name, one in choice.studies.items() if name in kept or _ran(collected, choice, name)},
         known_studies=choice.studies,
         results=results,
+        names=choice.names,
+        asked=part,
         warnings=warnings_of(results, choice.scenarios),
     )
     numbers = numbers.take(output.parent)

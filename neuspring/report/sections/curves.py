@@ -63,7 +63,8 @@ def curves(material: ReportData) -> PageSection:
     if not scenarios:
         return PageSection(key="curves", title="Curves", blocks=[Text(text="No run has finished.", tone="mute")])
     shown, methods = material.choice.shown, material.choice.methods
-    about = "" if len(shown) == len(methods) else f"{len(shown)} of {len(methods)} methods are drawn: {', '.join(shown)}."
+    drawn = ", ".join(map(material.numbers.name, shown))
+    about = "" if len(shown) == len(methods) else f"{len(shown)} of {len(methods)} methods are drawn: {drawn}."
     seen = {scenario: _observations(material, scenario) for scenario in scenarios}
     blocks: list[Block] = []
     for title, what, text in PLOTS:
@@ -79,7 +80,7 @@ def curves(material: ReportData) -> PageSection:
             name: (LINE_COLORS[i % len(LINE_COLORS)], LINE_DASHES[i // len(LINE_COLORS) % len(LINE_DASHES)])
             for name, i in index.items()
         }
-        legend = Legend(entries=[(name, *style) for name, style in styles.items()])
+        legend = Legend(entries=[(material.numbers.name(name), *style) for name, style in styles.items()])
         pictures = []
         for scenario, own in lines.items():
             future = observed.scenario if what in CURVE_ERRORS and (observed := seen[scenario]) else None

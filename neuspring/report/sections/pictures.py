@@ -14,6 +14,7 @@ from PIL import Image
 
 from neuspring.core.artifacts import Observations
 from neuspring.core.run_record import RunRecord
+from neuspring.core.text import program
 from neuspring.draw.scene import chosen_frames
 from neuspring.report.blocks import Block, Code, Fold, Grid, PageSection, Picture, Text
 from neuspring.report.data import UNREADABLE, ReportData, ReportSection, data_uri, link, several
@@ -117,7 +118,7 @@ def pictures(material: ReportData) -> PageSection:
     for scenario in material.choice.scenarios:
         runs = material.first_runs(scenario)
         if blocks := _scenario(material, runs, shown, frame_links(material, scenario)):
-            command = shlex.join(["neuspring", "play", *(str(material.folder(run)) for run in runs.values())])
+            command = shlex.join([program("neuspring"), "play", *(str(material.folder(run)) for run in runs.values())])
             seeds = sorted({run.seed for run in runs.values()})
             summary = f"{scenario}: {several(len(runs), 'method')}, seed {', '.join(map(str, seeds))}"
             folds.append(Fold(summary=summary, blocks=[*blocks, Code(text=command, whole=True)], open=len(folds) < MOST_OPEN_FILMS))
