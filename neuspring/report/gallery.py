@@ -52,9 +52,9 @@ def _films(record: RunRecord, run: Path, numbers: Numbers, folder: Path) -> list
     scores, name = numbers.everything.scores, numbers.name(record.method)
     own = scores[(scores["scenario"] == record.scenario) & (scores["method"] == record.method) & (scores["seed"] == record.seed)]
     values, parts = own.set_index(["task", "metric"])["value"], []
-    for task, name in (("reconstruction", "training"), ("future", "future")):
+    for task, frames in (("reconstruction", "training"), ("future", "future")):
         metrics = [METRICS[metric] for metric in CAPTIONED if (task, metric) in values.index]
-        parts += [f"{name} {', '.join(one.told(values[task, one.name]) for one in metrics)}"] if metrics else []
+        parts += [f"{frames} {', '.join(one.told(values[task, one.name]) for one in metrics)}"] if metrics else []
     caption = f"{name}: {'; '.join(parts)}".removesuffix(": ")
     if "video" in paths:
         return [

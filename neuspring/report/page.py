@@ -27,6 +27,8 @@ REPORT_SECTIONS: Registry[ReportSection] = Registry(
     "report_sections", modules("neuspring.report.sections", "section"), type=ReportSection
 )
 MEGABYTE = 1_000_000
+LAST_OPEN = 40
+"""Sections behind this place are folded."""
 MOST_SHOWN = 6
 """Methods that are drawn unless others are asked for."""
 
@@ -52,7 +54,8 @@ def write(results: Path, output: Path, options: Options, written: str | None = N
         made.update({name: section.make(material) for name, section in ordered if section.phase == phase})
 
     def page() -> str:
-        sections = [section for name, _ in ordered if (section := made.get(name))]
+        there = [(one.order, section) for name, one in ordered if (section := made.get(name))]
+        sections = [replace(section, folded=order > LAST_OPEN) for order, section in there]
         return html_page("NeuSpring: report", subtitle, sections, written=written)
 
     # Pictures take the room that all else leaves. What lists damaged files is made again last, because pictures may be damaged too.

@@ -30,8 +30,6 @@ DIVERGED_COST = 1e3
 """Costs above this stand for candidates that could not be simulated."""
 LINE_POINTS = 120
 """Most points of a line."""
-MOST_OPEN_PANELS = 6
-"""The panels of more scenarios than this are folded."""
 CURVE_ERRORS = {"track_error": track_errors, "track_error_bound": bound_track_errors}
 PLOTS = (
     (
@@ -85,7 +83,7 @@ def curves(material: ReportData) -> PageSection:
         for scenario, own in lines.items():
             future = observed.scenario if what in CURVE_ERRORS and (observed := seen[scenario]) else None
             pictures.append(_panel(own, styles, future, scenario, f"{title}, {scenario}: {', '.join(own)}"))
-        is_open = what == "track_error" or len(pictures) <= MOST_OPEN_PANELS
+        is_open = what == "track_error"
         blocks.append(Fold(summary=title, blocks=[Text(text=text), legend, Grid(blocks=pictures)], open=is_open))
     return PageSection(key="curves", title="Curves", about=about, blocks=blocks)
 
