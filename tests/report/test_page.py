@@ -139,7 +139,7 @@ def test_without_observations_pictures_lead_nowhere(tmp_path):
     results = report_tree.make(tmp_path / "results", ["rope"], ["baseline"], [0])
     (results / "rope" / "observations.npz").unlink()
     text = report(results)
-    assert 'target="player"' not in text and "neuspring play" in text and "--training" not in text
+    assert 'target="player"' not in text and "neuspring play" in text and "--training: " not in text
 
 
 @pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome is installed")
@@ -253,7 +253,7 @@ def test_one_control_moves_all_films_of_a_scenario(page, full):
     films = "[...document.querySelector('.films').querySelectorAll('video')]"
     boxes = "[...document.querySelectorAll('.films .panel')].slice(0, 3).map((one) => one.getBoundingClientRect())"
     slide = "(one => { one.value = 0.5; one.dispatchEvent(new Event('input')) })(document.querySelector('.control input'))"
-    assert page.count('class="grid films"') == 4
+    assert page.count('class="grid films fit"') == 4
     with Browser() as browser:
         browser.open(full / "report.html", 1280)
         # Observed once, then the predictions, in a row.

@@ -172,7 +172,7 @@ def test_a_table_is_drawn_as_markdown_latex_and_html():
     assert r"a$|$b & \underline{1.5 $\pm$ 0.1 ($-$2): worse} & $<$3 \\" in latex
     assert r"\multicolumn{1}{c}{Reconstruction \& Resimulation}" in latex and r"\caption{\textbf{T \& U.} 50 \% of a\_b}" in latex
     page = html_page("", "", [PageSection(key="a", title="A", blocks=[table])])
-    assert page.count("<table") == 2 and "<caption>C: Future Prediction</caption>" in page
+    assert page.count("<table") == 2 and "<caption><span>C: Future Prediction</span></caption>" in page
     assert '<td data-value="1.5"><b>1.5 ± 0.1</b><span class="hidden"> (second)</span><small>(-2)</small>' in page
     assert '<span class="chip bad"><span aria-hidden="true">▼</span> worse</span>' in page and "&lt;3" in page
 
