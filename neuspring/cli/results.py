@@ -25,6 +25,7 @@ OnDisk = Annotated[tuple[str, ...], arg(help="all on disk by default")]
 Names = Annotated[tuple[str, ...], arg(help="those of the settings, else all on disk, by default")]
 Scores = Annotated[Path | None, arg(help="instead of run records: a scores.csv that tables wrote, on any machine")]
 LeftOut = Annotated[str, arg(help="JSON: methods and the scenarios to which they do not apply, with reasons")]
+MethodTable = Annotated[Path, arg(help="the method table: names of methods for people")]
 StudyTable = Annotated[Path, arg(help="the study table")]
 Folder = Annotated[Path, arg(help="folder to write to")]
 Transfers = Annotated[tuple[str, ...], arg(help="scenarios whose twins were rolled out on other recordings")]
@@ -45,25 +46,28 @@ def tables(
     table: StudyTable = Path("config/studies.yaml"),
     scores: Scores = None,
     left_out: LeftOut = "{}",
+    method_table: MethodTable = Path("config/methods.yaml"),
     brief: Annotated[bool, arg(help="print the verdict and the first table alone")] = False,
     settings: Annotated[str, arg(help="of the benchmark: runs that were made with something else are named")] = "",
 ) -> None:
     """Run records -> numbers.json, each number computed once, and the benchmark's tables."""
     from neuspring.config.settings import Aim
     from neuspring.core.findings import warnings_of
+    from neuspring.core.job_records import asked
     from neuspring.report.data import job_records, traces
     from neuspring.report.gallery import write_gallery
     from neuspring.report.summary import write
     from neuspring.report.verdict import headline
     from neuspring.scores.metrics import require_metrics
-    from neuspring.scores.numbers import Numbers
-    from neuspring.scores.runs import collect, collect_transfers
+    from neuspring.scores.numbers import Numbers, shown_names
+    from neuspring.scores.runs import as_asked, collect, collect_transfers
 
     wanted = tuple(parse(Aim, row, "--aims") for row in json_value("--aims", aims, list))
     require_metrics(wanted)
     shown = {name: _study(table, name)[1] for name in studies}
     known = _study(table, studies[0])[0] if studies else {}
     common: Any = {"objects": objects, "aims": wanted, "studies": shown, "known_studies": known, "results": results}
+    common["names"] = shown_names(method_table)
     if scores:
         found = _read_scores(scores, scenarios, methods, seeds, left_out)
         print(write(Numbers(everything=found, baseline=baseline or str(found.runs["method"].iloc[0]), **common), output))
@@ -72,8 +76,8 @@ def tables(
     scenarios, methods, seeds = scenarios or tuple(there[0]), methods or tuple(there[1]), seeds or tuple(there[2])
     if not (scenarios and methods and seeds):
         raise InputError(results, "a results folder with runs is required", "none", "Run the workflow first, or name another.")
-    collected = collect(results, scenarios, methods, seeds, _read_left_out(left_out))
-    more: Any = {"warnings": warnings_of(results, scenarios), "made_otherwise": _made_otherwise(settings, results)}
+    collected, part = as_asked(collect(results, scenarios, methods, seeds, _read_left_out(left_out)), asked(results))
+    more: Any = {"asked": part, "warnings": warnings_of(results, scenarios), "made_otherwise": _made_otherwise(settings, results)}
     moved = collect_transfers(results, transfers, methods, seeds)
     numbers = Numbers(everything=collected, baseline=baseline or methods[0], transfers=moved, **common, **more)
     text = write(numbers, output)
@@ -81,7 +85,7 @@ def tables(
     print(f"Tables: {output / 'summary.md'}")
     finished = collected.runs.loc[collected.runs["status"] == "ok", "seed"].to_list()
     seed = next((seed for seed in seeds if seed in finished), seeds[0])
-    print(f"Pictures and videos: {write_gallery(results, scenarios, methods, seed, collected, output)}")
+    print(f"Pictures and videos: {write_gallery(results, scenarios, methods, seed, numbers, output)}")
 
 
 def _study(table: Path, name: str) -> tuple[dict[str, Study], Study]:
@@ -202,6 +206,7 @@ def report(
     baseline: Annotated[str | None, arg(help="method that others are compared with")] = None,
     shown: Annotated[tuple[str, ...], arg(help="methods to draw; six at most by default")] = (),
     table: StudyTable = Path("config/studies.yaml"),
+    method_table: MethodTable = Path("config/methods.yaml"),
     tables: Tables = "tables",
     megabytes: Annotated[float, arg(help="size that pictures and videos may fill")] = 25.0,
     video_megabytes: Annotated[float, arg(help="part of it for videos; the others are linked")] = 8.0,
@@ -210,6 +215,7 @@ def report(
 ) -> None:
     """Results folder -> one self-contained HTML file."""
     from neuspring.report import page
+    from neuspring.scores.numbers import shown_names
 
     options = page.Options(
         scenarios=scenarios,
@@ -221,6 +227,7 @@ def report(
         shown=shown,
         settings=None if settings == "{}" else read_settings(settings),
         studies=read_studies(table),
+        names=shown_names(method_table),
         tables=tables,
         megabytes=megabytes,
         video_megabytes=video_megabytes,

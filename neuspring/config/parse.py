@@ -123,6 +123,8 @@ def _extended(table: Mapping[str, Any], name: str, path: Path, what: str, below:
     if not isinstance(row["extends"], str):
         raise InputError(f"{path}, {what} {name}", "extends: the name of a row is required", row["extends"])
     whole = copy.deepcopy(_extended(table, row["extends"], path, what, (*below, name)))
+    # A name belongs to one row.
+    whole.pop("title", None)
     merge(whole, {key: value for key, value in row.items() if key != "extends"})
     return whole
 

@@ -31,6 +31,8 @@ class Method(SettingsSection):
 
     description: str
     """A line for people."""
+    title: str = ""
+    """Name for people, before the row's own: title PhysTwin is shown as PhysTwin (`baseline`). `extends` does not hand it on."""
     search: Name | None = None
     """A row of the search table; methods that name the same row share the search."""
     fit: Name | None = None

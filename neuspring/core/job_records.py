@@ -8,10 +8,10 @@ from __future__ import annotations
 import functools
 import json
 import uuid
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
@@ -23,6 +23,8 @@ JOB_CONFIG = ConfigDict(extra="forbid", strict=True)
 FOLDER, LOGS = "jobs", "logs"
 RUN_FILE = ".run"
 """File in FOLDER that names the current run of the workflow, or the last one."""
+ASKED = ".asked"
+"""File in FOLDER that tells the command of that run, and the scenarios, methods and seeds that it was about."""
 GPU_NOTES = ".gpus"
 """File in FOLDER in which the jobs of that run note which GPUs failed."""
 Outcome = Literal["ok", "transient", "permanent", "killed", "running"]
@@ -126,14 +128,24 @@ class JobRecord:
             raise InputError(path, "must be a job record", error.errors()[0]["msg"], "Delete it.") from error
 
 
-def begin_run(results: Path) -> None:
-    """Name the run of the workflow that begins, so that its attempts can be told from earlier ones.
+def begin_run(results: Path, about: Mapping[str, Any] | None = None) -> None:
+    """Name the run of the workflow that begins, so that its attempts can be told from earlier ones, and keep what it is `about`.
 
     A name and not a time: clocks of machines differ.
     """
     folder = Path(results) / FOLDER
     (folder / GPU_NOTES).unlink(missing_ok=True)
     write_text(folder / RUN_FILE, uuid.uuid4().hex)
+    write_text(folder / ASKED, json.dumps(dict(about or {})) + "\n")
+
+
+def asked(results: Path) -> dict[str, Any]:
+    """What the last run of the workflow was about: `command` (words), `only`, `scenarios`, `methods`, `seeds`; empty if unknown."""
+    try:
+        values = json.loads((Path(results) / FOLDER / ASKED).read_text())
+    except (OSError, ValueError):
+        return {}
+    return values if isinstance(values, dict) else {}
 
 
 def this_run(results: Path) -> str:

@@ -6,11 +6,18 @@ import re
 import sys
 import time
 from collections.abc import Iterable
+from pathlib import Path
 
 
 def masked(text: str) -> str:
     """Text without the user and password of any URI in it."""
     return re.sub(r"://[^/@\s]+@", "://***@", text)
+
+
+def program(name: str) -> str:
+    """A program of the environment that runs now, as it is typed in this folder."""
+    place, here = Path(sys.executable).parent / name, Path.cwd()
+    return str(place.relative_to(here) if place.is_relative_to(here) else place)
 
 
 def listed(names: Iterable[object], most: int = 12) -> str:

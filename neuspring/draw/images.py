@@ -12,14 +12,9 @@ import torch
 from matplotlib import pyplot as plt
 
 from neuspring.core.artifacts import Scenario
-from neuspring.draw.sheet import FUTURE, TRAINING, WORST, save
+from neuspring.draw.sheet import FUTURE, TIME_BAR, TITLE_LINE, TRAINING, WORST, save
 from neuspring.scores.pictures import Pair, psnr
 from neuspring.splats.losses import Shot
-
-TIME_BAR = 6
-"""Height of the bar that shows the time, px."""
-TITLE_LINE = 20
-"""Height of the line of names, px."""
 
 
 def error_picture(pair: Pair) -> np.ndarray:

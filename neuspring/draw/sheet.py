@@ -28,6 +28,10 @@ TRAINING, FUTURE = (110, 160, 240), (240, 150, 50)
 """Colors of the two parts of the time."""
 WORST = 0.5
 """Color difference, of 1, at the end of error pictures."""
+TIME_BAR = 6
+"""Height of the bar that shows the time in a run's film, px."""
+TITLE_LINE = 20
+"""Height of the line of names above its panels, px."""
 CONTROLLER = "tab:red"
 MOST_SPRINGS = 20_000
 """More springs than this are not drawn: lines would cover each other."""

@@ -357,7 +357,8 @@ class Graph:
         compared = ["--baseline", self.benchmark.compared_with]
         settings = ["--settings", _json(plain(self.whole) | NEUTRAL)]
         studies = ["--studies", *self.whole.studies, *self._study_table()] if self.whole.studies else []
-        return [*self._runs(output or self.folder), *self._transfers(), *compared, *objects, *aims, *studies, *settings]
+        names = ["--method-table", str(self.root / self.config.method_table)]
+        return [*self._runs(output or self.folder), *self._transfers(), *compared, *objects, *aims, *studies, *names, *settings]
 
     def study(self, name: str, part: str = "") -> list[str]:
         """Options of `neuspring study`, of the folder of tables or a part of it."""
@@ -379,6 +380,7 @@ class Graph:
         return [
             *("--results", self.results, "--output", output or f"{self.folder}/report.html", "--settings", _json(values)),
             *(*self._study_table(), "--tables", self.config.tables),
+            *("--method-table", str(self.root / self.config.method_table)),
             *("--baseline", self.benchmark.compared_with, *self._transfers(), *self._left_out()),
         ]
 

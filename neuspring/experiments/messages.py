@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections import defaultdict
+import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import IO, Any
@@ -32,24 +32,22 @@ LOOK_EVERY = 1.0
 
 
 class Overview:
-    """Progress of a quiet run: a line per rule when its last job has succeeded.
+    """Progress of a quiet run: a line when a job has succeeded, with how many have, and for how long the run has lasted.
 
     It watches the records of the run's jobs, in a thread of its own, from `start` to `stop`.
     """
 
     def __init__(self, results: Path, logs: Iterable[Path], stream: IO[str] | None = None) -> None:
         self._stream, self._run = stream or sys.stdout, this_run(results)
-        self._waiting: dict[str, set[Path]] = defaultdict(set)
-        for log in logs:
-            record = JobRecord.of_log(results, log)
-            self._waiting[record.rule].add(record.path(results))
-        self._counts = {rule: len(paths) for rule, paths in self._waiting.items()}
-        self._seconds = dict.fromkeys(self._counts, 0.0)
+        records = [JobRecord.of_log(results, log) for log in logs]
+        self._waiting = {record.path(results): record for record in records}
+        self._count, self._begun = len(records), time.monotonic()
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
     def start(self) -> None:
-        """Begin to watch."""
+        """Say how many jobs there are, and begin to watch."""
+        print(f"{self._count} job{'s' * (self._count != 1)} to do; a line tells when one is done.", file=self._stream, flush=True)
         self._thread.start()
 
     def stop(self) -> None:
@@ -63,23 +61,26 @@ class Overview:
         self._look()
 
     def _look(self) -> None:
-        for rule, paths in list(self._waiting.items()):
-            ended = {path: seconds for path in paths if (seconds := self._ended(path)) is not None}
-            paths -= set(ended)
-            self._seconds[rule] += sum(ended.values())
-            if not paths:
-                del self._waiting[rule]
-                count = self._counts[rule]
-                line = f"{rule:<17} {count:>5} job{'s' if count > 1 else ' '} {self._seconds[rule]:>8.0f} s"
-                print(line, file=self._stream, flush=True)
+        for path in [path for path in self._waiting if self._ended(path)]:
+            record = self._waiting.pop(path)
+            done, passed = self._count - len(self._waiting), elapsed(time.monotonic() - self._begun)
+            name = record.name.removeprefix(f"{record.rule}/")
+            print(f"[{done} of {self._count}, {passed}] {record.rule} {name}", file=self._stream, flush=True)
 
-    def _ended(self, path: Path) -> float | None:
-        """Seconds that a job of this run took; None while it has not succeeded."""
+    def _ended(self, path: Path) -> bool:
+        """True where a job of this run has succeeded."""
         try:
             last = JobRecord.load(path).last
         except (InputError, IndexError):
-            return None
-        return last.seconds if last.run == self._run and last.outcome == "ok" else None
+            return False
+        return last.run == self._run and last.outcome == "ok"
+
+
+def elapsed(seconds: float) -> str:
+    """A time for people: 40 s, 1 min 40 s, 2 h 5 min."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours = f"{minutes // 60} h {minutes % 60} min"
+    return hours if minutes >= 60 else f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
 def replaced(jobs: Iterable[tuple[str, Any, tuple[str, ...]]]) -> str:
@@ -152,7 +153,7 @@ def finished(graph: Graph, seconds: float) -> None:
             print(f"{len(waiting)} runs could not be logged ({reason}). Their records wait on disk; send them:")
             print(f"  {neuspring} sync {shlex.join(place)}")
         print(f"Look at the runs in MLflow: {neuspring} ui {shlex.join(place)}", flush=True)
-    print(f"It took {seconds / 60:.1f} minutes." if seconds >= 60 else f"It took {seconds:.0f} s.", flush=True)
+    print(f"It took {elapsed(seconds)}.", flush=True)
 
 
 def tell_findings(results: Path, scenarios: Sequence[str]) -> None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import jinja2
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from neuspring.core.table import Chip, Table, Tone
 
@@ -61,6 +62,12 @@ class Picture:
     paper: bool = False
     """Drawn for a white page."""
     size: tuple[int, int] = (0, 0)
+    panel: int | None = None
+    """Of a film of three panels side by side, the one that is seen; None: all of it."""
+    head: float = 0.0
+    """Height of what stands above the panels, over the width of the film."""
+    same: bool = False
+    """Another panel of the first film beside it, which the page's script adds, so that no film is there twice."""
     frames: Sequence[tuple[str, str]] = ()
     """Text and address of frames in the playground."""
 
@@ -97,6 +104,10 @@ class Grid:
     """Smallest width of a column, rem."""
     films: bool = False
     """The videos among them play in step, with one control."""
+    fit: bool = False
+    """A few blocks fill the width."""
+    training: float = 0.0
+    """Share of the films that is training; 0: the control does not tell."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,6 +131,8 @@ class PageSection:
     title: str
     blocks: Sequence[Block]
     about: str = ""
+    folded: bool = False
+    """Shown on a click on its title."""
 
 
 def markdown(blocks: Sequence[Block], level: str = "##") -> str:
@@ -136,6 +149,8 @@ def markdown(blocks: Sequence[Block], level: str = "##") -> str:
         elif isinstance(block, Items):
             parts += [f"{block.title}:"] if block.title else []
             parts.append("\n".join(f"- {item}" for item in block.items))
+        elif isinstance(block, Code):
+            parts.append(f"```sh\n{block.text}\n```")
         elif isinstance(block, Fold):
             parts.append(markdown(block.blocks, level).rstrip("\n"))
         else:
@@ -146,8 +161,9 @@ def markdown(blocks: Sequence[Block], level: str = "##") -> str:
 def html_page(title: str, subtitle: str, sections: Sequence[PageSection], *, written: str = "", embedded: bool = True) -> str:
     """The page as text. `embedded`: nothing but what it contains may be loaded; otherwise files beside it are shown too."""
     loader = jinja2.FileSystemLoader(PAGE_TEMPLATES)
-    template = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined).get_template("page.html.j2")
-    return template.render(
+    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
+    environment.filters["coded"] = lambda text: Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
+    return environment.get_template("page.html.j2").render(
         title=title,
         subtitle=subtitle,
         written=written,

@@ -54,6 +54,8 @@ class Options:
     """Methods whose curves and pictures are shown; empty: the baseline and the first rows of the studies, six in all."""
     settings: Config | None = None
     studies: Mapping[str, Study] = field(default_factory=dict)
+    names: Mapping[str, str] = field(default_factory=dict)
+    """Method to its name for people, of those that have one."""
     tables: str = "tables"
     """Folder of tables in the results folder."""
     megabytes: float = 25.0

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import pandas as pd
-
 from neuspring.core.files import write_text
 from neuspring.core.run_record import RunRecord
 from neuspring.report.blocks import Block, Fold, Grid, PageSection, Picture, Text, html_page
 from neuspring.report.data import link
 from neuspring.scores.metrics import METRICS
-from neuspring.scores.runs import Collected
+from neuspring.scores.numbers import Numbers
 
 GALLERY = "pictures.html"
 CAPTIONED = ("track_error", "iou")
@@ -20,7 +18,7 @@ CAPTIONED = ("track_error", "iou")
 
 
 def write_gallery(
-    results: Path, scenarios: Iterable[str], methods: Sequence[str], seed: int, collected: Collected, folder: Path
+    results: Path, scenarios: Iterable[str], methods: Sequence[str], seed: int, numbers: Numbers, folder: Path
 ) -> Path:
     """Write pictures.html into `folder`: the films of every scenario side by side, for one seed, with their scores.
 
@@ -30,8 +28,8 @@ def write_gallery(
     sections: list[PageSection] = []
     for scenario in scenarios:
         place = Path(results) / scenario
-        records = [record for method in methods if (record := collected.records.get((scenario, method, seed)))]
-        figures = [one for record in records for one in _films(record, Path(results) / record.name, collected.scores, folder)]
+        records = [record for method in methods if (record := numbers.everything.records.get((scenario, method, seed)))]
+        figures = [one for record in records for one in _films(record, Path(results) / record.name, numbers, folder)]
         # First the splats of all methods, then those of methods with splats of their own.
         learned = sorted(place.glob(f"appearance*/{seed}/appearance.png"))
         splats = [Picture(caption="", alt=path.stem, data=link(path, folder)) for path in learned]
@@ -48,19 +46,20 @@ def write_gallery(
     return folder / GALLERY
 
 
-def _films(record: RunRecord, run: Path, scores: pd.DataFrame, folder: Path) -> list[Block]:
+def _films(record: RunRecord, run: Path, numbers: Numbers, folder: Path) -> list[Block]:
     """A run's films, or its film strip where it has none, with its scores; nothing if it has no pictures."""
     paths = {path.stem: path for path in (run / name for name in record.artifacts.get("images", [])) if path.is_file()}
+    scores, name = numbers.everything.scores, numbers.name(record.method)
     own = scores[(scores["scenario"] == record.scenario) & (scores["method"] == record.method) & (scores["seed"] == record.seed)]
     values, parts = own.set_index(["task", "metric"])["value"], []
-    for task, name in (("reconstruction", "training"), ("future", "future")):
+    for task, frames in (("reconstruction", "training"), ("future", "future")):
         metrics = [METRICS[metric] for metric in CAPTIONED if (task, metric) in values.index]
-        parts += [f"{name} {', '.join(one.told(values[task, one.name]) for one in metrics)}"] if metrics else []
-    caption = f"{record.method}: {'; '.join(parts)}".removesuffix(": ")
+        parts += [f"{frames} {', '.join(one.told(values[task, one.name]) for one in metrics)}"] if metrics else []
+    caption = f"{name}: {'; '.join(parts)}".removesuffix(": ")
     if "video" in paths:
         return [
             Picture(film=True, caption=caption, data=link(paths["video"], folder)),
-            Picture(film=True, caption=f"{record.method}, from all around", data=link(paths["turntable"], folder)),
+            Picture(film=True, caption=f"{name}, from all around", data=link(paths["turntable"], folder)),
         ]
     if "images" in paths:
         alt = f"Frames of {record.scenario}, {record.method}"

@@ -96,6 +96,11 @@ def best(means: Iterable[tuple[str, str, float]]) -> dict[tuple[str, str], float
     return {key: choose[key[1]](values) for key, values in found.items() if len(values) > 1}
 
 
+def ratio_text(row: Any) -> str:
+    """The number of a pair of methods wherever it stands: ratio of errors, and its interval where there is one."""
+    return f"{row.ratio:.3f} {between(row.ratio_low, row.ratio_high, '{:.3f}'.format)}".rstrip()
+
+
 def between(low: float, high: float, show: Callable[[float], str]) -> str:
     """An interval; empty where there is none."""
     return "" if pd.isna(low) else f"[{show(low)}, {show(high)}]"

@@ -13,19 +13,22 @@ from neuspring.config import Config
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from neuspring.core.findings import warnings_of
+from neuspring.core.job_records import asked
 from neuspring.core.records import now
 from neuspring.core.text import listed
 from neuspring.registry import Registry, modules
 from neuspring.report.blocks import PageSection, html_page
 from neuspring.report.data import Options, ReportData, ReportSection, damaged_files, job_records, several, traces
 from neuspring.scores.numbers import Numbers, kept_studies
-from neuspring.scores.runs import Collected, collect, collect_transfers
+from neuspring.scores.runs import Collected, as_asked, collect, collect_transfers
 
 __all__ = ["REPORT_SECTIONS", "Options", "write"]
 REPORT_SECTIONS: Registry[ReportSection] = Registry(
     "report_sections", modules("neuspring.report.sections", "section"), type=ReportSection
 )
 MEGABYTE = 1_000_000
+LAST_OPEN = 40
+"""Sections behind this place are folded."""
 MOST_SHOWN = 6
 """Methods that are drawn unless others are asked for."""
 
@@ -51,7 +54,8 @@ def write(results: Path, output: Path, options: Options, written: str | None = N
         made.update({name: section.make(material) for name, section in ordered if section.phase == phase})
 
     def page() -> str:
-        sections = [section for name, _ in ordered if (section := made.get(name))]
+        there = [(one.order, section) for name, one in ordered if (section := made.get(name))]
+        sections = [replace(section, folded=order > LAST_OPEN) for order, section in there]
         return html_page("NeuSpring: report", subtitle, sections, written=written)
 
     # Pictures take the room that all else leaves. What lists damaged files is made again last, because pictures may be damaged too.
@@ -68,7 +72,8 @@ def gather(results: Path, output: Path, options: Options) -> ReportData:
     """Read what the report is about."""
     jobs, messages = job_records(results)
     choice = _filled(results, options, traces(results, jobs))
-    collected = collect(results, choice.scenarios, choice.methods, choice.seeds, choice.left_out)
+    everything = collect(results, choice.scenarios, choice.methods, choice.seeds, choice.left_out)
+    collected, part = as_asked(everything, asked(results))
     transfers = collect_transfers(results, choice.transfers, choice.methods, choice.seeds)
     damaged, config = damaged_files(results, collected, transfers, messages), choice.settings or Config()
     kept = kept_studies(output.parent)
@@ -81,6 +86,8 @@ def gather(results: Path, output: Path, options: Options) -> ReportData:
         studies={name: one for name, one in choice.studies.items() if name in kept or _ran(collected, choice, name)},
         known_studies=choice.studies,
         results=results,
+        names=choice.names,
+        asked=part,
         warnings=warnings_of(results, choice.scenarios),
     )
     numbers = numbers.take(output.parent)

@@ -1,4 +1,4 @@
-"""A benchmark's numbers laid out: averages, ratios and aims, paired differences, failures, pictures, transfers, breakdowns.
+"""A benchmark's numbers laid out: averages, ratios and aims, failures, pictures, transfers, breakdowns.
 
 `summary.md` and `report.html` show the same.
 """
@@ -19,7 +19,7 @@ from neuspring.core.table import Cell, Table
 from neuspring.draw.benchmark import cluster_methods, clusters_figure, ratios_figure
 from neuspring.draw.sheet import save
 from neuspring.report.blocks import Block, Fold, Items, Text, markdown
-from neuspring.report.grid import EMPTY, Columns, best, between, by_method, chip, columns, flat, grouped, rows
+from neuspring.report.grid import EMPTY, Columns, best, between, by_method, chip, columns, flat, grouped, ratio_text, rows
 from neuspring.report.notes import honest_notes
 from neuspring.report.verdict import NOUNS, verdict
 from neuspring.scores import failures, statistics
@@ -53,42 +53,45 @@ def score_blocks(numbers: Numbers) -> list[Block]:
     if numbers.made_otherwise:
         about = "Runs that were made with something else than this configuration; without `only` the workflow makes them again"
         blocks.append(Items(title=about, items=[line.strip() for line in numbers.made_otherwise]))
-    if removed := failures.removed_lines(runs, numbers.collected.left_out):
+    if removed := failures.removed_lines(runs, numbers.collected.left_out, numbers.labels):
         kept = f"Averages take {pairs(usable)} of {pairs(runs)} pairs of scenario and seed, those that every method finished."
         nothing = "No pair of scenario and seed was finished by every method, so there is no average of all methods."
         blocks.append(Text(text=" ".join([kept if len(usable) else nothing, *removed])))
     if not len(usable) and not (runs["status"] == "ok").any():
         blocks.append(Text(text="No run has finished, so there is nothing to average.", tone="mute"))
-    blocks += [errors_table(numbers), *aim_table(numbers.aimed), *breakdown_blocks(numbers.finished)]
+    blocks += [errors_table(numbers), *aim_table(_named(numbers.aimed, numbers))]
+    blocks += breakdown_blocks(_named(numbers.finished, numbers))
     return [*blocks, *image_blocks(numbers), *marked_blocks(numbers), *transfer_blocks(numbers)]
 
 
 def detail_blocks(numbers: Numbers) -> list[Block]:
-    """Certainty of the averages: floors, spread, ratios, paired differences, failures, and what to be careful with."""
-    differences, everyone = numbers.differences, numbers.everything.runs
+    """Certainty of the averages: floors, spread, ratios, failures, and what to be careful with."""
+    everyone, baseline = numbers.everything.runs, numbers.name(numbers.baseline)
     blocks: list[Block] = [Text(text=line) for line in floor_lines(numbers.floors)]
-    if len(numbers.seeds):
+    if len(spread := _named(numbers.seeds, numbers)):
         about = "Standard deviation of the log error, in per cent, mean over scenarios."
-        shown = columns(numbers.seeds)
-        blocks.append(
-            by_method("Spread over seeds", numbers.seeds, shown, lambda row, _: Cell(text=f"{100 * row.spread:.1f} %"), about)
-        )
-    blocks += ratio_table(f"Ratio of the error to that of {numbers.baseline}", numbers)
-    blocks += difference_table(f"Paired difference to {numbers.baseline}, mm", differences, columns(differences))
-    shown = columns(differences, ["pictures"])
-    blocks += difference_table(f"Pictures: paired difference to {numbers.baseline}", differences, shown) if shown else []
+        shown = columns(spread)
+        blocks.append(by_method("Spread over seeds", spread, shown, lambda row, _: Cell(text=f"{100 * row.spread:.1f} %"), about))
+    blocks += ratio_table(f"Ratio of the error to that of {baseline}", numbers)
+    blocks += difference_table(f"Pictures: paired difference to {baseline}", _named(numbers.differences, numbers))
     if len(numbers.held):
-        methods = {name: name for name in dict.fromkeys(numbers.held["method"])}
+        methods = {name: numbers.name(name) for name in dict.fromkeys(numbers.held["method"])}
         shown = columns(numbers.held, ["positions", "pictures"])
         table = failure_table("Failures (errors in mm)", numbers.held, methods, shown)
-        blocks += [table, *(Text(text=text, tone="warn") for text in failures.unknown_lines(numbers.held))]
+        blocks += [table, *(Text(text=text, tone="warn") for text in failures.unknown_lines(numbers.held, numbers.labels))]
     blocks += settings_table(numbers.settings)
-    blocks += [Text(text=line) for line in failures.left_out_lines(numbers.collected.left_out)]
+    blocks += [Text(text=line) for line in failures.left_out_lines(numbers.collected.left_out, numbers.labels)]
     if honest := honest_notes(numbers.everything):
         blocks.append(Items(title="Of your own recordings", items=honest))
     if len(noted := everyone[everyone["notes"] != ""]):
         blocks.append(Items(title="Notes", items=_notes(noted, everyone["method"].value_counts())))
     return blocks
+
+
+def _named(table: pd.DataFrame, numbers: Numbers) -> pd.DataFrame:
+    """The table with its methods as people read them."""
+    names = {column: table[column].map(numbers.name) for column in ("method", "baseline") if column in table}
+    return table.assign(**names)
 
 
 def errors_table(numbers: Numbers) -> Table:
@@ -101,16 +104,16 @@ def errors_table(numbers: Numbers) -> Table:
     spread = ", ± standard deviation over seeds" if _several_seeds(numbers.usable) else ""
     weighted = "; in brackets the frame-weighted mean" if _weighted(numbers.usable) else ""
     note = f"In mm, lower is better ({size}; {explained}). Mean over scenarios{spread}{weighted}. Best in bold."
-    lines = average_rows(numbers.averages, numbers.usable, runs, runs, shown)
+    lines = average_rows(numbers, numbers.usable, runs, runs, shown)
     oracles = numbers.everything.of(numbers.everything.oracles).runs
     if len(oracles):
         lines.append([Cell(text=ORACLE_LINE), *[Cell()] * (len(shown) + 1)])
-        lines += average_rows(numbers.averages, numbers.usable, oracles, oracles, shown, marked=False)
+        lines += average_rows(numbers, numbers.usable, oracles, oracles, shown, marked=False)
     return flat("Errors, mm", ["Method"], shown, lines, "Runs", note=note, sortable=True)
 
 
 def average_rows(
-    averages: pd.DataFrame,
+    numbers: Numbers,
     scores: pd.DataFrame,
     runs: pd.DataFrame,
     counted: pd.DataFrame,
@@ -123,7 +126,7 @@ def average_rows(
 
     `scores` say whether there are several seeds, and scenarios of different lengths.
     """
-    several, weighted = _several_seeds(scores), _weighted(scores)
+    several, weighted, averages = _several_seeds(scores), _weighted(scores), numbers.averages
     own: list[Any] = list(averages[averages["method"].isin(runs["method"])].itertuples())
     tops = best((row.task, row.metric, row.equal) for row in own) if marked else {}
     means = {(row.method, row.task, row.metric): row for row in own}
@@ -141,7 +144,7 @@ def average_rows(
         failed = f" ({status['failed']} failed)" if status.get("failed") else ""
         text, tone = f"{status.get('ok', 0)}/{sum(status.values())}{failed}", "bad" if failed else ""
         values = [cell(row, metric) if row else absent for row, metric in here]
-        lines.append([Cell(text=str(method)), *values, Cell(text=text, tone=tone, value=status.get("ok", 0))])  # type: ignore[arg-type]
+        lines.append([Cell(text=numbers.name(str(method))), *values, Cell(text=text, tone=tone, value=status.get("ok", 0))])  # type: ignore[arg-type]
     return lines
 
 
@@ -151,15 +154,14 @@ def ratio_table(caption: str, numbers: Numbers) -> list[Table]:
         return []
 
     def cell(row: Any, _: Metric) -> Cell:
-        small = [text for text in (between(row.ratio_low, row.ratio_high, "{:.3f}".format), f"(n = {row.n})") if text]
-        return Cell(text=f"{row.ratio:.3f}", small=small, chips=[chip(row.verdict)], value=float(row.ratio))
+        return Cell(text=ratio_text(row), small=[f"(n = {row.n})"], chips=[chip(row.verdict)], value=float(row.ratio))
 
     note = (
-        f"Geometric mean over objects of the paired log ratio to {numbers.baseline}, seeds averaged within an object; 95 % "
-        f"t-interval over objects ({NOUNS[numbers.objects]}), none below {statistics.LEAST_OBJECTS}; n objects. Every row takes "
-        "all pairs of scenario and seed that both methods finished."
+        f"Geometric mean over objects of the paired ratio to {numbers.name(numbers.baseline)}, seeds averaged within an object; "
+        f"95 % t-interval over objects ({NOUNS[numbers.objects]}), none below {statistics.LEAST_OBJECTS}; n objects. Every row "
+        "takes all pairs of scenario and seed that both methods finished."
     )
-    return [by_method(caption, numbers.ratios, columns(numbers.ratios), cell, note)]
+    return [by_method(caption, _named(numbers.ratios, numbers), columns(numbers.ratios), cell, note)]
 
 
 def aim_table(aims: pd.DataFrame) -> list[Table]:
@@ -167,26 +169,23 @@ def aim_table(aims: pd.DataFrame) -> list[Table]:
     lines, each = [], cast("Any", aims.itertuples())
     for row in each:
         what = f"{SHORT[str(row.task)]} {METRICS[str(row.metric)].heading}"
-        ratio = f"{row.ratio:.3f}" if np.isfinite(row.ratio) else DASH
-        ratio += f" {between(row.ratio_low, row.ratio_high, '{:.3f}'.format)}"
-        texts = [row.method, row.baseline, what, f"<= {row.aim:.2f}, interval below {row.below:g}", ratio.strip(), row.n]
+        ratio = ratio_text(row) if np.isfinite(row.ratio) else DASH
+        texts = [row.method, row.baseline, what, f"<= {row.aim:.2f}, interval below {row.below:g}", ratio, row.n]
         lines.append([*(Cell(text=str(text)) for text in texts), Cell(chips=[chip(str(row.aim_verdict))])])
     header = ["Method", "Against", "What", "Aim", "Ratio [95 % interval]", "n", "Verdict"]
     return [Table(caption="Aims, declared in the configuration", header=header, rows=lines)] if lines else []
 
 
-def difference_table(caption: str, differences: pd.DataFrame, shown: Columns) -> list[Table]:
-    """Paired differences with intervals and verdicts; nothing without any."""
+def difference_table(caption: str, differences: pd.DataFrame) -> list[Table]:
+    """Paired differences of scores of pictures, with intervals and verdicts; nothing without any."""
 
     def cell(row: Any, metric: Metric) -> Cell:
         interval = between(row.low, row.high, lambda value: metric.text(value, "+"))
-        relative = f"({100 * row.relative:+.1f} %)" if metric.of != "pictures" else ""
-        small = [text for text in (interval, relative) if text]
-        chips = [chip(row.verdict)] if interval else []
+        small, chips = ([interval], [chip(row.verdict)]) if interval else ([], [])
         return Cell(text=metric.text(row.difference, "+"), small=small, chips=chips, value=float(row.difference))
 
     note = "Same scenario and seed; 95 % bootstrap interval over scenarios and seeds, none for a single scenario."
-    return [by_method(caption, differences, shown, cell, note)] if len(differences) else []
+    return [by_method(caption, differences, columns(differences, ["pictures"]), cell, note)] if len(differences) else []
 
 
 def failure_table(caption: str, means: pd.DataFrame, labels: Mapping[str, str], shown: Columns, scale: bool = True) -> Table:
@@ -259,7 +258,7 @@ def image_blocks(numbers: Numbers) -> list[Block]:
     note = (
         f"Higher is better; LPIPS: lower; PSNR in dB. {some}{_image_conditions(rendered['images'])} Mean over scenarios{weighted}."
     )
-    lines = average_rows(numbers.averages, pictured, collected.runs, runs, shown, NOT_COMPUTED)
+    lines = average_rows(numbers, pictured, collected.runs, runs, shown, NOT_COMPUTED)
     blocks: list[Block] = [flat("Scores of pictures", ["Method"], shown, lines, "Runs", note=note, sortable=True)]
     blocks.append(Text(text=f"Part of the surface that no camera sees in frame 0: {_unseen(rendered)}."))
     where = "in some runs " if "lpips" in set(pictured["metric"]) else ""
@@ -295,7 +294,7 @@ def marked_blocks(numbers: Numbers) -> list[Block]:
     own = scores[scores["metric"].isin([metric.name for _, metric in shown])]
     have, asked = own["scenario"].nunique(), runs["scenario"].nunique()
     note = f"{have} of {asked} scenarios, lower is better: px in the image; mm on the table."
-    lines = average_rows(numbers.averages, own, runs, runs[runs["scenario"].isin(own["scenario"])], shown)
+    lines = average_rows(numbers, own, runs, runs[runs["scenario"].isin(own["scenario"])], shown)
     return [flat("Points marked in images", ["Method"], shown, lines, "Runs", note=note)]
 
 
@@ -306,12 +305,11 @@ def transfer_blocks(numbers: Numbers) -> list[Block]:
         return []
     runs, shown = moved.everything.runs, columns(moved.usable)
     note = "All frames after the first: mean over targets, then over sources (in brackets weighted by frames). "
-    note += "A run is one source and seed. Intervals are over sources and seeds; sources may share targets."
+    note += "A run is one source and seed. Sources may share targets."
     caption = "Transfer: each twin on other recordings of the same object, errors in mm"
-    lines = average_rows(moved.averages, moved.usable, runs, runs, shown)
-    blocks: list[Block] = [flat(caption, ["Method"], shown, lines, "Runs", note=note, sortable=True)]
-    blocks += difference_table(f"Transfer: paired difference to {moved.baseline}, mm", moved.differences, shown)
-    return [*blocks, *ratio_table(f"Transfer: ratio to {moved.baseline}", moved)]
+    lines = average_rows(moved, moved.usable, runs, runs, shown)
+    table = flat(caption, ["Method"], shown, lines, "Runs", note=note, sortable=True)
+    return [table, *ratio_table(f"Transfer: ratio to {moved.name(moved.baseline)}", moved)]
 
 
 def breakdown_blocks(finished: pd.DataFrame) -> list[Block]:
@@ -406,8 +404,9 @@ def figures(numbers: Numbers) -> Iterator[tuple[str, str, Figure]]:
     """
     usable = numbers.usable
     size = f"{usable['scenario'].nunique()} scenarios, {usable['seed'].nunique()} seed(s)" if len(usable) else ""
-    if figure := ratios_figure(numbers.ratios, size):
-        yield "ratios.png", f"Ratio of every method's errors to those of {numbers.baseline}", figure
+    # Figures have no marks around a row's name.
+    if figure := ratios_figure(_named(numbers.ratios, numbers).replace("`", "", regex=True), size):
+        yield "ratios.png", f"Ratio of every method's errors to those of {numbers.name(numbers.baseline)}", figure
     collected = numbers.everything
     runs = collected.runs[collected.runs["method"].isin(list(cluster_methods(collected.runs["method"])))]
     finished = list(cluster_methods(runs.loc[runs["status"] == "ok", "method"]))
@@ -435,7 +434,7 @@ def write(numbers: Numbers, folder: Path) -> str:
     for name in ("ratios.png", "clusters.png"):
         (folder / name).unlink(missing_ok=True)
     shown = [f"![{caption}]({save(figure, folder / name).name})\n" for name, caption, figure in figures(numbers)]
-    parts = ["# Scores\n", summary, *shown, markdown([timing_table(collected.runs)])]
+    parts = ["# Scores\n", summary, *shown, markdown([timing_table(_named(collected.runs, numbers))])]
     write_text(folder / "summary.md", "\n".join(part for part in parts if part))
     return summary
 
@@ -445,5 +444,5 @@ def summary_text(numbers: Numbers) -> str:
     blocks: Sequence[Block] = [*verdict(numbers), *score_blocks(numbers), *detail_blocks(numbers)]
     runs = numbers.everything.runs
     why = runs["status"] + ": " + runs["reason"].astype(str)
-    ended = runs.assign(label=runs["method"], counted=runs["status"] == "ok", why=why)
+    ended = runs.assign(label=runs["method"].map(numbers.name), counted=runs["status"] == "ok", why=why)
     return markdown([*blocks, *not_counted(ended)])

@@ -17,7 +17,8 @@ from typing import Any, ClassVar
 import numpy as np
 import pandas as pd
 
-from neuspring.config import parse
+from neuspring.config import Method, parse
+from neuspring.config.parse import read_rows
 from neuspring.config.settings import Aim
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
@@ -25,7 +26,7 @@ from neuspring.core.findings import Finding
 from neuspring.core.records import read_json
 from neuspring.scores import failures, statistics
 from neuspring.scores.clips import ClipNumbers
-from neuspring.scores.metrics import METRICS, averages
+from neuspring.scores.metrics import METRICS, averages, metrics_of
 from neuspring.scores.paper import Study
 from neuspring.scores.runs import Collected, comparable, finished_scores, stacked
 from neuspring.scores.settings import differing
@@ -60,6 +61,10 @@ class Numbers:
     """Folder in which films of clips lie."""
     warnings: tuple[tuple[str, Finding], ...] = ()
     """Scenarios, and what steps of perception warned of."""
+    names: Mapping[str, str] = field(default_factory=dict)
+    """Method to its name for people, of those that have one (`shown_names`)."""
+    asked: str = ""
+    """The part of the configuration that was asked for (`only=...`), where other runs are therefore not there."""
     made_otherwise: tuple[str, ...] = ()
     """Lines on runs that were not made with the configuration that the tables are laid out for."""
 
@@ -67,6 +72,15 @@ class Numbers:
     def collected(self) -> Collected:
         """The runs without oracles."""
         return self.everything.comparison
+
+    def name(self, method: str) -> str:
+        """A method as people read it."""
+        return self.names.get(method, method)
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """All methods and their names for people."""
+        return {method: self.name(method) for method in dict.fromkeys(self.everything.runs["method"])}
 
     @cached_property
     def usable(self) -> pd.DataFrame:
@@ -84,7 +98,7 @@ class Numbers:
         if self.transfers is None or not len(self.transfers.runs):
             return None
         own = self.transfers.of([m for m in dict.fromkeys(self.transfers.runs["method"]) if m not in self.everything.oracles])
-        return Numbers(everything=own, baseline=self.baseline, objects=self.objects)
+        return Numbers(everything=own, baseline=self.baseline, objects=self.objects, names=self.names)
 
     @cached_property
     def averages(self) -> pd.DataFrame:
@@ -104,8 +118,9 @@ class Numbers:
 
     @cached_property
     def differences(self) -> pd.DataFrame:
-        """Paired differences of every method to the baseline, and whether they are resolved."""
-        table = statistics.paired_differences(self.usable, self.baseline) if len(self.usable) else pd.DataFrame()
+        """Paired differences of every method's scores of pictures to the baseline's, and whether they are resolved."""
+        scores = self.usable[self.usable["metric"].isin([metric.name for metric in metrics_of("pictures")])]
+        table = statistics.paired_differences(scores, self.baseline) if len(scores) else pd.DataFrame()
         rows: list[Any] = list(table.itertuples())
         return table.assign(verdict=[resolved(row.low, row.high, row.scenarios, METRICS[row.metric]) for row in rows])
 
@@ -136,19 +151,23 @@ class Numbers:
 
     @cached_property
     def lead(self) -> pd.DataFrame:
-        """The best method by the error that decides, and its ratio to its rival: what it is compared with, or else the second best.
+        """The best method by the geometric mean of the error that decides, and its rival: what it is compared with, or the
+        second best.
 
-        One row (`statistics.ratios`, with `baseline` the rival, "" without one); none where nothing can be compared.
+        One row of `statistics.ratios`, the same as in the table of ratios, so that a pair has one number; beside it `best` and
+        `rival` ("" without one). None where nothing can be compared.
         """
         there = set(zip(self.usable["task"], self.usable["metric"], strict=True))
         key = next((key for key in JUDGES if key in there), None)
         if key is None:
             return pd.DataFrame()
-        best, *others = self.means(*key)
+        judged = self.usable[(self.usable["task"] == key[0]) & (self.usable["metric"] == key[1])]
+        best, *others = statistics.typical(judged, self.objects).index
         rival = self.baseline if self.baseline in others else next(iter(others), "")
+        method, base = (rival, best) if best == self.baseline else (best, rival)
         part = self.finished[self.finished["method"].isin([best, rival]) & (self.finished["task"] == key[0])]
-        found = statistics.ratios(part[part["metric"] == key[1]], rival, self.objects).to_dict("records")
-        row: dict[str, Any] = {"method": best, "baseline": rival, "task": key[0], "metric": key[1]}
+        found = statistics.ratios(part[part["metric"] == key[1]], base, self.objects).to_dict("records")
+        row: dict[str, Any] = {"best": best, "rival": rival, "method": method, "baseline": base, "task": key[0], "metric": key[1]}
         row |= {"ratio": np.nan, "n": 0, "objects": self.objects}
         return pd.DataFrame([row | {"verdict": statistics.TOO_FEW} | (found[0] if found else {})])  # type: ignore[arg-type]
 
@@ -161,7 +180,7 @@ class Numbers:
     @cached_property
     def settings(self) -> pd.DataFrame:
         """Settings that differ between the methods."""
-        return differing(self.everything.records.values(), {name: name for name in dict.fromkeys(self.everything.runs["method"])})
+        return differing(self.everything.records.values(), self.labels)
 
     @cached_property
     def by_study(self) -> dict[str, StudyNumbers | ClipNumbers]:
@@ -182,7 +201,7 @@ class Numbers:
         """A digest of what the numbers are made of: numbers of other runs, or against another method, have another one."""
         parts = [found for found in (self.everything, self.transfers) if found]
         runs = [found.runs.reindex(columns=["scenario", "method", "seed", "status", "run_key"]) for found in parts]
-        told = [self.baseline, self.objects, [asdict(aim) for aim in self.aims], [table.to_csv() for table in runs]]
+        told = [self.baseline, self.objects, self.names, [asdict(aim) for aim in self.aims], [table.to_csv() for table in runs]]
         told += [found.scores.to_csv(index=False) for found in parts]
         return hashlib.sha256(json.dumps(told).encode()).hexdigest()
 
@@ -231,6 +250,12 @@ class Numbers:
         for name, part in found._parts.items():
             vars(part).update({table: _of_json(value) for table, value in values["tables"][name].items()})
         return found
+
+
+def shown_names(method_table: Path) -> dict[str, str]:
+    """Row of the method table to its name for people, title (`row`), of rows that have a title; none where there is no table."""
+    rows = read_rows(Method, method_table, "method") if method_table.is_file() else {}
+    return {name: f"{row.title} (`{name}`)" for name, row in rows.items() if row.title}
 
 
 def kept_studies(folder: Path) -> list[str]:

@@ -119,6 +119,19 @@ def collect(
     return Collected(stacked(scores), runs, stacked(frozen), absent, records)
 
 
+def as_asked(collected: Collected, asked: Mapping[str, Any]) -> tuple[Collected, str]:
+    """The runs without those that are missing because the last run of the workflow asked for others, and its `only=...`.
+
+    That is empty where none is left out. `asked` is what `core.job_records.asked` tells of it.
+    """
+    runs = collected.runs
+    if not asked.get("only"):
+        return collected, ""
+    inside = [runs[name].isin(asked.get(f"{name}s", [])) for name in ("scenario", "method", "seed")]
+    kept = (runs["status"] != "missing") | np.logical_and.reduce(inside)
+    return replace(collected, runs=runs[kept]), "" if kept.all() else f"only={asked['only']}"
+
+
 def _filled(runs: pd.DataFrame) -> pd.DataFrame:
     """`oracle` of every run; one without a record is as the others of its method."""
     known = runs["oracle"].astype(str).eq("True")

@@ -60,8 +60,7 @@ def interval(means: np.ndarray) -> tuple[float, float]:
 def paired_differences(scores: pd.DataFrame, baseline: str) -> pd.DataFrame:
     """Method minus baseline on the same scenarios and seeds: a row per method, task and metric, with 95 % intervals.
 
-    `relative` is the mean difference over the baseline's mean on the same pairs. `ratio` is the geometric mean of method/baseline,
-    in which scenarios of large errors weigh no more than others; it is NaN where an error is zero.
+    It is for scores of which a ratio means nothing; errors have `ratios`.
     """
     rows = []
     rng = np.random.default_rng(0)
@@ -73,12 +72,8 @@ def paired_differences(scores: pd.DataFrame, baseline: str) -> pd.DataFrame:
             if not len(both := wide[[method, baseline]].dropna()):
                 continue
             difference, low, high = _mean_interval(both[method] - both[baseline], rng)
-            base = both[baseline].groupby("scenario").mean()
             row = {"method": method, "baseline": baseline, "task": task, "metric": metric, "difference": difference}
-            row |= {"low": low, "high": high, "relative": difference / base.mean(), "scenarios": len(base)}
-            positive = bool((both > 0).all(axis=None))
-            ratios = np.exp(_mean_interval((both[method] / both[baseline]).map(math.log), rng)) if positive else [np.nan] * 3
-            rows.append(row | dict(zip(("ratio", "ratio_low", "ratio_high"), ratios, strict=True)))
+            rows.append(row | {"low": low, "high": high, "scenarios": both.index.get_level_values("scenario").nunique()})
     return pd.DataFrame(rows)
 
 
@@ -122,6 +117,14 @@ def ratios(scores: pd.DataFrame, baseline: str, objects: Objects = "scenario") -
             row |= {"ratio_low": math.exp(low), "ratio_high": math.exp(high), "n": len(each), "objects": objects}
             rows.append(row | {"pairs": len(both), "verdict": verdict(math.exp(low), math.exp(high))})
     return pd.DataFrame(rows, columns=list(RATIO_COLUMNS))
+
+
+def typical(scores: pd.DataFrame, objects: Objects = "scenario") -> pd.Series:
+    """Method to the geometric mean of one error over objects, seeds averaged within each, the best first: the order of `ratios`."""
+    with np.errstate(divide="ignore"):
+        logs = np.log(scores.set_index(["method", "category", "scenario"])["value"].astype(float))
+    each = logs.groupby(level=[0, 1, 2], sort=False).mean().groupby(["method", objects], sort=False).mean()
+    return np.exp(each.groupby(level="method", sort=False).mean()).sort_values(kind="stable")
 
 
 def t_interval(values: np.ndarray) -> tuple[float, float]:

@@ -4,7 +4,7 @@ import io
 from types import SimpleNamespace
 
 from neuspring.core.job_records import Attempt, JobRecord, begin_run, this_run
-from neuspring.experiments.messages import Overview, failed
+from neuspring.experiments.messages import Overview, elapsed, failed
 
 
 def save(results, name: str, **facts) -> None:
@@ -13,22 +13,28 @@ def save(results, name: str, **facts) -> None:
     JobRecord(**{**record.__dict__, "attempts": [attempt]}).save(results)
 
 
-def test_a_rule_is_told_once_when_its_last_job_of_this_run_has_succeeded(tmp_path):
+def test_a_line_tells_that_a_job_of_this_run_has_succeeded_and_how_many_have(tmp_path):
     begin_run(tmp_path)
     stream = io.StringIO()
-    logs = [tmp_path / "logs" / name for name in ("fit/a.log", "fit/b.log", "search/a.log")]
+    logs = [tmp_path / "logs" / f"{name}.log" for name in ("fit/rope/ours/0", "fit/rope/ours/1", "search/rope/uniform/0")]
     overview = Overview(tmp_path, logs, stream)
-    save(tmp_path, "fit/a", seconds=2.0)
-    save(tmp_path, "search/a", run="an earlier run", seconds=9.0)
+    save(tmp_path, "fit/rope/ours/0")
+    save(tmp_path, "search/rope/uniform/0", run="an earlier run")
+    save(tmp_path, "fit/rope/ours/1", outcome="transient")
     overview._look()
-    assert stream.getvalue() == ""
-    save(tmp_path, "fit/b", seconds=3.0, outcome="transient")
+    assert stream.getvalue() == "[1 of 3, 0 s] fit rope/ours/0\n"
     overview._look()
-    assert stream.getvalue() == ""
-    save(tmp_path, "fit/b", seconds=3.0)
+    save(tmp_path, "fit/rope/ours/1")
     overview.start()
     overview.stop()
-    assert stream.getvalue().split() == ["fit", "2", "jobs", "5", "s"]
+    assert stream.getvalue().splitlines()[1:] == [
+        "3 jobs to do; a line tells when one is done.",
+        "[2 of 3, 0 s] fit rope/ours/1",
+    ]
+
+
+def test_times_are_told_in_their_largest_units():
+    assert [elapsed(seconds) for seconds in (40.2, 100, 7500)] == ["40 s", "1 min 40 s", "2 h 5 min"]
 
 
 def interrupted(results, **outcomes):

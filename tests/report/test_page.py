@@ -11,6 +11,7 @@ import pytest
 from neuspring import config
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
+from neuspring.core.text import program
 from neuspring.draw.scene import chosen_frames
 from neuspring.report.blocks import PageSection, Text
 from neuspring.report.data import ReportSection, duration, hours, rendered
@@ -18,7 +19,7 @@ from neuspring.report.gallery import write_gallery
 from neuspring.report.page import REPORT_SECTIONS, Options, write
 from neuspring.report.sections.pictures import PLAY_ADDRESS
 from neuspring.report.sections.studies import answer
-from neuspring.scores.numbers import Numbers
+from neuspring.scores.numbers import Numbers, shown_names
 from neuspring.scores.paper import Study
 from neuspring.scores.runs import collect, collect_transfers
 from tests.support import report_tree
@@ -127,7 +128,7 @@ def test_the_page_holds_together_and_names_nothing_outside_itself(page, full):
 
 def test_pictures_lead_to_their_frames_in_the_player_and_a_command_opens_it(page, full):
     runs = " ".join(str(full / "rope" / method / "0") for method in ("baseline", "neuspring"))
-    assert f'<pre tabindex="0" class="whole">neuspring play {runs}</pre>' in page
+    assert f'<pre tabindex="0" class="whole">{program("neuspring")} play {runs}</pre>' in page
     link = r'href="http://127\.0\.0\.1:8080/\?frame=(\d+)&amp;scenario=rope" target="player">frame \1</a>'
     frames = [int(frame) for frame in re.findall(link, page)]
     facts = Observations.load(full / "rope" / "observations.npz").scenario
@@ -138,7 +139,7 @@ def test_without_observations_pictures_lead_nowhere(tmp_path):
     results = report_tree.make(tmp_path / "results", ["rope"], ["baseline"], [0])
     (results / "rope" / "observations.npz").unlink()
     text = report(results)
-    assert 'target="player"' not in text and "neuspring play" in text
+    assert 'target="player"' not in text and "neuspring play" in text and "--training: " not in text
 
 
 @pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome is installed")
@@ -152,8 +153,8 @@ def test_a_browser_without_network_shows_all_of_it(page, full, width):
         assert found["outside"] == []
         assert (found["broken"], found["silent"]) == ([], 0)
         assert (found["errors"], found["loaded"], found["asked"]) == ([], [], [])
-        # One seed of two scenarios and two methods, two films each.
-        assert browser.run(FILM_WIDTHS) == [48] * 8
+        # One seed of two scenarios and two methods, two films each; the first one's observed panel again.
+        assert browser.run(FILM_WIDTHS) == [48] * 10
 
 
 @pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome is installed")
@@ -192,10 +193,16 @@ def test_a_click_sorts_a_table_and_words_filter_it(many):
         assert browser.run(names) == ["neuspring"]
 
 
-def test_the_answer_comes_first_then_scores_film_and_curves_and_a_study_only_if_it_was_made(page):
+def test_the_answer_comes_first_then_last_frames_scores_film_and_curves_and_the_rest_is_folded(page):
     titles = re.findall(r"<h2>(.*?)</h2>", page)
-    assert titles[:6] == ["Verdict", "Scores", "Film", "Curves", "How sure the scores are", "The paper&#39;s tables"]
-    assert section(page, "verdict").startswith("Verdict Who wins neuspring, by track error on future frames: ")
+    assert titles[:5] == ["Verdict", "Last frame", "Scores", "Film", "Curves"]
+    assert titles[5:7] == ["How sure the scores are", "The paper&#39;s tables"]
+    folded = re.findall(r'<details class="part"><summary><h2>(.*?)</h2>', page)
+    assert folded == titles[5:]
+    assert section(page, "verdict").startswith("Verdict Who wins No method is ahead (2 scenes, 2 seeds). The track error on future")
+
+
+def test_a_study_is_shown_only_if_it_was_made(page):
     text = section(page, "studies")
     assert "systems: Systems" in text and "pieces: Pieces" not in text
     assert "Cannot be said: these are not the paper's data." in text
@@ -244,11 +251,15 @@ def test_a_package_adds_a_section_that_stands_where_it_says(monkeypatch, small):
 @pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome is installed")
 def test_one_control_moves_all_films_of_a_scenario(page, full):
     films = "[...document.querySelector('.films').querySelectorAll('video')]"
+    boxes = "[...document.querySelectorAll('.films .panel')].slice(0, 3).map((one) => one.getBoundingClientRect())"
     slide = "(one => { one.value = 0.5; one.dispatchEvent(new Event('input')) })(document.querySelector('.control input'))"
-    assert page.count('class="grid films"') == 4
+    assert page.count('class="grid films fit"') == 4
     with Browser() as browser:
         browser.open(full / "report.html", 1280)
-        browser.wait(f"{films}.length === 2 && {films}.every((film) => film.duration)")
+        # Observed once, then the predictions, in a row.
+        browser.wait(f"{films}.length === 3 && {films}.every((film) => film.duration)")
+        assert browser.run(f"new Set({boxes}.map((box) => box.top)).size") == 1
+        assert browser.run("document.querySelectorAll('.control').length") == 4
         assert browser.run("document.querySelectorAll('.films video[controls]').length") == 0
         browser.run(slide)
         times = f"{films}.map((film) => film.currentTime.toFixed(3))"
@@ -430,8 +441,9 @@ def test_of_many_methods_six_are_drawn_and_the_page_says_which(many):
 
 
 def test_the_gallery_links_every_video_with_its_scores(full, tmp_path):
-    collected = collect(full, ["rope", "cloth"], ["baseline", "neuspring"], [0, 1])
-    path = write_gallery(full, ["rope", "cloth", "zebra"], ["baseline", "neuspring"], 0, collected, tmp_path / "tables")
+    found = collect(full, ["rope", "cloth"], ["baseline", "neuspring"], [0, 1])
+    numbers = Numbers(everything=found, baseline="baseline", names={"baseline": "PhysTwin (`baseline`)"})
+    path = write_gallery(full, ["rope", "cloth", "zebra"], ["baseline", "neuspring"], 0, numbers, tmp_path / "tables")
     parser, page = Strict(), path.read_text()
     parser.feed(page)
     assert not parser.open
@@ -439,7 +451,34 @@ def test_the_gallery_links_every_video_with_its_scores(full, tmp_path):
     assert len([name for name in files if name.endswith(".mp4")]) == 8
     assert all((path.parent / name).is_file() for name in files)
     assert re.search(r"neuspring: training TE \d+\.\d+ mm, IoU \d+\.\d %; future TE", page)
+    assert page.count("PhysTwin (<code>baseline</code>): training TE") == 2
     assert "No pictures: no images, or no finished run." in section(page, "zebra")
+
+
+def test_methods_have_their_names_wherever_a_person_reads(full):
+    names = shown_names(Path(__file__).resolve().parents[2] / "config" / "methods.yaml")
+    assert names["search_only"] == "CMA-ES alone (`search_only`)" and names["clusters_4"] == "NeuSpring, 4 regions (`clusters_4`)"
+    # A row does not take the name of the one that it extends.
+    assert "PhysTwin (" not in names.get("model_a", "") and "springs_pooled" not in names
+    page = report(full, names=names)
+    for key in ("verdict", "strip", "scores", "pictures", "curves", "details", "failures"):
+        text = section(page, key)
+        assert "PhysTwin ( baseline )" in text and "NeuSpring ( neuspring )" in text, key
+    assert shown_names(full / "absent.yaml") == {}
+
+
+@pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome is installed")
+@pytest.mark.parametrize(("width", "most"), [(1400, 6000), (390, 9000)])
+def test_a_page_of_three_scenes_and_three_methods_is_short_and_a_link_unfolds_a_section(tmp_path, width, most):
+    results = report_tree.make(tmp_path / "results", ["rope", "cloth", "sloth"], ["search_only", "baseline", "neuspring"], [0])
+    report(results)
+    with Browser() as browser:
+        browser.open(results / "report.html", width)
+        assert browser.run("document.documentElement.scrollHeight") < most
+        fold = "document.querySelector('#details > details').open"
+        assert not browser.run(fold)
+        browser.run("location.hash = 'details'")
+        browser.wait(fold)
 
 
 def test_numbers_read_well():

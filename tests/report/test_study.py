@@ -174,7 +174,7 @@ def test_intervals_agree_with_those_of_the_summary():
     row = paired_differences(runs.scores, "baseline").iloc[0]
     width = row["high"] - row["low"]
     assert found["change"] == pytest.approx(1e3 * row["difference"])
-    assert found["relative"] == pytest.approx(row["relative"])
+    assert found["relative"] == pytest.approx(row["difference"] / averages(runs.scores).set_index("method")["equal"]["baseline"])
     assert found["change_low"] == pytest.approx(1e3 * row["low"], abs=50 * width)
     assert found["change_high"] == pytest.approx(1e3 * row["high"], abs=50 * width)
     assert found["low"] < found["ours"] < found["high"]

@@ -21,7 +21,7 @@ CHECK = """
   const page = document.documentElement;
   const outside = [...document.querySelectorAll("main *, header *, nav *")].filter((one) => {
     const box = one.getBoundingClientRect();
-    return box.width && box.right > page.clientWidth + 1 && !one.closest(".scroll, pre, svg, .hidden");
+    return box.width && box.right > page.clientWidth + 1 && !one.closest(".scroll, .panel, pre, svg, .hidden");
   });
   return {
     width: page.clientWidth, needed: page.scrollWidth, height: page.scrollHeight,

@@ -37,7 +37,7 @@ CLUSTER = workflow.remote_exec or (
 )
 
 
-# `--quiet all`: jobs write to their logs alone, and a line per rule is told. Snakemake would then hide errors too.
+# `--quiet all`: jobs write to their logs alone, and a line per finished job is told. Snakemake would then hide errors too.
 QUIET = "all" in {level.name.lower() for level in workflow.output_settings.quiet or ()}
 if QUIET:
     errors = logging.StreamHandler()

@@ -3,6 +3,7 @@ import time
 from types import SimpleNamespace
 
 from neuspring.core.job_records import begin_run
+from neuspring.core.text import program
 from neuspring.experiments import messages
 
 RUN = SimpleNamespace(begun=0.0, overview=None, warm=None)
@@ -38,7 +39,11 @@ def begin():
         raise WorkflowError(
             str(InputError("--cores", reason, workflow.resource_settings.cores, remedy))
         )
-    begin_run(Path(RESULTS))
+    chosen = {
+        name: list(getattr(CONFIG, name)) for name in ("scenarios", "methods", "seeds")
+    }
+    command = [program("snakemake"), *sys.argv[1:]]
+    begin_run(Path(RESULTS), {"command": command, "only": CONFIG.only, **chosen})
     tell_what_is_made_again()
     RUN.begun = time.monotonic()
     tell_without_gpu()

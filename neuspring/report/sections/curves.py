@@ -30,8 +30,6 @@ DIVERGED_COST = 1e3
 """Costs above this stand for candidates that could not be simulated."""
 LINE_POINTS = 120
 """Most points of a line."""
-MOST_OPEN_PANELS = 6
-"""The panels of more scenarios than this are folded."""
 CURVE_ERRORS = {"track_error": track_errors, "track_error_bound": bound_track_errors}
 PLOTS = (
     (
@@ -63,7 +61,8 @@ def curves(material: ReportData) -> PageSection:
     if not scenarios:
         return PageSection(key="curves", title="Curves", blocks=[Text(text="No run has finished.", tone="mute")])
     shown, methods = material.choice.shown, material.choice.methods
-    about = "" if len(shown) == len(methods) else f"{len(shown)} of {len(methods)} methods are drawn: {', '.join(shown)}."
+    drawn = ", ".join(map(material.numbers.name, shown))
+    about = "" if len(shown) == len(methods) else f"{len(shown)} of {len(methods)} methods are drawn: {drawn}."
     seen = {scenario: _observations(material, scenario) for scenario in scenarios}
     blocks: list[Block] = []
     for title, what, text in PLOTS:
@@ -79,12 +78,12 @@ def curves(material: ReportData) -> PageSection:
             name: (LINE_COLORS[i % len(LINE_COLORS)], LINE_DASHES[i // len(LINE_COLORS) % len(LINE_DASHES)])
             for name, i in index.items()
         }
-        legend = Legend(entries=[(name, *style) for name, style in styles.items()])
+        legend = Legend(entries=[(material.numbers.name(name), *style) for name, style in styles.items()])
         pictures = []
         for scenario, own in lines.items():
             future = observed.scenario if what in CURVE_ERRORS and (observed := seen[scenario]) else None
             pictures.append(_panel(own, styles, future, scenario, f"{title}, {scenario}: {', '.join(own)}"))
-        is_open = what == "track_error" or len(pictures) <= MOST_OPEN_PANELS
+        is_open = what == "track_error"
         blocks.append(Fold(summary=title, blocks=[Text(text=text), legend, Grid(blocks=pictures)], open=is_open))
     return PageSection(key="curves", title="Curves", about=about, blocks=blocks)
 

@@ -28,7 +28,7 @@ def failures(material: ReportData) -> PageSection:
         blocks.append(Text(text="Causes: " + ", ".join(f"{cause} ({count})" for cause, count in causes.most_common()) + "."))
         blocks.append(_jobs("Failed jobs", failed, material))
     if len(broken):
-        blocks.append(_numerical(broken))
+        blocks.append(_numerical(broken.assign(method=broken["method"].map(material.numbers.name))))
     if material.damaged:
         rows = [[Cell(text=path), Cell(text=why, wrap=True)] for path, why in list(material.damaged.items())[:MOST_ROWS]]
         note = "Delete a damaged file and run the same command again." + _rest(len(material.damaged))
@@ -42,7 +42,7 @@ def failures(material: ReportData) -> PageSection:
         summary = f"{several(len(retried), 'job')} that succeeded after another attempt"
         blocks.append(Fold(summary=summary, blocks=[_jobs("Jobs", retried, material)]))
     if len(runs):
-        blocks.append(_matrix(runs))
+        blocks.append(_matrix(runs.assign(method=runs["method"].map(material.numbers.name))))
     return PageSection(key="failures", title="Failures and missing runs", blocks=blocks)
 
 

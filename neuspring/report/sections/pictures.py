@@ -5,19 +5,23 @@ from __future__ import annotations
 import io
 import os
 import shlex
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 from PIL import Image
 
-from neuspring.core.artifacts import Observations
+from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.run_record import RunRecord
+from neuspring.core.text import program
 from neuspring.draw.scene import chosen_frames
+from neuspring.draw.sheet import TIME_BAR, TITLE_LINE
 from neuspring.report.blocks import Block, Code, Fold, Grid, PageSection, Picture, Text
 from neuspring.report.data import UNREADABLE, ReportData, ReportSection, data_uri, link, several
 
+HEAD = TITLE_LINE + TIME_BAR
+"""Height of what stands above the panels of a film, px."""
 WEBP_QUALITY = 75
 """Quality of WebP pictures, of 100."""
 MARKUP = 400
@@ -47,7 +51,7 @@ class Kind:
 
 
 KINDS = (
-    Kind(artifact="images", stem="video", title="Film: observed, predicted, difference", least=56),
+    Kind(artifact="images", stem="video", title="Film: observed, predicted", least=9),
     Kind(artifact="images", stem="images", title="Frames: observed, predicted, difference", width=1100, frames=True),
     Kind(artifact="images", stem="turntable", title="Film: the twin from all around", least=13),
     Kind(artifact="plots", stem="motion", title="Motion: predicted nodes and observed points", width=1200, paper=True, frames=True),
@@ -83,7 +87,8 @@ def embed(material: ReportData, room: int, video_room: int) -> dict[Path, Pictur
         fits = 4 * path.stat().st_size / 3 <= room
         data = data_uri("video/mp4", path.read_bytes()) if fits else ""
         room -= len(data)
-        shown[path] = Picture(caption="", film=True, data=data, reason="" if fits else NO_ROOM)
+        head = HEAD / max(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_WIDTH), 1.0) if fits else 0.0
+        shown[path] = Picture(caption="", film=True, data=data, head=min(head, 1.0), reason="" if fits else NO_ROOM)
     return shown
 
 
@@ -101,12 +106,17 @@ def _smaller(path: Path, width: int) -> Picture:
     return Picture(caption="", data=data_uri("image/webp", stream.getvalue()), size=picture.size)
 
 
-def frame_links(material: ReportData, scenario: str) -> tuple[tuple[str, str], ...]:
-    """Text and address of each frame that pictures of motion show; none where the observations cannot be read."""
+def facts_of(material: ReportData, scenario: str) -> Scenario | None:
+    """Frames of a scenario; None where its observations cannot be read."""
     try:
-        facts = Observations.load(material.results / scenario / "observations.npz").scenario
+        return Observations.load(material.results / scenario / "observations.npz").scenario
     except UNREADABLE:
-        return ()
+        return None
+
+
+def frame_links(facts: Scenario) -> tuple[tuple[str, str], ...]:
+    """Text and address of each frame that pictures of motion show."""
+    scenario = facts.name
     frames = sorted(chosen_frames(facts, facts.frame_count))
     return tuple((f"frame {frame}", f"{PLAY_ADDRESS}?frame={frame}&scenario={scenario}") for frame in frames)
 
@@ -116,25 +126,25 @@ def pictures(material: ReportData) -> PageSection:
     shown, folds = embed(material, material.room, int(1e6 * material.choice.video_megabytes)), list[Block]()
     for scenario in material.choice.scenarios:
         runs = material.first_runs(scenario)
-        if blocks := _scenario(material, runs, shown, frame_links(material, scenario)):
-            command = shlex.join(["neuspring", "play", *(str(material.folder(run)) for run in runs.values())])
+        if blocks := _scenario(material, runs, shown, facts_of(material, scenario)):
+            command = shlex.join([program("neuspring"), "play", *(str(material.folder(run)) for run in runs.values())])
             seeds = sorted({run.seed for run in runs.values()})
             summary = f"{scenario}: {several(len(runs), 'method')}, seed {', '.join(map(str, seeds))}"
             folds.append(Fold(summary=summary, blocks=[*blocks, Code(text=command, whole=True)], open=len(folds) < MOST_OPEN_FILMS))
     if not folds:
         return PageSection(key="pictures", title="Film", blocks=[Text(text="No run has left pictures yet.", tone="mute")])
     about = (
-        "All methods in step, one seed of every scenario. The bar above a film is blue in training frames and orange in the "
-        "future. The command below opens the twins in the browser, to be turned and pulled; links to frames lead there."
+        "All methods in step, one seed of every scenario; under the slider training is blue and the future orange. The command "
+        "opens the twins in the browser, to be turned and pulled; links to frames lead there. pictures.html has whole films."
     )
     return PageSection(key="pictures", title="Film", about=about, blocks=folds)
 
 
-def _scenario(
-    material: ReportData, runs: dict[str, RunRecord], shown: dict[Path, Picture], frames: Sequence[tuple[str, str]]
-) -> list[Block]:
-    folder = material.output.resolve().parent
-    blocks: list[Block] = []
+def _scenario(material: ReportData, runs: dict[str, RunRecord], shown: dict[Path, Picture], facts: Scenario | None) -> list[Block]:
+    folder, name = material.output.resolve().parent, material.numbers.name
+    grids: list[tuple[str, Grid]] = []
+    frames = frame_links(facts) if facts else ()
+    training = facts.train_end / facts.frame_count if facts else 0.0
     for kind in KINDS:
         # Methods share most splats, so a picture may belong to several.
         owners: dict[Path, list[str]] = {}
@@ -144,19 +154,24 @@ def _scenario(
         figures: list[Block] = []
         for path, methods in owners.items():
             run = runs[methods[0]]
-            caption = ", ".join(methods)
+            caption = ", ".join(map(name, methods))
             if kind.stem == "appearance":
                 caption = "Observed and drawn in frame 0" + (f", {caption}" if len(owners) > 1 else "")
             alt = f"{kind.title}: {run.scenario}, {', '.join(methods)}, seed {run.seed}"
             own = frames if kind.frames else ()
-            wide = bool(kind.width) or kind.least >= 40
+            wide, panel = bool(kind.width), 1 if kind.stem == "video" else None
             target = "" if shown[path].data else link(path, folder)
-            figures.append(replace(shown[path], caption=caption, alt=alt, link=target, wide=wide, paper=kind.paper, frames=own))
+            more = {"alt": alt, "link": target, "wide": wide, "paper": kind.paper, "frames": own, "panel": panel}
+            figures.append(replace(shown[path], caption=caption, **more))
+        if figures and kind.stem == "video":
+            head = max(shown[path].head for path in owners)
+            figures.insert(0, Picture(caption="Observed", film=True, panel=0, head=head, same=True))
         if figures:
-            grid = Grid(blocks=figures, least=kind.least, films=not kind.width)
-            # The first kind that there is can be seen at once.
-            blocks.append(Fold(summary=kind.title, blocks=[grid]) if blocks else grid)
-    return blocks
+            film = not kind.width
+            grids.append((kind.title, Grid(blocks=figures, least=kind.least, films=film, fit=film, training=training * film)))
+    # The first kind that there is can be seen at once.
+    folds: list[Block] = [Fold(summary=title, blocks=[grid]) for title, grid in grids[1:]]
+    return [*(grid for _, grid in grids[:1]), *([Fold(summary="More pictures", blocks=folds)] if folds else [])]
 
 
 section = ReportSection(order=30, make=pictures, phase=1)

@@ -50,7 +50,7 @@ def work(material: ReportData) -> PageSection:
         by_method[_owner(job)].append(job)
     rules = sorted(by_rule, key=lambda name: (ORDER.index(name) if name in ORDER else len(ORDER), name))
     steps = {name: by_rule[name] for name in rules} | ({"all": jobs} if len(rules) > 1 else {})
-    methods = {name: by_method[name] for name in sorted(by_method) if name}
+    methods = {material.numbers.name(name): by_method[name] for name in sorted(by_method) if name}
     blocks: list[Block] = [_costs("By step", "Step", steps, sortable=False)]
     if methods:
         caption = "By method (searches and splats apart, since methods share them)"

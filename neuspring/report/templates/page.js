@@ -45,7 +45,11 @@ const make = (kind, facts, ...inside) => {
   return made;
 };
 for (const group of document.querySelectorAll(".films")) {
-  const films = [...group.querySelectorAll("video")];
+  for (const same of group.querySelectorAll("video.same")) {
+    const first = group.querySelector("video[src]");
+    if (first) [same.src, same.closest("figure").hidden] = [first.src, false];
+  }
+  const films = [...group.querySelectorAll("video[src]")];
   if (!films.length) continue;
   const [first] = films;
   const button = make("button", { type: "button" });
@@ -69,6 +73,15 @@ for (const group of document.querySelectorAll(".films")) {
   });
   new IntersectionObserver(([seen]) => (seen.isIntersecting && wanted ? play() : pause())).observe(group);
   label();
-  group.prepend(make("div", { className: "control" }, button, slider, speed));
+  const control = make("div", { className: "control", style: group.style.cssText }, button, slider, speed);
+  group.before(control);
 }
+// A link to what is folded unfolds it.
+const reveal = () => {
+  let one = location.hash && document.getElementById(location.hash.slice(1));
+  if (one) one.querySelector(":scope > details.part")?.setAttribute("open", "");
+  for (; one; one = one.parentElement) if (one.tagName === "DETAILS") one.open = true;
+};
+addEventListener("hashchange", reveal);
+reveal();
 addEventListener("beforeprint", () => document.querySelectorAll("details").forEach((fold) => (fold.open = true)));

@@ -1,0 +1,64 @@
+"""The last frame of all methods beside the observed one, scenario below scenario: the future at one look."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from neuspring.report.blocks import Block, Fold, Grid, PageSection, Picture, Text
+from neuspring.report.data import ReportData, ReportSection, data_uri, several
+from neuspring.report.sections.pictures import HEAD, MOST_OPEN_FILMS, NO_ROOM, WEBP_QUALITY
+
+STRIP_WIDTH = 424
+"""Largest width of a picture, px."""
+
+
+def last_frame(path: Path) -> tuple[int, np.ndarray]:
+    """Number of frames of a run's film, and its last one [H, W, 3] uint8, RGB, without names and time. Raises ValueError."""
+    film = cv2.VideoCapture(str(path))
+    count = int(film.get(cv2.CAP_PROP_FRAME_COUNT))
+    film.set(cv2.CAP_PROP_POS_FRAMES, count - 1)
+    good, picture = film.read()
+    if not good or len(picture) <= HEAD:
+        raise ValueError("damaged: no film of a run")
+    return count, cv2.cvtColor(picture[HEAD:], cv2.COLOR_BGR2RGB)
+
+
+def strip(material: ReportData) -> PageSection | None:
+    """A row per scenario; None where no run has a film."""
+    rows: list[Block] = []
+    for scenario in material.choice.scenarios:
+        films = {name: material.file(run, "images", "video") for name, run in material.first_runs(scenario).items()}
+        ends = {name: end for name, path in films.items() if path and (end := material.read(path, last_frame))}
+        longest = max((count for count, _ in ends.values()), default=0)
+        figures = []
+        for name, (count, picture) in sorted(ends.items(), key=lambda pair: pair[1][0] < longest):
+            across = picture.shape[1] // 3
+            stopped = f", which ends at frame {count - 1}" * (count < longest)
+            if not figures:
+                figures.append(_picture(picture[:, :across], f"Observed: {scenario}, frame {count - 1}", scenario))
+            figures.append(_picture(picture[:, across : 2 * across], f"{material.numbers.name(name)}{stopped}", scenario))
+        if sum(len(one.data) for one in figures) > material.room:
+            rows.append(Text(text=f"{scenario}: {NO_ROOM}.", tone="mute"))
+        elif figures:
+            material.room -= sum(len(one.data) for one in figures)
+            rows.append(Grid(blocks=figures, least=10, fit=True))
+    rest = rows[MOST_OPEN_FILMS:]
+    more = [Fold(summary=f"{several(len(rest), 'scenario')} more", blocks=rest)] if rest else []
+    about = "What was filmed and what each method predicts, in the last frame of the future, first camera; one seed."
+    return PageSection(key="strip", title="Last frame", about=about, blocks=[*rows[:MOST_OPEN_FILMS], *more]) if rows else None
+
+
+def _picture(picture: np.ndarray, caption: str, scenario: str) -> Picture:
+    made, stream = Image.fromarray(np.ascontiguousarray(picture)), io.BytesIO()
+    made.thumbnail((STRIP_WIDTH, 10 * STRIP_WIDTH))
+    made.save(stream, "WEBP", quality=WEBP_QUALITY)
+    data = data_uri("image/webp", stream.getvalue())
+    return Picture(caption=caption, alt=f"Last frame of {scenario}: {caption}", data=data, size=made.size)
+
+
+section = ReportSection(order=15, make=strip, phase=1)
