@@ -17,7 +17,7 @@ from neuspring.draw.painter import DrawingStyle, Painter
 from neuspring.draw.scene import ShownRun, ShownScene, chosen_frames
 from neuspring.draw.sheet import place, save
 from neuspring.draw.strip import strip_figure
-from neuspring.draw.twin import LEGEND_ROOM, TwinPicture, histogram, rough_or_smooth, twin_figure
+from neuspring.draw.twin import LEGEND_ROOM, TwinPicture, histogram, twin_figure
 from neuspring.scores.metrics import errors_per_frame, metrics_of
 from neuspring.twin.body import lines_of
 
@@ -159,8 +159,7 @@ def _from_two_sides(observations: Observations, take: ShownRun, label: str, *qua
 
 
 def stiffness_figure(observations: Observations, take: ShownRun, searched: float | None) -> Figure:
-    """The body's lines in frame 0 colored by stiffness in two views, their histogram with the searched stiffness [N] marked, and
-    the variogram of springs between nodes.
+    """The body's lines in frame 0 colored by stiffness in two views, and their histogram with the searched stiffness [N] marked.
 
     The body must have a line.
     """
@@ -168,13 +167,9 @@ def stiffness_figure(observations: Observations, take: ShownRun, searched: float
     lines = lines_of(take.twin)
     stiffness = lines.stiffness[: lines.inner].astype(float)
     body = _from_two_sides(observations, take, f"{take.label}: {len(stiffness)} {lines.about}", "stiffness")
-    columns = 2 if take.twin.topology.object_spring_count and stiffness.std() > 0 else 1
-    figure = twin_figure(body, RUN_WIDTH + columns * HISTOGRAM, LEGEND_ROOM + columns * HISTOGRAM)
+    figure = twin_figure(body, RUN_WIDTH + HISTOGRAM, LEGEND_ROOM + HISTOGRAM)
     high = figure.get_figheight()
     axis = place(figure, RUN_WIDTH + 0.6, FOOT, HISTOGRAM - 0.9, max(high - FOOT - 0.1, 0.5))
     histogram(axis, stiffness, body.norm, searched)
     axis.set_ylabel(lines.kind)
-    if columns == 2:
-        axis = place(figure, RUN_WIDTH + HISTOGRAM + 0.6, FOOT, HISTOGRAM - 0.9, max(high - FOOT - 0.1, 0.5))
-        rough_or_smooth(axis, take.twin)
     return figure

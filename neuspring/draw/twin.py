@@ -21,10 +21,7 @@ from neuspring.core.artifacts import Twin
 from neuspring.draw.painter import empty, hands
 from neuspring.draw.scene import ShownRun, ShownScene
 from neuspring.draw.sheet import CONTROLLER, TEXT, color_bar, place, points_across, sample
-from neuspring.physics.topology import node_spacing
 from neuspring.twin.body import Lines, body_of, lines_of
-from neuspring.twin.field import midpoints
-from neuspring.twin.roughness import roughness, variogram
 
 Quantity = Literal["stiffness", "region"]
 STIFFNESS_COLORS = "viridis"
@@ -220,21 +217,6 @@ def histogram(axis: Axes, stiffness: np.ndarray, norm: LogNorm, searched: float 
         axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
         axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
         axis.xaxis.set_minor_formatter(NullFormatter())
-
-
-def rough_or_smooth(axis: Axes, twin: Twin) -> None:
-    """The variogram of a lattice's log stiffness over distance in node spacings, and its roughness (twin/roughness.py)."""
-    topology, inner = twin.topology, twin.topology.object_spring_count
-    middles = midpoints(topology.canonical, topology.springs[:inner])
-    values = np.log(np.maximum(twin.material.stiffness[:inner].astype(float), 1e-12))
-    spacing = node_spacing(topology.canonical[: len(topology.nodes)])
-    far = 0.5 * float(np.linalg.norm(np.ptp(middles, axis=0)))
-    edges = np.linspace(0, max(far, spacing), STIFFNESS_BINS + 1)
-    axis.plot((edges[1:] + edges[:-1]) / (2 * spacing), variogram(middles, values, edges), ".-", color="0.2", lw=1)
-    axis.axhline(1, color="0.6", lw=0.8, ls=":")
-    axis.set(ylim=(0, None), ylabel="difference, share of variance")
-    axis.set_xlabel(f"distance [node spacings]\nnearest springs: {roughness(middles, values):.2f}", fontsize=TEXT - 1)
-    axis.tick_params(labelsize=TEXT - 1)
 
 
 def _newtons(value: float) -> str:

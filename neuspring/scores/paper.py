@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import csv
 import functools
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from importlib import resources
@@ -30,7 +31,7 @@ CLUSTER_CLAIM = (
     "The paper shows the Chamfer distance of two scenarios as curves, without numbers: in both tasks it mostly falls as K grows. "
     "It takes K = 5 everywhere."
 )
-_MEANS = "MEAN22"
+MEANS = "MEAN22"
 CLIPS = "deform_published"
 """The table of numbers that were published on DEFORM's cables. It has cables in place of tasks, and one metric."""
 CLIP_METRIC = "deform_l1"
@@ -77,7 +78,7 @@ def table(name: str) -> Values:
     """One of the paper's tables, or `CLIPS`; empty if there is none of that name."""
     if name == CLIPS:
         return {
-            (row["method"], row["cable"], CLIP_METRIC): replace(_printed(row["l1_mm"], False), source=row["source"], tag=row["tag"])
+            (row["method"], row["cable"], CLIP_METRIC): replace(_printed(row["l1_mm"]), source=row["source"], tag=row["tag"])
             for row in _rows(f"{CLIPS}.csv")
         }
     tasks = {theirs: ours for ours, theirs in PAPER_TASKS.items()}
@@ -94,18 +95,24 @@ def tables() -> tuple[str, ...]:
     return tuple(dict.fromkeys(row["table"] for row in _rows("paper_tables.csv")))
 
 
+def released_scores(rows: Iterable[Mapping[str, str]] | None = None) -> Values:
+    """Scores of the released PhysTwin in stored units, by scenario, task, metric; of other `rows` than those that ship.
+
+    Means over scenarios stand under names that begin with `MEANS`.
+    """
+    names = {"chamfer_distance_m": "chamfer", "track_error_m": "track_error", "train": "reconstruction"}
+    return {
+        (row["scenario"], names.get(row["split"], row["split"]), names.get(row["metric"], row["metric"])): _printed(row["value"])
+        for row in (_rows("released_phystwin_scores.csv") if rows is None else rows)
+    }
+
+
 @functools.cache
 def released() -> pd.DataFrame:
     """Scores of the released PhysTwin: scenario, task, metric, value [m]. 11 of 22 scenarios have scores of training frames."""
     import pandas as pd
 
-    names = {"chamfer_distance_m": "chamfer", "track_error_m": "track_error"}
-    tasks = {"train": "reconstruction", "future": "future"}
-    rows = [
-        (row["scenario"], tasks[row["split"]], names[row["metric"]], float(row["value"]))
-        for row in _rows("released_phystwin_scores.csv")
-        if not row["scenario"].startswith(_MEANS)
-    ]
+    rows = [(*key, score.value) for key, score in released_scores().items() if not key[0].startswith(MEANS)]
     return pd.DataFrame(rows, columns=["scenario", "task", "metric", "value"])
 
 
@@ -115,7 +122,7 @@ def scenarios() -> frozenset[str]:
     return frozenset(released()["scenario"])
 
 
-def _printed(text: str, in_meters: bool) -> Printed:
+def _printed(text: str, in_meters: bool = False) -> Printed:
     text = f"{Decimal(text).scaleb(3):f}" if in_meters else text
     digits = len(text.partition(".")[2])
     return Printed(text=text, value=float(text), slack=0.5 * 10.0**-digits)

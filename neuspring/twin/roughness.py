@@ -4,8 +4,7 @@ With z_e = ln Y_e and E_k(e) the k springs whose canonical midpoints are nearest
 
     roughness = mean over e and n in E_k(e) of (z_e - z_n)^2 / 2,   over the variance of z
 
-which is 1 where neighbors have nothing in common, and near 0 where stiffness is smooth. The variogram is the same mean over pairs
-at a distance h.
+which is 1 where neighbors have nothing in common, and near 0 where stiffness is smooth.
 """
 
 from __future__ import annotations
@@ -14,8 +13,6 @@ import numpy as np
 
 SIDE_BY_SIDE = 8
 """Springs that a spring is compared with."""
-MOST_PAIRS = 200_000
-"""Pairs that a variogram draws at most."""
 
 
 def roughness(midpoints: np.ndarray, values: np.ndarray) -> float:
@@ -38,23 +35,3 @@ def neighbors(points: np.ndarray, most: int) -> np.ndarray:
     own = near == np.arange(len(points))[:, None]
     own[:, -1] |= ~own.any(axis=1)
     return np.asarray(near[~own].reshape(len(points), count))
-
-
-def variogram(midpoints: np.ndarray, values: np.ndarray, edges: np.ndarray, seed: int = 0) -> np.ndarray:
-    """Half the mean squared difference of values [S] over their variance, for pairs of springs whose midpoints [S, 3] are
-    edges[b] to edges[b + 1] apart, m: [B], NaN where there are none. Of many springs random pairs are drawn."""
-    count, variance = len(values), float(np.var(values))
-    first, second = np.triu_indices(count, 1) if count * (count - 1) <= 2 * MOST_PAIRS else _drawn(count, seed)
-    apart = np.linalg.norm(midpoints[first].astype(np.float64) - midpoints[second], axis=1)
-    place = np.digitize(apart, edges) - 1
-    inside = (place >= 0) & (place < len(edges) - 1) & (apart <= edges[-1])
-    square = np.square(values[first] - values[second])[inside]
-    pairs = np.bincount(place[inside], minlength=len(edges) - 1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        result: np.ndarray = np.bincount(place[inside], square, len(edges) - 1) / (2 * variance * pairs)
-    return result
-
-
-def _drawn(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    first, second = np.random.default_rng(seed).integers(0, count, (2, MOST_PAIRS))
-    return first[first != second], second[first != second]

@@ -17,7 +17,7 @@ from tests.support import scenes
 from tests.support.clips import CONTACT_SCALARS, NAMES, Clip, clip
 from tests.support.scenes import DEVICES
 
-# Tolerances: the golden data's README, section "Simulator". The record is float32; without self-collision an independent
+# Tolerances. The record is float32; without self-collision an independent
 # float64 simulation follows it to 2e-5 m over the whole clip.
 POSITION = 2e-5
 """m, over the whole clip."""

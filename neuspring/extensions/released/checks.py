@@ -4,10 +4,8 @@ Checks: 1 sizes and frame 0, 2 springs, 3 scores of the prediction, 4 deprojecti
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
@@ -42,6 +40,7 @@ from neuspring.physics.topology import uniform_topology
 from neuspring.scores import metrics
 from neuspring.scores.lpips import Lpips
 from neuspring.scores.metrics import METRICS, TASKS, averages
+from neuspring.scores.paper import MEANS, Printed, Values, released_scores
 from neuspring.scores.pictures import Pair, picture_scores
 from neuspring.splats.draw import OBJECT_COVERAGE, picture, prune_by_opacity, skinned_frames, view_of
 from neuspring.splats.model import Splats
@@ -51,9 +50,7 @@ Outcome = Literal["passed", "failed", "measured", "skipped"]
 """measured: there is no published number to compare with."""
 MEAN = "mean"
 """The scenario of findings about all scenarios."""
-SCORES = "released_phystwin_scores.csv"
-PUBLISHED_NAMES = {"chamfer_distance_m": "chamfer", "track_error_m": "track_error", "train": "reconstruction"}
-MEAN_ROWS = ("MEAN22_REEVAL", "MEAN22_PAPER")
+MEAN_ROWS = (f"{MEANS}_REEVAL", f"{MEANS}_PAPER")
 """Rows of means over the 22 scenarios: evaluated again with more digits, as printed in the paper."""
 
 
@@ -108,41 +105,19 @@ class Comparison:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reference:
-    """A published number."""
-
-    value: float
-    half_digit: float
-    """Half a unit of the last printed digit."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Published:
-    """Published scores of the released results, keyed by (scenario, task, metric). Means stand under the names in MEAN_ROWS."""
+    """Published scores of the released results, by (scenario, task, metric). Means stand under the names in MEAN_ROWS."""
 
-    scores: Mapping[tuple[str, str, str], Reference]
+    scores: Values
     scenarios: frozenset[str]
     """The scenarios that the means were taken over."""
 
     @classmethod
     def load(cls) -> Published:
-        """Load the table that ships."""
-        text = resources.files("neuspring.data").joinpath("tables", SCORES).read_text(encoding="utf-8")
-        return cls.parse(text, frozenset(released_cases()))
+        """The table that ships."""
+        return cls(scores=released_scores(), scenarios=frozenset(released_cases()))
 
-    @classmethod
-    def parse(cls, text: str, scenarios: frozenset[str]) -> Published:
-        """Parse CSV text with the columns scenario, split, metric and value."""
-        scores = {}
-        for row in csv.DictReader(text.splitlines()):
-            task, metric = (PUBLISHED_NAMES.get(row[name], row[name]) for name in ("split", "metric"))
-            if task not in TASKS or metric not in METRICS:
-                raise InputError(SCORES, "known splits and metrics are required", (row["split"], row["metric"]))
-            digits = len(row["value"].partition(".")[2])
-            scores[row["scenario"], task, metric] = Reference(value=float(row["value"]), half_digit=0.5 * 10.0**-digits)
-        return cls(scores=scores, scenarios=scenarios)
-
-    def means(self, task: str, metric: str) -> list[Reference]:
+    def means(self, task: str, metric: str) -> list[Printed]:
         """Published means of a task and metric, the one with most digits first."""
         keys = [(name, task, metric) for name in MEAN_ROWS]
         return [self.scores[key] for key in keys if key in self.scores]
@@ -183,10 +158,10 @@ def of_scores(
     return findings
 
 
-def _judged(score: Comparison, reference: Reference | None) -> Comparison:
+def _judged(score: Comparison, reference: Printed | None) -> Comparison:
     if reference is None:
         return score
-    return score.against(reference.value, max(METRICS[score.quantity].tolerance, reference.half_digit))
+    return score.against(reference.value, max(METRICS[score.quantity].tolerance, reference.slack))
 
 
 def of_means(findings: Iterable[Comparison], published: Published) -> list[Comparison]:

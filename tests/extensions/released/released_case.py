@@ -5,6 +5,7 @@ prediction by the float64 reference simulation, pictures by the rasterizer's spe
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from neuspring.extensions.released.files import Released
 from neuspring.physics import reference as simulation
 from neuspring.physics.reference import ReferenceTwin
 from neuspring.physics.topology import uniform_topology
+from neuspring.scores.paper import released_scores
 from neuspring.splats.model import Splats
 from neuspring.splats.rasterize import reference
 from neuspring.splats.skinning import Skin
@@ -225,7 +227,7 @@ def published_of(case: Released) -> Published:
     for name in (case.name, "MEAN22_REEVAL"):
         for split, frames in SPLITS.items():
             lines += [f"{name},{split},{metric},{np.mean([values[t] for t in frames]):.9f}" for metric, values in per_frame.items()]
-    return Published.parse("\n".join(lines), frozenset({case.name}))
+    return Published(scores=released_scores(csv.DictReader(lines)), scenarios=frozenset({case.name}))
 
 
 def distances(case: Released) -> dict[str, list[float]]:
