@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 import time
@@ -17,6 +18,14 @@ def listed(names: Iterable[object], most: int = 12) -> str:
     """The names, separated by commas; of more than `most` the first ones, and how many others there are."""
     texts = [str(name) for name in names]
     return ", ".join(texts) if len(texts) <= most else f"{', '.join(texts[:most])} and {len(texts) - most} more"
+
+
+def duration(seconds: float) -> str:
+    """A time for people."""
+    if not math.isfinite(seconds):
+        return "–"
+    minutes = f"{seconds / 60:.1f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+    return f"{seconds:.1f} s" if seconds < 100 else minutes
 
 
 def refuse_password(key: str, uri: str, instead: str) -> None:

@@ -78,7 +78,9 @@ workflow.config_settings.config_args = [
         for key, value in CHOSEN.items()
     ),
 ]
-BENCHMARK = or_workflow_error(needs.checked, config, ROOT)
+BENCHMARK = or_workflow_error(
+    needs.checked, config, ROOT, plan_only=workflow.output_settings.dryrun
+)
 CONFIG = BENCHMARK.config
 RESULTS = CONFIG.results
 POOL = () if CLUSTER else or_workflow_error(needs.pool_of, CONFIG, workflow)
@@ -167,7 +169,10 @@ def compared_with_records(stage):
         if stage.together and workflow.is_main_process:
             # Launches are shared again if some job that takes part is to be done, and in no other case.
             member = STAGES[stage.together.stage]
-            if any(unfinished(member, one) for one in GRAPH.in_step(stage, wildcards.scenario)):
+            if any(
+                unfinished(member, one)
+                for one in GRAPH.in_step(stage, wildcards.scenario)
+            ):
                 workflow.dag.forcefiles.add(output)
         return find(wildcards)
 
