@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shlex
 import shutil
@@ -9,7 +10,7 @@ import subprocess
 import sys
 import threading
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Any
 
@@ -17,6 +18,7 @@ from neuspring.config import plain
 from neuspring.core.errors import InputError
 from neuspring.core.findings import warnings_of
 from neuspring.core.job_records import FOLDER, RUN_FILE, JobRecord, failure_lines, read_jobs, this_run
+from neuspring.core.run_record import RunRecord
 from neuspring.core.text import listed
 from neuspring.experiments.freshness import told
 from neuspring.experiments.graph import Graph
@@ -131,7 +133,7 @@ def finished(graph: Graph, seconds: float) -> None:
     summary = Path(folder) / "summary.md"
     if summary.exists():
         print(f"\n{headline(summary.read_text())}\n")
-        tell_findings(Path(config.results), config.scenarios)
+        tell_findings(graph)
         pages = {f"{folder}/report.html": "everything", f"{folder}/pictures.html": "films of every method"}
         there = [f"{page} ({what})" for page, what in pages.items() if Path(page).exists()]
         print(f"Open in a browser: {', '.join(there)}" if there else "The report is made by the target `all`.")
@@ -155,10 +157,19 @@ def finished(graph: Graph, seconds: float) -> None:
     print(f"It took {seconds / 60:.1f} minutes." if seconds >= 60 else f"It took {seconds:.0f} s.", flush=True)
 
 
-def tell_findings(results: Path, scenarios: Sequence[str]) -> None:
-    """Findings of the steps of perception: warnings of all scenarios; notes are in the report."""
-    if found := warnings_of(results, scenarios):
-        print(f"Perception noticed {len(found)} thing{'s' * (len(found) > 1)} that may make results worse:")
+def tell_findings(graph: Graph) -> None:
+    """Warnings of the steps of perception on all scenarios, and of each method's fits the worst; notes are in the report."""
+    from neuspring.report.notes import of_fits
+
+    found = [*warnings_of(Path(graph.config.results), graph.config.scenarios)]
+    runs = list[RunRecord]()
+    for path in graph.runs():
+        with contextlib.suppress(InputError):  # the tables say which are damaged
+            runs.append(RunRecord.load(Path(path)))
+    fits = sorted(of_fits(runs), key=lambda pair: pair[1].value)
+    found += {(one.where.partition("/")[0], one.name): (name, one) for name, one in fits}.values()
+    if found:
+        print(f"Perception and fits noticed {len(found)} thing{'s' * (len(found) > 1)} that may make results worse:")
         print("\n".join(f"  {name}: {one}" for name, one in found[:MOST_FINDINGS]))
         if len(found) > MOST_FINDINGS:
             print(f"  {len(found) - MOST_FINDINGS} more are in the report.")

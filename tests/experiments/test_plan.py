@@ -28,7 +28,9 @@ def test_all_scenarios_without_data_are_one_error_before_any_job_and_a_line_of_a
     case = tmp_path / "data" / "different_types"
     for name in RELEASED[:2]:
         (case / name).mkdir(parents=True)
-    message = rf"^{case}: 3 of 3 scenarios lack final_data\.pkl .single_lift_rope, .*`neuspring fetch phystwin --data-root {tmp_path} "
+    message = (
+        rf"^{case}: 3 of 3 scenarios lack final_data\.pkl .single_lift_rope, .*`neuspring fetch phystwin --data-root {tmp_path} "
+    )
     with pytest.raises(InputError, match=message):
         needs.checked(config_with(released(tmp_path)), ROOT)
     place = plan.Place(gpus=(), cores=2)
@@ -56,7 +58,9 @@ def test_hours_are_published_ones_scaled_by_the_settings_until_jobs_of_the_folde
     place = plan.Place(gpus=("0", "1"), cores=4)
     lines = planned(tmp_path, counts, place, on_gpu=True, **sizes)
     # 20 x 6 min and 60 x 2.5 min.
-    assert lines[1].startswith("  time     4.5 h of GPU time, 2.2 h on 2 GPUs: fit 60 x 2.5 min, search 20 x 6.0 min (by PhysTwin's")
+    assert lines[1].startswith(
+        "  time     4.5 h of GPU time, 2.2 h on 2 GPUs: fit 60 x 2.5 min, search 20 x 6.0 min (by PhysTwin's"
+    )
     assert lines[2] == "           without a figure, and not counted: train (3)"
     for name, seconds in {"a": 60.0, "b": 120.0, "c": 600.0}.items():
         done = Attempt(started="2026-01-01T00:00:00+00:00", seconds=seconds, outcome="ok", devices=["0"])

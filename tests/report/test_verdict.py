@@ -107,11 +107,12 @@ def test_the_cause_is_what_the_records_of_the_weakest_scenario_say_with_the_next
     warned = finding("two objects", "warning", "camera 0", "2 pieces", "one is expected", "Look at masks.png; mark it.")
     texts = said(replace(collected(TWO), records=records), warnings=(("b", warned), ("a", replace(warned, name="other"))))
     assert texts["Probable cause"] == (
-        "b: two objects (camera 0). ours on b: up to 38% of the springs lie at the bound of their stiffness. "
+        "b: two objects (camera 0). ours on b: up to 38% of the springs lie at the bound of their stiffness (fit.output_bound). "
         "ours on b: the search ended at an end of its range in drag."
     )
     assert "Look at masks.png; mark it." in texts["Next move"]
-    assert texts["Next move"].endswith("Raise fit.output_bound. Widen search.variables for drag.")
+    move = "Raise output_bound in the settings of the row ours of the method table. Widen search.variables for drag."
+    assert texts["Next move"].endswith(move)
 
 
 @pytest.mark.parametrize(
