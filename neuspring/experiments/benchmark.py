@@ -284,7 +284,7 @@ class Benchmark:
             raise InputError(f"method {name}, fit.stiffness_range", rule, [low, high])
 
     def _check_data(self, plan_only: bool) -> None:
-        """What is absent is told of all scenarios at once, before anything else of their data."""
+        """Data that are absent are told of all scenarios at once, before anything else of their data."""
         placed = {name: path for name in self.scenarios if (path := self.data_path(name)) is not None}
         lacking = {name: path for name in placed if (path := self._lacking(name)) is not None}
         self.absent = self._absence(lacking, len(placed)) if lacking else None

@@ -46,7 +46,7 @@ FIRST_REQUEST = {name: (stage.memory_mb, stage.minutes) for name, stage in STAGE
     "sweep": (4000, 20),
 }
 """Rule -> MB and minutes to ask for, before any job of it was measured."""
-UNITS: dict[str, Callable[[Config], int]] = {
+UNITS_OF_WORK: dict[str, Callable[[Config], int]] = {
     "search": lambda config: config.search.rollouts,
     "fit": lambda config: config.fit.epochs,
     "appearance": lambda config: config.images.appearance.iterations,
@@ -202,7 +202,7 @@ class Needs:
         if (rule, kind) in self.history.median:
             return kind, self.history.median[rule, kind], True
         published = PUBLISHED.get((rule, kind))
-        return kind, None if published is None else published * UNITS.get(rule, lambda config: 1)(self._config), False
+        return kind, None if published is None else published * UNITS_OF_WORK.get(rule, lambda config: 1)(self._config), False
 
     def _request(self, rule: str, first: int, least: int, known: Callable[[Key], float]) -> Callable[..., int]:
         """`known`: what earlier jobs call for; 0 where there are none."""

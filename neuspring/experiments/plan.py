@@ -69,7 +69,7 @@ def _times(needs: Needs, jobs: Mapping[str, int], place: Place) -> Iterable[str]
 
 
 def _shared_out(kind: Kind, total: float, place: Place) -> str:
-    """What the devices make of a time; nothing where a scheduler hands them out."""
+    """The time on all devices together; nothing where a scheduler hands them out."""
     count, noun = (len(place.gpus), "GPU") if kind == "gpu" else (place.cores, "core")
     if place.cluster or not count:
         return ""

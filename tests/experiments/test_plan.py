@@ -98,5 +98,5 @@ def test_a_later_file_says_which_keys_it_changes_and_from_what(tmp_path):
 
 
 def test_published_times_are_of_rules_that_there_are():
-    assert {rule for rule, _ in needs.PUBLISHED} | set(needs.UNITS) <= set(needs.FIRST_REQUEST)
+    assert {rule for rule, _ in needs.PUBLISHED} | set(needs.UNITS_OF_WORK) <= set(needs.FIRST_REQUEST)
     assert (ROOT / needs.PUBLISHED_BY["cpu"].partition(":")[0]).is_file()
