@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 import time
@@ -30,6 +31,14 @@ def readable(value: float, unit: str) -> tuple[float, str]:
     """A value and its unit for reading: four significant digits, lengths in mm."""
     value, unit = (1e3 * value, "mm") if unit == "m" else (value, unit)
     return float(f"{value:.4g}"), unit
+
+
+def duration(seconds: float) -> str:
+    """A time for people."""
+    if not math.isfinite(seconds):
+        return "–"
+    minutes = f"{seconds / 60:.1f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+    return f"{seconds:.1f} s" if seconds < 100 else minutes
 
 
 def refuse_password(key: str, uri: str, instead: str) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import fnmatch
+import os
 import shlex
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -153,10 +154,10 @@ def with_method(config: Config, method: Method, name: str) -> Config:
 class Benchmark:
     """A configuration with the rows that it names, after everything that can be checked before a job starts.
 
-    Tables are read relative to `root`. Raises InputError.
+    Tables are read relative to `root`. Raises InputError; with `plan_only` data that are not there are no error, but `absent`.
     """
 
-    def __init__(self, values: Mapping[str, Any], root: Path) -> None:
+    def __init__(self, values: Mapping[str, Any], root: Path, *, plan_only: bool = False) -> None:
         self.root, self.on_gpu = root, False
         """`on_gpu`: True where jobs take GPUs; the workflow sets it."""
         given = with_deform(parse(Config, values, "configuration"))
@@ -191,7 +192,9 @@ class Benchmark:
             if (model := self.table[name].model) and BASELINES[model].pictured(with_method(self.whole, self.table[name], name))
         )
         """Methods of the whole configuration that are trained on pictures."""
-        self._check()
+        self.absent: InputError | None = None
+        """All data that are not there."""
+        self._check(plan_only)
 
     # --- the rows that the configuration names
 
@@ -245,7 +248,7 @@ class Benchmark:
 
     # --- what is checked before a job starts
 
-    def _check(self) -> None:
+    def _check(self, plan_only: bool) -> None:
         folders = {*RESERVED, self.config.tables}
         for name in [*self.scenarios, *self.methods]:
             if name in folders or name.startswith("search-"):
@@ -255,8 +258,7 @@ class Benchmark:
         for name, method in self.methods.items():
             self._check_settings(name, method)
         require_known(self.config.perception)
-        for name, row in self.scenarios.items():
-            self._check_data(name, row)
+        self._check_data(plan_only)
         if not any(self.applies(method, scenario) for method in self.methods for scenario in self.config.scenarios):
             rule = "at least one method must apply to a scenario; what is trained on silhouettes needs images, a pool `pools`"
             remedy = "Choose scenarios with images (and images.enabled), name pools, or choose another method."
@@ -281,19 +283,40 @@ class Benchmark:
             rule = f"must hold the search's range of {wanted.low} to {wanted.high}, or springs start beyond their clamp"
             raise InputError(f"method {name}, fit.stiffness_range", rule, [low, high])
 
-    def _check_data(self, name: str, row: ScenarioRow) -> None:
-        source, path = SOURCES[row.source], self.data_path(name)
-        if path is None:
-            return
-        where = f"scenario {name}"
-        if self.config.data_root is None:
+    def _check_data(self, plan_only: bool) -> None:
+        """Data that are absent are told of all scenarios at once, before anything else of their data."""
+        placed = {name: path for name in self.scenarios if (path := self.data_path(name)) is not None}
+        lacking = {name: path for name in placed if (path := self._lacking(name)) is not None}
+        self.absent = self._absence(lacking, len(placed)) if lacking else None
+        if self.absent and not plan_only:
+            raise self.absent
+        for name, path in placed.items():
+            if name not in lacking:
+                source = self.source(name)
+                source.required(path)
+                if source.films and not source.write_capture:
+                    BACKENDS["segment"][self.config.perception.segment.backend].require(path)
+
+    def _lacking(self, name: str) -> Path | None:
+        """The first file of a scenario that must be there and is not."""
+        path, needed = self.data_path(name), self.source(name).needed
+        assert path is not None
+        files = [path / file for file in needed] or [path]
+        return next((file for file in files if self.config.data_root is None or not file.exists()), None)
+
+    def _absence(self, lacking: Mapping[str, Path], count: int) -> InputError:
+        name, path = next(iter(lacking.items()))
+        row, source, root = self.scenarios[name], self.source(name), self.config.data_root
+        if root is None:
             remedy = "Give it: --config data_root=/path/to/data."
-            raise InputError(where, f"{row.source} scenarios need data_root", "null", remedy)
-        if not path.exists():
-            raise InputError(where, "its data must exist", path, "Correct data_root, or the scenario's name or path.")
-        source.required(path)
-        if source.films and not source.write_capture:
-            BACKENDS["segment"][self.config.perception.segment.backend].require(path)
+            remedy += f" {source.remedy.format(data_root='/path/to/data')}" if source.needed else ""
+            return InputError(f"scenario {name}", f"{row.source} scenarios need data_root", "null", remedy)
+        remedy = source.remedy.format(data_root=root)
+        if len(lacking) == 1:
+            return InputError(f"scenario {name}", "its data must exist", path, remedy)
+        files = " or ".join(dict.fromkeys(one.name if self.source(each).needed else each for each, one in lacking.items()))
+        above = os.path.commonpath([one.parent for one in lacking.values()])
+        return InputError(above, f"{len(lacking)} of {count} scenarios lack {files} ({listed(lacking, 3)})", remedy=remedy)
 
     # --- what is asked of it
 

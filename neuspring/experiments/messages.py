@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shlex
 import shutil
@@ -9,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Any
 
@@ -17,7 +18,8 @@ from neuspring.config import plain
 from neuspring.core.errors import InputError
 from neuspring.core.findings import warnings_of
 from neuspring.core.job_records import FOLDER, RUN_FILE, JobRecord, failure_lines, read_jobs, this_run
-from neuspring.core.text import listed
+from neuspring.core.run_record import RunRecord
+from neuspring.core.text import duration, listed
 from neuspring.experiments.freshness import told
 from neuspring.experiments.graph import Graph
 
@@ -63,7 +65,7 @@ class Overview:
     def _look(self) -> None:
         for path in [path for path in self._waiting if self._ended(path)]:
             record = self._waiting.pop(path)
-            done, passed = self._count - len(self._waiting), elapsed(time.monotonic() - self._begun)
+            done, passed = self._count - len(self._waiting), duration(time.monotonic() - self._begun)
             name = record.name.removeprefix(f"{record.rule}/")
             print(f"[{done} of {self._count}, {passed}] {record.rule} {name}", file=self._stream, flush=True)
 
@@ -74,13 +76,6 @@ class Overview:
         except (InputError, IndexError):
             return False
         return last.run == self._run and last.outcome == "ok"
-
-
-def elapsed(seconds: float) -> str:
-    """A time for people: 40 s, 1 min 40 s, 2 h 5 min."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours = f"{minutes // 60} h {minutes % 60} min"
-    return hours if minutes >= 60 else f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
 def replaced(jobs: Iterable[tuple[str, Any, tuple[str, ...]]]) -> str:
@@ -132,7 +127,7 @@ def finished(graph: Graph, seconds: float) -> None:
     summary = Path(folder) / "summary.md"
     if summary.exists():
         print(f"\n{headline(summary.read_text())}\n")
-        tell_findings(Path(config.results), config.scenarios)
+        tell_findings(graph)
         pages = {f"{folder}/report.html": "everything", f"{folder}/pictures.html": "films of every method"}
         there = [f"{page} ({what})" for page, what in pages.items() if Path(page).exists()]
         print(f"Open in a browser: {', '.join(there)}" if there else "The report is made by the target `all`.")
@@ -153,13 +148,22 @@ def finished(graph: Graph, seconds: float) -> None:
             print(f"{len(waiting)} runs could not be logged ({reason}). Their records wait on disk; send them:")
             print(f"  {neuspring} sync {shlex.join(place)}")
         print(f"Look at the runs in MLflow: {neuspring} ui {shlex.join(place)}", flush=True)
-    print(f"It took {elapsed(seconds)}.", flush=True)
+    print(f"It took {duration(seconds)}.", flush=True)
 
 
-def tell_findings(results: Path, scenarios: Sequence[str]) -> None:
-    """Findings of the steps of perception: warnings of all scenarios; notes are in the report."""
-    if found := warnings_of(results, scenarios):
-        print(f"Perception noticed {len(found)} thing{'s' * (len(found) > 1)} that may make results worse:")
+def tell_findings(graph: Graph) -> None:
+    """Warnings of the steps of perception on all scenarios, and of each method's fits the worst; notes are in the report."""
+    from neuspring.report.notes import of_fits
+
+    found = [*warnings_of(Path(graph.config.results), graph.config.scenarios)]
+    runs = list[RunRecord]()
+    for path in graph.runs():
+        with contextlib.suppress(InputError):  # the tables say which are damaged
+            runs.append(RunRecord.load(Path(path)))
+    fits = sorted(of_fits(runs), key=lambda pair: pair[1].value)
+    found += {(one.where.partition("/")[0], one.name): (name, one) for name, one in fits}.values()
+    if found:
+        print(f"Perception and fits noticed {len(found)} thing{'s' * (len(found) > 1)} that may make results worse:")
         print("\n".join(f"  {name}: {one}" for name, one in found[:MOST_FINDINGS]))
         if len(found) > MOST_FINDINGS:
             print(f"  {len(found) - MOST_FINDINGS} more are in the report.")

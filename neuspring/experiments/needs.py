@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import statistics
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -45,11 +46,33 @@ FIRST_REQUEST = {name: (stage.memory_mb, stage.minutes) for name, stage in STAGE
     "sweep": (4000, 20),
 }
 """Rule -> MB and minutes to ask for, before any job of it was measured."""
+UNITS_OF_WORK: dict[str, Callable[[Config], int]] = {
+    "search": lambda config: config.search.rollouts,
+    "fit": lambda config: config.fit.epochs,
+    "appearance": lambda config: config.images.appearance.iterations,
+}
+"""Rule -> units of work in one of its jobs."""
+PUBLISHED: dict[tuple[str, Kind], float] = {
+    **{("search", "gpu"): 12 * 60 / 220, ("fit", "gpu"): 5 * 60 / 200, ("rollout", "gpu"): 12 * 60 / 220},
+    **{("search", "cpu"): 7.8 / 88, ("fit", "cpu"): 20.9 / 20, ("rollout", "cpu"): 0.8, ("score", "cpu"): 1.8},
+    **{("appearance", "cpu"): 29.6 / 300, ("render", "cpu"): 6.9},
+    # What it does is counted as the time of the fits.
+    **{("fits", "gpu"): 0.0, ("fits", "cpu"): 0.0},
+}
+"""Rule and kind -> s per unit of work, before any job of it was measured."""
+PUBLISHED_BY: dict[Kind, str] = {
+    "gpu": "PhysTwin's README: one stuffed animal, 220 rollouts and 200 epochs on an RTX 4090",
+    "cpu": "results/published/demo/summary.md: 300 nodes, 45 frames, one core",
+}
+"""Source of the figures of `PUBLISHED`."""
 
 
-def checked(values: Mapping[str, Any], root: Path) -> Benchmark:
-    """The benchmark of a configuration, after everything that can be checked before a job starts. Raises InputError."""
-    benchmark = Benchmark(values, root)
+def checked(values: Mapping[str, Any], root: Path, *, plan_only: bool = False) -> Benchmark:
+    """The benchmark of a configuration, after everything that can be checked before a job starts. Raises InputError.
+
+    `plan_only`: a plan may be made where data are not there yet.
+    """
+    benchmark = Benchmark(values, root, plan_only=plan_only)
     results = Path(benchmark.config.results)
     try:
         results.mkdir(parents=True, exist_ok=True)
@@ -126,12 +149,15 @@ class History:
     """Longest wall time of jobs that succeeded."""
     memory: Mapping[Key, float] = field(default_factory=dict)
     """Largest resident memory of any attempt, MiB."""
+    median: Mapping[tuple[str, Kind], float] = field(default_factory=dict)
+    """Median wall time of jobs that succeeded, s, by rule and kind."""
 
     @classmethod
     def of(cls, records: Iterable[JobRecord]) -> History:
         """From job records. The time of a job is that of its last success, with the attempts that it went on from."""
         seconds: dict[Key, float] = defaultdict(float)
         memory: dict[Key, float] = defaultdict(float)
+        every: dict[tuple[str, Kind], list[float]] = defaultdict(list)
         for record in records:
             for attempt in record.attempts:
                 for scenario in {"", record.scenario}:
@@ -140,17 +166,18 @@ class History:
             ends = [-1, *(place for place, attempt in enumerate(record.attempts) if attempt.outcome == "ok")]
             if len(ends) > 1:
                 took = sum(attempt.seconds for attempt in record.attempts[ends[-2] + 1 : ends[-1] + 1])
+                every[record.rule, record.attempts[ends[-1]].kind].append(took)
                 for scenario in {"", record.scenario}:
                     key = (record.rule, record.attempts[ends[-1]].kind, scenario)
                     seconds[key] = max(seconds[key], took)
-        return cls(dict(seconds), dict(memory))
+        return cls(dict(seconds), dict(memory), {key: statistics.median(times) for key, times in every.items()})
 
 
 class Needs:
-    """Memory and time to ask for."""
+    """Memory and time to ask for, and to expect."""
 
     def __init__(self, benchmark: Benchmark, kind: Kind) -> None:
-        self.results, self._kind = Path(benchmark.config.results), kind
+        self.results, self._kind, self._config = Path(benchmark.config.results), kind, benchmark.config
 
     @cached_property
     def history(self) -> History:
@@ -166,6 +193,16 @@ class Needs:
         """(wildcards, attempt) -> minutes to ask for: three times the longest that earlier jobs took."""
         _, first = FIRST_REQUEST[rule]
         return self._request(rule, first, LEAST_MINUTES, lambda key: HEADROOM_TIME * self.history.seconds.get(key, 0.0) / 60)
+
+    def expected(self, rule: str) -> tuple[Kind, float | None, bool]:
+        """The kind of a rule's jobs, seconds of one, and True where earlier jobs say so: their median, else `PUBLISHED`."""
+        kind: Kind = "gpu" if self._kind == "gpu" and rule in ALWAYS_GPU else "cpu"
+        if self._kind == "gpu" and rule in BACKEND_DECIDES and (rule, "gpu") in self.history.median:
+            kind = "gpu"
+        if (rule, kind) in self.history.median:
+            return kind, self.history.median[rule, kind], True
+        published = PUBLISHED.get((rule, kind))
+        return kind, None if published is None else published * UNITS_OF_WORK.get(rule, lambda config: 1)(self._config), False
 
     def _request(self, rule: str, first: int, least: int, known: Callable[[Key], float]) -> Callable[..., int]:
         """`known`: what earlier jobs call for; 0 where there are none."""

@@ -155,14 +155,6 @@ def several(count: int, noun: str) -> str:
     return f"{count:,} {noun}{'s' * (count != 1)}"
 
 
-def duration(seconds: float) -> str:
-    """A time for people."""
-    if not math.isfinite(seconds):
-        return DASH
-    minutes = f"{seconds / 60:.1f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
-    return f"{seconds:.1f} s" if seconds < 100 else minutes
-
-
 def hours(seconds: float) -> str:
     """Hours, with fewer decimals for larger values."""
     value = seconds / 3600

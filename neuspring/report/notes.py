@@ -13,9 +13,11 @@ from typing import Any
 import pandas as pd
 
 from neuspring.baselines import REFERENCES
+from neuspring.checks import examine
+from neuspring.core.findings import Finding
 from neuspring.core.run_record import RunRecord
 from neuspring.scenes.sources import SOURCES
-from neuspring.scores.metrics import METRICS, SHARE_AT_BOUND
+from neuspring.scores.metrics import METRICS
 from neuspring.scores.runs import Collected, finished_scores
 
 STATIC = "static"
@@ -58,16 +60,15 @@ def _against_static(scenario: str, scores: pd.DataFrame) -> list[str]:
 
 def causes(runs: Iterable[RunRecord]) -> list[tuple[str, str]]:
     """Evidence in the records of one method's seeds against search and training, each with the next move."""
+    runs = list(runs)
     facts = [record.params for record in runs]
     ends = {name.strip() for values in facts for name in str(values.get("search.result.at_ends", "")).split(",") if name.strip()}
-    bound = [values for values in facts if values.get("fit.result.at_bound", 0.0) > SHARE_AT_BOUND]
     first = [values for values in facts if values.get("fit.result.best_epoch", 1) <= 0]
     found = []
     if not max((held for values in facts if (held := _gripping(values)) is not None), default=1):
         found.append(("no spring joins a hand to the object, so nothing moves it", "Look at the hands in lifted.png."))
-    if bound:
-        most = max(values["fit.result.at_bound"] for values in bound)
-        found.append((f"up to {most:.0%} of the springs lie at the bound of their stiffness", "Raise fit.output_bound."))
+    limited = {one.name: one for _, one in sorted(of_fits(runs), key=lambda pair: pair[1].value)}
+    found += [("up to " + one.text.removesuffix(one.remedy).rstrip(" ."), one.remedy) for one in limited.values()]
     if ends:
         names = ", ".join(sorted(ends))
         found.append((f"the search ended at an end of its range in {names}", f"Widen search.variables for {names}."))
@@ -75,6 +76,11 @@ def causes(runs: Iterable[RunRecord]) -> list[tuple[str, str]]:
         of = f" with {len(first)} of {len(facts)} seeds" if len(facts) > 1 else ""
         found.append((f"training improved nothing: the best epoch is the first{of}", "Lower fit.learning_rate."))
     return found
+
+
+def of_fits(runs: Iterable[RunRecord]) -> list[tuple[str, Finding]]:
+    """Scenario and finding of all fits: springs at a limit of their stiffness, with the command that widens it."""
+    return [(run.scenario, one) for run in runs for one in examine("fit", f"{run.method}/{run.seed}", run)]
 
 
 def _grip(runs: Iterable[RunRecord]) -> list[tuple[str, str]]:

@@ -19,6 +19,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuspring.checks.case import FINAL_DATA
 from neuspring.config import Config, ScenarioRow, parse, read_text
 from neuspring.core.errors import InputError
 from neuspring.core.text import listed
@@ -50,6 +51,10 @@ class Source:
     """True for films of users: methods that learn nothing stand beside the others, and tables say what to be careful with."""
     files: tuple[str, ...] = ()
     """Files of its folder that observations are read from; none: the path itself."""
+    needed: tuple[str, ...] = ()
+    """Files of its folder without which no job can run; none: the path itself."""
+    remedy: str = "Correct data_root, or the scenario's name or path."
+    """The next move where data are not there, a format string over `data_root`."""
     capture_files: tuple[str, ...] = ()
     """Files of its folder that a capture is made from, beside images."""
     images_beside: Callable[[Path], bool] = lambda folder: False
@@ -272,6 +277,9 @@ SOURCES = Registry(
             reads=("data_root",),
             write_capture="neuspring.intake.phystwin_raw",
             files=phystwin.FILES,
+            needed=(FINAL_DATA, phystwin.SPLIT),
+            remedy="Bring them: `neuspring fetch phystwin --data-root {data_root} --parts data results images`; or name the folder "
+            "above data/different_types: --config data_root=...",
             capture_files=phystwin.RAW_FILES,
             images_beside=phystwin.has_images,
             cameras=_counted,

@@ -38,9 +38,6 @@ SHORT = {"reconstruction": "Recon.", "future": "Future", "transfer": "Transfer"}
 SCORE_COLUMNS = ("scenario", "category", "method", "seed", "task", "metric", "value", "unit", "frames")
 DASH = "–"
 """Stands for a value that there is not."""
-SHARE_AT_BOUND = 0.05
-"""A share of springs at the bound of their stiffness above this says that the bound was in training's way: in notes of runs and
-below tables alike."""
 Of = Literal["positions", "pictures", "marks"]
 
 

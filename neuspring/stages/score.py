@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from neuspring.baselines import BASELINES
+from neuspring.checks.fitted import SHARE_AT_BOUND
 from neuspring.config import plain
 from neuspring.core import provenance
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.records import StageRecord, digest_file, now
 from neuspring.core.run_folder import RunFolder
 from neuspring.core.run_record import RunRecord, flat, key_of
-from neuspring.scores.metrics import SHARE_AT_BOUND
 from neuspring.stages.stage import MayFail, Rows, stage
 from neuspring.twin.body import code, lines_of
 

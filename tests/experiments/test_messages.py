@@ -4,7 +4,8 @@ import io
 from types import SimpleNamespace
 
 from neuspring.core.job_records import Attempt, JobRecord, begin_run, this_run
-from neuspring.experiments.messages import Overview, elapsed, failed
+from neuspring.experiments.messages import Overview, failed, tell_findings
+from tests.support.runs import run_record
 
 
 def save(results, name: str, **facts) -> None:
@@ -29,12 +30,8 @@ def test_a_line_tells_that_a_job_of_this_run_has_succeeded_and_how_many_have(tmp
     overview.stop()
     assert stream.getvalue().splitlines()[1:] == [
         "3 jobs to do; a line tells when one is done.",
-        "[2 of 3, 0 s] fit rope/ours/1",
+        "[2 of 3, 0.0 s] fit rope/ours/1",
     ]
-
-
-def test_times_are_told_in_their_largest_units():
-    assert [elapsed(seconds) for seconds in (40.2, 100, 7500)] == ["40 s", "1 min 40 s", "2 h 5 min"]
 
 
 def interrupted(results, **outcomes):
@@ -61,3 +58,17 @@ def test_a_run_that_failed_ends_with_a_line_per_job_its_cause_and_what_to_do(tmp
     assert output[1] == "The run did not finish. What is finished is kept."
     assert f"  fit/b: bad input (attempt 1): x: must be y.; {tmp_path}/logs/fit/b.log" in output
     assert output[-1] == "Mend the cause; the same command continues where this one stopped." and len(output) < 8
+
+
+def test_the_end_of_a_run_tells_the_worst_fit_of_each_method_with_the_command_that_widens_its_bound(tmp_path, capsys):
+    shares = {"a/model_b/0": 0.2, "b/model_b/0": 0.91, "b/baseline/0": 0.0}
+    for name, share in shares.items():
+        scenario, method, _ = name.split("/")
+        (tmp_path / name).mkdir(parents=True)
+        run_record(scenario=scenario, method=method, params={"fit.result.at_bound": share}).save(tmp_path / name / "run.json")
+    paths = [f"{tmp_path}/{name}/run.json" for name in (*shares, "c/model_b/0")]
+    tell_findings(SimpleNamespace(config=SimpleNamespace(results=str(tmp_path), scenarios=["a", "b"]), runs=lambda: paths))
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "Perception and fits noticed 1 thing that may make results worse:"
+    assert lines[1].startswith("  b: warning: model_b/0: springs at their bound: 91% of the springs lie at the bound")
+    assert lines[1].endswith("add `--config 'methods=[model_b,model_b_wide]'` to the command.") and lines[2:] == [""]

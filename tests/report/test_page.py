@@ -11,10 +11,10 @@ import pytest
 from neuspring import config
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
-from neuspring.core.text import program
+from neuspring.core.text import duration, program
 from neuspring.draw.scene import chosen_frames
 from neuspring.report.blocks import PageSection, Text
-from neuspring.report.data import ReportSection, duration, hours, rendered
+from neuspring.report.data import ReportSection, hours, rendered
 from neuspring.report.gallery import write_gallery
 from neuspring.report.page import REPORT_SECTIONS, Options, write
 from neuspring.report.sections.pictures import PLAY_ADDRESS

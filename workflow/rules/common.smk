@@ -78,7 +78,9 @@ workflow.config_settings.config_args = [
         for key, value in CHOSEN.items()
     ),
 ]
-BENCHMARK = or_workflow_error(needs.checked, config, ROOT)
+BENCHMARK = or_workflow_error(
+    needs.checked, config, ROOT, plan_only=workflow.output_settings.dryrun
+)
 CONFIG = BENCHMARK.config
 RESULTS = CONFIG.results
 POOL = () if CLUSTER else or_workflow_error(needs.pool_of, CONFIG, workflow)

@@ -1,10 +1,11 @@
 # What is told before, during and after a run; the warm process of its jobs.
 import time
+from collections import Counter
 from types import SimpleNamespace
 
 from neuspring.core.job_records import begin_run
 from neuspring.core.text import program
-from neuspring.experiments import messages
+from neuspring.experiments import messages, plan
 
 RUN = SimpleNamespace(begun=0.0, overview=None, warm=None)
 
@@ -24,11 +25,15 @@ def tell_what_is_made_again():
     )
 
 
-def tell_without_gpu():
-    if GPU and not CLUSTER and not POOL:
-        print(
-            "There is no GPU here: device: cuda will be refused when this is no dry run."
-        )
+def tell_plan():
+    """What the jobs will take, where, what is missing, and where the tables will be."""
+    jobs = workflow.dag.needrun_jobs(exclude_finished=False)
+    place = plan.Place(
+        gpus=POOL, cores=workflow.resource_settings.cores or 1, cluster=CLUSTER
+    )
+    counts = Counter(job.rule.name for job in jobs)
+    files = workflow.config_settings.configfiles
+    print(plan.told(GRAPH, NEEDS, counts, place, files), end="", flush=True)
 
 
 def begin():
@@ -45,8 +50,8 @@ def begin():
     command = [program("snakemake"), *sys.argv[1:]]
     begin_run(Path(RESULTS), {"command": command, "only": CONFIG.only, **chosen})
     tell_what_is_made_again()
+    tell_plan()
     RUN.begun = time.monotonic()
-    tell_without_gpu()
     if QUIET:
         jobs = [
             job
@@ -74,7 +79,7 @@ def end_of_dry_run():
     # Snakemake has no hook for it.
     if workflow.dryrun and workflow.dag:
         tell_what_is_made_again()
-        tell_without_gpu()
+        tell_plan()
 
 
 if workflow.is_main_process:

@@ -10,8 +10,9 @@ import pandas as pd
 
 from neuspring.core.job_records import JobRecord
 from neuspring.core.table import Cell, Chip, Table, Tone
+from neuspring.core.text import duration
 from neuspring.report.blocks import Block, Fold, PageSection, Text
-from neuspring.report.data import MOST_ROWS, ReportData, ReportSection, duration, link, several
+from neuspring.report.data import MOST_ROWS, ReportData, ReportSection, link, several
 
 
 def failures(material: ReportData) -> PageSection:

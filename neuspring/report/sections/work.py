@@ -9,8 +9,9 @@ import numpy as np
 
 from neuspring.core.job_records import JobRecord
 from neuspring.core.table import Cell, Table
+from neuspring.core.text import duration
 from neuspring.report.blocks import Block, PageSection, Text
-from neuspring.report.data import METHOD_RULES, ReportData, ReportSection, duration, hours, memory
+from neuspring.report.data import METHOD_RULES, ReportData, ReportSection, hours, memory
 from neuspring.report.summary import timing_table
 from neuspring.scores.metrics import DASH
 
