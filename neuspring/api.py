@@ -25,7 +25,7 @@ from neuspring.core.run_folder import RunFolder
 if TYPE_CHECKING:
     import pandas as pd
 
-    from neuspring.draw.show import Shown
+    from neuspring.draw.show import InlinePicture
     from neuspring.twin.body import Learned
 
 __all__ = [
@@ -125,7 +125,7 @@ def show(
     output: Path | str | None = None,
     *,
     film: bool = False,
-) -> Shown:
+) -> InlinePicture:
     """A picture of a run, a twin or a prediction; as the last value of a notebook's cell it is shown there.
 
     A twin is colored by stiffness. A prediction is drawn in a few frames, beside what was seen where `observations` are given;

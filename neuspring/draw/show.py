@@ -31,7 +31,7 @@ ALONE_RATE = 30.0
 
 
 @dataclass(frozen=True)
-class Shown:
+class InlinePicture:
     """A picture or a film; as the last value of a notebook's cell it is shown there."""
 
     data: bytes = field(repr=False)
@@ -46,7 +46,7 @@ class Shown:
         return f'<img src="{source}">'
 
 
-def show(what: RunFolder | Twin | Trajectory, observations: Observations | None, output: Path | None, film: bool) -> Shown:
+def show(what: RunFolder | Twin | Trajectory, observations: Observations | None, output: Path | None, film: bool) -> InlinePicture:
     """`neuspring.api.show`."""
     if isinstance(what, RunFolder):
         observations = what.observations if observations is None else observations
@@ -69,7 +69,7 @@ def show(what: RunFolder | Twin | Trajectory, observations: Observations | None,
             painter = _painter(subject, observations)
             panels = len(painter.takes) + (not painter.manner.together)
             write_film(painter, path, panels * CELL_PIXELS, megabytes=CELL_MEGABYTES)
-        return Shown(path.read_bytes(), mimetypes.guess_type(path.name)[0] or "application/octet-stream")
+        return InlinePicture(path.read_bytes(), mimetypes.guess_type(path.name)[0] or "application/octet-stream")
 
 
 def _figure(subject: Twin | Trajectory, observations: Observations | None) -> Figure:

@@ -36,9 +36,9 @@ DATABASE_RETRIES = 2
 ARTIFACTS = "mlartifacts"
 VIEW = "scores"
 """Name of the view of the table of runs, names and scores first; a tag of the experiment holds it, as its page would."""
-NAMED = ("method", "scenario", "seed")
+RUN_TAGS = ("method", "scenario", "seed")
 """Tags that are the first columns of the table of runs."""
-NARROW, WIDE = 70, 200
+SEED_WIDTH, SCORE_WIDTH = 70, 200
 """Widths of a column of seeds, and of others, pixels."""
 LOCK_PATIENCE = 600.0
 """Seconds to wait for another process that logs the same record or creates the database."""
@@ -108,9 +108,9 @@ def _view() -> dict[str, Any]:
     """The state of MLflow's table of runs: method, scenario, seed, then every score; columns that no run has are not shown."""
     from neuspring.scores.metrics import METRICS, TASKS
 
-    tags = [f"tags.`{name}`" for name in NAMED]
+    tags = [f"tags.`{name}`" for name in RUN_TAGS]
     scores = [f"metrics.`{score_name(task, metric.name, metric.unit)}`" for task in TASKS for metric in METRICS.values()]
-    widths = dict.fromkeys((*tags, *scores), WIDE) | {"tags.`seed`": NARROW}
+    widths = dict.fromkeys((*tags, *scores), SCORE_WIDTH) | {"tags.`seed`": SEED_WIDTH}
     order = ["attributes.`Run Name`", "runDateAndNestInfo", *tags, *scores]
     return {"selectedColumns": [*tags, *scores], "columnOrder": order, "columnWidths": widths}
 
