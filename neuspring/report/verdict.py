@@ -34,7 +34,7 @@ MOST_SAID = 3
 GROWS = 2.0
 """A future error of so many times that on training frames is a drift."""
 ONE_SEED = "Seeds 0, 1 and 2 would tell how much is chance in training."
-APART = (
+TWO_MEASURES = (
     "The two measure different things: track error is how far a few tracked points are, IoU how much of the whole silhouette is "
     "covered, of which a thin object loses nearly all when it lies one width beside its picture."
 )
@@ -180,7 +180,7 @@ class Duel:
                 best = table.index[table["track_error"].argmin()]
                 values = " and ".join(METRICS[name].told(table[name][best]) for name in ("track_error", "iou"))
                 found.append(f"{self.numbers.name(best)} in {scenario} ({values})")
-        return [f"The best track error goes with the worst IoU: {listed(found, MOST_SAID)}. {APART}"] if found else []
+        return [f"The best track error goes with the worst IoU: {listed(found, MOST_SAID)}. {TWO_MEASURES}"] if found else []
 
     def others(self) -> list[str]:
         """Other measures of the same frames by which another method is first."""
