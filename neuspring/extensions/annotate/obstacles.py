@@ -48,6 +48,8 @@ OUTLYING = 0.003
 """m: distance from which a point counts less."""
 HELD = 0.05
 """Distance from the surface, m, that counts like a step of 1 of a box's sides."""
+MOST_STEPS = 50
+"""Of a fit: what is no box creeps for long."""
 SLAB, LEVEL_NORMAL = 0.04, 0.97
 """m; and the vertical part of a normal from which a plane is level."""
 LARGEST_BALL = 1.0
@@ -90,7 +92,7 @@ def fit(points: np.ndarray, up: float, eye: np.ndarray) -> MeasuredObstacle:
 
 
 def _solved(distances: Any, start: np.ndarray) -> np.ndarray:
-    return np.asarray(least_squares(distances, start, loss="cauchy", f_scale=OUTLYING).x)
+    return np.asarray(least_squares(distances, start, loss="cauchy", f_scale=OUTLYING, max_nfev=MOST_STEPS).x)
 
 
 def _reach(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
