@@ -1,4 +1,4 @@
-# make install | demo | test | test-all | lint | bench | gpu: each makes or reuses .venv by itself; make findings needs python3 alone.
+# make install | demo | play | test | test-all | lint | bench | gpu: each makes or reuses .venv by itself; make findings needs python3 alone.
 SUITS := -c 'import sys; raise SystemExit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do $$p $(SUITS) && echo $$p && break; done)
 BIN := .venv/bin
@@ -9,12 +9,11 @@ INSTALLED := .venv/.installed
 ifndef CORES
 CORES := $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 endif
-SNAKEMAKE := $(BIN)/snakemake --profile workflow/profiles/default
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(CORES)
 export MLFLOW_DISABLE_TELEMETRY = true
 export DO_NOT_TRACK = true
 
-.PHONY: install demo test test-core test-slow test-all lint format bench gpu findings clean
+.PHONY: install demo play sample test test-core test-slow test-all lint format bench gpu findings clean
 
 define INSTALL
 @test -n "$(PYTHON)" && $(PYTHON) $(SUITS) || { echo "PYTHON=$(PYTHON): Python 3.11, 3.12 or 3.13 is needed;" \
@@ -27,7 +26,7 @@ PYTHONWARNINGS=ignore PIP_CONSTRAINT="$(CURDIR)/workflow/envs/constraints.txt" $
 endef
 
 $(DEMO): pyproject.toml workflow/envs/constraints.txt
-	$(call INSTALL,synthetic$(COMMA)video)
+	$(call INSTALL,synthetic$(COMMA)video$(COMMA)play)
 
 $(INSTALLED): pyproject.toml workflow/envs/constraints.txt
 	$(call INSTALL,dev)
@@ -41,8 +40,20 @@ ifneq ($(shell test ! -e .venv -a ! -L .venv || $(BIN)/python $(SUITS) || echo w
 $(DEMO) $(INSTALLED): again
 endif
 
-demo: $(if $(wildcard $(INSTALLED)),$(INSTALLED),$(DEMO))
-	$(SNAKEMAKE) --cores $(CORES) --quiet all --configfile config/data/demo.yaml
+RUNS := $(if $(wildcard $(INSTALLED)),$(INSTALLED),$(DEMO))
+
+demo: $(RUNS)
+	$(BIN)/neuspring demo --cores $(CORES)
+
+play: $(RUNS)
+	$(BIN)/neuspring play
+
+# The twin that travels with the package (neuspring/data/sample.py), made again: a run of the demo, and of its files those of the run.
+SAMPLE := synthetic_single_lift_sloth
+sample: $(RUNS)
+	rm -rf .sample neuspring/data/sample_twin && mkdir -p neuspring/data/sample_twin
+	$(BIN)/snakemake --profile workflow/profiles/default --cores $(CORES) --quiet all --configfile config/data/demo.yaml \
+		--config results=.sample 'scenarios=[$(SAMPLE)]' 'methods=[neuspring]' compare_with=neuspring
 
 test: $(INSTALLED)
 	$(PYTEST) --dist worksteal -m "not slow"

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 from neuspring.core.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from neuspring.api import Observations, Topology, Trajectory, Twin, fit, load_run, roll_out, score, search
+    from neuspring.api import Observations, Topology, Trajectory, Twin, fit, load_run, roll_out, sample_twin, score, search
 
-__all__ = ["Observations", "Topology", "Trajectory", "Twin", "fit", "load_run", "roll_out", "score", "search"]
+__all__ = ["Observations", "Topology", "Trajectory", "Twin", "fit", "load_run", "roll_out", "sample_twin", "score", "search"]
 
 
 def __getattr__(name: str) -> Any:
