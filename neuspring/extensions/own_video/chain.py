@@ -147,7 +147,7 @@ class Chain:
         return self.capture if window == "all" else cut
 
     def _workflow(self, step: str, capture: Path) -> None:
-        chosen = {"scenarios": [capture.name], "methods": list(dict.fromkeys([BESIDE, self.method]))}
+        chosen: dict[str, object] = {"scenarios": [capture.name], "methods": list(dict.fromkeys([BESIDE, self.method]))}
         chosen |= {"data_root": str(capture.parent), "compare_with": BESIDE, "results": "results", "effort": self.wish.effort}
         until = [] if step == STEPS[-1] else ["--until", step]
         settings = [f"{key}={value if isinstance(value, str) else json.dumps(value)}" for key, value in chosen.items()]
