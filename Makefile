@@ -48,12 +48,18 @@ demo: $(RUNS)
 play: $(RUNS)
 	$(BIN)/neuspring play
 
-# The twin that travels with the package (neuspring/data/sample.py), made again: a run of the demo, and of its files those of the run.
+# The twin that travels with the package (neuspring/data/sample.py), made again: a run of the demo with fewer splats, and
+# those of its files that a twin needs.
 SAMPLE := synthetic_single_lift_sloth
+SAMPLE_RUN := run.json fit.json twin.npz rollout.json trajectory.npz scores.parquet history.parquet
 sample: $(RUNS)
-	rm -rf .sample neuspring/data/sample_twin && mkdir -p neuspring/data/sample_twin
 	$(BIN)/snakemake --profile workflow/profiles/default --cores $(CORES) --quiet all --configfile config/data/demo.yaml \
-		--config results=.sample 'scenarios=[$(SAMPLE)]' 'methods=[neuspring]' compare_with=neuspring
+		--config results=.sample 'scenarios=[$(SAMPLE)]' 'methods=[neuspring]' compare_with=neuspring \
+		'images={appearance: {spacing: 2.6}}'
+	rm -rf neuspring/data/sample_twin && mkdir neuspring/data/sample_twin
+	cd .sample && cp --parents -t ../neuspring/data/sample_twin $(SAMPLE)/observations.npz \
+		$(SAMPLE)/search-*/0/search.json $(addprefix $(SAMPLE)/neuspring/0/,$(SAMPLE_RUN)) \
+		$(addprefix $(SAMPLE)/appearance/0/,appearance.json splats.ply)
 
 test: $(INSTALLED)
 	$(PYTEST) --dist worksteal -m "not slow"
