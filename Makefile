@@ -1,4 +1,4 @@
-# make install | demo | test | test-all | lint | bench | gpu: each makes or reuses .venv by itself; make findings needs python3 alone.
+# make install | demo | play | test | test-all | lint | bench | gpu: each makes or reuses .venv by itself; make findings needs python3 alone.
 SUITS := -c 'import sys; raise SystemExit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do $$p $(SUITS) && echo $$p && break; done)
 BIN := .venv/bin
@@ -9,12 +9,11 @@ INSTALLED := .venv/.installed
 ifndef CORES
 CORES := $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 endif
-SNAKEMAKE := $(BIN)/snakemake --profile workflow/profiles/default
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(CORES)
 export MLFLOW_DISABLE_TELEMETRY = true
 export DO_NOT_TRACK = true
 
-.PHONY: install demo test test-core test-slow test-all lint format bench gpu findings clean
+.PHONY: install demo play sample test test-core test-slow test-all lint format bench gpu findings clean
 
 define INSTALL
 @test -n "$(PYTHON)" && $(PYTHON) $(SUITS) || { echo "PYTHON=$(PYTHON): Python 3.11, 3.12 or 3.13 is needed;" \
@@ -27,7 +26,7 @@ PYTHONWARNINGS=ignore PIP_CONSTRAINT="$(CURDIR)/workflow/envs/constraints.txt" $
 endef
 
 $(DEMO): pyproject.toml workflow/envs/constraints.txt
-	$(call INSTALL,synthetic$(COMMA)video)
+	$(call INSTALL,synthetic$(COMMA)video$(COMMA)play)
 
 $(INSTALLED): pyproject.toml workflow/envs/constraints.txt
 	$(call INSTALL,dev)
@@ -41,8 +40,26 @@ ifneq ($(shell test ! -e .venv -a ! -L .venv || $(BIN)/python $(SUITS) || echo w
 $(DEMO) $(INSTALLED): again
 endif
 
-demo: $(if $(wildcard $(INSTALLED)),$(INSTALLED),$(DEMO))
-	$(SNAKEMAKE) --cores $(CORES) --quiet all --configfile config/data/demo.yaml
+RUNS := $(if $(wildcard $(INSTALLED)),$(INSTALLED),$(DEMO))
+
+demo: $(RUNS)
+	$(BIN)/neuspring demo --cores $(CORES)
+
+play: $(RUNS)
+	$(BIN)/neuspring play
+
+# The twin that travels with the package (neuspring/data/sample.py), made again: a run of the demo with fewer splats, and
+# those of its files that a twin needs.
+SAMPLE := synthetic_single_lift_sloth
+SAMPLE_RUN := run.json fit.json twin.npz rollout.json trajectory.npz scores.parquet history.parquet
+sample: $(RUNS)
+	$(BIN)/snakemake --profile workflow/profiles/default --cores $(CORES) --quiet all --configfile config/data/demo.yaml \
+		--config results=.sample 'scenarios=[$(SAMPLE)]' 'methods=[neuspring]' compare_with=neuspring \
+		'images={appearance: {spacing: 2.6}}'
+	rm -rf neuspring/data/sample_twin && mkdir neuspring/data/sample_twin
+	cd .sample && cp --parents -t ../neuspring/data/sample_twin $(SAMPLE)/observations.npz \
+		$(SAMPLE)/search-*/0/search.json $(addprefix $(SAMPLE)/neuspring/0/,$(SAMPLE_RUN)) \
+		$(addprefix $(SAMPLE)/appearance/0/,appearance.json splats.ply)
 
 test: $(INSTALLED)
 	$(PYTEST) --dist worksteal -m "not slow"

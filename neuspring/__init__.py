@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         fit,
         load_run,
         roll_out,
+        sample_twin,
         score,
         search,
         show,
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Observations", "Topology", "Trajectory", "Twin",
-    "fit", "load_run", "roll_out", "score", "search", "show", "twin_from_capture", "with_mass",
+    "fit", "load_run", "roll_out", "sample_twin", "score", "search", "show", "twin_from_capture", "with_mass",
 ]  # fmt: skip
 
 

@@ -1,6 +1,6 @@
 """Functions for researchers in Python: `import neuspring as ns`.
 
-    run = ns.load_run("results/synthetic_single_lift_sloth/neuspring/0")
+    run = ns.load_run()  # the sample twin, or "results/<scenario>/<method>/<seed>"
     print(run.summary())
     ns.show(ns.roll_out(run.twin, run.observations), run.observations)
 
@@ -21,6 +21,7 @@ from neuspring.config.settings import read_settings as settings_of
 from neuspring.core.artifacts import Observations, Topology, Trajectory, Twin
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.run_folder import RunFolder
+from neuspring.data.sample import sample_twin
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,18 +31,19 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Observations", "Topology", "Trajectory", "Twin",
-    "fit", "load_run", "roll_out", "score", "search", "show", "twin_from_capture", "with_mass",
+    "fit", "load_run", "roll_out", "sample_twin", "score", "search", "show", "twin_from_capture", "with_mass",
 ]  # fmt: skip
 Settings = Config | Mapping[str, Any] | Path | str | None
 """An object, values as in a YAML file (`{"fit": {"epochs": 60}}`), YAML files (with commas between them), or none: the defaults."""
 
 
-def load_run(folder: Path | str) -> RunFolder:
+def load_run(folder: Path | str | None = None) -> RunFolder:
     """A run of the workflow, `results/<scenario>/<method>/<seed>`: its `twin`, `trajectory`, `observations`, `scores`, `records`.
 
+    Without a folder it is the twin that travels with the package (`sample_twin`).
     Raises InputError if the folder holds no run, and where what was asked for is missing, damaged or of another version.
     """
-    run = RunFolder.of(Path(folder))
+    run = RunFolder.of(sample_twin() if folder is None else Path(folder))
     if not run.stages:
         remedy = "Name results/<scenario>/<method>/<seed>; `make demo` makes some."
         raise InputError(folder, "must be the folder of a run", "no record of a stage", remedy)

@@ -22,7 +22,11 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.version import __version__
 from neuspring.registry import Registry
 
-_OURS = {"data": "check-data mask compare-masks", "results": "tables perception-table study explain report track-init log sync ui"}
+_OURS = {
+    "data": "check-data mask compare-masks",
+    "results": "tables perception-table study explain report track-init log sync ui",
+    "workflow": "demo",
+}
 COMMANDS: Registry[Callable[..., int | None]] = Registry(
     "commands",
     {name: f"neuspring.cli.{module}:{name.replace('-', '_')}" for module, names in _OURS.items() for name in names.split()},

@@ -7,7 +7,10 @@ the Host header must name this machine, and what a browser says about a request'
 from __future__ import annotations
 
 import ipaddress
+import os
 import socket
+import sys
+import webbrowser
 from collections.abc import Mapping
 from urllib.parse import urlsplit
 
@@ -26,6 +29,13 @@ def is_loopback(host: str) -> bool:
     """True where an address or name means this machine alone."""
     address = _address(host)
     return host == "localhost" if address is None else address.is_loopback
+
+
+def open_page(url: str) -> None:
+    """Open an address in the user's browser, where there is a display."""
+    # Without a window webbrowser may start a text browser in this terminal.
+    if sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        webbrowser.open(url)
 
 
 def check_host(header: str | None, bound: str) -> None:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
-import webbrowser
 from pathlib import Path
 from typing import Annotated
 
@@ -19,7 +16,7 @@ def annotate(
     settings: Settings = "{}",
 ) -> None:
     """Mark masks and tracks of a capture in the browser; serves until Ctrl-C."""
-    from neuspring.core.web import is_loopback
+    from neuspring.core.web import is_loopback, open_page
     from neuspring.data.capture import Capture
     from neuspring.extensions.annotate.server import Server
 
@@ -27,10 +24,8 @@ def annotate(
     print(f"Annotate {capture} at {server.url} (stop with Ctrl-C)", flush=True)
     if not is_loopback(host):
         print("Anybody who can read this network's traffic can read the address; an SSH tunnel to 127.0.0.1 is safer.", flush=True)
-    # Without a window webbrowser may start a text browser in this terminal.
-    has_display = sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-    if not no_open and has_display:
-        webbrowser.open(server.url)
+    if not no_open:
+        open_page(server.url)
     try:
         server.serve_forever()
     except KeyboardInterrupt:

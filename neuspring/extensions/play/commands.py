@@ -4,31 +4,31 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from neuspring.cli.options import Positional, arg
 from neuspring.core.errors import InputError
 
-if TYPE_CHECKING:
-    pass
-
 
 def play(
     results: Annotated[
-        Positional[tuple[Path, ...]], arg(help="results/<scenario>, or runs <scenario>/<method>/<seed> of one scenario")
-    ],
+        Positional[tuple[Path, ...]],
+        arg(help="results/<scenario>, or runs <scenario>/<method>/<seed> of one scenario; the sample twin by default"),
+    ] = (),
     host: Annotated[str, arg(help="address to listen at; the default is for this machine alone")] = "127.0.0.1",
     port: Annotated[int, arg(help="0: any that is free")] = 8080,
     frame: Annotated[int, arg(help="frame to begin with")] = 0,
     save: Annotated[Path, arg(help="folder where recordings are saved")] = Path(),
     replay: Annotated[Path | None, arg(help="show a saved recording again")] = None,
+    no_open: Annotated[bool, arg(help="print the address, and open no browser")] = False,
     compare: Annotated[bool, arg(help="with --replay: print how the other twins move under it, and end")] = False,
 ) -> None:
     """Runs of a results folder in the browser, until Ctrl-C; twins that can be pulled by hand."""
+    from neuspring.data.sample import sample_twin
     from neuspring.extensions.play.controls import comparison, load_controls, pulled_run
     from neuspring.report.shown import find
 
-    found = find(results)
+    found = find(results or (sample_twin(),))
     frames = found.observations.scenario.frame_count
     if not 0 <= frame < frames:
         raise InputError("--frame", f"{found.folder.name} has the frames 0 to {frames - 1}", frame)
@@ -40,7 +40,7 @@ def play(
         for line in comparison(found, controls, own):
             print(line, flush=True)
         return
-    from neuspring.core.web import is_loopback
+    from neuspring.core.web import is_loopback, open_page
     from neuspring.extensions.play.page import Page
     from neuspring.extensions.play.serve import address, start
 
@@ -59,6 +59,8 @@ def play(
     print(f"Play {found.folder.name} at {address(server)} (stop with Ctrl-C)", flush=True)
     if not is_loopback(host):
         print("Everybody who can reach this address sees and moves the scene; an SSH tunnel to 127.0.0.1 is safer.", flush=True)
+    if not no_open:
+        open_page(address(server))
     try:
         threading.Event().wait()
     except KeyboardInterrupt:

@@ -1,0 +1,35 @@
+"""The workflow on this machine without make: where its files are, and the command that runs it."""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib.metadata import PackageNotFoundError, files
+from pathlib import Path
+
+from neuspring.core.errors import InputError
+from neuspring.core.provenance import PACKAGE_FOLDER
+
+SNAKEFILE = "Snakefile"
+
+
+def workflow_folder() -> Path:
+    """The folder of Snakefile, workflow/ and config/: the checkout, else where the installation put them. Raises InputError."""
+    if (PACKAGE_FOLDER.parent / SNAKEFILE).is_file():
+        return PACKAGE_FOLDER.parent
+    try:
+        for file in files("neuspring") or ():
+            if file.name == SNAKEFILE and (place := Path(str(file.locate()))).is_file():
+                return place.resolve().parent
+    except PackageNotFoundError:
+        pass
+    raise InputError("workflow", "the package must have its Snakefile", "none", "Use a checkout, or install it from one.")
+
+
+def workflow_command(data: str, *options: str, cores: int | None = None) -> list[str]:
+    """The command that runs config/data/<data>.yaml on `cores` cores, all by default; `options` are Snakemake's."""
+    root = workflow_folder()
+    count = cores or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()) or 1
+    command = [sys.executable, "-m", "snakemake", "--snakefile", str(root / SNAKEFILE)]
+    command += ["--profile", str(root / "workflow" / "profiles" / "default"), "--cores", str(count), "--quiet", "all"]
+    return [*command, "--configfile", str(root / "config" / "data" / f"{data}.yaml"), *options]

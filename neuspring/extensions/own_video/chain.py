@@ -1,0 +1,237 @@
+"""The chain of commands from a film to its twin: each a process with a log, told in a line, and passed over where it was done."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from neuspring.config.parse import read_yaml
+from neuspring.core.errors import InputError
+from neuspring.core.files import load_json, write_text
+from neuspring.core.run_folder import RunFolder
+from neuspring.data.capture import CAPTURE, read_description
+from neuspring.experiments.local import workflow_command, workflow_folder
+from neuspring.extensions.own_video.commands import Wish
+
+STEPS = ("capture", "masks", "check", "observe", "search", "fit", "page")
+STEPS_DONE = "steps.json"
+"""Step -> its command, once it has succeeded; `window`: the frames that were chosen."""
+PROPOSED = re.compile(r"--frames (\d+-\d+)")
+"""The longest constant grip, which `check-data` proposes first."""
+WINDOW = re.compile(r"all|\d+-\d+")
+FILM_ENDINGS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
+LOOK_FOR_MASKS, GRACE = 0.5, 2.0
+"""s between two looks whether masks were saved, and until the page that saved them ends."""
+LAST_LINES = 8
+"""Lines of a failed step's log that are shown."""
+BESIDE = "static"
+"""The row that learns nothing, whose errors stand beside the twin's."""
+
+
+class StepFailed(Exception):
+    """A step ended without success; the argument is its exit status."""
+
+
+class Chain:
+    """The steps of one wish. Raises InputError for what cannot be, before anything is run or written."""
+
+    def __init__(self, wish: Wish) -> None:
+        self.wish, film = wish, wish.film
+        if not film.exists():
+            raise InputError(film, "a folder of color and depth, a recording, a video or a capture is required", "nothing there")
+        if wish.mass is not None and not 0 < wish.mass < math.inf:
+            raise InputError("--mass", "must be a positive number of kg", wish.mass)
+        _require_window("--window", wish.window or "all")
+        for path in (*wish.masks, *wish.hands, *filter(None, [wish.marks])):
+            if not path.exists():
+                raise InputError(path, "what --masks, --hands and --marks name must exist", "nothing there")
+        self.given = (film / CAPTURE).is_file()
+        if self.given and any((wish.mass, wish.rate, wish.frames, wish.intake)):
+            rule = "--mass, --rate, --frames and --intake make a capture, and this is one"
+            raise InputError(film, rule, CAPTURE, f'Write "mass" into {CAPTURE}; keep frames with --window.')
+        name = re.sub(r"[^A-Za-z0-9_.-]+", "_", film.resolve().stem if film.is_file() else film.resolve().name).strip("._-")
+        self.folder = (wish.output or Path("twins") / name).resolve()
+        self.capture = film.resolve() if self.given else self.folder / "captures" / self.folder.name
+        self.method = wish.method or str(read_yaml(workflow_folder() / "config" / "data" / "own.yaml")["methods"][-1])
+        record = self.folder / STEPS_DONE
+        self.done: dict[str, list[str]] = load_json(record) if record.is_file() else {}
+
+    def run(self) -> int:
+        """Do what is not done yet; returns the exit status."""
+        try:
+            if not self.given:
+                self._make_capture()
+            self._masks()
+            chosen = self._window()
+            for step in STEPS[3:]:
+                self._workflow(step, chosen)
+        except StepFailed as failed:
+            return int(failed.args[0])
+        return 0 if self.wish.dry_run else self._tell(self.folder / "results" / chosen.name)
+
+    # --- the steps
+
+    def _make_capture(self) -> None:
+        wish, made = self.wish, (self.capture / CAPTURE).is_file()
+        words = [*_parts(wish.film.resolve()), "--category", wish.category, "--output", str(self.capture)]
+        for name in ("mass", "rate", "frames"):
+            words += [f"--{name}", str(getattr(wish, name))] if getattr(wish, name) else []
+        command = _neuspring("make-capture", *words, *shlex.split(wish.intake))
+        if made and (before := self.done.get("capture", command)) != command:
+            remedy = "Choose another --output, or delete that folder."
+            raise InputError(self.capture, f"was made by: {shlex.join(before)}", shlex.join(command), remedy)
+        self._step("capture", command, made)
+
+    def _masks(self) -> None:
+        wish = self.wish
+        words = ["--marks", str(wish.marks.resolve())] if wish.marks else []
+        for name, paths in (("--masks", wish.masks), ("--hands", wish.hands)):
+            words += [name, *(str(path.resolve()) for path in paths)] if paths else []
+        command = _neuspring("mask", str(self.capture), *words)
+        if words:
+            self._step("masks", command, self._masked() and self.done.get("masks") == command)
+        elif self._masked():
+            self._say("masks", "they are in the capture")
+        else:
+            place = ["--no-open"] if wish.no_browser else []
+            self._step("masks", _neuspring("annotate", str(self.capture), *place), run=self._annotate)
+
+    def _masked(self) -> bool:
+        return (self.capture / CAPTURE).is_file() and read_description(self.capture / CAPTURE).masks
+
+    def _annotate(self, command: list[str], log: Path) -> int:
+        """Serve the page on which a user marks object and hands, until every camera has masks."""
+        print(
+            "\n      Mark object and hands in the page that opens, carry them through the film, and press Save masks.", flush=True
+        )
+        with subprocess.Popen(command) as page:
+            try:
+                while page.poll() is None and not self._masked():
+                    time.sleep(LOOK_FOR_MASKS)
+                time.sleep(GRACE if page.poll() is None else 0)
+            finally:
+                if page.poll() is None:
+                    page.send_signal(signal.SIGINT)
+        log.write_text("" if self._masked() else "the page ended before masks were saved\n", encoding="utf-8")
+        return 0 if self._masked() else 2
+
+    def _window(self) -> Path:
+        """The capture that the twin is learned from: all frames, or those of one grip."""
+        log = self._step("check", _neuspring("check-data", str(self.capture)))
+        wish, before = self.wish, self.done.get("window", [""])[0]
+        found = PROPOSED.search(log.read_text(encoding="utf-8")) if log.is_file() else None
+        window = wish.window or before or (found[1] if found else "all")
+        if found and not (wish.window or before or wish.yes or wish.dry_run):
+            if sys.stdin.isatty():
+                window = input(f"      Hands change. Frames to learn from: {window} (a constant grip), all, or others? ") or window
+                _require_window("answer", window)
+            print(f"      Frames {window} are learned from: --window all takes all.")
+        cut = self.folder / "captures" / f"{self.capture.name}_{window}"
+        if window != "all" and (cut / CAPTURE).is_file():
+            masks = max((path.stat().st_mtime for path in (self.capture / "mask").glob("*")), default=0.0)
+            if masks > (cut / CAPTURE).stat().st_mtime:
+                raise InputError(cut, f"must have the masks of {self.capture}", "older ones", "Delete this folder.")
+        elif window != "all":
+            cutting = _neuspring("cut-capture", str(self.capture), "--frames", window, "--output", str(cut))
+            self._step("check", cutting)
+        self._keep("window", [window])
+        return self.capture if window == "all" else cut
+
+    def _workflow(self, step: str, capture: Path) -> None:
+        chosen: dict[str, object] = {"scenarios": [capture.name], "methods": list(dict.fromkeys([BESIDE, self.method]))}
+        chosen |= {"data_root": str(capture.parent), "compare_with": BESIDE, "results": "results", "effort": self.wish.effort}
+        until = [] if step == STEPS[-1] else ["--until", step]
+        settings = [f"{key}={value if isinstance(value, str) else json.dumps(value)}" for key, value in chosen.items()]
+        options = ["--directory", str(self.folder), *until, "--config", *settings]
+        self._step(step, workflow_command("own", *options, cores=self.wish.cores))
+
+    # --- what all steps share
+
+    def _step(self, name: str, command: list[str], made: bool = False, run: Callable[[list[str], Path], int] | None = None) -> Path:
+        """Run a step unless it is `made`; returns its log. Raises StepFailed."""
+        log = self.folder / "logs" / f"{STEPS.index(name) + 1}_{name}.log"
+        print(f"$ {shlex.join(command)}", flush=True)
+        if made or self.wish.dry_run:
+            self._say(name, "done before" if made else "not run")
+            return log
+        log.parent.mkdir(parents=True, exist_ok=True)
+        self._say(name, "... ", end="")
+        begun = time.monotonic()
+        status = (run or _run)(command, log)
+        print(f"{time.monotonic() - begun:.0f} s" if not status else "failed", flush=True)
+        if status:
+            lines = log.read_text(encoding="utf-8", errors="replace").rstrip().splitlines()[-LAST_LINES:]
+            told = "".join(f"  {line}\n" for line in lines)
+            print(f"{told}Step {name} failed, exit status {status}. Its output: {log}", file=sys.stderr)
+            print(f"By hand:\n  {shlex.join(command)}\nneuspring twin goes on from here.", file=sys.stderr)
+            raise StepFailed(status)
+        self._keep(name, command)
+        return log
+
+    def _say(self, name: str, text: str, end: str = "\n") -> None:
+        print(f"[{STEPS.index(name) + 1}/{len(STEPS)}] {name} {text}", end=end, flush=True)
+
+    def _keep(self, name: str, words: list[str]) -> None:
+        if not self.wish.dry_run:
+            self.done[name] = words
+            write_text(self.folder / STEPS_DONE, json.dumps(self.done, indent=1) + "\n")
+
+    def _tell(self, scenario: Path) -> int:
+        """Errors beside the row that learns nothing, and what to open."""
+        print("Errors in mm, future frames (training frames):")
+        for method in dict.fromkeys([BESIDE, self.method]):
+            scores = RunFolder.of(scenario / method / "0").scores
+            errors = 1000 * scores[scores["unit"] == "m"].pivot(index="metric", columns="task", values="value")
+            told = [f"{row.Index} {row.future:.1f} ({row.reconstruction:.1f})" for row in errors.dropna().itertuples()]
+            print(f"  {method:<16} {', '.join(told)}")
+        run = scenario / self.method / "0"
+        page = {"page": self.folder / "results" / "tables" / "report.html", "film": run / "video.mp4"}
+        print("".join(f"{name}: {path}\n" for name, path in page.items() if path.is_file()), end="")
+        command = _neuspring("play", str(run))
+        print(f"play: {shlex.join(command)}", flush=True)
+        if self.wish.play:
+            os.execv(command[0], command)
+        return 0
+
+
+def _neuspring(*words: str) -> list[str]:
+    return [sys.executable, "-m", "neuspring", *words]
+
+
+def _run(command: list[str], log: Path) -> int:
+    """Run a command whose output goes to a log; returns its exit status. Ctrl-C reaches it too, and its end is waited for."""
+    with log.open("w", encoding="utf-8") as output, subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT) as process:
+        try:
+            return process.wait()
+        except KeyboardInterrupt:
+            process.wait()
+            raise
+
+
+def _require_window(where: str, text: str) -> None:
+    if not WINDOW.fullmatch(text):
+        raise InputError(where, "a first and a last frame are required, as in 12-97, or all", text)
+
+
+def _parts(film: Path) -> list[str]:
+    """The options of make-capture that name the parts of a film."""
+    if film.is_file() and film.suffix.lower() in FILM_ENDINGS:
+        return ["--color", str(film)]
+    inside = sorted(film.iterdir()) if film.is_dir() else []
+    options: list[str] = []
+    for option, stems in {"color": ("color", "rgb"), "depth": ("depth",)}.items():
+        found = [path for path in inside if path.stem in stems and (path.is_file() or any(map(Path.is_file, path.iterdir())))]
+        options += [f"--{option}", str(found[0])] if found else []
+    if "--color" not in options:
+        return ["--recording", str(film)]
+    files = [path for path in inside if path.name in ("intrinsics.json", "poses.json")]
+    return options + [word for path in files for word in (f"--{path.stem}", str(path))]

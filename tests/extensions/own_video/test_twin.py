@@ -1,0 +1,196 @@
+"""`neuspring twin`: the order of its commands, what it passes over, what it refuses; steps leave what the real ones leave."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from neuspring.cli.main import main
+from neuspring.core.files import write_text
+from neuspring.extensions.own_video import chain
+from tests.support import captures
+
+NOTE = "note: hands within 5 cm: 0-2: 1, 3-4: 2: neuspring cut-capture x --frames 0-2 or --frames 3-4 --output ..."
+
+
+class Steps:
+    """In the place of processes: what was run, and files as the commands leave them."""
+
+    def __init__(self) -> None:
+        self.ran: list[list[str]] = []
+        self.failing = ""
+        self.said = "0 errors"
+
+    def run(self, command: list[str], log: Path) -> int:
+        words = command[3:]
+        self.ran.append(words)
+        write_text(log, f"reason\n{self.said}\n")
+        if self.failing in words:
+            return 2
+        place = Path(words[words.index("--output") + 1]) if "--output" in words else Path(words[1])
+        if words[0] == "make-capture":
+            captures.write(place, captures.describe(masks=False))
+        elif words[0] == "mask":
+            path = place / "capture.json"
+            path.write_text(path.read_text().replace('"masks": false', '"masks": true'))
+        elif words[0] == "cut-capture":
+            captures.write(place)
+        return 0
+
+    @property
+    def names(self) -> list[str]:
+        return [words[0] if "--until" not in words else words[words.index("--until") + 1] for words in self.ran]
+
+
+@pytest.fixture
+def steps(monkeypatch):
+    one = Steps()
+    monkeypatch.setattr(chain, "_run", one.run)
+    monkeypatch.setattr(chain.Chain, "_tell", lambda self, scenario: print(f"told of {scenario.name}") or 0)
+    return one
+
+
+@pytest.fixture
+def film(tmp_path):
+    """A folder as a camera leaves it, and masks of another tool."""
+    for name in ("color", "depth", "masks"):
+        write_text(tmp_path / "my toy" / name / "0.png", "")
+    write_text(tmp_path / "my toy" / "intrinsics.json", "{}")
+    return tmp_path / "my toy"
+
+
+def twin(film: Path, *words: str) -> int:
+    return main(["twin", str(film), "--output", str(film.parent / "out"), *words])
+
+
+def with_masks(film: Path, *words: str) -> int:
+    return twin(film, "--masks", str(film / "masks"), *words)
+
+
+def test_the_commands_of_the_tutorial_run_in_their_order(film, steps, capsys):
+    assert with_masks(film, "--mass", "0.3", "--rate", "30", "--intake=--top-down --take distance") == 0
+    assert steps.names == ["make-capture", "mask", "check-data", "observe", "search", "fit", "--snakefile"]
+    color, depth = (f"--{name} {film / name}" for name in ("color", "depth"))
+    lens, where = f"--intrinsics {film / 'intrinsics.json'}", f"--output {film.parent / 'out/captures/out'}"
+    assert " ".join(steps.ran[0]) == (
+        f"make-capture {color} {depth} {lens} --category object {where} --mass 0.3 --rate 30.0 --top-down --take distance"
+    )
+    page = " ".join(steps.ran[-1])
+    assert "config/data/own.yaml" in page and f"--directory {film.parent / 'out'}" in page
+    assert 'scenarios=["out"]' in page and 'methods=["static", ' in page and "effort=quick" in page
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(" ...")[0] for line in lines if line[0] == "["] == [
+        f"[{index}/7] {name}" for index, name in enumerate(chain.STEPS, start=1)
+    ]
+    assert sum(line.startswith(f"$ {sys.executable} -m ") for line in lines) == 7, "each can be run alone"
+    assert lines[-1] == "told of out"
+
+
+def test_a_second_call_does_what_is_left(film, steps, capsys):
+    steps.failing = "search"
+    assert with_masks(film) == 2
+    error = capsys.readouterr().err
+    log = film.parent / "out" / "logs" / "5_search.log"
+    assert "Step search failed" in error and "reason" in error and str(log) in error and "--until search" in error
+    steps.failing, steps.ran = "", []
+    assert with_masks(film) == 0
+    assert steps.names == ["check-data", "observe", "search", "fit", "--snakefile"], "the workflow passes over what it has"
+    steps.ran = []
+    assert with_masks(film, "--mass", "2") == 2
+    assert "was made by: " in capsys.readouterr().err and not steps.ran
+
+
+def test_the_longest_constant_grip_is_taken_or_another_window(film, steps, capsys, monkeypatch):
+    steps.said = NOTE
+    assert with_masks(film) == 0
+    assert steps.names[:4] == ["make-capture", "mask", "check-data", "cut-capture"]
+    assert 'scenarios=["out_0-2"]' in " ".join(steps.ran[-1]) and "Frames 0-2 are learned from" in capsys.readouterr().out
+    assert with_masks(film, "--window", "all") == 0
+    assert 'scenarios=["out"]' in " ".join(steps.ran[-1])
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr("builtins.input", lambda text: "1-4")
+    (film.parent / "out" / chain.STEPS_DONE).unlink()
+    assert with_masks(film) == 0
+    assert 'scenarios=["out_1-4"]' in " ".join(steps.ran[-1])
+
+
+def test_a_window_that_was_cut_before_masks_changed_is_refused(film, steps, capsys):
+    steps.said = NOTE
+    assert with_masks(film, "--yes") == 0
+    write_text(film.parent / "out" / "captures" / "out" / "mask" / "new" / "0.png", "")
+    assert with_masks(film, "--yes") == 2
+    assert "older ones. Delete this folder" in capsys.readouterr().err
+
+
+PAGE = """
+import json, pathlib, sys, time
+path = pathlib.Path(sys.argv[-1]) / "capture.json"
+if not {saves}: sys.exit(0)
+path.write_text(path.read_text().replace('"masks": false', '"masks": true'))
+time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("saves", [True, False])
+def test_the_page_is_served_until_masks_are_saved(saves, film, steps, capsys, monkeypatch):
+    """A process stands for the page: it saves and goes on serving, or ends without."""
+    real = chain._neuspring
+    page = [sys.executable, "-c", PAGE.format(saves=saves)]
+    monkeypatch.setattr(chain, "_neuspring", lambda *words: [*page, words[1]] if words[0] == "annotate" else real(*words))
+    monkeypatch.setattr(chain, "LOOK_FOR_MASKS", 0.05)
+    monkeypatch.setattr(chain, "GRACE", 0.0)
+    assert twin(film) == (0 if saves else 2)
+    assert ("observe" in steps.names) == saves
+    assert ("the page ended before masks were saved" in capsys.readouterr().err) == (not saves)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--mass", "0"], "--mass: must be a positive number of kg; received 0"),
+        (["--mass", "-1"], "--mass: must be a positive number of kg; received -1"),
+        (["--window", "12"], "--window: a first and a last frame are required"),
+        (["--masks", "/nowhere"], "what --masks, --hands and --marks name must exist"),
+    ],
+)
+def test_bad_input_costs_nothing(words, message, film, steps, capsys):
+    assert twin(film, *words) == 2
+    assert message in capsys.readouterr().err
+    assert not steps.ran and not (film.parent / "out").exists()
+
+
+def test_an_effort_that_is_none_and_a_film_that_is_not_there(film, steps, capsys):
+    with pytest.raises(SystemExit) as ended:
+        twin(film, "--effort", "huge")
+    assert ended.value.code == 2 and "huge" in capsys.readouterr().err
+    assert twin(film / "nothing") == 2
+    assert "nothing there" in capsys.readouterr().err and not steps.ran
+
+
+def test_a_capture_is_taken_as_it_is(tmp_path, steps, capsys):
+    made = captures.write(tmp_path / "here" / "thing")
+    assert twin(made.folder) == 0
+    assert steps.names == ["check-data", "observe", "search", "fit", "--snakefile"]
+    assert f"data_root={tmp_path / 'here'}" in steps.ran[-1]
+    assert twin(made.folder, "--mass", "0.3") == 2
+    assert 'Write "mass" into capture.json' in capsys.readouterr().err
+
+
+def test_a_dry_run_prints_commands_and_writes_nothing(film, steps, capsys):
+    assert with_masks(film, "--dry-run") == 0
+    assert not steps.ran and not (film.parent / "out").exists()
+    assert capsys.readouterr().out.count("\n$ ") == 6
+
+
+@pytest.mark.parametrize("name", ["film.mp4", "film.bag"])
+def test_a_file_is_a_video_or_a_recording(name, tmp_path, steps):
+    write_text(tmp_path / name, "")
+    assert twin(tmp_path / name, "--dry-run") == 0
+    assert chain._parts(tmp_path / name)[0] == {"film.mp4": "--color", "film.bag": "--recording"}[name]
+
+
+def test_the_command_that_made_each_step_is_kept(film, steps):
+    assert with_masks(film) == 0
+    kept = json.loads((film.parent / "out" / chain.STEPS_DONE).read_text())
+    assert kept["capture"][3] == "make-capture" and kept["window"] == ["all"] and {*chain.STEPS} <= kept.keys()
