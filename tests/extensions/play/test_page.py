@@ -19,7 +19,7 @@ from neuspring.core.files import read_npz, write_npz
 from neuspring.core.records import digest_file
 from neuspring.data.capture import Capture
 from neuspring.extensions.play.colors import linear
-from neuspring.extensions.play.layers import SPLAT_UNIT, NOT_SEEN_COLOR, SplatLayer, unseen
+from neuspring.extensions.play.layers import NOT_SEEN_COLOR, SPLAT_UNIT, SplatLayer, unseen
 from neuspring.extensions.play.page import Page
 from neuspring.extensions.play.player import Player
 from neuspring.report.shown import find
