@@ -40,16 +40,16 @@ FLYING = 0.01
 """m: a pixel whose depth differs more from the median around it shows neither side of a border."""
 CROWD, ALONE = 8, 3.0
 """A point whose so-manieth neighbor, itself included, is so many times as far as usual shows no surface."""
-WITHIN = 0.9
+SHARE_WITHIN = 0.9
 """Part of the points whose distance is the residual; the others may be flying pixels at borders."""
 SIMPLER = 0.001
 """m."""
 OUTLYING = 0.003
 """m: distance from which a point counts less."""
-HELD = 0.05
+HOLD_SIDES = 0.05
 """Distance from the surface, m, that counts like a step of 1 of a box's sides."""
 MOST_STEPS = 50
-"""Of a fit: what is no box creeps for long."""
+"""Steps of a fit: what is no box creeps for long."""
 SLAB, LEVEL_NORMAL = 0.04, 0.97
 """m; and the vertical part of a normal from which a plane is level."""
 LARGEST_BALL = 1.0
@@ -73,7 +73,7 @@ class MeasuredObstacle:
         sides = " x ".join(f"{200 * half:.1f}" for half in one.half_sizes)
         sizes = f"radius {100 * one.radius:.1f} cm" if self.kind == "ball" else f"{sides} cm"
         kind = "plane (as a slab)" if self.kind == "plane" else self.kind
-        return f"{kind} of {sizes}, residual {1e3 * self.residual:.1f} mm ({WITHIN:.0%} of {self.points} points)"
+        return f"{kind} of {sizes}, residual {1e3 * self.residual:.1f} mm ({SHARE_WITHIN:.0%} of {self.points} points)"
 
 
 def fit(points: np.ndarray, up: float, eye: np.ndarray) -> MeasuredObstacle:
@@ -85,7 +85,7 @@ def fit(points: np.ndarray, up: float, eye: np.ndarray) -> MeasuredObstacle:
     found = [_plane(some, up, eye), _box(some, up)]
     if ball := _ball(some, eye):
         found.insert(1, ball)
-    residuals = [float(np.quantile(np.abs(distance_of(points)), WITHIN)) for _, _, distance_of in found]
+    residuals = [float(np.quantile(np.abs(distance_of(points)), SHARE_WITHIN)) for _, _, distance_of in found]
     best = next(index for index, own in enumerate(residuals) if own <= min(residuals) + SIMPLER)
     kind, obstacle, _ = found[best]
     return MeasuredObstacle(kind, obstacle, residuals[best], len(points))
@@ -140,7 +140,7 @@ def _box(points: np.ndarray, up: float) -> tuple[str, Obstacle, Any]:
     # Points off the first box may have made it too large: they do not count for the second one.
     for _ in range(2):
         solved = [_box_from(own, axes) for axes in (_upright(own), _perpendicular(own))]
-        best = min(solved, key=lambda one: float(np.quantile(np.abs(box_distance(points, *one)), WITHIN)))
+        best = min(solved, key=lambda one: float(np.quantile(np.abs(box_distance(points, *one)), SHARE_WITHIN)))
         own = points[np.abs(box_distance(points, *best)) < FLYING]
     center, half, turn = best
     return "box", _obstacle(*_to_table(center, half, turn, up), turn), lambda p: box_distance(p, *best)
@@ -156,7 +156,7 @@ def _box_from(points: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndar
         return axes @ (low + high) / 2 + v[3:6], half, axes @ Rotation.from_rotvec(v[:3]).as_matrix()
 
     # A side that no point shows stays where it is.
-    return box(_solved(lambda v: np.append(box_distance(points, *box(v)), HELD * v), np.zeros(9)))
+    return box(_solved(lambda v: np.append(box_distance(points, *box(v)), HOLD_SIDES * v), np.zeros(9)))
 
 
 def box_distance(points: np.ndarray, center: np.ndarray, half: np.ndarray, turn: np.ndarray) -> np.ndarray:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 NODE_COLOR, HAND_COLOR, GRABBED_COLOR = (70, 90, 120), (214, 39, 40), (255, 200, 0)
 SEEN_COLOR, TRACK_COLOR, CAMERA_COLOR = (0, 150, 90), (150, 0, 200), (60, 60, 60)
 PREDICTED_COLOR, APART_COLOR = (230, 120, 0), (90, 90, 90)
-UNSEEN_COLOR = (150, 150, 150)
+NOT_SEEN_COLOR = (150, 150, 150)
 UNSEEN_REACH = 3.5
 """Distance from all points that were seen, in median distances between them, from which nobody saw a part of the body. Of points
 that are spread at random over a surface, one in a thousand places is farther from its nearest point."""
@@ -96,7 +96,7 @@ class BodyLayer:
         self._handles: Any = None
         self._colors = node_colors(twin) if twin else np.tile(np.array(NODE_COLOR, np.uint8), (len(nodes), 1))
         # Live twins may start in another frame.
-        self._colors[unseen(twin.topology.nodes if twin else nodes, seen)] = UNSEEN_COLOR
+        self._colors[unseen(twin.topology.nodes if twin else nodes, seen)] = NOT_SEEN_COLOR
         self.nodes = _balls(scene, f"/{name}/nodes", nodes, radius, self._colors)
         self.hands = _balls(scene, f"/{name}/hands", hands, 1.3 * radius, HAND_COLOR)
         self.springs: Any = None
@@ -224,7 +224,7 @@ class SplatLayer:
         colors = np.clip(0.5 + C0 * splats.harmonics[chosen, 0], 0, 1)
         # Half their own light: a plain gray would show no shape.
         hidden = unseen(splats.means[chosen], seen)
-        colors[hidden] = 0.5 * (np.array(UNSEEN_COLOR) / 255 + colors[hidden].mean(axis=1, keepdims=True))
+        colors[hidden] = 0.5 * (np.array(NOT_SEEN_COLOR) / 255 + colors[hidden].mean(axis=1, keepdims=True))
         opacities = 1 / (1 + np.exp(-splats.opacity_logits[chosen, None]))
         self._skin = Skin(self._nodes, frozen=True)
         self.handle: Any = scene.add_gaussian_splats(

@@ -56,7 +56,7 @@ OBSERVED_MARKS = {
     "hands": layers.HAND_COLOR,
     "the node that is held": layers.GRABBED_COLOR,
     "cameras": layers.CAMERA_COLOR,
-    "parts of the body that nobody saw in frame 0": layers.UNSEEN_COLOR,
+    "parts of the body that nobody saw in frame 0": layers.NOT_SEEN_COLOR,
 }
 """Colors of what is not a spring."""
 

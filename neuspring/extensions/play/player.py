@@ -23,7 +23,7 @@ ROOM = 1.08
 """The first view shows so much of what the runs fill."""
 WAY = (1.0, -0.35, 0.45)
 """Direction of the first view: across the row of runs, from above."""
-STEEPEST = 0.02
+LEAST_LEVEL = 0.02
 """Least level part of the first view's direction, of its vertical part."""
 RANGE_SAMPLES = 12
 """Frames that the range of strain and force is taken from."""
@@ -179,8 +179,8 @@ class Player:
         if self._eye is not None:
             way = self._eye - 0.5 * (self.low + self.high)
         # Straight from above nothing says which side is up.
-        if np.linalg.norm(way[:2]) < STEEPEST * abs(way[2]):
-            way[0] += STEEPEST * abs(way[2])
+        if np.linalg.norm(way[:2]) < LEAST_LEVEL * abs(way[2]):
+            way[0] += LEAST_LEVEL * abs(way[2])
         return np.asarray(way / np.linalg.norm(way))
 
     def view(

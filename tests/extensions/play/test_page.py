@@ -19,7 +19,7 @@ from neuspring.core.files import read_npz, write_npz
 from neuspring.core.records import digest_file
 from neuspring.data.capture import Capture
 from neuspring.extensions.play.colors import linear
-from neuspring.extensions.play.layers import SPLAT_UNIT, UNSEEN_COLOR, SplatLayer, unseen
+from neuspring.extensions.play.layers import NOT_SEEN_COLOR, SPLAT_UNIT, SplatLayer, unseen
 from neuspring.extensions.play.page import Page
 from neuspring.extensions.play.player import Player
 from neuspring.report.shown import find
@@ -176,8 +176,8 @@ def test_parts_that_nobody_saw_are_gray(scenario, server, tmp_path):
     half = replace(found.observations, **half_seen(found.observations, hidden))
     player = Player(server.scene, replace(found, observations=half))
     body = player._bodies["baseline/0"]
-    assert (body.nodes.batched_colors[unseen(nodes, player.seen)] == linear(np.array(UNSEEN_COLOR, np.uint8))).all()
-    assert (body.nodes.batched_colors[~unseen(nodes, player.seen)] != linear(np.array(UNSEEN_COLOR, np.uint8))).any(axis=1).all()
+    assert (body.nodes.batched_colors[unseen(nodes, player.seen)] == linear(np.array(NOT_SEEN_COLOR, np.uint8))).all()
+    assert (body.nodes.batched_colors[~unseen(nodes, player.seen)] != linear(np.array(NOT_SEEN_COLOR, np.uint8))).any(axis=1).all()
     colors, gray = body.splats.handle.rgbs / 255, unseen(splats.means, player.seen)
     assert gray.any() and not gray.all()
     assert (np.ptp(colors[gray], axis=1) < 0.01).all()
