@@ -21,8 +21,8 @@ MODULES = sorted(
     for path in PACKAGE.rglob("*.py")
     if "wp.kernel" in path.read_text(encoding="utf-8")
 )
-LONG = {"neuspring.physics.frame"}
-"""Modules that take half a minute."""
+LONG = {"neuspring.physics.frame", "neuspring.rods.solver"}
+"""Modules that take half a minute and more."""
 ARCHITECTURES = (80, 90)
 """A100 and H100, as compute capability x 10."""
 CHOICES: dict[str, tuple[Any, ...]] = {"real": (wp.float32, wp.float64), "width": (1,)}
