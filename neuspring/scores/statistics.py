@@ -121,10 +121,12 @@ def ratios(scores: pd.DataFrame, baseline: str, objects: Objects = "scenario") -
 
 def typical(scores: pd.DataFrame, objects: Objects = "scenario") -> pd.Series:
     """Method to the geometric mean of one error over objects, seeds averaged within each, the best first: the order of `ratios`."""
+    values = scores.set_index(["method", "category", "scenario"])["value"].astype(float)
     with np.errstate(divide="ignore"):
-        logs = np.log(scores.set_index(["method", "category", "scenario"])["value"].astype(float))
+        logs = pd.Series(np.log(values.to_numpy()), index=values.index)
     each = logs.groupby(level=[0, 1, 2], sort=False).mean().groupby(["method", objects], sort=False).mean()
-    return np.exp(each.groupby(level="method", sort=False).mean()).sort_values(kind="stable")
+    means = each.groupby(level="method", sort=False).mean()
+    return pd.Series(np.exp(means.to_numpy()), index=means.index).sort_values(kind="stable")
 
 
 def t_interval(values: np.ndarray) -> tuple[float, float]:

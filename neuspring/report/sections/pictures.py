@@ -161,8 +161,8 @@ def _scenario(material: ReportData, runs: dict[str, RunRecord], shown: dict[Path
             own = frames if kind.frames else ()
             wide, panel = bool(kind.width), 1 if kind.stem == "video" else None
             target = "" if shown[path].data else link(path, folder)
-            more = {"alt": alt, "link": target, "wide": wide, "paper": kind.paper, "frames": own, "panel": panel}
-            figures.append(replace(shown[path], caption=caption, **more))
+            picture = replace(shown[path], caption=caption, alt=alt, link=target, wide=wide)
+            figures.append(replace(picture, paper=kind.paper, frames=own, panel=panel))
         if figures and kind.stem == "video":
             head = max(shown[path].head for path in owners)
             figures.insert(0, Picture(caption="Observed", film=True, panel=0, head=head, same=True))
