@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
-import numpy as np
 import torch
 
 from neuspring.core.artifacts import Twin
@@ -151,16 +150,16 @@ class BatchedSearches(Shared):
         together: dict[Any, list[Any]] = {}
         for lane in self._active:
             one: Rollouts = lane.waiting[1][0]
-            together.setdefault(physics_with(one.twins[0], one.hands), []).append((lane, one))
+            together.setdefault(physics_with(one.twins[0], one.hands.shape[-1] == 3), []).append((lane, one))
         for group in together.values():
             for (lane, _), answer in zip(group, rolled([one for _, one in group], self._device), strict=True):
                 lane.waiting, lane.answer = None, answer
 
 
-def physics_with(twin: Twin, hands: torch.Tensor | np.ndarray) -> tuple[Any, ...]:
-    """What rollouts must have in common to share launches; with hands that let go, whose waypoints say so, the nodes too."""
-    always = hands.shape[-1] == 3
-    return (*physics_of(twin.simulation), always or twin.topology.nodes.tobytes(), always or twin.topology.controllers.shape)
+def physics_with(twin: Twin, always: bool) -> tuple[Any, ...]:
+    """What rollouts must have in common to share launches: the physics, and the points too unless hands `always` hold."""
+    points = () if always else (twin.topology.nodes.tobytes(), twin.topology.controllers.shape)
+    return physics_of(twin.simulation), points
 
 
 class BatchedFits(Shared):

@@ -147,7 +147,7 @@ def search(
 
     def save(kept: list[dict[str, Any]]) -> None:
         if record is not None:
-            save_trace(record, key, kept, attempts, earlier + time.perf_counter() - clock)
+            save_trace(record, key, kept, attempts - (lane is not None), earlier + time.perf_counter() - clock)
 
     start = 0
     with _threads(problem.threads) as each:
