@@ -280,37 +280,36 @@ class Graph:
 
     def _batches(self, stage: Stage) -> dict[str, list[Any]]:
         assert stage.together
-        other, key, alone = STAGES[stage.together.stage], stage.together.key, stage.together.alone
         alike: dict[Any, list[Any]] = defaultdict(list)
-        for one in self._jobs(other):
-            if (own := key(self.rows(one))) is not None:
-                alike[own].append(one)
-        count = self.benchmark.gpu_slots
-        wanted = self.config.gpus.batch
-        groups: dict[tuple[str, int], list[Any]] = defaultdict(list)
-        for number, jobs in enumerate(alike.values()):
-            if wanted == "auto":
-                most = 1 if not self.benchmark.on_gpu else min(LARGEST_BATCH, -(-len(jobs) // count) if count else LARGEST_BATCH)
-            else:
-                most = wanted
-            if most > 1:
-                parts = -(-len(jobs) // most)
-                for part in range(parts):
-                    # As large as one another.
-                    members = jobs[len(jobs) * part // parts : len(jobs) * (part + 1) // parts]
-                    groups["", len(groups)] += members if len(members) > 1 else []
-            elif alone is not None:
+        for one in self._jobs(STAGES[stage.together.stage]):
+            if (key := stage.together.key(self.rows(one))) is not None:
+                alike[key].append(one)
+        # Without batches a job does all of its scenario that are in step with enough others.
+        of_scenarios: dict[str, list[Any]] = defaultdict(list)
+        batches: list[list[Any]] = []
+        for jobs in alike.values():
+            if (most := self._most(len(jobs))) > 1:
+                parts, total = -(-len(jobs) // most), len(jobs)
+                # As large as one another.
+                batches += [jobs[total * part // parts : total * (part + 1) // parts] for part in range(parts)]
+            elif (fewest := stage.together.alone) is not None:
                 counts = Counter(one.scenario for one in jobs)
                 for one in jobs:
-                    if counts[one.scenario] >= alone:
-                        groups[one.scenario, -1].append(one)
+                    of_scenarios[one.scenario] += [one] * (counts[one.scenario] >= fewest)
         made: dict[str, list[Any]] = {}
-        firsts: Counter[str] = Counter()
-        for members in filter(None, groups.values()):
-            scenario = members[0].scenario
-            made[self.output_of(stage, SimpleNamespace(scenario=scenario, launch=firsts[scenario]))] = members
-            firsts[scenario] += 1
+        numbers: Counter[str] = Counter()
+        for members in [*(batch for batch in batches if len(batch) > 1), *filter(None, of_scenarios.values())]:
+            first = members[0].scenario
+            made[self.output_of(stage, SimpleNamespace(scenario=first, launch=numbers[first]))] = members
+            numbers[first] += 1
         return made
+
+    def _most(self, jobs: int) -> int:
+        """Jobs that are done together at most, of so many that are alike."""
+        if self.config.gpus.batch != "auto":
+            return self.config.gpus.batch
+        slots = self.benchmark.gpu_slots
+        return 1 if not self.benchmark.on_gpu else min(LARGEST_BATCH, -(-jobs // slots) if slots else LARGEST_BATCH)
 
     def _jobs(self, stage: Stage) -> list[Any]:
         """The jobs of all runs of a stage that learns, of methods or of searches, scenario by scenario."""
