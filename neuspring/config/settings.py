@@ -29,12 +29,15 @@ Device = Annotated[int, Field(ge=0)] | Annotated[str, StringConstraints(pattern=
 
 @dataclass(frozen=True, kw_only=True)
 class Gpus(SettingsSection):
-    """GPUs of this machine that jobs lease. On a cluster these are not read: its scheduler chooses."""
+    """GPUs of this machine that jobs lease. On a cluster its scheduler chooses them, and `batch` alone is read."""
 
     devices: Literal["all"] | tuple[Device, ...] = "all"
     """Indices or UUIDs of the GPUs; all: those of CUDA_VISIBLE_DEVICES, or all of the machine where it is not set."""
     jobs_per_gpu: Count = 1
     """Number of jobs that share a GPU; use 1 for timings that can be compared."""
+    batch: Count | Literal["auto"] = "auto"
+    """Most searches, or fits, of all scenarios and seeds that one job does together, with shared launches; auto: on GPUs as many as
+    give each GPU a job, 16 at most, on a CPU 1. 1: jobs of their own, but for the fits of a scenario (`twins_per_launch`)."""
 
     def __post_init__(self) -> None:
         if self.devices != "all" and (not self.devices or len(set(map(str, self.devices))) != len(self.devices)):

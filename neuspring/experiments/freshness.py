@@ -91,7 +91,7 @@ class Freshness:
         """Its checkpoints are of use to jobs that are still to be done; it makes no result of its own."""
         assert stage.together
         other = STAGES[stage.together.stage]
-        for member in self.graph.in_step(stage, job.scenario):
+        for member in self.graph.in_step(stage, job):
             if self.look(other, member) or not Path(self.graph.output_of(other, member)).exists():
                 yield f"its {stage.name} are not finished"
                 return

@@ -12,7 +12,7 @@ import hashlib
 import json
 import re
 import shlex
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -38,6 +38,8 @@ NEUTRAL: dict[str, Any] = {
     "tune": None,
 }
 """Keys that no result depends on, with what stands for them where settings are compared."""
+LARGEST_BATCH = 16
+"""Searches or fits in a job on a GPU, where `gpus.batch` is auto. It was not measured with several scenes."""
 
 
 def one_of(names: Collection[str]) -> str:
@@ -56,6 +58,7 @@ class Graph:
         tune = self.config.tune
         self.sweep_folder = f"{self.results}/tune/{tune.study}" if tune else ""
         self._texts: dict[tuple[Any, ...], str] = {}
+        self._shared: dict[str, dict[str, list[Any]]] = {}
         # Thousands of jobs share a few rows.
         self._of, self._laid = functools.cache(self._rows), functools.cache(self._lay)
         self.owners = {one.name: self._owners(one.shared) for one in STAGES.values() if one.shared}
@@ -69,6 +72,7 @@ class Graph:
             "camera": r"[A-Za-z0-9][A-Za-z0-9_.-]*",
             "seed": "|".join(map(str, self.whole.seeds)),
             "study": one_of(benchmark.studies),
+            "launch": r"\d+",
         }
         """Pattern of each wildcard."""
 
@@ -243,9 +247,8 @@ class Graph:
     def shared_launches(self, stage: Stage, job: Any) -> list[str]:
         """The record of the launches that a job shared with others, if it is one of several."""
         shared, output = self.together(stage), self.output_of(stage, job)
-        if shared is None or output not in {self.output_of(stage, one) for one in self.in_step(shared, job.scenario)}:
-            return []
-        return [self.output_of(shared, job)]
+        launches = self._launches(shared) if shared else {}
+        return [path for path, members in launches.items() if output in (self.output_of(stage, one) for one in members)]
 
     def members(self, stage: Stage, job: Any) -> list[Member]:
         """The jobs that a job does together; none for other stages."""
@@ -258,22 +261,71 @@ class Graph:
                 inputs=self.inputs(other)(one),
                 options=self.options(other, one),
                 settings=self.settings(other, one),
-                method=one.method,
             )
-            for one in self.in_step(stage, job.scenario)
+            for one in self.in_step(stage, job)
         ]
 
-    def in_step(self, stage: Stage, scenario: str) -> list[Any]:
-        """The jobs of a scenario that share launches: those in step, if not too few. None where `twins_per_launch` is 1."""
+    def in_step(self, stage: Stage, job: Any) -> list[Any]:
+        """The jobs that a job does together."""
+        return self._launches(stage).get(self.output_of(stage, job), [])
+
+    def _launches(self, stage: Stage) -> dict[str, list[Any]]:
+        """Record of each job that does others together -> these: of one scenario, or with `gpus.batch` of all.
+
+        None where `twins_per_launch` is 1.
+        """
+        if self.config.twins_per_launch != 1 and stage.name not in self._shared:
+            self._shared[stage.name] = self._batches(stage)
+        return self._shared.get(stage.name, {})
+
+    def _batches(self, stage: Stage) -> dict[str, list[Any]]:
         assert stage.together
-        if self.config.twins_per_launch == 1 or scenario not in self.config.scenarios:
-            return []
-        together, other = stage.together, STAGES[stage.together.stage]
-        names = [name for name in dict.fromkeys(self.owners[other.name].values()) if self.benchmark.applies(name, scenario)]
-        keys = {name: key for name in names if (key := together.key(self._of(scenario, name, None))) is not None}
-        counts, seeds = Counter(keys.values()), self.config.seeds
-        enough = [name for name, key in keys.items() if counts[key] * len(seeds) >= together.least]
-        return [SimpleNamespace(scenario=scenario, method=name, seed=seed) for name in enough for seed in seeds]
+        alike: dict[Any, list[Any]] = defaultdict(list)
+        for one in self._jobs(STAGES[stage.together.stage]):
+            if (key := stage.together.key(self.rows(one))) is not None:
+                alike[key].append(one)
+        # Without batches a job does all of its scenario that are in step with enough others.
+        of_scenarios: dict[str, list[Any]] = defaultdict(list)
+        batches: list[list[Any]] = []
+        for jobs in alike.values():
+            if (most := self._most(len(jobs))) > 1:
+                parts, total = -(-len(jobs) // most), len(jobs)
+                # As large as one another.
+                batches += [jobs[total * part // parts : total * (part + 1) // parts] for part in range(parts)]
+            elif (fewest := stage.together.alone) is not None:
+                counts = Counter(one.scenario for one in jobs)
+                for one in jobs:
+                    of_scenarios[one.scenario] += [one] * (counts[one.scenario] >= fewest)
+        made: dict[str, list[Any]] = {}
+        numbers: Counter[str] = Counter()
+        for members in [*(batch for batch in batches if len(batch) > 1), *filter(None, of_scenarios.values())]:
+            first = members[0].scenario
+            made[self.output_of(stage, SimpleNamespace(scenario=first, launch=numbers[first]))] = members
+            numbers[first] += 1
+        return made
+
+    def _most(self, jobs: int) -> int:
+        """Jobs that are done together at most, of so many that are alike."""
+        if self.config.gpus.batch != "auto":
+            return self.config.gpus.batch
+        slots = self.benchmark.gpu_slots
+        return 1 if not self.benchmark.on_gpu else min(LARGEST_BATCH, -(-jobs // slots) if slots else LARGEST_BATCH)
+
+    def _jobs(self, stage: Stage) -> list[Any]:
+        """The jobs of all runs of a stage that learns, of methods or of searches, scenario by scenario."""
+        known, found = self.benchmark, []
+        for scenario in self.config.scenarios:
+            if "method" in stage.wildcards:
+                kind, names = "method", [name for name in self.owners[stage.name].values() if known.applies(name, scenario)]
+            else:
+                rows = [row for name, row in known.methods.items() if row.search and known.applies(name, scenario)]
+                kind, names = "search", [row.searched for row in rows]
+            found += [
+                SimpleNamespace(scenario=scenario, seed=seed, **{kind: name})
+                for name in dict.fromkeys(names)
+                for seed in self.config.seeds
+            ]
+        return found
 
     # --- what a job is told
 

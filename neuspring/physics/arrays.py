@@ -2,11 +2,12 @@
 
 B twins lie in G groups of W lanes (lanes.py). A quantity of points is an array [points, G] of Vectors; one of springs an array [S,
 G] of Numbers; one of a twin an array [G] of Numbers. Torch tensors with the same storage are at hand by name. On a CPU W lanes
-share one thread's instructions (G = 1); on a GPU W = 1 and a thread is a point of one twin. Lanes that no twin needs repeat the
-last one.
+share one thread's instructions; on a GPU W = 1 and a thread is a point of one twin. The twins of a group have one table of
+springs. Lanes that no twin needs repeat the last one of their table.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
+import copy
 import functools
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
@@ -51,6 +52,8 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
         capacity: int
         up: real
         gravity: lane.Vector
+        first_row: integers
+        first_spring: integers
         rows: integers
         partners: integers
         links: integers
@@ -116,14 +119,28 @@ class Buffers:
         *,
         differentiable: bool,
         threads: bool,
+        tables: Sequence[int] = (),
+        sizes: Sequence[int] = (),
     ) -> None:
+        """`tables`: the table of springs of each twin, without it the first; `sizes`: nodes of each, without it all."""
         start_warp()
         self.nodes, self.controllers, self.simulation = nodes, controllers, simulations[0]
         self.device, self.dtype, self.differentiable, self.threads = device, dtype, differentiable, threads
         self.real = wp.float32 if dtype == torch.float32 else wp.float64
         self.twins = len(simulations)
-        self.width = 1 if threads else width_for(self.twins)
-        self.groups = -(-self.twins // self.width)
+        self.sizes = list(sizes) or [nodes] * self.twins
+        members = [
+            [k for k, table in enumerate(tables or [0] * self.twins) if table == one] for one in range(max(tables, default=0) + 1)
+        ]
+        self.width = 1 if threads else width_for(max(map(len, members)))
+        self.table_of_group: list[int] = []
+        seats: list[int] = []
+        for table, twins in enumerate(members):
+            groups = -(-len(twins) // self.width)
+            self.table_of_group += [table] * groups
+            seats += twins + twins[-1:] * (groups * self.width - len(twins))
+        self.groups = len(self.table_of_group)
+        self._seat(seats, [seats.index(twin) for twin in range(self.twins)])
         self.lanes = lanes(self.real, self.width)
         self.counts = [simulation.substeps for simulation in simulations]
         self.first, self.substeps = 0, max(self.counts)
@@ -163,6 +180,31 @@ class Buffers:
                 tensor = self._zeros(shape, (self.width,))
                 self.tensors[name], self.views[name] = tensor, wp.from_torch(tensor, dtype=self.lanes.Number)
 
+    def _seat(self, seats: Sequence[int], own: Sequence[int]) -> None:
+        """Take the twin of each lane of each group, and the lane of each twin."""
+        self._in_order = own == list(range(self.twins))
+        self.seats, self._own = (torch.tensor(places, device=self.device) for places in (seats, own))
+
+    def of_twins(self, values: torch.Tensor) -> torch.Tensor:
+        """From [G W, ...] in the order of lanes to [B, ...]."""
+        return values[: self.twins] if self._in_order else values.index_select(0, self._own)
+
+    def part(self, twins: slice) -> "Buffers":
+        """The state of some twins, in the same storage; arrays that are added to it are its own.
+
+        They must have nodes in common; their groups may have lanes of others.
+        """
+        first, stop, _ = twins.indices(self.twins)
+        own, seats, count = copy.copy(self), self._own[first:stop].tolist(), stop - first
+        begin, end = min(seats) // self.width, max(seats) // self.width + 1
+        own.twins, own.groups, own.nodes = count, end - begin, self.sizes[first]
+        places = self.seats[begin * self.width : end * self.width].tolist()
+        others = [twin - first if first <= twin < first + count else 0 for twin in places]
+        own._seat(others, [seat - begin * self.width for seat in seats])
+        own.tensors = {name: self.tensors[name][:, :, begin:end] for name in ("x", "v")}
+        own.views = {name: wp.from_torch(tensor, dtype=self.lanes.Vector) for name, tensor in own.tensors.items()}
+        return own
+
     def _zeros(self, shape: tuple[int, ...], entry: tuple[int, ...]) -> torch.Tensor:
         """Zeros [*shape, G, *entry]. In memory: for threads the twins of a point side by side, else each group's data together."""
         kind: dict[str, Any] = {"dtype": self.dtype, "device": self.device}
@@ -198,7 +240,7 @@ class Buffers:
         """The first `count` Vectors of an array (None: all), of one slot where it has slots, as [B, P, 3]."""
         source = (self.tensors[name] if slot is None else self.tensors[name][slot])[:count]
         twins = source.permute(1, 3, 0, 2).reshape(self.groups * self.width, len(source), 3)
-        return twins[: self.twins].clone()
+        return self.of_twins(twins).clone()
 
     def set_numbers(self, name: str, values: torch.Tensor) -> None:
         """Take [B] numbers of twins, or [B, S] of their springs."""
@@ -212,7 +254,7 @@ class Buffers:
         source = self.tensors[name]
         twins = source.permute(1, 2, 0).reshape(self.groups * self.width, len(source))
         # Contiguous, so that the sum over a twin's numbers takes the same order whatever the width.
-        return twins[: self.twins].contiguous()
+        return self.of_twins(twins).contiguous()
 
     def add_parameters(self, springs: int) -> None:
         """Add what is declared in parameters.py, and its adjoints."""
@@ -243,12 +285,18 @@ class Buffers:
                 result[name] = own.index_select(1, self.indices["ranks"])
             elif parameter.trained:
                 of_nodes = self.get_numbers(f"adj_{name}")
-                result[name] = of_nodes if parameter.per == "node" else of_nodes.sum(dim=1)
+                result[name] = of_nodes if parameter.per == "node" else self._sums(of_nodes)
         return result
 
+    def _sums(self, of_nodes: torch.Tensor) -> torch.Tensor:
+        """Sums over the nodes of each twin; of other nodes the order of a sum would be another."""
+        if set(self.sizes) == {self.nodes}:
+            return of_nodes.sum(dim=1)
+        return torch.cat([of_nodes[k : k + 1, :size].sum(dim=1) for k, size in enumerate(self.sizes)])
+
     def _padded(self, values: torch.Tensor) -> torch.Tensor:
-        spare = self.groups * self.width - self.twins
-        return torch.cat([values, values[-1:].expand(spare, *values.shape[1:])]) if spare else values
+        alone = self._in_order and len(self.seats) == self.twins
+        return values if alone else values.index_select(0, self.seats)
 
     @functools.cached_property
     def arguments(self) -> tuple[Any, Any, Any]:

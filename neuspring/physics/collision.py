@@ -67,7 +67,7 @@ def overflow(b: Buffers) -> torch.Tensor:
     """Candidates that did not fit the lists so far, of each twin [B]."""
     if not b.simulation.self_collision:
         return torch.zeros(b.twins, dtype=torch.int64)
-    return b.indices["overflow"].sum(dim=0).reshape(-1)[: b.twins].cpu()
+    return b.of_twins(b.indices["overflow"].sum(dim=0).reshape(-1)).cpu()
 
 
 def _make_room(b: Buffers, pairs: int) -> None:

@@ -5,9 +5,8 @@
 and a frame whose substeps are no longer in a solver's buffers is simulated again from its start before its backward pass. A
 `FrameWindow` has buffers for the last frames, as many as its memory takes.
 
-Several twins of the same nodes and controllers may have topologies of their own (`union`). A twin's spring that another one lacks
-is there for both, and has no stiffness and no dashpot in the other: it adds nothing. The springs of a node are summed in the order
-of its partners, so that a twin moves, bit for bit, as in a solver of its own.
+Several twins may have nodes, controllers and springs of their own (union.py). The springs of a node are summed in the order of its
+partners, so that a twin moves, bit for bit, as in a solver of its own.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from neuspring.core.artifacts import Simulation, Topology, Twin
+from neuspring.core.artifacts import Simulation, Twin
 from neuspring.core.device import load
 from neuspring.core.errors import InputError
 from neuspring.physics import collision, frame, obstacles, springs
@@ -28,6 +27,7 @@ from neuspring.physics.arrays import Buffers, Graphs
 from neuspring.physics.controllers import ControllerSprings, begins, begun
 from neuspring.physics.lanes import LANE_WIDTHS
 from neuspring.physics.parameters import PARAMETERS, Parameters, packed
+from neuspring.physics.union import Union
 
 FRAME_WINDOW_BYTES = 1 << 30
 """Bytes that a `FrameWindow` may take."""
@@ -37,13 +37,20 @@ PER_TWIN = ("frame_time", "substeps", "initial_velocity")
 """Fields that may differ between the simulations of one solver; it does not read the last."""
 
 
+IN_COMMON = tuple(field.name for field in fields(Simulation) if field.name not in PER_TWIN)
+
+
+def physics_of(simulation: Simulation) -> tuple[Any, ...]:
+    """Values that must be the same for all twins of a solver."""
+    return tuple(getattr(simulation, name) for name in IN_COMMON)
+
+
 def _check(simulations: Sequence[Simulation]) -> None:
     """One physics for all twins of a solver."""
-    for field in fields(Simulation):
-        values = {getattr(simulation, field.name) for simulation in simulations}
-        if field.name not in PER_TWIN and len(values) != 1:
+    for name in IN_COMMON:
+        if len(values := {getattr(simulation, name) for simulation in simulations}) != 1:
             rule = "must be the same for all twins of a solver, of which there is at least one"
-            raise InputError(f"simulation.{field.name}", rule, sorted(values), "Make a solver for each.")
+            raise InputError(f"simulation.{name}", rule, sorted(values), "Make a solver for each.")
 
 
 class FrameSolver:
@@ -54,7 +61,7 @@ class FrameSolver:
 
     A sequence of simulations makes a solver of as many twins, which may differ in parameters and state, and in `PER_TWIN` of their
     simulations (else InputError); then every tensor has a leading axis [B]. A twin's numbers are the same, bit for bit, alone and
-    in company.
+    in company. They may have `tables` of springs: `spring_pairs` are then several, and `sizes` the nodes of each twin (`Union`).
 
     `threads` chooses how a frame is computed (frame.py): by a thread per node, as on CUDA, or by one thread, as on a CPU. `block`
     threads go through a twin's nodes instead, in one launch for all substeps; 0: a launch for each.
@@ -62,7 +69,7 @@ class FrameSolver:
 
     def __init__(
         self,
-        spring_pairs: np.ndarray,
+        spring_pairs: np.ndarray | Sequence[np.ndarray],
         nodes: int,
         controllers: int,
         simulation: Simulation | Sequence[Simulation],
@@ -72,22 +79,26 @@ class FrameSolver:
         differentiable: bool = True,
         threads: bool | None = None,
         block: int = 0,
+        tables: Sequence[int] = (),
+        sizes: Sequence[int] = (),
     ) -> None:
         self.block = block
+        each = [spring_pairs] if isinstance(spring_pairs, np.ndarray) else list(spring_pairs)
         self.together = not isinstance(simulation, Simulation)
         simulations = [simulation] if isinstance(simulation, Simulation) else list(simulation)
         _check(simulations)
         self.nodes, self.simulation, self.device, self.dtype = nodes, simulations[0], device, dtype
         threads = device != "cpu" or block > 0 if threads is None else threads
-        self.buffers = Buffers(nodes, controllers, simulations, device, dtype, differentiable=differentiable, threads=threads)
-        self.buffers.add_parameters(len(spring_pairs))
-        springs.allocate(self.buffers, spring_pairs)
+        options: dict[str, Any] = {"differentiable": differentiable, "threads": threads, "tables": tables, "sizes": sizes}
+        self.buffers = Buffers(nodes, controllers, simulations, device, dtype, **options)
+        self.buffers.add_parameters(max(map(len, each)))
+        springs.allocate(self.buffers, each)
         collision.allocate(self.buffers)
         obstacles.allocate(self.buffers)
         self._pushes = False
         """True where some spring only pushes."""
         self._choose_kernels()
-        self.grips = ControllerSprings(spring_pairs, nodes, device)
+        self.grips = ControllerSprings(each[0], nodes, device) if len(each) == 1 else None
         self._held: torch.Tensor | None = None
         """Rest lengths of grips that began since the parameters were set [B, L] (controllers.py)."""
         self._plain: torch.Tensor | None = None
@@ -183,6 +194,9 @@ class FrameSolver:
     def _lead(self, begin: torch.Tensor, end: torch.Tensor) -> None:
         """Take where controllers are at the begin and the end of a frame: rows of `controllers.waypoints` [B, C, 3 or 4]."""
         if begin.shape[-1] == end.shape[-1] == 4:
+            if self.grips is None:
+                rule = "those of several scenes at once must hold in all frames"
+                raise InputError("controllers", rule, "4 numbers per controller", "Make a solver for each.")
             if bool(begins(begin).any()):
                 self._held = self.grips.taken(self._held, self.buffers.get_vectors("x", 0, self.nodes), begin)
             self._hold(begin[..., 3] * end[..., 3] > 0)
@@ -197,6 +211,7 @@ class FrameSolver:
     def _hold(self, holds: torch.Tensor | None) -> None:
         """Let the springs of controllers act that hold [B, C], and not those of others; None: all act."""
         assert self._plain is not None, "set_parameters comes first"
+        assert self.grips is not None
         self._factor = None
         if holds is not None:
             self._factor = torch.ones_like(self._plain)
@@ -211,6 +226,7 @@ class FrameSolver:
 
         For a rollout that does not begin in frame 0; more positions than rows may be given. It makes no difference where all hold.
         """
+        assert self.grips is not None, "a rollout of one scene"
         known = torch.nonzero(begins(rows).any(dim=-1)).flatten().tolist()
         states = [torch.tensor(positions[number], dtype=self.dtype, device=self.device) for number in known]
         lengths = self.grips.taken_before([rows[number] for number in known], states)
@@ -456,34 +472,44 @@ def solver_for(
     differentiable: bool = True,
     block: int = 0,
 ) -> FrameSolver:
-    """A solver with parameters set: of a lattice, or of several of the same nodes and controllers: tensors have an axis [B]."""
+    """A solver with parameters set: of a lattice, or of several: tensors have an axis [B]."""
     options: dict[str, Any] = {"device": device, "dtype": dtype, "differentiable": differentiable, "block": block}
-    first = twins.topology if isinstance(twins, Twin) else twins[0].topology
     if isinstance(twins, Twin):
+        first = twins.topology
         solver = FrameSolver(first.springs, len(first.nodes), len(first.controllers), twins.simulation, **options)
         solver.set_parameters(packed(twins, device, dtype))
         return solver
-    pairs, places = union([twin.topology for twin in twins])
-    solver = FrameSolver(pairs, len(first.nodes), len(first.controllers), [twin.simulation for twin in twins], **options)
-    solver.set_parameters(stacked([packed(twin, device, dtype) for twin in twins], places, len(pairs)))
+    union = Union([twin.topology for twin in twins])
+    solver = solver_of(union, [twin.simulation for twin in twins], **options)
+    solver.set_parameters(union.parameters([packed(twin, device, dtype) for twin in twins]))
     return solver
+
+
+def solver_of(union: Union, simulations: Sequence[Simulation], **options: Any) -> FrameSolver:
+    """A solver of twins side by side, with options of `FrameSolver`; without parameters."""
+    pairs = union.tables[0] if len(union.tables) == 1 else union.tables
+    options |= {"tables": union.table, "sizes": [nodes for nodes, _ in union.sizes]}
+    return FrameSolver(pairs, union.nodes, union.controllers, simulations, **options)
 
 
 def narrowing_solver(twins: Sequence[Twin], device: str) -> FrameSolver:
     """A solver without gradients of several twins; on a CPU the first, if they come slowest first, end frames in fewer lanes.
 
     Lanes cost the same whoever still moves in them, and few candidates of a search need several times the substeps of the others.
+    Twins of several scenes do not narrow.
     """
-    topologies, counts = [twin.topology for twin in twins], [twin.simulation.substeps for twin in twins]
-    pairs, places = union(topologies)
-    every = stacked([packed(twin, device) for twin in twins], places, len(pairs))
+    simulations = [twin.simulation for twin in twins]
+    union, counts = Union([twin.topology for twin in twins]), [simulation.substeps for simulation in simulations]
+    if len(union.tables) > 1:
+        return solver_for(twins, device, differentiable=False)
+    every, pairs = union.parameters([packed(twin, device) for twin in twins]), union.tables[0]
 
     def made(count: int) -> FrameSolver:
         own = {name: values[:count] for name, values in every.items()}
         kept = (own["springs"][..., 1] != 0).any(dim=0)
-        own["springs"], size = own["springs"][:, kept], (len(topologies[0].nodes), len(topologies[0].controllers))
-        simulations = [twin.simulation for twin in twins[:count]]
-        solver = FrameSolver(pairs[kept.cpu().numpy()], *size, simulations, device=device, differentiable=False)
+        own["springs"] = own["springs"][:, kept]
+        springs = pairs[kept.cpu().numpy()]
+        solver = FrameSolver(springs, union.nodes, union.controllers, simulations[:count], device=device, differentiable=False)
         solver.set_parameters(own)
         return solver
 
@@ -494,31 +520,3 @@ def narrowing_solver(twins: Sequence[Twin], device: str) -> FrameSolver:
                 wider, narrowest = narrowest, made(width)
                 wider.narrow(narrowest)
     return solver
-
-
-def union(topologies: Sequence[Topology]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """All springs [S, 2] of several topologies, and for each topology where its own springs stand among them."""
-    total = len(topologies[0].nodes) + len(topologies[0].controllers)
-    codes = [np.sort(t.springs.astype(np.int64), axis=1) @ np.array([total, 1]) for t in topologies]
-    every = np.unique(np.concatenate(codes))
-    return np.stack([every // total, every % total], axis=1).astype(np.int32), [np.searchsorted(every, c) for c in codes]
-
-
-def stacked(each: Sequence[Parameters], places: Sequence[np.ndarray], springs: int) -> Parameters:
-    """The parameters of several twins with a leading axis [B], their springs put where they stand among all `springs`."""
-    result = {}
-    for name, parameter in PARAMETERS.items():
-        values = [one[name] for one in each]
-        if parameter.per == "spring":
-            own, values = values, [value.new_zeros((springs, *value.shape[1:])) for value in values]
-            for target, value, place in zip(values, own, places, strict=True):
-                target[torch.as_tensor(place, device=target.device)] = value
-        # Masses of all nodes at once and of each node may meet.
-        result[name] = torch.stack(torch.broadcast_tensors(*values))
-    return result
-
-
-def unstacked(gradients: Parameters, lane: int, place: np.ndarray) -> Parameters:
-    """The gradients of one of several twins, whose springs stand at `place` among all springs."""
-    index = torch.as_tensor(place, device=gradients["springs"].device)
-    return {name: each[lane][index] if PARAMETERS[name].per == "spring" else each[lane] for name, each in gradients.items()}

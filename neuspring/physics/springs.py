@@ -8,11 +8,12 @@ A controller's spring that only pushes has no force while it is longer than at r
 
 `allocate` lists the springs twice: as rows, each spring once at its lower end, for one thread that goes through all nodes in turn;
 and as links, each spring at both ends, for a thread per node that shares nothing with others. A node's sum goes through its
-partners in ascending order both ways, so both give the same numbers.
+partners in ascending order both ways, so both give the same numbers. Twins of other scenes have tables of springs of their own.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,24 +23,50 @@ from neuspring.physics.arrays import Buffers, structs
 from neuspring.physics.lanes import lanes
 
 
-def allocate(b: Buffers, pairs: np.ndarray) -> None:
-    """Springs [S, 2] between points, ordered by lower end, then by upper end; i >= nodes means controller i - nodes."""
-    ends = np.sort(np.asarray(pairs, np.int32).reshape(-1, 2), axis=1)
-    order = np.lexsort((ends[:, 1], ends[:, 0]))
-    lower, upper = ends[order].T
-    first, other, spring = np.concatenate([lower, upper]), np.concatenate([upper, lower]), np.tile(np.arange(len(order)), 2)
-    linked = np.lexsort((other, first))
-    linked = linked[first[linked] < b.nodes]
-    places = np.arange(b.nodes + 1)
+def allocate(b: Buffers, tables: Sequence[np.ndarray]) -> None:
+    """Tables of springs [S, 2] between points, each for some groups of twins; i >= nodes means controller i - nodes.
+
+    Springs are ordered by lower end, then by upper end; where there are several tables, the caller's must be.
+    """
+    rows, links = [_rows(b.nodes, pairs) for pairs in tables], [_links(b.nodes, pairs) for pairs in tables]
+    starts, link_starts = (np.cumsum([0, *(len(one[-1]) for one in each)])[:-1] for each in (rows, links))
+    most = max(len(order) for order, _, _ in rows)
+    order = rows[0][0] if len(tables) == 1 else np.arange(most)
     b.add_integers(
         order=order,  # Where each spring stands in the caller's list [S].
         ranks=np.argsort(order),  # Where each spring of the caller's list stands here [S].
-        rows=np.searchsorted(lower, places),  # First spring of each node's row [N + 1].
-        partners=upper,  # Upper end of each spring [S].
-        links=np.searchsorted(first[linked], places),  # First link of each node [N + 1].
-        link_partners=other[linked],  # Other end of each link, ascending within a node.
-        link_springs=spring[linked],  # The link's spring.
+        # First spring of each node's row [N + 1], and upper end of each spring, of all tables one after the other.
+        rows=np.concatenate([first + start for (_, first, _), start in zip(rows, starts, strict=True)]),
+        partners=np.concatenate([upper for _, _, upper in rows]),
+        # The same for links: the first of each node, their other ends, ascending within a node, and their springs in the table.
+        links=np.concatenate([first + start for (first, _, _), start in zip(links, link_starts, strict=True)]),
+        link_partners=np.concatenate([other for _, other, _ in links]),
+        link_springs=np.concatenate([spring for _, _, spring in links]),
+        # Of each group: where its table begins among rows and links, and among springs.
+        first_row=np.array(b.table_of_group) * (b.nodes + 1),
+        first_spring=starts[b.table_of_group],
     )
+
+
+def _sorted(pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    ends = np.sort(np.asarray(pairs, np.int32).reshape(-1, 2), axis=1)
+    order = np.lexsort((ends[:, 1], ends[:, 0]))
+    return order, ends[order]
+
+
+def _rows(nodes: int, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Order of a table's springs, first of each row [N + 1], upper ends [S]."""
+    order, ends = _sorted(pairs)
+    return order, np.searchsorted(ends[:, 0], np.arange(nodes + 1)), ends[:, 1]
+
+
+def _links(nodes: int, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """First link of each node [N + 1], other ends, springs."""
+    order, ends = _sorted(pairs)
+    first, other, spring = ends.T.reshape(-1), ends[:, ::-1].T.reshape(-1), np.tile(np.arange(len(order)), 2)
+    linked = np.lexsort((other, first))
+    linked = linked[first[linked] < nodes]
+    return np.searchsorted(first[linked], np.arange(nodes + 1)), other[linked], spring[linked]
 
 
 @functools.cache
@@ -139,9 +166,11 @@ def functions(real: Any, width: int, pushes: bool = False) -> tuple[Any, Any, An
         x = state.x[slot, i, g]
         v = state.v[slot, i, g]
         total = state.force[i, g]
-        for each in range(model.rows[i], model.rows[i + 1]):
-            e = plain(each)
-            j = plain(model.partners[e])
+        row = plain(model.first_row[g] + i)
+        first = model.first_spring[g]
+        for each in range(model.rows[row], model.rows[row + 1]):
+            e = plain(each - first)
+            j = plain(model.partners[plain(each)])
             f = pull(model, state, slot, e, j, g, x, v)
             total = total + f
             state.force[j, g] = state.force[j, g] - f
@@ -155,9 +184,11 @@ def functions(real: Any, width: int, pushes: bool = False) -> tuple[Any, Any, An
         adj_force = adjoint.force[turn, i, g]
         adj_x = adjoint.x[i, g]
         adj_v = adjoint.v[i, g]
-        for each in range(model.rows[i], model.rows[i + 1]):
-            e = plain(each)
-            j = plain(model.partners[e])
+        row = plain(model.first_row[g] + i)
+        first = model.first_spring[g]
+        for each in range(model.rows[row], model.rows[row + 1]):
+            e = plain(each - first)
+            j = plain(model.partners[plain(each)])
             c = adj_force - adjoint.force[turn, j, g]
             offset, relative, parameters = pull_adjoint(model, state, slot, e, j, g, x, v, c)
             adj_x = adj_x - offset
@@ -174,7 +205,8 @@ def functions(real: Any, width: int, pushes: bool = False) -> tuple[Any, Any, An
         x = state.x[slot, i, g]
         v = state.v[slot, i, g]
         total = Vector()
-        for each in range(model.links[i], model.links[i + 1]):
+        row = plain(model.first_row[g] + i)
+        for each in range(model.links[row], model.links[row + 1]):
             k = plain(each)
             j = plain(model.link_partners[k])
             e = plain(model.link_springs[k])
@@ -189,7 +221,8 @@ def functions(real: Any, width: int, pushes: bool = False) -> tuple[Any, Any, An
         adj_force = adjoint.force[turn, i, g]
         adj_x = adjoint.x[i, g]
         adj_v = adjoint.v[i, g]
-        for each in range(model.links[i], model.links[i + 1]):
+        row = plain(model.first_row[g] + i)
+        for each in range(model.links[row], model.links[row + 1]):
             k = plain(each)
             j = plain(model.link_partners[k])
             e = plain(model.link_springs[k])

@@ -61,29 +61,46 @@ def search(
     candidate's cost is the mean over all, or with `leave_out` over the others. A `body` that is a rod has no topology to
     search: its constants are found by Levenberg-Marquardt on the first frames (twin/rod_fit.py), and its trace has a row per step.
     """
-    from neuspring.core.checkpoint import checkpoint_key
     from neuspring.core.files import write_history
+
+    options = prepared(settings, run, leave_out, clusters, seed, device, threads, twins_per_launch)
+    result = BODIES[body].search(observations, pool, settings, options)
+    files = run.beside(twin="twin.npz", trace="trace.parquet", history="history.parquet")
+    result.twin.save(files["twin"])
+    write_history(result.course.index, dict(result.course), files["history"])
+    return Written(files=files, facts=result.facts, attempts=result.attempts, earlier_seconds=result.earlier_seconds)
+
+
+def prepared(
+    settings: Config,
+    run: Recorder,
+    leave_out: bool,
+    clusters: int,
+    seed: int,
+    device: str,
+    threads: int,
+    twins_per_launch: int | Literal["auto"],
+    lane: Any = None,
+    **others: Any,
+) -> SearchOptions:
+    """The way a search runs, where its trace lies, and what one must match to be continued. Raises InputError."""
+    from neuspring.core.checkpoint import checkpoint_key
 
     if threads < 1:
         raise InputError("--threads", "must be at least 1", threads)
     # The budget is not part of the key: a search with a larger one begins with the same candidates.
     without_budget = {name: value for name, value in run.settings["search"].items() if name != "rollouts"}
-    key = checkpoint_key(run.inputs, run.settings | {"search": without_budget}, device, "neuspring.twin.search")
-    files = run.beside(twin="twin.npz", trace="trace.parquet", history="history.parquet")
-    options = SearchOptions(
+    return SearchOptions(
         clusters=clusters,
         leave_out=leave_out,
         seed=seed,
         device=device,
         threads=threads,
         together=launch_size(twins_per_launch),
-        record=files["trace"],
-        key=key,
+        record=run.beside(trace="trace.parquet")["trace"],
+        key=checkpoint_key(run.inputs, run.settings | {"search": without_budget}, device, "neuspring.twin.search"),
+        lane=lane,
     )
-    result = BODIES[body].search(observations, pool, settings, options)
-    result.twin.save(files["twin"])
-    write_history(result.course.index, dict(result.course), files["history"])
-    return Written(files=files, facts=result.facts, attempts=result.attempts, earlier_seconds=result.earlier_seconds)
 
 
 def launch_size(twins_per_launch: int | Literal["auto"]) -> int:

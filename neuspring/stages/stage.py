@@ -145,7 +145,6 @@ class Member:
     options: Mapping[str, Any]
     settings: str
     """As JSON."""
-    method: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,10 +155,10 @@ class Together:
     """The other one, whose jobs go on from there."""
     key: Callable[[Rows], Any]
     """Jobs of equal key are in step; None: that one is done alone."""
-    least: int
-    """Fewer in step are left to jobs of their own."""
     given: Callable[[Sequence[Member]], Mapping[str, Any]]
     """Values of options."""
+    alone: int | None = None
+    """Without `gpus.batch`: the jobs of one scenario, if so many are in step; None: no jobs."""
 
 
 @dataclass(frozen=True)

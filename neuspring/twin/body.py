@@ -53,6 +53,8 @@ class SearchOptions:
     record: Path | None = None
     """File of the trace; one with the same `key` that is there already may be continued."""
     key: str = ""
+    lane: Any = None
+    """Serves the launches that it shares with other searches (batch.py); None: it shares none."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

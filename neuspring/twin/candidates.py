@@ -28,7 +28,7 @@ from neuspring.physics.topology import controller_reach, node_spacing, piecewise
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.rollout import initial_velocity
 from neuspring.twin.transfer import OutOfReach, move, require_pool
-from neuspring.twin.trials import Outcome, outcomes
+from neuspring.twin.trials import Outcome, Rollouts, rolled
 
 INTEGERS = ("object_neighbors", "controller_neighbors")
 REGIONAL = ("object_radius", "object_neighbors")
@@ -41,6 +41,8 @@ CMAES, OTHER_WAY = "cmaes", "hands"
 """Stages of candidates that CMA-ES proposes, and of its first generation in the other way of hands (`search.hands`)."""
 Map = Callable[..., Iterable[Any]]
 """As the builtin `map`."""
+Launch = Callable[[Rollouts], Any]
+"""As `rolled` of one; `batch.SearchLane` is one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,9 +255,18 @@ def made(problem: SearchProblem, normalized: np.ndarray, push: bool = False) -> 
 
 
 def evaluate(
-    problem: SearchProblem, population: Sequence[np.ndarray], push: bool, index: int, generation: int, each: Map = map
+    problem: SearchProblem,
+    population: Sequence[np.ndarray],
+    push: bool,
+    index: int,
+    generation: int,
+    each: Map = map,
+    lane: Launch | None = None,
 ) -> list[dict[str, Any]]:
-    """Rows of the trace for the candidates of a generation, numbered from `index` on; `each` may work in several threads."""
+    """Rows of the trace for the candidates of a generation, numbered from `index` on; `each` may work in several threads.
+
+    With a `lane` their launches are shared with other searches.
+    """
     candidates = list(each(lambda normalized: made(problem, normalized, push), population))
     for number, (row, _) in enumerate(candidates):
         row |= {"rollout": index + number, "generation": generation}
@@ -265,7 +276,7 @@ def evaluate(
     def simulate(members: list[int]) -> None:
         start = time.perf_counter()
         results = [
-            outcomes([families[k][place] for k in members], one.hands, one.velocity, one.loss, device)
+            launch(problem, Rollouts([families[k][place] for k in members], one.hands, one.velocity, one.loss), lane)
             for place, one in enumerate(recordings)
         ]
         share = (time.perf_counter() - start) / len(members)
@@ -285,6 +296,11 @@ def evaluate(
     simulated = each if device == "cpu" else map
     list(simulated(simulate, groups(twins, device, problem.together, problem.threads) if twins else []))
     return [row for row, _ in candidates]
+
+
+def launch(problem: SearchProblem, rollouts: Rollouts, lane: Launch | None) -> Any:
+    """The results of rollouts (trials.py)."""
+    return lane(rollouts) if lane else rolled([rollouts], problem.device)[0]
 
 
 def mean_outcome(results: Sequence[Outcome]) -> Outcome:

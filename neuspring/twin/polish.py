@@ -20,10 +20,10 @@ import torch
 from neuspring.config.search import TRIALS, Search
 from neuspring.core.levenberg import LevenbergMarquardt
 from neuspring.twin.body import TERMS
-from neuspring.twin.candidates import PENALTY, Map, SearchProblem, made
+from neuspring.twin.candidates import PENALTY, Launch, Map, SearchProblem, launch, made
 from neuspring.twin.losses import OF_IMAGES, FrameLoss
 from neuspring.twin.rollout import FAR_AWAY
-from neuspring.twin.trials import motions
+from neuspring.twin.trials import Rollouts
 
 SLOPES, POLISH = "slopes", "polish"
 """Stages of a search after CMA-ES; candidates of `SLOPES` are its means alone and never its result."""
@@ -147,6 +147,7 @@ def slope_rows(
     index: int,
     generation: int,
     each: Map = map,
+    lane: Launch | None = None,
 ) -> list[dict[str, Any]]:
     """Rows of a base and its neighbors, with the products of their slopes.
 
@@ -165,7 +166,7 @@ def slope_rows(
     for place, recording in enumerate(problem.recordings):
         twins = [family[place] for family in families]
         twins = [replace(twin, simulation=replace(twin.simulation, substeps=most[place])) for twin in twins]
-        positions, velocities = motions(twins, recording.hands, recording.velocity, problem.device)
+        positions, velocities = launch(problem, Rollouts(twins, recording.hands, recording.velocity), lane)
         fine = [known and bool((positions[:, k].abs() < FAR_AWAY).all()) for k, known in enumerate(fine)]
         seen.append((recording.loss, recording.velocity, positions, velocities))
     # Only now is it known which candidates are fine everywhere.

@@ -27,7 +27,18 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_atomically
 from neuspring.core.text import Progress
 from neuspring.twin.body import Learned
-from neuspring.twin.candidates import CMAES, OTHER_WAY, PENALTY, UNSTABLE, Map, SearchProblem, candidate, evaluate, still_cost
+from neuspring.twin.candidates import (
+    CMAES,
+    OTHER_WAY,
+    PENALTY,
+    UNSTABLE,
+    Launch,
+    Map,
+    SearchProblem,
+    candidate,
+    evaluate,
+    still_cost,
+)
 from neuspring.twin.polish import POLISH, SLOPES, Polish, slope_rows
 
 if TYPE_CHECKING:
@@ -92,11 +103,12 @@ class Proposals:
 
 
 def _strategy(start: np.ndarray, sigma: float, seed: int) -> cma.CMAEvolutionStrategy:
-    # cma takes 0 to mean "seed from the clock", so seeds are shifted by one.
+    # Numbers of its own: searches that share launches are threads, and cma would draw from those that numpy has for all.
     import cma
 
+    numbers = np.random.RandomState(seed + 1)
     no_end = {"maxiter": np.inf, "tolfun": 0, "tolx": 0, "tolstagnation": np.inf}
-    options = {"bounds": [0, 1], "seed": seed + 1, "verbose": -9, **no_end}
+    options = {"bounds": [0, 1], "randn": numbers.randn, "seed": np.nan, "verbose": -9, **no_end}
     return cma.CMAEvolutionStrategy(start, sigma, options)
 
 
@@ -113,8 +125,10 @@ Judge = Callable[[Sequence[np.ndarray], bool, int, int], list[dict[str, Any]]]
 """Rows of candidates [V], given also True where hands only push, the number of the first candidate, and the generation."""
 
 
-def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key: str = "") -> SearchResult:
-    """Run the search within its budget of rollouts.
+def search(
+    problem: SearchProblem, seed: int, *, record: Path | None = None, key: str = "", lane: Launch | None = None
+) -> SearchResult:
+    """Run the search within its budget of rollouts; with a `lane` it shares launches with others (batch.py).
 
     The trace is written to `record` after every generation. A trace with the same `key` that is there already is continued,
     whatever its budget was. Raises NumericalFailure if no candidate could be simulated.
@@ -133,11 +147,11 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
 
     def save(kept: list[dict[str, Any]]) -> None:
         if record is not None:
-            save_trace(record, key, kept, attempts, earlier + time.perf_counter() - clock)
+            save_trace(record, key, kept, attempts - (lane is not None), earlier + time.perf_counter() - clock)
 
     start = 0
     with _threads(problem.threads) as each:
-        judge = partial(evaluate, problem, each=each)
+        judge = partial(evaluate, problem, each=each, lane=lane)
         # The last generation may be cut short, so that searches of any population size use exactly the same budget.
         while start < budget:
             population = proposals.ask()[: budget - start]
@@ -163,7 +177,7 @@ def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key
                 save(other + trace)
         done, polished = other + trace[:budget], list[dict[str, Any]]()
         recorded = [row for row in rows if row["stage"] not in (CMAES, OTHER_WAY)]
-        slopes = partial(slope_rows, problem, each=each)
+        slopes = partial(slope_rows, problem, each=each, lane=lane)
         for polished in _polished(settings, variables, done, recorded, proposals.generation, judge, slopes, push):
             if len(polished) > len(recorded) or polished[-1] is not recorded[len(polished) - 1]:
                 save(other + trace + polished)

@@ -2,7 +2,8 @@
 
 Everything stays in the solver's buffers, in lanes: after each frame kernels add the frame's loss to each twin's sum, and note the
 frame in which a twin leaves the scene. Terms without a kernel here come from losses.py, twin by twin. Sums go through points and
-nodes in order, in float64, so that a twin's cost does not depend on its batch, bit for bit on a CPU.
+nodes in order, in float64, so that a twin's cost does not depend on its batch, bit for bit on a CPU. Rollouts on several
+recordings, of one scene or of several, may share launches.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
@@ -10,6 +11,7 @@ import functools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import torch
@@ -18,7 +20,8 @@ import warp as wp
 from neuspring.core.artifacts import Twin
 from neuspring.core.device import load
 from neuspring.physics.lanes import lanes
-from neuspring.physics.solver import FrameSolver, narrowing_solver, solver_for
+from neuspring.physics.solver import FrameSolver, narrowing_solver
+from neuspring.physics.union import Union
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.rollout import FAR_AWAY
 
@@ -39,51 +42,90 @@ class Outcome:
     collision_overflow: int
 
 
-def outcomes(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor, loss: FrameLoss, device: str) -> list[Outcome]:
-    """Roll twins of the same nodes out from velocity [N, 3], m/s, and judge the frames that the loss holds.
+@dataclass(frozen=True, eq=False)
+class Rollouts:
+    """Twins of the same nodes on a recording, to be rolled out from velocity [N, 3], m/s.
 
-    hands are the controllers' positions [T, C, 3], or `controllers.waypoints` of them.
+    hands are the controllers' positions [T, C, 3], or `controllers.waypoints` of them. With a loss each twin is judged (`Outcome`)
+    in the frames that it holds; without one their motion is kept: positions, m, and velocities, m/s, [T - 1, B, N, 3] at the end
+    of each frame, on the CPU.
     """
+
+    twins: Sequence[Twin]
+    hands: torch.Tensor
+    velocity: torch.Tensor
+    loss: FrameLoss | None = None
+
+
+def rolled(each: Sequence[Rollouts], device: str) -> list[Any]:
+    """Results of several `Rollouts`, whose launches are shared: one physics, and, of several scenes, hands that always hold."""
+    twins = [twin for one in each for twin in one.twins]
     solver = narrowing_solver(twins, device)
-    sums = LossSums(solver, loss, velocity)
-    for frame in _frames(solver, twins, hands, velocity):
-        sums.add(frame)
-        if frame % CHECK_EVERY[device.partition(":")[0]] == 0 and bool(sums.diverged.all()):
-            break
-    return [
-        Outcome(math.inf if frame else cost, int(frame), overflow)
-        for cost, frame, overflow in zip(sums.costs(len(hands) - 1), sums.diverged.tolist(), solver.overflows, strict=True)
+    firsts = accumulate((len(one.twins) for one in each), initial=0)
+    seen = [
+        (LossSums if one.loss else Motions)(solver, one.loss, one.velocity, slice(first, first + len(one.twins)))
+        for one, first in zip(each, firsts, strict=False)
     ]
+    for frame in _frames(solver, each, max(len(one.hands) for one in each)):
+        for one, sums in zip(each, seen, strict=True):
+            if frame < len(one.hands):
+                sums.add(frame)
+        if frame % CHECK_EVERY[device.partition(":")[0]] == 0 and all(sums.ended for sums in seen):
+            break
+    return [sums.result(len(one.hands) - 1) for one, sums in zip(each, seen, strict=True)]
+
+
+def outcomes(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor, loss: FrameLoss, device: str) -> list[Outcome]:
+    """`Rollouts` that are judged, alone."""
+    judged: list[Outcome] = rolled([Rollouts(twins, hands, velocity, loss)], device)[0]
+    return judged
 
 
 def motions(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor, device: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Positions, m, and velocities, m/s, [T - 1, B, N, 3] at the end of each frame of rollouts over hands [T, C, 3], on the CPU."""
-    solver = solver_for(twins, device, differentiable=False)
-    kept: dict[str, list[torch.Tensor]] = {"x": [], "v": []}
-    for _ in _frames(solver, twins, hands, velocity):
-        for name, states in kept.items():
-            states.append(solver.buffers.get_vectors(name, solver.last, solver.nodes).cpu())
-    return torch.stack(kept["x"]), torch.stack(kept["v"])
+    """`Rollouts` whose motion is kept, alone."""
+    kept: tuple[torch.Tensor, torch.Tensor] = rolled([Rollouts(twins, hands, velocity)], device)[0]
+    return kept
 
 
-def _frames(solver: FrameSolver, twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor) -> Iterator[int]:
-    """Simulate frame after frame: 1, 2, ... while the solver holds its end."""
-    count = len(twins)
-    nodes = torch.tensor(twins[0].topology.nodes, device=solver.device)
-    solver.start(nodes.expand(count, -1, -1), velocity.expand(count, -1, -1))
-    every = hands[:, None].expand(-1, count, -1, -1)
-    for frame in range(1, len(hands)):
-        solver.advance(every[frame - 1], every[frame])
+def _frames(solver: FrameSolver, each: Sequence[Rollouts], count: int) -> Iterator[int]:
+    """Simulate frame after frame: 1, 2, ... while the solver holds its end. The hands of a shorter recording stay at its end."""
+    union = Union([twin.topology for one in each for twin in one.twins])
+    nodes = [torch.tensor(one.twins[0].topology.nodes, device=solver.device) for one in each for _ in one.twins]
+    velocities = [one.velocity for one in each for _ in one.twins]
+    solver.start(union.of_nodes(nodes, places=True), union.of_nodes(velocities))
+    lasting = [torch.cat([one.hands, one.hands[-1:].expand(count - len(one.hands), -1, -1)]) for one in each]
+    hands = union.of_controllers([path for one, path in zip(each, lasting, strict=True) for _ in one.twins])
+    for frame in range(1, count):
+        solver.advance(hands[frame - 1], hands[frame])
         yield frame
         solver.go_on()
 
 
-class LossSums:
-    """The sums of a population's losses, on its device."""
+class Motions:
+    """The motion of some twins of a solver."""
 
-    def __init__(self, solver: FrameSolver, loss: FrameLoss, velocity: torch.Tensor) -> None:
-        b = self._buffers = solver.buffers
-        self._solver, self._loss = solver, loss
+    ended = False
+
+    def __init__(self, solver: FrameSolver, loss: None, velocity: torch.Tensor, twins: slice) -> None:
+        self._solver, self._part = solver, solver.buffers.part(twins)
+        self._kept: dict[str, list[torch.Tensor]] = {"x": [], "v": []}
+
+    def add(self, frame: int) -> None:
+        """Keep the end of a frame, which the solver holds."""
+        for name, states in self._kept.items():
+            states.append(self._part.get_vectors(name, self._solver.last, self._part.nodes).cpu())
+
+    def result(self, frames: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Positions and velocities [T - 1, B, N, 3]."""
+        return torch.stack(self._kept["x"]), torch.stack(self._kept["v"])
+
+
+class LossSums:
+    """The sums of a population's losses, on its device; the population is all twins of a solver, or some."""
+
+    def __init__(self, solver: FrameSolver, loss: FrameLoss, velocity: torch.Tensor, twins: slice = slice(None)) -> None:
+        b = self._buffers = solver.buffers.part(twins)
+        self._solver, self._loss, self._twins = solver, loss, twins
         self._kernels = [load(kernel, b.device) for kernel in kernels(b.width)]
         b.add_vectors(before=(b.nodes,), change=(b.nodes,))
         b.set_vectors("before", velocity.expand(b.twins, -1, -1))
@@ -123,13 +165,27 @@ class LossSums:
 
     def costs(self, frames: int) -> list[float]:
         """Mean loss of `frames` frames, of each twin."""
-        totals = self._total.reshape(-1)[: self._buffers.twins] + self._other_terms
+        totals = self._buffers.of_twins(self._total.reshape(-1)) + self._other_terms
         return [float(total) / frames for total in totals.cpu()]
 
     @property
     def diverged(self) -> torch.Tensor:
         """The frame in which each twin left the scene; 0 if it did not."""
-        return self._buffers.tensors["diverged"].reshape(-1)[: self._buffers.twins]
+        return self._buffers.of_twins(self._buffers.tensors["diverged"].reshape(-1))
+
+    @property
+    def ended(self) -> bool:
+        """True where all twins have left the scene."""
+        return bool(self.diverged.all())
+
+    def result(self, frames: int) -> list[Outcome]:
+        """The outcome of each twin after so many frames."""
+        return [
+            Outcome(math.inf if frame else cost, int(frame), overflow)
+            for cost, frame, overflow in zip(
+                self.costs(frames), self.diverged.tolist(), self._solver.overflows[self._twins], strict=True
+            )
+        ]
 
 
 @functools.cache

@@ -15,7 +15,7 @@ from neuspring.core.artifacts import Twin
 from neuspring.core.device import load
 from neuspring.physics import frame
 from neuspring.physics.lanes import LANE_WIDTHS
-from neuspring.physics.solver import union
+from neuspring.physics.union import Union
 from neuspring.twin import trials
 from neuspring.twin.candidates import SearchProblem
 from neuspring.twin.search import SearchResult, search
@@ -55,7 +55,7 @@ def by_topologies(bench: Bench) -> list[Row]:
     scenes = [box(nodes, substeps, size) for size in np.linspace(16, 32, count).astype(int)]
     twins, hands = [twin for twin, _ in scenes], scenes[0][1]
     own = round(statistics.mean([len(twin.topology.springs) for twin in twins]))
-    every = len(union([twin.topology for twin in twins])[0])
+    every = Union([twin.topology for twin in twins]).springs
     bench.notes.append(f"{count} topologies, {bench.device}: {own:,} springs in the mean, {every:,} in the graph of all")
     rows = []
     for kind, gradient in KINDS:

@@ -11,7 +11,8 @@ from torch.nn.functional import smooth_l1_loss
 from neuspring.core.artifacts import Twin
 from neuspring.physics import reference
 from neuspring.physics.parameters import Parameters, packed
-from neuspring.physics.solver import simulate_frame, solver_for, stacked, union
+from neuspring.physics.solver import simulate_frame, solver_for
+from neuspring.physics.union import Union
 from tests.benchmarks.simulators import Frame
 
 
@@ -58,8 +59,8 @@ class Ours:
         Their topologies may differ. Positions [N, 3] and gradient [S] of the frame are those of the first twin.
         """
         solver = solver_for(twins, self.device, block=self.block, differentiable=gradient)
-        pairs, places = union([twin.topology for twin in twins])
-        parameters = stacked([packed(twin, self.device) for twin in twins], places, len(pairs))
+        union = Union([twin.topology for twin in twins])
+        parameters = union.parameters([packed(twin, self.device) for twin in twins])
         x, v, begin, end = (values.expand(len(twins), -1, -1).contiguous() for values in self._start(twins[0], hands))
         last: list[torch.Tensor] = []
 
@@ -75,7 +76,7 @@ class Ours:
 
         def along() -> np.ndarray:
             assert parameters["springs"].grad is not None
-            return of_log_stiffness(parameters["springs"].grad[0], parameters["springs"][0])[places[0]]
+            return of_log_stiffness(parameters["springs"].grad[0], parameters["springs"][0])[union.places[0]]
 
         parameters["springs"].requires_grad_(gradient)
         return Frame(learn if gradient else run, lambda: last[0][0].detach().cpu().numpy(), along if gradient else None)

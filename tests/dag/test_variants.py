@@ -100,7 +100,7 @@ def test_fits_that_share_launches_end_as_they_would_one_by_one(project):
     targets = [f"results/{SCENE}/baseline/{seed}/fit.json" for seed in (0, 1, 2)]
     run(project, changes, "--", *targets)
     results = project / "results" / SCENE
-    record = json.loads((results / "fits.json").read_text())
+    record = json.loads((results / "fits-0.json").read_text())
     assert record["facts"]["batches"] == [targets]
     assert record["facts"]["errors"] == {}
     twins = {seed: (results / "baseline" / seed / "twin.npz").read_bytes() for seed in "012"}

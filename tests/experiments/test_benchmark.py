@@ -442,16 +442,17 @@ def test_scenarios_without_a_pool_are_left_out_of_its_methods(tmp_path: Path) ->
     assert [path for path in Graph(made).runs() if "cloth" in path] == [f"results/cloth/full/{seed}/run.json" for seed in range(3)]
     assert made.applies("one", "a")
     assert in_step(made, "a") == [(name, seed) for name in ("full", "one") for seed in range(3)]
-    job, others = SimpleNamespace(scenario="a"), ["results/b/observations.npz", "results/c/observations.npz"]
+    job, others = SimpleNamespace(scenario="a", launch=0), ["results/b/observations.npz", "results/c/observations.npz"]
     rows = json.loads(Graph(made).options(STAGES["fits"], job)["rows"])
-    assert [row["pool"] for row in rows] == [[], others]
+    pools = {tuple(inputs.get("pool", [])) for row in rows for inputs in row["jobs"].values()}
+    assert pools == {(), tuple(others)}
     assert set(others) < set(Graph(made).inputs(STAGES["fits"])(job)["also"])
     alone = pooled(tmp_path, methods=["full"])
     assert (alone.pools, list(alone.scenarios)) == ({}, ["a"]), "no pool is asked for without such a method"
 
 
 def in_step(made: Benchmark, scenario: str) -> list[tuple[str, int]]:
-    return [(job.method, job.seed) for job in Graph(made).in_step(STAGES["fits"], scenario)]
+    return [(job.method, job.seed) for job in Graph(made).in_step(STAGES["fits"], SimpleNamespace(scenario=scenario, launch=0))]
 
 
 def test_oracles_on_a_pool_have_fits_of_their_own_over_all_frames(tmp_path: Path) -> None:
@@ -698,6 +699,27 @@ def test_fits_of_equal_horizon_share_launches_where_they_are_not_too_few():
     assert pairs(seeds=[0, 1, 2], only="method=search_only") == ()
     three = ["baseline", "neuspring", "no_triplane", "fixed_resolution"]
     assert pairs(seeds=[4], methods=three) == (("neuspring", 4), ("no_triplane", 4), ("fixed_resolution", 4))
+
+
+def test_batches_of_all_scenes_have_each_job_once_and_every_gpu_has_one():
+    scenes = ["toy_rope_lift_smooth", "toy_cloth_lift_smooth", "toy_rope_shake_smooth"]
+
+    def batches(stage: str, slots: int | None = None, **changes: Any) -> list[list[tuple[str, int]]]:
+        made = Benchmark(shipped("toy") | {"scenarios": scenes, "methods": ["baseline"], "seeds": [0, 1]} | changes, ROOT)
+        made.on_gpu, made.gpu_slots = slots is not None, slots or 0
+        graph = Graph(made)
+        launches = [SimpleNamespace(scenario=name, launch=k) for name in scenes for k in range(3)]
+        return [[(job.scenario, job.seed) for job in own] for one in launches if (own := graph.in_step(STAGES[stage], one))]
+
+    every = [(name, seed) for name in scenes for seed in (0, 1)]
+    for stage in ("searches", "fits"):
+        assert batches(stage) == [], "on a CPU each is alone"
+        assert batches(stage, gpus={"batch": 2}) == [every[:2], every[2:4], every[4:]]
+        assert batches(stage, gpus={"batch": 4}) == [every[:3], every[3:]], "as large as one another"
+        assert batches(stage, slots=2) == [every[:3], every[3:]], "a job for each GPU"
+        assert batches(stage, slots=0) == [every], "a cluster decides"
+        assert batches(stage, slots=6) == []
+        assert batches(stage, gpus={"batch": 4}, twins_per_launch=1) == []
 
 
 def test_quirks_of_a_search_row_reach_its_search_and_its_fits_alone() -> None:

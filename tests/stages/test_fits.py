@@ -16,9 +16,10 @@ from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
 from neuspring.stages.fit import fit
-from neuspring.stages.fits import FitRow, fits
+from neuspring.stages.fits import fits
 from neuspring.stages.observe import observe
 from neuspring.stages.search import search
+from neuspring.stages.together import MemberRow
 from neuspring.twin import fit as twin_fit
 from tests.support import small
 
@@ -52,38 +53,43 @@ def text(name: str) -> str:
     return json.dumps({"fit": config.plain(ROWS[name])})
 
 
-def rows_of(started: Path, folder: Path) -> list[FitRow]:
+def rows_of(started: Path, folder: Path) -> list[MemberRow]:
     """Three rows of the method table, two seeds each; the last has another horizon."""
     return [
-        FitRow(
-            kind="field" if name == "field" else "springs",
+        MemberRow(
+            options={"kind": "field" if name == "field" else "springs"},
             settings=text(name),
-            fits={str(folder / name / str(k) / "fit.json"): str(started / f"search-{k}" / "search.json") for k in (0, 1)},
+            jobs={
+                str(folder / name / str(k) / "fit.json"): inputs(started, started / f"search-{k}" / "search.json") for k in (0, 1)
+            },
         )
         for name in ROWS
     ]
 
 
-def together(started: Path, rows: list[FitRow] | str, output: Path, **options: object) -> dict:
+def inputs(started: Path, found: Path) -> dict[str, str]:
+    return {"observations": str(started / "observations.npz"), "search": str(found)}
+
+
+def together(rows: list[MemberRow] | str, output: Path, **options: object) -> dict:
     """The facts of fits that share launches."""
     given = rows if isinstance(rows, str) else json.dumps([asdict(row) for row in rows])
-    fits(observations=started / "observations.npz", rows=given, device="cpu", output=output, **options)
+    fits(rows=given, device="cpu", output=output, **options)
     return StageRecord.load(output).facts
 
 
-def finish(started: Path, rows: list[FitRow]) -> None:
+def finish(rows: list[MemberRow]) -> None:
     """The jobs of the fits themselves."""
     for row in rows:
-        for output, found in row.fits.items():
-            seen, settings = started / "observations.npz", read_settings(row.settings)
-            fit(observations=seen, search=Path(found), settings=settings, kind=row.kind, device="cpu", output=Path(output))
+        for output, given in row.jobs.items():
+            fit(**given, settings=read_settings(row.settings), **row.options, device="cpu", output=Path(output))
 
 
 @pytest.fixture(scope="module")
 def alone(started: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The fits one by one."""
     folder = tmp_path_factory.mktemp("alone")
-    finish(started, rows_of(started, folder))
+    finish(rows_of(started, folder))
     return folder
 
 
@@ -105,16 +111,16 @@ def assert_same(got: Path, wanted: Path) -> None:
 @pytest.mark.parametrize("most", [0, 3])
 def test_what_ran_together_is_continued_to_the_same_end(started: Path, alone: Path, tmp_path: Path, most: int) -> None:
     rows = rows_of(started, tmp_path)
-    facts = together(started, rows, tmp_path / "fits.json", twins_per_launch=most or "auto")
+    facts = together(rows, tmp_path / "fits.json", twins_per_launch=most or "auto")
     sizes = [len(batch) for batch in facts["batches"]]
     # Four of one horizon and two of another; of three at most, one would be alone, and is left to itself.
     assert sizes == ([4, 2] if most == 0 else [3, 2])
     assert facts["errors"] == {}
-    finish(started, rows)
+    finish(rows)
     assert_same(tmp_path, alone)
     shared = {path for batch in facts["batches"] for path in batch}
     for row in rows:
-        for output in row.fits:
+        for output in row.jobs:
             record = StageRecord.load(Path(output))
             assert (record.facts["epochs_together"], record.attempts) == (3 if output in shared else 0, 1)
             assert (record.facts["spring_updates"] == 0) == (output in shared)
@@ -126,17 +132,17 @@ def test_finished_fits_and_failed_searches_are_left_alone(started: Path, alone: 
     rows = rows_of(started, alone)
     broken = tmp_path / "failed.json"
     replace(StageRecord.load(started / "search-0" / "search.json"), status="failed", reason="x").save(broken)
-    rows.append(FitRow(fits={str(tmp_path / "a" / "fit.json"): str(broken)}))
+    rows.append(MemberRow(jobs={str(tmp_path / "a" / "fit.json"): inputs(started, broken)}))
     before = {path: path.stat().st_mtime_ns for path in alone.rglob("*") if path.is_file()}
-    assert together(started, rows, tmp_path / "fits.json")["batches"] == []
+    assert together(rows, tmp_path / "fits.json")["batches"] == []
     assert {path: path.stat().st_mtime_ns for path in alone.rglob("*") if path.is_file()} == before
 
 
 def test_a_fit_with_other_settings_is_made_again(started: Path, alone: Path, tmp_path: Path) -> None:
     rows = rows_of(started, tmp_path)
-    finish(started, rows)
+    finish(rows)
     longer = [replace(row, settings=json.dumps({"fit": {"epochs": 4}})) for row in rows[:1]]
-    assert len(together(started, longer, tmp_path / "fits.json")["batches"][0]) == 2
+    assert len(together(longer, tmp_path / "fits.json")["batches"][0]) == 2
 
 
 def test_an_error_of_one_is_named_and_holds_nobody_up(
@@ -151,9 +157,9 @@ def test_an_error_of_one_is_named_and_holds_nobody_up(
 
     with monkeypatch.context() as patch:
         patch.setattr(twin_fit, "fit", failing)
-        errors = together(started, rows, tmp_path / "fits.json")["errors"]
+        errors = together(rows, tmp_path / "fits.json")["errors"]
     assert errors == {str(tmp_path / "field" / "1" / "fit.json"): "MemoryError: too large"}
-    finish(started, rows)
+    finish(rows)
     assert_same(tmp_path, alone)
 
 
@@ -162,4 +168,4 @@ def test_an_error_of_one_is_named_and_holds_nobody_up(
 )
 def test_bad_rows(started: Path, tmp_path: Path, given: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        together(started, given, tmp_path / "fits.json")
+        together(given, tmp_path / "fits.json")

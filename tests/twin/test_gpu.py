@@ -35,7 +35,7 @@ def test_a_search_judges_candidates_as_the_cpu_does():
 
 
 def test_a_fit_learns_what_the_cpu_does():
-    settings = config.Fit(epochs=3, learning_rate=5e-3, checkpoint_every=1)
+    settings = config.Fit(epochs=3, learning_rate=5e-3)
     found, wanted = (fit(small.fit_problem(fit=settings, device=device)) for device in ("cuda:0", "cpu"))
     np.testing.assert_allclose(found.history["loss"], wanted.history["loss"], rtol=LOSS)
     apart = np.abs(found.twin.material.stiffness.astype(float) / wanted.twin.material.stiffness - 1)

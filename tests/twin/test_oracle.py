@@ -15,9 +15,10 @@ from neuspring.core.records import StageRecord
 from neuspring.physics.parameters import twin_tensors
 from neuspring.stages.fit import fit as fit_stage
 from neuspring.stages.fit import prepared
-from neuspring.stages.fits import FitRow, fits
+from neuspring.stages.fits import fits
 from neuspring.stages.rollout import rollout
 from neuspring.stages.search import search as search_stage
+from neuspring.stages.together import MemberRow
 from neuspring.twin.fit import fit
 from neuspring.twin.losses import FrameLoss
 from tests.support import small
@@ -89,10 +90,12 @@ def test_an_oracle_in_shared_launches_is_the_oracle_alone(started, tmp_path):
     seen, found = started / "observations.npz", started / "search.json"
     settings = json.dumps({"fit": config.plain(SETTINGS.fit)})
     names = ["normal", "oracle", "oracle_again"]
+    inputs = {"observations": str(seen), "search": str(found)}
     rows = [
-        FitRow(settings=settings, oracle=name != "normal", fits={str(tmp_path / name / "fit.json"): str(found)}) for name in names
+        MemberRow(settings=settings, options={"oracle": name != "normal"}, jobs={str(tmp_path / name / "fit.json"): inputs})
+        for name in names
     ]
-    fits(observations=seen, rows=json.dumps([asdict(row) for row in rows]), device="cpu", output=tmp_path / "fits.json")
+    fits(rows=json.dumps([asdict(row) for row in rows]), device="cpu", output=tmp_path / "fits.json")
     batches = StageRecord.load(tmp_path / "fits.json").facts["batches"]
     assert batches == [[str(tmp_path / name / "fit.json") for name in names[1:]]]
     twins = []

@@ -15,7 +15,8 @@ from neuspring import config
 from neuspring.core.artifacts import Observations, Topology, Twin
 from neuspring.physics.controllers import waypoints
 from neuspring.physics.parameters import packed
-from neuspring.physics.solver import FrameSolver, narrowing_solver, solver_for, stacked, union
+from neuspring.physics.solver import FrameSolver, narrowing_solver, solver_for
+from neuspring.physics.union import Union
 from neuspring.twin.candidates import SearchProblem, candidate
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.rollout import FAR_AWAY, Diverged, frames
@@ -293,7 +294,8 @@ def topology(springs: np.ndarray) -> Topology:
 
 @given(graphs(), st.randoms(use_true_random=False))
 def test_the_union_has_every_spring_once_and_knows_where(each, random):
-    pairs, places = union([topology(springs) for springs in each])
+    union = Union([topology(springs) for springs in each])
+    (pairs,), places = union.tables, union.places
     ends = {frozenset(pair) for pair in pairs.tolist()}
     assert len(ends) == len(pairs)
     assert ends == {frozenset(pair) for springs in each for pair in springs.tolist()}
@@ -304,7 +306,7 @@ def test_the_union_has_every_spring_once_and_knows_where(each, random):
     for springs in random.sample(each, len(each)):
         turned = [pair[::-1] if random.random() < 0.5 else pair for pair in random.sample(springs.tolist(), len(springs))]
         others.append(topology(np.array(sorted(turned, key=lambda pair: max(pair) >= 5), np.int32)))
-    again, _ = union(others)
+    (again,) = Union(others).tables
     np.testing.assert_array_equal(again, pairs)
 
 
@@ -312,9 +314,9 @@ def test_the_union_has_every_spring_once_and_knows_where(each, random):
 def test_springs_that_a_twin_lacks_have_no_strength_in_it(each):
     """Its own stand where the union says."""
     rng = np.random.default_rng(0)
-    pairs, places = union([topology(springs) for springs in each])
+    union = Union([topology(springs) for springs in each])
     one = packed(candidate(small.search_problem(), small.start_values()))
     own = [one | {"springs": torch.tensor(rng.uniform(1.0, 2.0, (len(springs), 3)))} for springs in each]
-    for parameters, springs, got in zip(own, each, stacked(own, places, len(pairs))["springs"], strict=True):
+    for parameters, springs, got in zip(own, each, union.parameters(own)["springs"], strict=True):
         values = {frozenset(pair): row for pair, row in zip(springs.tolist(), parameters["springs"].tolist(), strict=True)}
-        assert got.tolist() == [values.get(frozenset(pair), [0.0, 0.0, 0.0]) for pair in pairs.tolist()]
+        assert got.tolist() == [values.get(frozenset(pair), [0.0, 0.0, 0.0]) for pair in union.tables[0].tolist()]

@@ -88,6 +88,7 @@ GPU = int(
     CONFIG.device == "cuda" or (CONFIG.device == "auto" and (CLUSTER or bool(POOL)))
 )
 BENCHMARK.on_gpu = bool(GPU)
+BENCHMARK.gpu_slots = len(POOL) * CONFIG.gpus.jobs_per_gpu
 GRAPH = Graph(BENCHMARK)
 FRESH = Freshness(GRAPH)
 NEEDS = needs.Needs(BENCHMARK, "gpu" if GPU else "cpu")
@@ -169,10 +170,7 @@ def compared_with_records(stage):
         if stage.together and workflow.is_main_process:
             # Launches are shared again if some job that takes part is to be done, and in no other case.
             member = STAGES[stage.together.stage]
-            if any(
-                unfinished(member, one)
-                for one in GRAPH.in_step(stage, wildcards.scenario)
-            ):
+            if any(unfinished(member, one) for one in GRAPH.in_step(stage, wildcards)):
                 workflow.dag.forcefiles.add(output)
         return find(wildcards)
 

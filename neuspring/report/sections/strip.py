@@ -35,7 +35,7 @@ def strip(material: ReportData) -> PageSection | None:
         films = {name: material.file(run, "images", "video") for name, run in material.first_runs(scenario).items()}
         ends = {name: end for name, path in films.items() if path and (end := material.read(path, last_frame))}
         longest = max((count for count, _ in ends.values()), default=0)
-        figures = []
+        figures: list[Picture] = []
         for name, (count, picture) in sorted(ends.items(), key=lambda pair: pair[1][0] < longest):
             across = picture.shape[1] // 3
             stopped = f", which ends at frame {count - 1}" * (count < longest)

@@ -79,7 +79,7 @@ and it goes on for the rest of dt.
             threads=options.threads,
             together=options.together,
         )
-        return search(problem, options.seed, record=options.record, key=options.key)
+        return search(problem, options.seed, record=options.record, key=options.key, lane=options.lane)
 
     def fit(self, problem: FitProblem, *, partial: Path | None = None, key: str = "", threads: int = 1) -> FitResult:
         """Adam, with gradients through the simulation; see `fit.fit`. It has one thread."""
