@@ -47,7 +47,7 @@ class Steps:
 def steps(monkeypatch):
     one = Steps()
     monkeypatch.setattr(chain, "_run", one.run)
-    monkeypatch.setattr(chain.Chain, "_tell", lambda self, scenario: print(f"told of {scenario.name}") or 0)
+    monkeypatch.setattr(chain.TwinChain, "_tell", lambda self, scenario: print(f"told of {scenario.name}") or 0)
     return one
 
 
@@ -81,7 +81,7 @@ def test_the_commands_of_the_tutorial_run_in_their_order(film, steps, capsys):
     assert 'scenarios=["out"]' in page and 'methods=["static", ' in page and "effort=quick" in page
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(" ...")[0] for line in lines if line[0] == "["] == [
-        f"[{index}/7] {name}" for index, name in enumerate(chain.STEPS, start=1)
+        f"[{index}/7] {name}" for index, name in enumerate(chain.TWIN_STEPS, start=1)
     ]
     assert sum(line.startswith(f"$ {sys.executable} -m ") for line in lines) == 7, "each can be run alone"
     assert lines[-1] == "told of out"
@@ -193,4 +193,4 @@ def test_a_file_is_a_video_or_a_recording(name, tmp_path, steps):
 def test_the_command_that_made_each_step_is_kept(film, steps):
     assert with_masks(film) == 0
     kept = json.loads((film.parent / "out" / chain.STEPS_DONE).read_text())
-    assert kept["capture"][3] == "make-capture" and kept["window"] == ["all"] and {*chain.STEPS} <= kept.keys()
+    assert kept["capture"][3] == "make-capture" and kept["window"] == ["all"] and {*chain.TWIN_STEPS} <= kept.keys()
