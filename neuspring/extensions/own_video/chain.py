@@ -20,15 +20,15 @@ from neuspring.core.files import load_json, write_text
 from neuspring.core.run_folder import RunFolder
 from neuspring.data.capture import CAPTURE, read_description
 from neuspring.experiments.local import workflow_command, workflow_folder
-from neuspring.extensions.own_video.commands import Wish
+from neuspring.extensions.own_video.options import Wish
 
-STEPS = ("capture", "masks", "check", "observe", "search", "fit", "page")
+TWIN_STEPS = ("capture", "masks", "check", "observe", "search", "fit", "page")
 STEPS_DONE = "steps.json"
 """Step -> its command, once it has succeeded; `window`: the frames that were chosen."""
 PROPOSED = re.compile(r"--frames (\d+-\d+)")
 """The longest constant grip, which `check-data` proposes first."""
 WINDOW = re.compile(r"all|\d+-\d+")
-FILM_ENDINGS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
+MOVIE_ENDINGS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 LOOK_FOR_MASKS, GRACE = 0.5, 2.0
 """s between two looks whether masks were saved, and until the page that saved them ends."""
 LAST_LINES = 8
@@ -41,7 +41,7 @@ class StepFailed(Exception):
     """A step ended without success; the argument is its exit status."""
 
 
-class Chain:
+class TwinChain:
     """The steps of one wish. Raises InputError for what cannot be, before anything is run or written."""
 
     def __init__(self, wish: Wish) -> None:
@@ -72,7 +72,7 @@ class Chain:
                 self._make_capture()
             self._masks()
             chosen = self._window()
-            for step in STEPS[3:]:
+            for step in TWIN_STEPS[3:]:
                 self._workflow(step, chosen)
         except StepFailed as failed:
             return int(failed.args[0])
@@ -149,7 +149,7 @@ class Chain:
     def _workflow(self, step: str, capture: Path) -> None:
         chosen: dict[str, object] = {"scenarios": [capture.name], "methods": list(dict.fromkeys([BESIDE, self.method]))}
         chosen |= {"data_root": str(capture.parent), "compare_with": BESIDE, "results": "results", "effort": self.wish.effort}
-        until = [] if step == STEPS[-1] else ["--until", step]
+        until = [] if step == TWIN_STEPS[-1] else ["--until", step]
         settings = [f"{key}={value if isinstance(value, str) else json.dumps(value)}" for key, value in chosen.items()]
         options = ["--directory", str(self.folder), *until, "--config", *settings]
         self._step(step, workflow_command("own", *options, cores=self.wish.cores))
@@ -158,7 +158,7 @@ class Chain:
 
     def _step(self, name: str, command: list[str], made: bool = False, run: Callable[[list[str], Path], int] | None = None) -> Path:
         """Run a step unless it is `made`; returns its log. Raises StepFailed."""
-        log = self.folder / "logs" / f"{STEPS.index(name) + 1}_{name}.log"
+        log = self.folder / "logs" / f"{TWIN_STEPS.index(name) + 1}_{name}.log"
         print(f"$ {shlex.join(command)}", flush=True)
         if made or self.wish.dry_run:
             self._say(name, "done before" if made else "not run")
@@ -178,7 +178,7 @@ class Chain:
         return log
 
     def _say(self, name: str, text: str, end: str = "\n") -> None:
-        print(f"[{STEPS.index(name) + 1}/{len(STEPS)}] {name} {text}", end=end, flush=True)
+        print(f"[{TWIN_STEPS.index(name) + 1}/{len(TWIN_STEPS)}] {name} {text}", end=end, flush=True)
 
     def _keep(self, name: str, words: list[str]) -> None:
         if not self.wish.dry_run:
@@ -224,7 +224,7 @@ def _require_window(where: str, text: str) -> None:
 
 def _parts(film: Path) -> list[str]:
     """The options of make-capture that name the parts of a film."""
-    if film.is_file() and film.suffix.lower() in FILM_ENDINGS:
+    if film.is_file() and film.suffix.lower() in MOVIE_ENDINGS:
         return ["--color", str(film)]
     inside = sorted(film.iterdir()) if film.is_dir() else []
     options: list[str] = []

@@ -7,9 +7,12 @@ from pathlib import Path
 import pytest
 
 from neuspring.cli.main import main
-from neuspring.core.files import write_text
+from neuspring.core.files import write_table, write_text
+from neuspring.core.run_folder import RunFolder
 from neuspring.extensions.own_video import chain
-from tests.support import captures
+from neuspring.extensions.own_video.options import Wish
+from neuspring.scores import metrics
+from tests.support import captures, played
 
 NOTE = "note: hands within 5 cm: 0-2: 1, 3-4: 2: neuspring cut-capture x --frames 0-2 or --frames 3-4 --output ..."
 
@@ -47,7 +50,7 @@ class Steps:
 def steps(monkeypatch):
     one = Steps()
     monkeypatch.setattr(chain, "_run", one.run)
-    monkeypatch.setattr(chain.Chain, "_tell", lambda self, scenario: print(f"told of {scenario.name}") or 0)
+    monkeypatch.setattr(chain.TwinChain, "_tell", lambda self, scenario: print(f"told of {scenario.name}") or 0)
     return one
 
 
@@ -81,7 +84,7 @@ def test_the_commands_of_the_tutorial_run_in_their_order(film, steps, capsys):
     assert 'scenarios=["out"]' in page and 'methods=["static", ' in page and "effort=quick" in page
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(" ...")[0] for line in lines if line[0] == "["] == [
-        f"[{index}/7] {name}" for index, name in enumerate(chain.STEPS, start=1)
+        f"[{index}/7] {name}" for index, name in enumerate(chain.TWIN_STEPS, start=1)
     ]
     assert sum(line.startswith(f"$ {sys.executable} -m ") for line in lines) == 7, "each can be run alone"
     assert lines[-1] == "told of out"
@@ -193,4 +196,19 @@ def test_a_file_is_a_video_or_a_recording(name, tmp_path, steps):
 def test_the_command_that_made_each_step_is_kept(film, steps):
     assert with_masks(film) == 0
     kept = json.loads((film.parent / "out" / chain.STEPS_DONE).read_text())
-    assert kept["capture"][3] == "make-capture" and kept["window"] == ["all"] and {*chain.STEPS} <= kept.keys()
+    assert kept["capture"][3] == "make-capture" and kept["window"] == ["all"] and {*chain.TWIN_STEPS} <= kept.keys()
+
+
+def test_the_end_names_errors_beside_static_the_page_and_how_to_play(tmp_path, capsys):
+    scenario = played.results(tmp_path / "out" / "results", ("static", "neuspring"))
+    for method in ("static", "neuspring"):
+        run = RunFolder.of(scenario / method / "0")
+        write_table(metrics.score(run.trajectory, run.observations, method, 0), run.folder / "scores.parquet")
+    write_text(tmp_path / "out" / "results" / "tables" / "report.html", "")
+    whole = chain.TwinChain(Wish(film=tmp_path, output=tmp_path / "out", method="neuspring"))
+    assert whole._tell(scenario) == 0
+    first, *rows, page, play = capsys.readouterr().out.splitlines()
+    assert first == "Errors in mm, future frames (training frames):" and [row.split()[0] for row in rows] == ["static", "neuspring"]
+    value = 1000 * run.scores.set_index(["task", "metric"])["value"]["future", "chamfer"]
+    assert f"chamfer {value:.1f} (" in rows[1]
+    assert page.endswith("tables/report.html") and play.endswith(f"neuspring play {scenario / 'neuspring' / '0'}")
