@@ -712,12 +712,12 @@ def test_batches_of_all_scenes_have_each_job_once_and_every_gpu_has_one():
         return [[(job.scenario, job.seed) for job in own] for one in launches if (own := graph.in_step(STAGES[stage], one))]
 
     every = [(name, seed) for name in scenes for seed in (0, 1)]
-    for stage in ("searches", "fits"):
-        assert batches(stage) == [], "on a CPU each is alone"
-        assert batches(stage, gpus={"batch": 2}) == [every[:2], every[2:4], every[4:]]
-        assert batches(stage, gpus={"batch": 4}) == [every[:3], every[3:]], "as large as one another"
-        assert batches(stage, slots=2) == [every[:3], every[3:]], "a job for each GPU"
-        assert batches(stage, slots=0) == [every], "a cluster decides"
+    for several in ("searches", "fits"):
+        assert batches(several) == [], "on a CPU each is alone"
+        assert batches(several, gpus={"batch": 2}) == [every[:2], every[2:4], every[4:]]
+        assert batches(several, gpus={"batch": 4}) == [every[:3], every[3:]], "as large as one another"
+        assert batches(several, slots=2) == [every[:3], every[3:]], "a job for each GPU"
+        assert batches(several, slots=0) == [every], "a cluster decides"
         assert batches(stage, slots=6) == []
         assert batches(stage, gpus={"batch": 4}, twins_per_launch=1) == []
 
