@@ -718,8 +718,8 @@ def test_batches_of_all_scenes_have_each_job_once_and_every_gpu_has_one():
         assert batches(several, gpus={"batch": 4}) == [every[:3], every[3:]], "as large as one another"
         assert batches(several, slots=2) == [every[:3], every[3:]], "a job for each GPU"
         assert batches(several, slots=0) == [every], "a cluster decides"
-        assert batches(stage, slots=6) == []
-        assert batches(stage, gpus={"batch": 4}, twins_per_launch=1) == []
+        assert batches(several, slots=6) == []
+        assert batches(several, gpus={"batch": 4}, twins_per_launch=1) == []
 
 
 def test_quirks_of_a_search_row_reach_its_search_and_its_fits_alone() -> None:
