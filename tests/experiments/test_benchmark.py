@@ -704,12 +704,12 @@ def test_fits_of_equal_horizon_share_launches_where_they_are_not_too_few():
 def test_batches_of_all_scenes_have_each_job_once_and_every_gpu_has_one():
     scenes = ["toy_rope_lift_smooth", "toy_cloth_lift_smooth", "toy_rope_shake_smooth"]
 
-    def batches(stage: str, slots: int | None = None, **changes: Any) -> list[list[tuple[str, int]]]:
+    def batches(kind: str, slots: int | None = None, **changes: Any) -> list[list[tuple[str, int]]]:
         made = Benchmark(shipped("toy") | {"scenarios": scenes, "methods": ["baseline"], "seeds": [0, 1]} | changes, ROOT)
         made.on_gpu, made.gpu_slots = slots is not None, slots or 0
         graph = Graph(made)
         launches = [SimpleNamespace(scenario=name, launch=k) for name in scenes for k in range(3)]
-        return [[(job.scenario, job.seed) for job in own] for one in launches if (own := graph.in_step(STAGES[stage], one))]
+        return [[(job.scenario, job.seed) for job in own] for one in launches if (own := graph.in_step(STAGES[kind], one))]
 
     every = [(name, seed) for name in scenes for seed in (0, 1)]
     for several in ("searches", "fits"):
