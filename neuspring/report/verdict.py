@@ -177,8 +177,8 @@ class Duel:
             table = part.pivot_table(index="method", columns="metric", values="value")
             table = table.dropna() if {"track_error", "iou"} <= set(table) else table[:0]
             if len(table) and table["track_error"].idxmin() == table["iou"].idxmin() and table["iou"].nunique() > 1:
-                best = table["track_error"].idxmin()
-                values = " and ".join(METRICS[name].told(table[name][best]) for name in ("track_error", "iou"))
+                best = str(table["track_error"].idxmin())
+                values = " and ".join(METRICS[name].told(float(table[name].min())) for name in ("track_error", "iou"))
                 found.append(f"{self.numbers.name(best)} in {scenario} ({values})")
         return [f"The best track error goes with the worst IoU: {listed(found, MOST_SAID)}. {TWO_MEASURES}"] if found else []
 

@@ -208,7 +208,7 @@ class BatchedFits(Shared):
             lane.asked = own
         # A lane without a request repeats its last one.
         begin, end, x, v, parameters = zip(*(lane.asked for lane in self._members), strict=True)
-        hands = [union.of_controllers(places) for places in (begin, end)]
+        hands = union.of_controllers(begin), union.of_controllers(end)
         state = union.of_nodes(x, places=True), union.of_nodes(v)
         before = solver.overflows if solver.simulation.self_collision else None
         after = solver.run(*hands, *state, union.parameters(parameters))
