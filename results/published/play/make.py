@@ -1,7 +1,7 @@
-"""Pictures of the playground for its page: `python -m results.published.play.make RESULTS/SCENARIO OUTPUT [--pulled GIF]`.
+"""Pictures of the playground for its page: `python -m results.published.play.make RESULTS/SCENARIO OUTPUT`.
 
 A headless Chromium opens the page as a user does. The scenario should be synthetic, with splats, and have runs of `neuspring` and
-`baseline`; pictures of real footage are not for this repository. With --pulled a film of a twin that is pulled is made.
+`baseline`; pictures of real footage are not for this repository.
 """
 
 from __future__ import annotations
@@ -12,9 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from PIL import Image, ImageDraw
 
-from neuspring.draw.film import write_gif
 from neuspring.extensions.play.page import Page
 from neuspring.extensions.play.serve import address, start
 from neuspring.report.shown import find
@@ -26,8 +24,6 @@ QUALITY = 82
 PATIENCE = 900.0
 SECONDS = 20
 """Seconds that a picture is given."""
-MOVES, AFTER, REACH = 24, 8, 130
-"""Steps of the mouse in a film, pictures after it let go, and how far it pulls, pixels."""
 CLOSE_NOTES = "document.querySelectorAll('.mantine-Notification-closeButton').forEach((one) => one.click())"
 
 
@@ -36,7 +32,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scenario", type=Path)
     parser.add_argument("output", type=Path)
-    parser.add_argument("--pulled", type=Path, help="make this GIF alone")
     a = parser.parse_args()
     a.output.mkdir(parents=True, exist_ok=True)
     found = find([a.scenario])
@@ -46,9 +41,6 @@ def main() -> None:
         with Browser(served=True, webgl=True, patience=PATIENCE) as browser:
             browser.open(address(server), *WINDOW)
             until(server.get_clients, PATIENCE)
-            if a.pulled:
-                pulled(page, browser, server, a.pulled)
-                return
             recording(page, browser, a.output)
             live(page, browser, server, a.output)
     finally:
@@ -88,43 +80,6 @@ def live(page: Page, browser: Browser, server, output: Path) -> None:
         settle()
         save(browser, output / "live.jpg")
     page.panel.stop()
-
-
-def pulled(page: Page, browser: Browser, server, path: Path) -> None:
-    """A twin that the mouse pulls aside and up, swings back, and lets go: a picture per step of the mouse, as a GIF that loops."""
-    settle()
-    browser.run(CLOSE_NOTES)
-    change(page, splats=True, nodes=False, springs=False, points=False)
-    page.panel.start(page.player.display.runs[0])
-    choose_tab(browser, "Live")
-    one = page.panel.live
-    assert one is not None
-    until(lambda: one.simulator.frame > 5, PATIENCE)
-    camera = next(iter(server.get_clients().values())).camera
-    x, y = pixel(camera, one.simulator.positions[int(np.argmax(one.simulator.positions[:, 0]))])
-    wide, pictures = int(camera.image_width), []
-    turns = np.linspace(0, 2 * np.pi, MOVES, endpoint=False)
-    path_of_mouse = [(x + REACH * np.sin(turn), y - 0.6 * REACH * (1 - np.cos(turn))) for turn in turns]
-    browser._mouse("mouseMoved", x, y, 0)
-    browser._mouse("mousePressed", x, y, 0)
-    for k, at in enumerate([*path_of_mouse, *[path_of_mouse[0]] * AFTER]):
-        if k < MOVES:
-            browser._mouse("mouseMoved", *at, 0, buttons=1)
-        elif k == MOVES:
-            browser._mouse("mouseReleased", *at, 0)
-        begun = one.simulator.frame
-        until(lambda begun=begun: one.simulator.frame >= begun + 2, PATIENCE)
-        time.sleep(SECONDS / 8)
-        picture = path.with_suffix(".png")
-        browser.screenshot(picture, height=WINDOW[1])
-        image = Image.open(picture).convert("RGB").crop((0, 0, wide, WINDOW[1]))
-        draw = ImageDraw.Draw(image)
-        draw.ellipse((at[0] - 6, at[1] - 6, at[0] + 6, at[1] + 6), outline=(220, 60, 0), width=3)
-        pictures.append(np.asarray(image.resize((round(0.55 * wide), round(0.55 * WINDOW[1])))))
-        picture.unlink()
-    page.panel.stop()
-    write_gif(path, pictures, 10.0)
-    print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
 
 
 def future_frame(page: Page) -> int:
