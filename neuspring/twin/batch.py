@@ -157,7 +157,7 @@ class BatchedSearches(Shared):
 
 
 def physics_with(twin: Twin, always: bool) -> tuple[Any, ...]:
-    """What rollouts must have in common to share launches: the physics, and the points too unless hands `always` hold."""
+    """The physics, which rollouts that share launches have in common, and the points too unless hands `always` hold."""
     points = () if always else (twin.topology.nodes.tobytes(), twin.topology.controllers.shape)
     return physics_of(twin.simulation), points
 
@@ -208,7 +208,7 @@ class BatchedFits(Shared):
             lane.asked = own
         # A lane without a request repeats its last one.
         begin, end, x, v, parameters = zip(*(lane.asked for lane in self._members), strict=True)
-        hands = [union.of_controllers(places) for places in (begin, end)]
+        hands = union.of_controllers(begin), union.of_controllers(end)
         state = union.of_nodes(x, places=True), union.of_nodes(v)
         before = solver.overflows if solver.simulation.self_collision else None
         after = solver.run(*hands, *state, union.parameters(parameters))
