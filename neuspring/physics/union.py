@@ -15,7 +15,7 @@ import torch
 from neuspring.core.artifacts import Topology
 from neuspring.physics.parameters import PARAMETERS, Parameters
 
-FAR, APART = 1e4, 1.0
+ASIDE, ASIDE_STEP = 1e4, 1.0
 """Place along x of the first point that stands for none, and from there to the next, m."""
 
 
@@ -58,7 +58,7 @@ class Union:
         """[B, N, 3] from [N_k, 3] of each; the rest is 0, or with `places` where points stand that are none."""
         rest = values[0].new_zeros((self.nodes, 3))
         if places:
-            rest[:, 0] = FAR + APART * torch.arange(self.nodes, device=rest.device)
+            rest[:, 0] = ASIDE + ASIDE_STEP * torch.arange(self.nodes, device=rest.device)
         return torch.stack([torch.cat([one, rest[len(one) :]]) if len(one) < self.nodes else one for one in values])
 
     def of_controllers(self, values: Sequence[torch.Tensor]) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""What stages have in common that do the jobs of another one together, with shared launches: `searches`, `fits`.
+"""Common parts of stages that do the jobs of another one together, with shared launches: `searches`, `fits`.
 
 A job of theirs leaves what each of its members would leave behind if it were killed at its end, and the member's own job continues
 from there: to its end, if nothing went wrong. So they make no result of their own, and an error in one member costs time alone.
@@ -42,7 +42,7 @@ def rows_of(members: Sequence[Member]) -> dict[str, str]:
 
 
 def physics(rows: Rows) -> tuple[Any, ...]:
-    """What the scenario table says of the physics: a launch has one."""
+    """The physics, of which a launch has one, as the scenario table says it."""
     return rows.scenario.self_collision, rows.scenario.ground
 
 

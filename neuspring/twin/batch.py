@@ -157,7 +157,7 @@ class BatchedSearches(Shared):
 
 
 def physics_with(twin: Twin, always: bool) -> tuple[Any, ...]:
-    """What rollouts must have in common to share launches: the physics, and the points too unless hands `always` hold."""
+    """The physics, which rollouts that share launches have in common, and the points too unless hands `always` hold."""
     points = () if always else (twin.topology.nodes.tobytes(), twin.topology.controllers.shape)
     return physics_of(twin.simulation), points
 

@@ -99,16 +99,16 @@ def test_costs_and_products_of_a_polish_are_means_over_the_recordings():
 def test_a_neighbor_that_leaves_one_recording_has_no_slope(monkeypatch):
     problem, calls = on_pool(polished(seen(LIFTED)), SHAKEN), []
     polish = Polish(problem.search, [problem.variables.index(name) for name in problem.search.polished], problem.encode(), 1.0)
-    motions = module.motions
+    launch = module.launch
 
     def leaving(*arguments):
-        x, v = motions(*arguments)
+        x, v = launch(*arguments)
         calls.append(1)
         if len(calls) == 2:
             x[-1, 2] = float("nan")
         return x, v
 
-    monkeypatch.setattr(module, "motions", leaving)
+    monkeypatch.setattr(module, "launch", leaving)
     rows = module.slope_rows(problem, polish.ask(), False, polish.steps(), 0, 0)
     assert len(calls) == 2
     assert [row["cost"] < PENALTY for row in rows] == [True, True, False, True]
