@@ -11,6 +11,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from typing import Any, TypeVar
 
 import torch
@@ -81,6 +82,9 @@ class Shared(ABC):
     A request is what it asks for and its inputs.
     """
 
+    one_at_a_time = False
+    """True where a work runs only while all others wait."""
+
     def __init__(self, lanes: Sequence[AnyLane]) -> None:
         self.lanes = lanes
         self._active = list(lanes)
@@ -140,7 +144,12 @@ class SearchLane:
 
 
 class BatchedSearches(Shared):
-    """Searches whose candidates are rolled out together, generation by generation, whatever their scenes."""
+    """Searches whose candidates are rolled out together, generation by generation, whatever their scenes.
+
+    They make their candidates one after the other: Warp's tables of kernels are not made for threads.
+    """
+
+    one_at_a_time = True
 
     def __init__(self, count: int, device: str) -> None:
         super().__init__([SearchLane(self) for _ in range(count)])
@@ -263,7 +272,7 @@ def _run(batch: Shared, works: Sequence[Callable[[Any], T]]) -> list[T | Excepti
     def run(lane: Any, work: Callable[[Any], T]) -> T | Exception:
         try:
             # Backward passes run in the thread that asks for them, on CUDA too: one thread for all would wait for itself.
-            with torch.autograd.set_multithreading_enabled(False):
+            with torch.autograd.set_multithreading_enabled(False), batch.turn if batch.one_at_a_time else nullcontext():
                 return work(lane)
         except Exception as error:
             return error

@@ -5,9 +5,9 @@ import shutil
 
 import pytest
 
-from tests.dag.test_variants import OTHER
 from tests.support.project import SCENE, run
 
+OTHER = "toy_cloth_lift_smooth"
 TARGETS = [f"results/{name}/baseline/0/fit.json" for name in (SCENE, OTHER)]
 CHANGES = {"methods": ["baseline"], "scenarios": [SCENE, OTHER], "seeds": [0], "fit": {"epochs": 2}}
 

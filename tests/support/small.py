@@ -9,13 +9,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pandas as pd
 import torch
 
 from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.scenes.synthetic import toy
 from neuspring.twin.candidates import SearchProblem, candidate
-from neuspring.twin.fit import FitProblem
+from neuspring.twin.fit import FitProblem, FitResult
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.trials import Outcome, outcomes
 
@@ -124,3 +126,15 @@ def fit_problem(seen: Observations | None = None, values: dict[str, float] | Non
         "quirks": search.quirks,
     }
     return FitProblem(**(settings | changes))  # type: ignore[arg-type]
+
+
+def assert_same_fit(got: FitResult | Exception, wanted: FitResult) -> None:
+    """Equal histories and twins, bit for bit."""
+    assert isinstance(got, FitResult), got
+    pd.testing.assert_frame_equal(got.history, wanted.history, check_exact=True)
+    for name in ("best_epoch", "best_loss", "rollbacks"):
+        assert got.facts[name] == wanted.facts[name]
+    assert got.twin.simulation == wanted.twin.simulation
+    for part in ("topology", "material"):
+        for name, value in vars(getattr(wanted.twin, part)).items():
+            np.testing.assert_array_equal(getattr(getattr(got.twin, part), name), value, err_msg=name)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 
-import numpy as np
-import pandas as pd
 import pytest
 import torch
 
@@ -40,21 +38,10 @@ def in_a_batch(problems: list[FitProblem], **more) -> list[FitResult | Exception
     return run_batch([problem.twin for problem in problems], "cpu", works)
 
 
-def assert_equal(got: FitResult | Exception, wanted: FitResult) -> None:
-    assert isinstance(got, FitResult), got
-    pd.testing.assert_frame_equal(got.history, wanted.history, check_exact=True)
-    for name in ("best_epoch", "best_loss", "rollbacks"):
-        assert got.facts[name] == wanted.facts[name]
-    assert got.twin.simulation == wanted.twin.simulation
-    for part in ("topology", "material"):
-        for name, value in vars(getattr(wanted.twin, part)).items():
-            np.testing.assert_array_equal(getattr(getattr(got.twin, part), name), value, err_msg=name)
-
-
 def test_fits_in_a_batch_equal_those_alone() -> None:
     problems = several()
     for got, problem in zip(in_a_batch(problems), problems, strict=True):
-        assert_equal(got, fit(problem))
+        small.assert_same_fit(got, fit(problem))
 
 
 def test_fits_in_step_share_their_launches(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -76,7 +63,7 @@ def test_one_that_fails_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None
     results = in_a_batch([problems[0], broken, problems[2]])
     assert isinstance(results[1], NumericalFailure)
     for k in (0, 2):
-        assert_equal(results[k], fit(problems[k]))
+        small.assert_same_fit(results[k], fit(problems[k]))
 
 
 def test_an_error_in_the_shared_launch_reaches_everyone(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -94,7 +81,7 @@ def test_self_collision_in_a_batch() -> None:
     crowded = replace(seen, scenario=replace(seen.scenario, self_collision=True))
     problems = [small.fit_problem(crowded, fit=replace(base.fit, learning_rate=rate)) for rate in (1e-2, 5e-2)]
     for got, problem in zip(in_a_batch(problems), problems, strict=True):
-        assert_equal(got, fit(problem))
+        small.assert_same_fit(got, fit(problem))
         assert torch.is_grad_enabled()
 
 

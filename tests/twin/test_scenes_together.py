@@ -22,9 +22,7 @@ from neuspring.twin.candidates import SearchProblem, candidate
 from neuspring.twin.fit import FitProblem, fit
 from neuspring.twin.search import search
 from tests.support import small
-from tests.support.devices import CUDA, DEVICES
-from tests.twin.test_batch import assert_equal
-from tests.twin.test_gpu import COST_LARGEST, COST_MEDIAN, LOSS
+from tests.support.devices import COST_LARGEST, COST_MEDIAN, CUDA, DEVICES, LOSS
 
 SCENES = ("rope/lift/smooth", "cloth/lift/smooth")
 
@@ -81,7 +79,7 @@ def test_fits_of_several_scenes_end_as_each_alone() -> None:
     given = fits()
     together = run_batch([one.twin for one in given], "cpu", [lambda lane, one=one: fit(one, lane=lane) for one in given])
     for got, problem in zip(together, given, strict=True):
-        assert_equal(got, fit(problem))
+        small.assert_same_fit(got, fit(problem))
 
 
 @pytest.mark.parametrize("device", DEVICES)
