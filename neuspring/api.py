@@ -79,7 +79,7 @@ def twin_from_capture(
     row, cameras = row_of_capture(folder / CAPTURE), tuple(CaptureFolder.load(folder).cameras)
     read = dataclasses.replace(read_settings(settings), data_root=str(folder.parent))
     regions, method = read.clusters if clusters is None else clusters, "python"
-    kind = kind or ("rod" if body == "rod" else "field")
+    kind = kind or {"lattice": "field"}.get(body, body)
     own = {"capture": folder / CAPTURE, "scenario": row, "clusters": regions, "body": body, "kind": kind, "method": method}
     own |= {"seed": seed, "device": device, "threads": threads}
     own |= {"variant": {"search": body, "clusters": regions, "fit": kind}}

@@ -140,7 +140,7 @@ def begin_run(results: Path, about: Mapping[str, Any] | None = None) -> None:
 
 
 def asked(results: Path) -> dict[str, Any]:
-    """What the last run of the workflow was about: `command` (words), `only`, `scenarios`, `methods`, `seeds`; empty if unknown."""
+    """The last run of the workflow: `command` (words), `only`, `scenarios`, `methods`, `seeds`; empty if unknown."""
     try:
         values = json.loads((Path(results) / FOLDER / ASKED).read_text())
     except (OSError, ValueError):

@@ -63,7 +63,7 @@ class Picture:
     """Drawn for a white page."""
     size: tuple[int, int] = (0, 0)
     panel: int | None = None
-    """Of a film of three panels side by side, the one that is seen; None: all of it."""
+    """The panel that is seen of a film of three side by side; None: all of it."""
     head: float = 0.0
     """Height of what stands above the panels, over the width of the film."""
     same: bool = False

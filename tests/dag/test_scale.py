@@ -134,7 +134,7 @@ def test_the_whole_benchmark_is_planned_with_its_jobs(project, tmp_path):
     # Of the baselines' models Spring-Gaus needs images, which these folders do not have.
     twins, models = 2 * 20 * 3, 2 * 3 * 3
     runs = twins + models
-    expected = {"observe": 2, "track_init": 1, "search": 2 * 8 * 3, "fits": 2, "fit": 2 * 17 * 3, "rollout": twins}
+    expected = {"observe": 2, "track_init": 1, "search": 2 * 8 * 3, "searches": 3, "fits": 7, "fit": 2 * 17 * 3, "rollout": twins}
     expected |= {"train": 2 * 3, "predict": models, "score": runs, "log_run": runs}
     expected |= {"study": 5, "tables": 1, "report": 1, "all": 1}
     assert jobs_in(output) == expected

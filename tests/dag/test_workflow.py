@@ -43,7 +43,7 @@ def tiny_run(tmp_path_factory):
 def test_a_configuration_becomes_a_table_with_every_run_in_mlflow(tiny_run):
     project, output = tiny_run
     results = project / "results"
-    assert "| baseline " in output
+    assert "(`baseline`)" in output
     assert "neuspring ui --results results" in output
     scores = pd.read_csv(results / "tables" / "scores.csv")
     found = set(scores["metric"])

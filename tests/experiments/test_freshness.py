@@ -126,10 +126,11 @@ def test_fits_share_launches_again_only_where_one_of_them_is_still_to_be_done(re
     for job in members:
         record(made, "search", job)
         record(made, "fit", job)
-    record(made, "fits", SimpleNamespace(scenario=SCENE))
-    assert Freshness(made).look(STAGES["fits"], JOB) == ()
+    launch = SimpleNamespace(scenario=SCENE, launch=0)
+    record(made, "fits", launch)
+    assert Freshness(made).look(STAGES["fits"], launch) == ()
     again = graph(results, seeds=[0, 1, 2], fit={"epochs": 60})
-    assert Freshness(again).look(STAGES["fits"], JOB) == ("its fits are not finished",)
+    assert Freshness(again).look(STAGES["fits"], launch) == ("its fits are not finished",)
 
 
 def test_runs_that_were_made_with_another_configuration_are_named_for_the_tables(results):

@@ -133,4 +133,4 @@ def test_options_of_the_workflow_survive_the_command_line():
 
 
 def test_every_module_is_listed_in_the_flow():
-    assert {found.name for found in pkgutil.iter_modules(stages.__path__)} == {*FLOW.split(), "stage"}
+    assert {found.name for found in pkgutil.iter_modules(stages.__path__)} == {*FLOW.split(), "stage", "together"}

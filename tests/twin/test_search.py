@@ -520,7 +520,7 @@ def test_the_search_is_the_same_where_lists_of_partners_are_full():
 def test_a_killed_search_continues_in_another_batch(tmp_path, monkeypatch):
     """Killed in the second generation, while its candidates are simulated."""
     record = tmp_path / "trace.parquet"
-    function, calls = candidates.outcomes, 0
+    function, calls = candidates.launch, 0
 
     def dying(*arguments):
         nonlocal calls
@@ -530,7 +530,7 @@ def test_a_killed_search_continues_in_another_batch(tmp_path, monkeypatch):
         return function(*arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(candidates, "outcomes", dying)
+        patch.setattr(candidates, "launch", dying)
         with pytest.raises(KeyboardInterrupt):
             search(small.search_problem(threads=2), 5, record=record, key="k")
     assert calls > 1
@@ -541,7 +541,7 @@ def test_a_killed_search_continues_in_another_batch(tmp_path, monkeypatch):
     assert_same_trace(continued.trace, search(small.search_problem(together=1), seed=5).trace)
 
 
-@pytest.mark.parametrize(("where", "threads"), [("made", 1), ("outcomes", 2)])
+@pytest.mark.parametrize(("where", "threads"), [("made", 1), ("launch", 2)])
 def test_what_goes_wrong_in_a_thread_comes_out(tmp_path, monkeypatch, where, threads):
     """And the record has whole generations alone."""
     record = tmp_path / "trace.parquet"
@@ -561,13 +561,13 @@ def test_what_goes_wrong_in_a_thread_comes_out(tmp_path, monkeypatch, where, thr
 def test_threads_of_a_search_have_none_of_torch(monkeypatch):
     """`threads` cores are busy, not its square; afterwards torch has what it had."""
     before, seen = torch.get_num_threads(), set()
-    function = candidates.outcomes
+    function = candidates.launch
 
     def watched(*arguments):
         seen.add((threading.get_ident(), torch.get_num_threads()))
         return function(*arguments)
 
-    monkeypatch.setattr(candidates, "outcomes", watched)
+    monkeypatch.setattr(candidates, "launch", watched)
     torch.set_num_threads(3)
     try:
         search(small.search_problem(threads=2, together=1), seed=0)
@@ -605,13 +605,13 @@ def test_candidates_of_every_fate_in_one_generation(monkeypatch):
 
 @pytest.mark.parametrize("first", [0, 3])
 def test_a_cost_that_is_no_number_is_penalized_and_never_the_best(monkeypatch, first):
-    simulate = candidates.outcomes
+    simulate = candidates.launch
     lost = iter(range(1000))
 
     def spoiled(*arguments):
         return [replace(one, cost=float("nan")) if next(lost) % 4 == first else one for one in simulate(*arguments)]
 
-    monkeypatch.setattr(candidates, "outcomes", spoiled)
+    monkeypatch.setattr(candidates, "launch", spoiled)
     result = search(small.search_problem(search=small.released(rollouts=12)), seed=0)
     named = result.trace["reason"] == "its cost is not a number"
     assert named.sum() == 3 and (result.trace["cost"][named] == PENALTY).all()
