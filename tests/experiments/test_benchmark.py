@@ -815,7 +815,7 @@ def test_an_oracle_has_a_fit_of_its_own_is_named_in_its_record_and_is_not_transf
     assert graph.settings(fit, job("oracle_neuspring")) == graph.settings(fit, job("neuspring"))
     assert graph.inputs(fit)(job("oracle_neuspring")) == graph.inputs(fit)(job("neuspring"))
     together = json.loads(graph.options(STAGES["fits"], SimpleNamespace(scenario=SCENES[0], launch=0))["rows"])
-    assert [bool(row["options"]["variant"].get("oracle")) for row in together] == [False, False, True]
+    assert [bool(row["options"].get("oracle")) for row in together] == [False, False, True]
     assert {path.split("/")[-3] for path in graph.transfers()} == {"baseline", "neuspring"}
 
 

@@ -1,6 +1,7 @@
 """Failures and scenarios that a method leaves out change what averages mean, and tables say how."""
 
 import json
+import re
 import math
 from pathlib import Path
 
@@ -228,9 +229,9 @@ def test_every_command_of_tables_takes_what_is_left_out(results, tmp_path, capsy
     assert main(["study", "--study", "systems", "--results", str(results), "--output", made]) == 0
     assert main(["report", *common, "--table", str(studies), "--output", str(tmp_path / "out" / "report.html")]) == 0
     told = capsys.readouterr().out
-    assert "Left out: spring_gaus on cable" in told and "Left out: SG on cable" in told
+    assert "Left out: Spring-Gaus (`spring_gaus`) on cable" in told and "Left out: SG on cable" in told
     page = (tmp_path / "out" / "report.html").read_text()
-    assert "Left out: spring_gaus on cable: it needs images." in page
+    assert re.search(r"Left out: Spring-Gaus \(.{,20}spring_gaus.{,20}\) on cable: it needs images\.", page)
     assert page.count("all, failures held") >= 2, "in the scores and in the study"
 
 
