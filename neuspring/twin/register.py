@@ -27,7 +27,7 @@ MOST_POINTS = 1500
 ALIKE_STARTS = 1.02
 """Starts whose residual is within this factor of the best fit alike; the earliest wins, so that a symmetric body does not turn."""
 EXACT_FIT = 1e-6
-"""Residuals below this part of the extent are those of an exact fit; their last digits, which differ by processor, decide nothing."""
+"""Residuals below this part of the extent are an exact fit; their last digits, which differ by processor, decide nothing."""
 RIGID_ENOUGH = 0.75
 """In spacings of the coarser set: a rigid fit this close needs no bending."""
 BEND_WIDTHS = (0.3, 0.2, 0.12, 0.08)

@@ -1,8 +1,8 @@
 """Failures and scenarios that a method leaves out change what averages mean, and tables say how."""
 
 import json
-import re
 import math
+import re
 from pathlib import Path
 
 import pandas as pd
