@@ -39,11 +39,11 @@ TRIMMED = 0.03
 FLYING = 0.01
 """m: a pixel whose depth differs more from the median around it shows neither side of a border."""
 CROWD, ALONE = 8, 3.0
-"""A point whose so-manieth neighbor, itself included, is so many times as far as usual shows no surface."""
+"""Rank of a neighbor, the point itself included, and the multiple of its usual distance from which a point shows no surface."""
 SHARE_WITHIN = 0.9
 """Part of the points whose distance is the residual; the others may be flying pixels at borders."""
 SIMPLER = 0.001
-"""m."""
+"""A simpler shape is taken where its residual is larger by no more than this, m."""
 OUTLYING = 0.003
 """m: distance from which a point counts less."""
 HOLD_SIDES = 0.05
