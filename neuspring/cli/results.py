@@ -66,7 +66,7 @@ def tables(
     require_metrics(wanted)
     shown = {name: _study(table, name)[1] for name in studies}
     known = _study(table, studies[0])[0] if studies else {}
-    common: Any = {"objects": objects, "aims": wanted, "studies": shown, "known_studies": known, "results": results}
+    common: Any = {"objects": objects, "aims": wanted, "studies": shown, "known_studies": known}
     common["names"] = shown_names(method_table)
     if scores:
         found = _read_scores(scores, scenarios, methods, seeds, left_out)
@@ -77,7 +77,8 @@ def tables(
     if not (scenarios and methods and seeds):
         raise InputError(results, "a results folder with runs is required", "none", "Run the workflow first, or name another.")
     collected, part = as_asked(collect(results, scenarios, methods, seeds, _read_left_out(left_out)), asked(results))
-    more: Any = {"asked": part, "warnings": warnings_of(results, scenarios), "made_otherwise": _made_otherwise(settings, results)}
+    warned = warnings_of(results, scenarios)
+    more: Any = {"results": results, "asked": part, "warnings": warned, "made_otherwise": _made_otherwise(settings, results)}
     moved = collect_transfers(results, transfers, methods, seeds)
     numbers = Numbers(everything=collected, baseline=baseline or methods[0], transfers=moved, **common, **more)
     text = write(numbers, output)

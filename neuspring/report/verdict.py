@@ -44,7 +44,7 @@ Move = tuple[str, str]
 
 def verdict(numbers: Numbers) -> list[Block]:
     """Labeled paragraphs on a benchmark, and commands to go on with."""
-    runs, about = numbers.collected.runs, asked(numbers.results)
+    runs, about = numbers.collected.runs, asked(numbers.results) if numbers.results else {}
     moves: list[Move] = []
     if (runs["status"] != "ok").any():
         moves.append(("Finish what is missing; what is there is kept:", again(about)))
@@ -208,12 +208,9 @@ class Duel:
     def looks(self) -> list[Move]:
         """The command that shows the weakest scenario; none where no folder holds its runs."""
         results, methods = self.numbers.results, dict.fromkeys([self.method, str(self.lead.rival)])
-        runs = [path.parent for name in methods if name for path in sorted(results.glob(f"{self.weakest}/{name}/*/run.json"))[:1]]
-        return (
-            [(f"Look where {self.weakest} goes wrong:", shlex.join([program("neuspring"), "play", *map(str, runs)]))]
-            if runs
-            else []
-        )
+        found = [sorted(results.glob(f"{self.weakest}/{name}/*/run.json"))[:1] for name in methods if name] if results else []
+        runs = [str(path.parent) for paths in found for path in paths]
+        return [(f"Look where {self.weakest} goes wrong:", shlex.join([program("neuspring"), "play", *runs]))] if runs else []
 
     def drift(self) -> list[str]:
         """Sentence on the error of the weakest scenario: there from the start, or growing where the twin predicts."""

@@ -57,8 +57,8 @@ class Numbers:
     """The studies that are shown."""
     known_studies: Mapping[str, Study] = field(default_factory=dict)
     """Those and the ones that may stand beside them."""
-    results: Path = Path("results")
-    """Folder in which films of clips lie."""
+    results: Path | None = None
+    """The folder of the runs, for films of clips, how the runs were asked for, and where to look; None where none holds them."""
     warnings: tuple[tuple[str, Finding], ...] = ()
     """Scenarios, and what steps of perception warned of."""
     names: Mapping[str, str] = field(default_factory=dict)
@@ -192,7 +192,7 @@ class Numbers:
             runs = self.everything.runs
             named: Any = {f"{name}s": list(dict.fromkeys(runs[name])) for name in ("method", "seed")}
             named["sources"] = list(dict.fromkeys(runs["scenario"]))
-            return ClipNumbers(name=name, study=study, results=self.results, **named)
+            return ClipNumbers(name=name, study=study, results=self.results or Path("results"), **named)
         beside = self.known_studies.get(study.beside or "")
         return StudyNumbers(name=name, study=study, collected=self.everything, beside=beside)
 

@@ -128,7 +128,7 @@ def test_each_fault_costs_one_job_and_the_same_command_continues(project, tmp_pa
     # The server is away: the runs wait on disk.
     assert {path.read_text().split(":")[0] for path in results.glob("*/*/*/mlflow.txt")} == {"unreachable"}
     so_far = (results / "tables" / "so_far" / "summary.md").read_text()
-    assert f"baseline, {RELEASED} / seed 0: missing" in so_far
+    assert f"PhysTwin (`baseline`), {RELEASED} / seed 0: missing" in so_far
     assert "have not finished" in output
     assert "bad input" in (results / "tables" / "so_far" / "report.html").read_text()
 
