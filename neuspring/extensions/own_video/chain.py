@@ -13,16 +13,19 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from neuspring.config.parse import read_yaml
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
 from neuspring.core.run_folder import RunFolder
+from neuspring.core.text import duration
 from neuspring.data.capture import CAPTURE, read_description
 from neuspring.experiments.local import workflow_command, workflow_folder
 from neuspring.extensions.own_video.options import Wish
 
-TWIN_STEPS = ("capture", "masks", "check", "observe", "search", "fit", "page")
+Run = Callable[[list[str], Path], int]
+TWIN_STEPS = ("capture", "masks", "check", "twin")
 STEPS_DONE = "steps.json"
 """Step -> its command, once it has succeeded; `window`: the frames that were chosen."""
 PROPOSED = re.compile(r"--frames (\d+-\d+)")
@@ -31,6 +34,7 @@ WINDOW = re.compile(r"all|\d+-\d+")
 MOVIE_ENDINGS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 LOOK_FOR_MASKS, GRACE = 0.5, 2.0
 """s between two looks whether masks were saved, and until the page that saved them ends."""
+TOGETHER: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "encoding": "utf-8", "errors": "replace"}
 LAST_LINES = 8
 """Lines of a failed step's log that are shown."""
 BESIDE = "static"
@@ -72,8 +76,7 @@ class TwinChain:
                 self._make_capture()
             self._masks()
             chosen = self._window()
-            for step in TWIN_STEPS[3:]:
-                self._workflow(step, chosen)
+            self._twin(chosen)
         except StepFailed as failed:
             return int(failed.args[0])
         return 0 if self.wish.dry_run else self._tell(self.folder / "results" / chosen.name)
@@ -110,9 +113,7 @@ class TwinChain:
 
     def _annotate(self, command: list[str], log: Path) -> int:
         """Serve the page on which a user marks object and hands, until every camera has masks."""
-        print(
-            "\n      Mark object and hands in the page that opens, carry them through the film, and press Save masks.", flush=True
-        )
+        print("      Mark object and hands in the page that opens, carry them through the film, and press Save masks.", flush=True)
         with subprocess.Popen(command) as page:
             try:
                 while page.poll() is None and not self._masked():
@@ -146,17 +147,17 @@ class TwinChain:
         self._keep("window", [window])
         return self.capture if window == "all" else cut
 
-    def _workflow(self, step: str, capture: Path) -> None:
+    def _twin(self, capture: Path) -> None:
+        """Observe, search, fit and page: the workflow, in one run that tells a line per job."""
         chosen: dict[str, object] = {"scenarios": [capture.name], "methods": list(dict.fromkeys([BESIDE, self.method]))}
         chosen |= {"data_root": str(capture.parent), "compare_with": BESIDE, "results": "results", "effort": self.wish.effort}
-        until = [] if step == TWIN_STEPS[-1] else ["--until", step]
         settings = [f"{key}={value if isinstance(value, str) else json.dumps(value)}" for key, value in chosen.items()]
-        options = ["--directory", str(self.folder), *until, "--config", *settings]
-        self._step(step, workflow_command("own", *options, cores=self.wish.cores))
+        options = ["--directory", str(self.folder), "--config", *settings]
+        self._step("twin", workflow_command("own", *options, cores=self.wish.cores), shown=True)
 
     # --- what all steps share
 
-    def _step(self, name: str, command: list[str], made: bool = False, run: Callable[[list[str], Path], int] | None = None) -> Path:
+    def _step(self, name: str, command: list[str], made: bool = False, shown: bool = False, run: Run | None = None) -> Path:
         """Run a step unless it is `made`; returns its log. Raises StepFailed."""
         log = self.folder / "logs" / f"{TWIN_STEPS.index(name) + 1}_{name}.log"
         print(f"$ {shlex.join(command)}", flush=True)
@@ -164,14 +165,14 @@ class TwinChain:
             self._say(name, "done before" if made else "not run")
             return log
         log.parent.mkdir(parents=True, exist_ok=True)
-        self._say(name, "... ", end="")
+        self._say(name, "... ", end="\n" if shown or run else "")
         begun = time.monotonic()
-        status = (run or _run)(command, log)
-        print(f"{time.monotonic() - begun:.0f} s" if not status else "failed", flush=True)
+        status = run(command, log) if run else _run(command, log, shown)
+        print(f"{'      ' if shown or run else ''}{'failed' if status else duration(time.monotonic() - begun)}", flush=True)
         if status:
             lines = log.read_text(encoding="utf-8", errors="replace").rstrip().splitlines()[-LAST_LINES:]
             told = "".join(f"  {line}\n" for line in lines)
-            print(f"{told}Step {name} failed, exit status {status}. Its output: {log}", file=sys.stderr)
+            print(f"{'' if shown else told}Step {name} failed, exit status {status}. Its output: {log}", file=sys.stderr)
             print(f"By hand:\n  {shlex.join(command)}\nneuspring twin goes on from here.", file=sys.stderr)
             raise StepFailed(status)
         self._keep(name, command)
@@ -207,14 +208,17 @@ def _neuspring(*words: str) -> list[str]:
     return [sys.executable, "-m", "neuspring", *words]
 
 
-def _run(command: list[str], log: Path) -> int:
+def _run(command: list[str], log: Path, shown: bool) -> int:
     """Run a command whose output goes to a log; returns its exit status. Ctrl-C reaches it too, and its end is waited for."""
-    with log.open("w", encoding="utf-8") as output, subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT) as process:
+    with log.open("w", encoding="utf-8") as output, subprocess.Popen(command, **TOGETHER) as process:
         try:
-            return process.wait()
+            for line in process.stdout or ():
+                output.write(line)
+                print(f"      {line}" * shown, end="", flush=True)
         except KeyboardInterrupt:
-            process.wait()
+            output.writelines(process.stdout or ())
             raise
+    return process.returncode
 
 
 def _require_window(where: str, text: str) -> None:

@@ -25,7 +25,7 @@ class Steps:
         self.failing = ""
         self.said = "0 errors"
 
-    def run(self, command: list[str], log: Path) -> int:
+    def run(self, command: list[str], log: Path, shown: bool) -> int:
         words = command[3:]
         self.ran.append(words)
         write_text(log, f"reason\n{self.said}\n")
@@ -43,7 +43,7 @@ class Steps:
 
     @property
     def names(self) -> list[str]:
-        return [words[0] if "--until" not in words else words[words.index("--until") + 1] for words in self.ran]
+        return [words[0] for words in self.ran]
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def with_masks(film: Path, *words: str) -> int:
 
 def test_the_commands_of_the_tutorial_run_in_their_order(film, steps, capsys):
     assert with_masks(film, "--mass", "0.3", "--rate", "30", "--intake=--top-down --take distance") == 0
-    assert steps.names == ["make-capture", "mask", "check-data", "observe", "search", "fit", "--snakefile"]
+    assert steps.names == ["make-capture", "mask", "check-data", "--snakefile"]
     color, depth = (f"--{name} {film / name}" for name in ("color", "depth"))
     lens, where = f"--intrinsics {film / 'intrinsics.json'}", f"--output {film.parent / 'out/captures/out'}"
     assert " ".join(steps.ran[0]) == (
@@ -84,21 +84,21 @@ def test_the_commands_of_the_tutorial_run_in_their_order(film, steps, capsys):
     assert 'scenarios=["out"]' in page and 'methods=["static", ' in page and "effort=quick" in page
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(" ...")[0] for line in lines if line[0] == "["] == [
-        f"[{index}/7] {name}" for index, name in enumerate(chain.TWIN_STEPS, start=1)
+        f"[{index}/4] {name}" for index, name in enumerate(chain.TWIN_STEPS, start=1)
     ]
-    assert sum(line.startswith(f"$ {sys.executable} -m ") for line in lines) == 7, "each can be run alone"
+    assert sum(line.startswith(f"$ {sys.executable} -m ") for line in lines) == 4, "each can be run alone"
     assert lines[-1] == "told of out"
 
 
 def test_a_second_call_does_what_is_left(film, steps, capsys):
-    steps.failing = "search"
+    steps.failing = "check-data"
     assert with_masks(film) == 2
     error = capsys.readouterr().err
-    log = film.parent / "out" / "logs" / "5_search.log"
-    assert "Step search failed" in error and "reason" in error and str(log) in error and "--until search" in error
+    log = film.parent / "out" / "logs" / "3_check.log"
+    assert "Step check failed" in error and "reason" in error and str(log) in error and "check-data" in error
     steps.failing, steps.ran = "", []
     assert with_masks(film) == 0
-    assert steps.names == ["check-data", "observe", "search", "fit", "--snakefile"], "the workflow passes over what it has"
+    assert steps.names == ["check-data", "--snakefile"], "the workflow passes over what it has"
     steps.ran = []
     assert with_masks(film, "--mass", "2") == 2
     assert "was made by: " in capsys.readouterr().err and not steps.ran
@@ -116,6 +116,14 @@ def test_the_longest_constant_grip_is_taken_or_another_window(film, steps, capsy
     (film.parent / "out" / chain.STEPS_DONE).unlink()
     assert with_masks(film) == 0
     assert 'scenarios=["out_1-4"]' in " ".join(steps.ran[-1])
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_what_a_step_says_is_in_its_log_and_the_workflow_tells_its_jobs(shown, tmp_path, capsys):
+    command = [sys.executable, "-c", "import sys; print('a job'); print('why', file=sys.stderr); sys.exit(3)"]
+    assert chain._run(command, tmp_path / "log", shown) == 3
+    assert set((tmp_path / "log").read_text().split("\n")) == {"a job", "why", ""}
+    assert ("      a job" in capsys.readouterr().out) == shown
 
 
 def test_a_window_that_was_cut_before_masks_changed_is_refused(film, steps, capsys):
@@ -144,7 +152,7 @@ def test_the_page_is_served_until_masks_are_saved(saves, film, steps, capsys, mo
     monkeypatch.setattr(chain, "LOOK_FOR_MASKS", 0.05)
     monkeypatch.setattr(chain, "GRACE", 0.0)
     assert twin(film) == (0 if saves else 2)
-    assert ("observe" in steps.names) == saves
+    assert ("--snakefile" in steps.names) == saves
     assert ("the page ended before masks were saved" in capsys.readouterr().err) == (not saves)
 
 
@@ -174,7 +182,7 @@ def test_an_effort_that_is_none_and_a_film_that_is_not_there(film, steps, capsys
 def test_a_capture_is_taken_as_it_is(tmp_path, steps, capsys):
     made = captures.write(tmp_path / "here" / "thing")
     assert twin(made.folder) == 0
-    assert steps.names == ["check-data", "observe", "search", "fit", "--snakefile"]
+    assert steps.names == ["check-data", "--snakefile"]
     assert f"data_root={tmp_path / 'here'}" in steps.ran[-1]
     assert twin(made.folder, "--mass", "0.3") == 2
     assert 'Write "mass" into capture.json' in capsys.readouterr().err
@@ -183,7 +191,7 @@ def test_a_capture_is_taken_as_it_is(tmp_path, steps, capsys):
 def test_a_dry_run_prints_commands_and_writes_nothing(film, steps, capsys):
     assert with_masks(film, "--dry-run") == 0
     assert not steps.ran and not (film.parent / "out").exists()
-    assert capsys.readouterr().out.count("\n$ ") == 6
+    assert capsys.readouterr().out.count("\n$ ") == 3
 
 
 @pytest.mark.parametrize("name", ["film.mp4", "film.bag"])
