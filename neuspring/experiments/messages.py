@@ -19,7 +19,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.findings import warnings_of
 from neuspring.core.job_records import FOLDER, RUN_FILE, JobRecord, failure_lines, read_jobs, this_run
 from neuspring.core.run_record import RunRecord
-from neuspring.core.text import duration, listed
+from neuspring.core.text import duration, listed, program
 from neuspring.experiments.freshness import told
 from neuspring.experiments.graph import Graph
 
@@ -122,7 +122,7 @@ def finished(graph: Graph, seconds: float) -> None:
     """After success: the verdict, a table, what to open, where the runs are in MLflow, how long it took."""
     from neuspring.report.verdict import headline
 
-    config, folder, neuspring = graph.config, graph.folder, Path(sys.executable).parent / "neuspring"
+    config, folder, neuspring = graph.config, graph.folder, program("neuspring")
     begun = (Path(config.results) / FOLDER / RUN_FILE).stat().st_mtime
     summary = Path(folder) / "summary.md"
     if summary.exists():

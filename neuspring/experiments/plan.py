@@ -47,9 +47,10 @@ def told(graph: Graph, needs: Needs, counts: Mapping[str, int], place: Place, fi
 
 def _times(needs: Needs, jobs: Mapping[str, int], place: Place) -> Iterable[str]:
     """A line per kind of device, and one of what is not known."""
-    unknown = []
+    unknown: list[str] = []
     for kind in ("gpu", "cpu"):
         each: dict[str, tuple[float, bool]] = {}
+        others = len(unknown)
         for rule in jobs:
             of, seconds, recorded = needs.expected(rule)
             if of == kind and seconds is None:
@@ -63,7 +64,8 @@ def _times(needs: Needs, jobs: Mapping[str, int], place: Place) -> Iterable[str]
         parts = ", ".join(f"{rule} {jobs[rule]:,} x {duration(each[rule][0])}" for rule in first if each[rule][0])
         sources = [text for known, text in ((True, "jobs of this results folder"), (False, PUBLISHED_BY[kind]))
                    if known in {recorded for _, recorded in each.values()}]  # fmt: skip
-        yield f"{duration(total)} of {kind.upper()} time{_shared_out(kind, total, place)}: {parts} (by {'; '.join(sources)})"
+        least = "at least " * (len(unknown) > others)
+        yield f"{least}{duration(total)} of {kind.upper()} time{_shared_out(kind, total, place)}: {parts} (by {'; '.join(sources)})"
     if unknown:
         yield f"without a figure, and not counted: {listed(unknown)}"
 

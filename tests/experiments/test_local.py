@@ -53,11 +53,14 @@ def test_without_a_checkout_it_is_found_where_the_installation_put_it(tmp_path, 
     assert local.workflow_folder() == snakefile.parent
 
 
-def test_the_demo_is_one_command_of_snakemake(monkeypatch):
+@pytest.mark.parametrize("near", [True, False], ids=["in the checkout", "elsewhere"])
+def test_the_demo_is_one_command_of_snakemake_with_names_as_they_are_typed_there(near, tmp_path, monkeypatch):
     ran = []
+    monkeypatch.chdir(ROOT if near else tmp_path)
     monkeypatch.setattr(os, "execv", lambda program, words: ran.append((program, words)))
     assert main(["demo", "--cores", "3", "--dry-run"]) == 0
     [(program, words)] = ran
     assert program == words[0] == sys.executable and words[-1] == "--dry-run"
-    assert words[words.index("--configfile") + 1] == str(ROOT / "config" / "data" / "demo.yaml")
+    assert words[words.index("--configfile") + 1] == str((Path() if near else ROOT) / "config" / "data" / "demo.yaml")
+    assert local.workflow_folder() == ROOT and "--directory" not in words
     assert words[words.index("--cores") + 1] == "3" and all(Path(word).exists() for word in words if word.startswith("/"))

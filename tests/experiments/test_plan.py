@@ -59,7 +59,7 @@ def test_hours_are_published_ones_scaled_by_the_settings_until_jobs_of_the_folde
     lines = planned(tmp_path, counts, place, on_gpu=True, **sizes)
     # 20 x 6 min and 60 x 2.5 min.
     assert lines[1].startswith(
-        "  time     4.5 h of GPU time, 2.2 h on 2 GPUs: fit 60 x 2.5 min, search 20 x 6.0 min (by PhysTwin's"
+        "  time     at least 4.5 h of GPU time, 2.2 h on 2 GPUs: fit 60 x 2.5 min, search 20 x 6.0 min (by PhysTwin's"
     )
     assert lines[2] == "           without a figure, and not counted: train (3)"
     for name, seconds in {"a": 60.0, "b": 120.0, "c": 600.0}.items():

@@ -150,7 +150,12 @@ class TwinChain:
     def _twin(self, capture: Path) -> None:
         """Observe, search, fit and page: the workflow, in one run that tells a line per job."""
         chosen: dict[str, object] = {"scenarios": [capture.name], "methods": list(dict.fromkeys([BESIDE, self.method]))}
-        chosen |= {"data_root": str(capture.parent), "compare_with": BESIDE, "results": "results", "effort": self.wish.effort}
+        chosen |= {
+            "data_root": str(capture.parent),
+            "compare_with": BESIDE,
+            "results": str(self.folder / "results"),
+            "effort": self.wish.effort,
+        }
         settings = [f"{key}={value if isinstance(value, str) else json.dumps(value)}" for key, value in chosen.items()]
         options = ["--directory", str(self.folder), "--config", *settings]
         self._step("twin", workflow_command("own", *options, cores=self.wish.cores), shown=True)
