@@ -4,9 +4,11 @@ import importlib.util
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
+import zipfile
 
 import pytest
 import yaml
@@ -91,15 +93,32 @@ def test_names_alone_are_jobs_to_cancel(tmp_path):
     assert calls.read_text() == "delete job --wait=false --ignore-not-found a b\n"
 
 
+def image_copies() -> list[str]:
+    """What the image's recipe copies to /source."""
+    lines = re.findall(r"^COPY (.+) /source\S*$", (ROOT / "workflow" / "envs" / "Dockerfile").read_text(), re.MULTILINE)
+    return [name for line in lines for name in line.split()]
+
+
+def test_what_the_image_copies_can_be_installed_and_holds_the_workflow(tmp_path):
+    source = tmp_path / "source"
+    source.mkdir()
+    for name in image_copies():
+        kept = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(ROOT / name, source / name, ignore=kept) if (ROOT / name).is_dir() else shutil.copy(ROOT / name, source)
+    pip = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
+    subprocess.run([*pip, "--wheel-dir", str(tmp_path), str(source)], check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    assert any(name.endswith("share/neuspring/Snakefile") for name in zipfile.ZipFile(wheel).namelist())
+
+
 def test_the_image_is_built_of_files_and_extras_that_there_are():
     """No test builds it: a job of CI does, from these names."""
-    copied = re.findall(r"^COPY (.+) /source\S*$", (ROOT / "workflow" / "envs" / "Dockerfile").read_text(), re.MULTILINE)
-    assert {"neuspring", "pyproject.toml"} <= {name for line in copied for name in line.split()}
+    copied = image_copies()
     text = (ROOT / ".github" / "workflows" / "image.yml").read_text()
     job = yaml.safe_load(text)
     # YAML reads the key `on` as true.
     named = [*job[True]["push"]["paths"], *re.findall(r"(?:--file|--profile|--configfile) (\S+)", text)]
-    assert [name for name in (*(name for line in copied for name in line.split()), *named) if not (ROOT / name).exists()] == []
+    assert [name for name in (*copied, *named) if not (ROOT / name).exists()] == []
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     (chosen,) = re.findall(r"EXTRAS=(\S+)", text)
     # Those that `make demo` installs, among others.
