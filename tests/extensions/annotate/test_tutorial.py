@@ -135,6 +135,7 @@ def test_the_capture_is_what_was_filmed_and_the_masks_are_right(followed):
             assert (ours & true).sum() / (ours | true).sum() > 0.9, (frame, label)
 
 
+@pytest.mark.slow
 def test_perception_makes_the_pictures(followed):
     project, _, _ = followed
     [look] = shown("Look at what was perceived")

@@ -115,6 +115,7 @@ STIFF = {"bending": 0.2, "twisting": 0.2, "rest": "first_frame"}
 SWINGS = {"drag": 1.0, "rest": "first_frame"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("markers", "move", "rod", "limit"),
     [(7, 0.0, {}, HANGING), (7, 0.0, STIFF, HANGING), (13, 0.0, STIFF, HANGING), (7, 0.002, SWINGS, SWINGING)],

@@ -57,6 +57,7 @@ def test_its_capture_format_is_read(installed, tmp_path):
     assert f"{FRAMES} frames" in made and (tmp_path / "capture" / "capture.json").exists()
 
 
+@pytest.mark.slow
 def test_its_baseline_metric_section_and_export_go_through_the_whole_workflow(installed, tmp_path):
     copy = project.copy_workflow(tmp_path / "project")
     methods = copy / "config" / "methods.yaml"

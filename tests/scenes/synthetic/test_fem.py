@@ -128,6 +128,7 @@ def test_twice_the_substeps_change_little_and_runs_repeat_exactly():
     assert 0 < nudged < 1e-5
 
 
+@pytest.mark.slow
 def test_what_hangs_at_rest_in_one_engine_stays_at_rest_in_the_other():
     """Different integrators, the same statics: the sag of a bar that a hand holds at one end."""
     body = bar(height=0.3)
