@@ -16,8 +16,8 @@ from tests.support.spaced import spaced
 
 COLOR = {
     "scenarios": ["painted"],
-    "methods": ["static", "controller_lbs", "search_only", "baseline", "neuspring"],
-    "compare_with": "baseline",
+    "methods": ["static", "neuspring"],
+    "compare_with": "static",
     "search": {"rollouts": 14},
     "fit": {"epochs": 1},
     "perception": {"segment": {"backend": "given"}, "sample": {"voxel": 0.02, "nodes": 60}},

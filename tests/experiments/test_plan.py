@@ -69,7 +69,7 @@ def test_hours_are_published_ones_scaled_by_the_settings_until_jobs_of_the_folde
     assert lines[1] == "  time     2.0 h of GPU time, 60.0 min on 2 GPUs: fit 60 x 2.0 min (by jobs of this results folder)"
     # A job on a GPU says nothing of one on the CPU.
     lines = planned(tmp_path, {"fit": 60}, place, **sizes)
-    assert lines[1].startswith("  time     1.7 h of CPU time, 26.1 min on 4 cores: fit 60 x 1.7 min (by results/published/demo")
+    assert lines[1].startswith("  time     2.3 h of CPU time, 34.8 min on 4 cores: fit 60 x 2.3 min (by results/published/demo")
 
 
 def test_a_plan_says_how_jobs_share_gpus_and_where_tables_will_be(tmp_path):
