@@ -470,11 +470,16 @@ def test_methods_have_their_names_wherever_a_person_reads(full):
 @pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome is installed")
 @pytest.mark.parametrize(("width", "most"), [(1400, 6000), (390, 9000)])
 def test_a_page_of_three_scenes_and_three_methods_is_short_and_a_link_unfolds_a_section(tmp_path, width, most):
-    results = report_tree.make(tmp_path / "results", ["rope", "cloth", "sloth"], ["search_only", "baseline", "neuspring"], [0])
-    report(results)
+    names = [f"synthetic_single_lift_{name}" for name in ("rope", "cloth_1", "sloth")]
+    results = report_tree.make(tmp_path / "results", names, ["search_only", "baseline", "neuspring"], [0])
+    report(results, names=shown_names(Path(__file__).resolve().parents[2] / "config" / "methods.yaml"))
     with Browser() as browser:
         browser.open(results / "report.html", width)
         assert browser.run("document.documentElement.scrollHeight") < most
+        if width == 1400:
+            browser.run("document.querySelectorAll('#scores details').forEach((fold) => (fold.open = true))")
+            tables = "[...document.querySelectorAll('#scores .scroll')].filter((one) => one.scrollWidth > one.clientWidth + 1)"
+            assert browser.run(f"{tables}.map((one) => one.textContent)") == [], "no column is cut"
         fold = "document.querySelector('#details > details').open"
         assert not browser.run(fold)
         browser.run("location.hash = 'details'")
