@@ -10,7 +10,7 @@ import pytest
 from neuspring import config
 from neuspring.experiments.tracking import log as tracking
 from tests.support.extensions import with_extensions
-from tests.support.project import SCENE, plan, run
+from tests.support.project import SCENE, jobs_in, plan, run
 
 OTHER = "toy_cloth_lift_smooth"
 
@@ -97,22 +97,27 @@ def names(folder: Path) -> list[str]:
 @pytest.mark.slow
 def test_fits_of_seeds_share_launches_and_nothing_finished_is_made_again(project):
     """That twins end as they would alone, bit for bit, test_batches shows."""
-    changes = {"methods": ["baseline"], "seeds": [0, 1], "fit": {"epochs": 2}}
-    targets = [f"results/{SCENE}/baseline/{seed}/fit.json" for seed in (0, 1)]
-    run(project, changes, "--", *targets)
-    results = project / "results" / SCENE
-    record = json.loads((results / "fits-0.json").read_text())
+    changes = {"methods": ["baseline"], "fit": {"epochs": 2}}
+    first, *targets = (f"results/{SCENE}/baseline/{seed}/fit.json" for seed in (0, 1, 2))
+    run(project, changes | {"seeds": [0]}, "--", first)
+    changes["seeds"] = [0, 1, 2]
+    # Seeds that are added share launches; the finished one, which was made alone, stays.
+    before = (project / first).stat().st_mtime_ns
+    output = run(project, changes, "--", first, *targets)
+    jobs = jobs_in(output)
+    assert (jobs["fits"], jobs["fit"]) == (1, 2)
+    assert (project / first).stat().st_mtime_ns == before
+    record = json.loads((project / "results" / SCENE / "fits-0.json").read_text())
     assert record["facts"]["batches"] == [targets]
     assert record["facts"]["errors"] == {}
     assert all(json.loads((project / path).read_text())["facts"]["epochs_together"] == 2 for path in targets)
-    # Another seed is made alone, and nothing again.
-    jobs = plan(project, changes | {"seeds": [0, 1, 2]}, "--", *targets, f"results/{SCENE}/baseline/2/fit.json")
-    assert jobs["fit"] == 1 and "fits" not in jobs
+    later = [first, *targets, f"results/{SCENE}/baseline/3/fit.json"]
+    assert plan(project, changes | {"seeds": [0, 1, 2, 3]}, "--", *later)["fit"] == 1
     # A further method in a finished folder, without targets.
     output = run(project, changes | {"methods": ["baseline", "model_b"]}, "--dry-run")
     planned = {words[0]: words[1] for words in map(str.split, output.splitlines()) if len(words) == 2}
-    assert planned["fits"] == "1" and planned["fit"] == "2" and planned["all"] == "1"
+    assert planned["fits"] == "1" and planned["fit"] == "3" and planned["all"] == "1"
     # Nothing of another scene is overlooked where a part of the seeds of this one is asked for.
     both = changes | {"scenarios": [SCENE, OTHER], "only": "seed=0"}
     assert plan(project, both)["observe"] == plan(project, both)["search"] == 1
-    assert not plan(project, changes | {"twins_per_launch": 1}, "--forcerun", "fit", "--", *targets).keys() & {"fits"}
+    assert not plan(project, changes | {"twins_per_launch": 1}, "--forcerun", "fit", "--", first, *targets).keys() & {"fits"}

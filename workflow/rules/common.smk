@@ -187,14 +187,15 @@ def shared_launches(stage):
     """The record of the launches that a job shared with others, as an input of a stage whose jobs may be done together.
 
     Their checkpoints, from which a job goes on, are those that it would have left alone. But behind a job that is made again Snakemake
-    overlooks what is missing, if all that it reads is ancient.
+    overlooks what is missing, if all that it reads is ancient. A finished job waits for no record that is only made now: Snakemake takes
+    what is ancient and absent for a reason to make the job again.
     """
 
     def found(wildcards):
         paths = GRAPH.shared_launches(stage, wildcards)
-        return (
-            paths if unfinished(stage, wildcards) else [ancient(path) for path in paths]
-        )
+        if unfinished(stage, wildcards):
+            return paths
+        return [ancient(path) for path in paths if Path(path).exists()]
 
     return {"shared": found} if GRAPH.together(stage) else {}
 
