@@ -64,11 +64,9 @@ sample: $(RUNS)
 test: $(INSTALLED)
 	$(PYTEST) --dist worksteal -m "not slow"
 
-# The core stands without its extensions: a copy of the tracked files, less both folders. The finder of the editable installation is
-# taken away there, because it finds neuspring.extensions in this folder.
+# The core stands without its extensions: a copy of the tracked files, less both folders.
 test-core: $(INSTALLED)
 	rm -rf .core && mkdir .core && git ls-files -z ':!neuspring/extensions' ':!tests/extensions' | xargs -0 cp --parents -t .core
-	echo 'import sys; sys.meta_path[:] = [f for f in sys.meta_path if "Editable" not in getattr(f, "__name__", "")]' >.core/sitecustomize.py
 	cd .core && PYTHONPATH=$(CURDIR)/.core PATH="$(CURDIR)/$(BIN):$$PATH" OMP_NUM_THREADS=1 \
 		$(CURDIR)/$(BIN)/python -m pytest -n $(CORES) --dist worksteal -m "not slow"
 	rm -rf .core

@@ -1,9 +1,13 @@
 """Pages name files, folders, headings and configurations that there are, are short, and have plain sentences."""
 
 import re
+import shlex
 from pathlib import Path
 
 import pytest
+from snakemake.cli import get_argument_parser
+
+from neuspring.config import read_yaml
 
 ROOT = Path(__file__).parents[1]
 PLACES = ("", ".github", "config", "findings", "results", "tests/benchmarks", "tests/golden", "workflow")
@@ -42,6 +46,21 @@ def test_links_and_paths_of_a_page_lead_somewhere(page):
             dead.append(target)
     dead += [name for name in PATH.findall(text) if not (ROOT / name).exists()]
     assert not without_extensions(dead)
+
+
+def test_commands_of_the_workflow_ask_for_targets_that_there_are():
+    """Without running them: Snakemake reads a word that belongs to no option as a target."""
+    rules = [*(ROOT / "workflow" / "rules").glob("*.smk"), ROOT / "Snakefile"]
+    known = {name for path in rules for name in re.findall(r"^\s*rule (\w+):", path.read_text(), re.MULTILINE)}
+    known |= set(read_yaml(ROOT / "config" / "studies.yaml"))
+    asked = {}
+    for page in PAGES:
+        for command in re.findall(r"snakemake ((?:[^`\n\\]|\\\n)*--configfile(?:[^`\n\\]|\\\n)*)", page.read_text()):
+            if "..." not in command:
+                words = shlex.split(command.replace("\\\n", " "), comments=True)
+                targets = get_argument_parser().parse_args(words).targets
+                asked |= {f"{page.name}: {word}": word for word in targets if "/" not in word and not word.isupper()}
+    assert len(asked) > 2 and not {place for place, word in asked.items() if word not in known}
 
 
 def test_the_page_of_configurations_names_every_file_and_no_other():
