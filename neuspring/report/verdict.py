@@ -57,13 +57,12 @@ def verdict(numbers: Numbers) -> list[Block]:
     said = {
         "Who wins": duel.winner(),
         "Is it resolved": duel.resolved(),
-        "What went wrong": [*_unfinished(numbers), *duel.weak(), *duel.apart(), *duel.others()]
-        or ["Nothing that the runs recorded."],
+        "What went wrong": [*_unfinished(numbers), *duel.weak(), *duel.apart(), *duel.others()] or ["No run failed."],
         "Probable cause": why,
     }
-    if duel.seeds == 1:
-        moves.append(("Two more seeds, to tell how much is chance in training:", again(about, "seeds", "[0,1,2]")))
-    return _paragraphs(said, [*moves, *duel.looks()])
+    seeds = [("Two more seeds, to tell how much is chance in training:", again(about, "seeds", "[0,1,2]"))] * (duel.seeds == 1)
+    # Seeds tell nothing of other scenes: with one, looking comes first.
+    return _paragraphs(said, [*moves, *(seeds + duel.looks() if duel.scenarios > 1 else duel.looks() + seeds)])
 
 
 def again(about: Mapping[str, Any], key: str = "", value: str = "") -> str:
@@ -165,9 +164,14 @@ class Duel:
         said = []
         if len(self.by_scenario) > 1:
             said.append(f"{self.best} is weakest in {self.weakest} ({self.text(self.by_scenario[self.weakest])}).")
-        rivals = {name: self.each.get((str(self.lead.rival), self.task, name)) for name in self.by_scenario}
-        worse = [name for name, value in rivals.items() if value is not None and value < self.by_scenario[name]]
-        said += [f"{self.rival} is better in {listed(worse, MOST_SAID)}."] if worse else []
+        better, worse = list[str](), list[str]()
+        for name, own in self.by_scenario.items():
+            theirs = self.each.get((str(self.lead.rival), self.task, name))
+            if theirs is not None and theirs != own:
+                (better if theirs < own else worse).append(f"{name} ({self.metric.text(theirs)} against {self.text(own)})")
+        if better:
+            behind = f", worse in {listed(worse, MOST_SAID)}" if worse else ""
+            said.append(f"{self.rival} is better in {listed(better, MOST_SAID)}{behind}.")
         return [*said, f"{self.best} learns nothing, and no method that learns is better."] if self.method in REFERENCES else said
 
     def apart(self) -> list[str]:
@@ -193,7 +197,8 @@ class Duel:
                 mean = "mean " * (name == self.metric.name)
                 against = f"{mean}{metric.heading} ({metric.text(values[leader])} against {metric.text(values[self.method])})"
                 first.setdefault(self.numbers.name(leader), []).append(against)
-        return [f"By other measures {leader} is first: {', '.join(found)}." for leader, found in first.items()]
+        told = [f"{leader} in {', '.join(found)}" for leader, found in first.items()]
+        return [f"By other measures another is first: {'; '.join(told)}."] if told else []
 
     def causes(self) -> list[str]:
         """Causes that records name, with what to change, weakest scenario first: perception's warnings there, search, fit."""
@@ -210,7 +215,8 @@ class Duel:
         results, methods = self.numbers.results, dict.fromkeys([self.method, str(self.lead.rival)])
         found = [sorted(results.glob(f"{self.weakest}/{name}/*/run.json"))[:1] for name in methods if name] if results else []
         runs = [str(path.parent) for paths in found for path in paths]
-        return [(f"Look where {self.weakest} goes wrong:", shlex.join([program("neuspring"), "play", *runs]))] if runs else []
+        where = f"Look where {self.weakest} goes wrong:" if self.scenarios > 1 else f"Look at {self.weakest}:"
+        return [(where, shlex.join([program("neuspring"), "play", *runs]))] if runs else []
 
     def drift(self) -> list[str]:
         """Sentence on the error of the weakest scenario: there from the start, or growing where the twin predicts."""

@@ -24,7 +24,7 @@ from neuspring.data.capture import CAPTURE, read_description
 from neuspring.experiments.local import workflow_command, workflow_folder
 from neuspring.extensions.own_video.options import Wish
 
-Run = Callable[[list[str], Path], int]
+StepRun = Callable[[list[str], Path], int]
 TWIN_STEPS = ("capture", "masks", "check", "twin")
 STEPS_DONE = "steps.json"
 """Step -> its command, once it has succeeded; `window`: the frames that were chosen."""
@@ -34,7 +34,7 @@ WINDOW = re.compile(r"all|\d+-\d+")
 MOVIE_ENDINGS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 LOOK_FOR_MASKS, GRACE = 0.5, 2.0
 """s between two looks whether masks were saved, and until the page that saved them ends."""
-TOGETHER: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "encoding": "utf-8", "errors": "replace"}
+JOINED: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "encoding": "utf-8", "errors": "replace"}
 LAST_LINES = 8
 """Lines of a failed step's log that are shown."""
 BESIDE = "static"
@@ -162,7 +162,7 @@ class TwinChain:
 
     # --- what all steps share
 
-    def _step(self, name: str, command: list[str], made: bool = False, shown: bool = False, run: Run | None = None) -> Path:
+    def _step(self, name: str, command: list[str], made: bool = False, shown: bool = False, run: StepRun | None = None) -> Path:
         """Run a step unless it is `made`; returns its log. Raises StepFailed."""
         log = self.folder / "logs" / f"{TWIN_STEPS.index(name) + 1}_{name}.log"
         print(f"$ {shlex.join(command)}", flush=True)
@@ -215,7 +215,7 @@ def _neuspring(*words: str) -> list[str]:
 
 def _run(command: list[str], log: Path, shown: bool) -> int:
     """Run a command whose output goes to a log; returns its exit status. Ctrl-C reaches it too, and its end is waited for."""
-    with log.open("w", encoding="utf-8") as output, subprocess.Popen(command, **TOGETHER) as process:
+    with log.open("w", encoding="utf-8") as output, subprocess.Popen(command, **JOINED) as process:
         try:
             for line in process.stdout or ():
                 output.write(line)

@@ -18,7 +18,8 @@ from neuspring.report.data import MOST_ROWS, ReportData, ReportSection, link, se
 def failures(material: ReportData) -> PageSection:
     """Everything that keeps runs out of the tables, and a table of the runs that there are."""
     failed = [job for job in material.jobs if job.failed]
-    left = [job for job in material.jobs if job.last.outcome == "running"]
+    # This page's own job has no end yet.
+    left = [job for job in material.jobs if job.last.outcome == "running" and job.rule != "report"]
     runs = material.collected.runs
     broken = runs[runs["status"] == "failed"] if len(runs) else runs
     blocks: list[Block] = []
