@@ -30,6 +30,8 @@ from neuspring.scores.runs import DAMAGED, Collected, one_line
 UNREADABLE = (InputError, OSError, ValueError, KeyError, TypeError, AttributeError)
 """Exceptions of a damaged record, table or picture."""
 Value = TypeVar("Value")
+PERCEPTION = "perception"
+"""Kind of the pictures that perception left of a scenario, and their folder in it."""
 MOST_ROWS = 400
 """At most so many failures of a kind are listed; the rest is counted."""
 METHOD_RECORDS = (RUN_RECORD, "rollout.json", "fit.json", "train.json")
@@ -91,7 +93,9 @@ class ReportData:
         return self.results / run.name
 
     def file(self, run: RunRecord, kind: str, stem: str) -> Path | None:
-        """One of the files that a run's record names; None if there is none, or it is not there."""
+        """One of the files that a run's record names, or that perception left; None if there is none, or it is not there."""
+        if kind == PERCEPTION:
+            return next(iter(sorted((self.results / run.scenario / PERCEPTION).rglob(f"{stem}.png"))), None)
         paths = (self.folder(run) / name for name in run.artifacts.get(kind, []))
         return next((path for path in paths if path.stem == stem and path.is_file()), None)
 

@@ -42,6 +42,8 @@ HOLE = "\ufffc"
 DIFFERING = (
     "Settings that differ between the rows, as the runs recorded them. A stage that a row does not have is not listed for it."
 )
+SHORT_NAMES = {"NSF": "neural spring field", "PT": "piecewise topology"}
+"""Abbreviations in names of methods."""
 
 
 def score_blocks(numbers: Numbers) -> list[Block]:
@@ -100,7 +102,11 @@ def errors_table(numbers: Numbers) -> Table:
     scenarios, seeds = runs["scenario"].nunique(), runs["seed"].nunique()
     size = f"{scenarios} scenario{'s' * (scenarios > 1)}, {seeds} seed{'s' * (seeds > 1)}"
     used = dict.fromkeys(metric for _, metric in shown)
-    explained = "; ".join(f"{metric.heading}: {metric.explained or metric.title}" for metric in used)
+    words = [word for method in runs["method"].unique() for word in numbers.name(method).split()]
+    short = {metric.heading: metric.explained or metric.title for metric in used} | {
+        name: told for name, told in SHORT_NAMES.items() if name in [word.strip(",") for word in words]
+    }
+    explained = "; ".join(f"{name}: {told}" for name, told in short.items())
     spread = ", ± standard deviation over seeds" if _several_seeds(numbers.usable) else ""
     weighted = "; in brackets the frame-weighted mean" if _weighted(numbers.usable) else ""
     note = f"In mm, lower is better ({size}; {explained}). Mean over scenarios{spread}{weighted}. Best in bold."

@@ -89,10 +89,11 @@ class TwinChain:
         for name in ("mass", "rate", "frames"):
             words += [f"--{name}", str(getattr(wish, name))] if getattr(wish, name) else []
         command = _neuspring("make-capture", *words, *shlex.split(wish.intake))
-        if made and (before := self.done.get("capture", command)) != command:
+        # The words behind `python -m neuspring`: the same step in another environment is the same step.
+        if made and (before := self.done.get("capture", command))[3:] != command[3:]:
             remedy = "Choose another --output, or delete that folder."
             raise InputError(self.capture, f"was made by: {shlex.join(before)}", shlex.join(command), remedy)
-        self._step("capture", command, made)
+        self._step("capture", command, made, shown=True)
 
     def _masks(self) -> None:
         wish = self.wish
@@ -101,7 +102,7 @@ class TwinChain:
             words += [name, *(str(path.resolve()) for path in paths)] if paths else []
         command = _neuspring("mask", str(self.capture), *words)
         if words:
-            self._step("masks", command, self._masked() and self.done.get("masks") == command)
+            self._step("masks", command, self._masked() and self.done.get("masks", [])[3:] == command[3:], shown=True)
         elif self._masked():
             self._say("masks", "they are in the capture")
         else:
@@ -127,7 +128,7 @@ class TwinChain:
 
     def _window(self) -> Path:
         """The capture that the twin is learned from: all frames, or those of one grip."""
-        log = self._step("check", _neuspring("check-data", str(self.capture)))
+        log = self._step("check", _neuspring("check-data", str(self.capture)), shown=True)
         wish, before = self.wish, self.done.get("window", [""])[0]
         found = PROPOSED.search(log.read_text(encoding="utf-8")) if log.is_file() else None
         window = wish.window or before or (found[1] if found else "all")
@@ -192,7 +193,8 @@ class TwinChain:
             write_text(self.folder / STEPS_DONE, json.dumps(self.done, indent=1) + "\n")
 
     def _tell(self, scenario: Path) -> int:
-        """Errors beside the row that learns nothing, and what to open."""
+        """What the twin is made of, errors beside the row that learns nothing, and what to open."""
+        print(_made_of(RunFolder.of(scenario / self.method / "0")))
         print("Errors in mm, future frames (training frames):")
         for method in dict.fromkeys([BESIDE, self.method]):
             scores = RunFolder.of(scenario / method / "0").scores
@@ -200,13 +202,22 @@ class TwinChain:
             told = [f"{row.Index} {row.future:.1f} ({row.reconstruction:.1f})" for row in errors.dropna().itertuples()]
             print(f"  {method:<16} {', '.join(told)}")
         run = scenario / self.method / "0"
-        page = {"page": self.folder / "results" / "tables" / "report.html", "film": run / "video.mp4"}
-        print("".join(f"{name}: {path}\n" for name, path in page.items() if path.is_file()), end="")
+        places = {"page": self.folder / "results" / "tables" / "report.html", "film": run / "video.mp4"}
+        places |= {"masks, tracks, points": scenario / "perception", "logs": self.folder / "logs"}
+        print("".join(f"{name}: {path}\n" for name, path in places.items() if path.exists()), end="")
         command = _neuspring("play", str(run))
         print(f"play: {shlex.join(command)}", flush=True)
         if self.wish.play:
             os.execv(command[0], command)
         return 0
+
+
+def _made_of(run: RunFolder) -> str:
+    """Nodes, springs, and how much of the surface is invented, in a line."""
+    twin, facts = run.twin, {name: value for record in run.records.values() for name, value in record.facts.items()}
+    size = f"{len(twin.topology.nodes):,} nodes, {len(twin.topology.springs):,} springs" if twin else "no springs"
+    unseen = facts.get("unseen_surface")
+    return f"Twin: {size}" + (f"; no camera saw {100 * unseen:.0f} % of its surface, which is invented" if unseen else "")
 
 
 def _neuspring(*words: str) -> list[str]:

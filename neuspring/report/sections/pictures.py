@@ -18,7 +18,7 @@ from neuspring.core.text import program
 from neuspring.draw.scene import chosen_frames
 from neuspring.draw.sheet import TIME_BAR, TITLE_LINE
 from neuspring.report.blocks import Block, Code, Fold, Grid, PageSection, Picture, Text
-from neuspring.report.data import UNREADABLE, ReportData, ReportSection, data_uri, link, several
+from neuspring.report.data import PERCEPTION, UNREADABLE, ReportData, ReportSection, data_uri, link, several
 
 HEAD = TITLE_LINE + TIME_BAR
 """Height of what stands above the panels of a film, px."""
@@ -48,6 +48,8 @@ class Kind:
     """Least width in the page, rem."""
     frames: bool = False
     """Shows the frames that `frame_links` names."""
+    shared: str = ""
+    """Caption of a picture that methods of a scenario share."""
 
 
 KINDS = (
@@ -57,7 +59,10 @@ KINDS = (
     Kind(artifact="plots", stem="motion", title="Motion: predicted nodes and observed points", width=1200, paper=True, frames=True),
     Kind(artifact="plots", stem="stiffness", title="Stiffness of the springs", width=900, paper=True, least=27),
     Kind(artifact="plots", stem="topology", title="Regions and springs", width=900, paper=True, least=27),
-    Kind(artifact="images", stem="appearance", title="Splats of frame 0", width=900),
+    Kind(artifact="images", stem="appearance", title="Splats of frame 0", width=900, shared="Observed and drawn in frame 0"),
+    Kind(artifact=PERCEPTION, stem="masks", title="Perceived: masks", width=900, shared="Masks of the first camera"),
+    Kind(artifact=PERCEPTION, stem="tracks", title="Perceived: tracks", width=900, shared="Tracks of the first camera"),
+    Kind(artifact=PERCEPTION, stem="lifted", title="Perceived: points in space", width=900, shared="Points in space", paper=True),
 )
 
 
@@ -155,8 +160,8 @@ def _scenario(material: ReportData, runs: dict[str, RunRecord], shown: dict[Path
         for path, methods in owners.items():
             run = runs[methods[0]]
             caption = ", ".join(map(name, methods))
-            if kind.stem == "appearance":
-                caption = "Observed and drawn in frame 0" + (f", {caption}" if len(owners) > 1 else "")
+            if kind.shared:
+                caption = kind.shared + (f", {caption}" if len(owners) > 1 else "")
             alt = f"{kind.title}: {run.scenario}, {', '.join(methods)}, seed {run.seed}"
             own = frames if kind.frames else ()
             wide, panel = bool(kind.width), 1 if kind.stem == "video" else None
