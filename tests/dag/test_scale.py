@@ -76,10 +76,10 @@ def test_runs_made_again_with_the_same_seed_are_equal_bit_for_bit(two_gpu_run):
 @pytest.mark.slow
 def test_a_study_is_a_target_and_explain_names_its_runs(two_gpu_run):
     project, _ = two_gpu_run
-    # Two of the rows, since each is fitted twice.
+    # Two of the rows, since each is fitted twice; with fewer rows it is no longer the paper's.
     table2 = config.read_yaml(project / "config" / "studies.yaml")["table2"]
     rows = {label: table2["rows"][label] for label in ("Baseline", "Model-A (PT)")}
-    (project / "config" / "two_rows.yaml").write_text(json.dumps({"table2": table2 | {"rows": rows}}))
+    (project / "config" / "two_rows.yaml").write_text(json.dumps({"table2": table2 | {"reference": None, "rows": rows}}))
     run_on_two_gpus(project, {"study_table": "config/two_rows.yaml"}, "--", "table2")
     page = (project / "results" / "tables" / "studies" / "table2.md").read_text()
     assert "Model-A (PT)" in page
