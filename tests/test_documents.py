@@ -58,9 +58,13 @@ def test_commands_of_the_workflow_ask_for_targets_that_there_are():
         for command in re.findall(r"snakemake ((?:[^`\n\\]|\\\n)*--configfile(?:[^`\n\\]|\\\n)*)", page.read_text()):
             if "..." not in command:
                 words = shlex.split(command.replace("\\\n", " "), comments=True)
-                targets = get_argument_parser().parse_args(words).targets
-                asked |= {f"{page.name}: {word}": word for word in targets if "/" not in word and not word.isupper()}
-    assert len(asked) > 2 and not {place for place, word in asked.items() if word not in known}
+                found = get_argument_parser().parse_args(words)
+                assert all((ROOT / path).is_file() for path in found.configfile), (page, command)
+                asked |= {
+                    f"{page.relative_to(ROOT)}: {word}": word for word in found.targets if "/" not in word and not word.isupper()
+                }
+    assert len(asked) > 2
+    assert not {place for place, word in asked.items() if word not in known}
 
 
 def test_the_page_of_configurations_names_every_file_and_no_other():

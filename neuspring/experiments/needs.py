@@ -64,7 +64,7 @@ PUBLISHED: dict[tuple[str, Kind], float] = {
 """Rule and kind -> s per unit of work, before any job of it was measured."""
 PUBLISHED_BY: dict[Kind, str] = {
     "gpu": "PhysTwin's README: one stuffed animal, 220 rollouts and 200 epochs on an RTX 4090",
-    "cpu": "results/published/demo/summary.md: 300 nodes, 45 frames, two vCPUs of an AMD EPYC",
+    "cpu": "jobs of make demo: 300 nodes, 45 frames, two vCPUs of an AMD EPYC",
 }
 """Source of the figures of `PUBLISHED`."""
 

@@ -50,13 +50,14 @@ def _times(needs: Needs, jobs: Mapping[str, int], place: Place) -> Iterable[str]
     unknown: list[str] = []
     for kind in ("gpu", "cpu"):
         each: dict[str, tuple[float, bool]] = {}
-        others = len(unknown)
+        missing = []
         for rule in jobs:
             of, seconds, recorded = needs.expected(rule)
             if of == kind and seconds is None:
-                unknown.append(f"{rule} ({jobs[rule]:,})")
+                missing.append(f"{rule} ({jobs[rule]:,})")
             elif of == kind and seconds is not None:
                 each[rule] = (seconds, recorded)
+        unknown += missing
         if not each:
             continue
         total = sum(jobs[rule] * seconds for rule, (seconds, _) in each.items())
@@ -64,7 +65,7 @@ def _times(needs: Needs, jobs: Mapping[str, int], place: Place) -> Iterable[str]
         parts = ", ".join(f"{rule} {jobs[rule]:,} x {duration(each[rule][0])}" for rule in first if each[rule][0])
         sources = [text for known, text in ((True, "jobs of this results folder"), (False, PUBLISHED_BY[kind]))
                    if known in {recorded for _, recorded in each.values()}]  # fmt: skip
-        least = "at least " * (len(unknown) > others)
+        least = "at least " if missing else ""
         yield f"{least}{duration(total)} of {kind.upper()} time{_shared_out(kind, total, place)}: {parts} (by {'; '.join(sources)})"
     if unknown:
         yield f"without a figure, and not counted: {listed(unknown)}"

@@ -93,9 +93,13 @@ class ReportData:
         return self.results / run.name
 
     def file(self, run: RunRecord, kind: str, stem: str) -> Path | None:
-        """One of the files that a run's record names, or that perception left; None if there is none, or it is not there."""
+        """One of the files that a run's record names; None if there is none, or it is not there.
+
+        Of `PERCEPTION`: what it left of the scenario, of the first camera where each has its own.
+        """
         if kind == PERCEPTION:
-            return next(iter(sorted((self.results / run.scenario / PERCEPTION).rglob(f"{stem}.png"))), None)
+            folder = self.results / run.scenario / PERCEPTION
+            return next((path for path in (folder / f"{stem}.png", *sorted(folder.glob(f"*/{stem}.png"))) if path.is_file()), None)
         paths = (self.folder(run) / name for name in run.artifacts.get(kind, []))
         return next((path for path in paths if path.stem == stem and path.is_file()), None)
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -102,10 +103,9 @@ def errors_table(numbers: Numbers) -> Table:
     scenarios, seeds = runs["scenario"].nunique(), runs["seed"].nunique()
     size = f"{scenarios} scenario{'s' * (scenarios > 1)}, {seeds} seed{'s' * (seeds > 1)}"
     used = dict.fromkeys(metric for _, metric in shown)
-    words = [word for method in runs["method"].unique() for word in numbers.name(method).split()]
-    short = {metric.heading: metric.explained or metric.title for metric in used} | {
-        name: told for name, told in SHORT_NAMES.items() if name in [word.strip(",") for word in words]
-    }
+    names = " ".join(map(numbers.name, runs["method"].unique()))
+    short = {metric.heading: metric.explained or metric.title for metric in used}
+    short |= {name: told for name, told in SHORT_NAMES.items() if re.search(rf"\b{name}\b", names)}
     explained = "; ".join(f"{name}: {told}" for name, told in short.items())
     spread = ", ± standard deviation over seeds" if _several_seeds(numbers.usable) else ""
     weighted = "; in brackets the frame-weighted mean" if _weighted(numbers.usable) else ""

@@ -60,9 +60,11 @@ def verdict(numbers: Numbers) -> list[Block]:
         "What went wrong": [*_unfinished(numbers), *duel.weak(), *duel.apart(), *duel.others()] or ["No run failed."],
         "Probable cause": why,
     }
-    seeds = [("Two more seeds, to tell how much is chance in training:", again(about, "seeds", "[0,1,2]"))] * (duel.seeds == 1)
+    again_with = again(about, "seeds", "[0,1,2]")
+    seeds = [("Two more seeds, to tell how much is chance in training:", again_with)] if duel.seeds == 1 else []
     # Seeds tell nothing of other scenes: with one, looking comes first.
-    return _paragraphs(said, [*moves, *(seeds + duel.looks() if duel.scenarios > 1 else duel.looks() + seeds)])
+    order = [*seeds, *duel.looks()] if duel.scenarios > 1 else [*duel.looks(), *seeds]
+    return _paragraphs(said, [*moves, *order])
 
 
 def again(about: Mapping[str, Any], key: str = "", value: str = "") -> str:
@@ -167,10 +169,10 @@ class Duel:
         better, worse = list[str](), list[str]()
         for name, own in self.by_scenario.items():
             theirs = self.each.get((str(self.lead.rival), self.task, name))
-            if theirs is not None and theirs != own:
+            if theirs is not None and self.text(theirs) != self.text(own):
                 (better if theirs < own else worse).append(f"{name} ({self.metric.text(theirs)} against {self.text(own)})")
         if better:
-            behind = f", worse in {listed(worse, MOST_SAID)}" if worse else ""
+            behind = f"; it is worse in {listed(worse, MOST_SAID)}" if worse else ""
             said.append(f"{self.rival} is better in {listed(better, MOST_SAID)}{behind}.")
         return [*said, f"{self.best} learns nothing, and no method that learns is better."] if self.method in REFERENCES else said
 
@@ -198,7 +200,7 @@ class Duel:
                 against = f"{mean}{metric.heading} ({metric.text(values[leader])} against {metric.text(values[self.method])})"
                 first.setdefault(self.numbers.name(leader), []).append(against)
         told = [f"{leader} in {', '.join(found)}" for leader, found in first.items()]
-        return [f"By other measures another is first: {'; '.join(told)}."] if told else []
+        return [f"First by other measures: {'; '.join(told)}."] if told else []
 
     def causes(self) -> list[str]:
         """Causes that records name, with what to change, weakest scenario first: perception's warnings there, search, fit."""

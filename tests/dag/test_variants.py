@@ -111,8 +111,11 @@ def test_fits_of_seeds_share_launches_and_nothing_finished_is_made_again(project
     assert record["facts"]["batches"] == [targets]
     assert record["facts"]["errors"] == {}
     assert all(json.loads((project / path).read_text())["facts"]["epochs_together"] == 2 for path in targets)
-    later = [first, *targets, f"results/{SCENE}/baseline/3/fit.json"]
-    assert plan(project, changes | {"seeds": [0, 1, 2, 3]}, "--", *later)["fit"] == 1
+    later = [first, *targets, *(f"results/{SCENE}/baseline/{seed}/fit.json" for seed in (3, 4))]
+    more = changes | {"seeds": [0, 1, 2, 3, 4]}
+    jobs, alone = (plan(project, more | {"twins_per_launch": count}, "--", *later) for count in ("auto", 1))
+    assert jobs["fit"] == alone["fit"] == 2
+    assert jobs["fits"] == 1 and "fits" not in alone
     # A further method in a finished folder, without targets.
     output = run(project, changes | {"methods": ["baseline", "model_b"]}, "--dry-run")
     planned = {words[0]: words[1] for words in map(str.split, output.splitlines()) if len(words) == 2}
@@ -120,4 +123,3 @@ def test_fits_of_seeds_share_launches_and_nothing_finished_is_made_again(project
     # Nothing of another scene is overlooked where a part of the seeds of this one is asked for.
     both = changes | {"scenarios": [SCENE, OTHER], "only": "seed=0"}
     assert plan(project, both)["observe"] == plan(project, both)["search"] == 1
-    assert not plan(project, changes | {"twins_per_launch": 1}, "--forcerun", "fit", "--", first, *targets).keys() & {"fits"}

@@ -69,7 +69,7 @@ def test_hours_are_published_ones_scaled_by_the_settings_until_jobs_of_the_folde
     assert lines[1] == "  time     2.0 h of GPU time, 60.0 min on 2 GPUs: fit 60 x 2.0 min (by jobs of this results folder)"
     # A job on a GPU says nothing of one on the CPU.
     lines = planned(tmp_path, {"fit": 60}, place, **sizes)
-    assert lines[1].startswith("  time     2.3 h of CPU time, 34.8 min on 4 cores: fit 60 x 2.3 min (by results/published/demo")
+    assert lines[1].startswith("  time     2.3 h of CPU time, 34.8 min on 4 cores: fit 60 x 2.3 min (by jobs of make demo")
 
 
 def test_a_plan_says_how_jobs_share_gpus_and_where_tables_will_be(tmp_path):
@@ -99,4 +99,3 @@ def test_a_later_file_says_which_keys_it_changes_and_from_what(tmp_path):
 
 def test_published_times_are_of_rules_that_there_are():
     assert {rule for rule, _ in needs.PUBLISHED} | set(needs.UNITS_OF_WORK) <= set(needs.FIRST_REQUEST)
-    assert (ROOT / needs.PUBLISHED_BY["cpu"].partition(":")[0]).is_file()

@@ -39,7 +39,7 @@ def test_a_lead_that_is_not_resolved_is_no_lead_and_where_the_best_is_weakest_is
         "(geometric mean over 2 scenarios)."
     )
     assert texts["What went wrong"] == (
-        "ours is weakest in b (30.00 mm). base is better in b (28.00 against 30.00 mm), worse in a (20.00 against 10.00 mm)."
+        "ours is weakest in b (30.00 mm). base is better in b (28.00 against 30.00 mm); it is worse in a (20.00 against 10.00 mm)."
     )
 
 
@@ -83,7 +83,7 @@ def test_one_large_error_does_not_make_a_leader():
     assert texts["Who wins"].startswith(
         "base is ahead of ours (6 scenes, 1 seed). The track error on future frames of ours is 1.22"
     )
-    assert "By other measures another is first: ours in mean TE (" in texts["What went wrong"]
+    assert "First by other measures: ours in mean TE (" in texts["What went wrong"]
 
 
 @pytest.mark.parametrize("factor", [0.8, 1.25])
@@ -151,7 +151,7 @@ def test_failures_missing_runs_and_other_measures_are_named():
     other = found.scores.assign(metric="chamfer", value=found.scores["value"].where(found.scores["method"] == "base", 0.05))
     text = said(Collected(pd.concat([found.scores, other]), pd.concat([found.runs, missing])))["What went wrong"]
     assert text.startswith("1 of 6 runs have not finished. 1 of 6 runs failed, first ours on c: diverged. ")
-    assert text.endswith("By other measures another is first: base in CD (24.00 against 50.00).")
+    assert text.endswith("First by other measures: base in CD (24.00 against 50.00).")
 
 
 def test_nothing_finished_is_no_verdict():

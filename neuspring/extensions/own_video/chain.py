@@ -1,4 +1,4 @@
-"""The chain of commands from a film to its twin: each a process with a log, told in a line, and passed over where it was done."""
+"""The chain of commands from a film to its twin: each a process whose output is shown and logged, passed over where it was done."""
 
 from __future__ import annotations
 
@@ -35,8 +35,7 @@ MOVIE_ENDINGS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 LOOK_FOR_MASKS, GRACE = 0.5, 2.0
 """s between two looks whether masks were saved, and until the page that saved them ends."""
 JOINED: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "encoding": "utf-8", "errors": "replace"}
-LAST_LINES = 8
-"""Lines of a failed step's log that are shown."""
+JOINED["env"] = os.environ | {"PYTHONUNBUFFERED": "1"}
 BESIDE = "static"
 """The row that learns nothing, whose errors stand beside the twin's."""
 
@@ -93,7 +92,7 @@ class TwinChain:
         if made and (before := self.done.get("capture", command))[3:] != command[3:]:
             remedy = "Choose another --output, or delete that folder."
             raise InputError(self.capture, f"was made by: {shlex.join(before)}", shlex.join(command), remedy)
-        self._step("capture", command, made, shown=True)
+        self._step("capture", command, made)
 
     def _masks(self) -> None:
         wish = self.wish
@@ -102,7 +101,7 @@ class TwinChain:
             words += [name, *(str(path.resolve()) for path in paths)] if paths else []
         command = _neuspring("mask", str(self.capture), *words)
         if words:
-            self._step("masks", command, self._masked() and self.done.get("masks", [])[3:] == command[3:], shown=True)
+            self._step("masks", command, self._masked() and self.done.get("masks", [])[3:] == command[3:])
         elif self._masked():
             self._say("masks", "they are in the capture")
         else:
@@ -123,12 +122,14 @@ class TwinChain:
             finally:
                 if page.poll() is None:
                     page.send_signal(signal.SIGINT)
-        log.write_text("" if self._masked() else "the page ended before masks were saved\n", encoding="utf-8")
-        return 0 if self._masked() else 2
+        told = "" if self._masked() else "the page ended before masks were saved\n"
+        log.write_text(told, encoding="utf-8")
+        print(told, end="", file=sys.stderr)
+        return 2 if told else 0
 
     def _window(self) -> Path:
         """The capture that the twin is learned from: all frames, or those of one grip."""
-        log = self._step("check", _neuspring("check-data", str(self.capture)), shown=True)
+        log = self._step("check", _neuspring("check-data", str(self.capture)))
         wish, before = self.wish, self.done.get("window", [""])[0]
         found = PROPOSED.search(log.read_text(encoding="utf-8")) if log.is_file() else None
         window = wish.window or before or (found[1] if found else "all")
@@ -159,11 +160,11 @@ class TwinChain:
         }
         settings = [f"{key}={value if isinstance(value, str) else json.dumps(value)}" for key, value in chosen.items()]
         options = ["--directory", str(self.folder), "--config", *settings]
-        self._step("twin", workflow_command("own", *options, cores=self.wish.cores), shown=True)
+        self._step("twin", workflow_command("own", *options, cores=self.wish.cores))
 
     # --- what all steps share
 
-    def _step(self, name: str, command: list[str], made: bool = False, shown: bool = False, run: StepRun | None = None) -> Path:
+    def _step(self, name: str, command: list[str], made: bool = False, run: StepRun | None = None) -> Path:
         """Run a step unless it is `made`; returns its log. Raises StepFailed."""
         log = self.folder / "logs" / f"{TWIN_STEPS.index(name) + 1}_{name}.log"
         print(f"$ {shlex.join(command)}", flush=True)
@@ -171,14 +172,12 @@ class TwinChain:
             self._say(name, "done before" if made else "not run")
             return log
         log.parent.mkdir(parents=True, exist_ok=True)
-        self._say(name, "... ", end="\n" if shown or run else "")
+        self._say(name, "...")
         begun = time.monotonic()
-        status = run(command, log) if run else _run(command, log, shown)
-        print(f"{'      ' if shown or run else ''}{'failed' if status else duration(time.monotonic() - begun)}", flush=True)
+        status = (run or _run)(command, log)
+        print(f"      {'failed' if status else duration(time.monotonic() - begun)}", flush=True)
         if status:
-            lines = log.read_text(encoding="utf-8", errors="replace").rstrip().splitlines()[-LAST_LINES:]
-            told = "".join(f"  {line}\n" for line in lines)
-            print(f"{'' if shown else told}Step {name} failed, exit status {status}. Its output: {log}", file=sys.stderr)
+            print(f"Step {name} failed, exit status {status}. Its output: {log}", file=sys.stderr)
             print(f"By hand:\n  {shlex.join(command)}\nneuspring twin goes on from here.", file=sys.stderr)
             raise StepFailed(status)
         self._keep(name, command)
@@ -193,8 +192,8 @@ class TwinChain:
             write_text(self.folder / STEPS_DONE, json.dumps(self.done, indent=1) + "\n")
 
     def _tell(self, scenario: Path) -> int:
-        """What the twin is made of, errors beside the row that learns nothing, and what to open."""
-        print(_made_of(RunFolder.of(scenario / self.method / "0")))
+        """Size of the twin, errors beside the row that learns nothing, and what to open."""
+        print(_made_of(RunFolder.of(scenario / self.method / "0")), end="")
         print("Errors in mm, future frames (training frames):")
         for method in dict.fromkeys([BESIDE, self.method]):
             scores = RunFolder.of(scenario / method / "0").scores
@@ -213,26 +212,32 @@ class TwinChain:
 
 
 def _made_of(run: RunFolder) -> str:
-    """Nodes, springs, and how much of the surface is invented, in a line."""
+    """Nodes, springs, and how much of the surface is invented, in a line; empty where the method has no springs."""
     twin, facts = run.twin, {name: value for record in run.records.values() for name, value in record.facts.items()}
-    size = f"{len(twin.topology.nodes):,} nodes, {len(twin.topology.springs):,} springs" if twin else "no springs"
+    if twin is None:
+        return ""
     unseen = facts.get("unseen_surface")
-    return f"Twin: {size}" + (f"; no camera saw {100 * unseen:.0f} % of its surface, which is invented" if unseen else "")
+    size = f"Twin: {len(twin.topology.nodes):,} nodes, {len(twin.topology.springs):,} springs"
+    return size + (f"; no camera saw {100 * unseen:.0f} % of its surface, which is invented\n" if unseen else "\n")
 
 
 def _neuspring(*words: str) -> list[str]:
     return [sys.executable, "-m", "neuspring", *words]
 
 
-def _run(command: list[str], log: Path, shown: bool) -> int:
-    """Run a command whose output goes to a log; returns its exit status. Ctrl-C reaches it too, and its end is waited for."""
+def _run(command: list[str], log: Path) -> int:
+    """Run a command whose output is shown and logged; returns its exit status. Ctrl-C reaches it too, and its end is waited for."""
     with log.open("w", encoding="utf-8") as output, subprocess.Popen(command, **JOINED) as process:
-        try:
+
+        def follow() -> None:
             for line in process.stdout or ():
                 output.write(line)
-                print(f"      {line}" * shown, end="", flush=True)
+                print(f"      {line}", end="", flush=True)
+
+        try:
+            follow()
         except KeyboardInterrupt:
-            output.writelines(process.stdout or ())
+            follow()
             raise
     return process.returncode
 

@@ -83,8 +83,8 @@ class Page:
         gui.add_html(FIT)
         gui.add_markdown(
             f"**{scenario.name}** ({scenario.category}): {scenario.frame_count} frames at {scenario.frame_rate:g} per second. "
-            "To pull the twin: *Live*, *Start*, then drag it. Forces are shown as if each node weighed 1 kg, or a meter of cable; "
-            "`neuspring export --mass` scales them to the object."
+            "To pull the twin: *Live*, *Start*, then drag it. Forces are shown as if each node, or each meter of a cable, weighed "
+            "1 kg; `neuspring export --mass` scales them to the object."
         )
         self.quantity: Any = gui.add_dropdown("Springs by", QUANTITIES, initial_value=self._before[0])
         self.legend = gui.add_html("")
@@ -242,7 +242,7 @@ class Page:
 
     def _update_error_text(self) -> None:
         found = self.player.errors()
-        what = "track error in this frame" if self.player.clock.frame else "at rest, from tracked points to the nodes they follow"
+        what = "track error in this frame" if self.player.clock.frame else "in frame 0, distance of tracked points from their nodes"
         self.errors.content = f"<div style='{SMALL_STYLE}'>{what}: {escape(found)}</div>" if found else ""
 
     def _tick(self) -> None:

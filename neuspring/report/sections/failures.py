@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from neuspring.core.job_records import JobRecord
+from neuspring.core.job_records import JobRecord, this_run
 from neuspring.core.table import Cell, Chip, Table, Tone
 from neuspring.core.text import duration
 from neuspring.report.blocks import Block, Fold, PageSection, Text
@@ -18,8 +18,9 @@ from neuspring.report.data import MOST_ROWS, ReportData, ReportSection, link, se
 def failures(material: ReportData) -> PageSection:
     """Everything that keeps runs out of the tables, and a table of the runs that there are."""
     failed = [job for job in material.jobs if job.failed]
-    # This page's own job has no end yet.
-    left = [job for job in material.jobs if job.last.outcome == "running" and job.rule != "report"]
+    # Jobs of the run that makes this page, its own among them, may still have no end.
+    now = this_run(material.results)
+    left = [job for job in material.jobs if job.last.outcome == "running" and not (now and job.last.run == now)]
     runs = material.collected.runs
     broken = runs[runs["status"] == "failed"] if len(runs) else runs
     blocks: list[Block] = []

@@ -49,7 +49,7 @@ class Kind:
     frames: bool = False
     """Shows the frames that `frame_links` names."""
     shared: str = ""
-    """Caption of a picture that methods of a scenario share."""
+    """Caption of a picture that methods of a scenario share; {} stands for the name of its folder."""
 
 
 KINDS = (
@@ -60,8 +60,8 @@ KINDS = (
     Kind(artifact="plots", stem="stiffness", title="Stiffness of the springs", width=900, paper=True, least=27),
     Kind(artifact="plots", stem="topology", title="Regions and springs", width=900, paper=True, least=27),
     Kind(artifact="images", stem="appearance", title="Splats of frame 0", width=900, shared="Observed and drawn in frame 0"),
-    Kind(artifact=PERCEPTION, stem="masks", title="Perceived: masks", width=900, shared="Masks of the first camera"),
-    Kind(artifact=PERCEPTION, stem="tracks", title="Perceived: tracks", width=900, shared="Tracks of the first camera"),
+    Kind(artifact=PERCEPTION, stem="masks", title="Perceived: masks", width=900, shared="Masks of camera {}"),
+    Kind(artifact=PERCEPTION, stem="tracks", title="Perceived: tracks", width=900, shared="Tracks of camera {}"),
     Kind(artifact=PERCEPTION, stem="lifted", title="Perceived: points in space", width=900, shared="Points in space", paper=True),
 )
 
@@ -161,7 +161,7 @@ def _scenario(material: ReportData, runs: dict[str, RunRecord], shown: dict[Path
             run = runs[methods[0]]
             caption = ", ".join(map(name, methods))
             if kind.shared:
-                caption = kind.shared + (f", {caption}" if len(owners) > 1 else "")
+                caption = kind.shared.format(path.parent.name) + (f", {caption}" if len(owners) > 1 else "")
             alt = f"{kind.title}: {run.scenario}, {', '.join(methods)}, seed {run.seed}"
             own = frames if kind.frames else ()
             wide, panel = bool(kind.width), 1 if kind.stem == "video" else None
