@@ -6,6 +6,7 @@ from html.parser import HTMLParser
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from neuspring import config
@@ -18,6 +19,7 @@ from neuspring.report.data import ReportSection, hours, rendered
 from neuspring.report.gallery import write_gallery
 from neuspring.report.page import REPORT_SECTIONS, Options, write
 from neuspring.report.sections.pictures import PLAY_ADDRESS
+from neuspring.report.sections.strip import around
 from neuspring.report.sections.studies import answer
 from neuspring.scores.numbers import Numbers, shown_names
 from neuspring.scores.paper import Study
@@ -453,6 +455,18 @@ def test_the_gallery_links_every_video_with_its_scores(full, tmp_path):
     assert re.search(r"neuspring: training TE \d+\.\d+ mm, IoU \d+\.\d %; future TE", page)
     assert page.count("PhysTwin (<code>baseline</code>): training TE") == 2
     assert "No pictures: no images, or no finished run." in section(page, "zebra")
+
+
+def test_last_frames_are_cut_to_what_they_show_in_the_proportions_of_the_film():
+    first, second = np.zeros((2, 120, 3 * 200, 3), np.uint8)
+    assert around([first, second]) == (slice(0, 120), slice(0, 200))
+    first[50:60, 200 + 20 : 200 + 26] = 255  # predicted
+    second[55:70, 400 + 30 : 400 + 44, 0] = 255  # observed elsewhere, as the difference shows
+    second[0:40, 400 + 100 : 400 + 200] = 90  # a hand
+    rows, columns = around([first, second])
+    assert 0 <= rows.start <= 50 and 70 <= rows.stop <= 120 and 0 <= columns.start <= 20 and 44 <= columns.stop <= 200
+    height, width = rows.stop - rows.start, columns.stop - columns.start
+    assert height < 60 and width / height == pytest.approx(200 / 120, rel=0.05)
 
 
 def test_methods_have_their_names_wherever_a_person_reads(full):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,8 @@ from neuspring.report.sections.pictures import HEAD, MOST_OPEN_FILMS, NO_ROOM, W
 
 STRIP_WIDTH = 424
 """Largest width of a picture, px."""
+DARK, MARGIN = 40, 0.15
+"""Brightness of 255 up to which a film's predictions and differences show nothing; room around what they show."""
 
 
 def last_frame(path: Path) -> tuple[int, np.ndarray]:
@@ -28,6 +31,22 @@ def last_frame(path: Path) -> tuple[int, np.ndarray]:
     return count, cv2.cvtColor(picture[HEAD:], cv2.COLOR_BGR2RGB)
 
 
+def around(pictures: Sequence[np.ndarray]) -> tuple[slice, slice]:
+    """Rows and columns that hold what any of these frames [H, 3 W, 3] predicts or observes, in the proportions of a panel."""
+    height, width = pictures[0].shape[0], pictures[0].shape[1] // 3
+    # Hands are gray in differences, which have colors.
+    bright = [picture[:, width : 2 * width].max(axis=2) > DARK for picture in pictures]
+    colored = [np.ptp(picture[:, 2 * width : 3 * width], axis=2) > DARK for picture in pictures]
+    shown = np.argwhere(np.any([*bright, *colored], axis=0))
+    if not len(shown):
+        return slice(0, height), slice(0, width)
+    low, high, size = shown.min(axis=0), shown.max(axis=0) + 1, np.array([height, width])
+    share = min(float(((high - low) / size).max()) * (1 + 2 * MARGIN), 1.0)
+    part = np.ceil(share * size).astype(int)
+    top, left = np.clip((low + high - part) // 2, 0, size - part)
+    return slice(top, top + part[0]), slice(left, left + part[1])
+
+
 def strip(material: ReportData) -> PageSection | None:
     """A row per scenario; None where no run has a film."""
     rows: list[Block] = []
@@ -35,13 +54,16 @@ def strip(material: ReportData) -> PageSection | None:
         films = {name: material.file(run, "images", "video") for name, run in material.first_runs(scenario).items()}
         ends = {name: end for name, path in films.items() if path and (end := material.read(path, last_frame))}
         longest = max((count for count, _ in ends.values()), default=0)
+        # Films of one scenario have the same size unless a run was made otherwise.
+        alike = len({picture.shape for _, picture in ends.values()}) == 1
+        box = around([picture for _, picture in ends.values()]) if alike else (slice(None), slice(None))
         figures: list[Picture] = []
         for name, (count, picture) in sorted(ends.items(), key=lambda pair: pair[1][0] < longest):
             across = picture.shape[1] // 3
             stopped = f", which ends at frame {count - 1}" * (count < longest)
             if not figures:
-                figures.append(_picture(picture[:, :across], f"Observed: {scenario}, frame {count - 1}", scenario))
-            figures.append(_picture(picture[:, across : 2 * across], f"{material.numbers.name(name)}{stopped}", scenario))
+                figures.append(_picture(picture[:, :across][box], f"Observed: {scenario}, frame {count - 1}", scenario))
+            figures.append(_picture(picture[:, across : 2 * across][box], f"{material.numbers.name(name)}{stopped}", scenario))
         if sum(len(one.data) for one in figures) > material.room:
             rows.append(Text(text=f"{scenario}: {NO_ROOM}.", tone="mute"))
         elif figures:
@@ -49,7 +71,7 @@ def strip(material: ReportData) -> PageSection | None:
             rows.append(Grid(blocks=figures, least=10, fit=True))
     rest = rows[MOST_OPEN_FILMS:]
     more = [Fold(summary=f"{several(len(rest), 'scenario')} more", blocks=rest)] if rest else []
-    about = "What was filmed and what each method predicts, in the last frame of the future, first camera; one seed."
+    about = "What was filmed and what each method predicts, in the last frame of the future, first camera, cut out; one seed."
     return PageSection(key="strip", title="Last frame", about=about, blocks=[*rows[:MOST_OPEN_FILMS], *more]) if rows else None
 
 
