@@ -57,7 +57,7 @@ def play(
     if own is not None:
         page.panel.start(own.name, controls)
     print(f"Play {found.folder.name} at {address(server)} (stop with Ctrl-C)", flush=True)
-    print("To pull the twin there: Live, Start, then drag it.", flush=True)
+    print("To pull the twin there: Live, Start, then take it with the mouse.", flush=True)
     if not is_loopback(host):
         print("Everybody who can reach this address sees and moves the scene; an SSH tunnel to 127.0.0.1 is safer.", flush=True)
     if not no_open:
