@@ -16,7 +16,7 @@ from neuspring.report.sections.pictures import HEAD, MOST_OPEN_FILMS, NO_ROOM, W
 
 STRIP_WIDTH = 424
 """Largest width of a picture, px."""
-DARK, MARGIN = 40, 0.15
+DARK, CUT_MARGIN = 40, 0.15
 """Brightness of 255 up to which a film's predictions and differences show nothing; room around what they show."""
 
 
@@ -41,7 +41,7 @@ def around(pictures: Sequence[np.ndarray]) -> tuple[slice, slice]:
     if not len(shown):
         return slice(0, height), slice(0, width)
     low, high, size = shown.min(axis=0), shown.max(axis=0) + 1, np.array([height, width])
-    share = min(float(((high - low) / size).max()) * (1 + 2 * MARGIN), 1.0)
+    share = min(float(((high - low) / size).max()) * (1 + 2 * CUT_MARGIN), 1.0)
     part = np.ceil(share * size).astype(int)
     top, left = np.clip((low + high - part) // 2, 0, size - part)
     return slice(top, top + part[0]), slice(left, left + part[1])
