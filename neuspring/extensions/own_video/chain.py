@@ -35,7 +35,6 @@ MOVIE_ENDINGS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 LOOK_FOR_MASKS, GRACE = 0.5, 2.0
 """s between two looks whether masks were saved, and until the page that saved them ends."""
 JOINED: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "encoding": "utf-8", "errors": "replace"}
-JOINED["env"] = os.environ | {"PYTHONUNBUFFERED": "1"}
 BESIDE = "static"
 """The row that learns nothing, whose errors stand beside the twin's."""
 
@@ -227,7 +226,9 @@ def _neuspring(*words: str) -> list[str]:
 
 def _run(command: list[str], log: Path) -> int:
     """Run a command whose output is shown and logged; returns its exit status. Ctrl-C reaches it too, and its end is waited for."""
-    with log.open("w", encoding="utf-8") as output, subprocess.Popen(command, **JOINED) as process:
+    # Without it Python keeps what it prints into a pipe until the end.
+    now = os.environ | {"PYTHONUNBUFFERED": "1"}
+    with log.open("w", encoding="utf-8") as output, subprocess.Popen(command, env=now, **JOINED) as process:
 
         def follow() -> None:
             for line in process.stdout or ():
