@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import difflib
-import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -16,11 +15,9 @@ from scipy.ndimage import median_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
 
 from neuspring.checks.table import object_on_table
 from neuspring.core.checks import Check
-from neuspring.core.geometry import Obstacle
 from neuspring.data.camera import FAR, FASTEST, NEAR, SLOWEST, Camera
 from neuspring.data.capture import HANDS, OBJECT, THIN
 
@@ -273,17 +270,14 @@ OBJECT_RIM = 9
 """Pixels beside a mask may still be of its object."""
 
 
-def height_in_air(camera: Camera, sample: Sample, up: float, obstacles: Sequence[Obstacle]) -> dict[str, Any] | None:
-    """Height of the object of frame 0 above the table, m, where no obstacle is under it: the twin would fall.
-
-    Where a level surface is seen around its foot, the words have the box that stands for it.
-    """
+def height_in_air(camera: Camera, sample: Sample, up: float) -> dict[str, Any] | None:
+    """Height of the object of frame 0 above the table, m: the twin would fall. None where the object is on the table or held."""
     own = lifted(camera, sample, OBJECT) * (1, 1, up)
     if len(own) < FEWEST_POINTS:
         return None
     low, high = extents(own)[:, 2]
     foot, away = own[own[:, 2] < low + LEVEL], max(AIR[0], AIR[1] * (high - low))
-    if low < RAISED or any((one.depth((foot - (0, 0, away)) * (1, 1, up)) > 0).any() for one in obstacles):
+    if low < RAISED:
         return None
     around = cv2.dilate((sample.mask > 0).astype(np.uint8), np.ones((OBJECT_RIM, OBJECT_RIM), np.uint8))
     y, x = np.nonzero((around == 0) & (sample.depth > 0))
@@ -292,27 +286,11 @@ def height_in_air(camera: Camera, sample: Sample, up: float, obstacles: Sequence
     top = seen[near & (seen[:, 2] > max(RAISED, low - away)) & (seen[:, 2] < low + LEVEL)]
     level = float(np.median(top[:, 2])) if len(top) > 2 * FEWEST_POINTS else 0.0
     if level and np.mean(np.abs(top[:, 2] - level) < LEVEL) > 0.8:
-        (x0, y0), sides, angle = cv2.minAreaRect(np.concatenate([top, foot])[:, :2].astype(np.float32))
-        turn = Rotation.from_euler("z", angle, degrees=True).as_matrix()
-        center, half = np.round([[x0, y0, up * level / 2], [*np.divide(sides, 2), level / 2]], 3).tolist()
-        box = json.dumps({"shape": "box", "center": center, "half_sizes": half, "rotation": (turn.round(4) + 0.0).tolist()})
-        next_move = f'Add to capture.json, as measured here: "obstacles": [{box}]. Or mark it as the object too, if both move.'
-        return {"value": low, "cm": 100 * low, "on": f"on something {100 * level:.1f} cm high", "next": next_move}
+        return {"value": low, "cm": 100 * low, "on": f"on something {100 * level:.1f} cm high"}
     hands, steep = lifted(camera, sample, HANDS), -up * camera.camera_to_world[2, 2] > np.sin(np.radians(SIDE_VIEW))
     if low < away or steep or (len(hands) and KDTree(own).query(hands * (1, 1, up))[0].min() < HAND_REACH):
         return None
-    next_move = "Measure what it stands on, and add it to obstacles of capture.json; or mark it as the object too."
-    return {"value": low, "cm": 100 * low, "on": "and no hand is near", "next": next_move}
-
-
-INSIDE, INSIDE_SHARE = 0.01, 0.05
-"""m, and share of the object's points: deeper in an obstacle than depth cameras err, they are inside."""
-
-
-def inside(obstacles: Sequence[Obstacle], points: np.ndarray) -> list[dict[str, Any]]:
-    """Share of the object's points [n, 3], m, of frame 0 that is inside each obstacle: nodes there would be thrown out."""
-    shares = [float((one.depth(points) > INSIDE).mean()) if len(points) else 0.0 for one in obstacles]
-    return [{"value": share, "number": number} for number, share in enumerate(shares)]
+    return {"value": low, "cm": 100 * low, "on": "and no hand is near"}
 
 
 BODY_WORDS = ("sloth", "plush", "toy", "ball", "cable", "rod")
@@ -399,11 +377,7 @@ checks = (
           'If it is a sheet, write "category": "cloth" in capture.json: then no volume is made of it.'),
     Check("object above the table", "support", height_in_air, None, "warning",
           "what is seen of it in frame 0 begins {cm:.0f} cm above the table, {on}; there is nothing under the twin, and it falls.",
-          "{next}"),
-    Check("inside an obstacle", "obstacles", inside, (0, INSIDE_SHARE), "error",
-          "the object of frame 0 must be outside, but for {high:.0%} of what is seen of it. Look at center, rotation and sizes; "
-          f"they are in meters, in the world of the cameras.; received {{value:.0%}} more than {1e3 * INSIDE:g} mm inside",
-          title="obstacles[{number}]"),
+          "Film the object on the table, or annotate its support as object too."),
     # Speeds and forces of the twin scale with it.
     Check("frame rate", "frame rate", lambda rate: rate, (SLOWEST, FASTEST), "error",
           "frames per second at which it was filmed are required, {low:g} to {high:g}; received {value:g}", title="frame_rate"),

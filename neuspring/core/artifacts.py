@@ -20,7 +20,7 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.core.files import DamagedFile, read_npz, write_npz
-from neuspring.core.geometry import SAME_WORLD, Obstacle, obstacles_of
+from neuspring.core.geometry import SAME_WORLD
 
 FORMAT_VERSION = 2
 """Version of the files of all artifacts; files of another version are refused."""
@@ -219,8 +219,6 @@ class Scenario(Artifact):
     """Direction up along the world's z axis; the ground is the plane z = 0."""
     self_collision: bool = False
     ground: bool = True
-    obstacles: tuple[Obstacle, ...] = field(default=(), metadata=OMITTED)
-    """Boxes and spheres that stand in the scene and do not move."""
     mass: float | None = field(default=None, metadata=OMITTED)
     """Mass of the object, kg, to which exports are scaled; None: not known. Motion depends on forces per mass alone."""
     provenance: dict[str, str] = field(default_factory=dict)
@@ -232,7 +230,6 @@ class Scenario(Artifact):
         return up_sign(self.up)
 
     def check(self) -> None:
-        object.__setattr__(self, "obstacles", obstacles_of(self.obstacles, f"scenario {self.name}"))
         if not SAFE_NAME.fullmatch(self.name):
             raise InputError("scenario.name", f"a name must match {SAFE_NAME.pattern}", repr(self.name))
         if not 1 < self.train_end <= self.frame_count:
@@ -491,11 +488,8 @@ class Simulation:
     """Give controllers their finite-difference velocity in the dashpots. The released simulator uses zero."""
     initial_velocity: InitialVelocity = "rest"
     """Velocity at the start of a rollout: rest (none), as in the released simulator, or the one observed in the first frames."""
-    obstacles: tuple[Obstacle, ...] = field(default=(), metadata=OMITTED)
-    """Nodes collide with them as with the ground, with its elasticity and friction."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "obstacles", obstacles_of(self.obstacles, "simulation"))
         if not (0 < self.frame_time < np.inf and self.substeps >= 1 and self.collision_capacity >= 1 and np.isfinite(self.gravity)):
             rule = "finite frame_time > 0, substeps >= 1, collision_capacity >= 1, finite gravity are required"
             raise InputError("simulation", rule, self)

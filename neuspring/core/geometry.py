@@ -1,79 +1,8 @@
-"""Static obstacles (boxes and spheres that stand in the scene and do not move), choices among points, and how lines run."""
+"""Choices among points, rigid motions, and how lines run."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
-
 import numpy as np
-
-from neuspring.core.errors import InputError
-
-UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-NOT_TURNED = 1e-4
-"""Largest difference between an entry of R R' and that of the unit matrix."""
-Triple = tuple[float, float, float]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Obstacle:
-    """A box or a sphere in the world."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
-    shape: Literal["box", "sphere"]
-    center: Triple
-    """m."""
-    half_sizes: Triple = (0.0, 0.0, 0.0)
-    """Half sizes of a box along its own axes, m."""
-    rotation: tuple[Triple, Triple, Triple] = UPRIGHT
-    """Rotation of a box from its own axes to the world: x_world = center + rotation x_own."""
-    radius: float = 0.0
-    """Radius of a sphere, m."""
-
-    def __post_init__(self) -> None:
-        for name in ("center", "half_sizes"):
-            object.__setattr__(self, name, tuple(map(float, getattr(self, name))))
-        object.__setattr__(self, "rotation", tuple(tuple(map(float, row)) for row in self.rotation))
-
-    def wrong(self) -> tuple[str, str, object] | None:
-        """(field, rule, value) of what is wrong with it; None if nothing is."""
-        turn, sizes = np.array(self.rotation), np.array(self.half_sizes)
-        if self.shape not in ("box", "sphere"):
-            return "shape", "must be 'box' or 'sphere'", self.shape
-        if np.shape(self.center) != (3,) or not np.isfinite(self.center).all():
-            return "center", "three finite numbers are required, m", self.center
-        if self.shape == "sphere":
-            return None if 0 < self.radius < np.inf else ("radius", "a positive radius is required, m", self.radius)
-        if sizes.shape != (3,) or not (np.isfinite(sizes).all() and (sizes > 0).all()):
-            return "half_sizes", "three positive half sizes are required, m", self.half_sizes
-        if turn.shape != (3, 3) or not np.isfinite(turn).all():
-            return "rotation", "three rows of three finite numbers are required", self.rotation
-        if np.abs(turn @ turn.T - np.eye(3)).max() > NOT_TURNED or np.linalg.det(turn) < 0:
-            return "rotation", "must be a rotation: orthonormal rows, determinant +1", self.rotation
-        return None
-
-    def depth(self, points: np.ndarray) -> np.ndarray:
-        """Depth [P], m, of points [P, 3], m, inside; negative outside."""
-        away = np.asarray(points, np.float64) - np.array(self.center)
-        if self.shape == "sphere":
-            return np.asarray(self.radius - np.linalg.norm(away, axis=1))
-        return np.asarray((np.array(self.half_sizes) - np.abs(away @ np.array(self.rotation))).min(axis=1))
-
-    def row(self) -> list[float]:
-        """16 numbers for kernels: 0 for a box or 1 for a sphere, center, own axes one after the other, half sizes or radius."""
-        axes = np.array(self.rotation).T.ravel().tolist()
-        sizes = list(self.half_sizes) if self.shape == "box" else [self.radius] * 3
-        return [float(self.shape == "sphere"), *self.center, *axes, *sizes]
-
-
-def obstacles_of(values: Iterable[Obstacle | dict[str, Any]], where: str) -> tuple[Obstacle, ...]:
-    """Obstacles, from themselves or from what JSON holds of them. Raises InputError naming `where` and the field."""
-    found = tuple(value if isinstance(value, Obstacle) else Obstacle(**value) for value in values)
-    for number, obstacle in enumerate(found):
-        if wrong := obstacle.wrong():
-            raise InputError(f"{where}.obstacles[{number}].{wrong[0]}", wrong[1], wrong[2])
-    return found
 
 
 def farthest(points: np.ndarray, count: int) -> np.ndarray:

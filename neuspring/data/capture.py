@@ -36,7 +36,6 @@ from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
 from neuspring.core.findings import Finding, broken, refuse
-from neuspring.core.geometry import Obstacle
 from neuspring.core.records import digest_file
 from neuspring.core.section import STRICT, Name, Positive
 from neuspring.data.c3d import Markers, is_c3d
@@ -53,7 +52,7 @@ FEWEST_FRAMES = 5
 """Frames of a capture."""
 THIN = ("cloth", "package")
 """Categories of which no volume is made; those of all other words are filled."""
-LEFT_OUT = ("obstacles", "depth", "tracks", "pose", "mass")
+LEFT_OUT = ("depth", "tracks", "pose", "mass")
 """Fields of capture.json that are not written where they have their default."""
 TEXT_TOLERANCE = 1e-4
 """Allowed deviation from R^T R = 1 in JSON, where matrices may have five digits."""
@@ -95,9 +94,6 @@ class Description:
     """True where the object may touch itself, for a scenario without a row of its own; null: where the category is cloth."""
     ground: bool = True
     """True where there is a table, for a scenario without a row of its own."""
-    obstacles: tuple[Obstacle, ...] = ()
-    """Things that stand in the scene and do not move, besides the table, m: {"shape": "box", "center": [x, y, z], "half_sizes":
-    [a, b, c], "rotation": [3 rows; own axes to world]} or {"shape": "sphere", "center": [x, y, z], "radius": r}."""
     mass: Positive | None = None
     """Mass of the object, kg, for exports, which are of 1 kg per node without it."""
     provenance: dict[str, str] = field(default_factory=dict)
@@ -343,9 +339,6 @@ def description_findings(path: Path, description: Description) -> list[Finding]:
         findings.append(broken(path, "cameras", rule, f"none, depth: {description.depth} and tracks: {description.tracks}"))
     if description.depth == "none" and len(names) > 1:
         findings.append(broken(path, "depth", "none is for one camera", f"{len(names)} cameras"))
-    for number, obstacle in enumerate(description.obstacles):
-        if wrong := obstacle.wrong():
-            findings.append(broken(path, f"obstacles[{number}].{wrong[0]}", wrong[1], wrong[2]))
     for camera in description.cameras:
         where = f"cameras.{camera.name}"
         size = (camera.width, camera.height)

@@ -20,7 +20,7 @@ from neuspring.checks.masks import Shown
 from neuspring.checks.moving import Moving
 from neuspring.checks.rig import CameraAlone, Judged, Rig
 from neuspring.checks.table import object_on_table
-from neuspring.checks.things import HAND_LEAST, INSIDE, Sample, hands_on, lifted, outline, place_of, sampled
+from neuspring.checks.things import HAND_LEAST, Sample, hands_on, lifted, outline, place_of, sampled
 from neuspring.checks.timing import Streams, Watched, in_space, measure, of_cameras, on_images
 from neuspring.config import Mocap
 from neuspring.core.artifacts import up_sign
@@ -166,9 +166,9 @@ def _with_depth(capture: Capture, name: str, samples: dict[int, Sample]) -> list
     found += examine("object", f"{where}, object", place_of(bodies, sign))
     if 0 not in bodies:
         return at(path, found)
-    found += examine("support", f"{where}, object", camera, samples[0], sign, described.obstacles)
+    found += examine("support", f"{where}, object", camera, samples[0], sign)
     found += examine("sheet", f"{where}, object", bodies[0], sign, described.category)
-    return at(path, found) + examine("obstacles", path, described.obstacles, bodies[0])
+    return at(path, found)
 
 
 def _rig(capture: Capture, samples: Mapping[str, Mapping[int, Sample]]) -> list[Finding]:
@@ -207,9 +207,7 @@ def _color_alone(capture: Capture, name: str, samples: dict[int, Sample]) -> lis
         supposed = {frame: replace(sample, depth=np.full(mask.shape, depth)) for frame, sample in samples.items()}
         seen = examine("object and hands", f"camera {name}", camera, supposed, HAND_LEAST)
         findings += at(path, [one for one in seen if one.name != "depth holes"])
-    # Obstacles stand on the table: what lies beneath one is met above it.
-    above = places[np.isfinite(places[:, 0])] + np.array([0.0, 0.0, 2 * INSIDE * up_sign(up)])
-    return findings + examine("obstacles", path, described.obstacles, above)
+    return findings
 
 
 def check_layout(folder: Path, settings: Mocap = DEFORM) -> list[Finding]:

@@ -392,7 +392,6 @@ def scenario_of(row: ScenarioRow, capture: Capture, origin: dict[str, str]) -> S
         up=described.up,
         self_collision=row.self_collision,
         ground=row.ground,
-        obstacles=described.obstacles,
         mass=described.mass,
         provenance=described.provenance | {name: f"sha256:{digest_file(folder / name)}" for name in files} | origin,
     )

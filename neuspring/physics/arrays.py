@@ -38,7 +38,6 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
     integers: Any = wp.array(dtype=int)
     lists: Any = wp.array3d(dtype=int)
     table: Any = wp.array2d(dtype=int)
-    reals: Any = wp.array2d(dtype=real)
 
     class Model:
         nodes: int
@@ -71,7 +70,6 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
         closing: table
         bits: numbers
         alike: int
-        obstacles: reals
 
     @wp.struct
     class State:

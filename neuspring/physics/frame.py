@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from neuspring.physics import collision, motion, obstacles, springs
+from neuspring.physics import collision, motion, springs
 from neuspring.physics.arrays import UNFUSED, structs
 from neuspring.physics.lanes import lanes
 
@@ -53,14 +53,14 @@ class Kernels(NamedTuple):
 
 
 @functools.cache
-def kernels(real: Any, width: int, among: bool = False, pushes: bool = False) -> Kernels:
-    """Kernels for a scalar type, wp.float32 or wp.float64, and a number of lanes; `among` obstacles, or without any; with springs
-    that only push (`pushes`), or without any."""
+def kernels(real: Any, width: int, pushes: bool = False) -> Kernels:
+    """Kernels for a scalar type, wp.float32 or wp.float64, and a number of lanes; with springs that only push
+    (`pushes`), or without any."""
     lane = lanes(real, width)
     Vector, Number, chosen, chosen_number = lane.Vector, lane.Number, lane.chosen, lane.chosen_number
     Model, State, Adjoint = structs(real, width)
     move_controller, updated, updated_adjoint = motion.velocity(real, width)
-    moved, moved_adjoint = (obstacles if among else motion).position(real, width)
+    moved, moved_adjoint = motion.position(real, width)
     collided, add_pairs, after_pairs, collided_adjoint, add_pairs_adjoint = collision.functions(real, width)
     add_row, add_row_adjoint, gathered, gathered_adjoint = springs.functions(real, width, pushes)
 
@@ -68,9 +68,7 @@ def kernels(real: Any, width: int, among: bool = False, pushes: bool = False) ->
     def advance(model: Model, state: State, step: int, i: int, g: int, moving: Vector):
         """x' and v' of node i; a twin that is at the end of its frame stays."""
         slot = step % model.slots
-        x, v = moved(
-            state.x[slot, i, g], moving, model.substep[g], model.up, model.ground_e[g], model.ground_mu[g], model.obstacles
-        )
+        x, v = moved(state.x[slot, i, g], moving, model.substep[g], model.up, model.ground_e[g], model.ground_mu[g])
         if step >= model.fewest:
             x = chosen(step, model.counts[g], x, state.x[slot, i, g])
             v = chosen(step, model.counts[g], v, state.v[slot, i, g])
@@ -90,7 +88,6 @@ def kernels(real: Any, width: int, among: bool = False, pushes: bool = False) ->
             model.ground_mu[g],
             adjoint.x[i, g],
             adjoint.v[i, g],
-            model.obstacles,
         )
         if step >= model.fewest:
             adj_x = chosen(step, model.counts[g], adj_x, adjoint.x[i, g])

@@ -7,12 +7,12 @@
 Drag is dv/dt = -drag v; its exact solution is taken over a substep, so any value is stable. The mass m is 1 kg if none is given.
 
 With ground, a node that would be below at the end of the substep and moves down is reflected at its time of impact toi = -z / v_z:
-x' = x + v toi + v' (dt - toi). The response is that of all contacts (collision.py, obstacles.py), an impulse with elasticity e in
+x' = x + v toi + v' (dt - toi). The response is that of all contacts (collision.py), an impulse with elasticity e in
 [0, 1] and friction mu in [0, 2]: a relative velocity u = u_n + u_t (normal, tangential) becomes
 
     -e u_n + a u_t,   a = max(0, 1 - mu (1 + e) |u_n| / |u_t|).
 
-The same in float64: `reference.bounce`. Where obstacles stand in the scene, ground and obstacles are one law in obstacles.py.
+The same in float64: `reference.bounce`.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
@@ -68,15 +68,14 @@ def velocity(real: Any, width: int) -> tuple[Any, Any, Any]:
 
 @functools.cache
 def position(real: Any, width: int) -> tuple[Any, Any]:
-    """Two functions for a scalar type and a number of lanes. Only obstacles.py reads the obstacles [O, 16]:
+    """Two functions for a scalar type and a number of lanes:
 
-    moved            (x, v, dt, up, e, mu, obstacles) -> x', v'
-    moved_adjoint    (x, v, dt, up, e, mu, dL/dx', dL/dv', obstacles) -> dL/d(x), dL/d(v), dL/d(e), dL/d(mu)
+    moved            (x, v, dt, up, e, mu) -> x', v'
+    moved_adjoint    (x, v, dt, up, e, mu, dL/dx', dL/dv') -> dL/d(x), dL/d(v), dL/d(e), dL/d(mu)
     """
     lane = lanes(real, width)
     Number, Vector, scaled, column, put = lane.Number, lane.Vector, lane.scaled, lane.column, lane.put
     vec3 = wp.types.vector(3, real)
-    Table: Any = wp.array2d(dtype=real)
     zero, one = wp.constant(real(0.0)), wp.constant(real(1.0))
     approach, floor = wp.constant(real(APPROACH)), wp.constant(real(MIN_TANGENT))
 
@@ -97,7 +96,7 @@ def position(real: Any, width: int) -> tuple[Any, Any]:
         return vec3(a * w[0], a * w[1], -e * w[2])
 
     @wp.func
-    def moved(p: Vector, w: Vector, dt: Number, up: real, e: Number, mu: Number, table: Table):
+    def moved(p: Vector, w: Vector, dt: Number, up: real, e: Number, mu: Number):
         x = p + scaled(w, dt)
         v = w
         # Almost no node is at the ground: one look at all lanes first.
@@ -136,7 +135,7 @@ def position(real: Any, width: int) -> tuple[Any, Any]:
         return vec3(hx[0], hx[1], hx[2] - htoi / w[2]), vec3(gx, gy, gz), he, hmu
 
     @wp.func
-    def moved_adjoint(p: Vector, w: Vector, dt: Number, up: real, e: Number, mu: Number, hx: Vector, hv: Vector, table: Table):
+    def moved_adjoint(p: Vector, w: Vector, dt: Number, up: real, e: Number, mu: Number, hx: Vector, hv: Vector):
         adj_x = hx
         adj_v = hv + scaled(hx, dt)
         adj_e = Number()

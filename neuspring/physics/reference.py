@@ -11,7 +11,6 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from neuspring.core.artifacts import Simulation, Twin
-from neuspring.core.geometry import Obstacle
 from neuspring.physics.lanes import MIN_SPRING_LENGTH
 from neuspring.physics.motion import APPROACH, MIN_TANGENT
 
@@ -130,8 +129,6 @@ def substep(
     v = (v + dt * (force / mass[:, None] + gravity)) * np.exp(-dt * scene.drag)
     if pairs is not None:
         v = collide(x, v, mass, pairs, scene.contact_distance, *scene.contact)
-    if sim.obstacles:
-        return among(x, v, dt, sim, *scene.ground)
     if sim.ground:
         return bounce(x, v, dt, sim.up_sign, *scene.ground)
     return x + dt * v, v
@@ -192,51 +189,3 @@ def bounce(x: np.ndarray, v: np.ndarray, dt: float, up: float, e: float, mu: flo
     impact = -x[:, 2] / np.where(falling, v[:, 2], 1.0)
     after = x + v * impact[:, None] + bounced * (dt - impact)[:, None]
     return np.where(falling[:, None], after, x + v * dt), np.where(falling[:, None], bounced, v)
-
-
-def among(x: np.ndarray, v: np.ndarray, dt: float, sim: Simulation, e: float, mu: float) -> tuple[np.ndarray, np.ndarray]:
-    """Motion among obstacles: each node is reflected at the contact that is first in time, the ground among them."""
-    moved, speeds = x + v * dt, v.copy()
-    for i in range(len(x)):
-        found = [surface(obstacle, x[i], v[i], dt) for obstacle in sim.obstacles]
-        found += [(sim.up_sign * x[i, 2], np.array([0.0, 0.0, sim.up_sign]))] if sim.ground else []
-        # (time of impact, normal) of surfaces that the node would pass inwards.
-        hits = [
-            (-distance / (v[i] @ n), n)
-            for distance, n in (each for each in found if each is not None)
-            if v[i] @ n < -APPROACH and distance + v[i] @ n * dt < 0
-        ]
-        if not hits:
-            continue
-        impact, n = min(hits, key=lambda hit: hit[0])
-        s = v[i] @ n
-        tangent = v[i] - s * n
-        speeds[i] = response(np.asarray(s), np.asarray(np.linalg.norm(tangent)), e, mu) * tangent - e * s * n
-        moved[i] = x[i] + v[i] * impact + speeds[i] * (dt - impact)
-    return moved, speeds
-
-
-def surface(obstacle: Obstacle, x: np.ndarray, v: np.ndarray, dt: float) -> tuple[float, np.ndarray] | None:
-    """Distance from the surface of an obstacle that a node at x [3] with velocity v would pass, and its normal; None: none."""
-    away = x - np.array(obstacle.center)
-    if obstacle.shape == "sphere":
-        length = float(np.linalg.norm(away))
-        enters = length > 0 and np.linalg.norm(away + v * dt) < obstacle.radius
-        return (length - obstacle.radius, away / length) if enters else None
-    axes = np.array(obstacle.rotation)
-    own, speed, sizes = away @ axes, v @ axes, np.array(obstacle.half_sizes)
-    gaps = np.abs(own) - sizes
-    if (gaps <= 0).all():
-        axis = int(gaps.argmax())
-    else:
-        closing = np.sign(own) * speed
-        times = np.full(3, -np.inf)
-        outside = gaps > 0
-        if (closing[outside] >= 0).any():
-            return None
-        times[outside] = -gaps[outside] / closing[outside]
-        axis = int(times.argmax())
-        others = np.arange(3) != axis
-        if (np.abs(own + speed * times[axis])[others] > sizes[others]).any():
-            return None
-    return float(gaps[axis]), np.sign(own[axis]) * axes[:, axis]

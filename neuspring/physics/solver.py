@@ -22,7 +22,7 @@ import torch
 from neuspring.core.artifacts import Simulation, Twin
 from neuspring.core.device import load
 from neuspring.core.errors import InputError
-from neuspring.physics import collision, frame, obstacles, springs
+from neuspring.physics import collision, frame, springs
 from neuspring.physics.arrays import Buffers, Graphs
 from neuspring.physics.controllers import ControllerSprings, begins, begun
 from neuspring.physics.lanes import LANE_WIDTHS
@@ -94,7 +94,6 @@ class FrameSolver:
         self.buffers.add_parameters(max(map(len, each)))
         springs.allocate(self.buffers, each)
         collision.allocate(self.buffers)
-        obstacles.allocate(self.buffers)
         self._pushes = False
         """True where some spring only pushes."""
         self._choose_kernels()
@@ -121,8 +120,7 @@ class FrameSolver:
         return sum(tensor.nbytes for tensor in (*self.buffers.tensors.values(), *self.buffers.indices.values()))
 
     def _choose_kernels(self) -> None:
-        among = bool(self.simulation.obstacles)
-        self._kernels = frame.kernels(self.buffers.real, self.buffers.width, among, self._pushes)
+        self._kernels = frame.kernels(self.buffers.real, self.buffers.width, self._pushes)
         self._graphs = Graphs(self.device)
 
     def set_parameters(self, parameters: Parameters) -> None:

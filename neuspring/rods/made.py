@@ -126,7 +126,6 @@ def rod_twin(
         up=scenario.up,
         gravity=settings.simulation.gravity,
         ground=scenario.ground,
-        obstacles=scenario.obstacles,
         self_collision=scenario.self_collision,
         initial_velocity=settings.simulation.initial_velocity,
     )

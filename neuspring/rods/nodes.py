@@ -369,10 +369,9 @@ def _rod(twin: Twin) -> Rod:
     """The rod of a twin. Raises InputError where the scene asks for what a rod does not do."""
     assert twin.rod is not None
     simulation = twin.simulation
-    if simulation.self_collision or simulation.obstacles:
-        found = "self-collision" if simulation.self_collision else f"{len(simulation.obstacles)} obstacles"
+    if simulation.self_collision:
         remedy = "Turn it off in the table of scenarios, or choose a method whose twin is a lattice."
-        raise InputError("twin.rod", "a rod touches the ground alone", found, remedy)
+        raise InputError("twin.rod", "a rod touches the ground alone", "self-collision", remedy)
     return twin.rod
 
 

@@ -198,7 +198,6 @@ def candidate(problem: SearchProblem, values: dict[str, float], push: bool = Fal
         up=scenario.up,
         gravity=settings.gravity,
         ground=scenario.ground,
-        obstacles=scenario.obstacles,
         self_collision=scenario.self_collision,
         collision_capacity=settings.collision_capacity,
         initial_velocity=settings.initial_velocity,

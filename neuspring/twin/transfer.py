@@ -67,7 +67,6 @@ def move(
         frame_time=twin.simulation.frame_time if keep_frame_time else 1.0 / scenario.frame_rate,
         up=scenario.up,
         ground=scenario.ground,
-        obstacles=scenario.obstacles,
         self_collision=scenario.self_collision,
     )
     return body.stable(replace(moved, simulation=simulation), safety), registration

@@ -19,7 +19,7 @@ from neuspring.physics.motion import APPROACH
 from tests.support import terms
 from tests.support.differences import EXACT, Arrays, assert_gradients, differences
 from tests.support.scenes import scene, solver_for
-from tests.support.terms import launch, no_obstacles, numbers, twins, vectors
+from tests.support.terms import launch, numbers, twins, vectors
 
 KERNEL = 1e-7
 """Relative to the largest entry of the gradient compared; measured 1e-9 to 1e-8."""
@@ -157,7 +157,7 @@ def moved(values: Arrays, up: float) -> np.ndarray:
     after = [vectors(np.zeros_like(values["x"])) for _ in range(2)]
     state, response = (vectors(values["x"]), vectors(values["v"])), (numbers(values["e"]), numbers(values["mu"]))
     kernel, count = terms.kernels(len(values["x"])).motion, values["x"].shape[1]
-    launch(kernel, count, *state, numbers(values["dt"]), up, *response, no_obstacles(), *after)
+    launch(kernel, count, *state, numbers(values["dt"]), up, *response, *after)
     return np.stack([twins(array) for array in after], axis=2)
 
 
@@ -165,7 +165,7 @@ def moved_adjoints(values: Arrays, up: float, weight: np.ndarray) -> Arrays:
     width, count = values["x"].shape[:2]
     adjoints = [vectors(weight[:, :, 0]), vectors(weight[:, :, 1]), *(numbers(np.zeros((width, count))) for _ in range(2))]
     state, response = (vectors(values["x"]), vectors(values["v"])), (numbers(values["e"]), numbers(values["mu"]))
-    launch(terms.kernels(width).motion_adjoint, count, *state, numbers(values["dt"]), up, *response, no_obstacles(), *adjoints)
+    launch(terms.kernels(width).motion_adjoint, count, *state, numbers(values["dt"]), up, *response, *adjoints)
     adj_x, adj_v, adj_e, adj_mu = map(twins, adjoints)
     return {"x": adj_x, "v": adj_v, "e": adj_e.sum(axis=1), "mu": adj_mu.sum(axis=1)}
 

@@ -24,7 +24,6 @@ def kernels(width: int) -> SimpleNamespace:
     lane = lanes(real, width)
     vectors: Any = wp.array(dtype=lane.Vector)
     numbers: Any = wp.array(dtype=lane.Number)
-    table: Any = wp.array2d(dtype=real)
     add_row, add_row_adjoint, gathered, gathered_adjoint = springs.functions(real, width)
     _, updated, updated_adjoint = velocity(real, width)
     moved, moved_adjoint = position(real, width)
@@ -75,12 +74,11 @@ def kernels(width: int) -> SimpleNamespace:
         up: wp.float64,
         e: numbers,
         mu: numbers,
-        none: table,
         after_x: vectors,
         after_v: vectors,
     ):
         i = wp.tid()
-        own_x, own_v = moved(x[i], v[i], dt[0], up, e[0], mu[0], none)
+        own_x, own_v = moved(x[i], v[i], dt[0], up, e[0], mu[0])
         after_x[i] = own_x
         after_v[i] = own_v
 
@@ -91,14 +89,13 @@ def kernels(width: int) -> SimpleNamespace:
         up: wp.float64,
         e: numbers,
         mu: numbers,
-        none: table,
         adj_x: vectors,
         adj_v: vectors,
         adj_e: numbers,
         adj_mu: numbers,
     ):
         i = wp.tid()
-        own_x, own_v, own_e, own_mu = moved_adjoint(x[i], v[i], dt[0], up, e[0], mu[0], adj_x[i], adj_v[i], none)
+        own_x, own_v, own_e, own_mu = moved_adjoint(x[i], v[i], dt[0], up, e[0], mu[0], adj_x[i], adj_v[i])
         adj_x[i] = own_x
         adj_v[i] = own_v
         adj_e[i] = own_e
@@ -136,11 +133,6 @@ def kernels(width: int) -> SimpleNamespace:
 def launch(kernel: Any, size: int | tuple[int, int], *arguments: Any) -> None:
     """Run a kernel on the CPU."""
     wp.launch(load(kernel, "cpu"), size, list(arguments), device="cpu")
-
-
-def no_obstacles() -> Any:
-    """A table of no obstacles."""
-    return wp.zeros((0, 16), dtype=wp.float64, device="cpu")
 
 
 def vectors(values: np.ndarray) -> Any:

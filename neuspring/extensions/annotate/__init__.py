@@ -2,7 +2,6 @@
 
 server, guard            requests, and who is answered; static/ is the page: no build step, nothing from the network
 masks, tracks            the two modes, as all tabs share them
-obstacles                shapes of marked things that stand still, into capture.json
 clicks                   clicks on points, as a file; one point through the video of one camera
 shared                   files that several tabs edit; work in the background
 """

@@ -1,4 +1,4 @@
-"""The masks mode: marks, a preview of one frame, carrying them through the video, saving what came out, and obstacles."""
+"""The masks mode: marks, a preview of one frame, carrying them through the video, saving what came out."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from neuspring.config import parse, plain
 from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
-from neuspring.extensions.annotate.obstacles import measure_obstacles, write_obstacles
 from neuspring.extensions.annotate.shared import BackgroundJob, Document, Report
 from neuspring.perception.marks.carry import CameraFilm, Carried, carry_camera, frame_mask
 from neuspring.perception.marks.marks import MARKS, Marks
@@ -137,12 +136,6 @@ class MasksMode:
                     if self._results.get(camera) is result:
                         self._results[camera] = replace(result, saved=True)
         return list(results)
-
-    def measure(self) -> str:
-        """Measure marked obstacles, write them into capture.json, and say so. Raises InputError."""
-        found = measure_obstacles(self.capture, self.document.read()[1])
-        with self._saving:
-            return write_obstacles(self.capture, found)
 
     def _unpacked(self, camera: str, labels: bytes) -> np.ndarray:
         view = self.capture.cameras[camera]

@@ -93,7 +93,6 @@ class Server:
                 Route("/api/carry", self._carry, methods=["POST"]),
                 Route("/api/stop", self._stop, methods=["POST"]),
                 Route("/api/masks/save", lambda _: JSONResponse({"cameras": self.masks.save()}), methods=["POST"]),
-                Route("/api/obstacles", lambda _: JSONResponse({"text": self.masks.measure()}), methods=["POST"]),
                 Route("/api/clicks", lambda asked: self._write(asked, self.tracks, "annotations"), methods=["POST"]),
                 Route("/api/tracks/save", self._save_tracks, methods=["POST"]),
                 Mount("/", StaticFiles(directory=STATIC_FOLDER, html=True)),

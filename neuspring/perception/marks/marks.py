@@ -5,12 +5,12 @@ what they say about the pixels of a frame.
 
 | kind | points | what it says |
 |---|---|---|
-| `box` | two opposite corners | the label's pixels of this frame lie in its boxes; the last three labels: they fill it |
+| `box` | two opposite corners | the label's pixels of this frame lie in its boxes; `ignore` and `person`: they fill it |
 | `click` | one | the disk of `radius` has this label |
 | `scribble` | one or more | the line of half width `radius` has this label |
-| `polygon` | three or more | the label fills it, up to `radius` at its border; the last three labels: exactly |
+| `polygon` | three or more | the label fills it, up to `radius` at its border; `ignore` and `person`: exactly |
 
-Labels are `object`, `hand`, `ignore` (neither), `person` (neither in any frame, nor background) and `obstacle`.
+Labels are `object`, `hand`, `ignore` (neither) and `person` (neither in any frame, nor background).
 Points are pixels (x, y), pixel centers at whole coordinates, as in data/capture.py.
 """
 
@@ -35,9 +35,9 @@ from neuspring.data.capture import HANDS, NOTHING, OBJECT, PERSON, Capture
 
 MARKS = "marks.json"
 """Its name in a capture's folder."""
-MARK_VALUES = {"object": OBJECT, "hand": HANDS, "ignore": NOTHING, "person": PERSON, "obstacle": NOTHING}
-"""Label in a mask of a mark's word. An obstacle is background whose shape is measured (extensions/annotate)."""
-FILLED_MARKS = ("ignore", "person", "obstacle")
+MARK_VALUES = {"object": OBJECT, "hand": HANDS, "ignore": NOTHING, "person": PERSON}
+"""Label in a mask of a mark's word."""
+FILLED_MARKS = ("ignore", "person")
 """Labels whose boxes and polygons are filled: all that is inside has the label."""
 LEAST_POINTS = {"box": 2, "click": 1, "scribble": 1, "polygon": 3}
 EXACT_POINTS = ("box", "click")
@@ -57,7 +57,7 @@ class Mark:
 
     __pydantic_config__ = STRICT
     frame: Annotated[int, Field(ge=0)]
-    label: Literal["object", "hand", "ignore", "person", "obstacle"]
+    label: Literal["object", "hand", "ignore", "person"]
     kind: Literal["box", "click", "scribble", "polygon"]
     points: tuple[tuple[Finite, Finite], ...]
     """(x, y), pixels."""

@@ -31,7 +31,7 @@ def test_marks_that_are_not_there_lead_to_the_browser(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"label": "cat"}, r"label.*'object', 'hand', 'ignore', 'person' or 'obstacle'.*received 'cat'"),
+        ({"label": "cat"}, r"label.*'object', 'hand', 'ignore' or 'person'.*received 'cat'"),
         ({"frame": -1}, "frame.*greater than or equal to 0"),
         ({"points": [[1, 2]]}, "a box needs 2 points; received 1"),
         ({"points": [[1, 2], [1.5, 9]]}, "corners of a box must be a pixel or more apart"),

@@ -10,7 +10,7 @@ import { row, swatch } from "./rows.js";
 
 const find = (id) => document.getElementById(id);
 const KINDS = { b: "box", c: "click", s: "scribble", p: "polygon" };
-const LABELS = { 1: "object", 2: "hand", 3: "ignore", 4: "person", 5: "obstacle" };
+const LABELS = { 1: "object", 2: "hand", 3: "ignore", 4: "person" };
 const HINTS = {
   box: "Drag a box around the {label}.",
   click: "Click on the {label}.",
@@ -45,7 +45,6 @@ export class MasksMode {
     find("carry-all").onclick = guard(() => this.carry(app.cameras().filter((name) => this.marksOf(name).length)));
     find("stop").onclick = guard(() => post("/api/stop"));
     find("save-masks").onclick = guard(() => this.save());
-    find("measure").onclick = guard(() => this.measure());
     this.setLabel("object");
     this.setTool("box");
     this.setRadius(3);
@@ -182,11 +181,6 @@ export class MasksMode {
     say(`Saved masks of camera ${cameras.join(", ")}.`, "good");
   }
 
-  async measure() {
-    await this.edits.sending;
-    say((await post("/api/obstacles")).text, "good");
-  }
-
   // The panel.
   setLabel(label) {
     this.label = label;
@@ -231,7 +225,6 @@ export class MasksMode {
       app.chip(frame, `${frame} · ${Math.round(100 * doubt)} %`, doubt > HIGH ? "high" : "mid")));
     find("doubtful").dataset.empty = this.doubt().length ? "none: all frames are sure" : "known once masks are carried";
     const unsaved = Object.keys(results.carried).filter((name) => !results.carried[name].saved);
-    find("measure").disabled = !Object.values(this.edits.value?.cameras ?? {}).flat().some((mark) => mark.label === "obstacle");
     find("save-masks").disabled = running || !unsaved.length;
     const list = (names) => names.join(", ");
     find("masks-note").textContent =

@@ -1,7 +1,7 @@
 // How marks and points look.
 
 export const COLORS = {
-  object: "rgb(0 200 160)", hand: "rgb(255 140 0)", ignore: "rgb(200 120 255)", person: "rgb(150 160 255)", obstacle: "rgb(240 220 70)",
+  object: "rgb(0 200 160)", hand: "rgb(255 140 0)", ignore: "rgb(200 120 255)", person: "rgb(150 160 255)",
 };
 
 const tinted = (color, opacity) => color.replace(")", ` / ${opacity})`);
