@@ -20,7 +20,6 @@ PLACES = {
 """Of drag, with `decay`, what the kernels take of it: files of the package that a force with one trained parameter needs."""
 VALUES = {
     "scenes/synthetic/toy.py": "the drag of the toy's truth",
-    "extensions/released/checks.py": "the released files' drag",
     "twin/search.py": "the released rounding of drag",
     "extensions/exports/formats/mujoco.py": "drag in MuJoCo",
     "extensions/exports/newton_twin.py": "drag in Newton",

@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 
 WIDTH, HEIGHT = 64, 48
-OBJECT_RADIUS, OBJECT_NEIGHBORS = 0.025, 10
-CONTROLLER_RADIUS, CONTROLLER_NEIGHBORS = 0.06, 10
 
 
 def dump(path: Path, value: Any, protocol: int = 4) -> None:
@@ -81,66 +79,6 @@ def write_case(
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file."""
     path.write_text(json.dumps(value), encoding="utf-8")
-
-
-def write_results(folder: Path) -> None:
-    """Write the released result files of the case `folder`: a prediction equal to its rest state, parameters, a checkpoint."""
-    import torch
-
-    from neuspring.physics.topology import uniform_topology
-
-    root, name = folder.parents[2], folder.name
-    data = pickle.loads((folder / "final_data.pkl").read_bytes())
-    rest = np.concatenate([data["object_points"][0], data["surface_points"], data["interior_points"]]).astype(np.float32)
-    motion = data["controller_points"][:, 0] - data["controller_points"][0, 0]
-    dump(root / "experiments" / name / "inference.pkl", (rest + motion[:, None]).astype(np.float32))
-    hands = data["controller_points"][0].astype(np.float32)
-    topology = uniform_topology(rest, hands, OBJECT_RADIUS, OBJECT_NEIGHBORS, CONTROLLER_RADIUS, CONTROLLER_NEIGHBORS)
-    parameters = {
-        "global_spring_Y": np.float64(3e4),
-        "object_radius": np.float64(OBJECT_RADIUS),
-        "object_max_neighbours": OBJECT_NEIGHBORS,
-        "controller_radius": np.float64(CONTROLLER_RADIUS),
-        "controller_max_neighbours": CONTROLLER_NEIGHBORS,
-        "collide_elas": np.float32(0.5),
-        "collide_fric": np.float32(0.3),
-        "collide_object_elas": np.float32(0.7),
-        "collide_object_fric": np.float32(0.3),
-        "collision_dist": np.float64(0.02),
-        "drag_damping": np.float64(3.5),
-        "dashpot_damping": np.float64(100.5),
-    }
-    dump(root / "experiments_optimization" / name / "optimal_params.pkl", parameters)
-    checkpoint = root / "experiments" / name / "train" / "best_199.pth"
-    checkpoint.parent.mkdir(parents=True)
-    stiffness = torch.full((len(topology.springs),), 3e4)
-    torch.save({"epoch": 199, "num_object_springs": topology.object_spring_count, "spring_Y": stiffness}, checkpoint)
-
-
-def write_raw_frame(folder: Path, *, mirrored: bool) -> None:
-    """Write the same depth and tracks of frame 0 for all cameras, and make the points of frame 0 their lift.
-
-    They are lifted with c_x, or with the mirrored W - c_x.
-    """
-    rng = np.random.default_rng(1)
-    pose, intrinsics = camera()
-    pixels = rng.permutation(WIDTH * HEIGHT)[:200]
-    row, column = pixels // WIDTH, pixels % WIDTH
-    depth = rng.integers(300, 480, (HEIGHT, WIDTH)).astype(np.uint16)
-    z = depth[row, column] / 1000
-    center = WIDTH - intrinsics[0, 2] if mirrored else intrinsics[0, 2]
-    lifted = np.stack([z * (column - center) / 60, z * (row - intrinsics[1, 2]) / 60, z], axis=1) + pose[:3, 3]
-    data = pickle.loads((folder / "final_data.pkl").read_bytes())
-    points = np.unique(lifted, axis=0)[: data["object_points"].shape[1]]
-    data["object_points"][0] = points
-    dump(folder / "final_data.pkl", data)
-    visible = (lifted[:, None] == points[None]).all(axis=2).any(axis=1)
-    (folder / "cotracker").mkdir()
-    tracks = np.stack([row, column], axis=1).astype(np.float32)[None]
-    for index in "012":
-        (folder / "depth" / index).mkdir(parents=True)
-        np.save(folder / "depth" / index / "0.npy", depth)
-        np.savez(folder / "cotracker" / f"{index}.npz", tracks=tracks, visibility=visible[None])
 
 
 def edit(folder: Path, **changes: Any) -> None:

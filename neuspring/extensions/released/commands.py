@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from neuspring.cli.options import Device, Positional, arg
+from neuspring.cli.options import Positional, arg
 
 
 def fetch(
@@ -14,36 +14,33 @@ def fetch(
     *,
     data_root: Annotated[Path, arg(help="folder to write to; data_root of the configuration")],
     parts: Annotated[
-        tuple[str, ...], arg(help="data, results, appearance, images, other; all: these five; extra: more clothes")
+        tuple[Literal["data", "results", "images"], ...],
+        arg(help="data: processed cases; results: predictions, checkpoints, parameters; images: color, depth, masks"),
     ] = ("data", "results"),
     revision: Annotated[str, arg(help="branch, tag or commit of the data set")] = "main",
-    dry_run: Annotated[bool, arg(help="say what would be fetched and the space it takes")] = False,
+    dry_run: Annotated[bool, arg(help="print the sizes alone")] = False,
 ) -> int:
     """Released archives -> the folders that the readers expect; exit status 2 if a fetched file is damaged."""
     from neuspring.extensions.released import fetch
-    from neuspring.intake.check import render
+    from neuspring.intake.check import check_layout, render
 
-    findings = fetch.fetch(data_root, scenarios, parts, revision=revision, dry_run=dry_run)
-    if dry_run:
+    fetch.fetch(data_root, scenarios, parts, revision, dry_run=dry_run)
+    if dry_run or "data" not in parts:
         return 0
+    findings = check_layout(data_root)
     print(render(findings))
     return 2 if any(finding.level == "error" for finding in findings) else 0
 
 
 def verify_released(
-    data_root: Annotated[Positional[Path], arg(help="folder that holds data, experiments and the other released folders")],
+    data_root: Annotated[Positional[Path], arg(help="folder that holds data, experiments and experiments_optimization")],
     output: Annotated[Path, arg(help="folder to write to")],
     scenarios: Annotated[tuple[str, ...], arg(help="all that are there by default")] = (),
-    checks: Annotated[
-        tuple[int, ...],
-        arg(help="1 sizes and first frame, 2 springs, 3 scores, 4 deprojection, 5 pictures, 6 replay; all by default"),
-    ] = (),
-    device: Device = "auto",
 ) -> int:
-    """PhysTwin's released results, checked against ours."""
-    from neuspring.extensions.released import run
+    """PhysTwin's released results, compared with ours; exit status 1 if one differs, 2 if nothing could be compared."""
+    from neuspring.extensions.released import verify
 
-    chosen = checks or tuple(run.RELEASED_CHECKS)
-    report = run.verify_released(data_root, output, scenarios=scenarios, checks=chosen, device=device)
-    print(report.text, end="")
-    return report.status
+    table = verify.verify_released(data_root, output, scenarios)
+    print(table.to_string(index=False, na_rep="-"))
+    outcomes = set(table["outcome"])
+    return 1 if "failed" in outcomes else 0 if "passed" in outcomes else 2

@@ -1,22 +1,21 @@
 """One trial of a sweep: search and fit with its settings, judged by a tail of the training frames, which neither has seen.
 
-The tail is the last fifth of a scenario's training frames. Search and fit see only the frames before it. After every
-epoch of the fit its twin is rolled out over the tail. A trial's value is the mean loss over the tail of the twin that the method's
-own rule (`fit.selection`) selects, averaged over scenarios. All frames after the training frames are cut off before anything is
-computed.
+Search and fit see the frames before the tail. The value of a trial is the loss over the tail of the twin that the method's own rule
+(`fit.selection`) selects, averaged over scenarios. Frames after the training frames are removed before anything is computed.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import optuna
+from filelock import FileLock
 
 from neuspring import config
 from neuspring.config import Config
@@ -26,10 +25,7 @@ from neuspring.core.provenance import code_digest
 from neuspring.core.records import StageRecord, canonical, digest_file
 from neuspring.extensions.tuning.space import SWEEP_SEED, Plan
 from neuspring.stages.search import search as search_stage
-from neuspring.twin.fit import RELEASED_CHECKPOINT_EPOCHS, FitProblem, NonFinite, TwinFit, fit, tail_start
-
-Report = Callable[[int, float, str], None]
-"""Receives a step, the mean loss of the scenarios begun so far, m^2, and what was just done."""
+from neuspring.twin.fit import FitProblem, NonFinite, TwinFit, eligible, fit, tail_start
 
 
 @dataclass(frozen=True)
@@ -48,9 +44,8 @@ class TrainingScene:
         if scenario.train_end < 3:
             rule = "a tail needs at least two training frames after frame 0"
             raise InputError(f"scenario {scenario.name}", rule, scenario.train_end - 1)
-        head = cut(observations, tail_start(scenario.train_end))
         target = folder / f"{scenario.name}.npz"
-        head.save(target)
+        cut(observations, tail_start(scenario.train_end)).save(target)
         return cls(scenario.name, cut(observations, scenario.train_end), target)
 
     @property
@@ -69,112 +64,83 @@ def cut(observations: Observations, end: int) -> Observations:
     return replace(observations, scenario=replace(observations.scenario, frame_count=end, train_end=end, provenance={}), **arrays)
 
 
-def run(
-    plan: Plan,
-    values: Mapping[str, Any],
-    scenes: Sequence[TrainingScene],
-    folder: Path,
-    number: int,
-    device: str,
-    report: Report,
-    losses: dict[str, float],
-) -> None:
-    """Search and fit every scenario with a trial's values; `losses` receives the loss of each one's tail, m^2.
+def value_of(trial: optuna.Trial, plan: Plan, scenes: Sequence[TrainingScene], folder: Path, device: str) -> float:
+    """Search and fit every scenario with a trial's values; the mean loss of their tails, m^2.
 
-    `folder` is the sweep's. Trials share the searches in it, and the fits continue from the checkpoints of trial `number`. Raises
-    what `report` raises; NumericalFailure; InputError for settings that exclude each other or do not fit the data.
+    Reports the loss of every epoch to Optuna, or with several scenarios that of each one. `folder` is the sweep's; trials share the
+    searches in it. Raises TrialPruned, NumericalFailure, and InputError for settings that exclude each other.
     """
-    settings, clusters = plan.at(values, f"trial {number}")
-    # The loss over the tail is needed after every epoch, whichever rule selects one.
-    tailed = replace(settings, fit=replace(settings.fit, selection="tail"))
-    for index, scene in enumerate(scenes):
-        path = searched(scene, settings, clusters, SWEEP_SEED, device, folder)
+    settings, clusters = plan.at({name: suggest(trial, name, plan) for name in plan.tune.space}, f"trial {trial.number}")
+    losses = list[float]()
+
+    def report(step: int, loss: float) -> None:
+        trial.report(loss, step)
+        if trial.should_prune():
+            raise optuna.TrialPruned
+
+    for scene in scenes:
+        path = searched(scene, settings, clusters, device, folder)
         record = StageRecord.load(path)
         if record.status == "failed":
             raise NumericalFailure(f"{scene.name}, search: {record.reason}")
-        twin = Twin.load(record.file("twin", path))
         problem = FitProblem(
             observations=scene.training,
-            twin=twin,
-            fit=tailed.fit,
-            simulation=tailed.simulation,
-            losses=tailed.losses,
-            quirks=tailed.released_quirks,
+            twin=Twin.load(record.file("twin", path)),
+            # The loss over the tail is needed after every epoch, whichever rule selects one.
+            fit=replace(settings.fit, selection="tail"),
+            simulation=settings.simulation,
+            losses=settings.losses,
+            quirks=settings.released_quirks,
             device=device,
             kind=plan.method.fit or "springs",
             seed=SWEEP_SEED,
         )
 
-        def report_epoch(epoch: int, loss: float, name: str = scene.name, first: int = index * plan.epochs) -> None:
-            mean = (sum(losses.values()) + loss) / (len(losses) + 1)
-            report(first + epoch, mean, f"{name}, epoch {epoch}")
+        def report_epoch(history: Sequence[Mapping[str, Any]]) -> None:
+            if len(scenes) == 1 and (loss := history[-1]["tail_loss"]) is not None:
+                report(history[-1]["epoch"], loss)
 
         try:
-            if plan.method.fit is None:
-                loss = TwinFit(problem).tail_loss()
-                report_epoch(0, loss)
-            else:
-                key = _key(problem, record.files["twin"][1], device)
-                loss = _fitted(problem, settings, folder / "trials" / str(number) / f"{scene.name}.partial.npz", key, report_epoch)
+            losses.append(_fitted(problem, settings, report_epoch) if plan.method.fit else TwinFit(problem).tail_loss())
         except (NonFinite, NumericalFailure) as failure:
             raise NumericalFailure(f"{scene.name}, fit: {failure}") from failure
-        losses[scene.name] = loss
+        if len(scenes) > 1:
+            report(len(losses), losses[-1])
+    return sum(losses) / len(losses)
 
 
-def searched(scene: TrainingScene, settings: Config, clusters: int, seed: int, device: str, folder: Path) -> Path:
+def suggest(trial: optuna.Trial, name: str, plan: Plan) -> Any:
+    """The trial's value of a setting."""
+    dimension = plan.tune.space[name]
+    low, high = dimension.low, dimension.high
+    if dimension.choices or low is None or high is None:
+        return trial.suggest_categorical(name, dimension.choices)
+    if isinstance(plan.baseline[name], int):
+        return trial.suggest_int(name, int(low), int(high), step=int(dimension.step or 1), log=dimension.log)
+    return trial.suggest_float(name, low, high, step=dimension.step, log=dimension.log)
+
+
+def searched(scene: TrainingScene, settings: Config, clusters: int, device: str, folder: Path) -> Path:
     """The record of a search on the frames before the tail. The first trial that needs the search makes it."""
-    from filelock import FileLock
-
     values = {name: config.plain(getattr(settings, name)) for name in ("search", "simulation", "losses", "released_quirks")}
-    facts = [
-        scene.name,
-        digest_file(scene.head),
-        values,
-        clusters,
-        seed,
-        device.partition(":")[0],
-        code_digest("neuspring.twin.search"),
-    ]
-    place = folder / f"search-{hashlib.sha256(canonical(facts).encode()).hexdigest()[:16]}"
-    place.mkdir(parents=True, exist_ok=True)
-    record = place / "search.json"
-    with FileLock(place / ".lock"):
+    facts = [scene.name, digest_file(scene.head), values, clusters, device.partition(":")[0], code_digest("neuspring.twin.search")]
+    record = folder / f"search-{hashlib.sha256(canonical(facts).encode()).hexdigest()[:16]}" / "search.json"
+    record.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(record.with_name(".lock")):
         if not record.is_file():
-            search_stage(observations=scene.head, settings=settings, clusters=clusters, seed=seed, device=device, output=record)
+            search_stage(
+                observations=scene.head, settings=settings, clusters=clusters, seed=SWEEP_SEED, device=device, output=record
+            )
     return record
 
 
-def _key(problem: FitProblem, twin: str, device: str) -> str:
-    """Digest of everything that must be equal for a fit to continue from a checkpoint."""
-    sections = [config.plain(part) for part in (problem.fit, problem.simulation, problem.losses, problem.quirks)]
-    facts = [sections, problem.kind, problem.seed, twin, device.partition(":")[0], code_digest("neuspring.twin.fit")]
-    return hashlib.sha256(canonical(facts).encode()).hexdigest()
-
-
-def _fitted(problem: FitProblem, settings: Config, partial: Path, key: str, report: Callable[[int, float], None]) -> float:
+def _fitted(problem: FitProblem, settings: Config, report: Any) -> float:
     """The loss over the tail of the twin that `settings.fit.selection` selects."""
-    by = "tail_loss" if settings.fit.selection == "tail" else "loss"
-    least, selected, count = math.inf, math.inf, 0
-
-    def see(history: Sequence[Mapping[str, Any]]) -> None:
-        nonlocal least, selected, count
-        for row in history[count:]:
-            count += 1
-            if row["rolled_back"]:
-                continue
-            last = row["epoch"] == settings.fit.epochs - 1
-            sparse = settings.released_quirks.sparse_checkpoints and row["epoch"] % RELEASED_CHECKPOINT_EPOCHS and not last
-            if row[by] < least and not sparse:
-                least, selected = row[by], row["tail_loss"]
-            if math.isfinite(selected):
-                report(row["epoch"], selected)
-
-    result = fit(problem, partial=partial, key=key, on_epoch=see)
-    # A fit that was complete when its worker was killed has no further epoch.
-    see(result.history.to_dict("records"))  # type: ignore[arg-type]
-    if by == "tail_loss":
-        # The start may be best.
-        return float(result.facts["best_loss"])
-    if not math.isfinite(selected):
+    result = fit(problem, on_epoch=report)
+    if settings.fit.selection == "tail":
+        return result.best_loss  # the start may be best
+    rows: list[dict[str, Any]] = result.history.to_dict("records")  # type: ignore[assignment]
+    kept = [row for row in rows if not row["rolled_back"] and eligible(row["epoch"], problem)]
+    if not kept:
         raise NumericalFailure(f"no epoch with a finite loss over the tail; rolled back: {'; '.join(result.facts['rollbacks'])}")
-    return selected
+    return float(min(kept, key=lambda row: row["loss"])["tail_loss"])
