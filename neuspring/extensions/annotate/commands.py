@@ -15,7 +15,7 @@ def annotate(
     no_open: Annotated[bool, arg(help="print the address, and open no browser")] = False,
     settings: Settings = "{}",
 ) -> None:
-    """Mark masks and tracks of a capture in the browser; serves until Ctrl-C."""
+    """Mark object, controllers and person of a capture in the browser; serves until Ctrl-C."""
     from neuspring.core.web import is_loopback, open_page
     from neuspring.data.capture import Capture
     from neuspring.extensions.annotate.server import Server
@@ -29,6 +29,6 @@ def annotate(
     try:
         server.serve_forever()
     except KeyboardInterrupt:
-        print("\nStopped. Marks and clicks are saved.", flush=True)
+        print("\nStopped. Marks are saved.", flush=True)
     finally:
         server.close()

@@ -32,10 +32,8 @@ from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.core.web import Refused, check_host, check_origin
 from neuspring.data.capture import HANDS, OBJECT, PERSON, Capture
-from neuspring.extensions.annotate.clicks import Annotations
 from neuspring.extensions.annotate.masks import MasksMode
 from neuspring.extensions.annotate.shared import Busy, Stale
-from neuspring.extensions.annotate.tracks import Foreign, TracksMode
 
 STATIC_FOLDER = Path(__file__).parent / "static"
 """The only files that are given out."""
@@ -56,7 +54,7 @@ LABEL_COLORS = {OBJECT: (0, 200, 160), HANDS: (255, 140, 0), PERSON: (150, 160, 
 INSIDE_OPACITY, BORDER_OPACITY = 90, 255
 """Opacity inside a mask and on its border, of 255."""
 JPEG_QUALITY = 95
-ANSWERS: dict[type[Exception], int] = {Stale: 409, Busy: 409, Foreign: 428, InputError: 422}
+ANSWERS: dict[type[Exception], int] = {Stale: 409, Busy: 409, InputError: 422}
 """HTTP status of what a request can raise."""
 
 
@@ -75,26 +73,20 @@ class Server:
         self.capture, self.host, self.token = capture, host, token or secrets.token_urlsafe(16)
         self.masks = MasksMode(capture, settings or MarksSegmentation())
         self.masks.document.read()
-        Annotations.load(capture)
         self._socket = _listen(host, port)
         self.port: int = self._socket.getsockname()[1]
-        self.tracks = TracksMode(capture)
         app = Starlette(
             routes=[
                 Route("/api/state", self._state),
                 Route("/api/masks", lambda _: JSONResponse(self.masks.plain())),
-                Route("/api/clicks", lambda _: JSONResponse(self.tracks.plain())),
                 Route("/api/job", lambda _: JSONResponse(self.masks.job.plain())),
-                Route("/api/tracks/{since:int}", lambda asked: JSONResponse(self.tracks.results(asked.path_params["since"]))),
                 Route("/api/color/{camera}/{frame:int}", self._color),
                 Route("/api/overlay/{source}/{camera}/{frame:int}", self._overlay),
-                Route("/api/marks", lambda asked: self._write(asked, self.masks, "marks"), methods=["POST"]),
+                Route("/api/marks", self._write, methods=["POST"]),
                 Route("/api/preview", self._preview, methods=["POST"]),
                 Route("/api/carry", self._carry, methods=["POST"]),
                 Route("/api/stop", self._stop, methods=["POST"]),
                 Route("/api/masks/save", lambda _: JSONResponse({"cameras": self.masks.save()}), methods=["POST"]),
-                Route("/api/clicks", lambda asked: self._write(asked, self.tracks, "annotations"), methods=["POST"]),
-                Route("/api/tracks/save", self._save_tracks, methods=["POST"]),
                 Mount("/", StaticFiles(directory=STATIC_FOLDER, html=True)),
             ],
             middleware=[Middleware(BaseHTTPMiddleware, dispatch=self._answer)],
@@ -124,7 +116,6 @@ class Server:
         self._socket.close()
         self.masks.job.stop()
         self.masks.job.join()
-        self.tracks.close()
 
     async def _answer(self, request: Request, go_on: Callable[[Request], Awaitable[Response]]) -> Response:
         """Check who asks, read the body, and answer; what is refused or fails becomes a status and a sentence."""
@@ -158,7 +149,7 @@ class Server:
         return camera, frame
 
     def _state(self, _: Request) -> Response:
-        """The capture, the marks and the clicks."""
+        """The capture and the marks."""
         description = self.capture.description
         cameras = [
             {"name": entry.name, "width": entry.width, "height": entry.height, "missing": list(entry.missing)}
@@ -171,7 +162,6 @@ class Server:
             "frame_rate": description.frame_rate,
             "cameras": cameras,
             "masks": self.masks.plain(),
-            "tracks": self.tracks.plain(),
         }
         return JSONResponse(values)
 
@@ -195,9 +185,9 @@ class Server:
         labels = self.masks.preview(*self._frame(values.get("camera"), values.get("frame")))
         return Response(overlay_png(labels), media_type="image/png")
 
-    def _write(self, request: Request, mode: MasksMode | TracksMode, key: str) -> Response:
+    def _write(self, request: Request) -> Response:
         values = request.state.values
-        return JSONResponse({"revision": mode.write(values.get("revision"), values.get(key))})
+        return JSONResponse({"revision": self.masks.write(values.get("revision"), values.get("marks"))})
 
     def _carry(self, request: Request) -> Response:
         """Begin to carry the marks of the named cameras."""
@@ -210,9 +200,6 @@ class Server:
     def _stop(self, _: Request) -> Response:
         self.masks.job.stop()
         return JSONResponse(self.masks.job.plain())
-
-    def _save_tracks(self, request: Request) -> Response:
-        return JSONResponse({"points": self.tracks.save(replace=request.state.values.get("replace") is True)})
 
 
 def overlay_png(labels: np.ndarray) -> bytes:

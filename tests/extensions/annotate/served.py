@@ -77,10 +77,10 @@ def decoded(content: bytes) -> np.ndarray:
     return image
 
 
-def show(browser: Browser, client: Client, query: str = "", width: int = 1280, height: int = 800) -> None:
+def show(browser: Browser, client: Client, width: int = 1280, height: int = 800) -> None:
     """Open the page of a server, and wait until it can be used."""
     browser.open("about:blank", width, height)
-    browser.open(f"http://127.0.0.1:{client.port}/{query}#{TOKEN}", width, height)
+    browser.open(f"http://127.0.0.1:{client.port}/#{TOKEN}", width, height)
     browser.wait("document.body.dataset.ready === 'yes'")
 
 

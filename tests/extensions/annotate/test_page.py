@@ -1,26 +1,23 @@
 """The page in a real browser, by mouse and keys, beside a server with a stand-in for the masks' method."""
 
 import json
-import time
 
 import numpy as np
 import pytest
 
 from tests.extensions.annotate.served import show
 from tests.support.browser import Browser, chromium
-from tests.support.moving import FRAMES, truth
 
 pytestmark = pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome is installed")
-POINT = (46.0, 62.0)
 CONTROL, SHIFT = 2, 8
 
 
 class Page:
     """What a user does on the page."""
 
-    def __init__(self, browser: Browser, client, query: str = "") -> None:
+    def __init__(self, browser: Browser, client) -> None:
         self.browser, self.client = browser, client
-        show(browser, client, query)
+        show(browser, client)
 
     def at(self, *point: float) -> tuple[float, float]:
         """Where a pixel of the frame is in the window."""
@@ -32,8 +29,8 @@ class Page:
     def text(self, selector: str) -> str:
         return self.browser.run(f"document.querySelector({json.dumps(selector)}).textContent")
 
-    def saved(self, what: str = "Marks") -> None:
-        self.shown("#saved", f"{what} saved")
+    def saved(self) -> None:
+        self.shown("#saved", "Marks saved")
 
     def marks(self, camera: str = "0") -> list:
         return self.client.get("/api/masks")["marks"]["cameras"].get(camera, [])
@@ -116,20 +113,6 @@ def test_marks_can_be_undone_removed_and_copied(page):
     np.testing.assert_allclose(page.marks()[0]["points"], [[60, 12], [90, 42]], atol=0.15)
 
 
-def test_zoom_keeps_the_pixel_under_the_pointer(page):
-    x, y = np.round(page.at(100, 30)).tolist()
-    here = f"annotate.view.toImage({{ clientX: {x}, clientY: {y} }})"
-    before = page.browser.run(here)
-    page.browser.call("Input.dispatchMouseEvent", type="mouseWheel", x=x, y=y, deltaX=0, deltaY=-600)
-    page.browser.wait("!annotate.view.fitted")
-    np.testing.assert_allclose(page.browser.run(here), before, atol=0.11)  # it is rounded to 0.1 pixel
-    page.drag((95, 25), (105, 35))
-    page.saved()
-    np.testing.assert_allclose(page.marks()[0]["points"], [[95, 25], [105, 35]], atol=0.1)
-    page.browser.key("f")
-    assert page.browser.run("annotate.view.fitted")
-
-
 def test_frames_and_cameras_are_reached_by_keys(page):
     page.browser.key("ArrowRight", SHIFT)
     assert page.text("#frame-text") == "frame 10 of 0–11"
@@ -170,20 +153,6 @@ def test_marks_are_previewed_carried_with_progress_and_saved(page, painted, capt
     page.browser.wait("!document.getElementById('stale').hidden")
 
 
-def test_what_is_carried_again_at_once_can_be_saved(page, painted, capture):
-    page.drag((40, 50), (60, 70))
-    page.saved()
-    masks = "annotate.modes.masks"
-    page.browser.run(f"void {masks}.carry(['0'])")
-    page.browser.wait(f"{masks}.results.job.state === 'done'")
-    # Between two looks of the page at the job.
-    painted.gate.clear()
-    page.browser.run(f"void {masks}.carry(['0'])")
-    time.sleep(0.6)
-    painted.gate.set()
-    page.browser.wait("!document.getElementById('save-masks').disabled")
-
-
 def test_an_error_is_shown_in_the_page(page):
     page.browser.click("#carry")
     page.told("Draw a box around it first")
@@ -218,47 +187,8 @@ def test_a_lost_server_is_told_and_the_change_is_kept(page):
     assert len(page.marks()) == 1
 
 
-def test_points_are_clicked_followed_corrected_and_saved(browser, client, capture):
-    page, places = Page(browser, client, "?tracks"), truth(POINT)
-    page.drag(tuple(places[0]))
-    page.saved("Clicks")
-    page.browser.wait("annotate.modes.tracks.followed.get('point 1')?.trails['0'].filter(Boolean).length === 11")
-    page.browser.key("End")
-    ring = page.browser.run("annotate.modes.tracks.placeHere(annotate.modes.tracks.point)")
-    np.testing.assert_allclose(ring, places[11], atol=0.4)
-    page.drag(tuple(places[11] + (3, 0)), tuple(places[11]))  # pressed beside it and pulled to its place
-    page.browser.key("n")
-    page.drag(tuple(places[11] + (8, 6)))
-    page.browser.run("annotate.go(6)")
-    page.browser.key("h")
-    page.browser.run("const name = document.getElementById('point-name'); name.value = 'tip'; name.onchange()")
-    page.saved("Clicks")
-    page.browser.wait("annotate.modes.tracks.busy === false && annotate.modes.tracks.followed.has('tip')")
-    page.browser.click("#save-tracks")
-    page.told("Saved 2 tracks")
-    points = client.get("/api/clicks")["annotations"]["points"]
-    assert [point["name"] for point in points] == ["point 1", "tip"]
-    assert [click["frame"] for click in points[0]["clicks"]["0"]] == [0, 11]
-    assert points[1]["clicks"]["0"][0] == {"frame": 6, "hidden": True}
-    tracks = capture.tracks()
-    pixels, _ = capture.cameras["0"].project(tracks[:, 0])
-    assert np.nanmax(np.linalg.norm(pixels - places, axis=1)) < 0.5
-    assert np.isfinite(tracks[:, 1]).all(axis=1).tolist() == [False] * (FRAMES - 1) + [True]
-
-
-def test_a_note_leads_to_its_frame_and_camera(browser, client):
-    places = truth(POINT)
-    page = Page(browser, client, "?tracks")
-    page.browser.key("k")
-    page.drag(tuple(places[0]))
-    page.browser.wait("document.querySelector('#notes li')?.textContent.includes('lost')")
-    page.browser.key("k")
-    page.browser.click("#notes li")
-    assert page.browser.run("[annotate.camera, annotate.frame]") == ["covered", 5]
-
-
 def test_the_page_works_in_a_narrow_window(browser, client):
-    show(browser, client, "", 500, 900)
+    show(browser, client, 500, 900)
     found = browser.check()
     assert found["needed"] == found["width"]
     assert found["errors"] == []

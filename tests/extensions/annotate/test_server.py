@@ -1,4 +1,4 @@
-"""What the page asks of the server: marks, masks and clicks that are never lost, and never written over by a stale tab."""
+"""Requests of the page: marks and masks that are never lost, and never written over by a stale tab."""
 
 import json
 
@@ -6,24 +6,21 @@ import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.data.capture import TRACKS, write_tracks
-from neuspring.extensions.annotate.clicks import ANNOTATIONS
 from neuspring.extensions.annotate.server import LABEL_COLORS, Server, overlay_png
 from neuspring.perception.marks.store import MasksFile
 from tests.extensions.annotate.served import decoded, served
-from tests.support.moving import FRAMES, truth
+from tests.support.moving import FRAMES
 
 BOX = {"frame": 1, "label": "object", "kind": "box", "points": [[40, 50], [60, 70]], "radius": 3.0}
 HAND = BOX | {"label": "hand", "points": [[80, 50], [100, 70]]}
-POINT = (46.0, 62.0)
 
 
 def marks(*marks, camera="0") -> dict:
     return {"format": 1, "cameras": {camera: list(marks)}}
 
 
-def revision(client, what: str = "masks") -> str:
-    return client.get(f"/api/{what}")["revision"]
+def revision(client) -> str:
+    return client.get("/api/masks")["revision"]
 
 
 def write_marks(client, *own, camera="0"):
@@ -37,7 +34,6 @@ def test_the_state_describes_the_capture_and_frames_come_as_they_are(client, cap
     assert (state["name"], state["frames"], state["frame_rate"]) == ("thing", FRAMES, 30.0)
     assert state["cameras"][0] == {"name": "0", "width": 128, "height": 96, "missing": [4]}
     assert state["masks"]["marks"] == {"format": 1, "cameras": {}}
-    assert state["tracks"]["annotations"] == {"format": 1, "points": []}
     assert state["masks"]["saved"] == {}
     shown = client.image("/api/color/0/3")[..., ::-1].astype(int)
     assert np.abs(shown - capture.color("0", 3)).mean() < 2.0  # JPEG
@@ -64,17 +60,14 @@ def test_marks_that_break_a_rule_are_refused_and_change_nothing(client, capture)
 def test_work_goes_on_after_a_new_start(capture):
     with served(capture) as client:
         write_marks(client, BOX)
-        client.post("/api/clicks", revision="none", annotations={"format": 1, "points": [{"name": "ear"}]})
     with served(capture) as client:
         state = client.get("/api/state")
     assert state["masks"]["marks"] == marks(BOX)
-    assert state["tracks"]["annotations"]["points"] == [{"name": "ear", "clicks": {}}]
 
 
-@pytest.mark.parametrize("name", ["marks.json", ANNOTATIONS])
-def test_a_damaged_file_is_refused_at_the_start(capture, name):
-    (capture.folder / name).write_text("{")
-    with pytest.raises(InputError, match=name):
+def test_a_damaged_file_is_refused_at_the_start(capture):
+    (capture.folder / "marks.json").write_text("{")
+    with pytest.raises(InputError, match=r"marks\\.json"):
         Server(capture)
 
 
@@ -150,84 +143,6 @@ def test_only_marked_cameras_are_carried(client, cameras, status):
     write_marks(client, BOX)
     assert client.post("/api/carry", cameras=cameras)[0] == status
     assert client.get("/api/job")["state"] == "idle"
-
-
-def clicks(*frames, name="ear", camera="0") -> dict:
-    places = truth(POINT)
-    own = [{"frame": frame, "x": float(places[frame, 0]), "y": float(places[frame, 1])} for frame in frames]
-    return {"format": 1, "points": [{"name": name, "clicks": {camera: own}}]}
-
-
-def followed(client) -> dict:
-    return client.wait(lambda: (answer := client.get("/api/tracks/0"))["busy"] is False and answer)
-
-
-def test_clicks_become_tracks(client, capture):
-    status, answer = client.post("/api/clicks", revision="none", annotations=clicks(0))
-    assert status == 200
-    assert revision(client, "clicks") == answer["revision"]
-    assert client.post("/api/clicks", revision="none", annotations=clicks(1))[0] == 409
-    point = followed(client)["points"][0]
-    trail = np.array([[np.nan] * 2 if place is None else place for place in point["trails"]["0"]])
-    assert np.flatnonzero(np.isnan(trail).any(axis=1)).tolist() == [4]
-    assert np.nanmax(np.linalg.norm(trail - truth(POINT), axis=1)) < 0.3
-    assert client.post("/api/tracks/save") == (200, {"points": 1})
-    saved = capture.tracks()
-    assert saved.shape == (FRAMES, 1, 3)
-    assert np.isnan(saved[4]).all()
-    pixels, _ = capture.cameras["0"].project(saved[:, 0])
-    assert np.nanmax(np.linalg.norm(pixels - truth(POINT), axis=1)) < 0.3
-    version = client.get("/api/tracks/0")["version"]
-    assert "points" not in client.get(f"/api/tracks/{version}")
-
-
-def test_a_correction_follows_only_what_changed(client):
-    client.post("/api/clicks", revision="none", annotations=clicks(0, 8))
-    followed(client)
-    runs = client.server.tracks._run.cache_info().misses
-    client.post("/api/clicks", revision=revision(client, "clicks"), annotations=clicks(0, 8, 11))
-    followed(client)
-    # From 8 to 11, from 11 to 8, and from 11 to the end.
-    assert client.server.tracks._run.cache_info().misses == runs + 3
-
-
-def test_bad_clicks_are_refused_and_tracks_need_a_point(client, capture):
-    for annotations in (clicks(4), None, {"format": 1, "points": [{"name": ""}]}):
-        assert client.post("/api/clicks", revision="none", annotations=annotations)[0] == 422
-    assert not (capture.folder / ANNOTATIONS).exists()
-    assert client.post("/api/tracks/save")[0] == 422
-
-
-def test_tracks_that_were_there_before_are_not_replaced_without_a_word(client, capture):
-    write_tracks(capture.folder, np.zeros((FRAMES, 3, 3)))
-    client.post("/api/clicks", revision="none", annotations=clicks(0))
-    followed(client)
-    status, answer = client.post("/api/tracks/save")
-    assert (status, answer["error"]) == (428, f"The capture already has {TRACKS}, with 3 tracks. Saving replaces them.")
-    assert capture.tracks().shape[1] == 3
-    assert client.post("/api/tracks/save", replace="yes")[0] == 428
-    assert client.post("/api/tracks/save", replace=True) == (200, {"points": 1})
-    assert client.post("/api/tracks/save") == (200, {"points": 1})
-    write_tracks(capture.folder, np.ones((FRAMES, 2, 3)))
-    assert client.post("/api/tracks/save")[0] == 428, "another program wrote them since"
-    assert capture.tracks().shape[1] == 2
-
-
-def test_an_image_that_cannot_be_read_or_an_error_of_the_program_is_told_and_work_goes_on(client, capture, monkeypatch):
-    path = capture.path("color", "0", 2)
-    image = path.read_bytes()
-    path.write_bytes(b"no image")
-    client.post("/api/clicks", revision="none", annotations=clicks(0))
-    assert "00002.png" in followed(client)["failure"]
-    status, answer = client.post("/api/tracks/save")
-    assert (status, "00002.png" in answer["error"]) == (409, True)
-    path.write_bytes(image)
-    with monkeypatch.context() as patch:
-        patch.setattr(client.server.tracks, "_run", lambda *_: 1 / 0)
-        client.post("/api/clicks", revision=revision(client, "clicks"), annotations=clicks(1))
-        assert "ZeroDivisionError" in followed(client)["failure"]
-    client.post("/api/clicks", revision=revision(client, "clicks"), annotations=clicks(0, 1))
-    assert followed(client)["failure"] == ""
 
 
 def test_borders_of_an_overlay_are_strong_and_its_inside_is_clear():

@@ -1,10 +1,9 @@
-// The page: which camera and frame are shown, and in which mode.
+// The page: which camera and frame are shown.
 
 import { getJson, Images } from "./api.js";
 import { MasksMode } from "./masks.js";
 import { say } from "./messages.js";
 import { Timeline } from "./timeline.js";
-import { TracksMode } from "./tracks.js";
 import { View } from "./view.js";
 
 const find = (id) => document.getElementById(id);
@@ -18,9 +17,9 @@ class App {
     this.frames = state.frames;
     this.images = new Images();
     this.view = new View(find("view"));
-    this.timeline = new Timeline({ go: (frame) => this.go(frame), bars: () => this.mode?.bars() ?? [] });
+    this.timeline = new Timeline({ go: (frame) => this.go(frame), bars: () => this.masks?.bars() ?? [] });
     this.timeline.set(state.frames, state.frame_rate);
-    this.modes = { masks: new MasksMode(this), tracks: new TracksMode(this) };
+    this.masks = this.view.mode = new MasksMode(this);
     find("name").textContent = state.name;
     find("name").title = state.folder;
     document.title = `${state.name} – neuspring annotate`;
@@ -30,21 +29,27 @@ class App {
       button.onclick = () => this.go(this.frame, name);
       return button;
     }));
-    for (const name of ["masks", "tracks"]) find(`mode-${name}`).onclick = () => this.setMode(name);
     find("show-help").onclick = () => find("help").showModal();
     find("overlay").onclick = () => this.toggleOverlay();
     // A button that was clicked gives the keys back: Space plays, and does not press it again.
     document.addEventListener("click", (event) => event.detail && event.target.closest("button")?.blur());
     window.addEventListener("keydown", (event) => this.key(event));
     window.addEventListener("beforeunload", (event) => {
-      if (Object.values(this.modes).some((mode) => mode.edits.dirty)) event.preventDefault();
+      if (this.masks.edits.dirty) event.preventDefault();
     });
   }
 
   async start() {
-    this.modes.masks.start(this.state.masks);
-    this.modes.tracks.start(this.state.tracks);
-    await this.setMode(location.search === "?tracks" ? "tracks" : "masks");
+    this.masks.start(this.state.masks);
+    find("legend").replaceChildren(...this.masks.legend().map(([color, text]) => {
+      const entry = document.createElement("span");
+      const swatch = document.createElement("i");
+      swatch.className = "swatch";
+      swatch.style.background = color;
+      entry.append(swatch, text);
+      return entry;
+    }));
+    await this.go(this.frame);
     document.body.dataset.ready = "yes";
   }
 
@@ -56,34 +61,17 @@ class App {
     return this.state.cameras.find((camera) => camera.name === name);
   }
 
-  async setMode(name) {
-    this.mode?.left();
-    this.mode = this.modes[name];
-    this.view.mode = this.mode;
-    document.body.dataset.mode = name;
-    for (const other of ["masks", "tracks"]) find(`mode-${other}`).setAttribute("aria-selected", other === name);
-    find("legend").replaceChildren(...this.mode.legend().map(([color, text]) => {
-      const entry = document.createElement("span");
-      const swatch = document.createElement("i");
-      swatch.className = "swatch";
-      swatch.style.background = color;
-      entry.append(swatch, text);
-      return entry;
-    }));
-    await this.go(this.frame);
-  }
-
   // Show a frame; resolves when it is there. Of several calls the last one wins.
   async go(frame, camera = this.camera) {
     const moved = camera !== this.camera || frame !== this.frame;
     this.camera = camera;
     this.frame = Math.min(Math.max(frame, 0), this.frames - 1);
-    if (moved) this.mode.left();
+    if (moved) this.masks.left();
     const { width, height, missing } = this.size();
     this.view.setSize(width, height);
     for (const [k, name] of this.cameras().entries()) find("cameras").children[k].setAttribute("aria-pressed", name === camera);
     this.timeline.show(this.frame);
-    this.mode.refresh();
+    this.masks.refresh();
     this.refreshOverlay();
     const asked = (this.asked = (this.asked ?? 0) + 1);
     this.refreshHint();
@@ -94,7 +82,7 @@ class App {
       return;
     }
     try {
-      const [picture, overlay] = await Promise.all([this.picture(this.frame), this.modes.masks.overlay(camera, this.frame)]);
+      const [picture, overlay] = await Promise.all([this.picture(this.frame), this.masks.overlay(camera, this.frame)]);
       if (asked !== this.asked) return;
       this.view.frame = picture;
       this.view.overlay = overlay;
@@ -116,7 +104,7 @@ class App {
     for (let next = this.frame + 1; next <= Math.min(this.frame + AHEAD, this.frames - 1); next += 1) {
       if (missing.includes(next)) continue;
       this.picture(next).catch(() => {});
-      this.modes.masks.overlay(this.camera, next);
+      this.masks.overlay(this.camera, next);
     }
   }
 
@@ -126,19 +114,19 @@ class App {
   }
 
   toggleOverlay() {
-    this.mode.showOverlay = !this.mode.showOverlay;
+    this.masks.showOverlay = !this.masks.showOverlay;
     this.refreshOverlay();
   }
 
   refreshOverlay() {
-    this.view.showOverlay = this.mode.showOverlay;
-    find("overlay").setAttribute("aria-pressed", this.mode.showOverlay);
-    find("overlay-text").textContent = this.modes.masks.source(this.camera, this.frame) ?? "no";
+    this.view.showOverlay = this.masks.showOverlay;
+    find("overlay").setAttribute("aria-pressed", this.masks.showOverlay);
+    find("overlay-text").textContent = this.masks.source(this.camera, this.frame) ?? "no";
     this.view.draw();
   }
 
   refreshHint() {
-    this.hint(this.mode?.hint?.() ?? "");
+    this.hint(this.masks?.hint() ?? "");
   }
 
   hint(text) {
@@ -163,7 +151,7 @@ class App {
       this.timeline.stop();
       this.go(frame);
     };
-    if ((event.ctrlKey || event.metaKey) && key === "z") event.shiftKey ? this.mode.edits.redo() : this.mode.edits.undo();
+    if ((event.ctrlKey || event.metaKey) && key === "z") event.shiftKey ? this.masks.edits.redo() : this.masks.edits.undo();
     else if (event.ctrlKey || event.metaKey || event.altKey) return;
     else if (key === "arrowleft") move(this.frame - step);
     else if (key === "arrowright") move(this.frame + step);
@@ -174,7 +162,7 @@ class App {
     else if (key === "f") this.view.fit();
     else if (key === "m") this.toggleOverlay();
     else if (key === "?") find("help").showModal();
-    else if (!this.mode.key(event)) return;
+    else if (!this.masks.key(event)) return;
     event.preventDefault();
   }
 }

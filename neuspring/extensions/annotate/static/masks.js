@@ -1,4 +1,4 @@
-// The masks mode: marks on frames, previews, carrying, saving.
+// Marks on frames, previews, carrying, saving.
 
 import { getJson, post, postForImage } from "./api.js";
 import { doubtColor, HIGH, worst } from "./doubt.js";

@@ -1,4 +1,4 @@
-// How marks and points look.
+// How marks look.
 
 export const COLORS = {
   object: "rgb(0 200 160)", hand: "rgb(255 140 0)", ignore: "rgb(200 120 255)", person: "rgb(150 160 255)",
@@ -52,51 +52,4 @@ function stroke(context, color, width) {
   context.strokeStyle = color;
   context.lineWidth = width;
   context.stroke();
-}
-
-// Colors far apart from each other, by number.
-export const pointColor = (number) => `hsl(${(number * 137.5 + 190) % 360} 90% 66%)`;
-
-export function drawPoint(context, view, place, color, { chosen, clicked, name }) {
-  const [x, y] = view.toCanvas(place);
-  const radius = chosen ? 7 : 5;
-  context.beginPath();
-  context.arc(x, y, radius, 0, 2 * Math.PI);
-  stroke(context, "rgb(0 0 0 / .7)", 4);
-  stroke(context, color, 2);
-  if (clicked) {
-    context.beginPath();
-    context.arc(x, y, 2.6, 0, 2 * Math.PI);
-    context.fillStyle = color;
-    context.fill();
-  }
-  if (chosen) {
-    context.beginPath();
-    for (const [dx, dy] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
-      context.moveTo(x + dx * radius, y + dy * radius);
-      context.lineTo(x + dx * (radius + 7), y + dy * (radius + 7));
-    }
-    stroke(context, color, 1.5);
-  }
-  context.font = "12px system-ui, sans-serif";
-  context.lineWidth = 3;
-  context.strokeStyle = "rgb(0 0 0 / .7)";
-  context.strokeText(name, x + radius + 4, y - radius);
-  context.fillStyle = color;
-  context.fillText(name, x + radius + 4, y - radius);
-}
-
-export function drawWay(context, view, places, color) {
-  context.beginPath();
-  let on = false;
-  for (const place of places) {
-    if (!place) on = false;
-    else {
-      const [x, y] = view.toCanvas(place);
-      if (on) context.lineTo(x, y);
-      else context.moveTo(x, y);
-      on = true;
-    }
-  }
-  stroke(context, color, 1.5);
 }

@@ -1,10 +1,9 @@
 // A row of a list in the panel: a colored sign, a text, and what a click on it or on its cross does.
 
-export function row({ sign, text, count = null, chosen = false, pick, name = text, remove = null }) {
+export function row({ sign, text, chosen = false, pick, name = text, remove = null }) {
   const item = document.createElement("li");
   item.classList.toggle("chosen", chosen);
   item.append(sign, element("span", text));
-  if (count !== null) item.append(element("small", count));
   if (remove) {
     const cross = element("button", "✕");
     cross.ariaLabel = `Remove ${name}`;
@@ -21,13 +20,6 @@ export function row({ sign, text, count = null, chosen = false, pick, name = tex
 export function swatch(label) {
   const sign = document.createElement("i");
   sign.className = `swatch ${label}`;
-  return sign;
-}
-
-export function dot(color) {
-  const sign = document.createElement("i");
-  sign.className = "dot";
-  sign.style.background = color;
   return sign;
 }
 

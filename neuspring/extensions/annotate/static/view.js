@@ -1,4 +1,4 @@
-// The picture: a frame, masks over it, and what a mode paints on top; zoom, shift, and pixels of the image under the pointer.
+// The picture: a frame, masks over it, and the marks on top; zoom, shift, and pixels of the image under the pointer.
 // Pixel centers lie at whole coordinates, so that a pixel covers half a unit to each side.
 
 export class View {
