@@ -26,7 +26,7 @@ FASTEST_HAND = 5.0
 NODE_RANGE = (30, 5000)
 """Structure points that can deform, and that a search can pay for."""
 OF_CONTROLLERS: dict[str, Any] = {"where": "controllers"}
-MASKS = "Masks may take something else for a hand: look at masks.png; perception.lift has grip and grip_reach."
+MASKS = "Masks may take something else for a hand: look at masks.png; perception.lift has grip."
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from neuspring.checks.followed import Tracked, few
 from neuspring.checks.masks import OFTEN, Shown
 from neuspring.checks.observed import Observed
 from neuspring.checks.things import Sample, place_of, sampled
-from neuspring.core.artifacts import ImageObservations, Observations
+from neuspring.core.artifacts import Observations
 from neuspring.core.checks import Check
 from neuspring.core.findings import Finding
 from neuspring.data.capture import Capture
@@ -27,14 +27,10 @@ LARGEST_HULL = 0.012
 """m^3 of a hull: a large plush animal has 5 liters."""
 INVENTED = 0.8
 """Share of the surface that no camera saw; of a body seen from one side it is about two thirds."""
-RISES = 0.05
-"""Part of a body that is not laid onto the table, because it would lie too far behind. Two sloths that lie have up to 0.03."""
 TRUSTED = 0.5
 """Share of motions that agree with their neighbors, of points that are seen in both frames; points that are lost are said apart."""
 SEEN_SHARE = 0.05
 """Share of the object's points that are seen in a frame."""
-RESIZED = 1.8
-"""Change of a hand's apparent size."""
 
 
 def look_at_masks(capture: Capture, camera: str, labels: np.ndarray, facts: Mapping[str, float]) -> list[Finding]:
@@ -61,33 +57,12 @@ def look_at_observations(observations: Observations, moves: float = 0.0) -> list
     return examine("observations", "observations", Observed(observations, moves))
 
 
-def look_at_lifted(lifted: LiftedTracks, prior: ShapePrior, up: float, image: ImageObservations | None = None) -> list[Finding]:
-    """Findings about points in the world and the shape; `up` is +1 or -1. `image`: the evidence of color alone."""
+def look_at_lifted(lifted: LiftedTracks, prior: ShapePrior, up: float) -> list[Finding]:
+    """Findings about points in the world and the shape; `up` is +1 or -1."""
     found = examine("object", "object of all cameras", place_of({0: lifted.cloud}, up))
-    if image is None and prior.backend.startswith("visual_hull"):
+    if prior.backend.startswith("visual_hull"):
         found += examine("sheet", "object in frame 0", lifted.cloud, up)
-    found += examine("pose", "shape", lifted) + examine("shape", "shape", prior)
-    if image is None:
-        return found + examine("lifted tracks", "lifted tracks", lifted)
-    return found + examine("tracks in the image", "tracks", image) + examine("hands in the image", "hands", image)
-
-
-def given_pose(lifted: LiftedTracks) -> dict[str, Any] | None:
-    """Share of a body that rises from what touches the table, where the capture says how it lies or stands."""
-    backend = lifted.backend
-    if not backend.startswith("color alone, body") or backend == "color alone, body":
-        return None
-    return {"value": lifted.facts["shape_raised"], "pose": backend.rsplit(", ", 1)[1]}
-
-
-def supposed_pose(lifted: LiftedTracks) -> dict[str, Any] | None:
-    """Share of a body that is supposed to rise, where color alone shows it and nothing says whether it lies or stands."""
-    if lifted.backend != "color alone, body":
-        return None
-    deep, across, raised = (lifted.facts[f"shape_{name}"] for name in ("longest", "across", "raised"))
-    rises = f", so {raised:.0%} of it is supposed to rise" if raised > RISES else ""
-    level = "warning" if raised > RISES else "note"
-    return {"value": raised, "deep": 100 * deep, "across": 100 * across, "rises": rises, "level": level}
+    return found + examine("shape", "shape", prior) + examine("lifted tracks", "lifted tracks", lifted)
 
 
 def hull_volume(prior: ShapePrior) -> dict[str, Any]:
@@ -124,25 +99,11 @@ def stray_hand(lifted: LiftedTracks) -> dict[str, Any] | None:
     return {"where": "controllers", "value": count, "first": first, "level": level, "frames": (first,)}
 
 
-def hand_sizes(image: ImageObservations) -> dict[str, Any] | None:
-    """Apparent sizes of hands, as multiples of those in frame 0, that change more than at arm's length."""
-    if not image.hands:
-        return None
-    least, most = float(image.hand_sizes.min()), float(image.hand_sizes.max())
-    return {"value": most, "least": least} if most > RESIZED or least < 1 / RESIZED else None
-
-
 LOST_TEXT = (
     "{value:.0%} of the object's points are seen in frame {frame}; few in {count} frames; at least {least:.0%} are expected in "
 )
 # fmt: off
 checks = (
-    Check("pose", "pose", given_pose, None, "note",
-          "{pose}, as capture.json says; {value:.0%} of it rises from what touches the table; thickness follows the width of the "
-          "outline."),
-    Check("pose", "pose", supposed_pose, None, "note",
-          "if it lies, it reaches {deep:.0f} cm behind its nearest point and is {across:.0f} cm wide{rises}; one picture cannot "
-          "say whether it lies or stands.", 'Write "pose": "lying" or "standing" in capture.json.'),
     Check("volume of the hull", "shape", hull_volume, (-np.inf, LARGEST_HULL), "warning",
           f"{{liters:.1f}} liters; at most {1e3 * LARGEST_HULL:g} liters are expected of a thing that hands hold.",
           "Masks that show sleeves, table or other things make it large: look at masks.png and lifted.png."),
@@ -161,9 +122,4 @@ checks = (
     Check("points lost", "lifted tracks", lambda lifted: few(lifted.object_visibility, SEEN_SHARE), None, "warning",
           LOST_TEXT + "every frame.",
           "End the capture before frame {first}. Look at tracks.png and lifted.png; perception.lift has neighborhood."),
-    Check("points lost", "tracks in the image", lambda image: few(image.visible[: len(image.inside)], SEEN_SHARE), None, "warning",
-          LOST_TEXT + "every training frame; silhouettes alone say where the object is in the others.", "Look at tracks.png."),
-    Check("size of hands", "hands in the image", hand_sizes, None, "warning",
-          "a hand appears {least:.2f} to {value:.2f} times as large as in frame 0; a hand at arm's length changes by less than "
-          f"{RESIZED:g} times; it was not followed well.", "Look at hands.png, and mark the hands anew."),
 )

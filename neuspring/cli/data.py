@@ -40,10 +40,9 @@ def mask(
     from neuspring.checks.perceived import look_at_masks
     from neuspring.core.text import Progress
     from neuspring.data.capture import Capture
-    from neuspring.perception import segment_sam2
-    from neuspring.perception.marks import store
-    from neuspring.perception.marks.carry import carry_camera
-    from neuspring.perception.marks.marks import MARKS, Marks
+    from neuspring.perception import masks as store
+    from neuspring.perception.backends import SEGMENTERS
+    from neuspring.perception.marks import MARKS, Marks
 
     read, path = Capture.load(capture), marks or capture / MARKS
     if masks or hands:
@@ -53,14 +52,12 @@ def mask(
             raise InputError("--masks, --hands", rule, f"{len(masks)} and {len(hands)}")
         for name, folder, held in zip(named, masks, hands or [None] * len(named), strict=True):
             read.require_camera(name)
-            written, how = store.import_masks(read, name, folder, held)
-            print(f"camera {name}: masks are in {written}, numbered by {how}")
+            print(f"camera {name}: masks are in {store.import_masks(read, name, folder, held)}")
         print(f"next:\n  neuspring check-data {capture}")
         return
     marked = Marks.load(path)
     marked.require(read, path)
-    segmentation = read_settings(settings).perception.segment
-    own = segmentation.marks if backend == "marks" else segmentation.grounded_sam2
+    perception, carrier = read_settings(settings).perception, SEGMENTERS["marks" if backend == "marks" else "grounded_sam2"]
     wanted = cameras or tuple(name for name in read.cameras if marked.of(name))
     for name in wanted:
         read.require_camera(name)
@@ -70,18 +67,12 @@ def mask(
         raise InputError(f"{path}, cameras", "a camera of the capture needs marks", sorted(marked.cameras))
     made = store.MasksFile.of(read)
     for name in wanted:
-        source = store.source_digest(read, name, marked.of(name), backend, own)
+        source = store.source_digest(read, name, marked.of(name), backend)
         if made.holds(read, name, source) and not again:
             doubts = made.cameras[name].doubt
             told = "marks, images and settings are unchanged; its masks are kept"
         else:
-            if backend == "sam2":
-                from neuspring.core.device import resolve_device
-
-                carried = segment_sam2.carry(read, name, marked.of(name), segmentation.grounded_sam2, resolve_device(device))
-            else:
-                progress = Progress(f"camera {name}", 0).of
-                carried = carry_camera(read, name, marked.of(name), segmentation.marks, progress=progress)
+            carried = carrier.carry(read, name, marked.of(name), perception, device, Progress(f"camera {name}", 0).of)
             doubts = store.save_carried(read, name, carried, source, backend).doubt
             for finding in look_at_masks(read, name, carried.labels, mask_facts(read, name, carried.labels)):
                 print(finding)
@@ -99,6 +90,6 @@ def compare_masks(
     truth: Annotated[Positional[Path], arg(help="folder of masks to compare with; its frames count")],
 ) -> None:
     """Two folders of masks -> their overlap per frame."""
-    from neuspring.perception.marks.store import compare, table
+    from neuspring.perception.masks import compare, table
 
     print(table(compare(masks, truth)), end="")

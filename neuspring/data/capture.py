@@ -17,6 +17,7 @@ and has no files.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import os
 import shutil
@@ -75,7 +76,7 @@ class Description:
     cameras: tuple[CameraEntry, ...]
     """None: points in space alone, with `depth: none` and `tracks: train` (points.py)."""
     depth: Literal["measured", "none"] = "measured"
-    """none: color alone, of one camera, with the table at z = 0 (neuspring/perception/color.py), or no camera."""
+    """The lifter of the capture (`LIFTERS` of neuspring/perception/backends.py). none: color of one camera alone, or no camera."""
     tracks: Literal["score", "train"] = "score"
     """score: annotated points are for scoring alone. train: those of training frames teach the twin too."""
     depth_unit: Positive = 0.001
@@ -141,9 +142,15 @@ class Capture:
         return self.description.train_end or int(0.7 * self.frame_count)
 
     @property
+    def streams(self) -> frozenset[str]:
+        """What the capture has of every frame: color, and depth and mask where it has them."""
+        there = (True, self.description.depth == "measured", self.description.masks)
+        return frozenset(itertools.compress(("color", "depth", "mask"), there))
+
+    @property
     def has_depth(self) -> bool:
         """True where depth was measured."""
-        return self.description.depth == "measured"
+        return "depth" in self.streams
 
     def require_camera(self, name: str) -> None:
         """Raise InputError if there is no such camera."""
@@ -247,11 +254,9 @@ class Writer:
         """RGB uint8 [H, W, 3], depth as stored [H, W] (None with `depth: none`), labels uint8 [H, W]."""
         write_image(self.capture.path("color", camera, frame), color[..., ::-1])
         path = self.capture.path("depth", camera, frame)
-        if depth is None:
-            assert not self.capture.has_depth, "depth was measured"
-        elif path.suffix == ".png":
+        if depth is not None and path.suffix == ".png":
             write_image(path, depth)
-        else:
+        elif depth is not None:
             make_way(path)
             np.save(path, depth, allow_pickle=False)
         if mask is not None:

@@ -43,23 +43,10 @@ def gray(capture: Capture, camera: str, frame: int) -> np.ndarray:
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(capture.color(camera, frame)), cv2.COLOR_RGB2GRAY))
 
 
-def heights(capture: Capture, camera: str, depth: np.ndarray) -> np.ndarray:
-    """Height [H, W], m, above the table z = 0 of what an image of depth [H, W], m, shows; NaN where nothing was measured."""
-    view = capture.cameras[camera]
-    pixels = np.stack(np.meshgrid(np.arange(view.width), np.arange(view.height)), axis=-1).astype(float)
-    return np.where(depth > 0, capture.description.up_sign * view.lift(pixels, depth)[..., 2], np.nan)
-
-
 def overlap(one: np.ndarray, other: np.ndarray) -> float:
     """Intersection over union of two masks [...] bool; NaN if both are empty."""
     union = int((one | other).sum())
     return float((one & other).sum() / union) if union else float("nan")
-
-
-def at_border(boxes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Pieces [n] bool, by the boxes [n, 5] of `cv2.connectedComponentsWithStats`, that reach the border of an image [H, W]."""
-    left, top, width, height = boxes.T[:4]
-    return np.asarray((left == 0) | (top == 0) | (left + width == shape[1]) | (top + height == shape[0]))
 
 
 def without_islands(capture: Capture, camera: str, labels: np.ndarray) -> np.ndarray:

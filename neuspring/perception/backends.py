@@ -1,13 +1,14 @@
-"""The backends of segmentation and tracking: `SEGMENTERS` and `TRACKERS` declare them, and stages and workflow ask them.
+"""The backends of segmentation, tracking and lifting: `SEGMENTERS`, `TRACKERS` and `LIFTERS` declare them.
 
-To add a backend: its module with the function `segment` or `track`, and its line here; its settings, if it has some, in
-neuspring/config/perception.py. A package adds one, a `Backend`, by an entry point of the group `neuspring.segmenters` or
-`neuspring.trackers`.
+To add a backend: its module with the function `segment`, `track` or `lift`, and its line here; its settings, if it has some, in
+neuspring/config/perception.py. A package adds one, a `Backend`, by an entry point of the group `neuspring.segmenters`,
+`neuspring.trackers` or `neuspring.lifters`. The word `depth` of a capture names its lifter.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,12 +20,28 @@ from neuspring.registry import Registry
 if TYPE_CHECKING:
     import numpy as np
 
+    from neuspring.core.artifacts import ImageObservations
+    from neuspring.core.findings import Finding
     from neuspring.data.capture import Capture
+    from neuspring.data.results import LiftedTracks, Masks, PixelTracks, ShapePrior
+    from neuspring.perception.film import Carried, Progress
+    from neuspring.perception.marks import Mark
     from neuspring.perception.track_opencv import Followed
 
 
-PERCEPTION_SEED = 0
-"""Seed of the pixels that are followed and of the points that are sampled; methods have seeds of their own."""
+@dataclass(frozen=True, kw_only=True)
+class Lifted:
+    """What a lifter knows of object and hands in the world."""
+
+    tracks: LiftedTracks
+    prior: ShapePrior
+    findings: Sequence[Finding]
+    image: ImageObservations | None = None
+    """Evidence in the image, for losses that read it."""
+    depths: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Supposed depth of frame 0 [H, W], m, by camera, in place of a measured one."""
+    pictures: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Images to look at, RGB [H, W, 3], by the names of their files."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,32 +55,63 @@ class Backend:
     """True where it takes a GPU where there is one; it is then given the device as its last argument."""
     truth: bool = False
     """True where it reads the truth of a synthetic scene: for measuring perception; no method may use it."""
-
-    given: bool = False
-    """True where a capture must have something for it that not every one has, which its `require(capture)` asks for."""
+    needs: tuple[str, ...] = ()
+    """Streams of a capture that it reads besides color, `Capture.streams`."""
+    file: str = ""
+    """File of a capture that it reads; its module checks the content: `require(capture)`."""
 
     def require(self, folder: Path) -> None:
         """Raise InputError where a capture lacks what it needs, before any job runs. Damaged ones fail their own jobs."""
         from neuspring.data.capture import Capture
 
-        if not self.given:
-            return
         try:
             capture = Capture.load(folder)
         except InputError:
             return
-        import_module(self.module).require(capture)
+        self.require_of(capture)
+
+    def require_of(self, capture: Capture) -> None:
+        """Raise InputError where a capture lacks a stream or the file that it needs."""
+        if lacking := [stream for stream in self.needs if stream not in capture.streams]:
+            rule = f"perception.segment.backend needs {', '.join(lacking)} of every frame"
+            remedy = f"Draw masks with `neuspring annotate {capture.folder}`, or choose another backend."
+            raise InputError(capture.folder, rule, f"a capture of {', '.join(sorted(capture.streams))}", remedy)
+        if self.file:
+            import_module(self.module).require(capture)
 
     def segment(self, capture: Capture, camera: str, settings: Perception, device: str) -> np.ndarray:
-        """Labels [T, H, W] uint8 of one camera: 0 table, 1 object, 2 hands, 3 person (`data.capture.OBJECT`, ...)."""
-        own = (getattr(settings.segment, self.section),) if self.section else ()
-        labels: np.ndarray = self._call("segment", (capture, camera, *own), device)
+        """Labels [T, H, W] uint8 of one camera: 0 table, 1 object, 2 hands, 3 person (`data.capture.OBJECT`, ...).
+
+        Raises InputError where the capture lacks what it needs.
+        """
+        self.require_of(capture)
+        labels: np.ndarray = self._call("segment", (capture, camera, *self._settings(settings)), device)
+        return labels
+
+    def carry(
+        self, capture: Capture, camera: str, marks: Sequence[Mark], settings: Perception, device: str, progress: Progress
+    ) -> Carried:
+        """Labels and doubt of every frame of a camera from marks on a few. Raises InputError where they do not fit."""
+        carried: Carried = self._call("carry", (capture, camera, marks, progress, *self._settings(settings)), device)
+        return carried
+
+    def outline(self, capture: Capture, camera: str, frame: int, marks: Sequence[Mark]) -> np.ndarray:
+        """Labels [H, W] uint8 of one frame from the marks on it. Raises InputError where no object or hand is marked there."""
+        labels: np.ndarray = import_module(self.module).outline(capture, camera, frame, marks)
         return labels
 
     def track(self, capture: Capture, camera: str, labels: np.ndarray, settings: Perception, device: str) -> Followed:
         """Tracks of pixels of the masks `labels` [T, H, W]."""
-        tracks: Followed = self._call("track", (capture, camera, labels, settings.track, PERCEPTION_SEED), device)
+        tracks: Followed = self._call("track", (capture, camera, labels, settings.track), device)
         return tracks
+
+    def lift(self, capture: Capture, masks: Mapping[str, Masks], tracks: Mapping[str, PixelTracks], settings: Perception) -> Lifted:
+        """Object and hands in the world, from masks and tracks by camera."""
+        lifted: Lifted = import_module(self.module).lift(capture, masks, tracks, settings)
+        return lifted
+
+    def _settings(self, settings: Perception) -> tuple[Any, ...]:
+        return (getattr(settings.segment, self.section),) if self.section else ()
 
     def _call(self, step: str, given: tuple[Any, ...], device: str) -> Any:
         from neuspring.core.device import resolve_device
@@ -74,9 +122,8 @@ class Backend:
 SEGMENTERS = Registry(
     "segmenters",
     {
-        "given": Backend(module="neuspring.perception.segment_given", given=True),
-        "opencv": Backend(module="neuspring.perception.segment_opencv", section="opencv", given=True),
-        "marks": Backend(module="neuspring.perception.marks.store", section="marks", given=True),
+        "given": Backend(module="neuspring.perception.segment_given", needs=("mask",)),
+        "opencv": Backend(module="neuspring.perception.segment_opencv", needs=("depth",)),
         "grounded_sam2": Backend(module="neuspring.perception.segment_sam2", section="grounded_sam2", gpu=True),
     },
     Backend,
@@ -90,17 +137,17 @@ TRACKERS = Registry(
     },
     Backend,
 )
-BACKENDS = {"segment": SEGMENTERS, "track": TRACKERS}
+LIFTERS = Registry("lifters", {"measured": Backend(module="neuspring.perception.lift")}, Backend)
+BACKENDS = {"segment": SEGMENTERS, "track": TRACKERS, "lift": LIFTERS}
 
 
 def segmentation(name: str, capture: Capture) -> str:
-    """The backend of a capture's segmentation where `name` is configured: marks, where it has some, in place of `opencv`.
+    """The backend of a capture's segmentation where `name` is configured: that of the capture's marks in place of `opencv`.
 
-    Whoever has drawn marks knows that height and color do not tell the object from the table.
+    A user who has drawn marks knows that height and color do not separate the object from the table.
     """
-    from neuspring.perception.marks.marks import MARKS
-
-    return "marks" if name == "opencv" and (capture.folder / MARKS).exists() else name
+    drawn = (other for other, one in SEGMENTERS.items() if one.file and (capture.folder / one.file).exists())
+    return next(drawn, name) if name == "opencv" else name
 
 
 def require_known(settings: Perception) -> None:
@@ -110,17 +157,13 @@ def require_known(settings: Perception) -> None:
             raise InputError(f"perception.{step}.backend", f"must be one of {', '.join(BACKENDS[step])}", name)
 
 
-def _possible(step: str, name: str) -> list[Backend]:
-    """Backends that may run where `name` is configured."""
-    return [BACKENDS[step][one] for one in ((name, "marks") if (step, name) == ("segment", "opencv") else (name,))]
-
-
 def segmentation_keys(name: str) -> tuple[str, ...]:
     """Keys of the configuration that a segmentation reads."""
-    sections = [one.section for one in _possible("segment", name) if one.section]
-    return ("perception.segment.backend", *(f"perception.segment.{section}" for section in sections))
+    section = SEGMENTERS[name].section
+    return ("perception.segment.backend", *((f"perception.segment.{section}",) if section else ()))
 
 
 def backend_modules(step: str, name: str) -> tuple[str, ...]:
-    """Modules that a backend is made of."""
-    return tuple(one.module for one in _possible(step, name))
+    """Modules that a backend is made of; `opencv` gives way to marks."""
+    others = [one.module for one in SEGMENTERS.values() if one.file and (step, name) == ("segment", "opencv")]
+    return (BACKENDS[step][name].module, *others)

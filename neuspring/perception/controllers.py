@@ -20,6 +20,10 @@ from neuspring.config.perception import Lift
 from neuspring.core.errors import InputError
 from neuspring.core.geometry import farthest
 
+MOST_CONTROLLERS = 30
+"""Largest number of controller points."""
+GRASP_REACH = 0.03
+"""m by which controllers of `grip: patch` may lie farther from the object than a hand's nearest point in frame 0."""
 HAND_GAP = 0.04
 """m: a point nearer than this to a point of a hand belongs to that hand."""
 LEAST_FOR_POSE = 3
@@ -43,8 +47,8 @@ def choose_controllers(
 
     `controller_gaps: none`, as released: points visible in all frames whose motion never disagrees. `rigid`: points seen in at
     least `controller_share` of the frames; where one is not seen it goes where the rigid motion of its hand takes it. At most
-    `controllers` points, each the farthest from those before. `grip: patch` takes them from `patches` instead. Raises InputError if
-    fewer than `least_controllers` remain.
+    MOST_CONTROLLERS points, each the farthest from those before. `grip: patch` takes them from `patches` instead. Raises
+    InputError if fewer than `least_controllers` remain.
     """
     eligible, filled = visible.all(axis=0) & valid[:-1].all(axis=0), 0.0
     trusted = visible & np.concatenate([visible[:1], valid[:-1]])
@@ -54,7 +58,7 @@ def choose_controllers(
         filled = float(1.0 - trusted[:, eligible].mean()) if eligible.any() else 0.0
     count = int(eligible.sum())
     if settings.grip == "patch" and points.shape[1]:
-        candidates, misfit = patches(points, trusted, cloud, settings.grip_reach)
+        candidates, misfit = patches(points, trusted, cloud)
         facts = {"patch_points": float(candidates.shape[1]), "patch_misfit_mm": 1e3 * misfit}
         filled = 0.0
     elif settings.controller_gaps == "rigid":
@@ -64,27 +68,27 @@ def choose_controllers(
     if candidates.shape[1] < settings.least_controllers:
         if settings.grip == "patch":
             rule = f"at least {settings.least_controllers} points of the hands must lie near the object in frame 0"
-            remedy = "perception.lift has grip_reach and least_controllers."
+            remedy = "perception.lift has least_controllers."
         else:
             rule = f"at least {settings.least_controllers} points of the hands must be followed through the video"
             remedy = "Look at the overlay of tracks; perception.lift has controller_gaps, controller_share and least_controllers."
         raise InputError(where, rule, f"{candidates.shape[1]} of {visible.shape[1]}", remedy)
-    controllers = candidates[:, farthest(candidates[0], settings.controllers)]
+    controllers = candidates[:, farthest(candidates[0], MOST_CONTROLLERS)]
     facts |= {"controllers": float(controllers.shape[1]), "hand_tracks_kept": float(count), "controllers_filled": filled}
     return controllers, facts
 
 
-def patches(points: np.ndarray, trusted: np.ndarray, cloud: np.ndarray, reach: float) -> tuple[np.ndarray, float]:
+def patches(points: np.ndarray, trusted: np.ndarray, cloud: np.ndarray) -> tuple[np.ndarray, float]:
     """The points of each hand that are near the object in frame 0, moving rigidly with their hand: [T, n', 3], m; and how far
     trusted points are from that motion, m (root mean square).
 
-    A point at distance d from `cloud` is near if d <= reach + the least such distance of its hand: a hand that has yet to come
-    grips with what is foremost. A hand's motion is that of its trusted points, as in `fill_rigidly`; all others follow it too, so
-    the fingertips that are hidden later still grip.
+    A point at distance d from `cloud` is near if d <= GRASP_REACH + the least such distance of its hand: a hand that has yet to
+    come grips with what is foremost. A hand's motion is that of its trusted points, as in `fill_rigidly`; all others follow it too,
+    so the fingertips that are hidden later still grip.
     """
     rigid = fill_rigidly(points, np.zeros_like(trusted), trusted)
     distance = cKDTree(cloud).query(points[0])[0]
-    near = [hand[distance[hand] <= distance[hand].min() + reach] for hand in hands_of(points[0])]
+    near = [hand[distance[hand] <= distance[hand].min() + GRASP_REACH] for hand in hands_of(points[0])]
     misfit = float(np.sqrt(np.mean(np.sum((rigid - points)[trusted] ** 2, axis=1))))
     return rigid[:, np.concatenate(near)], misfit
 

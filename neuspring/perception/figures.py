@@ -8,7 +8,6 @@ import cv2
 import matplotlib
 import numpy as np
 
-from neuspring.core.artifacts import ImageObservations
 from neuspring.core.files import write_atomically
 from neuspring.data.capture import Capture
 from neuspring.data.frames import frames_of, overlay, spread, tints_of, write_png
@@ -19,8 +18,6 @@ STRIP_FRAMES = 5
 TRAIL = 8
 """Frames by which the tail of a track reaches back."""
 MOST_TRACKS = 400
-HAND_ARROW = 40.0
-"""Pixels of the arrow of a hand that appears as large as in frame 0."""
 
 
 def masks_strip(capture: Capture, camera: str, masks: Masks, path: Path) -> Path:
@@ -48,26 +45,6 @@ def tracks_strip(capture: Capture, camera: str, tracks: PixelTracks, path: Path)
                 cv2.polylines(image, [np.round(tail).astype(np.int32)[:, None]], False, color, 1, cv2.LINE_AA)
                 cv2.circle(image, tuple(np.round(tail[-1]).astype(int).tolist()), 1, color, -1, cv2.LINE_AA)
         tiles.append(image)
-    return write_png(path, np.hstack(tiles))
-
-
-def hands_strip(capture: Capture, image: ImageObservations, controllers: np.ndarray, path: Path) -> Path:
-    """Frames of the video with the grip of each hand: its place, turn and size, and where it was; of hands that the capture brings
-    the controllers [T, C, 3], m."""
-    tiles, camera = [], next(iter(capture.cameras))
-    for frame in spread(frames_of(capture, camera), STRIP_FRAMES):
-        tile = np.ascontiguousarray(capture.color(camera, frame))
-        if not image.hands:
-            pixels, depth = capture.cameras[camera].project(controllers[frame].astype(float))
-            for pixel in np.round(pixels[depth > 0]).astype(int).tolist():
-                cv2.circle(tile, tuple(pixel), 2, (255, 60, 60), -1, cv2.LINE_AA)
-        for hand in range(image.hands):
-            way = np.round(image.hand_centers[: frame + 1, hand]).astype(np.int32)
-            cv2.polylines(tile, [way[:, None]], False, (255, 210, 0), 1, cv2.LINE_AA)
-            angle, size = float(image.hand_angles[frame, hand]), HAND_ARROW * float(image.hand_sizes[frame, hand])
-            tip = way[-1] + np.round(size * np.array([np.cos(angle), np.sin(angle)])).astype(int)
-            cv2.arrowedLine(tile, tuple(way[-1].tolist()), tuple(tip.tolist()), (255, 60, 60), 2, cv2.LINE_AA)
-        tiles.append(tile)
     return write_png(path, np.hstack(tiles))
 
 

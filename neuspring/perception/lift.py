@@ -1,27 +1,32 @@
 """Tracks of all cameras -> points in the world: cleaned masks, visibility, agreement of motion, controllers.
 
 After sections 2.5 to 2.7 of the processing that PhysTwin released, vectorized. The released result depends on the order of points,
-and its outlier test looks at single coordinates; ours does neither. Settings of `perception.lift` switch the released behavior on.
+and its outlier test looks at single coordinates; ours does neither.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from neuspring.config.perception import Lift
+from neuspring.checks.perceived import look_at_lifted
+from neuspring.config.perception import Lift, Perception
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Camera
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.data.results import LiftedTracks, Masks, PixelTracks
 from neuspring.intake.points import held, read
+from neuspring.perception.backends import Lifted
 from neuspring.perception.controllers import ALWAYS, HAND_GAP, SeenBody, choose_controllers, holding
+from neuspring.perception.shape import no_prior, shape_prior
 
-REFERENCE_FOCAL = 430.0
-"""Pixels: the focal length that `outlier_neighbors` is meant for. A longer one shows a surface in more pixels."""
+NEAREST, FARTHEST = 0.2, 1.5
+"""Depth that is used, m along the optical axis, as released."""
+OUTLIER_NEIGHBORS, REFERENCE_FOCAL = 40.0, 430.0
+"""Neighbors that a masked pixel must exceed, at a focal length in pixels: a longer one shows a surface in more pixels."""
 DEPTH_WINDOW = 3
 """Side of the window, pixels, whose median depth inside the mask a track gets."""
 LEAST_NEIGHBORS = 5
@@ -51,15 +56,23 @@ class Seen:
         return cls(points, visible, np.concatenate([camera.colors for camera in cameras]))
 
 
-def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTracks], settings: Lift) -> LiftedTracks:
+def lift(capture: Capture, masks: Mapping[str, Masks], tracks: Mapping[str, PixelTracks], settings: Perception) -> Lifted:
+    """Tracks of cameras with depth in the world, and the shape prior where the capture brings no nodes. Raises InputError."""
+    lifted = lift_tracks(capture, masks, tracks, settings.lift)
+    given = len(read(capture).nodes)
+    prior = no_prior() if given else shape_prior(capture, masks, lifted.cloud, settings.shape)
+    return Lifted(tracks=lifted, prior=prior, findings=look_at_lifted(lifted, prior, capture.description.up_sign))
+
+
+def lift_tracks(capture: Capture, masks: Mapping[str, Masks], tracks: Mapping[str, PixelTracks], settings: Lift) -> LiftedTracks:
     """All tracks as points in the world, with the controllers that the capture brings, or chosen among those of the hands.
 
     Raises InputError where nothing of the object or too little of the hands remains.
     """
-    cameras = lifting_cameras(capture, settings)
-    labels, cloud, colors = clean_masks(capture, cameras, masks, settings)
+    cameras = capture.cameras
+    labels, cloud, colors = clean_masks(capture, masks, settings.neighborhood)
     objects, hands = (
-        Seen.of_all([_lifted(capture, camera, tracks[name], labels[name] == label, settings) for name, camera in cameras.items()])
+        Seen.of_all([_lifted(capture, camera, tracks[name], labels[name] == label) for name, camera in cameras.items()])
         for label in (OBJECT, HANDS)
     )
     where = f"{capture.folder}, perception"
@@ -67,12 +80,12 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
         shown = sum(int((mask.labels[0] == OBJECT).sum()) for mask in masks.values())
         usable = sum(int((label[0] == OBJECT).sum()) for label in labels.values())
         received = f"{shown} pixels of the object's masks, {usable} of them with depth in range and enough neighbors, no track"
-        remedy = "Look at masks and tracks; perception.lift has depth_range, neighborhood and outlier_neighbors."
+        remedy = f"Look at masks and tracks; depth from {NEAREST:g} to {FARTHEST:g} m is used."
         raise InputError(where, "at least one tracked point must lie on the object in frame 0", received, remedy)
-    valid = agreeing_motion(objects, settings)
+    valid = agreeing_motion(objects, settings.neighborhood)
     space = read(capture)
     if space.hands is None:
-        moving = agreeing_motion(hands, settings)
+        moving = agreeing_motion(hands, settings.neighborhood)
         controllers, facts = choose_controllers(hands.points, hands.visible, moving, cloud, settings, where)
         body, in_view = _body(capture, cameras, labels, objects)
         grips = holding(controllers, (hands.points, hands.visible), body, in_view, settings.release or HAND_GAP)
@@ -102,7 +115,7 @@ def lift(capture: Capture, masks: dict[str, Masks], tracks: dict[str, PixelTrack
         controller_valid=holds,
         cloud=cloud,
         cloud_colors=colors,
-        backend="released" if settings.released else "vectorised",
+        backend="vectorised",
         facts=facts,
     )
 
@@ -124,32 +137,20 @@ def _body(
     return SeenBody(clouds[OBJECT], clouds[HANDS], objects.points, objects.visible), in_view
 
 
-def lifting_cameras(capture: Capture, settings: Lift) -> dict[str, Camera]:
-    """The cameras that pixels are lifted with."""
-    if not settings.mirrored_principal_point:
-        return capture.cameras
-    mirrored = {}
-    for name, camera in capture.cameras.items():
-        intrinsics = camera.intrinsics.copy()
-        intrinsics[0, 2] = camera.width - intrinsics[0, 2]
-        mirrored[name] = replace(camera, intrinsics=intrinsics)
-    return mirrored
-
-
 def clean_masks(
-    capture: Capture, cameras: Mapping[str, Camera], masks: Mapping[str, Masks], settings: Lift, frames: int | None = None
+    capture: Capture, masks: Mapping[str, Masks], neighborhood: float, frames: int | None = None
 ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
     """Labels [T, H, W] per camera, and the object's cloud of frame 0 [P, 3], m, with its colors [P, 3].
 
     Labels lose the pixels that have no usable depth, and those whose points float alone. Only the first `frames` are cleaned, if
     given.
     """
+    cameras = capture.cameras
     labels = {name: np.zeros_like(mask.labels) for name, mask in masks.items()}
     cloud, colors = np.zeros((0, 3)), np.zeros((0, 3))
     # The density of the points that a camera sees on a surface goes with the square of its focal length.
     focal = {name: camera.intrinsics[0, 0] for name, camera in cameras.items()}
-    least = {name: settings.outlier_neighbors * (length / REFERENCE_FOCAL) ** 2 for name, length in focal.items()}
-    low, high = settings.depth_range
+    least = {name: OUTLIER_NEIGHBORS * (length / REFERENCE_FOCAL) ** 2 for name, length in focal.items()}
     for frame in range(frames or capture.frame_count):
         names = [name for name in cameras if capture.has(name, frame)]
         if not names:
@@ -159,11 +160,11 @@ def clean_masks(
             pixels, points = {}, []
             for name in names:
                 depth = depths[name]
-                pixels[name] = np.nonzero((masks[name].labels[frame] == label) & (depth > low) & (depth < high))
+                pixels[name] = np.nonzero((masks[name].labels[frame] == label) & (depth > NEAREST) & (depth < FARTHEST))
                 y, x = pixels[name]
                 points.append(cameras[name].lift(np.stack([x, y], axis=1).astype(float), depth[y, x]))
             needed = np.concatenate([np.full(len(part), least[name]) for name, part in zip(names, points, strict=True)])
-            stays = _crowded(np.concatenate(points), settings.neighborhood, needed, settings.released)
+            stays = _crowded(np.concatenate(points), neighborhood, needed)
             for name, own in zip(names, np.split(stays, np.cumsum([len(part) for part in points])[:-1]), strict=True):
                 y, x = pixels[name]
                 labels[name][frame, y[own], x[own]] = label
@@ -173,37 +174,26 @@ def clean_masks(
     return labels, cloud, colors
 
 
-def agreeing_motion(seen: Seen, settings: Lift) -> np.ndarray:
+def agreeing_motion(seen: Seen, neighborhood: float) -> np.ndarray:
     """[T, n] bool, row t for the motion from t to t + 1: the point is visible in both, and half of its neighbors move alike."""
-    test = _sequential if settings.released else _simultaneous
     valid = np.zeros_like(seen.visible)
     for frame in range(len(seen.points) - 1):
         if len(moving := np.flatnonzero(seen.visible[frame] & seen.visible[frame + 1])):
             here = seen.points[frame, moving]
-            valid[frame, moving] = test(here, seen.points[frame + 1, moving] - here, settings)
+            valid[frame, moving] = _agreeing(here, seen.points[frame + 1, moving] - here, neighborhood)
     return valid
 
 
-def _simultaneous(points: np.ndarray, motion: np.ndarray, settings: Lift) -> np.ndarray:
+def _agreeing(points: np.ndarray, motion: np.ndarray, neighborhood: float) -> np.ndarray:
     """Every point judged by all others: independent of their order."""
-    pairs = cKDTree(points).query_pairs(settings.neighborhood, output_type="ndarray")
+    pairs = cKDTree(points).query_pairs(neighborhood, output_type="ndarray")
     alike = np.linalg.norm(motion[pairs[:, 0]] - motion[pairs[:, 1]], axis=1) < AGREEMENT
     count = np.bincount(pairs.ravel(), minlength=len(points)) + 1
     agreeing = np.bincount(pairs[alike].ravel(), minlength=len(points)) + 1
     return (count >= LEAST_NEIGHBORS) & (agreeing >= 0.5 * count)
 
 
-def _sequential(points: np.ndarray, motion: np.ndarray, settings: Lift) -> np.ndarray:
-    """As released: points in order, each judged by those not dropped before it."""
-    valid = np.ones(len(points), dtype=bool)
-    for i, near in enumerate(cKDTree(points).query_ball_point(points, settings.neighborhood)):
-        neighbors = np.array([j for j in near if valid[j]], dtype=int)
-        alike = np.linalg.norm(motion[neighbors] - motion[i], axis=1) < AGREEMENT
-        valid[i] = len(neighbors) >= LEAST_NEIGHBORS and alike.sum() >= 0.5 * len(neighbors)
-    return valid
-
-
-def _lifted(capture: Capture, camera: Camera, tracks: PixelTracks, inside: np.ndarray, settings: Lift) -> Seen:
+def _lifted(capture: Capture, camera: Camera, tracks: PixelTracks, inside: np.ndarray) -> Seen:
     """The tracks of one camera that start inside the mask `inside` [T, H, W]."""
     rounded = np.round(tracks.pixels).astype(int)
     visible = tracks.visible & camera.sees(tracks.pixels)
@@ -212,35 +202,28 @@ def _lifted(capture: Capture, camera: Camera, tracks: PixelTracks, inside: np.nd
         seen[seen] = inside[frame, y, x]
     own = visible[0]
     rounded, visible = rounded[:, own], visible[:, own]
-    places = rounded if settings.released else tracks.pixels[:, own]
+    places = tracks.pixels[:, own]
     points = np.zeros((*visible.shape, 3))
     for frame, seen in enumerate(visible):
         if seen.any():
             x, y = rounded[frame, seen].T
-            depth = local_depth(capture.depth(camera.name, frame), inside[frame], x, y, 1 if settings.released else DEPTH_WINDOW)
+            depth = local_depth(capture.depth(camera.name, frame), inside[frame], x, y)
             points[frame, seen] = camera.lift(places[frame, seen].astype(float), depth)
     x, y = rounded[0].T
     return Seen(points, visible, capture.color(camera.name, 0)[y, x] / 255.0)
 
 
-def local_depth(depth: np.ndarray, inside: np.ndarray, x: np.ndarray, y: np.ndarray, window: int) -> np.ndarray:
+def local_depth(depth: np.ndarray, inside: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Median depth [n], m, of the pixels around (x, y) that belong to the same mask; (x, y) itself does."""
-    reach = np.arange(window) - window // 2
+    reach = np.arange(DEPTH_WINDOW) - DEPTH_WINDOW // 2
     rows = np.clip(y[:, None, None] + reach[:, None], 0, depth.shape[0] - 1)
     columns = np.clip(x[:, None, None] + reach[None, :], 0, depth.shape[1] - 1)
     values = np.where(inside[rows, columns], depth[rows, columns], np.nan)
     return np.asarray(np.nanmedian(values.reshape(len(x), -1), axis=1))
 
 
-def _crowded(points: np.ndarray, radius: float, least: np.ndarray, by_coordinate: bool) -> np.ndarray:
-    """The points [n] bool that have more than `least` [n] points, themselves included, within `radius` of each.
-
-    `by_coordinate`, as released: a point is also dropped if any one of its coordinates equals that of a dropped point.
-    """
+def _crowded(points: np.ndarray, radius: float, least: np.ndarray) -> np.ndarray:
+    """The points [n] bool that have more than `least` [n] points, themselves included, within `radius` of each."""
     if not len(points):
         return np.zeros(0, dtype=bool)
-    stays = cKDTree(points).query_ball_point(points, radius, return_length=True) > least
-    if by_coordinate and not stays.all():
-        outliers = points[~stays]
-        stays &= ~np.any([np.isin(points[:, k], outliers[:, k]) for k in range(3)], axis=0)
-    return np.asarray(stays)
+    return np.asarray(cKDTree(points).query_ball_point(points, radius, return_length=True) > least)

@@ -21,7 +21,7 @@ from neuspring.core.geometry import on_table
 from neuspring.data.capture import Capture
 from neuspring.data.results import LiftedTracks, ShapePrior
 from neuspring.intake.points import in_both, read, scenario_of, standing, taught_by
-from neuspring.perception.backends import PERCEPTION_SEED
+from neuspring.perception.film import PERCEPTION_SEED
 
 SURFACE, INTERIOR = 1024, 10000
 """Points drawn on the prior's surface, and in its bounding box, of which those inside are kept; as released."""

@@ -13,11 +13,10 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.data.frames import at_border, frames_of, heights, spread
-from neuspring.perception.marks.colors import bins_of, count, lab_of
+from neuspring.data.frames import frames_of, spread
+from neuspring.perception.film import at_border, heights
 
 HISTOGRAM_BINS = (12, 64, 64)
 """Bins of L, a and b."""
@@ -31,8 +30,12 @@ UNSEEN_COLOR = 1e-5
 """Probability of a color never seen."""
 TABLE_SHADES = (1.0, 0.85, 0.7, 0.55, 0.45)
 """Factors that darken the table's colors, for shadows that fall beside the object and not on the border."""
+RISEN = 0.012
+"""Height above the table, m, from which a pixel is foreground whatever its color; below, its color decides."""
+HAND_HUE, HAND_CHROMA = (35.0, 70.0), (9.0, 36.0)
+"""Skin in Lab: hue, degrees (atan2(b, a)), and chroma."""
 CERTAIN_HEIGHT = 2.5
-"""Pixels higher than this many times `height` are foreground by their height alone."""
+"""Pixels higher than this many times RISEN are foreground by their height alone."""
 CERTAIN = 1.5
 """Log ratio from which a color alone decides."""
 GRABCUT_MARGIN = 10
@@ -48,26 +51,28 @@ SMALLEST_PIECE = 0.0004
 SPECK = np.ones((3, 3), np.uint8)
 
 
-def require(capture: Capture) -> None:
-    """Raise InputError for a capture of color alone."""
-    if not capture.has_depth:
-        remedy = "Choose perception.segment.backend: marks (`neuspring annotate`), given or grounded_sam2."
-        rule = "segmentation by opencv needs depth: heights tell what is on the table"
-        raise InputError(f"{capture.folder}, depth", rule, "none", remedy)
+def lab_of(image: np.ndarray) -> np.ndarray:
+    """Lab [H, W, 3] uint8 of RGB."""
+    return cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2LAB)
 
 
-def segment(capture: Capture, camera: str, settings: OpenCvSegmentation) -> np.ndarray:
-    """Labels [T, H, W]. Raises InputError without depth, or where nothing rises above the table."""
-    require(capture)
-    rise, hand = learn(capture, camera, settings)
+def bins_of(lab: np.ndarray, bins: tuple[int, int, int]) -> np.ndarray:
+    """The bin of every pixel [H, W], of so many bins of L, a and b."""
+    first, second, third = (lab[..., axis].astype(np.int32) * count // 256 for axis, count in enumerate(bins))
+    return np.asarray((first * bins[1] + second) * bins[2] + third)
+
+
+def segment(capture: Capture, camera: str) -> np.ndarray:
+    """Labels [T, H, W]. Raises InputError where nothing rises above the table."""
+    rise, hand = learn(capture, camera)
     view = capture.cameras[camera]
     labels = np.zeros((capture.frame_count, view.height, view.width), dtype=np.uint8)
     for frame in frames_of(capture, camera):
-        labels[frame] = _frame(capture, camera, frame, rise, hand, settings)
+        labels[frame] = _frame(capture, camera, frame, rise, hand)
     return labels
 
 
-def learn(capture: Capture, camera: str, settings: OpenCvSegmentation) -> tuple[np.ndarray, np.ndarray]:
+def learn(capture: Capture, camera: str) -> tuple[np.ndarray, np.ndarray]:
     """Log ratios of the probabilities of colors [bins], from frames of the whole video: of what rises to the table's, and of hands
     to the object's.
 
@@ -77,20 +82,20 @@ def learn(capture: Capture, camera: str, settings: OpenCvSegmentation) -> tuple[
     views = []
     for frame in spread(frames_of(capture, camera), SAMPLED_FRAMES):
         image, height = capture.color(camera, frame), heights(capture, camera, capture.depth(camera, frame))
-        risen = height > settings.height
+        risen = height > RISEN
         views.append((image, risen))
-        above += count(_bins(image), risen, HISTOGRAM_BINS)
-        edge = ~(height > settings.height / 2)
+        above += _counts(_bins(image), risen)
+        edge = ~(height > RISEN / 2)
         rows, columns = (max(int(BORDER * size), 2) for size in edge.shape)
         edge[rows:-rows, columns:-columns] = False
         for shade in TABLE_SHADES:
-            table += count(_bins((shade * image).astype(np.uint8)), edge, HISTOGRAM_BINS)
+            table += _counts(_bins((shade * image).astype(np.uint8)), edge)
     where = f"{capture.folder}, camera {camera}"
     if not above.sum():
-        raise InputError(where, f"an object more than {1e3 * settings.height:g} mm above the table z = 0 is required", "nothing")
-    hands, body = _divide([(image, risen, _skin(image, settings)) for image, risen in views])
+        raise InputError(where, f"an object more than {1e3 * RISEN:g} mm above the table z = 0 is required", "nothing")
+    hands, body = _divide([(image, risen, _skin(image)) for image, risen in views])
     if not hands.sum():
-        skin = f"hue in {list(settings.hand_hue)} degrees, chroma in {list(settings.hand_chroma)} (Lab)"
+        skin = f"hue in {list(HAND_HUE)} degrees, chroma in {list(HAND_CHROMA)} (Lab)"
         print(f"{where}: nothing above the table has the color of hands ({skin}); all of it is the object", flush=True)
     first = _log_probability(hands) - _log_probability(body)
     hands, body = _divide([(image, risen, first[_bins(image)] > 0) for image, risen in views])
@@ -102,23 +107,21 @@ def _divide(views: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.
     hands, body = np.zeros(np.prod(HISTOGRAM_BINS)), np.zeros(np.prod(HISTOGRAM_BINS))
     for image, risen, like_hand in views:
         labels = _tidy(np.where(risen, np.where(like_hand, HANDS, OBJECT), 0).astype(np.uint8))
-        hands += count(_bins(image), labels == HANDS, HISTOGRAM_BINS)
-        body += count(_bins(image), labels == OBJECT, HISTOGRAM_BINS)
+        hands += _counts(_bins(image), labels == HANDS)
+        body += _counts(_bins(image), labels == OBJECT)
     return hands, body
 
 
-def _frame(
-    capture: Capture, camera: str, frame: int, rise: np.ndarray, hand: np.ndarray, settings: OpenCvSegmentation
-) -> np.ndarray:
+def _frame(capture: Capture, camera: str, frame: int, rise: np.ndarray, hand: np.ndarray) -> np.ndarray:
     """Labels [H, W] of one frame, by the log ratios that `learn` gives."""
     image = capture.color(camera, frame)
     bins, height = _bins(image), heights(capture, camera, capture.depth(camera, frame))
     ratio = cv2.GaussianBlur(rise[bins], (0, 0), 1.0)
-    flat = np.nan_to_num(height, nan=0.0) < settings.height
+    flat = np.nan_to_num(height, nan=0.0) < RISEN
     # High things are foreground whatever their color; low ones need the color of something that rises in some frame.
-    seeds = (height > settings.height) | (flat & (ratio > CERTAIN))
+    seeds = (height > RISEN) | (flat & (ratio > CERTAIN))
     seeds = cv2.morphologyEx(seeds.astype(np.uint8), cv2.MORPH_OPEN, SPECK).astype(bool)
-    foreground = _grab(image, seeds, ratio, height > CERTAIN_HEIGHT * settings.height) if seeds.any() else seeds
+    foreground = _grab(image, seeds, ratio, height > CERTAIN_HEIGHT * RISEN) if seeds.any() else seeds
     foreground |= _holes(foreground)
     in_hand = cv2.GaussianBlur(hand[bins], (0, 0), DECISION) > 0
     return _tidy(np.where(foreground, np.where(in_hand, HANDS, OBJECT), 0).astype(np.uint8))
@@ -170,12 +173,16 @@ def _tidy(labels: np.ndarray) -> np.ndarray:
     return tidy
 
 
-def _skin(image: np.ndarray, settings: OpenCvSegmentation) -> np.ndarray:
+def _skin(image: np.ndarray) -> np.ndarray:
     """Pixels [H, W] whose hue and chroma are those of hands."""
     a, b = lab_of(image)[..., 1:].astype(float).transpose(2, 0, 1) - 128.0
     hue, chroma = np.degrees(np.arctan2(b, a)), np.hypot(a, b)
-    (least_hue, most_hue), (least_chroma, most_chroma) = settings.hand_hue, settings.hand_chroma
+    (least_hue, most_hue), (least_chroma, most_chroma) = HAND_HUE, HAND_CHROMA
     return np.asarray((least_hue < hue) & (hue < most_hue) & (least_chroma < chroma) & (chroma < most_chroma))
+
+
+def _counts(bins: np.ndarray, where: np.ndarray) -> np.ndarray:
+    return np.bincount(bins[where], minlength=int(np.prod(HISTOGRAM_BINS))).astype(float)
 
 
 def _bins(image: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ start masks, masks are carried through the video.
 Weights come from the usual Hugging Face cache or from a folder; they are large and only downloaded if `download` allows it. As in
 the released processing, the prompt names object and hand, boxes need a score, and every detection that is not a hand is the object.
 
-With a user's marks (`carry`) SAM 2 starts from the masks of the marked frames, and words are not needed.
+With a user's marks (`carry`) SAM 2 starts from those, and words are not needed.
 """
 
 from __future__ import annotations
@@ -15,18 +15,20 @@ from typing import Any
 
 import numpy as np
 
-from neuspring.config.perception import GroundedSam2, MarksSegmentation
+from neuspring.config.perception import GroundedSam2
 from neuspring.core.errors import InputError
 from neuspring.core.extras import needed
-from neuspring.data.capture import HANDS, OBJECT, Capture
+from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
 from neuspring.data.frames import frames_of
-from neuspring.perception.marks.carry import CameraFilm, Carried, Cues, doubt_of, frame_mask, over_capture
-from neuspring.perception.marks.marks import Mark
+from neuspring.perception.film import CameraFilm, Carried, Progress, doubt_of, over_capture
+from neuspring.perception.marks import Mark, drawn
 
 DETECTOR, VIDEO_MODEL = "IDEA-Research/grounding-dino-tiny", "facebook/sam2.1-hiera-large"
 """GroundingDINO and SAM 2 on the Hugging Face hub, as released."""
 BOX_SCORE, WORD_SCORE = 0.35, 0.25
 """Least scores of a box, and of a word for it, as released."""
+UNSURE = 0.5
+"""Mean probability of the other side of a border that makes a doubt of 63 %."""
 
 
 @dataclass(frozen=True)
@@ -54,14 +56,14 @@ def segment(capture: Capture, camera: str, settings: GroundedSam2, device: str, 
     models = models or load(settings, device)
     frames = frames_of(capture, camera)
     images = [capture.color(camera, frame) for frame in frames]
-    prompt = settings.prompt or capture.description.category
-    detections = detect(images[0], prompt, settings, models, device)
+    prompt = capture.description.category
+    detections = detect(images[0], prompt, models, device)
     is_hand = ["hand" in detection.words.replace(".", " ").split() for detection in detections]
     if all(is_hand) or not any(is_hand):
         missing = "hand" if detections and not any(is_hand) else "object"
         where = f"{capture.folder}, camera {camera}, frame {frames[0]}"
         rule = f"the prompt {prompt!r} and 'hand' must find an object and a hand"
-        remedy = "Set perception.segment.grounded_sam2.prompt to other words for the object."
+        remedy = f"Write other words for the object as category of {CAPTURE}, or mark it: `neuspring annotate {capture.folder}`."
         raise InputError(where, rule, f"no {missing} among {[detection.words for detection in detections]}", remedy)
     labels = np.zeros((capture.frame_count, *images[0].shape[:2]), dtype=np.uint8)
     boxes = {"obj_ids": list(range(len(detections))), "input_boxes": [[list(detection.box) for detection in detections]]}
@@ -73,9 +75,15 @@ def segment(capture: Capture, camera: str, settings: GroundedSam2, device: str, 
 
 
 def carry(
-    capture: Capture, camera: str, marks: Sequence[Mark], settings: GroundedSam2, device: str, models: Models | None = None
+    capture: Capture,
+    camera: str,
+    marks: Sequence[Mark],
+    progress: Progress | None,
+    settings: GroundedSam2,
+    device: str,
+    models: Models | None = None,
 ) -> Carried:
-    """Labels [T, H, W] and doubt [T] from marks on a few frames: their masks (`frame_mask`), carried by SAM 2 both ways.
+    """Labels [T, H, W] and doubt [T] from marks on a few frames: SAM 2's prompts (`prompt_of`), carried both ways.
 
     Doubt comes from how unsure SAM 2 is at borders and from jumps of areas. Raises InputError where weights are missing or marks do
     not fit.
@@ -86,23 +94,38 @@ def carry(
 
     def work(film: CameraFilm, own: list[Mark]) -> Carried:
         networks = models or load(settings, device, words=False)
-        frames = sorted({mark.frame for mark in own if mark.value in (OBJECT, HANDS)})
-        starts = {frame: frame_mask(film, frame, own, MarksSegmentation()) for frame in frames}
         images = [film.color(index) for index in range(film.count)]
-        labels = np.zeros((film.count, *images[0].shape[:2]), np.uint8)
-        unsure = np.zeros((film.count, 2))
+        size = images[0].shape[:2]
+        labels, unsure = np.zeros((film.count, *size), np.uint8), np.zeros((film.count, 2))
         # Hands come last: they are in front of what they hold.
         for column, label in enumerate((OBJECT, HANDS)):
-            masks = {index: start == label for index, start in starts.items() if (start == label).any()}
-            prompts = {index: {"obj_ids": [0], "input_masks": [mask]} for index, mask in masks.items()}
+            frames = sorted({mark.frame for mark in own if mark.value == label})
+            prompts = {at: prompt_of([mark for mark in own if (mark.frame, mark.value) == (at, label)], size) for at in frames}
             carried = propagate(images, prompts, networks, device, back=True) if prompts else {}
             for index, (logits,) in carried.items():
                 labels[index][logits > 0] = label
                 near = np.abs(logits) < np.quantile(np.abs(logits[logits > 0]), 0.2) if (logits > 0).any() else logits > 0
                 unsure[index, column] = float((1 / (1 + np.exp(np.abs(logits[near])))).mean()) if near.any() else 0.0
-        return Carried(labels, doubt_of(labels, [Cues(unsure=float(both.max())) for both in unsure]))
+                if progress is not None:
+                    progress(column * film.count + index + 1, 2 * film.count)
+        return Carried(labels, doubt_of(labels, (unsure.max(axis=1) / UNSURE) ** 2))
 
     return over_capture(capture, camera, marks, work)
+
+
+def prompt_of(marks: Sequence[Mark], size: tuple[int, int]) -> dict[str, Any]:
+    """SAM 2's prompt from the marks of one label on a frame of a size (height, width).
+
+    Polygons are a mask; without any, the rectangle around all boxes is a box, and clicks and scribbles are points.
+    """
+    if polygons := [drawn(mark, size, 1.0, grown=0) for mark in marks if mark.kind == "polygon"]:
+        return {"obj_ids": [0], "input_masks": [np.any(polygons, axis=0)]}
+    prompt: dict[str, Any] = {"obj_ids": [0]}
+    if corners := [point for mark in marks if mark.kind == "box" for point in mark.points]:
+        prompt["input_boxes"] = [[[*np.min(corners, axis=0).tolist(), *np.max(corners, axis=0).tolist()]]]
+    if points := [list(point) for mark in marks if mark.kind != "box" for point in mark.points]:
+        prompt |= {"input_points": [[points]], "input_labels": [[[1] * len(points)]]}
+    return prompt
 
 
 def propagate(
@@ -149,7 +172,7 @@ def load(settings: GroundedSam2, device: str, *, words: bool = True) -> Models:
         raise InputError("perception.segment.grounded_sam2", rule, str(error).splitlines()[0], remedy) from error
 
 
-def detect(image: np.ndarray, prompt: str, settings: GroundedSam2, models: Models, device: str) -> list[Detection]:
+def detect(image: np.ndarray, prompt: str, models: Models, device: str) -> list[Detection]:
     """Boxes of an RGB image that the prompt finds, best first."""
     import torch
 

@@ -249,31 +249,6 @@ def discs(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.stack([x, y], axis=1)[order], distance[y, x][order], distance
 
 
-def inflated(mask: np.ndarray, depth: np.ndarray, widest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depth of the front and of the back [H, W], m, of the ellipsoids whose outlines are the `discs` of a silhouette `mask` [H, W].
-
-    The disc at q with radius r belongs to an ellipsoid with its center at `depth` [n] and `widest` [n] thick, m. The pixel p shows
-    its surfaces at depth_q -+ widest_q / 2 sqrt(1 - |p - q|^2 / r^2); the front is the nearest of all, the back the farthest.
-    Pixels that no disc covers, of pointed corners, are as thick as their distance from the edge says, about the middle of the
-    nearest other pixel. Zero outside.
-    """
-    centers, radii, distance = discs(mask)
-    front, back = np.full(mask.shape, np.inf), np.full(mask.shape, -np.inf)
-    for (x, y), r, d, w in zip(centers.tolist(), radii.tolist(), depth.tolist(), widest.tolist(), strict=True):
-        reach = int(r)
-        rows, columns = slice(max(y - reach, 0), y + reach + 1), slice(max(x - reach, 0), x + reach + 1)
-        v, u = np.ogrid[rows.start : min(rows.stop, len(mask)), columns.start : min(columns.stop, mask.shape[1])]
-        inside = r * r - (v - y) ** 2 - (u - x) ** 2
-        half = np.where(inside > 0, 0.5 * w / r * np.sqrt(np.maximum(inside, 0.0)), np.nan)
-        front[rows, columns] = np.fmin(front[rows, columns], d - half)
-        back[rows, columns] = np.fmax(back[rows, columns], d + half)
-    bare = ~np.isfinite(front)
-    nearest = tuple(ndimage.distance_transform_edt(bare, return_distances=False, return_indices=True))
-    middle, half = 0.5 * (front[nearest] + back[nearest]), distance * float(np.median(0.5 * widest / radii))
-    front, back = np.where(bare, middle - half, front), np.where(bare, middle + half, back)
-    return np.where(mask, front, 0.0), np.where(mask, back, 0.0)
-
-
 def _grown(mask: np.ndarray, reach: int) -> np.ndarray:
     return cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0
 

@@ -23,16 +23,14 @@ WEIGHTS = "scaled_online.pth"
 WEIGHTS_URL = f"https://huggingface.co/facebook/cotracker3/resolve/main/{WEIGHTS}"
 
 
-def track(
-    capture: Capture, camera: str, labels: np.ndarray, settings: PointTracking, seed: int, device: str, model: Any = None
-) -> Followed:
-    """Follow up to `settings.points` pixels of the masks `labels` [T, H, W]; none where frame 0 shows neither object nor hands.
+def track(capture: Capture, camera: str, labels: np.ndarray, settings: PointTracking, device: str, model: Any = None) -> Followed:
+    """Follow up to MOST_TRACKED pixels of the masks `labels` [T, H, W]; none where frame 0 shows neither object nor hands.
 
     `model` is called as CoTracker3's online predictor is: once with is_first_step and the queries [1, Q, 3] (frame, x, y), then
     with the latest 2 * step frames of the video [1, t, 3, H, W], 0 to 255, every `step` frames; it returns tracks [1, t, Q, 2] and
     visibility [1, t, Q] of all frames so far. Raises InputError where the model cannot be loaded.
     """
-    start = choose(labels[0], settings.points, seed)
+    start = choose(labels[0])
     result = Followed.starting_at(start, capture.frame_count)
     if not len(start):
         return result

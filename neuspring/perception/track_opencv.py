@@ -17,7 +17,10 @@ from scipy.spatial import cKDTree
 from neuspring.config.perception import PointTracking
 from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture
 from neuspring.data.frames import gray
+from neuspring.perception.film import PERCEPTION_SEED
 
+MOST_TRACKED = 5000
+"""Pixels that are followed per camera, drawn at random from the masks of frame 0."""
 LEVELS = 3
 """Levels of the image pyramid, beside the image itself."""
 TRACK_BACKWARD = 0.5
@@ -62,9 +65,9 @@ class Followed:
         return cls(np.repeat(start[None], frames, axis=0), visible)
 
 
-def track(capture: Capture, camera: str, labels: np.ndarray, settings: PointTracking, seed: int) -> Followed:
-    """Follow up to `settings.points` pixels of the masks `labels` [T, H, W]; none where frame 0 shows neither object nor hands."""
-    return follow(capture, camera, labels, choose(labels[0], settings.points, seed), settings)
+def track(capture: Capture, camera: str, labels: np.ndarray, settings: PointTracking) -> Followed:
+    """Follow up to MOST_TRACKED pixels of the masks `labels` [T, H, W]; none where frame 0 shows neither object nor hands."""
+    return follow(capture, camera, labels, choose(labels[0]), settings)
 
 
 def follow(capture: Capture, camera: str, labels: np.ndarray, start: np.ndarray, settings: PointTracking) -> Followed:
@@ -98,13 +101,14 @@ def follow(capture: Capture, camera: str, labels: np.ndarray, start: np.ndarray,
     return result
 
 
-def choose(labels: np.ndarray, count: int, seed: int) -> np.ndarray:
-    """At most `count` random pixels (x, y) [Q, 2] of object and hands."""
+def choose(labels: np.ndarray, count: int | None = None) -> np.ndarray:
+    """At most `count` (MOST_TRACKED) random pixels (x, y) [Q, 2] of object and hands."""
+    count = count or MOST_TRACKED
     y, x = np.nonzero(np.isin(labels, (OBJECT, HANDS)))
     pixels = np.stack([x, y], axis=1).astype(np.float32)
     if len(pixels) <= count:
         return pixels
-    return pixels[np.sort(np.random.default_rng(seed).choice(len(pixels), count, replace=False))]
+    return pixels[np.sort(np.random.default_rng(PERCEPTION_SEED).choice(len(pixels), count, replace=False))]
 
 
 def lucas_kanade(

@@ -16,10 +16,10 @@ DEPTH_TOLERANCE = 0.01
 """m by which the depth image may differ from a point's depth for the point to count as seen."""
 
 
-def track(capture: Capture, camera: str, labels: np.ndarray, settings: PointTracking, seed: int) -> Followed:
-    """Exact places [T, Q, 2] of up to `settings.points` pixels of the masks, and whether depth and mask show them there."""
+def track(capture: Capture, camera: str, labels: np.ndarray, settings: PointTracking) -> Followed:
+    """Exact places [T, Q, 2] of up to MOST_TRACKED pixels of the masks, and whether depth and mask show them there."""
     truth, view = truth_of(capture), capture.cameras[camera]
-    start = choose(labels[0], settings.points, seed)
+    start = choose(labels[0])
     x, y = start.astype(int).T
     material = under_pixels(truth, view, start)
     traceable = (labels[0, y, x] == HANDS) | (material.face >= 0)

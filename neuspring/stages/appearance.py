@@ -60,7 +60,7 @@ def appearance(
     """
     import pandas as pd
 
-    from neuspring.core.files import write_table
+    from neuspring.core.files import read_npz, write_table
     from neuspring.data.results import masks_of_cameras
     from neuspring.draw import images as figures
     from neuspring.splats.draw import orbit_view, picture
@@ -71,11 +71,12 @@ def appearance(
     images = settings.images
     masks_of = masks_of_cameras(capture, paths(masks))
     backend = choose_backend(images.backend, device)
-    depths = {} if capture.has_depth or lifted is None else _guessed_depth(capture, lifted)
+    supposed = read_npz(lifted.file("depth"))[0] if lifted is not None and lifted.has("depth") else {}
+    depths = {name: supposed.get(name, capture.depth(name, 0)) for name in capture.cameras}
     shots = _shots(capture, masks_of, images, device, depths)
     width = float(np.nanmedian([shot.pixel_width for shot in shots]))
     surface = _surface(capture, masks_of, settings, seed, width, lifted, observations)
-    beside = beside_hands(capture, masks_of, surface.cloud)
+    beside = beside_hands(capture, masks_of, depths, surface.cloud)
     # Where all lies at hands there is nothing else to begin with.
     if 0 < beside.sum() < len(beside):
         print(f"{beside.sum()} of {len(beside)} points beside hands become no splats", flush=True)
@@ -111,23 +112,11 @@ def appearance(
     return Written(files=files, facts=facts)
 
 
-def _guessed_depth(capture: Capture, before: Before) -> dict[str, np.ndarray]:
-    """Depth of frame 0 [H, W], m, of a camera without depth: where perception put what each pixel shows."""
-    from neuspring.data.results import LiftedTracks
+def beside_hands(capture: Capture, masks: Mapping[str, Masks], depths: Mapping[str, np.ndarray], points: np.ndarray) -> np.ndarray:
+    """True for points [P, 3], m, that some camera shows in frame 0 beside or beneath the mask of a hand or a person.
 
-    lifted = LiftedTracks.load(before.file("lifted"))
-    depths = {}
-    for name, camera in capture.cameras.items():
-        pixels, distance = camera.project(lifted.cloud.astype(float))
-        seen = camera.sees(pixels)
-        x, y = np.round(pixels[seen]).astype(int).T
-        depths[name] = np.zeros((camera.height, camera.width))
-        depths[name][y, x] = distance[seen]
-    return depths
-
-
-def beside_hands(capture: Capture, masks: Mapping[str, Masks], points: np.ndarray) -> np.ndarray:
-    """True for points [P, 3], m, that some camera shows in frame 0 beside or beneath the mask of a hand or a person."""
+    `depths` [H, W], m, of frame 0 by camera say which point a pixel shows.
+    """
     import cv2
 
     from neuspring.splats.losses import REFERENCE_WIDTH
@@ -139,18 +128,14 @@ def beside_hands(capture: Capture, masks: Mapping[str, Masks], points: np.ndarra
         pixels, distance = camera.project(points.astype(float))
         shown = camera.sees(pixels) & (distance > 0)
         x, y = np.round(pixels[shown]).astype(int).T
-        own = np.abs(capture.depth(name, 0)[y, x] - distance[shown]) < SAME_SURFACE if capture.has_depth else True
-        found[shown] |= near[y, x] & own
+        found[shown] |= near[y, x] & (np.abs(depths[name][y, x] - distance[shown]) < SAME_SURFACE)
     return found
 
 
 def _shots(
     capture: Capture, masks: Mapping[str, Masks], images: Images, device: str, depths: Mapping[str, np.ndarray]
 ) -> list[Shot]:
-    """Views of frame 0 to train on; a camera that does not show the object is left out, and said.
-
-    `depths` are guesses for cameras without depth.
-    """
+    """Views of frame 0 to train on, with `depths` [H, W], m, by camera; a camera that does not show the object is left out."""
     from neuspring.splats.draw import view_of
     from neuspring.splats.losses import HAND_MARGIN, REFERENCE_WIDTH, Shot
 
@@ -158,7 +143,7 @@ def _shots(
     for name, camera in capture.cameras.items():
         labels = masks[name].labels[0]
         margin = HAND_MARGIN * camera.width / REFERENCE_WIDTH
-        seen = (capture.color(name, 0), labels == OBJECT, labels >= HANDS, depths.get(name, capture.depth(name, 0)))
+        seen = (capture.color(name, 0), labels == OBJECT, labels >= HANDS, depths[name])
         if (shot := Shot.of(name, view_of(camera, images, device), *seen, margin)) is None:
             print(f"camera {name}: the object is not in view in frame 0; it does not train the appearance", flush=True)
         else:
@@ -220,7 +205,7 @@ def _surface(
 ) -> _Surface:
     """From perception's record, or from masks and processed observations; `width`, m, is a pixel's at the object."""
     from neuspring.data.results import LiftedTracks, ShapePrior
-    from neuspring.perception.lift import clean_masks, lifting_cameras
+    from neuspring.perception.lift import clean_masks
 
     if before is not None:
         lifted, prior = LiftedTracks.load(before.file("lifted")), ShapePrior.load(before.file("shape"))
@@ -235,11 +220,9 @@ def _surface(
     if observations is None:
         raise InputError("--lifted, --observations", "one of the two is required", "neither")
     require_length(capture, observations)
-    chosen = settings.perception.lift
-    _, cloud, colors = clean_masks(capture, lifting_cameras(capture, chosen), masks, chosen, frames=1)
+    _, cloud, colors = clean_masks(capture, masks, settings.perception.lift.neighborhood, frames=1)
     if not len(cloud):
-        remedy = "perception.lift has depth_range, neighborhood and outlier_neighbors."
-        raise InputError(capture.folder, "the object's masks of frame 0 must hold pixels with usable depth", "none", remedy)
+        raise InputError(capture.folder, "the object's masks of frame 0 must hold pixels with usable depth", "none")
     return _Surface(cloud, colors, observations.surface_points, NEAR_SEEN * width, None)
 
 

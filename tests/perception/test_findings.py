@@ -258,16 +258,6 @@ def test_volume_and_invented_surface_are_said():
     assert said(look_at_lifted(tracked(BOX), half, 1.0)) == {"note: size of the object", "note: invented surface"}
 
 
-@pytest.mark.parametrize(
-    ("backend", "raised", "levels"),
-    [("body", 0.4, ["warning"]), ("body", 0.0, ["note"]), ("body, standing", 0.4, ["note"]), ("round", 0.0, [])],
-)
-def test_how_a_body_lies_or_stands_is_said(backend, raised, levels):
-    facts = {"shape_longest": 0.55, "shape_across": 0.3, "shape_raised": raised}
-    found = look_at_lifted(replace(tracked(BOX), backend=f"color alone, {backend}", facts=facts), no_prior(), 1.0)
-    assert [one.level for one in found if one.name == "pose"] == levels
-
-
 VISIBLE = np.ones((FRAMES, 200), bool)
 
 

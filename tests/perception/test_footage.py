@@ -9,13 +9,13 @@ import pytest
 
 from neuspring.checks.masks import mask_facts
 from neuspring.checks.perceived import look_at_masks
-from neuspring.config.perception import Lift, MarksSegmentation, ShapePriorSettings
+from neuspring.config.perception import Lift, ShapePriorSettings
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, Writer
 from neuspring.data.results import Masks
+from neuspring.extensions.color_alone.segment import carry_film, frame_mask
 from neuspring.perception import segment_given
 from neuspring.perception.lift import clean_masks
-from neuspring.perception.marks.carry import carry, frame_mask
-from neuspring.perception.marks.marks import Marks
+from neuspring.perception.marks import Marks
 from neuspring.perception.shape import shape_prior
 from results.published.film22.films import carried, film
 from tests.support.captures import describe, entry
@@ -130,7 +130,7 @@ def test_committed_marks_are_valid_and_few(path):
 @pytest.mark.parametrize("case", LEAST)
 def test_frame_0_of_the_footage(case):
     truth = cv2.imread(str(FOOTAGE / "masks" / case / "0000.png"), cv2.IMREAD_UNCHANGED)
-    labels = frame_mask(beginning(case, 1), 0, Marks.load(MARKS / "phystwin_camera0" / f"{case}.json").of("0"), MarksSegmentation())
+    labels = frame_mask(beginning(case, 1), 0, Marks.load(MARKS / "phystwin_camera0" / f"{case}.json").of("0"))
     assert label_overlap(labels, truth, OBJECT) > LEAST[case]
     assert label_overlap(labels, truth, HANDS) > 0.88
 
@@ -140,7 +140,7 @@ def test_the_plush_recording_is_carried_for_a_few_frames():
     frames = [np.ascontiguousarray(cv2.imread(str(PLUSH / "color" / f"{250 + k:06d}.png"))[..., ::-1]) for k in range(4)]
     truth = [cv2.imread(str(PLUSH / "masks_250_335" / f"{k:05d}.png"), cv2.IMREAD_UNCHANGED) for k in range(4)]
     marks = [mark for mark in Marks.load(MARKS / "rgbd_plush.json").of("0") if mark.frame == 90]
-    carried = carry(Painted(frames, np.stack(truth)), [replace(mark, frame=0) for mark in marks], MarksSegmentation())
+    carried = carry_film(Painted(frames, np.stack(truth)), [replace(mark, frame=0) for mark in marks])
     assert label_overlap(carried.labels[3], truth[3], OBJECT) > 0.85
 
 

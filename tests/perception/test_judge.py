@@ -13,7 +13,7 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.data.capture import OBJECT, Capture
 from neuspring.data.results import Masks, PixelTracks
 from neuspring.perception.judge import judge, lifted_quality, mask_quality, track_quality
-from neuspring.perception.lift import lift
+from neuspring.perception.lift import lift_tracks
 from neuspring.perception.truth import track
 from neuspring.scenes.synthetic import make as making
 from neuspring.scenes.synthetic.truth import at_points, truth_of, truth_path, under_pixels
@@ -36,9 +36,9 @@ def perfect(tmp_path_factory):
     masks = {c: Masks(labels=np.stack([capture.mask(c, f) for f in frames]), backend="given") for c in capture.cameras}
     tracks = {}
     for camera in capture.cameras:
-        exact = track(capture, camera, masks[camera].labels, PointTracking(points=500), 0)
+        exact = track(capture, camera, masks[camera].labels, PointTracking())
         tracks[camera] = PixelTracks(pixels=exact.pixels, visible=exact.visible, backend="truth")
-    lifted = lift(capture, masks, tracks, SETTINGS)
+    lifted = lift_tracks(capture, masks, tracks, SETTINGS)
     return SimpleNamespace(capture=capture, truth=truth_of(capture), masks=masks, tracks=tracks, lifted=lifted)
 
 

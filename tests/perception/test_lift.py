@@ -1,4 +1,4 @@
-"""From pixels to the world: cleaned masks, agreement of motion, controllers, and the switches to the released behavior."""
+"""From pixels to the world: cleaned masks, agreement of motion, controllers, and their limits."""
 
 from dataclasses import replace
 
@@ -13,10 +13,17 @@ from neuspring.core.geometry import farthest
 from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
 from neuspring.data.results import Masks, PixelTracks
 from neuspring.perception import lift as lifting
-from neuspring.perception.controllers import choose_controllers, fill_rigidly, hands_of, rigid_motion
+from neuspring.perception.controllers import GRASP_REACH, choose_controllers, fill_rigidly, hands_of, rigid_motion
 from tests.support.captures import FRAMES, describe, entry
 
-SETTINGS = Lift(neighborhood=0.045, outlier_neighbors=460.0, least_controllers=3, controllers=4)
+SETTINGS = Lift(neighborhood=0.045, least_controllers=3)
+
+
+@pytest.fixture(autouse=True)
+def few_pixels(monkeypatch):
+    """Images of 32 x 24 pixels show 40 neighbors only where the limit is that of a shorter focal length."""
+    monkeypatch.setattr(lifting, "OUTLIER_NEIGHBORS", 460.0)
+
 
 NEAR = np.zeros((1, 3))
 """An object's cloud, for hands whose distance from it does not matter."""
@@ -48,7 +55,7 @@ def tracks_of(capture: Capture) -> dict[str, PixelTracks]:
 
 
 def test_points_lie_where_the_camera_saw_them(scene):
-    lifted = lifting.lift(scene, masks_of(scene), tracks_of(scene), SETTINGS)
+    lifted = lifting.lift_tracks(scene, masks_of(scene), tracks_of(scene), SETTINGS)
     assert lifted.object_points.shape == (FRAMES, 100, 3)
     assert lifted.object_visibility.all()
     assert lifted.object_motion_valid[:-1].all()
@@ -58,7 +65,7 @@ def test_points_lie_where_the_camera_saw_them(scene):
     moved = lifted.object_points[-1] - lifted.object_points[0]
     np.testing.assert_allclose(moved, np.tile([2 * 0.8 / 40, 0, 0], (100, 1)), atol=1e-6)
     np.testing.assert_allclose(lifted.object_colors, 40 / 255, atol=1e-6)
-    assert lifted.controller_points.shape == (FRAMES, 4, 3)
+    assert lifted.controller_points.shape == (FRAMES, 30, 3)
     assert len(lifted.cloud) == 100
 
 
@@ -66,21 +73,24 @@ def test_a_track_that_leaves_the_mask_is_invisible_and_zero(scene):
     tracks = tracks_of(scene)["0"]
     pixels = tracks.pixels.copy()
     pixels[2, 0] = [31.0, 23.0]
-    lifted = lifting.lift(scene, masks_of(scene), {"0": PixelTracks(pixels=pixels, visible=tracks.visible, backend="x")}, SETTINGS)
+    lifted = lifting.lift_tracks(
+        scene, masks_of(scene), {"0": PixelTracks(pixels=pixels, visible=tracks.visible, backend="x")}, SETTINGS
+    )
     assert not lifted.object_visibility[2, 0]
     np.testing.assert_array_equal(lifted.object_points[2, 0], 0.0)
     assert lifted.object_visibility[3, 0]
     assert not lifted.object_motion_valid[[1, 2], 0].any()
 
 
-def test_specks_and_depth_out_of_range_are_cleaned_away(scene):
+def test_specks_and_depth_out_of_range_are_cleaned_away(scene, monkeypatch):
     masks = masks_of(scene)["0"]
     labels = masks.labels.copy()
     labels[:, 20, 3] = OBJECT
-    clean, cloud, _ = lifting.clean_masks(scene, scene.cameras, {"0": Masks(labels=labels, backend="x")}, SETTINGS)
+    clean, cloud, _ = lifting.clean_masks(scene, {"0": Masks(labels=labels, backend="x")}, SETTINGS.neighborhood)
     assert not clean["0"][:, 20, 3].any()
     np.testing.assert_array_equal(clean["0"], masks.labels)
-    clean, cloud, _ = lifting.clean_masks(scene, scene.cameras, masks_of(scene), replace(SETTINGS, depth_range=(0.2, 0.7)))
+    monkeypatch.setattr(lifting, "FARTHEST", 0.7)
+    clean, cloud, _ = lifting.clean_masks(scene, masks_of(scene), SETTINGS.neighborhood)
     assert not clean["0"].any()
     assert not len(cloud)
 
@@ -89,7 +99,7 @@ def test_no_object_and_no_hand_are_named(scene):
     for label, message in ((OBJECT, "at least one tracked point must lie on"), (HANDS, "at least 3 points of the hands")):
         labels = np.where(masks_of(scene)["0"].labels == label, 0, masks_of(scene)["0"].labels).astype(np.uint8)
         with pytest.raises(InputError, match=message):
-            lifting.lift(scene, {"0": Masks(labels=labels, backend="x")}, tracks_of(scene), SETTINGS)
+            lifting.lift_tracks(scene, {"0": Masks(labels=labels, backend="x")}, tracks_of(scene), SETTINGS)
 
 
 def still(folder, camera) -> tuple[Capture, np.ndarray]:
@@ -110,7 +120,7 @@ def test_a_missing_frame_leaves_points_invisible(tmp_path):
     visible = np.ones(pixels.shape[:2], bool)
     visible[2] = False
     tracks = {"0": PixelTracks(pixels=pixels, visible=visible, backend="x")}
-    lifted = lifting.lift(capture, {"0": masks}, tracks, replace(SETTINGS, controller_gaps="rigid"))
+    lifted = lifting.lift_tracks(capture, {"0": masks}, tracks, replace(SETTINGS, controller_gaps="rigid"))
     np.testing.assert_array_equal(lifted.object_visibility.all(axis=1), [True, True, False, True, True])
     np.testing.assert_allclose(lifted.controller_points, np.repeat(lifted.controller_points[:1], FRAMES, axis=0), atol=1e-6)
 
@@ -119,12 +129,11 @@ def grid(count: int = 6) -> np.ndarray:
     return np.stack(np.meshgrid(*[np.arange(count) * 0.004] * 2, [0.0]), axis=-1).reshape(-1, 3)
 
 
-@pytest.mark.parametrize("released", [False, True])
-def test_a_point_that_moves_alone_is_not_trusted(released):
+def test_a_point_that_moves_alone_is_not_trusted():
     points = np.stack([grid(), grid() + np.array([0.002, 0, 0])])
     points[1, 7] += [0.0, 0.0, 0.02]
     seen = lifting.Seen(points, np.ones(points.shape[:2], bool), np.zeros((36, 3)))
-    assert np.flatnonzero(~lifting.agreeing_motion(seen, Lift(released=released))[0]).tolist() == [7]
+    assert np.flatnonzero(~lifting.agreeing_motion(seen, 0.01)[0]).tolist() == [7]
 
 
 def test_the_order_of_points_does_not_matter():
@@ -132,23 +141,23 @@ def test_the_order_of_points_does_not_matter():
     points = np.stack([grid(8), grid(8) + rng.normal(0, 0.002, (64, 3))])
     order = rng.permutation(64)
     first, second = (lifting.Seen(p, np.ones(p.shape[:2], bool), np.zeros((64, 3))) for p in (points, points[:, order]))
-    valid = lifting.agreeing_motion(first, Lift())
+    valid = lifting.agreeing_motion(first, 0.01)
     assert 0 < valid[0].sum() < 64
-    np.testing.assert_array_equal(valid[:, order], lifting.agreeing_motion(second, Lift()))
+    np.testing.assert_array_equal(valid[:, order], lifting.agreeing_motion(second, 0.01))
 
 
 def test_few_neighbors_are_not_enough():
     for side, trusted in ((2, False), (3, True)):
         points = np.stack([grid(side), grid(side)])
         seen = lifting.Seen(points, np.ones(points.shape[:2], bool), np.zeros((side**2, 3)))
-        assert lifting.agreeing_motion(seen, Lift())[0].all() == trusted
+        assert lifting.agreeing_motion(seen, 0.01)[0].all() == trusted
 
 
 def test_depth_at_an_edge_comes_from_the_same_mask():
     depth, inside = np.full((5, 5), 0.9), np.zeros((5, 5), bool)
     depth[:, :2], inside[:, :2] = 0.5, True
     depth[2, 1] = 0.53
-    assert lifting.local_depth(depth, inside, np.array([1]), np.array([2]), 3)[0] == pytest.approx(0.5)
+    assert lifting.local_depth(depth, inside, np.array([1]), np.array([2]))[0] == pytest.approx(0.5)
 
 
 def test_rigid_motions_are_recovered_and_fill_gaps():
@@ -181,7 +190,7 @@ def grasp(frames: int = 8) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Rot
     return np.concatenate(moving, axis=1), cloud, rng.random((frames, 300)) < 0.5, turns
 
 
-PATCH = Lift(grip="patch", grip_reach=0.04, controllers=30, controller_gaps="rigid", controller_share=0.1)
+PATCH = Lift(grip="patch", controller_gaps="rigid", controller_share=0.1)
 
 
 def test_patches_lie_near_the_object_and_move_rigidly_with_their_hand():
@@ -198,7 +207,7 @@ def test_patches_lie_near_the_object_and_move_rigidly_with_their_hand():
     for hand in (range(150), range(150, 300)):
         part = [k for k in own if k in hand]
         assert part, "every hand holds"
-        assert from_object[part].max() <= from_object[hand].min() + PATCH.grip_reach
+        assert from_object[part].max() <= from_object[hand].min() + GRASP_REACH
     spread, _ = choose_controllers(points, seen | True, seen | True, cloud, replace(PATCH, grip="points"), "here")
     assert cKDTree(cloud).query(spread[0])[0].max() > 0.1, "forearm and all"
 
@@ -223,8 +232,8 @@ def test_a_hand_that_has_yet_to_come_grips_with_what_is_foremost_and_a_small_pat
     controllers, _ = choose_controllers(points, seen, seen, cloud - np.array([0.5, 0, 0]), PATCH, "here")
     assert (controllers[0, :, 0] < -0.1).any()
     assert (controllers[0, :, 0] > 0.05).any()
-    with pytest.raises(InputError, match=r"near the object in frame 0.*grip_reach"):
-        choose_controllers(points, seen, seen, cloud, replace(PATCH, grip_reach=1e-6), "here")
+    with pytest.raises(InputError, match=r"near the object in frame 0.*least_controllers"):
+        choose_controllers(points, seen, seen, cloud, replace(PATCH, least_controllers=300), "here")
 
 
 @pytest.mark.parametrize(("second", "hands"), [(8, [8, 8]), (2, [10])])
@@ -253,7 +262,7 @@ def test_a_small_camera_keeps_what_it_alone_sees(tmp_path):
         writer.frame("many", frame, nothing, np.full((96, 128), 800, np.uint16), nothing[..., 0])
     capture = writer.finish()
     masks = {n: Masks(labels=np.stack([capture.mask(n, f) for f in range(FRAMES)]), backend="given") for n in capture.cameras}
-    clean, _, _ = lifting.clean_masks(capture, capture.cameras, masks, SETTINGS)
+    clean, _, _ = lifting.clean_masks(capture, masks, SETTINGS.neighborhood)
     assert clean["few"][0].sum() == labels.sum()
 
 
@@ -261,7 +270,7 @@ def test_released_controllers_are_visible_throughout():
     points = np.repeat(grid(6)[None], 4, axis=0)
     visible, valid = np.ones((4, 36), bool), np.ones((4, 36), bool)
     visible[2, :10], valid[1, 10:20] = False, False
-    controllers, facts = choose_controllers(points, visible, valid, NEAR, Lift(controllers=30, least_controllers=16), "here")
+    controllers, facts = choose_controllers(points, visible, valid, NEAR, Lift(least_controllers=16), "here")
     assert facts["hand_tracks_kept"] == 16
     assert controllers.shape == (4, 16, 3)
     with pytest.raises(InputError, match=r"here: at least 17 points of the hands.*received 16 of 36"):
@@ -269,39 +278,6 @@ def test_released_controllers_are_visible_throughout():
     # With gaps filled, everything that is seen in enough frames counts.
     _, facts = choose_controllers(points, visible, valid, NEAR, Lift(controller_gaps="rigid", controller_share=0.7), "here")
     assert facts["hand_tracks_kept"] == 36
-
-
-def test_whole_pixels_as_released_lift_the_pixel_that_a_track_is_in(scene):
-    plain = tracks_of(scene)["0"]
-    tracks = {"0": replace(plain, pixels=plain.pixels + 0.3 * (np.arange(FRAMES) > 0)[:, None, None].astype(np.float32))}
-    exact, released = (
-        lifting.lift(scene, masks_of(scene), tracks, replace(SETTINGS, released=released)).object_points
-        for released in (False, True)
-    )
-    rounded = lifting.lift(scene, masks_of(scene), tracks_of(scene), SETTINGS).object_points
-    np.testing.assert_array_equal(released, rounded)
-    # 0.3 pixels in x and in y, at 0.8 m and a focal length of 40 pixels.
-    np.testing.assert_allclose(np.abs(exact - released)[1:], np.broadcast_to([0.006, 0.006, 0.0], exact[1:].shape), atol=1e-6)
-
-
-def test_a_mirrored_principal_point_as_before_july_2025_shifts_the_object(tmp_path):
-    camera = entry()
-    capture, _ = still(tmp_path, replace(camera, intrinsics=((40.0, 0.0, 13.0), *camera.intrinsics[1:])))
-    right, mirrored = (
-        lifting.clean_masks(capture, lifting.lifting_cameras(capture, settings), masks_of(capture), settings)[1]
-        for settings in (SETTINGS, replace(SETTINGS, mirrored_principal_point=True))
-    )
-    # The principal point moves from 13 to 32 - 13 = 19, six pixels of 0.8 m / 40 each, so points move the other way.
-    np.testing.assert_allclose(mirrored - right, np.tile([-6 * 0.8 / 40, 0, 0], (len(right), 1)), atol=1e-6)
-
-
-def test_coordinate_outliers_as_released_drop_what_shares_one_coordinate():
-    line = np.stack([np.linspace(0, 0.01, 11), np.zeros(11), np.arange(11) * 1e-4], axis=1)
-    stray = np.array([[line[3, 0], 0.5, 0.5]])
-    points, least = np.concatenate([line, stray]), np.full(12, 3.0)
-    assert np.flatnonzero(~lifting._crowded(points, 0.005, least, by_coordinate=False)).tolist() == [11]
-    # Point 3 lies in the crowd, but has the x of the outlier.
-    assert np.flatnonzero(~lifting._crowded(points, 0.005, least, by_coordinate=True)).tolist() == [3, 11]
 
 
 def test_farthest_points_are_spread():

@@ -144,7 +144,7 @@ def test_sam2_carries_marks_both_ways_and_skips_missing_frames(capture):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(segment_sam2, "propagate", hear)
-        carried = segment_sam2.carry(capture, "0", marks, GroundedSam2(), "cpu", Models(None, None, model, processor))
+        carried = segment_sam2.carry(capture, "0", marks, None, GroundedSam2(), "cpu", Models(None, None, model, processor))
     # Frame 2 is missing: frames 3 to 5 are the third to the fifth that there are.
     assert heard[0] == ([1], [0, 1, 2, 3, 4])
     assert [prompts for prompts, _ in heard[1:]] in ([[2]], [])
@@ -156,7 +156,9 @@ def test_sam2_carries_marks_both_ways_and_skips_missing_frames(capture):
 
 def test_marks_without_an_object_start_nothing(capture):
     with pytest.raises(InputError, match=r"an object must be marked.*received \['hand'\]"):
-        segment_sam2.carry(capture, "0", [mark("hand", "click", [(5, 5)])], GroundedSam2(), "cpu", Models(None, None, None, None))
+        segment_sam2.carry(
+            capture, "0", [mark("hand", "click", [(5, 5)])], None, GroundedSam2(), "cpu", Models(None, None, None, None)
+        )
 
 
 def test_grounding_dino_finds_boxes_in_the_image(capture, tmp_path, monkeypatch):
@@ -164,7 +166,7 @@ def test_grounding_dino_finds_boxes_in_the_image(capture, tmp_path, monkeypatch)
     model, processor = detector_models(tmp_path)
     monkeypatch.setattr(segment_sam2, "BOX_SCORE", 0.001)
     monkeypatch.setattr(segment_sam2, "WORD_SCORE", 0.001)
-    detections = segment_sam2.detect(capture.color("0", 0), "toy", GroundedSam2(), Models(model, processor, None, None), "cpu")
+    detections = segment_sam2.detect(capture.color("0", 0), "toy", Models(model, processor, None, None), "cpu")
     assert detections
     assert [d.score for d in detections] == sorted((d.score for d in detections), reverse=True)
     assert all(len(d.box) == 4 and np.isfinite(d.box).all() for d in detections)

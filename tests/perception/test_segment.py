@@ -7,7 +7,6 @@ import pytest
 
 from neuspring.checks.masks import mask_facts
 from neuspring.checks.perceived import WRONG, look_at_masks
-from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
 from neuspring.data.frames import overlap
@@ -30,7 +29,7 @@ def agreement(capture, labels, camera: str, frame: int, label: int) -> float:
 
 @pytest.mark.parametrize("camera", ["0", "1"])
 def test_object_and_hand_are_found_and_told_apart(capture, camera):
-    labels = segment_opencv.segment(capture, camera, OpenCvSegmentation())
+    labels = segment_opencv.segment(capture, camera)
     for frame in range(FRAMES):
         if capture.has(camera, frame):
             assert agreement(capture, labels, camera, frame, OBJECT) > 0.9
@@ -44,11 +43,12 @@ def test_an_empty_table_has_no_object(tmp_path):
     for frame in range(5):
         writer.frame("0", frame, np.full((48, 64, 3), 120, np.uint8), np.full((48, 64), 900, np.uint16))
     with pytest.raises(InputError, match=r"an object more than 12 mm above the table z = 0 is required; received nothing"):
-        segment_opencv.segment(writer.finish(), "0", OpenCvSegmentation())
+        segment_opencv.segment(writer.finish(), "0")
 
 
-def test_without_a_hand_s_color_all_is_object_and_the_settings_are_named(capture, capsys):
-    labels = segment_opencv.segment(capture, "0", OpenCvSegmentation(hand_hue=(100.0, 110.0)))
+def test_without_a_hand_s_color_all_is_object(capture, capsys, monkeypatch):
+    monkeypatch.setattr(segment_opencv, "HAND_HUE", (100.0, 110.0))
+    labels = segment_opencv.segment(capture, "0")
     assert set(np.unique(labels)) == {0, OBJECT}
     assert "nothing above the table has the color of hands (hue in [100.0, 110.0] degrees" in capsys.readouterr().out
 

@@ -16,7 +16,7 @@ from neuspring.core.records import RECORD_FORMAT
 from neuspring.data.capture import HANDS, OBJECT, THIN, Capture
 from neuspring.intake.check import check_layout
 from neuspring.intake.phystwin import released_cases
-from neuspring.perception.marks.marks import MARKS, Marks
+from neuspring.perception.marks import MARKS, Marks
 from neuspring.scenes.sources import read_scenarios
 from results.published.film22.films import DRAWN, PREFIX, category_of, film, marks_of, scaled, write_capture
 from results.published.film22.films import MARKS as MARKED

@@ -45,7 +45,7 @@ def test_points_and_controllers_move_as_filmed(whole):
     assert observations.object_points.shape[1] > 40
     assert np.median(motion_error(observations)) < 0.002
     controllers = observations.controller_points
-    assert controllers.shape[1] == 10
+    assert controllers.shape[1] == 30
     moved = np.linalg.norm(controllers - controllers[0] - np.arange(FRAMES)[:, None, None] * STEP, axis=2)
     # A pixel is 4.4 mm wide there, and a ball has little to hold on to.
     assert np.median(moved[1:]) < 0.003
@@ -60,7 +60,7 @@ def test_each_step_names_its_backend_and_draws_a_picture(whole):
     tracks = StageRecord.load(folder / "0" / "tracks.json")
     assert tracks.settings["perception"]["track"]["backend"] == "opencv"
     assert 0 < tracks.facts["visible_share"] <= 1
-    assert StageRecord.load(folder / "lifted.json").facts["controllers"] == 10
+    assert StageRecord.load(folder / "lifted.json").facts["controllers"] == 30
     for path, role in ((folder / "0" / "masks.json", "picture"), (folder / "lifted.json", "picture")):
         assert StageRecord.load(path).file(role, path).stat().st_size > 5000
     assert observations.scenario.provenance["shape prior"] == "visual_hull"

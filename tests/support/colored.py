@@ -12,7 +12,6 @@ import numpy as np
 from neuspring.core.artifacts import ImageObservations, Observations
 from neuspring.data.camera import Camera
 from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
-from neuspring.perception.color import silhouettes
 from tests.support import small
 from tests.support.captures import describe
 
@@ -30,6 +29,18 @@ def camera(target: np.ndarray, distance: float = 0.8, elevation: float = 40.0) -
     pose[:3, 3] = target - distance * forward
     intrinsics = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
     return Camera("0", WIDTH, HEIGHT, intrinsics, pose)
+
+
+def silhouettes(labels: np.ndarray) -> dict[str, np.ndarray]:
+    """60 pixels inside the object per frame, and the distance of cells of 4 x 4 pixels from object and hands."""
+    rng = np.random.default_rng(0)
+    inside, outside = [], []
+    for label in labels:
+        y, x = np.nonzero(label == OBJECT)
+        inside.append(np.stack([x, y], axis=1)[rng.choice(len(x), 60)])
+        away = cv2.distanceTransform((label == 0).astype(np.uint8), cv2.DIST_L2, 5)
+        outside.append(away.reshape(HEIGHT // 4, 4, WIDTH // 4, 4).mean(axis=(1, 3)))
+    return {"inside": np.array(inside, np.float32), "outside": np.array(outside, np.float32)}
 
 
 @functools.cache
@@ -57,7 +68,7 @@ def observed(path: str = "rope/lift/smooth") -> Observations:
         pixel_size=float(np.median(depth[0])) / FOCAL,
         pixels=np.where(visible[..., None], pixels, 0.0),
         visible=visible,
-        **silhouettes(labels, 60),
+        **silhouettes(labels),
         cell=4,
         hand_of=np.zeros(seen.controller_points.shape[1], int),
         hand_centers=hands,

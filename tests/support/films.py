@@ -81,7 +81,7 @@ def newly_covered(labels: np.ndarray, truth: dict[int, np.ndarray]) -> list[floa
 def stepwise(colors: list[np.ndarray], labels: np.ndarray, start: np.ndarray, **settings: Any) -> tuple[np.ndarray, np.ndarray]:
     """The tracker of the workflow: places [T, K, 2] and whether they are visible [T, K], among its own random points."""
     chosen = replace(PointTracking(rim=RIM), **settings)
-    points = np.concatenate([start, track_opencv.choose(labels[0], chosen.points, 0)]).astype(np.float32)
+    points = np.concatenate([start, track_opencv.choose(labels[0])]).astype(np.float32)
     found = track_opencv.follow(Film(colors), "0", labels, points, chosen)  # type: ignore[arg-type]
     return found.pixels[:, : len(start)], found.visible[:, : len(start)]
 

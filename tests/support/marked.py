@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from neuspring.data.capture import HANDS, OBJECT
-from neuspring.perception.marks.marks import Mark
+from neuspring.perception.marks import Mark
 
 SIZE = (72, 112)
 """Height, width."""

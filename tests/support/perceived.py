@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from neuspring.config import Config, ScenarioRow
-from neuspring.config.perception import Lift, Perception, PointTracking, Sampling
+from neuspring.config.perception import Lift, Perception, Sampling
 from neuspring.core.artifacts import Observations
 from neuspring.data.capture import Capture
 from neuspring.stages.lift import lift
@@ -17,8 +17,7 @@ ROW = ScenarioRow(scenario="film", source="capture", category="toy", path="film"
 SETTINGS = Config(
     scenarios=("film",),
     perception=Perception(
-        track=PointTracking(points=400),
-        lift=Lift(neighborhood=0.02, controller_gaps="rigid", controller_share=0.5, least_controllers=5, controllers=10),
+        lift=Lift(neighborhood=0.02, controller_gaps="rigid", controller_share=0.5, least_controllers=5),
         sample=Sampling(voxel=0.015),
     ),
 )

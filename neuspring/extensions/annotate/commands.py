@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from neuspring.cli.options import Positional, Settings, arg, read_settings
+from neuspring.cli.options import Positional, arg
 
 
 def annotate(
@@ -13,14 +13,13 @@ def annotate(
     host: Annotated[str, arg(help="address to listen at; the default is for this machine alone")] = "127.0.0.1",
     port: Annotated[int, arg(help="0: any that is free")] = 8765,
     no_open: Annotated[bool, arg(help="print the address, and open no browser")] = False,
-    settings: Settings = "{}",
 ) -> None:
     """Mark object, controllers and person of a capture in the browser; serves until Ctrl-C."""
     from neuspring.core.web import is_loopback, open_page
     from neuspring.data.capture import Capture
     from neuspring.extensions.annotate.server import Server
 
-    server = Server(Capture.load(capture), read_settings(settings).perception.segment.marks, host, port)
+    server = Server(Capture.load(capture), host, port)
     print(f"Annotate {capture} at {server.url} (stop with Ctrl-C)", flush=True)
     if not is_loopback(host):
         print("Anybody who can read this network's traffic can read the address; an SSH tunnel to 127.0.0.1 is safer.", flush=True)

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 
 from neuspring.config import parse, plain
-from neuspring.config.perception import MarksSegmentation
+from neuspring.config.perception import Perception
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
 from neuspring.extensions.annotate.shared import BackgroundJob, Document, Report
-from neuspring.perception.marks.carry import CameraFilm, Carried, carry_camera, frame_mask
-from neuspring.perception.marks.marks import MARKS, Marks
-from neuspring.perception.marks.store import MasksFile, save_carried, source_digest
+from neuspring.perception.backends import SEGMENTERS
+from neuspring.perception.film import Carried
+from neuspring.perception.marks import MARKS, Marks
+from neuspring.perception.masks import MasksFile, save_carried, source_digest
 
 MOST_MARKS = 2000
 """Marks of a camera: a limit for what a browser may send."""
@@ -39,8 +40,8 @@ class CarriedMasks:
 class MasksMode:
     """State of the masks mode, shared by all tabs."""
 
-    def __init__(self, capture: Capture, settings: MarksSegmentation) -> None:
-        self.capture, self.settings, self.job = capture, settings, BackgroundJob()
+    def __init__(self, capture: Capture) -> None:
+        self.capture, self.job = capture, BackgroundJob()
         path = capture.folder / MARKS
         self.document: Document[Marks] = Document(
             path, lambda: Marks.load(path) if path.exists() else Marks(), lambda marks: marks.save(path)
@@ -81,10 +82,7 @@ class MasksMode:
 
     def preview(self, camera: str, frame: int) -> np.ndarray:
         """Labels [H, W] of one marked frame from its marks alone. Raises InputError."""
-        # A film lacks the frames that its camera missed.
-        place = sum(self.capture.has(camera, before) for before in range(frame))
-        marks = [replace(mark, frame=place) for mark in self.document.read()[1].of(camera) if mark.frame == frame]
-        return frame_mask(CameraFilm(self.capture, camera), place, marks, self.settings)
+        return SEGMENTERS["marks"].outline(self.capture, camera, frame, self.document.read()[1].of(camera))
 
     def carry(self, cameras: Sequence[str]) -> None:
         """Begin to carry the marks of cameras through the video. Raises InputError, Busy."""
@@ -103,7 +101,7 @@ class MasksMode:
                 report(f"camera {camera}", done, total)
 
             progress(0, self.capture.frame_count)
-            carried = carry_camera(self.capture, camera, marks.of(camera), self.settings, progress=progress)
+            carried = SEGMENTERS["marks"].carry(self.capture, camera, marks.of(camera), Perception(), "cpu", progress)
             doubtful += int((carried.doubt > 0.5).sum())
             with self._lock:
                 self._results[camera] = CarriedMasks([zlib.compress(labels, 1) for labels in carried.labels], carried.doubt, marks)
@@ -129,7 +127,7 @@ class MasksMode:
         # Two tabs would write the same files, and the record of one of them would be lost.
         with self._saving:
             for camera, result in results.items():
-                source = source_digest(self.capture, camera, result.marks.of(camera), "marks", self.settings)
+                source = source_digest(self.capture, camera, result.marks.of(camera), "marks")
                 carried = Carried(np.stack([self._unpacked(camera, labels) for labels in result.packed]), result.doubt)
                 save_carried(self.capture, camera, carried, source, "marks")
                 with self._lock:

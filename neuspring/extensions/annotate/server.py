@@ -28,7 +28,6 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.core.web import Refused, check_host, check_origin
 from neuspring.data.capture import HANDS, OBJECT, PERSON, Capture
@@ -64,14 +63,13 @@ class Server:
     def __init__(
         self,
         capture: Capture,
-        settings: MarksSegmentation | None = None,
         host: str = "127.0.0.1",
         port: int = 0,
         token: str | None = None,
     ) -> None:
         """Listen; port 0: any that is free. Raises InputError for an address that cannot be had, or a damaged file."""
         self.capture, self.host, self.token = capture, host, token or secrets.token_urlsafe(16)
-        self.masks = MasksMode(capture, settings or MarksSegmentation())
+        self.masks = MasksMode(capture)
         self.masks.document.read()
         self._socket = _listen(host, port)
         self.port: int = self._socket.getsockname()[1]

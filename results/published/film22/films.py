@@ -19,13 +19,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from neuspring.config.perception import MarksSegmentation
 from neuspring.data.camera import Camera
 from neuspring.data.capture import CAPTURE, THIN, Capture, Description, Writer
+from neuspring.extensions.color_alone.segment import carry_film
 from neuspring.intake.phystwin import released_cases
-from neuspring.perception.marks.carry import carry
-from neuspring.perception.marks.marks import MARKS as MARKS_FILE
-from neuspring.perception.marks.marks import Mark, Marks
+from neuspring.perception.marks import MARKS as MARKS_FILE
+from neuspring.perception.marks import Mark, Marks
 
 MARKS = Path(__file__).parents[3] / "tests" / "data" / "marks"
 DRAWN = {"phystwin22_films": (640, 362), "phystwin_camera0": (848, 480)}
@@ -50,7 +49,7 @@ IN_THE_AIR = ("rope_double_hand", "weird_package")
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Images in memory; implements `Film` of neuspring/perception/marks/carry.py."""
+    """Images in memory; implements `Film` of neuspring/perception/film.py."""
 
     colors: list[np.ndarray]
     depths: list[np.ndarray] | None = None
@@ -122,7 +121,7 @@ def marks_of(case: str, size: tuple[int, int]) -> tuple[Mark, ...]:
 
 def carried(colors: list[np.ndarray], case: str, scale: float = 1.0) -> np.ndarray:
     """Labels [T, H, W] from the committed marks of frame 0, worked out on pictures of `scale` times the film's size."""
-    return carry(Frames(colors), marks_of(case, colors[0].shape[1::-1]), MarksSegmentation(scale=scale)).labels
+    return carry_film(Frames(colors), marks_of(case, colors[0].shape[1::-1]), scale=scale).labels
 
 
 def category_of(case: str) -> str:

@@ -11,18 +11,21 @@ import pytest
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
 from neuspring.extensions.annotate import masks
-from neuspring.perception.marks.carry import Carried
-from neuspring.perception.marks.marks import Mark
+from neuspring.perception.film import Carried
+from neuspring.perception.marks import Mark
 
 
 class Painted:
-    """Stands in for `frame_mask` and `carry_camera` of the page. `gate` holds work back after its first report until it is set."""
+    """Stands in for the segmenter of marks. `gate` holds work back after its first report until it is set."""
 
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
         self.gate = Event()
         self.gate.set()
-        patch.setattr(masks, "frame_mask", lambda film, place, marks, _: self.fill(marks, film.color(place).shape[:2]))
-        patch.setattr(masks, "carry_camera", self.carry)
+        patch.setattr(masks, "SEGMENTERS", {"marks": self})
+
+    def outline(self, capture: Capture, camera: str, frame: int, marks: Sequence[Mark]) -> np.ndarray:
+        view = capture.cameras[camera]
+        return self.fill([mark for mark in marks if mark.frame == frame], (view.height, view.width))
 
     def fill(self, marks: Sequence[Mark], size: tuple[int, ...]) -> np.ndarray:
         if not marks:
@@ -34,7 +37,7 @@ class Painted:
         return labels
 
     def carry(
-        self, capture: Capture, camera: str, marks: Sequence[Mark], _: object, *, progress: Callable[[int, int], None]
+        self, capture: Capture, camera: str, marks: Sequence[Mark], _: object, device: str, progress: Callable[[int, int], None]
     ) -> Carried:
         first = min(mark.frame for mark in marks)
         view, count = capture.cameras[camera], capture.frame_count

@@ -6,11 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import Capture
 from neuspring.extensions.annotate.masks import MasksMode
-from neuspring.perception.marks.store import MasksFile
+from neuspring.perception.masks import MasksFile
 from tests.support.moving import CORNER, FRAMES, SHIFT, SIDE, moving
 
 MISSING = (1, 2)
@@ -43,7 +42,7 @@ def overlap(one, other) -> float:
 
 
 def page_of(capture: Capture) -> MasksMode:
-    return MasksMode(capture, MarksSegmentation())
+    return MasksMode(capture)
 
 
 def test_a_preview_is_of_the_frame_that_was_marked_also_after_missing_frames(capture):

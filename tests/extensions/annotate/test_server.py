@@ -7,7 +7,7 @@ import pytest
 
 from neuspring.core.errors import InputError
 from neuspring.extensions.annotate.server import LABEL_COLORS, Server, overlay_png
-from neuspring.perception.marks.store import MasksFile
+from neuspring.perception.masks import MasksFile
 from tests.extensions.annotate.served import decoded, served
 from tests.support.moving import FRAMES
 

@@ -19,7 +19,7 @@ import pytest
 from neuspring.cli.main import main
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.extensions.annotate.server import Server
-from neuspring.perception.marks.marks import MARKS, Mark, Marks
+from neuspring.perception.marks import MARKS, Mark, Marks
 from tests.support.filmed import film
 from tests.support.project import copy_workflow, jobs_in, output_of, start
 

@@ -11,17 +11,15 @@ from neuspring.checks import examine
 from neuspring.checks.masks import mask_facts
 from neuspring.checks.perceived import look_at_masks
 from neuspring.checks.table import on_table
-from neuspring.config.perception import OpenCvSegmentation
 from neuspring.core.errors import InputError
 from neuspring.core.geometry import rigid_inverse
 from neuspring.data.capture import CAPTURE, OBJECT, Capture
 from neuspring.extensions.make_capture.formats import pairs
 from neuspring.extensions.make_capture.make import Intake, make_capture
 from neuspring.intake.check import check_layout
-from neuspring.perception import segment_opencv
 from neuspring.perception.backends import BACKENDS
-from neuspring.perception.marks.carry import CameraFilm
-from neuspring.perception.marks.store import save_masks
+from neuspring.perception.film import CameraFilm
+from neuspring.perception.masks import save_masks
 from tests.extensions.make_capture.board import BOARD, LENS, board_image
 from tests.support.desk import FRAMES, SIZE, camera, looking, seen, write_folders, write_json, write_poses
 from tests.support.findings import holds, of_level, serious
@@ -252,11 +250,7 @@ def test_a_pose_is_refused_where_depth_is_measured(tmp_path):
 
 
 def test_segmentation_by_height_is_refused_at_the_start(capture):
-    for refuse in (
-        lambda: segment_opencv.segment(capture, "0", OpenCvSegmentation()),
-        lambda: BACKENDS["segment"]["opencv"].require(capture.folder),
-    ):
-        with pytest.raises(InputError, match=r"segmentation by opencv needs depth.*marks .*, given or grounded_sam2"):
-            refuse()
+    with pytest.raises(InputError, match=r"needs depth of every frame; received a capture of color"):
+        BACKENDS["segment"]["opencv"].require(capture.folder)
     film = CameraFilm(capture, "0")
     assert film.depth(0) is None and film.height(0) is None

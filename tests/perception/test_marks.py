@@ -5,7 +5,7 @@ import json
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.perception.marks.marks import Mark, Marks, marks_digest
+from neuspring.perception.marks import Mark, Marks, marks_digest
 from tests.support.filmed import film
 from tests.support.marked import mark
 

@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from neuspring.perception.segment_opencv import bins_of as opencv_bins
+
 LAB_BINS = (32, 64, 64)
 """Bins of L, a and b, each of which has 256 values."""
 BIN_VOLUME = float(np.prod([256 / count for count in LAB_BINS]))
@@ -46,15 +48,9 @@ MOST_DEPTH = 3.0
 """Largest log ratio that a pixel's depth counts; depth is off by pixels at borders."""
 
 
-def lab_of(image: np.ndarray) -> np.ndarray:
-    """Lab [H, W, 3] uint8 of RGB."""
-    return cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2LAB)
-
-
-def bins_of(lab: np.ndarray, bins: tuple[int, int, int] = LAB_BINS) -> np.ndarray:
-    """The bin of every pixel [H, W], of so many bins of L, a and b."""
-    first, second, third = (lab[..., axis].astype(np.int32) * count // 256 for axis, count in enumerate(bins))
-    return np.asarray((first * bins[1] + second) * bins[2] + third)
+def bins_of(lab: np.ndarray) -> np.ndarray:
+    """The bin of every pixel [H, W]."""
+    return opencv_bins(lab, LAB_BINS)
 
 
 def log_density(counts: np.ndarray) -> np.ndarray:
@@ -64,9 +60,9 @@ def log_density(counts: np.ndarray) -> np.ndarray:
     return np.asarray(np.log((1 - UNSEEN) * share / BIN_VOLUME + UNSEEN / COLOR_SPREAD), dtype=np.float32)
 
 
-def count(seen: np.ndarray, where: np.ndarray, bins: tuple[int, int, int] = LAB_BINS) -> np.ndarray:
+def count(seen: np.ndarray, where: np.ndarray) -> np.ndarray:
     """Counts of each color [bins] where a mask [H, W] is true; `seen` [H, W] are the bins of pixels."""
-    return np.bincount(seen[where], minlength=int(np.prod(bins))).astype(float)
+    return np.bincount(seen[where], minlength=int(np.prod(LAB_BINS))).astype(float)
 
 
 def mixed(parts: list[tuple[float, np.ndarray]]) -> np.ndarray:

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from neuspring.config import Config
-from neuspring.config.perception import ColorSettings
 from neuspring.core.artifacts import ImageObservations
 from neuspring.data.capture import HANDS, OBJECT
 from neuspring.data.results import PixelTracks
+from neuspring.extensions.color_alone.first_frame import FirstFrame
+from neuspring.extensions.color_alone.hands import along_arms, follow_hands, grips, place
+from neuspring.extensions.color_alone.lift import lift_color, silhouettes
 from neuspring.intake.points import read
-from neuspring.perception.color import FirstFrame, lift_color, silhouettes
-from neuspring.perception.color_hands import along_arms, follow_hands, grips, place
 from neuspring.stages.lift import lift
 from neuspring.stages.segment import segment
 from neuspring.stages.track import track
@@ -134,11 +134,11 @@ def test_sheets_alone_are_held_by_fingers_alone(tmp_path, monkeypatch, category,
     y, x = np.nonzero(labels[0] == HANDS)
     # The painted hand gets an arm.
     labels[0, : y.max(), x.min() : x.max()] = HANDS
-    first = FirstFrame.of(capture, labels[0], ColorSettings())
+    first = FirstFrame.of(capture, labels[0])
     y, x = np.nonzero(labels[0] == OBJECT)
     pixels = np.repeat(np.stack([x, y], axis=1)[None, ::50].astype(np.float32), 3, axis=0)
     tracks = PixelTracks(pixels=pixels, visible=np.ones(pixels.shape[:2], bool), backend="test")
-    monkeypatch.setattr("neuspring.perception.color.GRIP_LENGTH", 3 * first.pixel_size)
+    monkeypatch.setattr("neuspring.extensions.color_alone.lift.GRIP_LENGTH", 3 * first.pixel_size)
     _, image = lift_color(capture, labels, tracks, first, 30, read(capture))
     assert (len(image.hand_of) < 30) == fingers
 

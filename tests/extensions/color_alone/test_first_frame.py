@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from neuspring.config.perception import ColorSettings, Perception, Sampling
+from neuspring.config.perception import Perception, Sampling
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Camera
 from neuspring.data.capture import HANDS, OBJECT
 from neuspring.data.results import Masks, PixelTracks
-from neuspring.perception import color
-from neuspring.perception.color import SHEET_THICKNESS, FirstFrame, beneath_hands, camera_depth, from_color
+from neuspring.extensions.color_alone.first_frame import SHEET_THICKNESS, FirstFrame, beneath_hands, camera_depth
+from neuspring.extensions.color_alone.lift import lift
 from neuspring.perception.sample import structure
 from neuspring.perception.track_opencv import choose
 from tests.support.colored import HEIGHT, WIDTH, camera, paint
@@ -47,7 +47,7 @@ def object_points(first: FirstFrame) -> np.ndarray:
 
 
 def test_a_sheet_has_its_size_on_the_table():
-    first = FirstFrame.of(capture_of("cloth"), shown(SQUARE), ColorSettings())
+    first = FirstFrame.of(capture_of("cloth"), shown(SQUARE))
     points = object_points(first)
     np.testing.assert_allclose(points[:, 2], SHEET_THICKNESS / 2, atol=1e-9)
     # Rows of pixels are 1.6 times as far apart on the table, seen at 40 degrees.
@@ -57,7 +57,7 @@ def test_a_sheet_has_its_size_on_the_table():
 
 
 def test_a_rope_is_as_thick_as_it_is_wide():
-    first = FirstFrame.of(capture_of("rope"), shown([[-0.15, -0.02], [0.15, -0.02], [0.15, 0.02], [-0.15, 0.02]]), ColorSettings())
+    first = FirstFrame.of(capture_of("rope"), shown([[-0.15, -0.02], [0.15, -0.02], [0.15, 0.02], [-0.15, 0.02]]))
     upper = object_points(first)[:, 2]
     # 4 cm of the table are 2.6 cm in the image at 40 degrees.
     assert np.median(upper[upper > 0.5 * upper.max()]) == pytest.approx(0.0257, abs=1.5 * PIXEL)
@@ -86,8 +86,8 @@ def box(x: float, y: float, z: float) -> np.ndarray:
 def sides(labels: np.ndarray, pose: str | None) -> tuple[np.ndarray, np.ndarray]:
     """Upper and lower points [n, 3], m, of a body in a pose that is as thick as it is wide."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(color, "BODY_THICKNESS", 1.0)
-        first = FirstFrame.of(capture_of("toy", pose=pose), labels, ColorSettings())
+        patch.setattr("neuspring.extensions.color_alone.first_frame.BODY_THICKNESS", 1.0)
+        first = FirstFrame.of(capture_of("toy", pose=pose), labels)
     y, x = np.nonzero(labels == OBJECT)
     pixels = np.stack([x, y], axis=1)
     upper, lower = first.points(pixels), first.camera.lift(pixels.astype(float), first.depths(0.0)[y, x])
@@ -136,7 +136,7 @@ def test_a_long_body_that_points_away_lies_only_if_the_capture_says_so():
     assert np.ptp(lying[:, 1]) == pytest.approx(0.3, abs=0.05)
     assert lying[:, 2].max() < 0.07
     assert unknown[:, 2].max() > 0.15
-    known = [FirstFrame.of(capture_of("toy", pose=pose), labels, ColorSettings()).facts for pose in (None, "lying")]
+    known = [FirstFrame.of(capture_of("toy", pose=pose), labels).facts for pose in (None, "lying")]
     assert known[0]["raised"] > 0.5
     assert known[1]["raised"] == 0
     assert known[0]["longest"] == pytest.approx(0.3, abs=0.05)
@@ -146,7 +146,7 @@ def test_a_long_body_that_points_away_lies_only_if_the_capture_says_so():
 def test_a_compact_box_does_not_rise(size, elevation):
     """Its outline is one disc, which is as wide as it is."""
     capture = capture_of("toy", view=camera(np.zeros(3), elevation=elevation))
-    assert FirstFrame.of(capture, filled_outline(box(*size), elevation), ColorSettings()).facts["raised"] == 0
+    assert FirstFrame.of(capture, filled_outline(box(*size), elevation)).facts["raised"] == 0
 
 
 @pytest.mark.parametrize("category", ["toy", "rope"])
@@ -157,7 +157,7 @@ def test_a_camera_above_the_table_that_looks_straight_down_sees_a_shape(category
     capture = capture_of(category, view=replace(camera(np.zeros(3)), camera_to_world=pose))
     labels = np.zeros((HEIGHT, WIDTH), np.uint8)
     labels[20:70, 78:98] = OBJECT
-    frame = FirstFrame.of(capture, labels, ColorSettings())
+    frame = FirstFrame.of(capture, labels)
     assert all(np.isfinite(value) for value in frame.facts.values())
     assert np.isfinite(frame.heights).all()
     assert frame.heights.max() < 0.2
@@ -167,14 +167,14 @@ def test_nothing_rises_below_a_steep_camera():
     labels = np.zeros((HEIGHT, WIDTH), np.uint8)
     labels[20:70, 78:84] = OBJECT
     capture = capture_of("toy", view=camera(np.zeros(3), elevation=80.0))
-    assert FirstFrame.of(capture, labels, ColorSettings()).facts["raised"] == 0
+    assert FirstFrame.of(capture, labels).facts["raised"] == 0
 
 
 def test_up_may_be_minus_z():
     view = camera(np.zeros(3))
     turn = np.diag([1.0, -1.0, -1.0, 1.0])
     capture = capture_of("zebra", "-z", view=replace(view, camera_to_world=turn @ view.camera_to_world))
-    first = FirstFrame.of(capture, shown(SQUARE), ColorSettings())
+    first = FirstFrame.of(capture, shown(SQUARE))
     assert object_points(first)[:, 2].max() <= 0
     assert object_points(first)[:, 2].min() < -0.05
 
@@ -198,9 +198,9 @@ def test_an_object_above_the_horizon_is_refused():
     level = camera(np.zeros(3)).camera_to_world.copy()
     level[:3, :3] = np.stack([[1, 0, 0], [0, 0, -1], [0, 1, 0]], axis=1)
     with pytest.raises(InputError, match="must look at the table"):
-        FirstFrame.of(capture_of("cloth", view=replace(camera(np.zeros(3)), camera_to_world=level)), labels, ColorSettings())
+        FirstFrame.of(capture_of("cloth", view=replace(camera(np.zeros(3)), camera_to_world=level)), labels)
     with pytest.raises(InputError, match="must be in view"):
-        FirstFrame.of(capture_of("cloth"), 0 * labels, ColorSettings())
+        FirstFrame.of(capture_of("cloth"), 0 * labels)
 
 
 def test_rays_beyond_the_horizon_never_meet_the_table():
@@ -212,12 +212,13 @@ def test_observations_of_a_painted_capture(tmp_path, category):
     """Nodes where the square is, controllers at its far edge; a body's hull is closed and above the table."""
     capture = paint(tmp_path, category)
     labels = np.stack([capture.mask("0", frame) for frame in range(capture.frame_count)])
-    start = choose(labels[0], 600, 0)
+    start = choose(labels[0], 600)
     still = np.repeat(start[None], capture.frame_count, axis=0)
     tracks = PixelTracks(pixels=still, visible=np.ones(still.shape[:2], bool), backend="test")
     masks = {"0": Masks(labels=labels, backend="given")}
     settings = Perception(sample=Sampling(voxel=0.01, nodes=300))
-    lifted, prior, image = from_color(capture, masks, {"0": tracks}, settings)
+    known = lift(capture, masks, {"0": tracks}, settings)
+    lifted, prior, image = known.tracks, known.prior, known.image
     assert image.hands == 1
     assert not image.visible[capture.train_end :].any()
     assert len(image.inside) == capture.train_end

@@ -6,19 +6,16 @@ import cv2
 import numpy as np
 import pytest
 
-from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, PERSON
-from neuspring.perception.marks.carry import carry, frame_mask
-from neuspring.perception.marks.colors import LAB_BINS, Background, bins_of
+from neuspring.extensions.color_alone.colors import LAB_BINS, Background, bins_of
+from neuspring.extensions.color_alone.segment import carry_film, frame_mask
 from tests.support.marked import SIZE, SQUARE, Painted, mark, overlap, painted, rope
-
-SETTINGS = MarksSegmentation()
 
 
 def test_an_object_and_the_hand_over_it_are_carried():
     film, heard = painted(), []
-    carried = carry(film, SQUARE, SETTINGS, progress=lambda done, total: heard.append((done, total)))
+    carried = carry_film(film, SQUARE, progress=lambda done, total: heard.append((done, total)))
     for frame in range(film.count):
         assert overlap(carried.labels[frame], film.truth[frame], OBJECT) > 0.9, frame
         assert overlap(carried.labels[frame], film.truth[frame], HANDS) > 0.8, frame
@@ -32,13 +29,13 @@ def test_an_object_and_the_hand_over_it_are_carried():
 def test_a_box_and_a_click_are_enough_for_one_frame():
     film = painted(1)
     marks = [mark("object", "box", [(15, 24), (48, 56)]), mark("hand", "scribble", [(38, 2), (38, 24)], radius=2.0)]
-    labels = frame_mask(film, 0, marks, SETTINGS)
+    labels = frame_mask(film, 0, marks)
     assert overlap(labels, film.truth[0], OBJECT) > 0.85
     assert overlap(labels, film.truth[0], HANDS) > 0.8
 
 
 def test_a_frame_may_show_a_hand_alone():
-    labels = frame_mask(painted(1), 0, SQUARE[1:], SETTINGS)
+    labels = frame_mask(painted(1), 0, SQUARE[1:])
     assert overlap(labels, painted(1).truth[0], HANDS) > 0.8
     assert not (labels == OBJECT).any()
 
@@ -46,7 +43,7 @@ def test_a_frame_may_show_a_hand_alone():
 def test_a_thin_rope_stays_whole():
     film = rope()
     ends = [(12, 30), (41, 37), (70, 37), (100, 31)]
-    carried = carry(film, [mark("object", "scribble", ends, radius=1.5)], SETTINGS)
+    carried = carry_film(film, [mark("object", "scribble", ends, radius=1.5)])
     for frame in range(film.count):
         assert overlap(carried.labels[frame], film.truth[frame], OBJECT) > 0.7, frame
 
@@ -54,7 +51,7 @@ def test_a_thin_rope_stays_whole():
 def test_a_cut_in_the_film_is_doubted_most():
     film = painted(9, hand=False)
     frames = [*film.frames[:5], *(np.ascontiguousarray(frame[:, ::-1]) for frame in film.frames[5:])]
-    whole, cut = (carry(Painted(own, film.truth), SQUARE[:1], SETTINGS).doubt for own in (film.frames, frames))
+    whole, cut = (carry_film(Painted(own, film.truth), SQUARE[:1]).doubt for own in (film.frames, frames))
     assert cut.argmax() == 5
     assert cut[5] > 0.8
     assert whole.max() < 0.4
@@ -63,7 +60,7 @@ def test_a_cut_in_the_film_is_doubted_most():
 def test_a_hand_that_is_marked_later_is_known_before_too():
     film = painted(6)
     late = mark("hand", "scribble", [(53, 2), (53, 26)], frame=5, radius=2.0)
-    carried = carry(film, [SQUARE[0], late], SETTINGS)
+    carried = carry_film(film, [SQUARE[0], late])
     assert overlap(carried.labels[5], film.truth[5], HANDS) > 0.7
     assert overlap(carried.labels[3], film.truth[3], HANDS) > 0.6
 
@@ -82,7 +79,7 @@ def test_what_a_hand_uncovers_of_a_cloth_is_object():
             image[place] = np.clip(color + 25 * grain[place], 0, 255)
     outline, arm = [(25, 24), (94, 24), (94, 67), (25, 67)], [(50, 0), (69, 0), (69, 51), (50, 51)]
     marks = [mark("object", "polygon", outline, radius=2.0), mark("hand", "polygon", arm, radius=2.0)]
-    assert (carry(made, marks, SETTINGS).labels[-1][fold] == OBJECT).mean() > 0.7
+    assert (carry_film(made, marks).labels[-1][fold] == OBJECT).mean() > 0.7
 
 
 def test_an_ignored_hand_that_leaves_does_not_make_the_table_object():
@@ -94,7 +91,7 @@ def test_an_ignored_hand_that_leaves_does_not_make_the_table_object():
         for place, color in ((truth == OBJECT, (190, 180, 170)), (arm, (190, 120, 95))):
             image[place] = np.clip(color + 30 * grain[place], 0, 255)
     beside = mark("ignore", "polygon", [(44, 0), (57, 0), (57, 51), (44, 51)])
-    labels = carry(made, [*SQUARE, beside], MarksSegmentation()).labels
+    labels = carry_film(made, [*SQUARE, beside]).labels
     # Without the hand 121 pixels at the pale square are wrong in the last frame; 470 were with it.
     assert ((labels[-1] > 0) & (made.truth[-1] == 0)).sum() < 250
     assert all((labels[frame, :26, 46:] == 0).all() for frame in range(5)), "while it is there it is neither"
@@ -118,7 +115,7 @@ SLEEVE = mark("person", "scribble", [(70, 48), (108, 48)], frame=6, radius=4.0)
 def test_a_person_that_is_marked_once_is_neither_object_nor_hand_in_any_frame():
     """Its sleeve has nearly the color of the hands, and counted as one."""
     film, sleeve = visited((180, 110, 92))
-    plain, known = (carry(film, marks, SETTINGS).labels for marks in (SQUARE, [*SQUARE, SLEEVE]))
+    plain, known = (carry_film(film, marks).labels for marks in (SQUARE, [*SQUARE, SLEEVE]))
     assert np.isin(plain[sleeve], (OBJECT, HANDS)).mean() > 0.5
     assert np.isin(known[sleeve], (OBJECT, HANDS)).mean() < 0.05
     assert all((known[frame][sleeve[frame]] == PERSON).mean() > 0.7 for frame in (4, 5, 6, 7))
@@ -134,7 +131,7 @@ def test_a_person_s_depth_tells_it_from_hands_of_its_color():
             near = np.where(self.truth[frame] > 0, 0.6, 1.0)
             return np.where(sleeve[frame], 0.8, near).astype(np.float32)
 
-    flat, deep = (carry(kind(film.frames, film.truth), [*SQUARE, SLEEVE], SETTINGS).labels for kind in (Painted, Deep))
+    flat, deep = (carry_film(kind(film.frames, film.truth), [*SQUARE, SLEEVE]).labels for kind in (Painted, Deep))
     wrong = [np.isin(found[sleeve], (OBJECT, HANDS)).mean() for found in (flat, deep)]
     assert wrong[1] < 0.05
     assert overlap(deep[3], film.truth[3], HANDS) > max(0.75, overlap(flat[3], film.truth[3], HANDS) - 0.05)
@@ -155,20 +152,14 @@ def test_colors_of_a_person_teach_no_background():
 def test_a_mark_corrects_what_was_carried():
     film = painted(5, hand=False)
     there = mark("ignore", "polygon", [(32, 24), (60, 24), (60, 56), (32, 56)], frame=4, radius=1.0)
-    assert not (carry(film, [SQUARE[0], there], SETTINGS).labels[4][26:54, 34:58] == OBJECT).any()
+    assert not (carry_film(film, [SQUARE[0], there]).labels[4][26:54, 34:58] == OBJECT).any()
 
 
 def test_half_the_size_is_coarser_and_of_the_same_shape():
     film = painted(3)
-    carried = carry(film, SQUARE, MarksSegmentation(scale=0.5))
+    carried = carry_film(film, SQUARE, scale=0.5)
     assert carried.labels.shape == film.truth.shape
     assert overlap(carried.labels[2], film.truth[2], OBJECT) > 0.8
-
-
-def test_without_the_background_flow_and_colors_carry():
-    film = painted(4, hand=False)
-    carried = carry(film, SQUARE[:1], MarksSegmentation(background=False))
-    assert overlap(carried.labels[3], film.truth[3], OBJECT) > 0.85
 
 
 @pytest.mark.parametrize(
@@ -182,9 +173,9 @@ def test_without_the_background_flow_and_colors_carry():
 )
 def test_marks_that_carry_nothing_are_refused(marks, message):
     with pytest.raises(InputError, match=message):
-        carry(painted(3), marks, SETTINGS)
+        carry_film(painted(3), marks)
 
 
 def test_a_frame_without_marks_has_no_mask_of_its_own():
     with pytest.raises(InputError, match="frame 1: an object or a hand must be marked on it"):
-        frame_mask(painted(2), 1, SQUARE, SETTINGS)
+        frame_mask(painted(2), 1, SQUARE)

@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 
 from neuspring.data.capture import HANDS, NOTHING, OBJECT, PERSON
-from neuspring.data.frames import at_border
-from neuspring.perception.marks.colors import (
+from neuspring.extensions.color_alone.colors import (
     Background,
     apart,
     bins_of,
@@ -24,7 +23,8 @@ from neuspring.perception.marks.colors import (
     mixed,
     shaded_density,
 )
-from neuspring.perception.marks.marks import ODDS_FALL, UNMARKED_PIXEL, Seeds
+from neuspring.extensions.color_alone.seeds import ODDS_FALL, UNMARKED_PIXEL, Seeds
+from neuspring.perception.film import at_border
 
 SMOOTHNESS = 1.5
 """Cost of a border between two neighboring pixels of the same color, as a log ratio of probabilities."""

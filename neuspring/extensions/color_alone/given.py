@@ -3,22 +3,16 @@ sees is, and are the nodes of the twin."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from neuspring.config.perception import Perception
-from neuspring.core.artifacts import ImageObservations
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Camera
 from neuspring.data.capture import Capture
-from neuspring.data.results import LiftedTracks, Masks, PixelTracks, ShapePrior
-from neuspring.intake.points import read
-from neuspring.perception.color import BENEATH, FirstFrame, beneath_hands, from_color, lift_color
+from neuspring.extensions.color_alone.first_frame import BENEATH, FirstFrame, beneath_hands
 from neuspring.perception.sample import spacing
-from neuspring.perception.shape import no_prior
 
 PLANE_NODES = 6
 """Front nodes around a pixel that say how deep it is."""
@@ -67,20 +61,6 @@ class GivenFrame(FirstFrame):
         found = mean + (slope * (pixels - middle)).sum(axis=1)
         depth = 1.0 / np.clip(found, inverse.min(axis=1), inverse.max(axis=1))
         return self.camera.lift(pixels.astype(float), depth + (0.0 if share == 1.0 else 0.5 * self.apart))
-
-
-def from_image(
-    capture: Capture, masks: Mapping[str, Masks], tracks: Mapping[str, PixelTracks], settings: Perception
-) -> tuple[LiftedTracks, ShapePrior, ImageObservations]:
-    """`color.from_color`; where the capture brings nodes, with their depths in place of a supposed shape, and without a prior."""
-    space = read(capture)
-    if not len(space.nodes):
-        return from_color(capture, masks, tracks, settings)
-    name = next(iter(capture.cameras))
-    labels = masks[name].labels
-    first = GivenFrame.by(capture, labels[0], space.nodes)
-    lifted, image = lift_color(capture, labels, tracks[name], first, settings.lift.controllers, space)
-    return lifted, no_prior(), image
 
 
 def facing(camera: Camera, nodes: np.ndarray) -> np.ndarray:

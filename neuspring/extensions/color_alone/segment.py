@@ -9,37 +9,33 @@ time. A second pass knows the whole film's background.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from neuspring.config.perception import MarksSegmentation
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, NOTHING, OBJECT, PERSON, Capture
-from neuspring.data.frames import frames_of, heights, overlap, spread, without_islands
-from neuspring.perception.marks.colors import (
+from neuspring.data.frames import overlap, spread
+from neuspring.extensions.color_alone.colors import (
     DIFFERENT,
     Background,
     apart,
     bins_of,
     count,
     depth_odds,
-    lab_of,
     log_density,
     mixed,
 )
-from neuspring.perception.marks.marks import Mark, Seeds, require_marks
-from neuspring.perception.marks.solve import CarriedFrame, MarkedFrame, Pass, start
+from neuspring.extensions.color_alone.seeds import Seeds
+from neuspring.extensions.color_alone.solve import CarriedFrame, MarkedFrame, Pass, start
+from neuspring.perception.film import CameraFilm, Carried, Film, Progress, doubt_of, over_capture
+from neuspring.perception.marks import MARKS, Mark, Marks, require_marks
+from neuspring.perception.segment_opencv import lab_of
 
-MEDIAN_AROUND = 4
-"""Frames before and after with whose median an area is compared."""
-DOUBTED_JUMP = 0.5
-"""Jump of areas that makes a doubt of 63 %."""
 MISFIT = 2.0
 """Log ratio from which a color contradicts its label."""
 CARRY_WIDTH = 848
@@ -54,8 +50,6 @@ STRANGE = 1.0
 """Log ratio, to the background's, from which a color is one of a person that is marked, and teaches no background."""
 LEARNED_APART = 4
 """Pixels around object and hands that teach no background."""
-Progress: TypeAlias = Callable[[int, int], None]
-"""A call that work makes as it goes on: (done, of all)."""
 
 
 class Cues(NamedTuple):
@@ -69,6 +63,10 @@ class Cues(NamedTuple):
     """Part of object and hands whose colors contradict their label."""
     unsure: float = 0.0
     """Mean of 2 (1 - p) over the pixels at the border of object and hands."""
+
+    def squares(self) -> float:
+        """Sum of the squares of the cues, each over its value in WHOLE."""
+        return sum((value / whole) ** 2 for value, whole in zip(self, WHOLE, strict=True))
 
 
 WHOLE = Cues(disagreement=0.35, flow=0.8, misfit=0.5, unsure=0.5)
@@ -88,130 +86,62 @@ def cues_of(step: CarriedFrame, other: np.ndarray) -> Cues:
     return Cues(disagreement, float(step.flow_doubt[shown].mean()), misfit, unsure)
 
 
-def doubt_of(labels: np.ndarray, cues: list[Cues]) -> np.ndarray:
-    """Doubt [T], 0 to 1: 1 - exp(-sum of cues), each against its scale; the last one is the jump of areas.
+def require(capture: Capture) -> None:
+    """Raise InputError if marks.json is missing or wrong, or contains no marks of a camera."""
+    for camera in capture.cameras:
+        _marks_of(capture, camera)
 
-    A jump is |log(area / median of the frames around)|, with 1 % of the film's largest area added to both.
+
+def segment(capture: Capture, camera: str) -> np.ndarray:
+    """Labels [T, H, W]. Raises InputError without marks.json, or where it contains no marks of this camera."""
+    carried = carry(capture, camera, _marks_of(capture, camera))
+    doubtful = np.argsort(-carried.doubt, kind="stable")[:3]
+    print(f"camera {camera}: most doubtful frames: " + ", ".join(f"{f} ({carried.doubt[f]:.2f})" for f in doubtful), flush=True)
+    return carried.labels
+
+
+def _marks_of(capture: Capture, camera: str) -> tuple[Mark, ...]:
+    path = capture.folder / MARKS
+    marks = Marks.load(path)
+    marks.require(capture, path)
+    if not marks.of(camera):
+        raise InputError(f"{path}, cameras", f"camera {camera} needs marks", sorted(marks.cameras))
+    return marks.of(camera)
+
+
+def outline(capture: Capture, camera: str, frame: int, marks: Sequence[Mark]) -> np.ndarray:
+    """Labels [H, W] uint8 of one frame from the marks on it alone. Raises InputError where no object or hand is marked on it."""
+    film = CameraFilm(capture, camera)
+    index = film.frames.index(frame)
+    return frame_mask(film, index, [replace(mark, frame=index) for mark in marks if mark.frame == frame])
+
+
+def carry(capture: Capture, camera: str, marks: Sequence[Mark], progress: Progress | None = None) -> Carried:
+    """Labels [T, H, W] and doubt [T] of all frames of a camera, 0 where it has none, from marks on a few.
+
+    Raises InputError where marks do not fit the capture.
     """
-    total = np.array([sum((value / whole) ** 2 for value, whole in zip(cue, WHOLE, strict=True)) for cue in cues])
-    for label in (OBJECT, HANDS):
-        areas = (labels == label).sum(axis=(1, 2)).astype(float)
-        logs = np.log(areas + 0.01 * max(float(areas.max(initial=0.0)), 100.0))
-        usual = [np.median(logs[max(frame - MEDIAN_AROUND, 0) : frame + MEDIAN_AROUND + 1]) for frame in range(len(logs))]
-        total += (np.abs(logs - usual) / DOUBTED_JUMP) ** 2
-    return np.asarray(1 - np.exp(-total))
+    return over_capture(capture, camera, marks, lambda film, own: carry_film(film, own, progress=progress))
 
 
-class Film(Protocol):
-    """The frames of one camera, read on demand."""
-
-    @property
-    def count(self) -> int:
-        """Number of frames."""
-
-    def color(self, frame: int, /) -> np.ndarray:
-        """RGB [H, W, 3] uint8."""
-
-    def depth(self, frame: int, /) -> np.ndarray | None:
-        """Depth [H, W] float32, m, 0 where nothing was measured; None: this camera has no depth."""
-
-    def height(self, frame: int, /) -> np.ndarray | None:
-        """Height above the table [H, W], m, NaN where nothing was measured; None: not known."""
-
-
-@dataclass(frozen=True, eq=False)
-class CameraFilm:
-    """The frames that a camera of a capture has, in their order: a `Film`. Raises InputError for an unknown camera."""
-
-    capture: Capture
-    camera: str
-
-    def __post_init__(self) -> None:
-        self.capture.require_camera(self.camera)
-
-    @cached_property
-    def frames(self) -> list[int]:
-        """Their numbers in the capture."""
-        return frames_of(self.capture, self.camera)
-
-    @property
-    def count(self) -> int:
-        """Number of frames, missing ones left out."""
-        return len(self.frames)
-
-    def color(self, frame: int, /) -> np.ndarray:
-        """RGB [H, W, 3] uint8."""
-        return self.capture.color(self.camera, self.frames[frame])
-
-    def depth(self, frame: int, /) -> np.ndarray | None:
-        """Depth [H, W] float32, m, 0 where nothing was measured; None: there is none of this frame."""
-        if not self.capture.has_depth or not self.capture.path("depth", self.camera, self.frames[frame]).exists():
-            return None
-        return self.capture.depth(self.camera, self.frames[frame]).astype(np.float32)
-
-    def height(self, frame: int, /) -> np.ndarray | None:
-        """Height above the table [H, W], m, NaN where nothing was measured; None: there is no depth of this frame."""
-        depth = self.depth(frame)
-        return None if depth is None else heights(self.capture, self.camera, depth).astype(np.float32)
-
-
-@dataclass(frozen=True, eq=False)
-class Carried:
-    """Labels of every frame."""
-
-    labels: np.ndarray
-    """[T, H, W] uint8: 0 nothing, 1 object, 2 hands, 3 person."""
-    doubt: np.ndarray
-    """[T] float, 0 (sure) to 1."""
-
-
-def frame_mask(film: Film, frame: int, marks: Sequence[Mark], settings: MarksSegmentation) -> np.ndarray:
-    """Labels [H, W] uint8 of one frame from the marks on it alone. Raises InputError where it has no object or hand marked."""
-    own = [mark for mark in marks if mark.frame == frame]
-    if not any(mark.value in (OBJECT, HANDS) for mark in own):
-        raise InputError(f"frame {frame}", "an object or a hand must be marked on it", sorted({mark.label for mark in own}))
-    work = _Work(film, own, settings, whole=False)
-    return work.full_labels(work.start(frame).probability)
-
-
-def carry(film: Film, marks: Sequence[Mark], settings: MarksSegmentation, *, progress: Progress | None = None) -> Carried:
-    """Labels and doubt of every frame from the marks of one camera; `progress(done, all)` is called as work goes on.
+def carry_film(film: Film, marks: Sequence[Mark], *, scale: float = 1.0, progress: Progress | None = None) -> Carried:
+    """As `carry`, worked out on images of `scale` times the film's size.
 
     Raises InputError where no object is marked, or marks lie outside the images.
     """
-    work = _Work(film, marks, settings, progress)
+    work = _Work(film, marks, scale, progress)
     if not marks:
         raise InputError("marks", "an object must be marked in one frame or more", 0, 'Add a mark with "label": "object".')
     return work.second_pass(work.first_pass())
 
 
-def carry_camera(
-    capture: Capture, camera: str, marks: Sequence[Mark], settings: MarksSegmentation, *, progress: Progress | None = None
-) -> Carried:
-    """As `carry`, for a camera of a capture: labels [T, H, W] and doubt [T] of all its frames, 0 where the camera has none.
-
-    Raises InputError where marks do not fit the capture.
-    """
-    return over_capture(capture, camera, marks, lambda film, own: carry(film, own, settings, progress=progress))
-
-
-def over_capture(
-    capture: Capture, camera: str, marks: Sequence[Mark], work: Callable[[CameraFilm, list[Mark]], Carried]
-) -> Carried:
-    """Result of `work` on the film of a camera and its marks, at the frames of the capture; 0 where the camera has none.
-
-    Raises InputError where marks lie on frames that the camera lacks.
-    """
-    film = CameraFilm(capture, camera)
-    place = {number: index for index, number in enumerate(film.frames)}
-    absent = [mark.frame for mark in marks if mark.frame not in place]
-    if absent:
-        raise InputError(f"marks of camera {camera}", "must lie on frames that the camera has", absent[0])
-    carried = work(film, [replace(mark, frame=place[mark.frame]) for mark in marks])
-    view = capture.cameras[camera]
-    labels, doubt = np.zeros((capture.frame_count, view.height, view.width), np.uint8), np.zeros(capture.frame_count)
-    labels[film.frames], doubt[film.frames] = carried.labels, carried.doubt
-    return Carried(without_islands(capture, camera, labels), doubt)
+def frame_mask(film: Film, frame: int, marks: Sequence[Mark]) -> np.ndarray:
+    """As `outline`, of a frame of a film."""
+    own = [mark for mark in marks if mark.frame == frame]
+    if not any(mark.value in (OBJECT, HANDS) for mark in own):
+        raise InputError(f"frame {frame}", "an object or a hand must be marked on it", sorted({mark.label for mark in own}))
+    work = _Work(film, own, 1.0, whole=False)
+    return work.full_labels(work.start(frame).probability)
 
 
 class _Work:
@@ -221,12 +151,12 @@ class _Work:
         self,
         film: Film,
         marks: Sequence[Mark],
-        settings: MarksSegmentation,
+        scale: float,
         progress: Progress | None = None,
         *,
         whole: bool = True,
     ) -> None:
-        self.film, self.settings, self.scale = film, settings, settings.scale
+        self.film, self.scale = film, scale
         self.progress = progress or (lambda done, total: None)
         self.full: tuple[int, int] = film.color(0).shape[:2]
         require_marks(tuple(marks), film.count, self.full, whole=whole)
@@ -280,7 +210,7 @@ class _Work:
         labels = np.zeros((count, *self.size), np.uint8)
         self.starts[begin] = self.start(begin)
         labels[begin] = self.starts[begin].labels
-        self.background = Background.empty(self.size, self.guests(), self.strangers()) if self.settings.background else None
+        self.background = Background.empty(self.size, self.guests(), self.strangers())
         for frames in (range(begin + 1, count), range(begin - 1, -1, -1)):
             walk = self.walk_from(begin, learns=True)
             for frame in frames:
@@ -327,7 +257,7 @@ class _Work:
                 cues[frame] = cues_of(step, there.argmax(axis=0))
                 labels[frame] = self.full_labels((1 - weight) * there + weight * step.probability)
                 self.tick()
-        return Carried(labels, doubt_of(labels, cues))
+        return Carried(labels, doubt_of(labels, np.array([cue.squares() for cue in cues])))
 
     def guests(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
         """Things that are ignored in a marked frame and leave: where [h, w] bool, and its look, Lab [h, w, 3].

@@ -28,7 +28,8 @@ from scipy.spatial.transform import Rotation
 
 from neuspring.core.artifacts import ImageObservations
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.data.frames import gray
+from neuspring.data.frames import frames_of, gray, spread
+from neuspring.perception.figures import STRIP_FRAMES
 
 CORNERS, LEAST_CORNERS, CORNERS_KEPT = 120, 6, 0.5
 """Corners of a key frame, fewest for a fit, and the share of them below which there is a new key frame."""
@@ -242,3 +243,23 @@ def rays(image: ImageObservations) -> np.ndarray:
     pixels = image.hand_centers.astype(np.float64)
     ones = np.ones((*pixels.shape[:-1], 1))
     return np.asarray(np.concatenate([pixels, ones], axis=-1) @ np.linalg.inv(image.intrinsics).T)
+
+
+def hands_strip(capture: Capture, image: ImageObservations, controllers: np.ndarray) -> np.ndarray:
+    """Frames of the video with the grip of each hand: its place, turn and size, and where it was; of hands that the capture brings
+    the controllers [T, C, 3], m."""
+    tiles, camera = [], next(iter(capture.cameras))
+    for frame in spread(frames_of(capture, camera), STRIP_FRAMES):
+        tile = np.ascontiguousarray(capture.color(camera, frame))
+        if not image.hands:
+            pixels, depth = capture.cameras[camera].project(controllers[frame].astype(float))
+            for pixel in np.round(pixels[depth > 0]).astype(int).tolist():
+                cv2.circle(tile, tuple(pixel), 2, (255, 60, 60), -1, cv2.LINE_AA)
+        for hand in range(image.hands):
+            way = np.round(image.hand_centers[: frame + 1, hand]).astype(np.int32)
+            cv2.polylines(tile, [way[:, None]], False, (255, 210, 0), 1, cv2.LINE_AA)
+            angle, size = float(image.hand_angles[frame, hand]), 40.0 * float(image.hand_sizes[frame, hand])
+            tip = way[-1] + np.round(size * np.array([np.cos(angle), np.sin(angle)])).astype(int)
+            cv2.arrowedLine(tile, tuple(way[-1].tolist()), tuple(tip.tolist()), (255, 60, 60), 2, cv2.LINE_AA)
+        tiles.append(tile)
+    return np.hstack(tiles)

@@ -1,36 +1,26 @@
-"""Masks of a capture: made from its marks (the backend `marks`), kept in its folder mask/ with what they were made from, shown on a
-contact sheet, and compared with others.
-
-marks = Marks.load(folder / MARKS)
-capture = Capture.load(folder)
-carried = carry_camera(capture, "0", marks.of("0"), MarksSegmentation())
-save_masks(capture, "0", carried.labels)
-"""
+"""Masks of a capture: its folder mask/, the record of what made them, a sheet to look at, and comparison with others."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
 
-from neuspring.checks.timing import Shift, Watched, measure
-from neuspring.config import parse, plain
-from neuspring.config.perception import MarksSegmentation
+from neuspring.config import parse
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
 from neuspring.core.records import canonical, digest_file
 from neuspring.core.section import STRICT, Name
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, PERSON, Capture, images_digest, read_labels
 from neuspring.data.frames import Color, frames_of, overlap, overlay, spread, tints_of, write_png
-from neuspring.perception.marks.carry import Carried, carry_camera
-from neuspring.perception.marks.marks import MARKS, Mark, Marks, marks_digest
+from neuspring.perception.film import Carried
+from neuspring.perception.marks import Mark, marks_digest
 
 MADE = "masks.json"
 """Source of the masks of a capture, and how far each frame is doubted; in its folder."""
@@ -39,29 +29,6 @@ EVEN, DOUBTFUL = 8, 8
 """Frames that are shown evenly over the video, and in doubt."""
 TILE_WIDTH = 424
 """Width of a tile, pixels, at most."""
-
-
-def require(capture: Capture) -> None:
-    """Raise InputError if marks.json is not there, is wrong, or lacks a camera."""
-    for camera in capture.cameras:
-        _marks_of(capture, camera)
-
-
-def segment(capture: Capture, camera: str, settings: MarksSegmentation) -> np.ndarray:
-    """Labels [T, H, W]. Raises InputError without marks.json, or where it has no marks of this camera."""
-    carried = carry_camera(capture, camera, _marks_of(capture, camera), settings)
-    doubtful = np.argsort(-carried.doubt, kind="stable")[:3]
-    print(f"camera {camera}: most doubtful frames: " + ", ".join(f"{f} ({carried.doubt[f]:.2f})" for f in doubtful), flush=True)
-    return carried.labels
-
-
-def _marks_of(capture: Capture, camera: str) -> tuple[Mark, ...]:
-    path = capture.folder / MARKS
-    marks = Marks.load(path)
-    marks.require(capture, path)
-    if not marks.of(camera):
-        raise InputError(f"{path}, cameras", f"camera {camera} needs marks", sorted(marks.cameras))
-    return marks.of(camera)
 
 
 def save_masks(capture: Capture, camera: str, labels: np.ndarray) -> Path:
@@ -91,72 +58,23 @@ def save_masks(capture: Capture, camera: str, labels: np.ndarray) -> Path:
     return capture.folder / "mask" / camera
 
 
-def import_masks(capture: Capture, camera: str, masks: Path, hands: Path | None = None) -> tuple[Path, str]:
-    """Save the masks of other tools as those of a camera: folders of <number>.png, see `capture.read_labels`.
+def import_masks(capture: Capture, camera: str, masks: Path, hands: Path | None = None) -> Path:
+    """Save the masks of other tools as those of a camera: folders of <frame of the capture>.png, see `capture.read_labels`.
 
-    Numbers count the frames of the capture, or those of the film that it was cut from; what moves decides where both can be. With
-    `hands` all but 0 counts: in `masks` as the object, in `hands` as hands, who lie before it. Returns the folder and what was
-    decided. Raises InputError.
+    With `hands` all but 0 counts: in `masks` as the object, in `hands` as hands, who lie before it. Returns the folder. Raises
+    InputError.
     """
-    view, frames = capture.cameras[camera], frames_of(capture, camera)
-    folders = [(_numbered(folder), label) for folder, label in ((masks, OBJECT), (hands, HANDS)) if folder is not None]
-
-    def read(numbers: Sequence[int]) -> np.ndarray:
-        labels = np.zeros((capture.frame_count, view.height, view.width), np.uint8)
-        for files, label in folders:
-            for frame, number in zip(frames, numbers, strict=True):
-                found = read_labels(files[number], view, binary=hands is not None)
-                labels[frame] = np.where(found > 0, np.where(hands is None, found, label), labels[frame])
-        return labels
-
-    there = sorted(set.intersection(*(set(files) for files, _ in folders)))
-    readings = {what: numbers for what, numbers in _readings(capture, frames, there).items() if set(numbers) <= set(there)}
-    if not readings:
-        lacking = next(frame for frame in frames if frame not in there)
-        rule = f"a mask of frame {lacking} of camera {camera} is required, with its number as the name: {lacking:05d}.png"
-        raise InputError(masks, rule, f"frames {min(there, default='-')} to {max(there, default='-')}, {len(there)} in all")
-    read_as = {what: read(numbers) for what, numbers in readings.items()}
-    shifts = {what: _shift(capture, camera, labels) for what, labels in read_as.items()}
-    fitting = [what for what, shift in shifts.items() if shift and shift.known and not shift.wrong]
-    if len(readings) > 1 and len(fitting) != 1:
-        alike = "; ".join(f"{what}: frame {frames[0]} is {numbers[0]:05d}.png" for what, numbers in readings.items())
-        remedy = f"Name them by the frames of the capture, from {frames[0]:05d}.png, and remove the others."
-        raise InputError(masks, "the numbers of masks must have one meaning, and what moves does not tell", alike, remedy)
-    chosen = fitting[0] if fitting else next(iter(readings))
-    if (shift := shifts[chosen]) and shift.wrong:
-        rule = f"masks of camera {camera} must be of the frames of the film"
-        late, numbers = round(shift.frames), readings[chosen]
-        at, frame = max(late, 0), frames[max(-late, 0)]
-        remedy = f"Mask {numbers[min(at, len(numbers) - 1)]:05d}.png is that of frame {frame}: name it {frame:05d}.png, and so on."
-        raise InputError(masks, rule, shift.text("the film", "masks"), remedy)
-    left, shift = sorted(set(there) - set(readings[chosen])), shifts[chosen]
-    told = chosen if shift and shift.known else f"{chosen} (too little of one motion to check the time)"
-    told += f"; not used: {len(left)}, {left[0]:05d}.png to {left[-1]:05d}.png" if left else ""
-    return save_masks(capture, camera, read_as[chosen]), told
-
-
-SOURCE_FRAMES = re.compile(r"numbers (\d+) to (\d+) of the source(?:, one in (\d+))?")
-"""The frames of the film in capture.json's provenance, as make-capture and cut-capture say them."""
-
-
-def _readings(capture: Capture, frames: Sequence[int], there: Sequence[int]) -> dict[str, list[int]]:
-    """Numbers of the masks of `frames`, by what numbers may count; each once."""
-    readings = {"frames of the capture": list(frames)}
-    if match := SOURCE_FRAMES.search(capture.description.provenance.get("frames", "")):
-        source = range(int(match[1]), int(match[2]) + 1, int(match[3] or 1))
-        if len(source) == capture.frame_count:
-            readings["frames of the film that the capture was made of"] = [source[frame] for frame in frames]
-    if len(there) == len(frames) and len(set(np.diff(there))) <= 1:
-        readings["order"] = list(there)
-    return {what: numbers for k, (what, numbers) in enumerate(readings.items()) if numbers not in [*readings.values()][:k]}
-
-
-def _shift(capture: Capture, camera: str, labels: np.ndarray) -> Shift | None:
-    """The shift in time of masks [T, H, W] against the film."""
-    watched = Watched(capture.frame_count)
-    for frame in frames_of(capture, camera):
-        watched.see(frame, capture.color(camera, frame), mask=labels[frame])
-    return measure(watched.color, watched.masks)
+    view = capture.cameras[camera]
+    labels = np.zeros((capture.frame_count, view.height, view.width), np.uint8)
+    for folder, label in ((masks, OBJECT), (hands, HANDS)):
+        files = {} if folder is None else _numbered(folder)
+        for frame in frames_of(capture, camera) if files else ():
+            if frame not in files:
+                rule = f"a mask of frame {frame} of camera {camera} is required, with its number as the name: {frame:05d}.png"
+                raise InputError(str(folder), rule, f"frames {min(files)} to {max(files)}, {len(files)} in all")
+            found = read_labels(files[frame], view, binary=hands is not None)
+            labels[frame] = np.where(found > 0, label if hands is not None else found, labels[frame])
+    return save_masks(capture, camera, labels)
 
 
 def has_masks(capture: Capture, cameras: Sequence[str] = ()) -> bool:
@@ -215,9 +133,9 @@ def save_carried(capture: Capture, camera: str, carried: Carried, source: str, b
     return made
 
 
-def source_digest(capture: Capture, camera: str, marks: Sequence[Mark], backend: str, settings: Any) -> str:
-    """SHA-256 over the backend, its settings, the marks and the contents of the camera's images."""
-    digest = hashlib.sha256(canonical([backend, plain(settings), marks_digest(tuple(marks))]).encode())
+def source_digest(capture: Capture, camera: str, marks: Sequence[Mark], backend: str) -> str:
+    """SHA-256 over the backend, the marks and the contents of the camera's images."""
+    digest = hashlib.sha256(canonical([backend, marks_digest(tuple(marks))]).encode())
     for kind in ("color", "depth"):
         for path in sorted((capture.folder / kind / camera).glob("*")):
             digest.update(f"{kind}/{path.name} {digest_file(path)}".encode())

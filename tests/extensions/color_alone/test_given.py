@@ -1,6 +1,5 @@
 """Hands, nodes and annotated points that a capture brings, beside film of color alone and of depth."""
 
-import cv2
 import numpy as np
 import torch
 
@@ -10,10 +9,11 @@ from neuspring.core.provenance import image_stamps
 from neuspring.data.camera import Camera
 from neuspring.data.capture import CAPTURE, TRACKS, write_tracks
 from neuspring.data.results import Masks, PixelTracks
+from neuspring.extensions.color_alone.given import GivenFrame, facing
+from neuspring.extensions.color_alone.hands import hands_strip
+from neuspring.extensions.color_alone.lift import lift
 from neuspring.intake.points import Hands, write
-from neuspring.perception.figures import hands_strip
-from neuspring.perception.given import GivenFrame, facing, from_image
-from neuspring.perception.lift import lift
+from neuspring.perception.lift import lift_tracks
 from neuspring.perception.sample import among, assemble, spacing
 from neuspring.perception.shape import no_prior
 from neuspring.perception.track_opencv import choose
@@ -49,10 +49,10 @@ def brought(capture, nodes=NODES[:0], *, train=False):
 def seen_of(capture):
     """Observations and what was lifted; the painted points stand still in the image."""
     labels = np.stack([capture.mask("0", frame) for frame in range(capture.frame_count)])
-    still = np.repeat(choose(labels[0], 200, 0)[None], capture.frame_count, axis=0)
+    still = np.repeat(choose(labels[0], 200)[None], capture.frame_count, axis=0)
     tracks = PixelTracks(pixels=still, visible=np.ones(still.shape[:2], bool), backend="test")
-    lifted, prior, image = from_image(capture, {"0": Masks(labels=labels, backend="given")}, {"0": tracks}, SETTINGS)
-    return assemble(ROW, capture, lifted, prior, SETTINGS, image), lifted
+    known = lift(capture, {"0": Masks(labels=labels, backend="given")}, {"0": tracks}, SETTINGS)
+    return assemble(ROW, capture, known.tracks, known.prior, SETTINGS, known.image), known.tracks
 
 
 def test_given_hands_are_the_controllers(tmp_path):
@@ -69,8 +69,8 @@ def test_given_hands_are_the_controllers(tmp_path):
     assert np.isfinite(metrics.errors_per_frame(np.repeat(seen.nodes[None], 8, axis=0), seen)["track_error"]).all()
     begun = small.search_problem(seen).recordings[0].hands
     np.testing.assert_allclose(begun[:, :, :3], hands[: seen.scenario.train_end], atol=1e-6)
-    strip = hands_strip(capture, seen.image, lifted.controller_points, tmp_path / "hands.png")
-    assert (cv2.imread(str(strip)) == (60, 60, 255)).all(axis=2).any()
+    strip = hands_strip(capture, seen.image, lifted.controller_points)
+    assert (strip == (255, 60, 60)).all(axis=2).any()
     assert {"controllers.npz"} <= seen.scenario.provenance.keys()
 
 
@@ -111,9 +111,9 @@ def test_hands_and_nodes_beside_depth_take_the_place_of_what_is_chosen_and_suppo
     grid = np.stack(np.meshgrid(*[np.arange(-0.04, 0.05, 0.02)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.05 * UP
     nodes = grid[np.linalg.norm(grid - 0.05 * UP, axis=1) < 0.045]
     write(capture.folder, Hands(hands, np.zeros((0, 0), bool), np.zeros(0, int)), nodes)
-    places = np.repeat(choose(masks["0"].labels[0], 100, 0)[None], capture.frame_count, axis=0)
+    places = np.repeat(choose(masks["0"].labels[0], 100)[None], capture.frame_count, axis=0)
     tracks = PixelTracks(pixels=places, visible=np.ones(places.shape[:2], bool), backend="test")
-    lifted = lift(capture, masks, {"0": tracks}, Lift(neighborhood=0.02))
+    lifted = lift_tracks(capture, masks, {"0": tracks}, Lift(neighborhood=0.02))
     np.testing.assert_allclose(lifted.controller_points, hands, atol=1e-6)
     assert not lifted.controller_valid.size
     assert lifted.facts["controllers"] == 2

@@ -11,13 +11,11 @@ from neuspring.cli.main import main
 from neuspring.config.perception import Perception, Segmentation
 from neuspring.core.errors import InputError
 from neuspring.data import frames
-from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
+from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.perception.backends import BACKENDS
-from neuspring.perception.marks import store
-from neuspring.perception.marks.carry import CameraFilm, Carried
-from neuspring.perception.marks.marks import Marks
-from neuspring.perception.marks.store import MasksFile, has_masks, save_masks
-from tests.support.captures import describe, entry
+from neuspring.perception.film import CameraFilm, Carried
+from neuspring.perception.marks import Marks
+from neuspring.perception.masks import MasksFile, has_masks, save_carried, save_masks
 from tests.support.filmed import FRAMES, film
 from tests.support.marked import mark, overlap
 
@@ -53,7 +51,7 @@ def polygon(truth, label, name):
 def test_masks_of_another_tool_become_those_of_a_capture(folder, tmp_path, capsys):
     truth = {name: folder / "truth" / name for name in ("0", "1")}
     assert main(["mask", str(folder), "--masks", str(truth["0"]), str(truth["1"])]) == 0
-    assert f"camera 1: masks are in {folder}/mask/1, numbered by frames of the capture" in capsys.readouterr().out
+    assert f"camera 1: masks are in {folder}/mask/1" in capsys.readouterr().out
     capture = Capture.load(folder)
     assert capture.description.masks
     labels = capture.mask("0", 2)
@@ -84,70 +82,6 @@ def test_masks_of_another_tool_that_do_not_fit(folder, capsys):
     (truth / "0" / "00004.png").rename(truth / "0" / "00044.png")
     assert main(["mask", str(folder), "--masks", str(truth / "0"), "--cameras", "0"]) == 2
     assert "a mask of frame 4 of camera 0 is required, with its number as the name: 00004.png; received" in capsys.readouterr().err
-
-
-SOURCE = range(12, 52, 2)
-"""Pictures of a film that a capture has."""
-
-
-def moving(still=False):
-    """Color and labels of a film: a square with a pattern that runs to and fro."""
-    pattern = np.random.default_rng(0).integers(0, 255, (20, 20, 3)).astype(np.uint8)
-    for k in range(60):
-        color, labels = np.full((60, 120, 3), 90, np.uint8), np.zeros((60, 120), np.uint8)
-        x = 50 if still else round(50 + 45 * np.sin(k / 6))
-        color[20:40, x : x + 20], labels[20:40, x : x + 20] = pattern, OBJECT
-        yield color, labels
-
-
-def cut(root, numbers, still=False):
-    """A capture of the pictures SOURCE, and a folder of the masks with these numbers: mask k is of picture numbers[k]."""
-    said = {"frames": "20 frames, numbers 12 to 50 of the source, one in 2"}
-    about = describe(frame_count=len(SOURCE), cameras=(entry(width=120, height=60),), depth="none", masks=False, provenance=said)
-    writer, film = Writer(root / "capture", about), [*moving(still)]
-    for frame, number in enumerate(SOURCE):
-        writer.frame("0", frame, film[number][0], None, None)
-    writer.finish(None)
-    (root / "masks").mkdir()
-    for name, number in numbers.items():
-        cv2.imwrite(str(root / "masks" / f"{name:05d}.png"), film[number][1])
-    return film
-
-
-@pytest.mark.parametrize(
-    ("numbers", "how"),
-    [
-        ({k: k for k in range(60)}, "by frames of the film that the capture was made of; not used: 40, 00000.png to 00059.png\n"),
-        ({k: k for k in SOURCE}, "by frames of the film that the capture was made of\n"),
-        (dict(enumerate(SOURCE)), "by frames of the capture\n"),
-        ({k + 1: number for k, number in enumerate(SOURCE)}, "by order\n"),
-    ],
-)
-def test_numbers_of_masks_are_those_of_the_film_or_of_the_capture(tmp_path, capsys, numbers, how):
-    film = cut(tmp_path, numbers)
-    assert main(["mask", str(tmp_path / "capture"), "--masks", str(tmp_path / "masks")]) == 0
-    assert how in capsys.readouterr().out
-    capture = Capture.load(tmp_path / "capture")
-    for frame, number in enumerate(SOURCE):
-        np.testing.assert_array_equal(capture.mask("0", frame), film[number][1])
-
-
-@pytest.mark.parametrize(
-    ("numbers", "still", "words"),
-    [
-        ({k: k for k in range(60)}, True, "frames of the capture: frame 0 is 00000.png; frames of the film"),
-        (
-            {k: 2 * k + 18 for k in range(20)},
-            False,
-            "masks is 3.0 frames earlier than the film, by what moves. Mask 00000.png is that of frame 3: name it 00003.png",
-        ),
-    ],
-)
-def test_masks_of_other_moments_are_refused(tmp_path, capsys, numbers, still, words):
-    cut(tmp_path, numbers, still)
-    assert main(["mask", str(tmp_path / "capture"), "--masks", str(tmp_path / "masks")]) == 2
-    assert words in capsys.readouterr().err
-    assert not Capture.load(tmp_path / "capture").description.masks
 
 
 def test_marks_become_the_masks_of_a_capture(folder, capsys):
@@ -203,7 +137,7 @@ def test_masks_are_announced_when_every_camera_has_them(folder):
 def test_masks_that_are_half_written_are_not_taken_for_those_before(folder, monkeypatch):
     capture = Capture.load(folder)
     carried = Carried(np.ones((FRAMES, 90, 160), np.uint8), np.zeros(FRAMES))
-    store.save_carried(capture, "0", carried, "sha256:before", "marks")
+    save_carried(capture, "0", carried, "sha256:before", "marks")
     assert MasksFile.of(capture).holds(capture, "0", "sha256:before")
 
     def full(path, write):

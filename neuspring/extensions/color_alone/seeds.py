@@ -1,0 +1,81 @@
+"""Evidence of the marks on one frame: what each pixel is, can be, and probably is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from neuspring.data.capture import HANDS, NOTHING, OBJECT, PERSON
+from neuspring.perception.marks import FILLED_MARKS, Mark, drawn
+
+UNMARKED_PIXEL = 255
+"""In `Seeds.certain`: no mark says what the pixel is."""
+ODDS_FALL = 0.08
+"""Distance from its marks, as part of the image, by which the odds of a label without bounds fall by e."""
+POLYGON_SLOPE = 0.3
+"""Distance from the border of a polygon, as part of its `radius`, by which the log odds change by 1."""
+MOST_ODDS = 4.0
+"""Largest log odds by place."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seeds:
+    """Evidence of the marks of one frame."""
+
+    certain: np.ndarray
+    """[H, W] uint8: the label, or UNMARKED_PIXEL."""
+    possible: np.ndarray
+    """[K, H, W] bool: where nothing, object and hands can be; K = 4 with a person."""
+    prior: np.ndarray
+    """[K, H, W] float32: log odds that the marks' places alone give; 0 where they say nothing."""
+
+    @classmethod
+    def of(cls, marks: Sequence[Mark], size: tuple[int, int], scale: float, *, carried: bool = False, kinds: int = PERSON) -> Seeds:
+        """Evidence of the marks on one frame, drawn into an image of `size` (height, width) that is `scale` times the camera's.
+
+        Boxes and polygons bound a label, unless it is also clicked or scribbled outside of them. Hands lie over objects, what is
+        ignored over both, and clicks and scribbles over polygons. With `carried` the place of labels is also known from the frame
+        before: then a label without marks can be anywhere, as a person can. `kinds` is K.
+        """
+        certain, possible = np.full(size, UNMARKED_PIXEL, np.uint8), np.ones((kinds, *size), bool)
+        prior = np.zeros((kinds, *size), np.float32)
+        for label in (OBJECT, HANDS):
+            own = [mark for mark in marks if mark.value == label]
+            areas = [drawn(mark, size, scale, grown=1) for mark in own if mark.kind in ("box", "polygon")]
+            lines = [drawn(mark, size, scale) for mark in own if mark.kind in ("click", "scribble")]
+            if not own:
+                possible[label] = carried
+            elif areas and all((line & np.any(areas, axis=0)).any() for line in lines):
+                possible[label] = np.any([*areas, *lines], axis=0)
+            elif not carried:
+                # Not bounded: what is far from all marks of a label needs a color that says so.
+                far = cv2.distanceTransform((~np.any([*areas, *lines], axis=0)).astype(np.uint8), cv2.DIST_L2, 5)
+                prior[label] = np.maximum(-far / (ODDS_FALL * max(size)), -MOST_ODDS)
+            for mark in own:
+                if mark.kind == "polygon":
+                    inside = drawn(mark, size, scale, grown=0)
+                    away = [cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, 5) for part in (inside, ~inside)]
+                    slope = (away[0] - away[1]) / max(POLYGON_SLOPE * mark.radius * scale, 0.5)
+                    prior[label] = np.maximum(prior[label], np.clip(slope, -MOST_ODDS, MOST_ODDS) * (possible[label]))
+        for shapes in (("polygon", "box"), ("scribble", "click")):
+            for mark in sorted(marks, key=lambda mark: (OBJECT, HANDS, PERSON, NOTHING).index(mark.value)):
+                # A box of a label says where it can be, not where it is.
+                if mark.kind in shapes and (mark.kind != "box" or mark.label in FILLED_MARKS):
+                    certain[drawn(mark, size, scale)] = mark.value
+        known = certain != UNMARKED_PIXEL
+        possible[:, known] = False
+        for label in range(kinds):
+            possible[label, certain == label] = True
+        return cls(certain, possible, prior)
+
+    @property
+    def marked(self) -> np.ndarray:
+        """Pixels [H, W] bool that are certain or inside of a polygon."""
+        return np.asarray((self.certain != UNMARKED_PIXEL) | (self.prior[1:] > 0).any(axis=0))
+
+    def part(self, window: tuple[slice, slice]) -> Seeds:
+        """A window of it."""
+        return Seeds(self.certain[window], self.possible[(slice(None), *window)], self.prior[(slice(None), *window)])
