@@ -53,6 +53,7 @@ def test_commands_of_the_workflow_ask_for_targets_that_there_are():
     rules = [*(ROOT / "workflow" / "rules").glob("*.smk"), ROOT / "Snakefile"]
     known = {name for path in rules for name in re.findall(r"^\s*rule (\w+):", path.read_text(), re.MULTILINE)}
     known |= set(read_yaml(ROOT / "config" / "studies.yaml"))
+    known |= {name for path in (ROOT / "config" / "rows").glob("*.yaml") for name in read_yaml(path).get("studies", {})}
     asked = {}
     for page in PAGES:
         for command in re.findall(r"snakemake ((?:[^`\n\\]|\\\n)*--configfile(?:[^`\n\\]|\\\n)*)", page.read_text()):

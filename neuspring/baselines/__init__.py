@@ -2,7 +2,7 @@
 
 `BASELINES` declares them; a method row's `model` names one. PhysTwin is not here: it is a row of the method table, made of the
 platform's own search and fit. Spring-Gaus and GS-Dynamics are extensions, and come through the door that is open to every package:
-an entry point of the group `neuspring.baselines`, and one of `neuspring.baseline_settings` for what rows shall set.
+an entry point of the group `neuspring.baselines`, and one of `neuspring.settings` for what rows shall set.
 """
 
 from __future__ import annotations

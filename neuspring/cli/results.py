@@ -27,6 +27,7 @@ Scores = Annotated[Path | None, arg(help="instead of run records: a scores.csv t
 LeftOut = Annotated[str, arg(help="JSON: methods and the scenarios to which they do not apply, with reasons")]
 MethodTable = Annotated[Path, arg(help="the method table: names of methods for people")]
 StudyTable = Annotated[Path, arg(help="the study table")]
+ExtraRows = Annotated[tuple[Path, ...], arg(help="files with more rows of these tables")]
 Folder = Annotated[Path, arg(help="folder to write to")]
 Transfers = Annotated[tuple[str, ...], arg(help="scenarios whose twins were rolled out on other recordings")]
 Tables = Annotated[str, arg(help="folder of tables in the results folder")]
@@ -47,6 +48,7 @@ def tables(
     scores: Scores = None,
     left_out: LeftOut = "{}",
     method_table: MethodTable = Path("config/methods.yaml"),
+    extra_rows: ExtraRows = (),
     brief: Annotated[bool, arg(help="print the verdict and the first table alone")] = False,
     settings: Annotated[str, arg(help="of the benchmark: runs that were made with something else are named")] = "",
 ) -> None:
@@ -64,10 +66,10 @@ def tables(
 
     wanted = tuple(parse(Aim, row, "--aims") for row in json_value("--aims", aims, list))
     require_metrics(wanted)
-    shown = {name: _study(table, name)[1] for name in studies}
-    known = _study(table, studies[0])[0] if studies else {}
+    shown = {name: _study(table, extra_rows, name)[1] for name in studies}
+    known = _study(table, extra_rows, studies[0])[0] if studies else {}
     common: Any = {"objects": objects, "aims": wanted, "studies": shown, "known_studies": known}
-    common["names"] = shown_names(method_table)
+    common["names"] = shown_names(method_table, extra_rows)
     if scores:
         found = _read_scores(scores, scenarios, methods, seeds, left_out)
         print(write(Numbers(everything=found, baseline=baseline or str(found.runs["method"].iloc[0]), **common), output))
@@ -89,9 +91,9 @@ def tables(
     print(f"Pictures and videos: {write_gallery(results, scenarios, methods, seed, numbers, output)}")
 
 
-def _study(table: Path, name: str) -> tuple[dict[str, Study], Study]:
-    """All studies of a table, and one of them. Raises InputError."""
-    studies = read_studies(table)
+def _study(table: Path, extra: Sequence[Path], name: str) -> tuple[dict[str, Study], Study]:
+    """All studies of a table and of extra rows, and one of them. Raises InputError."""
+    studies = read_studies(table, extra)
     if name not in studies:
         raise InputError("study", f"must be a row of {table}", name, f"Known: {', '.join(studies)}")
     return studies, studies[name]
@@ -138,6 +140,7 @@ def study(
     tables: Tables = "tables",
     scores: Scores = None,
     table: Annotated[Path, arg(help="with --scores: the study table")] = Path("config/studies.yaml"),
+    extra_rows: ExtraRows = (),
     scenarios: Annotated[tuple[str, ...], arg(help="with --scores: a part of it")] = (),
     methods: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (),
@@ -150,7 +153,7 @@ def study(
     from neuspring.scores.numbers import Numbers
 
     if scores:
-        studies, one = _study(table, study)
+        studies, one = _study(table, extra_rows, study)
         if one.clips:
             remedy = "Leave out --scores; `neuspring tables --studies` makes its numbers."
             raise InputError(f"study {study}", "a study of clips needs the transfers of a results folder", "scores alone", remedy)
@@ -208,6 +211,7 @@ def report(
     shown: Annotated[tuple[str, ...], arg(help="methods to draw; six at most by default")] = (),
     table: StudyTable = Path("config/studies.yaml"),
     method_table: MethodTable = Path("config/methods.yaml"),
+    extra_rows: ExtraRows = (),
     tables: Tables = "tables",
     megabytes: Annotated[float, arg(help="size that pictures and videos may fill")] = 25.0,
     video_megabytes: Annotated[float, arg(help="part of it for videos; the others are linked")] = 8.0,
@@ -227,8 +231,8 @@ def report(
         left_out=_read_left_out(left_out),
         shown=shown,
         settings=None if settings == "{}" else read_settings(settings),
-        studies=read_studies(table),
-        names=shown_names(method_table),
+        studies=read_studies(table, extra_rows),
+        names=shown_names(method_table, extra_rows),
         tables=tables,
         megabytes=megabytes,
         video_megabytes=video_megabytes,

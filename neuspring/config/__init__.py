@@ -3,7 +3,7 @@
     settings                       the whole configuration (`Config`), GPUs, a part of it for one step
     simulation, search, twin, rod  integration; the zero-order search; losses, field, fit; rods
     data, perception, images       sources; raw video to observations; splats and their scores
-    baselines, tuning              Spring-Gaus, GS-Dynamics; sweeps over settings
+    extensions, tuning             sections that packages bring; sweeps over settings
     rows                           rows of the scenario, method and search tables
     parse                          the types of settings, YAML to settings and back
     page                           writes config/README.md from all of these

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from typing import Any, Literal, get_args
 
-from neuspring.config.baselines import BASELINE_SETTINGS
+from neuspring.config.extensions import SETTINGS
 from neuspring.config.parse import merge
 
 Effort = Literal["quick", "normal", "paper"]
@@ -24,7 +24,7 @@ EFFORT_SIZES: dict[str, tuple[Any, Any, Any]] = {
     "images.appearance.iterations": (300, 400, 10_000),
     "images.appearance.spacing": (2.0, 2.0, 0.0),
     "images.appearance.degree": (0, 0, 3),
-    **{f"baselines.{name}.{key}": values for name, kind in BASELINE_SETTINGS.items() for key, values in kind.efforts.items()},
+    **{f"{path}.{key}": values for path, kind in SETTINGS.items() for key, values in kind.efforts.items()},
 }
 """Key -> its value at each effort. quick: `make demo`. normal: the published synthetic benchmark. paper: sizes of the paper and of
 the released code, the defaults of all keys but `synthetic.size`. Pictures of the first camera are scored, as in the paper."""

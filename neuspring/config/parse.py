@@ -97,32 +97,52 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return values
 
 
-def read_rows(kind: type[T], path: Path, what: str) -> dict[str, T]:
-    """A table of a YAML file: name -> row. Raises InputError.
+EXTRA_ROWS = {"method": "methods", "search": "searches", "study": "studies"}
+"""Kind of row -> its section in a file of extra rows."""
 
-    A row that `extends` another one has that row's values, its own on top. A row with `each: [2, 3]` stands for one row per value,
-    which takes the place of {each} in its name and its texts.
+
+def read_rows(kind: type[T], path: Path, what: str, extra: Iterable[Path] = ()) -> dict[str, T]:
+    """A table of a YAML file, then the rows of the same kind in the files `extra`: name -> row. Raises InputError.
+
+    A row that `extends` another row of any of these files has that row's values below its own. A row with `each: [2, 3]` defines
+    one row per value, which replaces {each} in its name and its texts.
     """
     table: dict[str, Any] = {}
-    for name, row in read_yaml(path).items():
-        values = row.pop("each", None) if isinstance(row, dict) else None
-        if values is not None and not (isinstance(values, list) and values):
-            raise InputError(f"{path}, {what} {name}", "each: a list of at least one value is required", values)
-        for value in [None] if values is None else values:
-            table[str(name).replace("{each}", str(value))] = row if value is None else _filled(row, str(value))
-    return {name: parse(kind, _extended(table, name, path, what, ()), f"{path}, {what} {name}") for name in table}
+    files: dict[str, Path] = {}
+    for file, rows in [(path, read_yaml(path)), *((file, _extra_rows(file).get(EXTRA_ROWS[what], {})) for file in extra)]:
+        for name, row in rows.items():
+            values = row.pop("each", None) if isinstance(row, dict) else None
+            if values is not None and not (isinstance(values, list) and values):
+                raise InputError(f"{file}, {what} {name}", "each: a list of at least one value is required", values)
+            for value in [None] if values is None else values:
+                made = str(name).replace("{each}", str(value))
+                if made in table:
+                    raise InputError(f"{file}, {what} {made}", "names of rows must differ", f"a row of {files[made]}", "Rename it.")
+                table[made], files[made] = row if value is None else _filled(row, str(value)), file
+    return {name: parse(kind, _extended(table, name, files, what, ()), f"{files[name]}, {what} {name}") for name in table}
 
 
-def _extended(table: Mapping[str, Any], name: str, path: Path, what: str, below: tuple[str, ...]) -> Any:
+def _extra_rows(path: Path) -> dict[str, Any]:
+    """The sections of a file of extra rows."""
+    sections = read_yaml(path)
+    for name, rows in sections.items():
+        if name not in EXTRA_ROWS.values():
+            raise InputError(f"{path}, {name}", f"a file of extra rows has the sections {', '.join(EXTRA_ROWS.values())}", name)
+        if not isinstance(rows, dict):
+            raise InputError(f"{path}, {name}", "must be a mapping of rows", type(rows).__name__)
+    return sections
+
+
+def _extended(table: Mapping[str, Any], name: str, files: Mapping[str, Path], what: str, below: tuple[str, ...]) -> Any:
     if name not in table or name in below:
         rule = "extends: a row of this table is required, which does not extend this one"
-        raise InputError(f"{path}, {what} {below[-1]}", rule, name, f"Known: {', '.join(table)}.")
+        raise InputError(f"{files[below[-1]]}, {what} {below[-1]}", rule, name, f"Known: {', '.join(table)}.")
     row = table[name]
     if not isinstance(row, dict) or "extends" not in row:
         return row
     if not isinstance(row["extends"], str):
-        raise InputError(f"{path}, {what} {name}", "extends: the name of a row is required", row["extends"])
-    whole = copy.deepcopy(_extended(table, row["extends"], path, what, (*below, name)))
+        raise InputError(f"{files[name]}, {what} {name}", "extends: the name of a row is required", row["extends"])
+    whole = copy.deepcopy(_extended(table, row["extends"], files, what, (*below, name)))
     # A name belongs to one row.
     whole.pop("title", None)
     merge(whole, {key: value for key, value in row.items() if key != "extends"})

@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, StringConstraints
 
-from neuspring.config.baselines import Baselines
 from neuspring.config.data import Deform, Mocap, Posed, Synthetic, Toy
 from neuspring.config.effort import EFFORTS, Effort, sizes
+from neuspring.config.extensions import Baselines, with_extensions
 from neuspring.config.images import Images
 from neuspring.config.parse import json_value, merge, parse, plain, read_yaml
 from neuspring.config.perception import Perception
@@ -97,6 +97,7 @@ class Aim(SettingsSection):
 
 
 @dataclass(frozen=True, kw_only=True)
+@with_extensions("")
 class Config(SettingsSection):
     """One benchmark: which scenarios, methods and seeds, and how."""
 
@@ -147,6 +148,9 @@ class Config(SettingsSection):
     """The search table; its path is relative to the Snakefile."""
     study_table: str = "config/studies.yaml"
     """The study table; its path is relative to the Snakefile."""
+    extra_rows: dict[Name, str] = field(default_factory=dict)
+    """Name -> file with more rows of these tables, in the sections `methods`, `searches` and `studies`; paths are relative to the
+    Snakefile."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Device of the simulations; auto: CUDA where there are GPUs, see [gpus](#gpus)."""
     twins_per_launch: Count | Literal["auto"] = "auto"

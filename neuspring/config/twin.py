@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from neuspring.config.extensions import with_extensions
 from neuspring.config.rod import RodFit
 from neuspring.core.section import Count, NonNegative, Positive, Range, SettingsSection
 
@@ -63,6 +64,7 @@ class SpringFieldSettings(SettingsSection):
 
 
 @dataclass(frozen=True, kw_only=True)
+@with_extensions("fit")
 class Fit(SettingsSection):
     """First-order stage: Adam, with gradients through the simulation. A method's `fit` says what is free per spring."""
 

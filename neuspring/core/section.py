@@ -7,10 +7,11 @@ them from there.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 from pydantic import ConfigDict, Field, StringConstraints
 
+S = TypeVar("S")
 STRICT = ConfigDict(extra="forbid", strict=True)
 """No unknown keys, no casts."""
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -27,6 +28,13 @@ class SettingsSection:
     __pydantic_config__ = STRICT
     efforts: ClassVar[dict[str, tuple[Any, Any, Any]]] = {}
     """Key -> its value at each effort (quick, normal, paper), for a section that a package brings."""
+
+    def section(self, kind: type[S]) -> S:
+        """The section of this type. Raises LookupError."""
+        for value in vars(self).values():
+            if isinstance(value, kind):
+                return value
+        raise LookupError(f"{type(self).__name__} has no section {kind.__name__}")
 
     @classmethod
     def completed(cls, given: Mapping[str, Any]) -> Mapping[str, Any]:

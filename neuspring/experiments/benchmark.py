@@ -11,7 +11,7 @@ import difflib
 import fnmatch
 import os
 import shlex
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -32,9 +32,9 @@ RESERVED = ("tables", "logs", "benchmarks", "jobs", "tune", "mlartifacts", "publ
 NAME_DATA = "Name what to run on, for example --configfile config/data/demo.yaml."
 
 
-def read_methods(path: Path) -> dict[str, Method]:
-    """The method table: name -> Method, without rows whose model is of an extension that was left out. Raises InputError."""
-    methods = read_rows(Method, path, "method")
+def read_methods(path: Path, extra: Iterable[Path] = ()) -> dict[str, Method]:
+    """The method table with extra rows: name -> Method, without models of extensions that were left out. Raises InputError."""
+    methods = read_rows(Method, path, "method", extra)
     methods = {name: method for name, method in methods.items() if method.model not in BASELINES.left_out}
     fits = [kind for body in BODIES.values() for kind in body.fits]
     for name, method in methods.items():
@@ -53,9 +53,9 @@ def read_methods(path: Path) -> dict[str, Method]:
     return methods
 
 
-def read_searches(path: Path, clusters: int) -> dict[str, SearchRow]:
-    """The search table: name -> SearchRow; rows that name no number of regions have `clusters`. Raises InputError."""
-    rows = read_rows(SearchRow, path, "search")
+def read_searches(path: Path, clusters: int, extra: Iterable[Path] = ()) -> dict[str, SearchRow]:
+    """The search table with extra rows: name -> SearchRow; rows without a number of regions have `clusters`. Raises InputError."""
+    rows = read_rows(SearchRow, path, "search", extra)
     for name, row in rows.items():
         if row.body not in BODIES:
             raise InputError(f"{path}, search {name}, body", f"must be one of {', '.join(BODIES)}", repr(row.body))
@@ -99,17 +99,21 @@ def for_targets(values: Mapping[str, Any], targets: Collection[str], root: Path)
     So a table of the paper is made of its rows and no others, whatever methods the configuration names. Raises InputError.
     """
     tables = [values.get(key, getattr(Config, key)) for key in ("study_table", "method_table")]
+    files = values.get("extra_rows") or {}
     listed = values.get("studies") or []
     # What is of another type is refused where settings are read.
-    if not targets or not isinstance(listed, list) or not all(isinstance(table, str) for table in tables):
+    if not targets or not isinstance(listed, list) or not isinstance(files, dict):
         return {}
-    studies = read_studies(root / tables[0])
+    if not all(isinstance(path, str) for path in (*tables, *files.values())):
+        return {}
+    extra = [root / path for path in files.values()]
+    studies = read_studies(root / tables[0], extra)
     asked = [name for name in studies if name in targets]
     if not asked:
         return {}
     changes: dict[str, Any] = {"studies": [*listed, *(name for name in asked if name not in listed)]}
     if len(asked) == len(targets):
-        known = read_methods(root / tables[1])
+        known = read_methods(root / tables[1], extra)
         shown = [name for study in asked for name in rows_of(studies, study) if name in known]
         changes["only"] = f"method={','.join(dict.fromkeys(shown))} {values.get('only') or ''}".strip()
     return changes
@@ -164,9 +168,11 @@ class Benchmark:
         """Jobs that may hold a GPU at once, which the workflow sets; 0: a cluster decides."""
         given = with_deform(parse(Config, values, "configuration"))
         rows = scenario_rows(given, root)
-        searches = read_searches(root / given.search_table, given.clusters)
-        self.table = shared_searches(read_methods(root / given.method_table), searches)
-        self.studies = read_studies(root / given.study_table)
+        self.extra = [root / path for path in given.extra_rows.values()]
+        """Files with more rows of the tables."""
+        searches = read_searches(root / given.search_table, given.clusters, self.extra)
+        self.table = shared_searches(read_methods(root / given.method_table, self.extra), searches)
+        self.studies = read_studies(root / given.study_table, self.extra)
         """All rows of the method and of the study table; `config` names those that are made without being asked for."""
         self.whole = self._whole(given, rows)
         """The configuration as it was given: what tables are laid out for, whatever part of it is run now."""
@@ -204,7 +210,7 @@ class Benchmark:
         """The configuration with all methods that stand in it by a study or by its data."""
         _require_known("studies", given.studies, self.studies, given.study_table)
         if absent := [name for name in given.methods if name not in self.table]:
-            row = read_rows(Method, self.root / given.method_table, "method").get(absent[0])
+            row = read_rows(Method, self.root / given.method_table, "method", self.extra).get(absent[0])
             if row and row.model in BASELINES.left_out:
                 remedy = "Restore its folder in neuspring/extensions, or leave the method out."
                 raise InputError(f"method {absent[0]}, model", "the extension that brings it was left out", row.model, remedy)

@@ -408,17 +408,20 @@ class Graph:
         aims = ["--aims", _json(plain(self.config)["aims"])] if self.config.aims else []
         compared = ["--baseline", self.benchmark.compared_with]
         settings = ["--settings", _json(plain(self.whole) | NEUTRAL)]
-        studies = ["--studies", *self.whole.studies, *self._study_table()] if self.whole.studies else []
-        names = ["--method-table", str(self.root / self.config.method_table)]
-        return [*self._runs(output or self.folder), *self._transfers(), *compared, *objects, *aims, *studies, *names, *settings]
+        studies = ["--studies", *self.whole.studies] if self.whole.studies else []
+        more = [*compared, *objects, *aims, *studies, *self._row_tables(), *settings]
+        return [*self._runs(output or self.folder), *self._transfers(), *more]
 
     def study(self, name: str, part: str = "") -> list[str]:
         """Options of `neuspring study`, of the folder of tables or a part of it."""
         tables = "/".join(word for word in (self.config.tables, part) if word)
         return ["--study", name, "--results", self.results, "--tables", tables, "--output", f"{self.results}/{tables}/studies"]
 
-    def _study_table(self) -> list[str]:
-        return ["--table", str(self.root / self.config.study_table)]
+    def _row_tables(self) -> list[str]:
+        """Options that name the tables of studies and methods."""
+        extra = [str(path) for path in self.benchmark.extra]
+        tables = ["--table", str(self.root / self.config.study_table), "--method-table", str(self.root / self.config.method_table)]
+        return [*tables, *(["--extra-rows", *extra] if extra else [])]
 
     def perception(self) -> list[str]:
         """Options of `neuspring perception-table`."""
@@ -431,8 +434,7 @@ class Graph:
         del values["tracking"]
         return [
             *("--results", self.results, "--output", output or f"{self.folder}/report.html", "--settings", _json(values)),
-            *(*self._study_table(), "--tables", self.config.tables),
-            *("--method-table", str(self.root / self.config.method_table)),
+            *(*self._row_tables(), "--tables", self.config.tables),
             *("--baseline", self.benchmark.compared_with, *self._transfers(), *self._left_out()),
         ]
 

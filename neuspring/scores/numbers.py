@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -252,9 +252,9 @@ class Numbers:
         return found
 
 
-def shown_names(method_table: Path) -> dict[str, str]:
-    """Row of the method table to its name for people, title (`row`), of rows that have a title; none where there is no table."""
-    rows = read_rows(Method, method_table, "method") if method_table.is_file() else {}
+def shown_names(method_table: Path, extra: Iterable[Path] = ()) -> dict[str, str]:
+    """Method to its name for people, title (`row`), of methods with a title; none where there is no table."""
+    rows = read_rows(Method, method_table, "method", extra) if method_table.is_file() else {}
     return {name: f"{row.title} (`{name}`)" for name, row in rows.items() if row.title}
 
 

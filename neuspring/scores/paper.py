@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import StringConstraints
 
-from neuspring.config import parse, read_yaml
+from neuspring.config.parse import read_rows
 from neuspring.core.artifacts import SAFE_NAME
 from neuspring.core.errors import InputError
 from neuspring.core.section import STRICT, Name
@@ -181,9 +181,9 @@ class Study:
         return table(self.reference) if self.reference else {}
 
 
-def read_studies(path: Path) -> dict[str, Study]:
-    """The studies of a YAML file by name. Raises InputError."""
-    studies = {name: parse(Study, row, f"{path}, study {name}") for name, row in read_yaml(path).items()}
+def read_studies(path: Path, extra: Iterable[Path] = ()) -> dict[str, Study]:
+    """The studies of the table, and of files of extra rows, by name. Raises InputError."""
+    studies = read_rows(Study, path, "study", extra)
     for name in studies:
         if not SAFE_NAME.fullmatch(str(name)) or name in TAKEN:
             rule = f"letters, digits, _, . and - make the name of a study, and {', '.join(TAKEN)} are taken"

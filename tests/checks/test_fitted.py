@@ -25,7 +25,8 @@ def test_a_fit_whose_springs_lie_at_their_bound_is_a_finding_with_the_command_th
     assert str(one) == (
         "warning: model_b/0: springs at their bound: 91% of the springs lie at the bound of their stiffness, 4.5 times the "
         "searched one or less by as much (fit.output_bound). "
-        "Compare with a wider bound: add `--config 'methods=[model_b,model_b_wide]'` to the command."
+        "Compare with a wider bound: add `--config 'extra_rows={ours: config/rows/ours.yaml}' 'methods=[model_b,model_b_wide]'` "
+        "to the command."
     )
     [other] = found("model_b_wide", at_bound=0.2)
     assert other.remedy == "Raise output_bound in the settings of the row model_b_wide of the method table."
@@ -43,7 +44,7 @@ def test_free_springs_and_runs_without_a_fit_have_no_finding():
 
 @pytest.mark.parametrize(("row", "wider"), WIDER_ROWS.items())
 def test_a_wider_row_differs_by_its_bound_alone(row, wider):
-    methods = read_methods(ROOT / "config" / "methods.yaml")
+    methods = read_methods(ROOT / "config" / "methods.yaml", [ROOT / "config" / "rows" / "ours.yaml"])
     narrow, wide = (plain(with_method(Config(), methods[name], name).fit) for name in (row, wider))
     assert {key for key in wide if wide[key] != narrow[key]} == {"output_bound"}
     assert math.exp(wide["output_bound"]) > 20 > math.exp(narrow["output_bound"])

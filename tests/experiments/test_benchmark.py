@@ -522,6 +522,10 @@ def test_every_configuration_that_is_shipped_is_valid(data, studies, tmp_path):
     assert set(Graph(benchmark).owners["fit"]) == {name for name, row in benchmark.methods.items() if row.fit}
 
 
+EXTRA = sorted((ROOT / "config" / "rows").glob("*.yaml"))
+EXTRA_ROWS = {"extra_rows": {path.stem: str(path) for path in EXTRA}}
+
+
 def shipped(data: str, *studies: str) -> dict:
     """What the workflow reads of config/config.yaml, a file of config/data and files of config/studies."""
     values: dict = {}
@@ -550,8 +554,7 @@ def test_the_synthetic_benchmark_sees_what_studies_of_the_demo_see():
 def test_the_whole_benchmark_has_every_method_and_study_of_the_paper(tmp_path):
     whole, paper = shipped("phystwin"), config.read_yaml(ROOT / "config" / "studies" / "paper.yaml")
     assert {name: whole[name] for name in paper} == paper
-    of_paper = [name for name, study in read_studies(ROOT / "config" / "studies.yaml").items() if not study.clips]
-    assert of_paper == paper["studies"]
+    assert list(read_studies(ROOT / "config" / "studies.yaml")) == paper["studies"]
     rows = read_scenarios(ROOT / "config" / "scenarios.tsv").values()
     released = [row for row in rows if row.source == "phystwin"]
     assert {row.scenario for row in released} == set(whole["scenarios"])
@@ -572,7 +575,7 @@ def test_studies_bring_the_methods_of_their_rows_in_the_order_of_the_table():
 
 
 def test_a_study_of_clips_is_made_of_transfers_of_its_rows_whose_numbers_are_kept():
-    values = shipped("toy") | {"studies": ["deform"], "methods": [], "seeds": [0], "only": ""}
+    values = shipped("toy") | {"studies": ["deform"], "methods": [], "seeds": [0], "only": ""} | EXTRA_ROWS
     scene, other = "toy_rope_lift_smooth", "toy_rope_shake_smooth"
     values |= {"scenarios": [scene], "transfers": {scene: [other]}, "pools": {"ropes": [scene, other]}}
     graph = Graph(Benchmark(values, ROOT))
@@ -639,8 +642,8 @@ def test_targets_leave_a_part_that_was_asked_for_and_other_targets_as_they_are()
 
 
 def test_every_method_that_is_shipped_is_valid():
-    methods = tables.read_methods(ROOT / "config" / "methods.yaml")
-    values = config.read_yaml(ROOT / "config" / "data" / "demo.yaml") | {"methods": list(methods)}
+    methods = tables.read_methods(ROOT / "config" / "methods.yaml", EXTRA)
+    values = config.read_yaml(ROOT / "config" / "data" / "demo.yaml") | {"methods": list(methods)} | EXTRA_ROWS
     made = Benchmark(values, ROOT)
     # No two rows are the same: each has a fit of its own, the oracle too. But one has as many regions as `clusters` says.
     owners = Graph(made).owners["fit"]
@@ -651,12 +654,36 @@ def test_every_method_that_is_shipped_is_valid():
 
 def test_every_row_that_is_shipped_is_named_somewhere():
     """By a study, by a file of config/data or config/studies, or on the page of the twin or of the baselines."""
-    files = [path for name in ("data/*.yaml", "studies/*.yaml", "studies.yaml") for path in (ROOT / "config").glob(name)]
+    files = [
+        path for name in ("data/*.yaml", "studies/*.yaml", "rows/*.yaml", "studies.yaml") for path in (ROOT / "config").glob(name)
+    ]
     files += [ROOT / "neuspring" / room / "README.md" for room in ("twin", "baselines")]
     words = set(re.findall(r"\w+", "\n".join(path.read_text() for path in files)))
-    methods = tables.read_methods(ROOT / "config" / "methods.yaml")
+    methods = tables.read_methods(ROOT / "config" / "methods.yaml", EXTRA)
     assert set(methods) <= words
-    assert set(read_searches(ROOT / "config" / "searches.yaml")) == {row.search for row in methods.values() if row.search}
+    assert set(read_searches(ROOT / "config" / "searches.yaml", extra=EXTRA)) == {
+        row.search for row in methods.values() if row.search
+    }
+
+
+def test_a_configuration_brings_rows_of_its_own(tmp_path):
+    write(
+        tmp_path / "rows.yaml", "methods: {mine: {extends: ours, description: x}}\nsearches: {small: {clusters: 1, description: x}}"
+    )
+    made = benchmark(tmp_path, extra_rows={"mine": "rows.yaml"}, methods=["ours", "mine"])
+    assert made.methods["mine"].search == made.methods["ours"].search
+    for text, message in (
+        (
+            "methods: {ours: {search: uniform, description: x}}",
+            r"rows\.yaml, method ours: names of rows must differ; .*methods\.yaml",
+        ),
+        ("methods: {mine: {extends: none}}", r"rows\.yaml, method mine: extends: .*received none"),
+        ("method: {mine: {}}", r"rows\.yaml, method: .*sections methods, searches, studies"),
+        ("methods: [mine]", r"rows\.yaml, methods: must be a mapping of rows"),
+    ):
+        write(tmp_path / "rows.yaml", text)
+        with pytest.raises(InputError, match=message):
+            benchmark(tmp_path, extra_rows={"mine": "rows.yaml"}, methods=["ours"])
 
 
 def test_a_row_extends_another_and_each_stands_for_one_per_value(tmp_path):
@@ -797,6 +824,7 @@ SCENES = ["toy_rope_lift_smooth", "toy_rope_shake_smooth"]
 
 def oracles(**changes: Any) -> Benchmark:
     values = config.read_yaml(ROOT / "config" / "data" / "toy.yaml") | {"methods": NAMES, "scenarios": SCENES, "studies": []}
+    values |= EXTRA_ROWS
     return Benchmark(values | changes, ROOT)
 
 

@@ -12,7 +12,7 @@ import yaml
 
 from neuspring import config
 from neuspring.baselines import BASELINES
-from neuspring.config.baselines import Baselines
+from neuspring.config.extensions import Baselines
 from neuspring.config.images import Appearance, Images
 from neuspring.core.artifacts import Observations, SplatCenters, Trajectory
 from neuspring.core.errors import InputError

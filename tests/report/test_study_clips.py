@@ -24,6 +24,7 @@ from neuspring.scores.runs import collect
 from tests.support.clip_runs import FRAMES, RATE, write_transfer
 from tests.support.study_runs import rows_of, tables_in, write_run
 
+ROWS = Path(__file__).resolve().parents[2] / "config" / "rows" / "rods.yaml"
 STUDY_TABLE = Path(__file__).resolve().parents[2] / "config" / "studies.yaml"
 VALUES = {
     "title": "T",
@@ -48,7 +49,7 @@ def test_published_numbers_keep_their_digits_their_sources_and_what_the_tag_mean
     assert values["DEFORM", "DLO3", "deform_l1"].tag == "second-hand"
     assert {value.tag for value in values.values()} == set(paper.TAGS)
     assert {cable for _, cable, _ in values} == {f"DLO{k}" for k in range(1, 6)}
-    assert read_studies(STUDY_TABLE)["deform"].clips
+    assert read_studies(STUDY_TABLE, [ROWS])["deform"].clips
 
 
 @pytest.mark.parametrize(
@@ -119,7 +120,10 @@ def test_the_command_writes_tables_growth_and_films(tmp_path, capsys, monkeypatc
     output.mkdir()
     (output / "deform_DLO9.gif").write_bytes(b"of an older run")
     runs = ["--scenarios", "DLO3_train", "--methods", "rod", "model_b_pooled", "--seeds", "0"]
-    command, known = ["study", "--study", "deform", "--output", str(output)], ["--table", str(STUDY_TABLE)]
+    command, known = (
+        ["study", "--study", "deform", "--output", str(output)],
+        ["--table", str(STUDY_TABLE), "--extra-rows", str(ROWS)],
+    )
     kept = ["--output", str(results / "tables"), "--studies", "deform", *known]
     assert main(["tables", "--results", str(results), *runs, *kept]) == 0
     assert main([*command, "--results", str(results)]) == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 from neuspring.config import plain
 from neuspring.config.settings import select
@@ -24,7 +25,10 @@ def check(benchmark: Benchmark, *, cluster: bool) -> None:
 def settings(benchmark: Benchmark) -> str:
     """Settings of a sweep's workers, as JSON; its tables of methods and searches are found wherever a job runs."""
     values = select(benchmark.config, ("clusters", "simulation", "losses", "search", "fit", "released_quirks", "tune"))
-    tables = {name: str(benchmark.root / getattr(benchmark.config, name)) for name in ("method_table", "search_table")}
+    tables: dict[str, Any] = {
+        name: str(benchmark.root / getattr(benchmark.config, name)) for name in ("method_table", "search_table")
+    }
+    tables["extra_rows"] = {name: str(benchmark.root / path) for name, path in benchmark.config.extra_rows.items()}
     return json.dumps(values | tables | {"scenarios": list(benchmark.whole.scenarios)}, sort_keys=True)
 
 

@@ -18,7 +18,6 @@ from neuspring.config import Config
 from neuspring.config.tuning import Tune
 from neuspring.core.files import write_text
 from neuspring.core.table import Table
-from neuspring.experiments.benchmark import read_methods, read_searches
 from neuspring.extensions.tuning.space import Plan
 from neuspring.extensions.tuning.worker import FINISHED_STATES, study_of
 
@@ -37,7 +36,7 @@ def report(settings: Config, tune: Tune, output: Path, root: Path = Path()) -> N
         f"{', '.join(settings.scenarios)}. Test frames were not read. All trials: `trials.csv`; figures: `optuna-dashboard`.",
     ]
     if done:
-        write_best(plan, done[0], settings, folder, root)
+        write_best(plan, done[0], folder)
         rows = [[str(t.number), f"{t.value:.4e}", *(_shown(t.params[name]) for name in tune.space)] for t in done[:10]]
         lines += [
             "## Best trials",
@@ -55,8 +54,8 @@ def report(settings: Config, tune: Tune, output: Path, root: Path = Path()) -> N
     write_text(output, "\n\n".join(lines) + "\n")
 
 
-def write_best(plan: Plan, best: FrozenTrial, settings: Config, folder: Path, root: Path) -> None:
-    """Write best.yaml, an overlay with a new method row, and the tables that it names.
+def write_best(plan: Plan, best: FrozenTrial, folder: Path) -> None:
+    """Write best.yaml, an overlay with a new method row, and rows.yaml, which it names.
 
     The new method row is the varied one with the best trial's `fit` settings. Its `search` settings and `clusters` make a new
     search row. Settings that belong to no row (simulation, losses, quirks) are set for all methods.
@@ -69,16 +68,14 @@ def write_best(plan: Plan, best: FrozenTrial, settings: Config, folder: Path, ro
         functools.reduce(lambda inside, part: inside.setdefault(part, {}), above, sections)[key] = value
     fit, search = sections.pop("fit", {}), sections.pop("search", {})
     clusters = sections.pop("clusters", plan.row.clusters)
-    methods = {key: config.plain(row) for key, row in read_methods(root / settings.method_table).items()}
-    searches = {key: config.plain(row) for key, row in read_searches(root / settings.search_table, settings.clusters).items()}
     tuned = config.plain(plan.method) | {"description": description, "search": name}
     row = config.plain(plan.row) | {"description": description, "clusters": clusters}
     config.merge(tuned["settings"], fit)
     config.merge(row["settings"], search)
     overlay = {"methods": [method, name], "compare_with": method, "tables": f"tables-{name}"} | sections
     # Absolute: relative ones would start from the Snakefile.
-    overlay |= {f"{table}_table": str((folder / f"{table}_table.yaml").resolve()) for table in ("method", "search")}
-    for file, content in {"best": overlay, "method_table": methods | {name: tuned}, "search_table": searches | {name: row}}.items():
+    overlay["extra_rows"] = {name: str((folder / "rows.yaml").resolve())}
+    for file, content in {"best": overlay, "rows": {"methods": {name: tuned}, "searches": {name: row}}}.items():
         write_text(folder / f"{file}.yaml", yaml.safe_dump(content, sort_keys=False, width=120))
 
 

@@ -41,8 +41,9 @@ class Plan:
     @classmethod
     def of(cls, settings: Config, tune: Tune, root: Path = Path()) -> Plan:
         """Check a sweep as far as that needs no data. Tables are read relative to `root`. Raises InputError."""
-        methods = read_methods(root / settings.method_table)
-        searches = read_searches(root / settings.search_table, settings.clusters)
+        extra = [root / path for path in settings.extra_rows.values()]
+        methods = read_methods(root / settings.method_table, extra)
+        searches = read_searches(root / settings.search_table, settings.clusters, extra)
         method = methods.get(tune.method)
         row = searches.get(method.search) if method and method.search else None
         if method is None or row is None or method.oracle or not BODIES[row.body].by_gradients:

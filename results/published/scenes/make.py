@@ -26,7 +26,8 @@ from neuspring.report.blocks import markdown
 from neuspring.scores.paper import released
 from neuspring.scores.runs import collect
 
-METHODS = Path(__file__).parents[3] / "config" / "methods.yaml"
+CONFIG = Path(__file__).parents[3] / "config"
+ROWS = (CONFIG / "rows" / "ours.yaml",)
 
 MM = 1e3
 PHYSTWIN = "PhysTwin (released)"
@@ -157,10 +158,10 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--methods", nargs="+", help="all that have runs by default, in the order of config/methods.yaml")
     a = parser.parse_args()
-    from neuspring.config.parse import read_yaml
+    from neuspring.experiments.benchmark import read_methods
 
     found = {path.name for path in a.results.glob("*/*") if any(path.glob("*/run.json"))}
-    methods = a.methods or [name for name in read_yaml(METHODS) if name in found]
+    methods = a.methods or [name for name in read_methods(CONFIG / "methods.yaml", ROWS) if name in found]
     scored = scores(a.results, methods)
     a.output.mkdir(parents=True, exist_ok=True)
     write_text(a.output / "scores.csv", scored.to_csv(index=False, float_format="%.4f"))

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from neuspring.baselines import TrainingRequest
 from neuspring.baselines.results import Prediction, Trained
 from neuspring.config import Config
-from neuspring.config.baselines import Baselines
+from neuspring.config.extensions import Baselines
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.extensions.gs_dynamics import model as gs

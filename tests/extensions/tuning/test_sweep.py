@@ -183,6 +183,8 @@ def test_the_report_names_the_best_trial_and_its_overlay_makes_it_a_method(finis
     assert len(pd.read_csv(folder / "trials.csv")) == 4
     values = BASE | {"scenarios": ["toy_rope_lift_smooth"], "methods": ["search_only"]}
     config.merge(values, config.read_yaml(folder / "best.yaml"))
+    tables = folder.parent / "config"
+    values |= {"method_table": str(tables / "methods.yaml"), "search_table": str(tables / "searches.yaml")}
     bench = benchmark.Benchmark(values, ROOT)
     tuned = benchmark.with_method(bench.config, bench.methods["baseline_small"], "baseline_small").fit
     assert list(bench.methods) == ["baseline", "baseline_small"]
@@ -196,8 +198,9 @@ def test_varied_search_settings_and_clusters_get_a_search_row(folder):
     best = min(work(folder, tune), key=lambda one: one.value).params
     report(settings(), tune, folder / "summary.md", folder.parent)
     overlay = config.read_yaml(folder / "best.yaml")
-    assert config.read_yaml(Path(overlay["search_table"]))["search_only_small"]["clusters"] == best["clusters"]
-    assert config.read_yaml(Path(overlay["method_table"]))["search_only_small"]["search"] == "search_only_small"
+    rows = config.read_yaml(Path(overlay["extra_rows"]["search_only_small"]))
+    assert rows["searches"]["search_only_small"]["clusters"] == best["clusters"]
+    assert rows["methods"]["search_only_small"]["search"] == "search_only_small"
     assert overlay["simulation"] == {"gravity": best["simulation.gravity"]}
 
 
