@@ -24,8 +24,8 @@ def at_bound(run: RunRecord) -> dict[str, Any] | None:
         return None
     remedy = f"Raise output_bound in the settings of the row {run.method} of the method table."
     if wider:
-        options = f"'extra_rows={{ours: config/rows/ours.yaml}}' 'methods=[{run.method},{wider}]'"
-        remedy = f"Compare with a wider bound: add `--config {options}` to the command."
+        options = f"`--config 'extra_rows={{ours: config/rows/ours.yaml}}' 'methods=[{run.method},{wider}]'`"
+        remedy = "Compare with a wider bound: add " + options + " to the command."
     factor = f", {math.exp(bound):.1f} times the searched one or less by as much" if bound else ""
     return {"value": share, "factor": factor, "remedy": remedy}
 

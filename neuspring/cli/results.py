@@ -66,8 +66,8 @@ def tables(
 
     wanted = tuple(parse(Aim, row, "--aims") for row in json_value("--aims", aims, list))
     require_metrics(wanted)
-    shown = {name: _study(table, extra_rows, name)[1] for name in studies}
-    known = _study(table, extra_rows, studies[0])[0] if studies else {}
+    known = read_studies(table, extra_rows) if studies else {}
+    shown = {name: _study(known, name) for name in studies}
     common: Any = {"objects": objects, "aims": wanted, "studies": shown, "known_studies": known}
     common["names"] = shown_names(method_table, extra_rows)
     if scores:
@@ -91,12 +91,11 @@ def tables(
     print(f"Pictures and videos: {write_gallery(results, scenarios, methods, seed, numbers, output)}")
 
 
-def _study(table: Path, extra: Sequence[Path], name: str) -> tuple[dict[str, Study], Study]:
-    """All studies of a table and of extra rows, and one of them. Raises InputError."""
-    studies = read_studies(table, extra)
+def _study(studies: dict[str, Study], name: str) -> Study:
+    """A study by its name. Raises InputError."""
     if name not in studies:
-        raise InputError("study", f"must be a row of {table}", name, f"Known: {', '.join(studies)}")
-    return studies, studies[name]
+        raise InputError("study", "must be a row of the study table", name, f"Known: {', '.join(studies)}")
+    return studies[name]
 
 
 def _read_scores(path: Path, scenarios: Sequence[str], methods: Sequence[str], seeds: Sequence[int], left_out: str) -> Collected:
@@ -139,7 +138,7 @@ def study(
     results: Results = Path("results"),
     tables: Tables = "tables",
     scores: Scores = None,
-    table: Annotated[Path, arg(help="with --scores: the study table")] = Path("config/studies.yaml"),
+    table: StudyTable = Path("config/studies.yaml"),
     extra_rows: ExtraRows = (),
     scenarios: Annotated[tuple[str, ...], arg(help="with --scores: a part of it")] = (),
     methods: tuple[str, ...] = (),
@@ -153,7 +152,8 @@ def study(
     from neuspring.scores.numbers import Numbers
 
     if scores:
-        studies, one = _study(table, extra_rows, study)
+        studies = read_studies(table, extra_rows)
+        one = _study(studies, study)
         if one.clips:
             remedy = "Leave out --scores; `neuspring tables --studies` makes its numbers."
             raise InputError(f"study {study}", "a study of clips needs the transfers of a results folder", "scores alone", remedy)

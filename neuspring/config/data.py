@@ -102,7 +102,5 @@ class Synthetic(SettingsSection):
     """Number of frames that are kept, the first ones; null keeps all."""
     certified_frames: Count = 20
     """Number of first frames in which twice the substeps must not move the clip; more of them cost time and change no picture."""
-    cameras: Annotated[int, Field(ge=1, le=3)] = 3
-    """Number of cameras that film the scene."""
     sensor: Literal["model", "clean"] = "model"
     """Depth sensor: with noise, dropouts and holes (model), or only quantized (clean)."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from neuspring.core.section import SettingsSection
 from neuspring.registry import Registry
@@ -42,3 +42,7 @@ def with_extensions(path: str) -> Callable[[type[T]], type[T]]:
 @with_extensions("baselines")
 class Baselines(SettingsSection):
     """The models of the baselines; a method's own `settings` go on top."""
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...

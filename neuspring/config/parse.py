@@ -126,10 +126,8 @@ def _extra_rows(path: Path) -> dict[str, Any]:
     """The sections of a file of extra rows."""
     sections = read_yaml(path)
     for name, rows in sections.items():
-        if name not in EXTRA_ROWS.values():
-            raise InputError(f"{path}, {name}", f"a file of extra rows has the sections {', '.join(EXTRA_ROWS.values())}", name)
-        if not isinstance(rows, dict):
-            raise InputError(f"{path}, {name}", "must be a mapping of rows", type(rows).__name__)
+        if name not in EXTRA_ROWS.values() or not isinstance(rows, dict):
+            raise InputError(path, f"this file must have mappings of rows under {', '.join(EXTRA_ROWS.values())}", name)
     return sections
 
 

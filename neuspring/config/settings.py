@@ -46,16 +46,13 @@ class Gpus(SettingsSection):
 
 def _seed_list(value: Any) -> Any:
     """`--config seeds=0,1,2` arrives as text, `seeds=0` as a number, `seeds=[0,1,2]` as a list of text."""
-    if isinstance(value, int) and not isinstance(value, bool):
-        return (value,)
-    entries = value.split(",") if isinstance(value, str) else value
+    entries = value.split(",") if isinstance(value, str) else [value] if type(value) is int else value
     if not isinstance(entries, list):
         return value
-    if all(isinstance(entry, str) and entry.strip().isdecimal() for entry in entries):
-        return tuple(map(int, entries))
-    if isinstance(value, str):
-        raise ValueError("integers separated by commas are required, as in seeds=0,1,2")
-    return tuple(entries)
+    try:
+        return tuple(int(entry) if isinstance(entry, str) else entry for entry in entries)
+    except ValueError as error:
+        raise ValueError("integers separated by commas are required, as in seeds=0,1,2") from error
 
 
 Seeds = Annotated[tuple[Annotated[int, Field(ge=0)], ...], BeforeValidator(_seed_list)]

@@ -151,12 +151,9 @@ class Artifact:
             raise InputError(
                 path, f"this file must be readable, of kind {cls.kind}", str(error), "Delete it and re-run its step."
             ) from error
-        if meta.get("kind") != cls.kind:
-            raise InputError(path, f"this file must be of kind {cls.kind}", meta.get("kind"))
-        if meta.get("format") != FORMAT_VERSION:
-            raise InputError(
-                path, f"this version reads format {FORMAT_VERSION}", meta.get("format"), "Re-run the step that made it."
-            )
+        if (found := (meta.get("kind"), meta.get("format"))) != (cls.kind, FORMAT_VERSION):
+            rule = f"this file must be of kind {cls.kind}, format {FORMAT_VERSION}"
+            raise InputError(path, rule, found, "Re-run the step that made it.")
         try:
             return cls._build(arrays, meta["fields"], "")
         except (KeyError, TypeError) as error:

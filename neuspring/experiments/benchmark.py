@@ -98,24 +98,19 @@ def for_targets(values: Mapping[str, Any], targets: Collection[str], root: Path)
 
     So a table of the paper is made of its rows and no others, whatever methods the configuration names. Raises InputError.
     """
-    tables = [values.get(key, getattr(Config, key)) for key in ("study_table", "method_table")]
-    files = values.get("extra_rows") or {}
-    listed = values.get("studies") or []
-    # What is of another type is refused where settings are read.
-    if not targets or not isinstance(listed, list) or not isinstance(files, dict):
+    if not targets:
         return {}
-    if not all(isinstance(path, str) for path in (*tables, *files.values())):
-        return {}
-    extra = [root / path for path in files.values()]
-    studies = read_studies(root / tables[0], extra)
+    given = parse(Config, values, "configuration")
+    extra = [root / path for path in given.extra_rows.values()]
+    studies = read_studies(root / given.study_table, extra)
     asked = [name for name in studies if name in targets]
     if not asked:
         return {}
-    changes: dict[str, Any] = {"studies": [*listed, *(name for name in asked if name not in listed)]}
+    changes: dict[str, Any] = {"studies": list(dict.fromkeys([*given.studies, *asked]))}
     if len(asked) == len(targets):
-        known = read_methods(root / tables[1], extra)
+        known = read_methods(root / given.method_table, extra)
         shown = [name for study in asked for name in rows_of(studies, study) if name in known]
-        changes["only"] = f"method={','.join(dict.fromkeys(shown))} {values.get('only') or ''}".strip()
+        changes["only"] = f"method={','.join(dict.fromkeys(shown))} {given.only}".strip()
     return changes
 
 
@@ -209,11 +204,6 @@ class Benchmark:
     def _whole(self, given: Config, rows: Mapping[str, ScenarioRow]) -> Config:
         """The configuration with all methods that stand in it by a study or by its data."""
         _require_known("studies", given.studies, self.studies, given.study_table)
-        if absent := [name for name in given.methods if name not in self.table]:
-            row = read_rows(Method, self.root / given.method_table, "method", self.extra).get(absent[0])
-            if row and row.model in BASELINES.left_out:
-                remedy = "Restore its folder in neuspring/extensions, or leave the method out."
-                raise InputError(f"method {absent[0]}, model", "the extension that brings it was left out", row.model, remedy)
         _require_known("methods", given.methods, self.table, given.method_table)
         # The methods in the rows of its studies come too, and those of which rows are means. If they add any, all are in the order
         # of the method table.

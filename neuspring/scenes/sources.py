@@ -247,7 +247,7 @@ SOURCES = Registry(
             write_capture="neuspring.scenes.synthetic.make",
             needs_data=False,
             has_truth=True,
-            cameras=lambda folder, config: tuple(map(str, range(config.synthetic.cameras))),
+            cameras=lambda folder, config: ("0", "1", "2"),
         ),
         "capture": Source(
             module="neuspring.data.capture",

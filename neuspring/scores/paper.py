@@ -185,7 +185,7 @@ def read_studies(path: Path, extra: Iterable[Path] = ()) -> dict[str, Study]:
     """The studies of the table, and of files of extra rows, by name. Raises InputError."""
     studies = read_rows(Study, path, "study", extra)
     for name in studies:
-        if not SAFE_NAME.fullmatch(str(name)) or name in TAKEN:
+        if not SAFE_NAME.fullmatch(name) or name in TAKEN:
             rule = f"letters, digits, _, . and - make the name of a study, and {', '.join(TAKEN)} are taken"
             raise InputError(f"{path}, study {name}", rule, repr(name), "Rename it.")
         beside = studies[name].beside
@@ -193,5 +193,5 @@ def read_studies(path: Path, extra: Iterable[Path] = ()) -> dict[str, Study]:
             beside == name or beside not in studies or not set(studies[beside].rows) & set(studies[name].rows)
         ):
             rule = "beside: must be another study of this table, with labels of this one"
-            raise InputError(f"{path}, study {name}", rule, repr(beside), f"Known: {', '.join(studies)}")
+            raise InputError(f"{path}, study {name}", rule, beside, f"Known: {', '.join(studies)}")
     return studies

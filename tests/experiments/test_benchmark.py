@@ -678,8 +678,8 @@ def test_a_configuration_brings_rows_of_its_own(tmp_path):
             r"rows\.yaml, method ours: names of rows must differ; .*methods\.yaml",
         ),
         ("methods: {mine: {extends: none}}", r"rows\.yaml, method mine: extends: .*received none"),
-        ("method: {mine: {}}", r"rows\.yaml, method: .*sections methods, searches, studies"),
-        ("methods: [mine]", r"rows\.yaml, methods: must be a mapping of rows"),
+        ("method: {mine: {}}", r"rows\.yaml: .*under methods, searches, studies; received method"),
+        ("methods: [mine]", r"rows\.yaml: .*received methods"),
     ):
         write(tmp_path / "rows.yaml", text)
         with pytest.raises(InputError, match=message):

@@ -20,7 +20,7 @@ from neuspring.scenes.synthetic.truth import at_points, truth_of, truth_path, un
 from tests.support.filmed import film
 
 ROW = ScenarioRow(scenario="box", source="synthetic", category="package", path="weird_package", self_collision=True, ground=True)
-TINY = Synthetic(size="tiny", frames=6, cameras=2)
+TINY = Synthetic(size="tiny", frames=6)
 SETTINGS = Lift(neighborhood=0.03, controller_gaps="rigid", controller_share=0.5, least_controllers=3)
 
 

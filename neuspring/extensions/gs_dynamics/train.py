@@ -40,7 +40,6 @@ from neuspring.extensions.gs_dynamics.model import (
     steps,
     upright,
 )
-from neuspring.extensions.gs_dynamics.settings import GsDynamics
 
 DENSE_POINTS = 1000
 """Most tracks from which particles are drawn."""
@@ -274,7 +273,7 @@ class GsDynamicsTrainer:
     """Runs epochs on the training frames of a capture."""
 
     def __init__(self, request: TrainingRequest) -> None:
-        self.settings, self.seed = GsDynamicsTraining.of(request.settings.baselines.section(GsDynamics)), request.seed
+        self.settings, self.seed = GsDynamicsTraining.of(request.settings.baselines.gs_dynamics), request.seed
         self.category = request.observations.scenario.category
         self.rules, self.recipe = resolve(self.settings, self.category)
         self.tracks = Tracks.of(request.observations, self.settings)
@@ -342,7 +341,7 @@ class GsDynamicsTrainer:
 
 def train(request: TrainingRequest) -> Trained[GsDynamicsModel]:
     """Train on the tracks of the training frames; continue a checkpoint with the same key."""
-    training, settings = GsDynamicsTrainer(request), request.settings.baselines.section(GsDynamics)
+    training, settings = GsDynamicsTrainer(request), request.settings.baselines.gs_dynamics
     if len(training.windows):
         return run_epochs(training, GS_DYNAMICS_METRICS, settings.epochs, request.partial, request.key())
     # A network that learned nothing must not move the object at random.

@@ -34,7 +34,6 @@ from neuspring.data.results import masks_of_cameras
 from neuspring.extensions.spring_gaus.baseline import find_vgg16
 from neuspring.extensions.spring_gaus.model import Follower, SpringGausModel, SpringGausTraining, choose_anchors
 from neuspring.extensions.spring_gaus.physics import AnchorGraph, AnchorSolver
-from neuspring.extensions.spring_gaus.settings import SpringGaus
 from neuspring.splats.draw import view_of
 from neuspring.splats.losses import ssim
 from neuspring.splats.model import Gaussians, Splats
@@ -80,7 +79,7 @@ class Problem:
 def train(request: TrainingRequest) -> Trained[SpringGausModel]:
     """Train on silhouettes, or on points. Raises InputError for `supervision: masks` without pictures."""
     observations, settings, device = request.observations, request.settings, request.device
-    chosen, scenario = SpringGausTraining.of(settings.baselines.section(SpringGaus)), observations.scenario
+    chosen, scenario = SpringGausTraining.of(settings.baselines.spring_gaus), observations.scenario
     pictures = request.pictures if chosen.supervision == "masks" else None
     if chosen.supervision == "masks" and pictures is None:
         rule = "supervision: masks needs --capture, --masks and --appearance"

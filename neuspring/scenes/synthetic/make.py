@@ -120,7 +120,7 @@ def make(row: ScenarioRow, settings: Synthetic, folder: Path) -> tuple[Capture, 
         sensitivity=sensitivity,
     )
     _refuse(row.scenario, truth)
-    cameras = place_cameras(clip, hands, size, settings.cameras)
+    cameras = place_cameras(clip, hands, size)
     description = Description(
         format=1,
         name=row.scenario,
@@ -156,7 +156,7 @@ def _refuse(name: str, truth: Truth) -> None:
         raise NumericalFailure(f"{name}: twice the substeps move the mean node by {deviations}; not converged")
 
 
-def place_cameras(clip: Clip, hands: Sequence[Hand], size: CaptureSize, count: int) -> list[Camera]:
+def place_cameras(clip: Clip, hands: Sequence[Hand], size: CaptureSize) -> list[Camera]:
     """Cameras around the object, as near as the motion of object and hands allows, so that they fill the image."""
     focal = 0.5 * size.width / np.tan(np.radians(FIELD_OF_VIEW / 2))
     k = np.array([[focal, 0.0, (size.width - 1) / 2], [0.0, focal, (size.height - 1) / 2], [0.0, 0.0, 1.0]])
@@ -164,7 +164,7 @@ def place_cameras(clip: Clip, hands: Sequence[Hand], size: CaptureSize, count: i
     points = np.concatenate([clip.positions[::5, ::7].reshape(-1, 3), *(hand.poses(times)[:, :3] for hand in hands)])
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     cameras = []
-    for index, azimuth in enumerate(np.radians(AZIMUTHS[:count])):
+    for index, azimuth in enumerate(np.radians(AZIMUTHS)):
         up = np.radians(CAMERA_ELEVATION)
         away = np.array([np.cos(up) * np.cos(azimuth), np.cos(up) * np.sin(azimuth), np.sin(up)])
         distance = 0.35
