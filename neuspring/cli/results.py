@@ -25,8 +25,7 @@ OnDisk = Annotated[tuple[str, ...], arg(help="all on disk by default")]
 Names = Annotated[tuple[str, ...], arg(help="those of the settings, else all on disk, by default")]
 Scores = Annotated[Path | None, arg(help="instead of run records: a scores.csv that tables wrote, on any machine")]
 LeftOut = Annotated[str, arg(help="JSON: methods and the scenarios to which they do not apply, with reasons")]
-MethodTable = Annotated[Path, arg(help="the method table: names of methods for people")]
-StudyTable = Annotated[Path, arg(help="the study table")]
+RowTable = Annotated[Path, arg(help="this table of the configuration")]
 ExtraRows = Annotated[tuple[Path, ...], arg(help="files with more rows of these tables")]
 Folder = Annotated[Path, arg(help="folder to write to")]
 Transfers = Annotated[tuple[str, ...], arg(help="scenarios whose twins were rolled out on other recordings")]
@@ -44,10 +43,10 @@ def tables(
     objects: Annotated[Literal["scenario", "category"], arg(help="what intervals of ratios are over")] = "scenario",
     aims: Annotated[str, arg(help="JSON: ratios that are aimed at (config/README.md, aims)")] = "[]",
     studies: Annotated[tuple[str, ...], arg(help="rows of the study table whose numbers are kept too")] = (),
-    table: StudyTable = Path("config/studies.yaml"),
+    table: RowTable = Path("config/studies.yaml"),
     scores: Scores = None,
     left_out: LeftOut = "{}",
-    method_table: MethodTable = Path("config/methods.yaml"),
+    method_table: RowTable = Path("config/methods.yaml"),
     extra_rows: ExtraRows = (),
     brief: Annotated[bool, arg(help="print the verdict and the first table alone")] = False,
     settings: Annotated[str, arg(help="of the benchmark: runs that were made with something else are named")] = "",
@@ -68,8 +67,8 @@ def tables(
     require_metrics(wanted)
     known = read_studies(table, extra_rows) if studies else {}
     shown = {name: _study(known, name) for name in studies}
-    common: Any = {"objects": objects, "aims": wanted, "studies": shown, "known_studies": known}
-    common["names"] = shown_names(method_table, extra_rows)
+    names = shown_names(method_table, extra_rows)
+    common: Any = {"objects": objects, "aims": wanted, "studies": shown, "known_studies": known, "names": names}
     if scores:
         found = _read_scores(scores, scenarios, methods, seeds, left_out)
         print(write(Numbers(everything=found, baseline=baseline or str(found.runs["method"].iloc[0]), **common), output))
@@ -77,7 +76,7 @@ def tables(
     there = traces(results, job_records(results)[0])
     scenarios, methods, seeds = scenarios or tuple(there[0]), methods or tuple(there[1]), seeds or tuple(there[2])
     if not (scenarios and methods and seeds):
-        raise InputError(results, "a results folder with runs is required", "none", "Run the workflow first, or name another.")
+        raise InputError(results, "a results folder with runs is required", remedy="Run the workflow first, or name another.")
     collected, part = as_asked(collect(results, scenarios, methods, seeds, _read_left_out(left_out)), asked(results))
     warned = warnings_of(results, scenarios)
     more: Any = {"results": results, "asked": part, "warnings": warned, "made_otherwise": _made_otherwise(settings, results)}
@@ -94,7 +93,7 @@ def tables(
 def _study(studies: dict[str, Study], name: str) -> Study:
     """A study by its name. Raises InputError."""
     if name not in studies:
-        raise InputError("study", "must be a row of the study table", name, f"Known: {', '.join(studies)}")
+        raise InputError("study", "must be a row of the study table", name)
     return studies[name]
 
 
@@ -138,7 +137,7 @@ def study(
     results: Results = Path("results"),
     tables: Tables = "tables",
     scores: Scores = None,
-    table: StudyTable = Path("config/studies.yaml"),
+    table: RowTable = Path("config/studies.yaml"),
     extra_rows: ExtraRows = (),
     scenarios: Annotated[tuple[str, ...], arg(help="with --scores: a part of it")] = (),
     methods: tuple[str, ...] = (),
@@ -153,8 +152,7 @@ def study(
 
     if scores:
         studies = read_studies(table, extra_rows)
-        one = _study(studies, study)
-        if one.clips:
+        if (one := _study(studies, study)).clips:
             remedy = "Leave out --scores; `neuspring tables --studies` makes its numbers."
             raise InputError(f"study {study}", "a study of clips needs the transfers of a results folder", "scores alone", remedy)
         everything = _read_scores(scores, scenarios, methods, seeds, left_out)
@@ -209,8 +207,8 @@ def report(
     transfers: Transfers = (),
     baseline: Annotated[str | None, arg(help="method that others are compared with")] = None,
     shown: Annotated[tuple[str, ...], arg(help="methods to draw; six at most by default")] = (),
-    table: StudyTable = Path("config/studies.yaml"),
-    method_table: MethodTable = Path("config/methods.yaml"),
+    table: RowTable = Path("config/studies.yaml"),
+    method_table: RowTable = Path("config/methods.yaml"),
     extra_rows: ExtraRows = (),
     tables: Tables = "tables",
     megabytes: Annotated[float, arg(help="size that pictures and videos may fill")] = 25.0,

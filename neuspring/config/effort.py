@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 from typing import Any, Literal, get_args
 
-from neuspring.config.extensions import SETTINGS
-from neuspring.config.parse import merge
+from neuspring.config.extensions import EXTENSION_SETTINGS
+from neuspring.config.parse import merge, nested
 
 Effort = Literal["quick", "normal", "paper"]
 EFFORTS = get_args(Effort)
@@ -24,7 +23,7 @@ EFFORT_SIZES: dict[str, tuple[Any, Any, Any]] = {
     "images.appearance.iterations": (300, 400, 10_000),
     "images.appearance.spacing": (2.0, 2.0, 0.0),
     "images.appearance.degree": (0, 0, 3),
-    **{f"{path}.{key}": values for path, kind in SETTINGS.items() for key, values in kind.efforts.items()},
+    **{f"{path}.{key}": values for path, kind in EXTENSION_SETTINGS.items() for key, values in kind.efforts.items()},
 }
 """Key -> its value at each effort. quick: `make demo`. normal: the published synthetic benchmark. paper: sizes of the paper and of
 the released code, the defaults of all keys but `synthetic.size`. Pictures of the first camera are scored, as in the paper."""
@@ -34,6 +33,5 @@ def sizes(effort: str) -> dict[str, Any]:
     """The values of an effort, nested as in a configuration file."""
     values: dict[str, Any] = {}
     for path, choices in EFFORT_SIZES.items():
-        nested = functools.reduce(lambda inner, name: {name: inner}, reversed(path.split(".")), choices[EFFORTS.index(effort)])
-        merge(values, nested)
+        merge(values, nested(path, choices[EFFORTS.index(effort)]))
     return values

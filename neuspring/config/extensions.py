@@ -20,7 +20,7 @@ from neuspring.core.section import SettingsSection
 from neuspring.registry import Registry
 
 T = TypeVar("T")
-SETTINGS = Registry[type[SettingsSection]]("settings", {}, type)
+EXTENSION_SETTINGS = Registry[type[SettingsSection]]("settings", {}, type)
 """Dotted path of a section -> its dataclass."""
 
 
@@ -28,11 +28,11 @@ def with_extensions(path: str) -> Callable[[type[T]], type[T]]:
     """Decorate a section, below its `dataclass`: it gets the sections that packages bring at `path` (empty: the top level)."""
 
     def extended(kind: type[T]) -> type[T]:
-        for name in SETTINGS:
+        for name in EXTENSION_SETTINGS:
             above, _, key = name.rpartition(".")
             if above == path:
-                kind.__annotations__[key] = SETTINGS[name]
-                setattr(kind, key, field(default_factory=SETTINGS[name]))
+                kind.__annotations__[key] = EXTENSION_SETTINGS[name]
+                setattr(kind, key, field(default_factory=EXTENSION_SETTINGS[name]))
         return kind
 
     return extended

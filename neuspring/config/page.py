@@ -13,7 +13,6 @@ import yaml
 from pydantic import TypeAdapter
 
 from neuspring.config.effort import EFFORT_SIZES, EFFORTS
-from neuspring.config.parse import plain
 from neuspring.config.rows import Method, ScenarioRow, SearchRow
 from neuspring.config.settings import Config
 from neuspring.core.section import STRICT
@@ -33,17 +32,17 @@ def schema_of(kind: type) -> dict[str, Any]:
 
 
 @functools.cache
-def sections() -> dict[str, tuple[dict[str, Any], Any]]:
-    """Title -> schema of each section and the defaults of its keys, in the order of their declarations."""
+def sections() -> dict[str, dict[str, Any]]:
+    """Title -> schema of each section, in the order of their declarations."""
     whole = schema_of(Config)
 
-    def nested(section: dict[str, Any], path: str, defaults: Any) -> Iterator[tuple[str, tuple[dict[str, Any], Any]]]:
-        yield path or "(top level)", (section, defaults)
+    def below(section: dict[str, Any], path: str) -> Iterator[tuple[str, dict[str, Any]]]:
+        yield path or "(top level)", section
         for key, value in section["properties"].items():
             for name in referred(value):
-                yield from nested(whole["$defs"][name], f"{path}.{key}".lstrip("."), defaults.get(key) or {})
+                yield from below(whole["$defs"][name], f"{path}.{key}".lstrip("."))
 
-    return dict(nested(whole, "", plain(Config()))) | {title: (schema_of(kind), {}) for title, kind in ROWS.items()}
+    return dict(below(whole, "")) | {title: schema_of(kind) for title, kind in ROWS.items()}
 
 
 def referred(value: Any) -> list[str]:
@@ -58,8 +57,8 @@ def text() -> str:
     written = PAGE.read_text(encoding="utf-8").partition(HEADING)[0] + HEADING
     sizes = [[f"`{key}`", *(f"`{yaml_text(value)}`" for value in values)] for key, values in EFFORT_SIZES.items()]
     first, *others = [
-        "\n".join([f"### {title}", "", schema["description"].partition("\n")[0], "", *table(fields(schema, defaults)), ""])
-        for title, (schema, defaults) in sections().items()
+        "\n".join([f"### {title}", "", schema["description"].partition("\n")[0], "", *table(fields(schema)), ""])
+        for title, schema in sections().items()
     ]
     efforts = ["### effort", "", "The sizes that `effort` sets.", "", *table([["key", *EFFORTS], *sizes]), ""]
     return "\n".join([written, first, *efforts, *others])
@@ -71,13 +70,13 @@ def table(rows: list[list[str]]) -> list[str]:
     return [head, "|" + "---|" * len(rows[0]), *lines]
 
 
-def fields(schema: dict[str, Any], defaults: Any) -> list[list[str]]:
+def fields(schema: dict[str, Any]) -> list[list[str]]:
     """key, default, values and meaning (the first sentence of its description) of every key that is no section."""
     rows = [["key", "default", "values", "meaning"]]
     for key, value in schema["properties"].items():
         if "$ref" in value and referred(value):
             continue
-        default = "required" if key in schema.get("required", ()) else f"`{yaml_text(defaults.get(key, value.get('default', {})))}`"
+        default = "required" if key in schema.get("required", ()) else f"`{yaml_text(value.get('default', {}))}`"
         meaning = " ".join(value["description"].split()).partition(". ")[0].rstrip(".").replace("|", r"\|")
         rows.append([f"`{key}`", default, allowed(value), f"{meaning}."])
     return rows

@@ -187,6 +187,11 @@ def merge(base: dict[str, Any], overlay: Mapping[str, Any]) -> None:
             base[key] = value
 
 
+def nested(path: str, value: Any) -> dict[str, Any]:
+    """A value under a dotted key, nested as in a configuration file."""
+    return functools.reduce(lambda inner, name: {name: inner}, reversed(path.split(".")), value)
+
+
 def json_value(option: str, text: str, kind: type = dict) -> Any:
     """The JSON object (or list) given with an option. Raises InputError."""
     try:

@@ -39,38 +39,34 @@ class Variable:
         return self.low + normalized * (self.high - self.low)
 
 
-def _default(*values: Any) -> Any:
-    return field(default_factory=lambda: Variable(*values))
-
-
 @dataclass(frozen=True, kw_only=True)
 class SearchVariables(SettingsSection):
     """Variables of the search: lowest and highest value, start, and scale (linear or log). A setting names what differs."""
 
-    stiffness: Variable = _default(10.0, 1e5, 3e3, "log")
+    stiffness: Variable = Variable(10.0, 1e5, 3e3, "log")
     """Stiffness Y of the springs, N."""
-    object_radius: Variable = _default(1.2, 5.0, 2.5)
+    object_radius: Variable = Variable(1.2, 5.0, 2.5)
     """Radius within which object nodes are joined, in units of `lengths`."""
-    object_neighbors: Variable = _default(10.0, 50.0, 30.0)
+    object_neighbors: Variable = Variable(10.0, 50.0, 30.0)
     """Most neighbors of an object node, itself included."""
-    controller_radius: Variable = _default(0.5, 5.0, 2.0)
+    controller_radius: Variable = Variable(0.5, 5.0, 2.0)
     """Radius within which a controller is joined to object nodes, m; with `lengths: spacing` how far it goes beyond the smallest
     distance between a controller and a node, in spacings."""
-    controller_neighbors: Variable = _default(10.0, 80.0, 50.0)
+    controller_neighbors: Variable = Variable(10.0, 80.0, 50.0)
     """Most object nodes that a controller is joined to."""
-    ground_elasticity: Variable = _default(0.0, 1.0, 0.5)
+    ground_elasticity: Variable = Variable(0.0, 1.0, 0.5)
     """Restitution on the ground."""
-    ground_friction: Variable = _default(0.0, 2.0, 0.3)
+    ground_friction: Variable = Variable(0.0, 2.0, 0.3)
     """Friction on the ground."""
-    contact_elasticity: Variable = _default(0.0, 1.0, 0.7)
+    contact_elasticity: Variable = Variable(0.0, 1.0, 0.7)
     """Restitution between nodes."""
-    contact_friction: Variable = _default(0.0, 2.0, 0.3)
+    contact_friction: Variable = Variable(0.0, 2.0, 0.3)
     """Friction between nodes."""
-    contact_distance: Variable = _default(0.5, 3.0, 1.0)
+    contact_distance: Variable = Variable(0.5, 3.0, 1.0)
     """Distance at which nodes collide, in units of `lengths`."""
-    drag: Variable = _default(0.05, 50.0, 3.0, "log")
+    drag: Variable = Variable(0.05, 50.0, 3.0, "log")
     """Velocity decay, 1/s."""
-    dashpot: Variable = _default(0.1, 500.0, 20.0, "log")
+    dashpot: Variable = Variable(0.1, 500.0, 20.0, "log")
     """Damping along springs, N s/m."""
 
     @model_validator(mode="before")

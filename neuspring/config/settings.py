@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -14,7 +15,7 @@ from neuspring.config.data import Deform, Mocap, Posed, Synthetic, Toy
 from neuspring.config.effort import EFFORTS, Effort, sizes
 from neuspring.config.extensions import Baselines, with_extensions
 from neuspring.config.images import Images
-from neuspring.config.parse import json_value, merge, parse, plain, read_yaml
+from neuspring.config.parse import json_value, merge, nested, parse, plain, read_yaml
 from neuspring.config.perception import Perception
 from neuspring.config.rod import RodSettings
 from neuspring.config.search import Search
@@ -188,21 +189,15 @@ class Config(SettingsSection):
         if len(set(pooled)) != len(pooled) or any(len(members) < 2 for members in (self.pools or {}).values()):
             raise ValueError("pools: at least two scenarios each, and every scenario in one pool at most, are required")
         for source, targets in (self.transfers or {}).items():
-            if not targets or len(set(targets)) != len(targets) or source in targets:
-                rule = "at least one other scenario is required, each once; leave the entry out for no transfer"
-                raise ValueError(f"transfers.{source}: {rule}, received {list(targets)}")
+            if not targets or len({source, *targets}) <= len(targets):
+                raise ValueError(f"transfers.{source}: other scenarios, each once, are required, received {list(targets)}")
 
 
 def select(config: Config, keys: Iterable[str]) -> dict[str, Any]:
     """The values under dotted keys (`images.backend`), nested as in a configuration file, as plain values."""
-    values = plain(config)
-    part: dict[str, Any] = {}
+    values, part = plain(config), {}
     for key in keys:
-        *sections, last = key.split(".")
-        source, target = values, part
-        for section in sections:
-            source, target = source[section], target.setdefault(section, {})
-        target[last] = source[last]
+        merge(part, nested(key, functools.reduce(dict.__getitem__, key.split("."), values)))
     return part
 
 

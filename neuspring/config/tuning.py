@@ -37,12 +37,10 @@ class Dimension(SettingsSection):
             return
         if self.low is None or self.high is None:
             raise ValueError("low and high, or choices, are required")
-        if not self.low < self.high:
-            raise ValueError(f"low < high is required, received {self.low} and {self.high}")
-        if self.log and (self.low <= 0 or self.step is not None):
-            raise ValueError(f"log: low > 0 and no step are required, received low {self.low} and step {self.step}")
-        if self.step is not None and not 0 < self.step <= self.high - self.low:
-            raise ValueError(f"step: 0 < step <= high - low is required, received {self.step}")
+        wrong_step = self.step is not None and (self.log or not 0 < self.step <= self.high - self.low)
+        if not self.low < self.high or (self.log and self.low <= 0) or wrong_step:
+            rule = "low < high is required, for log low > 0 and no step, otherwise 0 < step <= high - low"
+            raise ValueError(f"{rule}, received {self}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -187,7 +187,7 @@ def read_studies(path: Path, extra: Iterable[Path] = ()) -> dict[str, Study]:
     for name in studies:
         if not SAFE_NAME.fullmatch(name) or name in TAKEN:
             rule = f"letters, digits, _, . and - make the name of a study, and {', '.join(TAKEN)} are taken"
-            raise InputError(f"{path}, study {name}", rule, repr(name), "Rename it.")
+            raise InputError(f"{path}, study {name}", rule, name, "Rename it.")
         beside = studies[name].beside
         if beside is not None and (
             beside == name or beside not in studies or not set(studies[beside].rows) & set(studies[name].rows)

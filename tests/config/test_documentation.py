@@ -23,19 +23,19 @@ def test_the_configuration_page_is_up_to_date_and_complete():
 def test_shown_defaults_are_accepted_as_they_are_written():
     """Read as YAML by the strict configuration, they are the defaults."""
     written = {}
-    for title, (schema, defaults) in config_page.sections().items():
+    for title, schema in config_page.sections().items():
         if title.startswith(("tune", "aims", "rows")):
             continue  # null and empty unless they are set
         place = written
         for name in [] if title == "(top level)" else title.split("."):
             place = place.setdefault(name, {})
-        rows = config_page.fields(schema, defaults)[1:]
+        rows = config_page.fields(schema)[1:]
         place |= {key.strip("`"): yaml.safe_load(default.strip("`")) for key, default, _, _ in rows}
     assert config.plain(config.parse(config.Config, written, "the page")) == config.plain(config.Config())
 
 
 def test_ranges_are_those_that_the_configuration_enforces():
-    shown = {key.strip("`"): words for key, _, words, _ in config_page.fields(*config_page.sections()["fit"])}
+    shown = {key.strip("`"): words for key, _, words, _ in config_page.fields(config_page.sections()["fit"])}
     assert shown["epochs"] == "integer >= 1"
     assert shown["factor_learning_rate"] == "number > 0 or `null`"
     assert shown["damping"] == "`fixed`, `homogeneous`"
