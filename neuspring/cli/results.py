@@ -127,8 +127,7 @@ def perception_table(
     """Errors of perception, per category."""
     from neuspring.report import perception
 
-    named = [(name, str(category)) for name, category in json_value("--scenarios", scenarios).items()]
-    print(perception.write(perception.collect(results, named), output.parent))
+    print(perception.write(perception.collect(results, [*json_value("--scenarios", scenarios).items()]), output.parent))
 
 
 def study(
