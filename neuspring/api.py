@@ -180,8 +180,7 @@ def search(
     """CMA-ES over material and topology: the best `twin`, its `cost`, the `trace`.
 
     The topology has `clusters` regions, by default as many as the settings say; 1 is uniform. The trace is kept in the file
-    `record`, and a search that was stopped goes on from it. With `body="rod"` the constants of an elastic rod are found, for a
-    long thin object. Raises InputError, NumericalFailure.
+    `record`, and a search that was stopped goes on from it. A package may bring `body`. Raises InputError, NumericalFailure.
     """
     from neuspring.core.device import resolve_device
     from neuspring.twin.body import BODIES, SearchOptions
@@ -205,7 +204,7 @@ def fit(
 ) -> Learned:
     """Train a twin's stiffness by gradients through the simulation, as a neural spring `field` or each of the `springs` apart.
 
-    A rod is fitted as `kind="rod"`, in everything that is unknown of it.
+    Another body has fits of its own kinds (`Body.fits`).
 
     The result has the best `twin`, of this `mass`, kg, where it is given (`with_mass`), and the `history` of losses. With a
     `checkpoint`, a fit that was stopped goes on. Raises InputError, NumericalFailure.

@@ -10,7 +10,7 @@ from neuspring.core import provenance
 PACKAGE = Path(provenance.__file__).parents[1]
 FLOORS = (
     "extensions > cli > experiments > stages > report > draw > scores baselines > splats perception > scenes > intake > checks > "
-    "data > twin > rods > physics config > core"
+    "data > twin > physics config > core"
 )
 LIGHT = (
     "",
@@ -105,7 +105,7 @@ for name in {twin_and_simulator()}:
 
 def twin_and_simulator() -> list[str]:
     """Modules of both rooms, but the float64 reference, and what moves a twin to another recording: these stand on SciPy."""
-    paths = [path for room in ("physics", "rods", "twin") for path in sorted((PACKAGE / room).glob("*.py"))]
+    paths = [path for room in ("physics", "twin") for path in sorted((PACKAGE / room).glob("*.py"))]
     names = [".".join(["neuspring", *path.relative_to(PACKAGE).with_suffix("").parts]) for path in paths]
     return [name.removesuffix(".__init__") for name in names if not name.endswith((".reference", ".register", ".transfer"))]
 

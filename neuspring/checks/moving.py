@@ -1,4 +1,4 @@
-"""Points in space from frame to frame: hands, markers on an object, markers along a cable.
+"""Points in space from frame to frame: hands, markers on an object or along a line.
 
 Nothing that moves is anywhere twice to the bit, leaves its place for a frame, or changes places with another. Where a file says so,
 a marker was lost, a stream stood still, or labels were exchanged.
@@ -22,7 +22,7 @@ AROUND = 4
 """Frames before and after a step with which it is compared; up to two more large steps there do not hide it."""
 STEP, HELD_STEP, ALL_TOGETHER = 6.0, 3.0, 4.0
 """Steps so many times as large as those around are no motion: of a point, after it stood still to the bit, of all points together.
-In 350 released recordings of cables one marker steps at most 4.2 times as far as around. Some of them lack samples: there all step
+In 350 recordings of motion capture one marker steps at most 4.2 times as far as around. Some of them lack samples: there all step
 together, up to 9.9 times as far."""
 LEAST, SLOW = 0.01, 0.5
 """m and m/s: smaller and slower steps may be noise."""
@@ -32,7 +32,7 @@ EXCHANGED = 0.5
 """Steps after an exchange of labels, as a part of those before it, that show that they were exchanged."""
 STEADY_SPAN, MAX_STRETCH, CHANGED_MOST = 0.1, 0.5, 0.005
 """Distances of neighbors that vary by less than STEADY_SPAN of their median, between the quintiles, are kept by what carries them.
-One that changes by more than MAX_STRETCH and CHANGED_MOST, m, is wrong. DEFORM's cables change by 0.37 at most, once by more."""
+One that changes by more than MAX_STRETCH and CHANGED_MOST, m, is wrong. Recordings change by 0.37 at most, once by more."""
 MANY = 4
 """Points from which there is a motion of all."""
 PAUSE = 0.25

@@ -219,7 +219,7 @@ def longest(side: float) -> dict[str, Any] | None:
 
 
 SLENDER = 6.0
-"""Area of an outline over the square of its greatest width. Ropes of real films that lie have 8.9 and more; toys, cloths, rods and
+"""Area of an outline over the square of its greatest width. Ropes of real films that lie have 8.9 and more; toys, cloths and
 boxes, real and rendered from all sides, up to 4.1."""
 
 
@@ -293,7 +293,7 @@ def height_in_air(camera: Camera, sample: Sample, up: float) -> dict[str, Any] |
     return {"value": low, "cm": 100 * low, "on": "and no hand is near"}
 
 
-BODY_WORDS = ("sloth", "plush", "toy", "ball", "cable", "rod")
+BODY_WORDS = ("sloth", "plush", "toy", "ball")
 """Words for bodies that are near to those that mean another thing."""
 
 

@@ -13,11 +13,10 @@ DOUBTFUL_FRAMES_SHOWN = 5
 
 
 def check_data(folder: Positional[Path], settings: Settings = "{}") -> int:
-    """Report how a data folder departs from the expected layout; exit status 2 where it cannot be used. Of the settings it reads
-    those of recordings of cables (mocap)."""
+    """Report how a data folder departs from the expected layout; exit status 2 where it cannot be used."""
     from neuspring.intake.check import check_layout, render
 
-    findings = check_layout(folder, read_settings(settings).mocap)
+    findings = check_layout(folder, read_settings(settings))
     print(render(findings))
     return 2 if any(finding.level == "error" for finding in findings) else 0
 

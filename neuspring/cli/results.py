@@ -144,16 +144,15 @@ def study(
     left_out: LeftOut = "{}",
 ) -> None:
     """The numbers that `tables --studies` kept, or a scores.csv -> one of the paper's tables, beside the paper's values."""
-    from neuspring.report.clips import write_clips
     from neuspring.report.study import write_study
-    from neuspring.scores.clips import ClipNumbers
     from neuspring.scores.numbers import Numbers
+    from neuspring.scores.study import StudyNumbers
 
     if scores:
         studies = read_studies(table, extra_rows)
-        if (one := _study(studies, study)).clips:
+        if (one := _study(studies, study)).kind:
             remedy = "Leave out --scores; `neuspring tables --studies` makes its numbers."
-            raise InputError(f"study {study}", "a study of clips needs the transfers of a results folder", "scores alone", remedy)
+            raise InputError(f"study {study}", f"a study of the kind {one.kind} needs a results folder", "scores alone", remedy)
         everything = _read_scores(scores, scenarios, methods, seeds, left_out)
         numbers = Numbers(everything=everything, baseline="", studies={study: one}, known_studies=studies)
     else:
@@ -164,7 +163,7 @@ def study(
                 "--study", f"must be in {results / tables}", study, f"There: {known}. Make it: tables --studies {study}."
             )
     found = numbers.by_study[study]
-    print(write_clips(found, output) if isinstance(found, ClipNumbers) else write_study(found, output))
+    print(write_study(found, output) if isinstance(found, StudyNumbers) else found.write(output))
 
 
 def explain(

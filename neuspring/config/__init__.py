@@ -1,7 +1,7 @@
 """Every setting: its meaning, unit, range and default, as frozen dataclasses that refuse unknown keys.
 
     settings                       the whole configuration (`Config`), GPUs, a part of it for one step
-    simulation, search, twin, rod  integration; the zero-order search; losses, field, fit; rods
+    simulation, search, twin       integration; the zero-order search; losses, field, fit
     data, perception, images       sources; raw video to observations; splats and their scores
     extensions, tuning             sections that packages bring; sweeps over settings
     rows                           rows of the scenario, method and search tables
@@ -11,9 +11,8 @@
 Nothing here imports torch, Warp or MLflow, because the workflow reads the configuration before any job exists.
 """
 
-from neuspring.config.data import Mocap, Posed, Synthetic, Toy
+from neuspring.config.data import Synthetic, Toy
 from neuspring.config.parse import merge, of_command_line, parse, plain, read_text, read_yaml
-from neuspring.config.rod import RodSettings
 from neuspring.config.rows import Method, ScenarioRow, SearchRow
 from neuspring.config.search import Search, SearchVariables, Variable
 from neuspring.config.settings import Config, Tracking
@@ -25,10 +24,7 @@ __all__ = [
     "Fit",
     "Losses",
     "Method",
-    "Mocap",
-    "Posed",
     "ReleasedQuirks",
-    "RodSettings",
     "ScenarioRow",
     "Search",
     "SearchRow",

@@ -16,7 +16,7 @@ class SearchRow(SettingsSection):
     """Number K of regions, each with its own radius and neighbors: 2K + 10 variables; 1 is the uniform topology; null: the key
     `clusters`."""
     body: Name = "lattice"
-    """lattice: springs between nodes. rod: a discrete elastic rod, for long thin bodies; it has no regions."""
+    """lattice: springs between nodes; or the body of a package."""
     description: str
     """A line for people."""
     settings: dict[str, Any] = field(default_factory=dict)
@@ -36,8 +36,8 @@ class Method(SettingsSection):
     search: Name | None = None
     """A row of the search table; methods that name the same row share the search."""
     fit: Name | None = None
-    """Unknowns that the first-order stage trains: each spring by itself, the neural spring field, or a rod (of a search with
-    `body: rod`); null: there is no such stage."""
+    """Unknowns that the first-order stage trains: each spring by itself, the neural spring field, or those of another body; null:
+    there is no such stage."""
     model: Name | None = None
     """A baseline, which has neither search nor fit, by its name in `BASELINES`."""
     mean_of: Name | None = None
@@ -82,7 +82,7 @@ class ScenarioRow(SettingsSection):
     scenario: Name
     """Name of the scenario."""
     source: Name
-    """The kind of its data: phystwin, mocap, posed, toy, synthetic, capture, points, phystwin_raw, or one of a package."""
+    """The kind of its data: phystwin, toy, synthetic, capture, points, phystwin_raw, or one of a package."""
     category: Name
     """Kind of object, for example rope, cloth, package or sloth."""
     path: str

@@ -11,13 +11,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, StringConstraints
 
-from neuspring.config.data import Deform, Mocap, Posed, Synthetic, Toy
+from neuspring.config.data import Synthetic, Toy
 from neuspring.config.effort import EFFORTS, Effort, sizes
 from neuspring.config.extensions import Baselines, with_extensions
 from neuspring.config.images import Images
 from neuspring.config.parse import json_value, merge, nested, parse, plain, read_yaml
 from neuspring.config.perception import Perception
-from neuspring.config.rod import RodSettings
 from neuspring.config.search import Search
 from neuspring.config.simulation import ReleasedQuirks, SimulationSettings
 from neuspring.config.tuning import Tune
@@ -87,7 +86,7 @@ class Aim(SettingsSection):
     task: Literal["reconstruction", "future", "transfer"] = "future"
     """Training frames, future frames, or twins on other recordings."""
     metric: Name = "track_error"
-    """The error: a metric of positions, for example chamfer, track_error_bound or deform_l1."""
+    """The error: a metric of positions, for example chamfer or track_error_bound."""
     ratio: Annotated[float, Field(gt=0.0)]
     """Largest geometric mean."""
     below: Annotated[float, Field(gt=0.0)] = 1.0
@@ -100,15 +99,15 @@ class Config(SettingsSection):
     """One benchmark: which scenarios, methods and seeds, and how."""
 
     scenarios: tuple[Name, ...] = ()
-    """Scenarios that are run: rows of the scenario table, captures in `data_root` by the names of their folders, and recordings of
-    cables there: `DLO3_train_15` is `DLO3/train/15.pkl`."""
+    """Scenarios that are run: rows of the scenario table, captures in `data_root` by the names of their folders, and names that
+    a source of a package gives to its recordings there."""
     methods: tuple[Name, ...] = ()
     """Rows of the method table that are run, beside the methods in the rows of `studies`. If studies add any, all methods stand in
     the order of the method table."""
     compare_with: Name | None = None
     """The method that tables compare the others with; the first method where this is null or is not run."""
     objects: Literal["scenario", "category"] = "scenario"
-    """Objects that intervals of ratios are over: every scenario, or all of a category together (the recordings of one cable)."""
+    """Objects that intervals of ratios are over: every scenario, or all of a category together (the recordings of one object)."""
     aims: tuple[Aim, ...] = ()
     """Ratios that methods are to reach against others, declared before the run, see [aims](#aims)."""
     seeds: Seeds = (0,)
@@ -159,12 +158,8 @@ class Config(SettingsSection):
     losses: Losses = field(default_factory=Losses)
     search: Search = field(default_factory=Search)
     fit: Fit = field(default_factory=Fit)
-    rod: RodSettings = field(default_factory=RodSettings)
     released_quirks: ReleasedQuirks = field(default_factory=ReleasedQuirks)
     toy: Toy = field(default_factory=Toy)
-    mocap: Mocap = field(default_factory=Mocap)
-    deform: Deform = field(default_factory=Deform)
-    posed: Posed = field(default_factory=Posed)
     synthetic: Synthetic = field(default_factory=Synthetic)
     perception: Perception = field(default_factory=Perception)
     images: Images = field(default_factory=Images)
@@ -172,6 +167,13 @@ class Config(SettingsSection):
     tracking: Tracking = field(default_factory=Tracking)
     tune: Tune | None = None
     """A sweep over settings, for the target `sweep`, see [tune](#tune); null: none."""
+
+    def expanded(self) -> Config:
+        """The configuration with the scenarios, pools and transfers that sections of packages stand for. Raises InputError."""
+        whole = self
+        for section in vars(self).values():
+            whole = section.expand(whole) if isinstance(section, SettingsSection) else whole
+        return whole
 
     @classmethod
     def completed(cls, given: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -25,7 +25,7 @@ class SimulationSettings(SettingsSection):
     """Candidate partners for self-collision, per node and frame; overflow is reported."""
     initial_velocity: Literal["rest", "observed", "before"] = "rest"
     """Velocity in frame 0: zero (rest), from the first three frames (observed), or from the sample before it (before). rest is as
-    released; before needs `mocap.start` of at least 1, and uses no later frame."""
+    released; before needs a source that knows that sample, and uses no later frame."""
 
 
 @dataclass(frozen=True, kw_only=True)

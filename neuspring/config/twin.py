@@ -9,7 +9,6 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from neuspring.config.extensions import with_extensions
-from neuspring.config.rod import RodFit
 from neuspring.core.section import Count, NonNegative, Positive, Range, SettingsSection
 
 
@@ -99,7 +98,6 @@ class Fit(SettingsSection):
     """Loss that chooses the best epoch: that seen while training, as in the paper, or that on a tail of training frames. On a tail,
     the last fifth, nothing is fitted; the start of the fit is a candidate too."""
     field: SpringFieldSettings = dataclasses.field(default_factory=SpringFieldSettings)
-    rod: RodFit = dataclasses.field(default_factory=RodFit)
 
     def __post_init__(self) -> None:
         low, high = self.stiffness_range

@@ -36,6 +36,10 @@ class SettingsSection:
                 return value
         raise LookupError(f"{type(self).__name__} has no section {kind.__name__}")
 
+    def expand(self, config: S) -> S:
+        """The configuration with what this section of it stands for, of a section at its top level. Raises InputError."""
+        return config
+
     @classmethod
     def completed(cls, given: Mapping[str, Any]) -> Mapping[str, Any]:
         """The given values, with those that follow from them."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,6 @@ import pandas as pd
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from neuspring.scores.metrics import averages, metrics_of
@@ -161,26 +160,3 @@ def _draw(axis: Axes, curves: pd.DataFrame, *, faint: bool = False) -> None:
         elif len(part):
             bars = part["std"] if np.any(part["std"] > 0) else None
             axis.errorbar(part["clusters"], part["mean"], bars, color=color, marker=marker, ms=4, capsize=3, label=task)
-
-
-def growth_figure(growth: pd.DataFrame, labels: Sequence[str]) -> Figure:
-    """Draw the mean error of free markers over time, a panel per cable, from rows cable, label, seconds, euclid_mm.
-
-    A row of the table has its color by its place in `labels`, whichever of them are there.
-    """
-    cables, shown = list(dict.fromkeys(growth["cable"])), [label for label in labels if label in set(growth["label"])]
-    # A column of the legend is as wide as a panel.
-    size = (2.6 * len(cables) + 0.6, 2.8 + 0.2 * -(-len(shown) // len(cables)))
-    figure, axes = plt.subplots(1, len(cables), figsize=size, layout="constrained", squeeze=False, sharex=True, sharey=True)
-    colors = plt.get_cmap("tab10" if len(labels) <= 10 else "tab20")
-    handles = [Line2D([], [], color=colors(labels.index(label)), label=label) for label in shown]
-    for axis, cable in zip(axes[0], cables, strict=True):
-        for label in shown:
-            part = growth[(growth["cable"] == cable) & (growth["label"] == label)].sort_values("seconds")
-            axis.plot(part["seconds"], part["euclid_mm"], color=colors(labels.index(label)), lw=1.2)
-        axis.set(title=cable, xlim=(0, growth["seconds"].max()), ylim=(0, None))
-        axis.grid(color="0.92")
-    figure.supxlabel("time [s]", fontsize=9)
-    figure.supylabel("error of free markers [mm]", fontsize=9)
-    figure.legend(handles=handles, loc="outside upper center", ncols=min(len(shown), len(cables)), frameon=False, fontsize=8)
-    return figure

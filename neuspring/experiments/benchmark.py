@@ -21,7 +21,7 @@ from neuspring.config.parse import read_rows
 from neuspring.core.errors import InputError
 from neuspring.core.text import listed
 from neuspring.perception.backends import BACKENDS, require_known
-from neuspring.scenes.sources import SOURCES, Source, location, scenario_rows, with_deform
+from neuspring.scenes.sources import SOURCES, Source, location, scenario_rows
 from neuspring.scores.metrics import require_metrics
 from neuspring.scores.paper import Study, read_studies
 from neuspring.twin.body import BODIES
@@ -161,7 +161,7 @@ class Benchmark:
         """`on_gpu`: True where jobs take GPUs; the workflow sets it."""
         self.gpu_slots = 0
         """Jobs that may hold a GPU at once, which the workflow sets; 0: a cluster decides."""
-        given = with_deform(parse(Config, values, "configuration"))
+        given = parse(Config, values, "configuration").expanded()
         rows = scenario_rows(given, root)
         self.extra = [root / path for path in given.extra_rows.values()]
         """Files with more rows of the tables."""

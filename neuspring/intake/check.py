@@ -7,14 +7,14 @@ What cannot work is an error, what is only unusual a warning with the next move;
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from neuspring.checks import cable, examine
+from neuspring.checks import examine
 from neuspring.checks.case import FINAL_DATA, Case, whole
 from neuspring.checks.masks import Shown
 from neuspring.checks.moving import Moving
@@ -22,7 +22,7 @@ from neuspring.checks.rig import CameraAlone, Judged, Rig
 from neuspring.checks.table import object_on_table
 from neuspring.checks.things import HAND_LEAST, Sample, hands_on, lifted, outline, place_of, sampled
 from neuspring.checks.timing import Streams, Watched, in_space, measure, of_cameras, on_images
-from neuspring.config import Mocap
+from neuspring.config import Config
 from neuspring.core.artifacts import up_sign
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
@@ -33,13 +33,25 @@ from neuspring.data.capture import CAPTURE, NODES, OBJECT, POINTS, Capture, desc
 from neuspring.data.unpickle import load_pickle
 from neuspring.intake import phystwin
 from neuspring.intake.points import InSpace, look
+from neuspring.registry import Registry
 
 LEAST_AROUND = 0.1
 """Share of the image that must have depth, beside object and hands, before the table is looked for."""
-DEFORM = Mocap()
-"""Unit, rate and up axis of recordings of cables where nothing else is said."""
 CAMERAS = 3
 """Cameras of every released case."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """Files of another kind that `check-data` can look at; a package brings one by an entry point of `neuspring.layouts`."""
+
+    recognizes: Callable[[Path], bool]
+    """True for a file of this kind, by its name."""
+    check: Callable[[Path, Config], list[Finding]]
+    """Every finding about a file; bad content is a finding and raises nothing."""
+
+
+LAYOUTS: Registry[Layout] = Registry("layouts", {}, Layout)
 
 
 def check_capture(folder: Path) -> list[Finding]:
@@ -210,29 +222,27 @@ def _color_alone(capture: Capture, name: str, samples: dict[int, Sample]) -> lis
     return findings
 
 
-def check_layout(folder: Path, settings: Mocap = DEFORM) -> list[Finding]:
+def check_layout(folder: Path, config: Config | None = None) -> list[Finding]:
     """Check a capture or a folder of them, a processed case, a folder of cases, a root with data/different_types, C3D files (or
-    one, with labels or without), or cable recordings (folder or .pkl file), whose unit, rate and up axis are in `settings`.
-    Returns every finding.
+    one, with labels or without), or files of a kind in `LAYOUTS`, which may read the configuration. Returns every finding.
 
     Raises InputError only if `folder` does not exist or holds no data of a known layout.
     """
     folder = Path(folder)
-    if plain_file(folder).is_file():
-        return check_markers(folder) if is_c3d(folder) else check_recording(folder, settings)
-    if not folder.is_dir():
+    if not plain_file(folder).exists():
         raise InputError(folder, "a folder or file to check is required", "nothing there")
     if captures := _captures(folder):
         return [finding for path in captures for finding in check_capture(path)]
     if cases := find_cases(folder):
         findings = [finding for case in cases for finding in _check_case(case)]
         return findings + examine("cases", folder, folder, cases, findings)
-    marked, files = (sorted(path for path in folder.rglob("*") if path.suffix.lower() == kind) for kind in (".c3d", ".pkl"))
-    if not marked and not files:
-        rule = "a capture, a case with final_data.pkl, a folder of cases, a root with data/different_types, C3D files or cable "
-        raise InputError(folder, f"{rule}recordings are required", "none of them")
-    findings = [finding for file in marked for finding in check_markers(file)]
-    return findings + [finding for file in files for finding in check_recording(file, settings)]
+    files = sorted(folder.rglob("*")) if folder.is_dir() else [folder]
+    found = [check_markers(file) for file in files if is_c3d(file)]
+    found += [kind.check(file, config or Config()) for file in files for kind in LAYOUTS.values() if kind.recognizes(file)]
+    if not found:
+        rule = "a capture, a case with final_data.pkl, a folder of cases, a root with data/different_types, or files of "
+        raise InputError(folder, f"{rule}{', '.join(['C3D', *LAYOUTS])} are required", "none of them")
+    return [finding for findings in found for finding in findings]
 
 
 def check_markers(path: Path) -> list[Finding]:
@@ -252,20 +262,13 @@ def check_markers(path: Path) -> list[Finding]:
     return findings + examine("moving", path, Moving(markers.points, markers.rate), remedy)
 
 
-def check_recording(file: Path, settings: Mocap) -> list[Finding]:
-    """Every finding of one recording of a cable; nothing is raised for bad content."""
-    findings: list[Finding] = []
-    raw = _read(findings, Path(file), load_pickle)
-    return findings or cable.look(file, raw, settings)
-
-
 def find_cases(folder: Path) -> list[Case]:
     """The processed cases in or below `folder`; none in a file, or if there are captures.
 
     Raises InputError for a root with data/different_types that holds no case.
     """
     folder = Path(folder)
-    if folder.is_file() or _captures(folder):
+    if not folder.is_dir() or _captures(folder):
         return []
     below = folder / "data" / "different_types"
     if below.is_dir():
@@ -304,7 +307,7 @@ def _captures(folder: Path) -> list[Path]:
 
 
 def _subfolders(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    return sorted(path for path in folder.glob("*") if path.is_dir() and not path.name.startswith("."))
 
 
 def _check_case(case: Case) -> list[Finding]:

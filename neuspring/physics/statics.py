@@ -35,13 +35,13 @@ UNBALANCED = 1e-6
 def at_rest(twin: Twin) -> Twin:
     """The twin in equilibrium under gravity: such are its nodes. Its rest shape stays, and controllers are where frame 0 has them.
 
-    Minimizes sum Y l0 (l / l0 - 1)^2 / 2 - sum m g x by Newton steps in a trust region. Raises InputError for a rod and for a body
-    that would be below the ground, NumericalFailure where nothing holds a part.
+    Minimizes sum Y l0 (l / l0 - 1)^2 / 2 - sum m g x by Newton steps in a trust region. Raises InputError for another body
+    and for one that would be below the ground, NumericalFailure where nothing holds a part.
     """
     from scipy.optimize import minimize
 
-    if twin.rod is not None:
-        raise InputError("twin.rod", "equilibria are found of lattices", "a rod", "Use rod_nodes.hanging.")
+    if twin.body:
+        raise InputError("twin.body", "equilibria are found of lattices", twin.body.kind)
     topology, simulation, count = twin.topology, twin.simulation, len(twin.topology.nodes)
     hands, lengths = topology.controllers.astype(np.float64), topology.rest_lengths.astype(np.float64)
     weight = np.outer(masses(twin), [0.0, 0.0, -simulation.up_sign * simulation.gravity])

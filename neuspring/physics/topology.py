@@ -26,7 +26,7 @@ TREE_QUANTILE = 0.9
 def node_spacing(nodes: np.ndarray) -> float:
     """Distance between neighboring nodes of a body [N, 3], m: the 0.9 quantile of the edges of its minimum spanning tree.
 
-    The tree joins all nodes by the shortest edges that do. Its longest edges lead across gaps: from ring to ring of a cable, whose
+    The tree joins all nodes by the shortest edges that do. Its longest edges lead across gaps: from ring to ring of a body whose
     nodes are nearer to each other within a ring, and from voxel to voxel where a body was sampled on voxels. So a radius of one
     spacing joins the body. The median distance of nearest neighbors does not: nodes of a voxel grid come in close pairs, those of a
     ring are near each other. The last tenth of the edges is left out because of holes in what was seen.

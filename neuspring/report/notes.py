@@ -91,7 +91,7 @@ def _grip(runs: Iterable[RunRecord]) -> list[tuple[str, str]]:
 
 
 def _gripping(values: Mapping[str, Any]) -> int | None:
-    """Number of springs that hold the hands: the fit's, else the search's. None of rods, whose clamps have none."""
+    """Number of springs that hold the hands: the fit's, else the search's. None where clamps hold it."""
     for stage in ("fit", "search"):
         if f"{stage}.result.vertices" in values:
             return None

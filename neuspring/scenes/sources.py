@@ -12,7 +12,6 @@ with `path` where its data lie.
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib import import_module
@@ -22,7 +21,6 @@ from typing import TYPE_CHECKING, Any
 from neuspring.checks.case import FINAL_DATA
 from neuspring.config import Config, ScenarioRow, parse, read_text
 from neuspring.core.errors import InputError
-from neuspring.core.text import listed
 from neuspring.data import capture
 from neuspring.intake import phystwin
 from neuspring.registry import Registry
@@ -59,6 +57,8 @@ class Source:
     """Files of its folder that a capture is made from, beside images."""
     images_beside: Callable[[Path], bool] = lambda folder: False
     """True where images lie beside processed data, so that a capture can be made of them for pictures."""
+    row_of: Callable[[str], ScenarioRow | None] = lambda name: None
+    """The row of a scenario that no table has, where its name says all of it."""
     required: Callable[[Path], None] = lambda folder: None
     """Raises InputError where its folder lacks what no run can do without."""
     require_alike: Callable[[Config], None] = lambda config: None
@@ -89,62 +89,17 @@ def location(row: ScenarioRow, settings: Config) -> Path:
     return Path(settings.data_root or ".") / row.path
 
 
-RECORDING = re.compile(r"(?P<cable>[A-Za-z0-9][\w.-]*)_(?P<part>train|eval)_(?P<number>\d+)")
-"""Name of a recording of DEFORM's data set, which lies in CABLE/PART/NUMBER.pkl."""
-
-
-def with_deform(settings: Config) -> Config:
-    """The configuration with the scenarios, pools and transfers of its section `deform`. Raises InputError where files lack."""
-    chosen = settings.deform
-    if chosen.cables and settings.data_root is None:
-        raise InputError(
-            "configuration, deform", "DEFORM's data need data_root", "null", "Give it: --config data_root=/path/to/data."
-        )
-    pools, transfers = dict(settings.pools or {}), dict(settings.transfers or {})
-    known: list[str] = []
-    for cable in chosen.cables:
-        folder = Path(settings.data_root or ".") / cable
-        train, judged = (
-            [
-                f"{cable}_{part}_{number}"
-                for number in sorted(int(file.stem) for file in folder.glob(f"{part}/*.pkl") if file.stem.isdecimal())
-            ]
-            for part in ("train", "eval")
-        )
-        known += [*train, *judged]
-        free, judged = ([name for name in names if name not in chosen.leave_out] for names in (train, judged))
-        if len(free) < chosen.clips or not judged:
-            rule = f"at least {chosen.clips} recordings train/NUMBER.pkl (deform.clips) and one eval/NUMBER.pkl are required"
-            there = listed(sorted({path.parent.parent.name for path in folder.parent.glob("*/eval/*.pkl")})) or "none"
-            received = f"{len(free)} and {len(judged)}"
-            raise InputError(folder, rule, received, f"Correct data_root, deform.cables (there: {there}), clips or leave_out.")
-        picked = [train[i * (len(train) - 1) // (chosen.clips - 1)] for i in range(chosen.clips)]
-        spare = [name for name in free if name not in picked]
-        for place, name in enumerate(picked):
-            if name not in free:
-                apart = [abs(train.index(other) - train.index(name)) for other in spare]
-                picked[place] = spare.pop(apart.index(min(apart)))
-        pools[cable], transfers[picked[0]] = tuple(picked), tuple(judged)
-    if unknown := [name for name in chosen.leave_out if name not in known]:
-        rule = "must be recordings of deform.cables"
-        raise InputError("configuration, deform.leave_out", rule, listed(unknown), f"There: {listed(known, 200) or 'none'}.")
-    scenarios = tuple(dict.fromkeys([*settings.scenarios, *(pools[cable][0] for cable in chosen.cables)]))
-    return dataclasses.replace(settings, scenarios=scenarios, pools=pools or None, transfers=transfers or None)
-
-
 def scenario_rows(settings: Config, root: Path = Path(), also: Iterable[str] = ()) -> dict[str, ScenarioRow]:
     """All scenarios, name -> row: those of the table, which lies below `root`, and each capture in `data_root` that no row names.
 
-    Such a capture needs no row: its folder is the scenario's name, and capture.json says the rest. A recording of a cable that the
-    configuration or `also` names needs none either: its name says where it lies. Raises InputError.
+    Such a capture needs no row: its folder is the scenario's name, and capture.json says the rest. What the configuration or `also`
+    names needs none either, where a source knows the name (`Source.row_of`). Raises InputError.
     """
     rows = read_scenarios(root / settings.scenario_table)
     groups = [*(settings.pools or {}).items(), *(settings.transfers or {}).items()]
     for name in dict.fromkeys([*settings.scenarios, *also, *(name for first, others in groups for name in (first, *others))]):
-        if name not in rows and (found := RECORDING.fullmatch(name)):
-            file = f"{found['cable']}/{found['part']}/{found['number']}.pkl"
-            values = {"scenario": name, "source": "mocap", "category": found["cable"], "path": file}
-            rows[name] = parse(ScenarioRow, values | {"self_collision": False, "ground": False}, f"scenario {name}")
+        if name not in rows and (found := next(filter(None, (source.row_of(name) for source in SOURCES.values())), None)):
+            rows[name] = found
     for path in sorted(Path(settings.data_root).glob(f"*/{capture.CAPTURE}")) if settings.data_root else ():
         name = path.parent.name
         try:
@@ -186,6 +141,8 @@ def read_scenarios(path: Path) -> dict[str, ScenarioRow]:
         if cells[0] in rows:
             raise InputError(where, "scenario names must differ")
         row = parse(ScenarioRow, values, where)
+        if row.source in SOURCES.left_out:
+            continue
         if row.source not in SOURCES:
             raise InputError(f"{where}, source", f"must be one of {', '.join(SOURCES)}", repr(row.source))
         rows[cells[0]] = row
@@ -223,12 +180,6 @@ def _required_in_space(folder: Path) -> None:
     read(capture.Capture.load(folder))
 
 
-def _require_rings(config: Config) -> None:
-    if config.mocap.rings is None:
-        rule = "must be set where twins are transferred, so that all recordings have as many nodes"
-        raise InputError("configuration, mocap.rings", rule, None)
-
-
 def _counted(folder: Path, config: Config) -> tuple[str, ...]:
     return tuple(map(str, range(phystwin.camera_count(folder))))
 
@@ -238,8 +189,6 @@ SOURCES = Registry(
     "sources",
     {
         "toy": Source(module="neuspring.scenes.synthetic.toy", reads=("toy",), needs_data=False),
-        "mocap": Source(module="neuspring.scenes.mocap", reads=("data_root", "mocap"), require_alike=_require_rings),
-        "posed": Source(module="neuspring.scenes.posed", reads=("data_root", "posed")),
         "synthetic": Source(
             module="neuspring.scenes.synthetic.make",
             reads=("synthetic",),

@@ -3,7 +3,7 @@
 Chamfer distance: each visible observed point to its nearest surface node, one direction, in the L1 norm |dx| + |dy| + |dz|.
 Track error: annotated tracks, matched to the nearest of all nodes at frame 0, Euclidean distance.
 Both follow the released evaluation of PhysTwin. The track error has a floor, its value in frame 0. The bound track error has none:
-its points move with the nodes around them (`carried`). DEFORM's L1 error is that of its evaluation, of markers along a cable.
+its points move with the nodes around them (`carried`).
 Metrics of pictures are computed in `pictures` and `lpips`.
 
 A metric is one member of `METRICS` and carries its function: it is computed wherever runs are scored, and stands in all tables.
@@ -173,31 +173,6 @@ def _mean_errors(positions: np.ndarray, tracks: np.ndarray, carried: Callable[[n
     return mean
 
 
-LOWEST = 0.002001
-"""Height, m, below which DEFORM's evaluation lifts observed markers."""
-
-
-def deform_l1(positions: np.ndarray, observations: Observations) -> np.ndarray:
-    """Mean absolute difference per frame [F], m, over the markers of the line and coordinates, of positions [F, N, 3].
-
-    As DEFORM's evaluation has it: held markers count with 0, and observed ones are at least `LOWEST` high. The line must consist of
-    tracked points, which are visible always, and controllers.
-    """
-    free = observations.line[observations.line < len(observations.nodes)]
-    seen = observations.object_points[: len(positions), free].astype(np.float64)
-    seen[..., 2] = np.maximum(seen[..., 2], LOWEST)
-    total: np.ndarray = np.abs(positions[:, free] - seen).sum(axis=(1, 2))
-    return total / (3 * len(observations.line))
-
-
-def _of_cables(positions: np.ndarray, observations: Observations) -> np.ndarray | None:
-    """DEFORM's error; None but for a line of markers alone."""
-    line = observations.line
-    of_markers = not ((line >= observations.object_points.shape[1]) & (line < len(observations.nodes))).any()
-    of_markers &= bool(line.size) and observations.scenario.up == "+z" and bool(observations.object_visibility.all())
-    return deform_l1(positions, observations) if of_markers else None
-
-
 def _of_marks(positions: np.ndarray, observations: Observations, *, on_table: bool) -> np.ndarray | None:
     """Errors of marked points, px or m on the table; None for captures with depth, and where no point was marked."""
     image = observations.image
@@ -210,10 +185,6 @@ def _of_marks(positions: np.ndarray, observations: Observations, *, on_table: bo
 _MM: Any = {"unit": "m", "shown_unit": "mm", "factor": 1e3, "digits": 2}
 _DRAWN: Any = {"unit": "1", "of": "pictures", "average": "frames", "in_studies": True}
 _ALL = (
-    Metric(
-        name="deform_l1", title="L1 error of DEFORM", heading="L1", **_MM, function=_of_cables,
-        explained="mean absolute difference of all coordinates of the markers along a cable, held ones (0) included",
-    ),
     Metric(
         name="chamfer", title="Chamfer distance", heading="CD", **_MM, function=chamfer_per_frame, paper_name="cd", in_studies=True,
         explained="single-directional L1 Chamfer",

@@ -25,9 +25,8 @@ from neuspring.core.files import write_text
 from neuspring.core.findings import Finding
 from neuspring.core.records import read_json
 from neuspring.scores import failures, statistics
-from neuspring.scores.clips import ClipNumbers
 from neuspring.scores.metrics import METRICS, averages, metrics_of
-from neuspring.scores.paper import Study
+from neuspring.scores.paper import STUDY_KINDS, OwnStudy, Study
 from neuspring.scores.runs import Collected, comparable, finished_scores, stacked
 from neuspring.scores.settings import differing
 from neuspring.scores.study import StudyNumbers, resolved
@@ -58,7 +57,7 @@ class Numbers:
     known_studies: Mapping[str, Study] = field(default_factory=dict)
     """Those and the ones that may stand beside them."""
     results: Path | None = None
-    """The folder of the runs, for films of clips, how the runs were asked for, and where to look; None where none holds them."""
+    """The folder of the runs, for videos, how the runs were asked for, and where to look; None where none holds them."""
     warnings: tuple[tuple[str, Finding], ...] = ()
     """Scenarios, and what steps of perception warned of."""
     names: Mapping[str, str] = field(default_factory=dict)
@@ -183,16 +182,13 @@ class Numbers:
         return differing(self.everything.records.values(), self.labels)
 
     @cached_property
-    def by_study(self) -> dict[str, StudyNumbers | ClipNumbers]:
+    def by_study(self) -> dict[str, StudyNumbers | OwnStudy]:
         """The numbers of every study."""
         return {name: self._of_study(name, study) for name, study in self.studies.items()}
 
-    def _of_study(self, name: str, study: Study) -> StudyNumbers | ClipNumbers:
-        if study.clips:
-            runs = self.everything.runs
-            named: Any = {f"{name}s": list(dict.fromkeys(runs[name])) for name in ("method", "seed")}
-            named["sources"] = list(dict.fromkeys(runs["scenario"]))
-            return ClipNumbers(name=name, study=study, results=self.results or Path("results"), **named)
+    def _of_study(self, name: str, study: Study) -> StudyNumbers | OwnStudy:
+        if study.kind:
+            return STUDY_KINDS[study.kind].of(name, study, self)
         beside = self.known_studies.get(study.beside or "")
         return StudyNumbers(name=name, study=study, collected=self.everything, beside=beside)
 
@@ -206,7 +202,7 @@ class Numbers:
         return hashlib.sha256(json.dumps(told).encode()).hexdigest()
 
     @property
-    def _parts(self) -> dict[str, Numbers | StudyNumbers | ClipNumbers]:
+    def _parts(self) -> dict[str, Numbers | StudyNumbers | OwnStudy]:
         """The names of tables' owners in the file: "" is this one, "moved" twins on other recordings, others are studies."""
         return {"": self, **({"moved": self.moved} if self.moved else {}), **self.by_study}
 

@@ -1,16 +1,17 @@
-"""Printed numbers, as data: the paper's tables, the released PhysTwin's scores, published errors on DEFORM's cables; and studies,
+"""Printed numbers, as data: the paper's tables, the released PhysTwin's scores; and studies,
 which say which of our methods stands in each row of a table."""
 
 from __future__ import annotations
 
 import csv
 import functools
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from decimal import Decimal
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 from pydantic import StringConstraints
 
@@ -18,6 +19,7 @@ from neuspring.config.parse import read_rows
 from neuspring.core.artifacts import SAFE_NAME
 from neuspring.core.errors import InputError
 from neuspring.core.section import STRICT, Name
+from neuspring.registry import Registry
 from neuspring.scores.metrics import METRICS, Metric
 
 if TYPE_CHECKING:
@@ -32,16 +34,6 @@ CLUSTER_CLAIM = (
     "It takes K = 5 everywhere."
 )
 MEANS = "MEAN22"
-CLIPS = "deform_published"
-"""The table of numbers that were published on DEFORM's cables. It has cables in place of tasks, and one metric."""
-CLIP_METRIC = "deform_l1"
-TAGS = {
-    "second-hand": "The paper printed the number. We read it second-hand, from a page that was made of the paper's TeX.",
-    "log": "The number stands in logs that DEFORM's authors published with their code.",
-    "others": "Others than DEFORM's authors trained DEFORM and published the number.",
-    "reference": "We measured it. It is no method: it shows what one gets without learning, or the least that is possible.",
-}
-"""Meaning of the tag of a number in `CLIPS`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,13 +44,10 @@ class Printed:
     value: float
     slack: float
     """Half a unit of the last digit: what rounding may have hidden."""
-    source: str = ""
-    tag: str = ""
-    """One of `TAGS`; empty: printed by the paper."""
 
 
 Values = dict[tuple[str, str, str], Printed]
-"""By label of the row, our task (of `CLIPS`: cable), our metric."""
+"""By label of the row, our task, our metric."""
 
 
 @functools.cache
@@ -75,16 +64,11 @@ def in_studies() -> dict[str, Metric]:
 
 @functools.cache
 def table(name: str) -> Values:
-    """One of the paper's tables, or `CLIPS`; empty if there is none of that name."""
-    if name == CLIPS:
-        return {
-            (row["method"], row["cable"], CLIP_METRIC): replace(_printed(row["l1_mm"]), source=row["source"], tag=row["tag"])
-            for row in _rows(f"{CLIPS}.csv")
-        }
+    """One of the paper's tables; empty if there is none of that name."""
     tasks = {theirs: ours for ours, theirs in PAPER_TASKS.items()}
     ours = {metric.paper_name: metric for metric in metrics().values()}
     return {
-        (row["method"], tasks[row["task"]], ours[row["metric"]].name): _printed(row["value"], ours[row["metric"]].unit == "m")
+        (row["method"], tasks[row["task"]], ours[row["metric"]].name): printed(row["value"], ours[row["metric"]].unit == "m")
         for row in _rows("paper_tables.csv")
         if row["table"] == name
     }
@@ -102,7 +86,7 @@ def released_scores(rows: Iterable[Mapping[str, str]] | None = None) -> Values:
     """
     names = {"chamfer_distance_m": "chamfer", "track_error_m": "track_error", "train": "reconstruction"}
     return {
-        (row["scenario"], names.get(row["split"], row["split"]), names.get(row["metric"], row["metric"])): _printed(row["value"])
+        (row["scenario"], names.get(row["split"], row["split"]), names.get(row["metric"], row["metric"])): printed(row["value"])
         for row in (_rows("released_phystwin_scores.csv") if rows is None else rows)
     }
 
@@ -122,7 +106,8 @@ def scenarios() -> frozenset[str]:
     return frozenset(released()["scenario"])
 
 
-def _printed(text: str, in_meters: bool = False) -> Printed:
+def printed(text: str, in_meters: bool = False) -> Printed:
+    """A printed number with the half unit of its last digit, in mm where it is printed in m."""
     text = f"{Decimal(text).scaleb(3):f}" if in_meters else text
     digits = len(text.partition(".")[2])
     return Printed(text=text, value=float(text), slack=0.5 * 10.0**-digits)
@@ -140,12 +125,12 @@ TAKEN = ("summary", "scores", "runs", "numbers", "transfers", "perception", "pic
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """A row of studies.yaml: one of the paper's tables, published numbers on cables, or a table of ours."""
+    """A row of studies.yaml: one of the paper's tables, or a table of ours."""
 
     __pydantic_config__ = STRICT
     title: Text
     reference: str | None
-    """Name of the table in paper_tables.csv, or `CLIPS`; null: the paper gives no numbers."""
+    """Name of the table in paper_tables.csv, or of one of the study's kind; null: nobody published numbers."""
     baseline: str
     """Label of the row that the others are compared with, on the same scenarios and seeds."""
     rows: dict[Text, Name]
@@ -155,9 +140,8 @@ class Study:
     """Training of the rows, in words."""
     beside: Name | None = None
     """A study of the same labels whose numbers this one shows next to its own: the same rows, trained in another way."""
-    clips: bool = False
-    """True for a table of twins on other recordings (`transfers`): a column per category, for example a cable. Published rows
-    stand above ours, under labels of their own. Its films show the baseline."""
+    kind: Name | None = None
+    """A kind of study that a package lays out (`STUDY_KINDS`); null: a table of methods like the paper's."""
 
     def __post_init__(self) -> None:
         if self.baseline not in self.rows:
@@ -166,10 +150,10 @@ class Study:
             raise ValueError(f"rows: methods must differ, received {list(self.rows.values())}")
         if self.reference is None:
             return
-        known = (CLIPS,) if self.clips else tables()
+        known = tables() if self.kind is None else tuple(STUDY_KINDS[self.kind].published)
         if self.reference not in known:
             raise ValueError(f"reference: must be null or one of {', '.join(known)}, received {self.reference!r}")
-        if self.clips:
+        if self.kind:
             return
         missing = [label for label in dict.fromkeys(label for label, _, _ in self.values) if label not in self.rows]
         if missing:
@@ -177,8 +161,38 @@ class Study:
 
     @property
     def values(self) -> Values:
-        """Values that the paper prints; empty without a reference."""
-        return table(self.reference) if self.reference else {}
+        """Published values; empty without a reference."""
+        if self.reference is None:
+            return {}
+        return STUDY_KINDS[self.kind].published[self.reference]() if self.kind else table(self.reference)
+
+
+class OwnStudy(ABC):
+    """The numbers of a kind of study that a package lays out."""
+
+    published: ClassVar[Mapping[str, Callable[[], Values]]] = {}
+    """Tables of published numbers by name."""
+    TABLES: ClassVar[tuple[str, ...]]
+    """Attributes that are tables, which numbers.json keeps."""
+    name: str
+    study: Study
+
+    @classmethod
+    @abstractmethod
+    def of(cls, name: str, study: Study, numbers: Any) -> Self:
+        """Those of a study on the `Numbers` of a benchmark."""
+
+    @abstractmethod
+    def blocks(self) -> list[Any]:
+        """What the report shows: blocks of neuspring.report.blocks."""
+
+    @abstractmethod
+    def write(self, folder: Path) -> str:
+        """Write all files; returns the Markdown."""
+
+
+STUDY_KINDS: Registry[type[OwnStudy]] = Registry("studies", {}, type)
+"""Kind -> class, from entry points of the group `neuspring.studies`."""
 
 
 def read_studies(path: Path, extra: Iterable[Path] = ()) -> dict[str, Study]:

@@ -86,7 +86,7 @@ def _mean_interval(values: pd.Series, rng: np.random.Generator) -> tuple[float, 
 
 
 Objects = Literal["scenario", "category"]
-"""Objects that intervals are over: a scenario, or all scenarios of a category (a cable with several recordings)."""
+"""Objects that intervals are over: a scenario, or all scenarios of a category (an object with several recordings)."""
 BELOW, NOT_RESOLVED, ABOVE, TOO_FEW = "below 1", "not resolved", "above 1", "too few objects"
 REACHED, MISSED, NOT_RUN = "reached", "missed", "not run"
 RATIO_COLUMNS = ("method", "baseline", "task", "metric", "ratio", "ratio_low", "ratio_high", "n", "objects", "pairs", "verdict")

@@ -44,7 +44,7 @@ def fit(
     run: Recorder,
     pool: Sequence[Observations] = (),
     leave_out: Annotated[bool, "fit the pool alone"] = False,
-    kind: Annotated[str, "springs: train each spring; field: the neural spring field; rod: all of a rod"] = "springs",
+    kind: Annotated[str, "springs: train each spring; field: the neural spring field; or a kind of another body"] = "springs",
     oracle: Annotated[bool, "fit all frames, the future included: what fitting could reach at best"] = False,
     device: str = "auto",
     threads: int = 1,
@@ -53,7 +53,7 @@ def fit(
 
     A field's first weights follow the search's seed. An `oracle` fits all frames, the future included, and the record says so. With
     a `pool` of other recordings the twin is fitted on all, or with `leave_out` on the others. A checkpoint that a killed fit left,
-    or one that ran together with others (`fits`), is continued. A rod has Levenberg-Marquardt in place of gradients, on `threads`
+    or one that ran together with others (`fits`), is continued. Another body may do without gradients, on `threads`
     cores, and begins anew.
     """
     from neuspring.core.files import write_history

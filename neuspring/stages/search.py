@@ -47,7 +47,7 @@ def search(
     pool: Sequence[Observations] = (),
     leave_out: Annotated[bool, "judge by the pool alone"] = False,
     clusters: int = 1,
-    body: Annotated[str, "lattice or rod, or a package's own"] = "lattice",
+    body: Annotated[str, "lattice, or a package's own"] = "lattice",
     seed: int = 0,
     device: str = "auto",
     threads: int = 1,
@@ -58,8 +58,8 @@ def search(
     `clusters` regions of the topology have values of their own (1: uniform). At most `twins_per_launch` candidates share a launch
     (auto: as many as pay), and `threads` launches run at the same time on a CPU; neither changes a number there. A trace of the
     same search is continued, so a larger `search.rollouts` costs only the difference. With a `pool` of other recordings a
-    candidate's cost is the mean over all, or with `leave_out` over the others. A `body` that is a rod has no topology to
-    search: its constants are found by Levenberg-Marquardt on the first frames (twin/rod_fit.py), and its trace has a row per step.
+    candidate's cost is the mean over all, or with `leave_out` over the others. A `body` of a package
+    may search in another way, and have other rows in its trace.
     """
     from neuspring.core.files import write_history
 

@@ -1,6 +1,6 @@
 """The paper's method: from observations to a twin, and from a twin to a prediction.
 
-body        what a twin is made of, asked by all others: bodies/lattice, bodies/rod (neuspring.rods, rod_fit)
+body        what a twin is made of, asked by all others: bodies/lattice, and bodies of packages
 search      CMA-ES over topology and a homogeneous material: candidates (variables, twin, cost), trials (many on the lanes of one
             solver), polish (Levenberg-Marquardt)
 field       the neural spring field

@@ -1,4 +1,4 @@
-"""The body: what a twin is made of. A lattice of springs and a rod answer the same questions, and so does a package's own body.
+"""The body: what a twin is made of. The lattice of springs and the bodies of packages answer the same questions.
 
 A body is a module of `neuspring.twin.bodies` with a `body`, or an entry point of the group `neuspring.bodies`. It imports what it
 computes with in its methods: the workflow asks for names and settings before any job exists.
@@ -7,7 +7,7 @@ computes with in its methods: the workflow asks for names and settings before an
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from neuspring.config import Config
-from neuspring.core.artifacts import Artifact, Observations, Rod, Twin
+from neuspring.core.artifacts import Artifact, Observations, Twin
 from neuspring.registry import Registry, modules
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class SearchOptions:
 class Lines:
     """Lines that a twin is drawn with: those of its body, then the springs of hands.
 
-    A point is a node, then a controller, then what else the body has: the vertices of a rod's center line.
+    A point is a node, then a controller, then what else the body has.
     """
 
     pairs: np.ndarray
@@ -69,7 +69,7 @@ class Lines:
     rest_lengths: np.ndarray
     """[L], m."""
     stiffness: np.ndarray
-    """[L], N; of an edge of a rod EI / l^2."""
+    """[L], N."""
     inner: int
     """Number of lines that are the body's; the others are those of hands."""
     kind: str
@@ -115,12 +115,14 @@ class Body(ABC):
     """The body, in the plain export."""
     convention = "1 kg per node"
     """Masses of its twins where nobody weighed the object."""
+    sizes: Mapping[str, str] = {}
+    """Meaning of the dimensions of the arrays of its data (`Twin.body`), in the plain export."""
     equations: str
     """A step of its simulation, in the plain export; a paragraph each."""
 
     @abstractmethod
     def describes(self, twin: Twin) -> bool:
-        """True for a twin that has this body; a lattice has springs, as every twin."""
+        """True for a twin that has this body, by `Twin.body`."""
 
     # --- from recordings to twins
 
@@ -179,13 +181,9 @@ class Body(ABC):
     def mass_at(self, twin: Twin, node: int) -> float:
         """Mass that a force on a node moves first, kg."""
 
-    def parts(self, twin: Twin) -> tuple[Artifact, ...]:
-        """Parts of a twin beside topology and material, whose arrays are exported with their kind as prefix."""
-        return ()
-
-    def center_line(self, twin: Twin) -> Rod | None:
-        """The elastic line that carries the nodes; None where springs between nodes are all there is."""
-        return None
+    def version(self, twin: Twin) -> int:
+        """Version of the plain export's format that can say all of a twin."""
+        return 1
 
 
 BODIES: Registry[Body] = Registry("bodies", modules("neuspring.twin.bodies", "body"), type=Body)

@@ -114,7 +114,7 @@ def initial_velocity(observations: Observations, kind: InitialVelocity) -> np.nd
         if not len(observations.velocity_before):
             rule = "before needs a recording that knows the sample before frame 0"
             where = f"{scenario.name}, simulation.initial_velocity"
-            raise InputError(where, rule, "none", "Set mocap.start: 1, or choose observed.")
+            raise InputError(where, rule, "none", "Choose observed.")
         places = np.concatenate([observations.object_points[0], observations.controller_points[0]])
         return spread(places, observations.velocity_before, nodes)
     x, hands = (values[:3].astype(np.float64) for values in (observations.object_points, observations.controller_points))

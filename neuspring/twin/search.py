@@ -61,7 +61,7 @@ class Proposals:
 
     In the first `tied_rollouts` it searches the 12 variables of the uniform topology; then it starts again in all variables, from
     the best candidate so far. K regions have too many variables for a few hundred rollouts: free from the start, the piecewise
-    search of cables ended above the uniform one on training frames, although its space contains the other's.
+    search ended above the uniform one on training frames, although its space contains the other's.
     """
 
     def __init__(self, start: np.ndarray, variables: Sequence[str], tied: int, seed: int) -> None:

@@ -47,7 +47,7 @@ class OutOfReach(InputError):
 
 
 LENGTH_SPREAD = 0.2
-"""Cables bent in frame 0 reach 0.02; nodes in another order lie above 0.5."""
+"""Bodies bent in frame 0 reach 0.02; nodes in another order lie above 0.5."""
 LEAST_LENGTH = 1e-9
 """Shorter springs count as this long, m."""
 
@@ -290,10 +290,9 @@ def _means(places: np.ndarray, at: np.ndarray) -> Callable[[np.ndarray], np.ndar
 
 
 def require_pool(here: Observations, pool: Sequence[Observations]) -> None:
-    """Raise InputError unless a lattice can be judged on the pool: of a cable, recordings with as many nodes and hands, i on i.
+    """Raise InputError unless a lattice can be judged on the pool: along a line, recordings with as many nodes and hands, i on i.
 
-    Rings around a line that is recorded from its other end are others; all such recordings are named. Another body may have other
-    nodes in each recording; its shapes must fit onto each other (`laid_onto`).
+    Another body may have other nodes in each recording; its shapes must fit onto each other (`laid_onto`).
     """
     recordings = [here, *pool]
     if not any(each.line.size for each in recordings):
@@ -302,10 +301,6 @@ def require_pool(here: Observations, pool: Sequence[Observations]) -> None:
                 laid_onto(here.canonical[: len(here.nodes)], there)
         return
     require_alike(recordings, "nodes and controllers", lambda each: (len(each.nodes), each.controller_points.shape[1]))
-    orders = along(recordings) if pool and here.line.size else []
-    if turned := [each.scenario.name for each, order in zip(recordings, orders, strict=False) if order[0] > 1]:
-        rule = "node i of a cable must be node i in every recording, so all must run from the same end"
-        raise InputError(f"pool of {here.scenario.name}", rule, f"{listed(turned)} from the other", LEAVE_OUT)
 
 
 def require_alike(recordings: Sequence[Observations], counted: str, counts: Callable[[Observations], tuple[int, ...]]) -> None:
@@ -313,36 +308,4 @@ def require_alike(recordings: Sequence[Observations], counted: str, counts: Call
     here, others = counts(recordings[0]), {each.scenario.name: counts(each) for each in recordings[1:]}
     if wrong := [f"{received} in {name}" for name, received in others.items() if received != here]:
         rule = f"recordings of a pool must have as many {counted}: {here}"
-        raise InputError(
-            f"pool of {recordings[0].scenario.name}", rule, listed(wrong), f"Sample all alike (mocap.rings). {LEAVE_OUT}"
-        )
-
-
-LEAVE_OUT = "Leave them out (deform.leave_out, or pools)."
-BETTER_ORDER = 0.9
-"""Another order must fit distances of neighbors by so many times the error of that of the file. For DEFORM's cables the true order
-is at most 0.8 times the other one."""
-
-
-def along(recordings: Sequence[Observations]) -> list[np.ndarray]:
-    """Order [V] of the line of each recording of a cable in which neighbors are as far apart as in most of them.
-
-    It is that of the file, that from the other end, or one with the two markers of an end exchanged. Distances are medians over the
-    training frames: those of a single frame change with the cable's bend. Another order than that of the file is printed.
-    """
-
-    def apart(each: Observations, order: np.ndarray | slice = slice(None)) -> np.ndarray:
-        tracked, extra = each.object_points.shape[1], len(each.nodes) - each.object_points.shape[1]
-        points = np.concatenate([each.object_points, each.controller_points], axis=1)[: each.scenario.train_end]
-        line = points[:, np.where(each.line < tracked, each.line, each.line - extra)][:, order]
-        return np.asarray(np.median(np.linalg.norm(np.diff(line, axis=1), axis=2), axis=0))
-
-    count = len(recordings[0].line)
-    orders = [np.arange(count), np.arange(count)[::-1], np.r_[1, 0, 2:count], np.r_[: count - 2, count - 1, count - 2]]
-    usual = np.median([apart(each) for each in recordings], axis=0)
-    errors = [[np.abs(apart(each, order) - usual).mean() for order in orders] for each in recordings]
-    found = [orders[np.argmin(error) if min(error) < BETTER_ORDER * error[0] else 0] for error in errors]
-    for each, order in zip(recordings, found, strict=True):
-        if order is not orders[0]:
-            print(f"note: {each.scenario.name}: by the distances between its markers their order is {order.tolist()}")
-    return found
+        raise InputError(f"pool of {recordings[0].scenario.name}", rule, listed(wrong), "Sample all alike, or shorten the pool.")

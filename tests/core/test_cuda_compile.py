@@ -21,7 +21,7 @@ MODULES = sorted(
     for path in PACKAGE.rglob("*.py")
     if "wp.kernel" in path.read_text(encoding="utf-8")
 )
-LONG = {"neuspring.physics.frame", "neuspring.rods.solver"}
+LONG = {"neuspring.physics.frame", "neuspring.extensions.rods.solver"}
 """Modules that take minutes: each architecture compiles them for one of the scalar types."""
 ARCHITECTURES = (80, 90)
 """A100 and H100, as compute capability x 10."""

@@ -96,7 +96,7 @@ def test_transitive_imports_count(copy):
     edit(copy / "physics" / "lanes.py", "MIN_SPRING_LENGTH = 1e-6", "MIN_SPRING_LENGTH = 1e-7")
     assert digest(search, lattice) != before
     assert "neuspring.physics.springs" in provenance.used_modules("neuspring.stages.fit")
-    assert "neuspring.rods.solver" not in provenance.used_modules(lattice), "a change of the rod searches no lattice again"
+    assert "neuspring.extensions.rods.solver" not in provenance.used_modules(lattice), "a change of a rod changes no lattice"
 
 
 def test_declarations_and_reporting_do_not_count(copy):

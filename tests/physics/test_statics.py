@@ -12,7 +12,6 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.physics.statics import at_rest, elasticity, young
 from neuspring.physics.topology import object_springs
 from neuspring.twin.rollout import roll_out
-from tests.support import rods
 from tests.support.scenes import scene, twin_of
 
 DENSITY, SIDE, LENGTH, STIFFNESS = 1000.0, 0.03, 0.1, 2.0
@@ -110,9 +109,3 @@ def test_springs_in_all_directions_make_an_isotropic_body_of_poissons_ratio_a_qu
 def test_what_does_not_come_to_rest_is_named(twin, error, words):
     with pytest.raises(error, match=words):
         at_rest(twin)
-
-
-def test_a_rod_is_refused():
-    rod = rods.rod(rods.straight(4))
-    with pytest.raises(InputError, match=r"twin\.rod: .*lattices.*rod_nodes\.hanging"):
-        at_rest(replace(held_node(), rod=replace(rod, edge=np.zeros(1, np.int32), place=np.zeros((1, 3)))))

@@ -12,7 +12,7 @@ from neuspring.core.files import write_text
 from neuspring.core.records import Recorder
 from neuspring.splats.model import Splats
 from neuspring.twin.rollout import roll_out
-from tests.support import ropes, small
+from tests.support import small
 
 
 def results(folder: Path, methods: tuple[str, ...] = ("baseline", "neuspring")) -> Path:
@@ -27,18 +27,6 @@ def results(folder: Path, methods: tuple[str, ...] = ("baseline", "neuspring")) 
         roll_out(twin, seen.controller_points).save(place / "trajectory.npz")
         record(place)
     return scenario
-
-
-def rod_results(folder: Path, *, clamped: bool = False) -> Path:
-    """results/<scenario> of a rope that a hand lifts, or of a cable between clamps, with one run whose twin is a rod."""
-    seen = (ropes.cable if clamped else ropes.rope)(frames=6, move=(0.0, 0.002, 0.004))
-    place = folder / "small" / "rod" / "0"
-    seen.save(folder / "small" / "observations.npz")
-    twin = ropes.twin(seen)
-    twin.save(place / "twin.npz")
-    roll_out(twin, seen.controller_points).save(place / "trajectory.npz")
-    record(place)
-    return folder / "small"
 
 
 def record(run: Path) -> None:

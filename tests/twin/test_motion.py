@@ -78,7 +78,7 @@ def test_the_velocity_before_frame_0_reads_no_later_frame():
     count = seen.object_points.shape[1] + seen.controller_points.shape[1]
     known = replace(seen, velocity_before=np.tile([1.0, 2.0, 3.0], (count, 1)))
     np.testing.assert_allclose(initial_velocity(known, "before"), np.tile([1.0, 2.0, 3.0], (len(seen.nodes), 1)), atol=ROUNDING)
-    with pytest.raises(InputError, match=r"simulation\.initial_velocity: before needs.*mocap\.start: 1"):
+    with pytest.raises(InputError, match=r"simulation\.initial_velocity: before needs.*Choose observed"):
         initial_velocity(seen, "before")
 
 

@@ -9,12 +9,10 @@ import pandas as pd
 
 from neuspring.core.table import Tone
 from neuspring.report.blocks import Answer, Block, Fold, Grid, PageSection
-from neuspring.report.clips import clip_blocks
 from neuspring.report.data import ReportData, ReportSection, several
 from neuspring.report.grid import chip
 from neuspring.report.study import study_blocks
 from neuspring.scores import paper, study
-from neuspring.scores.clips import ClipNumbers
 from neuspring.scores.study import StudyNumbers, verdict_text
 
 Kind = study.Verdict
@@ -30,7 +28,7 @@ def studies(material: ReportData) -> PageSection | None:
     cards = [answer_card(one) for one in found if isinstance(one, StudyNumbers) and one.study.reference]
     folds = []
     for one in found:
-        blocks: list[Block] = clip_blocks(one) if isinstance(one, ClipNumbers) else study_blocks(one)
+        blocks: list[Block] = study_blocks(one) if isinstance(one, StudyNumbers) else one.blocks()
         folds.append(Fold(summary=f"{one.name}: {one.study.title}", blocks=blocks, open=True, key=f"study-{one.name}"))
     about = f"{_foreign(material.collected.runs)} The command neuspring explain STUDY/ROW/TASK/METRIC says what a cell is made of."
     return PageSection(

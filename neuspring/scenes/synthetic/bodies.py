@@ -20,9 +20,9 @@ from neuspring.scenes.synthetic.meshes import (
     ellipsoid,
     embed,
     fill,
-    rod,
     smooth_union,
     sphere,
+    stick,
     surface,
 )
 
@@ -201,7 +201,7 @@ def rope(name: str, spacing: float, skin_spacing: float) -> SoftBody:
     length, knots, color = ROPES[name]
     along = np.linspace(-length / 2, length / 2, round(length / spacing) + 1)
     knot = _knots(along, knots)
-    nodes, tetrahedra = rod(length, ROPE_RADIUS + (KNOT_RADIUS - ROPE_RADIUS) * knot, 8)
+    nodes, tetrahedra = stick(length, ROPE_RADIUS + (KNOT_RADIUS - ROPE_RADIUS) * knot, 8)
     radius = 0.0035
     nodes[:, 2] += ROPE_RADIUS + radius
     stiffness = ROPE_MODULUS * (1.0 + 3.0 * _knots(nodes[tetrahedra].mean(axis=1)[:, 0], knots))

@@ -1,5 +1,5 @@
 """Meshes of bodies and hands: triangle surfaces of signed distance functions, tetrahedra of implicit bodies (body-centered lattice,
-boundary snapped to the surface), boxes and rods, in NumPy.
+boundary snapped to the surface), boxes and sticks, in NumPy.
 
 Distances [...] of points [..., 3], m, are negative inside. The ellipsoid and the smooth union are approximate distances with exact
 signs away from the blend, which is all that meshing needs. Meshes are (nodes [N, 3] m, tetrahedra [E, 4] with positive volume).
@@ -236,8 +236,8 @@ def block(low: Sequence[float] | np.ndarray, high: Sequence[float] | np.ndarray,
     return nodes, oriented(nodes, np.concatenate(elements))
 
 
-def rod(length: float, radii: np.ndarray, around: int) -> Mesh:
-    """A rod along x, centered: `radii` [n + 1] at equal steps, a node on the axis and `around` nodes on each ring, three
+def stick(length: float, radii: np.ndarray, around: int) -> Mesh:
+    """A stick along x, centered: `radii` [n + 1] at equal steps, a node on the axis and `around` nodes on each ring, three
     tetrahedra per prism, split by node order so that neighbors agree."""
     along = np.linspace(-length / 2, length / 2, len(radii))
     angles = 2 * np.pi * np.arange(around) / around

@@ -57,7 +57,7 @@ and it goes on for the rest of dt.
 """
 
     def describes(self, twin: Twin) -> bool:
-        return twin.rod is None
+        return twin.body is None
 
     def search(
         self, observations: Observations, pool: Sequence[Observations], settings: Config, options: SearchOptions

@@ -38,10 +38,10 @@ from neuspring.core.artifacts import Rod, Simulation, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.table import Cell, Table
 from neuspring.data.c3d import Markers
+from neuspring.extensions.rods.solver import RodLanes, RodSolver
 from neuspring.physics.parameters import homogeneous
 from neuspring.physics.statics import at_rest, young
 from neuspring.physics.topology import build, object_springs
-from neuspring.rods.solver import RodLanes, RodSolver
 from neuspring.twin.body import body_of
 from neuspring.twin.rollout import roll_out
 

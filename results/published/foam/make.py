@@ -27,9 +27,9 @@ from neuspring.core.files import write_text
 from neuspring.core.run_folder import RunFolder
 from neuspring.core.table import Table
 from neuspring.draw.sheet import save
+from neuspring.extensions.rods import posed
+from neuspring.extensions.rods.made import marker_shares
 from neuspring.report.blocks import markdown
-from neuspring.rods.made import marker_shares
-from neuspring.scenes import posed
 from neuspring.twin.body import body_of
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.transfer import move

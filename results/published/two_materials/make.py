@@ -31,9 +31,9 @@ from neuspring import config
 from neuspring.core.artifacts import Rod, Simulation, Twin
 from neuspring.core.files import write_text
 from neuspring.core.table import Table
+from neuspring.extensions.rods.nodes import RodFrames, bound
 from neuspring.physics.parameters import homogeneous
 from neuspring.physics.topology import build
-from neuspring.rods.nodes import RodFrames, bound
 from neuspring.twin.parameters import TwinParameters
 from results.published.two_materials.beams import (
     CELLS,

@@ -14,8 +14,8 @@ from neuspring.extensions.exports.formats import rrd
 from neuspring.extensions.exports.source import read_source
 from neuspring.scores.metrics import errors_per_frame
 from tests.extensions.exports import exported
+from tests.extensions.rods.ropes import rod_results
 from tests.support import captures
-from tests.support.played import rod_results
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed (extra `rerun`)")
 RED = (200, 50, 20)
@@ -154,7 +154,7 @@ def test_a_twin_alone_upside_down_and_a_rod(folder, tmp_path):
     source = read_source(rod_results(tmp_path, clamped=True) / "rod" / "0")
     rrd.write(source, [0, 5], tmp_path / "rod.rrd")
     strips = np.array(read(tmp_path / "rod.rrd")["/world/predicted/springs"][5]["LineStrips3D:strips"])
-    assert len(strips) == len(source.twin.rod.lengths) + len(source.twin.topology.springs)
+    assert len(strips) == len(source.twin.body.lengths) + len(source.twin.topology.springs)
     np.testing.assert_allclose(strips[2:5, 0], source.positions[5], atol=1e-6)
 
 

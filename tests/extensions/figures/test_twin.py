@@ -13,7 +13,7 @@ from neuspring.draw.twin import CROSSING, TwinPicture, region_colors, twin_figur
 from neuspring.extensions.figures.filmed import SurfacePicture, finer
 from neuspring.report.shown import find
 from neuspring.twin.body import body_of, lines_of
-from tests.support.played import rod_results
+from tests.extensions.rods.ropes import rod_results
 from tests.support.shown import painter
 
 LUMA = np.array([0.2126, 0.7152, 0.0722])
@@ -105,9 +105,9 @@ def test_a_surface_has_the_colors_of_its_nodes(video):
 def test_a_rod_is_drawn_as_its_center_line_colored_by_its_bending_stiffness(tmp_path, clamped):
     found = find([rod_results(tmp_path, clamped=clamped)])
     (run,) = found.runs
-    take, rod = ShownRun("rod", run.trajectory.positions, run.twin), run.twin.rod
+    take, rod = ShownRun("rod", run.trajectory.positions, run.twin), run.twin.body
     scene = ShownScene.from_side(found.observations, [take], [0])
-    uneven = replace(run.twin, rod=replace(rod, bending=np.linspace(1, 2, len(rod.bending)) * rod.bending))
+    uneven = replace(run.twin, body=replace(rod, bending=np.linspace(1, 2, len(rod.bending)) * rod.bending))
     take = replace(take, twin=uneven)
     lines = lines_of(uneven)
     assert lines.inner == len(rod.lengths) == len(lines.pairs) - len(uneven.topology.springs)

@@ -14,8 +14,10 @@ from neuspring.extensions.play.simulator import Simulator, Start, hands_of, star
 from neuspring.physics import stability
 from neuspring.report.shown import find
 from neuspring.twin.rollout import roll_out
-from tests.support import ropes, small
-from tests.support.played import results, rod_results, softer
+from tests.extensions.rods import ropes
+from tests.extensions.rods.ropes import rod_results
+from tests.support import small
+from tests.support.played import results, softer
 
 FRAMES, NODE = 12, 3
 NAMES = {"scenario": "small", "method": "truth", "seed": "0", "twin_digest": "0"}

@@ -26,8 +26,9 @@ from neuspring.report.shown import find
 from neuspring.scores.metrics import track_errors
 from neuspring.splats.model import Gaussians
 from neuspring.splats.view import C0
+from tests.extensions.rods.ropes import rod_results
 from tests.support.captures import describe, entry
-from tests.support.played import dressed, record, rod_results, softer, spoil
+from tests.support.played import dressed, record, softer, spoil
 
 RUN = "baseline/0"
 
@@ -76,7 +77,7 @@ def test_a_rod_is_shown_and_pulled_live(opened, tmp_path):
     page = opened(rod_results(tmp_path))
     page.panel.start("rod/0")
     live = page.panel.live
-    edges = len(live.simulator.twin.rod.lengths)
+    edges = len(live.simulator.twin.body.lengths)
     assert len(live.body.parts.pairs) == edges + len(live.simulator.twin.topology.springs)
     until(lambda: live.simulator.frame > 2)
     place = live.simulator.positions[4].copy()

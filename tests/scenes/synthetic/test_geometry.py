@@ -63,7 +63,7 @@ def test_a_body_is_filled_to_its_surface():
     ("mesh", "volume"),
     [
         (meshes.block((0, 0, 0), (0.3, 0.2, 0.1), (4, 3, 2)), 0.006),
-        (meshes.rod(0.5, np.full(11, 0.01), 8), 0.5 * 8 * 0.5 * 0.01**2 * np.sin(np.pi / 4)),
+        (meshes.stick(0.5, np.full(11, 0.01), 8), 0.5 * 8 * 0.5 * 0.01**2 * np.sin(np.pi / 4)),
     ],
 )
 def test_boxes_and_rods_fit_together(mesh, volume):

@@ -10,17 +10,20 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from neuspring.core.files import write_text
-from neuspring.extensions.exports import Export, cable
-from neuspring.extensions.exports.cable import HINGE_AXES, text
+from neuspring.extensions.exports import Export, of_body
 from neuspring.extensions.exports.formats import npz
 from neuspring.extensions.exports.source import ExportSource, require_start
-from neuspring.rods.nodes import radius_of
-from neuspring.twin.body import body_of
 from neuspring.twin.rollout import FAR_AWAY
 
+AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
 MODEL = "twin.xml"
 GROUND_TIME = 4
 """Time constant of contacts with the ground, in time steps; MuJoCo takes 2 or more."""
+
+
+def text(*values: float | np.floating) -> str:
+    """Numbers as MJCF has them; float32 to the last bit."""
+    return " ".join(f"{float(value):.9g}" for value in values)
 
 
 def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Path]:
@@ -41,16 +44,17 @@ def mjcf(source: ExportSource) -> str:
     ground acts by priority alone. It is as hard as the time step allows. The cone of friction is round, since the pyramid that is
     MuJoCo's default brakes otherwise along the diagonals.
 
-    Of a rod, nodes are sites of a cable (cable.py), and the time step is `cable.STEP` at most.
+    A package writes its body itself (`BODY_EXPORTS`): bodies that carry a site per node, and the longest time step.
     """
     twin = source.twin
     simulation, material, topology = twin.simulation, twin.material, twin.topology
     radius = material.contact_distance / 2
     root = ET.Element("mujoco", model=source.name)
     gravity = (0, 0, -simulation.gravity * simulation.up_sign)
-    rod = body_of(twin).center_line(twin)
-    radius = max(radius_of(rod), cable.THICKNESS) if rod else radius
-    step, integrator = (min(simulation.substep, cable.CABLE_STEP), "implicitfast") if rod else (simulation.substep, "Euler")
+    write_body = of_body(twin, "mujoco")
+    own = write_body(twin) if write_body else None
+    radius = own.radius if own else radius
+    step, integrator = (min(simulation.substep, own.step), "implicitfast") if own else (simulation.substep, "Euler")
     ET.SubElement(root, "option", timestep=text(step), integrator=integrator, gravity=text(*gravity), cone="elliptic")
     world = ET.SubElement(root, "worldbody")
     if simulation.ground:
@@ -63,11 +67,11 @@ def mjcf(source: ExportSource) -> str:
     # The plane meets nodes; nodes meet each other only with self-collision.
     meets: dict[str, Any] = {"contype": "1" if simulation.self_collision else "0", "conaffinity": "1"}
     meets["friction"] = text(material.contact_friction, 0.005, 0.0001)
-    if rod:
-        cable.add(rod, root, world, meets)
-    for index, (place, mass) in enumerate(zip(topology.nodes, source.masses, strict=True) if not rod else ()):
+    if own:
+        own.add(root, world, meets)
+    for index, (place, mass) in enumerate(zip(topology.nodes, source.masses, strict=True) if not own else ()):
         body = ET.SubElement(world, "body", name=f"node{index}", pos=text(*place))
-        for axis, direction in HINGE_AXES.items():
+        for axis, direction in AXES.items():
             damping = text(material.drag * float(mass))
             ET.SubElement(body, "joint", name=f"node{index}{axis}", type="slide", axis=direction, damping=damping)
         ET.SubElement(body, "geom", type="sphere", size=text(radius), mass=text(mass), **meets)
@@ -87,7 +91,7 @@ def mjcf(source: ExportSource) -> str:
         tendon = ET.SubElement(tendons, "spatial", name=f"spring{index}", width=text(radius / 5), **law)
         for end in ends:
             ET.SubElement(tendon, "site", site=names[end])
-    if not rod and source.velocity.any():
+    if not own and source.velocity.any():
         ET.SubElement(ET.SubElement(root, "keyframe"), "key", name="start", qvel=text(*source.velocity.ravel()))
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"

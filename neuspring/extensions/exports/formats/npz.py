@@ -17,8 +17,6 @@ from neuspring.extensions.exports import Export
 from neuspring.extensions.exports.source import ExportSource
 from neuspring.twin.body import body_of
 
-VERSION = 1
-"""Format and version of the description. A reader should refuse a version that it does not know."""
 ARRAYS_FILE, DESCRIPTION_FILE = "arrays.npz", "description.json"
 SIZE_MEANINGS = {
     "N": "nodes",
@@ -29,13 +27,9 @@ SIZE_MEANINGS = {
     "F": "exported frames",
     "G": "splats",
     "A": "1 (isotropic) or 3",
-    "V": "vertices of a rod's center line",
-    "E": "edges between them",
-    "M": "places of a rod's line that are observed",
-    "P": "branches that slip inside a rod",
     "K": "coefficients of spherical harmonics per channel: 1, 4, 9 or 16",
 }
-SETTINGS: dict[str, tuple[str, str]] = {
+EXPORTED_SETTINGS: dict[str, tuple[str, str]] = {
     "frame_time": ("s", "simulated time per frame"),
     "substeps": ("1", "steps per frame"),
     "gravity": ("m/s^2", "acceleration downwards"),
@@ -44,7 +38,7 @@ SETTINGS: dict[str, tuple[str, str]] = {
     "self_collision": ("1", "whether nodes collide with each other"),
     "controller_velocity": ("1", "whether dashpots see the velocity of controllers"),
 }
-SETTINGS |= {
+EXPORTED_SETTINGS |= {
     spec.name: (spec.metadata["unit"], spec.metadata["doc"]) for spec in dataclasses.fields(Material) if spec.name in SCALARS
 }
 MOTION: dict[str, tuple[str, str, str]] = {
@@ -62,11 +56,10 @@ def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Pat
     """Write arrays.npz and description.json of these frames to the folder `output`."""
     arrays, described = arrays_of(source, frames)
     twin, body = source.twin, body_of(source.twin)
-    rod = body.center_line(twin)
     values = dataclasses.asdict(twin.simulation) | {"up_sign": int(twin.simulation.up_sign)}
     values |= {name: float(getattr(twin.material, name)) for name in SCALARS}
-    settings = dict(SETTINGS)
-    for part in body.parts(twin):
+    settings = dict(EXPORTED_SETTINGS)
+    for part in [twin.body] if twin.body else []:
         numbers = [
             spec for spec in dataclasses.fields(part) if "shape" not in spec.metadata and kept(spec, getattr(part, spec.name))
         ]
@@ -75,15 +68,15 @@ def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Pat
     text = {
         # A reader of one body's format would simulate another as that body.
         "format": body.format,
-        # Who does not know springs that only push would let them pull, and a rod that slips inside would ring on.
-        "version": 2 if twin.topology.pushes.any() or (rod and (len(rod.slip) or rod.by_angle)) else VERSION,
+        # Who does not know springs that only push would let them pull.
+        "version": 2 if twin.topology.pushes.any() else body.version(twin),
         "made_by": f"neuspring {__version__}",
         "name": source.name,
         "made_from_sha256": source.made_from,
         "about": f"{body.about}, and moved by controllers.",
         "mass": {"value": source.total_mass, "unit": "kg", "about": source.weight},
         "units": "SI: m, kg, s, N. Coordinates are right-handed; z is vertical.",
-        "sizes": SIZE_MEANINGS,
+        "sizes": SIZE_MEANINGS | body.sizes,
         "arrays": described,
         "settings": {name: {"value": values[name], "unit": unit, "about": about} for name, (unit, about) in settings.items()},
         "equations": [" ".join(paragraph.split()) for paragraph in body.equations.strip().split("\n\n")],
@@ -125,8 +118,8 @@ def arrays_of(source: ExportSource, frames: Sequence[int]) -> tuple[dict[str, np
 
     declared(source.twin.topology)
     declared(source.twin.material)
-    for piece in body_of(source.twin).parts(source.twin):
-        declared(piece, f"{piece.kind}_")
+    if source.twin.body:
+        declared(source.twin.body, f"{source.twin.body.kind}_")
     part = source.only(frames)
     moving = {"frame": part.frames, "time": part.times, "mass": source.masses}
     for name, (dimensions, unit, about) in MOTION.items():

@@ -15,9 +15,8 @@ from neuspring.core.files import write_atomically
 from neuspring.extensions.exports import Export
 from neuspring.extensions.exports.formats import ply
 from neuspring.extensions.exports.source import ExportSource
-from neuspring.rods.nodes import radius_of
 from neuspring.splats.view import C0
-from neuspring.twin.body import body_of
+from neuspring.twin.body import lines_of
 
 SUFFIXES = (".usdc", ".usda", ".usd")
 ROOT_PRIM = "/Twin"
@@ -85,7 +84,7 @@ class _Shapes:
         self._geom, self._vt, self._sdf = (needed(f"pxr.{name}") for name in ("UsdGeom", "Vt", "Sdf"))
 
     def graph(self, source: ExportSource, codes: dict[int, float]) -> None:
-        """Nodes, controllers and springs; of a rod, its center line."""
+        """Nodes, controllers and springs; of another body also its lines."""
         topology, material, token = source.twin.topology, source.twin.material, self._geom.Tokens
         unit = float(np.median(topology.rest_lengths)) if len(topology.rest_lengths) else 0.01
         nodes = self._points("Nodes", NODE_WIDTH * unit, (0.8, 0.8, 0.8))
@@ -97,16 +96,16 @@ class _Shapes:
             self._primvar(springs, name, value, token.uniform)
         if source.masses.any():
             self._primvar(nodes, "mass", source.masses, token.vertex)
-        if rod := body_of(source.twin).center_line(source.twin):
-            thickness = max(radius_of(rod), 0.5 * SPRING_WIDTH * float(rod.lengths.mean()))
-            line = self._curves("CenterLine", [len(rod.vertices)], 2 * thickness)
-            for name, value in {"mass": rod.mass, "bending": rod.bending, "twisting": rod.twisting}.items():
-                self._primvar(line, name, value, token.vertex)
+        lines = lines_of(source.twin)
+        inner = lines.pairs[: lines.inner] if source.twin.body else lines.pairs[:0]
+        body = self._curves("Body", [2] * len(inner), NODE_WIDTH * float(np.median(lines.rest_lengths))) if len(inner) else None
+        if body:
+            self._primvar(body, "stiffness", lines.stiffness[: lines.inner], token.uniform)
         for frame, code in codes.items():
             both = ply.points(source, frame)
             shown = {nodes: source.positions[frame], hands: source.hands[frame], springs: both[topology.springs].reshape(-1, 3)}
-            if rod:
-                shown[line] = both[-len(rod.vertices) :]
+            if body:
+                shown[body] = both[inner].reshape(-1, 3)
             for prim, points in shown.items():
                 self._place(prim, prim.CreatePointsAttr(), points, prim.GetWidthsAttr().Get()[0] / 2, code)
 

@@ -1,0 +1,311 @@
+"""The numbers of a study of twins on other recordings of the same object, beside published numbers: DEFORM's benchmark."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+from typing import Any, ClassVar
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from neuspring.core.artifacts import Observations
+from neuspring.core.files import read_npz, write_text
+from neuspring.core.records import StageRecord
+from neuspring.core.table import LATEX_PREAMBLE, Cell, Table
+from neuspring.draw.film import write_film
+from neuspring.draw.painter import DrawingStyle, Painter
+from neuspring.draw.scene import ShownRun, ShownScene
+from neuspring.draw.sheet import save
+from neuspring.extensions.rods.metric import DEFORM_L1
+from neuspring.report.blocks import Block, Items, markdown
+from neuspring.scores.metrics import DASH
+from neuspring.scores.paper import OwnStudy, Printed, Study, Values, printed
+from neuspring.scores.runs import DAMAGED, collect, read_transfers
+
+EUCLID = "track_error"
+"""Markers of cables are nodes, so it is the mean Euclidean error of free markers."""
+LEARNING = ("search", "fit", "train")
+"""Stages whose time is that of the model."""
+CLIP_COLUMNS = ["cable", "clip", "label", "method", "source", "seed", "l1_mm", "euclid_mm", "minutes"]
+CLIP_FACTS = ["l1_mm", "spread_mm", "median_mm", "worst_mm", "euclid_mm", "minutes", "worst_clip", "clips", "of", "seeds"]
+
+
+TAGS = {
+    "second-hand": "The paper printed the number. We read it second-hand, from a page that was made of the paper's TeX.",
+    "log": "The number stands in logs that DEFORM's authors published with their code.",
+    "others": "Others than DEFORM's authors trained DEFORM and published the number.",
+    "reference": "We measured it. It is no method: it shows what one gets without learning, or the least that is possible.",
+}
+"""Meaning of the tag of a number in deform_published.csv."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PublishedError(Printed):
+    """A published value."""
+
+    source: str
+    tag: str
+    """One of `TAGS`; empty: printed by the paper."""
+
+
+def published() -> Values:
+    """PublishedError errors on DEFORM's cables, mm, by label of the row, cable, metric."""
+    text = resources.files("neuspring.extensions.rods").joinpath("deform_published.csv").read_text(encoding="utf-8")
+    return {
+        (row["method"], row["cable"], DEFORM_L1.name): PublishedError(
+            **vars(printed(row["l1_mm"])), source=row["source"], tag=row["tag"]
+        )
+        for row in csv.DictReader(text.splitlines())
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClipNumbers(OwnStudy):
+    """The predictions of a study's methods on other recordings; each table is computed once, or was read from numbers.json."""
+
+    TABLES: ClassVar = ("clips", "records", "cells", "growth")
+    published: ClassVar = {"deform_published": published}
+    name: str
+    study: Study
+    results: Path
+    sources: Sequence[str]
+    """Scenarios whose twins were rolled out on clips."""
+    methods: Sequence[str]
+    """The methods of the benchmark."""
+    seeds: Sequence[int]
+
+    @classmethod
+    def of(cls, name: str, study: Study, numbers: Any) -> ClipNumbers:
+        runs = numbers.everything.runs
+        sources, methods, seeds = (list(dict.fromkeys(runs[column])) for column in ("scenario", "method", "seed"))
+        results = numbers.results or Path("results")
+        return cls(name=name, study=study, results=results, sources=sources, methods=methods, seeds=seeds)
+
+    def blocks(self) -> list[Any]:
+        return list(clip_blocks(self))
+
+    def write(self, folder: Path) -> str:
+        return write_clips(self, folder)
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """Method to label, of the methods that the benchmark has."""
+        return {method: label for label, method in self.study.rows.items() if method in self.methods}
+
+    @property
+    def cables(self) -> list[str]:
+        """Those that we predicted, else those with published numbers."""
+        return list(dict.fromkeys(self.clips["cable"])) or list(dict.fromkeys(cable for _, cable, _ in self.study.values))
+
+    @cached_property
+    def _read(self) -> tuple[pd.DataFrame, pd.DataFrame]:
+        return read_transfers(self.results, self.sources, self.labels, self.seeds)
+
+    @cached_property
+    def clips(self) -> pd.DataFrame:
+        """Every clip, row, source and seed, mm; minutes of search and fit."""
+        if not len(table := self._read[0]):
+            return pd.DataFrame(columns=CLIP_COLUMNS)
+        keys = {"category": "cable", "scenario": "clip", "method": "method", "source": "source", "seed": "seed"}
+        clips = 1e3 * table.pivot_table(index=list(keys), columns="metric", values="value", sort=False)
+        clips = clips.reindex(columns=[DEFORM_L1.name, EUCLID]).dropna(subset=DEFORM_L1.name).reset_index()
+        clips = clips.rename(columns=keys | {DEFORM_L1.name: "l1_mm", EUCLID: "euclid_mm"})
+        runs = collect(self.results, self.sources, self.labels, self.seeds).records.items()
+        minutes = {key: sum(record.timings.get(stage, 0.0) for stage in LEARNING) / 60 for key, record in runs}
+        times = [minutes.get(key, np.nan) for key in zip(clips["source"], clips["method"], clips["seed"], strict=True)]
+        clips = clips.assign(label=clips["method"].map(self.labels), minutes=times)[CLIP_COLUMNS]
+        return clips.sort_values("cable", kind="stable", key=lambda names: names.map(list(dict.fromkeys(names)).index))
+
+    @cached_property
+    def records(self) -> pd.DataFrame:
+        """Every transfer that has a record: how it ended, clips that it was to be judged on, files that it kept, in the results."""
+        rows = []
+        runs: list[dict[str, Any]] = self._read[1].to_dict("records")  # type: ignore[assignment]
+        for run in runs:
+            path = self.results / run["scenario"] / run["method"] / str(run["seed"]) / "transfer.json"
+            record = None if run["reason"].startswith(DAMAGED) else StageRecord.load(path)
+            kept = [role for role in ("frames", "lines") if record and role in record.files]
+            files = {role: record.file(role, path).relative_to(self.results).as_posix() for role in kept if record}
+            targets = int(record.facts["targets"]) if record and record.facts else 0
+            rows.append(run | {"label": self.labels[run["method"]], "targets": targets, "frames": "", "lines": ""} | files)
+        columns = ["scenario", "method", "seed", "status", "reason", "label", "targets", "frames", "lines"]
+        return pd.DataFrame(rows, columns=columns)
+
+    @cached_property
+    def cells(self) -> pd.DataFrame:
+        """A row per cable and row of the table, published numbers first; those have a `text`.
+
+        `l1_mm` is the mean over clips, seeds averaged within each; `spread_mm` the standard deviation over the seeds that have
+        every clip. `ranked`: it is a method, and has every clip that it was to be judged on, with every seed.
+        """
+        asked: dict[Any, int] = self.records.groupby("scenario")["targets"].max().to_dict()
+        rows: list[dict[str, Any]] = []
+        for (label, cable, _), value in self.study.values.items():
+            facts = {"source": value.source, "tag": value.tag, "text": value.text, "ranked": value.tag != "reference"}
+            rows += [{"cable": cable, "label": label, "l1_mm": value.value, **facts}] if cable in self.cables else []
+        for key, part in self.clips.groupby(["cable", "label"], sort=False):
+            cable, label = map(str, key)
+            of = sum(asked.get(source, 0) for source in part["source"].unique())
+            means, seeds = part.groupby("clip")[["l1_mm", "euclid_mm", "minutes"]].mean(), part.groupby("seed")
+            l1, spread = means["l1_mm"], seeds["l1_mm"].mean()[seeds["clip"].nunique() == of].std(ddof=1)
+            numbers = [l1.mean(), spread, l1.median(), l1.max(), means["euclid_mm"].mean(), means["minutes"].mean(), l1.idxmax()]
+            facts = dict(zip(CLIP_FACTS, [*numbers, int(seeds["clip"].nunique().min()), of, len(seeds)], strict=True))
+            facts |= {"source": "ours", "tag": "", "text": "", "ranked": facts["clips"] == of}
+            rows.append({"cable": cable, "label": label, **facts})
+        return pd.DataFrame(rows, columns=["cable", "label", *CLIP_FACTS, "source", "tag", "text", "ranked"])
+
+    @cached_property
+    def growth(self) -> pd.DataFrame:
+        """Mean error of free markers over clips and seeds: cable, label, seconds, euclid_mm."""
+        tables = [pd.DataFrame(columns=["cable", "label", "seconds", "euclid_mm"])]
+        cables = dict(zip(self.clips["clip"], self.clips["cable"], strict=True))
+        for run in self.records[self.records["frames"] != ""].itertuples():
+            table = pd.read_parquet(self.results / str(run.frames))
+            table = table[(table["metric"] == EUCLID) & table["scenario"].isin(list(cables))].assign(label=str(run.label))
+            tables.append(table.assign(cable=table["scenario"].map(cables), euclid_mm=1e3 * table["value"]))
+        table = pd.concat([table for table in tables if len(table)] or tables)
+        return table.groupby(["cable", "label", "seconds"], sort=False)["euclid_mm"].mean().reset_index()
+
+
+TAG_SIGNS = {"second-hand": "†", "log": "‡", "others": "§", "reference": "¶", "": ""}
+"""Tag of a published number to the sign behind it."""
+FILM_RATE, FILM_WIDTH, FILM_MEGABYTES = 20, 960, 3.0
+"""Pictures per second, pixels, and size of a film."""
+
+
+def clip_blocks(found: ClipNumbers) -> list[Block]:
+    """L1 per cable beside published numbers; ours in detail; every clip. Then the rows and runs that are not there, and why."""
+    lines = [f"{label}: not run" for label in found.study.rows if label not in set(found.clips["label"])]
+    failed = found.records[found.records["status"] != "ok"].itertuples()
+    lines += [f"{run.label}, {run.scenario} / seed {run.seed}: {run.reason}" for run in failed]
+    last = [Items(title="Not in the tables, or not whole", items=lines)] if lines else []
+    return [_overview(found), *([_details(found), _per_clip(found)] if len(found.clips) else []), *last]
+
+
+def _overview(found: ClipNumbers) -> Table:
+    cells, counts = found.cells, found.clips.groupby("cable", sort=False)["clip"].nunique()
+    best, rows = cells[cells["ranked"].astype(bool)].groupby("cable")["l1_mm"].min(), []
+    for (label, source), part in cells.groupby(["label", "source"], sort=False):
+        of = {cell.cable: cell for cell in part.itertuples()}
+        values = [_l1(of[cable], best) if cable in of else Cell(text=DASH) for cable in found.cables]
+        rows.append([Cell(text=str(label)), Cell(text=str(source)), *values])
+    note = "mm: mean absolute error over clips, all markers (held ones count with 0), three coordinates and frames. "
+    clips = ", ".join(f"{cable} {count}" for cable, count in counts.items()) or "not run"
+    note += f"Ours: evaluation clips ({clips}), predicted open loop; ± standard deviation over seeds; * clips are missing. "
+    note += f"{found.study.training}. "
+    note += " ".join(f"{TAG_SIGNS[tag]} {text}" for tag, text in TAGS.items() if tag in set(cells["tag"]))
+    return Table(caption="L1 per cable", note=note.strip(), header=["Method", "Source", *found.cables], rows=rows, stub=2)
+
+
+def _l1(cell: Any, best: pd.Series) -> Cell:
+    spread = f" ± {cell.spread_mm:.2f}" if np.isfinite(cell.spread_mm) else ""
+    text = f"{cell.text}{TAG_SIGNS[cell.tag]}" if cell.text else f"{cell.l1_mm:.2f}{spread}{'' if cell.ranked else ' *'}"
+    return Cell(text=text, mark="best" if cell.ranked and cell.l1_mm == best[cell.cable] else "", value=cell.l1_mm)
+
+
+def _details(found: ClipNumbers) -> Table:
+    rows = []
+    for cell in found.cells[found.cells["text"] == ""].itertuples():
+        numbers = [getattr(cell, name) for name in CLIP_FACTS[:6]]
+        texts = [DASH if np.isnan(value) else f"{value:.2f}" for value in numbers]
+        texts += [str(cell.worst_clip), f"{cell.clips:.0f}/{cell.of:.0f}", f"{cell.seeds:.0f}"]
+        rows.append([str(cell.cable), str(cell.label), *texts])
+    note = "L1 in mm: mean, median and worst over clips, seeds averaged within each. Euclidean: mean distance of free markers, mm. "
+    note += "Minutes: search and fit of one twin, mean over seeds; rows that share a search count it each."
+    header = ["Cable", "Method", "Mean", "± seeds", "Median clip", "Worst clip", "Euclidean", "Minutes", "Worst", "Clips", "Seeds"]
+    return replace(Table.of_texts(header, rows, "Ours in detail"), note=note, stub=2)
+
+
+def _per_clip(found: ClipNumbers) -> Table:
+    means = found.clips.groupby(["cable", "clip", "label"], sort=False)["l1_mm"].mean()
+    labels, rows = [label for label in found.study.rows if label in set(found.clips["label"])], []
+    for _, part in means.groupby(level=["cable", "clip"], sort=False):
+        values = part.droplevel([0, 1])
+        rows.append([*map(str, part.index[0][:2]), *(f"{values[label]:.2f}" if label in values else DASH for label in labels)])
+    return replace(Table.of_texts(["Cable", "Clip", *labels], rows, "L1 per clip"), note="mm, seeds averaged.", stub=2)
+
+
+def write_clips(found: ClipNumbers, folder: Path) -> str:
+    """Write all files of a study of clips; returns the Markdown."""
+    name = found.name
+    for old in (path for ending in ("gif", "mp4", "png") for path in folder.glob(f"{name}_*.{ending}")):
+        old.unlink()
+    for suffix, rows in {"": found.cells, "_clips": found.clips}.items():
+        write_text(folder / f"{name}{suffix}.csv", rows.to_csv(index=False))
+    title, (first, *rest) = found.study.title, clip_blocks(found)
+    tables = [block for block in (first, *rest) if isinstance(block, Table)]
+    floats = [table.latex(f"{name}-{k}", f"{title}: {table.caption}") for k, table in enumerate(tables, 1)]
+    write_text(folder / f"{name}.tex", "\n".join([LATEX_PREAMBLE, *floats]))
+    parts = [f"# {title}\n", markdown([first])]
+    if len(found.growth):
+        path = save(growth_figure(found.growth, list(found.study.rows)), folder / f"{name}_growth.png")
+        parts.append(f"![Mean error of free markers over time, per cable]({path.name})\n")
+    for cable in dict.fromkeys(found.clips["cable"]):
+        painters = filmed(found, cable)
+        for ending in ("gif", "mp4") if painters else ():
+            path, (before, after) = folder / f"{name}_{cable}.{ending}", painters[0].frames[:2]
+            write_film(painters[0], path, FILM_WIDTH, 1 / (after - before), FILM_MEGABYTES, painters[1:])
+            parts.append(f"{'!' * (ending == 'gif')}[{cable}: observed blue, predicted dark, held red ({ending})]({path.name})\n")
+    text = "\n".join([*parts, markdown(rest)])
+    write_text(folder / f"{name}.md", text)
+    return text
+
+
+def filmed(found: ClipNumbers, cable: str) -> list[Painter]:
+    """Who paints the best, the median and the worst clip of a cable: by the baseline, else the last row that kept any."""
+    here = found.clips[found.clips["cable"] == cable].sort_values("l1_mm")
+    runs = found.records[found.records["lines"] != ""].sort_values("seed")
+    for label in dict.fromkeys([found.study.baseline, *reversed(found.study.rows)]):
+        for run in runs[runs["label"] == label].itertuples():
+            part = here[(here["source"] == run.scenario) & (here["seed"] == run.seed) & (here["label"] == label)]
+            if len(part):
+                lines, last = read_npz(found.results / str(run.lines))[0], len(part) - 1
+                # Of fewer than three clips one stands for two.
+                words = {last: "worst", last // 2: "median", 0: "best"}
+                shown = [(part.iloc[place], f"{label}, {words[place]}") for place in sorted(words)]
+                count = min(len(lines[clip["clip"]]) for clip, _ in shown)
+                return [_painter(found.results, clip, title, lines[clip["clip"]][:count]) for clip, title in shown]
+    return []
+
+
+def _painter(results: Path, clip: pd.Series, title: str, line: np.ndarray) -> Painter:
+    """Paints a clip: the observed center line, and a predicted one [F, V, 3], m, in one view."""
+    seen = Observations.load(results / clip["clip"] / "observations.npz")
+    free = seen.line < len(seen.nodes)
+    positions = np.full((len(line), *seen.object_points.shape[1:]), np.nan)
+    positions[:, seen.line[free]] = line[:, free]
+    take = ShownRun(f"{title}: {clip['clip']}, L1 {clip['l1_mm']:.1f} mm", positions)
+    frames = range(0, len(line), max(round(seen.scenario.frame_rate / FILM_RATE), 1))
+    manner = DrawingStyle(error="none", together=True)
+    return Painter(ShownScene.from_side(seen, [take], frames), [take], frames, manner)
+
+
+def growth_figure(growth: pd.DataFrame, labels: Sequence[str]) -> Figure:
+    """Draw the mean error of free markers over time, a panel per cable, from rows cable, label, seconds, euclid_mm.
+
+    A row of the table has its color by its place in `labels`, whichever of them are there.
+    """
+    cables, shown = list(dict.fromkeys(growth["cable"])), [label for label in labels if label in set(growth["label"])]
+    # A column of the legend is as wide as a panel.
+    size = (2.6 * len(cables) + 0.6, 2.8 + 0.2 * -(-len(shown) // len(cables)))
+    figure, axes = plt.subplots(1, len(cables), figsize=size, layout="constrained", squeeze=False, sharex=True, sharey=True)
+    colors = plt.get_cmap("tab10" if len(labels) <= 10 else "tab20")
+    handles = [Line2D([], [], color=colors(labels.index(label)), label=label) for label in shown]
+    for axis, cable in zip(axes[0], cables, strict=True):
+        for label in shown:
+            part = growth[(growth["cable"] == cable) & (growth["label"] == label)].sort_values("seconds")
+            axis.plot(part["seconds"], part["euclid_mm"], color=colors(labels.index(label)), lw=1.2)
+        axis.set(title=cable, xlim=(0, growth["seconds"].max()), ylim=(0, None))
+        axis.grid(color="0.92")
+    figure.supxlabel("time [s]", fontsize=9)
+    figure.supylabel("error of free markers [mm]", fontsize=9)
+    figure.legend(handles=handles, loc="outside upper center", ncols=min(len(shown), len(cables)), frameon=False, fontsize=8)
+    return figure

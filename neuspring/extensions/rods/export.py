@@ -1,0 +1,183 @@
+"""A rod as a chain of rigid edges, and as MuJoCo's bodies. Its plugin for cables is gone, and knew one stiffness of the whole.
+
+The rest pose of the bodies is the unloaded shape (unloaded curvatures, no twist), the keyframe `start` is frame 0. A body's axes
+are t, m1, m2. Between two edges are three hinges, about t with stiffness GJ / l, about m1 and m2 with EI / l, each with the rod's
+damping times that. Edges keep their lengths, and their mass lies along them. A clamp is a mocap body that the end is welded to.
+Drag is left out. A rod that slips inside is refused: a branch is a spring behind a friction, and hinges have them side by side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import accumulate
+from operator import mul
+from typing import Any, NamedTuple
+from xml.etree import ElementTree as ET
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from neuspring.core.artifacts import Twin
+from neuspring.core.errors import InputError
+from neuspring.extensions.rods.nodes import frame_zero, radius_of
+from neuspring.extensions.rods.rod import Rod, rod_of
+
+CABLE_STEP = 2e-4
+"""s, at most: springs of joints are explicit there."""
+THICKNESS = 0.002
+"""Least radius, m: nodes on the line show none."""
+WELD: dict[str, Any] = {"solref": f"{2 * CABLE_STEP} 1", "solimp": "0.999 0.9999 1e-4"}
+"""A clamp is as stiff as the time step allows."""
+
+
+SHEAR = 0.01
+"""Share of the sag between two clamps that shear may add: Newton's joints give way sideways, ours do not."""
+STRAIN = 1e-3
+"""Stretch of a rod by its own weight, if its EA allows no more."""
+SHORTEST_STEP = 1e-4
+"""s: Newton keeps poses of bodies in float32, which stand still in shorter steps."""
+HINGE_AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
+
+
+def text(*values: float | np.floating) -> str:
+    """Numbers as MJCF has them; float32 to the last bit."""
+    return " ".join(f"{float(value):.9g}" for value in values)
+
+
+class to_mujoco:
+    """What the MuJoCo format asks of a body other than the lattice."""
+
+    step = CABLE_STEP
+
+    def __init__(self, twin: Twin) -> None:
+        self.rod = rod_of(twin)
+        self.radius = max(radius_of(self.rod), THICKNESS)
+
+    def add(self, root: ET.Element, world: ET.Element, meets: dict[str, Any]) -> None:
+        """Add the chain edge0, edge1, ..., a site per node, clamps clamp0 and clamp1, and the keyframe `start` of frame 0."""
+        _add(self.rod, self.radius, root, world, meets)
+
+
+def _add(rod: Rod, radius: float, root: ET.Element, world: ET.Element, meets: dict[str, Any]) -> None:
+    edges = len(rod.lengths)
+    mass, bend, twist, frames, rest, held = chain_of(rod)
+    pose = [*rod.vertices[0], *frames[0].as_quat(scalar_first=True)]
+    parent = world
+    at: dict[str, Any] = {"pos": text(*rod.vertices[0]), "quat": text(*pose[3:])}
+    for j in range(edges):
+        parent = ET.SubElement(parent, "body", name=f"edge{j}", **at)
+        if j:
+            for axis, k in zip(HINGE_AXES, (twist[j - 1], bend[j - 1], bend[j - 1]), strict=True):
+                law: dict[str, Any] = {"stiffness": text(k), "damping": text(rod.damping * k)}
+                ET.SubElement(parent, "joint", name=f"joint{j}{axis}", type="hinge", axis=HINGE_AXES[axis], **law)
+            pose += (rest[j - 1].inv() * frames[j - 1].inv() * frames[j]).as_euler("XYZ").tolist()
+        else:
+            ET.SubElement(parent, "freejoint", name="joint0")
+        along: dict[str, Any] = {"type": "capsule", "fromto": text(0, 0, 0, rod.lengths[j], 0, 0), "mass": text(mass[j])}
+        ET.SubElement(parent, "geom", size=text(radius), **along, **meets)
+        for n in np.flatnonzero(rod.edge == j):
+            f, a, b = rod.place[n]
+            ET.SubElement(parent, "site", name=f"node{n}", pos=text(f * rod.lengths[j], a, b), size=text(radius / 4))
+        if j + 1 < edges:
+            at = {"pos": text(rod.lengths[j], 0, 0), "quat": text(*rest[j].as_quat(scalar_first=True))}
+    equality = ET.SubElement(root, "equality") if held else root
+    for number, edge in held.items():
+        quat = text(*frames[edge].as_quat(scalar_first=True))
+        ET.SubElement(world, "body", name=f"clamp{number}", pos=text(*rod.vertices[edge]), quat=quat, mocap="true")
+        ET.SubElement(equality, "weld", body1=f"clamp{number}", body2=f"edge{edge}", relpose="0 0 0 1 0 0 0", **WELD)
+    ET.SubElement(ET.SubElement(root, "keyframe"), "key", name="start", qpos=text(*pose))
+
+
+class Chain(NamedTuple):
+    """A rod as rigid edges with springs of joints between them."""
+
+    mass: np.ndarray
+    """Mass of each edge [E], kg: that of its vertices, which others share."""
+    bend: np.ndarray
+    """EI / l of each joint [E - 1], N m."""
+    twist: np.ndarray
+    """GJ / l of each joint [E - 1], N m."""
+    frames: Rotation
+    """Axes t, m1, m2 of each edge in frame 0 [E]."""
+    rest: Rotation
+    """Turn from each edge to the next without moments [E - 1]."""
+    held: dict[int, int]
+    """End that is clamped, 0 or 1 -> its edge."""
+
+
+def chain_of(rod: Rod) -> Chain:
+    """The edges and joints of a rod. Raises InputError if it slips inside."""
+    if len(rod.slip):
+        rule = "the rod of another engine has no branches that slip inside"
+        raise InputError("--to", rule, f"{len(rod.slip)} (Rod.slip)", "Take --to npz, or fit a rod without: fit.rod.slip = 0.")
+    edges = len(rod.lengths)
+    share = rod.mass / np.where(np.isin(np.arange(edges + 1), (0, edges)), 1, 2)
+    spans = rod.spans[1:-1]
+    ends = {0: (0, rod.held[:2]), 1: (edges - 1, rod.held[-2:])}
+    held = {end: edge for end, (edge, hands) in ends.items() if (hands >= 0).all()}
+    bend, twist = rod.bending[1:-1] / spans, rod.twisting[1:-1] / spans
+    return Chain(share[:-1] + share[1:], bend, twist, frames_of(rod), _rest(rod.curvature, bool(rod.by_angle)), held)
+
+
+def frames_of(rod: Rod) -> Rotation:
+    """The axes t, m1, m2 of each edge in frame 0."""
+    m1, along = frame_zero(rod)[0], np.diff(rod.vertices, axis=0)
+    t = along / np.linalg.norm(along, axis=1, keepdims=True)
+    return Rotation.from_matrix(np.stack([t, m1, np.cross(t, m1)], axis=2))
+
+
+def _rest(curvature: np.ndarray, by_angle: bool = False) -> Rotation:
+    """The turn from each edge to the next without moments, in the axes of either: about (0, -k2, k1) by 2 atan(|k| / 2), or |k|."""
+    k = np.stack([np.zeros(len(curvature) - 2), -curvature[1:-1, 1], curvature[1:-1, 0]], axis=1)
+    size = np.linalg.norm(k, axis=1, keepdims=True)
+    angle = size if by_angle else 2 * np.arctan(size / 2)
+    return Rotation.from_rotvec(angle * k / np.maximum(size, 1e-12))
+
+
+def to_newton(source: Any, points: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+    """Arrays of `newton.Rod` and of its joints, bodies and clamps, of a twin whose points (`Lines.points`) are these by frame.
+
+    Quaternions have w last, and z along the edge.
+
+    Raises InputError if the solver needs a step that is too short for it: a joint may turn an edge, and pull at it, by no more than
+    its inertia over a step resists, or the iterations end before the rod is as stiff as it should be.
+    """
+    rod = rod_of(source.twin)
+    chain = chain_of(rod)
+    rest = Rotation.concatenate(list(accumulate(chain.rest, mul, initial=chain.frames[0])))
+    along = rod.lengths[:, None] * rest.as_matrix()[..., 0]
+    held = list(chain.held.values())
+    spans, weight = rod.spans[1:-1], source.twin.simulation.gravity * rod.mass.sum()
+    # A beam of n edges, each of which gives way by force / pull, sags by this share more: 96 EI / (pull l^3 n^2). Below 4 EI / l^3
+    # turning would need the shorter steps.
+    stiff = max(4.0, 96 / (SHEAR * (len(rod.lengths) - len(held)) ** 2))
+    pull = np.maximum(stiff * chain.bend / spans**2, min(rod.stretching, weight / STRAIN) / spans)
+    step = min(source.twin.simulation.substep, float(np.sqrt(np.minimum(chain.mass[:-1], chain.mass[1:]) / pull).min()))
+    if step < SHORTEST_STEP:
+        rule = f"Newton's solver of rods needs steps of {SHORTEST_STEP:g} s or more, or its float32 poses stand still"
+        found = f"{source.name}, which is so stiff, or has so short edges, that it needs {step:.2g} s"
+        raise InputError("--to newton", rule, found, "Take --to mujoco, or fit fewer vertices.")
+    clamps = np.zeros((len(points), len(held), 7))
+    for row, placed in enumerate(points):
+        line = placed[-len(rod.vertices) :]
+        clamps[row, :, :3] = ((line[:-1] + line[1:]) / 2)[held]
+        clamps[row, :, 3:] = _quaternions(frames_of(replace(rod, vertices=line)))[held]
+        # q and -q are one pose, but not between two poses.
+        clamps[row, :, 3:] *= np.where((clamps[row] * clamps[row - 1])[:, 3:].sum(axis=1, keepdims=True) < 0, -1, 1)
+    return {
+        "points": rod.vertices,
+        "quaternions": _quaternions(chain.frames),
+        "rest_points": rod.vertices[0] + np.concatenate([np.zeros((1, 3)), np.cumsum(along, axis=0)]),
+        "rest_quaternions": _quaternions(rest),
+        "stiffness": np.stack([pull, pull, pull, chain.bend, chain.bend, chain.twist], axis=1),
+        "mass": chain.mass,
+        "step": np.array(step),
+        "held": np.array(held, np.int32),
+        "clamps": clamps,
+    }
+
+
+def _quaternions(frames: Rotation) -> np.ndarray:
+    """Quaternions of axes m1, m2, t, w last [E, 4]."""
+    return np.asarray(Rotation.from_matrix(np.roll(frames.as_matrix(), -1, axis=-1)).as_quat())

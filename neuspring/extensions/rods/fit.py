@@ -1,0 +1,581 @@
+"""Fit of a rod to whole recordings: Levenberg-Marquardt in everything that is unknown of a cable, through rising horizons.
+
+With errors e of all coordinates of tracked points in the frames of the horizon, and variables q with start 0 and scale s, it lowers
+
+    mean(sqrt(e^2 + b^2) - b) + PRIOR sum((q / s)^2).
+
+Derivatives are finite differences: a rollout per variable and recording, all of them lanes of one solver in double precision.
+Positive numbers are varied on logarithmic scales, and those along the arc as fields (`RodFit`) or joint by joint.
+
+Markers lie beside the center line of a cable, by 1 to 2 cm. How far (`Rod.offsets`, `Rod.clamps`) and the unloaded lengths are
+variables too: without them held ends are in a wrong place, and distances between markers change as the cable bends. Where vertices
+were laid out (`rod.lay_out`), these are the clamps' places and tilts, and place and mass of each marker.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from neuspring import config
+from neuspring.core.artifacts import Observations, Twin
+from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.files import write_table
+from neuspring.core.levenberg import LevenbergMarquardt
+from neuspring.core.text import Progress, listed
+from neuspring.extensions.rods import made
+from neuspring.extensions.rods.axes import SAME_WORLD, angle_between, heading, turned
+from neuspring.extensions.rods.nodes import RodFrames, settled, turn_of
+from neuspring.extensions.rods.rod import Rod, rod_of
+from neuspring.extensions.rods.settings import RodFit
+from neuspring.physics.controllers import waypoints
+from neuspring.twin.body import Learned
+from neuspring.twin.losses import frames_seen
+from neuspring.twin.rollout import initial_velocity
+from neuspring.twin.transfer import require_alike
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+PRIOR = 1e-6
+"""Weight of the variables' squares, m: they decide where recordings say nothing."""
+SCALED_STEP = 5e-3
+"""Step of the finite differences, in scales."""
+LARGEST_ERROR = 2.0
+"""Largest error of a coordinate that counts, m: what left the scene."""
+LEAST_GAIN = 2e-3
+"""A step that lowers the objective by less than this part of it is a stage's last."""
+DAMPINGS = (0.1, 1.0, 10.0, 100.0)
+"""Factors on the damping, for each step that is tried."""
+LAUNCHED = 16
+"""Frames kept of a launch."""
+STIFFNESS_TRIED = np.arange(-2.0, 9.0, 0.5)
+"""Logarithms of stiffness over that of the start which a search tries in frame 0 of a rod that was laid out."""
+LANES = 512
+"""Rollouts that run in one solver at most."""
+VARIABLE_SCALES = {
+    "bending": 1.0, "twisting": 1.0, "damping": 1.0, "drag": 1.0, "drag_quadratic": 1.0, "marker_mass": 1.0, "hands": 1.0,
+    "dashpots": 1.0, "roll": 1.0, "curvature": 0.3, "bending_along": 0.5, "twisting_along": 0.5, "clamps": 0.02, "offsets": 0.01,
+    "stretch": 0.01, "tilts": 0.05, "places": 0.01, "slip_share": 1.0, "slip_yield": 0.7, "slip_twist": 0.5,
+}  # fmt: skip
+"""Scale of each kind of variable: of logarithms, rad, curvatures (1), and m."""
+LOGARITHMIC = (
+    *("bending", "twisting", "damping", "drag", "drag_quadratic", "marker_mass", "hands", "dashpots"),
+    *("slip_share", "slip_yield", "slip_twist"),
+)
+SLIP_SHARE, SLIP_ANGLES = 0.3, (0.02, 3.0)
+"""Share of each branch that slips where a fit begins, and turns of the whole rod at which the first and the last does, rad."""
+SLIP_DAMPING = 0.02
+"""Inner damping there, at most, s: friction takes its place."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RodSteps(RodFit):
+    """The settings with the course of the fit."""
+
+    markers: bool = True
+    """Fit of how far markers lie beside the center line, and the lengths between them."""
+    rounds: int = 8
+    """Steps per stage, at most; a stage ends where a step gains less than 0.2 %."""
+    robust: float = 0.02
+    """Robustness b, m: errors e count as sqrt(e^2 + b^2), so that recordings that flip do not decide."""
+
+
+@dataclass(frozen=True)
+class Variables:
+    """Variables of a twin, as one vector q [Q], 0 at the start."""
+
+    twin: Twin
+    tracked: int
+    sizes: dict[str, int]
+    stiffness_along: np.ndarray
+    """Basis [V, n] of log EI and log GJ along the arc."""
+    curvature_along: np.ndarray
+    """Basis [V, n] of k1 and k2 over the joint's length, along the arc."""
+
+    @classmethod
+    def of(cls, twin: Twin, settings: RodSteps, tracked: int = 0) -> Variables:
+        """The variables of a fit. So many first nodes are tracked points."""
+        rod, held = rod_of(twin), rod_of(twin).held >= 0
+        if settings.slip and not len(rod.slip):
+            yields = np.geomspace(*SLIP_ANGLES, settings.slip) / rod.lengths.sum()
+            branches = np.stack([np.full(settings.slip, SLIP_SHARE), yields], axis=1)
+            rod = replace(rod, slip=branches, slip_twist=1.0, damping=min(rod.damping, SLIP_DAMPING))
+            twin = replace(twin, body=rod)
+        joints = len(held) - 2
+        along = _basis(rod, {"constant": "none"}.get(settings.stiffness, settings.stiffness), settings.knots)
+        bent = _basis(rod, {"straight": "none"}.get(settings.curvature, settings.curvature), settings.knots)
+        if settings.curvature != "free":
+            # A field of the curvature per length.
+            bent = bent * (rod.spans / rod.spans[1:-1].mean())[:, None]
+        ends = int(held[:2].all()) + int(held[-2:].all())
+        sizes = dict.fromkeys(("bending", "twisting", "damping", "drag", "drag_quadratic"), 1)
+        sizes |= {"marker_mass": tracked if rod.laid else 1} if held.any() else {"hands": 1, "dashpots": 1}
+        sizes |= {"slip_share": settings.slip, "slip_yield": settings.slip, "slip_twist": int(settings.slip > 0)}
+        sizes |= {"roll": int(ends == 2), "curvature": 2 * bent.shape[1]}
+        sizes |= {"bending_along": along.shape[1], "twisting_along": along.shape[1]}
+        if settings.markers and rod.laid:
+            sizes |= {"clamps": 3 * ends, "tilts": 2 * ends, "places": 3 * tracked}
+        elif settings.markers and ends:
+            sizes |= {"clamps": 3 * ends, "offsets": 2 * int((~held).sum()), "stretch": joints - 1}
+        return cls(twin, tracked, {name: size for name, size in sizes.items() if size}, along, bent)
+
+    @property
+    def kinds(self) -> np.ndarray:
+        """Kind of each variable [Q]."""
+        return np.repeat(list(self.sizes), list(self.sizes.values()))
+
+    @property
+    def scale(self) -> np.ndarray:
+        """Scale of each variable [Q]."""
+        return np.array([VARIABLE_SCALES[name] for name in self.kinds])
+
+    def part(self, q: np.ndarray, name: str) -> np.ndarray:
+        """The variables of one kind; zeros where they are not varied."""
+        parts = np.split(q, np.cumsum(list(self.sizes.values())))
+        return dict(zip(self.sizes, parts, strict=False)).get(name, np.zeros(1))
+
+    def made(self, q: np.ndarray) -> Twin:
+        """The twin of variables q [Q]."""
+        start, twin = rod_of(self.twin), self.twin
+        factor = {name: np.exp(self.part(q, name)) for name in LOGARITHMIC}
+        bending, twisting = (start.bending * factor["bending"], start.twisting * factor["twisting"])
+        if self.stiffness_along.shape[1]:
+            bending = bending * np.exp(self.stiffness_along @ self.part(q, "bending_along"))
+            twisting = twisting * np.exp(self.stiffness_along @ self.part(q, "twisting_along"))
+        changes: dict[str, Any] = {"bending": bending, "twisting": twisting, "roll": start.roll + float(self.part(q, "roll")[0])}
+        changes |= {name: getattr(start, name) * float(factor[name][0]) for name in ("damping", "drag_quadratic")}
+        if self.curvature_along.shape[1]:
+            coefficients = self.part(q, "curvature").reshape(2, -1)
+            changes["curvature"] = start.curvature + (self.curvature_along @ coefficients.T)
+        if "slip_share" in self.sizes:
+            branches = np.stack([factor["slip_share"], factor["slip_yield"]], axis=1)
+            changes |= {"slip": start.slip * branches, "slip_twist": start.slip_twist * float(factor["slip_twist"][0])}
+        clamps = start.clamps.copy()
+        if "clamps" in self.sizes:
+            clamped = [bool((start.held[end] >= 0).all()) for end in (slice(2), slice(-2, None))]
+            clamps[clamped] += self.part(q, "clamps").reshape(-1, 3)
+            changes["clamps"] = clamps
+        if "tilts" in self.sizes:
+            tilts = start.tilts.copy()
+            tilts[clamped] += self.part(q, "tilts").reshape(-1, 2)
+            changes |= {"tilts": tilts} | self._relaid(q, clamps - start.clamps)
+            # Curvatures per length stay.
+            stretch = changes["lengths"][0] / start.lengths[0]
+            changes["curvature"] = stretch * changes.get("curvature", start.curvature)
+        lengths = changes.get("lengths", start.lengths).copy()
+        if "offsets" in self.sizes:
+            free = start.held < 0
+            lengths[1:-1] = np.maximum(lengths[1:-1] + self.part(q, "stretch"), 0.1 * lengths[1:-1])
+            offsets = np.zeros((len(free), 2)) if not start.offsets.size else start.offsets.copy()
+            offsets[free] += self.part(q, "offsets").reshape(-1, 2)
+            changes |= {"lengths": lengths, "offsets": offsets}
+        if "marker_mass" in self.sizes:
+            before, own = (np.convolve(each, [0.5, 0.5]) for each in (start.lengths, lengths))
+            markers = (start.mass - before) * factor["marker_mass"][0]
+            if start.laid:
+                masses = np.linalg.lstsq(made.marker_shares(start, self.tracked), start.mass - before)[0]
+                markers = made.marker_shares(replace(start, **changes), self.tracked) @ (masses * factor["marker_mass"])
+            changes["mass"] = own + markers
+        material = replace(twin.material, drag=twin.material.drag * float(factor["drag"][0]))
+        if "hands" in self.sizes:
+            material = replace(
+                material, stiffness=material.stiffness * factor["hands"], dashpot=material.dashpot * factor["dashpots"]
+            )
+        return replace(twin, material=material, body=replace(start, **changes))
+
+    def _relaid(self, q: np.ndarray, moved: np.ndarray) -> dict[str, np.ndarray]:
+        """Lengths and places of nodes of a rod that was laid out, where its clamps go by `moved` [2, 3] along and beside it, m.
+
+        What is between clamps stays where it is on the unloaded line; tracked points go along and beside it by their variables.
+        """
+        start = rod_of(self.twin)
+        low, high = free_part(start)
+        ratio = 1 + (moved[1, 0] - moved[0, 0]) / (high - low)
+        lengths = start.lengths * ratio
+        place = start.place.copy()
+        # Distance from the middle of the first edge.
+        at = np.concatenate([[0.0], start.lengths.cumsum()])[start.edge] + place[:, 0] * start.lengths[start.edge]
+        at = at - start.lengths[0] / 2 + lengths[0] / 2 - moved[0, 0]
+        by = self.part(q, "places").reshape(-1, 3)
+        at[: len(by)] += by[:, 0]
+        place[: len(by), 1:] += by[:, 1:]
+        arc = np.concatenate([[0.0], lengths.cumsum()])
+        edge = np.clip(np.searchsorted(arc, at, side="right") - 1, 0, len(lengths) - 1)
+        place[:, 0] = (at - arc[edge]) / lengths[edge]
+        return {"lengths": lengths, "edge": edge.astype(np.int32), "place": place}
+
+
+def free_part(rod: Rod) -> tuple[float, float]:
+    """Distances from the first vertex, m, between which fields along the arc have their knots.
+
+    They are those of the joints at the ends, or the ends of what bends where vertices were laid out, whose number is arbitrary.
+    """
+    arc = np.concatenate([[0.0], np.cumsum(rod.lengths)])
+    if not rod.laid:
+        return float(arc[1]), float(arc[-2])
+    return float(arc[1] / 2), float(arc[-1] - (rod.held[-1] >= 0) * rod.lengths[-1] / 2)
+
+
+def _basis(rod: Rod, kind: str, knots: int) -> np.ndarray:
+    """Functions along the arc at the vertices [V, n]: none, one per inner joint, or cubic splines between knots."""
+    joints = len(rod.mass) - 2
+    if kind == "none":
+        return np.zeros((joints + 2, 0))
+    if kind == "free":
+        return np.eye(joints + 2)[:, 1:-1]
+    if kind == "constant":
+        return np.ones((joints + 2, 1))
+    from scipy.interpolate import CubicSpline
+
+    arc, (low, high) = np.concatenate([[0.0], np.cumsum(rod.lengths)]), free_part(rod)
+    return np.asarray(CubicSpline(np.linspace(low, high, knots), np.eye(knots), bc_type="natural")(np.clip(arc, low, high)))
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """Tracked points and hands of C recordings of one body, padded to as many frames."""
+
+    observations: tuple[Observations, ...]
+    hands: torch.Tensor
+    """Way points [T, C, hands, 3 or 4] (controllers.py)."""
+    points: np.ndarray
+    """Tracked points [C, T, No, 3], m."""
+    counts: np.ndarray
+    """True where a point is seen in a training frame [C, T, No]."""
+    velocities: tuple[np.ndarray, ...]
+    """Velocities of tracked points or of all nodes in frame 0, m/s."""
+
+    @classmethod
+    def of(cls, observations: Sequence[Observations], twin: Twin, oracle: bool = False) -> Recordings:
+        """Recordings with as many tracked points and hands each; frames before the split, or all for an oracle."""
+        frames = [frames_seen(each, oracle=oracle) for each in observations]
+        rows = [np.minimum(np.arange(max(frames)), end - 1) for end in frames]
+        pairs = list(zip(observations, rows, strict=True))
+        inside = [np.arange(max(frames)) < end for end in frames]
+        counts = [each.object_visibility[index] & known[:, None] for (each, index), known in zip(pairs, inside, strict=True)]
+        return cls(
+            tuple(observations),
+            _paths(pairs),
+            np.stack([each.object_points[index] for each, index in pairs]).astype(np.float64),
+            np.stack(counts),
+            tuple(initial_velocity(each, twin.simulation.initial_velocity) for each in observations),
+        )
+
+    def bodies(self, twins: Sequence[Twin]) -> list[Twin]:
+        """Each twin in frame 0 of each recording. Of a cable that clamps hold, tracked points are the only nodes."""
+        pairs = [(twin, each) for twin in twins for each in self.observations]
+        if len(twins[0].topology.springs):
+            return [made.on_recording(twin, each) for twin, each in pairs]
+        if rod_of(twins[0]).laid:
+            return made.hung([made.of_first(twin, self.points.shape[2]) for twin, _ in pairs], [each for _, each in pairs])
+        moved = [made.of_markers(twin, each) for twin, each in pairs]
+        vertices = settled([rod_of(twin) for twin in moved], np.stack([rod_of(twin).vertices for twin in moved]))
+        return [replace(twin, body=replace(rod_of(twin), vertices=x)) for twin, x in zip(moved, vertices, strict=True)]
+
+    def predicted(self, twins: Sequence[Twin], frames: int, every: int, device: str) -> np.ndarray:
+        """Tracked points [K, C, frames kept, No, 3], m, of K twins: frames 1, 1 + every, ... below `frames`."""
+        count, tracked = len(self.observations), self.points.shape[2]
+        bodies = self.bodies(twins)
+        solver = RodFrames(bodies, device)
+        x = torch.tensor(np.stack([body.topology.nodes for body in bodies]))
+        nodes = x.shape[1]
+        v = torch.tensor(np.stack([v[:nodes] for _ in twins for v in self.velocities]), dtype=torch.float32)
+        hands = self.hands.repeat(1, len(twins), 1, 1)
+        solver.start(x, v, hands[0])
+        kept, size = [], LAUNCHED * every if hands.shape[-1] == 3 else 1
+        for first in range(1, frames, size):
+            rows = hands[first - 1 : min(first + size, frames)]
+            # Frames 1, 1 + every, ...
+            kept.append(solver.advance(rows, slice((1 - first) % every, None, every))[:, :, :tracked].cpu())
+        found = torch.cat(kept).transpose(0, 1).reshape(len(twins), count, -1, tracked, 3).numpy()
+        return np.asarray(np.nan_to_num(found, nan=LARGEST_ERROR * 10, posinf=LARGEST_ERROR * 10, neginf=-LARGEST_ERROR * 10))
+
+
+def _paths(pairs: Sequence[tuple[Observations, np.ndarray]]) -> torch.Tensor:
+    """Way points of the hands of recordings, in these frames of each [T, C, hands, 3 or 4]: 4 where some do not always hold."""
+    parts = []
+    for each, rows in pairs:
+        valid = each.controller_valid[rows] if each.controller_valid.size else None
+        parts.append(waypoints(torch.tensor(each.controller_points[rows]), valid))
+    width = max(part.shape[-1] for part in parts)
+    return torch.stack([torch.cat([part, torch.ones_like(part[..., : width - part.shape[-1]])], dim=-1) for part in parts], dim=1)
+
+
+class Levenberg:
+    """Lowers the objective of some variables on some recordings."""
+
+    def __init__(self, recordings: Recordings, settings: RodSteps, device: str = "cpu", threads: int = 1) -> None:
+        self.recordings, self.settings, self.device = recordings, settings, device
+        self.threads = threads if device == "cpu" else 1
+        self.rollouts = 0
+
+    def errors(self, variables: Variables, qs: Sequence[np.ndarray], frames: int, every: int) -> np.ndarray:
+        """Errors [K, R], m, of K candidates in all coordinates that count."""
+        recordings, kept = self.recordings, slice(1, frames, every)
+        size = max(LANES // len(recordings.observations), 1)
+        parts = np.array_split(np.arange(len(qs)), max(-(-len(qs) // size), min(self.threads, len(qs))))
+
+        def one(part: np.ndarray) -> np.ndarray:
+            found = recordings.predicted([variables.made(qs[k]) for k in part], frames, every, self.device)
+            apart = np.clip(found - recordings.points[None, :, kept], -LARGEST_ERROR, LARGEST_ERROR)
+            return np.asarray(apart[:, recordings.counts[:, kept]].reshape(len(part), -1))
+
+        self.rollouts += len(qs) * len(recordings.observations)
+        with ThreadPoolExecutor(max(self.threads, 1)) as pool:
+            return np.concatenate(list((pool.map if self.threads > 1 else map)(one, parts)))
+
+    def objective(self, errors: np.ndarray, q: np.ndarray, scale: np.ndarray) -> np.ndarray:
+        """The objective of candidates, m, from errors [K, R] and variables [K, Q]."""
+        b = self.settings.robust
+        return np.asarray(np.mean(np.sqrt(errors**2 + b**2) - b, axis=-1) + PRIOR * ((q / scale) ** 2).sum(axis=-1))
+
+    def lowered(self, twin: Twin, progress: Progress) -> tuple[Twin, float, list[dict[str, Any]]]:
+        """The twin after the stages of the settings, the objective of the last one, m, and a row per step."""
+        variables, history = Variables.of(twin, self.settings, self.recordings.points.shape[2]), list[dict[str, Any]]()
+        q, end = np.zeros(len(variables.scale)), self.recordings.points.shape[1]
+        for horizon in self.settings.horizons:
+            frames = min(horizon + 1, end) if horizon else end
+
+            def report(row: dict[str, float], frames: int = frames) -> None:
+                history.append(row | {"stage": str(frames - 1)})
+                progress.update(len(history), f"{frames - 1} frames, error {1e3 * row['loss'] ** 0.5:.1f} mm")
+
+            q = self.stage(variables, q, frames, report)
+        last = self.errors(variables, [q], frames, self.settings.every)
+        return variables.made(q), float(self.objective(last, q, variables.scale)[0]), history
+
+    def stage(self, variables: Variables, q: np.ndarray, frames: int, report: Callable[[dict[str, float]], None]) -> np.ndarray:
+        """Steps on the first frames, from q. `report` gets a row after each."""
+        every = self.settings.every
+        if frames <= 30 * every:
+            every = max(every // 2, 1)
+        scale, b = variables.scale, self.settings.robust
+        errors = self.errors(variables, [q], frames, every)[0]
+        value = float(self.objective(errors, q, scale))
+        descent = LevenbergMarquardt(
+            base=q, cost=value, damping=1e-2, factors=DAMPINGS, raised=DAMPINGS[-1] * 10, least=1e-6, most=1e6, tolerance=LEAST_GAIN
+        )
+        for _ in range(self.settings.rounds):
+            q, steps, bound = descent.base, np.diag(SCALED_STEP * scale), np.ones(len(scale))
+            # In the units of their scales, so that bounds and damping mean the same for all.
+            slopes = (self.errors(variables, list(q + steps), frames, every) - errors) / SCALED_STEP
+            weights = 1 / np.sqrt(errors**2 + b**2) / len(errors)
+            products = (slopes * weights) @ slopes.T + 2 * PRIOR * np.eye(len(q))
+            gradient = slopes @ (weights * errors) + 2 * PRIOR * q / scale
+            best = None
+            while best is None and descent.damping <= descent.most:
+                tried = [q + scale * move for move in descent.moves(products, gradient, -bound, bound)]
+                found = self.errors(variables, tried, frames, every)
+                best = descent.take(tried, list(self.objective(found, np.array(tried), scale)))
+            if best is None:
+                break
+            errors, norm = found[best], float(np.linalg.norm(gradient))
+            report({"loss": float(3 * np.mean(errors**2)), "gradient_norm": norm, "learning_rate": descent.damping})
+            if descent.finished:
+                break
+        return descent.base
+
+
+@dataclass(frozen=True, kw_only=True)
+class RodResult(Learned):
+    """The best rod, and how it was found."""
+
+    value: float
+    """The objective at the end, m."""
+    history: pd.DataFrame
+    """A row per step: stage, loss (mean squared error of the horizon's frames, m^2), gradient_norm, learning_rate (the damping)."""
+
+
+def search_rod(
+    observations: Observations,
+    pool: Sequence[Observations],
+    settings: config.Config,
+    *,
+    device: str = "cpu",
+    threads: int = 1,
+    record: Path | None = None,
+) -> RodResult:
+    """The constants of a rod, on the frames of the first horizon; a row per step goes to the file `record`."""
+    import pandas as pd
+
+    recordings = in_order([observations, *pool])
+    first = RodSteps(**vars(settings.fit.section(RodFit)))
+    first = replace(first, stiffness="constant", curvature="constant", markers=False, slip=0)
+    first = replace(first, horizons=first.horizons[:1])
+    axis, steady = choose_axis([made.line_of(each) for each in recordings if each.line.size])
+    start = made.rod_twin(observations, settings, axis.tolist(), steady)
+    solver = Levenberg(Recordings.of(recordings, start), first, device, threads)
+    if rod_of(start).laid:
+        # What hangs in frame 0 says how stiff it is.
+        variables = Variables.of(start, first, observations.object_points.shape[1])
+        tried = [factor * (variables.kinds == "bending") + factor * (variables.kinds == "twisting") for factor in STIFFNESS_TRIED]
+        values = solver.objective(solver.errors(variables, tried, 2, 1), np.array(tried), variables.scale)
+        start = variables.made(tried[int(values.argmin())])
+    twin, value, history = solver.lowered(start, Progress(f"search {observations.scenario.name}, rod", first.rounds))
+    found = _result(twin, value, history)
+    if record is not None:
+        write_table(found.history, record)
+    costs = found.history["loss"]
+    facts = {"cost": value, "rollouts": solver.rollouts, "collision_overflow": 0, **found.facts, **twin.counts}
+    return replace(found, course=pd.DataFrame({"cost": costs, "best_cost": costs.cummin()}), facts=facts)
+
+
+def fit_rod(
+    observations: Observations,
+    pool: Sequence[Observations],
+    twin: Twin,
+    settings: RodFit,
+    *,
+    oracle: bool = False,
+    device: str = "cpu",
+    threads: int = 1,
+) -> RodResult:
+    """All variables of a rod, stage by stage, from the twin of its search. Raises InputError, NumericalFailure."""
+    recordings, settings = Recordings.of(in_order([observations, *pool]), twin, oracle), RodSteps(**vars(settings))
+    solver = Levenberg(recordings, settings, device, threads)
+    progress = Progress(f"fit {observations.scenario.name}, rod", settings.rounds * len(settings.horizons))
+    twin, value, history = solver.lowered(twin, progress)
+    if pool:
+        require_unmirrored(recordings, twin, settings, device)
+    # Where markers lie beside the line, frame 0 has another line now.
+    twin = made.on_recording(twin, observations)
+    found = _result(twin, value, history)
+    counted = {"best_loss": value, "steps": len(history), "rollouts": solver.rollouts, "collision_overflow": 0}
+    return replace(found, facts=counted | found.facts | twin.counts)
+
+
+def require_pool(here: Observations, pool: Sequence[Observations]) -> None:
+    """Raise InputError unless recordings have one center line: as many tracked points, hands and vertices."""
+    if pool and not here.line.size:
+        rule = "recordings of a pool must have markers along the line, for a rod"
+        raise InputError(f"pool of {here.scenario.name}", rule, "none", "Choose row rod_single.")
+    counted = "tracked points, controllers and vertices"
+    require_alike(
+        [here, *pool], counted, lambda each: (each.object_points.shape[1], each.controller_points.shape[1], len(each.line))
+    )
+
+
+def in_order(recordings: Sequence[Observations]) -> list[Observations]:
+    """Recordings of a pool, the lines of all in the order of the first.
+
+    Raises InputError unless they have one center line, and the first is like most.
+    """
+    require_pool(recordings[0], recordings[1:])
+    if not recordings[0].line.size:
+        return list(recordings)
+    orders = along(recordings)
+    if (np.diff(orders[0]) != 1).any():
+        rule = "markers of a pool's first recording must be in the order of most"
+        raise InputError(f"pool of {recordings[0].scenario.name}", rule, orders[0].tolist(), LEAVE_OUT)
+    return [replace(each, line=each.line[order]) for each, order in zip(recordings, orders, strict=True)]
+
+
+LEAVE_OUT = "Leave them out of the pool."
+BETTER_ORDER = 0.9
+"""Another order must fit distances of neighbors by so many times the error of that of the file. For DEFORM's cables the true order
+is at most 0.8 times the other one."""
+
+
+def along(recordings: Sequence[Observations]) -> list[np.ndarray]:
+    """Order [V] of the line of each recording of a cable in which neighbors are as far apart as in most of them.
+
+    It is that of the file, that from the other end, or one with the two markers of an end exchanged. Distances are medians over the
+    training frames: those of a single frame change with the cable's bend. Another order than that of the file is printed.
+    """
+
+    def apart(each: Observations, order: np.ndarray | slice = slice(None)) -> np.ndarray:
+        tracked, extra = each.object_points.shape[1], len(each.nodes) - each.object_points.shape[1]
+        points = np.concatenate([each.object_points, each.controller_points], axis=1)[: each.scenario.train_end]
+        line = points[:, np.where(each.line < tracked, each.line, each.line - extra)][:, order]
+        return np.asarray(np.median(np.linalg.norm(np.diff(line, axis=1), axis=2), axis=0))
+
+    count = len(recordings[0].line)
+    orders = [np.arange(count), np.arange(count)[::-1], np.r_[1, 0, 2:count], np.r_[: count - 2, count - 1, count - 2]]
+    usual = np.median([apart(each) for each in recordings], axis=0)
+    errors = [[np.abs(apart(each, order) - usual).mean() for order in orders] for each in recordings]
+    found = [orders[np.argmin(error) if min(error) < BETTER_ORDER * error[0] else 0] for error in errors]
+    for each, order in zip(recordings, found, strict=True):
+        if order is not orders[0]:
+            print(f"note: {each.scenario.name}: by the distances between its markers their order is {order.tolist()}")
+    return found
+
+
+ALIKE_HEADINGS = 0.6
+"""Length of the mean heading from which recordings have a world in common. Any eight of DEFORM's cables have 0.85 at least, one of
+eight that is turned by half leaves 0.75."""
+TURNS_KNOWN = 0.5
+"""Mean cosine of the turns between ends from which an axis of the world tells whole turns apart."""
+
+
+def choose_axis(lines: Sequence[np.ndarray]) -> tuple[np.ndarray, float]:
+    """`Rod.axis` and `Rod.steady` of the first of several lines [V, 3] in frame 0.
+
+    A turn of the last clamp against the first is known but for whole turns, so turns between the ends of the recordings should lie
+    far from half a turn. The axis is x or y, where one of these is good enough, or else normal to the lines' mean heading. Where
+    lines head all ways, recordings have no world in common, and the axis turns with each.
+    """
+    if not lines:
+        return np.eye(3)[1], SAME_WORLD
+    ways = np.array([heading(line) for line in lines])
+    steady = SAME_WORLD if np.linalg.norm(ways.mean(axis=0)) > ALIKE_HEADINGS else 0.0
+    angles = [angle_between(ways[0], way) for way in ways]
+    angles = [angle if abs(angle) > steady else 0.0 for angle in angles]
+
+    def known(axis: np.ndarray) -> float:
+        return float(np.mean([np.cos(turn_of(line, turned(axis, angle))) for line, angle in zip(lines, angles, strict=True)]))
+
+    axis = max(np.eye(3)[:2], key=known)
+    if known(axis) < TURNS_KNOWN:
+        ahead = np.sum([turned(way, -angle) for way, angle in zip(ways, angles, strict=True)], axis=0)
+        axis = np.cross(ahead, np.eye(3)[2]) / np.linalg.norm(ahead)
+    return axis, steady
+
+
+MIRROR_ERROR = 0.7
+"""A recording is mirrored if its mirror image has so many times its error. In fits to DEFORM's cables it has 1.6 times at least,
+and that of a mirrored one among others 0.4 to 0.6 times."""
+
+
+def require_unmirrored(recordings: Recordings, twin: Twin, settings: RodSteps, device: str) -> None:
+    """Raise InputError, naming all, where mirror images of recordings follow the twin far better than these do.
+
+    Gravity and time are the same in a mirror; the unloaded curvature of a cable, and the side of it that markers are on, are not.
+    So one recording can be told among others, and a whole pool that is mirrored is another cable.
+    """
+    seen, names = recordings.observations, ("object_points", "surface_points", "controller_points", "velocity_before")
+    flip = np.array([1.0, -1.0, 1.0], np.float32)
+    images = Recordings.of([replace(each, **{name: getattr(each, name) * flip for name in names}) for each in seen], twin)
+    frames, every = min(settings.horizons[0] or len(recordings.hands), len(recordings.hands) - 1) + 1, settings.every
+    errors = []
+    for each in (recordings, images):
+        apart = each.predicted([twin], frames, every, device)[0] - each.points[:, 1:frames:every]
+        seen_there = each.counts[:, 1:frames:every, :, None]
+        errors.append(1e3 * np.where(seen_there, np.abs(apart), 0.0).mean(axis=(1, 2, 3)))
+    found = [(one.scenario.name, own, image) for one, own, image in zip(seen, *errors, strict=True)]
+    if wrong := [
+        f"{name} ({own:.1f} mm, its mirror image {image:.1f} mm)" for name, own, image in found if image < MIRROR_ERROR * own
+    ]:
+        rule = "recordings of a pool must not be mirrored"
+        raise InputError(f"pool of {seen[0].scenario.name}", rule, listed(wrong), f"Correct their axes. {LEAVE_OUT}")
+
+
+def _result(twin: Twin, value: float, history: list[dict[str, Any]]) -> RodResult:
+    import pandas as pd
+
+    if not history or not np.isfinite(value):
+        raise NumericalFailure(f"no step lowers the error of the rod from its start ({value:.3g} m)")
+    rod = rod_of(twin)
+    inner = slice(1, -1)
+    facts = {name: float(np.median(getattr(rod, name)[inner])) for name in ("bending", "twisting", "mass")}
+    facts |= {name: float(getattr(rod, name)) for name in ("damping", "drag_quadratic", "roll")}
+    facts |= {"drag": twin.material.drag, "axis": rod.axis.tolist()}
+    table = pd.DataFrame(history)
+    course = table[["loss", "gradient_norm", "learning_rate"]]
+    return RodResult(twin=twin, value=value, history=table, course=course, facts=facts)

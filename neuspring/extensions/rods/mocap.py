@@ -1,0 +1,232 @@
+"""Motion capture of cables (DLO data of DEFORM, arXiv 2406.05931) -> Observations.
+
+One pickle is one recording: positions [T, 3, n], float64; released as nested lists in meters, 100 Hz, z up. Arrays are accepted
+too, and `mocap.unit`, `mocap.rate` and `mocap.up` name another unit, rate and axis.
+Markers run along the cable. Robots hold the two at either end: they are the controllers, with `grip: clamp` each with a ring of
+points around it. The others are observed. There is no surface, so the body is sampled as rings around a smooth centerline through
+the markers of frame 0.
+
+Points on one line leave the roll about it free. A gripper does not, so with `grip: clamp` each held marker m gets a ring of points
+
+    m(t) + r (cos a_k n(t) + sin a_k d(t) x n(t)),    a_k = 2 pi (k + 1/2) / count.
+
+d(t) is the unit direction of the end's two markers. n(t) is normal to it and parallel-transported: from frame to frame the smallest
+rotation that turns d carries n along, so the ring follows every turn of the end and never spins about it. A spin that the gripper
+did make is not in the data. Half a step of the angle keeps the points away from the body's own ring around the first and the last
+marker.
+
+In frame 0 the roll of both ends is that of one direction, projected (`axis_on`): y, about normal to a cable that heads along x.
+So ring node i is the same node in every recording of a cable, as far as its grippers begin alike. A cable that heads elsewhere
+takes its direction with it.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from neuspring.config import Config, ScenarioRow
+from neuspring.core.artifacts import NO_REST_SHAPE, Observations, Scenario
+from neuspring.core.errors import InputError
+from neuspring.core.findings import refuse
+from neuspring.core.records import digest_file
+from neuspring.data.unpickle import load_pickle
+from neuspring.extensions.rods.axes import axis_on
+from neuspring.extensions.rods.checks import MIN_DISTANCE, MIN_FRAMES, in_space, look
+from neuspring.extensions.rods.settings import Mocap
+
+X, Y, Z = np.eye(3)
+
+
+def clamps(held: np.ndarray, normals: np.ndarray, radius: float, count: int, nearest: float, where: str) -> np.ndarray:
+    """Points [T, 4 * count, 3], m, of rings around held markers [T, 4, 3] (two at either end, in the order along the cable).
+
+    `normals` [2, 3] give the roll of either end in frame 0: those of the body's first and last ring. Raises InputError, naming
+    `where`, if the two markers of an end come nearer than `nearest`, m: they have no direction then.
+    """
+    parts = []
+    for normal, end in zip(normals, (held[:, :2], held[:, 2:]), strict=True):
+        along = end[:, 1] - end[:, 0]
+        length = np.linalg.norm(along, axis=1, keepdims=True)
+        if length.min() < nearest:
+            rule = f"the two held markers of an end must stay {nearest} m apart (mocap.grip: clamp)"
+            raise InputError(where, rule, f"{length.min():.2g} m in sample {int(length.argmin())}", "Use grip: markers.")
+        directions = along / length
+        transported = transport(directions, normal)
+        across = np.cross(directions, transported)
+        parts += [end[:, [k]] + circle(transported, across, radius, count, 0.5) for k in (0, 1)]
+    return np.concatenate(parts, axis=1)
+
+
+def circle(normal: np.ndarray, across: np.ndarray, radius: float, count: int, turn: float = 0.0) -> np.ndarray:
+    """Offsets [..., count, 3], m, from the center of a circle, with unit vectors [..., 3] normal to the cable. The first lies along
+    `normal`, or `turn` steps of the angle from it."""
+    angle = (2 * np.pi * (np.arange(count) + turn) / count)[:, None]
+    offsets: np.ndarray = radius * (np.cos(angle) * normal[..., None, :] + np.sin(angle) * across[..., None, :])
+    return offsets
+
+
+def transport(directions: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Unit normals [T, 3] to unit directions [T, 3], by the smallest rotation from each direction to the next.
+
+    The first is `normal` [3], projected. A vector n normal to d goes to n - (d' n) / (1 + d d') (d + d').
+    """
+    first = normal - (normal @ directions[0]) * directions[0]
+    normals = np.empty_like(directions)
+    normals[0] = first / np.linalg.norm(first)
+    for t, (before, after) in enumerate(pairwise(directions)):
+        turned = normals[t] - (after @ normals[t]) / (1.0 + before @ after) * (before + after)
+        # Rounding would add up over thousands of samples.
+        turned -= (turned @ after) * after
+        normals[t + 1] = turned / np.linalg.norm(turned)
+    return normals
+
+
+RING_SPACING = 0.012
+"""Distance of rings along the center line where `mocap.rings` gives no number of them, m."""
+RING_RADIUS = 0.006
+"""m."""
+OVERSAMPLING = 64
+"""Evaluations of the spline per marker interval, for its arc length."""
+
+
+def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Observations:
+    """See `neuspring.scenes.sources`."""
+    return read(row, path, config.section(Mocap))
+
+
+def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
+    """Read one recording; options in `settings` (config, `mocap`). Meters, float32, world with +z up.
+
+    Frame rate `mocap.rate` / stride, all markers visible, tracks = observed markers. Raises InputError naming the file.
+    """
+    file = Path(file)
+    raw = load_pickle(file)
+    refuse(look(file, raw, settings))
+    data = in_space(raw, settings)
+    samples = data[settings.start :: settings.stride].transpose(0, 2, 1)
+    markers = samples if settings.frames is None else samples[: settings.frames]
+    frames, count, _ = markers.shape
+    if frames < MIN_FRAMES:
+        rule = f"at least {MIN_FRAMES} frames must remain after mocap.start = {settings.start} and mocap.stride = {settings.stride}"
+        raise InputError(file, rule, f"{frames} of {len(data)} samples", "Choose a smaller start or stride.")
+    if settings.frames is not None and frames < settings.frames:
+        rule = f"{settings.frames} frames are required after start {settings.start} and stride {settings.stride} (mocap.frames)"
+        raise InputError(file, rule, f"{frames} of {len(data)} samples", "Leave this recording out, or lower mocap.frames.")
+
+    held = [0, 1, count - 2, count - 1]
+    observed = markers[:, 2:-2]
+    centers, tangents = centerline(markers[0], RING_SPACING, settings.rings)
+    normals = rolled(tangents, axis_on(Y, -X, markers[0]))
+    body = rings(centers, tangents, normals, RING_RADIUS, settings.ring)
+    points = np.concatenate([markers[0], body])
+    nearest = float(cKDTree(points).query(points, k=2)[0][:, 1].min())
+    if nearest < MIN_DISTANCE:
+        rule = f"markers and ring nodes of frame 0 must be {MIN_DISTANCE} m apart"
+        raise InputError(file, rule, f"{nearest:.2g} m", "Lower mocap.rings or mocap.ring.")
+    rest_shape = NO_REST_SHAPE
+    if settings.rest_shape == "straight":
+        line, rest_body = straightened(markers[0], len(body) // settings.ring, RING_RADIUS, settings.ring)
+        rest_shape = np.concatenate([line[2:-2], rest_body, line[held]])
+    controllers = markers[:, held]
+    before = data[max(settings.start - 1, 0)].T
+    back = np.stack([markers[0], before])[:, held]
+    if settings.grip == "clamp":
+        # Rings turn at the full rate of the record: the fewer samples, the less of a turn is seen.
+        recorded = data[settings.start :].transpose(0, 2, 1)[: (frames - 1) * settings.stride + 1, held]
+        grips = normals[[0, -1]], RING_RADIUS, settings.ring, MIN_DISTANCE, str(file)
+        controllers = np.concatenate([controllers, clamps(recorded, *grips)[:: settings.stride]], axis=1)
+        back = np.concatenate([back, clamps(back, *grips)], axis=1)
+        if len(rest_shape):
+            around = circle(Y, Z, RING_RADIUS, settings.ring, 0.5)
+            rest_shape = np.concatenate([rest_shape, (line[held][:, None] + around).reshape(-1, 3)])
+    visible = np.ones(observed.shape[:2], dtype=bool)
+    motion_valid = visible.copy()
+    motion_valid[-1] = False
+    first = np.concatenate([observed[0] - before[2:-2], back[0] - back[1]]) * settings.rate
+    nodes = len(observed[0]) + len(body)
+    options = ", ".join(f"{name}={getattr(settings, name)}" for name in Mocap.__dataclass_fields__)
+    return Observations(
+        scenario=Scenario(
+            name=row.scenario,
+            source="mocap",
+            category=row.category,
+            frame_count=frames,
+            train_end=int(settings.train_fraction * frames),
+            frame_rate=settings.rate / settings.stride,
+            up="+z",
+            self_collision=row.self_collision,
+            ground=row.ground,
+            provenance={file.name: f"sha256:{digest_file(file)}", "options": options},
+        ),
+        object_points=observed,
+        object_visibility=visible,
+        object_motion_valid=motion_valid,
+        controller_points=controllers,
+        surface_points=body,
+        interior_points=np.zeros((0, 3)),
+        tracks=observed,
+        rest_shape=rest_shape,
+        line=np.array([nodes, nodes + 1, *range(count - 4), nodes + 2, nodes + 3]),
+        velocity_before=first if settings.start else np.zeros((0, 3)),
+    )
+
+
+def rings(centers: np.ndarray, tangents: np.ndarray, normals: np.ndarray, radius: float, count: int) -> np.ndarray:
+    """Nodes [R * count, 3], m, on circles around `centers` [R, 3] in the planes normal to unit `tangents` [R, 3], ring after ring.
+
+    The first node of each lies along its unit normal [R, 3] (`rolled`), so node k of one ring is nearest to node k of the next.
+    """
+    nodes: np.ndarray = centers[:, None] + circle(normals, np.cross(tangents, normals), radius, count)
+    return nodes.reshape(-1, 3)
+
+
+def rolled(tangents: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Unit normals [R, 3] to unit tangents [R, 3], equally spaced along the arc: `axis` [3], projected, at both ends.
+
+    Between them they are transported by the smallest rotations, and what is missing at the far end, at most half a turn, is twist
+    that is even along the arc.
+    """
+    normals, last = transport(tangents, axis), tangents[-1]
+    missing = np.arctan2(np.cross(normals[-1], axis) @ last, normals[-1] @ axis)
+    turns = Rotation.from_rotvec(np.linspace(0.0, missing, len(tangents))[:, None] * tangents)
+    return np.asarray(turns.apply(normals))
+
+
+def straightened(markers: np.ndarray, number: int, radius: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The cable laid out along x without twist: its markers [n, 3] and the nodes of its `number` rings [number * count, 3], m.
+
+    Arc lengths along the centerline are kept.
+    """
+    _, knots, dense, arc = _arc(markers)
+    line = np.zeros((len(markers), 3))
+    line[:, 0] = np.interp(knots, dense, arc)
+    centers = np.linspace(0.0, arc[-1], number)[:, None, None] * X
+    return line, (centers + circle(Y, Z, radius, count)).reshape(-1, 3)
+
+
+def centerline(markers: np.ndarray, spacing: float, number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Points and unit tangents [R, 3] of a natural cubic spline through `markers` [n, 3], equally spaced along its arc.
+
+    The first and last point are the first and last marker: `number` points in all, or the spacing nearest to `spacing` that divides
+    the arc evenly.
+    """
+    spline, _, dense, arc = _arc(markers)
+    number = max(round(arc[-1] / spacing), 1) + 1 if number is None else number
+    at = np.interp(np.linspace(0.0, arc[-1], number), arc, dense)
+    tangents = spline(at, 1)
+    return spline(at), tangents / np.linalg.norm(tangents, axis=1, keepdims=True)
+
+
+def _arc(markers: np.ndarray) -> tuple[CubicSpline, np.ndarray, np.ndarray, np.ndarray]:
+    """Spline through the markers, its parameters at the markers, dense parameters, and the arc length, m, at each dense one."""
+    knots = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(markers, axis=0), axis=1))])
+    spline = CubicSpline(knots, markers, bc_type="natural")
+    dense = np.unique(np.concatenate([np.linspace(a, b, OVERSAMPLING) for a, b in pairwise(knots)]))
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(spline(dense), axis=0), axis=1))])
+    return spline, knots, dense, arc

@@ -1,0 +1,33 @@
+"""The sources of recordings of long thin objects: motion capture of cables, and tables of poses with markers."""
+
+from __future__ import annotations
+
+import re
+
+from neuspring.config import Config, ScenarioRow, parse
+from neuspring.core.errors import InputError
+from neuspring.extensions.rods.settings import Mocap
+from neuspring.scenes.sources import Source
+
+RECORDING = re.compile(r"(?P<cable>[A-Za-z0-9][\w.-]*)_(?P<part>train|eval)_(?P<number>\d+)")
+"""Name of a recording of DEFORM's data set, which lies in CABLE/PART/NUMBER.pkl."""
+
+
+def row_of(name: str) -> ScenarioRow | None:
+    """The row of a recording of a cable: its name says where it lies, as DLO3_train_15 is DLO3/train/15.pkl."""
+    if not (found := RECORDING.fullmatch(name)):
+        return None
+    values = {"scenario": name, "source": "mocap", "category": found["cable"]}
+    values |= {"path": f"{found['cable']}/{found['part']}/{found['number']}.pkl"}
+    return parse(ScenarioRow, values | {"self_collision": False, "ground": False}, f"scenario {name}")
+
+
+def require_rings(config: Config) -> None:
+    """Raise InputError where recordings of one cable may have different numbers of nodes."""
+    if config.section(Mocap).rings is None:
+        rule = "must be set where twins are transferred, so that all recordings have as many nodes"
+        raise InputError("configuration, mocap.rings", rule, None)
+
+
+MOCAP = Source(module="neuspring.extensions.rods.mocap", reads=("data_root", "mocap"), require_alike=require_rings, row_of=row_of)
+POSED = Source(module="neuspring.extensions.rods.posed", reads=("data_root", "posed"))

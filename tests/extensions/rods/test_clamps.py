@@ -1,0 +1,119 @@
+"""Clamps that move and turn with a hand's pose, and rest under gravity, against rigid motions and the elastica."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_bvp
+from scipy.spatial.transform import Rotation
+
+from neuspring.core.errors import NumericalFailure
+from neuspring.extensions.rods.nodes import Clamps, hanging
+from neuspring.extensions.rods.rod import Rod
+from neuspring.extensions.rods.solver import RodLanes, RodSolver
+from tests.extensions.rods import make
+
+LENGTH = 0.5
+JAWS = np.array([[-0.05, 0, 0], [0, 0, 0], [-0.05, 0, 0.02]])
+"""Outer and inner controller on the line, and the one that says the roll, m in the frame of the hand."""
+
+
+def held(vertices: int, length: float = LENGTH, **changes: object) -> Rod:
+    """A straight rod along x whose first edge a hand with a pose clamps in its middle, at the origin."""
+    edge = length / (vertices - 1.5)
+    x = edge * (np.arange(vertices) - 0.5)[:, None] * np.array([1.0, 0, 0])
+    values = {
+        "bending": 0.02,
+        "twisting": 0.02,
+        "stretching": 1e4,
+        "axis": np.array([0, 0, 1.0]),
+        "tilts": np.zeros((2, 2)),
+        "by_angle": 1.0,
+    }
+    return make.rod(x, (0, 1), rolls=np.array([2, -1], np.int32), **(values | changes))
+
+
+def moved(rod: Rod, turns: Rotation, shifts: np.ndarray, drag: float = 0.0, **changes: object) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [F, V, 3] and m1 [F, E, 3] behind each frame of a hand with rotations [F + 1] and positions [F + 1, 3]."""
+    hands = np.stack([turns.apply(jaw) for jaw in JAWS], axis=1) + shifts[:, None]
+    paths, axes = Clamps.of([rod]).paths(make.real(hands)[:, None])
+    solver = RodSolver(RodLanes.of([rod], [drag]), make.simulation(**changes))
+    solver.start(make.real(turns[0].apply(np.array(rod.vertices)) + shifts[0])[None], torch.zeros(1, len(rod.mass), 3), axes[0])
+    x, m1 = solver.frames(paths, axes)
+    return x[:, 0].numpy().copy(), m1[:, 0].numpy().copy()
+
+
+@pytest.mark.parametrize("jolt", [0.0, 0.05])
+def test_turned_and_shifted_paths_of_a_hand_move_the_rod_alike(jolt: float) -> None:
+    rod = held(9, damping=0.01, curvature=np.full((9, 2), 0.1), tilts=np.array([[0.1, -0.2], [0, 0]]), clamps=np.full((2, 3), 0.01))
+    path = Rotation.from_rotvec(np.linspace(0, 1, 12)[:, None] * [1.0, 0.5, -0.8])
+    shifts = jolt * np.sin(np.arange(12))[:, None] * [1, 2, 3]
+    turn = Rotation.from_rotvec([0.4, -1.0, 0.7])
+    here, there = moved(rod, path, shifts), moved(rod, turn * path, turn.apply(shifts) + 3.0)
+    np.testing.assert_allclose(there[0], (turn.apply(here[0].reshape(-1, 3)) + 3.0).reshape(here[0].shape), atol=1e-9)
+    np.testing.assert_allclose(there[1], turn.apply(here[1].reshape(-1, 3)).reshape(here[1].shape), atol=1e-9)
+
+
+def test_a_clamp_that_turns_about_its_own_axis_takes_a_bent_rod_around() -> None:
+    """By slow quarters of a turn to a whole one: the rod is what it was, turned, and its directors have gone all the way."""
+    rod = held(9, bending=1.0, twisting=1.0, curvature=np.tile([0.1, 0.05], (9, 1)), damping=0.05)
+    frames, still = 400, 100
+    angles = np.concatenate([np.zeros(still), np.linspace(0, 2 * np.pi, frames), np.full(still, 2 * np.pi)])
+    turns = Rotation.from_rotvec(angles[:, None] * [1.0, 0, 0])
+    x, m1 = moved(rod, turns, np.zeros((len(angles), 3)), drag=5.0)
+    rest = x[still - 1]
+    assert np.abs(rest[-1, 1:]).max() > 0.05, "it is bent"
+    np.testing.assert_allclose(x[-1], rest, atol=1e-3 * LENGTH)
+    for frame in (still + 99, still + 199, still + 299):
+        wanted = turns[frame + 1].apply(rest)
+        # It lags while it turns.
+        np.testing.assert_allclose(x[frame], wanted, atol=0.02)
+        np.testing.assert_allclose(m1[frame, 0], turns[frame + 1].apply([0, 0, 1.0]), atol=1e-9)
+
+
+def elastica(length: float, bending: float, weight: float) -> np.ndarray:
+    """End [2], m, of a cantilever that begins along x: EI theta'' = q (L - s) cos theta, theta below the horizontal."""
+    s = np.linspace(0, length, 201)
+    found = solve_bvp(
+        lambda s, y: np.stack([y[1], -weight * (length - s) * np.cos(y[0]) / bending]),
+        lambda a, b: np.array([a[0], b[1]]),
+        s,
+        np.stack([0.5 * s, np.full_like(s, 0.5)]),
+        tol=1e-8,
+    )
+    theta = found.sol(s)[0]
+    return np.array([np.trapezoid(np.cos(theta), s), -np.trapezoid(np.sin(theta), s)])
+
+
+def test_a_rod_at_rest_is_the_elastica() -> None:
+    wanted, apart = elastica(LENGTH, 0.1, 9.8), []
+    for vertices in (9, 17, 33):
+        rod = held(vertices, bending=0.1, stretching=1e6)
+        x = hanging([rod], JAWS[None], make.simulation(gravity=9.8))[0][0]
+        apart.append(np.linalg.norm(x[-1, [0, 2]] - wanted))
+    assert wanted[1] < -0.2 * LENGTH, "it bends far"
+    assert apart[1] < 0.003 * LENGTH
+    # Second order in the length of an edge.
+    assert np.log2(apart[0] / apart[1]) == pytest.approx(2, abs=0.25)
+    assert np.log2(apart[1] / apart[2]) == pytest.approx(2, abs=0.25)
+
+
+def test_a_rod_at_rest_stays_and_lanes_do_not_mix() -> None:
+    rods = [held(9, bending=each, curvature=np.full((9, 2), 0.05)) for each in (0.01, 0.05)]
+    x, m1, axes = hanging(rods, np.stack([JAWS, JAWS + 1.0]), make.simulation(gravity=9.8))
+    np.testing.assert_allclose(hanging(rods[1:], JAWS[None] + 1.0, make.simulation(gravity=9.8))[0][0], x[1], atol=1e-12)
+    solver = RodSolver(
+        RodLanes.of([replace(rod, vertices=own) for rod, own in zip(rods, x, strict=True)], [0, 0]), make.simulation(gravity=9.8)
+    )
+    solver.start(make.real(x), torch.zeros(2, 9, 3), make.real(axes))
+    np.testing.assert_array_equal(solver.directors().numpy(), m1)
+    later, _ = solver.frames(solver.x.expand(51, -1, -1, -1))
+    np.testing.assert_allclose(later[-1].numpy(), x, atol=1e-6)
+
+
+def test_a_rod_that_never_rests_is_named() -> None:
+    with pytest.raises(NumericalFailure, match="does not come to rest"):
+        hanging([held(9, curvature=np.full((9, 2), 40.0))], JAWS[None], make.simulation(gravity=9.8))

@@ -1,0 +1,172 @@
+"""A study of clips: ours beside published numbers per cable, growth over time, films; with any part of cables and methods."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+from neuspring.cli.main import main
+from neuspring.config import parse
+from neuspring.core.errors import InputError
+from neuspring.extensions.rods import clips as study_clips
+from neuspring.extensions.rods.clips import TAGS, ClipNumbers, clip_blocks, filmed, published
+from neuspring.report import page
+from neuspring.report.blocks import markdown
+from neuspring.scores.metrics import SCORE_COLUMNS
+from neuspring.scores.numbers import Numbers
+from neuspring.scores.paper import Study, read_studies
+from neuspring.scores.runs import collect
+from tests.extensions.rods.clip_runs import FRAMES, RATE, write_transfer
+from tests.support.study_runs import rows_of, tables_in, write_run
+
+ROWS = Path(__file__).resolve().parents[3] / "config" / "rows" / "rods.yaml"
+STUDY_TABLE = Path(__file__).resolve().parents[3] / "config" / "studies.yaml"
+VALUES = {
+    "title": "T",
+    "reference": "deform_published",
+    "kind": "clips",
+    "baseline": "Rod",
+    "training": "Choices were made on training clips",
+    "rows": {"Field": "model_b_pooled", "Rod": "rod", "Residual": "rod_free"},
+}
+STUDY = parse(Study, VALUES, "here")
+CLIPS = {"DLO3_eval_a": 0.002, "DLO3_eval_b": 0.006, "DLO3_eval_c": 0.004}
+
+
+def found(results: Path, sources=("DLO3_train",), seeds=(0, 1)):
+    return ClipNumbers(name="deform", study=STUDY, results=results, sources=sources, methods=list(STUDY.rows.values()), seeds=seeds)
+
+
+def test_published_numbers_keep_their_digits_their_sources_and_what_the_tag_means():
+    values = published()
+    printed = values["DEFORM, best over the evaluation", "DLO4", "deform_l1"]
+    assert (printed.text, printed.slack, printed.tag) == ("11.53", pytest.approx(0.005), "log")
+    assert values["DEFORM", "DLO3", "deform_l1"].tag == "second-hand"
+    assert {value.tag for value in values.values()} == set(TAGS)
+    assert {cable for _, cable, _ in values} == {f"DLO{k}" for k in range(1, 6)}
+    assert read_studies(STUDY_TABLE, [ROWS])["deform"].kind == "clips"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kind": None}, "reference: must be null or one of table1_comparison"),
+        ({"reference": "table2_ablation"}, "reference: must be null or one of deform_published"),
+    ],
+)
+def test_a_wrong_study_of_clips_is_refused(change, message):
+    with pytest.raises(InputError, match=message):
+        parse(Study, VALUES | change, "here")
+
+
+def test_ours_stand_beside_published_numbers_with_clips_seeds_and_time(tmp_path):
+    for seed, factor in ((0, 1.0), (1, 1.5)):
+        write_transfer(tmp_path, "DLO3", "rod", seed, {clip: factor * value for clip, value in CLIPS.items()})
+    tables = tables_in(clip_blocks(found(tmp_path)))
+    overview = rows_of(tables["L1 per cable"])
+    # Seeds have 4 and 6 mm.
+    assert overview["Rod"]["DLO3"].text == "5.00 ± 1.41" and overview["Rod"]["DLO3"].mark == "best"
+    assert overview["DEFORM"]["DLO3"].text == "7.7†" and overview["DEFORM"]["DLO3"].mark == ""
+    floor = overview["Floor: segments of constant length"]["DLO3"]
+    assert floor.text == "0.42¶" and floor.mark == "", "it is no method"
+    note = tables["L1 per cable"].note
+    assert "evaluation clips (DLO3 3)" in note and STUDY.training in note and TAGS["second-hand"] in note
+    detail = rows_of(tables["Ours in detail"])["DLO3"]
+    texts = {name: cell.text for name, cell in detail.items()}
+    assert (texts["Median clip"], texts["Worst clip"], texts["Worst"]) == ("5.00", "7.50", "DLO3_eval_b")
+    assert (texts["Euclidean"], texts["Clips"], texts["Seeds"]) == ("15.00", "3/3", "2")
+    assert [row[2].text for row in tables["L1 per clip"].rows] == ["2.50", "7.50", "5.00"]
+
+
+def test_minutes_are_those_of_search_and_fit(tmp_path):
+    write_transfer(tmp_path, "DLO3", "rod", 0, CLIPS)
+    path = write_run(tmp_path, "DLO3_train", "rod", 0, {})
+    values = json.loads(path.read_text())
+    values["timings"] = {"search": 30.0, "fit": 60.0, "score": 1000.0}
+    path.write_text(json.dumps(values))
+    assert found(tmp_path).cells.set_index("label").loc["Rod", "minutes"] == pytest.approx(1.5)
+
+
+def test_a_mean_of_fewer_clips_is_marked_and_never_the_best(tmp_path):
+    write_transfer(tmp_path, "DLO3", "rod", 0, CLIPS)
+    fewer = dict.fromkeys(list(CLIPS)[:2], 0.001)
+    write_transfer(tmp_path, "DLO3", "rod_free", 0, fewer, diverged=("DLO3_eval_c",))
+    blocks = clip_blocks(found(tmp_path))
+    overview = rows_of(tables_in(blocks)["L1 per cable"])
+    assert overview["Residual"]["DLO3"].text == "1.00 *" and overview["Residual"]["DLO3"].mark == ""
+    assert overview["Rod"]["DLO3"].mark == "best"
+    text = markdown(blocks)
+    assert "Residual, DLO3_train / seed 0: diverged on DLO3_eval_c" in text and "Field: not run" in text
+
+
+def test_a_cable_without_published_numbers_and_a_study_without_runs(tmp_path):
+    write_transfer(tmp_path, "WIRE", "rod", 0, {"WIRE_eval": 0.001})
+    overview = tables_in(clip_blocks(found(tmp_path, ["WIRE_train"])))["L1 per cable"]
+    assert overview.header == ["Method", "Source", "WIRE"] and [row[0].text for row in overview.rows] == ["Rod"]
+    nothing = tables_in(clip_blocks(found(tmp_path, ["DLO1_train"])))
+    assert list(nothing) == ["L1 per cable"] and nothing["L1 per cable"].header[2:] == [f"DLO{k}" for k in range(1, 6)]
+
+
+def test_the_command_writes_tables_growth_and_films(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(study_clips, "FILM_WIDTH", 300)
+    results, output = tmp_path / "results", tmp_path / "tables"
+    write_transfer(results, "DLO3", "rod", 0, CLIPS)
+    write_transfer(results, "DLO3", "model_b_pooled", 0, {clip: 2 * value for clip, value in CLIPS.items()}, line=False)
+    output.mkdir()
+    (output / "deform_DLO9.gif").write_bytes(b"of an older run")
+    runs = ["--scenarios", "DLO3_train", "--methods", "rod", "model_b_pooled", "--seeds", "0"]
+    command, known = (
+        ["study", "--study", "deform", "--output", str(output)],
+        ["--table", str(STUDY_TABLE), "--extra-rows", str(ROWS)],
+    )
+    kept = ["--output", str(results / "tables"), "--studies", "deform", *known]
+    assert main(["tables", "--results", str(results), *runs, *kept]) == 0
+    assert main([*command, "--results", str(results)]) == 0
+    names = ["deform.csv", "deform.md", "deform.tex", "deform_DLO3.gif", "deform_DLO3.mp4"]
+    names += ["deform_clips.csv", "deform_growth.png"]
+    assert sorted(path.name for path in output.iterdir()) == names
+    growth = Numbers.load(results / "tables", results).by_study["deform"].growth
+    rod = growth[growth["label"] == "Rod"]
+    np.testing.assert_allclose(rod["seconds"], np.arange(FRAMES) / RATE)
+    np.testing.assert_allclose(rod["euclid_mm"], [0.0, *[12.0] * (FRAMES - 1)])
+    with Image.open(output / "deform_DLO3.gif") as film:
+        # 20 of 100 frames per second.
+        assert film.n_frames == 2 and film.info["duration"] == 50
+    assert "\\begin{tabular}{@{} ll r @{}}" in (output / "deform.tex").read_text(), "numbers, and no paragraphs"
+    assert "![DLO3" in (output / "deform.md").read_text() and "7.7†" in capsys.readouterr().out
+    pd.DataFrame(columns=list(SCORE_COLUMNS)).to_csv(tmp_path / "scores.csv")
+    assert main([*command, *known, "--scores", str(tmp_path / "scores.csv")]) != 0
+    assert "a study of the kind clips needs a results folder" in capsys.readouterr().err
+
+
+def test_the_film_shows_the_best_the_median_and_the_worst_clip_of_the_chosen_row(tmp_path):
+    write_transfer(tmp_path, "DLO3", "model_b_pooled", 0, CLIPS)
+    titles = [painter.takes[0].label for painter in filmed(found(tmp_path), "DLO3")]
+    assert titles == [
+        "Field, best: DLO3_eval_a, L1 2.0 mm",
+        "Field, median: DLO3_eval_c, L1 4.0 mm",
+        "Field, worst: DLO3_eval_b, L1 6.0 mm",
+    ], "the last row that ran, where the baseline has not"
+    write_transfer(tmp_path, "DLO3", "rod", 0, {"DLO3_eval_a": 0.002, "DLO3_eval_b": 0.006})
+    painters = filmed(found(tmp_path), "DLO3")
+    assert [painter.takes[0].label for painter in painters] == [
+        "Rod, best: DLO3_eval_a, L1 2.0 mm",
+        "Rod, worst: DLO3_eval_b, L1 6.0 mm",
+    ]
+    moved = painters[1].takes[0].positions - painters[1].scene.observations.object_points
+    np.testing.assert_allclose(moved, np.tile([0, 0, 0.018], (FRAMES, 3, 1)), atol=1e-6)
+
+
+def test_the_page_shows_the_same_tables_once_the_study_was_made(tmp_path):
+    write_transfer(tmp_path, "DLO3", "rod", 0, CLIPS)
+    write_run(tmp_path, "DLO3_train", "rod", 0, {("future", "chamfer"): 0.01}, category="DLO3", source="mocap")
+    options = page.Options(studies={"deform": STUDY})
+    assert "L1 per clip" not in page.write(tmp_path, tmp_path / "report.html", options).read_text()
+    runs = collect(tmp_path, ["DLO3_train"], ["rod"], [0])
+    studies = {"deform": STUDY}
+    Numbers(everything=runs, baseline="rod", studies=studies, known_studies=studies, results=tmp_path).save(tmp_path)
+    text = page.write(tmp_path, tmp_path / "report.html", options).read_text()
+    assert "L1 per clip" in text and "7.7†" in text and "DLO3_eval_b" in text

@@ -1,0 +1,192 @@
+"""Twins that are rods: the line through a body, its vertices and nodes, rollouts, other recordings."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from neuspring import config
+from neuspring.core.errors import InputError
+from neuspring.extensions.rods.center_line import center_line
+from neuspring.extensions.rods.made import rod_twin
+from neuspring.twin.rollout import roll_out
+from neuspring.twin.transfer import move
+from tests.extensions.rods import ropes
+from tests.support import colored
+
+SINGLE = 1e-6
+"""m: rounding of float32 nodes."""
+
+
+def arc(count: int) -> np.ndarray:
+    """Points on two thirds of a circle of radius 10 cm."""
+    angle = np.linspace(0, 4 * np.pi / 3, count)
+    return 0.1 * np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)
+
+
+def test_a_line_is_found_in_unordered_nodes():
+    nodes = ropes.tube(arc(60))
+    line = center_line(np.random.default_rng(0).permutation(nodes), 20)
+    # A tenth of the radius of the tube.
+    assert np.abs(np.linalg.norm(line[:, :2], axis=1) - 0.1).max() < 1e-3
+    assert np.abs(line[:, 2]).max() < 1e-3
+    lengths = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    assert np.ptp(lengths) < 0.02 * lengths.mean()
+    ends = {tuple(np.round(point, 2)) for point in (arc(2)[0], arc(2)[1])}
+    assert {tuple(np.round(point, 2)) for point in line[[0, -1]]} == ends
+    assert np.array_equal(center_line(nodes, 20), line)
+
+
+def test_points_beside_the_body_and_gaps_do_not_bend_the_line():
+    nodes = ropes.tube(ropes.straight(80))
+    gap = nodes[(nodes[:, 0] < 0.1) | (nodes[:, 0] > 0.2)]
+    beside = np.random.default_rng(1).uniform([0.25, 0.03, 0.1], [0.3, 0.06, 0.12], (len(gap) // 20, 3))
+    line = center_line(np.concatenate([gap, beside]), 12)
+    assert np.linalg.norm(line[:, 1:] - [0, ropes.HEIGHT], axis=1).max() < 0.1 * ropes.RADIUS
+    np.testing.assert_allclose(line[[0, -1], 0], [0, ropes.LENGTH], atol=0.2 * ropes.RADIUS)
+
+
+@pytest.mark.parametrize("shape", ["ball", "cross", "ring"])
+def test_what_is_no_rod_is_refused(shape):
+    circle = 2 * np.pi * np.arange(60) / 60
+    shapes = {
+        "ball": np.random.default_rng(0).normal(size=(300, 3)),
+        "cross": np.concatenate(
+            [ropes.tube(ropes.straight(40)), ropes.tube(ropes.straight(40) - [0.2, 0, 0])[:, [1, 0, 2]] + [0.2, 0, 0]]
+        ),
+        "ring": ropes.tube(0.1 * np.stack([np.cos(circle), np.sin(circle), 0 * circle], axis=1)),
+    }
+    with pytest.raises(InputError, match=r"long and thin.*lattice"):
+        center_line(shapes[shape], 12)
+
+
+def test_markers_along_a_cable_are_the_vertices_and_clamps_move_theirs():
+    seen = ropes.cable(move=(0.0, 0.01, 0.005))
+    twin = ropes.twin(seen)
+    assert twin.body is not None
+    assert twin.body.held.tolist() == [0, 1, -1, -1, -1, 2, 3]
+    assert twin.counts == {"vertices": 7, "nodes": 3, "springs": 0, "object_springs": 0, "substeps": 17}
+    np.testing.assert_allclose(twin.body.vertices[2:5], seen.nodes, atol=SINGLE)
+    # 1 kg/m, and the markers.
+    assert twin.body.mass.sum() == pytest.approx(twin.body.lengths.sum() + 7 * ropes.SETTINGS.rod.marker_mass)
+    moved = roll_out(twin, seen.controller_points).positions
+    np.testing.assert_array_equal(moved[0], seen.nodes)
+    assert 0.002 < moved[-1, -1, 1] < 0.03, "the marker beside the clamp goes with it"
+    again = roll_out(twin, seen.controller_points).positions
+    np.testing.assert_array_equal(moved, again)
+
+
+def test_a_start_velocity_moves_the_vertices():
+    seen = ropes.cable(frames=2)
+    still, fast = (
+        roll_out(ropes.twin(seen), seen.controller_points, velocity=np.tile([0, v, 0], (3, 1))).positions for v in (0.0, 0.3)
+    )
+    # Within a frame of 1/30 s; clamps slow it.
+    assert 0.002 < (fast - still)[1, 1, 1] < 0.3 / 30
+
+
+def test_the_shape_of_frame_0_may_be_without_moments():
+    seen = ropes.cable(frames=8)
+    settings = replace(
+        ropes.SETTINGS, rod=replace(ropes.ROD, rest="first_frame"), simulation=config.SimulationSettings(gravity=0.0)
+    )
+    twin = ropes.twin(seen, settings)
+    at_rest = roll_out(twin, seen.controller_points).positions
+    assert np.abs(at_rest - at_rest[0]).max() < SINGLE
+    t = np.diff(twin.body.vertices, axis=0) / np.linalg.norm(np.diff(twin.body.vertices, axis=0), axis=1, keepdims=True)
+    angle = np.arccos((t[1:] * t[:-1]).sum(axis=1))
+    np.testing.assert_allclose(np.linalg.norm(twin.body.curvature[1:-1], axis=1), 2 * np.tan(angle / 2), rtol=1e-6)
+    assert not ropes.twin(seen).rod.curvature.any()
+
+
+def test_a_hand_lifts_a_rope_and_lets_it_go():
+    up = np.ones((8, 3), bool)
+    seen = ropes.rope(frames=8, height=0.02, move=(0.0, 0.0, 0.01))
+    twin = ropes.twin(seen)
+    assert twin.topology.object_spring_count == 0 < len(twin.topology.springs)
+    lifted = roll_out(twin, seen.controller_points).positions[-1]
+    middle = np.abs(lifted[:, 0] - 0.2) < 0.02
+    assert lifted[middle, 2].mean() > 0.07 > lifted[~middle, 2].min()
+    up[2:] = False
+    fallen = roll_out(twin, seen.controller_points, valid=up).positions[-1]
+    assert fallen[:, 2].max() < 0.06
+    assert fallen[:, 2].min() > -ropes.RADIUS
+
+
+def test_a_rod_that_nothing_holds_is_refused():
+    seen = ropes.rope()
+    away = replace(seen, controller_points=seen.controller_points)
+    variables = config.SearchVariables(controller_radius=config.Variable(0.0, 1.0, 0.0))
+    none = replace(ropes.SETTINGS, search=config.Search(variables=variables))
+    with pytest.raises(InputError, match=r"a hand must hold the rod.*controller_radius"):
+        rod_twin(away, none, ropes.AXIS)
+
+
+def test_a_body_that_was_seen_without_depth_is_refused():
+    with pytest.raises(InputError, match=r"tracked in space.*without depth.*lattice"):
+        ropes.twin(colored.observed())
+
+
+def test_a_scene_with_self_collision_is_refused_before_it_is_simulated():
+    seen = ropes.rope()
+    twin = ropes.twin(seen)
+    touching = replace(twin, simulation=replace(twin.simulation, self_collision=True))
+    with pytest.raises(InputError, match=r"twin\.rod.*ground alone.*lattice"):
+        roll_out(touching, seen.controller_points)
+
+
+@pytest.mark.parametrize("body", [ropes.rope, ropes.cable])
+def test_another_recording_moves_the_same_elsewhere(body):
+    here = body(frames=5, move=(0.0, 0.01, 0.004))
+    shift = np.array([0.5, -0.25, 0.0])
+    there = replace(here, object_points=here.object_points + shift, controller_points=here.controller_points + shift)
+    twin = ropes.twin(here)
+    moved, registration = move(twin, there)
+    assert registration is None
+    assert moved.rod is not None
+    assert moved.rod.lengths is not None
+    np.testing.assert_array_equal(moved.rod.lengths, twin.body.lengths)
+    expected = roll_out(twin, here.controller_points).positions + shift
+    # The line is found anew, in float32 coordinates.
+    np.testing.assert_allclose(roll_out(moved, there.controller_points).positions, expected, atol=1e-4)
+
+
+def test_a_rope_that_lies_along_another_axis_moves_as_the_same_turned():
+    here = ropes.rope(frames=5, move=(0.0, 0.01, 0.004))
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    there = replace(here, object_points=here.object_points @ turn.T, controller_points=here.controller_points @ turn.T)
+    twin = ropes.twin(here)
+    expected = roll_out(twin, here.controller_points).positions @ turn.T
+    found = roll_out(move(twin, there)[0], there.controller_points).positions
+    # Nodes come in another order to the search for the line.
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+
+
+def test_a_rope_that_was_sampled_with_other_nodes_moves_alike():
+    here, there = (ropes.rope(frames=5, move=(0.0, 0.01, 0.004), count=count) for count in (20, 27))
+    twin = ropes.twin(here)
+    moved = move(twin, there)[0]
+    assert moved.rod.mass.sum() == twin.body.mass.sum()
+    strength = [float((one.material.stiffness / one.topology.rest_lengths).sum()) for one in (twin, moved)]
+    assert strength[1] == pytest.approx(strength[0], rel=1e-5)
+    first, other = (roll_out(*pair).positions[-1] for pair in ((twin, here.controller_points), (moved, there.controller_points)))
+    # Lines of both, by the mean of the first and the last circle; other nodes are held.
+    for part in (slice(0, 6), slice(-6, None)):
+        np.testing.assert_allclose(other[part].mean(axis=0), first[part].mean(axis=0), atol=5e-3)
+
+
+def test_lengths_belong_to_the_cable_and_not_to_a_recording():
+    here = ropes.cable(frames=3)
+    longer = replace(here, object_points=here.object_points + np.array([0, 0, 0.002]))
+    moved = move(ropes.twin(here), longer)[0]
+    np.testing.assert_array_equal(moved.rod.lengths, ropes.twin(here).rod.lengths)
+    np.testing.assert_allclose(moved.rod.vertices[2:5], longer.nodes, atol=SINGLE)
+
+
+def test_recordings_of_another_body_are_refused():
+    here = ropes.cable(frames=3)
+    double = replace(here, object_points=2 * here.object_points, controller_points=2 * here.controller_points)
+    with pytest.raises(InputError, match="as long as the twin's"):
+        move(ropes.twin(here), double)
+    with pytest.raises(InputError, match=r"center line of 7 vertices.*no line"):
+        move(ropes.twin(here), ropes.rope())

@@ -1,0 +1,36 @@
+"""What every kind of body must answer, whoever brings it."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from neuspring.core.artifacts import Artifact, Observations, Twin
+from neuspring.twin.body import BODIES, body_of, lines_of
+
+
+def require_answers(name: str, twin: Twin, seen: Observations) -> None:
+    """Assert that the body of this name answers for its twin, which was made on these observations."""
+    body = body_of(twin)
+    assert body is BODIES[name] and body.name == name
+    lines, nodes, hands = lines_of(twin), twin.topology.nodes, twin.topology.controllers
+    assert len(lines.points(nodes, hands)) == len(lines.labels) == len(lines.masses) > lines.pairs.max()
+    assert len(lines.pairs) == len(lines.stiffness) == len(lines.rest_lengths) >= lines.inner > 0
+    assert body.node_stiffness(twin).shape == (len(nodes),)
+    assert lines.masses.sum() > 0 and body.mass_at(twin, 0) > 0
+    body.check(body.stable(twin, 0.8))
+    np.testing.assert_array_equal(body.on_recording(twin, seen)[0].topology.nodes, nodes)
+
+
+def differing(before: Any, after: Any, prefix: str = "") -> set[str]:
+    """Fields whose values differ, by name."""
+    found = set()
+    for spec in fields(before):
+        old, new = getattr(before, spec.name), getattr(after, spec.name)
+        if isinstance(old, Artifact):
+            found |= differing(old, new, f"{prefix}{spec.name}.")
+        elif not np.array_equal(old, new):
+            found.add(prefix + spec.name)
+    return found
