@@ -1,4 +1,4 @@
-"""Settings of the zero-order search: its variables, their ranges and scales, and the polish that follows."""
+"""Settings of the zero-order search: its variables, their ranges and scales."""
 
 from __future__ import annotations
 
@@ -96,11 +96,10 @@ VARIABLES = tuple(spec.name for spec in dataclasses.fields(SearchVariables))
 
 @dataclass(frozen=True, kw_only=True)
 class Search(SettingsSection):
-    """Zero-order stage: CMA-ES over homogeneous material and topology, then a polish of few variables."""
+    """Zero-order stage: CMA-ES over homogeneous material and topology."""
 
     rollouts: Count = 220
-    """Budget in candidate rollouts, those of the polish included, the same for every method that is compared. The last generation
-    of CMA-ES may be cut short."""
+    """Budget in candidate rollouts, the same for every method that is compared. The last generation may be cut short."""
     tied_rollouts: Annotated[int, Field(ge=0)] = 0
     """Rollouts, out of the budget, in which all regions share their values; afterwards each region is free around the best
     candidate."""
@@ -120,9 +119,6 @@ class Search(SettingsSection):
     controller_rest: Literal["rest_shape", "first_frame"] = "rest_shape"
     """Shape in which springs of controllers have no force: the body's rest shape, or frame 0, as a hand takes hold of a body that
     is bent already."""
-    polish: Annotated[int, Field(ge=0)] = 6
-    """Most rounds of the polish: Levenberg-Marquardt from the best candidate of CMA-ES, in few variables, on the residuals of all
-    training frames; 0: none. A round takes a rollout, one more per variable for the slopes, and four for the damped steps."""
     variables: SearchVariables = field(default_factory=SearchVariables)
 
     def __post_init__(self) -> None:
@@ -138,36 +134,5 @@ class Search(SettingsSection):
                 raise ValueError(f"variables.{name}: start = {it.start} lies outside [{it.low}, {it.high}]")
             if it.scale == "log" and it.low <= 0:
                 raise ValueError(f"variables.{name}: scale log needs a positive low, received {it.low}")
-        if self.tied_rollouts >= self.cma_rollouts:
-            rule = f"tied_rollouts must be below rollouts, without those of the polish ({self.cma_rollouts})"
-            raise ValueError(f"{rule}, received {self.tied_rollouts}")
-
-    @property
-    def polished(self) -> tuple[str, ...]:
-        """Variables that are polished."""
-        return tuple(name for name in POLISHED if name not in self.fixed)
-
-    @property
-    def polish_rounds(self) -> int:
-        """Most rounds of the polish that its share of the budget holds."""
-        if not self.polished:
-            return 0
-        return min(self.polish, int(POLISH_SHARE * self.rollouts) // self.round_rollouts)
-
-    @property
-    def round_rollouts(self) -> int:
-        """Rollouts of a round of the polish."""
-        return 1 + len(self.polished) + TRIALS
-
-    @property
-    def cma_rollouts(self) -> int:
-        """Rollouts of CMA-ES: the budget without what the polish may take."""
-        return self.rollouts - self.polish_rounds * self.round_rollouts
-
-
-POLISHED = ("stiffness", "dashpot", "drag")
-"""Variables of the polish, which decide nothing of which springs and pairs there are; fixed ones are left out."""
-TRIALS = 4
-"""Damped steps that a round of the polish tries."""
-POLISH_SHARE = 0.25
-"""Largest part of the budget `rollouts` that the polish may take: a search of few rollouts has fewer rounds, or none."""
+        if self.tied_rollouts >= self.rollouts:
+            raise ValueError(f"tied_rollouts must be below rollouts ({self.rollouts}), received {self.tied_rollouts}")

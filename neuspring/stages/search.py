@@ -1,4 +1,4 @@
-"""Observations -> coarse twin, by CMA-ES and a polish."""
+"""Observations -> coarse twin, by CMA-ES."""
 
 from __future__ import annotations
 

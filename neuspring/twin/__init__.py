@@ -2,10 +2,10 @@
 
 body        what a twin is made of, asked by all others: bodies/lattice, and bodies of packages
 search      CMA-ES over topology and a homogeneous material: candidates (variables, twin, cost), trials (many on the lanes of one
-            solver), polish (Levenberg-Marquardt)
+            solver)
 field       the neural spring field
 fit         Adam through the simulation, on one recording or several: parameters (what is trained), batch (fits that share launches)
-losses      every term of the training loss, for search, fit and polish
+losses      every term of the training loss, for search and fit
 rollout     prediction
 transfer    a twin on another recording, with register where its nodes are others
 """

@@ -1,4 +1,4 @@
-"""The training loss, in one place: a term is a function that says a frame's errors, and search, fit and polish sum their squares.
+"""The training loss, in one place: a term is a function that says a frame's errors, and search and fit sum their squares.
 
 A term's loss is weight / divisor times the sum of s(e)^2 over its errors e, m; `config.Losses` has the weight under its name:
 
@@ -10,15 +10,15 @@ A term's loss is weight / divisor times the sum of s(e)^2 over its errors e, m; 
                   s(e) = e; D is the distance from object and hands, bilinear between cells: a node that a hand hides is not wrong
 
 The last two are of one camera without depth, with the projection u(x) = K R^T (x - c) / depth, pixels, and p, m per pixel at the
-object in frame 0. The first three are those of the released PhysTwin code. The fit takes `FrameLoss.__call__`, the polish
-`Errors.residuals`. The search takes the first three on the lanes of its solver (trials.py, tested against this file) and what else
-there is from here: a term needs its function, its name in `body.TERMS`, and its weight. A package's term weighs its errors itself.
+object in frame 0. The first three are those of the released PhysTwin code. The fit takes `FrameLoss.__call__`. The search takes the
+first three on the lanes of its solver (trials.py, tested against this file) and what else there is from here: a term needs its
+function, its name in `body.TERMS`, and its weight. A package's term weighs its errors itself.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
@@ -75,36 +75,14 @@ class Errors(NamedTuple):
     divisor: int | torch.Tensor
     """At least 1."""
     penalty: Penalty
-    rows: torch.Tensor | None = None
-    """Places of the values among all points of the term, bool [P]; none: they are all."""
-    single: bool = False
-    """Residuals are scaled in single precision, as earlier polishes did."""
 
     def loss(self) -> torch.Tensor:
         """The sum."""
-        if self.penalty.total is None:
-            return self.residuals().square().sum()
-        return self.weight * (self.penalty.total(self.values) / self.divisor)
-
-    def residuals(self, frames: int = 1) -> torch.Tensor:
-        """[P, d]: their squares sum up to the loss over `frames`; 0 where there is no error."""
-        result = self.penalty.root(self.values)
-        if self.penalty.total is None:
-            result = result * _root(self.weight / self.divisor)
-            result = result / frames**0.5 if frames > 1 else result
-        elif self.single:
-            result = result * (torch.tensor(self.weight / self.divisor) / frames).sqrt()
-        else:
-            result = result * _root(self.weight / self.divisor / frames)
-        if self.rows is None:
-            return result
-        everywhere = result.new_zeros(len(self.rows), result.shape[1])
-        everywhere[self.rows] = result
-        return everywhere
-
-
-def _root(value: float | torch.Tensor) -> float | torch.Tensor:
-    return value.sqrt() if isinstance(value, torch.Tensor) else math.sqrt(value)
+        if self.penalty.total is not None:
+            return self.weight * (self.penalty.total(self.values) / self.divisor)
+        scale = self.weight / self.divisor
+        root = scale.sqrt() if isinstance(scale, torch.Tensor) else math.sqrt(scale)
+        return (self.penalty.root(self.values) * root).square().sum()
 
 
 class FrameState(NamedTuple):
@@ -113,8 +91,6 @@ class FrameState(NamedTuple):
     frame: int
     x: torch.Tensor
     """Nodes [N, 3], m."""
-    near: Mapping[str, torch.Tensor] | None = None
-    """Assignments by term (`FrameLoss.assigned`); none: those of x."""
     jerk: torch.Tensor | None = None
     """Change of the velocity change [N, 3], m/s; none: not counted."""
     u: torch.Tensor | None = None
@@ -138,8 +114,6 @@ def nearest(points: torch.Tensor, nodes: torch.Tensor) -> torch.Tensor:
 
 def _near(loss: FrameLoss, state: FrameState, term: str) -> torch.Tensor:
     """Index of the surface node that each point of a term is assigned to."""
-    if state.near is not None:
-        return state.near[term]
     with torch.no_grad():
         return ASSIGNED[term](loss, state.frame, state.x)
 
@@ -148,21 +122,21 @@ def chamfer(loss: FrameLoss, state: FrameState) -> list[Errors]:
     """From visible points to nearest surface nodes, over the points that are visible."""
     visible = loss.visible[state.frame]
     values = state.x[_near(loss, state, "chamfer")] - loss.points[state.frame][visible]
-    return [Errors(values, loss.weights.chamfer, max(loss.counts[state.frame][0], 1), SQUARES, visible)]
+    return [Errors(values, loss.weights.chamfer, max(loss.counts[state.frame][0], 1), SQUARES)]
 
 
 def track(loss: FrameLoss, state: FrameState) -> list[Errors]:
     """From tracks to their nodes, over valid tracks and axes. Frame t uses the validity of t - 1."""
     target, valid = loss.points[state.frame], loss.motion_valid[state.frame - 1]
     values = state.x[: len(target)][valid] - target[valid]
-    return [Errors(values, loss.weights.track, 3 * max(loss.counts[state.frame][1], 1), SMOOTH_L1, valid)]
+    return [Errors(values, loss.weights.track, 3 * max(loss.counts[state.frame][1], 1), SMOOTH_L1)]
 
 
 def acceleration(loss: FrameLoss, state: FrameState) -> list[Errors]:
     """Smoothness of motion, over nodes and axes."""
     if state.jerk is None:
         return []
-    return [Errors(state.jerk, loss.weights.acceleration, state.jerk.numel(), SMOOTH_L1, single=True)]
+    return [Errors(state.jerk, loss.weights.acceleration, state.jerk.numel(), SMOOTH_L1)]
 
 
 def image_track(loss: FrameLoss, state: FrameState) -> list[Errors]:
@@ -326,12 +300,11 @@ class FrameLoss:
         self,
         frame: int,
         x: torch.Tensor,
-        near: Mapping[str, torch.Tensor] | None = None,
         jerk: torch.Tensor | None = None,
         without: Collection[str] = (),
     ) -> dict[str, list[Errors]]:
         """Errors of a frame >= 1 by term, for what `FrameState` holds; terms named in `without` are left out."""
-        state = FrameState(frame, x, near, jerk, self.image.project(x) if self.image else None)
+        state = FrameState(frame, x, jerk, self.image.project(x) if self.image else None)
         found = {name: TERMS[name](self, state) for name in self.names if name not in without}
         return {name: parts for name, parts in found.items() if parts}
 
@@ -346,7 +319,3 @@ class FrameLoss:
         """The sum of a frame's terms, without acceleration."""
         losses = list(self.terms(frame, x).values())
         return sum(losses[1:], start=losses[0]) if losses else x.sum() * 0.0
-
-    def assigned(self, frame: int, x: torch.Tensor) -> dict[str, torch.Tensor]:
-        """The surface nodes that points are assigned to, for nodes x [N, 3], by term."""
-        return {name: find(self, frame, x) for name, find in ASSIGNED.items() if name in self.names}

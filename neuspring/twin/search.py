@@ -1,11 +1,11 @@
-"""Zero-order stage: CMA-ES over topology and homogeneous material (as in the released PhysTwin code), then a polish (polish.py).
+"""Zero-order stage: CMA-ES over topology and homogeneous material (as in the released PhysTwin code).
 
 The best candidate wins. With `search.hands: auto` the first generation is judged with hands that hold and with hands that push, and
 the way of its best candidate is kept. Hands that push an object that is held leave it where it is, and first candidates that hold
 may be worse than that: so pushing must also cost less than a body that stays. With `search.tied_rollouts` the first part of the
 budget searches the 12 variables of the uniform topology; then the regions are freed around the best candidate. A trace records
 every candidate. A killed search continues from it, and so does a finished one with a larger budget: CMA-ES is replayed with the
-recorded costs, the polish with the recorded products.
+recorded costs.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from neuspring.config.search import Search
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_atomically
 from neuspring.core.text import Progress
@@ -39,7 +38,6 @@ from neuspring.twin.candidates import (
     evaluate,
     still_cost,
 )
-from neuspring.twin.polish import POLISH, SLOPES, Polish, slope_rows
 
 if TYPE_CHECKING:
     import cma
@@ -138,11 +136,11 @@ def search(
     trace, other = ([row for row in rows if row["stage"] == stage] for stage in (CMAES, OTHER_WAY))
     saved = len(trace)
     # One candidate cannot be judged both ways.
-    ways = WAYS[settings.hands][: settings.cma_rollouts]
+    ways = WAYS[settings.hands][: settings.rollouts]
     push = ways[0]
     tied = settings.tied_rollouts if problem.clusters > 1 else 0
     proposals = Proposals(problem.encode(), variables, tied, seed)
-    budget, name = settings.cma_rollouts, problem.observations.scenario.name
+    budget, name = settings.rollouts, problem.observations.scenario.name
     progress = Progress(f"search {name}, regions: {problem.clusters}, seed {seed}", settings.rollouts)
 
     def save(kept: list[dict[str, Any]]) -> None:
@@ -175,14 +173,7 @@ def search(
             start = stop
             if len(trace) > saved:
                 save(other + trace)
-        done, polished = other + trace[:budget], list[dict[str, Any]]()
-        recorded = [row for row in rows if row["stage"] not in (CMAES, OTHER_WAY)]
-        slopes = partial(slope_rows, problem, each=each, lane=lane)
-        for polished in _polished(settings, variables, done, recorded, proposals.generation, judge, slopes, push):
-            if len(polished) > len(recorded) or polished[-1] is not recorded[len(polished) - 1]:
-                save(other + trace + polished)
-            progress.update(len(done) + len(polished), "polish")
-    return _best(problem, done + polished, push, attempts, earlier)
+    return _best(problem, other + trace[:budget], push, attempts, earlier)
 
 
 def _best(problem: SearchProblem, rows: Sequence[dict[str, Any]], push: bool, attempts: int, earlier: float) -> SearchResult:
@@ -206,7 +197,6 @@ def _best(problem: SearchProblem, rows: Sequence[dict[str, Any]], push: bool, at
         **values,
         "hands": "push" if twin.topology.pushes.any() else "hold",
         "cost": float(best["cost"]),
-        "cost_before_polish": float(costs[table["stage"] == CMAES].min()),
         "spacing": problem.spacing,
         "controller_reach": problem.reach,
         "rollouts": len(table),
@@ -222,7 +212,7 @@ def _best(problem: SearchProblem, rows: Sequence[dict[str, Any]], push: bool, at
         values=values,
         cost=float(best["cost"]),
         trace=table,
-        course=pd.DataFrame({"cost": costs, "best_cost": costs.where(table["stage"] != SLOPES).cummin().ffill()}),
+        course=pd.DataFrame({"cost": costs, "best_cost": costs.cummin()}),
         facts=facts,
         attempts=attempts,
         earlier_seconds=earlier,
@@ -230,9 +220,8 @@ def _best(problem: SearchProblem, rows: Sequence[dict[str, Any]], push: bool, at
 
 
 def _least(trace: pd.DataFrame) -> Any:
-    """The row of the best candidate; those for slopes are never the result."""
-    judged = trace[trace["stage"] != SLOPES]
-    return judged.iloc[int(judged["cost"].to_numpy().argmin())]
+    """The row of the best candidate."""
+    return trace.iloc[int(trace["cost"].to_numpy().argmin())]
 
 
 SURFACES = ("ground_", "contact_")
@@ -263,39 +252,6 @@ def _ways(
     other = [row | {"stage": OTHER_WAY} for push, rows in judged.items() if push != chosen for row in rows]
     numbered = [row | {"rollout": number} for number, row in enumerate(other + judged[chosen])]
     return numbered[len(other) :], numbered[: len(other)]
-
-
-def _polished(
-    settings: Search,
-    variables: tuple[str, ...],
-    trace: Sequence[dict[str, Any]],
-    recorded: Sequence[dict[str, Any]],
-    generation: int,
-    judge: Judge,
-    slopes: Callable[..., list[dict[str, Any]]],
-    push: bool,
-) -> Iterator[list[dict[str, Any]]]:
-    """The rows of the polish after each of its generations; those that are recorded are taken as they are, if they replay."""
-    best = min(trace, key=lambda row: row["cost"])
-    if not settings.polish_rounds or best["cost"] >= PENALTY:
-        return
-    start = np.array([best[f"normalized.{name}"] for name in variables])
-    columns = [variables.index(name) for name in settings.polished]
-    polish, rows = Polish(settings, columns, start, best["cost"]), list[dict[str, Any]]()
-    while not polish.done:
-        generation += 1
-        population, first = polish.ask(), len(trace) + len(rows)
-        made = list(recorded[len(rows) : len(rows) + len(population)])
-        same = len(made) == len(population) and all(row["rollout"] == first + k for k, row in enumerate(made))
-        if not same or not replays(made, population, variables):
-            made, recorded = [], []
-            if polish.stage == SLOPES:
-                made = slopes(population, push, polish.steps(), first, generation)
-            else:
-                made = [row | {"stage": POLISH} for row in judge(population, push, first, generation)]
-        rows = rows + made
-        polish.tell(made)
-        yield rows
 
 
 @contextmanager

@@ -105,7 +105,7 @@ MISTAKES = {
     "an unknown variable": ("search: {variables: {bending: {low: 1}}}", "search.variables.bending: unknown key"),
     "always tied": (
         "search: {rollouts: 9, tied_rollouts: 9}",
-        "tied_rollouts must be below rollouts, without those of the polish (9), received 9",
+        "tied_rollouts must be below rollouts (9), received 9",
     ),
     "start outside": ("search: {variables: {drag: {start: 60}}}", "variables.drag: start = 60.0 lies outside [0.05, 50.0]"),
     "clamp reversed": ("fit: {stiffness_range: [5, 1]}", "stiffness_range", "received [5.0, 1.0]"),
@@ -116,7 +116,7 @@ MISTAKES = {
     "unknown scale": ("search: {variables: {drag: {scale: cubic}}}", "search.variables.drag.scale", "received 'cubic'"),
     "unit of lengths": ("search: {lengths: inch}", "search.lengths", "received 'inch'"),
     "a fixed stranger": ("search: {fixed: [mass]}", "fixed: different ones of stiffness, object_radius", "received ['mass']"),
-    "negative rounds": ("search: {polish: -1}", "search.polish", "received -1"),
+    "a polish": ("search: {polish: 6}", "search.polish: unknown key"),
     "isolated nodes": ("search: {isolated_nodes: ignore}", "search.isolated_nodes", "received 'ignore'"),
     "resolution word": ("fit: {field: {resolution: fine}}", "fit.field.resolution", "'adaptive'"),
     "no texels": ("fit: {field: {resolution: 0}}", "fit.field.resolution", "received 0"),

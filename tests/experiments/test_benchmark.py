@@ -56,7 +56,7 @@ uniform: {clusters: 1, description: one region}
 pieces:
   clusters: 5
   description: five regions
-  settings: {rollouts: 33, polish: 1}
+  settings: {rollouts: 33, hands: auto}
 """
 
 
@@ -77,7 +77,7 @@ def test_rows_lie_on_top_of_the_configuration(tmp_path: Path) -> None:
     rows = read_searches(write(tmp_path / "searches.yaml", SEARCHES))
     assert {name: row.clusters for name, row in rows.items()} == {"uniform": 1, "pieces": 5}
     searched = tables.with_search(made, rows["pieces"], "pieces").search
-    assert (searched.rollouts, searched.tied_rollouts, searched.polish) == (33, 5, 1)
+    assert (searched.rollouts, searched.tied_rollouts, searched.hands) == (33, 5, "auto")
     assert tables.with_search(made, rows["uniform"], "uniform") == made
 
 
@@ -688,15 +688,15 @@ def test_a_configuration_brings_rows_of_its_own(tmp_path):
 
 def test_a_row_extends_another_and_each_stands_for_one_per_value(tmp_path):
     text = """
-uniform: {clusters: 1, description: one, settings: {rollouts: 40, polish: 2}}
+uniform: {clusters: 1, description: one, settings: {rollouts: 40, tied_rollouts: 2}}
 more: {extends: uniform, description: more, settings: {rollouts: 80}}
-most: {extends: more, settings: {polish: 0}}
+most: {extends: more, settings: {tied_rollouts: 0}}
 k{each}: {each: [2, 3], extends: uniform, clusters: "{each}", description: "{each} regions"}
 key: {extends: k2, clusters: null}
 """
     rows = tables.read_searches(write(tmp_path / "searches.yaml", text), clusters=7)
-    assert rows["most"] == config.SearchRow(clusters=1, description="more", settings={"rollouts": 80, "polish": 0})
-    assert rows["uniform"].settings == {"rollouts": 40, "polish": 2}
+    assert rows["most"] == config.SearchRow(clusters=1, description="more", settings={"rollouts": 80, "tied_rollouts": 0})
+    assert rows["uniform"].settings == {"rollouts": 40, "tied_rollouts": 2}
     assert {name: (row.clusters, row.description) for name, row in rows.items() if name[0] == "k"} == {
         "k2": (2, "2 regions"),
         "k3": (3, "3 regions"),
@@ -774,7 +774,7 @@ def test_the_released_rows_have_the_released_search() -> None:
         search = tables.with_search(made.config, row, name).search
         variables = config.plain(search.variables)
         assert {one["scale"] for one in variables.values()} == {"linear"}
-        assert (search.lengths, search.polish_rounds, search.fixed) == ("meter", 0, ())
+        assert (search.lengths, search.fixed) == ("meter", ())
         assert search.variables.stiffness == config.Variable(0.0, 1e5, 3e4)
         assert search.variables.object_radius.start == 0.02
     assert tables.with_search(made.config, made.searches["released_quirks"], "x").search.isolated_nodes == "allow"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pandas as pd
 
 from neuspring.twin.candidates import CMAES
-from neuspring.twin.polish import SLOPES
 from neuspring.twin.search import at_ends
 
 VARIABLES = ("stiffness", "dashpot", "drag", "contact_friction")
@@ -19,7 +18,3 @@ def trace(*rows: tuple[str, float, float, float, float, float]) -> pd.DataFrame:
 def test_variables_at_the_ends_of_their_ranges_are_named():
     best = (CMAES, 1.0, 0.995, 0.5, 0.002, 1.0)
     assert at_ends(trace((CMAES, 2.0, 0.5, 1.0, 0.5, 0.5), best), VARIABLES) == ["stiffness", "drag"], "contact is left out"
-
-
-def test_a_candidate_for_slopes_is_never_the_best():
-    assert at_ends(trace((CMAES, 2.0, 0.5, 0.5, 0.5, 0.5), (SLOPES, 1.0, 1.0, 1.0, 1.0, 1.0)), VARIABLES) == []

@@ -82,7 +82,6 @@ def test_every_step_leaves_what_its_record_names(finished):
     found = StageRecord.load(folder / "small" / "search-uniform" / "0" / "search.json").facts
     assert found["spacing"] == node_spacing(observations.nodes)
     assert 0 < found["controller_reach"] < found["controller_radius"]
-    assert found["cost_before_polish"] == found["cost"], "too few rollouts for a polish"
     assert Twin.load(folder / "small" / "truth.npz").topology.nodes.shape == twin.topology.nodes.shape
     assert not list(folder.rglob("*partial*"))
     assert not list(folder.rglob("*.part"))

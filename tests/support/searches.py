@@ -13,7 +13,7 @@ LOGARITHMIC = {
     "scales": {"stiffness": "log", "dashpot": "log", "drag": "log"},
     "ranges": {"stiffness": [1e2, 1e5], "dashpot": [0.1, 200.0], "drag": [0.05, 20.0]},
 }
-"""Settings of variables that a polish moves."""
+"""Variables on logarithmic scales."""
 
 
 def budget(rollouts: int, clusters: int = 1) -> SearchProblem:

@@ -15,7 +15,6 @@ from neuspring.twin import losses
 from neuspring.twin.candidates import candidate
 from neuspring.twin.fit import TwinFit
 from neuspring.twin.losses import FrameLoss
-from neuspring.twin.polish import products
 from neuspring.twin.trials import motions
 from tests.support import small
 
@@ -161,7 +160,7 @@ def height(loss: FrameLoss, state: losses.FrameState) -> list[losses.Errors]:
 
 
 def test_a_new_term_is_a_weight_and_a_function(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Search, fit and polish follow: their costs of a rollout agree, with that of the term itself."""
+    """Search and fit follow: their costs of a rollout agree, with that of the term itself."""
     monkeypatch.setitem(losses.TERMS._own, "height", height)
     weights = Weights(chamfer=0.0, track=0.0, acceleration=0.0)
     problem = small.search_problem(losses=weights)
@@ -174,7 +173,5 @@ def test_a_new_term_is_a_weight_and_a_function(monkeypatch: pytest.MonkeyPatch) 
     expected = float((x[:, 0, :, 2].double() - 0.1).square().mean())
     assert searched.cost == pytest.approx(expected, rel=1e-5)
     assert small.rollout_loss(loss, zip(range(1, len(own.hands)), x[:, 0], v[:, 0], strict=True), start) == pytest.approx(expected)
-    polished, _, _ = products(loss, start, x, v, [True], np.zeros(0))
-    assert polished.tolist() == pytest.approx([expected])
     fitted = TwinFit(small.fit_problem(losses=weights, twin=twin, fit=config.Fit(horizon=0))).epoch()["loss"]
     assert fitted == pytest.approx(expected, rel=1e-5)

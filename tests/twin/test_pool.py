@@ -10,17 +10,14 @@ import torch
 from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError
-from neuspring.twin import polish as module
 from neuspring.twin.batch import run_batch
 from neuspring.twin.candidates import PENALTY, SearchProblem, evaluate, made, mean_outcome
 from neuspring.twin.fit import FitProblem, FitResult, PooledFit, fit
-from neuspring.twin.polish import POLISH, SLOPES, Polish
 from neuspring.twin.search import search
 from neuspring.twin.trials import Outcome, outcomes
 from tests.support import small
 from tests.support.searches import LOGARITHMIC
 
-ROLLOUTS = 11 + 8
 MEAN = 1e-6
 """Relative: a mean of two losses in float32."""
 SINGLE_POSITIONS = 3e-6
@@ -30,20 +27,14 @@ PLACES = ("object_points", "surface_points", "controller_points")
 LIFTED, SHAKEN = "rope/lift/smooth", "rope/shake/smooth"
 
 
-@pytest.fixture(autouse=True)
-def any_share(monkeypatch):
-    """The polish may take nearly the whole budget, which is small here."""
-    monkeypatch.setattr("neuspring.config.search.POLISH_SHARE", 0.9)
-
-
 def seen(path: str) -> Observations:
     """The same rope, moved in one of two ways."""
     return small.scene(path).observations
 
 
-def polished(own: Observations, **changes) -> SearchProblem:
-    """A search of one generation with a polish of one round."""
-    settings = {"rollouts": ROLLOUTS, "start": {"object_radius": 0.045, "stiffness": 6e3}, "polish": 1}
+def short(own: Observations, **changes) -> SearchProblem:
+    """A search of one generation."""
+    settings = {"rollouts": 11, "start": {"object_radius": 0.045, "stiffness": 6e3}}
     return small.search_problem(own, search=small.released(**settings, **LOGARITHMIC), **changes)
 
 
@@ -66,59 +57,28 @@ def searched(here: str, *others: str, **options) -> pd.DataFrame:
 
 
 def test_a_recording_beside_itself_changes_nothing():
-    alone = polished(seen(LIFTED))
-    expected = traced(alone)
-    assert expected["stage"].tolist()[11:] == [SLOPES] * 4 + [POLISH] * 4
-    pd.testing.assert_frame_equal(traced(on_pool(alone, LIFTED)), expected, check_exact=True)
+    alone = short(seen(LIFTED))
+    pd.testing.assert_frame_equal(traced(on_pool(alone, LIFTED)), traced(alone), check_exact=True)
 
 
-def test_costs_and_products_of_a_polish_are_means_over_the_recordings():
-    """The same candidates, judged on one recording, on two, and with the second one twice: as CMA-ES does, and for slopes."""
-    alone = polished(seen(LIFTED))
+def test_costs_are_means_over_the_recordings():
+    """The same candidates, judged on one recording, on two, and with the second one twice."""
+    alone = short(seen(LIFTED))
     both = on_pool(alone, SHAKEN)
     problems = (alone, both, on_pool(alone, SHAKEN, SHAKEN))
-    settings = both.search
-    columns = [both.variables.index(name) for name in settings.polished]
-    polish = Polish(settings, columns, both.encode(), 1.0)
-    population, steps = polish.ask(), polish.steps()
+    population = [both.encode(), 0.9 * both.encode()]
     costs = [np.array([row["cost"] for row in evaluate(each, population, False, 0, 0)]) for each in problems]
     families = [made(both, normalized)[1] for normalized in population]
     there = both.recordings[1]
     moved = [judged.cost for judged in outcomes([pair[1] for pair in families], there.hands, there.velocity, there.loss, "cpu")]
     np.testing.assert_allclose(costs[1], (costs[0] + moved) / 2, rtol=1e-12)
     np.testing.assert_allclose(costs[2], (costs[0] + moved + moved) / 3, rtol=1e-12)
-    tables = [pd.DataFrame(module.slope_rows(each, population, False, steps, 0, 0)) for each in problems]
-    judged = ["cost", *(name for name in tables[0] if name.startswith("product."))]
-    assert len(judged) == 5
-    one, mean, twice = (table[judged].to_numpy() for table in tables)
-    other = 2 * mean - one
-    np.testing.assert_allclose(twice, (one + 2 * other) / 3, rtol=1e-9, atol=0)
-    assert (np.abs(one[1:] / other[1:] - 1) > 0.1).any(), "two recordings say something else"
-
-
-def test_a_neighbor_that_leaves_one_recording_has_no_slope(monkeypatch):
-    problem, calls = on_pool(polished(seen(LIFTED)), SHAKEN), []
-    polish = Polish(problem.search, [problem.variables.index(name) for name in problem.search.polished], problem.encode(), 1.0)
-    launch = module.launch
-
-    def leaving(*arguments):
-        x, v = launch(*arguments)
-        calls.append(1)
-        if len(calls) == 2:
-            x[-1, 2] = float("nan")
-        return x, v
-
-    monkeypatch.setattr(module, "launch", leaving)
-    rows = module.slope_rows(problem, polish.ask(), False, polish.steps(), 0, 0)
-    assert len(calls) == 2
-    assert [row["cost"] < PENALTY for row in rows] == [True, True, False, True]
-    assert [row["product.residual"] != 0 for row in rows] == [False, True, False, True]
 
 
 def test_springs_and_radii_are_the_same_on_all_recordings():
     """Lengths in spacings of the scenario's own body, whatever the poses of the others."""
-    search_settings = replace(polished(seen(LIFTED)).search, lengths="spacing")
-    alone = replace(polished(seen(LIFTED)), search=search_settings)
+    search_settings = replace(short(seen(LIFTED)).search, lengths="spacing")
+    alone = replace(short(seen(LIFTED)), search=search_settings)
     stretched = replace(seen(SHAKEN), **{name: 1.1 * getattr(seen(SHAKEN), name) for name in PLACES})
     _, (here, there) = made(replace(alone, pool=(stretched,)), alone.encode())
     np.testing.assert_array_equal(here.topology.springs, there.topology.springs)

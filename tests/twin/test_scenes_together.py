@@ -35,13 +35,12 @@ def seen(path: str, *, frames: int = small.FRAMES, collide: bool = False) -> Obs
 def problems(collide: bool = False, **changes: object) -> list[SearchProblem]:
     """A rope, a sheet with more nodes whose recording is longer, and the rope once more: two of one scene among three."""
     each = [(SCENES[0], small.FRAMES), (SCENES[1], small.FRAMES + 2), (SCENES[0], small.FRAMES)]
-    settings = small.released(rollouts=33, start={"object_radius": 0.045, "stiffness": 1e4}, polish=1)
+    settings = small.released(rollouts=33, start={"object_radius": 0.045, "stiffness": 1e4})
     return [small.search_problem(seen(path, frames=count, collide=collide), search=settings, **changes) for path, count in each]
 
 
 @pytest.mark.parametrize("collide", [False, True])
 def test_searches_of_several_scenes_end_as_each_alone(collide: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Costs of all candidates, the products of the polish too."""
     given, sizes = problems(collide), []
     assert len({len(one.observations.nodes) for one in given}) == 2
     alone = [search(problem, seed=k).trace for k, problem in enumerate(given)]

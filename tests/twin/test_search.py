@@ -148,7 +148,6 @@ def test_fixed_variables_keep_their_start():
     problem = ours(rollouts=11, fixed=["drag", "object_radius"], variables={"drag": {"start": 0.0}})
     assert len(problem.variables) == len(problem.encode()) == 10
     assert set(problem.names) - set(problem.variables) == {"drag", "object_radius"}
-    assert problem.search.polished == ("stiffness", "dashpot")
     result = search(problem, seed=0)
     # Outside the range, where no search would go.
     assert (result.trace["drag"] == 0).all()
@@ -453,7 +452,6 @@ def test_the_future_is_never_read():
         "simulation": config.SimulationSettings(initial_velocity="observed"),
     }
     first, second = (search(small.search_problem(o, **changes), seed=0) for o in (small.observations(), small.spoiled_future()))
-    assert first.trace["stage"].nunique() == 3, "the polish too"
     assert first.trace["cost"].tolist() == second.trace["cost"].tolist()
 
 

@@ -62,7 +62,7 @@ and it goes on for the rest of dt.
     def search(
         self, observations: Observations, pool: Sequence[Observations], settings: Config, options: SearchOptions
     ) -> SearchResult:
-        """CMA-ES over topology and a homogeneous material, and a polish; see `search.search`."""
+        """CMA-ES over topology and a homogeneous material; see `search.search`."""
         from neuspring.twin.candidates import SearchProblem
         from neuspring.twin.search import search
 

@@ -123,7 +123,7 @@ def test_a_rod_hangs_from_the_hand_in_frame_0_and_follows_its_turns(tmp_path: Pa
 
 def test_a_lattice_follows_a_turning_hand(tmp_path: Path) -> None:
     here = seen(tmp_path, table(frames=21))
-    settings = parse(Config, {"search": {"rollouts": 11, "tied_rollouts": 0, "polish": 0}, "simulation": {"gravity": 0.0}}, "test")
+    settings = parse(Config, {"search": {"rollouts": 11, "tied_rollouts": 0}, "simulation": {"gravity": 0.0}}, "test")
     from neuspring.twin.body import SearchOptions
 
     twin = lattice.search(here, [], settings, SearchOptions()).twin
