@@ -90,16 +90,14 @@ format: $(INSTALLED)
 	$(BIN)/snakefmt Snakefile workflow/rules
 
 bench: $(INSTALLED)
-	$(BIN)/python -m tests.benchmarks.bench
-	$(BIN)/python -m tests.benchmarks.bench_splats
-	$(BIN)/python -m tests.benchmarks.bench_spring_gaus
-	$(BIN)/python -m tests.extensions.play.bench
-	$(BIN)/python -m tests.benchmarks.bench_workflow
+	$(BIN)/python -m results.published.bench
+	$(BIN)/python -m results.published.bench.splats
+	$(BIN)/python -m results.published.bench.spring_gaus
 
-# Needs a GPU; `make gpu GPU_OPTIONS="-k fit"` passes options to pytest. See tests/benchmarks/GPU.md.
+# Needs a GPU; `make gpu GPU_OPTIONS="-k fit"` passes options to pytest. See results/published/bench/GPU.md.
 gpu: $(INSTALLED)
 	$(BIN)/python -m pytest -m cuda $(GPU_OPTIONS) $(shell grep -rlE '\b(DEVICES|WAYS)\b|import CUDA|mark\.cuda' --include='test_*.py' tests)
-	$(BIN)/python -m tests.benchmarks.bench --device cuda:0
+	$(BIN)/python -m results.published.bench --device cuda:0
 
 # Each script says whether an outside library still behaves as its head says: 0 yes, 1 no, else it could not run.
 findings:

@@ -10,7 +10,7 @@ from snakemake.cli import get_argument_parser
 from neuspring.config import read_yaml
 
 ROOT = Path(__file__).parents[1]
-PLACES = ("", ".github", "config", "findings", "results", "tests/benchmarks", "tests/golden", "workflow")
+PLACES = ("", ".github", "config", "findings", "results", "results/published/bench", "tests/golden", "workflow")
 PAGES = [*(path for place in PLACES for path in sorted((ROOT / place).glob("*.md"))), *sorted((ROOT / "neuspring").rglob("*.md"))]
 WRITTEN = [page for page in PAGES if page != ROOT / "config" / "README.md"]
 MOST_WORDS, ALL_WORDS = 5_000, 42_000

@@ -14,7 +14,7 @@ import warp as wp
 MIN_SPRING_LENGTH = 1e-6
 """Lengths are floored here when a direction is formed, m."""
 LANE_WIDTHS = (1, 4, 8)
-"""Lanes that kernels are made for. 16 were no faster per twin than 8 (tests/benchmarks/NOTES.md)."""
+"""Lanes that kernels are made for. 16 were no faster per twin than 8 (results/published/bench/NOTES.md)."""
 
 
 def width_for(twins: int) -> int:

@@ -19,7 +19,7 @@ from neuspring.core.files import write_text
 from neuspring.core.provenance import commit
 from neuspring.core.table import Table
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 COMMITTED = "results/published/bench"
 """Tables that are part of the repository, a file per kind of machine."""
 SCRATCH = "results/bench"

@@ -19,11 +19,11 @@ from neuspring.physics.union import Union
 from neuspring.twin import trials
 from neuspring.twin.candidates import SearchProblem
 from neuspring.twin.search import SearchResult, search
-from tests.benchmarks.plush import problem
-from tests.benchmarks.rows import KINDS, Bench, Entry, agree, frame_of, timed
-from tests.benchmarks.scenes import CASES, box
-from tests.benchmarks.simulators import Frame, Times
-from tests.benchmarks.table import Row
+from results.published.bench.plush import problem
+from results.published.bench.rows import KINDS, Bench, Entry, agree, frame_of, timed
+from results.published.bench.scenes import CASES, box
+from results.published.bench.simulators import Frame, Times
+from results.published.bench.table import Row
 
 GENERATION = 11
 """Candidates of a generation: what CMA-ES proposes for 12 variables."""

@@ -1,4 +1,4 @@
-"""Time and memory of the rasterizer: `python -m tests.benchmarks.bench_splats [--device cuda:0] [--repeats 9]`.
+"""Time and memory of the rasterizer: `python -m results.published.bench.splats [--device cuda:0] [--repeats 9]`.
 
 A ball of splats, as a toy before a camera: 7 % of the picture, all splats in view, isotropic, harmonics of degree 3 as tensors that
 ask for gradients. Columns: medians over repeats of the forward pass and of both passes, and the growth of the peak memory. On a GPU
@@ -19,8 +19,8 @@ from neuspring.core.errors import InputError
 from neuspring.splats.rasterize import Backend, choose_backend, rasterize
 from neuspring.splats.skinning import Skin
 from neuspring.splats.view import View
-from tests.benchmarks.memory import growth
-from tests.benchmarks.simulators import take_turns
+from results.published.bench.memory import growth
+from results.published.bench.simulators import take_turns
 
 SIZES = ((212, 120), (424, 240), (848, 480))
 COUNTS = (2_000, 10_000, 50_000)

@@ -26,7 +26,7 @@ import warp as wp
 from neuspring.core.artifacts import Twin
 from neuspring.core.device import start_warp
 from neuspring.core.errors import InputError
-from tests.benchmarks.simulators import Frame
+from results.published.bench.simulators import Frame
 
 PACKAGE = "qqtt"
 SIMULATOR = Path(PACKAGE, "model", "diff_simulator", "spring_mass_warp.py")

@@ -13,7 +13,7 @@ from neuspring.physics import reference
 from neuspring.physics.parameters import Parameters, packed
 from neuspring.physics.solver import simulate_frame, solver_for
 from neuspring.physics.union import Union
-from tests.benchmarks.simulators import Frame
+from results.published.bench.simulators import Frame
 
 
 class Ours:

@@ -1,4 +1,4 @@
-"""A frame of Spring-Gaus with its gradient, by kernels and in eager torch: python -m tests.benchmarks.bench_spring_gaus [DEVICE]
+"""A frame of Spring-Gaus with its gradient, by kernels and in eager torch: python -m results.published.bench.spring_gaus [DEVICE]
 
 Both in float32, on one CPU thread or on a GPU (`cuda`); states and gradients are compared before the times.
 """
@@ -13,7 +13,7 @@ import torch
 from neuspring.core.device import resolve_device
 from neuspring.extensions.spring_gaus.model import SpringGausModel, SpringGausTraining
 from neuspring.extensions.spring_gaus.physics import AnchorGraph, AnchorSolver, reference_substep
-from tests.benchmarks.simulators import take_turns
+from results.published.bench.simulators import take_turns
 
 ANCHORS, SUBSTEPS, REPEATS = 1024, 100, 5
 

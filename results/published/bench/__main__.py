@@ -1,6 +1,6 @@
 """The table of times of the simulator:
 
-    python -m tests.benchmarks.bench [--quick] [--only SECTION] [--device DEVICE] [--peer CHECKOUT] [--save]
+    python -m results.published.bench [--quick] [--only SECTION] [--device DEVICE] [--peer CHECKOUT] [--save]
 
 On the CPU, one thread, and on the first GPU where there is one; --device chooses one of them. Prints one table, and how every row
 changed since the table of the same kind of machine that was kept last. Writes results/bench/<kind of machine>.json, or with
@@ -18,11 +18,11 @@ import torch
 
 from neuspring.core.device import resolve_device, start_warp
 from neuspring.core.errors import InputError
-from tests.benchmarks import table
-from tests.benchmarks.ours import Ours
-from tests.benchmarks.phystwin import PhysTwin
-from tests.benchmarks.rows import Bench
-from tests.benchmarks.sections import ON_CUDA, SECTIONS
+from results.published.bench import table
+from results.published.bench.ours import Ours
+from results.published.bench.phystwin import PhysTwin
+from results.published.bench.rows import Bench
+from results.published.bench.sections import ON_CUDA, SECTIONS
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from neuspring.core.artifacts import Twin
-from tests.benchmarks.ours import Ours
-from tests.benchmarks.simulators import Frame, Simulator, distances, gradient_difference, take_turns
-from tests.benchmarks.table import Row
+from results.published.bench.ours import Ours
+from results.published.bench.simulators import Frame, Simulator, distances, gradient_difference, take_turns
+from results.published.bench.table import Row
 
 KINDS = (("forward", False), ("forward + backward", True))
 """What is timed of a frame, and whether with its gradient."""
