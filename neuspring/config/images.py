@@ -9,8 +9,6 @@ from pydantic import Field
 
 from neuspring.core.section import Count, NonNegative, Positive, SettingsSection
 
-ImageQuirk = Literal["second_camera_intrinsics", "any_alpha", "unit_lpips", "degenerate_skinning", "unturned_harmonics"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Appearance(SettingsSection):
@@ -53,11 +51,3 @@ class Images(SettingsSection):
     video: bool = True
     """Videos: observed, predicted and error side by side, and a turntable of the twin."""
     appearance: Appearance = field(default_factory=Appearance)
-    released_quirks: tuple[ImageQuirk, ...] = ()
-    """Errors of the released evaluation of pictures that are made on purpose. second_camera_intrinsics: every view has the
-    intrinsics of the second camera. any_alpha: a pixel counts as object whose 8-bit coverage is not zero, not only from a half on.
-    unit_lpips: the inputs of LPIPS stay in [0, 1]; its networks were trained with [-1, 1]. degenerate_skinning: one node on a line
-    of neighbors turns all nodes as it turns; several such nodes turn none. unturned_harmonics: splats turn and their colors that
-    depend on the direction do not."""
-    corner_pixels: bool = False
-    """Shift of pictures, as released, in training too: calibrated intrinsics are used unchanged, half a pixel off."""

@@ -285,10 +285,8 @@ def _pictures(runs: pd.DataFrame) -> str:
     scored = [fact for fact in facts if fact and "failed" not in fact]
     if not scored:
         return ""
-    quirks = sorted({name for fact in scored for name in fact["quirks"]})
     lpips = sorted({str(fact["lpips"]) for fact in scored} - {"computed"})
-    text = f"Quirks of the released evaluation of pictures that were on: {', '.join(quirks) or 'none'}."
-    return " ".join([text, *(f"LPIPS not computed in some runs: {reason}." for reason in lpips)])
+    return " ".join(f"LPIPS not computed in some runs: {reason}." for reason in lpips)
 
 
 def left_out_items(numbers: StudyNumbers) -> list[Block]:

@@ -287,9 +287,7 @@ def _image_conditions(facts: Iterable[dict[str, Any]]) -> str:
     def several(name: str) -> str:
         return " and ".join(sorted({", ".join(v) if isinstance(v := values[name], list) else str(v) for values in facts}))
 
-    quirks = several("quirks")
-    text = f"Cameras scored: {several('views')}; masks: {several('masks')}; rasterizer: {several('backend')}"
-    return f"{text}; released quirks: {quirks}." if quirks.strip() else f"{text}; none of the released evaluation's quirks."
+    return f"Cameras scored: {several('views')}; masks: {several('masks')}; rasterizer: {several('backend')}."
 
 
 def marked_blocks(numbers: Numbers) -> list[Block]:

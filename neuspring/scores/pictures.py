@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -11,7 +10,7 @@ import torch
 
 from neuspring.config.images import Images
 from neuspring.core.errors import InputError
-from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
+from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.data.results import Masks
 from neuspring.scores.lpips import Lpips
 from neuspring.scores.metrics import metrics_of
@@ -97,23 +96,22 @@ class Pair:
     """[H, W] bool."""
 
     @classmethod
-    def of(cls, observed: np.ndarray, rendered: np.ndarray, mask: np.ndarray, hands: np.ndarray, covered: int) -> Pair:
-        """From bytes, as `masked_pair` takes them; `covered` is the least coverage, of 255, that counts as object."""
+    def of(cls, observed: np.ndarray, rendered: np.ndarray, mask: np.ndarray, hands: np.ndarray) -> Pair:
+        """From bytes, as `masked_pair` takes them."""
         truth, prediction = masked_pair(observed, mask, rendered, hands)
-        return cls(observed, rendered, truth, prediction, silhouettes(mask, rendered, hands, covered), hands > 0)
+        return cls(observed, rendered, truth, prediction, silhouettes(mask, rendered, hands, OBJECT_COVERAGE), hands > 0)
 
 
 Perceptual = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 """LPIPS of two pictures [3, H, W]."""
 
 
-def picture_scores(pair: Pair, lpips: Lpips | str, *, unit_lpips: bool) -> dict[str, float]:
+def picture_scores(pair: Pair, lpips: Lpips | str) -> dict[str, float]:
     """Every metric of pictures (`metrics.METRICS`) of a pair.
 
-    `lpips` is the network, or a text that says why there is none; then LPIPS is left out. `unit_lpips`: `released_range` of
-    `Lpips`.
+    `lpips` is the network, or a text that says why there is none; then LPIPS is left out.
     """
-    perceptual = None if isinstance(lpips, str) else functools.partial(lpips, released_range=unit_lpips)
+    perceptual = None if isinstance(lpips, str) else lpips
     values = {metric.name: metric.measure(pair, perceptual) for metric in metrics_of("pictures")}
     return {name: value for name, value in values.items() if value is not None}
 
@@ -160,29 +158,21 @@ class Scored:
     masks_from: str
     views: Mapping[str, View]
     backend: Backend
-    covered: int
-    """Least coverage, of 255, that counts as object."""
 
     @classmethod
     def of(cls, capture: Capture, perceived: Mapping[str, Masks], images: Images, device: str) -> Scored:
-        """The cameras that `images.views` asks for. Raises InputError if a second camera is asked for and there is none."""
-        quirks, cameras = images.released_quirks, list(capture.cameras.values())
-        if "second_camera_intrinsics" in quirks and len(cameras) < 2:
-            rule = "images.released_quirks: second_camera_intrinsics needs a second camera"
-            raise InputError(capture.folder / CAPTURE, rule, f"{len(cameras)} camera")
-        borrowed = cameras[1] if "second_camera_intrinsics" in quirks else None
-        scored = cameras[: 1 if images.views == "first" else None]
-        views = {camera.name: view_of(camera, images, device, borrowed) for camera in scored}
+        """The cameras that `images.views` asks for."""
+        scored = list(capture.cameras.values())[: 1 if images.views == "first" else None]
+        views = {camera.name: view_of(camera, device) for camera in scored}
         # Scores should not depend on the segmentation under test, where the capture comes with masks of its own.
         own = capture.description.masks
         labels = {} if own else {name: perceived[name].labels for name in views}
         source = "given" if own else next(iter(perceived.values())).backend
-        covered = 1 if "any_alpha" in quirks else OBJECT_COVERAGE
-        return cls(capture, labels, source, views, choose_backend(images.backend, device), covered)
+        return cls(capture, labels, source, views, choose_backend(images.backend, device))
 
     def pair(self, name: str, frame: int, gaussians: Gaussians) -> Pair:
         """Observed and predicted picture of one camera in one frame."""
         labels = self.masks[name][frame] if self.masks else self.capture.mask(name, frame)
         mask, hands = (np.where(own, 255, 0).astype(np.uint8) for own in (labels == OBJECT, labels >= HANDS))
         rendered = picture(gaussians, self.views[name], self.backend)
-        return Pair.of(self.capture.color(name, frame), rendered, mask, hands, self.covered)
+        return Pair.of(self.capture.color(name, frame), rendered, mask, hands)

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from neuspring.config.images import Images
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.data.camera import Camera
 from neuspring.splats.model import Gaussians, Splats
@@ -24,11 +23,9 @@ LEAST_OPACITY = 0.1
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 
-def view_of(camera: Camera, images: Images, device: str, borrowed: Camera | None = None) -> View:
-    """The view of a calibrated camera, or with the intrinsics of another one."""
-    intrinsics = (borrowed or camera).intrinsics
-    shift = 0.0 if images.corner_pixels else 0.5
-    return View.of(camera.camera_to_world, intrinsics, camera.width, camera.height, device, shift)
+def view_of(camera: Camera, device: str) -> View:
+    """The view of a calibrated camera."""
+    return View.of(camera.camera_to_world, camera.intrinsics, camera.width, camera.height, device)
 
 
 def prune_by_opacity(splats: Splats) -> Splats:
@@ -39,14 +36,14 @@ def prune_by_opacity(splats: Splats) -> Splats:
     return Splats(**{field.name: getattr(splats, field.name)[dense] for field in fields(Splats)})
 
 
-def skinned_frames(splats: Splats, positions: np.ndarray, images: Images, device: str) -> Iterator[Gaussians]:
+def skinned_frames(splats: Splats, positions: np.ndarray, device: str) -> Iterator[Gaussians]:
     """The splats in every frame of a trajectory [F, N, 3], m; colors that depend on the direction turn with them."""
     start = Gaussians.of(splats, device)
     unturned = rotations(start.quaternions).mT
-    skin = Skin(positions[0], device=device, released_degeneracy="degenerate_skinning" in images.released_quirks)
+    skin = Skin(positions[0], device=device)
     for frame, (means, quaternions) in enumerate(skin.carry(positions, start.means, start.quaternions)):
         harmonics = start.harmonics
-        if frame and "unturned_harmonics" not in images.released_quirks:
+        if frame:
             harmonics = turned_harmonics(harmonics, rotations(quaternions) @ unturned)
         yield Gaussians(means, quaternions, start.log_scales, start.opacity_logits, harmonics)
 

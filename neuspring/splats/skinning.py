@@ -40,14 +40,13 @@ class Skin:
     """Carries splats by nodes whose frame 0 is `nodes` [N, 3], m.
 
     frozen: keep the nodes that each splat is bound to in its first step (weights follow), for real time.
-    released_degeneracy: as released, one node on a line of neighbors turns all nodes as itself, several turn none.
     """
 
-    def __init__(self, nodes: np.ndarray, *, device: str = "cpu", frozen: bool = False, released_degeneracy: bool = False) -> None:
+    def __init__(self, nodes: np.ndarray, *, device: str = "cpu", frozen: bool = False) -> None:
         start_warp()
         if len(nodes) == 0 or not np.isfinite(nodes).all():
             raise InputError("skinning, nodes", "at least one node, all finite, is required", np.shape(nodes))
-        self._device, self._frozen, self._released = device, frozen, released_degeneracy
+        self._device, self._frozen = device, frozen
         self._bound: Any = None
         self._count = min(SKIN_NEIGHBORS, len(nodes))
         # Where this radius holds too few nodes, the search doubles it. A larger start would make every search slower.
@@ -89,13 +88,7 @@ class Skin:
     def _rotations(self, before: Any, after: Any) -> Any:
         count = len(before)
         rotations = wp.zeros(count, dtype=wp.mat33, device=self._device)
-        ranks = wp.zeros(count, dtype=int, device=self._device)
-        self._launch(turn_nodes, count, [before, after, self._relations, rotations, ranks])
-        if self._released and len(poor := np.flatnonzero(ranks.numpy() < 2)):
-            values = rotations.numpy()
-            alone = len(poor) == 1 and ranks.numpy()[poor[0]] == 1
-            values[:] = values[poor[0]] if alone else np.eye(3)
-            rotations.assign(values)
+        self._launch(turn_nodes, count, [before, after, self._relations, rotations])
         return rotations
 
     def _nearest(self, points: Any, queries: Any, *, own: bool, wanted: int) -> Any:
@@ -186,7 +179,6 @@ def turn_nodes(
     after: wp.array[wp.vec3],
     neighbors: wp.array2d[int],
     rotations: wp.array[wp.mat33],
-    ranks: wp.array[int],
 ):
     """The rotation that best takes each node's offsets to its neighbors from `before` to `after`."""
     i = wp.tid()
@@ -196,16 +188,12 @@ def turn_nodes(
         moment += wp.outer(wp.vec3d(after[j] - after[i]), wp.vec3d(before[j] - before[i]))
     u, s, v = wp.svd3(moment)
     turn = wp.identity(n=3, dtype=wp.float64)
-    rank = wp.int32(0)
     if s[0] > wp.float64(POINT_SPREAD):
         if s[1] > wp.float64(DEGENERATE) * s[0]:
-            rank = 2
             turn = u * wp.transpose(v)
         else:
-            rank = 1
             turn = shortest_turn(wp.normalize(wp.transpose(v)[0]), wp.normalize(wp.transpose(u)[0]))
     rotations[i] = wp.mat33(turn)
-    ranks[i] = rank
 
 
 @wp.kernel(enable_backward=False)

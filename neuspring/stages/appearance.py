@@ -31,7 +31,7 @@ NEAR_SEEN = 1.5
 @stage(
     output="{scenario}/{looks}/{seed}/appearance.json",
     reads=lambda settings, given: (
-        *("images.backend", "images.appearance", "images.corner_pixels"),
+        *("images.backend", "images.appearance"),
         # Perception has not lifted the masks of processed data.
         *(() if given.get("lifted") else ("perception.lift",)),
     ),
@@ -144,7 +144,7 @@ def _shots(
         labels = masks[name].labels[0]
         margin = HAND_MARGIN * camera.width / REFERENCE_WIDTH
         seen = (capture.color(name, 0), labels == OBJECT, labels >= HANDS, depths[name])
-        if (shot := Shot.of(name, view_of(camera, images, device), *seen, margin)) is None:
+        if (shot := Shot.of(name, view_of(camera, device), *seen, margin)) is None:
             print(f"camera {name}: the object is not in view in frame 0; it does not train the appearance", flush=True)
         else:
             shots.append(shot)

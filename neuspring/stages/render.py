@@ -16,7 +16,6 @@ from neuspring.data.capture import CAPTURE, Capture
 from neuspring.stages.stage import MayFail, Rows, Written, paths, require_length, stage
 
 if TYPE_CHECKING:
-    from neuspring.config.images import Images
     from neuspring.splats.model import Gaussians, Splats
 
 RENDERED_VIDEOS = ("video", "turntable")
@@ -31,7 +30,7 @@ def _weights(rows: Rows) -> str:
 
 @stage(
     output="{scenario}/{method}/{seed}/render.json",
-    reads=("images.backend", "images.views", "images.video", "images.released_quirks", "images.corner_pixels"),
+    reads=("images.backend", "images.views", "images.video"),
     gpu=True,
     memory_mb=8000,
     minutes=120,
@@ -72,7 +71,7 @@ def render(
     trajectory = Trajectory.load(rollout.file("trajectory")) if rollout.has("trajectory") else None
     if trajectory is None or not len(trajectory.positions):
         raise NumericalFailure(rollout.record.reason)
-    splats, frames = posed(appearance, rollout, trajectory, images, device)
+    splats, frames = posed(appearance, rollout, trajectory, device)
     predicted = len(trajectory.positions)
     rows: list[dict[str, Any]] = []
     shown, pairs = chosen_frames(scenario, predicted), {}
@@ -86,7 +85,7 @@ def render(
                 if not capture.has(name, frame):
                     continue
                 pair = scored.pair(name, frame, gaussians)
-                scores = picture_scores(pair, lpips, unit_lpips="unit_lpips" in images.released_quirks)
+                scores = picture_scores(pair, lpips)
                 rows += [{"frame": frame, "camera": name, "metric": key, "value": value} for key, value in scores.items()]
                 if name == first and frame < predicted:
                     if frame in shown:
@@ -107,7 +106,6 @@ def render(
         "views": list(scored.views),
         "splats": len(splats.means),
         "lpips": lpips if isinstance(lpips, str) else "computed",
-        "quirks": sorted([*images.released_quirks, *["corner_pixels"] * images.corner_pixels]),
         "unseen_surface": appearance.record.facts["unseen_surface"],
         # Nothing but black on both sides: such frames have no finite PSNR.
         "empty_frames": int(np.isinf(table.loc[table["frame"] < predicted, "value"]).sum()),
@@ -115,9 +113,7 @@ def render(
     return Written(files=files, facts=facts, failure=rollout.record.reason)
 
 
-def posed(
-    appearance: Before, rollout: Before, trajectory: Trajectory, images: Images, device: str
-) -> tuple[Splats, Iterator[Gaussians]]:
+def posed(appearance: Before, rollout: Before, trajectory: Trajectory, device: str) -> tuple[Splats, Iterator[Gaussians]]:
     """Splats of frame 0, and in every frame: where the method's own model puts them, else skinned to the trajectory.
 
     Raises NumericalFailure where no splat is opaque enough to be moved.
@@ -128,7 +124,7 @@ def posed(
     splats = Splats.load(appearance.file("splats"))
     if not rollout.has("centers"):
         splats = prune_by_opacity(splats)
-        return splats, skinned_frames(splats, trajectory.positions, images, device)
+        return splats, skinned_frames(splats, trajectory.positions, device)
     return splats, frames_from_centers(splats, SplatCenters.load(rollout.file("centers")).positions, device)
 
 
@@ -171,8 +167,8 @@ def draw_frames(
     beyond = [frame for frame in wanted if not 0 <= frame < count]
     if beyond or not count:
         raise InputError("--frames", f"the trajectory has the frames 0 to {count - 1}", beyond)
-    _, frames_of_splats = posed(appearance, rollout, trajectory, images, device)
-    view, backend = view_of(capture.cameras[camera], images, device), choose_backend(images.backend, device)
+    _, frames_of_splats = posed(appearance, rollout, trajectory, device)
+    view, backend = view_of(capture.cameras[camera], device), choose_backend(images.backend, device)
     made = []
     for frame, gaussians in enumerate(frames_of_splats):
         if frame in wanted:

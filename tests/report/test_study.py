@@ -405,10 +405,9 @@ def test_a_table_can_be_made_from_scores_alone(tmp_path, capsys):
 
 
 def test_how_pictures_were_scored_is_said(tmp_path):
-    facts = {"quirks": ["any_alpha"], "lpips": "no weights"}
+    facts = {"lpips": "no weights"}
     write_run(tmp_path, RELEASED[0], "baseline", 0, all_scores(), images=facts)
     text = study_text("table1", STUDIES["table1"], tmp_path, RELEASED[:1], [0], ["baseline"], tmp_path / "out")
-    assert "Quirks of the released evaluation of pictures that were on: any_alpha." in text
     assert "LPIPS not computed in some runs: no weights." in text
 
 

@@ -99,26 +99,6 @@ def test_all_views_are_scored_if_wanted_each_with_its_own_camera(scene):
     assert set(record.files) == {"frames", "strip"}
 
 
-def test_quirks_are_switches_and_named(scene):
-    rollout = scene.roll(STEP, "quirks")
-    _, plain = scene.render(rollout, settings(video=False))
-    record, loose = scene.render(rollout, settings(video=False, released_quirks=("any_alpha",)))
-    assert record.facts["quirks"] == ["any_alpha"]
-    assert mean(loose, "iou", 0) < mean(plain, "iou", 0)
-    _, corner = scene.render(rollout, settings(video=False, corner_pixels=True))
-    assert mean(corner, "psnr", 0) < mean(plain, "psnr", 0)
-
-
-def test_another_camera_s_intrinsics_make_another_picture(tmp_path):
-    """Cameras of two sizes: with the second one's matrix the first sees the object elsewhere."""
-    made = Scene(film(tmp_path / "capture", cameras=2, sizes=(SIZE, (120, 100))), tmp_path)
-    made.learn(settings())
-    rollout = made.roll(STEP, "borrowed")
-    _, own = made.render(rollout, settings(video=False))
-    _, borrowed = made.render(rollout, settings(video=False, released_quirks=("second_camera_intrinsics",)))
-    assert mean(borrowed, "psnr", 0) < mean(own, "psnr", 0) - 5
-
-
 def test_one_camera_that_misses_frames_and_z_down(tmp_path):
     made = Scene(film(tmp_path / "capture", cameras=1, missing={0: (2,)}, up="-z"), tmp_path)
     assert made.learn(settings(appearance=SHORT)).facts["unseen_surface"] > 0.2
@@ -126,8 +106,6 @@ def test_one_camera_that_misses_frames_and_z_down(tmp_path):
     assert sorted(table["frame"].unique()) == [0, 1, 3, 4, 5]
     assert set(metrics.score_images(table, made.observations.scenario, FRAMES, "m", 0)["frames"]) == {2}
     assert rendered.status == "ok"
-    with pytest.raises(InputError, match="needs a second camera"):
-        made.render(made.roll(STEP, "two"), settings(released_quirks=("second_camera_intrinsics",)))
 
 
 def test_a_diverged_rollout_is_shown_as_far_as_it_goes_and_held_for_averages_over_all_runs(scene):

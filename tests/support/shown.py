@@ -51,7 +51,7 @@ def filmed(folder: Path, missing: tuple[int, ...] = ()) -> Path:
     )
     facts = {"format": 1, "name": "small", "category": "rope", "frame_count": count, "frame_rate": seen.scenario.frame_rate}
     writer = Writer(scenario / "capture", Description(**facts, cameras=(entry,), train_end=seen.scenario.train_end, masks=True))
-    view = view_of(writer.capture.cameras["0"], Images(), "cpu")
+    view = view_of(writer.capture.cameras["0"], "cpu")
     for frame, gaussians in take.gaussians(range(count), Images(), "cpu"):
         if frame in missing:
             continue

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
@@ -89,7 +88,7 @@ class ExportSource:
             rule = "splats are required, of a scenario with images"
             raise InputError(self.name, rule, "none", "Name the folder of a run whose scenario has appearance/<seed>/splats.ply.")
         wanted = set(frames)
-        carried = skinned_frames(prune_by_opacity(self.splats), self.positions[: max(frames) + 1], Images(), "cpu")
+        carried = skinned_frames(prune_by_opacity(self.splats), self.positions[: max(frames) + 1], "cpu")
         return ((frame, gaussians.stored()) for frame, gaussians in enumerate(carried) if frame in wanted)
 
 

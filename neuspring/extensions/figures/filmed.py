@@ -21,7 +21,7 @@ from neuspring.draw.painter import ERROR_COLORS, DrawingStyle, Painter, empty, h
 from neuspring.draw.scene import ShownRun, ShownScene, box_around, shown_points
 from neuspring.draw.twin import Quantity, TwinPicture
 from neuspring.scores.pictures import Pair, psnr
-from neuspring.splats.draw import OBJECT_COVERAGE, frames_from_centers, picture, skinned_frames, view_of
+from neuspring.splats.draw import frames_from_centers, picture, skinned_frames, view_of
 from neuspring.splats.model import Gaussians, Splats
 from neuspring.splats.rasterize import choose_backend
 from neuspring.splats.view import C0
@@ -44,7 +44,7 @@ class SplatRun(ShownRun):
         wanted = {frame for frame in frames if frame < len(self.positions)}
         stop = max(wanted, default=-1) + 1
         if self.centers is None:
-            every = skinned_frames(self.splats, self.positions[:stop], images, device) if stop else iter(())
+            every = skinned_frames(self.splats, self.positions[:stop], device) if stop else iter(())
         else:
             every = frames_from_centers(self.splats, self.centers[:stop], device)
         return ((frame, gaussians) for frame, gaussians in enumerate(every) if frame in wanted)
@@ -137,7 +137,7 @@ class PhotoPainter(Painter):
             self.error_name, self.error_label = "difference", "color difference"
 
     def _splats(self, take: SplatRun, images: Images, device: str) -> dict[int, Drawn]:
-        view, backend = view_of(self.scene.camera, images, device), choose_backend(images.backend, device)
+        view, backend = view_of(self.scene.camera, device), choose_backend(images.backend, device)
         made = {}
         for frame, gaussians in take.gaussians(self.frames, images, device):
             rgba = picture(gaussians, view, backend)
@@ -149,7 +149,7 @@ class PhotoPainter(Painter):
         if photo is None or labels is None:
             return Drawn(self.scene.cut(rgba))
         own, hands = (np.where(part, 255, 0).astype(np.uint8) for part in (labels == OBJECT, labels >= HANDS))
-        pair = Pair.of(photo, rgba, own, hands, OBJECT_COVERAGE)
+        pair = Pair.of(photo, rgba, own, hands)
         difference = (pair.truth - pair.prediction).abs().mean(0).numpy()
         shows = pair.silhouettes[0] | pair.silhouettes[1]
         cut = self.scene.cut
@@ -257,7 +257,7 @@ class SurfacePicture(TwinPicture):
         plain = torch.tensor((rgb - 0.5) / C0, dtype=torch.float32, device=self.device)[:, None]
         painted: Gaussians = replace(gaussians, harmonics=plain)
         # Nothing is compared with it, so it need not have the camera's pixels.
-        view = view_of(finer(scene.view, 900), self.images, self.device)
+        view = view_of(finer(scene.view, 900), self.device)
         return picture(painted, view, choose_backend(self.images.backend, self.device))
 
 

@@ -19,7 +19,7 @@ def find_vgg16() -> Path | str:
 
 def _reads(section: SpringGaus) -> tuple[str, ...]:
     if section.supervision == "masks":
-        return ("simulation.gravity", "images.backend", "images.corner_pixels")
+        return ("simulation.gravity", "images.backend")
     return ("simulation.gravity", "losses")
 
 

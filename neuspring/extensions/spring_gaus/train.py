@@ -125,7 +125,7 @@ def silhouettes(
         for frame in range(capture.train_end)
         if capture.has(name, frame)
     }
-    views = {name: view_of(camera, images, device) for name, camera in capture.cameras.items()}
+    views = {name: view_of(camera, device) for name, camera in capture.cameras.items()}
     features = None if isinstance(weights, str) else load_features(weights, device)
     backend, shape = choose_backend(images.backend, device), Gaussians.of(splats, device)
 

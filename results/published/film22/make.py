@@ -161,7 +161,7 @@ def pictures(run: Path, capture: Capture, frames: Collection[int]) -> dict[int, 
     images = parse(Images, own.records["render"].settings["images"], str(own.stages["render"].path))
     scored, last = Scored.of(capture, {}, images, "cpu"), None
     try:
-        _, moved = posed(own.stages["appearance"], own.stages["rollout"], own.trajectory, images, "cpu")
+        _, moved = posed(own.stages["appearance"], own.stages["rollout"], own.trajectory, "cpu")
         for frame in range(max(frames) + 1):
             last = next(moved, last)
             if frame in frames and last is not None:
