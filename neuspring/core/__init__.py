@@ -1,7 +1,6 @@
 """The ground that everything stands on.
 
-- `artifacts`: the nouns (`Observations`, `Topology`, `Material`, `Twin`, `Trajectory`, ...); `geometry`: points and lines;
-  `levenberg`: descents by damped steps.
+- `artifacts`: the nouns (`Observations`, `Topology`, `Material`, `Twin`, `Trajectory`, ...); `geometry`: points and lines.
 - `records`, `run_record`, `job_records`: what a stage, a run, a job did; `Recorder` measures a stage and writes its record.
 - `errors`: `InputError` and `NumericalFailure`; `findings`: what is implausible, but no reason to stop.
 - `files`: written whole, or not there; `lock`; `text`: tables, addresses and progress as they are printed.

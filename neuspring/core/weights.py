@@ -16,8 +16,6 @@ from neuspring.core.records import digest_file
 if TYPE_CHECKING:
     import torch
 
-SHOWN_DIGITS = 8
-
 
 def hub_folder() -> Path:
     """Folder in which torch hub keeps checkpoints; read from the environment, since torch itself takes seconds to import."""
@@ -38,27 +36,19 @@ def find_file(what: str, given: Path | None, places: Iterable[Path], digest: str
     for place in places:
         if not (fault := _fault(place, digest, trusted)):
             return place
-        faults.append(f"{_short(place)} {fault}")
+        faults.append(f"{place} {fault}")
     return f"no {what}: {', '.join(faults)}"
-
-
-def _short(path: Path) -> str:
-    """A path as users write it."""
-    home = Path.home()
-    return f"~/{path.relative_to(home)}" if path.is_relative_to(home) else str(path)
 
 
 def _fault(path: Path, digest: str, trusted: bool) -> str:
     """Fault of a weight file in words; empty where it has none."""
+    if not path.is_file():
+        return "is not there"
     try:
-        if not path.is_file():
-            return "is not there"
         found = digest if trusted else digest_file(path)
     except OSError as error:
         return f"cannot be read ({error.strerror})"
-    if found.startswith(digest):
-        return ""
-    return f"has SHA-256 {found[:SHOWN_DIGITS]}..., not {digest[:SHOWN_DIGITS]}..."
+    return "" if found.startswith(digest) else f"has SHA-256 {found[:8]}..., not {digest[:8]}..."
 
 
 def read_tensors(path: Path, shapes: Mapping[str, tuple[int, ...]], device: str) -> list[torch.Tensor]:
@@ -76,10 +66,7 @@ def read_tensors(path: Path, shapes: Mapping[str, tuple[int, ...]], device: str)
     tensors = []
     for name, shape in shapes.items():
         value = stored.get(name)
-        if not isinstance(value, torch.Tensor) or value.shape != shape or not value.is_floating_point():
-            received = f"{value.dtype} {list(value.shape)}" if isinstance(value, torch.Tensor) else type(value).__name__
-            raise InputError(path, f"`{name}` must be a float tensor {list(shape)}", received, remedy)
-        if not value.isfinite().all():
-            raise InputError(path, f"`{name}` must be finite", None, remedy)
+        if not (isinstance(value, torch.Tensor) and value.shape == shape and value.is_floating_point() and value.isfinite().all()):
+            raise InputError(path, f"`{name}` must be a finite float tensor {list(shape)}", getattr(value, "shape", value), remedy)
         tensors.append(value.to(device, torch.float32))
     return tensors

@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from neuspring.core import artifacts
 from neuspring.core.artifacts import Artifact, Material, Simulation, Topology, Trajectory, Twin
 from neuspring.core.errors import InputError
-from neuspring.core.files import write_text
 from tests.support.scenarios import observations, scenario
 
 
@@ -49,7 +48,7 @@ MAKERS: dict[str, Any] = {
     "scenario": lambda: scenario(provenance={"file": "a.pkl", "digest": "0f"}, ground=False, up="-z"),
     "observations": lambda: observations(tracks=np.where(np.arange(10).reshape(5, 2, 1) % 3, 1 / 3, np.nan).repeat(3, axis=2)),
     "topology": lambda: topology(controller_rest="first_frame"),
-    "material": material,
+    "material": lambda: material(mass=np.array([0.5, 1.0, 1.5, 1.0])),
     "twin": twin,
     "trajectory": trajectory,
     "diverged trajectory": lambda: trajectory(frame_count=9, diverged_frame=3, reason="node 0 left", collision_overflow=2),
@@ -102,62 +101,41 @@ def test_arrays_are_copied_cast_and_frozen() -> None:
 
 # Validation: the message names the field, the rule and the value ------------------------------------------------------
 
-BAD_ARRAYS = {
+BROKEN = {
     "dimensions": (lambda: topology(nodes=np.zeros(4)), r"topology\.nodes: the shape must be \[N, 3\] float32; received \(4,\)"),
     "axis": (lambda: topology(nodes=np.zeros((4, 2))), r"topology\.nodes: .*axis 1 must have 3 entries; received \(4, 2\)"),
     "agreement": (lambda: topology(rest_lengths=np.ones(2)), r"topology\.rest_lengths: .*axis 0 must have 3 entries"),
     "dtype": (lambda: topology(springs=np.zeros((3, 2))), r"topology\.springs: the dtype must be int32; received float64"),
     "not bool": (lambda: observations(object_visibility=np.ones((5, 3), int)), r"object_visibility: .*bool; received int64"),
-    "not numbers": (lambda: topology(nodes=np.ones((4, 3), bool)), r"topology\.nodes: the dtype must be float32; received bool"),
-    "text": (lambda: topology(labels=np.array(list("abcd"))), r"topology\.labels: the dtype must be int32"),
     "nan": (lambda: topology(nodes=np.full((4, 3), np.nan)), r"nodes: every entry must be finite; received nan at index \(0"),
-    "inf": (lambda: material(stiffness=np.array([1, np.inf, 1])), r"material\.stiffness: .*received inf at index \(1,\)"),
-    "too large": (lambda: trajectory(positions=np.full((3, 4, 3), 1e300)), r"trajectory\.positions: every entry must be finite"),
     "integers that do not fit": (lambda: topology(labels=np.full(4, 2**40)), r"topology\.labels"),
-}
-
-
-@pytest.mark.filterwarnings("ignore:overflow encountered in cast")
-@pytest.mark.parametrize("name", BAD_ARRAYS)
-def test_wrong_arrays_are_named(name: str) -> None:
-    make, message = BAD_ARRAYS[name]
-    with pytest.raises(InputError, match=message):
-        make()
-
-
-BAD_FIELDS = {
     "scenario name": (lambda: scenario(name="../etc"), r"scenario\.name.*'\.\./etc'"),
-    "scenario name with newline": (lambda: scenario(name="a\n"), r"scenario\.name"),
     "split": (lambda: scenario(train_end=9), r"scenario scene, split: 1 < train_end <= frame_count = 5.*train_end = 9"),
     "frame rate": (lambda: scenario(frame_rate=0.0), r"frame_rate: a positive number.*received 0"),
     "up": (lambda: scenario(up="y"), r"up: must be '\+z' or '-z'; received 'y'"),
     "frames": (lambda: observations(scenario=scenario(frame_count=6)), r"declares 6 frames; received arrays of 5 frames"),
     "no points": (lambda: observations(points=0), r"at least one tracked object point"),
-    "no hand": (lambda: observations(controller_points=np.zeros((5, 0, 3))), r"at least one controller point.*Without a hand"),
     "hidden at rest": (lambda: observations(object_visibility=np.zeros((5, 3), bool)), r"visible in frame 0.*3 of 3 are not"),
     "index": (lambda: topology(springs=np.array([[0, 1], [1, 2], [5, 3]])), r"topology\.springs: indices must lie in \[0, 5\)"),
     "order": (lambda: topology(springs=np.array([[0, 1], [4, 2], [1, 3]])), r"object springs must come before controller springs"),
-    "two hands": (lambda: topology(controllers=np.ones((2, 3)), springs=np.array([[0, 1], [1, 2], [4, 5]])), "two controllers"),
     "zero length": (lambda: topology(rest_lengths=np.array([0.1, 0.0, 0.3])), r"received 0\.0 m for spring 1 between \[1, 2\]"),
     "negative stiffness": (lambda: material(stiffness=np.array([1.0, -2, 1])), r"stiffness: must not be negative; received -2"),
-    "drag": (lambda: material(drag=-1.0), r"drag >= 0"),
     "nan friction": (lambda: material(ground_friction=float("nan")), r"material\.ground_friction: must be finite"),
-    "distance": (lambda: material(contact_distance=0.0), r"contact_distance > 0"),
     "substeps": (lambda: Simulation(frame_time=0.1, substeps=0), r"simulation: .*substeps >= 1"),
-    "frame time": (lambda: Simulation(frame_time=0.0, substeps=1), r"frame_time > 0"),
-    "gravity": (lambda: Simulation(frame_time=0.1, substeps=1, gravity=float("nan")), r"finite gravity"),
-    "simulation up": (lambda: Simulation(frame_time=0.1, substeps=1, up="z"), r"up"),  # type: ignore[arg-type]
     "one value per spring": (
         lambda: dataclasses.replace(twin(), material=material(stiffness=np.ones(2), dashpot=np.ones(2))),
         r"one stiffness per spring \(3\); received 2",
     ),
+    "masses": (lambda: dataclasses.replace(twin(), material=material(mass=np.ones(3))), r"one mass per node \(4\), or none"),
+    "no mass": (lambda: material(mass=np.array([1.0, 0.0])), r"material\.mass: must be positive"),
+    "rest shape": (lambda: topology(rest_shape=np.ones((4, 3))), r"rest_shape: one position per node and controller \(5\)"),
     "frames of a trajectory": (lambda: trajectory(frame_count=4), r"trajectory\.positions: 4 frames are expected; received 3"),
 }
 
 
-@pytest.mark.parametrize("name", BAD_FIELDS)
+@pytest.mark.parametrize("name", BROKEN)
 def test_broken_rules_are_named(name: str) -> None:
-    make, message = BAD_FIELDS[name]
+    make, message = BROKEN[name]
     with pytest.raises(InputError, match=message):
         make()
 
@@ -165,13 +143,6 @@ def test_broken_rules_are_named(name: str) -> None:
 def test_drifted_contact_scalars_are_accepted() -> None:
     """Released checkpoints hold values just outside the clamps (quirk 5): clamped on use, not refused."""
     assert material(ground_elasticity=-0.0103, contact_friction=2.0112).contact_friction == 2.0112
-
-
-def test_canonical_nodes() -> None:
-    given = observations()
-    np.testing.assert_array_equal(given.nodes[:, 0], [0, 1, 2, 0, 0])
-    assert given.surface_count == 4
-    assert topology().object_spring_count == 2
 
 
 # Reading other files --------------------------------------------------------------------------------------------------
@@ -200,9 +171,9 @@ def test_a_missing_file(tmp_path: Path) -> None:
 def test_another_kind_or_version(tmp_path: Path) -> None:
     path = tmp_path / "it.npz"
     twin().save(path)
-    refuses(Trajectory, path, "must be of kind trajectory; received twin")
+    refuses(Trajectory, path, r"must be of kind trajectory, format 2; received \('twin', 2\)")
     rewrite(path, format=99)
-    refuses(Twin, path, r"reads format 2; received 99\. Re-run")
+    refuses(Twin, path, r"received \('twin', 99\)\. Re-run")
 
 
 def test_what_is_optional_may_be_missing_in_a_file(tmp_path: Path) -> None:
@@ -211,24 +182,6 @@ def test_what_is_optional_may_be_missing_in_a_file(tmp_path: Path) -> None:
     with np.load(path) as stored:
         np.savez(path, **{name: stored[name] for name in stored.files if name != "rest_shape"})
     assert_same(Topology.load(path), topology())
-
-
-def test_masses_are_positive_and_one_per_node(tmp_path: Path) -> None:
-    made = dataclasses.replace(twin(), material=material(mass=np.array([0.5, 1.0, 1.5, 1.0])))
-    made.save(tmp_path / "it.npz")
-    assert_same(Twin.load(tmp_path / "it.npz"), made)
-    with pytest.raises(InputError, match=r"one mass per node \(4\), or none"):
-        dataclasses.replace(made, material=material(mass=np.ones(3)))
-    with pytest.raises(InputError, match=r"material\.mass: must be positive"):
-        material(mass=np.array([1.0, 0.0]))
-
-
-def test_a_rest_shape_has_one_position_per_node_and_controller() -> None:
-    made = topology()
-    points = len(made.nodes) + len(made.controllers)
-    assert len(topology(rest_shape=np.ones((points, 3))).canonical) == points
-    with pytest.raises(InputError, match=rf"topology\.rest_shape: one position per node and controller \({points}\)"):
-        topology(rest_shape=np.ones((points - 1, 3)))
 
 
 @pytest.mark.parametrize(("part", "name"), [("material", "drag_quadratic"), ("simulation", "controller_path")])
@@ -323,9 +276,3 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(InputError, match=r"file/sub: this folder must be writable.*Choose another results folder"):
         trajectory().save(tmp_path / "file" / "sub" / "it.npz")
-
-
-def test_text_is_written_atomically(tmp_path: Path) -> None:
-    write_text(tmp_path / "a" / "it.json", "Größe")
-    assert (tmp_path / "a" / "it.json").read_text(encoding="utf-8") == "Größe"
-    assert os.listdir(tmp_path / "a") == ["it.json"]

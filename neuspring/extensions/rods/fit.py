@@ -27,10 +27,10 @@ from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_table
-from neuspring.core.levenberg import LevenbergMarquardt
 from neuspring.core.text import Progress, listed
 from neuspring.extensions.rods import made
 from neuspring.extensions.rods.axes import SAME_WORLD, angle_between, heading, turned
+from neuspring.extensions.rods.levenberg import LevenbergMarquardt
 from neuspring.extensions.rods.nodes import RodFrames, settled, turn_of
 from neuspring.extensions.rods.rod import Rod, rod_of
 from neuspring.extensions.rods.settings import RodFit
