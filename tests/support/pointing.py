@@ -52,18 +52,6 @@ def pixel(camera: Any, point: np.ndarray) -> tuple[float, float]:
     return wide / 2 + focal * local[0] / local[2], high / 2 + focal * local[1] / local[2]
 
 
-def choose_tab(browser: Browser, name: str) -> None:
-    """Click a tab of the panel with the mouse, until it is open: viser's tabs do not listen to a script's clicks, and may move."""
-    tab = f"[...document.querySelectorAll('[role=tab]')].find((one) => one.textContent.trim() === {name!r})"
-
-    def is_open() -> bool:
-        box = browser.run(f"JSON.parse(JSON.stringify({tab}.getBoundingClientRect()))")
-        browser.drag((box["x"] + box["width"] / 2, box["y"] + box["height"] / 2))
-        return bool(browser.run(f"{tab}.getAttribute('aria-selected') === 'true'"))
-
-    until(is_open)
-
-
 def colored(browser: Browser, path: Path) -> np.ndarray:
     """Which pixels of the window [H, W] have a color, in a picture that is written to a path."""
     browser.screenshot(path)

@@ -18,32 +18,19 @@ def play(
     host: Annotated[str, arg(help="address to listen at; the default is for this machine alone")] = "127.0.0.1",
     port: Annotated[int, arg(help="0: any that is free")] = 8080,
     frame: Annotated[int, arg(help="frame to begin with")] = 0,
-    save: Annotated[Path, arg(help="folder where recordings are saved")] = Path(),
-    replay: Annotated[Path | None, arg(help="show a saved recording again")] = None,
     no_open: Annotated[bool, arg(help="print the address, and open no browser")] = False,
-    compare: Annotated[bool, arg(help="with --replay: print how the other twins move under it, and end")] = False,
 ) -> None:
     """Runs of a results folder in the browser, until Ctrl-C; twins that can be pulled by hand."""
+    from neuspring.core.web import is_loopback, open_page
     from neuspring.data.sample import sample_twin
-    from neuspring.extensions.play.controls import comparison, load_controls, pulled_run
+    from neuspring.extensions.play.page import Page
+    from neuspring.extensions.play.serve import address, start
     from neuspring.report.shown import find
 
     found = find(results or (sample_twin(),))
     frames = found.observations.scenario.frame_count
     if not 0 <= frame < frames:
         raise InputError("--frame", f"{found.folder.name} has the frames 0 to {frames - 1}", frame)
-    controls = load_controls(replay) if replay else None
-    own = pulled_run(found, controls, replay) if controls and replay else None
-    if compare:
-        if controls is None or own is None:
-            raise InputError("--compare", "a recording is required", "none", "Give it with --replay FILE.")
-        for line in comparison(found, controls, own):
-            print(line, flush=True)
-        return
-    from neuspring.core.web import is_loopback, open_page
-    from neuspring.extensions.play.page import Page
-    from neuspring.extensions.play.serve import address, start
-
     pages: list[Page] = []
 
     def go_to(chosen: int) -> None:
@@ -51,11 +38,9 @@ def play(
             page.show(chosen)
 
     server = start(host, port, go_to, found.folder.name)
-    page = Page(server, found, save)
+    page = Page(server, found)
     page.show(frame)
     pages.append(page)
-    if own is not None:
-        page.panel.start(own.name, controls)
     print(f"Play {found.folder.name} at {address(server)} (stop with Ctrl-C)", flush=True)
     print("To pull the twin there: Live, Start, then take it with the mouse.", flush=True)
     if not is_loopback(host):

@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from neuspring.core.errors import InputError
-from neuspring.extensions.play.controls import MOST_FRAMES, ControlRecorder, Controls
 from neuspring.extensions.play.layers import BodyLayer
 from neuspring.extensions.play.player import Player
-from neuspring.extensions.play.simulator import Simulator, StartState, hands_of
+from neuspring.extensions.play.simulator import Simulator, hands_of
 from neuspring.report.shown import Run
 from neuspring.twin.rollout import Diverged
 
@@ -24,44 +23,25 @@ if TYPE_CHECKING:
 
 FASTEST_GRAB = 3.0
 """m/s: a grab follows a faster mouse at this speed, as a jump would tear the twin."""
-AVERAGED_FRAMES = 30
-"""Frames that frame rate and latency are averages of."""
-TOO_MUCH = 0.3
-"""Strain from which springs are red at the beginning."""
-FOR_SPLATS = 0.4
-"""Part of the time that splats may take; where it is not enough, they are drawn in some frames only."""
 
 
 class Live:
-    """One twin, simulated in a thread of its own, one frame of the twin after another; `played`: a recording to show again.
+    """One twin, simulated in a thread of its own, one frame of the twin after another. It stands still while nobody watches."""
 
-    It stands still while nobody watches the player.
-    """
-
-    def __init__(
-        self, server: viser.ViserServer, player: Player, run: Run, begin: StartState, played: Controls | None = None
-    ) -> None:
+    def __init__(self, server: viser.ViserServer, player: Player, run: Run) -> None:
         twin = run.twin
         if twin is None:
             raise InputError(run.folder, "a run with a twin is required", "none", "Choose a method that makes a twin.")
-        if played is not None:
-            played.require_fit(twin)
-        self.run, self.begin, self.played, self._server, self._player = run, begin, played, server, player
-        self.simulator = Simulator(twin, start=begin.start if played is None else played.start)
+        self.run, self._server, self._player = run, server, player
+        self.simulator = Simulator(twin)
         hands = self.simulator.hands
         self.grab = Grab(len(twin.topology.nodes), hands, hands_of(hands, player.found.observations.controller_hand))
-        self.grab.following = played is not None or len(begin.hands) > 0
-        self.most, self.message = TOO_MUCH, ""
-        self.strain, self.over = 0.0, 0
-        self.rate = self.factor = self.latency = 0.0
-        self.recording = ControlRecorder()
-        self.recording.begin(self.simulator.positions)
-        self._latencies: deque[float] = deque(maxlen=AVERAGED_FRAMES)
+        self.message, self.rate = "", 0.0
         self._splat_seconds = 0.0
         self._again, self._stop = threading.Event(), threading.Event()
-        self.body = BodyLayer(server.scene, f"live {run.name}", twin, self.simulator.positions, hands, player.seen)
-        if played is None:
-            self._listen()
+        self.body = BodyLayer(server.scene, f"live {run.name}", twin, self.simulator.positions, hands)
+        self._player.dress(self.body, run, springs=True)
+        self._listen()
         self._thread = threading.Thread(target=self._run, name="live", daemon=True)
         self._thread.start()
 
@@ -72,50 +52,20 @@ class Live:
         self.body.remove()
 
     def reset(self) -> None:
-        """Back to the start before the next step; what was recorded is forgotten."""
+        """Back to the start before the next step."""
         self._again.set()
 
-    def recorded(self) -> Controls:
-        """Controls since the last reset. Raises InputError where there are none, or too many."""
-        return self.recording.controls(
-            self.begin.start,
-            self.begin.frame,
-            scenario=self._player.found.observations.scenario.name,
-            method=self.run.method,
-            seed=self.run.seed,
-            twin_digest=self.run.twin_digest,
-        )
-
     def status(self) -> str:
-        """Frame rate, strain and what is held, as HTML."""
+        """Frame rate and what is held, as HTML."""
         simulator, node = self.simulator, self.simulator.grabbed
         wanted = 1 / simulator.twin.simulation.frame_time
-        held = "nothing is held"
-        if node >= 0:
-            held = f"node {node} is held, k = {simulator.grab_stiffness(node)[0]:.3g} N/m"
-        delay = f"; from mouse to scene {1e3 * self.latency:.0f} ms" if self.latency else ""
-        script, done = len(self.begin.hands), simulator.frame
-        hands = f"hands repeat frame {self.begin.frame + min(done, script)} of the recording" if script else ""
-        if script and done >= script:
-            hands = "the recorded hands have ended, and stay"
+        held = f"node {node} is held, k = {simulator.grab_stiffness(node)[0]:.3g} N/m" if node >= 0 else "nothing is held"
         lines = [
-            f"<b>{self.rate:.1f} frames/s</b> of {wanted:.0f}; real-time factor <b>{self.factor:.2f}</b>{delay}",
-            f"{done} frames, {done / wanted:.1f} s from frame {self.begin.frame}; {held}",
-            hands,
-            self._strain_text(),
+            f"<b>{self.rate:.1f} frames/s</b> of {wanted:.0f}",
+            f"{simulator.frame / wanted:.1f} s; {held}",
             escape(self.message),
         ]
-        return (
-            f"<div style='margin:0 .8em;font-size:.8em;overflow-wrap:anywhere'>{'<br>'.join(line for line in lines if line)}</div>"
-        )
-
-    def _strain_text(self) -> str:
-        """The largest strain; a warning where it is above what is red."""
-        text = f"largest strain {self.strain:.2f}"
-        if not self.over:
-            return f"{text}, below {self.most:.2f}"
-        style = "background:#c1121f;color:white;padding:.15em .5em;border-radius:3px;font-weight:bold"
-        return f"<span style='{style}'>Over-stretched: {self.over} springs above {self.most:.2f}; {text}</span>"
+        return f"<div style='margin:0 .8em;font-size:.8em;overflow-wrap:anywhere'>{'<br>'.join(filter(None, lines))}</div>"
 
     def _listen(self) -> None:
         """Take drags. Asynchronous functions keep the order of a drag's events."""
@@ -144,82 +94,49 @@ class Live:
 
     def _run(self) -> None:
         frame_time = self.simulator.twin.simulation.frame_time
-        ends: deque[float] = deque(maxlen=AVERAGED_FRAMES)
+        ends: deque[float] = deque(maxlen=30)
         due = time.monotonic()
         while not self._stop.is_set():
             if not self._player.watched.wait(0.2):
                 continue
             if self._again.is_set():
-                self._restart()
+                self._restart("")
             try:
                 self._step(frame_time)
             except Diverged as end:
-                self._restart()
-                self.message = f"{end}; it began again"
+                self._restart(f"{end}; it began again")
             except Exception as error:
                 self.message = f"stopped: {error}"
                 return
             ends.append(time.monotonic())
             if len(ends) > 1:
                 self.rate = (len(ends) - 1) / max(ends[-1] - ends[0], 1e-9)
-                self.factor = self.rate * frame_time
             # A slow machine falls behind, and does not hurry later.
             due = max(due + frame_time, time.monotonic())
-            self._wait(due - time.monotonic())
+            self._stop.wait(max(due - time.monotonic(), 0.001))
 
-    def _wait(self, seconds: float) -> None:
-        """Let real time pass before the next frame, and other threads work."""
-        self._stop.wait(max(seconds, 0.001))
-
-    def _restart(self) -> None:
+    def _restart(self, message: str) -> None:
         self._again.clear()
         self.simulator.reset()
         self.grab.reset(self.simulator.hands)
-        self.recording.begin(self.simulator.positions)
-        self.message = ""
+        self.message = message
 
     def _step(self, frame_time: float) -> None:
         """A frame: controls, simulation, drawing."""
-        simulator = self.simulator
+        simulator, node = self.simulator, self.grab.node
         before = simulator.grabbed
-        if (controls := self._controls(frame_time)) is None:
-            return
-        x = simulator.step(*controls)
-        if self.recording.add((*controls[:3], simulator.holds), x):
-            self.message = f"the recording ended after {MOST_FRAMES} frames; reset to begin another"
-        if self.played is not None and simulator.frame == len(self.played.grabbed):
-            same = self.recording.motion_digest() == self.played.motion_digest
-            self.message = "the same motion as recorded, bit for bit" if same else "not the motion that was recorded"
+        at = simulator.target if node == before else simulator.positions[max(node, 0)]
+        x = simulator.step(*self.grab.next(frame_time, simulator.hands, at))
         with self._server.atomic():
-            display = self._player.display
-            self._player.add_splats(self.body, self.run)
-            self.body.show(display)
-            strain = self.body.move(x, simulator.hands, display.quantity, self._player.scale, self.most)
+            self.body.move(x, simulator.hands)
             self._draw_splats(x, frame_time)
             if simulator.grabbed != before:
-                self.body.mark(simulator.grabbed if simulator.grabbed >= 0 else None)
-        self.strain, self.over = float(strain.max(initial=0.0)), int((strain > self.most).sum())
-        if (delay := self.grab.drawn()) is not None:
-            self._latencies.append(delay)
-            self.latency = sum(self._latencies) / len(self._latencies)
-
-    def _controls(self, frame_time: float) -> tuple[np.ndarray, int, np.ndarray, np.ndarray | None] | None:
-        """Arguments of `Simulator.step` for the next frame; None where a recording has ended."""
-        simulator, frame = self.simulator, self.simulator.frame
-        if self.played is not None:
-            return self.played.row(frame) if frame < len(self.played.grabbed) else None
-        node = self.grab.node
-        at = simulator.target if node == simulator.grabbed else simulator.positions[max(node, 0)]
-        hands, holds = self.begin.script(frame)
-        return (*self.grab.next(frame_time, simulator.hands, at, hands), holds)
+                self.body.mark(simulator.grabbed)
 
     def _draw_splats(self, x: np.ndarray, frame_time: float) -> None:
-        """Move the splats, in as many frames as time allows."""
-        splats = self.body.splats
-        if splats is None or not splats.shown:
-            return
-        every = max(1, math.ceil(self._splat_seconds / (FOR_SPLATS * frame_time)))
-        if self.simulator.frame % every == 0:
+        """Move the splats, in as many frames as 0.4 of the time allows."""
+        splats, every = self.body.splats, max(1, math.ceil(self._splat_seconds / (0.4 * frame_time)))
+        if splats is not None and splats.handle.visible and self.simulator.frame % every == 0:
             start = time.monotonic()
             splats.move(x)
             self._splat_seconds = time.monotonic() - start
@@ -233,20 +150,15 @@ class Grab:
 
     def __init__(self, nodes: int, hands: np.ndarray, groups: np.ndarray) -> None:
         self._lock, self._nodes, self._groups = threading.Lock(), nodes, groups
-        self.following = False
-        """Hands follow a recording, so that nobody can take them."""
-        self.asked = 0.0
-        """Time when a mouse was last moved, s (time.monotonic); 0 once that was drawn."""
         self.reset(hands)
 
     def reset(self, hands: np.ndarray) -> None:
         """Let go; hands are at [C, 3], m."""
         with self._lock:
-            self._start = hands.copy()
             self.owner: int | None = None
             self.node, self._target, self._shift = -1, np.zeros(3, np.float32), np.zeros(3, np.float32)
-            self._hand, self._from, self._base = -1, np.zeros(3), self._start
-            self.wanted = self._start.copy()
+            self._hand, self._from = -1, np.zeros(3)
+            self.wanted = self._base = hands.copy()
 
     def take(self, client: int, kind: str, index: Any, place: Any, at: Any = None) -> bool:
         """A browser grabs a node, which is at `at` [3], m, or a hand, with the mouse at `place` [3], m; returns whether it may."""
@@ -254,8 +166,6 @@ class Grab:
         with self._lock:
             most = self._nodes if kind == "node" else len(self._groups)
             if self.owner is not None or point is None or not isinstance(index, int) or not 0 <= index < most:
-                return False
-            if kind == "hand" and self.following:
                 return False
             self.owner = client
             if kind == "node":
@@ -272,7 +182,6 @@ class Grab:
             if self.owner != client or point is None:
                 return
             self._target = point + self._shift
-            self.asked = self.asked or time.monotonic()
             if self._hand >= 0:
                 self.wanted = self._base.copy()
                 self.wanted[self._groups == self._hand] += point - self._from
@@ -283,26 +192,12 @@ class Grab:
             if self.owner == client:
                 self.owner, self.node, self._hand = None, -1, -1
 
-    def next(
-        self, seconds: float, hands: np.ndarray, at: np.ndarray, recorded: np.ndarray | None = None
-    ) -> tuple[np.ndarray, int, np.ndarray]:
-        """Hands [C, 3], node and target [3] at the end of a frame, from hands and target (`at`) at its begin.
-
-        `recorded` hands [C, 3] are taken as they are.
-        """
+    def next(self, seconds: float, hands: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, int, np.ndarray]:
+        """Hands [C, 3], node and target [3] at the end of a frame, from hands and target (`at`) at its begin."""
         with self._lock:
-            if recorded is not None:
-                self.wanted = recorded
             wanted, node, target = self.wanted, self.node, self._target
         reach = FASTEST_GRAB * seconds
-        moved = hands + _limited(wanted - hands, reach) if recorded is None else recorded
-        return moved, node, at + _limited((target - at)[None], reach)[0] if node >= 0 else target
-
-    def drawn(self) -> float | None:
-        """Seconds since the mouse was moved whose pull has just been drawn; None: it was not moved."""
-        with self._lock:
-            asked, self.asked = self.asked, 0.0
-        return time.monotonic() - asked if asked else None
+        return hands + _limited(wanted - hands, reach), node, at + _limited((target - at)[None], reach)[0] if node >= 0 else target
 
 
 def nearest_to_ray(points: np.ndarray, eye: Any, through: Any) -> int:

@@ -17,7 +17,7 @@ from neuspring.extensions.play.page import Page
 from neuspring.extensions.play.serve import address, start
 from neuspring.report.shown import find
 from tests.support.browser import Browser
-from tests.support.pointing import WINDOW, choose_tab, pixel, pull, until
+from tests.support.pointing import WINDOW, pixel, pull, until
 
 QUALITY = 82
 """JPEG's quality."""
@@ -36,7 +36,7 @@ def main() -> None:
     a.output.mkdir(parents=True, exist_ok=True)
     found = find([a.scenario])
     server = start("127.0.0.1", 0)
-    page = Page(server, found, a.output)
+    page = Page(server, found)
     try:
         with Browser(served=True, webgl=True, patience=PATIENCE) as browser:
             browser.open(address(server), *WINDOW)
@@ -56,18 +56,16 @@ def recording(page: Page, browser: Browser, output: Path) -> None:
     settle()
     settle()
     save(browser, output / "recording.jpg")
-    choose_tab(browser, "Show")
-    change(page, splats=True, nodes=False, springs=False, points=False)
+    change(page, splats=True, springs=False)
     settle()
     save(browser, output / "splats.jpg")
-    change(page, splats=False, nodes=True, springs=True, points=False)
+    change(page, splats=False, springs=True)
 
 
 def live(page: Page, browser: Browser, server, output: Path) -> None:
     """A twin that is pulled too far."""
-    page.panel.start(page.player.display.runs[0])
-    choose_tab(browser, "Live")
-    one = page.panel.live
+    page.begin(page.player.runs[0])
+    one = page.live
     assert one is not None
     until(lambda: one.simulator.frame > 5, PATIENCE)
     camera = next(iter(server.get_clients().values())).camera
@@ -79,7 +77,7 @@ def live(page: Page, browser: Browser, server, output: Path) -> None:
         until(lambda: one.simulator.frame > begun + 25, PATIENCE)
         settle()
         save(browser, output / "live.jpg")
-    page.panel.stop()
+    page.end()
 
 
 def future_frame(page: Page) -> int:
