@@ -235,13 +235,13 @@ class Benchmark:
         everyone = tuple(name for source, names in transfers.items() for name in (source, *names))
         _require_known("transfers", everyone, rows, self.config.scenario_table)
         transfers = {source: names for source, names in transfers.items() if source in self.config.scenarios}
-        _require_alike(self.config, rows, transfers, "transfers")
+        _require_alike(rows, transfers, "transfers")
         pools: dict[str, tuple[str, ...]] = {}
         if any(self.table[name].pool for name in self.whole.methods):
             for names in (self.whole.pools or {}).values():
                 _require_known("pools", names, rows, self.whole.scenario_table)
                 pools |= {name: tuple(other for other in names if other != name) for name in names}
-            _require_alike(self.whole, rows, pools, "pools")
+            _require_alike(rows, pools, "pools")
         return pools, transfers
 
     # --- what is checked before a job starts
@@ -374,14 +374,13 @@ def with_references(config: Config, scenarios: Mapping[str, ScenarioRow], method
     return dataclasses.replace(config, methods=beside + config.methods) if beside else config
 
 
-def _require_alike(config: Config, scenarios: Mapping[str, ScenarioRow], groups: Mapping[str, tuple[str, ...]], key: str) -> None:
+def _require_alike(scenarios: Mapping[str, ScenarioRow], groups: Mapping[str, tuple[str, ...]], key: str) -> None:
     """Raise InputError unless twins go to recordings of the same object with as many nodes."""
     for source, target in ((s, t) for s, targets in groups.items() for t in targets):
         here, there = scenarios[source], scenarios[target]
         if (here.source, here.category) != (there.source, there.category):
             rule = f"{target} must be of the same object as {source}: source {here.source}, category {here.category}"
             raise InputError(f"configuration, {key}", rule, f"source {there.source}, category {there.category}")
-        SOURCES[here.source].require_alike(config)
 
 
 def _require_known(key: str, names: tuple[str, ...], known: Mapping[str, Any], table: str) -> None:

@@ -61,8 +61,6 @@ class Source:
     """The row of a scenario that no table has, where its name says all of it."""
     required: Callable[[Path], None] = lambda folder: None
     """Raises InputError where its folder lacks what no run can do without."""
-    require_alike: Callable[[Config], None] = lambda config: None
-    """Raises InputError where settings do not promise that recordings of one object have as many nodes, as transfers need."""
     cameras: Callable[[Path, Config], tuple[str, ...]] = lambda folder, config: ()
     """Names of the cameras before the capture is made. Raises InputError."""
 

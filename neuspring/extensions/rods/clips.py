@@ -16,13 +16,9 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from neuspring.core.artifacts import Observations
-from neuspring.core.files import read_npz, write_text
+from neuspring.core.files import write_text
 from neuspring.core.records import StageRecord
 from neuspring.core.table import LATEX_PREAMBLE, Cell, Table
-from neuspring.draw.film import write_film
-from neuspring.draw.painter import DrawingStyle, Painter
-from neuspring.draw.scene import ShownRun, ShownScene
 from neuspring.draw.sheet import save
 from neuspring.extensions.rods.metric import DEFORM_L1
 from neuspring.report.blocks import Block, Items, markdown
@@ -132,11 +128,10 @@ class ClipNumbers(OwnStudy):
         for run in runs:
             path = self.results / run["scenario"] / run["method"] / str(run["seed"]) / "transfer.json"
             record = None if run["reason"].startswith(DAMAGED) else StageRecord.load(path)
-            kept = [role for role in ("frames", "lines") if record and role in record.files]
-            files = {role: record.file(role, path).relative_to(self.results).as_posix() for role in kept if record}
+            frames = record.file("frames", path).relative_to(self.results).as_posix() if record and "frames" in record.files else ""
             targets = int(record.facts["targets"]) if record and record.facts else 0
-            rows.append(run | {"label": self.labels[run["method"]], "targets": targets, "frames": "", "lines": ""} | files)
-        columns = ["scenario", "method", "seed", "status", "reason", "label", "targets", "frames", "lines"]
+            rows.append(run | {"label": self.labels[run["method"]], "targets": targets, "frames": frames})
+        columns = ["scenario", "method", "seed", "status", "reason", "label", "targets", "frames"]
         return pd.DataFrame(rows, columns=columns)
 
     @cached_property
@@ -177,8 +172,6 @@ class ClipNumbers(OwnStudy):
 
 TAG_SIGNS = {"second-hand": "†", "log": "‡", "others": "§", "reference": "¶", "": ""}
 """Tag of a published number to the sign behind it."""
-FILM_RATE, FILM_WIDTH, FILM_MEGABYTES = 20, 960, 3.0
-"""Pictures per second, pixels, and size of a film."""
 
 
 def clip_blocks(found: ClipNumbers) -> list[Block]:
@@ -187,7 +180,7 @@ def clip_blocks(found: ClipNumbers) -> list[Block]:
     failed = found.records[found.records["status"] != "ok"].itertuples()
     lines += [f"{run.label}, {run.scenario} / seed {run.seed}: {run.reason}" for run in failed]
     last = [Items(title="Not in the tables, or not whole", items=lines)] if lines else []
-    return [_overview(found), *([_details(found), _per_clip(found)] if len(found.clips) else []), *last]
+    return [_overview(found), *([_details(found)] if len(found.clips) else []), *last]
 
 
 def _overview(found: ClipNumbers) -> Table:
@@ -224,20 +217,9 @@ def _details(found: ClipNumbers) -> Table:
     return replace(Table.of_texts(header, rows, "Ours in detail"), note=note, stub=2)
 
 
-def _per_clip(found: ClipNumbers) -> Table:
-    means = found.clips.groupby(["cable", "clip", "label"], sort=False)["l1_mm"].mean()
-    labels, rows = [label for label in found.study.rows if label in set(found.clips["label"])], []
-    for _, part in means.groupby(level=["cable", "clip"], sort=False):
-        values = part.droplevel([0, 1])
-        rows.append([*map(str, part.index[0][:2]), *(f"{values[label]:.2f}" if label in values else DASH for label in labels)])
-    return replace(Table.of_texts(["Cable", "Clip", *labels], rows, "L1 per clip"), note="mm, seeds averaged.", stub=2)
-
-
 def write_clips(found: ClipNumbers, folder: Path) -> str:
     """Write all files of a study of clips; returns the Markdown."""
     name = found.name
-    for old in (path for ending in ("gif", "mp4", "png") for path in folder.glob(f"{name}_*.{ending}")):
-        old.unlink()
     for suffix, rows in {"": found.cells, "_clips": found.clips}.items():
         write_text(folder / f"{name}{suffix}.csv", rows.to_csv(index=False))
     title, (first, *rest) = found.study.title, clip_blocks(found)
@@ -248,44 +230,9 @@ def write_clips(found: ClipNumbers, folder: Path) -> str:
     if len(found.growth):
         path = save(growth_figure(found.growth, list(found.study.rows)), folder / f"{name}_growth.png")
         parts.append(f"![Mean error of free markers over time, per cable]({path.name})\n")
-    for cable in dict.fromkeys(found.clips["cable"]):
-        painters = filmed(found, cable)
-        for ending in ("gif", "mp4") if painters else ():
-            path, (before, after) = folder / f"{name}_{cable}.{ending}", painters[0].frames[:2]
-            write_film(painters[0], path, FILM_WIDTH, 1 / (after - before), FILM_MEGABYTES, painters[1:])
-            parts.append(f"{'!' * (ending == 'gif')}[{cable}: observed blue, predicted dark, held red ({ending})]({path.name})\n")
     text = "\n".join([*parts, markdown(rest)])
     write_text(folder / f"{name}.md", text)
     return text
-
-
-def filmed(found: ClipNumbers, cable: str) -> list[Painter]:
-    """Who paints the best, the median and the worst clip of a cable: by the baseline, else the last row that kept any."""
-    here = found.clips[found.clips["cable"] == cable].sort_values("l1_mm")
-    runs = found.records[found.records["lines"] != ""].sort_values("seed")
-    for label in dict.fromkeys([found.study.baseline, *reversed(found.study.rows)]):
-        for run in runs[runs["label"] == label].itertuples():
-            part = here[(here["source"] == run.scenario) & (here["seed"] == run.seed) & (here["label"] == label)]
-            if len(part):
-                lines, last = read_npz(found.results / str(run.lines))[0], len(part) - 1
-                # Of fewer than three clips one stands for two.
-                words = {last: "worst", last // 2: "median", 0: "best"}
-                shown = [(part.iloc[place], f"{label}, {words[place]}") for place in sorted(words)]
-                count = min(len(lines[clip["clip"]]) for clip, _ in shown)
-                return [_painter(found.results, clip, title, lines[clip["clip"]][:count]) for clip, title in shown]
-    return []
-
-
-def _painter(results: Path, clip: pd.Series, title: str, line: np.ndarray) -> Painter:
-    """Paints a clip: the observed center line, and a predicted one [F, V, 3], m, in one view."""
-    seen = Observations.load(results / clip["clip"] / "observations.npz")
-    free = seen.line < len(seen.nodes)
-    positions = np.full((len(line), *seen.object_points.shape[1:]), np.nan)
-    positions[:, seen.line[free]] = line[:, free]
-    take = ShownRun(f"{title}: {clip['clip']}, L1 {clip['l1_mm']:.1f} mm", positions)
-    frames = range(0, len(line), max(round(seen.scenario.frame_rate / FILM_RATE), 1))
-    manner = DrawingStyle(error="none", together=True)
-    return Painter(ShownScene.from_side(seen, [take], frames), [take], frames, manner)
 
 
 def growth_figure(growth: pd.DataFrame, labels: Sequence[str]) -> Figure:

@@ -8,10 +8,6 @@ Drag is left out. A rod that slips inside is refused: a branch is a spring behin
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from itertools import accumulate
-from operator import mul
 from typing import Any, NamedTuple
 from xml.etree import ElementTree as ET
 
@@ -31,12 +27,6 @@ WELD: dict[str, Any] = {"solref": f"{2 * CABLE_STEP} 1", "solimp": "0.999 0.9999
 """A clamp is as stiff as the time step allows."""
 
 
-SHEAR = 0.01
-"""Share of the sag between two clamps that shear may add: Newton's joints give way sideways, ours do not."""
-STRAIN = 1e-3
-"""Stretch of a rod by its own weight, if its EA allows no more."""
-SHORTEST_STEP = 1e-4
-"""s: Newton keeps poses of bodies in float32, which stand still in shorter steps."""
 HINGE_AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
 
 
@@ -133,51 +123,3 @@ def _rest(curvature: np.ndarray, by_angle: bool = False) -> Rotation:
     size = np.linalg.norm(k, axis=1, keepdims=True)
     angle = size if by_angle else 2 * np.arctan(size / 2)
     return Rotation.from_rotvec(angle * k / np.maximum(size, 1e-12))
-
-
-def to_newton(source: Any, points: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
-    """Arrays of `newton.Rod` and of its joints, bodies and clamps, of a twin whose points (`Lines.points`) are these by frame.
-
-    Quaternions have w last, and z along the edge.
-
-    Raises InputError if the solver needs a step that is too short for it: a joint may turn an edge, and pull at it, by no more than
-    its inertia over a step resists, or the iterations end before the rod is as stiff as it should be.
-    """
-    rod = rod_of(source.twin)
-    chain = chain_of(rod)
-    rest = Rotation.concatenate(list(accumulate(chain.rest, mul, initial=chain.frames[0])))
-    along = rod.lengths[:, None] * rest.as_matrix()[..., 0]
-    held = list(chain.held.values())
-    spans, weight = rod.spans[1:-1], source.twin.simulation.gravity * rod.mass.sum()
-    # A beam of n edges, each of which gives way by force / pull, sags by this share more: 96 EI / (pull l^3 n^2). Below 4 EI / l^3
-    # turning would need the shorter steps.
-    stiff = max(4.0, 96 / (SHEAR * (len(rod.lengths) - len(held)) ** 2))
-    pull = np.maximum(stiff * chain.bend / spans**2, min(rod.stretching, weight / STRAIN) / spans)
-    step = min(source.twin.simulation.substep, float(np.sqrt(np.minimum(chain.mass[:-1], chain.mass[1:]) / pull).min()))
-    if step < SHORTEST_STEP:
-        rule = f"Newton's solver of rods needs steps of {SHORTEST_STEP:g} s or more, or its float32 poses stand still"
-        found = f"{source.name}, which is so stiff, or has so short edges, that it needs {step:.2g} s"
-        raise InputError("--to newton", rule, found, "Take --to mujoco, or fit fewer vertices.")
-    clamps = np.zeros((len(points), len(held), 7))
-    for row, placed in enumerate(points):
-        line = placed[-len(rod.vertices) :]
-        clamps[row, :, :3] = ((line[:-1] + line[1:]) / 2)[held]
-        clamps[row, :, 3:] = _quaternions(frames_of(replace(rod, vertices=line)))[held]
-        # q and -q are one pose, but not between two poses.
-        clamps[row, :, 3:] *= np.where((clamps[row] * clamps[row - 1])[:, 3:].sum(axis=1, keepdims=True) < 0, -1, 1)
-    return {
-        "points": rod.vertices,
-        "quaternions": _quaternions(chain.frames),
-        "rest_points": rod.vertices[0] + np.concatenate([np.zeros((1, 3)), np.cumsum(along, axis=0)]),
-        "rest_quaternions": _quaternions(rest),
-        "stiffness": np.stack([pull, pull, pull, chain.bend, chain.bend, chain.twist], axis=1),
-        "mass": chain.mass,
-        "step": np.array(step),
-        "held": np.array(held, np.int32),
-        "clamps": clamps,
-    }
-
-
-def _quaternions(frames: Rotation) -> np.ndarray:
-    """Quaternions of axes m1, m2, t, w last [E, 4]."""
-    return np.asarray(Rotation.from_matrix(np.roll(frames.as_matrix(), -1, axis=-1)).as_quat())

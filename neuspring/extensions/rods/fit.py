@@ -27,11 +27,10 @@ from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_table
-from neuspring.core.text import Progress, listed
+from neuspring.core.text import Progress
 from neuspring.extensions.rods import made
-from neuspring.extensions.rods.axes import SAME_WORLD, angle_between, heading, turned
 from neuspring.extensions.rods.levenberg import LevenbergMarquardt
-from neuspring.extensions.rods.nodes import RodFrames, settled, turn_of
+from neuspring.extensions.rods.nodes import RodFrames, settled
 from neuspring.extensions.rods.rod import Rod, rod_of
 from neuspring.extensions.rods.settings import RodFit
 from neuspring.physics.controllers import waypoints
@@ -405,12 +404,13 @@ def search_rod(
     """The constants of a rod, on the frames of the first horizon; a row per step goes to the file `record`."""
     import pandas as pd
 
-    recordings = in_order([observations, *pool])
+    require_pool(observations, pool)
+    recordings = [observations, *pool]
     first = RodSteps(**vars(settings.fit.section(RodFit)))
     first = replace(first, stiffness="constant", curvature="constant", markers=False, slip=0)
     first = replace(first, horizons=first.horizons[:1])
-    axis, steady = choose_axis([made.line_of(each) for each in recordings if each.line.size])
-    start = made.rod_twin(observations, settings, axis.tolist(), steady)
+    axis = axis_for([made.line_of(each) for each in recordings if each.line.size])
+    start = made.rod_twin(observations, settings, axis)
     solver = Levenberg(Recordings.of(recordings, start), first, device, threads)
     if rod_of(start).laid:
         # What hangs in frame 0 says how stiff it is.
@@ -438,12 +438,11 @@ def fit_rod(
     threads: int = 1,
 ) -> RodResult:
     """All variables of a rod, stage by stage, from the twin of its search. Raises InputError, NumericalFailure."""
-    recordings, settings = Recordings.of(in_order([observations, *pool]), twin, oracle), RodSteps(**vars(settings))
+    require_pool(observations, pool)
+    recordings, settings = Recordings.of([observations, *pool], twin, oracle), RodSteps(**vars(settings))
     solver = Levenberg(recordings, settings, device, threads)
     progress = Progress(f"fit {observations.scenario.name}, rod", settings.rounds * len(settings.horizons))
     twin, value, history = solver.lowered(twin, progress)
-    if pool:
-        require_unmirrored(recordings, twin, settings, device)
     # Where markers lie beside the line, frame 0 has another line now.
     twin = made.on_recording(twin, observations)
     found = _result(twin, value, history)
@@ -462,108 +461,11 @@ def require_pool(here: Observations, pool: Sequence[Observations]) -> None:
     )
 
 
-def in_order(recordings: Sequence[Observations]) -> list[Observations]:
-    """Recordings of a pool, the lines of all in the order of the first.
-
-    Raises InputError unless they have one center line, and the first is like most.
-    """
-    require_pool(recordings[0], recordings[1:])
-    if not recordings[0].line.size:
-        return list(recordings)
-    orders = along(recordings)
-    if (np.diff(orders[0]) != 1).any():
-        rule = "markers of a pool's first recording must be in the order of most"
-        raise InputError(f"pool of {recordings[0].scenario.name}", rule, orders[0].tolist(), LEAVE_OUT)
-    return [replace(each, line=each.line[order]) for each, order in zip(recordings, orders, strict=True)]
-
-
-LEAVE_OUT = "Leave them out of the pool."
-BETTER_ORDER = 0.9
-"""Another order must fit distances of neighbors by so many times the error of that of the file. For DEFORM's cables the true order
-is at most 0.8 times the other one."""
-
-
-def along(recordings: Sequence[Observations]) -> list[np.ndarray]:
-    """Order [V] of the line of each recording of a cable in which neighbors are as far apart as in most of them.
-
-    It is that of the file, that from the other end, or one with the two markers of an end exchanged. Distances are medians over the
-    training frames: those of a single frame change with the cable's bend. Another order than that of the file is printed.
-    """
-
-    def apart(each: Observations, order: np.ndarray | slice = slice(None)) -> np.ndarray:
-        tracked, extra = each.object_points.shape[1], len(each.nodes) - each.object_points.shape[1]
-        points = np.concatenate([each.object_points, each.controller_points], axis=1)[: each.scenario.train_end]
-        line = points[:, np.where(each.line < tracked, each.line, each.line - extra)][:, order]
-        return np.asarray(np.median(np.linalg.norm(np.diff(line, axis=1), axis=2), axis=0))
-
-    count = len(recordings[0].line)
-    orders = [np.arange(count), np.arange(count)[::-1], np.r_[1, 0, 2:count], np.r_[: count - 2, count - 1, count - 2]]
-    usual = np.median([apart(each) for each in recordings], axis=0)
-    errors = [[np.abs(apart(each, order) - usual).mean() for order in orders] for each in recordings]
-    found = [orders[np.argmin(error) if min(error) < BETTER_ORDER * error[0] else 0] for error in errors]
-    for each, order in zip(recordings, found, strict=True):
-        if order is not orders[0]:
-            print(f"note: {each.scenario.name}: by the distances between its markers their order is {order.tolist()}")
-    return found
-
-
-ALIKE_HEADINGS = 0.6
-"""Length of the mean heading from which recordings have a world in common. Any eight of DEFORM's cables have 0.85 at least, one of
-eight that is turned by half leaves 0.75."""
-TURNS_KNOWN = 0.5
-"""Mean cosine of the turns between ends from which an axis of the world tells whole turns apart."""
-
-
-def choose_axis(lines: Sequence[np.ndarray]) -> tuple[np.ndarray, float]:
-    """`Rod.axis` and `Rod.steady` of the first of several lines [V, 3] in frame 0.
-
-    A turn of the last clamp against the first is known but for whole turns, so turns between the ends of the recordings should lie
-    far from half a turn. The axis is x or y, where one of these is good enough, or else normal to the lines' mean heading. Where
-    lines head all ways, recordings have no world in common, and the axis turns with each.
-    """
-    if not lines:
-        return np.eye(3)[1], SAME_WORLD
-    ways = np.array([heading(line) for line in lines])
-    steady = SAME_WORLD if np.linalg.norm(ways.mean(axis=0)) > ALIKE_HEADINGS else 0.0
-    angles = [angle_between(ways[0], way) for way in ways]
-    angles = [angle if abs(angle) > steady else 0.0 for angle in angles]
-
-    def known(axis: np.ndarray) -> float:
-        return float(np.mean([np.cos(turn_of(line, turned(axis, angle))) for line, angle in zip(lines, angles, strict=True)]))
-
-    axis = max(np.eye(3)[:2], key=known)
-    if known(axis) < TURNS_KNOWN:
-        ahead = np.sum([turned(way, -angle) for way, angle in zip(ways, angles, strict=True)], axis=0)
-        axis = np.cross(ahead, np.eye(3)[2]) / np.linalg.norm(ahead)
-    return axis, steady
-
-
-MIRROR_ERROR = 0.7
-"""A recording is mirrored if its mirror image has so many times its error. In fits to DEFORM's cables it has 1.6 times at least,
-and that of a mirrored one among others 0.4 to 0.6 times."""
-
-
-def require_unmirrored(recordings: Recordings, twin: Twin, settings: RodSteps, device: str) -> None:
-    """Raise InputError, naming all, where mirror images of recordings follow the twin far better than these do.
-
-    Gravity and time are the same in a mirror; the unloaded curvature of a cable, and the side of it that markers are on, are not.
-    So one recording can be told among others, and a whole pool that is mirrored is another cable.
-    """
-    seen, names = recordings.observations, ("object_points", "surface_points", "controller_points", "velocity_before")
-    flip = np.array([1.0, -1.0, 1.0], np.float32)
-    images = Recordings.of([replace(each, **{name: getattr(each, name) * flip for name in names}) for each in seen], twin)
-    frames, every = min(settings.horizons[0] or len(recordings.hands), len(recordings.hands) - 1) + 1, settings.every
-    errors = []
-    for each in (recordings, images):
-        apart = each.predicted([twin], frames, every, device)[0] - each.points[:, 1:frames:every]
-        seen_there = each.counts[:, 1:frames:every, :, None]
-        errors.append(1e3 * np.where(seen_there, np.abs(apart), 0.0).mean(axis=(1, 2, 3)))
-    found = [(one.scenario.name, own, image) for one, own, image in zip(seen, *errors, strict=True)]
-    if wrong := [
-        f"{name} ({own:.1f} mm, its mirror image {image:.1f} mm)" for name, own, image in found if image < MIRROR_ERROR * own
-    ]:
-        rule = "recordings of a pool must not be mirrored"
-        raise InputError(f"pool of {seen[0].scenario.name}", rule, listed(wrong), f"Correct their axes. {LEAVE_OUT}")
+def axis_for(lines: Sequence[np.ndarray]) -> np.ndarray:
+    """`Rod.axis` [3] for lines [V, 3] in frame 0: y, or x where the end of one lies along y."""
+    ends = np.concatenate([np.diff(line, axis=0)[[0, -1]] for line in lines] or [np.eye(3)[:1]])
+    ends /= np.linalg.norm(ends, axis=1, keepdims=True)
+    return np.eye(3)[1 if np.abs(ends[:, 1]).max() <= PARALLEL else 0]
 
 
 def _result(twin: Twin, value: float, history: list[dict[str, Any]]) -> RodResult:

@@ -23,7 +23,6 @@ from neuspring import config
 from neuspring.config.search import VARIABLES
 from neuspring.core.artifacts import Observations, Simulation, Twin
 from neuspring.core.errors import InputError
-from neuspring.extensions.rods.axes import SAME_WORLD, axis_on, heading
 from neuspring.extensions.rods.center_line import center_line
 from neuspring.extensions.rods.nodes import bound, frame_zero, hanging, place_on, placed, radius_of, settled
 from neuspring.extensions.rods.rod import Rod, rod_of
@@ -62,10 +61,8 @@ class RodStart(RodSettings):
     """Longest integration step with `simulation.substeps: auto`, s."""
 
 
-def rod_twin(
-    observations: Observations, settings: config.Config, axis: Sequence[float] = (0.0, 1.0, 0.0), steady: float = SAME_WORLD
-) -> Twin:
-    """The rod that a fit starts from (`settings.rod`), on the body of a recording in frame 0; `axis` [3], `steady`: see `Rod`.
+def rod_twin(observations: Observations, settings: config.Config, axis: Sequence[float] | np.ndarray = (0.0, 1.0, 0.0)) -> Twin:
+    """The rod that a fit starts from (`settings.rod`), on the body of a recording in frame 0; `axis` [3]: see `Rod`.
 
     Springs of controllers and all scalars have the starts of `search.variables`, as a lattice's search does, but the linear drag of
     `rod`. Raises InputError if the body is not long and thin, nothing holds it, or only a camera without depth saw it.
@@ -95,7 +92,7 @@ def rod_twin(
     density = len(nodes) / lengths.sum() if len(pairs) else 1.0
     laid = start.lay_out is not None and bool(observations.line.size)
     mass = density * own if len(pairs) or laid else own + start.marker_mass
-    direction = axis_on(np.array(axis, np.float64), heading(vertices), vertices) if (held >= 0).any() else _across(vertices)
+    direction = np.array(axis, np.float64) if (held >= 0).any() else _across(vertices)
     rod = Rod(
         vertices=vertices,
         held=held,
@@ -108,7 +105,6 @@ def rod_twin(
         damping=start.damping,
         drag_quadratic=start.drag_quadratic,
         roll=0.0,
-        steady=steady,
         line=observations.line,
         axis=direction,
         edge=np.zeros(0, np.int32),
@@ -173,20 +169,12 @@ def on_recording(twin: Twin, observations: Observations) -> Twin:
         material = replace(material, stiffness=np.full(len(pairs), stiffness), dashpot=np.full(len(pairs), dashpot))
     else:
         topology, vertices = build(nodes, hands, here.springs), line_of(observations)
-        rod = replace(rod, axis=_axis(twin, vertices))
     found = np.linalg.norm(np.diff(vertices, axis=0), axis=1).sum() / rod.lengths.sum()
     if abs(found - 1) > MOST_STRETCH:
         rule = f"the center line must be as long as the twin's within {MOST_STRETCH:.0%}: {rod.lengths.sum():.3f} m"
         raise InputError(where, rule, f"{found * rod.lengths.sum():.3f} m", "Name a recording of the same body.")
     moved = replace(rod, held=held, line=observations.line, vertices=settled([rod], vertices[None])[0])
     return replace(twin, topology=topology, material=material, body=_bound(moved, observations))
-
-
-def _axis(twin: Twin, line: np.ndarray) -> np.ndarray:
-    """`Rod.axis` [3] on a recording with the line [V, 3] in frame 0, of a twin whose line is observed."""
-    rod, topology = rod_of(twin), twin.topology
-    own = np.concatenate([topology.nodes, topology.controllers])[rod.line].astype(np.float64)
-    return axis_on(rod.axis, heading(own), line, rod.steady)
 
 
 def laid_out(observations: Observations, count: int, held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -291,8 +279,7 @@ def of_markers(twin: Twin, observations: Observations) -> Twin:
     edge = np.zeros(len(nodes), np.int32)
     edge[line[line < len(nodes)]] = np.flatnonzero(line < len(nodes))
     topology = build(nodes, hands, np.zeros((0, 2), np.int32))
-    vertices = line_of(observations)
-    own = replace(rod, vertices=vertices, axis=_axis(twin, vertices), edge=edge, place=np.zeros((len(nodes), 3)))
+    own = replace(rod, vertices=line_of(observations), edge=edge, place=np.zeros((len(nodes), 3)))
     return replace(twin, topology=topology, body=own)
 
 

@@ -2,11 +2,11 @@
 
 One pickle is one recording: positions [T, 3, n], float64; released as nested lists in meters, 100 Hz, z up. Arrays are accepted
 too, and `mocap.unit`, `mocap.rate` and `mocap.up` name another unit, rate and axis.
-Markers run along the cable. Robots hold the two at either end: they are the controllers, with `grip: clamp` each with a ring of
-points around it. The others are observed. There is no surface, so the body is sampled as rings around a smooth centerline through
+Markers run along the cable. Robots hold the two at either end: they are the controllers, each with a ring of points around
+it. The others are observed. There is no surface, so the body is sampled as rings around a smooth centerline through
 the markers of frame 0.
 
-Points on one line leave the roll about it free. A gripper does not, so with `grip: clamp` each held marker m gets a ring of points
+Points on one line leave the roll about it free. A gripper does not, so each held marker m gets a ring of points
 
     m(t) + r (cos a_k n(t) + sin a_k d(t) x n(t)),    a_k = 2 pi (k + 1/2) / count.
 
@@ -15,9 +15,8 @@ rotation that turns d carries n along, so the ring follows every turn of the end
 did make is not in the data. Half a step of the angle keeps the points away from the body's own ring around the first and the last
 marker.
 
-In frame 0 the roll of both ends is that of one direction, projected (`axis_on`): y, about normal to a cable that heads along x.
-So ring node i is the same node in every recording of a cable, as far as its grippers begin alike. A cable that heads elsewhere
-takes its direction with it.
+In frame 0 the roll of both ends is that of y, projected; DEFORM's cables head along x. So ring node i is the same node in every
+recording of a cable.
 """
 
 from __future__ import annotations
@@ -31,31 +30,30 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from neuspring.config import Config, ScenarioRow
-from neuspring.core.artifacts import NO_REST_SHAPE, Observations, Scenario
+from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.errors import InputError
 from neuspring.core.findings import refuse
 from neuspring.core.records import digest_file
 from neuspring.data.unpickle import load_pickle
-from neuspring.extensions.rods.axes import axis_on
 from neuspring.extensions.rods.checks import MIN_DISTANCE, MIN_FRAMES, in_space, look
 from neuspring.extensions.rods.settings import Mocap
 
 X, Y, Z = np.eye(3)
 
 
-def clamps(held: np.ndarray, normals: np.ndarray, radius: float, count: int, nearest: float, where: str) -> np.ndarray:
+def clamps(held: np.ndarray, normals: np.ndarray, radius: float, count: int, where: str) -> np.ndarray:
     """Points [T, 4 * count, 3], m, of rings around held markers [T, 4, 3] (two at either end, in the order along the cable).
 
     `normals` [2, 3] give the roll of either end in frame 0: those of the body's first and last ring. Raises InputError, naming
-    `where`, if the two markers of an end come nearer than `nearest`, m: they have no direction then.
+    `where`, if the two markers of an end come nearer than `MIN_DISTANCE`: they have no direction then.
     """
     parts = []
     for normal, end in zip(normals, (held[:, :2], held[:, 2:]), strict=True):
         along = end[:, 1] - end[:, 0]
         length = np.linalg.norm(along, axis=1, keepdims=True)
-        if length.min() < nearest:
-            rule = f"the two held markers of an end must stay {nearest} m apart (mocap.grip: clamp)"
-            raise InputError(where, rule, f"{length.min():.2g} m in sample {int(length.argmin())}", "Use grip: markers.")
+        if length.min() < MIN_DISTANCE:
+            rule = f"the two held markers of an end must stay {MIN_DISTANCE} m apart"
+            raise InputError(where, rule, f"{length.min():.2g} m in sample {int(length.argmin())}")
         directions = along / length
         transported = transport(directions, normal)
         across = np.cross(directions, transported)
@@ -87,8 +85,8 @@ def transport(directions: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return normals
 
 
-RING_SPACING = 0.012
-"""Distance of rings along the center line where `mocap.rings` gives no number of them, m."""
+RING = 3
+"""Nodes per ring."""
 RING_RADIUS = 0.006
 """m."""
 OVERSAMPLING = 64
@@ -121,30 +119,25 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
 
     held = [0, 1, count - 2, count - 1]
     observed = markers[:, 2:-2]
-    centers, tangents = centerline(markers[0], RING_SPACING, settings.rings)
-    normals = rolled(tangents, axis_on(Y, -X, markers[0]))
-    body = rings(centers, tangents, normals, RING_RADIUS, settings.ring)
+    centers, tangents = centerline(markers[0], settings.rings)
+    normals = rolled(tangents, Y)
+    body = rings(centers, tangents, normals, RING_RADIUS, RING)
     points = np.concatenate([markers[0], body])
     nearest = float(cKDTree(points).query(points, k=2)[0][:, 1].min())
     if nearest < MIN_DISTANCE:
         rule = f"markers and ring nodes of frame 0 must be {MIN_DISTANCE} m apart"
-        raise InputError(file, rule, f"{nearest:.2g} m", "Lower mocap.rings or mocap.ring.")
-    rest_shape = NO_REST_SHAPE
-    if settings.rest_shape == "straight":
-        line, rest_body = straightened(markers[0], len(body) // settings.ring, RING_RADIUS, settings.ring)
-        rest_shape = np.concatenate([line[2:-2], rest_body, line[held]])
-    controllers = markers[:, held]
+        raise InputError(file, rule, f"{nearest:.2g} m", "Lower mocap.rings.")
+    line, rest_body = straightened(markers[0], settings.rings, RING_RADIUS, RING)
+    around = (line[held][:, None] + circle(Y, Z, RING_RADIUS, RING, 0.5)).reshape(-1, 3)
+    rest_shape = np.concatenate([line[2:-2], rest_body, line[held], around])
+    # Rings turn at the full rate of the record: the fewer samples, the less of a turn is seen.
+    recorded = data[settings.start :].transpose(0, 2, 1)[: (frames - 1) * settings.stride + 1, held]
     before = data[max(settings.start - 1, 0)].T
     back = np.stack([markers[0], before])[:, held]
-    if settings.grip == "clamp":
-        # Rings turn at the full rate of the record: the fewer samples, the less of a turn is seen.
-        recorded = data[settings.start :].transpose(0, 2, 1)[: (frames - 1) * settings.stride + 1, held]
-        grips = normals[[0, -1]], RING_RADIUS, settings.ring, MIN_DISTANCE, str(file)
-        controllers = np.concatenate([controllers, clamps(recorded, *grips)[:: settings.stride]], axis=1)
-        back = np.concatenate([back, clamps(back, *grips)], axis=1)
-        if len(rest_shape):
-            around = circle(Y, Z, RING_RADIUS, settings.ring, 0.5)
-            rest_shape = np.concatenate([rest_shape, (line[held][:, None] + around).reshape(-1, 3)])
+    controllers, back = (
+        np.concatenate([ends[::stride], clamps(ends, normals[[0, -1]], RING_RADIUS, RING, str(file))[::stride]], axis=1)
+        for ends, stride in ((recorded, settings.stride), (back, 1))
+    )
     visible = np.ones(observed.shape[:2], dtype=bool)
     motion_valid = visible.copy()
     motion_valid[-1] = False
@@ -210,14 +203,12 @@ def straightened(markers: np.ndarray, number: int, radius: float, count: int) ->
     return line, (centers + circle(Y, Z, radius, count)).reshape(-1, 3)
 
 
-def centerline(markers: np.ndarray, spacing: float, number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+def centerline(markers: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
     """Points and unit tangents [R, 3] of a natural cubic spline through `markers` [n, 3], equally spaced along its arc.
 
-    The first and last point are the first and last marker: `number` points in all, or the spacing nearest to `spacing` that divides
-    the arc evenly.
+    The first and last point are the first and last marker.
     """
     spline, _, dense, arc = _arc(markers)
-    number = max(round(arc[-1] / spacing), 1) + 1 if number is None else number
     at = np.interp(np.linspace(0.0, arc[-1], number), arc, dense)
     tangents = spline(at, 1)
     return spline(at), tangents / np.linalg.norm(tangents, axis=1, keepdims=True)

@@ -12,19 +12,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 import torch
 
 from neuspring.core.artifacts import Simulation, Twin
 from neuspring.core.errors import InputError, NumericalFailure
-from neuspring.extensions.rods.axes import PARALLEL
 from neuspring.extensions.rods.rod import Rod, rod_of
 from neuspring.extensions.rods.solver import RodHands, RodLanes, RodSolver
 from neuspring.physics.controllers import ControllerSprings, begins
 from neuspring.physics.parameters import CONTACT_LIMITS
 
+PARALLEL = 0.99
+"""Cosine to a direction from which a projection normal to it is not worth the name."""
 SMOOTHING_WEIGHT = 1e-6
 """Weight of second differences along the vertices against nodes: decides where no node is."""
 SETTLING = 4
@@ -178,16 +178,6 @@ def settled(rods: Sequence[Rod], lines: np.ndarray) -> np.ndarray:
         m2 = torch.linalg.cross(along / along.norm(dim=-1, keepdim=True), m1)
         x[:, free] = points[:, free] - offsets[..., :1] * m1 - offsets[..., 1:] * m2
     return x.numpy()
-
-
-def turn_of(line: np.ndarray, axis: np.ndarray) -> float:
-    """Angle about the last tangent of a line [V, 3] from `axis`, projected at the first edge and carried along, to `axis` there."""
-    tangents = np.diff(line, axis=0)
-    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    first, last = (axis - (axis @ t) * t for t in tangents[[0, -1]])
-    for before, after in pairwise(tangents):
-        first = first - (after @ first) / (1 + before @ after) * (before + after)
-    return float(np.arctan2(np.cross(first, last) @ tangents[-1], first @ last))
 
 
 def place_on(vertices: np.ndarray, directors: np.ndarray, nodes: np.ndarray, edge: np.ndarray) -> np.ndarray:

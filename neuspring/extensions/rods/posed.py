@@ -20,6 +20,10 @@ from neuspring.extensions.rods.mocap import centerline, circle, rings, transport
 from neuspring.extensions.rods.settings import Posed
 from neuspring.intake.points import carried, in_both, taught_by
 
+TIME = "t"
+"""Column of the time."""
+RINGS, RING = 24, 3
+"""Rings of nodes along the body, of which lattices are made, and nodes per ring."""
 HAND_GRIP = 0.05
 """Distance of the two points of a hand on the line, m."""
 UNEVEN = 0.01
@@ -36,7 +40,7 @@ def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Obser
     side = np.eye(3)[np.abs(along).argmin()]
     normal = transport(along[None], side)[0]
     ends = np.stack([clamp - HAND_GRIP * along, clamp])
-    around = circle(normal, np.cross(along, normal), settings.radius, settings.ring, 0.5)
+    around = circle(normal, np.cross(along, normal), settings.radius, RING, 0.5)
     jaws = np.concatenate([ends, *(end + around for end in ends)])
     controllers = carried(poses[:, None], jaws[None])
     points, visible = taught_by(tracks)
@@ -54,7 +58,7 @@ def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Obser
             source=row.source,
             category=row.category,
             frame_count=len(points),
-            train_end=int(settings.train_fraction * len(points)),
+            train_end=len(points),
             frame_rate=rate,
             up="+z",
             self_collision=row.self_collision,
@@ -76,8 +80,8 @@ def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Obser
 
 def _body(line: np.ndarray, normal: np.ndarray, settings: Posed) -> np.ndarray:
     """Nodes [n, 3], m, of rings along the part of a line [M, 3] that begins at the clamp."""
-    centers, tangents = centerline(line[1:], 1.0, settings.rings)
-    nodes = rings(centers, tangents, transport(tangents, normal), settings.radius, settings.ring)
+    centers, tangents = centerline(line[1:], RINGS)
+    nodes = rings(centers, tangents, transport(tangents, normal), settings.radius, RING)
     return np.asarray(nodes)
 
 
@@ -97,7 +101,7 @@ def _table(path: Path, settings: Posed) -> tuple[np.ndarray, np.ndarray, float]:
         raise InputError(
             path, "a table with one header line is required", str(error), "Correct its row of scenarios.tsv."
         ) from error
-    known = [settings.time, *settings.position, *settings.rotation]
+    known = [TIME, *settings.position, *settings.rotation]
     marked = [name for columns in settings.markers for name in columns]
     if missing := [name for name in (*known, *marked) if name not in table]:
         remedy = f"Name columns in the section posed; there are {', '.join(map(str, table.columns[:12]))}."
@@ -108,11 +112,11 @@ def _table(path: Path, settings: Posed) -> tuple[np.ndarray, np.ndarray, float]:
     for name in known:
         if len(bad := np.flatnonzero(~np.isfinite(table[name]))):
             raise InputError(path, f"{name}: every entry must be a number", f"another in sample {bad[0]} ({len(bad)} in all)")
-    steps = np.diff(table[settings.time])
+    steps = np.diff(table[TIME])
     step = float(np.median(steps))
     if not (step > 0 and np.abs(steps / step - 1).max() < UNEVEN):
         where = int(np.abs(steps - step).argmax())
-        rule = f"{settings.time}: samples must follow each other evenly, within {UNEVEN:.0%}"
+        rule = f"{TIME}: samples must follow each other evenly, within {UNEVEN:.0%}"
         raise InputError(path, rule, f"{steps[where]:.4g} s behind sample {where}, {step:.4g} elsewhere", "Resample the table.")
     turns, tracks = table[list(settings.rotation)].to_numpy(), table[marked].to_numpy().reshape(len(table), -1, 3)
     if not settings.angles and np.abs(np.linalg.norm(turns, axis=1) - 1).max() > UNEVEN:

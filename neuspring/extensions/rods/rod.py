@@ -9,7 +9,6 @@ import numpy as np
 
 from neuspring.core.artifacts import BodyData, Topology, Twin, array, number
 from neuspring.core.errors import InputError
-from neuspring.extensions.rods.axes import SAME_WORLD
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,9 +81,6 @@ class Rod(BodyData):
     damping: float = number("s", "time of inner damping: moments are EI / l (k - k0 + damping dk/dt)")
     drag_quadratic: float = number("1/m", "deceleration by air is this times speed squared; linear drag is the material's")
     roll: float = number("rad", "turn of the last edge's directors from `axis` projected")
-    steady: float = number(
-        "rad", "`axis` turns about the vertical with a recording whose line heads elsewhere by more", default=SAME_WORLD
-    )
 
     def check(self) -> None:
         edges = len(self.vertices) - 1

@@ -62,24 +62,14 @@ class Mocap(SettingsSection):
     """Number of frames that are kept, the first ones, counted after the stride; shorter recordings are refused. null keeps all."""
     train_fraction: Annotated[float, Field(gt=0, le=1)] = 0.7
     """Part of the frames that are for training, the first ones. 1: all, where future frames are those of other recordings."""
-    rings: Annotated[int, Field(ge=2)] | None = None
-    """Number of rings, whatever their spacing, so that a twin can move to another recording of the cable; null: one every 12 mm."""
-    ring: Annotated[int, Field(ge=3)] = 4
-    """Nodes per ring."""
-    rest_shape: Literal["first_frame", "straight"] = "first_frame"
-    """Shape without forces: frame 0, as in the paper, or a straight cable with the arc lengths of frame 0."""
-    grip: Literal["markers", "clamp"] = "markers"
-    """Hold of an end: its two markers, which leave its roll free, or a clamp. clamp: and a ring of `ring` points around each, which
-    turns with the direction of the two without spinning, so that direction and roll are held. With a straight rest shape set
-    `search.controller_rest: first_frame` too."""
+    rings: Annotated[int, Field(ge=2)] = 40
+    """Number of rings, whatever their spacing, so that a twin can move to another recording of the cable."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Posed(SettingsSection):
     """A table with a row per sample: the pose of a hand that holds a long thin body, and markers on it. Meters, seconds, z up."""
 
-    time: str = "t"
-    """Column of the time."""
     position: tuple[str, str, str] = ("x", "y", "z")
     """Columns of the hand's position."""
     rotation: tuple[str, ...] = ("qx", "qy", "qz", "qw")
@@ -94,14 +84,8 @@ class Posed(SettingsSection):
     """Place of the clamp on the body's line, in the frame of the hand."""
     radius: Positive = 0.01
     """Radius of the body."""
-    rings: Annotated[int, Field(ge=2)] = 24
-    """Number of rings of nodes along the body, which lattices are made of."""
-    ring: Annotated[int, Field(ge=3)] = 3
-    """Nodes per ring."""
     stride: Count = 1
     """Stride of samples of the table."""
-    train_fraction: Annotated[float, Field(gt=0, le=1)] = 1.0
-    """Part of the frames that are for training, the first ones. 1: all, where future frames are those of other recordings."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,8 +97,6 @@ class Deform(SettingsSection):
     and `transfers`."""
     clips: Annotated[int, Field(ge=2)] = 8
     """Training recordings per cable, equally spaced in the order of their numbers. The first of them names the pool's scenario."""
-    leave_out: tuple[Name, ...] = ()
-    """Recordings that are not used, as DLO3_train_15. The place of one for training takes the nearest by number."""
 
     def expand(self, config: Any) -> Any:
         """The configuration with the scenarios, pools and transfers of the cables. Raises InputError where files lack."""
@@ -122,33 +104,17 @@ class Deform(SettingsSection):
             raise InputError(
                 "configuration, deform", "DEFORM's data need data_root", "null", "Give it: --config data_root=/path/to/data."
             )
-        pools, transfers = dict(config.pools or {}), dict(config.transfers or {})
-        known: list[str] = []
+        pools, transfers, scenarios = dict(config.pools or {}), dict(config.transfers or {}), [*config.scenarios]
         for cable in self.cables:
             folder = Path(config.data_root or ".") / cable
-            train, judged = (
-                [
-                    f"{cable}_{part}_{number}"
-                    for number in sorted(int(file.stem) for file in folder.glob(f"{part}/*.pkl") if file.stem.isdecimal())
-                ]
-                for part in ("train", "eval")
-            )
-            known += [*train, *judged]
-            free, judged = ([name for name in names if name not in self.leave_out] for names in (train, judged))
-            if len(free) < self.clips or not judged:
+            numbers = {part: sorted(int(file.stem) for file in folder.glob(f"{part}/[0-9]*.pkl")) for part in ("train", "eval")}
+            train, judged = ([f"{cable}_{part}_{number}" for number in found] for part, found in numbers.items())
+            if len(train) < self.clips or not judged:
                 rule = f"at least {self.clips} recordings train/NUMBER.pkl (deform.clips) and one eval/NUMBER.pkl are required"
                 there = listed(sorted({path.parent.parent.name for path in folder.parent.glob("*/eval/*.pkl")})) or "none"
-                received = f"{len(free)} and {len(judged)}"
-                raise InputError(folder, rule, received, f"Correct data_root, deform.cables (there: {there}), clips or leave_out.")
+                received = f"{len(train)} and {len(judged)}"
+                raise InputError(folder, rule, received, f"Correct data_root, deform.cables (there: {there}) or clips.")
             picked = [train[i * (len(train) - 1) // (self.clips - 1)] for i in range(self.clips)]
-            spare = [name for name in free if name not in picked]
-            for place, name in enumerate(picked):
-                if name not in free:
-                    apart = [abs(train.index(other) - train.index(name)) for other in spare]
-                    picked[place] = spare.pop(apart.index(min(apart)))
             pools[cable], transfers[picked[0]] = tuple(picked), tuple(judged)
-        if unknown := [name for name in self.leave_out if name not in known]:
-            rule = "must be recordings of deform.cables"
-            raise InputError("configuration, deform.leave_out", rule, listed(unknown), f"There: {listed(known, 200) or 'none'}.")
-        scenarios = tuple(dict.fromkeys([*config.scenarios, *(pools[cable][0] for cable in self.cables)]))
-        return dataclasses.replace(config, scenarios=scenarios, pools=pools or None, transfers=transfers or None)
+            scenarios += [picked[0]] if picked[0] not in scenarios else []
+        return dataclasses.replace(config, scenarios=tuple(scenarios), pools=pools or None, transfers=transfers or None)

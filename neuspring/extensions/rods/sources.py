@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import re
 
-from neuspring.config import Config, ScenarioRow, parse
-from neuspring.core.errors import InputError
-from neuspring.extensions.rods.settings import Mocap
+from neuspring.config import ScenarioRow, parse
 from neuspring.scenes.sources import Source
 
 RECORDING = re.compile(r"(?P<cable>[A-Za-z0-9][\w.-]*)_(?P<part>train|eval)_(?P<number>\d+)")
@@ -22,12 +20,5 @@ def row_of(name: str) -> ScenarioRow | None:
     return parse(ScenarioRow, values | {"self_collision": False, "ground": False}, f"scenario {name}")
 
 
-def require_rings(config: Config) -> None:
-    """Raise InputError where recordings of one cable may have different numbers of nodes."""
-    if config.section(Mocap).rings is None:
-        rule = "must be set where twins are transferred, so that all recordings have as many nodes"
-        raise InputError("configuration, mocap.rings", rule, None)
-
-
-MOCAP = Source(module="neuspring.extensions.rods.mocap", reads=("data_root", "mocap"), require_alike=require_rings, row_of=row_of)
+MOCAP = Source(module="neuspring.extensions.rods.mocap", reads=("data_root", "mocap"), row_of=row_of)
 POSED = Source(module="neuspring.extensions.rods.posed", reads=("data_root", "posed"))

@@ -34,10 +34,11 @@ import torch
 from scipy.optimize import brentq, least_squares
 from scipy.spatial.transform import Rotation
 
-from neuspring.core.artifacts import Rod, Simulation, Twin
+from neuspring.core.artifacts import Simulation, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.table import Cell, Table
 from neuspring.data.c3d import Markers
+from neuspring.extensions.rods.rod import Rod
 from neuspring.extensions.rods.solver import RodLanes, RodSolver
 from neuspring.physics.parameters import homogeneous
 from neuspring.physics.statics import at_rest, young

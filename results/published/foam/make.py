@@ -22,13 +22,14 @@ from scipy.interpolate import CubicSpline
 
 from neuspring.config import Config, ScenarioRow
 from neuspring.config.parse import parse, read_yaml
-from neuspring.core.artifacts import Observations, Rod, Twin
+from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.files import write_text
 from neuspring.core.run_folder import RunFolder
 from neuspring.core.table import Table
 from neuspring.draw.sheet import save
 from neuspring.extensions.rods import posed
 from neuspring.extensions.rods.made import marker_shares
+from neuspring.extensions.rods.rod import Rod, rod_of
 from neuspring.report.blocks import markdown
 from neuspring.twin.body import body_of
 from neuspring.twin.rollout import roll_out
@@ -93,8 +94,7 @@ def way(twin: Twin, folder: Path, trajectory: int, settings: Config) -> np.ndarr
 
 def with_vertices(twin: Twin, count: int, tracked: int = 2) -> Twin:
     """A rod that was laid out, with other vertices and the same body: fields along the arc, places and masses of markers."""
-    rod = twin.rod
-    assert rod is not None
+    rod = rod_of(twin)
     length = float(rod.lengths[0] * (len(rod.mass) - 1.5))
     edge = length / (count - 1.5)
     old, new = (h * (np.arange(n) - 0.5) for h, n in ((rod.lengths[0], len(rod.mass)), (edge, count)))
@@ -118,7 +118,7 @@ def with_vertices(twin: Twin, count: int, tracked: int = 2) -> Twin:
         place=np.column_stack([(at - new[edges]) / edge, rod.place[:, 1:]]),
         mass=own[1],
     )
-    return replace(twin, rod=replace(finer, mass=own[1] + marker_shares(finer, tracked) @ masses))
+    return replace(twin, body=replace(finer, mass=own[1] + marker_shares(finer, tracked) @ masses))
 
 
 def _laid(rod: Rod, count: int, **values: np.ndarray) -> Rod:

@@ -28,10 +28,11 @@ from matplotlib import pyplot as plt
 from scipy.optimize import minimize
 
 from neuspring import config
-from neuspring.core.artifacts import Rod, Simulation, Twin
+from neuspring.core.artifacts import Simulation, Twin
 from neuspring.core.files import write_text
 from neuspring.core.table import Table
 from neuspring.extensions.rods.nodes import RodFrames, bound
+from neuspring.extensions.rods.rod import Rod
 from neuspring.physics.parameters import homogeneous
 from neuspring.physics.topology import build
 from neuspring.twin.parameters import TwinParameters
@@ -190,7 +191,7 @@ def rods(beam: Beam, moduli: np.ndarray) -> torch.Tensor:
         )
         topology = build(nodes, hands, np.zeros((0, 2), np.int32))
         simulation = Simulation(frame_time=0.5, substeps=100, gravity=GRAVITY, ground=False)
-        twins.append(Twin(topology=topology, material=material, simulation=simulation, rod=bound(rod, nodes)))
+        twins.append(Twin(topology=topology, material=material, simulation=simulation, body=bound(rod, nodes)))
     solver, paths = RodFrames(twins), torch.tensor(np.stack([hands] * len(twins)), dtype=torch.float32)
     state = torch.tensor(np.stack([nodes] * len(twins)), dtype=torch.float32)
     state, speed = state, torch.zeros_like(state)

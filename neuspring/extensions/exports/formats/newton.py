@@ -8,27 +8,21 @@ from pathlib import Path
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 from neuspring.extensions.exports import Export, of_body
-from neuspring.extensions.exports.formats import npz, ply
+from neuspring.extensions.exports.formats import npz
 from neuspring.extensions.exports.source import ExportSource, require_start
 
 SCRIPT = Path(__file__).parents[1] / "newton_twin.py"
-CHAIN_FILE = "chain.npz"
 
 
 def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Path]:
-    """Write arrays.npz, description.json, newton_twin.py and, of a body of rigid edges, chain.npz to the folder `output`."""
+    """Write arrays.npz, description.json and newton_twin.py to the folder `output`."""
     require_start(frames)
     springs = source.twin.topology
     if springs.pushes.any():
         rule = "Newton's springs pull as well as push"
         raise InputError("--to newton", rule, f"{source.name}, whose hands only push", "Take --to mujoco or npz.")
+    of_body(source.twin, "newton")
     made = [output / SCRIPT.name]
-    if write_body := of_body(source.twin, "newton"):
-        if len(springs.springs):
-            rule = "Newton has no springs between particles and bodies"
-            raise InputError("--to newton", rule, f"{source.name}, whose hands pull by springs", "Take --to mujoco.")
-        made.append(output / CHAIN_FILE)
-        npz.save_arrays(made[-1], write_body(source, [ply.points(source, frame) for frame in frames]))
     write_text(output / SCRIPT.name, SCRIPT.read_text(encoding="utf-8"))
     return [*npz.write(source, frames, output), *made]
 
