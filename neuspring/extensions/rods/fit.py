@@ -30,7 +30,7 @@ from neuspring.core.files import write_table
 from neuspring.core.text import Progress
 from neuspring.extensions.rods import made
 from neuspring.extensions.rods.levenberg import LevenbergMarquardt
-from neuspring.extensions.rods.nodes import RodFrames, settled
+from neuspring.extensions.rods.nodes import PARALLEL, RodFrames, settled
 from neuspring.extensions.rods.rod import Rod, rod_of
 from neuspring.extensions.rods.settings import RodFit
 from neuspring.physics.controllers import waypoints

@@ -16,14 +16,14 @@ from neuspring.config import Config, ScenarioRow
 from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
-from neuspring.extensions.rods.mocap import centerline, circle, rings, transport
+from neuspring.extensions.rods.mocap import RING, centerline, circle, rings, transport
 from neuspring.extensions.rods.settings import Posed
 from neuspring.intake.points import carried, in_both, taught_by
 
 TIME = "t"
 """Column of the time."""
-RINGS, RING = 24, 3
-"""Rings of nodes along the body, of which lattices are made, and nodes per ring."""
+RINGS = 24
+"""Rings of nodes along the body, of which lattices are made."""
 HAND_GRIP = 0.05
 """Distance of the two points of a hand on the line, m."""
 UNEVEN = 0.01

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from neuspring.cli.main import main
 from neuspring.config import Config, ScenarioRow
 from neuspring.core.errors import InputError
 from neuspring.core.findings import Finding
@@ -107,11 +106,6 @@ def test_a_recording_is_turned_and_never_mirrored(up: str) -> None:
     assert np.linalg.det(turned) == 1 and turned[2, "xyz".index(up[1])] == (1 if up[0] == "+" else -1)
 
 
-def test_the_defaults_change_nothing() -> None:
-    np.testing.assert_array_equal(in_space(swinging().tolist(), Mocap()), swinging())
-    assert in_space(swinging().astype(np.float32), Mocap()).dtype == np.float32
-
-
 @pytest.mark.parametrize("order", [[0, 1, 3, 2, *range(4, 13)], np.random.default_rng(0).permutation(13).tolist()])
 def test_columns_in_another_order_are_named(tmp_path: Path, order: list[int]) -> None:
     (found,) = checked(tmp_path, swinging()[:, :, order])
@@ -141,13 +135,6 @@ def test_lost_and_exchanged_markers(tmp_path: Path) -> None:
     data[200:, :, [4, 8]] = data[200:, :, [8, 4]]
     (found,) = checked(tmp_path, data)
     assert (found.name, found.level, found.frames) == ("labels swapped", "warning", (200,))
-
-
-def test_check_data_takes_the_settings(tmp_path: Path) -> None:
-    path = tmp_path / "7.pkl"
-    path.write_bytes(pickle.dumps(1000 * swinging(), protocol=4))
-    assert main(["check-data", str(path)]) == 2
-    assert main(["check-data", str(path), "--settings", '{"mocap": {"unit": 0.001}}']) == 0
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the released recordings are not part of the repository")

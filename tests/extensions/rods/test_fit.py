@@ -1,39 +1,29 @@
 """The fit of a rod: planted cables are found again, on recordings of several lengths, with markers beside the line."""
 
-import pickle
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError
-from neuspring.data.unpickle import load_pickle
-from neuspring.extensions.rods import mocap
 from neuspring.extensions.rods.fit import (
     Levenberg,
     Recordings,
     RodResult,
     RodSteps,
     Variables,
-    choose_axis,
     fit_rod,
-    in_order,
-    require_unmirrored,
     search_rod,
 )
-from neuspring.extensions.rods.made import RodStart, line_of, of_markers, rod_twin
-from neuspring.extensions.rods.settings import Mocap
+from neuspring.extensions.rods.made import RodStart, rod_twin
 from neuspring.twin.fit import FitProblem
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.transfer import move
 from tests.extensions.rods import ropes
 from tests.support import scenarios
-from tests.support.real import FOLDER
 
-REAL = FOLDER / "mocap_dlo"
 SETTINGS = config.Config(
     rod=RodStart(bending=0.02, twisting=0.02), fit=config.Fit(rod=RodSteps(horizons=(0,), rounds=5, every=1, robust=1e-3))
 )
@@ -102,96 +92,11 @@ def changed(seen: Observations, matrix: np.ndarray) -> Observations:
     return replace(seen, **{name: (getattr(seen, name) @ matrix.T).astype(np.float32) for name in names})
 
 
-@pytest.mark.parametrize("angle", [37.0, 95.0, 127.0, 180.0, -100.0])
-def test_a_cable_that_was_recorded_elsewhere_has_its_axis_there(angle):
-    twin, turn = rod_twin(cable("one", 0), SETTINGS, AXIS), Rotation.from_euler("z", angle, degrees=True).as_matrix()
-    there = move(twin, changed(cable("one", 0), turn))[0]
-    within = abs(angle) < 90
-    np.testing.assert_allclose(there.rod.axis, AXIS if within else turn @ AXIS, atol=1e-5)
-    if not within:
-        # It is the same rod there: nodes have their places, and it moves as here.
-        np.testing.assert_allclose(there.rod.place, twin.body.place, atol=1e-5)
-        hands = cable("one", 0).controller_points
-        here, moved = roll_out(twin, hands).positions, roll_out(there, hands @ turn.T).positions
-        np.testing.assert_allclose(moved, here @ turn.T, atol=1e-4)
-
-
-def test_recordings_without_a_world_in_common_take_their_axis_along():
-    lines = [line_of(cable("one", seed)) for seed in range(5)]
-    turns = [Rotation.from_euler("z", angle, degrees=True).as_matrix() for angle in (0, 100, 150, -90, 170)]
-    oblique = Rotation.from_euler("z", 135, degrees=True).as_matrix()
-    axis, steady = choose_axis([line @ turn.T for line, turn in zip(lines, turns, strict=True)])
-    assert steady == 0.0
-    assert choose_axis(lines)[1] > 1.0
-    # Of a whole pool that was turned, no axis of the world will do: that across the cables.
-    np.testing.assert_allclose(choose_axis([line @ oblique.T for line in lines])[0] @ oblique @ [1, 0, 0], 0.0, atol=0.1)
-    np.testing.assert_allclose(axis, AXIS, atol=1e-6)
-
-
-@pytest.mark.parametrize("end", [(0.0, 1.0, 0.0), (0.0, -0.999, 0.04), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)])
-def test_ends_may_lie_along_any_axis(end):
-    seen = cable("one", 0)
-    hands = seen.controller_points.copy()
-    hands[:, 0] = hands[:, 1] - 0.1 * np.array(end)
-    seen = replace(seen, controller_points=hands)
-    for twin in (rod_twin(seen, SETTINGS, AXIS), move(rod_twin(cable("two", 1), SETTINGS, AXIS), seen)[0]):
-        assert np.isfinite(roll_out(twin, hands).positions).all()
-
-
-def test_a_recording_from_the_other_end_is_turned_round_and_said(capsys):
-    """The distances between markers are the cable's."""
-    seen = [uneven(cable(str(seed), seed)) for seed in range(4)]
-    other = replace(seen[2], object_points=seen[2].object_points[:, ::-1], controller_points=seen[2].controller_points[:, ::-1])
-    found = in_order([seen[0], seen[1], other, seen[3]])
-    np.testing.assert_array_equal(found[2].line, other.line[::-1])
-    np.testing.assert_array_equal(line_of(found[2]), line_of(seen[2]))
-    assert [one.line.tolist() for one in found[:2]] == [one.line.tolist() for one in seen[:2]]
-    assert capsys.readouterr().out == "note: 2: by the distances between its markers their order is [7, 6, 5, 4, 3, 2, 1, 0]\n"
-    with pytest.raises(InputError, match=r"first recording must be in the order of most; received \[7, 6, .*deform\.leave_out"):
-        in_order([other, *seen[:2], seen[3]])
-
-
-@pytest.mark.skipif(not REAL.is_dir(), reason="the released recordings are not part of the repository")
-@pytest.mark.parametrize("name", ["DLO1", "DLO2", "DLO3", "DLO4"])
-def test_released_recordings_turned_by_any_angle_and_from_the_other_end_are_laid(name, tmp_path):
-    settings = Mocap(start=1, stride=1, rings=24, ring=3, grip="clamp", train_fraction=1.0)
-    files = sorted((REAL / name / "train").glob("*.pkl"), key=lambda file: int(file.stem))[::8]
-    seen, lines = [], []
-    for number, file in enumerate(files):
-        turn = Rotation.from_euler("z", 80 * number, degrees=True).as_matrix()
-        data = turn @ np.asarray(load_pickle(file))
-        lines.append(data[1].T)
-        path = tmp_path / f"{number}.pkl"
-        path.write_bytes(pickle.dumps(data[:, :, ::-1] if number == 3 else data, protocol=4))
-        row = config.ScenarioRow(scenario=file.stem, source="mocap", category=name, path="x", self_collision=False, ground=False)
-        seen.append(mocap.read(row, path, settings))
-    found = in_order(seen)
-    axis, steady = choose_axis([line_of(each) for each in found])
-    twin = rod_twin(found[0], config.Config(), axis, steady)
-    for number, (each, line) in enumerate(zip(found, lines, strict=True)):
-        np.testing.assert_allclose(line_of(each), line, atol=1e-6)
-        own = Rotation.from_euler("z", -80 * number, degrees=True).apply(np.array(of_markers(twin, each).rod.axis))
-        # As the cables head in the recordings as they were: within 60 degrees of each other.
-        assert steady == 0.0 and axis @ own > 0.5
-
-
 def uneven(seen: Observations) -> Observations:
     """The recording at rest, its inner markers nearer to the first end."""
     points, hands = seen.object_points.copy(), np.repeat(seen.controller_points[:1], len(seen.controller_points), axis=0)
     points[:, 1:] -= 0.3 * np.diff(seen.object_points, axis=1)
     return replace(seen, object_points=points, controller_points=hands)
-
-
-def test_one_recording_that_is_mirrored_is_refused():
-    """A cable with an unloaded curvature to one side; a mirror image of all is another cable."""
-    start = rod_twin(cable("0", 0), SETTINGS, AXIS)
-    bent = replace(start, rod=replace(start.rod, curvature=np.tile([0.3, 0.3], (VERTICES, 1))))
-    seen = [recorded(bent, cable(str(seed), seed)) for seed in range(4)]
-    mirror = np.diag([1.0, -1.0, 1.0])
-    settings = RodSteps(**vars(WITHOUT_MARKERS))
-    require_unmirrored(Recordings.of(seen, bent), bent, settings, "cpu")
-    with pytest.raises(InputError, match=r"must not be mirrored; received 2 \(\d.*mirror image 0\.\d mm\)\. Correct.*leave_out"):
-        require_unmirrored(Recordings.of([*seen[:2], changed(seen[2], mirror), seen[3]], bent), bent, settings, "cpu")
 
 
 def test_markers_beside_the_line_are_found():

@@ -9,7 +9,7 @@ import torch
 
 from neuspring.core.artifacts import Material, Simulation, Topology, Twin
 from neuspring.core.errors import InputError
-from neuspring.extensions.rods.nodes import RodFrames, at_vertices, bind, placed
+from neuspring.extensions.rods.nodes import RodFrames, bind, placed
 from neuspring.twin.rollout import roll_out
 from tests.extensions.rods.make import rod
 from tests.support.scenes import SCALARS
@@ -72,15 +72,6 @@ def test_nodes_return_from_their_places_in_all_frames_at_once():
     np.testing.assert_allclose(found, [nodes, nodes + 1.0], atol=10 * EXACT)
 
 
-def test_values_of_nodes_that_are_linear_along_the_rod_come_back_at_vertices():
-    rng = np.random.default_rng(1)
-    body = twin(rng.uniform([0, -0.02, -0.02], [0.4, 0.02, 0.02], (50, 3)), np.zeros(3), [])
-    values = np.outer(body.rod.edge + body.rod.place[:, 0], [1.0, -2.0, 0.5])
-    expected = np.outer(np.arange(VERTICES), [1.0, -2.0, 0.5])
-    # The smoothing pulls by a millionth.
-    np.testing.assert_allclose(at_vertices(body.rod, values), expected, atol=1e-5)
-
-
 def test_a_rope_hangs_from_a_spring_by_its_weight():
     middle = np.array([[EDGE * (VERTICES - 1) / 2, 0, 0]])
     body = twin(middle, middle[0] + [0, 0, 0.02], [(0, 1)], drag=3.0, bending=np.full(VERTICES, 10.0))
@@ -125,16 +116,6 @@ def test_a_rope_on_the_ground_slides_as_friction_says():
     expected = speed**2 / (2 * 0.4 * G)
     np.testing.assert_allclose(moved[-1, :, 1] - moved[0, :, 1], expected, atol=speed * 0.002)
     np.testing.assert_allclose(moved[..., 2], np.tile(moved[0, :, 2], (frames, 1)), atol=1e-4)
-
-
-def test_a_grip_that_begins_later_has_no_force_at_that_moment():
-    node = np.array([[0.2, 0.0, 0.0]])
-    body = twin(node, np.array([0.2, 0, 0.02]), [(0, 1)], gravity=0.0)
-    hands = np.tile(body.topology.controllers, (6, 1, 1))
-    hands[:, 0, 2] += 0.005 * np.minimum(np.arange(6), 3)
-    holds = np.arange(6)[:, None] >= 3
-    assert np.abs(np.diff(roll_out(body, hands, valid=holds).positions, axis=0)).max() < SINGLE
-    assert np.abs(np.diff(roll_out(body, hands).positions, axis=0)).max() > 1e-4
 
 
 def test_lanes_are_the_same_as_rods_alone():

@@ -11,20 +11,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from neuspring import config
-from neuspring.config import Config, ScenarioRow, parse
+from neuspring.config import Config, ScenarioRow
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.core.errors import InputError
 from neuspring.extensions.rods import posed
 from neuspring.extensions.rods.fit import RodSteps, Variables, fit_rod, search_rod
 from neuspring.extensions.rods.made import RodStart, rod_twin
 from neuspring.extensions.rods.settings import Posed
-from neuspring.twin.bodies.lattice import body as lattice
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.transfer import move
 
 MARKED = [(f"{name}x", f"{name}y", f"{name}z") for name in ("middle_", "end_")]
 UNLOADED = ((0.25, 0.0, -0.01), (0.5, 0.0, -0.01))
-POSED = Posed(markers=tuple(MARKED), unloaded=UNLOADED, radius=0.01, rings=6)
+POSED = Posed(markers=tuple(MARKED), unloaded=UNLOADED, radius=0.01)
 ROD = RodStart(lay_out=9, bending=0.3, twisting=0.3, damping=0.02, substep=0.005)
 SINGLE = 1e-6
 """m: observations are float32."""
@@ -121,21 +120,6 @@ def test_a_rod_hangs_from_the_hand_in_frame_0_and_follows_its_turns(tmp_path: Pa
     np.testing.assert_allclose(path, here.object_points, atol=2e-3)
 
 
-def test_a_lattice_follows_a_turning_hand(tmp_path: Path) -> None:
-    here = seen(tmp_path, table(frames=21))
-    settings = parse(Config, {"search": {"rollouts": 11, "tied_rollouts": 0}, "simulation": {"gravity": 0.0}}, "test")
-    from neuspring.twin.body import SearchOptions
-
-    twin = lattice.search(here, [], settings, SearchOptions()).twin
-    moved = roll_out(twin, here.controller_points).positions
-    held = np.linalg.norm(moved[0][:, None] - here.controller_points[0], axis=2).min(axis=1) < 0.03
-    hand = here.controller_points
-    turn, _ = Rotation.align_vectors(hand[-1] - hand[-1, 1], hand[0] - hand[0, 1])
-    wanted = turn.apply(moved[0][held].astype(float) - hand[0, 1]) + hand[-1, 1]
-    assert held.any()
-    assert np.abs(moved[-1][held] - wanted).max() < 0.3 * np.abs(moved[-1][held] - moved[0][held]).max()
-
-
 def test_a_fit_finds_stiffness_and_slip_of_a_rod_that_swings(tmp_path: Path) -> None:
     first, second = (seen(tmp_path, table(61, seed), f"swing{seed}") for seed in (0, 1))
     steps = RodSteps(curvature="straight", horizons=(0,), rounds=12, every=2, markers=False, slip=1, robust=1e-3)
@@ -155,11 +139,3 @@ def test_a_fit_finds_stiffness_and_slip_of_a_rod_that_swings(tmp_path: Path) -> 
     # A search finds the stiffness from far.
     far = search_rod(pool[0], pool[1:], Config(rod=replace(ROD, bending=30.0, twisting=30.0), fit=config.Fit(rod=steps)))
     assert np.median(far.twin.body.bending) == pytest.approx(float(np.median(truth.rod.bending)), rel=0.5)
-
-
-def test_without_an_unloaded_shape_nothing_is_laid_out(tmp_path: Path) -> None:
-    here = seen(tmp_path, table())
-    with pytest.raises(InputError, match=r"unloaded shape must be known.*rod\.lay_out"):
-        rod_twin(replace(here, rest_shape=np.zeros((0, 3))), Config(rod=ROD))
-    with pytest.raises(InputError, match="begins with two controllers"):
-        rod_twin(replace(here, line=here.line[[0, 2, 3]]), Config(rod=ROD))
