@@ -1,4 +1,4 @@
-"""Anchors, what each feels, and their motion: one substep and its adjoint as kernels, frames of them, and the same in torch.
+"""Anchors, what each feels, and their motion: one substep and its adjoint as kernels, and frames of them.
 
 With d = |x_j - x_i|, n = (x_j - x_i) / d, strain e = d / l - 1 and the rank r of neighbor j by distance in frame 0, anchor i feels
 
@@ -338,42 +338,3 @@ class AnchorSolver:
                 wp.launch(kernel, self.count, [substep, fraction, *structs], device=self.device)
 
         self._graphs.run("backward" if backward else "forward", [kernel], record)
-
-
-def reference_substep(
-    graph: AnchorGraph,
-    physics: AnchorPhysics,
-    parameters: AnchorParameters,
-    x: torch.Tensor,
-    v: torch.Tensor,
-    controllers: torch.Tensor,
-    step: float,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """(x, v) [N, 3] after one substep of `step` s, under controllers [C, 3] at its end.
-
-    In torch: differentiable, in any precision.
-    """
-    neighbors = torch.tensor(graph.neighbors, device=x.device).long()
-    rest = torch.tensor(graph.lengths, dtype=x.dtype, device=x.device)
-    offset = x[neighbors] - x[:, None]
-    length = offset.norm(dim=2)
-    n = offset / length.clamp(min=MIN_ANCHOR_LENGTH)[..., None]
-    stretch = length - rest
-    stiff = parameters.stiffness[:, None] / rest * parameters.soft * stretch
-    pull = torch.where(stretch.abs() < SLACK, 0.0, stiff * (1 + stretch.abs() / rest) ** physics.exponent)
-    closing = ((v[neighbors] - v[:, None]) * n).sum(dim=2)
-    force = ((pull + parameters.damping / rest * closing)[..., None] * n).sum(dim=1)
-    anchor = torch.tensor(np.repeat(np.arange(len(graph.anchors)), np.diff(graph.link_starts)), device=x.device).long()
-    reach = controllers[torch.tensor(graph.links, device=x.device).long()] - x[anchor]
-    distance = reach.norm(dim=1, keepdim=True)
-    strain = distance / torch.tensor(graph.link_lengths, dtype=x.dtype, device=x.device)[:, None] - 1
-    force = force.index_add(0, anchor, reach / distance.clamp(min=MIN_ANCHOR_LENGTH) * strain * physics.link_stiffness)
-    force = force + x.new_tensor([0.0, 0.0, -physics.up_sign * physics.gravity])
-    v = v + step * force
-    x = x + step * v
-    if physics.ground:
-        below = (physics.up_sign * x[:, 2:] <= 0).expand(-1, 3)
-        x = torch.where(below, x * x.new_tensor([1.0, 1.0, 0.0]), x)
-        slowed = torch.cat([v[:, :2] * parameters.friction, torch.zeros_like(v[:, 2:])], dim=1)
-        v = torch.where(below, slowed, v)
-    return x, v

@@ -23,7 +23,7 @@ from neuspring.extensions.spring_gaus.model import (
     roll_out,
     soft_vector,
 )
-from neuspring.extensions.spring_gaus.physics import AnchorSolver, reference_substep
+from neuspring.extensions.spring_gaus.physics import MIN_ANCHOR_LENGTH, SLACK, AnchorSolver
 from neuspring.extensions.spring_gaus.train import FEATURE_WEIGHT, Problem, SpringGausTrainer, load_features, run, silhouette_loss
 from tests.support.devices import DEVICES
 
@@ -133,6 +133,45 @@ def parameters(anchors: int, ranks: int, dtype: torch.dtype = torch.float64) -> 
     soft = torch.linspace(1, 0.3, ranks, dtype=dtype)
     scalars = (torch.tensor(value, dtype=dtype) for value in (0.02, 0.5))
     return AnchorParameters(torch.full((anchors,), 100.0, dtype=dtype), soft, *scalars)
+
+
+def reference_substep(
+    graph: AnchorGraph,
+    physics: AnchorPhysics,
+    parameters: AnchorParameters,
+    x: torch.Tensor,
+    v: torch.Tensor,
+    controllers: torch.Tensor,
+    step: float,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """(x, v) [N, 3] after one substep of `step` s, under controllers [C, 3] at its end.
+
+    In torch: differentiable, in any precision.
+    """
+    neighbors = torch.tensor(graph.neighbors, device=x.device).long()
+    rest = torch.tensor(graph.lengths, dtype=x.dtype, device=x.device)
+    offset = x[neighbors] - x[:, None]
+    length = offset.norm(dim=2)
+    n = offset / length.clamp(min=MIN_ANCHOR_LENGTH)[..., None]
+    stretch = length - rest
+    stiff = parameters.stiffness[:, None] / rest * parameters.soft * stretch
+    pull = torch.where(stretch.abs() < SLACK, 0.0, stiff * (1 + stretch.abs() / rest) ** physics.exponent)
+    closing = ((v[neighbors] - v[:, None]) * n).sum(dim=2)
+    force = ((pull + parameters.damping / rest * closing)[..., None] * n).sum(dim=1)
+    anchor = torch.tensor(np.repeat(np.arange(len(graph.anchors)), np.diff(graph.link_starts)), device=x.device).long()
+    reach = controllers[torch.tensor(graph.links, device=x.device).long()] - x[anchor]
+    distance = reach.norm(dim=1, keepdim=True)
+    strain = distance / torch.tensor(graph.link_lengths, dtype=x.dtype, device=x.device)[:, None] - 1
+    force = force.index_add(0, anchor, reach / distance.clamp(min=MIN_ANCHOR_LENGTH) * strain * physics.link_stiffness)
+    force = force + x.new_tensor([0.0, 0.0, -physics.up_sign * physics.gravity])
+    v = v + step * force
+    x = x + step * v
+    if physics.ground:
+        below = (physics.up_sign * x[:, 2:] <= 0).expand(-1, 3)
+        x = torch.where(below, x * x.new_tensor([1.0, 1.0, 0.0]), x)
+        slowed = torch.cat([v[:, :2] * parameters.friction, torch.zeros_like(v[:, 2:])], dim=1)
+        v = torch.where(below, slowed, v)
+    return x, v
 
 
 @pytest.mark.parametrize(("dtype", "close"), [(torch.float64, 1e-11), (torch.float32, 3e-5)])
