@@ -47,10 +47,9 @@ class ShapePriorSettings(SettingsSection):
     """Shape of what was not seen; auto: none for cloth and packages, else visual_hull. none: only what was seen. visual_hull:
     voxels carved by masks and depth. mesh: a file, aligned to what was seen. truth: the surface of a synthetic capture, to measure
     what perception costs."""
-    back: Literal["none", "symmetry", "fraction"] = "symmetry"
-    """End of the hull where one camera alone shows the object in frame 0, so that its back is invented. fraction: behind the seen
-    surface by 1.2 of the silhouette's local width, rounded to its edge. symmetry: where the seen surface is mirrored about the
-    surface that the silhouette's rim spans. none: at the table, or a margin behind what was seen."""
+    back: Literal["none", "symmetry"] = "symmetry"
+    """End of the hull where one camera alone shows the object in frame 0, so that its back is invented. symmetry: where the seen
+    surface is mirrored about the surface that the silhouette's rim spans. none: at the table, or a margin behind what was seen."""
     mesh: str | None = None
     """File of the mesh for `backend: mesh`."""
 

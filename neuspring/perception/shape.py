@@ -9,8 +9,8 @@ them, and the hull ends at a back that is guessed, in depths along the optical a
 is the diameter 2 r of the largest disc inside it that covers the pixel; at a distance d from the edge a round body of that width is
 c(d) = 2 sqrt(r^2 - (r - d)^2) thick.
 
-fraction: back = seen + f c. symmetry: back = 2 middle - seen, where `middle` is the surface that the silhouette's rim spans (a
-harmonic one, held at seen + c / 2 on the rim). One plane perpendicular to the view is no substitute: bodies lie oblique to it.
+Its back is 2 middle - seen, where `middle` is the surface that the silhouette's rim spans (a harmonic one, held at seen + c / 2 on
+the rim). One plane perpendicular to the view is no substitute: bodies lie oblique to it.
 
 A mesh of the object from any generator, in any pose and size, is put where the object lies in frame 0: poses over all directions
 are tried; the best few are refined by ICP with scale against the observed cloud, which is only a part of the surface; then the mesh
@@ -22,7 +22,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -43,8 +42,6 @@ from neuspring.data.results import Masks, ShapePrior
 from neuspring.perception.sample import on_surface
 from neuspring.perception.truth import surface
 
-BACK_FRACTION = 1.2
-"""Thickness of the object in local widths of its silhouette, with `back: fraction`; 1: a round cross-section."""
 CARVED_MARGIN = 0.02
 """m around the cloud of frame 0 within which voxels are carved."""
 CARVING_TOLERANCE = 0.004
@@ -159,7 +156,7 @@ def one_sided(
     filled = np.where(labels == OBJECT, front(labels == OBJECT, depth, near, far), depth)
     if settings.back == "none":
         return filled, None
-    return filled, back(labels, filled, camera.intrinsics[0, 0], settings.back, BACK_FRACTION)
+    return filled, back(labels, filled, camera.intrinsics[0, 0])
 
 
 def _consistent(
@@ -209,21 +206,18 @@ def front(mask: np.ndarray, depth: np.ndarray, near: float, far: float) -> np.nd
     return np.where(mask, depth[tuple(nearest)], 0.0)
 
 
-def back(labels: np.ndarray, seen: np.ndarray, focal: float, how: Literal["symmetry", "fraction"], share: float) -> np.ndarray:
+def back(labels: np.ndarray, seen: np.ndarray, focal: float) -> np.ndarray:
     """Depth [H, W] of the back, from labels [H, W], the `seen` surface [H, W] and the focal length in pixels; zero outside the
-    object. `share` is f of `fraction`."""
+    object."""
     mask = labels == OBJECT
     chord = round_chord(mask) * seen / focal
-    if how == "fraction":
-        thickness = share * chord
-    else:
-        # Beyond the edge as at the edge, so that the median of a rim's pixel is one of the object.
-        extended = front(np.ones_like(mask), np.where(mask, seen, 0.0), 0.0, np.inf)
-        smooth = cv2.medianBlur(extended.astype(np.float32), 5).astype(float)
-        rim = mask & _grown(labels == NOTHING, MASK_BORDER) & ~_grown(labels >= HANDS, MASK_BORDER + 1)
-        if not rim.any():
-            rim = mask & _grown(~mask, MASK_BORDER)
-        thickness = 2.0 * (_spanned(smooth + 0.5 * chord, rim, mask) - smooth)
+    # Beyond the edge as at the edge, so that the median of a rim's pixel is one of the object.
+    extended = front(np.ones_like(mask), np.where(mask, seen, 0.0), 0.0, np.inf)
+    smooth = cv2.medianBlur(extended.astype(np.float32), 5).astype(float)
+    rim = mask & _grown(labels == NOTHING, MASK_BORDER) & ~_grown(labels >= HANDS, MASK_BORDER + 1)
+    if not rim.any():
+        rim = mask & _grown(~mask, MASK_BORDER)
+    thickness = 2.0 * (_spanned(smooth + 0.5 * chord, rim, mask) - smooth)
     return np.where(mask, seen + np.maximum(thickness, LEAST_THICKNESS), 0.0)
 
 

@@ -17,7 +17,6 @@ from neuspring.core.files import write_atomically
 from neuspring.splats.rasterize import Rendered, rasterize
 from neuspring.splats.view import View
 
-PLY_TYPES = {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1", "uint8": "u1"}
 PLY_FORMAT = "format binary_little_endian 1.0"
 LONGEST_HEADER = 100_000
 NORMALS = ("nx", "ny", "nz")
@@ -103,35 +102,22 @@ def _columns(scales: int, coefficients: int) -> list[str]:
 
 def _read_ply(path: Path) -> np.ndarray:
     """The vertices of a binary PLY as a structured array."""
-    rule = "must be a binary little-endian PLY of splats"
+    rule = "must be a binary little-endian PLY of vertices alone, with float properties of different names"
     try:
         content = path.read_bytes()
     except OSError as error:
         raise InputError(path, rule, error.strerror, "Run the step that makes it first.") from error
     head, end, _ = content[:LONGEST_HEADER].partition(b"end_header\n")
-    lines = head.decode("ascii", errors="replace").splitlines()
-    if not end or lines[:1] != ["ply"] or PLY_FORMAT not in lines:
-        raise InputError(path, rule, repr(content[:40]))
-    words = [line.split() for line in lines]
-    elements = [word for word in words if word[:1] == ["element"]]
-    properties = [word for word in words if word[:1] == ["property"]]
-    if len(elements) != 1 or elements[0][1:2] != ["vertex"] or not elements[0][2:] or not elements[0][2].isdigit():
-        raise InputError(path, f"{rule}, with vertices alone", elements)
-    unknown = [word for word in properties if len(word) != 3 or word[1] not in PLY_TYPES]
-    if unknown:
-        raise InputError(path, f"{rule}, with properties of type {', '.join(PLY_TYPES)}", " ".join(unknown[0]))
-    names = [word[2] for word in properties]
-    if not names or len(set(names)) < len(names):
-        raise InputError(path, f"{rule}, with properties of different names", " ".join(names) or "none")
-    layout = np.dtype([(name, PLY_TYPES[kind]) for _, kind, name in properties])
-    count, start = int(elements[0][2]), len(head) + len(end)
-    available = (len(content) - start) // layout.itemsize
-    if available < count:
+    lines = [line for line in head.decode("ascii", errors="replace").splitlines() if not line.startswith("comment ")]
+    count = lines[2].removeprefix("element vertex ") if end and lines[:2] == ["ply", PLY_FORMAT] and len(lines) > 3 else ""
+    names = [line.removeprefix("property float ") for line in lines[3:]]
+    if not count.isdigit() or int(count) == 0 or len(set(names)) < len(names) or any(" " in name for name in names):
+        raise InputError(path, rule, lines[:4] or repr(content[:40]))
+    layout = np.dtype([(name, "<f4") for name in names])
+    if (available := (len(content) - len(head) - len(end)) // layout.itemsize) < int(count):
         received = f"{available} whole ones: the file is truncated"
         raise InputError(path, f"the header promises {count} splats", received, "Delete it and re-run its step.")
-    if not count:
-        raise InputError(path, f"{rule}, at least one", "0 vertices")
-    return np.frombuffer(content, layout, count, offset=start)
+    return np.frombuffer(content, layout, int(count), offset=len(head) + len(end))
 
 
 @dataclass(frozen=True, eq=False)

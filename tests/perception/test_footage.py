@@ -10,7 +10,7 @@ import pytest
 from neuspring.checks.masks import mask_facts
 from neuspring.checks.perceived import look_at_masks
 from neuspring.config.perception import Lift, ShapePriorSettings
-from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, Writer
+from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
 from neuspring.data.results import Masks
 from neuspring.extensions.color_alone.segment import carry_film, frame_mask
 from neuspring.perception import segment_given
@@ -18,8 +18,7 @@ from neuspring.perception.lift import clean_masks
 from neuspring.perception.marks import Marks
 from neuspring.perception.shape import shape_prior
 from results.published.film22.films import carried, film
-from tests.support.captures import describe, entry
-from tests.support.films import Errors, Points, newly_covered, overlaps, stepwise, truths
+from tests.support.films import Errors, Points, overlaps, stepwise, truths
 from tests.support.marked import Painted
 from tests.support.marked import overlap as label_overlap
 from tests.support.real import FOOTAGE, PLUSH
@@ -57,31 +56,6 @@ def test_what_is_counted():
     assert (found.median, found.most) == pytest.approx((5.0, 5.0))
     assert found.lost == pytest.approx(own.sure[0, 1:].sum() / own.sure[:, 1:].sum())
     assert found.hidden == "2 of 2"
-
-
-@FILMED
-def test_drawn_masks_keep_what_is_newly_covered_and_masks_of_frame_0_do_not(tmp_path):
-    """The check needs no truth; here it is known. Eight times the last frame, because a check of one frame says nothing."""
-    case = "single_lift_rope"
-    colors, drawn = film(FOOTAGE, case), truths(FOOTAGE, case)
-    last, count = max(drawn), 9
-    height, width = drawn[0].shape
-    writer = Writer(tmp_path, describe(frame_count=count, cameras=(entry(width=width, height=height),), depth="none"))
-    for frame in range(count):
-        writer.frame("0", frame, colors[last if frame else 0], None)
-    capture, labels = writer.finish(), np.stack([drawn[0], *[drawn[last]] * (count - 1)])
-    assert mask_facts(capture, "0", labels)["newly_kept"] > 0.8
-    lost = np.where((labels == OBJECT) & (labels[0] != OBJECT), 0, labels)
-    facts = mask_facts(capture, "0", lost)
-    assert facts["newly_kept"] < 0.1
-    assert "newly covered parts lost" in {one.name for one in look_at_masks(capture, "0", lost, facts)}
-
-
-def test_newly_covered_pixels_are_those_beyond_frame_0():
-    truth = {0: np.zeros((4, 6), np.uint8), 5: np.zeros((4, 6), np.uint8)}
-    truth[0][:, :2], truth[5][:, 1:5] = OBJECT, OBJECT
-    labels = np.stack([truth[0]] * 5 + [np.where(np.arange(6) < 4, truth[5], 0)])
-    assert newly_covered(labels, truth) == [pytest.approx(2 / 3)]
 
 
 @FILMED
@@ -165,15 +139,14 @@ def test_a_real_bear_has_a_round_back(tmp_path):
     labels = segment_given.segment(capture, "cam0")
     masks = {"cam0": Masks(labels=labels, backend="given")}
     assert look_at_masks(capture, "cam0", labels, mask_facts(capture, "cam0", labels)) == []
-    _, cloud, _ = clean_masks(capture, capture.cameras, masks, Lift(), 1)
+    _, cloud, _ = clean_masks(capture, masks, Lift().neighborhood, 1)
     liters, wall = {}, {}
-    for how in ("none", "symmetry", "fraction"):
+    for how in ("none", "symmetry"):
         prior = shape_prior(capture, masks, cloud, ShapePriorSettings(back=how))
         # The camera looks along y. A flat back has many vertices at its end.
         away = prior.vertices[:, 1]
         liters[how], wall[how] = 1e3 * prior.facts["volume"], float((away > away.max() - 0.004).mean())
         assert 0.5 < prior.facts["invented_share"] < 0.8
     # It is 19 cm high and 12 cm wide.
-    assert 1.2 < liters["symmetry"] < liters["none"]
-    assert 1.2 < liters["fraction"] < liters["none"] < 2.5
-    assert max(wall["symmetry"], wall["fraction"]) < 0.3 * wall["none"]
+    assert 1.2 < liters["symmetry"] < liters["none"] < 2.5
+    assert wall["symmetry"] < 0.3 * wall["none"]

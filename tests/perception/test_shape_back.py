@@ -39,23 +39,12 @@ def volume(prior: ShapePrior) -> float:
     return float((np.cross(corners[:, 0], corners[:, 1]) * corners[:, 2]).sum() / 6.0)
 
 
-@pytest.mark.parametrize("back", ["symmetry", "fraction"])
-def test_one_camera_and_a_prior_find_a_ball(tmp_path, monkeypatch, back):
-    monkeypatch.setattr("neuspring.perception.shape.BACK_FRACTION", 1.0)
+def test_one_camera_and_a_prior_find_a_ball(tmp_path):
     capture, masks, cloud, truth = ball(tmp_path)
     without = visual_hull(capture, masks, cloud, replace(SETTINGS, back="none"))
-    hull = visual_hull(capture, masks, cloud, replace(SETTINGS, back=back))
+    hull = visual_hull(capture, masks, cloud, SETTINGS)
     assert overlap(hull, truth) > max(0.8, overlap(without, truth) + 0.05)
     assert volume(hull) == pytest.approx(4.0 / 3.0 * np.pi * RADIUS**3, rel=0.25)
-
-
-def test_thickness_goes_with_the_fraction(tmp_path, monkeypatch):
-    capture, masks, cloud, _ = ball(tmp_path)
-    volumes = []
-    for share in (0.5, 1.0):
-        monkeypatch.setattr("neuspring.perception.shape.BACK_FRACTION", share)
-        volumes.append(volume(visual_hull(capture, masks, cloud, replace(SETTINGS, back="fraction"))))
-    assert volumes[1] == pytest.approx(2.0 * volumes[0], rel=0.2)
 
 
 def test_an_oblique_rod_is_as_thick_as_it_is_wide(tmp_path):
@@ -66,7 +55,7 @@ def test_an_oblique_rod_is_as_thick_as_it_is_wide(tmp_path):
 
 def test_several_cameras_carve_the_back_and_guess_nothing(tmp_path):
     capture, masks, cloud, _ = ball(tmp_path, (EYE, np.array([-0.5, 0.1, 0.4])))
-    hulls = [visual_hull(capture, masks, cloud, replace(SETTINGS, back=how)) for how in ("none", "symmetry", "fraction")]
+    hulls = [visual_hull(capture, masks, cloud, replace(SETTINGS, back=how)) for how in ("none", "symmetry")]
     for hull in hulls:
         assert hull.backend == "visual_hull"
         np.testing.assert_array_equal(hull.vertices, hulls[0].vertices)

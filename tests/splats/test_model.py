@@ -68,9 +68,9 @@ HEAD = b"ply\nformat binary_little_endian 1.0\nelement vertex "
     [
         (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "must be a binary"),
         (HEAD + b"1\nproperty float x\nend_header\n\0\0\0\0", "no y, z, f_dc_0"),
-        (HEAD + b"1\nproperty list uchar int x\nend_header\n", "properties of type"),
+        (HEAD + b"1\nproperty list uchar int x\nend_header\n", "float properties"),
         (HEAD + b"1\nelement face 2\nend_header\n", "vertices alone"),
-        (HEAD + b"0\nproperty float x\nend_header\n", "0 vertices"),
+        (HEAD + b"0\nproperty float x\nend_header\n", "vertices alone"),
         (HEAD + b"1\nproperty float x\nproperty float x\nend_header\n", "different"),
         (HEAD + b"1\nproperty float f_rest_0\nend_header\n\0\0\0\0", "f_rest_"),
     ],

@@ -72,12 +72,6 @@ def overlaps(labels: np.ndarray, truth: dict[int, np.ndarray]) -> np.ndarray:
     return np.array([[overlap(labels[k] == label, mask == label) for label in (OBJECT, HANDS)] for k, mask in truth.items()])
 
 
-def newly_covered(labels: np.ndarray, truth: dict[int, np.ndarray]) -> list[float]:
-    """IoU of the object in the drawn frames but the first, over pixels that it does not cover there; NaN where it moves to none."""
-    first = truth[min(truth)] != OBJECT
-    return [overlap((labels[k] == OBJECT) & first, (truth[k] == OBJECT) & first) for k in sorted(truth)[1:]]
-
-
 def stepwise(colors: list[np.ndarray], labels: np.ndarray, start: np.ndarray, **settings: Any) -> tuple[np.ndarray, np.ndarray]:
     """The tracker of the workflow: places [T, K, 2] and whether they are visible [T, K], among its own random points."""
     chosen = replace(PointTracking(rim=RIM), **settings)

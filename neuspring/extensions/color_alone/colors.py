@@ -42,8 +42,6 @@ DEPTH_NOISE = (0.003, 0.008)
 """Spread of depth: m, and per m."""
 IN_FRONT = 0.5
 """Distance of things in front of the background, m; anywhere up to there."""
-DEPTH_BIN, DEPTH_BINS, DEPTH_BLUR, UNSEEN_DEPTH = 0.02, 256, 1.5, 0.1
-"""m, number, blur in bins of histograms of depth, and the part of the probability that any depth has."""
 MOST_DEPTH = 3.0
 """Largest log ratio that a pixel's depth counts; depth is off by pixels at borders."""
 
@@ -86,32 +84,20 @@ class Background:
     """[H, W] float32, how often."""
     depth: np.ndarray
     """[H, W] float32, m, running mean; 0 where never measured."""
-    guests: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
-    """Places [H, W] bool and looks, Lab [H, W, 3], of what is ignored and leaves. While it is there it is nothing by its own look,
-    and teaches none of what it hides."""
-    strangers: np.ndarray | None = None
-    """[bins] bool: colors of a person, which teach nothing."""
 
     @classmethod
-    def empty(
-        cls, size: tuple[int, int], guests: tuple[tuple[np.ndarray, np.ndarray], ...] = (), strangers: np.ndarray | None = None
-    ) -> Background:
+    def empty(cls, size: tuple[int, int]) -> Background:
         """Nothing is known."""
         color = (*size, 3)
         mean, variance, seen, depth = (np.zeros(shape, np.float32) for shape in (color, color, size, size))
-        return cls(mean, variance, seen, depth, guests, strangers)
+        return cls(mean, variance, seen, depth)
 
     def part(self, window: tuple[slice, slice]) -> Background:
         """A window of it, without a copy."""
-        guests = tuple((place[window], look[window]) for place, look in self.guests)
-        return Background(self.mean[window], self.variance[window], self.seen[window], self.depth[window], guests)
+        return Background(self.mean[window], self.variance[window], self.seen[window], self.depth[window])
 
     def learn(self, lab: np.ndarray, where: np.ndarray, depth: np.ndarray | None = None) -> None:
         """Take a frame's pixels [H, W, 3] where it shows the background [H, W] bool, and their depth [H, W], m, 0 none."""
-        for place, look in self.guests:
-            where = where & ~(place & _alike(lab, look))
-        if self.strangers is not None:
-            where = where & ~self.strangers[bins_of(lab)]
         self.seen += where
         weight = np.where(where, np.maximum(1.0 / np.maximum(self.seen, 1.0), FORGET), 0.0).astype(np.float32)[..., None]
         step = lab.astype(np.float32) - self.mean
@@ -131,10 +117,6 @@ class Background:
         known = np.clip(self.seen / SURE_AFTER, 0, 1) * USUAL
         # Of the background or a shadow on it, per unit of (L, a, b); meaningless where `seen` is 0.
         usual = shaded_density(lab.astype(np.float32) - self.mean - gain, np.sqrt(self.variance + LEAST_SPREAD**2))
-        for place, look in self.guests:
-            there = place & _alike(lab, look)
-            own = shaded_density(lab.astype(np.float32) - look - gain, 2 * LEAST_SPREAD)
-            known, usual = np.where(there, USUAL, known), np.where(there, own, usual)
         mixture = np.logaddexp(np.log(known + 1e-9) + usual, np.log(1 - known) + logs)
         return np.asarray(np.where(known > 0, mixture, logs), dtype=np.float32)
 
@@ -158,27 +140,6 @@ class Background:
         same = -0.5 * ((depth - self.depth) / spread) ** 2 - np.log(np.sqrt(2 * np.pi) * spread)
         ratio = np.clip(same + np.log(IN_FRONT), -MOST_DEPTH, MOST_DEPTH)
         return np.where((depth > 0) & (self.depth > 0), ratio, 0.0).astype(np.float32)
-
-
-def depth_bins(depth: np.ndarray) -> np.ndarray:
-    """The bin [...] of depth [...], m; 0 where nothing was measured."""
-    return np.clip(depth / DEPTH_BIN, 0, DEPTH_BINS - 1).astype(int)
-
-
-def depth_odds(own: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Log ratio [bins] of depths [n] of one thing to those of others [m], m; 0 where neither was seen, or nothing measured."""
-    shares = []
-    for part in (own[own > 0], others[others > 0]):
-        counts = gaussian_filter(np.bincount(depth_bins(part), minlength=DEPTH_BINS).astype(float), DEPTH_BLUR)
-        shares.append((1 - UNSEEN_DEPTH) * counts / max(len(part), 1) + UNSEEN_DEPTH / DEPTH_BINS)
-    odds = np.clip(np.log(shares[0] / shares[1]), -MOST_DEPTH, MOST_DEPTH)
-    odds[0] = 0.0
-    return np.asarray(odds, np.float32)
-
-
-def _alike(lab: np.ndarray, look: np.ndarray) -> np.ndarray:
-    """Pixels [H, W] bool at which two images in Lab [H, W, 3] do not differ plainly."""
-    return np.asarray(cv2.absdiff(np.ascontiguousarray(lab), np.ascontiguousarray(look)).max(axis=-1) <= DIFFERENT)
 
 
 def shaded_density(step: np.ndarray, spread: np.ndarray) -> np.ndarray:

@@ -12,78 +12,47 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from neuspring.core.errors import InputError
-from neuspring.data.capture import HANDS, NOTHING, OBJECT, PERSON, Capture
+from neuspring.data.capture import HANDS, OBJECT, PERSON, Capture
 from neuspring.data.frames import overlap, spread
 from neuspring.extensions.color_alone.colors import (
-    DIFFERENT,
     Background,
     apart,
     bins_of,
     count,
-    depth_odds,
-    log_density,
     mixed,
 )
 from neuspring.extensions.color_alone.seeds import Seeds
-from neuspring.extensions.color_alone.solve import CarriedFrame, MarkedFrame, Pass, start
+from neuspring.extensions.color_alone.solve import MarkedFrame, Pass, start
 from neuspring.perception.film import CameraFilm, Carried, Film, Progress, doubt_of, over_capture
 from neuspring.perception.marks import MARKS, Mark, Marks, require_marks
 from neuspring.perception.segment_opencv import lab_of
 
-MISFIT = 2.0
-"""Log ratio from which a color contradicts its label."""
+DISAGREEMENT, UNSURE_BORDER = 0.35, 0.5
+"""Values of each that make a doubt of 63 %."""
 CARRY_WIDTH = 848
 """Width of images, pixels, for which BORDER_MOVES is given."""
 BORDER_MOVES = 4.0
 """Distance of the border from where the flow carries it, pixels, at most."""
 BACKGROUND_FRAMES = 60
 """Number of frames that the background of the whole film is learned from."""
-LATER, GONE = 12, 0.2
-"""Number of later frames that say whether what is ignored leaves, and the share of them that must show another thing there."""
-STRANGE = 1.0
-"""Log ratio, to the background's, from which a color is one of a person that is marked, and teaches no background."""
 LEARNED_APART = 4
 """Pixels around object and hands that teach no background."""
 
 
-class Cues(NamedTuple):
-    """Doubts about one frame's labels, each 0 or more."""
-
-    disagreement: float = 0.0
-    """1 - IoU with the other direction or, outside of two marked frames, with the first pass; object or hands, the larger one."""
-    flow: float = 0.0
-    """Mean doubt of the flow on object and hands."""
-    misfit: float = 0.0
-    """Part of object and hands whose colors contradict their label."""
-    unsure: float = 0.0
-    """Mean of 2 (1 - p) over the pixels at the border of object and hands."""
-
-    def squares(self) -> float:
-        """Sum of the squares of the cues, each over its value in WHOLE."""
-        return sum((value / whole) ** 2 for value, whole in zip(self, WHOLE, strict=True))
-
-
-WHOLE = Cues(disagreement=0.35, flow=0.8, misfit=0.5, unsure=0.5)
-"""Value of each cue that makes a doubt of 63 %."""
-
-
-def cues_of(step: CarriedFrame, other: np.ndarray) -> Cues:
-    """Doubts about a frame's labels, with those [h, w] that it was given otherwise."""
-    labels = step.probability.argmax(axis=0)
+def cues_of(probability: np.ndarray, other: np.ndarray) -> float:
+    """Doubt about a frame's probabilities [K, h, w], squared: how far its labels are from those it was given otherwise [h, w] (1 -
+    IoU, of object or hands the larger one), and how unsure its borders are, the mean of 2 (1 - p) there."""
+    labels = probability.argmax(axis=0)
+    apart = max(1 - np.nan_to_num(overlap(labels == label, other == label), nan=1.0) for label in (OBJECT, HANDS))
     shown = np.isin(labels, (OBJECT, HANDS))
-    disagreement = max(1 - np.nan_to_num(overlap(labels == label, other == label), nan=1.0) for label in (OBJECT, HANDS))
-    if not shown.any():
-        return Cues(disagreement)
     rim = shown & (cv2.erode(shown.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
-    misfit = float((step.misfit[shown] > MISFIT).mean())
-    unsure = float(2 * (1 - step.probability.max(axis=0)[rim]).mean()) if rim.any() else 0.0
-    return Cues(disagreement, float(step.flow_doubt[shown].mean()), misfit, unsure)
+    unsure = float(2 * (1 - probability.max(axis=0)[rim]).mean()) if rim.any() else 0.0
+    return float((apart / DISAGREEMENT) ** 2 + (unsure / UNSURE_BORDER) ** 2)
 
 
 def require(capture: Capture) -> None:
@@ -168,7 +137,7 @@ class _Work:
         """Number of labels: a person is one where it is marked in any frame."""
         self.person = self._person() if self.kinds > PERSON else None
         self.starts: dict[int, MarkedFrame] = {}
-        self.background: Background | None = None
+        self.background = Background.empty(self.size)
         self.done = 0
 
     def lab(self, frame: int) -> np.ndarray:
@@ -200,8 +169,8 @@ class _Work:
         """A frame, solved from its marks."""
         return start(self.lab(frame), self.seeds(frame), self.resized(self.film.height(frame)), self.background, self.person)
 
-    def step(self, walk: Pass, frame: int, seeds: Seeds | None = None) -> CarriedFrame:
-        """A frame, solved from the one beside it."""
+    def step(self, walk: Pass, frame: int, seeds: Seeds | None = None) -> np.ndarray:
+        """Probabilities [K, h, w] of a frame, solved from the one beside it."""
         return walk.step(self.lab(frame), self.resized(self.film.depth(frame)), seeds)
 
     def first_pass(self) -> np.ndarray:
@@ -210,12 +179,11 @@ class _Work:
         labels = np.zeros((count, *self.size), np.uint8)
         self.starts[begin] = self.start(begin)
         labels[begin] = self.starts[begin].labels
-        self.background = Background.empty(self.size, self.guests(), self.strangers())
         for frames in (range(begin + 1, count), range(begin - 1, -1, -1)):
             walk = self.walk_from(begin, learns=True)
             for frame in frames:
                 seeds = self.seeds(frame, carried=True) if frame in self.marks else None
-                probability = self.step(walk, frame, seeds).probability
+                probability = self.step(walk, frame, seeds)
                 if seeds is not None:
                     self.starts[frame] = MarkedFrame.of(walk.lab, probability, seeds)
                     walk.first = self.colors()
@@ -226,73 +194,42 @@ class _Work:
     def second_pass(self, first: np.ndarray) -> Carried:
         """Labels and doubt, now that the whole film's background and the colors of all marked frames are known."""
         count = self.film.count
-        if self.background is not None:
-            # The background of the whole film, from frames where their labels say nothing.
-            self.background = Background.empty(self.size, self.background.guests, self.background.strangers)
-            for frame in spread(range(count), BACKGROUND_FRAMES):
-                self.background.learn(self.lab(frame), apart(first[frame], LEARNED_APART), self.resized(self.film.depth(frame)))
-            # What was uncovered later shows where the object ended at first.
-            self.starts[self.begin] = self.start(self.begin)
-        labels, cues = np.zeros((count, *self.full), np.uint8), [Cues() for _ in range(count)]
+        # The background of the whole film, from frames where their labels say nothing.
+        self.background = Background.empty(self.size)
+        for frame in spread(range(count), BACKGROUND_FRAMES):
+            self.background.learn(self.lab(frame), apart(first[frame], LEARNED_APART), self.resized(self.film.depth(frame)))
+        # What was uncovered later shows where the object ended at first.
+        self.starts[self.begin] = self.start(self.begin)
+        labels, doubt = np.zeros((count, *self.full), np.uint8), np.zeros(count)
         keys = sorted(self.starts)
         for key in keys:
             labels[key] = self.full_labels(self.starts[key].probability)
         for key, frames in ((keys[-1], range(keys[-1] + 1, count)), (keys[0], range(keys[0] - 1, -1, -1))):
             walk = self.walk_from(key, learns=False)
             for frame in frames:
-                step = self.step(walk, frame)
-                labels[frame] = self.full_labels(step.probability)
-                cues[frame] = cues_of(step, first[frame])
+                probability = self.step(walk, frame)
+                labels[frame] = self.full_labels(probability)
+                doubt[frame] = cues_of(probability, first[frame])
                 self.tick()
         # Between two marked frames: both directions, weighed by the distance in time.
         for left, right in pairwise(keys):
             forward, walk = {}, self.walk_from(left, learns=False)
             for frame in range(left + 1, right):
                 # A byte is enough, and a long film fits into memory.
-                forward[frame] = np.round(255 * self.step(walk, frame).probability).astype(np.uint8)
+                forward[frame] = np.round(255 * self.step(walk, frame)).astype(np.uint8)
             walk = self.walk_from(right, learns=False)
             for frame in range(right - 1, left, -1):
-                step = self.step(walk, frame)
+                probability = self.step(walk, frame)
                 there, weight = forward.pop(frame) / np.float32(255), (frame - left) / (right - left)
-                cues[frame] = cues_of(step, there.argmax(axis=0))
-                labels[frame] = self.full_labels((1 - weight) * there + weight * step.probability)
+                doubt[frame] = cues_of(probability, there.argmax(axis=0))
+                labels[frame] = self.full_labels((1 - weight) * there + weight * probability)
                 self.tick()
-        return Carried(labels, doubt_of(labels, np.array([cue.squares() for cue in cues])))
-
-    def guests(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-        """Things that are ignored in a marked frame and leave: where [h, w] bool, and its look, Lab [h, w, 3].
-
-        It differs in the film's last frame and in GONE of those after the marked one. What stays is background.
-        """
-        found = []
-        for frame, marks in self.marks.items():
-            later = spread(range(frame + 1, self.film.count), LATER) if frame + 1 < self.film.count else []
-            if later and any(mark.label == "ignore" for mark in marks):
-                look = self.lab(frame)
-                other = np.stack([cv2.absdiff(self.lab(k), look).max(axis=-1) > DIFFERENT for k in later])
-                place = (self.seeds(frame).certain == NOTHING) & other[-1] & (other.mean(axis=0) >= GONE)
-                found.append((place, look))
-        return tuple(found)
+        return Carried(labels, doubt_of(labels, doubt))
 
     def _person(self) -> np.ndarray:
         """Colors [bins] of the person in all frames in which one is marked."""
         frames = [frame for frame, marks in self.marks.items() if any(mark.label == "person" for mark in marks)]
         return mixed([(1.0, count(bins_of(self.lab(frame)), self.seeds(frame).certain == PERSON)) for frame in frames])
-
-    def person_depth(self) -> np.ndarray | None:
-        """Log ratio [bins] of the depths of the person to those of object and hands, from the marked frames so far."""
-        own, others = [np.zeros(0)], [np.zeros(0)]
-        for frame, known in self.starts.items() if self.person is not None else ():
-            if (depth := self.resized(self.film.depth(frame))) is not None:
-                own.append(depth[known.labels == PERSON])
-                others.append(depth[np.isin(known.labels, (OBJECT, HANDS))])
-        return depth_odds(np.concatenate(own), np.concatenate(others)) if len(own) > 1 else None
-
-    def strangers(self) -> np.ndarray | None:
-        """Colors [bins] bool that a person has and the background of the first marked frame has not."""
-        if self.person is None:
-            return None
-        return np.asarray(log_density(self.person) - log_density(self.starts[self.begin].counts[NOTHING]) > STRANGE)
 
     @property
     def begin(self) -> int:
@@ -305,7 +242,6 @@ class _Work:
             lab=self.lab(key),
             probability=self.starts[key].probability,
             first=self.colors(),
-            person_depth=self.person_depth(),
             background=self.background,
             learns=learns,
             reach=BORDER_MOVES * max(self.size) / CARRY_WIDTH,

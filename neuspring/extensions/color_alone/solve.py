@@ -18,7 +18,6 @@ from neuspring.extensions.color_alone.colors import (
     apart,
     bins_of,
     count,
-    depth_bins,
     log_density,
     mixed,
     shaded_density,
@@ -165,9 +164,9 @@ class MarkedFrame:
 def start(
     lab: np.ndarray,
     seeds: Seeds,
-    height: np.ndarray | None = None,
-    background: Background | None = None,
-    person: np.ndarray | None = None,
+    height: np.ndarray | None,
+    background: Background,
+    person: np.ndarray | None,
 ) -> MarkedFrame:
     """Labels and colors of a frame, Lab [H, W, 3], from its marks; with heights above the table [H, W], m, the background, and the
     colors [bins] of a person that is marked in any frame."""
@@ -184,8 +183,7 @@ def start(
         logs = np.stack([log_density(own)[bins] if own.sum() else np.full(bins.shape, NEVER) for own in counts])
         near = np.log(LOCAL_BACKGROUND) + _local_density(lab, labels == NOTHING)
         logs[NOTHING] = np.logaddexp(near, np.log(1 - LOCAL_BACKGROUND) + logs[NOTHING])
-        if background is not None:
-            logs[NOTHING] = background.explain(logs[NOTHING], lab, np.zeros(3, np.float32))
+        logs[NOTHING] = background.explain(logs[NOTHING], lab, np.zeros(3, np.float32))
         logs = place + COLOR_AT_START * logs
         probability = solve(logs.astype(np.float32), lab)
         labels = tidy(probability.argmax(axis=0).astype(np.uint8), seeds)
@@ -274,18 +272,6 @@ def tidy(labels: np.ndarray, seeds: Seeds) -> np.ndarray:
     return result
 
 
-@dataclass(frozen=True, eq=False)
-class CarriedFrame:
-    """A frame that is solved."""
-
-    probability: np.ndarray
-    """[K, H, W]."""
-    flow_doubt: np.ndarray
-    """[H, W], 0 to 1."""
-    misfit: np.ndarray
-    """[H, W]: by how much, as a log ratio, another label explains the pixel's color better; 0 or more."""
-
-
 @dataclass(eq=False, kw_only=True)
 class Pass:
     """State while labels are carried in one direction."""
@@ -296,9 +282,7 @@ class Pass:
     """Probabilities of the last frame [K, H, W]."""
     first: tuple[np.ndarray, ...]
     """Colors of the marked frames: counts [bins] of nothing, object, hands, person."""
-    person_depth: np.ndarray | None
-    """Log ratio [bins] of the depths of a person to those of object and hands."""
-    background: Background | None
+    background: Background
     learns: bool
     """True where the background is learned on the way."""
     reach: float
@@ -314,11 +298,11 @@ class Pass:
         self.running = [np.zeros_like(own) for own in self.first]
         self._learn(None)
 
-    def step(self, lab: np.ndarray, depth: np.ndarray | None = None, seeds: Seeds | None = None) -> CarriedFrame:
-        """The next frame, Lab [H, W, 3], which becomes the last one; with its depth, m, and its marks, if there are any."""
+    def step(self, lab: np.ndarray, depth: np.ndarray | None = None, seeds: Seeds | None = None) -> np.ndarray:
+        """Probabilities [K, H, W] of the next frame, Lab [H, W, 3], which becomes the last one; with its depth, m, and marks."""
         window = self.window(lab, seeds)
         near, before = lab[window], self.probability[(slice(None), *window)]
-        place, doubted = self.place(near, self.lab[window], before)
+        place = self.place(near, self.lab[window], before)
         part = None if seeds is None else seeds.part(window)
         if part is not None:
             self._show(near, part)
@@ -337,10 +321,7 @@ class Pass:
         self.probability[(slice(None), *window)] = solved
         self.lab, self.steps = lab, self.steps + 1
         self._learn(depth)
-        chosen = np.take_along_axis(color, solved.argmax(axis=0)[None], axis=0)[0]
-        flow_doubt, misfit = np.zeros(lab.shape[:2], np.float32), np.zeros(lab.shape[:2], np.float32)
-        flow_doubt[window], misfit[window] = doubted, color.max(axis=0) - chosen
-        return CarriedFrame(self.probability, flow_doubt, misfit)
+        return self.probability
 
     def window(self, lab: np.ndarray, seeds: Seeds | None) -> tuple[slice, slice]:
         """The part of the image that is worked on: around what was there, what comes in from the border, and marks."""
@@ -349,8 +330,7 @@ class Pass:
             busy |= seeds.marked
             if self._new(seeds):
                 return slice(None), slice(None)
-        if self.background is not None:
-            busy |= _entering(self.background.changed(lab))
+        busy |= _entering(self.background.changed(lab))
         margin = round(MOVES_AT_MOST * self.reach)
         places = []
         for axis in (1, 0):
@@ -358,8 +338,8 @@ class Pass:
             places.append(slice(max(found[0] - margin, 0), found[-1] + margin + 1) if len(found) else slice(None))
         return places[0], places[1]
 
-    def place(self, lab: np.ndarray, last: np.ndarray, probability: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Probabilities [K, h, w] by what the flow brings, and how far the flow [h, w] is doubted, 0 to 1."""
+    def place(self, lab: np.ndarray, last: np.ndarray, probability: np.ndarray) -> np.ndarray:
+        """Probabilities [K, h, w] by what the flow brings."""
         flow = flow_between(lab[..., 0], last[..., 0])
         height, width = lab.shape[:2]
         grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
@@ -378,7 +358,7 @@ class Pass:
             if self.first[label].sum():
                 place[label] += ANYWHERE[label]
         place = place + np.float32(1e-6)
-        return place / place.sum(axis=0), doubt
+        return np.asarray(place / place.sum(axis=0))
 
     def _new(self, seeds: Seeds) -> list[int]:
         """Labels that are marked on a frame and were on none before."""
@@ -398,19 +378,16 @@ class Pass:
         bins = bins_of(lab)
         logs = np.stack([own[bins] for own in self.colors])
         nearer = np.zeros(lab.shape[:2], np.float32)
-        if self.background is not None:
-            background = self.background.part(window)
-            gain = background.gain(lab, probability[NOTHING] > CONFIDENT)
-            logs[NOTHING] = background.explain(logs[NOTHING], lab, gain)
-            if depth is not None:
-                nearer = background.depth_log_ratio(depth)
+        background = self.background.part(window)
+        gain = background.gain(lab, probability[NOTHING] > CONFIDENT)
+        logs[NOTHING] = background.explain(logs[NOTHING], lab, gain)
+        if depth is not None:
+            nearer = background.depth_log_ratio(depth)
         # What the background explains teaches no color of the object: its shadow would become a part of it.
         self.explained = np.zeros(self.lab.shape[:2], bool)
         self.explained[window] = logs[NOTHING] > logs[1:].max(axis=0)
         logs = COLOR * np.maximum(logs - logs.max(axis=0), -MOST_COLOR / COLOR)
         logs[NOTHING] += nearer
-        if self.person_depth is not None and depth is not None:
-            logs[PERSON] += self.person_depth[depth_bins(depth)]
         return np.asarray(logs, dtype=np.float32)
 
     def tidy(self, probability: np.ndarray, place: np.ndarray, window: tuple[slice, slice], seeds: Seeds | None) -> np.ndarray:
@@ -437,8 +414,6 @@ class Pass:
 
         What a hand uncovers of a cloth has colors that no mark knows, such as those of folds.
         """
-        if self.background is None:
-            return
         nothing, seen = probability.argmax(axis=0) == NOTHING, self.background.part(window).seen > 0
         number, pieces, boxes, _ = cv2.connectedComponentsWithStats(nothing.astype(np.uint8), connectivity=4)
         areas = boxes[:, cv2.CC_STAT_AREA]
@@ -457,7 +432,7 @@ class Pass:
 
     def _learn(self, depth: np.ndarray | None) -> None:
         """Colors, from each fourth frame, and the background."""
-        if self.background is not None and self.learns:
+        if self.learns:
             labels = self.probability.argmax(axis=0)
             self.background.learn(self.lab, apart(labels, 3) & (self.probability[NOTHING] > CONFIDENT), depth)
         if self.steps % LEARN_EVERY:

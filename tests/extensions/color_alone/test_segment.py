@@ -1,14 +1,11 @@
 """Marks carried through films whose masks are known."""
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, PERSON
-from neuspring.extensions.color_alone.colors import LAB_BINS, Background, bins_of
 from neuspring.extensions.color_alone.segment import carry_film, frame_mask
 from tests.support.marked import SIZE, SQUARE, Painted, mark, overlap, painted, rope
 
@@ -82,21 +79,6 @@ def test_what_a_hand_uncovers_of_a_cloth_is_object():
     assert (carry_film(made, marks).labels[-1][fold] == OBJECT).mean() > 0.7
 
 
-def test_an_ignored_hand_that_leaves_does_not_make_the_table_object():
-    """It lay beside a pale object. Its look was learned as the table's there, and the table then passed for the object."""
-    made, (rows, columns) = painted(14, step=0.5), np.indices(SIZE)
-    grain = cv2.GaussianBlur(np.random.default_rng(7).normal(0, 1, SIZE), (0, 0), 1.5)[..., None]
-    for frame, (image, truth) in enumerate(zip(made.frames, made.truth, strict=True)):
-        arm = (columns >= 44) & (columns < 58) & (rows < 52 - 7 * max(frame - 4, 0)) & (truth == 0)
-        for place, color in ((truth == OBJECT, (190, 180, 170)), (arm, (190, 120, 95))):
-            image[place] = np.clip(color + 30 * grain[place], 0, 255)
-    beside = mark("ignore", "polygon", [(44, 0), (57, 0), (57, 51), (44, 51)])
-    labels = carry_film(made, [*SQUARE, beside]).labels
-    # Without the hand 121 pixels at the pale square are wrong in the last frame; 470 were with it.
-    assert ((labels[-1] > 0) & (made.truth[-1] == 0)).sum() < 250
-    assert all((labels[frame, :26, 46:] == 0).all() for frame in range(5)), "while it is there it is neither"
-
-
 def visited(color: tuple[int, int, int]) -> tuple[Painted, np.ndarray]:
     """A film into which a sleeve comes from the right in frame 2; and where it is [T, H, W] bool."""
     made, (rows, columns) = painted(8), np.indices(SIZE)
@@ -120,33 +102,6 @@ def test_a_person_that_is_marked_once_is_neither_object_nor_hand_in_any_frame():
     assert np.isin(known[sleeve], (OBJECT, HANDS)).mean() < 0.05
     assert all((known[frame][sleeve[frame]] == PERSON).mean() > 0.7 for frame in (4, 5, 6, 7))
     assert overlap(known[7], film.truth[7], OBJECT) > 0.85
-
-
-def test_a_person_s_depth_tells_it_from_hands_of_its_color():
-    film, sleeve = visited((190, 120, 95))
-
-    @dataclass(frozen=True, eq=False)
-    class Deep(Painted):
-        def depth(self, frame: int, /) -> np.ndarray:
-            near = np.where(self.truth[frame] > 0, 0.6, 1.0)
-            return np.where(sleeve[frame], 0.8, near).astype(np.float32)
-
-    flat, deep = (carry_film(kind(film.frames, film.truth), [*SQUARE, SLEEVE]).labels for kind in (Painted, Deep))
-    wrong = [np.isin(found[sleeve], (OBJECT, HANDS)).mean() for found in (flat, deep)]
-    assert wrong[1] < 0.05
-    assert overlap(deep[3], film.truth[3], HANDS) > max(0.75, overlap(flat[3], film.truth[3], HANDS) - 0.05)
-
-
-def test_colors_of_a_person_teach_no_background():
-    place = np.ones((4, 4), bool)
-    lab = np.full((4, 4, 3), 120, np.uint8)
-    strangers = np.zeros(int(np.prod(LAB_BINS)), bool)
-    strangers[bins_of(lab)] = True
-    background = Background.empty((4, 4), strangers=strangers)
-    background.learn(lab, place)
-    assert not background.seen.any()
-    background.learn(lab + 60, place)
-    assert background.seen.all()
 
 
 def test_a_mark_corrects_what_was_carried():
