@@ -1,4 +1,4 @@
-"""The masks of one camera over the video: whether object and hands are there, whole, and change as bodies and pictures do."""
+"""The masks of one camera over the video: whether object and hands are there, whole, and change as bodies and images do."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from neuspring.core.checks import Check
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.data.frames import frames_of, gray, spread
 
@@ -21,24 +20,13 @@ SECOND_PIECE = 0.3
 """A piece with at least this fraction of the largest piece's area counts as an object."""
 LEAVES = 0.1
 """Fraction of its area in frame 0 below which an object has left the view."""
-SMALL_MASK = 200
-"""Pixels of the object in frame 0."""
 BORDER_PIXELS = 3
 """Pixels of the object on the image border from which it may go on outside."""
-CUT = 0.1
-"""Share of the frames from which an object at the border counts as cut off; frame 0 alone does, where its shape is taken."""
-ENTERS = 0.5
-"""Share of the frames in which an arm enters the image; in real films and synthetic scenes it is 0.6 to 1."""
-BORDERED = 0.1
-"""Part of the image's border that is object, median over frames, from which the mask shows the background or a person."""
-AREA_JUMP = 2.0
-"""Ratio of the object's areas in neighboring frames: no body grows that fast."""
 AREA_STEP, STEPS_SHARE, FEWEST_STEPS = 1.5, 0.1, 3
 """A smaller such ratio, and the part and number of frames with it from which a mask flickers: what is hidden once and comes back
 jumps twice."""
 AREA_FLOOR = 1e-4
 """Part of the image by which areas are enlarged before they are divided: a few pixels of a hidden object are no jump."""
-MARK_REMEDY = "Mark object and hands in a few frames (`neuspring mask`), or choose another perception.segment.backend."
 
 
 class Shown:
@@ -111,42 +99,37 @@ def missing(shown: Shown) -> dict[str, Any] | None:
     return _of_frames(gone) if len(gone) and area[0] != 0 else None
 
 
-def at_border(shown: Shown) -> dict[str, Any] | None:
-    """Frames in which the object, and not the background with it, is cut off by the image."""
-    cut = shown.frames[shown.borders[OBJECT, shown.frames] >= BORDER_PIXELS]
-    cut_off = len(cut) and (cut[0] == 0 or len(cut) >= CUT * len(shown.frames))
-    return _of_frames(cut) if cut_off and shown.bordered <= BORDERED else None
-
-
 def exchanged(shown: Shown) -> dict[str, Any] | None:
-    """Share of its frames in which the object is at the image border, where arms should enter, and the hands stay inside."""
+    """Share of its frames in which the object is at the image border, where the hands stay inside; arms should enter there."""
     at_it, there = shown.borders >= BORDER_PIXELS, shown.areas > 0
     object_in, hands_in = (np.sum(at_it[label]) / max(np.sum(there[label]), 1) for label in (OBJECT, HANDS))
-    enough = there[HANDS].sum() >= ENTERS * len(shown.frames)
-    return {"value": float(object_in), "hands": hands_in} if enough and object_in >= ENTERS and hands_in < CUT else None
+    enough = there[HANDS].sum() >= 0.5 * len(shown.frames)
+    return {"value": float(object_in)} if enough and hands_in < 0.1 else None
 
 
 def jumps(shown: Shown) -> dict[str, Any] | None:
-    """Ratio of the object's areas in the first pair of frames between which it jumps."""
-    wild = {} if shown.steps > STEPS_SHARE else {frame: ratio for frame, ratio in shown.ratios().items() if ratio > AREA_JUMP}
-    if not wild:
+    """The largest ratio of the object's areas in neighboring frames, where they do not flicker."""
+    ratios = {} if shown.steps > STEPS_SHARE else shown.ratios()
+    if not ratios:
         return None
-    frame = next(iter(wild))
-    return _of_frames([*wild]) | {"value": wild[frame], "before": frame - 1}
+    frame = max(ratios, key=lambda one: ratios[one])
+    return {"value": ratios[frame], "detail": f"from frame {frame - 1} to {frame}", "frames": (frame,)}
 
 
-def _of_frames(frames: Sequence[int] | np.ndarray) -> dict[str, Any]:
-    return {"value": len(frames), "count": len(frames), "first": int(frames[0]), "frames": [int(frame) for frame in frames]}
+def outside(facts: Mapping[str, float]) -> dict[str, Any]:
+    """Share of the times in which something moves at the object and lies in no mask."""
+    first = int(facts.get("first_outside", 0))
+    return {"value": facts["moves_outside"], "detail": f"first in frame {first}", "frames": (first,)}
+
+
+def _of_frames(frames: np.ndarray) -> dict[str, Any]:
+    return {"value": len(frames), "detail": f"first is frame {frames[0]}", "frames": frames.tolist()}
 
 
 SAME_GRAY = 6
 """Change of gray below which a pixel did not change."""
 FLICKER_PAIRS = 16
 """Number of pairs of frames that are looked at for pixels that change their label alone."""
-HANDS_INSIDE = 0.25
-"""Part of the hands' pixels that lie in pieces enclosed by the object, from which they are its print."""
-FLICKER = 0.08
-"""Pixels that change their label and not their color, as part of object and hands, from which labels are noise."""
 LAG, LOOKED = 3, 24
 """Frames between two pictures that are compared, and number of such pairs."""
 COMPARED_WIDTH, COLOR_MOVED = 320, 12
@@ -160,16 +143,9 @@ OFTEN = 0.1
 """Share of the frames, or of the pairs, from which something is a warning: a rope that turns away for two frames is none."""
 STIRRED = 0.05
 """Part of the object's pixels that change where it moves."""
-NEW, DARKER, SHADOW_TINT = 0.01, 0.05, 0.12
-"""Part of the object's pixels that must look new; how much lighter, as a log ratio, a shadow may make a pixel, and by how much the
+DARKER, SHADOW_TINT = 0.05, 0.12
+"""How much lighter, as a log ratio, a shadow may make a pixel, and by how much the
 ratios of its three colors may differ."""
-LEAST_NEWLY_KEPT = 0.4
-"""Share of what the object seems to cover newly that lies in its mask. Right masks of real films keep 0.52 to 0.99, and masks that
-lose 80 % of it 0.2 or less. Of color alone: right masks of a real RGBD film, in which an arm comes near, keep 0.2 too."""
-UNMARKED = (
-    "Look there: a part of the object, or a hand that came in, lies in no mask. Mark it in that frame (`neuspring annotate`), and "
-    "carry again. If neither moves there, ignore this."
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,16 +241,6 @@ def object_moves(seen: Sequence[Motion], train_end: int) -> dict[str, float]:
     return {"object_moves": float(np.mean([motion.stirred for motion in seen if motion.frame < train_end] or [False]))}
 
 
-def newly_kept(seen: Sequence[Motion]) -> dict[str, float]:
-    """The part of what seems newly covered that lies in the object's mask, and the first frame in which that is too little."""
-    newly = [(motion.frame, *motion.newly) for motion in seen if motion.newly[1] > NEW * motion.begin.sum()]
-    if len(newly) < FEWEST_STEPS:
-        return {}
-    lost = [frame for frame, kept, found in newly if kept < LEAST_NEWLY_KEPT * found]
-    share = sum(kept for _, kept, _ in newly) / sum(found for *_, found in newly)
-    return {"newly_kept": share} | ({"first_newly_lost": float(lost[0])} if lost else {})
-
-
 def flicker(capture: Capture, camera: str, labels: np.ndarray, frames: np.ndarray) -> float:
     """Pixels that change their label and not their color from one frame to the next, as part of object and hands."""
     flips = total = 0
@@ -299,9 +265,6 @@ def hands_inside(labels: np.ndarray) -> float:
     return inside / max(int(hands.sum()), 1)
 
 
-Facts = Mapping[str, float]
-
-
 def mask_facts(capture: Capture, camera: str, labels: np.ndarray) -> dict[str, float]:
     """Shares and counts of labels [T, H, W], which the record of segmentation keeps."""
     shown, seen = Shown.of(capture, camera, labels), list(motions(capture, camera, labels))
@@ -319,70 +282,9 @@ def mask_facts(capture: Capture, camera: str, labels: np.ndarray) -> dict[str, f
         "flicker": flicker(capture, camera, labels, frames),
         **moves_outside(seen),
         **object_moves(seen, capture.train_end),
-        **newly_kept(seen),
     }
 
 
 def _median(values: Sequence[float] | np.ndarray) -> float:
     """0 of none: a camera may have no frame."""
     return float(np.median(values)) if len(values) else 0.0
-
-
-def outside(facts: Facts) -> dict[str, Any]:
-    """Share of the times in which something moves at the object and lies in no mask."""
-    first = int(facts.get("first_outside", 0))
-    return {"value": facts["moves_outside"], "first": first, "frames": (first,)}
-
-
-def kept(facts: Facts, has_depth: bool) -> dict[str, Any] | None:
-    """Share of newly covered parts that the object's mask keeps, of color alone."""
-    first = int(facts.get("first_newly_lost", 0))
-    return None if has_depth else {"value": facts.get("newly_kept", 1.0), "first": first, "frames": (first,)}
-
-
-INF = float("inf")
-# fmt: off
-checks = (
-    Check("no object in frame 0", "masks", lambda shown: first_area(shown, OBJECT), (0.5, INF), "warning",
-          f"no pixel with label {OBJECT} in frame 0; shape and points begin there.", MARK_REMEDY),
-    Check("no hand in frame 0", "masks", lambda shown: first_area(shown, HANDS), (0.5, INF), "warning",
-          f"no pixel with label {HANDS} in frame 0; controllers begin in frame 0, with what some camera shows of the hands there.",
-          "Begin the capture when a hand is in view, or mark it."),
-    Check("two objects", "masks", lambda shown: shown.objects, (0, 1), "warning",
-          "the object's mask of frame 0 has {value} pieces far apart; one object is expected, whose pieces lie together; two "
-          "become one twin.", MARK_REMEDY),
-    Check("small object", "masks", lambda shown: first_area(shown, OBJECT) or None, (SMALL_MASK, INF), "warning",
-          "{value:.0f} pixels of object in frame 0; at least {low} are expected.", "Film from nearer by."),
-    Check("object missing", "masks", missing, None, "warning",
-          "almost nothing of the object in {count} frames, first in frame {first}; each frame should show it; its points are "
-          "invisible there.", MARK_REMEDY),
-    Check("background in the mask", "masks", lambda shown: shown.bordered, (0, BORDERED), "warning",
-          "{value:.0%} of the image's border is object; at most {high:.0%} is expected; the mask holds the table, a sleeve or a "
-          "person.", MARK_REMEDY),
-    Check("labels exchanged", "masks", exchanged, None, "warning",
-          f"the object (label {OBJECT}) reaches the image border in {{value:.0%}} of its frames, the hands (label {HANDS}) in "
-          "{hands:.0%} of theirs; arms enter there, and the object does not.",
-          f"If they are exchanged, write {OBJECT} for the object and {HANDS} for hands."),
-    Check("object at the border", "masks", at_border, None, "warning",
-          "the object touches the image border in {count} frames, first in frame {first}; what is outside is neither seen nor "
-          "carved.",
-          "Is it the object? Then move the camera back, or keep other frames (make-capture --frames). If not, mark what it is."),
-    Check("mask flickers", "masks", lambda shown: shown.steps, (0, STEPS_SHARE), "warning",
-          f"the object's area changes {AREA_STEP:g}-fold or more in {{value:.0%}} of the frames; at most {{high:.0%}} are "
-          "expected.", MARK_REMEDY),
-    Check("mask jumps", "masks", jumps, None, "warning",
-          "the object's area changes {value:.1f}-fold from frame {before} to {first} (so in {count} frames); less than "
-          f"{AREA_JUMP:g}-fold is expected.", MARK_REMEDY),
-    Check("hands inside the object", "segmentation", lambda facts, _: facts["hands_inside"], (0, HANDS_INSIDE), "warning",
-          "{value:.0%} of the hands' pixels lie inside of the object; at most {high:.0%} are expected; its own colors are taken "
-          "for hands.", MARK_REMEDY),
-    Check("labels are noise", "segmentation", lambda facts, _: facts["flicker"], (0, FLICKER), "warning",
-          "{value:.0%} of the masks changes its label where the image does not change; at most {high:.0%} is expected.",
-          MARK_REMEDY),
-    Check("motion outside of the masks", "segmentation", lambda facts, _: outside(facts), (0, OFTEN), "warning",
-          f"in {{value:.0%}} of the times that were looked at, first in frame {{first}}, more than {OUTSIDE:.0%} of what moves "
-          "at the object lies in no mask; less than {high:.0%} is expected.", UNMARKED),
-    Check("newly covered parts lost", "segmentation", kept, (LEAST_NEWLY_KEPT, INF), "warning",
-          "of what the object seems to cover newly since frame 0, its mask keeps {value:.0%}, too little first in frame {first}; "
-          "at least {low:.0%} is expected.", UNMARKED),
-)

@@ -1,4 +1,4 @@
-"""Points in space from frame to frame: hands, markers on an object or along a line.
+"""Points in space from frame to frame: hands, markers on an object, markers along a cable.
 
 Nothing that moves is anywhere twice to the bit, leaves its place for a frame, or changes places with another. Where a file says so,
 a marker was lost, a stream stood still, or labels were exchanged.
@@ -15,14 +15,13 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-from neuspring.core.checks import Check
 from neuspring.core.text import listed
 
 AROUND = 4
 """Frames before and after a step with which it is compared; up to two more large steps there do not hide it."""
-STEP, HELD_STEP, ALL_TOGETHER = 6.0, 3.0, 4.0
-"""Steps so many times as large as those around are no motion: of a point, after it stood still to the bit, of all points together.
-In 350 recordings of motion capture one marker steps at most 4.2 times as far as around. Some of them lack samples: there all step
+STEP, HELD_STEP = 6.0, 3.0
+"""Steps so many times as large as those around are no motion: of a point, after it stood still to the bit.
+In 350 released recordings of cables one marker steps at most 4.2 times as far as around. Some of them lack samples: there all step
 together, up to 9.9 times as far."""
 LEAST, SLOW = 0.01, 0.5
 """m and m/s: smaller and slower steps may be noise."""
@@ -30,13 +29,10 @@ HELD = 4
 """Frames from which a place that stays equal to the bit is looked at."""
 EXCHANGED = 0.5
 """Steps after an exchange of labels, as a part of those before it, that show that they were exchanged."""
-STEADY_SPAN, MAX_STRETCH, CHANGED_MOST = 0.1, 0.5, 0.005
-"""Distances of neighbors that vary by less than STEADY_SPAN of their median, between the quintiles, are kept by what carries them.
-One that changes by more than MAX_STRETCH and CHANGED_MOST, m, is wrong. Recordings change by 0.37 at most, once by more."""
+MAX_STRETCH = 0.5
+"""Change of the distance of two neighbors, as a fraction of it, by which one of them left the other."""
 MANY = 4
 """Points from which there is a motion of all."""
-PAUSE = 0.25
-"""s. Where so much time is missing, a twin learns another motion."""
 FRAMES_AROUND, NAMED = 50, 3
 """Frames in which neighbors are looked for, and places that a message names."""
 
@@ -149,22 +145,6 @@ class Moving:
             found[last + 1 :, point][: np.argmax(np.append(self.large[last + 1 :, point], True)) + 1] = False
         return found
 
-    def strained(self) -> dict[str, Any] | None:
-        """The largest change of a steady distance of neighbors, as a part of its median, that nothing else explains."""
-        named = {point for group in self.swapped for point in group} | {point for point, *_ in self.held}
-        named |= set(np.flatnonzero(self.stepped.any(axis=0)).tolist())
-        links = [(one, two) for one, two in spanned(apart(self.points, np.nanmedian)).tolist() if not named & {one, two}]
-        if not links:
-            return None
-        one, two = np.transpose(links)
-        lengths = np.linalg.norm(self.points[:, one] - self.points[:, two], axis=2)
-        low, middle, high = np.nanquantile(lengths, (0.2, 0.5, 0.8), axis=0)
-        told = (high - low < STEADY_SPAN * middle) & (np.abs(lengths - middle) > CHANGED_MOST)
-        change = np.where(told, np.abs(lengths / middle - 1), 0.0)
-        frame, link = (int(i) for i in np.unravel_index(int(change.argmax()), change.shape))
-        words = {"value": float(change.max()), "length": lengths[frame, link], "median": middle[link]}
-        return words | {"frame": frame, "one": one[link], "two": two[link], "frames": (frame,)}
-
 
 def apart(points: np.ndarray, of: Callable[..., np.ndarray]) -> np.ndarray:
     """The largest (np.nanmax) or median distance [K, K], m, of each two points [T, K, 3] in some frames; 0 where none sees both."""
@@ -181,7 +161,7 @@ def spanned(distances: np.ndarray) -> np.ndarray:
 def told(entries: Sequence[tuple[int, int, str]]) -> dict[str, Any] | None:
     """Words about points and frames; their number is the value."""
     text = listed((f"point {point} {what}" for point, _, what in entries), NAMED)
-    return {"value": len(entries), "text": text, "frames": sorted({frame for _, frame, _ in entries})} if entries else None
+    return {"value": len(entries), "detail": text, "frames": sorted({frame for _, frame, _ in entries})} if entries else None
 
 
 def lost(moving: Moving) -> dict[str, Any] | None:
@@ -192,13 +172,6 @@ def lost(moving: Moving) -> dict[str, Any] | None:
     return words and words | {"frames": np.flatnonzero(moving.lost.any(axis=1))}
 
 
-def never_seen(moving: Moving) -> dict[str, Any] | None:
-    """Points with the same three equal coordinates in all frames, while others move."""
-    moved = np.nanmax(np.abs(moving.given - moving.given[0]), axis=(0, 2), initial=0.0)
-    equal = (moving.given == moving.given[0, :, :1]).all(axis=(0, 2)) & (moved.max(initial=0.0) > LEAST)
-    return told([(point, 0, f"is {moving.given[0, point].tolist()}") for point in np.flatnonzero(equal).tolist()])
-
-
 def held(moving: Moving) -> dict[str, Any] | None:
     """Places that were held."""
     return told([(point, first, f"from frame {first} to {last}") for point, first, last in moving.held])
@@ -206,7 +179,10 @@ def held(moving: Moving) -> dict[str, Any] | None:
 
 def swapped(moving: Moving) -> list[dict[str, Any]]:
     """Points whose labels are exchanged, and the frames."""
-    return [{"points": group, "value": at[0], "frames": at} for group, at in moving.swapped.items()]
+    return [
+        {"value": len(group), "detail": f"points {group} from frame {at[0]} on", "frames": at}
+        for group, at in moving.swapped.items()
+    ]
 
 
 def stepped(moving: Moving) -> dict[str, Any] | None:
@@ -214,40 +190,3 @@ def stepped(moving: Moving) -> dict[str, Any] | None:
     cm, speed = 100 * moving.away, moving.speed
     at = np.argwhere(moving.stepped).tolist()
     return told([(k, t, f"in frame {t} by {cm[t, k]:.1f} cm, {speed[t, k]:.2g} m/s") for t, k in at])
-
-
-def together(moving: Moving) -> dict[str, Any] | None:
-    """Steps of all points together, and by how many times they are larger than those around."""
-    explained = {last + 1 for *_, last in moving.held} | {frame for at in moving.swapped.values() for frame in at}
-    frames = [t for t in np.flatnonzero(moving.together > ALL_TOGETHER).tolist() if t not in explained]
-    if not frames:
-        return None
-    worst = max(frames, key=lambda t: moving.together[t, 0])
-    factor, cm = float(moving.together[worst, 0]), 100 * np.nanmedian(moving.away[worst])
-    level = "warning" if factor > PAUSE * moving.rate else "note"
-    return {"value": factor, "cm": cm, "frame": worst, "frames": frames, "level": level}
-
-
-# fmt: off
-checks = (
-    Check("lost points as numbers", "moving", lambda moving, _: lost(moving), None, "error",
-          "a point that is not seen has no place; received a value that is repeated to the bit, or three equal coordinates, far "
-          "from where it is seen: {text}. {1}", title=""),
-    Check("point never seen", "moving", lambda moving, _: never_seen(moving), None, "warning",
-          "{text} in every frame while others move. If it was never seen, leave it out", title=""),
-    Check("held value", "moving", lambda moving, _: held(moving), None, "warning",
-          "a place that stays equal to the bit, and is then left by a step or by its neighbors, was held; received {text}. Did the "
-          "stream stop, or was a gap filled with the last value? {1}", title=""),
-    Check("labels swapped", "moving", lambda moving, _: swapped(moving), None, "warning",
-          "points {points} change places in frame {value}: exchanged from there on, all their steps are shorter. Exchange the "
-          "labels, or leave the frames out", title=""),
-    Check("step far beyond the others", "moving", lambda moving, _: stepped(moving), None, "warning",
-          f"steps should be less than {STEP:g} times those around; received {{text}}. Another label, a lost marker, or a reflex? "
-          "{1}", title=""),
-    Check("all points step", "moving", lambda moving, _: together(moving), None, "note",
-          "all points step together in frame {frame} by {cm:.1f} cm, {value:.1f} times as far as around: samples are missing, "
-          "takes were joined, or a pose was lost", title=""),
-    Check("distance out of range", "moving", lambda moving, _: moving.strained(), (0, MAX_STRETCH), "warning",
-          "distances of neighbors that are steady should stay within {high:.0%} of their median {median:.3f} m; received "
-          "{length:.3f} m between points {one} and {two} in frame {frame}", title=""),
-)

@@ -1,79 +1,180 @@
-"""The table, which must be z = 0: how a plane stands in the world, and where pixels meet it."""
+"""All checks of the core: what is measured, the range that is fine, what a departure does to results, and the next step.
+
+`rows` is the table of neuspring/data/README.md. Limits were chosen so that the synthetic scenes and the real recordings of the
+tests pass.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterable
+from math import inf
 
-import numpy as np
-
+from neuspring.checks import masks, moving, objects, observed, perceived, rig, space, timing
+from neuspring.checks.fitted import SHARE_AT_BOUND, at_bound, at_range
 from neuspring.core.checks import Check
-from neuspring.data.camera import Camera, Plane
-from neuspring.data.capture import OBJECT
+from neuspring.data.camera import FAR, NEAR
+from neuspring.data.capture import HANDS, OBJECT
 
-SMALLEST_PLANE = 0.08
-"""Share of the pixels with depth from which a plane may be the table."""
-TILT, TABLE_OFF = 2.0, 0.01
-"""Degrees and m within which the table is level and at z = 0. Ground contact of the simulation is at z = 0."""
-TILTED, FAR_OFF = 15.0, 0.15
-"""Degrees and m beyond which the table is elsewhere, and no twin can rest on it."""
-EXPLAINED = (4.0, 0.03)
-"""Degrees and m within which the table lies after a change that explains a finding; m also as a part of the camera's height."""
-POSE = "Look at camera_to_world: the table must be z = 0 in meters, and the camera's z points forward."
-
-
-@dataclass(frozen=True)
-class Stand:
-    """Tilt and height of a plane in the world."""
-
-    tilt: float
-    """Angle of its normal with up, degrees."""
-    off: float
-    """Height of its points above z = 0 along up, m."""
-
-    def away(self, height: float) -> float:
-        """Its distance from z = 0, 1: as far as EXPLAINED; `height` is the camera's above the plane, m."""
-        return max(self.tilt / EXPLAINED[0], abs(self.off) / max(EXPLAINED[1], EXPLAINED[1] * height))
-
-
-def stand(plane: Plane, pose: np.ndarray, up: float) -> Stand:
-    """Tilt and height of `plane` in the world by `pose`, camera to world [4, 4], m."""
-    cosine = up * (pose[:3, :3] @ plane.normal)[2]
-    z = plane.points.mean(axis=0) @ pose[2, :3] + pose[2, 3]
-    return Stand(float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))), float(up * z))
-
-
-def other_side(up: str) -> str:
-    """The opposite of `up`."""
-    return "-z" if up == "+z" else "+z"
-
-
-def on_table(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """World points [n, 3], m, at which the rays of pixels (x, y) [n, 2] meet z = 0; NaN for rays that never do."""
-    eye = camera.camera_to_world[:3, 3]
-    rays = camera.lift(pixels.astype(float), np.ones(len(pixels))) - eye
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth = -eye[2] / rays[:, 2]
-    return np.asarray(eye + np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)[:, None] * rays)
-
-
-def object_on_table(camera: Camera, mask: np.ndarray) -> np.ndarray:
-    """Places at which the object's pixels of a mask [H, W] meet the table [n, 3], m; NaN beyond the horizon."""
-    y, x = np.nonzero(mask == OBJECT)
-    return on_table(camera, np.stack([x, y], axis=1))
-
-
-def beyond_horizon(camera: Camera, mask: np.ndarray) -> dict[str, Any] | None:
-    """Pixels of the object that look past the table."""
-    own = object_on_table(camera, mask)
-    beyond = int(np.isnan(own[:, 0]).sum())
-    return {"value": beyond, "count": len(own)} if beyond else None
-
+ANNOTATE = "Annotate object and hands in some frames (`neuspring annotate`), or choose another perception.segment.backend."
+SHEET = "Look at contact_sheet.jpg."
+UNIT = "Look at the unit of depth and poses (meters), and at the mask of frame 0 in contact_sheet.jpg."
+TRACKS = "Look at tracks.png; end the capture earlier, use more light or shorter exposures, or cotracker3."
+DEPTH = ("depth",)
+WARN, NOTE, ERROR = "warning", "note", "error"
 
 # fmt: off
 checks = (
-    Check("beyond the horizon", "horizon", beyond_horizon, None, "error",
-          "camera {0.name}: every pixel of the object in frame 0 must look at the table z = 0; received {value} of {count} pixels "
-          "at or above its horizon. " + POSE + " Or correct the mask",
-          title=""),
+    # Masks of one camera
+    Check("no object in frame 0", "masks", lambda shown: masks.first_area(shown, OBJECT), (1, inf), WARN,
+          "pixels of the object in frame 0", ANNOTATE, unit="pixels", effect="shape and points begin there"),
+    Check("no hand in frame 0", "masks", lambda shown: masks.first_area(shown, HANDS), (1, inf), WARN,
+          "pixels of hands in frame 0", "Begin the capture when a hand is in view, or annotate it.", unit="pixels",
+          effect="controllers begin in frame 0"),
+    Check("object missing", "masks", masks.missing, (0, 0), WARN,
+          "frames that show almost nothing of the object", ANNOTATE, unit="frames", effect="its points are invisible there"),
+    Check("background in the mask", "masks", lambda shown: shown.bordered, (0, 0.1), WARN,
+          "fraction of the image's border that is object", ANNOTATE, unit="%",
+          effect="the mask contains the table, a sleeve or a person"),
+    Check("labels exchanged", "masks", masks.exchanged, (0, 0.5), WARN,
+          "fraction of its frames in which the object reaches the image border, and hands do not",
+          f"If labels are exchanged, write {OBJECT} for the object and {HANDS} for hands.", unit="%",
+          effect="arms enter at the border, an object does not"),
+    Check("mask flickers", "masks", lambda shown: shown.steps, (0, masks.STEPS_SHARE), WARN,
+          f"fraction of frames in which the object's area changes {masks.AREA_STEP:g}-fold", ANNOTATE, unit="%",
+          effect="tracks and silhouettes are wrong"),
+    Check("mask jumps", "masks", masks.jumps, (0, 2), WARN,
+          "ratio of the object's areas in neighboring frames", ANNOTATE, effect="no object grows that fast"),
+    Check("hands inside the object", "segmentation", lambda facts: facts["hands_inside"], (0, 0.25), WARN,
+          "fraction of the hands' pixels inside of the object", ANNOTATE, unit="%", effect="its own colors are taken for hands"),
+    Check("labels are noise", "segmentation", lambda facts: facts["flicker"], (0, 0.08), WARN,
+          "fraction of the masks that changes its label where the image does not change", ANNOTATE, unit="%",
+          effect="tracks begin on the background"),
+    Check("motion outside of the masks", "segmentation", masks.outside, (0, masks.OFTEN), WARN,
+          "fraction of the times at which something moves beside the object and is in no mask", ANNOTATE, unit="%",
+          effect="a part of the object, or a hand, has no mask"),
+    # Object and hands of one camera
+    Check("depth holes", "object and hands", objects.holes, (0, 0.4), WARN,
+          "fraction of the object's pixels without depth",
+          "Record from farther than the sensor's least distance, without shine and direct sun.", unit="%",
+          effect="little of it is lifted", needs=DEPTH),
+    Check("hands too large", "object and hands", objects.hand_area, (0, 0.12), WARN,
+          "area of the hands", "Mark sleeves, torso and table to be ignored (`neuspring annotate`).", unit="m²",
+          effect="controllers are points of sleeves or a torso", needs=DEPTH),
+    Check("hand far from the object", "hands", objects.hand_gap, (0, objects.HAND_REACH), WARN,
+          "least distance of hands from the object", "Look for a wrong object or hand in contact_sheet.jpg.", unit="m",
+          effect="hands that do not touch move nothing", needs=DEPTH),
+    Check("constant grips", "grips", objects.constant_grips, None, NOTE,
+          f"hands within {100 * objects.HAND_REACH:g} cm of the object, by frames: {{text}}. A twin is best learned from one "
+          "constant grip{cut}", title=""),
+    Check("size of the object", "object", objects.size, None, NOTE, "{text}.", "Is that what was recorded?"),
+    Check("implausible size", "object", objects.longest, (0.02, 1.2), WARN, "longest side of the object", UNIT, unit="m",
+          effect="a wrong scale or mask makes wrong forces"),
+    Check("object below the table", "object", objects.lowest, (-0.02, inf), WARN,
+          "lowest height of the object above the table", UNIT, unit="m", effect="the ground pushes it up in the twin"),
+    Check("depth unit", "depths", lambda median: median, (NEAR, FAR), ERROR,
+          "median depth", "State the unit of the images, depth_unit in m per count.", unit="m",
+          effect="the twin has another scale", needs=DEPTH),
+    # Cameras
+    Check("table elsewhere", "rig", rig.off_table, (0, rig.TABLE_OFF), WARN,
+          "distance of the table from z = 0, tilt included",
+          f"{SHEET} Usual causes: unit, world-to-camera poses, axes of OpenGL, y up, another order of the cameras.", unit="m",
+          effect="ground contact is at z = 0", needs=DEPTH),
+    Check("view of the table", "rig", rig.view_of_table, (NEAR, 3.0), WARN,
+          "distance of the table z = 0 in the center of the image",
+          f"{SHEET} Usual causes: up, world-to-camera poses, axes of OpenGL, a unit that is not meters.", unit="m",
+          effect="the camera does not look at the table from above"),
+    Check("principal point", "rig", rig.off_center, (0, 0.1), WARN,
+          "distance of the principal point from the center of the image", "State the intrinsics of these images.", unit="%",
+          effect="intrinsics of another image size bend all that is lifted"),
+    Check("depth along the axis", "rig", rig.flatness, (-inf, 0.2), WARN,
+          "additional pixels on one plane if depth is taken for the distance to the camera",
+          "Convert it: z = r / sqrt(1 + ((x - cx) / fx)^2 + ((y - cy) / fy)^2).", unit="%",
+          effect="the distance to the camera instead of depth along the axis bends a flat table", needs=DEPTH),
+    Check("views disagree", "rig", rig.disagreement, (0, 0.12), WARN,
+          "points above the table of one camera that the other looked through",
+          f"{SHEET} A pose, the order of cameras, a lens or a moment is wrong.", unit="%",
+          effect="one object becomes two", needs=DEPTH),
+    # Time
+    Check("out of step", "streams", timing.out_of_step, (-timing.HALF, timing.HALF), ERROR,
+          "frames by which one stream is late, by what moves", "{next}", unit="frames",
+          effect="hands and object move at different times", title="time"),
+    Check("masks of another recording", "mask fit", timing.unlike, (timing.AGREE, inf), WARN,
+          "correlation of what moves in the images and in the masks", f"{SHEET} Give each camera its own masks.",
+          effect="masks show another camera or recording"),
+    Check("repeated images", "repeats", timing.repeats, (0, 0), WARN,
+          "images that are equal to the one before", "Record at the sensor's own rate, or keep one of each.", unit="images",
+          effect="motion stands still and jumps"),
+    # Points from frame to frame
+    Check("lost points as numbers", "moving", lambda one, _: moving.lost(one), (0, 0), ERROR,
+          "times at which a point has a repeated or impossible position", "{1}.", unit="times",
+          effect="a point that is not seen has no position", title=""),
+    Check("held value", "moving", lambda one, _: moving.held(one), (0, 0), WARN,
+          "times at which a point stays equal to the bit, and then steps", "Did the stream stop? {1}.", unit="times",
+          effect="a gap was filled with the last value", title=""),
+    Check("labels swapped", "moving", lambda one, _: moving.swapped(one), (0, 0), WARN,
+          "points that exchange their positions", "Exchange the labels, or leave the frames out.", unit="points",
+          effect="two points are mixed up", title=""),
+    Check("step far beyond the others", "moving", lambda one, _: moving.stepped(one), (0, 0), WARN,
+          f"steps {moving.STEP:g} times as large as those around", "Another label, a lost marker, or a reflex? {1}.", unit="steps",
+          effect="a controller or marker jumps", title=""),
+    # Points in space
+    Check("unit", "points", space.far, (0, FAR), ERROR, "largest coordinate", "{next}", unit="m",
+          effect="coordinates are not in meters", title="points"),
+    Check("off the table", "points", space.off_table, (-0.02, inf), WARN, "lowest height above the table z = 0",
+          "If y is up, write (x, -z, y) in all files; if -z is up, state --up -z; without a table state --no-table.", unit="m",
+          effect="the ground pushes the object up", title="points"),
+    Check("points off the body", "points on nodes", space.off_body, (0, objects.HAND_REACH), WARN,
+          "largest distance of annotated points from the nodes in frame 0", "Are points and nodes of one recording and world?",
+          unit="m", effect="points follow no node", title=""),
+    Check("hand far from the nodes", "holding", space.reach, (0, objects.HAND_REACH), ERROR,
+          "least distance of controllers that hold from the nodes in training frames",
+          "Are hands and nodes of one recording and world?", unit="m", effect="hands that do not touch move nothing",
+          title="points"),
+    # Results of perception
+    Check("points lost", "visible points", perceived.followed, (0.05, inf), WARN,
+          "least fraction of the object's points that are visible in a frame", TRACKS, unit="%", effect="motion is not seen there"),
+    Check("motion not trusted", "lifted tracks", perceived.trusted, (0.5, inf), WARN,
+          "fraction of the object's motions that agree with their neighbors", TRACKS, unit="%",
+          effect="the twin learns from wrong motion"),
+    Check("grip elsewhere", "lifted tracks", perceived.grip_elsewhere, None, WARN,
+          "in frame {value} a hand comes back to another part of the object; springs of hands are made for their position in frame "
+          "0, so nothing moves the twin there.", "End the capture before frame {value}."),
+    # Observations
+    Check("hand far from the object", "observations", observed.gap, (0, observed.NO_INTERACTION), ERROR,
+          "least distance of a controller from the object", "Look at masks.png: something else may be taken for a hand.", unit="m",
+          effect="there is no interaction to learn from"),
+    Check("controllers hold nothing", "observations", observed.first_gap, (0, observed.GRIP), WARN,
+          "least distance of a controller from the object in frame 0", "Begin the capture at the grip.", unit="m",
+          effect="springs of hands are made in frame 0, and would span the air"),
+    Check("controllers stand still", "observations", observed.motion_of_hands, (0.005, inf), WARN,
+          "farthest motion of a controller", "Look at masks.png: something else may be taken for a hand.", unit="m",
+          effect="nothing moves the twin"),
+    Check("controllers too fast", "observations", observed.speed_of_hands, (0, 5), WARN,
+          "largest median speed of the controllers", "Look at frame_rate and depth_unit, and at the tracks of hands.", unit="m/s",
+          effect="forces grow with the square of a wrong rate"),
+    Check("number of nodes", "observations", observed.node_count, (30, 5000), WARN,
+          "structure points", "Set perception.sample.voxel or perception.sample.nodes.", unit="nodes",
+          effect="few nodes do not deform, and many make searches take hours"),
+    Check("object stands still", "observations", observed.motion_of_object, (0.005, inf), WARN,
+          "farthest motion of the object in the training frames",
+          "Record an interaction, or move the split; if it moves, look at masks.png and tracks.png.", unit="m",
+          effect="there is nothing to learn, or the motion is not followed"),
+    # Fits
+    Check("springs at their bound", "fit", at_bound, (0, SHARE_AT_BOUND), WARN,
+          "fraction of the springs at the bound of their stiffness (fit.output_bound)",
+          "Raise fit.output_bound of this method, and compare.", unit="%",
+          effect="a wider bound may predict better"),
+    Check("springs at the end of the range", "fit", at_range, (0, SHARE_AT_BOUND), WARN,
+          "fraction of the springs at an end of the range of stiffness (fit.stiffness_range)",
+          "Widen it: add `--config 'fit={{stiffness_range: [{least}, {more}]}}'` to the command.", unit="%",
+          effect="a wider range may predict better"),
 )
+
+
+def rows(listed: Iterable[Check] = checks) -> str:
+    """The checks as a Markdown table."""
+    lines = ["| check | measured | expected | level | effect |", "|---|---|---|---|---|"]
+    for one in listed:
+        if one.effect:
+            lines.append(f"| {one.name} | {one.sentence} | {one.expected()} | {one.level} | {one.effect} |")
+    return "\n".join(lines) + "\n"

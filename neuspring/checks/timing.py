@@ -14,13 +14,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
 from typing import Any
 
 import cv2
 import numpy as np
 
-from neuspring.core.checks import Check
 from neuspring.data.camera import Camera, depth_noise
 
 WATCHED_WIDE, CELLS = 320, (24, 14)
@@ -132,6 +130,7 @@ class Watched:
 
     def __post_init__(self) -> None:
         self.color, self.depth, self.masks = (np.full((self.frames, CELLS[0] * CELLS[1]), np.nan) for _ in range(3))
+        self.repeated: dict[str, list[int]] = {"color": [], "depth": []}
         self._last: tuple[int, np.ndarray, np.ndarray | None, np.ndarray | None] | None = None
 
     def see(self, frame: int, color: np.ndarray, depth: np.ndarray | None = None, mask: np.ndarray | None = None) -> None:
@@ -145,6 +144,8 @@ class Watched:
         last, self._last = self._last, (frame, picture, near, labels)
         if last is None or last[0] != frame - 1:
             return
+        self.repeated["color"] += [frame] if np.array_equal(picture, last[1]) else []
+        self.repeated["depth"] += [frame] if near is not None and near.any() and np.array_equal(near, last[2]) else []
         change = np.clip(np.abs(picture - last[1]).max(axis=-1) - COLOR_STILL, 0, COLOR_MOST).astype(np.float32)
         self.color[frame] = _cells(change)
         if near is not None and last[2] is not None:
@@ -186,20 +187,6 @@ def in_space(watched: Mapping[str, Watched], cameras: Mapping[str, Camera]) -> d
     return maps
 
 
-def of_cameras(maps: Mapping[str, np.ndarray]) -> dict[str, Shift | None]:
-    """The shift of every camera but the first against it, by motion in space; through another camera where they share none."""
-    first, *others = maps
-    direct = {(a, b): measure(maps[a], maps[b]) for a, b in combinations(maps, 2)}
-    found = {name: direct[first, name] for name in others}
-    for a, b in ((a, b) for a, b in direct if a != first):
-        via, of = (a, b) if (there := found[a]) and there.known else (b, a)
-        step, there, own = direct[a, b], found[via], found[of]
-        if step and step.known and there and there.known and not (own and own.known):
-            frames = there.frames + (step.frames if via == a else -step.frames)
-            found[of] = Shift(frames, min(step.agreement, there.agreement), step.spread + there.spread)
-    return found
-
-
 def on_images(points: np.ndarray, camera: Camera) -> np.ndarray:
     """Motion of points [T, K, 3], m, NaN: unknown, in the cells of a camera's image [T, n]; NaN where none is known."""
     pixels, depth = camera.project(points)
@@ -238,42 +225,31 @@ class Streams:
     other: str
     shift: Shift | None
     """None where too little moves."""
-    late: str = ""
-    """The next move where the second is late; {frames} stands for whole frames."""
-    early: str = ""
-    """The next move where it is early, {back} for whole frames; the same by default."""
-    moved: int = 0
-    """Frames by which the second is moved already."""
+    remedy: str = ""
+    """The next step; {frames} stands for the whole frames by which the second is late."""
 
 
 def out_of_step(pairs: Sequence[Streams]) -> Iterator[dict[str, Any]]:
-    """Frames by which a second stream is clearly late, half a frame or more."""
+    """Frames by which a second stream is clearly late."""
     for streams in pairs:
         if streams.shift is None or not streams.shift.wrong:
             continue
-        frames, whole = streams.shift.frames, streams.moved + round(streams.shift.frames)
-        next_move = (streams.late if frames > 0 else streams.early or streams.late).format(frames=whole, back=-whole)
-        told = {"value": round(frames, 2), "text": streams.shift.text(streams.one, streams.other)}
+        frames = streams.shift.frames
+        told = {"value": round(frames, 2), "detail": streams.shift.text(streams.one, streams.other)}
         if abs(frames) < MENDABLE:
-            told |= {"level": "warning"}
-            next_move = "Whole frames do not mend it: synchronize them when filmed, or look at how pictures were paired."
-        yield told | {"next": next_move}
+            yield told | {"level": "warning", "next": "Whole frames do not fix it: synchronize the streams when they are recorded."}
+        else:
+            yield told | {"next": streams.remedy.format(frames=round(frames))}
 
 
-def in_step(pairs: Sequence[Streams]) -> dict[str, Any] | None:
-    """The greatest shift of all pairs, frames; and those of which time is not known."""
-    known = [streams for streams in pairs if streams.shift and streams.shift.known]
-    told = [f"{streams.other} {round(streams.shift.frames, 1) + 0.0:+.1f}" for streams in known if streams.shift]
-    left = [f"{streams.other} against {streams.one}" for streams in pairs if streams not in known]
-    text = f"in step, by what moves (frames late): {', '.join(told)}" if told else ""
-    text += ("; " if told and left else "") + (f"too little of one motion to check {', '.join(left)}" if left else "")
-    most = max((abs(streams.shift.frames) for streams in known if streams.shift), default=None)
-    return {"value": most, "text": text} if pairs else None
+def unlike(watched: Watched) -> float | None:
+    """Correlation of motion in the images and in the masks of one camera; None where too little moves in one of them."""
+    shift = measure(watched.color, watched.masks)
+    return None if shift is None else shift.agreement
 
 
-# fmt: off
-checks = (
-    Check("out of step", "streams", out_of_step, None, "error", "{text}; less than half a frame is required.", "{next}",
-          title="time"),
-    Check("in step", "streams", in_step, None, "note", "{text}", title="time"),
-)
+def repeats(watched: Watched) -> Iterator[dict[str, Any]]:
+    """Images of each stream that are equal to the one before."""
+    for kind, frames in watched.repeated.items():
+        if frames:
+            yield {"value": len(frames), "detail": f"{kind}, first is frame {frames[0]}", "frames": frames}

@@ -1,4 +1,4 @@
-"""A check as data: what is measured of a subject, the limit, and what is said where the measurement departs from it.
+"""A check as data: what is measured of a subject, the range that is fine, what a departure does to results, and the next step.
 
 A subject has a kind, a word, and is what `examine` is given of it: the masks of a camera, points in space, the content of a file. A
 measurement is a function of that.
@@ -25,19 +25,24 @@ class Check:
     of: str
     """The kind of subject."""
     measure: Callable[..., float | Words | Iterable[Words] | None]
-    """Subject -> the value, or what fills the sentence with the value under `value`, or several of these; None: nothing to say.
+    """Subject -> the value, or words with the value under `value`, or several of these; None: nothing to report.
 
-    Under `level`, `where` and `frames` a measurement may bring those of the finding."""
+    Under `level`, `where` and `frames` a measurement may bring those of the finding, and under `detail` what follows the value."""
     limit: tuple[float, float] | None
-    """Lowest and highest value that is fine; None: whatever is measured is said."""
+    """Lowest and highest value that is fine; None: whatever is measured is reported."""
     level: Level
     sentence: str
-    """A format string over the words, `low` and `high` of the limit, and the subject as {0}, {1}, ...: the value and the rule it
-    departs from."""
+    """What is measured: a format string over the words, `low` and `high` of the limit, and the subject as {0}, {1}, ..."""
     remedy: str = ""
-    """The next move, a format string too."""
+    """The next step, a format string too."""
     title: str | None = None
     """Beginning of messages before the sentence, a format string: the key of a file; None: the name."""
+    unit: str = ""
+    """Unit of the value; "%": the value is a fraction."""
+    effect: str = ""
+    """What a departure does to results. With it, the message states value and range after the sentence."""
+    needs: tuple[str, ...] = ()
+    """Streams of a capture (color, depth, mask) without which the check is left out."""
 
     def findings(self, where: object, *subject: Any) -> Iterator[Finding]:
         """Every finding about a subject, at the file, camera or other place `where`."""
@@ -48,17 +53,42 @@ class Check:
                 continue
             words = {"low": low, "high": high, **measured}
             remedy = self.remedy.format(*subject, **words)
+            text = self.sentence.format(*subject, **words)
+            if self.effect:
+                detail = f" ({measured['detail']})" if measured.get("detail") else ""
+                text += f": {self.shown(value)}{detail}" if value is not None else detail
+                text += (f", {self.expected()} expected" if self.limit else "") + f"; {self.effect}."
             yield Finding(
                 name=self.name,
                 level=measured.get("level", self.level),
                 where=str(measured.get("where", where)),
-                text=f"{self.sentence.format(*subject, **words)} {remedy}".rstrip(),
+                text=f"{text} {remedy}".rstrip(),
                 remedy=remedy,
                 title=None if self.title is None else self.title.format(*subject, **words),
-                value=value.item() if hasattr(value, "item") else value,  # a number of NumPy is none of JSON
+                value=value.item() if hasattr(value, "item") else value,  # JSON has no numbers of NumPy
                 limit=None if self.limit is None else (_bound(low), _bound(high)),
                 frames=tuple(int(frame) for frame in measured.get("frames", ())),
             )
+
+    def shown(self, value: Any) -> str:
+        """A value with its unit."""
+        if isinstance(value, str):
+            return value
+        return f"{self._number(value)} {self.unit}".rstrip()
+
+    def _number(self, value: float) -> str:
+        return f"{100 * value if self.unit == '%' else value:.4g}"
+
+    def expected(self) -> str:
+        """The range that is fine, in words; empty without one."""
+        if self.limit is None:
+            return ""
+        low, high = self.limit
+        if isfinite(low) and isfinite(high) and low not in (0, -high):
+            return f"{self._number(low)} to {self.shown(high)}"
+        if high == 0:
+            return "none"
+        return f"at least {self.shown(low)}" if not isfinite(high) else f"at most {self.shown(high)}"
 
 
 def _bound(limit: float) -> float | None:

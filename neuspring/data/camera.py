@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated, Any, TypeAlias
 
 import numpy as np
@@ -37,11 +37,13 @@ class Camera:
     camera_to_world: np.ndarray
     """[4, 4], m."""
 
-    def entry(self) -> CameraEntry:
-        """Its entry in capture.json."""
+    def entry(self, missing: tuple[int, ...] = ()) -> CameraEntry:
+        """Its entry in capture.json, with the frames that it misses."""
         intrinsics: Any = tuple(map(tuple, self.intrinsics.tolist()))
         pose: Any = tuple(map(tuple, self.camera_to_world.tolist()))
-        return CameraEntry(name=self.name, width=self.width, height=self.height, intrinsics=intrinsics, camera_to_world=pose)
+        return CameraEntry(
+            name=self.name, width=self.width, height=self.height, intrinsics=intrinsics, camera_to_world=pose, missing=missing
+        )
 
     def lift(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """World points [..., 3], m, of pixels (x, y) [..., 2] at depth [...], m along the optical axis: c2w (z K^-1 [x, y, 1])."""
@@ -70,14 +72,10 @@ class Lens:
     """K [3, 3], pixels."""
     distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """Coefficients; none: no distortion."""
-    model: str = "opencv"
-    """Model of the distortion, as the source says it; see `lenses.MODELS`."""
+    model: str = "none"
+    """Model of the distortion: none, opencv or fisheye."""
     size: tuple[int, int] | None = None
     """(width, height) for which it holds, where it is said."""
-    unit: float | None = None
-    """m per count of depth, where the file of the intrinsics says it."""
-    told: tuple[str, ...] = ()
-    """Lines on how the file was read, where that is not plain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,10 +94,6 @@ class Plane:
     """Its points, of at most `planes.CLOUD_POINTS`."""
     points: np.ndarray
     """They themselves [n, 3], m, in the coordinates of the camera."""
-
-    def scaled(self, factor: float) -> Plane:
-        """The same in a scene that is `factor` times as large."""
-        return replace(self, height=factor * self.height, rms=factor * self.rms, points=factor * self.points)
 
     @property
     def elevation(self) -> float:

@@ -40,7 +40,7 @@ from neuspring.core.findings import Finding, broken, refuse
 from neuspring.core.records import digest_file
 from neuspring.core.section import STRICT, Name, Positive
 from neuspring.data.c3d import Markers, is_c3d
-from neuspring.data.camera import Camera, CameraEntry
+from neuspring.data.camera import FASTEST, SLOWEST, Camera, CameraEntry
 from neuspring.data.images import make_way, read_array, read_image, write_image
 
 CAPTURE, TRACKS, POINTS = "capture.json", "tracks.json", "points.json"
@@ -140,6 +140,12 @@ class Capture:
     def train_end(self) -> int:
         """Training frames are [0, train_end)."""
         return self.description.train_end or int(0.7 * self.frame_count)
+
+    @cached_property
+    def streams(self) -> frozenset[str]:
+        """The kinds of images that its cameras have: color, depth, mask."""
+        stored = {"color": bool(self.cameras), "depth": self.description.depth == "measured", "mask": self.description.masks}
+        return frozenset(name for name, there in stored.items() if there)
 
     @property
     def streams(self) -> frozenset[str]:
@@ -339,6 +345,9 @@ def description_findings(path: Path, description: Description) -> list[Finding]:
     if description.train_end is not None and description.train_end > description.frame_count:
         rule = f"must be at most frame_count = {description.frame_count}"
         findings.append(broken(path, "train_end", rule, description.train_end))
+    if names and not SLOWEST <= description.frame_rate <= FASTEST:
+        rule = f"frames per second at which it was recorded are required, {SLOWEST:g} to {FASTEST:g}"
+        findings.append(broken(path, "frame_rate", rule, description.frame_rate))
     if not names and (description.depth, description.tracks) != ("none", "train"):
         rule = "at least one is required; a capture of points alone has depth: none and tracks: train"
         findings.append(broken(path, "cameras", rule, f"none, depth: {description.depth} and tracks: {description.tracks}"))
@@ -379,7 +388,8 @@ def pose_findings(file: Path, key: str, pose: np.ndarray, tolerance: float) -> l
         seems = ", and a mirror image" if mirrored else seems
         findings.append(broken(file, key, rule, f"a deviation of {error:.3g} from R^T R = 1{seems}"))
     if not np.array_equal(pose[3], [0, 0, 0, 1]):
-        findings.append(broken(file, key, "the last row must be [0, 0, 0, 1]", pose[3].tolist()))
+        seems = ": stored by columns, transpose it" if np.array_equal(pose[:, 3], [0, 0, 0, 1]) else ""
+        findings.append(broken(file, key, "the last row must be [0, 0, 0, 1]", f"{pose[3].tolist()}{seems}"))
     return findings
 
 

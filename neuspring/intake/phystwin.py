@@ -1,29 +1,61 @@
-"""PhysTwin's folders `data/different_types/{case}/`: processed -> Observations, raw -> a capture folder; the table of its 22 cases.
-
-Layout: the released PhysTwin data. Each `*_findings` function lists everything in one file that the reader refuses (errors) or
-that is not as released and harmless (warnings); `read` and `convert` raise the first error, `neuspring check-data`
-prints them all. Of raw cases images are linked where the file system allows it, else copied; masks are put together from one image
-per detection.
-"""
+"""PhysTwin's folders `data/different_types/{case}/`: processed cases -> Observations; the table of the 22 released cases."""
 
 from __future__ import annotations
 
 import csv
+from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from neuspring.checks import examine
-from neuspring.checks.case import FINAL_DATA, RELEASED_FRAME_RATE
 from neuspring.config import Config, ScenarioRow
 from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
-from neuspring.core.findings import refuse
 from neuspring.core.records import digest_file
 from neuspring.data.unpickle import load_pickle
+
+FINAL_DATA, SPLIT, GT_TRACKS, METADATA, CALIBRATION = (
+    "final_data.pkl",
+    "split.json",
+    "gt_track_3d.pkl",
+    "metadata.json",
+    "calibrate.pkl",
+)
+FILES = (FINAL_DATA, SPLIT, GT_TRACKS, METADATA)
+"""The files that the reader looks for in a processed case's folder."""
+RAW_FILES = (METADATA, CALIBRATION, SPLIT, GT_TRACKS)
+"""The files beside images that the importer looks for in a raw case's folder."""
+RELEASED_FRAME_RATE = 30.0
+"""Frames per second of every released recording; used where metadata.json is absent."""
+CASE_ARRAYS = {
+    "object_points": (("T", "No", 3), "f"),
+    "object_visibilities": (("T", "No"), "b"),
+    "object_motions_valid": (("T", "No"), "b"),
+    "controller_points": (("T", "C", 3), "f"),
+    "surface_points": (("Ns", 3), "f"),
+    "interior_points": (("Ni", 3), "f"),
+}
+"""Key -> shape, in which a letter is one size in all arrays, and NumPy's kind."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """The location of a processed case."""
+
+    root: Path
+    """The folder that the archives were unpacked in."""
+    name: str
+    loose: Path | None = None
+    """Folder of a case outside of data/different_types. No released results are known for it."""
+
+    @property
+    def folder(self) -> Path:
+        """The processed case."""
+        return self.loose or self.root / "data" / "different_types" / self.name
 
 
 @cache
@@ -31,14 +63,6 @@ def released_cases() -> dict[str, dict[str, str]]:
     """The table of the 22 released cases: case -> column -> text, empty where unknown."""
     text = resources.files("neuspring.data").joinpath("tables", "phystwin22.csv").read_text(encoding="utf-8")
     return {row["case"]: row for row in csv.DictReader(text.splitlines())}
-
-
-SPLIT, GT_TRACKS, METADATA = "split.json", "gt_track_3d.pkl", "metadata.json"
-CALIBRATION = "calibrate.pkl"
-FILES = (FINAL_DATA, SPLIT, GT_TRACKS, METADATA)
-"""The files that the reader looks for in a processed case's folder."""
-RAW_FILES = (METADATA, CALIBRATION, SPLIT, GT_TRACKS)
-"""The files beside images that the importer looks for in a raw case's folder."""
 
 
 def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Observations:
@@ -53,35 +77,23 @@ def read(row: ScenarioRow, folder: Path) -> Observations:
     present. Meters, float32, world with -z up. Raises InputError naming file and key.
     """
     folder = Path(folder)
-    data_path, split_path = folder / FINAL_DATA, folder / SPLIT
-    data = load_pickle(data_path)
-    refuse(examine("final data", data_path, data))
+    data = arrays_of(folder / FINAL_DATA)
     frames = len(data["object_points"])
-    split = load_json(split_path)
-    refuse(examine("split", split_path, split, frames))
-    used = [data_path, split_path]
-
-    if (tracks := annotated(folder, frames)) is not None:
-        used.append(folder / GT_TRACKS)
-    frame_rate = RELEASED_FRAME_RATE
+    train_end, tracks, rate = train_end_of(folder, frames), annotated(folder, frames), RELEASED_FRAME_RATE
     if (folder / METADATA).exists():
-        metadata = load_json(folder / METADATA)
-        refuse(examine("metadata", folder / METADATA, metadata))
-        frame_rate = float(metadata.get("fps", RELEASED_FRAME_RATE))
-        used.append(folder / METADATA)
-
+        rate = rate_of(folder / METADATA, metadata_of(folder), RELEASED_FRAME_RATE)
     return Observations(
         scenario=Scenario(
             name=row.scenario,
             source="phystwin",
             category=row.category,
             frame_count=frames,
-            train_end=split["train"][1],
-            frame_rate=frame_rate,
+            train_end=train_end,
+            frame_rate=rate,
             up="-z",
             self_collision=row.self_collision,
             ground=row.ground,
-            provenance={file.name: f"sha256:{digest_file(file)}" for file in used},
+            provenance={name: f"sha256:{digest_file(folder / name)}" for name in FILES if (folder / name).exists()},
         ),
         object_points=data["object_points"],
         object_visibility=data["object_visibilities"],
@@ -93,6 +105,56 @@ def read(row: ScenarioRow, folder: Path) -> Observations:
     )
 
 
+def arrays_of(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of final_data.pkl. Raises InputError for the first rule that they break."""
+    data, sizes = load_pickle(path), dict[str, int]()
+    _require(isinstance(data, dict), path, "a dict of arrays is required", type(data).__name__)
+    for key, (shape, kind) in CASE_ARRAYS.items():
+        value, form = data.get(key), f"{key}: a {'bool' if kind == 'b' else 'floating point'} array {list(shape)} is required"
+        if not isinstance(value, np.ndarray) or value.dtype.kind != kind or value.ndim != len(shape):
+            received = f"{value.dtype} {list(value.shape)}" if isinstance(value, np.ndarray) else type(value).__name__
+            raise InputError(path, form, received if key in data else "nothing: this key is missing")
+        wanted = [
+            size if isinstance(size, int) else sizes.setdefault(size, have) for size, have in zip(shape, value.shape, strict=True)
+        ]
+        _require(list(value.shape) == wanted, path, f"{form}, here {wanted}", list(value.shape))
+        bad = np.argwhere(~np.isfinite(value))
+        _require(not len(bad), path, f"{key}: every coordinate must be finite", bad[:1].tolist())
+    visible, points = data["object_visibilities"], data["object_points"]
+    both = visible[:-1] & visible[1:]
+    rules = {
+        "object_points: at least 2 frames and one point are required": len(visible) > 1 and visible.shape[1] > 0,
+        "controller_points: at least one controller point is required": sizes["C"] > 0,
+        "object_visibilities: every tracked point must be visible in frame 0, which is the rest state": visible[:1].all(),
+        "object_motions_valid: a valid motion requires the point to be visible in both frames": not (
+            data["object_motions_valid"][:-1] & ~both
+        ).any(),
+        "object_points: up is -z, and the object must not be below the table": not (points.size and np.median(points[0, :, 2]) > 0),
+    }
+    for rule, kept in rules.items():
+        _require(kept, path, rule, "another array")
+    return data
+
+
+def _require(kept: object, path: Path, rule: str, received: object) -> None:
+    if not kept:
+        raise InputError(path, rule, received)
+
+
+def metadata_of(case: Path) -> dict[str, Any]:
+    """metadata.json. Raises InputError."""
+    metadata = load_json(case / METADATA)
+    _require(isinstance(metadata, dict), case / METADATA, "a JSON object is required", type(metadata).__name__)
+    return dict(metadata)
+
+
+def rate_of(path: Path, metadata: dict[str, Any], default: float | None = None) -> float:
+    """fps of metadata.json. Raises InputError."""
+    fps = metadata.get("fps", default)
+    _require(type(fps) in (int, float) and 0 < fps < 1e6, path, "fps: a positive number of frames per second is required", fps)
+    return float(fps)
+
+
 def has_images(case: Path) -> bool:
     """True where a case's folder holds what a capture with masks needs: images, masks and calibration."""
     files = all((Path(case) / name).is_file() for name in (METADATA, CALIBRATION))
@@ -101,29 +163,30 @@ def has_images(case: Path) -> bool:
 
 def camera_count(case: Path) -> int:
     """Number of cameras that metadata.json declares. Raises InputError."""
-    path = Path(case) / METADATA
-    metadata = load_json(path)
-    intrinsics = metadata.get("intrinsics") if isinstance(metadata, dict) else None
+    intrinsics = metadata_of(Path(case)).get("intrinsics")
     if not isinstance(intrinsics, list) or not intrinsics:
-        raise InputError(path, "intrinsics: a list of 3 x 3 matrices is required", type(intrinsics).__name__)
+        raise InputError(Path(case) / METADATA, "intrinsics: a list of 3 x 3 matrices is required", type(intrinsics).__name__)
     return len(intrinsics)
 
 
 def annotated(case: Path, frames: int) -> np.ndarray | None:
-    """Annotated tracks [T, K, 3], m, if there are any. Raises InputError."""
+    """Annotated tracks [T, K, 3], m, NaN where not annotated; None without any. Raises InputError."""
     path = case / GT_TRACKS
     if not path.exists():
         return None
     tracks = load_pickle(path)
-    refuse(examine("annotated tracks", path, tracks, frames))
+    form = isinstance(tracks, np.ndarray) and tracks.dtype.kind == "f" and tracks.ndim == 3 and tracks.shape[::2] == (frames, 3)
+    received = tracks.shape if isinstance(tracks, np.ndarray) else type(tracks).__name__
+    _require(form and not np.isinf(tracks).any(), path, f"floating point [{frames}, K, 3] is required, NaN where unseen", received)
     return np.asarray(tracks, dtype=float)
 
 
-def train_end_of(case: Path, frames: int) -> int | None:
-    """Training frames are [0, this), if split.json says so. Raises InputError."""
-    path = case / SPLIT
-    if not path.exists():
-        return None
-    split = load_json(path)
-    refuse(examine("split", path, split, frames))
+def train_end_of(case: Path, frames: int) -> int:
+    """Training frames are [0, this) as split.json states. Raises InputError."""
+    split = load_json(case / SPLIT)
+    for key in ("train", "test"):
+        value = split.get(key) if isinstance(split, dict) else None
+        whole = isinstance(value, list) and len(value) == 2 and all(type(v) is int for v in value)
+        inside = whole and 0 <= value[0] <= value[1] <= frames and (key == "test" or value[1] >= 2)  # type: ignore[index]
+        _require(inside, case / SPLIT, f"{key}: whole numbers [start, end) within {frames} frames are required", value)
     return int(split["train"][1])

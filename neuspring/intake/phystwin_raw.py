@@ -1,6 +1,7 @@
 """A case in PhysTwin's raw layout: images of all cameras, calibration, and masks, one image per detection.
 
-Images of a scenario are linked where the file system allows it, else copied.
+Images of a scenario are linked where the file system allows it, else copied. A frame whose color or depth a camera does not have is
+`missing` there.
 """
 
 from __future__ import annotations
@@ -11,75 +12,102 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from neuspring.checks import examine
-from neuspring.checks.case import RELEASED_FRAME_RATE
 from neuspring.config import Config, ScenarioRow
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json
 from neuspring.core.findings import refuse
 from neuspring.core.records import digest_file
 from neuspring.data.camera import Camera
-from neuspring.data.capture import FEWEST_FRAMES, HANDS, OBJECT, Capture, Description, Writer
-from neuspring.data.images import read_image
+from neuspring.data.capture import (
+    FEWEST_FRAMES,
+    HANDS,
+    OBJECT,
+    Capture,
+    Description,
+    Writer,
+    description_findings,
+    intrinsics_findings,
+    pose_findings,
+)
+from neuspring.data.images import read_array, read_image
 from neuspring.data.unpickle import load_pickle
-from neuspring.intake.phystwin import CALIBRATION, METADATA, annotated, train_end_of
+from neuspring.intake.phystwin import CALIBRATION, METADATA, SPLIT, annotated, metadata_of, rate_of, train_end_of
+
+BINARY_TOLERANCE = 1e-5
+"""Allowed deviation from R^T R = 1 in a pickle of float64 products of OpenCV rotations."""
+UNIT = "depth_scale_m_per_unit"
+"""Key of metadata.json, m per count; 0.001 in released cases, which do not have it."""
 
 
 def write_capture(row: ScenarioRow, path: Path, config: Config, folder: Path) -> None:
     """See `neuspring.scenes.sources`."""
-    convert(row, path, folder)
+    convert(row.scenario, row.category, path, folder)
 
 
-def convert(row: ScenarioRow, case: Path, folder: Path) -> Capture:
+def convert(name: str, category: str, case: Path, folder: Path) -> Capture:
     """Write `case` as a capture folder. Raises InputError naming file and key."""
     case = Path(case)
     metadata, cameras = read_calibration(case)
-    frames = int(metadata["frame_num"])
-    has_masks = (case / "mask").is_dir()
+    frames, has_masks, missing = int(metadata["frame_num"]), (case / "mask").is_dir(), dict[str, tuple[int, ...]]()
+    kinds: tuple[Literal["color", "depth"], ...] = ("color", "depth")
+    endings = {"color": ".png", "depth": ".npy"}
+    for camera in cameras:
+        files = {frame: [case / kind / camera.name / f"{frame}{endings[kind]}" for kind in kinds] for frame in range(frames)}
+        missing[camera.name] = tuple(frame for frame, paths in files.items() if not all(path.is_file() for path in paths))
+    unit = metadata.get(UNIT, 0.001)
     description = Description(
         format=1,
-        name=row.scenario,
-        category=row.category,
+        name=name,
+        category=category,
         frame_count=frames,
-        frame_rate=float(metadata.get("fps", RELEASED_FRAME_RATE)),
-        cameras=tuple(camera.entry() for camera in cameras),
+        frame_rate=rate_of(case / METADATA, metadata),
+        cameras=tuple(camera.entry(missing[camera.name]) for camera in cameras),
+        depth_unit=unit,
         depth_format="npy",
         up="-z",
-        train_end=train_end_of(case, frames),
+        train_end=train_end_of(case, frames) if (case / SPLIT).exists() else None,
         masks=has_masks,
         provenance={name: f"sha256:{digest_file(case / name)}" for name in (METADATA, CALIBRATION)},
     )
+    refuse(description_findings(case / "color", description))
+    first = case / "depth" / cameras[0].name / "0.npy"
+    if (kind := read_array(first, cameras[0]).dtype) != np.uint16:
+        remedy = f"Write uint16, and the unit as {UNIT} of {METADATA} (m per count), if it is not 0.001."
+        raise InputError(first, "depth must be 16-bit counts", kind, remedy)
     writer = Writer(folder, description)
-    kinds: tuple[Literal["color", "depth"], ...] = ("color", "depth")
-    for name, camera in writer.capture.cameras.items():
-        ids = detections(case, name) if has_masks else {}
-        for frame in range(frames):
+    for camera in cameras:
+        ids = detections(case, camera.name) if has_masks else {}
+        for frame in (frame for frame in range(frames) if writer.capture.has(camera.name, frame)):
             for kind in kinds:
-                source = case / kind / name / f"{frame}{writer.capture.path(kind, name, frame).suffix}"
-                if not source.is_file():
-                    remedy = f"Make a capture of the frames that are there: `neuspring make-capture --phystwin-raw {case}`."
-                    raise InputError(source, "this image must exist", "no such file", remedy)
-                writer.link(kind, name, frame, source)
+                writer.link(kind, camera.name, frame, case / kind / camera.name / f"{frame}{endings[kind]}")
             if has_masks:
-                writer.mask(name, frame, labels_of(case, camera, frame, ids))
+                writer.mask(camera.name, frame, labels_of(case, camera, frame, ids))
     return writer.finish(annotated(case, frames))
 
 
 def read_calibration(case: Path) -> tuple[dict[str, Any], list[Camera]]:
     """metadata.json, and the cameras in it and in calibrate.pkl, named by their numbers. Raises InputError."""
-    metadata, poses = load_json(case / METADATA), load_pickle(case / CALIBRATION)
-    path = case / METADATA
-    refuse(examine("metadata", path, metadata) + examine("lenses of metadata", path, metadata, None))
-    count = metadata.get("frame_num")
+    path, metadata, poses = case / METADATA, metadata_of(case), load_pickle(case / CALIBRATION)
+    size, count = metadata.get("WH"), metadata.get("frame_num")
+    if not (isinstance(size, list) and len(size) == 2 and all(type(value) is int and value > 0 for value in size)):
+        raise InputError(path, "WH: two positive whole numbers [width, height] are required", size)
     if type(count) is not int or count < FEWEST_FRAMES:
-        raise InputError(case / METADATA, f"frame_num: at least {FEWEST_FRAMES} frames are required", count)
-    refuse(examine("calibration", case / CALIBRATION, poses, len(metadata["intrinsics"])))
-    width, height = metadata["WH"]
-    intrinsics = np.asarray(metadata["intrinsics"], dtype=np.float64)
-    return metadata, [
-        Camera(str(index), width, height, matrix, np.asarray(pose, dtype=np.float64))
-        for index, (matrix, pose) in enumerate(zip(intrinsics, poses, strict=True))
-    ]
+        raise InputError(path, f"frame_num: at least {FEWEST_FRAMES} frames are required", count)
+    try:
+        intrinsics = np.asarray(metadata.get("intrinsics"), dtype=np.float64)
+    except (TypeError, ValueError):
+        intrinsics = np.zeros(0)
+    if intrinsics.ndim != 3 or intrinsics.shape[1:] != (3, 3) or not len(intrinsics) or not np.isfinite(intrinsics).all():
+        raise InputError(path, "intrinsics: finite 3 x 3 matrices are required", f"shape {intrinsics.shape}")
+    if not isinstance(poses, (list, tuple)) or [np.shape(pose) for pose in poses] != [(4, 4)] * len(intrinsics):
+        rule = f"a list of {len(intrinsics)} camera-to-world matrices [4, 4] is required"
+        raise InputError(case / CALIBRATION, rule, type(poses).__name__)
+    cameras = []
+    for index, (matrix, pose) in enumerate(zip(intrinsics, poses, strict=True)):
+        refuse(intrinsics_findings(path, f"intrinsics, camera {index}", matrix, (size[0], size[1])))
+        refuse(pose_findings(case / CALIBRATION, f"camera {index}", np.asarray(pose, float), BINARY_TOLERANCE))
+        cameras.append(Camera(str(index), size[0], size[1], matrix, np.asarray(pose, dtype=np.float64)))
+    return metadata, cameras
 
 
 def detections(case: Path, camera: str) -> dict[int, list[str]]:

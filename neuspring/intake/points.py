@@ -13,7 +13,7 @@ Meters, in the capture's world. Files of another form, in other units or axes ar
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from neuspring.checks import examine
 from neuspring.checks.moving import Moving
-from neuspring.checks.space import SAME, Holding, travel
+from neuspring.checks.space import SAME, travel
 from neuspring.checks.timing import Streams, follows
 from neuspring.config import Config, ScenarioRow
 from neuspring.core.artifacts import Observations, Scenario
@@ -99,8 +99,7 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
 
     `brought` are files of `controllers`, `nodes` and `tracks` that are not in its folder yet.
     """
-    folder, description = capture.folder, capture.description
-    findings: list[Finding] = []
+    folder, description, findings = capture.folder, capture.description, list[Finding]()
 
     def attempt(reader: Callable[..., Any], *values: Any) -> Any:
         try:
@@ -109,54 +108,55 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
             findings.append(refusal(error))
 
     files: dict[str, Path | None] = dict(brought or {})
+    if brought is None:
+        files = {"controllers": attempt(given, folder, CONTROLLERS), "nodes": attempt(given, folder, NODES)}
     for what, names in (("controllers", CONTROLLERS), ("nodes", NODES)):
-        if brought is None:
-            files[what] = attempt(given, folder, names)
         if not files.get(what) and not findings and not description.cameras:
-            rule = f"a capture without cameras needs {' or '.join(names)}"
-            findings.append(broken(folder / names[0], "", rule, "no such file"))
-    marked, none = files.get("tracks") or folder / TRACKS, np.zeros((0, 3))
-    hands = attempt(read_hands, files["controllers"], capture.frame_count) if files.get("controllers") else None
+            findings.append(broken(folder / names[0], "", f"a capture without cameras needs {' or '.join(names)}", "no such file"))
+    marked, none = files.get("tracks") or folder / TRACKS, np.zeros((capture.frame_count, 0, 3))
+    hands = attempt(read_hands, file, capture.frame_count) if (file := files.get("controllers")) else None
     nodes: Any = attempt(read_nodes, files["nodes"]) if files.get("nodes") else None
-    annotated, tracks = attempt(capture.tracks, marked), np.zeros((capture.frame_count, 0, 3))
-    nodes, annotated = none if nodes is None else nodes, tracks if annotated is None else annotated
+    annotated = attempt(capture.tracks, marked)
+    nodes, annotated = none[0] if nodes is None else nodes, none if annotated is None else annotated
     # A hand may be anywhere while it holds nothing.
-    places = tracks if hands is None else np.where(hands.holds[..., None] if hands.holds.size else True, hands.points, np.nan)
-    moving = [Moving(points, description.frame_rate) for points in (annotated, places)]
-    for file, one, remedy in zip((marked, files.get("controllers")), moving, UNSEEN_ROW, strict=True):
-        findings += examine("moving", file, one, remedy) if one.given.size else []
-    # What is no place says nothing of unit and table.
-    annotated, places = (one.points for one in moving)
-    first = annotated[0][np.isfinite(annotated[0]).all(axis=1)]
-    if description.tracks == "train":
-        tracks = annotated
-        if len(first) < LEAST_NODES:
-            rule = f"with tracks: train at least {LEAST_NODES} points must be annotated in frame 0, where the twin starts"
-            findings.append(broken(marked, "", rule, f"{len(first)} of {tracks.shape[1]}"))
-    ground = description.up_sign if description.ground else None
-    moved = travel(np.concatenate([annotated, places], axis=1))
-    held_at, seen = (points[np.isfinite(points).all(axis=2)] for points in (places, annotated))
-    for what, file, points in (("nodes", files.get("nodes"), nodes), ("", marked, seen), ("", files.get("controllers"), held_at)):
-        if file is not None and points.size:
-            findings += examine("points", file, points.reshape(-1, 3), ground, what == "nodes", moved)
-    if any(one.level == "error" for one in findings):
-        return InSpace(hands, nodes, tracks, annotated), findings
-    if (body := files.get("nodes")) is not None:
-        findings += examine("nodes", body, nodes)
-    if len(nodes):
-        findings += examine("points on nodes", marked, annotated[0], nodes)
-    if (file := files.get("controllers")) is not None and hands is not None:
-        grouped = hands.hand if hands.hand.size else np.zeros(hands.points.shape[1], int)
-        start = held(hands, annotated, capture.train_end)[0]
-        taught = places[: capture.train_end]
-        holding = Holding(
-            grouped, taught[np.isfinite(taught).all(axis=2)], start, nodes, np.concatenate([nodes, first]), places, annotated
-        )
-        findings += examine("holding", file, holding)
-        if (shift := follows(hands.points, annotated)) and shift.wrong:
-            rows = "Row 0 of the points is row {back} of the hands: leave out the rows before that."
-            findings += examine("streams", marked, [Streams("the hands", "the annotated points", shift, rows)])
-    return InSpace(hands, nodes, tracks, annotated), findings
+    held_at = none if hands is None else np.where(hands.holds[..., None] if hands.holds.size else True, hands.points, np.nan)
+    space = InSpace(hands, nodes, annotated if description.tracks == "train" else none, annotated)
+    moving = [Moving(points, description.frame_rate) for points in (annotated, held_at)]
+    for where, one, remedy in zip((marked, file), moving, UNSEEN_ROW, strict=True):
+        findings += examine("moving", where, one, remedy) if one.given.size else []
+    # An entry that is no position says nothing about unit and table.
+    seen, places = (one.points for one in moving)
+    first = seen[0][np.isfinite(seen[0]).all(axis=1)]
+    if description.tracks == "train" and len(first) < LEAST_NODES:
+        rule = f"with tracks: train at least {LEAST_NODES} points must be annotated in frame 0, where the twin starts"
+        findings.append(broken(marked, "", rule, f"{len(first)} of {seen.shape[1]}"))
+    ground, moved = description.up_sign if description.ground else None, travel(np.concatenate([seen, places], axis=1))
+    for where, points in ((files.get("nodes"), nodes), (marked, seen), (file, places)):
+        known = points[np.isfinite(points).all(axis=-1)]
+        findings += examine("points", where, known, ground, moved) if where is not None and len(known) else []
+    if len(nodes) and not any(one.level == "error" for one in findings):
+        findings += examine("points on nodes", marked, seen[0], nodes)
+        findings += _holding(capture, space, places, first, file) if hands is not None and file is not None else []
+    return replace(space, tracks=seen if description.tracks == "train" else none, annotated=seen), findings
+
+
+def _holding(capture: Capture, space: InSpace, places: np.ndarray, first: np.ndarray, file: Path) -> list[Finding]:
+    """Findings about hands [T, C, 3], NaN while they hold nothing, and the object, with annotated points of frame 0 [n, 3]."""
+    assert space.hands is not None
+    taught = places[: capture.train_end]
+    holding = taught[np.isfinite(taught).all(axis=2)]
+    if not len(holding):
+        rule = "some controller must hold in some training frame, from which a twin learns"
+        return [broken(file, "holds", rule, f"none before frame {capture.train_end}")]
+    findings = examine("holding", file, holding, space.nodes)
+    near = cKDTree(np.concatenate([space.nodes, first])).query(held(space.hands, space.annotated, capture.train_end)[0])[0]
+    if (near < SAME).any():
+        rule = f"controllers must be {1e3 * SAME:g} mm from nodes and annotated points in frame 0: a spring needs a length"
+        findings.append(broken(file, "points", rule, f"controller {near.argmin()}, {(near < SAME).sum()} in all"))
+    if (shift := follows(space.hands.points, space.annotated)) and shift.wrong:
+        rows = "Shift the rows of the annotated points by {frames}."
+        findings += examine("streams", file, [Streams("the hands", "the annotated points", shift, rows)])
+    return findings
 
 
 def read_hands(path: Path, frames: int | None = None) -> Hands:

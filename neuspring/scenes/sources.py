@@ -18,7 +18,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuspring.checks.case import FINAL_DATA
 from neuspring.config import Config, ScenarioRow, parse, read_text
 from neuspring.core.errors import InputError
 from neuspring.data import capture
@@ -224,7 +223,7 @@ SOURCES = Registry(
             reads=("data_root",),
             write_capture="neuspring.intake.phystwin_raw",
             files=phystwin.FILES,
-            needed=(FINAL_DATA, phystwin.SPLIT),
+            needed=(phystwin.FINAL_DATA, phystwin.SPLIT),
             remedy="Bring them: `neuspring fetch phystwin --data-root {data_root} --parts data results images`; or name the folder "
             "above data/different_types: --config data_root=...",
             capture_files=phystwin.RAW_FILES,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from neuspring.checks import examine
-from neuspring.checks.timing import CELLS, Streams, Watched, follows, in_space, measure, of_cameras, on_images
+from neuspring.checks.timing import CELLS, Streams, Watched, follows, in_space, measure, on_images
 from neuspring.data.camera import Camera
 from tests.support import desk
 from tests.support.desk import RADIUS, TARGET, K, seen
@@ -51,28 +51,28 @@ def film(index=0, late=0, still=False):
     return watched
 
 
-@pytest.mark.parametrize(("late", "level"), [(0, "note"), (1, "error"), (-2, "error")])
-def test_depth_of_other_moments_is_found(late, level):
+@pytest.mark.parametrize("late", [0, 1, -2])
+def test_depth_of_other_moments_is_found(late):
     one = film(late=late)
     shift = measure(one.color, one.depth)
-    findings = examine("streams", "x", [Streams("color", "depth", shift, "--shift 0.depth={frames}")])
-    (found,) = (one for one in findings if one.level == level)
-    assert found.value == pytest.approx(late, abs=0.3)
-    assert (found.remedy == f"--shift 0.depth={late}") == (level == "error")
+    found = examine("streams", "x", [Streams("color", "depth", shift, "--shift 0.depth={frames}")])
+    assert [(found_.level, found_.remedy, round(found_.value)) for found_ in found] == (
+        [("error", f"--shift 0.depth={late}", late)] if late else []
+    )
 
 
-def test_a_film_in_which_nothing_moves_says_that_time_was_not_checked():
+def test_a_film_in_which_nothing_moves_has_no_shift_and_repeats_its_images():
     one = film(still=True)
-    (found,) = examine("streams", "x", [Streams("color", "depth", measure(one.color, one.depth))])
-    assert (found.name, found.level, found.value) == ("in step", "note", None)
-    assert "too little of one motion to check depth against color" in found.text
+    assert measure(one.color, one.depth) is None
+    assert one.repeated["color"] == list(range(1, FRAMES)) and film().repeated == {"color": [], "depth": []}
+    assert next(iter(examine("repeats", "camera 0", one))).value == FRAMES - 1
 
 
 def test_cameras_of_other_moments_are_found_in_space():
     watched = {"0": film(0), "1": film(1)}
     maps = in_space(watched, {name: camera(int(name)) for name in watched})
-    assert abs(of_cameras(maps)["1"].frames) < 0.4
-    shift = of_cameras({"0": maps["0"][:-1], "1": maps["1"][1:]})["1"]
+    assert abs(measure(maps["0"], maps["1"]).frames) < 0.4
+    shift = measure(maps["0"][:-1], maps["1"][1:])
     assert shift.wrong and shift.frames == pytest.approx(-1, abs=0.4)
 
 

@@ -1,79 +1,32 @@
-"""The layout check: a conforming data set has no errors or warnings; every finding is reported at once, with its level."""
+"""check-data on cases, C3D files and folders: what the readers refuse, with file and key."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from neuspring.config import ScenarioRow
+from neuspring.config import Config
 from neuspring.core.errors import InputError
 from neuspring.core.findings import broken, note, unusual
-from neuspring.intake import phystwin
-from neuspring.intake.check import check_layout, render
+from neuspring.intake import check
+from neuspring.intake.check import Layout, check_layout, render
+from neuspring.registry import Registry
 from tests.support.c3d_files import write_c3d
 from tests.support.findings import holds, of_level, serious
-from tests.support.phystwin_case import dump, edit, stored, write_case, write_json
+from tests.support.phystwin_case import dump, stored, write_case, write_json
+
+K = [[60.0, 0.0, 30.0], [0.0, 60.0, 20.0], [0.0, 0.0, 1.0]]
 
 
-def test_a_conforming_case_has_only_notes(tmp_path: Path) -> None:
-    findings = check_layout(write_case(tmp_path))
-    assert serious(findings) == []
-    assert render(findings).endswith("0 errors, 0 warnings")
-
-
-@pytest.mark.parametrize("missing", ["gt_track_3d.pkl", "calibrate.pkl", "metadata.json"])
-def test_missing_optional_files_are_notes(tmp_path: Path, missing: str) -> None:
-    folder = write_case(tmp_path)
-    (folder / missing).unlink()
-    findings = check_layout(folder)
-    assert serious(findings) == []
-    assert holds(findings, "note", missing, "skipped")
-
-
-def judged(folder: Path, level: str, file: str, words: tuple[str, ...]) -> None:
-    """The check says so, and the reader refuses what is an error, and nothing less."""
-    assert holds(check_layout(folder), level, file, *words), render(check_layout(folder))
-    row = ScenarioRow(scenario="case", source="phystwin", category="rope", path=".", self_collision=False, ground=True)
-    if level == "error" and "visible in both frames" not in words:  # readable, and the numbers would be wrong
-        with pytest.raises(InputError, match=file):
-            phystwin.read(row, folder)
-    else:
-        phystwin.read(row, folder)
-
-
-def set_entry(key: str, index: Any, value: Any) -> Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]:
+def put(key: str, index: Any, value: Any) -> Any:
     def change(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         data[key][index] = value
         return data
 
     return change
-
-
-def hide_frame(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    data["object_visibilities"][4] = False
-    data["object_motions_valid"][3:5] = False
-    data["object_points"][4] = 0
-    return data
-
-
-def duplicate(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    data["object_points"][0, 1] = data["object_points"][0, 0]
-    return data
-
-
-def shuffle(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    for key in ("object_points", "object_colors", "object_visibilities", "object_motions_valid"):
-        data[key] = data[key][:, ::-1]
-    return data
-
-
-def leave_trace(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    data["object_points"][tuple(np.argwhere(~data["object_visibilities"])[0])] = [0.01, 0.01, -0.01]
-    return data
 
 
 def trust_hidden(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -82,127 +35,62 @@ def trust_hidden(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return data
 
 
-@pytest.mark.parametrize(
-    ("change", "level", "words"),
-    [
-        (set_entry("object_points", (3, 0, 0), np.nan), "error", ("object_points", "nan at frame 3, point 0")),
-        (set_entry("object_visibilities", (0, 5), False), "error", ("object_visibilities", "point 5")),
-        (trust_hidden, "error", ("object_motions_valid", "visible in both frames")),
-        (leave_trace, "warning", ("object_points", "invisible")),
-        (set_entry("object_points", (2, 0, 2), 0.004), "warning", ("object_points", "z up to 0.004 m, frame 2, point 0")),
-        (set_entry("object_motions_valid", (-1, 0), True), "warning", ("object_motions_valid", "last row")),
-        (hide_frame, "warning", ("object_visibilities", "none in frames 4")),
-        (duplicate, "warning", ("object_points", "1 duplicates")),
-        (shuffle, "warning", ("object_points", "lexicographic")),
-        (lambda d: d | {"extra": 1}, "warning", ("extra", "unknown key")),
-        (lambda d: d | {"controller_points": d["controller_points"][:, :20]}, "warning", ("controller_points", "20")),
-        (lambda d: d | {"controller_points": d["controller_points"][:, :0]}, "error", ("controller_points", "at least one")),
-        (lambda d: d | {"object_points": d["object_points"].astype(np.float32)}, "warning", ("object_points", "float64")),
-        (lambda d: d | {"object_colors": d["object_colors"][:-1]}, "warning", ("object_colors", "10 entries")),
-        (lambda d: d | {"surface_points": d["surface_points"][:, :2]}, "error", ("surface_points", "shape")),
-        (lambda d: d | {"interior_points": "text"}, "error", ("interior_points", "received str")),
-        (lambda d: {k: v for k, v in d.items() if k != "controller_points"}, "error", ("controller_points", "missing")),
-        (lambda _: [1, 2], "error", ("dict of arrays", "list")),
-        (lambda d: d | {"object_visibilities": d["object_visibilities"].astype(int)}, "error", ("dtype must be bool",)),
-        (lambda d: d | {"object_points": d["object_points"].astype(int)}, "error", ("object_points", "floating")),
-    ],
-)
-def test_findings_of_final_data(tmp_path: Path, change: Callable[[Any], Any], level: str, words: tuple[str, ...]) -> None:
+def of_data(change: Any) -> Any:
+    return lambda folder: dump(folder / "final_data.pkl", change(stored(folder)))
+
+
+def of_json(name: str, value: Any) -> Any:
+    return lambda folder: write_json(folder / name, value)
+
+
+def of_pickle(name: str, value: Any) -> Any:
+    return lambda folder: dump(folder / name, value)
+
+
+FAULTS = [
+    (of_data(put("object_points", (3, 0, 0), np.nan)), "final_data.pkl", "object_points: every coordinate must be finite"),
+    (of_data(put("object_visibilities", (0, 5), False)), "final_data.pkl", "visible in frame 0"),
+    (of_data(trust_hidden), "final_data.pkl", "visible in both frames"),
+    (of_data(put("object_points", (slice(None), slice(None), 2), 0.1)), "final_data.pkl", "up is -z"),
+    (of_data(lambda d: d | {"controller_points": d["controller_points"][:, :0]}), "final_data.pkl", "at least one controller"),
+    (of_data(lambda d: d | {"surface_points": d["surface_points"][:, :2]}), "final_data.pkl", "surface_points"),
+    (of_data(lambda d: d | {"object_motions_valid": d["object_motions_valid"][1:]}), "final_data.pkl", "object_motions_valid"),
+    (of_data(lambda d: d | {"interior_points": "text"}), "final_data.pkl", "received str"),
+    (of_data(lambda d: {k: v for k, v in d.items() if k != "controller_points"}), "final_data.pkl", "this key is missing"),
+    (of_data(lambda d: d | {"object_visibilities": d["object_visibilities"].astype(int)}), "final_data.pkl", "a bool array"),
+    (of_data(lambda _: [1, 2]), "final_data.pkl", "dict of arrays"),
+    (of_json("split.json", {"train": [0, 7], "test": [7, 11]}), "split.json", "test: whole numbers"),
+    (of_json("split.json", {"train": [0, 7]}), "split.json", "test: whole numbers"),
+    (of_json("split.json", {"train": [0, 1], "test": [1, 10]}), "split.json", "train: whole numbers"),
+    (of_json("split.json", [0, 7]), "split.json", "train"),
+    (of_pickle("calibrate.pkl", [np.eye(4)] * 2), "calibrate.pkl", "a list of 3"),
+    (of_pickle("calibrate.pkl", [np.eye(4)] * 2 + [np.diag([1.0, 1.0, 2.0, 1.0])]), "calibrate.pkl", "camera 2: .*rotation"),
+    (of_json("metadata.json", {"intrinsics": [K] * 3, "WH": [64], "frame_num": 10, "fps": 30}), "metadata.json", "WH"),
+    (of_json("metadata.json", {"intrinsics": K, "WH": [64, 48], "frame_num": 10, "fps": 30}), "metadata.json", "intrinsics"),
+    (of_json("metadata.json", {"intrinsics": [K] * 3, "WH": [64, 48], "frame_num": 10, "fps": -1}), "metadata.json", "fps"),
+    (of_pickle("gt_track_3d.pkl", np.zeros((10, 5, 2))), "gt_track_3d.pkl", r"\[10, K, 3\]"),
+    (of_pickle("gt_track_3d.pkl", np.zeros((9, 5, 3))), "gt_track_3d.pkl", r"\[10, K, 3\]"),
+    (of_pickle("gt_track_3d.pkl", np.full((10, 5, 3), np.inf)), "gt_track_3d.pkl", "NaN where unseen"),
+    (lambda folder: (folder / "calibrate.pkl").write_bytes(b"cos\nsystem\n(S'true'\ntR."), "calibrate.pkl", "global os.system"),
+]
+
+
+@pytest.mark.parametrize(("damage", "file", "words"), FAULTS, ids=[f"{k}-{f[1]}" for k, f in enumerate(FAULTS)])
+def test_what_a_reader_refuses_is_an_error_with_file_and_key(tmp_path: Path, damage: Any, file: str, words: str) -> None:
+    import re
+
     folder = write_case(tmp_path)
-    dump(folder / "final_data.pkl", change(stored(folder)))
-    judged(folder, level, "final_data.pkl", words)
+    damage(folder)
+    (found,) = of_level(check_layout(folder), "error")
+    assert found.startswith(f"{file}: ") and re.search(words, found)
 
 
-@pytest.mark.parametrize(
-    ("split", "level", "words"),
-    [
-        ({"frame_len": 10, "train": [0, 6], "test": [6, 10]}, "warning", ("train", "[0, 7]")),
-        ({"frame_len": 9, "train": [0, 7], "test": [7, 10]}, "warning", ("frame_len", "10 frames")),
-        ({"frame_len": 10, "train": [0, 7], "test": [7, 11]}, "error", ("test", "[7, 11]")),
-        ({"frame_len": 10, "train": [0, 7]}, "error", ("test", "whole numbers")),
-        ({"train": [-1, 7], "test": [7, 10]}, "error", ("train", "[-1, 7]")),
-        ({"train": [0, 1], "test": [1, 10]}, "error", ("train", "one frame after frame 0")),
-        ([0, 7], "error", ("JSON object", "list")),
-    ],
-)
-def test_findings_of_the_split(tmp_path: Path, split: Any, level: str, words: tuple[str, ...]) -> None:
+def test_a_conforming_case_has_only_notes_and_optional_files_may_be_missing(tmp_path: Path) -> None:
     folder = write_case(tmp_path)
-    write_json(folder / "split.json", split)
-    judged(folder, level, "split.json", words)
-
-
-@pytest.mark.parametrize(
-    ("cameras", "words"),
-    [
-        ([np.eye(4)] * 2, ("list of 2",)),
-        ([np.eye(4), np.eye(3), np.eye(4)], ("camera 1", "(3, 3)")),
-        ([np.eye(4), np.eye(4), np.diag([1.0, 1.0, 2.0, 1.0])], ("camera 2", "rigid", "deviation of 3")),
-        ([np.diag([1.0, 1.0, -1.0, 1.0]), np.eye(4), np.eye(4)], ("camera 0", "rigid")),
-    ],
-)
-def test_findings_of_the_calibration(tmp_path: Path, cameras: Any, words: tuple[str, ...]) -> None:
-    folder = write_case(tmp_path)
-    dump(folder / "calibrate.pkl", cameras)
-    assert holds(check_layout(folder), "error", "calibrate.pkl", *words)
-
-
-K = [[60.0, 0.0, 30.0], [0.0, 60.0, 20.0], [0.0, 0.0, 1.0]]
-
-
-@pytest.mark.parametrize(
-    ("metadata", "level", "words"),
-    [
-        ({"intrinsics": [K] * 3, "WH": [64, 48]}, "warning", ("fps", "missing")),
-        ({"intrinsics": [K] * 3, "WH": [64, 48], "fps": 15}, "warning", ("fps", "15")),
-        ({"intrinsics": [K] * 3, "WH": [64, 48], "fps": 30, "frame_num": 3}, "warning", ("frame_num", "3")),
-        ({"intrinsics": [K] * 3, "WH": [64], "fps": 30}, "error", ("WH", "[64]")),
-        ({"intrinsics": [K] * 2, "WH": [64, 48], "fps": 30}, "error", ("intrinsics", "(2, 3, 3)")),
-        ({"intrinsics": [np.transpose(K).tolist()] * 3, "WH": [64, 48], "fps": 30}, "error", ("intrinsics", "fx")),
-        ([1], "error", ("JSON object",)),
-    ],
-)
-def test_findings_of_the_metadata(tmp_path: Path, metadata: Any, level: str, words: tuple[str, ...]) -> None:
-    folder = write_case(tmp_path)
-    write_json(folder / "metadata.json", metadata)
-    assert holds(check_layout(folder), level, "metadata.json", *words)
-
-
-@pytest.mark.parametrize(
-    ("tracks", "words"),
-    [
-        (np.zeros((10, 5, 2)), ("[T, K, 3]",)),
-        (np.zeros((10, 5, 3), int), ("floating point",)),
-        (np.full((10, 5, 3), np.inf), ("inf at frame 0, point 0",)),
-        ([1, 2], ("list",)),
-    ],
-)
-def test_tracks_that_are_none(tmp_path: Path, tracks: Any, words: tuple[str, ...]) -> None:
-    folder = write_case(tmp_path)
-    dump(folder / "gt_track_3d.pkl", tracks)
-    judged(folder, "error", "gt_track_3d.pkl", words)
-
-
-def test_findings_of_the_tracks(tmp_path: Path) -> None:
-    folder = write_case(tmp_path)
-    tracks = np.zeros((9, 2, 3))
-    tracks[1, 1, 0] = np.nan
-    dump(folder / "gt_track_3d.pkl", tracks)
-    findings = check_layout(folder)
-    assert holds(findings, "error", "gt_track_3d.pkl", "10 frames")
-    assert holds(findings, "warning", "gt_track_3d.pkl", "frame 1, point 1")
-
-
-def test_all_findings_are_reported_at_once(tmp_path: Path) -> None:
-    folder = write_case(tmp_path)
-    data = stored(folder)
-    data["object_points"][3, 0] = np.nan
-    data["controller_points"] = data["controller_points"][:, :5]
-    edit(folder, **data)
-    write_json(folder / "split.json", {"train": [0, 70], "test": [7, 10]})
-    (folder / "calibrate.pkl").write_bytes(b"cos\nsystem\n(S'true'\ntR.")
-    text = render(check_layout(folder))
-    assert all(word in text for word in ("nan at frame 3, point 0 (3 in all)", "[0, 70]", "global os.system", "30 controllers"))
-    assert text.splitlines()[-1] == "3 errors, 1 warning"
+    assert serious(check_layout(folder)) == [] and render(check_layout(folder)).endswith("0 errors, 0 warnings")
+    for name in ("gt_track_3d.pkl", "calibrate.pkl", "metadata.json"):
+        (folder / name).unlink()
+    assert serious(check_layout(folder)) == []
 
 
 def test_a_case_a_folder_of_cases_and_a_root(tmp_path: Path) -> None:
@@ -210,8 +98,7 @@ def test_a_case_a_folder_of_cases_and_a_root(tmp_path: Path) -> None:
     (second / "final_data.pkl").unlink()
     assert of_level(check_layout(first), "error") == []
     for folder in (first.parent, tmp_path):
-        errors = [d for d in check_layout(folder) if d.level == "error"]
-        assert [d.where for d in errors] == [str(second / "final_data.pkl")]
+        assert [d.where for d in check_layout(folder) if d.level == "error"] == [str(second / "final_data.pkl")]
 
 
 def test_folders_without_data_are_refused(tmp_path: Path) -> None:
@@ -222,6 +109,13 @@ def test_folders_without_data_are_refused(tmp_path: Path) -> None:
     (tmp_path / "data" / "different_types").mkdir(parents=True)
     with pytest.raises(InputError, match="at least one case"):
         check_layout(tmp_path)
+
+
+def test_a_package_adds_a_layout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mine = Layout(lambda path: path.suffix == ".mine", lambda path, config: [note(path, f"read with {config.data_root}")])
+    monkeypatch.setattr(check, "LAYOUTS", Registry("layouts", {"mine": mine}, Layout))
+    (tmp_path / "a.mine").write_text("")
+    assert [one.text for one in check_layout(tmp_path / "a.mine")] == [f"read with {Config().data_root}"]
 
 
 def test_markers_of_c3d_files_one_by_one_with_labels_and_as_a_folder(tmp_path: Path) -> None:
@@ -236,7 +130,7 @@ def test_markers_of_c3d_files_one_by_one_with_labels_and_as_a_folder(tmp_path: P
     assert holds(found, "warning", "take.c3d", "point 1 in frame 30", "leave the marker out: FILE.c3d#LABEL")
     assert [one.text for one in check_layout(tmp_path)] == [one.text for one in found]
     (alone,) = check_layout(Path(f"{path}#base,elbow"))
-    assert "of 2 markers: base, elbow; none is ever lost" in alone.text
+    assert "of 2 markers: base, elbow; lost: none" in alone.text
     assert holds(check_layout(Path(f"{path}#hand")), "error", "take.c3d#hand", "There are: base")
 
 

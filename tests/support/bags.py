@@ -13,7 +13,6 @@ import numpy as np
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
-from neuspring.data.camera import Camera
 from tests.support.desk import FRAMES, SIZE, K, camera, counts, seen
 
 FORMS = ("ros1", "sqlite3", "mcap")
@@ -100,47 +99,3 @@ def desk(bag: Recording, view: int = 0, prefix: str = "", late: int = 2_000_000)
 def packed_depth(depth: np.ndarray, scale: float = 0.0, shift: float = 0.0) -> bytes:
     """Counts [H, W] as compressedDepth has them."""
     return struct.pack("<iff", 0, scale, shift) + cv2.imencode(".png", depth)[1].tobytes()
-
-
-def realsense(path: Path, version: str = "2.57", **lens: Any) -> Path:
-    """The desk as librealsense records it: depth of a finer sensor, 15 mm beside that of color, in counts of 0.1 mm.
-
-    Version 2.59 writes text, PNG and its own times in the headers; 2.57 the unit of depth behind each image, which its definition
-    does not have; "old" only as an option. `lens` are fields of color's camera_info. Returns the file.
-    """
-    motion, fine, unit = np.eye(4), np.array([[140.0, 0, 79.2], [0, 140.0, 59.3], [0, 0, 1]]), 0.0001
-    motion[0, 3] = 0.015
-    sensor = Camera("depth", 160, 120, fine, camera().camera_to_world @ motion)
-    color, depth, option = "/device_0/sensor_1/Color_0", "/device_0/sensor_0/Depth_0", "/device_0/sensor_0/option/Depth_Units/value"
-    new = version == "2.59"
-    with recorded(path, "sqlite3" if new else "ros1") as bag:
-        place = "image/camera_info" if new else "info/camera_info"
-        model = "plumb_bob" if new else "Inverse Brown Conrady"
-        bag.info(f"{color}/{place}", **({"distortion_model": model} | lens))
-        bag.info(f"{depth}/{place}", fine, (160, 120))
-        bag.put(option, "std_msgs/String" if new else "std_msgs/Float32", START, data=f"{unit:.6f}" if new else unit)
-        for stream, shift in ((color, 0.015), (depth, 0.0)):
-            if new:
-                words = f"rotation=1.0,0.0,0.0,0.0,1.0,0.0,0.0,0.0,1.0;translation={shift:.6f},0.000000,-0.000000"
-                bag.put(f"{stream}/tf/ref_1", "std_msgs/String", START, data=words)
-                continue
-            turn = bag.made("geometry_msgs/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
-            there = bag.made("geometry_msgs/Vector3", x=shift, y=0.0, z=0.0)
-            bag.put(f"{stream}/tf/1", "geometry_msgs/Transform", START, translation=there, rotation=turn)
-        for frame in range(FRAMES):
-            stamp = START + frame * STEP
-            picture, deep = seen(camera(), frame)[0], counts(seen(sensor, frame)[1], unit)
-            more = struct.pack("<f", unit) if version == "2.57" else b""
-            if not new:
-                bag.image(f"{color}/image/data", stamp, picture, "rgb8", more=more and struct.pack("<f", 0.0))
-                bag.image(f"{depth}/image/data", stamp, deep, "mono16", more=more)
-                bag.image("/device_0/sensor_0/Infrared_1/image/data", stamp, picture[..., 0].copy(), "8UC1")
-                continue
-            arrived = 40_000_000 * frame  # ns since the recording began: not in the rhythm of the camera
-            png = cv2.imencode(".png", picture[..., ::-1])[1].tobytes()
-            bag.compressed(f"{color}/image/data/compressed", arrived + 15_000_000, png, "rgb8; png compressed bgr8")
-            bag.compressed(f"{depth}/image/data/compressedDepth", arrived, packed_depth(deep), "16UC1; compressedDepth png")
-            for stream in (color, depth):
-                words = f"Frame number={frame};timestamp_domain=Global Time;system_time=0.000000;timestamp={stamp / 1e6:.6f};"
-                bag.put(f"{stream}/image/metadata", "std_msgs/String", arrived, data=words)
-    return next(path.glob("*.db3")) if new else path

@@ -62,7 +62,7 @@ def counts(depth: np.ndarray, unit: float = 0.001) -> np.ndarray:
 
 
 def write_folders(root: Path, cameras: int = 1, frames: int = FRAMES, first: int = 0, unit: float = 0.001) -> Path:
-    """`color_K/frame_N.png` and `depth_K/frame_N.png` of each camera, numbers without leading zeros, and intrinsics.json."""
+    """`color_K/frame_N.png` and `depth_K/frame_N.png` of each camera, numbers without leading zeros, and rig.json."""
     for index in range(cameras):
         for frame in range(frames):
             color, depth = seen(camera(index), frame)
@@ -70,15 +70,19 @@ def write_folders(root: Path, cameras: int = 1, frames: int = FRAMES, first: int
                 path = root / f"{kind}_{index}" / f"frame_{first + frame}.png"
                 path.parent.mkdir(parents=True, exist_ok=True)
                 cv2.imwrite(str(path), image)
-    write_json(root / "intrinsics.json", {"width": SIZE[0], "height": SIZE[1], "fx": 70.0, "fy": 70.0, "cx": 39.5, "cy": 29.5})
+    write_rig(root / "rig.json", cameras, depth_unit=unit)
     return root
 
 
-def write_poses(path: Path, cameras: int = 2, key: str = "camera_to_world", motion: np.ndarray | None = None) -> Path:
-    """The poses of the cameras, in a world that `motion` [4, 4] moved."""
-    poses = [(np.eye(4) if motion is None else motion) @ camera(index).camera_to_world for index in range(cameras)]
-    listed = [(pose if key == "camera_to_world" else np.linalg.inv(pose)).tolist() for pose in poses]
-    return write_json(path, {key: listed})
+LENS = {"width": SIZE[0], "height": SIZE[1], "fx": 70.0, "fy": 70.0, "cx": 39.5, "cy": 29.5, "distortion_model": "none"}
+POSED = {"poses": "camera_to_world", "axes": "opencv", "up": "+z"}
+
+
+def write_rig(path: Path, count: int = 1, motion: np.ndarray | None = None, **changes: object) -> Path:
+    """What a user states about the cameras, in a world that `motion` [4, 4] moved; keys that are changed to None are left out."""
+    poses = [(np.eye(4) if motion is None else motion) @ camera(index).camera_to_world for index in range(count)]
+    rig = {"frame_rate": 30, "depth_unit": 0.001, **POSED, "cameras": [LENS | {"pose": pose.tolist()} for pose in poses]} | changes
+    return write_json(path, {key: value for key, value in rig.items() if value is not None})
 
 
 def write_json(path: Path, value: object) -> Path:

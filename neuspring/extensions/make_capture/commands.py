@@ -10,27 +10,29 @@ from neuspring.core.errors import InputError
 from neuspring.extensions.make_capture.options import Intake
 
 
-def make_capture(intake: Intake) -> None:
-    """Color and depth of a camera, or points in space -> a capture folder. What was found is printed, and the next command."""
+def make_capture(intake: Intake) -> int:
+    """Color and depth of cameras, or points in space -> a capture folder, checked as `check-data` checks it; exit status 2 means
+    that a check found an error."""
     from neuspring.extensions.make_capture.make import make_capture as make
+    from neuspring.intake.check import check_capture, render
 
     if intake.list_topics:
         from neuspring.extensions.make_capture.formats.bag import Bag
 
-        if not intake.bag:
-            raise InputError("--list", "is for --bag", "none", "Give --bag FILE.")
-        print("\n".join(Bag(path).text() for path in intake.bag))
-        return
+        print("\n".join(Bag(path).text() for path in intake.recording))
+        return 0
     capture, report = make(intake)
     print("\n".join(report))
+    findings = check_capture(capture.folder)
+    print(render(findings))
     print(f"written: {capture.folder}\nnext:")
-    print(f"  neuspring check-data {capture.folder}")
     if capture.cameras and not capture.description.masks:
         print(f"  neuspring annotate {capture.folder}")
     if not capture.cameras:
         run = "snakemake --profile workflow/profiles/default --cores 2 --configfile config/data/points.yaml"
         where = capture.folder.resolve()
         print(f"  {run} --config data_root={where.parent} 'scenarios=[{where.name}]'")
+    return 2 if any(one.level == "error" for one in findings) else 0
 
 
 def cut_capture(
@@ -38,7 +40,7 @@ def cut_capture(
     frames: Annotated[str, arg(help="first and last frame that are kept, like 12-97")],
     output: Annotated[Path, arg(help="the capture folder to write")],
 ) -> None:
-    """Some frames of a capture, with their masks and tracks -> another capture; marks stay behind."""
+    """Some frames of a capture, with their masks and tracks -> another capture; annotations of masks stay behind."""
     from neuspring.data.capture import Capture
     from neuspring.extensions.make_capture.cut import cut
 

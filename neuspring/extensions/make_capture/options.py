@@ -23,61 +23,41 @@ class Intake:
     color: tuple[Path, ...] = ()
     """per camera: a folder of images, or a video; FILE#1 is its second track"""
     depth: tuple[Path, ...] = ()
-    """per camera: a folder, or a 16-bit gray video; none: color alone, of one camera with --intrinsics and --poses"""
-    bag: tuple[Path, ...] = ()
-    """instead of color: recordings of ROS 1, ROS 2 or a RealSense camera; one may hold all cameras"""
-    topics: tuple[str, ...] = ()
-    """of --bag: COLOR DEPTH of each camera; the only ones by default"""
-    list_topics: Annotated[bool, arg(name="list")] = False
-    """print the topics of --bag and what can be read of them, and end"""
-    phystwin_raw: Path | None = None
-    """instead of color: a case in PhysTwin's raw layout"""
+    """per camera: a folder, or a 16-bit gray video"""
     recording: tuple[Path, ...] = ()
-    """instead of color: files or folders of another format"""
+    """instead of color: a ROS bag, a case in PhysTwin's raw layout, or files of another format"""
     format: str | None = None
     """the format of --recording, by name; recognized by default"""
-    cameras: tuple[str, ...] = ()
-    """names of the cameras; 0 1 2 ... by default"""
-    intrinsics: Path | None = None
-    """JSON: fx, fy, cx, cy or K of each camera, and distortion"""
-    depth_unit: float | None = None
-    """meters per count of depth; depth_scale of --intrinsics, or guessed, by default; said"""
-    rate: float | None = None
-    """frames per second at which it was filmed; that of the video by default"""
+    topics: tuple[str, ...] = ()
+    """of a bag: COLOR DEPTH of each camera; the only ones by default"""
+    list_topics: Annotated[bool, arg(name="list")] = False
+    """print the topics of a bag, and end"""
+    rig: Path | None = None
+    """JSON that states frame rate, unit of depth, lenses, poses and up; neuspring/extensions/make_capture/README.md has its keys"""
+    pair: Literal["names", "order"] | None = None
+    """images of one moment have equal frame numbers, or the same order, where these differ and there are no stamps"""
     frames: str = ""
-    """what is kept, by number: 250-335, 0-300/2, 1,5,9-20"""
+    """what is kept, by number: 250-335 or 0-300/2"""
     shift: tuple[str, ...] = ()
-    """pictures that a stream is late, by name: 0.depth=1 moves depth of camera 0, 1=-2 moves camera 1"""
+    """images that a stream is late, by name: 0.depth=1 moves depth of camera 0, 1=-2 moves camera 1"""
     train_end: int | None = None
     """training frames end before this frame; the first 70 percent by default"""
-    take: tuple[str, ...] = ()
-    """another meaning of lens, depth or poses, as a message names it: distance, lens_resized, inverse+opengl:0, order=2,1,0"""
-    poses: Path | None = None
-    """JSON: camera_to_world or world_to_camera; one camera with depth needs none: the table gives its pose"""
-    board: str | None = None
-    """a ChArUco board that every camera sees, SQUARES_XxSQUARES_Y:SQUARE_M:MARKER_M:DICTIONARY, like 5x7:0.04:0.03:DICT_5X5_100"""
-    board_images: tuple[Path, ...] = ()
-    """per camera: an image of the board, or a folder of them; the first frames by default"""
     pose: Literal["lying", "standing"] | None = None
-    """color alone: how the object is in frame 0, which one picture cannot say"""
-    level: bool = False
-    """move the world of given poses so that the table is z = 0"""
-    top_down: bool = False
-    """the camera looks straight down: the plane it faces is the table"""
-    table_at: tuple[float, float] | None = None
-    """a pixel of the table, where another plane is larger"""
+    """a camera without depth: how the object is in frame 0, which one image cannot show"""
     controllers: Path | None = None
     """hands in space: .npz or .csv, m, a row per frame of the capture; or markers of a C3D file, FILE.c3d#LABEL,LABEL"""
     nodes: Path | None = None
-    """the body of frame 0: .npz or .ply, m"""
+    """the object of frame 0: .npz or .ply, m"""
     tracks: Path | None = None
     """annotated points in space: JSON, m; or markers of a C3D file"""
     teach: bool = False
     """annotated points of training frames teach the twin; without color they always do"""
-    up: Up = "+z"
-    """up of points in space alone"""
+    rate: float | None = None
+    """points in space without color: rows per second; a C3D file states it"""
+    up: Up | None = None
+    """points in space without color, required: the axis that points up"""
     no_table: bool = False
-    """points in space alone: no table is below the object"""
+    """points in space without color: no table is below the object"""
     mass: float | None = None
     """mass of the object, kg, for exports; motion does not depend on it"""
     force: bool = False
@@ -91,10 +71,4 @@ class Intake:
     @property
     def brought(self) -> dict[str, Path]:
         """The files of points in space, by option."""
-        return {name: path for name in SPACE_OPTIONS if (path := getattr(self, name)) is not None}
-
-
-FILM_OPTIONS = ("color", "recording", "bag", "phystwin_raw")
-"""Options of which one says where the film is."""
-SPACE_OPTIONS = ("controllers", "nodes", "tracks")
-"""Options of files of points in space."""
+        return {name: path for name in ("controllers", "nodes", "tracks") if (path := getattr(self, name)) is not None}

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.support import project
-from tests.support.desk import FRAMES, SIZE, camera, counts, seen, write_json
+from tests.support.desk import FRAMES, camera, counts, seen, write_rig
 
 HERE = Path(__file__).parent
 PAGE = project.ROOT / "neuspring" / "extensions" / "README.md"
@@ -50,9 +50,7 @@ def test_its_command_and_formats_are_in_the_help(installed):
 def test_its_capture_format_is_read(installed, tmp_path):
     pictures = [seen(camera(), frame) for frame in range(FRAMES)]
     np.savez(tmp_path / "film.npz", color=[color for color, _ in pictures], depth=[counts(depth) for _, depth in pictures])
-    lens = {"width": SIZE[0], "height": SIZE[1], "fx": 70.0, "fy": 70.0, "cx": 39.5, "cy": 29.5}
-    write_json(tmp_path / "lens.json", lens)
-    film, options = tmp_path / "film.npz", ("--intrinsics", tmp_path / "lens.json", "--rate", 30, "--category", "ball")
+    film, options = tmp_path / "film.npz", ("--rig", write_rig(tmp_path / "rig.json"), "--category", "ball")
     made = neuspring(installed, "make-capture", "--color", film, "--depth", film, *options, "--output", tmp_path / "capture")
     assert f"{FRAMES} frames" in made and (tmp_path / "capture" / "capture.json").exists()
 

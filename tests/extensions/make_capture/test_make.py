@@ -1,7 +1,7 @@
-"""make-capture from end to end: every source ends in a capture that check-data accepts; what cannot be is refused at once."""
+"""From files to a capture: what is stored, the table and the board as poses, resuming, points in space, and a real recording."""
 
 import json
-import re
+import shutil
 
 import cv2
 import numpy as np
@@ -9,286 +9,294 @@ import pytest
 
 from neuspring.cli.main import main
 from neuspring.core.errors import InputError
-from neuspring.data.capture import CAPTURE, RECIPE, Capture
+from neuspring.core.geometry import rigid_inverse
+from neuspring.data.capture import CONTROLLERS, NODES, RECIPE, TRACKS, Capture
 from neuspring.extensions.make_capture import make
-from neuspring.extensions.make_capture.make import Intake, make_capture
+from neuspring.extensions.make_capture.make import make_capture
+from neuspring.extensions.make_capture.options import Intake
 from neuspring.intake.check import check_layout
-from neuspring.scenes.sources import SOURCES
-from tests.extensions.make_capture.board import BOARD, LENS, board_image, depth_of_table
-from tests.support.desk import FRAMES, SIZE, K, camera, counts, looking, seen, write_folders, write_json, write_poses, write_video
-from tests.support.findings import serious
+from neuspring.intake.points import Hands, read, write
+from tests.support import spaced as scene
+from tests.support.c3d_files import write_c3d
+from tests.support.desk import FRAMES, LENS, K, camera, looking, seen, write_folders, write_json, write_rig
+from tests.support.filmed import film, write_raw
+from tests.support.findings import holds, serious
+from tests.support.real import PLUSH
 
 
-def intake(root, cameras=1, **changes):
-    """An intake of the folders of `write_folders`."""
-    films = {kind: tuple(root / f"{kind}_{k}" for k in range(cameras)) for kind in ("color", "depth")}
-    plain = {"output": root / "capture", "name": "desk", "category": "ball", "rate": 30.0} | films
-    return Intake(**(plain | {"intrinsics": root / "intrinsics.json"} | changes))
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory):
+    return write_folders(tmp_path_factory.mktemp("desk"), 2)
 
 
-def test_folders_of_one_camera_become_a_capture(tmp_path):
-    capture, report = make_capture(intake(write_folders(tmp_path, frames=12, first=3), frames="3-13/2"))
-    about = Capture.load(capture.folder).description
-    assert (about.frame_count, about.frame_rate, about.up, about.depth_unit, about.masks) == (6, 15.0, "+z", 0.001, False)
-    assert capture.train_end == 4
-    np.testing.assert_array_equal(capture.color("0", 2), seen(camera(), 4)[0])
-    np.testing.assert_allclose(capture.depth("0", 2), counts(seen(camera(), 4)[1]) / 1000)
-    assert capture.cameras["0"].camera_to_world[2, 3] == pytest.approx(camera().camera_to_world[2, 3], abs=5e-4)
-    assert serious(check_layout(capture.folder)) == []
-    text = "\n".join(report)
-    assert "frames: 6 frames, numbers 3 to 13 of the source, one in 2; 15 frames per second, given, one in 2 of 30" in text
-    assert "depth: 0.001 m per count (millimeters), guessed from whole numbers" in text
-    assert "mm rms over" in text and "looking down at it by" in text
-    assert about.provenance["files"].startswith("sha256:") and "mm rms over" in about.provenance["table"]
+def given(desk, tmp_path, cameras=1, **changes):
+    streams = {"color": tuple(desk / f"color_{k}" for k in range(cameras))}
+    streams["depth"] = tuple(desk / f"depth_{k}" for k in range(cameras))
+    rig = changes.pop("rig", None) or write_rig(tmp_path / "rig.json", cameras)
+    return Intake(**({"output": tmp_path / "capture", "category": "ball", "rig": rig} | streams | changes))
+
+
+def test_images_are_stored_as_they_are_with_what_was_stated(desk, tmp_path):
+    capture, report = make_capture(given(desk, tmp_path, 2, frames="1-6", mass=0.2, train_end=4))
+    assert (capture.frame_count, capture.train_end, capture.description.mass) == (6, 4, 0.2)
+    assert capture.streams == {"color", "depth"}
+    for name in "01":
+        color, depth = seen(camera(int(name)), 3)
+        np.testing.assert_array_equal(capture.color(name, 2), color)
+        np.testing.assert_allclose(capture.depth(name, 2), depth, atol=0.0006)
+        np.testing.assert_allclose(capture.cameras[name].camera_to_world, camera(int(name)).camera_to_world)
+    said = capture.description.provenance
+    assert said["frames"] == "6 frames, numbers 1 to 6 of the source" and said["rig file"].startswith("sha256:")
+    assert report[0].startswith("frames: 6 frames") and "depth: 0.001 m per count" in report
     assert not (capture.folder / RECIPE).exists()
 
 
-def test_a_color_video_and_a_depth_video_become_a_capture(tmp_path):
-    pictures = [seen(camera(), frame) for frame in range(FRAMES)]
-    color = write_video(tmp_path / "color.mkv", [color for color, _ in pictures], "ffv1", "bgr0", rate=15)
-    depth = write_video(tmp_path / "depth.mkv", [counts(depth) for _, depth in pictures], "ffv1", "gray16le", rate=15)
-    lens = write_json(tmp_path / "k.json", {"K": K.tolist()})
-    capture, report = make_capture(
-        Intake(output=tmp_path / "capture", name="v", category="ball", color=(color,), depth=(depth,), intrinsics=lens)
-    )
-    assert capture.description.frame_rate == pytest.approx(15, rel=0.01)
-    assert any("as the source says" in line for line in report)
-    np.testing.assert_array_equal(capture.color("0", 3), pictures[3][0])
-    np.testing.assert_allclose(capture.depth("0", 3), counts(pictures[3][1]) / 1000)
-
-
-def test_floating_point_depth_keeps_its_digits(tmp_path):
-    root = write_folders(tmp_path)
+def test_depth_in_meters_is_stored_as_npy(desk, tmp_path):
+    (tmp_path / "npy").mkdir()
     for frame in range(FRAMES):
-        np.save(root / "depth_0" / f"frame_{frame}.npy", seen(camera(), frame)[1].astype(np.float32))
-        (root / "depth_0" / f"frame_{frame}.png").unlink()
-    capture, report = make_capture(intake(root))
-    np.testing.assert_allclose(capture.depth("0", 1), seen(camera(), 1)[1], atol=1e-6)
-    assert capture.description.depth_format == "npy" and "1 m per count (meters)" in "\n".join(report)
+        depth = seen(camera(), frame)[1].astype(np.float32)
+        np.save(tmp_path / "npy" / f"frame_{frame}.npy", np.where(depth > 0, depth, np.nan))
+    rig = write_rig(tmp_path / "rig.json", depth_unit=1)
+    capture, _ = make_capture(given(desk, tmp_path, depth=(tmp_path / "npy",), rig=rig))
+    assert (capture.description.depth_format, capture.path("depth", "0", 0).suffix) == ("npy", ".npy")
+    np.testing.assert_allclose(capture.depth("0", 3), seen(camera(), 3)[1], atol=1e-6)
 
 
-@pytest.mark.parametrize("scale", [0.0002500000118743628, 4000])
-def test_the_depth_scale_of_the_intrinsics_is_the_unit(tmp_path, scale):
-    root = write_folders(tmp_path, unit=0.00025)
-    lens = write_json(tmp_path / "k.json", json.loads((root / "intrinsics.json").read_text()) | {"depth_scale": scale})
-    with pytest.raises(InputError, match=r"k\.json: its unit of depth must be that of --depth-unit, 0\.001 m.*received 0\.00025"):
-        make_capture(intake(root, intrinsics=lens, depth_unit=0.001))
-    for given in (None, 0.00025):
-        capture, _ = make_capture(intake(root, intrinsics=lens, depth_unit=given, output=tmp_path / str(given)))
-        assert capture.description.depth_unit == pytest.approx(0.00025, rel=1e-6)
-    wrong = write_json(tmp_path / "k.json", json.loads(lens.read_text()) | {"depth_scale": 1.0})
-    with pytest.raises(InputError, match=r"k\.json: the unit that it says: .*received 1 m per count.*Plausible would be.*0\.00025"):
-        make_capture(intake(root, intrinsics=wrong, output=tmp_path / "wrong"))
+def test_the_table_gives_the_pose_of_one_camera(desk, tmp_path):
+    rig = write_rig(tmp_path / "rig.json", poses="table", axes=None, up=None, cameras=[LENS])
+    capture, report = make_capture(given(desk, tmp_path, rig=rig))
+    pose, true = capture.cameras["0"].camera_to_world, camera().camera_to_world
+    assert pose[2, 3] == pytest.approx(true[2, 3], abs=0.003)
+    assert pose[2, :3] == pytest.approx(true[2, :3], abs=0.01)
+    assert any("poses: by the table" in line for line in report)
+    assert [one for one in check_layout(capture.folder) if one.level == "error"] == []
 
 
-@pytest.mark.parametrize("key", ["camera_to_world", "world_to_camera"])
-def test_two_cameras_with_poses(tmp_path, key):
-    root = write_folders(tmp_path, cameras=2)
-    capture, report = make_capture(intake(root, 2, poses=write_poses(tmp_path / "poses.json", key=key)))
-    np.testing.assert_allclose(capture.cameras["1"].camera_to_world, camera(1).camera_to_world, atol=1e-9)
-    assert serious(check_layout(capture.folder)) == []
-    assert sum((line.startswith("camera ") and "mm above z = 0" in line) or "mm below z = 0" in line for line in report) == 2
+def test_a_wall_is_no_table_and_a_pixel_may_state_it(desk, tmp_path):
+    above = looking(np.array([0.05, 0.049, 0.6]), np.array([0.05, 0.05, 0.0]), (0, 1, 0))
+    for frame in range(FRAMES):
+        view = camera()
+        color, depth = seen(type(view)("0", view.width, view.height, K, above), frame)
+        for kind, image in (("color", color[..., ::-1]), ("depth", np.round(1000 * depth).astype(np.uint16))):
+            (tmp_path / kind).mkdir(exist_ok=True)
+            cv2.imwrite(str(tmp_path / kind / f"{frame}.png"), image)
+    streams = {"color": (tmp_path / "color",), "depth": (tmp_path / "depth",)}
+    table = {"poses": "table", "cameras": [LENS]}
+    with pytest.raises(InputError, match=r"the table must be seen.*it faces the camera: .*table_at"):
+        make_capture(given(desk, tmp_path, **streams, rig=write_rig(tmp_path / "a.json", **table)))
+    capture, _ = make_capture(given(desk, tmp_path, **streams, rig=write_rig(tmp_path / "b.json", **table, table_at=[5, 5])))
+    assert capture.cameras["0"].camera_to_world[2, 3] == pytest.approx(0.6, abs=0.005)
+    with pytest.raises(InputError, match="table is for one camera with depth"):
+        make_capture(
+            given(desk, tmp_path, 2, output=tmp_path / "c", rig=write_rig(tmp_path / "c.json", poses="table", cameras=[LENS] * 2))
+        )
 
 
-def test_poses_of_a_world_that_is_elsewhere_need_level(tmp_path):
-    root = write_folders(tmp_path, cameras=2)
-    motion = looking(np.array([0.3, 0.2, 1.0]), np.array([0.1, 0.4, 0.7]))
-    poses = write_poses(tmp_path / "poses.json", motion=motion)
-    with pytest.raises(InputError, match=r"the table that the camera sees must be z = 0.*--level"):
-        make_capture(intake(root, 2, poses=poses))
-    assert not (tmp_path / "capture").exists()
-    capture, report = make_capture(intake(root, 2, poses=poses, level=True))
-    assert any(line.startswith("leveled: the world was turned by") for line in report)
-    assert serious(check_layout(capture.folder)) == []
-    one, two = (view.camera_to_world for view in capture.cameras.values())
-    right = np.linalg.inv(camera(0).camera_to_world) @ camera(1).camera_to_world
-    np.testing.assert_allclose(np.linalg.inv(one) @ two, right, atol=1e-9)
+BOARD = {"squares": [5, 7], "square": 0.04, "marker": 0.03, "dictionary": "DICT_5X5_100"}
+BIG = {"width": 640, "height": 480, "fx": 600.0, "fy": 600.0, "cx": 319.5, "cy": 239.5, "distortion_model": "none"}
+WIDE = np.array([[600, 0, 319.5], [0, 600, 239.5], [0, 0, 1.0]])
+
+
+def board_image(pose):
+    """What a camera sees of a board that lies on z = 0, its corner at the origin, its rows along x, its columns along minus y."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    print_ = cv2.aruco.CharucoBoard((5, 7), 0.04, 0.03, dictionary).generateImage((500, 700))
+    to_world = np.array([[0.0004, 0, 0.0002], [0, -0.0004, -0.0002], [0, 0, 1]])
+    homography = WIDE @ rigid_inverse(pose)[:3][:, [0, 1, 3]] @ to_world
+    view = cv2.warpPerspective(print_, homography, (640, 480), borderValue=200, flags=cv2.INTER_AREA)
+    return np.repeat(cv2.GaussianBlur(view, (3, 3), 0)[..., None], 3, axis=2)
+
+
+def test_a_board_gives_the_poses(tmp_path):
+    poses = [looking(np.array(eye), np.array([0.1, -0.14, 0])) for eye in ((0.1, -0.6, 0.4), (0.45, -0.4, 0.5))]
+    for index, pose in enumerate(poses):
+        for frame in range(5):
+            path = tmp_path / f"color_{index}" / f"{frame}.png"
+            path.parent.mkdir(exist_ok=True)
+            cv2.imwrite(str(path), board_image(pose))
+    rig = {"frame_rate": 30, "poses": "board", "board": BOARD, "cameras": [BIG, BIG | {"board_images": "color_1"}]}
+    intake = {"category": "cloth", "color": (tmp_path / "color_0", tmp_path / "color_1")}
+    with pytest.raises(InputError, match="none is for one camera"):
+        make_capture(Intake(output=tmp_path / "two", rig=write_json(tmp_path / "rig.json", rig), **intake))
+    for index, pose in enumerate(poses):
+        one = write_json(tmp_path / f"{index}.json", rig | {"cameras": rig["cameras"][index : index + 1]})
+        alone = {"color": (tmp_path / f"color_{index}",), "category": "cloth", "output": tmp_path / f"capture_{index}"}
+        capture, _ = make_capture(Intake(rig=one, **alone))
+        np.testing.assert_allclose(capture.cameras["0"].camera_to_world, pose, atol=0.003)
+    blank = write_json(tmp_path / "blank.json", rig | {"cameras": [BIG], "board": BOARD | {"dictionary": "DICT_4X4_50"}})
+    with pytest.raises(InputError, match="at least 6 corners of the board must be seen"):
+        make_capture(Intake(output=tmp_path / "none", rig=blank, color=(tmp_path / "color_0",), category="cloth"))
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "words"),
     [
-        ({"intrinsics": None}, "intrinsics of camera 0 are required"),
-        ({"depth_unit": 1.0}, "Plausible would be 0.001 (millimeters)"),
-        ({"frames": "0-2"}, "a capture needs at least 5 frames"),
-        ({"train_end": 100}, "train_end: must be at most frame_count = 7; received 100"),
-        ({"name": "a b"}, "--name: letters, digits, '.', '_' and '-' are required"),
+        ({"category": ""}, "--category: is required"),
+        ({"color": ()}, "one of --color and --recording is required"),
+        ({"shift": ("2=1",)}, r"--shift: STREAM=IMAGES is required, with a stream of 0\.depth; received 2=1"),
+        ({"recording": ("x",)}, "received both"),
+        ({"train_end": 90}, "train_end: must be at most"),
     ],
 )
-def test_what_is_refused_before_anything_is_written(tmp_path, changes, message):
-    root = write_folders(tmp_path)
-    with pytest.raises(InputError, match=re.escape(message)):
-        make_capture(intake(root, **changes))
-    assert not (tmp_path / "capture").exists()
+def test_options_that_cannot_be_are_refused(desk, tmp_path, changes, words):
+    with pytest.raises(InputError, match=words):
+        make_capture(given(desk, tmp_path, **changes))
+    assert not (tmp_path / "capture" / "capture.json").exists()
 
 
-def test_two_cameras_without_poses_and_depth_that_is_not_aligned(tmp_path):
-    root = write_folders(tmp_path, cameras=2)
-    with pytest.raises(InputError, match=r"the poses of 2 cameras are required; received none. Give --poses FILE, or --board"):
-        make_capture(intake(root, 2))
-    cv2.imwrite(str(root / "depth_0" / "frame_0.png"), np.full((30, 40), 700, np.uint16))
-    with pytest.raises(InputError, match="depth must be aligned to color, pixel by pixel; received 40 x 30 for 80 x 60"):
-        make_capture(intake(root))
+def test_an_interrupted_call_resumes_and_work_of_people_is_never_replaced(desk, tmp_path, monkeypatch):
+    intake = given(desk, tmp_path)
+    writer, written = make.Writer.frame, []
 
-
-def test_a_capture_is_not_overwritten_and_masks_never(tmp_path):
-    root = write_folders(tmp_path)
-    capture, _ = make_capture(intake(root))
-    before = (capture.folder / CAPTURE).read_text()
-    with pytest.raises(InputError, match=r"--output must be a new or empty folder; received a capture.*--force"):
-        make_capture(intake(root, rate=15.0))
-    assert (capture.folder / CAPTURE).read_text() == before
-    assert make_capture(intake(root, rate=15.0, force=True))[0].description.frame_rate == 15.0
-    (capture.folder / "mask").mkdir()
-    with pytest.raises(InputError, match="--force does not remove masks, marks, clicks or tracks; received mask"):
-        make_capture(intake(root, force=True))
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "thesis.tex").touch()
-    with pytest.raises(InputError, match=r"received other files. Choose another folder"):
-        make_capture(intake(root, output=tmp_path / "other", force=True))
-
-
-def test_an_interrupted_call_goes_on_where_it_was(tmp_path, monkeypatch):
-    root = write_folders(tmp_path)
-    whole, _ = make_capture(intake(root, output=tmp_path / "whole"))
-    written, write = [], make.Writer.frame
-
-    def stop_after_four(self, camera, frame, *images):
-        if len(written) == 4:
+    def stops(self, camera_, frame, *images):
+        if frame == 4:
             raise KeyboardInterrupt
         written.append(frame)
-        write(self, camera, frame, *images)
+        writer(self, camera_, frame, *images)
 
-    monkeypatch.setattr(make.Writer, "frame", stop_after_four)
-    with pytest.raises(KeyboardInterrupt):
-        make_capture(intake(root))
-    assert not (tmp_path / "capture" / CAPTURE).exists()
-    (tmp_path / "capture" / "color" / "0" / "00003.png").write_bytes(b"half")
-    monkeypatch.setattr(make.Writer, "frame", lambda *a: (written.append(a[2]), write(*a)))
-    capture, _ = make_capture(intake(root))
-    assert written == [0, 1, 2, 3, 3, 4, 5, 6]
-    assert capture.description.provenance["images"] == whole.description.provenance["images"]
-
-
-def test_an_unfinished_capture_is_no_capture_for_anybody(tmp_path):
-    make.prepare(tmp_path / "capture", {"frames": 7}, force=False)
-    said = "a whole capture is required; received one that make-capture has not finished. Give the same make-capture command again"
-    for refuse in (Capture.load, SOURCES["capture"].required):
-        with pytest.raises(InputError, match=said):
-            refuse(tmp_path / "capture")
-    for folder in (tmp_path / "capture", tmp_path):
-        text = f"error: {tmp_path / 'capture'}: {said}: it goes on where it stopped."
-        assert [str(one) for one in check_layout(folder)] == [text]
-    assert make.prepare(tmp_path / "capture", {"frames": 7}, force=False)
-
-
-def test_a_replacement_that_stops_early_takes_no_image_of_the_old_capture(tmp_path, monkeypatch):
-    (tmp_path / "color").mkdir()
-    (tmp_path / CAPTURE).touch()
-    monkeypatch.setattr(make.shutil, "rmtree", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-    with pytest.raises(KeyboardInterrupt):
-        make.prepare(tmp_path, {"rate": 15}, force=True)
-    with pytest.raises(InputError, match=r"received an unfinished capture from other input.* or give --force"):
-        make.prepare(tmp_path, {"rate": 15}, force=False)
+    with monkeypatch.context() as patch:
+        patch.setattr(make.Writer, "frame", stops)
+        with pytest.raises(KeyboardInterrupt):
+            make_capture(intake)
+    with pytest.raises(InputError, match="a whole capture is required"):
+        Capture.load(intake.output)
+    with pytest.raises(InputError, match="an unfinished capture from other input"):
+        make_capture(given(desk, tmp_path, frames="0-5"))
+    with monkeypatch.context() as patch:
+        patch.setattr(make.Writer, "frame", lambda self, *images: (written.append(images[1]), writer(self, *images)))
+        capture, _ = make_capture(intake)
+    assert written == [0, 1, 2, 3, 3, 4, 5, 6], "the last image of an interrupted call may be half written"
+    with pytest.raises(InputError, match=r"must be a new or empty folder; received a capture.*--force"):
+        make_capture(intake)
+    (capture.folder / "mask").mkdir()
+    with pytest.raises(InputError, match=r"--force does not remove masks.*Move them away"):
+        make_capture(given(desk, tmp_path, force=True))
+    (capture.folder / "mask").rmdir()
+    assert make_capture(given(desk, tmp_path, frames="0-5", force=True))[0].frame_count == 6
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="received other files"):
+        make_capture(given(desk, tmp_path, output=tmp_path / "other", force=True))
 
 
-BENT = np.array([-0.3, 0.1, 0.0, 0.0, 0.0])
+def test_the_command_checks_what_it_wrote(desk, tmp_path, capsys):
+    words = ["--color", f"{desk}/color_0", "--depth", f"{desk}/depth_0", "--category", "ball", "--output", f"{tmp_path}/made"]
+    assert main(["make-capture", *words, "--rig", str(write_rig(tmp_path / "rig.json"))]) == 0
+    said = capsys.readouterr().out
+    assert "0 errors" in said and "neuspring annotate" in said and (tmp_path / "made" / "contact_sheet.jpg").exists()
+    wrong = write_rig(tmp_path / "wrong.json", cameras=[LENS | {"pose": np.linalg.inv(camera().camera_to_world).tolist()}])
+    assert main(["make-capture", *words, "--force", "--rig", str(wrong)]) == 2
+    assert "error    camera 0: table elsewhere" in capsys.readouterr().out
+    assert main(["make-capture", *words[:4], "--output", f"{tmp_path}/none", "--category", "ball"]) == 2
+    assert "frame_rate: is required" in capsys.readouterr().err
 
 
-def bent(image):
-    """A picture of the desk as a lens with the coefficients BENT shows it."""
-    y, x = np.mgrid[: SIZE[1], : SIZE[0]].astype(np.float32)
-    ideal = cv2.undistortPoints(np.stack([x, y], axis=-1).reshape(-1, 1, 2), K, BENT, P=K).reshape(SIZE[1], SIZE[0], 2)
-    return cv2.remap(np.ascontiguousarray(image), ideal[..., 0], ideal[..., 1], cv2.INTER_NEAREST)
+def test_a_raw_case_is_converted_with_frames_that_a_camera_misses(tmp_path):
+    whole = film(tmp_path / "film", cameras=2)
+    case = write_raw(whole, tmp_path / "case")
+    (case / "color" / "1" / "3.png").unlink()
+    capture, _ = make_capture(Intake(output=tmp_path / "capture", category="toy", recording=(case,)))
+    assert capture.description.masks and capture.description.up == "-z"
+    assert [camera.missing for camera in capture.description.cameras] == [(), (3,)]
+    np.testing.assert_array_equal(capture.mask("0", 2), whole.mask("0", 2))
+    np.testing.assert_allclose(capture.depth("0", 2), whole.depth("0", 2), atol=1e-9)
+    metadata = json.loads((case / "metadata.json").read_text())
+    for change, words in (
+        ({"fps": None}, "fps: a positive number"),
+        ({"WH": [64]}, "WH: two positive"),
+        ({"frame_num": 1}, "frame_num"),
+    ):
+        (case / "metadata.json").write_text(json.dumps(metadata | change))
+        with pytest.raises(InputError, match=rf"metadata\.json: {words}"):
+            make_capture(Intake(output=tmp_path / "none", category="toy", recording=(case,)))
+    (case / "metadata.json").write_text(json.dumps(metadata | {"depth_scale_m_per_unit": 0.00025}))
+    assert make_capture(Intake(output=tmp_path / "quarter", category="toy", recording=(case,)))[0].description.depth_unit == 0.00025
+    np.save(case / "depth" / "0" / "0.npy", np.zeros((90, 160), np.float32))
+    with pytest.raises(InputError, match=r"0\.npy: depth must be 16-bit counts; received float32.*depth_scale_m_per_unit"):
+        make_capture(Intake(output=tmp_path / "float", category="toy", recording=(case,)))
+    with pytest.raises(InputError, match="one case of PhysTwin's raw layout is required, alone; received --frames"):
+        make_capture(Intake(output=tmp_path / "part", category="toy", recording=(case,), frames="0-4"))
 
 
-def test_intrinsics_of_the_capture_are_those_given_and_fit_its_images(tmp_path):
-    root = write_folders(tmp_path)
-    for path in [*root.glob("color_0/*"), *root.glob("depth_0/*")]:
-        cv2.imwrite(str(path), bent(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
-    write_json(root / "intrinsics.json", {"K": K.tolist(), "dist": BENT.tolist()})
-    capture, report = make_capture(intake(root))
-    np.testing.assert_array_equal(capture.cameras["0"].intrinsics, K)
-    assert any(line.startswith("distortion, camera 0: removed, up to") for line in report)
-    # The table is flat by these intrinsics: one of another focal length, or of an image that is still bent, is not.
-    y, x = np.mgrid[: SIZE[1], : SIZE[0]]
-    truth = seen(camera(), 2, noise=0.0)[1]
-    found = capture.depth("0", 2)
-    inside = (found > 0) & (truth > 0) & (x > 12) & (x < 68) & (y > 12) & (y < 48)
-    assert inside.sum() > 1500 and np.median(np.abs(found - truth)[inside]) < 0.002
+def brought(folder, frames=FRAMES):
+    """Files of a hand, nodes and tracks, by option."""
+    folder.mkdir()
+    write(folder, Hands(scene.risen(scene.GRIP, frames), np.zeros((0, 0), bool), np.zeros(0, int)), scene.NODES)
+    (folder / TRACKS).write_text(json.dumps(np.swapaxes(scene.risen(scene.MARKED, frames), 0, 1).tolist()))
+    return {"controllers": folder / CONTROLLERS[0], "nodes": folder / NODES[0], "tracks": folder / TRACKS}
 
 
-def test_depth_of_a_sensor_that_stands_elsewhere(tmp_path):
-    root = write_folders(tmp_path, cameras=2)
-    films = {"color": (root / "color_1",), "depth": (root / "depth_1",)}
-    assert not any("not aligned" in line for line in make_capture(intake(root, **films))[1])
-    for path in root.glob("depth_1/*"):
-        cv2.imwrite(str(path), np.roll(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), 7, axis=1))
-    _, report = make_capture(intake(root, output=tmp_path / "moved", **films))
-    line = next(line for line in report if "not aligned" in line)
-    assert line.startswith("warning: camera 0: depth not aligned to color: edges of depth fit those of color when depth is ")
-    assert "pixels to the left; as it is they must fit within 1.5% of the width. Let the camera's software align depth" in line
+def of_points(tmp_path, **changes):
+    files = brought(tmp_path / "files", 8) if not (tmp_path / "files").exists() else {}
+    plain = {"output": tmp_path / "made", "category": "toy", "rate": 25.0, "up": "+z", "train_end": 5}
+    return Intake(**(plain | files | changes))
 
 
-BOARD_POSES = [looking(np.array(eye), np.array([0.1, -0.14, 0])) for eye in ((0.1, -0.55, 0.45), (0.5, -0.1, 0.5))]
-
-
-def board_folders(root, unit=0.001):
-    """Two cameras that see a board in the first of their frames, and a bare table later."""
-    for index, pose in enumerate(BOARD_POSES):
-        for frame in range(7):
-            color = board_image(pose) if frame < 2 else np.full((480, 640, 3), 128, np.uint8)
-            for kind, image in (("color", color), ("depth", counts(depth_of_table(pose), unit))):
-                (root / f"{kind}_{index}").mkdir(parents=True, exist_ok=True)
-                cv2.imwrite(str(root / f"{kind}_{index}" / f"{frame}.png"), image)
-    write_json(root / "intrinsics.json", {"K": LENS.tolist()})
-    return root
-
-
-def test_a_board_in_the_first_frames_or_in_images_gives_the_poses(tmp_path):
-    root, board = board_folders(tmp_path), BOARD
-    images = [root / f"color_{index}" / "0.png" for index in range(2)]
-    for name, pictures, frames in (("frames", (), "2-6"), ("images", images, "")):
-        capture, report = make_capture(intake(root, 2, output=tmp_path / name, board=board, board_images=pictures, frames=frames))
-        for view, pose in zip(capture.cameras.values(), BOARD_POSES, strict=True):
-            np.testing.assert_allclose(view.camera_to_world, pose, atol=4e-3)
-        assert sum("corners, 0." in line and "pixels rms" in line for line in report) == 2
-        assert any("of its distance" in line for line in report) == (name == "frames")
-        assert capture.description.up == "+z"
-
-
-def test_a_board_of_another_size_contradicts_depth(tmp_path):
-    root = board_folders(tmp_path)
-    board = BOARD.replace("0.04:0.03", "0.032:0.024")
-    with pytest.raises(InputError, match=r"depth must place the board where its size does.*the square is 1\.25 times as long"):
-        make_capture(intake(root, 2, board=board))
-    with pytest.raises(InputError, match="the board of --board-images must be described"):
-        make_capture(intake(root, 2, board_images=[root, root]))
-    with pytest.raises(InputError, match="--table-at: is for one camera without poses"):
-        make_capture(intake(root, 2, board=board, table_at=(3, 4)))
+def test_points_without_color_become_a_capture(tmp_path):
+    made, _ = make_capture(of_points(tmp_path, mass=0.35))
+    assert (made.frame_count, made.train_end, made.description.frame_rate, made.description.tracks) == (8, 5, 25.0, "train")
+    assert made.streams == set() and serious(check_layout(made.folder)) == []
+    np.testing.assert_allclose(read(made).hands.points, scene.risen(scene.GRIP, 8))
+    assert made.description.provenance["nodes file"].startswith("sha256:")
+    with pytest.raises(InputError, match="Move them away"):
+        make_capture(of_points(tmp_path, force=True))
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("changes", "words"),
     [
-        ([], "--bag, --phystwin-raw is required, or --controllers with --nodes and --tracks; received none"),
-        (["--color", "{root}/color_0", "--depth", "{root}/depth_0", "{root}/depth_0"], "as many folders or videos of depth as of"),
-        (["--color", "{root}/color_0", "--depth", "{root}/nothing"], "a folder of depth images (.png .npy .tif .tiff) or a video"),
-        (["--color", "{root}/color_0", "--depth", "{root}/depth_0", "--cameras", "a", "b"], "--cameras: 1 different names are"),
+        ({"nodes": None}, "points without color need --controllers, --nodes and --tracks; received no --nodes"),
+        ({"up": None}, r"--up: is required.*State the axis that points up"),
+        ({"rate": None}, r"--rate: rows per second are required"),
+        ({"up": "-z"}, r"tracks\.json: points: lowest height above the table.*state --up"),
+        ({"frames": "0-5"}, r"--frames: is for cameras.*a row is a frame"),
+        ({"pose": "standing"}, "--pose: is for cameras"),
     ],
 )
-def test_bad_words_end_with_status_2(tmp_path, capsys, words, message):
-    root = write_folders(tmp_path)
-    filled = [word.format(root=root) for word in words]
-    assert main(["make-capture", "--category", "ball", "--output", str(tmp_path / "capture"), "--rate", "30", *filled]) == 2
-    assert message in capsys.readouterr().err
+def test_points_are_refused_before_anything_is_written(tmp_path, changes, words):
+    with pytest.raises(InputError, match=words):
+        make_capture(of_points(tmp_path, **changes))
+    assert not (tmp_path / "made").exists()
 
 
-def test_the_command_prints_a_report_and_the_next_commands(tmp_path, capsys):
-    root = write_folders(tmp_path)
-    words = ["--color", f"{root}/color_0", "--depth", f"{root}/depth_0", "--intrinsics", f"{root}/intrinsics.json", "--rate", "30"]
-    assert main(["make-capture", "--category", "ball", "--output", str(tmp_path / "capture"), *words]) == 0
-    said = capsys.readouterr().out
-    assert f"cameras: 0 {SIZE[0]} x {SIZE[1]}" in said
-    assert f"neuspring check-data {tmp_path / 'capture'}" in said and f"neuspring annotate {tmp_path / 'capture'}" in said
-    assert json.loads((tmp_path / "capture" / CAPTURE).read_text())["name"] == "capture"
+def test_markers_of_c3d_files_are_controllers_and_tracks(tmp_path):
+    files = brought(tmp_path / "files", 8)
+    points = 1000 * np.concatenate([scene.risen(scene.GRIP, 8), scene.risen(scene.MARKED, 8)], axis=1)
+    lost = np.zeros((8, 8), bool)
+    lost[3, 5] = True
+    labels = [f"J{k}" for k in range(4)] + [f"M{k}" for k in range(4)]
+    path = write_c3d(tmp_path / "take.c3d", points, labels, rate=50.0, lost=lost)
+    named = {"controllers": f"{path}#J0,J1,J2,J3", "tracks": f"{path}#M0,M1,M2,M3"}
+    take = {name: type(path)(text) for name, text in named.items()} | {"nodes": files["nodes"], "rate": None}
+    made, _ = make_capture(of_points(tmp_path, **take))
+    np.testing.assert_allclose(read(made).hands.points, scene.risen(scene.GRIP, 8), atol=1e-6)
+    assert made.description.frame_rate == 50 and np.isnan(made.tracks()[3, 1]).all()
+    with pytest.raises(InputError, match="one rate for all files; received 50"):
+        make_capture(of_points(tmp_path, **take | {"rate": 25.0, "output": tmp_path / "other"}))
+
+
+def test_cameras_and_points_make_one_capture(desk, tmp_path):
+    files = brought(tmp_path / "files")
+    capture, _ = make_capture(given(desk, tmp_path, teach=True, **files))
+    assert capture.description.tracks == "train" and len(read(capture).nodes) == len(scene.NODES)
+    shutil.rmtree(tmp_path / "capture")
+    np.savez(files["controllers"], points=1000 * scene.risen(scene.GRIP, FRAMES))
+    with pytest.raises(InputError, match=r"controllers\.npz: points: largest coordinate.*divide by 1000"):
+        make_capture(given(desk, tmp_path, **files))
+    assert not (tmp_path / "capture").exists()
+
+
+@pytest.mark.skipif(not PLUSH.is_dir(), reason="the recording is not part of the repository")
+def test_the_table_of_a_real_recording(tmp_path):
+    lens = {"width": 320, "height": 240, "fx": 275.0, "fy": 275.0, "cx": 160.0, "cy": 120.0, "distortion_model": "none"}
+    rig = write_json(tmp_path / "rig.json", {"frame_rate": 30, "depth_unit": 0.001, "poses": "table", "cameras": [lens]})
+    streams = {"color": (PLUSH / "color",), "depth": (PLUSH / "depth",), "rig": rig}
+    capture, _ = make_capture(Intake(output=tmp_path / "plush", category="plush bear", frames="250-335", **streams))
+    assert capture.frame_count == 86
+    # The pose that was made manually, up to the position of the origin: its height and its axes.
+    by_hand = np.array(json.loads((PLUSH / "capture_250_335.json").read_text())["cameras"][0]["camera_to_world"])
+    pose = capture.cameras["0"].camera_to_world
+    assert pose[2, 3] == pytest.approx(by_hand[2, 3], abs=0.004)
+    assert np.degrees(np.arccos((np.trace(pose[:3, :3].T @ by_hand[:3, :3]) - 1) / 2)) < 0.5
+    found = check_layout(tmp_path / "plush")
+    assert serious(found) == [] and holds(found, "note", "contact_sheet.jpg", "look at it")

@@ -1,80 +1,83 @@
-"""Forms in which cameras leave their pictures: one file each, which says what it recognizes and how it opens it.
+"""Formats of images and recordings: one file each, which recognizes a path and opens it.
 
-To add one: a file here with a `CaptureFormat` named capture_format; or a package's entry point of the group
-`neuspring.capture_formats`. Pictures are taken by what a format recognizes, a recording by that or by its name (--format).
+To add one: a file here with a `CaptureFormat` named capture_format, or a package's entry point of the group
+`neuspring.capture_formats`. A format has one of
 
     pictures     color or depth of one camera (--color, --depth): a folder, a video
-    recording    all that cameras gave (--recording): a bag, PhysTwin's raw layout
+    recording    streams of all cameras (--recording): a bag
+    capture      writes the capture itself (--recording): PhysTwin's raw layout
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.core.files import foreign
-from neuspring.extensions.make_capture.feeds import ImageSource, Kind, Paired, Recorded, names_of
+from neuspring.data.capture import Capture
+from neuspring.extensions.make_capture.options import Intake
+from neuspring.extensions.make_capture.streams import ImageSource, Kind, View
 from neuspring.registry import Registry, modules
 
-T = TypeVar("T")
 ENDINGS = {"color": (".png", ".jpg", ".jpeg", ".bmp", ".npy"), "depth": (".png", ".npy", ".tif", ".tiff")}
 
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureFormat:
-    """One form of pictures."""
+    """One format of images or recordings."""
 
     about: str
-    """Its name for messages; {kind} and {endings} stand for the kind of pictures and the endings of their files."""
+    """Its name for messages; {kind} and {endings} stand for the kind of images and the endings of their files."""
     recognizes: Callable[[Path], bool]
-    """True for a path of this form."""
+    """True for a path of this format."""
     pictures: Callable[[Path, Kind], ImageSource] | None = None
-    """Opens pictures of one kind. Raises InputError."""
-    recording: Callable[[Sequence[Path], Sequence[str]], Recorded] | None = None
-    """Opens files or folders, one per camera or one for all, with names of the cameras, if they are given. Raises InputError."""
+    """Opens images of one kind. Raises InputError."""
+    recording: Callable[[Intake], list[View]] | None = None
+    """Opens --recording. Raises InputError."""
+    capture: Callable[[Intake], Capture] | None = None
+    """Writes --recording as a capture. Raises InputError."""
 
 
 FORMATS: Registry[CaptureFormat] = Registry("capture_formats", modules(__name__, "capture_format"), CaptureFormat)
 
 
 def open_images(path: Path, kind: Kind) -> ImageSource:
-    """Color or depth of one camera. Raises InputError for what is of no format."""
+    """Color or depth of one camera. Raises InputError for a path of no format."""
     for format_ in FORMATS.values():
         if format_.pictures is not None and format_.recognizes(path):
             return format_.pictures(path, kind)
-    suffix = path.suffix or "plain"
     name, remedy = foreign(next(iter(sorted(path.iterdir())), path) if path.is_dir() else path)
-    received = "a folder without any" if path.is_dir() else f"a {suffix} file" if path.exists() else "nothing there"
+    received = "a folder without any" if path.is_dir() else f"a {path.suffix or 'plain'} file" if path.exists() else "nothing there"
     known = " or ".join(format_.about for format_ in FORMATS.values() if format_.pictures is not None)
     raise InputError(path, known.format(kind=kind, endings=" ".join(ENDINGS[kind])), name or received, remedy)
 
 
-def open_recording(paths: Sequence[Path], name: str | None = None, cameras: Sequence[str] = ()) -> Recorded:
-    """All that cameras gave, by the format of this name, or the one that recognizes the first path. Raises InputError."""
-    fitting = {key: one for key, one in FORMATS.items() if one.recording is not None}
-    if name is None:
-        name = next((key for key, one in fitting.items() if one.recognizes(paths[0])), "")
-    if name not in fitting or (opened := fitting[name].recording) is None:
-        raise InputError("--format", f"must be one of {', '.join(fitting)}", name or f"none that reads {paths[0]}")
-    return opened(paths, cameras)
+def open_recording(intake: Intake) -> list[View] | Capture:
+    """The streams of a recording, or the capture that its format wrote. Raises InputError."""
+    fitting = {key: one for key, one in FORMATS.items() if one.pictures is None}
+    name = intake.format or next((key for key, one in fitting.items() if one.recognizes(intake.recording[0])), "")
+    if name not in fitting:
+        raise InputError("--format", f"must be one of {', '.join(fitting)}", name or f"none that reads {intake.recording[0]}")
+    one = fitting[name]
+    if one.recording is not None:
+        return one.recording(intake)
+    assert one.capture is not None, "a format without pictures opens recordings or writes captures"
+    return one.capture(intake)
 
 
-def picked(path: Path, pictures: Iterable[T], places: Sequence[int]) -> Iterator[T]:
-    """Pictures at ascending places. Raises InputError where the file ends early."""
-    wanted = list(places)
-    for place, picture in enumerate(pictures):
-        if not wanted:
-            return
-        if place == wanted[0]:
-            wanted.pop(0)
-            yield picture
-    if wanted:
-        raise InputError(path, f"a picture {wanted[0]} is required", "the file ends before it")
+def open_streams(intake: Intake) -> list[View]:
+    """The streams of --color and --depth, one of each per camera. Raises InputError."""
+    if intake.depth and len(intake.color) != len(intake.depth):
+        rule = "as many folders or videos of depth as of color are required, one each per camera"
+        raise InputError("--color, --depth", rule, f"{len(intake.color)} of color, {len(intake.depth)} of depth")
+    depths = [open_images(path, "depth") for path in intake.depth] or [None] * len(intake.color)
+    return [
+        View(str(k), open_images(path, "color"), depth) for k, (path, depth) in enumerate(zip(intake.color, depths, strict=True))
+    ]
 
 
 def require_kind(path: Path, kind: Kind, image: np.ndarray) -> np.ndarray:
@@ -84,30 +87,8 @@ def require_kind(path: Path, kind: Kind, image: np.ndarray) -> np.ndarray:
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
             raise InputError(path, "color must be 8-bit RGB [H, W, 3]", received)
         return image
-    if image.ndim == 3 and image.shape[2] == 1:
-        image = image[..., 0]
-    if image.ndim != 2:
-        remedy = "A picture of depth in colors is none: export the raw depth (16-bit PNG or npy)."
-        raise InputError(path, "depth must have one channel [H, W]", received, remedy)
-    if image.dtype.kind not in "uif" or image.dtype.itemsize < 2:
-        remedy = "8 bits cannot hold it: export the raw depth (16-bit PNG or npy)."
-        raise InputError(path, "depth must be integers of at least 16 bits, or floating point", received, remedy)
+    image = image[..., 0] if image.ndim == 3 and image.shape[2] == 1 else image
+    if image.ndim != 2 or image.dtype.kind not in "uif" or image.dtype.itemsize < 2:
+        remedy = "Export the raw depth (16-bit PNG or npy): colors and 8 bits lose it."
+        raise InputError(path, "depth must have one channel [H, W] of at least 16 bits", received, remedy)
     return image
-
-
-def pairs(colors: Sequence[Path], depths: Sequence[Path], names: Sequence[str] = ()) -> list[Paired]:
-    """The views of folders or videos, one of color and one of depth per camera; without depths color alone, of one camera.
-
-    Raises InputError.
-    """
-    if len(colors) > 1 and not depths:
-        rule = "without depth one camera is required: color alone is of one view"
-        raise InputError("--color", rule, len(colors), "Give one folder or video, or --depth for each.")
-    if not colors or (depths and len(colors) != len(depths)):
-        rule = "as many folders or videos of depth as of color are required, one each per camera"
-        raise InputError("--color, --depth", rule, f"{len(colors)} of color, {len(depths)} of depth")
-    names = names_of(len(colors), names)
-    deep: list[ImageSource | None] = [open_images(depth, "depth") for depth in depths]
-    return [
-        Paired(name, open_images(path, "color"), depth) for name, path, depth in zip(names, colors, deep or [None], strict=True)
-    ]

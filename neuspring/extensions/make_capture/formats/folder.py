@@ -1,4 +1,4 @@
-"""A folder of images."""
+"""A folder of images, in the order of the numbers in their names; stamps.csv (file,seconds) in it states when each was taken."""
 
 from __future__ import annotations
 
@@ -13,18 +13,31 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.data.images import read_npy, read_picture
-from neuspring.extensions.make_capture.feeds import Kind
 from neuspring.extensions.make_capture.formats import ENDINGS, CaptureFormat, require_kind
-from neuspring.extensions.make_capture.moments import Series
-from neuspring.extensions.make_capture.stamps import times_of
+from neuspring.extensions.make_capture.streams import Kind, Series
+
+STAMPS = "stamps.csv"
+DIGITS = re.compile(r"([0-9]+)")
 
 
 @dataclass(frozen=True)
 class ImageFolder:
-    """Images in one folder, in the order of their names, in which runs of digits count as numbers: 10 comes after 9."""
+    """Images in one folder; by stamps, else in the order of their names, in which digits count as numbers: 10 comes after 9."""
 
     path: Path
     kind: Kind
+
+    @cached_property
+    def stamps(self) -> dict[str, float]:
+        """s by file; empty without stamps.csv. Raises InputError."""
+        if not (file := self.path / STAMPS).is_file():
+            return {}
+        import pandas as pd
+
+        table = pd.read_csv(file)
+        if list(table) != ["file", "seconds"] or table["seconds"].dtype.kind not in "if" or table.duplicated("file").any():
+            raise InputError(file, "columns file,seconds are required, one row for each image", ",".join(map(str, table)))
+        return dict(zip(table["file"], table["seconds"].astype(float), strict=True))
 
     @cached_property
     def paths(self) -> list[Path]:
@@ -34,23 +47,22 @@ class ImageFolder:
         if len(endings) != 1:
             rule = f"{self.kind} images of one format are required ({' '.join(ENDINGS[self.kind])})"
             raise InputError(self.path, rule, " and ".join(endings) or "none", "Color and depth need a folder of their own each.")
-        # re.split with a group alternates text and digits.
-        words = {path: [(p.isdigit(), int(p) if p.isdigit() else 0, p) for p in re.split(r"([0-9]+)", path.stem)] for path in found}
-        told = times_of([path.stem for path in found])
-        times = dict(zip(found, told[0].tolist(), strict=True)) if told else {}
-        return sorted(found, key=lambda path: (times.get(path, 0.0), words[path]))
+        if self.stamps and (missing := {path.name for path in found} ^ self.stamps.keys()):
+            raise InputError(self.path / STAMPS, "one row for each image is required", f"not of both: {min(missing)}")
+        parts = {path: [int(part) if part.isdigit() else part for part in DIGITS.split(path.stem)] for path in found}
+        return sorted(found, key=lambda path: (self.stamps.get(path.name, 0.0), parts[path]))
 
     @cached_property
     def series(self) -> Series:
-        """Times in the names, with places as numbers; else the only number in which names differ; else places."""
-        stems = [path.stem for path in self.paths]
-        if told := times_of(stems):
-            return Series(list(range(len(stems))), times=told[0], clock=told[1])
-        words = [re.split(r"([0-9]+)", stem) for stem in stems]
-        counts = list(zip(*(word[1::2] for word in words), strict=True)) if len({tuple(word[::2]) for word in words}) == 1 else []
-        moving = [column for column in counts if len(set(column)) > 1]
-        numbers = [int(digits) for digits in moving[0]] if len(moving) == 1 else []
-        return Series(numbers, named=True) if len(set(numbers)) == len(stems) else Series(list(range(len(stems))))
+        """Stamps; else frame numbers: the digits in which the names differ."""
+        count = list(range(len(self.paths)))
+        if self.stamps:
+            return Series(count, np.array([self.stamps[path.name] for path in self.paths]), clock=STAMPS)
+        names = [DIGITS.split(path.stem) for path in self.paths]
+        moving = [column for column in zip(*(name[1::2] for name in names), strict=False) if len(set(column)) > 1]
+        numbers = [int("".join(digits)) for digits in zip(*moving, strict=True)]
+        plain = len({tuple(name[::2]) for name in names}) == 1 and numbers == sorted(set(numbers))
+        return Series(numbers, named=True) if plain and numbers else Series(count, named=False)
 
     def read(self, places: Sequence[int]) -> Iterator[np.ndarray]:
         """RGB [H, W, 3] uint8, or depth [H, W] as stored. Raises InputError for a damaged image or one of the wrong kind."""
@@ -62,7 +74,7 @@ class ImageFolder:
             yield require_kind(path, self.kind, image[..., ::-1] if self.kind == "color" else image)
 
     def files(self, places: Sequence[int]) -> list[Path]:
-        """One per picture."""
+        """One per image."""
         return [self.paths[place] for place in places]
 
 

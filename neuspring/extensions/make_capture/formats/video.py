@@ -13,16 +13,13 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.core.extras import needed
-from neuspring.extensions.make_capture.feeds import Kind
-from neuspring.extensions.make_capture.formats import CaptureFormat, picked, require_kind
-from neuspring.extensions.make_capture.moments import Series
+from neuspring.extensions.make_capture.formats import CaptureFormat, require_kind
+from neuspring.extensions.make_capture.streams import Kind, Series
 
 if TYPE_CHECKING:
     import av
 
 VIDEO_ENDINGS = (".mkv", ".mp4", ".mov", ".avi", ".m4v", ".webm")
-DEEP = ("gray16le", "gray16be")
-"""Pixel formats of a video that holds depth. Those of 10 and 12 bits would be scaled when they are read."""
 LOSSLESS = ("ffv1", "png", "rawvideo", "tiff", "apng")
 
 
@@ -33,50 +30,59 @@ class VideoFile:
     path: Path
     kind: Kind
     track: int | None = None
-    """Which of its video tracks, from 0; None: the first."""
-
-    @cached_property
-    def tracks(self) -> list[str]:
-        """Content of its video tracks."""
-        with self._opened() as (container, _):
-            return [f"{s.name} {s.width} x {s.height} {s.pix_fmt}" for s in _films(container)]
+    """Which of its video tracks, from 0; None: the only one."""
 
     @cached_property
     def series(self) -> Series:
-        """By the times of its pictures as they are decoded: a trimmed file holds more than it shows.
+        """Times of the images as they are decoded: a trimmed file contains more than it shows.
 
-        Raises InputError for a file without video, or one that is stored turned.
+        Raises InputError for a file without video, one whose container turns, flips or stretches it, and depth that is not exact.
         """
         with self._opened() as (container, stream):
-            tracks = len(_films(container))
-            if self.kind == "depth" and stream.codec_context.pix_fmt not in DEEP:
-                remedy = "Color maps and 8 bits lose the depth: store gray16le in FFV1 (mkv), or a folder of 16-bit PNG."
-                if tracks > 1 and self.track is None:
-                    remedy = f"It has {tracks} video tracks: name that of depth, like {self.path}#1."
-                raise InputError(self.path, "a depth video must be gray with 16 bits", stream.codec_context.pix_fmt, remedy)
-            if self.kind == "depth" and stream.codec_context.name not in LOSSLESS:
-                rule = f"a depth video must be lossless ({' '.join(LOSSLESS)})"
-                raise InputError(self.path, rule, stream.codec_context.name, "Store gray16le in FFV1 (mkv).")
+            codec, tracks = stream.codec_context, len(_films(container))
+            if self.track is None and tracks > 1:
+                raise InputError(self.path, "one video track must be named", f"{tracks} tracks", f"Like {self.path}#1.")
+            if self.kind == "depth" and (codec.pix_fmt not in ("gray16le", "gray16be") or codec.name not in LOSSLESS):
+                rule = f"a depth video must be gray with 16 bits and lossless ({' '.join(LOSSLESS)})"
+                raise InputError(
+                    self.path, rule, f"{codec.pix_fmt}, {codec.name}", "Store gray16le in FFV1 (mkv), or PNG of 16 bits."
+                )
             base, stamps = float(stream.time_base or 1), list[float]()
             for frame in container.decode(stream):
-                if not stamps and frame.rotation:
-                    remedy = "Write it upright, as the intrinsics are: ffmpeg -i VIDEO -crf 12 upright.mp4"
-                    raise InputError(self.path, "a video must be stored upright", f"turned by {frame.rotation} degrees", remedy)
+                if not stamps:
+                    self._require_plain(frame, stream)
                 stamps.append(np.nan if frame.pts is None else frame.pts * base)
-            if not stamps:
-                raise InputError(self.path, "a video must have pictures", "none")
-            numbers, times = list(range(len(stamps))), np.sort(stamps)
-            if not np.isfinite(times).all() or not (np.diff(times) > 0).all():
-                return Series(numbers)
-            # Tracks of one file have one clock; of a file alone the first picture is the start.
-            return Series(numbers, times=times if tracks > 1 else times - times[:1], clock=str(self.path) if tracks > 1 else "")
+        if not stamps:
+            raise InputError(self.path, "a video must have images", "none")
+        times = np.sort(stamps)
+        if not np.isfinite(times).all() or not (np.diff(times) > 0).all():
+            return Series(list(range(len(times))), named=False)
+        # Tracks of one file share a clock.
+        return Series(list(range(len(times))), times, clock=str(self.path) if tracks > 1 else "")
+
+    def _require_plain(self, frame: av.VideoFrame, stream: av.VideoStream) -> None:
+        ratio, matrix = stream.sample_aspect_ratio, [one for one in frame.side_data if "DISPLAYMATRIX" in str(one)]
+        if frame.rotation or matrix or (ratio and ratio != 1):
+            received = f"turned by {frame.rotation} degrees" if frame.rotation else "flipped" if matrix else f"pixels of {ratio}"
+            remedy = "Write it as the intrinsics are: ffmpeg -i VIDEO -vf scale=WIDTH:HEIGHT,setsar=1 -crf 12 upright.mp4"
+            raise InputError(self.path, "a video must be stored upright, with square pixels", received, remedy)
+        if frame.interlaced_frame or (stream.codec_context.color_trc in (16, 18)):
+            received = "interlaced" if frame.interlaced_frame else "HDR (PQ or HLG)"
+            remedy = "Convert it: ffmpeg -i VIDEO -vf bwdif (interlaced) or a tone map (HDR) -crf 12 plain.mp4"
+            raise InputError(self.path, "a video must have whole frames of 8-bit color", received, remedy)
 
     def read(self, places: Sequence[int]) -> Iterator[np.ndarray]:
         """As a folder. The video is decoded from its beginning. Raises InputError where it ends early."""
-        form = "rgb24" if self.kind == "color" else "gray16le"
+        wanted = list(places)
         with self._opened() as (container, stream):
-            for frame in picked(self.path, container.decode(stream), places):
-                yield require_kind(self.path, self.kind, frame.to_ndarray(format=form))
+            for place, frame in enumerate(container.decode(stream)):
+                if wanted and place == wanted[0]:
+                    wanted.pop(0)
+                    image = frame.to_ndarray(format="rgb24" if self.kind == "color" else "gray16le")
+                    yield require_kind(self.path, self.kind, image)
+                if not wanted:
+                    return
+        raise InputError(self.path, f"an image {wanted[0]} is required", "the file ends before it")
 
     def files(self, places: Sequence[int]) -> list[Path]:
         """The video."""
@@ -84,7 +90,7 @@ class VideoFile:
 
     @contextmanager
     def _opened(self) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
-        """The file with its track. Raises InputError for what is no video, or is damaged."""
+        """The file with its track. Raises InputError for a file that is no video, or is damaged."""
         needed("av")
         import av
 
@@ -92,8 +98,7 @@ class VideoFile:
             with av.open(str(self.path)) as container:
                 films, track = _films(container), self.track or 0
                 if track >= len(films):
-                    received = f"track {track}" if films else "none"
-                    raise InputError(self.path, f"a video track is required; the file has {len(films)}, from 0", received)
+                    raise InputError(self.path, f"a video track is required; the file has {len(films)}, from 0", f"track {track}")
                 films[track].thread_type = "AUTO"
                 yield container, films[track]
         except (av.error.FFmpegError, OSError) as error:
@@ -113,14 +118,13 @@ def _track(path: Path) -> tuple[Path, int | None]:
     return (Path(file), int(track)) if mark and track.isdigit() and Path(file).is_file() else (path, None)
 
 
-def _opened(path: Path, kind: Kind) -> VideoFile:
-    file, track = _track(path)
-    return VideoFile(file, kind, track)
-
-
 def _recognized(path: Path) -> bool:
     file, track = _track(path)
     return track is not None or (file.is_file() and file.suffix.lower() in VIDEO_ENDINGS)
 
 
-capture_format = CaptureFormat(about=f"a video ({' '.join(VIDEO_ENDINGS)})", recognizes=_recognized, pictures=_opened)
+capture_format = CaptureFormat(
+    about=f"a video ({' '.join(VIDEO_ENDINGS)})",
+    recognizes=_recognized,
+    pictures=lambda path, kind: VideoFile(_track(path)[0], kind, _track(path)[1]),
+)

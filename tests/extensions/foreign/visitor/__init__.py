@@ -12,7 +12,7 @@ import numpy as np
 from neuspring.baselines import Baseline
 from neuspring.extensions.exports import Export
 from neuspring.extensions.make_capture.formats import CaptureFormat
-from neuspring.extensions.make_capture.moments import Series
+from neuspring.extensions.make_capture.streams import Series
 from neuspring.report.blocks import PageSection, Text
 from neuspring.report.data import ReportSection
 
