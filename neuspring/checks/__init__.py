@@ -12,9 +12,7 @@ from neuspring.core.checks import Check
 from neuspring.core.findings import Finding
 from neuspring.registry import Registry
 
-CHECKS: Registry[Check | tuple[Check, ...]] = Registry(
-    "checks", {"core": "neuspring.checks.table:checks", "cable": "neuspring.checks.cable:checks"}, (Check, tuple)
-)
+CHECKS: Registry[Check | tuple[Check, ...]] = Registry("checks", {"core": "neuspring.checks.table:checks"}, (Check, tuple))
 """The table of the core, and the checks of packages."""
 
 

@@ -11,7 +11,7 @@ from neuspring.checks import examine
 from neuspring.checks.masks import Shown
 from neuspring.checks.objects import Sample, place_of, sampled
 from neuspring.checks.observed import Observed
-from neuspring.core.artifacts import ImageObservations, Observations
+from neuspring.core.artifacts import Observations
 from neuspring.core.findings import Finding
 from neuspring.data.capture import OBJECT, Capture
 from neuspring.data.results import LiftedTracks, ShapePrior
@@ -41,13 +41,11 @@ def look_at_observations(observations: Observations, moves: float = 0.0) -> list
     return examine("observations", "observations", Observed(observations, moves))
 
 
-def look_at_lifted(lifted: LiftedTracks, prior: ShapePrior, up: float, image: ImageObservations | None = None) -> list[Finding]:
-    """Findings about points in the world and the shape; `up` is +1 or -1. `image`: the evidence of a camera without depth."""
+def look_at_lifted(lifted: LiftedTracks, prior: ShapePrior, up: float) -> list[Finding]:
+    """Findings about points in the world and the shape; `up` is +1 or -1."""
     found = examine("object", "object of all cameras", place_of({0: lifted.cloud}, up))
-    if image is None:
-        found += examine("lifted tracks", "lifted tracks", lifted)
-        found += examine("visible points", "lifted tracks", lifted.object_visibility)
-    return found
+    found += examine("visible points", "lifted tracks", lifted.object_visibility)
+    return found + examine("lifted tracks", "lifted tracks", lifted)
 
 
 def followed(visible: np.ndarray) -> dict[str, Any] | None:

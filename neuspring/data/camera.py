@@ -12,8 +12,6 @@ from neuspring.core.section import STRICT, Finite, Name
 
 NEAR, FAR = 0.1, 10.0
 """m. Median depths outside this range are no table in a room."""
-SLOWEST, FASTEST = 1.0, 240.0
-"""Frames per second of a camera."""
 ROLL = 60.0
 """Degrees. The normal of a table leans from the upward direction of the image by less, that of a side wall or a ceiling by more."""
 Row3: TypeAlias = tuple[Finite, Finite, Finite]

@@ -19,6 +19,7 @@ from neuspring.checks.masks import Shown
 from neuspring.checks.moving import Moving
 from neuspring.checks.objects import Sample, hands_on, lifted, place_of, sampled
 from neuspring.checks.rig import Rig
+from neuspring.checks.sheet import SHEET_FILE, draw_sheet
 from neuspring.checks.timing import Streams, Watched, in_space, measure, on_images
 from neuspring.config import Config, ScenarioRow
 from neuspring.core.artifacts import up_sign
@@ -30,7 +31,6 @@ from neuspring.data.capture import CAPTURE, OBJECT, Capture, description_finding
 from neuspring.intake import phystwin, phystwin_raw
 from neuspring.intake.phystwin import FINAL_DATA, SPLIT, Case
 from neuspring.intake.points import InSpace, look
-from neuspring.intake.sheet import NAME, draw_sheet
 from neuspring.registry import Registry
 
 LEAST_AROUND = 0.1
@@ -47,21 +47,7 @@ class Layout:
     """All findings about it; nothing is raised for bad content."""
 
 
-def _check_recordings(path: Path, config: Config) -> list[Finding]:
-    from neuspring.checks import cable
-    from neuspring.data.unpickle import load_pickle
-
-    found = list[Finding]()
-    for file in sorted(path.rglob("*.pkl")) if path.is_dir() else [path]:
-        try:
-            found += cable.look(file, load_pickle(file), config.mocap)
-        except InputError as error:
-            found.append(refusal(error))
-    return found
-
-
-OWN = {"cable": Layout(lambda path: path.suffix == ".pkl" or any(path.rglob("*.pkl")), _check_recordings)}
-LAYOUTS: Registry[Layout] = Registry("layouts", OWN, Layout)
+LAYOUTS: Registry[Layout] = Registry("layouts", {}, Layout)
 """Kinds of data of packages: entry points of the group `neuspring.layouts`."""
 
 
@@ -84,11 +70,12 @@ def check_layout(folder: Path, config: Config | None = None) -> list[Finding]:
             return findings + examine("cases", folder, folder, cases, findings)
         if marked := sorted(path for path in folder.rglob("*") if path.suffix.lower() == ".c3d"):
             return [finding for file in marked for finding in check_markers(file)]
-    for layout in LAYOUTS.values():
-        if layout.recognizes(folder):
-            return layout.check(folder, config or Config())
-    rule = "a capture, a case with final_data.pkl, a folder of cases, a root with data/different_types or C3D files are required"
-    raise InputError(folder, rule, "none of them")
+    files = sorted(filter(Path.is_file, folder.rglob("*"))) if folder.is_dir() else [folder]
+    found = [kind.check(file, config or Config()) for file in files for kind in LAYOUTS.values() if kind.recognizes(file)]
+    if not found:
+        rule = "a capture, a case with final_data.pkl, a folder of cases, a root with data/different_types, or files of "
+        raise InputError(folder, f"{rule}{', '.join(['C3D', *LAYOUTS])} are required", "none of them")
+    return [finding for listed in found for finding in listed]
 
 
 def check_capture(folder: Path) -> list[Finding]:
@@ -120,8 +107,9 @@ def check_capture(folder: Path) -> list[Finding]:
         findings += examine("streams", path, list(_streams(capture, watched, space)))
         if capture.cameras:
             try:
-                draw_sheet(capture, space, folder / NAME)
-                findings.append(note(folder / NAME, "look at it: grids on the table, dots on the object, outlines around it"))
+                controllers = np.zeros((capture.frame_count, 0, 3)) if space.hands is None else space.hands.points
+                draw_sheet(capture, controllers, space.annotated, folder / SHEET_FILE)
+                findings.append(note(folder / SHEET_FILE, "look at it: grids on the table, dots on the object, outlines around it"))
             except InputError as error:
                 findings.append(replace(refusal(error), level="note"))
     if capture.cameras and not description.masks:
@@ -248,18 +236,16 @@ def _check_case(case: Case) -> list[Finding]:
     """What the readers of a case refuse: of its processed data, and of its calibration where it has images."""
     findings, folder = list[Finding](), case.folder
     row = ScenarioRow(scenario=case.name, source="phystwin", category="", path=".", self_collision=False, ground=True)
-    readers: list[tuple[str, Callable[[], Any]]] = []
+    readers: list[Callable[[], Any]] = []
     if (folder / FINAL_DATA).exists() or not (folder / "color").is_dir():
-        readers.append((FINAL_DATA, lambda: phystwin.read(row, folder)))
+        readers.append(lambda: phystwin.read(row, folder))
     if (folder / phystwin.CALIBRATION).exists():
-        readers.append((phystwin.CALIBRATION, lambda: phystwin_raw.read_calibration(folder)))
-    for name, reader in readers:
+        readers.append(lambda: phystwin_raw.read_calibration(folder))
+    for reader in readers:
         try:
             reader()
         except InputError as error:
             findings.append(refusal(error))
-        else:
-            findings.append(note(folder / name, "readable"))
     return findings
 
 

@@ -35,7 +35,7 @@ from neuspring.intake.phystwin import CALIBRATION, METADATA, SPLIT, annotated, m
 
 BINARY_TOLERANCE = 1e-5
 """Allowed deviation from R^T R = 1 in a pickle of float64 products of OpenCV rotations."""
-UNIT = "depth_scale_m_per_unit"
+UNIT_KEY = "depth_scale_m_per_unit"
 """Key of metadata.json, m per count; 0.001 in released cases, which do not have it."""
 
 
@@ -54,7 +54,7 @@ def convert(name: str, category: str, case: Path, folder: Path) -> Capture:
     for camera in cameras:
         files = {frame: [case / kind / camera.name / f"{frame}{endings[kind]}" for kind in kinds] for frame in range(frames)}
         missing[camera.name] = tuple(frame for frame, paths in files.items() if not all(path.is_file() for path in paths))
-    unit = metadata.get(UNIT, 0.001)
+    unit = metadata.get(UNIT_KEY, 0.001)
     description = Description(
         format=1,
         name=name,
@@ -72,7 +72,7 @@ def convert(name: str, category: str, case: Path, folder: Path) -> Capture:
     refuse(description_findings(case / "color", description))
     first = case / "depth" / cameras[0].name / "0.npy"
     if (kind := read_array(first, cameras[0]).dtype) != np.uint16:
-        remedy = f"Write uint16, and the unit as {UNIT} of {METADATA} (m per count), if it is not 0.001."
+        remedy = f"Write uint16, and the unit as {UNIT_KEY} of {METADATA} (m per count), if it is not 0.001."
         raise InputError(first, "depth must be 16-bit counts", kind, remedy)
     writer = Writer(folder, description)
     for camera in cameras:

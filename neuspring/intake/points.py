@@ -2,8 +2,7 @@
 
     controllers.npz    points [T, C, 3]; optional: holds [T, C] bool (all hold), hand [C] int (not grouped); or
                        poses [T, H, 4, 4], hands to world; optional: jaws [H, C, 3], points that each carries, holds [T, H]
-    controllers.csv    the same as rows, header frame,point,x,y,z[,holds][,hand]; frames from 0, holds 0 or 1; poses with
-                       qx,qy,qz,qw, a row per frame and hand (`point`)
+    controllers.csv    points as rows, header frame,point,x,y,z[,holds][,hand]; frames from 0, holds 0 or 1
     nodes.npz | .ply   points [N, 3]; or vertices: the body of frame 0
     tracks.json        annotated points (capture.py); with `tracks: train` those of training frames teach the twin
 
@@ -19,7 +18,6 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from neuspring.checks import examine
 from neuspring.checks.moving import Moving
@@ -37,12 +35,8 @@ from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, TRACKS, Capture
 
 CSV_COLUMNS = ("frame", "point", "x", "y", "z", "holds", "hand")
 """Columns of controllers.csv; the last two may be left out."""
-QUATERNION = ("qx", "qy", "qz", "qw")
-"""Further columns, where a row is the pose of a hand."""
 JAWS = 0.03 * np.concatenate([np.zeros((1, 3)), np.eye(3)])
 """Points that a hand with a pose carries where the file gives none, m in its frame: its origin, and one along each of its axes."""
-FAR_FROM_UNIT = 0.01
-"""Allowed deviation of the length of a quaternion from 1."""
 RIGID = 1e-4
 """Allowed deviation from R^T R = 1 of a pose."""
 UNSEEN_ROW = (
@@ -263,9 +257,8 @@ def _rows(path: Path) -> dict[str, np.ndarray]:
         table = pd.read_csv(path)
     except (OSError, ValueError) as error:
         raise InputError(path, "rows of numbers with one header line are required", str(error)) from error
-    turned = set(QUATERNION) <= set(table)
-    if not set(CSV_COLUMNS[:5]) <= set(table) <= {*CSV_COLUMNS, *(QUATERNION if turned else ())}:
-        rule = f"the header must be {','.join(CSV_COLUMNS[:5])}, may have holds and hand, and {','.join(QUATERNION)} for poses"
+    if not set(CSV_COLUMNS[:5]) <= set(table) <= set(CSV_COLUMNS):
+        rule = f"the header must be {','.join(CSV_COLUMNS[:5])}, and may have holds and hand; poses are in an .npz file"
         raise InputError(path, rule, ",".join(map(str, table)))
     for name, column in (table := table.apply(pd.to_numeric, errors="coerce")).items():
         if len(bad := np.flatnonzero(~np.isfinite(column))):
@@ -284,17 +277,6 @@ def _rows(path: Path) -> dict[str, np.ndarray]:
         if (grid["hand"] != grid["hand"][0]).any() or (grid["hand"] % 1).any():
             raise InputError(path, "hand: must be one whole number for each point", "numbers that change")
         arrays["hand"] = grid["hand"][0].astype(int)
-    if turned:
-        quaternions = np.stack([grid[name] for name in QUATERNION], axis=-1)
-        if np.abs(np.linalg.norm(quaternions, axis=-1) - 1).max() > FAR_FROM_UNIT:
-            rule = f"{','.join(QUATERNION)}: quaternions of length 1 within {FAR_FROM_UNIT:g} are required"
-            raise InputError(
-                path, rule, f"{np.linalg.norm(quaternions, axis=-1).min():.3g} to {np.linalg.norm(quaternions, axis=-1).max():.3g}"
-            )
-        poses = np.tile(np.eye(4), (*sizes, 1, 1))
-        poses[..., :3, :3] = Rotation.from_quat(quaternions.reshape(-1, 4)).as_matrix().reshape(*sizes, 3, 3)
-        poses[..., :3, 3] = arrays.pop("points")
-        arrays = {"poses": poses} | {name: value for name, value in arrays.items() if name == "holds"}
     return arrays
 
 

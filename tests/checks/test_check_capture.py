@@ -92,7 +92,6 @@ def test_a_good_film_has_no_errors_and_warnings_and_a_contact_sheet(filmed, tmp_
         (lambda values: values.update(depth_unit=1.0), "depth unit", "error"),
         (lens, "principal point", "warning"),
         (moved(shifted(z=-0.08)), "object below the table", "warning"),
-        (lambda values: values.update(frame_rate=3000.0), "frame_rate", "error"),
     ],
 )
 def test_a_description_that_contradicts_the_images(capture, change, name, level):

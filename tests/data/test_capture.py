@@ -98,6 +98,7 @@ def test_bad_cameras_are_refused(tmp_path, change, message):
         ({"format": 2}, "format"),
         ({"cameras": []}, "cameras"),
         ({"mass": 0.0}, "mass"),
+        ({"frame_rate": 3000.0}, "frame_rate"),
         ({"cameras": TWICE}, r"names must differ; received \['0', '0'\]"),
         ({"obstacles": [{"shape": "sphere", "center": [0, 0, 0], "radius": 1}]}, "obstacles"),
     ],

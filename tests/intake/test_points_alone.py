@@ -15,7 +15,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import read_npz
 from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, TRACKS, Capture, write_tracks
 from neuspring.intake.check import check_layout
-from neuspring.intake.points import JAWS, Hands, carried, held, observe, read, standing, write
+from neuspring.intake.points import Hands, held, observe, read, standing, write
 from neuspring.scenes.sources import SOURCES, scenario_rows
 from tests.support import spaced as scene
 from tests.support.filmed import film
@@ -332,24 +332,6 @@ def test_hands_with_a_pose_carry_their_jaws(capture):
     np.testing.assert_allclose(np.linalg.norm(hands.points[:, 3] - hands.points[:, 2], axis=1), np.hypot(0.02, 0.01), atol=1e-12)
     seen = observed(capture)
     assert seen.controller_points.shape == (8, 4, 3) and not seen.controller_valid.size
-
-
-def test_poses_as_rows_of_quaternions(capture):
-    poses, _ = posed()
-    poses = poses[:, 1:]
-    (capture.folder / CONTROLLERS[0]).unlink()
-    quaternions = Rotation.from_matrix(poses[:, 0, :3, :3]).as_quat()
-    rows = [",".join(map(str, (t, 0, *poses[t, 0, :3, 3], *quaternions[t], int(t > 1)))) for t in range(8)]
-    header = "frame,point,x,y,z,qx,qy,qz,qw,holds"
-    (capture.folder / CONTROLLERS[1]).write_text("\n".join([header, *rows]) + "\n")
-    hands = read(capture).hands
-    np.testing.assert_allclose(hands.points, carried(poses, JAWS[None]), atol=1e-12)
-    np.testing.assert_array_equal(hands.holds, np.tile(np.arange(8)[:, None] > 1, (1, 4)))
-    (capture.folder / CONTROLLERS[1]).write_text(
-        "\n".join([header, *[row.replace(",0.0,0.0,", ",0.0,0.7,") for row in rows]]) + "\n"
-    )
-    with pytest.raises(InputError, match=r"qx,qy,qz,qw.*length 1"):
-        read(capture)
 
 
 @pytest.mark.parametrize(

@@ -5,9 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from neuspring.checks import examine
-from neuspring.checks.followed import few
-from neuspring.checks.perceived import LOST_TEXT, SEEN_SHARE
-from neuspring.checks.things import place_of
+from neuspring.checks.objects import place_of
 from neuspring.core.artifacts import ImageObservations
 from neuspring.core.checks import Check
 from neuspring.core.findings import Finding
@@ -22,8 +20,8 @@ RESIZED = 1.8
 def findings_of(lifted: LiftedTracks, prior: ShapePrior, up: float, image: ImageObservations) -> list[Finding]:
     """Findings about points in the world, the shape and the evidence in the image; `up` is +1 or -1."""
     found = examine("object", "object of all cameras", place_of({0: lifted.cloud}, up))
-    found += examine("pose", "shape", lifted) + examine("shape", "shape", prior)
-    return found + examine("tracks in the image", "tracks", image) + examine("hands in the image", "hands", image)
+    found += examine("pose", "shape", lifted) + examine("visible points", "tracks", image.visible[: len(image.inside)])
+    return found + examine("hands in the image", "hands", image)
 
 
 def given_pose(lifted: LiftedTracks) -> dict[str, Any] | None:

@@ -27,15 +27,15 @@ from neuspring.data.camera import Camera, CameraEntry
 from neuspring.data.capture import CAPTURE, POINTS, TRACKS, Capture, Description, Writer, description_findings
 from neuspring.extensions.make_capture.formats import open_recording, open_streams
 from neuspring.extensions.make_capture.options import Intake
-from neuspring.extensions.make_capture.poses import Placed, Seen, place
-from neuspring.extensions.make_capture.rig import Rig, RigCamera, Straightener, lens_of, read_rig, stated
-from neuspring.extensions.make_capture.streams import FrameChoice, View, choose
+from neuspring.extensions.make_capture.poses import Placed, SeenCamera, place
+from neuspring.extensions.make_capture.rig import RigCamera, StatedRig, Straightener, lens_of, read_rig, stated
+from neuspring.extensions.make_capture.streams import CameraStreams, FrameChoice, choose
 from neuspring.intake import points
 
 OF_FILM = ("color", "depth", "recording", "rig", "frames", "shift", "pose", "pair")
 """Options that only concern cameras."""
-SAMPLED, BOARD_FRAMES = 5, 5
-"""Frames of a camera in which the table is looked for, and frames of the source in which a board is."""
+FEW_FRAMES = 5
+"""Frames of a camera in which the table or a board is looked for."""
 RATE_APART = 0.02
 """Stated frame rates may differ by this fraction from that of the stamps."""
 PRECIOUS = ("mask", "marks.json", "annotations.json", TRACKS, POINTS, *capture.CONTROLLERS, *capture.NODES)
@@ -95,7 +95,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     return Capture.load(intake.output), lines
 
 
-def shifts(given: Sequence[str], views: Sequence[View], names: Sequence[str]) -> dict[str, int]:
+def shifts(given: Sequence[str], views: Sequence[CameraStreams], names: Sequence[str]) -> dict[str, int]:
     """Images by which streams are late, by name, from options such as `0.depth=1`. Raises InputError."""
     known = [*(f"{name}.depth" for name, view in zip(names, views, strict=True) if view.depth is not None), *names[1:]]
     late = {}
@@ -107,7 +107,7 @@ def shifts(given: Sequence[str], views: Sequence[View], names: Sequence[str]) ->
     return late
 
 
-def rate_of(path: Path | None, rig: Rig, views: Sequence[View], step: int) -> float:
+def rate_of(path: Path | None, rig: StatedRig, views: Sequence[CameraStreams], step: int) -> float:
     """Frames per second of the capture: the stated rate, or that of the stamps, over `step`. Raises InputError."""
     value = stated(path, "frame_rate", rig.frame_rate)
     known = [rate for view in views if (rate := view.color.series.rate) is not None]
@@ -123,7 +123,7 @@ def rate_of(path: Path | None, rig: Rig, views: Sequence[View], step: int) -> fl
     return float(value) / step
 
 
-def unit_of(path: Path | None, rig: Rig, views: Sequence[View]) -> float | None:
+def unit_of(path: Path | None, rig: StatedRig, views: Sequence[CameraStreams]) -> float | None:
     """Meters per count of depth: of the recording or as stated; None without depth. Raises InputError."""
     if all(view.depth is None for view in views):
         return None
@@ -136,16 +136,18 @@ def unit_of(path: Path | None, rig: Rig, views: Sequence[View]) -> float | None:
     return known.pop() if known else float(stated(path, "depth_unit", rig.depth_unit))
 
 
-def look(path: Path | None, entry: RigCamera, view: View, choice: FrameChoice, unit: float | None, board: bool) -> Seen:
+def look(
+    path: Path | None, entry: RigCamera, view: CameraStreams, choice: FrameChoice, unit: float | None, board: bool
+) -> SeenCamera:
     """A few of the chosen frames of a camera without distortion; with `board` the first ones of the source. Raises InputError."""
     places = [place for _, place in sorted(choice.places[view.name].items())]
-    some = sorted({places[k] for k in np.linspace(0, len(places) - 1, SAMPLED).astype(int)})
-    pairs = list(view.read(range(min(BOARD_FRAMES, len(view.pairs))) if board else some))
+    some = sorted({places[k] for k in np.linspace(0, len(places) - 1, FEW_FRAMES).astype(int)})
+    pairs = list(view.read(range(min(FEW_FRAMES, len(view.pairs))) if board else some))
     size = pairs[0][0].shape[1], pairs[0][0].shape[0]
     lens = lens_of(path, view.name, entry, view.lens, size)
     straight = Straightener(lens, size)
     depths = [straight.depth(plain(depth)) * unit for _, depth in pairs if depth is not None and unit]
-    return Seen(view.name, view.path, size, lens, straight, [straight.color(color) for color, _ in pairs], depths)
+    return SeenCamera(view.name, view.path, size, lens, straight, [straight.color(color) for color, _ in pairs], depths)
 
 
 def plain(depth: np.ndarray) -> np.ndarray:
@@ -155,11 +157,11 @@ def plain(depth: np.ndarray) -> np.ndarray:
 
 def _described(
     intake: Intake,
-    views: Sequence[View],
+    views: Sequence[CameraStreams],
     choice: FrameChoice,
     rate: float,
     unit: float | None,
-    seen: Mapping[str, Seen],
+    seen: Mapping[str, SeenCamera],
     placed: Placed,
 ) -> Description:
     """capture.json. Raises InputError."""
@@ -197,7 +199,7 @@ def _parsed(intake: Intake, **entries: Any) -> Description:
 
 
 @contextmanager
-def _begun(intake: Intake, made: Description, seen: Mapping[str, Seen]) -> Iterator[tuple[Writer, bool]]:
+def _begun(intake: Intake, made: Description, seen: Mapping[str, SeenCamera]) -> Iterator[tuple[Writer, bool]]:
     """A writer of the images, True where the folder holds a part of them already; the points of a user follow the images.
 
     Raises InputError, before anything is written, for points of which no twin can be made.
@@ -215,7 +217,12 @@ def _begun(intake: Intake, made: Description, seen: Mapping[str, Seen]) -> Itera
 
 
 def _write(
-    writer: Writer, begun: bool, views: Sequence[View], choice: FrameChoice, unit: float | None, seen: Mapping[str, Seen]
+    writer: Writer,
+    begun: bool,
+    views: Sequence[CameraStreams],
+    choice: FrameChoice,
+    unit: float | None,
+    seen: Mapping[str, SeenCamera],
 ) -> None:
     """The images that are not there yet."""
     made, done = writer.capture.description, 0

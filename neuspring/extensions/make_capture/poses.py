@@ -20,7 +20,7 @@ from neuspring.data.camera import ROLL, Lens, Plane
 from neuspring.data.capture import TEXT_TOLERANCE, pose_findings
 from neuspring.data.planes import cloud, planes
 from neuspring.extensions.make_capture.formats import open_images
-from neuspring.extensions.make_capture.rig import BoardEntry, Rig, Straightener, stated
+from neuspring.extensions.make_capture.rig import BoardEntry, StatedRig, Straightener, stated
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 TABLE_SHARE, ROUGH = 0.1, 0.02
@@ -32,7 +32,7 @@ FEWEST_CORNERS, MOST_ERROR = 6, 1.5
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class SeenCamera:
     """A few frames of a camera, without distortion."""
 
     name: str
@@ -60,7 +60,7 @@ class Placed:
     """[4, 4]: from the stated world to this one."""
 
 
-def place(path: Path | None, rig: Rig, seen: Mapping[str, Seen]) -> Placed:
+def place(path: Path | None, rig: StatedRig, seen: Mapping[str, SeenCamera]) -> Placed:
     """Poses of all cameras as rig.json states. Raises InputError."""
     how, cameras = stated(path, "poses", rig.poses), dict(zip(seen, rig.cameras, strict=False))
     if how == "table":
@@ -118,7 +118,7 @@ def find_table(where: object, points: np.ndarray, at: np.ndarray | None = None) 
     raise InputError(where, "the table must be seen", received, "Film the table from above its edge, or state the poses.")
 
 
-def pose_on(table: Plane, points: np.ndarray, view: Seen) -> np.ndarray:
+def pose_on(table: Plane, points: np.ndarray, view: SeenCamera) -> np.ndarray:
     """Camera to world [4, 4], m, of a camera that sees `table`: z along its normal, x to the right of the image.
 
     The origin lies on the table below the median of the points [n, 3] in the middle third of the image.
@@ -147,7 +147,7 @@ def levelling(tables: Mapping[str, Plane], poses: Mapping[str, np.ndarray]) -> n
     return motion
 
 
-def by_board(board: BoardEntry, view: Seen, folder: Path | None) -> tuple[np.ndarray, float]:
+def by_board(board: BoardEntry, view: SeenCamera, folder: Path | None) -> tuple[np.ndarray, float]:
     """The pose of a camera by a board that lies still, and the error, pixels rms: in images of `folder`, else in its own frames.
 
     Raises InputError where too few corners are seen, or they do not fit.
@@ -186,7 +186,7 @@ def by_board(board: BoardEntry, view: Seen, folder: Path | None) -> tuple[np.nda
     return OPENGL @ rigid_inverse(board_to_camera), error  # OpenCV's board has y down and z into the paper.
 
 
-def _point(view: Seen, at: tuple[float, float]) -> np.ndarray:
+def _point(view: SeenCamera, at: tuple[float, float]) -> np.ndarray:
     """The point [3], m, in the camera's coordinates, at pixel (x, y): the median of the depth around it. Raises InputError."""
     x, y = round(at[0]), round(at[1])
     around = np.stack(view.depths)[:, max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3]

@@ -68,7 +68,7 @@ EXAMPLES = {
     "distortion": "[k1, k2, p1, p2, k3] of opencv, [k1, k2, k3, k4] of fisheye",
 }
 COEFFICIENTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,), "none": (0,)}
-FIELD_OF_VIEW = (10.0, 150.0)
+VIEW_DEGREES = (10.0, 150.0)
 """Degrees. A focal length that gives another field of view is not in pixels of these images."""
 
 
@@ -102,7 +102,7 @@ class BoardEntry:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rig:
+class StatedRig:
     """rig.json; keys that are not stated are None."""
 
     __pydantic_config__ = STRICT
@@ -116,15 +116,15 @@ class Rig:
     cameras: tuple[RigCamera, ...] = ()
 
 
-def read_rig(path: Path | None) -> Rig:
+def read_rig(path: Path | None) -> StatedRig:
     """The stated facts; none without a file. Raises InputError with the table of other programs' keys."""
     if path is None:
-        return Rig()
+        return StatedRig()
     values = load_json(path)
     try:
         if not isinstance(values, dict):
             raise InputError(path, "a JSON object is required", type(values).__name__)
-        return parse(Rig, values, str(path))
+        return parse(StatedRig, values, str(path))
     except InputError as error:
         rows = "".join(f"\n  {program}: {theirs} -> {ours}" for program, theirs, ours in KEYS)
         told = str(error).partition("\nSee config")[0]
@@ -166,8 +166,8 @@ def lens_of(path: Path | None, name: str, entry: RigCamera, source: Lens | None,
         remedy = "Undistort other models with the camera's software, and state the intrinsics of the result with none."
         raise InputError(where, rule, f"{lens.model} with {len(lens.distortion)}", remedy)
     views = np.degrees(2 * np.arctan(0.5 * np.array(size) / np.diag(lens.matrix)[:2]))
-    if not (FIELD_OF_VIEW[0] < views.min() and views.max() < FIELD_OF_VIEW[1]):
-        rule = f"camera {name}: a field of view between {FIELD_OF_VIEW[0]:g} and {FIELD_OF_VIEW[1]:g} degrees is required"
+    if not (VIEW_DEGREES[0] < views.min() and views.max() < VIEW_DEGREES[1]):
+        rule = f"camera {name}: a field of view between {VIEW_DEGREES[0]:g} and {VIEW_DEGREES[1]:g} degrees is required"
         received = f"{views[0]:.1f} x {views[1]:.1f} degrees"
         raise InputError(where, rule, received, "Focal lengths are in pixels of these images, not in millimeters.")
     return lens

@@ -112,7 +112,7 @@ def _by_time(where: object, names: tuple[str, str], one: Series, other: Series) 
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class CameraStreams:
     """The streams of one camera, with what the source states about it."""
 
     name: str
@@ -199,7 +199,7 @@ class FrameChoice:
         return f"{len(self.numbers)} frames, numbers {self.numbers[0]} to {self.numbers[-1]} of the source{stride}"
 
 
-def choose(views: Sequence[View], wanted: str, pairing: Pairing | None, late: Mapping[str, int]) -> FrameChoice:
+def choose(views: Sequence[CameraStreams], wanted: str, pairing: Pairing | None, late: Mapping[str, int]) -> FrameChoice:
     """The frames that `wanted` (FIRST-LAST or FIRST-LAST/STEP) keeps, numbered as those of the first camera.
 
     Raises InputError for too few frames, or a camera without the first frame or half of the others.

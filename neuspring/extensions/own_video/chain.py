@@ -57,8 +57,8 @@ class TwinChain:
             if not path.exists():
                 raise InputError(path, "what --masks, --hands and --marks name must exist", "nothing there")
         self.given = (film / CAPTURE).is_file()
-        if self.given and any((wish.mass, wish.rate, wish.frames, wish.intake)):
-            rule = "--mass, --rate, --frames and --intake make a capture, and this is one"
+        if self.given and any((wish.mass, wish.frames, wish.intake)):
+            rule = "--mass, --frames and --intake make a capture, and this is one"
             raise InputError(film, rule, CAPTURE, f'Write "mass" into {CAPTURE}; keep frames with --window.')
         name = re.sub(r"[^A-Za-z0-9_.-]+", "_", film.resolve().stem if film.is_file() else film.resolve().name).strip("._-")
         self.folder = (wish.output or Path("twins") / name).resolve()
@@ -84,7 +84,7 @@ class TwinChain:
     def _make_capture(self) -> None:
         wish, made = self.wish, (self.capture / CAPTURE).is_file()
         words = [*_parts(wish.film.resolve()), "--category", wish.category, "--output", str(self.capture)]
-        for name in ("mass", "rate", "frames"):
+        for name in ("mass", "frames"):
             words += [f"--{name}", str(getattr(wish, name))] if getattr(wish, name) else []
         command = _neuspring("make-capture", *words, *shlex.split(wish.intake))
         # The words behind `python -m neuspring`: the same step in another environment is the same step.
@@ -259,5 +259,5 @@ def _parts(film: Path) -> list[str]:
         options += [f"--{option}", str(found[0])] if found else []
     if "--color" not in options:
         return ["--recording", str(film)]
-    files = [path for path in inside if path.name in ("intrinsics.json", "poses.json")]
+    files = [path for path in inside if path.name == "rig.json"]
     return options + [word for path in files for word in (f"--{path.stem}", str(path))]

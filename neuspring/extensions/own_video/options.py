@@ -15,19 +15,17 @@ class Wish:
     """The film, and what is wanted of it: the options of `neuspring twin`."""
 
     film: Positional[Path]
-    """a folder with color/, depth/ and intrinsics.json; a bag; a video; or a capture"""
+    """a folder with color/, depth/ and rig.json; a bag; a video; or a capture"""
     output: Path | None = None
     """folder for everything, whose name is the twin's; twins/<name of the film> by default"""
     category: str = "object"
     """kind of object: cloth, rope, package, or any other word"""
     mass: float | None = None
     """mass of the object, kg, for exports"""
-    rate: float | None = None
-    """frames per second, where the film does not say it"""
     frames: str = ""
     """frames of the film that are kept, like 250-335"""
     intake: str = ""
-    """more options of make-capture, as one text: --intake="--top-down --take distance" """
+    """more options of make-capture, as one text: --intake="--pair order --shift 0.depth=1" """
     masks: tuple[Path, ...] = ()
     """per camera a folder of another tool's masks: 0 nothing, 1 object, 2 hands"""
     hands: tuple[Path, ...] = ()

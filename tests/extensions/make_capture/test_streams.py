@@ -8,7 +8,7 @@ import pytest
 
 from neuspring.core.errors import InputError
 from neuspring.extensions.make_capture.formats import open_images
-from neuspring.extensions.make_capture.streams import Series, View, choose, chosen, matched, spans
+from neuspring.extensions.make_capture.streams import CameraStreams, Series, choose, chosen, matched, spans
 from tests.support.desk import FRAMES, write_folders, write_video
 
 BEGIN = datetime(2024, 5, 1, 12, 30, 15, 33000)
@@ -40,7 +40,7 @@ def renamed(desk, folder, kind, name, kept=range(FRAMES), late=0.0, first=0, sta
 
 def paired(desk, folder, name, pairing=None, **depth):
     """The frames of depth that belong to those of color; NaN: none."""
-    view = View("0", renamed(desk, folder, "color", name), renamed(desk, folder, "depth", name, **depth), pairing=pairing)
+    view = CameraStreams("0", renamed(desk, folder, "color", name), renamed(desk, folder, "depth", name, **depth), pairing=pairing)
     kept = [*depth.get("kept", range(FRAMES))]
     return [(left, kept[right]) for left, right in view.pairs]
 
@@ -67,7 +67,7 @@ def test_names_with_times_are_not_read_and_stamps_are(desk, tmp_path, name):
         paired(desk, tmp_path / "none", name, late=0.002)
     color = renamed(desk, tmp_path, "color", name, stamps=True, kept=[0, 1, 3, 4, 5, 6])
     depth = renamed(desk, tmp_path, "depth", name, stamps=True, late=0.002, kept=[0, 1, 2, 3, 4, 6])
-    view = View("0", color, depth)
+    view = CameraStreams("0", color, depth)
     assert view.pairs == [(0, 0), (1, 1), (2, 3), (3, 4), (5, 5)] and view.without_partner == 2
     assert view.color.series.rate == pytest.approx(30, rel=1e-3)
 
@@ -100,7 +100,7 @@ def test_streams_without_a_common_clock_begin_together_and_must_end_together():
 
 def views(desk, names="01", missing=()):
     color = {name: open_images(desk / f"color_{name}", "color") for name in names}
-    found = [View(name, color[name], None) for name in names]
+    found = [CameraStreams(name, color[name], None) for name in names]
     if missing:
         object.__setattr__(found[1].color, "paths", [p for k, p in enumerate(color["1"].paths) if k not in missing])
     return found
@@ -132,7 +132,7 @@ def test_videos_are_paired_by_their_stamps_and_depth_must_be_exact(desk, tmp_pat
     depths = list(open_images(desk / "depth_0", "depth").read(range(FRAMES)))
     color = open_images(write_video(tmp_path / "color.mp4", frames, "libx264", "yuv420p"), "color")
     depth = open_images(write_video(tmp_path / "depth.mkv", depths, "ffv1", "gray16le"), "depth")
-    view = View("0", color, depth)
+    view = CameraStreams("0", color, depth)
     assert view.pairs == SAME and view.color.series.rate == pytest.approx(15, rel=1e-3)
     for (_, read), stored in zip(view.read([2, 5]), (depths[2], depths[5]), strict=True):
         np.testing.assert_array_equal(read, stored)

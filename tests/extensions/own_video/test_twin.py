@@ -60,7 +60,7 @@ def film(tmp_path):
     """A folder as a camera leaves it, and masks of another tool."""
     for name in ("color", "depth", "masks"):
         write_text(tmp_path / "my toy" / name / "0.png", "")
-    write_text(tmp_path / "my toy" / "intrinsics.json", "{}")
+    write_text(tmp_path / "my toy" / "rig.json", "{}")
     return tmp_path / "my toy"
 
 
@@ -73,13 +73,11 @@ def with_masks(film: Path, *words: str) -> int:
 
 
 def test_the_commands_of_the_tutorial_run_in_their_order(film, steps, capsys):
-    assert with_masks(film, "--mass", "0.3", "--rate", "30", "--intake=--top-down --take distance") == 0
+    assert with_masks(film, "--mass", "0.3", "--intake=--pair order") == 0
     assert steps.names == ["make-capture", "mask", "check-data", "--snakefile"]
     color, depth = (f"--{name} {film / name}" for name in ("color", "depth"))
-    lens, where = f"--intrinsics {film / 'intrinsics.json'}", f"--output {film.parent / 'out/captures/out'}"
-    assert " ".join(steps.ran[0]) == (
-        f"make-capture {color} {depth} {lens} --category object {where} --mass 0.3 --rate 30.0 --top-down --take distance"
-    )
+    lens, where = f"--rig {film / 'rig.json'}", f"--output {film.parent / 'out/captures/out'}"
+    assert " ".join(steps.ran[0]) == (f"make-capture {color} {depth} {lens} --category object {where} --mass 0.3 --pair order")
     page = " ".join(steps.ran[-1])
     assert "config/data/own.yaml" in page and f"--directory {film.parent / 'out'}" in page
     assert 'scenarios=["out"]' in page and 'methods=["static", ' in page and "effort=quick" in page

@@ -20,7 +20,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import foreign
 from neuspring.data.capture import Capture
 from neuspring.extensions.make_capture.options import Intake
-from neuspring.extensions.make_capture.streams import ImageSource, Kind, View
+from neuspring.extensions.make_capture.streams import CameraStreams, ImageSource, Kind
 from neuspring.registry import Registry, modules
 
 ENDINGS = {"color": (".png", ".jpg", ".jpeg", ".bmp", ".npy"), "depth": (".png", ".npy", ".tif", ".tiff")}
@@ -36,7 +36,7 @@ class CaptureFormat:
     """True for a path of this format."""
     pictures: Callable[[Path, Kind], ImageSource] | None = None
     """Opens images of one kind. Raises InputError."""
-    recording: Callable[[Intake], list[View]] | None = None
+    recording: Callable[[Intake], list[CameraStreams]] | None = None
     """Opens --recording. Raises InputError."""
     capture: Callable[[Intake], Capture] | None = None
     """Writes --recording as a capture. Raises InputError."""
@@ -56,7 +56,7 @@ def open_images(path: Path, kind: Kind) -> ImageSource:
     raise InputError(path, known.format(kind=kind, endings=" ".join(ENDINGS[kind])), name or received, remedy)
 
 
-def open_recording(intake: Intake) -> list[View] | Capture:
+def open_recording(intake: Intake) -> list[CameraStreams] | Capture:
     """The streams of a recording, or the capture that its format wrote. Raises InputError."""
     fitting = {key: one for key, one in FORMATS.items() if one.pictures is None}
     name = intake.format or next((key for key, one in fitting.items() if one.recognizes(intake.recording[0])), "")
@@ -69,15 +69,14 @@ def open_recording(intake: Intake) -> list[View] | Capture:
     return one.capture(intake)
 
 
-def open_streams(intake: Intake) -> list[View]:
+def open_streams(intake: Intake) -> list[CameraStreams]:
     """The streams of --color and --depth, one of each per camera. Raises InputError."""
     if intake.depth and len(intake.color) != len(intake.depth):
         rule = "as many folders or videos of depth as of color are required, one each per camera"
         raise InputError("--color, --depth", rule, f"{len(intake.color)} of color, {len(intake.depth)} of depth")
-    depths = [open_images(path, "depth") for path in intake.depth] or [None] * len(intake.color)
-    return [
-        View(str(k), open_images(path, "color"), depth) for k, (path, depth) in enumerate(zip(intake.color, depths, strict=True))
-    ]
+    colors = [open_images(path, "color") for path in intake.color]
+    depths = [open_images(path, "depth") for path in intake.depth] or [None] * len(colors)
+    return [CameraStreams(str(k), *pair) for k, pair in enumerate(zip(colors, depths, strict=True))]
 
 
 def require_kind(path: Path, kind: Kind, image: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from neuspring.core.extras import needed
 from neuspring.data.camera import Lens
 from neuspring.extensions.make_capture.formats import CaptureFormat, require_kind
 from neuspring.extensions.make_capture.options import Intake
-from neuspring.extensions.make_capture.streams import Kind, Series, View
+from neuspring.extensions.make_capture.streams import CameraStreams, Kind, Series
 
 ENCODINGS: dict[str, tuple[Kind, int, str, int | None]] = {
     "rgb8": ("color", 3, "u1", None),
@@ -34,18 +34,17 @@ ENCODINGS: dict[str, tuple[Kind, int, str, int | None]] = {
     "32fc1": ("depth", 1, "f4", None),
 }
 """Encoding -> kind, channels, type of a channel, OpenCV's code to RGB."""
-UNITS = {"u": 0.001, "f": 1.0}
+ROS_UNITS = {"u": 0.001, "f": 1.0}
 """m per count of integers and of floating point, as REP 118 of ROS defines depth."""
-PACKED = 12
-"""Bytes of the head of compressedDepth, before its PNG."""
 MODELS = {"plumb_bob": "opencv", "rational_polynomial": "opencv", "equidistant": "fisheye", "fisheye": "fisheye", "": "none"}
-IMAGES, INFO = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"), "sensor_msgs/msg/CameraInfo"
+IMAGE_TYPES, INFO = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"), "sensor_msgs/msg/CameraInfo"
 
 
 def decoded(where: Path, message: Any) -> np.ndarray:
     """RGB [H, W, 3] uint8 or depth [H, W] of an image message. Raises InputError for another encoding."""
     if hasattr(message, "format"):
-        data = message.data[PACKED:] if "compressedDepth" in message.format else message.data
+        # compressedDepth has a head of 12 bytes before its PNG.
+        data = message.data[12:] if "compressedDepth" in message.format else message.data
         image = None if message.format.startswith("32FC1") else cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
         if image is not None and (image.ndim == 2 or image.shape[2] == 3):
             # ROS's transport names the order in which it gave the channels to the codec; OpenCV returns BGR.
@@ -109,7 +108,7 @@ class Bag:
     def images(self, kind: Kind) -> list[str]:
         """Topics of images of one kind, by their first message."""
         found = []
-        for name in (name for name, (type_, count) in self.topics.items() if type_ in IMAGES and count):
+        for name in (name for name, (type_, count) in self.topics.items() if type_ in IMAGE_TYPES and count):
             try:
                 image = decoded(self.path, next(self.messages(name)))
             except InputError:
@@ -182,9 +181,9 @@ class Topic:
         return sorted(filter(Path.is_file, self.bag.path.iterdir())) if self.bag.path.is_dir() else [self.bag.path]
 
 
-def open_bags(intake: Intake) -> list[View]:
+def open_bags(intake: Intake) -> list[CameraStreams]:
     """Cameras by pairs of topics, all of one recording or one of each. Raises InputError that lists the topics."""
-    views, topics = list[View](), intake.topics
+    views, topics = list[CameraStreams](), intake.topics
     pairs, paths = [topics[k : k + 2] for k in range(0, len(topics), 2)] or [()], list(intake.recording)
     paths = paths * len(pairs) if len(paths) == 1 else paths
     pairs = pairs * len(paths) if len(pairs) == 1 else pairs
@@ -209,8 +208,8 @@ def open_bags(intake: Intake) -> list[View]:
         if lens is not None and other is not None and not np.allclose(lens.matrix, other.matrix):
             remedy = "Align it: rs-convert or rs.align (RealSense), a topic aligned_depth_to_color (ROS)."
             raise InputError(path, "depth must be aligned to color: both need one camera_info", f"two lenses, {depth}", remedy)
-        unit = UNITS[decoded(path, next(bag.messages(depth))).dtype.kind]
-        views.append(View(str(number), Topic(bag, color, "color"), Topic(bag, depth, "depth"), unit=unit, lens=lens))
+        unit = ROS_UNITS[decoded(path, next(bag.messages(depth))).dtype.kind]
+        views.append(CameraStreams(str(number), Topic(bag, color, "color"), Topic(bag, depth, "depth"), unit=unit, lens=lens))
     return views
 
 
