@@ -17,7 +17,6 @@ and has no files.
 from __future__ import annotations
 
 import hashlib
-import itertools
 import json
 import os
 import shutil
@@ -147,17 +146,6 @@ class Capture:
         stored = {"color": bool(self.cameras), "depth": self.description.depth == "measured", "mask": self.description.masks}
         return frozenset(name for name, there in stored.items() if there)
 
-    @property
-    def streams(self) -> frozenset[str]:
-        """What the capture has of every frame: color, and depth and mask where it has them."""
-        there = (True, self.description.depth == "measured", self.description.masks)
-        return frozenset(itertools.compress(("color", "depth", "mask"), there))
-
-    @property
-    def has_depth(self) -> bool:
-        """True where depth was measured."""
-        return "depth" in self.streams
-
     def require_camera(self, name: str) -> None:
         """Raise InputError if there is no such camera."""
         if name not in self.cameras:
@@ -182,7 +170,7 @@ class Capture:
 
     def depth(self, camera: str, frame: int) -> np.ndarray:
         """Depth [H, W], m, 0 where nothing was measured: everywhere with `depth: none`. Raises InputError."""
-        if not self.has_depth:
+        if "depth" not in self.streams:
             return np.zeros((self.cameras[camera].height, self.cameras[camera].width))
         path = self.path("depth", camera, frame)
         if path.suffix == ".png":

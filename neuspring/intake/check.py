@@ -29,7 +29,7 @@ from neuspring.core.text import listed
 from neuspring.data.c3d import Markers, is_c3d, plain_file
 from neuspring.data.capture import CAPTURE, OBJECT, Capture, description_findings, read_description
 from neuspring.intake import phystwin, phystwin_raw
-from neuspring.intake.phystwin import FINAL_DATA, SPLIT, Case
+from neuspring.intake.phystwin import FINAL_DATA, SPLIT
 from neuspring.intake.points import InSpace, look
 from neuspring.registry import Registry
 
@@ -66,8 +66,7 @@ def check_layout(folder: Path, config: Config | None = None) -> list[Finding]:
         if captures := _captures(folder):
             return [finding for path in captures for finding in check_capture(path)]
         if cases := find_cases(folder):
-            findings = [finding for case in cases for finding in _check_case(case)]
-            return findings + examine("cases", folder, folder, cases, findings)
+            return [finding for case in cases for finding in _check_case(case)]
         if marked := sorted(path for path in folder.rglob("*") if path.suffix.lower() == ".c3d"):
             return [finding for file in marked for finding in check_markers(file)]
     files = sorted(filter(Path.is_file, folder.rglob("*"))) if folder.is_dir() else [folder]
@@ -204,26 +203,12 @@ def check_markers(path: Path) -> list[Finding]:
     return [listing, *examine("moving", path, Moving(markers.points, markers.rate), remedy)]
 
 
-def find_cases(folder: Path) -> list[Case]:
-    """The processed cases in or below `folder`; none in a file, or if there are captures.
-
-    Raises InputError for a root with data/different_types that holds no case.
-    """
-    folder = Path(folder)
-    if folder.is_file() or _captures(folder):
-        return []
+def find_cases(folder: Path) -> list[Path]:
+    """The folders of cases in or below `folder`. Raises InputError for a root with data/different_types that holds none."""
     below = folder / "data" / "different_types"
-    if below.is_dir():
-        if not (paths := _subfolders(below)):
-            raise InputError(folder, "at least one case folder is required", "none")
-        return [Case(root=folder, name=path.name) for path in paths]
-    cases = []
-    for path in [folder] if is_case(folder) else filter(is_case, _subfolders(folder)):
-        path = path.absolute()
-        if path.parts[-3:-1] == ("data", "different_types"):
-            cases.append(Case(root=path.parents[2], name=path.name))
-        else:
-            cases.append(Case(root=path.parent, name=path.name, loose=path))
+    cases = [folder] if is_case(folder) else _subfolders(below) if below.is_dir() else list(filter(is_case, _subfolders(folder)))
+    if below.is_dir() and not cases:
+        raise InputError(folder, "at least one case folder is required", "none")
     return cases
 
 
@@ -232,10 +217,10 @@ def is_case(folder: Path) -> bool:
     return any((folder / name).exists() for name in (FINAL_DATA, SPLIT, phystwin.CALIBRATION))
 
 
-def _check_case(case: Case) -> list[Finding]:
+def _check_case(folder: Path) -> list[Finding]:
     """What the readers of a case refuse: of its processed data, and of its calibration where it has images."""
-    findings, folder = list[Finding](), case.folder
-    row = ScenarioRow(scenario=case.name, source="phystwin", category="", path=".", self_collision=False, ground=True)
+    findings = list[Finding]()
+    row = ScenarioRow(scenario=folder.name, source="phystwin", category="", path=".", self_collision=False, ground=True)
     readers: list[Callable[[], Any]] = []
     if (folder / FINAL_DATA).exists() or not (folder / "color").is_dir():
         readers.append(lambda: phystwin.read(row, folder))

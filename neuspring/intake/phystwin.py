@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -40,22 +39,6 @@ CASE_ARRAYS = {
     "interior_points": (("Ni", 3), "f"),
 }
 """Key -> shape, in which a letter is one size in all arrays, and NumPy's kind."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Case:
-    """The location of a processed case."""
-
-    root: Path
-    """The folder that the archives were unpacked in."""
-    name: str
-    loose: Path | None = None
-    """Folder of a case outside of data/different_types. No released results are known for it."""
-
-    @property
-    def folder(self) -> Path:
-        """The processed case."""
-        return self.loose or self.root / "data" / "different_types" / self.name
 
 
 @cache

@@ -198,7 +198,7 @@ def test_hands_count_by_their_motion_alone():
 def test_a_capture_of_one_camera_has_its_color_and_masks(tmp_path):
     capture = paint(tmp_path / "painted", frames=5)
     color = one_camera(capture, tmp_path / "scene_color", depth=False)
-    assert not color.has_depth
+    assert "depth" not in color.streams
     np.testing.assert_array_equal(Capture.load(color.folder).mask("0", 3), capture.mask("0", 3))
 
 

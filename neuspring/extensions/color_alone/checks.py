@@ -58,8 +58,6 @@ checks = (
     Check("pose", "pose", supposed_pose, None, "note",
           "if it lies, it reaches {deep:.0f} cm behind its nearest point and is {across:.0f} cm wide{rises}; one picture cannot "
           "say whether it lies or stands.", 'Write "pose": "lying" or "standing" in capture.json.'),
-    Check("points lost", "tracks in the image", lambda image: few(image.visible[: len(image.inside)], SEEN_SHARE), None, "warning",
-          LOST_TEXT + "every training frame; silhouettes alone say where the object is in the others.", "Look at tracks.png."),
     Check("size of hands", "hands in the image", hand_sizes, None, "warning",
           "a hand appears {least:.2f} to {value:.2f} times as large as in frame 0; a hand at arm's length changes by less than "
           f"{RESIZED:g} times; it was not followed well.", "Look at hands.png, and mark the hands anew."),

@@ -113,7 +113,7 @@ class _Recording:
                     self._stream.log(place, rr.Clear(recursive=True))
                     continue
                 self._stream.log(f"{place}/color", rr.Image(capture.color(name, frame)).compress(RRD_JPEG_QUALITY))
-                if capture.has_depth:
+                if "depth" in capture.streams:
                     counts = np.rint(capture.depth(name, frame) / unit).astype(np.uint16)
                     self._stream.log(f"{place}/depth", rr.DepthImage(counts, meter=1 / unit))
 
