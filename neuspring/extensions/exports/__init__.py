@@ -22,7 +22,7 @@ class Export:
     """A format that twins are written in."""
 
     write: Callable[..., list[Path]]
-    """(source, frames, output) -> paths written; the keyword `rate` (time codes per second) where the format has one."""
+    """(source, frames, output) -> paths written."""
     frames: str = ""
     """Frames by default, as `--frames` takes them; empty: all."""
     name: str = "{name}"

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
 from pathlib import Path
 from typing import Annotated
 
 from neuspring.cli.options import Positional, arg
 from neuspring.core.errors import InputError
-from neuspring.extensions.exports import EXPORTS, Export
+from neuspring.extensions.exports import EXPORTS
 
 
 def export(
@@ -17,7 +16,6 @@ def export(
     output: Annotated[Path | None, arg(help="file or folder to write; by default it is named after the run")] = None,
     frames: Annotated[str | None, arg(help="FIRST, FIRST:STOP or FIRST:STOP:STEP; all by default, or 0 for ply")] = None,
     mass: Annotated[float | None, arg(help="kg in all, which masses and forces get; by default as capture.json says")] = None,
-    rate: Annotated[float | None, arg(help="time codes per second (usd); the capture's frames per second by default")] = None,
 ) -> None:
     """A twin -> a file of another tool, by format."""
     from neuspring.extensions.exports.source import chosen_frames, read_source
@@ -25,16 +23,8 @@ def export(
     if to not in EXPORTS:
         raise InputError("--to", f"must be one of {', '.join(EXPORTS)}", to)
     format = EXPORTS[to]
-    own = {} if rate is None else {"rate": rate}
-    if own and not _takes_rate(format):
-        takers = ", ".join(name for name, other in EXPORTS.items() if _takes_rate(other))
-        raise InputError("--rate", f"is for {takers}", f"--to {to}", "Leave it out: the files say the time of each frame.")
     source = read_source(twin, mass)
     target = output or Path("export") / format.name.format(name=source.name)
-    for path in format.write(source, chosen_frames(frames, source, format.frames), target, **own):
+    for path in format.write(source, chosen_frames(frames, source, format.frames), target):
         print(f"Wrote {path}")
     print(f"Mass: {source.weight}")
-
-
-def _takes_rate(format: Export) -> bool:
-    return "rate" in inspect.signature(format.write).parameters

@@ -166,8 +166,6 @@ def test_what_cannot_be_exported(folder, kind):
 
 
 def test_the_command_says_what_is_wrong_and_writes_nothing(folder, tmp_path, capsys):
-    assert main(["export", str(folder), "--to", "npz", "--rate", "60"]) == 2
-    assert "--rate: is for usd" in capsys.readouterr().err
     (folder / "trajectory.npz").unlink()
     assert main(["export", str(folder), "--to", "npz", "--output", str(tmp_path / "out")]) == 2
     assert "run again" in capsys.readouterr().err and not (tmp_path / "out").exists()

@@ -26,14 +26,12 @@ SPLAT_REACH = float(np.sqrt(2 * np.log(255)))
 """Standard deviations from the center to where 1 / 255 is left of an opaque splat, which is as far as it is drawn."""
 
 
-def write(source: ExportSource, frames: Sequence[int], output: Path, rate: float | None = None) -> list[Path]:
-    """Write one file. Its time codes per second are `rate`, or one per frame of the twin; seconds stay what they are."""
+def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Path]:
+    """Write one file, with a time code per frame of the twin."""
     Usd, UsdGeom = needed("pxr.Usd"), needed("pxr.UsdGeom")
     if output.suffix not in SUFFIXES:
         raise InputError("--output", f"must end with {', '.join(SUFFIXES)}", output.name)
-    if rate is not None and not (np.isfinite(rate) and rate > 0):
-        raise InputError("--rate", "must be a positive number of time codes per second", rate)
-    rate = rate or 1 / source.twin.simulation.frame_time
+    rate = 1 / source.twin.simulation.frame_time
     codes = {frame: round(float(source.times[frame]) * rate, 6) for frame in frames}
     stage = Usd.Stage.CreateInMemory(f"twin{output.suffix}")  # The suffix chooses the encoding.
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
@@ -60,20 +58,6 @@ def colors(stiffness: np.ndarray) -> np.ndarray:
     span = np.ptp(logs) if len(logs) else 0.0
     share = (logs - logs.min()) / span if span else np.full(len(logs), 0.5)
     return np.stack([share, np.full(len(logs), 0.2), 1 - share], axis=1)
-
-
-def require_lengths(field: Any, stand_in: Any, code: float) -> None:
-    """Raise InputError unless each array of splats has a value per splat at this time: UsdValidation has no rule for them."""
-    count = len(field.GetPositionsAttr().Get(code))
-    arrays = [field.GetOrientationsAttr(), field.GetScalesAttr(), field.GetOpacitiesAttr(), stand_in.GetPointsAttr()]
-    arrays += [stand_in.GetWidthsAttr(), stand_in.GetDisplayColorAttr(), stand_in.GetDisplayOpacityAttr()]
-    degree = field.GetRadianceSphericalHarmonicsDegreeAttr().Get()
-    values = dict.fromkeys(arrays, 1) | {field.GetRadianceSphericalHarmonicsCoefficientsAttr(): (degree + 1) ** 2}
-    for attribute, each in values.items():
-        received = len(attribute.Get(code) or ())
-        if received != each * count:
-            rule = f"{each * count} values are required at time {code:g}, for {count} splats"
-            raise InputError(attribute.GetPath(), rule, received, "Delete appearance/<seed>/appearance.json and run again.")
 
 
 class _Shapes:
@@ -139,7 +123,6 @@ class _Shapes:
             axes = Rotation.from_quat(turns, scalar_first=True).as_matrix() * scales[:, None]
             self._place(field, field.CreatePositionsAttr(), means, SPLAT_REACH * np.linalg.norm(axes, axis=2), code)
             self._place(stand_in, stand_in.CreatePointsAttr(), means, scales.mean(axis=1, keepdims=True), code)
-            require_lengths(field, stand_in, code)
 
     def _points(self, name: str, width: float, color: tuple[float, float, float]) -> Any:
         prim = self._geom.Points.Define(self._stage, f"{ROOT_PRIM}/{name}")
