@@ -109,7 +109,7 @@ def test_phystwin_s_raw_layout_gives_the_same_observations(tmp_path):
 
 def test_given_masks_must_be_there(tmp_path):
     capture = film(tmp_path / "capture", cameras=1, masks=False)
-    with pytest.raises(InputError, match=r"backend: given needs masks.*neuspring annotate .*: marks, opencv"):
+    with pytest.raises(InputError, match=r"segment\.backend needs mask of every frame.*neuspring annotate "):
         segmented(capture, tmp_path, "0")
 
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import shutil
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -36,7 +40,19 @@ def intrinsics(size: tuple[int, int]) -> np.ndarray:
     return np.array([[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1.0]])
 
 
-def film(
+KEPT = tempfile.TemporaryDirectory(prefix="neuspring-films-")
+
+
+def film(folder: Path, **options: Any) -> Capture:
+    """The capture that `rendered` makes. Each film is rendered once per process; later calls copy its folder."""
+    kept = Path(KEPT.name) / hashlib.sha256(repr(sorted(options.items())).encode()).hexdigest()[:16]
+    if not kept.exists():
+        rendered(kept, **options)
+    shutil.copytree(kept, folder, dirs_exist_ok=True)
+    return Capture.load(folder)
+
+
+def rendered(
     folder: Path,
     cameras: int = 3,
     sizes: Sequence[tuple[int, int]] = (SIZE, SIZE, SIZE),
