@@ -1,6 +1,7 @@
 """Who imports whom: rooms of the package import downwards only, the workflow starts light, and no test imports another test."""
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -65,6 +66,14 @@ def test_extensions_know_only_the_core():
         assert others <= {parts[1]}, module
     core = [path for path in PACKAGE.rglob("*.py") if path.relative_to(PACKAGE).parts[0] != "extensions"]
     assert [path for path in core if "neuspring.extensions" in path.read_text()] == []
+
+
+def test_no_file_of_the_core_names_rods_or_cables():
+    """The second body is found by the registry alone."""
+    word = re.compile(r"\b(rods?|cables?|deform's|mocap|dlo\d)\b|\bRod[A-Z]", re.IGNORECASE)
+    core = [path for path in PACKAGE.rglob("*.py") if path.relative_to(PACKAGE).parts[0] != "extensions"]
+    lines = [f"{path}: {line.strip()}" for path in core for line in path.read_text().splitlines() if word.search(line)]
+    assert not lines, "\n".join(lines)
 
 
 def test_only_the_tracking_package_imports_mlflow():
