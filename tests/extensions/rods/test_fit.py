@@ -111,7 +111,7 @@ def test_markers_beside_the_line_are_found():
     # In frame 0 markers lie where they were seen, whatever the line is.
     moved = move(with_markers, new)[0]
     np.testing.assert_allclose(moved.topology.nodes, new.nodes, atol=1e-6)
-    assert np.abs(moved.rod.vertices[2:-2] - new.nodes).max() > 1e-3
+    assert np.abs(moved.body.vertices[2:-2] - new.nodes).max() > 1e-3
 
 
 def test_a_hand_that_lets_go_does_not_pull_in_the_fit_either():
@@ -166,5 +166,5 @@ def test_fields_along_the_arc():
         sizes[kind] = variables.sizes.get("bending_along", 0), variables.sizes["curvature"]
         # A constant is in each of them.
         made = variables.made(np.zeros(len(variables.scale)))
-        np.testing.assert_array_equal(made.rod.bending, twin.body.bending)
+        np.testing.assert_array_equal(made.body.bending, twin.body.bending)
     assert sizes == {"constant": (0, 2), "knots": (4, 8), "free": (6, 12)}

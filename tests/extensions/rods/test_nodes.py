@@ -53,7 +53,7 @@ def twin(
         topology=topology,
         material=Material(stiffness=np.full(count, stiffness), dashpot=np.zeros(count), **scalars),
         simulation=Simulation(frame_time=0.02, substeps=10, ground=ground, gravity=gravity),
-        rod=rod(x, edge=edge, place=place, **({"mass": np.full(VERTICES, EDGE)} | own)),  # type: ignore[arg-type]
+        body=rod(x, edge=edge, place=place, **({"mass": np.full(VERTICES, EDGE)} | own)),  # type: ignore[arg-type]
     )
 
 
@@ -121,7 +121,7 @@ def test_a_rope_on_the_ground_slides_as_friction_says():
 def test_lanes_are_the_same_as_rods_alone():
     node = np.array([[0.2, 0.0, 0.0], [0.1, 0.005, 0]])
     one = twin(node, np.array([0.2, 0, 0.02]), [(0, 2), (1, 2)])
-    soft = replace(one, rod=replace(one.rod, bending=0.1 * one.rod.bending))
+    soft = replace(one, body=replace(one.body, bending=0.1 * one.body.bending))
     hands = np.tile(one.topology.controllers, (5, 1, 1)).astype(np.float32)
     hands[:, 0, 1] += 0.01 * np.arange(5)
     together = RodFrames([one, soft])
@@ -137,6 +137,6 @@ def test_a_rod_is_not_continued_from_nodes_alone():
     hand = torch.tensor(body.topology.controllers)
     with pytest.raises(InputError, match="begins in frame 0"):
         RodFrames(body).forward(torch.tensor(body.topology.nodes) + 0.1, torch.zeros(1, 3), hand, hand)
-    along = replace(body, rod=replace(body.rod, axis=np.array([1.0, 0, 0])))
+    along = replace(body, body=replace(body.body, axis=np.array([1.0, 0, 0])))
     with pytest.raises(InputError, match=r"rod\.axis.*cosine below"):
         roll_out(along, np.tile(body.topology.controllers, (2, 1, 1)))

@@ -64,8 +64,8 @@ def test_a_hand_carries_its_points_and_the_unloaded_body_hangs_straight_from_it(
     along = np.array(UNLOADED[0]) / np.linalg.norm(UNLOADED[0])
     np.testing.assert_allclose(own[0, :2], [-posed.HAND_GRIP * along, [0, 0, 0]], atol=SINGLE)
     assert here.scenario.frame_rate == pytest.approx(50)
-    assert here.line.tolist() == [20, 21, 0, 1]
-    assert here.rest_shape.shape == (20 + 8, 3) and here.controller_hand.tolist() == [0] * 8
+    assert here.line.tolist() == [74, 75, 0, 1]
+    assert here.rest_shape.shape == (74 + 8, 3) and here.controller_hand.tolist() == [0] * 8
     rest = turns[0].inv().apply(here.rest_shape[:2] - rows[["x", "y", "z"]].to_numpy()[0])
     np.testing.assert_allclose(rest, UNLOADED, atol=SINGLE)
 
@@ -124,7 +124,7 @@ def test_a_fit_finds_stiffness_and_slip_of_a_rod_that_swings(tmp_path: Path) -> 
     first, second = (seen(tmp_path, table(61, seed), f"swing{seed}") for seed in (0, 1))
     steps = RodSteps(curvature="straight", horizons=(0,), rounds=12, every=2, markers=False, slip=1, robust=1e-3)
     start = rod_twin(first, Config(rod=ROD))
-    start = replace(start, rod=replace(start.rod, slip=np.array([[0.5, 0.3]]), slip_twist=1.0))
+    start = replace(start, body=replace(start.body, slip=np.array([[0.5, 0.3]]), slip_twist=1.0))
     variables = Variables.of(start, steps, 2)
     names = variables.kinds.tolist()
     q = np.zeros(len(names))
@@ -133,9 +133,9 @@ def test_a_fit_finds_stiffness_and_slip_of_a_rod_that_swings(tmp_path: Path) -> 
     truth = variables.made(q)
     pool = [recorded(truth, each) for each in (first, second)]
     found = fit_rod(pool[0], pool[1:], start, steps).twin
-    assert found.rod is not None and truth.rod is not None
-    np.testing.assert_allclose(found.rod.bending, truth.rod.bending, rtol=0.1)
-    np.testing.assert_allclose(found.rod.slip, truth.rod.slip, rtol=0.05)
+    assert found.body is not None and truth.body is not None
+    np.testing.assert_allclose(found.body.bending, truth.body.bending, rtol=0.1)
+    np.testing.assert_allclose(found.body.slip, truth.body.slip, rtol=0.05)
     # A search finds the stiffness from far.
     far = search_rod(pool[0], pool[1:], Config(rod=replace(ROD, bending=30.0, twisting=30.0), fit=config.Fit(rod=steps)))
-    assert np.median(far.twin.body.bending) == pytest.approx(float(np.median(truth.rod.bending)), rel=0.5)
+    assert np.median(far.twin.body.bending) == pytest.approx(float(np.median(truth.body.bending)), rel=0.5)

@@ -87,7 +87,7 @@ def test_the_shape_of_frame_0_may_be_without_moments():
     t = np.diff(twin.body.vertices, axis=0) / np.linalg.norm(np.diff(twin.body.vertices, axis=0), axis=1, keepdims=True)
     angle = np.arccos((t[1:] * t[:-1]).sum(axis=1))
     np.testing.assert_allclose(np.linalg.norm(twin.body.curvature[1:-1], axis=1), 2 * np.tan(angle / 2), rtol=1e-6)
-    assert not ropes.twin(seen).rod.curvature.any()
+    assert not ropes.twin(seen).body.curvature.any()
 
 
 def test_a_hand_lifts_a_rope_and_lets_it_go():
@@ -122,7 +122,7 @@ def test_a_scene_with_self_collision_is_refused_before_it_is_simulated():
     seen = ropes.rope()
     twin = ropes.twin(seen)
     touching = replace(twin, simulation=replace(twin.simulation, self_collision=True))
-    with pytest.raises(InputError, match=r"twin\.rod.*ground alone.*lattice"):
+    with pytest.raises(InputError, match=r"twin\.body.*ground alone.*lattice"):
         roll_out(touching, seen.controller_points)
 
 
@@ -134,9 +134,9 @@ def test_another_recording_moves_the_same_elsewhere(body):
     twin = ropes.twin(here)
     moved, registration = move(twin, there)
     assert registration is None
-    assert moved.rod is not None
-    assert moved.rod.lengths is not None
-    np.testing.assert_array_equal(moved.rod.lengths, twin.body.lengths)
+    assert moved.body is not None
+    assert moved.body.lengths is not None
+    np.testing.assert_array_equal(moved.body.lengths, twin.body.lengths)
     expected = roll_out(twin, here.controller_points).positions + shift
     # The line is found anew, in float32 coordinates.
     np.testing.assert_allclose(roll_out(moved, there.controller_points).positions, expected, atol=1e-4)
@@ -146,8 +146,8 @@ def test_lengths_belong_to_the_cable_and_not_to_a_recording():
     here = ropes.cable(frames=3)
     longer = replace(here, object_points=here.object_points + np.array([0, 0, 0.002]))
     moved = move(ropes.twin(here), longer)[0]
-    np.testing.assert_array_equal(moved.rod.lengths, ropes.twin(here).rod.lengths)
-    np.testing.assert_allclose(moved.rod.vertices[2:5], longer.nodes, atol=SINGLE)
+    np.testing.assert_array_equal(moved.body.lengths, ropes.twin(here).body.lengths)
+    np.testing.assert_allclose(moved.body.vertices[2:5], longer.nodes, atol=SINGLE)
 
 
 def test_recordings_of_another_body_are_refused():
