@@ -1,4 +1,4 @@
-"""Points in space from frame to frame: hands, markers on an object, markers along a cable.
+"""Points in space from frame to frame: hands, markers on an object or along a line.
 
 Nothing that moves is anywhere twice to the bit, leaves its place for a frame, or changes places with another. Where a file says so,
 a marker was lost, a stream stood still, or labels were exchanged.
@@ -21,7 +21,7 @@ AROUND = 4
 """Frames before and after a step with which it is compared; up to two more large steps there do not hide it."""
 STEP, HELD_STEP = 6.0, 3.0
 """Steps so many times as large as those around are no motion: of a point, after it stood still to the bit.
-In 350 released recordings of cables one marker steps at most 4.2 times as far as around. Some of them lack samples: there all step
+In 350 released recordings one marker steps at most 4.2 times as far as around. Some of them lack samples: there all step
 together, up to 9.9 times as far."""
 LEAST, SLOW = 0.01, 0.5
 """m and m/s: smaller and slower steps may be noise."""
