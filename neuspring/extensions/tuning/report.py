@@ -47,7 +47,7 @@ def report(settings: Config, tune: Tune, output: Path, root: Path = Path()) -> N
     if len(done) > 1:
         importance = optuna.importance.get_param_importances(study)
         shares = [[name, f"{share:.2f}"] for name, share in importance.items()]
-        lines += ["## Importance of settings (fANOVA)", _markdown(["Setting", "Share of variance"], shares)]
+        lines += ["## Importance of settings (PED-ANOVA)", _markdown(["Setting", "Share of variance"], shares)]
     if failed := study.get_trials(states=(TrialState.FAIL,)):
         reasons = [f"- trial {trial.number}: {trial.user_attrs.get('reason', 'its worker was killed')}" for trial in failed]
         lines += ["## Failed", "\n".join(reasons)]

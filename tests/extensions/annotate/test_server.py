@@ -67,7 +67,7 @@ def test_work_goes_on_after_a_new_start(capture):
 
 def test_a_damaged_file_is_refused_at_the_start(capture):
     (capture.folder / "marks.json").write_text("{")
-    with pytest.raises(InputError, match=r"marks\\.json"):
+    with pytest.raises(InputError, match=r"marks\.json"):
         Server(capture)
 
 
