@@ -53,7 +53,7 @@ play: $(RUNS)
 SAMPLE := synthetic_single_lift_sloth
 SAMPLE_RUN := run.json fit.json twin.npz rollout.json trajectory.npz scores.parquet history.parquet
 sample: $(RUNS)
-	$(BIN)/snakemake --profile workflow/profiles/default --cores $(CORES) --quiet all --configfile config/data/demo.yaml \
+	$(BIN)/snakemake --profile workflow/profiles/default --cores $(CORES) --quiet host progress rules reason --configfile config/data/demo.yaml \
 		--config results=.sample 'scenarios=[$(SAMPLE)]' 'methods=[neuspring]' compare_with=neuspring \
 		'images={appearance: {spacing: 2.6}}'
 	rm -rf neuspring/data/sample_twin && mkdir neuspring/data/sample_twin

@@ -1,4 +1,4 @@
-# The benchmark: captures -> observations -> search -> fit -> rollout -> pictures -> scores -> tables, every run in MLflow.
+# The benchmark: captures -> observations -> search -> fit -> predictions, images and scores -> tables, every run in MLflow.
 from snakemake.utils import min_version
 
 min_version("9.20")
@@ -8,44 +8,76 @@ configfile: f"{workflow.basedir}/config/config.yaml"
 
 
 include: "workflow/rules/common.smk"
-include: "workflow/rules/hooks.smk"
-include: "workflow/rules/stages.smk"
-include: "workflow/rules/results.smk"
-include: "workflow/rules/sweep.smk"
+include: "workflow/rules/jobs.smk"
 
 
 # On a cluster these run where Snakemake runs: seconds of work each.
 localrules:
     all,
-    track_init,
+    sweep,
     tables,
     study,
+    page,
     report,
     perception_table,
-    sweep,
+    sweep_report,
 
 
 rule all:
     default_target: True
     input:
-        **SHOWN,
-        page=rules.report.output,
-        logged=GRAPH.logged_runs(),
+        target(
+            lambda graph, tasks: [
+                graph.unit("page", "all"),
+                *tasks.shown(),
+                *graph.runs(),
+            ]
+        ),
 
 
-# A job that fails is tried twice again, with more memory. On a cluster it is the main process that tries again: inside a submitted
-# job rules' own retries would multiply.
-for each in workflow.rules:
-    each.restart_times = 0 if workflow.remote_exec else 2
+rule report:
+    input:
+        target(lambda graph, tasks: [graph.unit("page", "all")]),
+
+
+rule sweep:
+    input:
+        target(lambda graph, tasks: [graph.unit("sweep_report", "all")]),
+
+
+# A study of the paper is a target by its name, which must not be another's.
+for STUDY in BENCHMARK.studies:
+    if STUDY in {other.name for other in workflow.rules}:
+        reason = "this is the name of another target; rename the study."
+        raise WorkflowError(f"{CONFIG.study_table}, study {STUDY}: {reason}")
+
+    rule:
+        name:
+            STUDY
+        input:
+            target(
+                lambda graph, tasks, study=STUDY: [
+                    graph.unit("study", study),
+                    *graph.runs(graph.benchmark.methods_of(study)),
+                ]
+            ),
 
 
 onstart:
-    begin()
+    or_workflow_error(
+        messages.begin,
+        jobs()[0],
+        len(jobs()[0].todo(RUN.get("targets", []))),
+        local=not workflow.non_local_exec,
+        cores=workflow.resource_settings.cores,
+        cluster=CLUSTER,
+    )
+    tell_plan()
 
 
 onsuccess:
-    finish()
+    messages.finished(jobs()[0], BEGUN)
 
 
 onerror:
-    give_up()
+    messages.failed(*jobs(), BEGUN)

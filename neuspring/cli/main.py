@@ -24,7 +24,7 @@ from neuspring.registry import Registry
 
 _OURS = {
     "data": "check-data mask compare-masks",
-    "results": "tables perception-table study explain report track-init log sync ui",
+    "results": "tables perception-table study explain report sync ui",
     "workflow": "demo",
 }
 COMMANDS: Registry[Callable[..., int | None]] = Registry(

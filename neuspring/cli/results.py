@@ -1,8 +1,7 @@
-"""Commands on finished runs (tables, perception-table, study, explain, report) and on MLflow (track-init, log, sync, ui)."""
+"""Commands on finished runs (tables, perception-table, study, explain, report) and on MLflow (sync, ui)."""
 
 from __future__ import annotations
 
-import json
 import os
 import socket
 import sys
@@ -11,9 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from neuspring.cli.options import Positional, Results, Settings, arg, json_value, read_settings
-from neuspring.config import parse, plain
+from neuspring.config import parse
 from neuspring.core.errors import InputError
-from neuspring.core.files import write_text
 from neuspring.scores.paper import Study, read_studies
 
 if TYPE_CHECKING:
@@ -49,13 +47,12 @@ def tables(
     method_table: RowTable = Path("config/methods.yaml"),
     extra_rows: ExtraRows = (),
     brief: Annotated[bool, arg(help="print the verdict and the first table alone")] = False,
-    settings: Annotated[str, arg(help="of the benchmark: runs that were made with something else are named")] = "",
 ) -> None:
     """Run records -> numbers.json, each number computed once, and the benchmark's tables."""
     from neuspring.config.settings import Aim
     from neuspring.core.findings import warnings_of
     from neuspring.core.job_records import asked
-    from neuspring.report.data import job_records, traces
+    from neuspring.report.data import traces
     from neuspring.report.gallery import write_gallery
     from neuspring.report.summary import write
     from neuspring.report.verdict import headline
@@ -73,13 +70,13 @@ def tables(
         found = _read_scores(scores, scenarios, methods, seeds, left_out)
         print(write(Numbers(everything=found, baseline=baseline or str(found.runs["method"].iloc[0]), **common), output))
         return
-    there = traces(results, job_records(results)[0])
+    there = traces(results)
     scenarios, methods, seeds = scenarios or tuple(there[0]), methods or tuple(there[1]), seeds or tuple(there[2])
     if not (scenarios and methods and seeds):
         raise InputError(results, "a results folder with runs is required", remedy="Run the workflow first, or name another.")
     collected, part = as_asked(collect(results, scenarios, methods, seeds, _read_left_out(left_out)), asked(results))
     warned = warnings_of(results, scenarios)
-    more: Any = {"results": results, "asked": part, "warnings": warned, "made_otherwise": _made_otherwise(settings, results)}
+    more: Any = {"results": results, "asked": part, "warnings": warned}
     moved = collect_transfers(results, transfers, methods, seeds)
     numbers = Numbers(everything=collected, baseline=baseline or methods[0], transfers=moved, **common, **more)
     text = write(numbers, output)
@@ -102,23 +99,6 @@ def _read_scores(path: Path, scenarios: Sequence[str], methods: Sequence[str], s
 
     found = read_scores(path).named(scenario=scenarios, method=methods, seed=seeds)
     return replace(found, left_out=_read_left_out(left_out))
-
-
-def _made_otherwise(settings: str, results: Path) -> tuple[str, ...]:
-    """Lines on runs that are there but are not what these settings would make."""
-    from neuspring.core.provenance import PACKAGE_FOLDER
-    from neuspring.experiments.benchmark import Benchmark
-    from neuspring.experiments.freshness import Freshness
-    from neuspring.experiments.graph import Graph
-
-    if not settings:
-        return ()
-    values = plain(read_settings(settings)) | {"results": str(results)}
-    try:
-        return tuple(Freshness(Graph(Benchmark(values, PACKAGE_FOLDER.parent))).of_runs())
-    except InputError as error:
-        # Of a part of the scenarios, for example, whose others have no data here.
-        return (f"  Not compared with the configuration: {error}",)
 
 
 def perception_table(
@@ -242,26 +222,6 @@ def _read_left_out(text: str) -> dict[str, dict[str, str]]:
     if not all(isinstance(why, dict) and all(isinstance(reason, str) for reason in why.values()) for why in values.values()):
         raise InputError("--left-out", "must map methods to scenarios with reasons", text)
     return values
-
-
-def track_init(output: Path, results: Results = Path("results"), settings: Settings = "{}") -> None:
-    """Prepare the MLflow store, once before any run is logged."""
-    from neuspring.experiments.tracking import log
-
-    outcome = log.init(results, read_settings(settings).tracking)
-    write_text(output, json.dumps(outcome, indent=1, sort_keys=True) + "\n")
-    print(f"MLflow: {outcome['outcome']}")
-
-
-def log(
-    record: Annotated[Path, arg(help="run.json")], output: Path, results: Results = Path("results"), settings: Settings = "{}"
-) -> None:
-    """Log one run.json to MLflow."""
-    from neuspring.experiments.tracking import log
-
-    outcome = log.log_run(record, results, read_settings(settings).tracking)
-    write_text(output, outcome + "\n")
-    print(f"MLflow: {record}: {outcome}")
 
 
 def sync(results: Results = Path("results"), settings: Settings = "{}") -> int:

@@ -170,12 +170,26 @@ class Recorder:
                 raise InputError(path, rule, error.strerror, remedy) from error
         self.settings: dict[str, Any] = dict(settings or {})
         self.device = device
+        self.sharers = 1
+        """Stages that run in one batch; each is charged an equal part of the time."""
         self._started, self._start = now(), time.perf_counter()
 
     @property
     def seconds(self) -> float:
         """Seconds so far."""
         return time.perf_counter() - self._start
+
+    def agrees(self) -> bool:
+        """True where the record and its files are there already, made of the same inputs, settings and code."""
+        try:
+            there = StageRecord.load(self.output)
+        except InputError:
+            return False
+        settings = json.loads(json.dumps(self.settings))
+        # A stage may add what it found, such as `oracle`.
+        same = all(name in there.settings and there.settings[name] == value for name, value in settings.items())
+        made = (there.stage, there.inputs, there.code) == (self.stage, self.inputs, self.code)
+        return same and made and all(self.output.with_name(name).is_file() for name, _ in there.files.values())
 
     def beside(self, **names: str) -> dict[str, Path]:
         """Role -> path of a file beside the record."""
@@ -202,7 +216,7 @@ class Recorder:
             facts=dict(facts or {}),
             settings=self.settings,
             started=self._started,
-            seconds=round(earlier_seconds + self.seconds, 3),
+            seconds=round(earlier_seconds + self.seconds / self.sharers, 3),
             peak_memory_mb=round(peak, 1),
             attempts=attempts,
             device=self.device,

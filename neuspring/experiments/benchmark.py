@@ -11,6 +11,7 @@ import difflib
 import fnmatch
 import os
 import shlex
+import tempfile
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -148,6 +149,25 @@ def with_method(config: Config, method: Method, name: str) -> Config:
         looks = overlaid(config.images.appearance, method.appearance, f"method {name}, appearance")
         config = dataclasses.replace(config, images=dataclasses.replace(config.images, appearance=looks))
     return config
+
+
+def checked(values: Mapping[str, Any], root: Path, *, plan_only: bool = False) -> Benchmark:
+    """The benchmark of a configuration, after everything that can be checked before a job starts. Raises InputError.
+
+    `plan_only`: a plan may be made where data are not there yet.
+    """
+    benchmark = Benchmark(values, root, plan_only=plan_only)
+    results = Path(benchmark.config.results)
+    try:
+        results.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=results).close()
+    except OSError as error:
+        where, rule = f"configuration, results ({results})", "this folder must be writable"
+        raise InputError(where, rule, error.strerror, "Choose another: --config results=...") from error
+    if (results / "jobs" / ".run").exists():
+        rule, remedy = "results must be of this version's workflow", "Use another folder: --config results=..."
+        raise InputError(results, rule, "those of an older version", remedy)
+    return benchmark
 
 
 class Benchmark:

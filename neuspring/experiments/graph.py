@@ -1,8 +1,8 @@
-"""The jobs of a benchmark: for a stage and the wildcards of a job its inputs, options, settings and code.
+"""The jobs of a benchmark: which steps a job runs, what they read, and what their results follow from.
 
-A stage declares what it reads and what of the tables concerns it (`neuspring.stages.stage`); here stands where that lies in the
-results folder. The workflow's one rule per stage asks `inputs`, `command` and `stamp`. No stage is known by name but those whose
-records tables and MLflow are made of: `score` and `transfer`.
+A stage declares what it reads and what of the tables concerns it (`neuspring.stages.stage`). A `Unit` is a job, or a member of a
+batch: the stages of one rule with the same wildcards. Its digest is that of the settings, code and inputs of its steps, where an
+input that is made by another step counts with the digest of that step. The record of a finished unit has the digest in its name.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import functools
 import hashlib
 import json
 import re
-import shlex
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,71 +21,83 @@ from typing import Any
 from neuspring.config import Config, Method, ScenarioRow, plain
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
+from neuspring.core.job_records import FOLDER, JobRecord
+from neuspring.core.provenance import file_stamp
 from neuspring.experiments.benchmark import Benchmark, with_method, with_search
 from neuspring.stages import STAGES, makers
-from neuspring.stages.stage import Member, Rows, Stage
+from neuspring.stages.stage import Job, Rows, Stage
 
-TEMPLATE_FOLDER = Path(__file__).parents[1] / "report" / "templates"
 SPLATS_FOLDER = "appearance"
 """Folder of the splats that all methods share; those of one method have its name behind a hyphen."""
-NEUTRAL: dict[str, Any] = {
-    "only": "",
-    "effort": None,
-    "gpus": {},
-    "tracking": {},
-    "twins_per_launch": "auto",
-    "device": "auto",
-    "tune": None,
-}
-"""Keys that no result depends on, with what stands for them where settings are compared."""
+TOGETHER = "together"
+"""First part of the name of a batch."""
 LARGEST_BATCH = 16
-"""Searches or fits in a job on a GPU, where `gpus.batch` is auto. It was not measured with several scenes."""
+"""Units of a batch on a GPU at most, where `gpus.batch` is auto. It was not measured with several scenes."""
 
 
-def one_of(names: Collection[str]) -> str:
-    """A pattern of exactly these names; of none, one that matches nothing."""
-    return "|".join(map(re.escape, names)) or "(?!)"
+@dataclass(frozen=True)
+class Step:
+    """One call of a stage."""
+
+    stage: Stage
+    job: Any
+    """An object with its wildcards."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Unit:
+    """A job, or a member of a batch."""
+
+    rule: str
+    name: str
+    """Its wildcards, joined by /."""
+    steps: Sequence[Step] = ()
+    members: Sequence[Unit] = ()
+    """The units of a batch."""
+    needs: Sequence[Unit] = ()
+    """Units of other jobs whose results it reads."""
+    made_of: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Step -> settings, options, code and inputs."""
+    run: Callable[[Mapping[str, Any]], Sequence[Path]] | None = None
+    """Runs a job that is no stage's, given its device and threads; returns the files that it wrote."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Options of a command that is no stage's."""
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """Of everything that its results follow from."""
+        return _digest([self.made_of, *(one.digest for one in self.members)])
 
 
 class Graph:
-    """Answers for the jobs of one benchmark. A job is an object with its wildcards, such as Snakemake's."""
+    """Answers for the jobs of one benchmark."""
 
     def __init__(self, benchmark: Benchmark) -> None:
-        self.benchmark, self.config = benchmark, benchmark.config
-        self.results, self.root, self.whole = benchmark.config.results, benchmark.root, benchmark.whole
-        self.folder = f"{self.results}/{self.config.tables}"
-        """Folder of tables and report."""
-        tune = self.config.tune
-        self.sweep_folder = f"{self.results}/tune/{tune.study}" if tune else ""
-        self._texts: dict[tuple[Any, ...], str] = {}
-        self._shared: dict[str, dict[str, list[Any]]] = {}
+        self.benchmark, self.config, self.whole = benchmark, benchmark.config, benchmark.whole
+        self.results = benchmark.config.results
+        self.rules: dict[str, list[Stage]] = defaultdict(list)
+        """Rule -> its stages, in the order in which they run."""
+        for stage in STAGES.values():
+            self.rules[stage.job_rule].append(stage)
         # Thousands of jobs share a few rows.
         self._of, self._laid = functools.cache(self._rows), functools.cache(self._lay)
+        self.unit, self.batches = functools.cache(self._unit), functools.cache(self._batches)
+        self.tasks: Mapping[str, Callable[[str], Unit]] = {}
+        """Rule that is no stage's -> the name of a job -> its unit."""
+        self._digests: dict[str, str] = {}
+        self._texts: dict[Any, str] = {}
         self.owners = {one.name: self._owners(one.shared) for one in STAGES.values() if one.shared}
-        """Stage whose jobs methods share -> chosen method -> the first row of the method table with the same job."""
-        own = dict.fromkeys([*benchmark.methods, *(owner for owners in self.owners.values() for owner in owners.values())])
-        self.wildcards = {
-            "scenario": one_of(benchmark.scenarios),
-            "method": one_of(own),
-            "search": one_of(benchmark.searches),
-            "looks": one_of([SPLATS_FOLDER, *(f"{SPLATS_FOLDER}-{name}" for name in own)]),
-            "camera": r"[A-Za-z0-9][A-Za-z0-9_.-]*",
-            "seed": "|".join(map(str, self.whole.seeds)),
-            "study": one_of(benchmark.studies),
-            "launch": r"\d+",
-        }
-        """Pattern of each wildcard."""
+        """Stage whose jobs methods share -> method -> the first row of the method table with the same job."""
 
     def _owners(self, shared: Callable[[Config, Method], Any]) -> dict[str, str]:
         first: dict[Any, str] = {}
         keys = {name: shared(self._laid(name, None), row) for name, row in self.benchmark.table.items()}
-        owners = {name: first.setdefault(key, name) for name, key in keys.items() if key is not None}
-        return {name: owner for name, owner in owners.items() if name in self.benchmark.methods}
+        return {name: first.setdefault(key, name) for name, key in keys.items() if key is not None}
 
-    # --- the rows behind a job
+    # --- the rows behind a step
 
     def rows(self, job: Any) -> Rows:
-        """The rows of the tables that the wildcards of a job name."""
+        """The rows of the tables that the wildcards of a step name."""
         method = getattr(job, "method", None)
         if looks := getattr(job, "looks", None):
             method = looks.removeprefix(SPLATS_FOLDER).removeprefix("-") or None
@@ -114,106 +126,34 @@ class Graph:
         config = with_method(self.config, self.benchmark.table[name], name) if name else self.config
         return with_search(config, self.benchmark.searches[searched], searched) if searched else config
 
-    # --- which jobs there are
+    def _cameras(self, scenario: str) -> tuple[str, ...]:
+        try:
+            return self.benchmark.cameras(scenario)
+        except InputError:
+            # Damaged data must fail the jobs of their scenario, which say what is wrong, and not the planning of all.
+            return ("0",)
 
-    def constraints(self, stage: Stage) -> dict[str, str]:
-        """Patterns of a stage's wildcards: those of rows for which it has jobs."""
-        if "method" not in stage.wildcards:
-            found = [name for name in self.benchmark.scenarios if stage.when(self._of(name, None, None))]
-            return {"scenario": one_of(found)} if set(stage.wildcards) == {"scenario"} else {}
-        names = dict.fromkeys([*self.benchmark.methods, *self.owners.get(stage.name, {}).values()])
-        pairs = [(name, row) for name in names for row in self.benchmark.scenarios if stage.when(self._of(row, name, None))]
-        return {
-            "scenario": one_of(dict.fromkeys(row for _, row in pairs)),
-            "method": one_of(dict.fromkeys(name for name, _ in pairs)),
-        }
+    # --- steps
 
-    def earliness(self, scenario: str) -> float:
-        """From 1 for the first scenario that is run down to 0."""
-        names = self.config.scenarios
-        return 1 - names.index(scenario) / len(names) if scenario in names else 0.0
+    def output_of(self, stage: Stage, job: Any) -> str:
+        """The file that a step writes."""
+        return f"{self.results}/{stage.output.format(**{name: getattr(job, name) for name in stage.wildcards})}"
 
-    def judged(self, names: Sequence[str]) -> dict[str, str]:
-        """Scenarios whose truth is known, and their categories."""
-        known = self.benchmark
-        return {name: known.whole_scenarios[name].category for name in names if known.source(name).has_truth}
-
-    def _records(self, stage: str, scenarios: Sequence[str], methods: Sequence[str] | None) -> list[str]:
-        """Files that a stage writes of all runs, or of those of some methods."""
-        return [
-            self.output_of(STAGES[stage], SimpleNamespace(scenario=scenario, method=method, seed=seed))
-            for scenario in scenarios
-            for method in (self.config.methods if methods is None else methods)
-            if self.benchmark.applies(method, scenario) and STAGES[stage].when(self._of(scenario, method, None))
-            for seed in self.config.seeds
-        ]
-
-    def runs(self, methods: Sequence[str] | None = None) -> list[str]:
-        """The records of all runs, or of those of some methods."""
-        return self._records("score", self.config.scenarios, methods)
-
-    def transfers(self) -> list[str]:
-        """Records of transfers: per source, method and seed."""
-        return self._records("transfer", list(self.benchmark.transfers), None)
-
-    def logged_runs(self, methods: Sequence[str] | None = None) -> list[str]:
-        """Files that say that a run is in MLflow; none where tracking is off."""
-        return [path.replace("run.json", "mlflow.txt") for path in self.runs(methods) if self.config.tracking.enabled]
-
-    def behind(self, stage: Stage, job: Any, known: set[str] | None = None) -> Iterator[tuple[Stage, Any]]:
-        """The jobs behind a job, and then itself; not those of one camera."""
-        known = set() if known is None else known
-        if "camera" in stage.wildcards or (output := self.output_of(stage, job)) in known:
-            return
-        known.add(output)
-        for name in stage.inputs:
-            for maker, other in self._makers(stage, name, job):
-                yield from self.behind(maker, other, known)
-        yield stage, job
-
-    # --- what a job reads
-
-    def inputs(self, stage: Stage) -> Callable[..., dict[str, Any]]:
-        """Wildcards of a job -> its input files by parameter; `also`: files that it depends on beside them."""
-
-        def found(wildcards: Any) -> dict[str, Any]:
-            files: dict[str, Any] = {}
-            for name, parameter in stage.inputs.items():
-                paths = self._find(stage, name, wildcards)
-                files[name] = paths if parameter.many else paths[0] if paths else None
-            also = [str(path) for path in stage.also(self.rows(wildcards))]
-            members = [one.inputs for one in self.members(stage, wildcards)]
-            others = [paths for one in members for name, paths in one.items() if name not in stage.inputs]
-            also += dict.fromkeys(path for paths in others for path in ([paths] if isinstance(paths, str) else paths))
-            return {name: paths for name, paths in (files | {"also": also}).items() if paths}
-
-        return found
-
-    def _find(self, stage: Stage, name: str, job: Any) -> list[str]:
-        """The files of a parameter; none where a job goes without."""
-        rows = self.rows(job)
-        if name in stage.without(rows):
-            return []
-        made = [self.output_of(maker, other) for maker, other in self._makers(stage, name, job)]
-        return made or [str(path) for maker in makers(name) if not maker.when(rows) and (path := maker.instead(rows))]
-
-    def _makers(self, stage: Stage, name: str, job: Any) -> list[tuple[Stage, Any]]:
-        """The jobs that make the files of a parameter: one of its maker, or one of each camera or recording."""
+    def makers_of(self, stage: Stage, name: str, job: Any) -> list[Step]:
+        """The steps that make the files of a parameter: one of its maker, or one of each camera, recording or seed."""
         rows, parameter = self.rows(job), stage.inputs[name]
         if name in stage.without(rows):
             return []
         if parameter.many and parameter.type is Observations:
-            return [(one, SimpleNamespace(scenario=other)) for one in makers("observations") for other in getattr(rows, name)]
+            others = [SimpleNamespace(scenario=other) for other in getattr(rows, name)]
+            return [Step(one, other) for one in makers("observations") for other in others]
         if parameter.many and rows.method and rows.method.mean_of:
-            seeds = self.whole.seeds
-            others = [SimpleNamespace(scenario=job.scenario, method=rows.method.mean_of, seed=seed) for seed in seeds]
-            return [(one, other) for other in others for one in makers(name) if one.when(self.rows(other))]
-        found = [one for one in makers(name) if one.when(rows)]
-        if not found:
+            seeds = [SimpleNamespace(scenario=job.scenario, method=rows.method.mean_of, seed=seed) for seed in self.whole.seeds]
+            return [Step(one, other) for other in seeds for one in makers(name) if one.when(self.rows(other))]
+        if not (found := [one for one in makers(name) if one.when(rows)]):
             return []
         maker, method = found[0], getattr(job, "method", None)
-        owners = self.owners.get(maker.name, {})
-        owner = owners.get(method or "")
+        owner = self.owners.get(maker.name, {}).get(method or "")
         values = {
             "scenario": job.scenario,
             "seed": getattr(job, "seed", None),
@@ -223,259 +163,253 @@ class Graph:
         }
         wildcards = {wildcard: values[wildcard] for wildcard in maker.wildcards if wildcard != "camera"}
         if "camera" not in maker.wildcards:
-            return [(maker, SimpleNamespace(**wildcards))]
+            return [Step(maker, SimpleNamespace(**wildcards))]
         cameras = self._cameras(job.scenario) if parameter.many else [job.camera]
-        return [(maker, SimpleNamespace(**wildcards, camera=camera)) for camera in cameras]
+        return [Step(maker, SimpleNamespace(**wildcards, camera=camera)) for camera in cameras]
 
-    def _cameras(self, scenario: str) -> tuple[str, ...]:
-        try:
-            return self.benchmark.cameras(scenario)
-        except InputError:
-            # Damaged data must fail the jobs of their scenario, which say what is wrong, and not the planning of all.
-            return ("0",)
-
-    def output_of(self, stage: Stage, job: Any) -> str:
-        """The file that a job writes."""
-        return f"{self.results}/{stage.output.format(**{name: getattr(job, name) for name in stage.wildcards})}"
-
-    # --- jobs that share launches
-
-    def together(self, stage: Stage) -> Stage | None:
-        """The stage that does the jobs of a stage together; None if there is none."""
-        return next((one for one in STAGES.values() if one.together and one.together.stage == stage.name), None)
-
-    def shared_launches(self, stage: Stage, job: Any) -> list[str]:
-        """The record of the launches that a job shared with others, if it is one of several."""
-        shared, output = self.together(stage), self.output_of(stage, job)
-        launches = self._launches(shared) if shared else {}
-        return [path for path, members in launches.items() if output in (self.output_of(stage, one) for one in members)]
-
-    def members(self, stage: Stage, job: Any) -> list[Member]:
-        """The jobs that a job does together; none for other stages."""
-        if not stage.together:
+    def files(self, stage: Stage, name: str, job: Any) -> list[str]:
+        """The files of a parameter; none where a step goes without."""
+        rows = self.rows(job)
+        if name in stage.without(rows):
             return []
-        other = STAGES[stage.together.stage]
-        return [
-            Member(
-                output=self.output_of(other, one),
-                inputs=self.inputs(other)(one),
-                options=self.options(other, one),
-                settings=self.settings(other, one),
-            )
-            for one in self.in_step(stage, job)
-        ]
-
-    def in_step(self, stage: Stage, job: Any) -> list[Any]:
-        """The jobs that a job does together."""
-        return self._launches(stage).get(self.output_of(stage, job), [])
-
-    def _launches(self, stage: Stage) -> dict[str, list[Any]]:
-        """Record of each job that does others together -> these: of one scenario, or with `gpus.batch` of all.
-
-        None where `twins_per_launch` is 1.
-        """
-        if self.config.twins_per_launch != 1 and stage.name not in self._shared:
-            self._shared[stage.name] = self._batches(stage)
-        return self._shared.get(stage.name, {})
-
-    def _batches(self, stage: Stage) -> dict[str, list[Any]]:
-        assert stage.together
-        alike: dict[Any, list[Any]] = defaultdict(list)
-        for one in self._jobs(STAGES[stage.together.stage]):
-            if (key := stage.together.key(self.rows(one))) is not None:
-                alike[key].append(one)
-        # Without batches a job does all of its scenario that are in step with enough others.
-        of_scenarios: dict[str, list[Any]] = defaultdict(list)
-        batches: list[list[Any]] = []
-        for jobs in alike.values():
-            if (most := self._most(len(jobs))) > 1:
-                parts, total = -(-len(jobs) // most), len(jobs)
-                # As large as one another.
-                batches += [jobs[total * part // parts : total * (part + 1) // parts] for part in range(parts)]
-            elif (fewest := stage.together.alone) is not None:
-                counts = Counter(one.scenario for one in jobs)
-                for one in jobs:
-                    of_scenarios[one.scenario] += [one] * (counts[one.scenario] >= fewest)
-        made: dict[str, list[Any]] = {}
-        numbers: Counter[str] = Counter()
-        for members in [*(batch for batch in batches if len(batch) > 1), *filter(None, of_scenarios.values())]:
-            first = members[0].scenario
-            made[self.output_of(stage, SimpleNamespace(scenario=first, launch=numbers[first]))] = members
-            numbers[first] += 1
-        return made
-
-    def _most(self, jobs: int) -> int:
-        """Jobs that are done together at most, of so many that are alike."""
-        if self.config.gpus.batch != "auto":
-            return self.config.gpus.batch
-        slots = self.benchmark.gpu_slots
-        return 1 if not self.benchmark.on_gpu else min(LARGEST_BATCH, -(-jobs // slots) if slots else LARGEST_BATCH)
-
-    def _jobs(self, stage: Stage) -> list[Any]:
-        """The jobs of all runs of a stage that learns, of methods or of searches, scenario by scenario."""
-        known, found = self.benchmark, []
-        for scenario in self.config.scenarios:
-            if "method" in stage.wildcards:
-                kind, names = "method", [name for name in self.owners[stage.name].values() if known.applies(name, scenario)]
-            else:
-                rows = [row for name, row in known.methods.items() if row.search and known.applies(name, scenario)]
-                kind, names = "search", [row.searched for row in rows]
-            found += [
-                SimpleNamespace(scenario=scenario, seed=seed, **{kind: name})
-                for name in dict.fromkeys(names)
-                for seed in self.config.seeds
-            ]
-        return found
-
-    # --- what a job is told
-
-    def command(self, stage: Stage) -> Callable[..., str]:
-        """Wildcards and inputs of a job -> its command line, without where it runs and where it writes."""
-
-        def line(wildcards: Any, input: Any) -> str:
-            files = {name: _paths(input.get(name), parameter.many) for name, parameter in stage.inputs.items()}
-            text = self.settings(stage, wildcards)
-            settings = [] if text == "{}" else ["--settings", text]
-            return shlex.join([stage.name, *stage.words(files | self.options(stage, wildcards)), *settings])
-
-        return line
+        made = [self.output_of(one.stage, one.job) for one in self.makers_of(stage, name, job)]
+        return made or [str(path) for maker in makers(name) if not maker.when(rows) and (path := maker.instead(rows))]
 
     def options(self, stage: Stage, job: Any) -> dict[str, Any]:
-        """The options of a job's stage, by name."""
+        """The options of a step, by name."""
         rows = self.rows(job)
         given = dict(stage.given(rows))
-        if stage.together:
-            given |= stage.together.given(self.members(stage, job))
         for name, option in stage.options.items():
             if option.type is ScenarioRow:
-                given[name] = plain(rows.scenario)
+                given[name] = rows.scenario
             elif name not in given:
                 # What rows do not tell has the default of the signature; a required one is a wildcard.
                 given[name] = getattr(job, name) if option.required else getattr(job, name, option.default)
         return {name: given[name] for name in stage.options}
 
-    def recorded(self, stage: Stage, job: Any) -> dict[str, Any]:
-        """The settings and options that the record of a job would hold."""
-        options = self.options(stage, job)
-        # Wildcards are text.
-        options |= {name: int(options[name]) for name, option in stage.options.items() if option.type is int}
-        values: dict[str, Any] = json.loads(_json(json.loads(self.settings(stage, job)) | options))
-        return values
-
-    def settings(self, stage: Stage, job: Any) -> str:
-        """The settings that a stage reads, as JSON, so that changing another one runs nothing again."""
-        # Thousands of jobs share a few texts: those of one source and one row.
-        rows = (getattr(job, name, None) for name in ("method", "search", "looks"))
-        key = (stage.name, self.benchmark.scenarios[job.scenario].source, *rows)
-        if key not in self._texts:
-            self._texts[key] = _json(stage.settings(stage.settled(self.rows(job)), self._given(stage, job)))
-        return self._texts[key]
-
     def _given(self, stage: Stage, job: Any) -> dict[str, Any]:
-        """Values of parameters that `reads` and `code` of a stage ask for: what rows tell, and which inputs there are."""
-        files = {name: self._find(stage, name, job) for name in stage.inputs}
+        """Values of parameters that `reads` and `code` of a stage ask for: options, and which inputs there are."""
+        return self.options(stage, job) | {name: self.files(stage, name, job) for name in stage.inputs}
+
+    def made_of(self, stage: Stage, job: Any) -> dict[str, Any]:
+        """What the result of a step follows from, wherever results and data lie."""
+        rows, given = self.rows(job), self._given(stage, job)
+        # Thousands of steps share a few texts: those of one source and one row.
+        key = (stage.name, rows.scenario.source, *(getattr(job, name, None) for name in ("method", "search", "looks")))
+        if key not in self._texts:
+            read = stage.settings(stage.settled(rows), given)
+            read.pop("data_root", None)
+            self._texts[key] = json.dumps(read, sort_keys=True)
+        inputs: dict[str, str] = {}
+        for name in stage.inputs:
+            made = [self.digest(one.stage, one.job) for one in self.makers_of(stage, name, job)]
+            stamps = made or [_stamp(path) for path in given[name]]
+            inputs |= {f"{name}{place}" if stage.inputs[name].many else name: stamp for place, stamp in enumerate(stamps)}
+        return {
+            "settings": self._texts[key],
+            "options": {
+                name: plain(one) if isinstance(one, ScenarioRow) else one for name, one in self.options(stage, job).items()
+            },
+            "code": stage.code_of(stage.settled(rows), given),
+            "inputs": inputs,
+            "data": self.data(stage, job),
+        }
+
+    def data(self, stage: Stage, job: Any) -> dict[str, str]:
+        """Stamps of the user's files and images that a step reads beside its inputs."""
         rows = self.rows(job)
-        row = {name: rows.scenario for name, option in stage.options.items() if option.type is ScenarioRow}
-        return {**stage.given(rows), **row, **files}
+        found = {Path(path).name: _stamp(path) for path in stage.also(rows)}
+        own = "capture" in stage.inputs and not self.makers_of(stage, "capture", job)
+        stamps = {"stamp": stage.stamp(rows), "images": rows.image_stamps if own else ""}
+        return found | {name: stamp for name, stamp in stamps.items() if stamp}
 
-    # --- what makes a job run again beside its command
+    def digest(self, stage: Stage, job: Any) -> str:
+        """Of everything that the result of a step follows from."""
+        output = self.output_of(stage, job)
+        if output not in self._digests:
+            self._digests[output] = _digest(self.made_of(stage, job))
+        return self._digests[output]
 
-    def code(self, stage: Stage, job: Any) -> str:
-        """The digest of the code that makes a job's result."""
-        return stage.code_of(stage.settled(self.rows(job)), self._given(stage, job))
+    def job(self, step: Step, **places: Any) -> Job:
+        """A step, ready to run."""
+        stage, files = step.stage, {name: self.files(step.stage, name, step.job) for name in step.stage.inputs}
+        given: dict[str, Any] = {n: f if stage.inputs[n].many else f[0] if f else None for n, f in files.items()}
+        settings = stage.settled(self.rows(step.job)) if "settings" in stage.signature else None
+        given |= {name: places[name] for name in stage.places}
+        output = Path(self.output_of(stage, step.job))
+        output.parent.mkdir(parents=True, exist_ok=True)
+        made = stage.job(output=output, settings=settings, **given, **self.options(stage, step.job))
+        if data := self.data(stage, step.job):
+            made.record.inputs["data"] = _digest(data)
+        return made
 
-    def stamp(self, stage: Stage) -> Callable[..., str]:
-        """Wildcards of a job -> what no record holds of it: images that a capture is made of, weights that are there.
+    # --- units
 
-        Settings, code and inputs are compared with the records themselves (`neuspring.experiments.freshness`).
-        """
-        return lambda wildcards: stage.stamp(self.rows(wildcards))
+    def wildcards(self, rule: str) -> list[str]:
+        """The names in a unit's name."""
+        return [name for name in self.rules[rule][0].wildcards if name != "camera"]
 
-    def gpu(self, stage: Stage) -> Callable[..., int]:
-        """Wildcards of a job -> 1 where it takes a GPU if there is one."""
+    def _unit(self, rule: str, name: str) -> Unit:
+        """The unit of a rule with this name. Raises InputError if there is no such one."""
+        if rule in self.tasks:
+            return self.tasks[rule](name)
+        parts, names = name.split("/"), self.wildcards(rule)
+        if parts[0] == TOGETHER:
+            return self.batches(rule)[int(parts[1])]
+        if len(parts) != len(names) or parts[0] not in self.benchmark.scenarios:
+            raise InputError(f"{rule} {name}", f"must be {'/'.join(names)} of this configuration")
+        values: dict[str, Any] = dict(zip(names, parts, strict=True))
+        values |= {"seed": int(values["seed"])} if "seed" in values else {}
+        job, steps = SimpleNamespace(**values), list[Step]()
+        for stage in self.rules[rule]:
+            if stage.when(self.rows(job)):
+                cameras = self._cameras(job.scenario) if "camera" in stage.wildcards else [None]
+                steps += [Step(stage, SimpleNamespace(**values, **({"camera": one} if one else {}))) for one in cameras]
+        needs = dict[str, Unit]()
+        for step in steps:
+            for name_of in step.stage.inputs:
+                for other in self.makers_of(step.stage, name_of, step.job):
+                    key = self._name(other)
+                    if key != (rule, name):
+                        needs["/".join(key)] = self.unit(*key)
+        made_of = {
+            "/".join(filter(None, (s.stage.name, getattr(s.job, "camera", "")))): self.made_of(s.stage, s.job) for s in steps
+        }
+        return Unit(rule=rule, name=name, steps=steps, needs=list(needs.values()), made_of=made_of)
 
-        def taken(wildcards: Any) -> int:
-            wanted = stage.gpu(stage.settled(self.rows(wildcards))) if callable(stage.gpu) else stage.gpu
-            return int(self.benchmark.on_gpu and wanted)
+    def _name(self, step: Step) -> tuple[str, str]:
+        rule = step.stage.job_rule
+        return rule, "/".join(str(getattr(step.job, name)) for name in self.wildcards(rule))
 
-        return taken
-
-    # --- what commands are told that look at many runs: those of the whole benchmark, whatever part runs now
-
-    def tables(self, output: str = "") -> list[str]:
-        """Options of `neuspring tables`; into `output` instead of the folder of tables."""
-        objects = [] if self.config.objects == "scenario" else ["--objects", self.config.objects]
-        aims = ["--aims", _json(plain(self.config)["aims"])] if self.config.aims else []
-        compared = ["--baseline", self.benchmark.compared_with]
-        settings = ["--settings", _json(plain(self.whole) | NEUTRAL)]
-        studies = ["--studies", *self.whole.studies] if self.whole.studies else []
-        more = [*compared, *objects, *aims, *studies, *self._row_tables(), *settings]
-        return [*self._runs(output or self.folder), *self._transfers(), *more]
-
-    def study(self, name: str, part: str = "") -> list[str]:
-        """Options of `neuspring study`, of the folder of tables or a part of it."""
-        tables = "/".join(word for word in (self.config.tables, part) if word)
-        return ["--study", name, "--results", self.results, "--tables", tables, "--output", f"{self.results}/{tables}/studies"]
-
-    def _row_tables(self) -> list[str]:
-        """Options that name the tables of studies and methods."""
-        extra = [str(path) for path in self.benchmark.extra]
-        tables = ["--table", str(self.root / self.config.study_table), "--method-table", str(self.root / self.config.method_table)]
-        return [*tables, *(["--extra-rows", *extra] if extra else [])]
-
-    def perception(self) -> list[str]:
-        """Options of `neuspring perception-table`."""
-        return ["--results", self.results, "--scenarios", json.dumps(self.judged(self.whole.scenarios))]
-
-    def report(self, output: str = "") -> list[str]:
-        """Options of `neuspring report`; to the file `output` instead of the one in the folder of tables."""
-        values = plain(self.whole) | {"only": ""}
-        # Where MLflow lies concerns nothing that the report shows.
-        del values["tracking"]
+    def runs(self, methods: Collection[str] | None = None) -> list[Unit]:
+        """The runs of the configuration, or of some of its methods."""
         return [
-            *("--results", self.results, "--output", output or f"{self.folder}/report.html", "--settings", _json(values)),
-            *(*self._row_tables(), "--tables", self.config.tables),
-            *("--baseline", self.benchmark.compared_with, *self._transfers(), *self._left_out()),
+            self.unit("run", f"{scenario}/{method}/{seed}")
+            for scenario in self.config.scenarios
+            for method in (self.config.methods if methods is None else methods)
+            if self.benchmark.applies(method, scenario)
+            for seed in self.config.seeds
         ]
 
-    def _runs(self, output: str) -> list[str]:
-        whole = self.whole
-        runs = ["--scenarios", *whole.scenarios, "--methods", *whole.methods, "--seeds", *map(str, whole.seeds)]
-        return ["--results", self.results, "--output", output, *runs, *self._left_out()]
+    def judged(self, names: Sequence[str]) -> dict[str, str]:
+        """Scenarios whose truth is known, and their categories."""
+        known = self.benchmark
+        return {name: known.whole_scenarios[name].category for name in names if known.source(name).has_truth}
 
-    def _transfers(self) -> list[str]:
-        sources = [name for name in self.whole.transfers or {} if name in self.whole.scenarios]
-        return ["--transfers", *sources] if sources else []
+    def earliness(self, unit: Unit) -> float:
+        """From 1 for units of the first scenario that is run down to 0."""
+        names = self.config.scenarios
+        scenario = (unit.members[0] if unit.members else unit).name.partition("/")[0]
+        return 1 - names.index(scenario) / len(names) if scenario in names else 0.0
 
-    def _left_out(self) -> list[str]:
-        """The methods that do not apply to some scenarios, so that nothing is missing there."""
-        left_out = self.benchmark.whole_left_out
-        return ["--left-out", _json(left_out)] if left_out else []
+    def gpus(self, unit: Unit) -> int:
+        """GPUs that its job takes: 1 where one of its stages uses one and there are any."""
+        wanted = False
+        for one in unit.members or (unit,):
+            for stage, job in ((step.stage, step.job) for step in one.steps):
+                wanted |= stage.gpu(stage.settled(self.rows(job))) if callable(stage.gpu) else stage.gpu
+        return int(self.benchmark.on_gpu and wanted)
 
-    def report_stamp(self) -> list[str]:
-        """Digests of the report's templates, which that of its code does not hold, and of the sweep's summary, if it is there.
+    # --- batches: units that share launches
 
-        A sweep costs much: it is no input of the report, so that changed settings do not run it again.
-        """
-        summary = Path(self.sweep_folder) / "summary.md"
-        texts = [b"".join(path.read_bytes() for path in sorted(TEMPLATE_FOLDER.iterdir()))]
-        texts += [summary.read_bytes()] if self.sweep_folder and summary.exists() else []
-        return [hashlib.sha256(text).hexdigest()[:16] for text in texts]
+    def _batches(self, rule: str) -> list[Unit]:
+        """The batches of a rule, of the units of all runs; none where `twins_per_launch` is 1."""
+        stage = self.rules[rule][0]
+        if stage.many is None or self.config.twins_per_launch == 1:
+            return []
+        alike: dict[Any, dict[str, Unit]] = defaultdict(dict)
+        for unit in [one for run in self.runs() for one in behind(run) if one.rule == rule]:
+            assert stage.alike
+            if (key := stage.alike(self.rows(unit.steps[0].job))) is not None:
+                alike[key].setdefault(unit.name, unit)
+        batches: list[list[Unit]] = []
+        of_scenarios: dict[str, list[Unit]] = defaultdict(list)
+        for units in (list(found.values()) for found in alike.values()):
+            if (most := self._most(len(units))) > 1:
+                parts, total = -(-len(units) // most), len(units)
+                # As large as one another.
+                batches += [units[total * part // parts : total * (part + 1) // parts] for part in range(parts)]
+            elif stage.least_on_cpu:
+                counts = Counter(one.name.partition("/")[0] for one in units)
+                for one in units:
+                    of_scenarios[one.name.partition("/")[0]] += [one] * (counts[one.name.partition("/")[0]] >= stage.least_on_cpu)
+        batches += of_scenarios.values()
+        return [
+            Unit(
+                rule=rule,
+                name=f"{TOGETHER}/{place}",
+                members=members,
+                needs=list({id(n): n for m in members for n in m.needs}.values()),
+            )
+            for place, members in enumerate(batch for batch in batches if len(batch) > 1)
+        ]
 
-    def sweep_targets(self) -> list[str]:
-        """Files of the target `sweep`. Raises InputError if the configuration has none."""
-        if not self.sweep_folder:
-            remedy = "Add the section `tune` (config/README.md, config/studies/tune.yaml)."
-            raise InputError("configuration, tune", "the target sweep needs a sweep", None, remedy)
-        return [f"{self.sweep_folder}/summary.md"]
+    def _most(self, units: int) -> int:
+        """Units of a batch at most, of so many that are alike."""
+        if self.config.gpus.batch != "auto":
+            return self.config.gpus.batch
+        slots = self.benchmark.gpu_slots
+        return 1 if not self.benchmark.on_gpu else min(LARGEST_BATCH, -(-units // slots) if slots else LARGEST_BATCH)
+
+    # --- records of finished units
+
+    def folder(self, unit: Unit) -> Path:
+        """The folder of its job's records."""
+        return Path(self.results) / FOLDER / unit.rule / unit.name
+
+    def record(self, unit: Unit) -> Path:
+        """The record that says that it is finished."""
+        return self.folder(unit) / f"{unit.digest}.json"
+
+    def finished(self, unit: Unit) -> bool:
+        """True where its record is there and its results are too; a record without them is deleted."""
+        path = self.record(unit)
+        try:
+            record = JobRecord.load(path) if path.exists() else None
+        except InputError:
+            record = None
+        if record and all((Path(self.results) / name).exists() for name in record.files):
+            return True
+        path.unlink(missing_ok=True)
+        return False
+
+    def job_of(self, unit: Unit) -> Unit:
+        """The job that makes a unit: its batch while it is not finished, else itself."""
+        if unit.rule in self.rules and self.rules[unit.rule][0].many and not self.finished(unit):
+            return next((batch for batch in self.batches(unit.rule) if unit in batch.members), unit)
+        return unit
+
+    def todo(self, targets: Sequence[Unit]) -> list[Unit]:
+        """The jobs behind targets that are not finished."""
+        found: dict[int, Unit] = {}
+        waiting = [self.job_of(one) for one in targets]
+        while waiting:
+            one = waiting.pop()
+            if id(one) not in found and not self.finished(one):
+                found[id(one)] = one
+                waiting += [self.job_of(other) for other in one.needs]
+        return list(found.values())
 
 
-def _paths(files: Any, many: bool) -> Any:
-    if files is None:
-        return None
-    paths = [files] if isinstance(files, str) else [str(path) for path in files]
-    return paths if many else paths[0]
+def behind(unit: Unit, known: set[int] | None = None) -> Iterator[Unit]:
+    """The units behind a unit, each once."""
+    known = set() if known is None else known
+    for one in unit.needs:
+        if id(one) not in known:
+            known.add(id(one))
+            yield from behind(one, known)
+            yield one
 
 
-def _json(values: Any) -> str:
-    return json.dumps(values, sort_keys=True)
+@functools.cache
+def _stamp(path: Any) -> str:
+    return file_stamp(Path(path)) if Path(path).is_file() else ""
+
+
+def _digest(values: Any) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+def one_of(names: Collection[str]) -> str:
+    """A pattern of exactly these names; of none, one that matches nothing."""
+    return "|".join(map(re.escape, names)) or "(?!)"

@@ -33,5 +33,6 @@ def workflow_command(data: str, *options: str, cores: int | None = None) -> list
     root = Path() if root == Path.cwd() and "--directory" not in options else root
     count = cores or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()) or 1
     command = [sys.executable, "-m", "snakemake", "--snakefile", str(root / SNAKEFILE)]
-    command += ["--profile", str(root / "workflow" / "profiles" / "default"), "--cores", str(count), "--quiet", "all"]
+    command += ["--profile", str(root / "workflow" / "profiles" / "default"), "--cores", str(count)]
+    command += ["--quiet", "host", "progress", "rules", "reason"]
     return [*command, "--configfile", str(root / "config" / "data" / f"{data}.yaml"), *options]

@@ -35,8 +35,6 @@ PERCEPTION = "perception"
 MOST_ROWS = 400
 """At most so many failures of a kind are listed; the rest is counted."""
 METHOD_RECORDS = (RUN_RECORD, "rollout.json", "fit.json", "train.json")
-METHOD_RULES = ("fit", "train", "rollout", "predict", "render", "score")
-"""Rules whose jobs are named <rule>/<scenario>/<method>/<seed>."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,12 +128,11 @@ class ReportData:
         return {method: min(own, key=lambda run: not run.ok) for method, own in runs.items() if own}
 
 
-def traces(results: Path, jobs: Sequence[JobRecord]) -> tuple[list[str], list[str], list[int]]:
-    """Scenarios, methods and seeds that have left a trace: a record of a stage, or of a job."""
+def traces(results: Path) -> tuple[list[str], list[str], list[int]]:
+    """Scenarios, methods and seeds that have left a record of a stage."""
     paths = [path for name in METHOD_RECORDS for path in results.glob(f"*/*/*/{name}")]
     paths += results.glob("*/search-*/*/search.json")
     found = [path.relative_to(results).parts[:3] for path in paths]
-    found += [tuple(job.name.split("/")[1:]) for job in jobs if job.rule in METHOD_RULES]
     found = [parts for parts in found if len(parts) == 3 and parts[2].isdigit()]
     methods = {method for _, method, _ in found if not method.startswith("search-")}
     return sorted({scenario for scenario, _, _ in found}), sorted(methods), sorted({int(seed) for _, _, seed in found})
@@ -155,7 +152,7 @@ def damaged_files(results: Path, collected: Collected, transfers: Collected, mes
 def job_records(results: Path) -> tuple[list[JobRecord], list[str]]:
     """The job records that can be read, by name, and a message on each other one."""
     messages: list[str] = []
-    return [job for job in read_jobs(results, messages) if job.attempts], messages
+    return read_jobs(results, messages), messages
 
 
 def several(count: int, noun: str) -> str:

@@ -71,7 +71,7 @@ def write(results: Path, output: Path, options: Options, written: str | None = N
 def gather(results: Path, output: Path, options: Options) -> ReportData:
     """Read what the report is about."""
     jobs, messages = job_records(results)
-    choice = _filled(results, options, traces(results, jobs))
+    choice = _filled(results, options, traces(results))
     everything = collect(results, choice.scenarios, choice.methods, choice.seeds, choice.left_out)
     collected, part = as_asked(everything, asked(results))
     transfers = collect_transfers(results, choice.transfers, choice.methods, choice.seeds)

@@ -53,9 +53,6 @@ def score_blocks(numbers: Numbers) -> list[Block]:
     blocks: list[Block] = []
     if warning := mixed_settings(runs):
         blocks.append(Text(text=warning, tone="warn"))
-    if numbers.made_otherwise:
-        about = "Runs that were made with something else than this configuration; without `only` the workflow makes them again"
-        blocks.append(Items(title=about, items=[line.strip() for line in numbers.made_otherwise]))
     if removed := failures.removed_lines(runs, numbers.collected.left_out, numbers.labels):
         kept = f"Averages take {pairs(usable)} of {pairs(runs)} pairs of scenario and seed, those that every method finished."
         nothing = "No pair of scenario and seed was finished by every method, so there is no average of all methods."

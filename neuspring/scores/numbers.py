@@ -64,8 +64,6 @@ class Numbers:
     """Method to its name for people, of those that have one (`shown_names`)."""
     asked: str = ""
     """The part of the configuration that was asked for (`only=...`), where other runs are therefore not there."""
-    made_otherwise: tuple[str, ...] = ()
-    """Lines on runs that were not made with the configuration that the tables are laid out for."""
 
     @cached_property
     def collected(self) -> Collected:

@@ -15,7 +15,7 @@ LEARNED = "learned"
 """The input that is the record of whatever learned the run's model."""
 FLOW = """
     capture segment track lift judge observe
-    searches search fits fit appearance train
+    search fit appearance train
     rollout predict average render score transfer
 """
 STAGES: Registry[Stage] = Registry("stages", {name: f"{__name__}.{name}:{name}" for name in FLOW.split()}, Stage)

@@ -10,7 +10,7 @@ from neuspring.core.records import Before, Recorder
 from neuspring.stages.stage import Written, stage
 
 
-@stage(output="{scenario}/{method}/{seed}/rollout.json", when=lambda rows: bool(rows.method and rows.method.mean_of))
+@stage(output="{scenario}/{method}/{seed}/rollout.json", rule="run", when=lambda rows: bool(rows.method and rows.method.mean_of))
 def average(observations: Observations, rollout: Sequence[Before], run: Recorder) -> Written:
     """Trajectories of all seeds of a method -> their mean, node by node and frame by frame: trajectory.npz.
 

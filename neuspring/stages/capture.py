@@ -12,10 +12,11 @@ from neuspring.stages.stage import stage, there
 
 @stage(
     output="{scenario}/capture/capture.json",
+    rule="perceive",
     reads=lambda settings, given: SOURCES[given["scenario"].source].reads,
     code=lambda settings, given: (SOURCES[given["scenario"].source].write_capture,),
     minutes=120,
-    when=lambda rows: rows.source.write_capture,
+    when=lambda rows: bool(rows.source.write_capture and (rows.source.films or rows.images)),
     instead=lambda rows: rows.data / CAPTURE if rows.data else None,
     also=lambda rows: there(rows.data, rows.source.capture_files),
     stamp=lambda rows: rows.image_stamps,

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from neuspring.config import Config, SpringFieldSettings
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.core.records import Before, Recorder
-from neuspring.stages.stage import Rows, Written, stage
-from neuspring.twin.body import body_of, code
+from neuspring.stages.stage import Job, Rows, Written, physics, stage
+from neuspring.twin.body import BODIES, Learned, body_of, code
 
 if TYPE_CHECKING:
+    from neuspring.twin.batch import Lane
     from neuspring.twin.fit import FitProblem
 
 
@@ -23,6 +25,39 @@ def _settled(rows: Rows) -> Config:
     if rows.method is None or rows.method.fit != "springs":
         return rows.config
     return dataclasses.replace(rows.config, fit=dataclasses.replace(rows.config.fit, field=SpringFieldSettings()))
+
+
+def _alike(rows: Rows) -> tuple[Any, ...] | None:
+    """Frames per step, True for an oracle, which goes over all frames and not over those before the split alone, and the pool.
+
+    None for a body that is fitted without gradients.
+    """
+    row, search = rows.method, rows.search
+    if row is None or search is None or not BODIES[search.body].by_gradients:
+        return None
+    return *physics(rows), rows.config.fit.horizon, row.oracle, row.pool
+
+
+def _many(jobs: Sequence[Job]) -> list[Written | Exception]:
+    """Several fits; those of one physics and horizon share launches."""
+    from neuspring.twin.batch import physics_with, run_batch
+    from neuspring.twin.fit import fit as fit_one
+
+    def one(job: Job, problem: FitProblem, checkpoint: Path, key: str, lane: Lane) -> Written:
+        checkpoint.parent.mkdir(parents=True, exist_ok=True)
+        return written(job.record, fit_one(problem, partial=checkpoint, key=key, lane=lane), checkpoint)
+
+    ready = [prepared(**{name: value for name, value in job.arguments.items() if name != "threads"}) for job in jobs]
+    groups: dict[Any, list[int]] = {}
+    for place, (problem, _, _) in enumerate(ready):
+        always = all(seen.controller_valid.all() for seen in (problem.observations, *problem.pool))
+        groups.setdefault((physics_with(problem.twin, always), problem.fit.horizon), []).append(place)
+    made: dict[int, Written | Exception] = {}
+    for places in groups.values():
+        works = [partial(one, jobs[place], *ready[place]) for place in places]
+        results = run_batch([ready[place][0].twin for place in places], jobs[0].values["device"], works)
+        made |= dict(zip(places, results, strict=True))
+    return [made[place] for place in range(len(jobs))]
 
 
 @stage(
@@ -35,6 +70,9 @@ def _settled(rows: Rows) -> Config:
     when=lambda rows: bool(rows.method and rows.method.fit),
     given=lambda rows: {"kind": rows.method.fit, "oracle": rows.method.oracle, "leave_out": rows.leave_out} if rows.method else {},
     settled=_settled,
+    alike=_alike,
+    many=_many,
+    least_on_cpu=3,
     shared=lambda config, row: (row.search, row.pool, row.fit, row.oracle, config.fit) if row.fit else None,
 )
 def fit(
@@ -52,14 +90,17 @@ def fit(
     """Coarse twin -> fitted twin, by gradients: twin.npz, history.parquet (losses per epoch).
 
     A field's first weights follow the search's seed. An `oracle` fits all frames, the future included, and the record says so. With
-    a `pool` of other recordings the twin is fitted on all, or with `leave_out` on the others. A checkpoint that a killed fit left,
-    or one that ran together with others (`fits`), is continued. Another body may do without gradients, on `threads`
-    cores, and begins anew.
+    a `pool` of other recordings the twin is fitted on all, or with `leave_out` on the others. A killed fit continues from its
+    checkpoint. Another body may do without gradients, on `threads` cores, and begins anew.
     """
+    problem, checkpoint, key = prepared(observations, search, settings, run, pool, leave_out, kind, oracle, device)
+    return written(run, body_of(problem.twin).fit(problem, partial=checkpoint, key=key, threads=threads), checkpoint)
+
+
+def written(run: Recorder, result: Learned, checkpoint: Path) -> Written:
+    """The files of a fit."""
     from neuspring.core.files import write_history
 
-    problem, checkpoint, key = prepared(observations, search, settings, run, pool, leave_out, kind, oracle, device)
-    result = body_of(problem.twin).fit(problem, partial=checkpoint, key=key, threads=threads)
     files = run.beside(twin="twin.npz", history="history.parquet")
     result.twin.save(files["twin"])
     write_history(result.course.index, dict(result.course), files["history"])

@@ -10,7 +10,12 @@ from neuspring.data.capture import Capture
 from neuspring.stages.stage import Written, paths, stage
 
 
-@stage(output="{scenario}/perception/judged.json", reads=("perception.shape",), when=lambda rows: rows.source.has_truth)
+@stage(
+    output="{scenario}/perception/judged.json",
+    rule="perceive",
+    reads=("perception.shape",),
+    when=lambda rows: rows.source.has_truth,
+)
 def judge(
     capture: Capture, masks: Sequence[Before], tracks: Sequence[Before], lifted: Before, settings: Config, run: Recorder
 ) -> Written:

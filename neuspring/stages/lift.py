@@ -13,6 +13,7 @@ from neuspring.stages.stage import Written, paths, stage
 
 @stage(
     output="{scenario}/perception/lifted.json",
+    rule="perceive",
     reads=("perception.lift", "perception.shape"),
     code=lambda settings, given: [lifter.module for lifter in LIFTERS.values()],
     memory_mb=8000,

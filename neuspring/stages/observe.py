@@ -14,6 +14,7 @@ from neuspring.stages.stage import stage, there
 
 @stage(
     output="{scenario}/observations.npz",
+    rule="perceive",
     reads=lambda settings, given: (
         ("perception.sample",) if SOURCES[given["scenario"].source].films else SOURCES[given["scenario"].source].reads
     ),

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 @stage(
     output="{scenario}/{method}/{seed}/rollout.json",
+    rule="run",
     code=lambda settings, given: BASELINES[given["model"]].modules if given["model"] in BASELINES else (),
     gpu=True,
     minutes=60,

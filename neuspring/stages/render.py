@@ -30,6 +30,7 @@ def _weights(rows: Rows) -> str:
 
 @stage(
     output="{scenario}/{method}/{seed}/render.json",
+    rule="run",
     reads=("images.backend", "images.views", "images.video"),
     gpu=True,
     memory_mb=8000,

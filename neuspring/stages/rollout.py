@@ -10,6 +10,7 @@ from neuspring.twin.body import body_of, code
 
 @stage(
     output="{scenario}/{method}/{seed}/rollout.json",
+    rule="run",
     code=lambda settings, given: code(),
     gpu=True,
     minutes=60,

@@ -58,7 +58,7 @@ def _variant(rows: Rows) -> dict[str, Any]:
     return {"variant": switches | own}
 
 
-@stage(output="{scenario}/{method}/{seed}/run.json", code=lambda settings, given: code(), given=_variant)
+@stage(output="{scenario}/{method}/{seed}/run.json", rule="run", code=lambda settings, given: code(), given=_variant)
 def score(
     observations: Observations,
     rollout: MayFail,

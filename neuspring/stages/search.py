@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from neuspring.config import Config, Search
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.core.records import Recorder
-from neuspring.stages.stage import Rows, Written, stage
-from neuspring.twin.body import BODIES, SearchOptions, code
+from neuspring.stages.stage import Job, Rows, Written, physics, stage
+from neuspring.twin.body import BODIES, Learned, SearchOptions, code
+
+if TYPE_CHECKING:
+    from neuspring.twin.batch import SearchLane
 
 READS = ("search", "simulation", "losses", "released_quirks")
 
@@ -29,6 +33,25 @@ def _given(rows: Rows) -> dict[str, Any]:
     return {"clusters": rows.search.clusters, "body": rows.search.body, "leave_out": rows.leave_out}
 
 
+def _alike(rows: Rows) -> tuple[Any, ...] | None:
+    """None for a body whose search has no launches to share; those of one number of candidates end at about the same time."""
+    search = rows.search
+    return (*physics(rows), rows.config.search.rollouts) if search and BODIES[search.body].by_gradients else None
+
+
+def _many(jobs: Sequence[Job]) -> list[Written | Exception]:
+    """Several searches, whose generations share launches."""
+    from neuspring.twin.batch import run_searches
+
+    def one(job: Job, lane: SearchLane) -> Written:
+        given = job.arguments
+        names = ("settings", "run", "leave_out", "clusters", "seed", "device", "twins_per_launch")
+        options = prepared(**{name: given[name] for name in names}, threads=1, lane=lane)
+        return written(job.record, BODIES[given["body"]].search(given["observations"], given["pool"], given["settings"], options))
+
+    return run_searches(jobs[0].values["device"], [partial(one, job) for job in jobs])
+
+
 @stage(
     output="{scenario}/search-{search}/{seed}/search.json",
     reads=lambda settings, given: (*READS, *BODIES[given["body"]].reads),
@@ -39,6 +62,8 @@ def _given(rows: Rows) -> dict[str, Any]:
     when=lambda rows: rows.search is not None,
     given=_given,
     settled=_settled,
+    alike=_alike,
+    many=_many,
 )
 def search(
     observations: Observations,
@@ -61,10 +86,14 @@ def search(
     candidate's cost is the mean over all, or with `leave_out` over the others. A `body` of a package
     may search in another way, and have other rows in its trace.
     """
+    options = prepared(settings, run, leave_out, clusters, seed, device, threads, twins_per_launch)
+    return written(run, BODIES[body].search(observations, pool, settings, options))
+
+
+def written(run: Recorder, result: Learned) -> Written:
+    """The files of a search."""
     from neuspring.core.files import write_history
 
-    options = prepared(settings, run, leave_out, clusters, seed, device, threads, twins_per_launch)
-    result = BODIES[body].search(observations, pool, settings, options)
     files = run.beside(twin="twin.npz", trace="trace.parquet", history="history.parquet")
     result.twin.save(files["twin"])
     write_history(result.course.index, dict(result.course), files["history"])
@@ -81,7 +110,6 @@ def prepared(
     threads: int,
     twins_per_launch: int | Literal["auto"],
     lane: Any = None,
-    **others: Any,
 ) -> SearchOptions:
     """The way a search runs, where its trace lies, and what one must match to be continued. Raises InputError."""
     from neuspring.core.checkpoint import checkpoint_key

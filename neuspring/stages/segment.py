@@ -23,6 +23,8 @@ def _settled(rows: Rows) -> Config:
 
 @stage(
     output="{scenario}/perception/{camera}/masks.json",
+    rule="perceive",
+    when=lambda rows: rows.source.films or rows.images,
     reads=lambda settings, given: (*segmentation_keys(settings.perception.segment.backend), "perception.segment.verdict"),
     code=lambda settings, given: backend_modules("segment", settings.perception.segment.backend),
     gpu=lambda settings: BACKENDS["segment"][settings.perception.segment.backend].gpu,

@@ -20,7 +20,7 @@ An input has the name of the file that it is: `masks` is the masks.json that sta
 that is a sequence of observations has the name of a field of `Rows`, which lists the recordings: `pool`, `targets`.
 
 The workflow asks the declarations of a stage with the `Rows` behind a job: where there are such jobs, which inputs one goes
-without, what the tables tell its options, what makes it run again beside its record. It knows no stage by name.
+without, what the tables tell its options, which rule's jobs run it. It knows no stage by name.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
-import json
 import re
 import types
 import typing
@@ -137,39 +136,59 @@ class Rows:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Member:
-    """A job that shares launches with others."""
-
-    output: str
-    inputs: Mapping[str, Any]
-    options: Mapping[str, Any]
-    settings: str
-    """As JSON."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Together:
-    """The declaration of a stage whose jobs do those of another one together, as far as that goes, and make no result."""
-
-    stage: str
-    """The other one, whose jobs go on from there."""
-    key: Callable[[Rows], Any]
-    """Jobs of equal key are in step; None: that one is done alone."""
-    given: Callable[[Sequence[Member]], Mapping[str, Any]]
-    """Values of options."""
-    alone: int | None = None
-    """Without `gpus.batch`: the jobs of one scenario, if so many are in step; None: no jobs."""
-
-
-@dataclass(frozen=True)
 class Job:
-    """A stage with everything that it was given."""
+    """A stage with everything that it was given; its record is begun."""
 
-    arguments: dict[str, Any]
-    """Arguments of the function."""
+    stage: Stage
+    output: Path
+    settings: Config
+    values: Mapping[str, Any]
+    """Options and places by name."""
+    files: Mapping[str, Sequence[Path]]
+    """Inputs by parameter."""
     record: Recorder
-    failed: Before | None
-    """The first input whose failure is passed on."""
+
+    @property
+    def finished(self) -> bool:
+        """True where the result is there, made of the same inputs, settings and code."""
+        return self.output.exists() and self.record.agrees()
+
+    @functools.cached_property
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of the function, with the inputs loaded. Raises InputError for what is damaged."""
+        values = dict(self.values)
+        for name, parameter in self.stage.inputs.items():
+            loaded = [LOADERS[parameter.type](path) for path in self.files[name]]
+            values[name] = loaded if parameter.many else loaded[0] if loaded else None
+        own = {"settings": self.settings, "run": self.record, "output": self.output}
+        return values | {name: value for name, value in own.items() if name in self.stage.signature}
+
+    @property
+    def failed(self) -> Before | None:
+        """The first input whose failure is passed on."""
+        required = [n for n, p in self.stage.inputs.items() if p.type is Before and p.note != MAY_FAIL]
+        before = [Before.load(path) for name in required for path in self.files[name]]
+        return next((one for one in before if one.record.status == "failed"), None)
+
+    def run(self) -> None:
+        """Run the function, and write the record. A numerical failure is recorded, its own or that of an earlier stage."""
+        if "run" not in self.stage.signature:
+            self.stage.function(**self.arguments)
+            self.record.save()
+        elif failed := self.failed:
+            earlier = failed.record
+            self.record.save(failure=f"{earlier.stage}: {earlier.reason.removeprefix(f'{earlier.stage}: ')}")
+        else:
+            try:
+                self.keep(self.stage.function(**self.arguments))
+            except NumericalFailure as failure:
+                self.record.save(failure=str(failure))
+
+    def keep(self, made: Written) -> None:
+        """Write the record of these results."""
+        self.record.save(made.files, made.facts, failure=made.failure, attempts=made.attempts, earlier_seconds=made.earlier_seconds)
+        if made.checkpoint:
+            made.checkpoint.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +224,14 @@ class Stage:
     shared: Callable[[Config, Method], Any] | None = None
     """From a method and its configuration, what its result depends on: methods with the same share the job of the first one in the
     table. None: it has no such job, or, without this declaration, each method has its own."""
-    together: Together | None = None
+    rule: str = ""
+    """The rule whose jobs run it, with other stages; empty: one of its own name."""
+    alike: Callable[[Rows], Any] | None = None
+    """Jobs of equal key can share launches in a batch; None: no others can."""
+    least_on_cpu: int | None = None
+    """Members of a batch on a CPU, at least, which are of one scenario; None: there are no batches on a CPU."""
+    many: Callable[[Sequence[Job]], Sequence[Written | Exception]] | None = None
+    """Runs a batch: what each job made, or the error that ended it."""
 
     # --- what it declares
 
@@ -230,9 +256,9 @@ class Stage:
         return tuple(re.findall(r"{(\w+)}", self.output))
 
     @property
-    def job_name(self) -> str:
-        """The pattern that names its jobs in logs and job records."""
-        return "/".join(f"{{{name}}}" for name in self.wildcards)
+    def job_rule(self) -> str:
+        """The rule whose jobs run it."""
+        return self.rule or self.name
 
     @functools.cached_property
     def signature(self) -> Mapping[str, inspect.Parameter]:
@@ -289,7 +315,7 @@ class Stage:
     # --- how it runs
 
     def job(self, *, output: Path, settings: Config | None = None, **given: Any) -> Job:
-        """Load the inputs, digest them, begin the record. Raises InputError for what is missing, unknown or damaged."""
+        """Digest the inputs and begin the record. Raises InputError for what is missing or unknown."""
         unknown = sorted(given.keys() - self.parameters.keys())
         missing = [n for n, p in self.parameters.items() if p.required and n not in given and n != "output"]
         if unknown or missing:
@@ -305,58 +331,22 @@ class Stage:
             value = values[name] if parameter.many or values[name] is None else [values[name]]
             files[name] = [Path(path) for path in value or ()]
             roles |= {f"{name}{place}" if parameter.many else name: path for place, path in enumerate(files[name])}
-        chosen = settings or Config()
+        chosen, output = settings or Config(), Path(output)
         options = {n: config.plain(v) if dataclasses.is_dataclass(v := values[n]) else v for n in self.options}
         read, code = self.settings(chosen, values) | options, self.code_of(chosen, values)
         device = values.get("device", "cpu")
         record = Recorder(self.name, self.record_of(output), inputs=roles, settings=read, device=device, code=code)
         for path in (files[name][0].parent for name, one in self.inputs.items() if one.type is Capture and files[name]):
-            record.inputs["images"] = image_stamps(path)
-        failed = None
-        for name, parameter in self.inputs.items():
-            loaded = [LOADERS[parameter.type](path) for path in files[name]]
-            values[name] = loaded if parameter.many else loaded[0] if loaded else None
-            if parameter.type is Before and parameter.note != MAY_FAIL:
-                failed = failed or next((before for before in loaded if before.record.status == "failed"), None)
-        own = {"settings": chosen, "run": record, "output": output}
-        return Job(values | {name: value for name, value in own.items() if name in self.signature}, record, failed)
+            # Of images that stage `capture` made, its record says all; a user's may change.
+            if not (path / "capture.record.json").exists():
+                record.inputs["images"] = image_stamps(path)
+        return Job(stage=self, output=output, settings=chosen, values=values, files=files, record=record)
 
     def __call__(self, *, output: Path, settings: Config | None = None, **given: Any) -> None:
-        """Run it, and write its record. A numerical failure is recorded, its own or that of an earlier stage."""
-        job = self.job(output=Path(output), settings=settings, **given)
-        record = job.record
-        if "run" not in self.signature:
-            self.function(**job.arguments)
-            record.save()
-            return
-        if job.failed:
-            earlier = job.failed.record
-            record.save(failure=f"{earlier.stage}: {earlier.reason.removeprefix(f'{earlier.stage}: ')}")
-            return
-        try:
-            made = self.function(**job.arguments)
-        except NumericalFailure as failure:
-            record.save(failure=str(failure))
-            return
-        record.save(made.files, made.facts, failure=made.failure, attempts=made.attempts, earlier_seconds=made.earlier_seconds)
-        if made.checkpoint:
-            made.checkpoint.unlink(missing_ok=True)
+        """Run it, and write its record."""
+        self.job(output=output, settings=settings, **given).run()
 
     # --- its command
-
-    def words(self, given: Mapping[str, Any]) -> list[str]:
-        """The command line of these values; the opposite of `parse`."""
-        words: list[str] = []
-        for name, value in given.items():
-            many = self.parameters[name].many
-            if value is None or value is False or (many and not value):
-                continue
-            words.append(f"--{name.replace('_', '-')}")
-            if many:
-                words += map(str, value)
-            elif value is not True:
-                words.append(json.dumps(value, sort_keys=True) if isinstance(value, dict | list) else str(value))
-        return words
 
     def parse(self, words: Sequence[str]) -> dict[str, Any]:
         """Values of a command line, as `__call__` takes them. Raises InputError, and SystemExit for words that are no options."""
@@ -417,6 +407,11 @@ def read_row(text: str, settings: Config) -> ScenarioRow:
         rule = f"must be a row of {settings.scenario_table}, a capture or recording in data_root, or JSON"
         raise InputError("--scenario", rule, text)
     return rows[text]
+
+
+def physics(rows: Rows) -> tuple[Any, ...]:
+    """The physics, of which a launch has one, as the scenario table says it."""
+    return rows.scenario.self_collision, rows.scenario.ground
 
 
 def paths(records: Iterable[Before]) -> list[Path]:

@@ -11,6 +11,8 @@ from neuspring.stages.stage import Written, stage
 
 @stage(
     output="{scenario}/perception/{camera}/tracks.json",
+    rule="perceive",
+    when=lambda rows: rows.source.films,
     reads=("perception.track",),
     code=lambda settings, given: backend_modules("track", settings.perception.track.backend),
     gpu=lambda settings: BACKENDS["track"][settings.perception.track.backend].gpu,

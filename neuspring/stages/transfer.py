@@ -21,6 +21,7 @@ def _moves(rows: Rows) -> bool:
 
 @stage(
     output="{scenario}/{method}/{seed}/transfer.json",
+    rule="run",
     reads=("simulation",),
     code=lambda settings, given: BASELINES[given["model"]].modules if given["model"] in BASELINES else code(),
     gpu=True,

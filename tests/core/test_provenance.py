@@ -83,7 +83,7 @@ def test_modules_that_are_imported_by_name_count(copy):
 
     def now(stage: str) -> str:
         clear()
-        return graph.code(STAGES[stage], job)
+        return graph.made_of(STAGES[stage], job)["code"]
 
     before = {stage: now(stage) for stage in ("segment", "track", "lift")}
     edit(copy / "perception" / "segment_opencv.py", "import cv2", "import cv2\n\nADDED = 1")

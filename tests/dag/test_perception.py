@@ -55,24 +55,18 @@ def test_a_synthetic_capture_becomes_scores_and_a_table_of_perception(perceived_
     assert "| package " in (results / "tables" / "perception.md").read_text()
 
 
-def test_cameras_are_perceived_by_jobs_of_their_own_and_all_methods_share_one_appearance(project):
-    jobs = plan(project, SYNTHETIC | {"methods": ["search_only", "baseline", "neuspring"], "seeds": [0, 1]})
-    assert (jobs["capture"], jobs["segment"], jobs["track"], jobs["lift"], jobs["observe"]) == (1, 3, 3, 1, 1)
-    assert (jobs["appearance"], jobs["render"], jobs["score"]) == (2, 6, 6)
-    # A run without images has no such steps.
-    assert "render" not in plan(project, SYNTHETIC | {"images": {"enabled": False}})
-
-
 @pytest.mark.slow
-def test_a_change_leaves_the_steps_before_it_alone(perceived_run):
+def test_a_change_leaves_the_steps_before_it_alone(perceived_run, tmp_path):
     assert plan(perceived_run, SYNTHETIC) == {}
-    jobs = plan(perceived_run, SYNTHETIC | {"perception": SYNTHETIC["perception"] | {"sample": {"voxel": 0.025}}})
-    assert "lift" not in jobs
-    assert jobs["observe"] == 1
     # What concerns drawing alone does not train again.
     jobs = plan(perceived_run, SYNTHETIC | {"images": {"views": "all", "appearance": {"iterations": 40}}})
-    assert "appearance" not in jobs
-    assert (jobs["render"], jobs["score"]) == (1, 1)
+    assert "appearance" not in jobs and jobs["run"] == 1
+    project = copy_project(perceived_run, tmp_path / "project")
+    changes = SYNTHETIC | {"perception": SYNTHETIC["perception"] | {"sample": {"voxel": 0.025}}}
+    assert jobs_in(run(project, changes, "--until", "perceive")) == {"perceive": 1}
+    [log] = (project / "results" / "jobs" / "perceive").rglob("*.log")
+    lines = dict(line.split(": ", 1) for line in log.read_text().splitlines() if ": " in line)
+    assert lines["segment"] == lines["track"] == lines["lift"] == lines["judge"] == "finished before" != lines["observe"]
 
 
 @pytest.mark.slow
@@ -113,7 +107,7 @@ def test_spring_gaus_has_splats_of_its_own_and_draws_with_them(perceived_run, tm
     changes = SYNTHETIC | {"methods": ["search_only", "spring_gaus"], "tracking": {"enabled": False}}
     jobs = plan(project, changes | {"baselines": {"spring_gaus": small}})
     # The splats of all methods are there.
-    assert (jobs["appearance"], jobs["train"], jobs["predict"], jobs["render"]) == (1, 1, 1, 1)
+    assert (jobs["appearance"], jobs["train"], jobs["run"]) == (1, 1, 1)
     run(project, changes | {"baselines": {"spring_gaus": small}})
     folder = project / "results" / PACKAGE
     assert (folder / "appearance-spring_gaus" / "0" / "splats.ply").is_file()
@@ -141,17 +135,15 @@ def test_a_folder_of_the_user_s_own_and_masks_that_the_user_repairs(project):
     add_scenario(project, "film", "capture")
     changes = {"scenarios": ["film"], "methods": ["search_only"], "compare_with": "search_only", "data_root": str(project / "mine")}
     changes |= {"perception": PERCEPTION, "images": {"appearance": {"iterations": 20}}, "tracking": {"enabled": False}}
-    run(project, changes, "--", "results/film/search_only/0/run.json")
+    run(project, changes, "--until", "run")
     record = json.loads((project / "results" / "film" / "search_only" / "0" / "run.json").read_text())
     assert record["status"] == "ok"
     # No truth, no table of perception.
     assert "tables" in (left := plan(project, changes)) and "perception_table" not in left
 
-    target = "results/film/perception/1/masks.json"
-    assert plan(project, changes, "--", target) == {}
     path = capture.path("mask", "1", 2)
     path.write_bytes(path.read_bytes())
-    assert plan(project, changes, "--", target) == {"segment": 1}
+    assert plan(project, changes, "--until", "perceive") == {"perceive": 1}
 
 
 @pytest.mark.slow
@@ -166,9 +158,8 @@ def test_processed_cases_with_images_beside_them_are_drawn_too(project):
     changes |= {"perception": PERCEPTION | {"segment": {"backend": "opencv"}}, "images": {"appearance": {"iterations": 60}}}
     changes["tracking"] = {"enabled": False}
     # Tables, the report and MLflow treat all runs alike, so that the run's record is enough.
-    output = run(project, changes, "--", "results/film/search_only/0/run.json")
-    expected = ("capture", "segment", "observe", "search", "rollout", "appearance", "render", "score")
-    assert jobs_in(output) == dict.fromkeys(expected, 1) | {"segment": 3}
+    output = run(project, changes, "--until", "run")
+    assert jobs_in(output) == dict.fromkeys(("perceive", "search", "appearance", "run"), 1)
     scores = pd.read_parquet(project / "results" / "film" / "search_only" / "0" / "scores.parquet")
     assert scores.loc[scores["metric"] == "psnr", "value"].min() > 12
     masks = json.loads((project / "results" / "film" / "perception" / "0" / "masks.json").read_text())

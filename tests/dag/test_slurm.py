@@ -13,13 +13,13 @@ import pandas as pd
 import pytest
 import yaml
 
-from neuspring.core.job_records import Attempt, read_jobs
+from neuspring.core.job_records import read_jobs
 from tests.support import slurm
 from tests.support.project import SCENE, config_with, copy_workflow, environment
 
 pytestmark = pytest.mark.slow
 """Small versions: what a profile asks of a cluster in test_profiles and, with a stand-in for the cluster, in test_kubernetes."""
-GPU_RULES = {"search", "fit", "rollout"}
+GPU_RULES = {"search", "fit", "run"}
 PATIENCE = 600
 """s for the whole run; it took 225 on two cores that five processes shared."""
 
@@ -76,10 +76,6 @@ def submissions_of(submissions: list[dict[str, str]], name: str) -> list[dict[st
     return [job for job in submissions if job["Comment"].startswith(f"rule_{name}")]
 
 
-def attempts(results: Path) -> dict[str, list[Attempt]]:
-    return {job.name: job.attempts for job in read_jobs(results)}
-
-
 def test_a_run_on_slurm_ends_with_all_runs_tables_and_records(slurm_run):
     results, submissions, before = slurm_run
     assert "search-uniform/0/search.json" in before
@@ -90,33 +86,30 @@ def test_a_run_on_slurm_ends_with_all_runs_tables_and_records(slurm_run):
     assert len(scores) == 8
     assert np.isfinite(scores["value"]).all()
     assert {path.read_text().strip() for path in results.glob("*/*/*/mlflow.txt")} == {"logged"}
-    # observe, search, two of fit, and two groups of each of the two runs; the rest runs where Snakemake does.
-    assert len(submissions) == 8
-    assert sorted(job["JobState"] for job in submissions) == ["CANCELLED"] + ["COMPLETED"] * 7
+    # perceive, search, two of fit, and two runs; the rest runs where Snakemake does.
+    assert sorted(job["JobState"] for job in submissions) == ["CANCELLED"] + ["COMPLETED"] * 5
 
 
 def test_gpu_jobs_ask_for_one_device_and_cpu_jobs_for_none(slurm_run):
     _, submissions, _ = slurm_run
     devices = {job["Comment"].removeprefix("rule_").split("_")[0]: job.get("TresPerJob") for job in submissions}
     gpu = "gres:gpu:1"
-    assert devices == {"observe": None, "search": gpu, "fit": gpu, "prediction": gpu, "scores": None}
+    assert devices == {"perceive": None, "search": gpu, "fit": gpu, "run": gpu}
     assert {job["Partition"] for job in submissions} == {"main"}
 
 
 def test_jobs_use_the_device_that_slurm_gave_them_and_share_none(slurm_run):
     results, _, _ = slurm_run
-    jobs = attempts(results)
     leases: dict[str, list[tuple[datetime, datetime]]] = {}
-    for name, tries in jobs.items():
-        for attempt in tries:
-            assert len(attempt.devices) == (name.split("/")[0] in GPU_RULES), name
-            start = datetime.fromisoformat(attempt.started)
-            for device in attempt.devices:
-                leases.setdefault(device, []).append((start, start + timedelta(seconds=attempt.seconds)))
+    for job in read_jobs(results):
+        assert len(job.devices) == (job.rule in GPU_RULES), job.name
+        start = datetime.fromisoformat(job.started)
+        for device in job.devices:
+            leases.setdefault(device, []).append((start, start + timedelta(seconds=job.seconds)))
     assert set(leases) == {"0", "1"}
     for spans in leases.values():
         spans.sort()
-        assert all(end <= start for (_, end), (start, _) in itertools.pairwise(spans))
+        assert all(end <= start + timedelta(seconds=1) for (_, end), (start, _) in itertools.pairwise(spans))
 
 
 def test_a_cancelled_job_is_submitted_again_with_more_memory_and_goes_on_from_its_checkpoint(slurm_run):
@@ -125,6 +118,5 @@ def test_a_cancelled_job_is_submitted_again_with_more_memory_and_goes_on_from_it
     assert (first["JobState"], second["JobState"]) == ("CANCELLED", "COMPLETED")
     assert [int(job["MinMemoryNode"].removesuffix("M")) for job in (first, second)] == [8000, 16000]
     name = f"{SCENE}/baseline/0"
-    assert [attempt.outcome for attempt in attempts(results)[f"fit/{name}"]] == ["killed", "ok"]
     assert json.loads((results / name / "fit.json").read_text())["attempts"] == 2
-    assert "continuing the fit after epoch" in (results / "logs" / "fit" / f"{name}.log").read_text()
+    assert "continuing the fit after epoch" in next((results / "jobs" / "fit" / name).glob("*.log")).read_text()

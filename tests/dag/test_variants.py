@@ -10,9 +10,7 @@ import pytest
 from neuspring import config
 from neuspring.experiments.tracking import log as tracking
 from tests.support.extensions import with_extensions
-from tests.support.project import SCENE, jobs_in, plan, run
-
-OTHER = "toy_cloth_lift_smooth"
+from tests.support.project import SCENE, plan, run
 
 
 @pytest.mark.slow
@@ -43,8 +41,9 @@ def test_variants_end_in_one_table_and_a_larger_budget_continues_the_search(proj
     assert {Path(name).name for name in record["artifacts"]["plots"]} >= {"topology.png", "stiffness.png", "motion.png"}
 
     changes |= {"search": {"rollouts": 15}, "methods": ["pt_only"], "seeds": [0], "transfers": {}, "only": ""}
-    output = run(project, changes, "--", f"results/{SCENE}/pt_only/0/run.json")
-    assert "continuing the search after 11 rollouts" in output
+    run(project, changes, "--until", "run")
+    logs = (project / "results" / "jobs" / "search").rglob("*.log")
+    assert any("continuing the search after 11 rollouts" in log.read_text() for log in logs)
     assert len(pd.read_parquet(results / SCENE / "search-piecewise_5" / "0" / "trace.parquet")) == 15
 
 
@@ -86,40 +85,9 @@ def test_baselines_pass_through_the_same_workflow_and_say_where_they_do_not_appl
     # A model's own settings train it alone again.
     changes["baselines"]["gs_dynamics"]["epochs"] = 2
     jobs = plan(project, changes)
-    assert {name: jobs[name] for name in ("train", "predict", "score")} == {"train": 1, "predict": 1, "score": 1}
+    assert (jobs["train"], jobs["run"]) == (1, 1)
     assert "search" not in jobs
 
 
 def names(folder: Path) -> list[str]:
     return [path.name for path in folder.iterdir()]
-
-
-@pytest.mark.slow
-def test_fits_of_seeds_share_launches_and_nothing_finished_is_made_again(project):
-    """That twins end as they would alone, bit for bit, test_batches shows."""
-    changes = {"methods": ["baseline"], "fit": {"epochs": 2}}
-    first, *targets = (f"results/{SCENE}/baseline/{seed}/fit.json" for seed in (0, 1, 2))
-    run(project, changes | {"seeds": [0]}, "--", first)
-    changes["seeds"] = [0, 1, 2]
-    # Seeds that are added share launches; the finished one, which was made alone, stays.
-    before = (project / first).stat().st_mtime_ns
-    output = run(project, changes, "--", first, *targets)
-    jobs = jobs_in(output)
-    assert (jobs["fits"], jobs["fit"]) == (1, 2)
-    assert (project / first).stat().st_mtime_ns == before
-    record = json.loads((project / "results" / SCENE / "fits-0.json").read_text())
-    assert record["facts"]["batches"] == [targets]
-    assert record["facts"]["errors"] == {}
-    assert all(json.loads((project / path).read_text())["facts"]["epochs_together"] == 2 for path in targets)
-    later = [first, *targets, *(f"results/{SCENE}/baseline/{seed}/fit.json" for seed in (3, 4))]
-    more = changes | {"seeds": [0, 1, 2, 3, 4]}
-    jobs, alone = (plan(project, more | {"twins_per_launch": count}, "--", *later) for count in ("auto", 1))
-    assert jobs["fit"] == alone["fit"] == 2
-    assert jobs["fits"] == 1 and "fits" not in alone
-    # A further method in a finished folder, without targets.
-    output = run(project, changes | {"methods": ["baseline", "model_b"]}, "--dry-run")
-    planned = {words[0]: words[1] for words in map(str.split, output.splitlines()) if len(words) == 2}
-    assert planned["fits"] == "1" and planned["fit"] == "3" and planned["all"] == "1"
-    # Nothing of another scene is overlooked where a part of the seeds of this one is asked for.
-    both = changes | {"scenarios": [SCENE, OTHER], "only": "seed=0"}
-    assert plan(project, both)["observe"] == plan(project, both)["search"] == 1

@@ -69,4 +69,4 @@ def test_points_alone_become_scores_and_changed_hands_are_noticed(project, tmp_p
     assert not set(scores["metric"]) & {"psnr", "iou", "image_error"}
     assert plan(project, changes) == {}
     write(capture.folder, Hands(scene.risen(scene.GRIP, 8) + 0.001, np.zeros((0, 0), bool), np.zeros(0, int)), scene.NODES)
-    assert plan(project, changes).keys() >= {"observe", "search", "score"}
+    assert plan(project, changes).keys() >= {"perceive", "search", "run"}

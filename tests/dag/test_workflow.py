@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -55,48 +54,25 @@ def test_a_configuration_becomes_a_table_with_every_run_in_mlflow(tiny_run):
     assert {word: len(names) for word, names in tracking.sync(results, config.Tracking()).items()} == {"already logged": 2}
 
 
-def test_the_search_is_shared_and_changed_settings_rerun_the_stages_that_use_them_and_no_others(tiny_run):
+def test_a_finished_run_has_nothing_to_do_and_a_changed_setting_says_what_it_makes_again(tiny_run):
     project, output = tiny_run
-    assert jobs_in(output)["search"] == 1
-    # How candidates are simulated changes no result; the report states it, as the whole configuration.
-    assert plan(project, {"twins_per_launch": 3}, "--set-threads", "search=2") == {"report": 1, "all": 1}
-    # Both runs go to another experiment of MLflow; what is fitted is made again, and all of another seed is made.
-    expected = dict.fromkeys(["track_init", "search", "tables", "report", "all"], 1)
-    expected |= {"fit": 2, "rollout": 3, "score": 3, "log_run": 4}
-    assert plan(project, {"fit": {"epochs": 4}, "tracking": {"experiment": "other"}, "seeds": [0, 1]}) == expected
-
-
-def test_what_results_were_made_with_is_read_from_their_records_and_from_nothing_that_stays_behind(tiny_run, tmp_path):
-    """A results folder that was renamed, and whose `.snakemake` is gone: Snakemake would take it as finished whatever is asked."""
-    project = copy_project(tiny_run[0], tmp_path / "project")
+    assert jobs_in(output) == {"perceive": 1, "search": 1, "fit": 1, "run": 2, "tables": 1, "page": 1, "all": 1}
     shutil.rmtree(project / ".snakemake")
-    (project / "results").rename(project / "kept")
-    assert plan(project, {"results": "kept"}) == {}
-    changes = {"results": "kept", "fit": {"epochs": 4}, "compare_with": "search_only"}
-    output = run(project, changes, "--dry-run", "--quiet", "rules")
-    assert jobs_in(output) == dict.fromkeys(["fit", "rollout", "score", "log_run", "tables", "report", "all"], 1)
-    assert "  fit (baseline, 1 job): fit.epochs 3 -> 4\n" in output
-    assert "  tables (1 job): what it was told, or its code\n" in output
-    assert "To keep what is there, give another folder: --config results=" in output
-    assert plan(project, {"results": "kept", "toy": {"frames": 9}}, "--rerun-triggers", "mtime") == {}
+    assert plan(project) == {}
+    output = run(project, {"fit": {"epochs": 4}}, "--dry-run", "--quiet", "rules")
+    assert jobs_in(output) == {"fit": 1, "run": 1, "tables": 1, "page": 1, "all": 1}
+    assert "fit (1): fit.fit.epochs 3 -> 4\n" in output
 
 
 @pytest.mark.slow
 def test_a_killed_run_continues_in_the_middle_of_the_fit_and_ends_the_same(tiny_run, tmp_path):
     changes = {"methods": ["baseline"], "fit": {"epochs": 30}, "tracking": {"enabled": False}}
-    target = f"results/{SCENE}/baseline/0/fit.json"
     # Both begin with the search that is there.
     undisturbed, project = (copy_project(tiny_run[0], tmp_path / name) for name in ("undisturbed", "killed"))
-    assert jobs_in(run(undisturbed, changes, "--", target)) == {"fit": 1}
-
-    process = subprocess.Popen(
-        arguments(project, changes, "--", target),
-        cwd=project,
-        env=environment(),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
+    assert jobs_in(run(undisturbed, changes, "--until", "fit")) == {"fit": 1}
+    command = arguments(project, changes, "--until", "fit")
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
+    process = subprocess.Popen(command, cwd=project, env=environment(), **silent)
     folder = project / "results" / SCENE / "baseline" / "0"
     deadline = time.monotonic() + 120
     while not (folder / "fit.partial.npz").exists():
@@ -105,27 +81,46 @@ def test_a_killed_run_continues_in_the_middle_of_the_fit_and_ends_the_same(tiny_
         time.sleep(0.01)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-    assert not (folder / "fit.json").exists()
+    assert json.loads((folder / "fit.json").read_text())["settings"]["fit"]["epochs"] == 3
 
     run(project, changes, "--unlock")
-    assert "continuing the fit after epoch" in run(project, changes, "--", target)
+    run(project, changes, "--until", "fit")
+    [log] = (project / "results" / "jobs" / "fit").rglob("*.log")
+    assert "continuing the fit after epoch" in log.read_text()
     assert json.loads((folder / "fit.json").read_text())["attempts"] == 2
     expected = Twin.load(undisturbed / "results" / SCENE / "baseline" / "0" / "twin.npz")
     np.testing.assert_array_equal(Twin.load(folder / "twin.npz").material.stiffness, expected.material.stiffness)
 
 
+@pytest.mark.slow
 def test_one_step_alone_from_another_folder_into_a_path_with_spaces_and_quotes(project, tmp_path):
     results = tmp_path / "my 'best' results; echo"
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     arguments(project)
     overlays = [str(project / name) for name in ("config/data/demo.yaml", "overlay.yaml")]
-    target = f"{results}/{SCENE}/observations.npz"
-    command = [sys.executable, "-m", "snakemake", "--snakefile", str(project / "Snakefile"), "--cores", "1"]
-    command += ["--configfile", *overlays, "--config", f"results={results}", "--", target]
-    output_of(start(command, elsewhere))
-    assert Path(target).is_file()
+    command = [sys.executable, "-m", "snakemake", "--snakefile", str(project / "Snakefile"), "--cores", "1", "--until", "perceive"]
+    output_of(start([*command, "--configfile", *overlays, "--config", f"results={results}"], elsewhere))
+    assert (results / SCENE / "observations.npz").is_file()
     assert [path.name for path in elsewhere.iterdir()] == [".snakemake"]
+
+
+def test_a_failing_job_is_named_with_its_log_and_stops_no_other(project):
+    """The second recording is not there when its job begins."""
+    rows = (project / "config" / "scenarios.tsv").read_text()
+    (project / "config" / "scenarios.tsv").write_text(f"{rows}gone\tpoints\ttoy\tgone\tfalse\ttrue\n")
+    data = project / "data" / "gone"
+    data.mkdir(parents=True)
+    (data / "capture.json").write_text("{}")
+    changes = {
+        "scenarios": [SCENE, "gone"],
+        "methods": ["static"],
+        "data_root": str(project / "data"),
+        "tracking": {"enabled": False},
+    }
+    output = run(project, changes, fails=True)
+    assert "perceive gone failed: " in output and (project / "results" / SCENE / "static" / "0" / "run.json").exists()
+    assert "Fix the cause, then rerun the same command to resume." in output and "Report so far: " in output
 
 
 def test_bad_configuration_is_explained_before_any_job(project):

@@ -6,19 +6,17 @@ from pathlib import Path
 import pytest
 
 from neuspring.config import Tracking
-from neuspring.core.job_records import begin_run
-from neuspring.experiments.jobs import gpus
-from neuspring.experiments.jobs import wrapper as job
+from neuspring.experiments import gpus, job
 from neuspring.experiments.tracking import log as tracking
 
 
 @pytest.fixture
 def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A results folder in which a run of the workflow has begun; no GPU is leased to anybody."""
-    for name in (job.POOL, job.GPU_SHARE, gpus.VISIBLE):
+    """A results folder; no GPU is leased to anybody."""
+    for name in (job.POOL, gpus.VISIBLE):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv(gpus.LOCKS, str(tmp_path / "locks"))
-    begin_run(tmp_path / "results")
+    (tmp_path / "results").mkdir()
     return tmp_path / "results"
 
 

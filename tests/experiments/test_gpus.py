@@ -14,9 +14,10 @@ from pathlib import Path
 import pynvml  # noqa: F401 - loaded once, not in each fork
 import pytest
 
+from neuspring.config.settings import Gpus
 from neuspring.core.errors import InputError
 from neuspring.core.lock import try_lock
-from neuspring.experiments.jobs import gpus
+from neuspring.experiments import gpus
 
 EIGHT = tuple(map(str, range(8)))
 FORK = multiprocessing.get_context("fork")
@@ -163,9 +164,43 @@ def test_a_job_s_own_errors_do_not_take_all_devices_from_the_others(run):
     # None is beyond doubt: the one whose failure is longest ago comes first.
     first = run(1, ("1", "0"))
     assert first.devices == ("0",)
-    first.note("")
+    first.note(gpus.WORKS)
     first.release()
     assert run(1, ("1", "0")).devices == ("0",)
+
+
+@pytest.mark.parametrize(
+    ("error", "failure"),
+    [
+        ("RuntimeError: CUDA error: unspecified launch failure", gpus.SUSPECT_GPU),
+        ("Warp error: this machine has 0 CUDA devices", gpus.LOST_GPU),
+        ("torch.OutOfMemoryError: CUDA out of memory", ""),
+        ("ValueError: shapes differ", ""),
+    ],
+)
+def test_an_error_says_whether_the_device_failed(error, failure):
+    assert gpus.failure_of(error) == failure
+
+
+@pytest.mark.parametrize(("pool", "limit", "slots"), [(("0", "1"), None, 4), (("0", "1"), 3, 3), ((), None, 0)])
+def test_jobs_that_hold_a_gpu_at_once_are_all_slots_or_the_limit(pool, limit, slots):
+    assert gpus.slots_of(pool, 2, limit) == slots
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: gpus.slots_of(("0", "1"), 1, 3), "--resources gpu: must be 1 to 2"),
+        (lambda: gpus.slots_of((), 1, 1), "--resources gpu: this run has no GPU"),
+        (lambda: gpus.pool_of(Gpus(devices=(5,)), "auto"), r"gpus\.devices: must be GPUs that this run may use; received 5"),
+        (lambda: gpus.pool_of(Gpus(), "cuda"), "device: device: cuda requires a GPU"),
+    ],
+)
+def test_gpus_that_are_not_there_are_refused_before_any_job(call, message, monkeypatch):
+    monkeypatch.setenv(gpus.VISIBLE, "0" if "devices" in message else "")
+    with pytest.raises(InputError, match=message):
+        call()
+    assert gpus.pool_of(Gpus(), "cuda", plan_only=True) == gpus.visible_devices()
 
 
 def test_damaged_notes_count_for_nothing(tmp_path, run):

@@ -16,7 +16,14 @@ SETUP = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools
 
 
 def test_an_installation_brings_all_that_the_workflow_reads_and_the_sample_twin():
-    places = {"Snakefile": "", "config": "**/*", "workflow/rules": "*.smk", "workflow/profiles/default": "*", "workflow/envs": "*"}
+    places = {
+        "Snakefile": "",
+        "config": "**/*",
+        "workflow/rules": "*.smk",
+        "workflow/scripts": "*.py",
+        "workflow/profiles/default": "*",
+        "workflow/envs": "*",
+    }
     needed = {f for name, below in places.items() for f in ((ROOT / name).glob(below) if below else [ROOT / name])}
     needed = {file.relative_to(ROOT) for file in needed if file.is_file() and file.suffix != ".md"}
     brought = {

@@ -21,11 +21,9 @@ from neuspring import config
 from neuspring.cli.results import ui
 from neuspring.config import Config, Tracking
 from neuspring.core.errors import InputError
-from neuspring.core.job_records import Attempt, JobRecord
 from neuspring.core.run_record import RunRecord
 from neuspring.experiments.tracking import log as tracking
 from neuspring.experiments.tracking import store as tracking_store
-from neuspring.experiments.tracking.log import _usage
 from neuspring.experiments.tracking.store import score_name
 from neuspring.scores.metrics import METRICS, TASKS
 from tests.support.stores import STEPS, client_of, free_port, python, runs_of, write_run
@@ -122,60 +120,6 @@ def test_a_database_of_another_version_is_named_with_what_to_do(results: Path) -
     with pytest.raises(InputError, match=message):
         tracking_store.page(results, SETTINGS)
     assert re.search(message, tracking.init(results, SETTINGS)["outcome"])
-
-
-def write_job(results: Path, name: str, *attempts: Attempt) -> None:
-    JobRecord(rule=name.partition("/")[0], name=name, log=f"logs/{name}.log", attempts=list(attempts)).save(results)
-
-
-def test_the_use_of_the_machine_is_logged_where_jobs_recorded_it(results: Path) -> None:
-    """A job is found from the record of its stage, also where another method's fit, or splats of all methods, are shared."""
-    records = ["../../search-uniform/0/search.json", "../../owner/0/fit.json", "../../appearance/0/appearance.json", "rollout.json"]
-    for name in records:
-        path = results / "rope" / "ours" / "0" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("{}")
-    samples: list[list[float | None]] = [[0.5, 90.0, 400.0, 50.0, 900.0], [2.6, 110.0, 500.0, None, None]]
-    used = {"samples": samples, "peak_memory_mb": 512.0, "peak_gpu_memory_mb": 1000.0, "gpu_utilization": 50.0}
-    first = Attempt(started="2026-11-21T09:00:00+00:00", outcome="transient", peak_memory_mb=9999.0)
-    write_job(results, "search/rope/uniform/0", first, Attempt(started="2026-11-21T09:30:00+00:00", outcome="ok", **used))
-    for name in ("fit/rope/owner/0", "appearance/rope/appearance/0", "score/rope/ours/0", "render/rope/ours/0"):
-        write_job(results, name, Attempt(started="2026-11-21T09:30:00+00:00", outcome="ok", peak_memory_mb=64.0))
-    artifacts = {"records": records}
-    assert tracking.log_run(write_run(results, artifacts=artifacts), results, SETTINGS) == "logged"
-
-    (run,) = runs_of(results)
-    metrics = {name.removeprefix("usage/"): value for name, value in run.data.metrics.items() if name.startswith("usage/")}
-    assert metrics.pop("fit.seconds") == 12.5
-    peaks = {f"{stage}.peak_memory_mb": 64.0 for stage in ("fit", "appearance", "score")}
-    whole = {"peak_memory_mb": 512.0, "peak_gpu_memory_mb": 1000.0, "mean_gpu_percent": 50.0}
-    last = {"cpu_percent": 110.0, "memory_mb": 500.0, "gpu_percent": 50.0, "gpu_memory_mb": 900.0}
-    # No rollout: it has no job record.
-    assert metrics == peaks | {f"search.{name}": value for name, value in (whole | last).items()}
-    history = client_of(results).get_metric_history(run.info.run_id, "usage/search.memory_mb")
-    begin = STARTED_MS - 30 * 60_000
-    assert [(m.step, m.value, m.timestamp - begin) for m in history] == [(0, 400.0, 500), (3, 500.0, 2600)]
-
-    (results / "jobs" / "fit" / "rope" / "owner" / "0.json").write_text("{")
-    with pytest.raises(InputError, match=r"0\.json"):
-        tracking.log_run(write_run(results, artifacts=artifacts, run_key="ab" * 32), results, SETTINGS)
-
-
-def test_the_jobs_of_a_baseline_are_found_by_the_rules_that_made_them(results: Path) -> None:
-    records = ["train.json", "rollout.json", "../../appearance-ours/0/appearance.json"]
-    for name in records:
-        path = results / "rope" / "ours" / "0" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("{}")
-    for memory, name in enumerate(("train/rope/ours/0", "predict/rope/ours/0", "appearance/rope/appearance-ours/0"), 1):
-        write_job(results, name, Attempt(started="2026-11-21T09:30:00+00:00", outcome="ok", peak_memory_mb=float(memory)))
-    record = RunRecord.load(write_run(results, artifacts={"records": records}, variant={"model": "spring_gaus"}))
-    points = _usage(record, results / "rope" / "ours" / "0" / "run.json", results)
-    assert {point.key: point.value for point in points if point.key.endswith("memory_mb")} == {
-        "usage/train.peak_memory_mb": 1.0,
-        "usage/rollout.peak_memory_mb": 2.0,
-        "usage/appearance.peak_memory_mb": 3.0,
-    }
 
 
 def test_a_failed_run_is_logged_as_failed(results: Path) -> None:

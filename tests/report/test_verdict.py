@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from neuspring.core.findings import finding
-from neuspring.core.job_records import begin_run
+from neuspring.core.job_records import keep_asked
 from neuspring.report.blocks import Code, Text
 from neuspring.report.grid import ratio_text
 from neuspring.report.summary import detail_blocks
@@ -108,7 +108,7 @@ def test_the_best_track_error_with_the_worst_overlap_is_explained():
 
 def test_next_moves_are_commands_for_the_folder_in_use(tmp_path):
     results = report_tree.make(tmp_path / "results", ["rope"], ["baseline", "neuspring"], [0], pictures=False)
-    begin_run(results, {"command": ["snakemake", "--config", f"results={results}", "seeds=[0]", "--cores", "2"], "only": ""})
+    keep_asked(results, {"command": ["snakemake", "--config", f"results={results}", "seeds=[0]", "--cores", "2"], "only": ""})
     found = collect(results, ["rope"], ["baseline", "neuspring"], [0, 1])
     blocks = verdict(Numbers(everything=found, baseline="baseline", results=results))
     commands = [shlex.split(one.text) for one in blocks if isinstance(one, Code)]

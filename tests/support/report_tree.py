@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import itertools
 import os
 import re
 import zlib
@@ -18,7 +19,7 @@ import pandas as pd
 from neuspring import config
 from neuspring.core.artifacts import Observations, Scenario, Trajectory
 from neuspring.core.files import write_table, write_text
-from neuspring.core.job_records import Attempt, JobRecord
+from neuspring.core.job_records import JobRecord
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.draw.video import Video
 from neuspring.scores.metrics import METRICS, SCORE_COLUMNS
@@ -114,50 +115,21 @@ def write_run(
     return folder / "run.json"
 
 
-def write_jobs(
-    results: Path,
-    scenarios: Iterable[str],
-    methods: Iterable[str],
-    seeds: Iterable[int],
-    gpus: int = 4,
-    *,
-    again: int = 10,
-    never: int = 25,
-) -> None:
-    """Job records of fits that filled some GPUs; every `again`-th needed a second attempt, every `never`-th failed for good."""
-    ends, count = [0.0] * gpus, 0
-    for scenario in scenarios:
-        for method in methods:
-            for seed in seeds:
-                gpu = ends.index(min(ends))
-                attempts = []
-                again_then_ok = ["transient", "ok"] if count % again == again - 1 else ["ok"]
-                outcomes = ["permanent"] if count % never == never - 1 else again_then_ok
-                for outcome in outcomes:
-                    seconds = 200.0 + 37 * (count % 7)
-                    attempts.append(attempt(ends[gpu], seconds, outcome=outcome, devices=[str(gpu)]))
-                    ends[gpu] += seconds + 3
-                save_job(results, f"fit/{scenario}/{method}/{seed}", attempts)
-                count += 1
+def write_jobs(results: Path, scenarios: Iterable[str], methods: Iterable[str], seeds: Iterable[int], *, never: int = 25) -> None:
+    """Job records of fits on a GPU; every `never`-th failed."""
+    for count, (scenario, method, seed) in enumerate(itertools.product(scenarios, methods, seeds)):
+        save_job(results, f"fit/{scenario}/{method}/{seed}", failed=count % never == never - 1, seconds=200.0 + 37 * (count % 7))
 
 
-def attempt(start: float, seconds: float, **changes: Any) -> Attempt:
-    """An attempt that began `start` seconds after midnight; failed ones ran out of memory unless told otherwise."""
-    stamp = pd.Timestamp("2026-01-05T00:00:00+00:00") + pd.Timedelta(seconds=start)
-    failed = changes.get("outcome", "ok") not in ("ok", "running")
-    values: dict[str, Any] = {
-        **{"started": stamp.isoformat(), "seconds": seconds, "waited": 2.0, "outcome": "ok", "host": "server", "exit": int(failed)},
-        **{"device_names": ["NVIDIA H100"], "peak_memory_mb": 2100.0, "peak_gpu_memory_mb": 5000.0, "gpu_utilization": 83.0},
-        **{"cause": "out of GPU memory" if failed else "", "message": "CUDA error: out of memory" if failed else ""},
-        "cpu_seconds": 1.1 * seconds,
-    }
-    return Attempt(**(values | changes))
-
-
-def save_job(results: Path, name: str, attempts: Sequence[Attempt]) -> None:
+def save_job(results: Path, name: str, *, failed: bool = False, **changes: Any) -> None:
     """A job record and its log."""
-    JobRecord(rule=name.partition("/")[0], name=name, log=f"logs/{name}.log", attempts=list(attempts)).save(results)
-    write_text(results / "logs" / f"{name}.log", "what it said\n")
+    values: dict[str, Any] = {"started": "2026-01-05T00:00:00+00:00", "seconds": 5.0, "host": "server", "devices": ["0"]}
+    values |= {"device_names": ["NVIDIA H100"], "peak_memory_mb": 2100.0, "log": f"jobs/{name}/0.log"} | changes
+    if failed:
+        values |= {"outcome": "failed", "message": "CUDA error: out of memory"}
+    folder = results / "jobs" / name
+    JobRecord(rule=name.partition("/")[0], name=name, **values).save(folder / ("failed.json" if failed else "0.json"))
+    write_text(folder / "0.log", "what it said\n")
 
 
 def observations(name: str, source: str, nodes: int) -> Observations:

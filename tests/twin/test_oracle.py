@@ -1,7 +1,5 @@
 """The oracle reads the future, says so in its records, and is the same in shared launches."""
 
-import json
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +13,8 @@ from neuspring.core.records import StageRecord
 from neuspring.physics.parameters import twin_tensors
 from neuspring.stages.fit import fit as fit_stage
 from neuspring.stages.fit import prepared
-from neuspring.stages.fits import fits
 from neuspring.stages.rollout import rollout
 from neuspring.stages.search import search as search_stage
-from neuspring.stages.together import MemberRow
 from neuspring.twin.fit import fit
 from neuspring.twin.losses import FrameLoss
 from tests.support import small
@@ -88,19 +84,14 @@ def test_records_of_fit_and_rollout_say_oracle_and_digests_differ(started, tmp_p
 
 def test_an_oracle_in_shared_launches_is_the_oracle_alone(started, tmp_path):
     seen, found = started / "observations.npz", started / "search.json"
-    settings = json.dumps({"fit": config.plain(SETTINGS.fit)})
-    names = ["normal", "oracle", "oracle_again"]
-    inputs = {"observations": str(seen), "search": str(found)}
-    rows = [
-        MemberRow(settings=settings, options={"oracle": name != "normal"}, jobs={str(tmp_path / name / "fit.json"): inputs})
-        for name in names
-    ]
-    fits(rows=json.dumps([asdict(row) for row in rows]), device="cpu", output=tmp_path / "fits.json")
-    batches = StageRecord.load(tmp_path / "fits.json").facts["batches"]
-    assert batches == [[str(tmp_path / name / "fit.json") for name in names[1:]]]
+    given = {"observations": seen, "search": found, "settings": SETTINGS, "device": "cpu"}
+    outputs = {name: tmp_path / name / "fit.json" for name in ("normal", "oracle", "oracle_again")}
+    jobs = [fit_stage.job(output=output, oracle=name != "normal", **given) for name, output in outputs.items()]
+    for job, made in zip(jobs, fit_stage.many(jobs), strict=True):
+        job.keep(made)
     twins = []
+    fitted(started, tmp_path / "alone" / "fit.json", True)
     for folder in (tmp_path / "oracle", tmp_path / "alone"):
-        fitted(started, folder / "fit.json", True)
         twins.append(Twin.load(folder / "twin.npz"))
         assert len(pd.read_parquet(folder / "history.parquet"))
     np.testing.assert_array_equal(*map(parameters, twins))

@@ -10,7 +10,6 @@ is deleted when the record is logged.
 
 from __future__ import annotations
 
-import os
 import shlex
 import sys
 from collections.abc import Callable, Iterator
@@ -21,8 +20,6 @@ from typing import TYPE_CHECKING, Any
 from neuspring.config import Config, Tracking, plain
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
-from neuspring.core.job_records import FOLDER as JOBS
-from neuspring.core.job_records import JobRecord
 from neuspring.core.run_record import RUN_RECORD, RunRecord, flat, key_of
 from neuspring.core.text import masked, readable
 from neuspring.experiments.tracking.store import connect, default_uri, explained, lock, score_name
@@ -33,12 +30,8 @@ if TYPE_CHECKING:
 
 MOST_PARAMS, TAG_LENGTH = 60, 5000
 """These keep MLflow's tables readable. All is in run.json."""
-SAMPLE_COLUMNS = ("cpu_percent", "memory_mb", "gpu_percent", "gpu_memory_mb")
-"""Columns of a job record's samples, after the time."""
-USAGE = {"peak_memory_mb": "peak_memory_mb", "peak_gpu_memory_mb": "peak_gpu_memory_mb", "mean_gpu_percent": "gpu_utilization"}
-"""Metric of a whole job -> field of its record."""
 OUTCOME = "mlflow.txt"
-"""The outcome of logging a record, beside it; the workflow's rule writes it."""
+"""The outcome of logging a record, beside it; the workflow's job writes it."""
 
 
 def init(results: Path, settings: Tracking) -> dict[str, str]:
@@ -70,7 +63,7 @@ def log_run(run_json: Path, results: Path, settings: Tracking) -> str:
     try:
         # Locked to the end, not only while the run is created: the lock tells a live logger from a killed one.
         with lock(results, record.run_key):
-            return _log(*connect(results, settings), record, run_json, results)
+            return _log(*connect(results, settings), record, run_json)
     except InputError:
         raise
     except Exception as error:
@@ -117,7 +110,7 @@ def _warn(message: str) -> None:
 # --- what is sent for a run: its record and the files that it names, read and checked before anything is sent ---
 
 
-def _log(client: MlflowClient, experiment: str, record: RunRecord, run_json: Path, results: Path) -> str:
+def _log(client: MlflowClient, experiment: str, record: RunRecord, run_json: Path) -> str:
     """Log a record whose lock the caller holds."""
     from mlflow.entities import Param
 
@@ -132,7 +125,7 @@ def _log(client: MlflowClient, experiment: str, record: RunRecord, run_json: Pat
     files = [(run_json, None)] + [(run_json.parent / name, target) for target, names in record.artifacts.items() for name in names]
     for path, _ in files:
         _require_file(run_json, path)
-    metrics = [*_metrics(record, run_json), *_usage(record, run_json, results)]
+    metrics = list(_metrics(record, run_json))
     start, end = milliseconds(record.started), milliseconds(record.ended)
     run_id = client.create_run(experiment, start, _tags(record, run_json.parent), record.name).info.run_id
     params = [Param(name, str(value)) for name, value in params_of(record).items()]
@@ -177,7 +170,7 @@ def _tags(record: RunRecord, folder: Path) -> dict[str, str]:
 
 
 def _metrics(record: RunRecord, run_json: Path) -> Iterator[Metric]:
-    """Scores as `scores/{task}.{metric}`, histories as `training/{history}.{metric}` by step, timings as `usage/{stage}.seconds`.
+    """Scores as `scores/{task}.{metric}`, histories as `training/{history}.{metric}` by step, timings and memory as `usage/...`.
 
     MLflow's pages of curves have a section for each word before `/`, in the order of the alphabet, and what has none comes last.
     """
@@ -192,44 +185,8 @@ def _metrics(record: RunRecord, run_json: Path) -> Iterator[Metric]:
             yield Metric(f"training/{history}.{metric}", value, end, int(step))
     for stage, seconds in record.timings.items():
         yield Metric(f"usage/{stage}.seconds", seconds, end, 0)
-
-
-def _usage(record: RunRecord, run_json: Path, results: Path) -> Iterator[Metric]:
-    """Use of processor, memory and GPU as `usage/{stage}.{what}`; steps are seconds.
-
-    Not under `system/`: MLflow's table of a run shows what is named so before everything else, and scores come first.
-
-    They are those of each job's last attempt, which made the result. A stage that was run by hand has no job record and no such
-    metrics.
-    """
-    from mlflow.entities import Metric
-
-    for stage, path in _jobs(record, run_json, results).items():
-        attempts = JobRecord.load(path).attempts if path.is_file() else []
-        for attempt in attempts[-1:]:
-            start = milliseconds(attempt.started)
-            rows = [(seconds, *pair) for seconds, *row in attempt.samples for pair in zip(SAMPLE_COLUMNS, row, strict=True)]
-            rows += [(0.0, what, getattr(attempt, name)) for what, name in USAGE.items()]
-            for seconds, what, value in rows:
-                if seconds is not None and value is not None:
-                    yield Metric(f"usage/{stage}.{what}", value, start + round(1000 * seconds), round(seconds))
-
-
-def _jobs(record: RunRecord, run_json: Path, results: Path) -> dict[str, Path]:
-    """Stage -> path of its job record, which need not exist: jobs/<rule>/, then the path of the results."""
-    folders = {"score": run_json.parent}
-    folders |= {Path(name).stem: run_json.parent / Path(name).parent for name in record.artifacts.get("records", [])}
-    jobs = {}
-    for stage, folder in folders.items():
-        parts = Path(os.path.relpath(folder.resolve(), results.resolve())).parts
-        if len(parts) == 3 and ".." not in parts:
-            scenario, row, seed = parts
-            # A search's row is its folder without `search-`.
-            row = row.removeprefix("search-") if stage == "search" else row
-            # A trained baseline writes the same rollout.json as a twin, but its rule is called predict.
-            rule = "predict" if stage == "rollout" and record.model else stage
-            jobs[stage] = results / JOBS / rule / scenario / row / f"{seed}.json"
-    return jobs
+    for stage, megabytes in record.peak_memory_mb.items():
+        yield Metric(f"usage/{stage}.peak_memory_mb", megabytes, end, 0)
 
 
 def _table(run_json: Path, name: str, by: str, *more: str) -> list[tuple[Any, ...]]:

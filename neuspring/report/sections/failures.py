@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
 import pandas as pd
 
-from neuspring.core.job_records import JobRecord, this_run
-from neuspring.core.table import Cell, Chip, Table, Tone
+from neuspring.core.job_records import JobRecord
+from neuspring.core.table import Cell, Table, Tone
 from neuspring.core.text import duration
 from neuspring.report.blocks import Block, Fold, PageSection, Text
 from neuspring.report.data import MOST_ROWS, ReportData, ReportSection, link, several
@@ -18,17 +17,12 @@ from neuspring.report.data import MOST_ROWS, ReportData, ReportSection, link, se
 def failures(material: ReportData) -> PageSection:
     """Everything that keeps runs out of the tables, and a table of the runs that there are."""
     failed = [job for job in material.jobs if job.failed]
-    # Jobs of the run that makes this page, its own among them, may still have no end.
-    now = this_run(material.results)
-    left = [job for job in material.jobs if job.last.outcome == "running" and not (now and job.last.run == now)]
     runs = material.collected.runs
     broken = runs[runs["status"] == "failed"] if len(runs) else runs
     blocks: list[Block] = []
     if not failed and not len(broken) and not material.damaged:
         blocks.append(Text(text="Nothing has failed.", tone="good"))
     if failed:
-        causes = Counter(job.last.cause or "unknown" for job in failed)
-        blocks.append(Text(text="Causes: " + ", ".join(f"{cause} ({count})" for cause, count in causes.most_common()) + "."))
         blocks.append(_jobs("Failed jobs", failed, material))
     if len(broken):
         blocks.append(_numerical(broken.assign(method=broken["method"].map(material.numbers.name))))
@@ -36,14 +30,6 @@ def failures(material: ReportData) -> PageSection:
         rows = [[Cell(text=path), Cell(text=why, wrap=True)] for path, why in list(material.damaged.items())[:MOST_ROWS]]
         note = "Delete a damaged file and run the same command again." + _rest(len(material.damaged))
         blocks.append(Table(caption="Damaged files", header=["File", "Why"], rows=rows, note=note))
-    if left:
-        about = Text(text="Running now, or their wrapper was killed before it could write more.")
-        summary = several(len(left), "job") + " without an end"
-        blocks.append(Fold(summary=summary, blocks=[about, _jobs("Jobs", left, material)]))
-    retried = [job for job in material.jobs if not job.failed and len(job.attempts) > 1 and job.last.outcome == "ok"]
-    if retried:
-        summary = f"{several(len(retried), 'job')} that succeeded after another attempt"
-        blocks.append(Fold(summary=summary, blocks=[_jobs("Jobs", retried, material)]))
     if len(runs):
         blocks.append(_matrix(runs.assign(method=runs["method"].map(material.numbers.name))))
     return PageSection(key="failures", title="Failures and missing runs", blocks=blocks)
@@ -56,22 +42,12 @@ def _rest(count: int) -> str:
 def _jobs(caption: str, jobs: Sequence[JobRecord], material: ReportData) -> Table:
     rows = []
     for job in jobs[:MOST_ROWS]:
-        last, log = job.last, material.results / job.log
-        causes = dict.fromkeys(attempt.cause for attempt in job.attempts if attempt.cause)
-        tone, symbol = {"ok": ("good", "✓"), "transient": ("warn", "!"), "running": ("warn", "!")}.get(last.outcome, ("bad", "✗"))
-        outcome = Chip(text=last.outcome, tone=tone, symbol=symbol)  # type: ignore[arg-type]
+        log = material.results / job.log
         target = link(log, material.output.resolve().parent) if log.is_file() else ""
-        rows.append(
-            [
-                Cell(text=job.name),
-                Cell(text=", ".join(causes), chips=[outcome]),
-                Cell(text=last.message, wrap=True),
-                Cell(text=str(len(job.attempts))),
-                Cell(text=duration(job.seconds), value=job.seconds),
-                Cell(text="log" if target else job.log, link=target),
-            ]
-        )
-    header = ["Job", "Cause", "Message", "Attempts", "Time", "Log"]
+        time = Cell(text=duration(job.seconds), value=job.seconds)
+        cells = [Cell(text=job.name), Cell(text=job.message, wrap=True), time, Cell(text="log" if target else job.log, link=target)]
+        rows.append(cells)
+    header = ["Job", "Message", "Time", "Log"]
     return Table(caption=caption, header=header, rows=rows, sortable=True, note=_rest(len(jobs)).strip())
 
 

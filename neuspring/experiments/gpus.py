@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
+from neuspring.config.settings import Gpus
 from neuspring.core.errors import InputError
 from neuspring.core.lock import try_lock, wait_for_lock
 
@@ -28,8 +29,68 @@ LOCKS = "NEUSPRING_GPU_LOCKS"
 """Environment: the folder of the slots. Users who share GPUs set it to one folder that all of them can write to."""
 SLOT_POLL = 0.05
 """s between two looks for a free slot."""
+NOTES = "gpus.txt"
+"""The file of notes among the records of jobs."""
 LOST_GPU, SUSPECT_GPU, WORKS = "lost", "suspect", "works"
 """Words of notes. Suspect: the job itself may have caused the error on a sound device."""
+LOST = re.compile(
+    r"GPU is lost|GPU requires reset|fallen off the bus|no CUDA-capable device|No CUDA GPUs are available|has 0 CUDA devices|ECC",
+    re.I,
+)
+SUSPECT = re.compile(
+    r"CUDA.*(unspecified launch failure|launch timed out|unknown error|illegal memory access|unavailable|LAUNCH_TIMEOUT)", re.I
+)
+
+
+def failure_of(error: str) -> str:
+    """What an error says of the job's devices: LOST_GPU, SUSPECT_GPU, or nothing."""
+    return LOST_GPU if LOST.search(error) else SUSPECT_GPU if SUSPECT.search(error) else ""
+
+
+def pool_of(settings: Gpus, device: str, *, plan_only: bool = False) -> tuple[str, ...]:
+    """The GPUs of this machine that jobs may use; none on a CPU. Raises InputError for one that is not there or not allowed.
+
+    `plan_only`: a plan for other machines may be made where there is no GPU.
+    """
+    if device == "cpu":
+        return ()
+    visible = visible_devices()
+    chosen = visible if settings.devices == "all" else tuple(map(str, settings.devices))
+    with nvml() as library:
+        known = bool(library) or VISIBLE in os.environ
+    missing = [name for name in chosen if name not in visible and name.isdigit()] if known else []
+    if missing:
+        value = f"{', '.join(missing)}; allowed: {', '.join(visible) or 'none'}"
+        raise InputError("configuration, gpus.devices", "must be GPUs that this run may use", value, f"Correct it, or {VISIBLE}.")
+    if device == "cuda" and not chosen and not plan_only:
+        rule, remedy = "device: cuda requires a GPU that this run may use", f"Use device: cpu or auto, or correct {VISIBLE}."
+        raise InputError("configuration, device", rule, device, remedy)
+    return chosen
+
+
+def slots_of(pool: Sequence[str], jobs_per_gpu: int, limit: int | None) -> int:
+    """Number of jobs that may hold a GPU at once: all slots, or `limit` (--resources gpu=...). Raises InputError."""
+    slots = len(pool) * jobs_per_gpu
+    if limit is not None and not (pool or limit == 0):
+        raise InputError("--resources gpu", "this run has no GPU", limit, "Leave it out, or set device: cuda where there is one.")
+    if limit is None or not pool:
+        return slots
+    if not 1 <= limit <= slots:
+        rule = f"must be 1 to {slots} ({len(pool)} GPUs, gpus.jobs_per_gpu {jobs_per_gpu})"
+        raise InputError("--resources gpu", rule, limit, "Leave it out to use all. Use device: cpu for none.")
+    return limit
+
+
+def names_of(devices: Sequence[str]) -> list[str]:
+    """Names of devices, of those that NVML knows."""
+    found = list[str]()
+    if not devices:
+        return found
+    with nvml() as library:
+        for device in devices if library else ():
+            with contextlib.suppress(Exception):  # a MIG slice has no name of its own
+                found.append(str(library.nvmlDeviceGetName(handle_of(library, device))))
+    return found
 
 
 def failures(notes: Path | None) -> dict[str, str]:
@@ -63,12 +124,12 @@ class Lease:
         """Variables with which a command sees these devices alone, numbered as nvidia-smi does."""
         return {VISIBLE: ",".join(self.devices), "CUDA_DEVICE_ORDER": "PCI_BUS_ID"}
 
-    def note(self, failure: str) -> None:
-        """Note for later jobs how these devices failed (LOST, SUSPECT), or that they worked (empty). Raises OSError."""
-        if self.notes is None or not (failure or failures(self.notes).keys() & set(self.devices)):
+    def note(self, outcome: str) -> None:
+        """Note for later jobs that these devices failed (LOST_GPU, SUSPECT_GPU) or work (WORKS). Raises OSError."""
+        if self.notes is None or (outcome == WORKS and not failures(self.notes).keys() & set(self.devices)):
             return
         with self.notes.open("a", encoding="utf-8") as file:
-            file.write("".join(f"{failure or WORKS} {device}\n" for device in self.devices))
+            file.write("".join(f"{outcome} {device}\n" for device in self.devices))
 
     def release(self) -> None:
         """Give the slots back."""

@@ -1,0 +1,156 @@
+"""The jobs that look at many runs: tables, study, page (the report), perception_table; and those of a sweep.
+
+They concern the whole configuration, whatever part of it runs now. `tables` computes every number, once.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from neuspring.cli.main import COMMANDS
+from neuspring.config import plain
+from neuspring.core.errors import InputError
+from neuspring.core.provenance import code_digest, file_stamp
+from neuspring.experiments.graph import Graph, Unit
+from neuspring.registry import modules
+
+TEMPLATES = Path(__file__).parents[1] / "report" / "templates"
+PLACES = ("results", "output", "table", "method_table", "extra_rows", "observations")
+"""Options that say where files are. They are compared by content."""
+RULES = {"tables": 10, "study": 10, "page": 20, "perception_table": 10, "tune": 2880, "sweep_report": 20}
+"""Rule -> minutes that a job may take."""
+
+
+class Tasks:
+    """Units of rules that are no stages."""
+
+    def __init__(self, graph: Graph) -> None:
+        self.graph, self.config, self.whole, self.known = graph, graph.config, graph.whole, graph.benchmark
+        self.root, self.results = graph.benchmark.root, Path(graph.results)
+        self.folder = self.results / self.config.tables
+        """Folder of tables and report."""
+        graph.tasks = {name: functools.partial(getattr(self, name)) for name in RULES}
+
+    # --- tables and pages
+
+    def tables(self, name: str = "all") -> Unit:
+        """Every number, and the summary."""
+        given = {"output": self.folder, "baseline": self.known.compared_with, **self._runs(), **self._transfers()}
+        given |= {"aims": json.dumps(plain(self.config)["aims"]), "objects": self.config.objects}
+        given |= {"studies": tuple(self.whole.studies), **self._row_tables()}
+        files = [self.folder / "summary.md", self.folder / "numbers.json"]
+        return self._unit("tables", name, given, self.graph.runs(), ("report.summary", "report.gallery"), files)
+
+    def perception_table(self, name: str = "all") -> Unit:
+        """Errors of perception, by category."""
+        judged = self.graph.judged(self.whole.scenarios)
+        given = {"output": self.folder / "perception.md", "scenarios": json.dumps(judged)}
+        needs = [self.graph.unit("perceive", scenario) for scenario in self.graph.judged(self.config.scenarios)]
+        return self._unit("perception_table", name, given, needs, ("report.perception",), [given["output"]])
+
+    def study(self, name: str) -> Unit:
+        """One of the paper's tables."""
+        given = {"study": name, "tables": self.config.tables, "output": self.folder / "studies"}
+        also = json.dumps(plain(self.known.studies[name]))
+        needs = [self.graph.unit("tables", "all")]
+        return self._unit("study", name, given, needs, ("report.study", "report.clips"), [given["output"] / f"{name}.md"], also)
+
+    def page(self, name: str = "all") -> Unit:
+        """The page with everything."""
+        settings = plain(self.whole) | {"only": ""}
+        # Where MLflow and the results are concerns nothing that the report shows.
+        del settings["tracking"], settings["results"]
+        given = {"output": self.folder / "report.html", "settings": json.dumps(settings, sort_keys=True), **self._row_tables()}
+        given |= {"tables": self.config.tables}
+        given |= {"baseline": self.known.compared_with, **self._transfers(), "left_out": json.dumps(self.known.whole_left_out)}
+        own = [place.partition(":")[0].removeprefix("neuspring.") for place in modules("neuspring.report.sections").values()]
+        also = "".join(file_stamp(path) for path in sorted(TEMPLATES.iterdir()))
+        return self._unit("page", name, given, self.shown(), ("report.page", *own), [given["output"]], also)
+
+    def shown(self, studies: Iterable[str] | None = None) -> list[Unit]:
+        """What the report shows beside the runs."""
+        units = [self.graph.unit("tables", "all")]
+        units += [self.graph.unit("study", name) for name in (self.config.studies if studies is None else studies)]
+        return units + ([self.graph.unit("perception_table", "all")] if self.graph.judged(self.config.scenarios) else [])
+
+    def so_far(self, folder: Path) -> Path:
+        """Tables and report of the runs that are there, in a folder of their own; returns the page."""
+        unit, page = self.graph.unit("tables", "all"), self.graph.unit("page", "all")
+        self._call("tables", unit.options | {"output": folder, "brief": True})
+        self._call("report", page.options | {"output": folder / "report.html", "tables": f"{self.config.tables}/{folder.name}"})
+        return folder / "report.html"
+
+    def _runs(self) -> dict[str, Any]:
+        names = {name: tuple(getattr(self.whole, name)) for name in ("scenarios", "methods", "seeds")}
+        return names | {"left_out": json.dumps(self.known.whole_left_out)}
+
+    def _row_tables(self) -> dict[str, Any]:
+        tables = {"table": self.root / self.config.study_table, "method_table": self.root / self.config.method_table}
+        return tables | {"extra_rows": tuple(self.known.extra)}
+
+    def _transfers(self) -> dict[str, Any]:
+        return {"transfers": tuple(name for name in self.whole.transfers or {} if name in self.whole.scenarios)}
+
+    # --- a sweep: workers share one Optuna study, which is as long as the configuration says, however many there are
+
+    def tune(self, name: str) -> Unit:
+        """A worker."""
+        jobs, folder = self._tuning()
+        needs = [self.graph.unit("perceive", scenario) for scenario in self.known.tuned]
+        given = {"observations": tuple(self.results / scenario / "observations.npz" for scenario in self.known.tuned)}
+        given |= {"settings": jobs.settings(self.known), "worker": int(name), "output": folder / f"worker-{name}.json"}
+        code = ("extensions.tuning.trial",)
+        return self._unit("tune", name, given, needs, code, [given["output"]], jobs.rows(self.known), where=("device", "threads"))
+
+    def sweep_report(self, name: str = "all") -> Unit:
+        """The results of a sweep. Raises InputError if the configuration has none."""
+        jobs, folder = self._tuning()
+        assert self.config.tune
+        given = {"settings": jobs.settings(self.known), "output": folder / "summary.md"}
+        workers = [self.graph.unit("tune", str(worker)) for worker in range(self.config.tune.workers)]
+        return self._unit("sweep_report", name, given, workers, ("extensions.tuning.report",), [given["output"]])
+
+    def _tuning(self) -> tuple[Any, Path]:
+        if not self.config.tune:
+            remedy = "Add the section `tune` (config/README.md, config/studies/tune.yaml)."
+            raise InputError("configuration, tune", "the target sweep needs a sweep", None, remedy)
+        try:
+            from neuspring.extensions.tuning import jobs
+        except ModuleNotFoundError as error:
+            rule, remedy = "a sweep needs the extension neuspring/extensions/tuning", "Restore its folder, or leave tune out."
+            raise InputError("configuration, tune", rule, "left out", remedy) from error
+        return jobs, self.results / "tune" / self.config.tune.study
+
+    # --- common parts
+
+    def _unit(
+        self,
+        rule: str,
+        name: str,
+        given: Mapping[str, Any],
+        needs: Sequence[Unit],
+        code: Iterable[str],
+        files: Sequence[Path],
+        also: str = "",
+        where: Sequence[str] = (),
+    ) -> Unit:
+        told = {key: value for key, value in given.items() if key not in PLACES}
+        tables = [file_stamp(path) for key in ("table", "method_table") if (path := given.get(key))]
+        tables += [file_stamp(path) for path in given.get("extra_rows", ())]
+        digest = code_digest(*(f"neuspring.{module}" for module in code))
+        made_of = {rule: {"options": told, "code": digest, "data": [*tables, also], "inputs": [one.digest for one in needs]}}
+        command = {"page": "report", "sweep_report": "tune-report"}.get(rule, rule.replace("_", "-"))
+        options = dict(given) if rule in ("tune", "sweep_report") else {"results": self.results, **given}
+
+        def run(places: Mapping[str, Any]) -> Sequence[Path]:
+            self._call(command, options | {key: places[key] for key in where})
+            return files
+
+        return Unit(rule=rule, name=name, needs=needs, made_of=made_of, run=run, options=options)
+
+    def _call(self, command: str, options: Mapping[str, Any]) -> None:
+        COMMANDS[command](**options)

@@ -1,0 +1,15 @@
+"""One job of any rule. Snakemake provides `snakemake`; the configuration is the one that the workflow was planned with."""
+
+from pathlib import Path
+
+from neuspring.experiments.job import run
+
+run(
+    snakemake.config,  # noqa: F821 - Snakemake's
+    Path(snakemake.params.root),  # noqa: F821
+    snakemake.rule,  # noqa: F821
+    snakemake.wildcards.job,  # noqa: F821
+    snakemake.wildcards.digest,  # noqa: F821
+    threads=snakemake.threads,  # noqa: F821
+    gpus=snakemake.resources.get("gpu", 0),  # noqa: F821
+)
