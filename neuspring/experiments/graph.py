@@ -29,7 +29,7 @@ from neuspring.stages.stage import Job, Rows, Stage
 
 SPLATS_FOLDER = "appearance"
 """Folder of the splats that all methods share; those of one method have its name behind a hyphen."""
-TOGETHER = "together"
+BATCH = "together"
 """First part of the name of a batch."""
 LARGEST_BATCH = 16
 """Units of a batch on a GPU at most, where `gpus.batch` is auto. It was not measured with several scenes."""
@@ -254,7 +254,7 @@ class Graph:
         if rule in self.tasks:
             return self.tasks[rule](name)
         parts, names = name.split("/"), self.wildcards(rule)
-        if parts[0] == TOGETHER:
+        if parts[0] == BATCH:
             return self.batches(rule)[int(parts[1])]
         if len(parts) != len(names) or parts[0] not in self.benchmark.scenarios:
             raise InputError(f"{rule} {name}", f"must be {'/'.join(names)} of this configuration")
@@ -337,7 +337,7 @@ class Graph:
         return [
             Unit(
                 rule=rule,
-                name=f"{TOGETHER}/{place}",
+                name=f"{BATCH}/{place}",
                 members=members,
                 needs=list({id(n): n for m in members for n in m.needs}.values()),
             )

@@ -21,7 +21,7 @@ from neuspring.core.run_record import flat
 from neuspring.core.text import duration, listed
 from neuspring.experiments.graph import Graph, Unit
 
-MOST_SHOWN, LONGEST = 6, 60
+MOST_CHANGES, LONGEST_VALUE = 6, 60
 """Changes of settings in a line, and characters of a value."""
 MOST_RECORDS = 20
 """Records of a rule that are read for its time."""
@@ -33,7 +33,7 @@ SECONDS: dict[tuple[str, str], float] = {
 }
 """Stage and device -> s per unit of work. CPU: `make demo` (300 nodes, 45 frames) on two vCPUs of an AMD EPYC. GPU: PhysTwin's
 README, one stuffed animal on an RTX 4090."""
-UNITS: dict[str, Callable[[Config], int]] = {
+WORK_UNITS: dict[str, Callable[[Config], int]] = {
     "search": lambda config: config.search.rollouts,
     "fit": lambda config: config.fit.epochs,
     "appearance": lambda config: config.images.appearance.iterations,
@@ -91,7 +91,9 @@ def _seconds(graph: Graph, unit: Unit, kind: str) -> tuple[float, str]:
         return statistics.median(found), "jobs of this folder"
     names = [step.stage.name for step in unit.steps] or [unit.rule]
     config = graph.rows(unit.steps[0].job).config if unit.steps else graph.config
-    seconds = [SECONDS.get((name, kind), SECONDS.get((name, "cpu"), 0.0)) * UNITS.get(name, lambda _: 1)(config) for name in names]
+    seconds = [
+        SECONDS.get((name, kind), SECONDS.get((name, "cpu"), 0.0)) * WORK_UNITS.get(name, lambda _: 1)(config) for name in names
+    ]
     return sum(seconds), "one stuffed animal on an RTX 4090" if kind == "gpu" else "make demo"
 
 
@@ -107,7 +109,7 @@ def replaced(graph: Graph, todo: Sequence[Unit]) -> list[str]:
             if before and path != graph.record(unit):
                 groups[unit.rule, tuple(_differences(before, unit.made_of))] += 1
     keep = ["Results are replaced. To keep them, use another folder: --config results=..."] if groups else []
-    return [f"{rule} ({count}): {listed(changes, MOST_SHOWN)}" for (rule, changes), count in groups.items()] + keep
+    return [f"{rule} ({count}): {listed(changes, MOST_CHANGES)}" for (rule, changes), count in groups.items()] + keep
 
 
 def _differences(before: Mapping[str, Any], after: Mapping[str, Any]) -> Iterable[str]:
@@ -133,11 +135,11 @@ def overlays(files: Sequence[Path]) -> list[str]:
         if place:
             old = flat(before)
             changed = [f"{k} {_short(old.get(k))} -> {_short(v)}" for k, v in flat(values).items() if old.get(k) != v]
-            lines.append(f"{file.name} changes {listed(changed, MOST_SHOWN) or 'nothing'}")
+            lines.append(f"{file.name} changes {listed(changed, MOST_CHANGES) or 'nothing'}")
         merge(before, values)
     return lines
 
 
 def _short(value: object) -> str:
     text = json.dumps(value)
-    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+    return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 3]}..."

@@ -19,7 +19,7 @@ from neuspring.experiments.graph import Graph, Unit
 from neuspring.registry import modules
 
 TEMPLATES = Path(__file__).parents[1] / "report" / "templates"
-PLACES = ("results", "output", "table", "method_table", "extra_rows", "observations")
+FILE_OPTIONS = ("results", "output", "table", "method_table", "extra_rows", "observations")
 """Options that say where files are. They are compared by content."""
 RULES = {"tables": 10, "study": 10, "page": 20, "perception_table": 10, "tune": 2880, "sweep_report": 20}
 """Rule -> minutes that a job may take."""
@@ -138,7 +138,7 @@ class Tasks:
         also: str = "",
         where: Sequence[str] = (),
     ) -> Unit:
-        told = {key: value for key, value in given.items() if key not in PLACES}
+        told = {key: value for key, value in given.items() if key not in FILE_OPTIONS}
         tables = [file_stamp(path) for key in ("table", "method_table") if (path := given.get(key))]
         tables += [file_stamp(path) for path in given.get("extra_rows", ())]
         digest = code_digest(*(f"neuspring.{module}" for module in code))
