@@ -12,13 +12,12 @@ import difflib
 import errno
 import os
 import re
-import shutil
 import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.errors import InputError, NumericalFailure, full_disk
 from neuspring.core.version import __version__
 from neuspring.registry import Registry
 
@@ -57,14 +56,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print(f"neuspring: error: {full_disk(Path(error.filename or '.'))}", file=sys.stderr)
         return 1
-
-
-def full_disk(path: Path) -> InputError:
-    """The error of a file that does not fit on its disk."""
-    disk = next(folder for folder in [path.absolute(), *path.absolute().parents] if folder.is_mount())
-    free, whole = (size / 1e9 for size in (shutil.disk_usage(disk).free, shutil.disk_usage(disk).total))
-    rule = f"no space left on device: the disk at {disk} has {free:.1f} of {whole:.1f} GB free"
-    return InputError(path, rule, None, "Free some space there; the same command continues, and what is finished is kept.")
 
 
 def _threads(words: Sequence[str]) -> str:

@@ -18,8 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from neuspring.cli.main import full_disk
-from neuspring.core.errors import InputError
+from neuspring.core.errors import InputError, full_disk
 from neuspring.core.job_records import ASKED, FAILED, FOLDER, JobRecord, asked
 from neuspring.core.lock import try_lock
 from neuspring.core.records import now
@@ -37,10 +36,20 @@ JOB_POLL = 0.5
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-def run(values: Mapping[str, Any], root: Path, rule: str, name: str, digest: str, *, threads: int = 1, gpus: int = 0) -> None:
+def run(
+    values: Mapping[str, Any],
+    root: Path,
+    commands: Mapping[str, Callable[..., Any]],
+    rule: str,
+    name: str,
+    digest: str,
+    *,
+    threads: int = 1,
+    gpus: int = 0,
+) -> None:
     """Run a job of the configuration `values`; ends the process with status 2 for bad input, 1 for another error."""
     graph = Graph(Benchmark(values, root))
-    Tasks(graph)
+    Tasks(graph, commands)
     folder = Path(graph.results) / FOLDER / rule / name
     with logged(folder / f"{digest}.log") as say, alone(folder, say):
         own = Runner(graph, folder / f"{digest}.log", threads)

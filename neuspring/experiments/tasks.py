@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from neuspring.cli.main import COMMANDS
 from neuspring.config import plain
 from neuspring.core.errors import InputError
 from neuspring.core.provenance import code_digest, file_stamp
@@ -26,9 +26,10 @@ RULES = {"tables": 10, "study": 10, "page": 20, "perception_table": 10, "tune": 
 
 
 class Tasks:
-    """Units of rules that are no stages."""
+    """Units of rules that are no stages; `commands` are the functions that they call, by name."""
 
-    def __init__(self, graph: Graph) -> None:
+    def __init__(self, graph: Graph, commands: Mapping[str, Callable[..., Any]]) -> None:
+        self.commands = commands
         self.graph, self.config, self.whole, self.known = graph, graph.config, graph.whole, graph.benchmark
         self.root, self.results = graph.benchmark.root, Path(graph.results)
         self.folder = self.results / self.config.tables
@@ -119,7 +120,7 @@ class Tasks:
             remedy = "Add the section `tune` (config/README.md, config/studies/tune.yaml)."
             raise InputError("configuration, tune", "the target sweep needs a sweep", None, remedy)
         try:
-            from neuspring.extensions.tuning import jobs
+            jobs = import_module("neuspring.extensions.tuning.jobs")
         except ModuleNotFoundError as error:
             rule, remedy = "a sweep needs the extension neuspring/extensions/tuning", "Restore its folder, or leave tune out."
             raise InputError("configuration, tune", rule, "left out", remedy) from error
@@ -153,4 +154,4 @@ class Tasks:
         return Unit(rule=rule, name=name, needs=needs, made_of=made_of, run=run, options=options)
 
     def _call(self, command: str, options: Mapping[str, Any]) -> None:
-        COMMANDS[command](**options)
+        self.commands[command](**options)

@@ -148,7 +148,7 @@ def test_the_demo_has_thirty_jobs_and_the_whole_benchmark_less_than_two_thousand
     from neuspring.experiments.tasks import Tasks
 
     demo = shipped("demo", results=str(tmp_path / "demo"))
-    Tasks(demo)
+    Tasks(demo, {})
     found = counted(demo.todo(targets(demo)))
     assert found == {"perceive": 3, "search": 6, "fit": 6, "appearance": 3, "run": 9} | dict.fromkeys(
         ("tables", "page", "perception_table"), 1

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from neuspring.cli.main import COMMANDS
 from neuspring.core.job_records import JobRecord
 from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.graph import Graph, Unit
@@ -17,7 +18,7 @@ from tests.support.project import ROOT, config_with
 def planned(results: Path | str = "results", **changes: Any) -> Graph:
     """The jobs of the tiny configuration with changes."""
     graph = Graph(Benchmark(config_with({"results": str(results)} | changes), ROOT))
-    Tasks(graph)
+    Tasks(graph, COMMANDS)
     return graph
 
 

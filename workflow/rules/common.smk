@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 from neuspring import config as settings
+from neuspring.cli.main import COMMANDS
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import FOLDER
 from neuspring.experiments import gpus, job, messages, plan
@@ -76,7 +77,7 @@ def jobs():
         len(POOL) * CONFIG.gpus.jobs_per_gpu,
     )
     graph = Graph(benchmark)
-    return graph, Tasks(graph)
+    return graph, Tasks(graph, COMMANDS)
 
 
 def unit_of(rule, wildcards):

@@ -2,11 +2,13 @@
 
 from pathlib import Path
 
+from neuspring.cli.main import COMMANDS
 from neuspring.experiments.job import run
 
 run(
     snakemake.config,  # noqa: F821 - Snakemake's
     Path(snakemake.params.root),  # noqa: F821
+    COMMANDS,
     snakemake.rule,  # noqa: F821
     snakemake.wildcards.job,  # noqa: F821
     snakemake.wildcards.digest,  # noqa: F821
