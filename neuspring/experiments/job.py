@@ -40,6 +40,7 @@ def run(
     values: Mapping[str, Any],
     root: Path,
     commands: Mapping[str, Callable[..., Any]],
+    sweeps: Any,
     rule: str,
     name: str,
     digest: str,
@@ -49,7 +50,7 @@ def run(
 ) -> None:
     """Run a job of the configuration `values`; ends the process with status 2 for bad input, 1 for another error."""
     graph = Graph(Benchmark(values, root))
-    Tasks(graph, commands)
+    Tasks(graph, commands, sweeps)
     folder = Path(graph.results) / FOLDER / rule / name
     with logged(folder / f"{digest}.log") as say, alone(folder, say):
         own = Runner(graph, folder / f"{digest}.log", threads)

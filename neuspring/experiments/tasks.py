@@ -8,7 +8,6 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +25,13 @@ RULES = {"tables": 10, "study": 10, "page": 20, "perception_table": 10, "tune": 
 
 
 class Tasks:
-    """Units of rules that are no stages; `commands` are the functions that they call, by name."""
+    """Units of rules that are no stages; `commands` are the functions that they call, by name.
 
-    def __init__(self, graph: Graph, commands: Mapping[str, Callable[..., Any]]) -> None:
-        self.commands = commands
+    `sweeps`: the module that answers for sweeps; None where its extension was left out.
+    """
+
+    def __init__(self, graph: Graph, commands: Mapping[str, Callable[..., Any]], sweeps: Any = None) -> None:
+        self.commands, self.sweeps = commands, sweeps
         self.graph, self.config, self.whole, self.known = graph, graph.config, graph.whole, graph.benchmark
         self.root, self.results = graph.benchmark.root, Path(graph.results)
         self.folder = self.results / self.config.tables
@@ -104,7 +106,7 @@ class Tasks:
         needs = [self.graph.unit("perceive", scenario) for scenario in self.known.tuned]
         given = {"observations": tuple(self.results / scenario / "observations.npz" for scenario in self.known.tuned)}
         given |= {"settings": jobs.settings(self.known), "worker": int(name), "output": folder / f"worker-{name}.json"}
-        code = ("extensions.tuning.trial",)
+        code = (f"{jobs.__package__}.trial",)
         return self._unit("tune", name, given, needs, code, [given["output"]], jobs.rows(self.known), where=("device", "threads"))
 
     def sweep_report(self, name: str = "all") -> Unit:
@@ -113,18 +115,16 @@ class Tasks:
         assert self.config.tune
         given = {"settings": jobs.settings(self.known), "output": folder / "summary.md"}
         workers = [self.graph.unit("tune", str(worker)) for worker in range(self.config.tune.workers)]
-        return self._unit("sweep_report", name, given, workers, ("extensions.tuning.report",), [given["output"]])
+        return self._unit("sweep_report", name, given, workers, (f"{jobs.__package__}.report",), [given["output"]])
 
     def _tuning(self) -> tuple[Any, Path]:
         if not self.config.tune:
             remedy = "Add the section `tune` (config/README.md, config/studies/tune.yaml)."
             raise InputError("configuration, tune", "the target sweep needs a sweep", None, remedy)
-        try:
-            jobs = import_module("neuspring.extensions.tuning.jobs")
-        except ModuleNotFoundError as error:
+        if self.sweeps is None:
             rule, remedy = "a sweep needs the extension neuspring/extensions/tuning", "Restore its folder, or leave tune out."
-            raise InputError("configuration, tune", rule, "left out", remedy) from error
-        return jobs, self.results / "tune" / self.config.tune.study
+            raise InputError("configuration, tune", rule, "left out", remedy)
+        return self.sweeps, self.results / "tune" / self.config.tune.study
 
     # --- common parts
 
@@ -142,7 +142,7 @@ class Tasks:
         told = {key: value for key, value in given.items() if key not in FILE_OPTIONS}
         tables = [file_stamp(path) for key in ("table", "method_table") if (path := given.get(key))]
         tables += [file_stamp(path) for path in given.get("extra_rows", ())]
-        digest = code_digest(*(f"neuspring.{module}" for module in code))
+        digest = code_digest(*(module if module.startswith("neuspring.") else f"neuspring.{module}" for module in code))
         made_of = {rule: {"options": told, "code": digest, "data": [*tables, also], "inputs": [one.digest for one in needs]}}
         command = {"page": "report", "sweep_report": "tune-report"}.get(rule, rule.replace("_", "-"))
         options = dict(given) if rule in ("tune", "sweep_report") else {"results": self.results, **given}

@@ -14,6 +14,11 @@ from neuspring.experiments.benchmark import checked, for_targets
 from neuspring.experiments.graph import Graph
 from neuspring.experiments.tasks import RULES, Tasks
 
+try:
+    from neuspring.extensions.tuning import jobs as SWEEPS
+except ModuleNotFoundError:
+    SWEEPS = None
+
 ROOT = Path(workflow.basedir)
 # On a cluster the scheduler hands out GPUs, and Snakemake limits jobs (--jobs), not cores. A dry run sets cores to 1; inside a job of
 # the cluster neither is set. Which executor was asked for is not known yet.
@@ -36,6 +41,8 @@ settings.merge(config, settings.of_command_line(workflow.config_settings.config)
 DRY = workflow.output_settings.dryrun
 BENCHMARK = or_workflow_error(checked, config, ROOT, plan_only=DRY)
 CONFIG = BENCHMARK.config
+if CONFIG.tune and SWEEPS:
+    or_workflow_error(SWEEPS.check, BENCHMARK, cluster=CLUSTER)
 RESULTS = CONFIG.results
 POOL = (
     ()
@@ -77,7 +84,7 @@ def jobs():
         len(POOL) * CONFIG.gpus.jobs_per_gpu,
     )
     graph = Graph(benchmark)
-    return graph, Tasks(graph, COMMANDS)
+    return graph, Tasks(graph, COMMANDS, SWEEPS)
 
 
 def unit_of(rule, wildcards):

@@ -5,10 +5,16 @@ from pathlib import Path
 from neuspring.cli.main import COMMANDS
 from neuspring.experiments.job import run
 
+try:
+    from neuspring.extensions.tuning import jobs as SWEEPS
+except ModuleNotFoundError:
+    SWEEPS = None
+
 run(
     snakemake.config,  # noqa: F821 - Snakemake's
     Path(snakemake.params.root),  # noqa: F821
     COMMANDS,
+    SWEEPS,
     snakemake.rule,  # noqa: F821
     snakemake.wildcards.job,  # noqa: F821
     snakemake.wildcards.digest,  # noqa: F821
