@@ -154,7 +154,8 @@ def require_known(settings: Perception) -> None:
     """Raise InputError, with the names that there are, where a configured backend is none of them."""
     for step, name in (("segment", settings.segment.backend), ("track", settings.track.backend)):
         if name not in BACKENDS[step]:
-            raise InputError(f"perception.{step}.backend", f"must be one of {', '.join(BACKENDS[step])}", name)
+            remedy = "Restore the folder of its extension." if name in BACKENDS[step].left_out else ""
+            raise InputError(f"perception.{step}.backend", f"must be one of {', '.join(BACKENDS[step])}", name, remedy)
 
 
 def segmentation_keys(name: str) -> tuple[str, ...]:

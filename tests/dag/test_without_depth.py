@@ -11,6 +11,7 @@ from neuspring.data.capture import POINTS
 from neuspring.intake.points import Hands, write
 from tests.support import spaced as scene
 from tests.support.colored import paint
+from tests.support.extensions import with_extensions
 from tests.support.project import add_scenario, plan, run
 from tests.support.spaced import spaced
 
@@ -26,6 +27,7 @@ COLOR = {
 }
 
 
+@with_extensions
 @pytest.mark.slow
 def test_color_alone_becomes_scores_of_pictures_and_marked_points(project, tmp_path):
     capture = paint(tmp_path / "data" / "painted", frames=10)

@@ -16,6 +16,7 @@ from neuspring.perception.backends import BACKENDS
 from neuspring.perception.film import CameraFilm, Carried
 from neuspring.perception.marks import Marks
 from neuspring.perception.masks import MasksFile, has_masks, save_carried, save_masks
+from tests.support.extensions import with_extensions
 from tests.support.filmed import FRAMES, film
 from tests.support.marked import mark, overlap
 
@@ -84,6 +85,7 @@ def test_masks_of_another_tool_that_do_not_fit(folder, capsys):
     assert "a mask of frame 4 of camera 0 is required, with its number as the name: 00004.png; received" in capsys.readouterr().err
 
 
+@with_extensions
 def test_marks_become_the_masks_of_a_capture(folder, capsys):
     assert main(["mask", str(folder)]) == 0
     out, err = capsys.readouterr()
@@ -115,6 +117,7 @@ def test_marks_become_the_masks_of_a_capture(folder, capsys):
     assert "camera 1: masks are in" in out
 
 
+@with_extensions
 def test_the_workflow_segments_from_marks(folder):
     capture, settings = Capture.load(folder), Perception(segment=Segmentation(backend="marks"))
     labels = BACKENDS["segment"]["marks"].segment(capture, "1", settings, "cpu")
@@ -169,6 +172,7 @@ def test_frames_have_heights_above_the_table(folder):
     assert np.nanmedian(height[truth == OBJECT]) > 0.03
 
 
+@with_extensions
 def test_a_camera_without_marks_and_damaged_files_are_named(folder, capsys):
     Marks(cameras={"0": Marks.load(folder / "marks.json").of("0")}).save(folder / "one.json")
     assert main(["mask", str(folder), "--marks", str(folder / "one.json"), "--cameras", "1"]) == 2

@@ -43,6 +43,7 @@ from results.published.scenes.make import point_errors
 from results.published.scenes.make import tables as scene_tables
 from tests.support import small
 from tests.support.colored import paint
+from tests.support.extensions import with_extensions
 from tests.support.findings import of_level
 from tests.support.real import FILMS
 
@@ -163,6 +164,7 @@ def test_pixels_of_a_scaled_picture_keep_their_place_in_it():
     np.testing.assert_allclose(np.array(mark.points), (np.array(drawn.points) - 0.5) / 2)
 
 
+@with_extensions
 @pytest.mark.skipif(not FILMS.is_dir(), reason="the films are not part of the repository")
 def test_a_film_becomes_a_capture_of_color_alone(tmp_path):
     case = "single_lift_rope"

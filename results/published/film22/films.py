@@ -21,7 +21,6 @@ import numpy as np
 
 from neuspring.data.camera import Camera
 from neuspring.data.capture import CAPTURE, THIN, Capture, Description, Writer
-from neuspring.extensions.color_alone.segment import carry_film
 from neuspring.intake.phystwin import released_cases
 from neuspring.perception.marks import MARKS as MARKS_FILE
 from neuspring.perception.marks import Mark, Marks
@@ -121,6 +120,8 @@ def marks_of(case: str, size: tuple[int, int]) -> tuple[Mark, ...]:
 
 def carried(colors: list[np.ndarray], case: str, scale: float = 1.0) -> np.ndarray:
     """Labels [T, H, W] from the committed marks of frame 0, worked out on pictures of `scale` times the film's size."""
+    from neuspring.extensions.color_alone.segment import carry_film
+
     return carry_film(Frames(colors), marks_of(case, colors[0].shape[1::-1]), scale=scale).labels
 
 

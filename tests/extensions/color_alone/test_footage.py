@@ -74,7 +74,7 @@ def test_masks_and_tracks_of_a_whole_film(case):
         assert found.lost < LOST[case]
 
 
-MARKS = Path(__file__).parents[1] / "data" / "marks"
+MARKS = Path(__file__).parents[2] / "data" / "marks"
 LEAST = {
     "double_lift_cloth_1": 0.95,
     "double_lift_sloth": 0.85,
