@@ -61,7 +61,7 @@ class Registry(Mapping[str, T], Generic[T]):
             elif name in self._foreign:
                 member = self._imported(self._foreign[name])
             else:
-                raise Unknown(self.kind, name, list(self), name in self.left_out)
+                raise Unknown(self.kind, name, list(self))
             self._loaded[name] = member
         return self._loaded[name]
 
@@ -94,9 +94,8 @@ class Registry(Mapping[str, T], Generic[T]):
 class Unknown(InputError, KeyError):
     """No member has this name."""
 
-    def __init__(self, kind: str, name: str, known: list[str], left_out: bool = False) -> None:
-        remedy = "Restore the folder of its extension" if left_out else f"Known: {', '.join(known)}"
-        super().__init__(kind, "must be a registered name", name, f"{remedy}.")
+    def __init__(self, kind: str, name: str, known: list[str]) -> None:
+        super().__init__(kind, "must be a registered name", name, f"Known: {', '.join(known)}.")
 
 
 def modules(package: str, member: str = "{}") -> dict[str, str]:

@@ -167,6 +167,8 @@ def test_pixels_of_a_scaled_picture_keep_their_place_in_it():
 @with_extensions
 @pytest.mark.skipif(not FILMS.is_dir(), reason="the films are not part of the repository")
 def test_a_film_becomes_a_capture_of_color_alone(tmp_path):
+    from neuspring.extensions.color_alone.first_frame import FirstFrame
+
     case = "single_lift_rope"
     capture = write_capture(FILMS, tmp_path, case, 5)
     about, camera = capture.description, capture.cameras["0"]
@@ -175,12 +177,13 @@ def test_a_film_becomes_a_capture_of_color_alone(tmp_path):
     np.testing.assert_array_equal(capture.color("0", 4), film(FILMS, case, 5)[4])
     assert (capture.mask("0", 4) == 1).sum() > 1700
     Marks.load(capture.folder / MARKS).require(capture)
-    found = check_layout(capture.folder)
-    assert of_level(found, "error") == []
+    assert of_level(check_layout(capture.folder), "error") == []
     # The README of the footage back-projects the white rope onto the table: 38.7 cm from tip to tip (nobody measured it with a
-    # ruler). The mask ends within three pixels of 2.6 mm at both ends, and the size is told in whole centimeters.
-    (length,) = (int(size[1]) for text in of_level(found, "note") if (size := re.search(r"object size on the table (\d+) x", text)))
-    assert length == pytest.approx(38.7, abs=1.6 + 0.5)
+    # ruler). The mask ends within three pixels of 2.6 mm at both ends.
+    y, x = np.nonzero(capture.mask("0", 0) == OBJECT)
+    middle = np.quantile(rope := FirstFrame.of(capture, capture.mask("0", 0)).points(np.stack([x, y], axis=1)), 0.5, axis=0)
+    along = (rope - middle) @ np.linalg.svd(rope - middle, full_matrices=False)[2][0]
+    assert 100 * np.ptp(along) == pytest.approx(38.7, abs=1.6 + 0.5)
 
 
 def test_hands_count_by_their_motion_alone():
