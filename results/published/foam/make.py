@@ -28,8 +28,6 @@ from neuspring.core.run_folder import RunFolder
 from neuspring.core.table import Table
 from neuspring.draw.sheet import save
 from neuspring.extensions.rods import posed
-from neuspring.extensions.rods.made import marker_shares
-from neuspring.extensions.rods.rod import Rod, rod_of
 from neuspring.report.blocks import markdown
 from neuspring.twin.body import body_of
 from neuspring.twin.rollout import roll_out
@@ -90,41 +88,6 @@ def way(twin: Twin, folder: Path, trajectory: int, settings: Config) -> np.ndarr
     positions = roll_out(moved, here.controller_points).positions[:, END].astype(np.float64)
     last = stride * (len(positions) - 1)
     return np.asarray(CubicSpline(np.arange(0, last + 1, stride), positions)(np.arange(last + 1)))
-
-
-def with_vertices(twin: Twin, count: int, tracked: int = 2) -> Twin:
-    """A rod that was laid out, with other vertices and the same body: fields along the arc, places and masses of markers."""
-    rod = rod_of(twin)
-    length = float(rod.lengths[0] * (len(rod.mass) - 1.5))
-    edge = length / (count - 1.5)
-    old, new = (h * (np.arange(n) - 0.5) for h, n in ((rod.lengths[0], len(rod.mass)), (edge, count)))
-    inner = slice(1, -1)
-
-    def along(values: np.ndarray) -> np.ndarray:
-        return np.asarray(CubicSpline(old[inner], values[inner], bc_type="natural")(np.clip(new, old[1], old[-2])))
-
-    at = old[rod.edge] + rod.place[:, 0] * rod.lengths[rod.edge]
-    edges = np.clip(np.searchsorted(new, at, side="right") - 1, 0, count - 2).astype(np.int32)
-    own = [np.convolve(lengths, [0.5, 0.5]) for lengths in (rod.lengths, np.full(count - 1, edge))]
-    masses = np.linalg.lstsq(marker_shares(rod, tracked), rod.mass - own[0])[0]
-    finer = _laid(
-        rod,
-        count,
-        lengths=np.full(count - 1, edge),
-        bending=along(rod.bending),
-        twisting=along(rod.twisting),
-        curvature=edge * np.stack([along(column / rod.lengths[0]) for column in rod.curvature.T], axis=1),
-        edge=edges,
-        place=np.column_stack([(at - new[edges]) / edge, rod.place[:, 1:]]),
-        mass=own[1],
-    )
-    return replace(twin, body=replace(finer, mass=own[1] + marker_shares(finer, tracked) @ masses))
-
-
-def _laid(rod: Rod, count: int, **values: np.ndarray) -> Rod:
-    held = np.full(count, -1, np.int32)
-    held[:2] = rod.held[:2]
-    return replace(rod, vertices=np.zeros((count, 3)), held=held, **values)
 
 
 def scored(folder: Path, ways: Mapping[str, np.ndarray], truth: np.ndarray, trajectory: int) -> pd.DataFrame:
