@@ -12,8 +12,8 @@ from neuspring.registry import Registry
 PACKAGE = Path(__file__).parents[2] / "neuspring"
 BESIDE = {"auto", "none", "all"}
 """Words that stand for no member."""
-CHANCE = {frozenset({"score", "train"})}
-"""Words of a capture.json that are the names of two stages by chance."""
+CHANCE = {frozenset({"score", "train"}), frozenset({"measured", "none"})}
+"""Words that the format of capture.json defines: two are names of stages by chance, two of the lifters that read it."""
 
 
 def registries() -> dict[str, Registry[object]]:
