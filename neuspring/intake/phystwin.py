@@ -90,7 +90,8 @@ def read(row: ScenarioRow, folder: Path) -> Observations:
 
 def arrays_of(path: Path) -> dict[str, np.ndarray]:
     """The arrays of final_data.pkl. Raises InputError for the first rule that they break."""
-    data, sizes = load_pickle(path), dict[str, int]()
+    data: dict[str, np.ndarray] = load_pickle(path)
+    sizes = dict[str, int]()
     _require(isinstance(data, dict), path, "a dict of arrays is required", type(data).__name__)
     for key, (shape, kind) in CASE_ARRAYS.items():
         value, form = data.get(key), f"{key}: a {'bool' if kind == 'b' else 'floating point'} array {list(shape)} is required"
@@ -133,7 +134,7 @@ def metadata_of(case: Path) -> dict[str, Any]:
 
 def rate_of(path: Path, metadata: dict[str, Any], default: float | None = None) -> float:
     """fps of metadata.json. Raises InputError."""
-    fps = metadata.get("fps", default)
+    fps: Any = metadata.get("fps", default)
     _require(type(fps) in (int, float) and 0 < fps < 1e6, path, "fps: a positive number of frames per second is required", fps)
     return float(fps)
 

@@ -71,9 +71,9 @@ def convert(name: str, category: str, case: Path, folder: Path) -> Capture:
     )
     refuse(description_findings(case / "color", description))
     first = case / "depth" / cameras[0].name / "0.npy"
-    if (kind := read_array(first, cameras[0]).dtype) != np.uint16:
+    if (dtype := read_array(first, cameras[0]).dtype) != np.uint16:
         remedy = f"Write uint16, and the unit as {UNIT_KEY} of {METADATA} (m per count), if it is not 0.001."
-        raise InputError(first, "depth must be 16-bit counts", kind, remedy)
+        raise InputError(first, "depth must be 16-bit counts", dtype, remedy)
     writer = Writer(folder, description)
     for camera in cameras:
         ids = detections(case, camera.name) if has_masks else {}

@@ -68,7 +68,7 @@ def causes(runs: Iterable[RunRecord]) -> list[tuple[str, str]]:
     if not max((held for values in facts if (held := _gripping(values)) is not None), default=1):
         found.append(("no spring joins a hand to the object, so nothing moves it", "Look at the hands in lifted.png."))
     limited = {one.name: one for _, one in sorted(of_fits(runs), key=lambda pair: pair[1].value)}
-    found += [("up to " + one.text.removesuffix(one.remedy).rstrip(" ."), one.remedy) for one in limited.values()]
+    found += [(one.text.removesuffix(one.remedy).rstrip(" ."), one.remedy) for one in limited.values()]
     if ends:
         names = ", ".join(sorted(ends))
         found.append((f"the search ended at an end of its range in {names}", f"Widen search.variables for {names}."))

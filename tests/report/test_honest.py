@@ -47,7 +47,7 @@ def test_a_good_run_says_how_many_springs_hold_the_hands_and_nothing_else():
     ("changes", "text"),
     [
         ({"search.result.at_ends": "drag, object_radius"}, "the search ended at an end of its range in drag, object_radius"),
-        ({"fit.result.at_bound": 0.25}, "up to 25% of the springs lie at the bound of their stiffness"),
+        ({"fit.result.at_bound": 0.25}, "fraction of the springs at the bound of their stiffness (fit.output_bound): 25 %"),
         ({"fit.result.best_epoch": 0}, "training improved nothing: the best epoch is the first"),
         ({"fit.result.object_springs": 100}, "no spring joins a hand to the object, so nothing moves it"),
     ],

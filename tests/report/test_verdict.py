@@ -167,9 +167,9 @@ def test_the_cause_is_what_the_records_of_the_weakest_scenario_say_with_the_next
     warned = finding("two objects", "warning", "camera 0", "2 pieces", "one is expected", "Look at masks.png; mark it.")
     texts = said(replace(collected(TWO), records=records), warnings=(("b", warned), ("a", replace(warned, name="other"))))
     assert texts["Probable cause"] == (
-        "b: two objects (camera 0). Look at masks.png; mark it. ours on b: up to 38% of the springs lie at the bound of their "
-        "stiffness (fit.output_bound). Raise output_bound in the settings of the row ours of the method table. ours on b: the "
-        "search ended at an end of its range in drag. Widen search.variables for drag."
+        "b: two objects (camera 0). Look at masks.png; mark it. ours on b: fraction of the springs at the bound of "
+        "their stiffness (fit.output_bound): 38 %, at most 5 % expected; a wider bound may predict better. Raise fit.output_bound "
+        "of this method, and compare. ours on b: the search ended at an end of its range in drag. Widen search.variables for drag."
     )
 
 

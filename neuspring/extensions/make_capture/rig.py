@@ -13,7 +13,6 @@ cameras      in the order of --color, of each: name (optional), width, height, f
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -177,7 +176,7 @@ class Straightener:
     """Removes the distortion of one camera's images; K stays."""
 
     def __init__(self, lens: Lens, size: tuple[int, int]) -> None:
-        self.maps: Sequence[np.ndarray] = ()
+        self.maps: tuple[np.ndarray, np.ndarray] | None = None
         k, coefficients = lens.matrix, lens.distortion
         if coefficients.any():
             module = cv2.fisheye if lens.model == "fisheye" else cv2
