@@ -17,7 +17,7 @@ from neuspring.scores.paper import Study, read_studies
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from neuspring.scores.runs import Collected
+    from neuspring.scores.table import ScoreTable
 
 OnDisk = Annotated[tuple[str, ...], arg(help="all on disk by default")]
 Names = Annotated[tuple[str, ...], arg(help="those of the settings, else all on disk, by default")]
@@ -40,64 +40,55 @@ def tables(
     baseline: Annotated[str | None, arg(help="method that others are compared with; the first by default")] = None,
     objects: Annotated[Literal["scenario", "category"], arg(help="what intervals of ratios are over")] = "scenario",
     aims: Annotated[str, arg(help="JSON: ratios that are aimed at (config/README.md, aims)")] = "[]",
-    studies: Annotated[tuple[str, ...], arg(help="rows of the study table whose numbers are kept too")] = (),
-    table: RowTable = Path("config/studies.yaml"),
     scores: Scores = None,
     left_out: LeftOut = "{}",
     method_table: RowTable = Path("config/methods.yaml"),
     extra_rows: ExtraRows = (),
-    brief: Annotated[bool, arg(help="print the verdict and the first table alone")] = False,
+    brief: Annotated[bool, arg(help="print the verdict alone")] = False,
 ) -> None:
-    """Run records -> numbers.json, each number computed once, and the benchmark's tables."""
+    """Run records -> the long table of scores (scores.csv, runs.csv), and the benchmark's tables."""
     from neuspring.config.settings import Aim
-    from neuspring.core.findings import warnings_of
     from neuspring.core.job_records import asked
+    from neuspring.report import tables
+    from neuspring.report.blocks import markdown
     from neuspring.report.data import traces
-    from neuspring.report.gallery import write_gallery
-    from neuspring.report.summary import write
-    from neuspring.report.verdict import headline
     from neuspring.scores.metrics import require_metrics
-    from neuspring.scores.numbers import Numbers, shown_names
-    from neuspring.scores.runs import as_asked, collect, collect_transfers
+    from neuspring.scores.table import as_asked, collect
 
     wanted = tuple(parse(Aim, row, "--aims") for row in json_value("--aims", aims, list))
     require_metrics(wanted)
-    known = read_studies(table, extra_rows) if studies else {}
-    shown = {name: _study(known, name) for name in studies}
-    names = shown_names(method_table, extra_rows)
-    common: Any = {"objects": objects, "aims": wanted, "studies": shown, "known_studies": known, "names": names}
+    absent = _read_left_out(left_out)
+    common: Any = {"objects": objects, "aims": wanted, "names": tables.shown_names(method_table, extra_rows)}
     if scores:
         found = _read_scores(scores, scenarios, methods, seeds, left_out)
-        print(write(Numbers(everything=found, baseline=baseline or str(found.runs["method"].iloc[0]), **common), output))
-        return
-    there = traces(results)
-    scenarios, methods, seeds = scenarios or tuple(there[0]), methods or tuple(there[1]), seeds or tuple(there[2])
-    if not (scenarios and methods and seeds):
-        raise InputError(results, "a results folder with runs is required", remedy="Run the workflow first, or name another.")
-    collected, part = as_asked(collect(results, scenarios, methods, seeds, _read_left_out(left_out)), asked(results))
-    warned = warnings_of(results, scenarios)
-    more: Any = {"results": results, "asked": part, "warnings": warned}
-    moved = collect_transfers(results, transfers, methods, seeds)
-    numbers = Numbers(everything=collected, baseline=baseline or methods[0], transfers=moved, **common, **more)
-    text = write(numbers, output)
-    print(headline(text) if brief else text)
+    else:
+        there = traces(results)
+        scenarios, methods, seeds = scenarios or tuple(there[0]), methods or tuple(there[1]), seeds or tuple(there[2])
+        if not (scenarios and methods and seeds):
+            raise InputError(results, "a results folder with runs is required", "none", "Run the workflow first, or name another.")
+        about = asked(results)
+        found, _ = as_asked(collect(results, scenarios, methods, seeds, absent, transfers), about)
+        common |= {"results": results, "asked": about}
+    numbers = tables.Benchmark(table=found, baseline=baseline or found.methods[0], **common)
+    text = tables.write(numbers, output)
+    print(markdown(tables.verdict(numbers)) if brief else text)
     print(f"Tables: {output / 'summary.md'}")
-    finished = collected.runs.loc[collected.runs["status"] == "ok", "seed"].to_list()
-    seed = next((seed for seed in seeds if seed in finished), seeds[0])
-    print(f"Pictures and videos: {write_gallery(results, scenarios, methods, seed, numbers, output)}")
 
 
-def _study(studies: dict[str, Study], name: str) -> Study:
-    """A study by its name. Raises InputError."""
+def _study(table: Path, extra: Sequence[Path], name: str) -> Study:
+    """A study of the study table, or of files of extra rows. Raises InputError."""
+    studies = read_studies(table, extra)
     if name not in studies:
-        raise InputError("study", "must be a row of the study table", name)
+        raise InputError("study", f"must be a row of {table}", name, f"Known: {', '.join(studies)}")
     return studies[name]
 
 
-def _read_scores(path: Path, scenarios: Sequence[str], methods: Sequence[str], seeds: Sequence[int], left_out: str) -> Collected:
-    from neuspring.scores.runs import read_scores
+def _read_scores(
+    path: Path, scenarios: Sequence[str], methods: Sequence[str], seeds: Sequence[int], left_out: str, current: bool = False
+) -> ScoreTable:
+    from neuspring.scores.table import read_scores
 
-    found = read_scores(path).named(scenario=scenarios, method=methods, seed=seeds)
+    found = read_scores(path, current).named(scenario=scenarios, method=methods, seed=seeds)
     return replace(found, left_out=_read_left_out(left_out))
 
 
@@ -107,7 +98,8 @@ def perception_table(
     """Errors of perception, per category."""
     from neuspring.report import perception
 
-    print(perception.write(perception.collect(results, [*json_value("--scenarios", scenarios).items()]), output.parent))
+    named = [(name, str(category)) for name, category in json_value("--scenarios", scenarios).items()]
+    print(perception.write(perception.collect(results, named), output.parent))
 
 
 def study(
@@ -118,62 +110,36 @@ def study(
     scores: Scores = None,
     table: RowTable = Path("config/studies.yaml"),
     extra_rows: ExtraRows = (),
-    scenarios: Annotated[tuple[str, ...], arg(help="with --scores: a part of it")] = (),
+    scenarios: Annotated[tuple[str, ...], arg(help="a part of the scores")] = (),
     methods: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (),
     left_out: LeftOut = "{}",
 ) -> None:
-    """The numbers that `tables --studies` kept, or a scores.csv -> one of the paper's tables, beside the paper's values."""
+    """The scores.csv that `tables` wrote -> one of the paper's tables, beside the paper's values."""
     from neuspring.report.study import write_study
-    from neuspring.scores.numbers import Numbers
-    from neuspring.scores.study import StudyNumbers
 
-    if scores:
-        studies = read_studies(table, extra_rows)
-        if (one := _study(studies, study)).kind:
-            remedy = "Leave out --scores; `neuspring tables --studies` makes its numbers."
-            raise InputError(f"study {study}", f"a study of the kind {one.kind} needs a results folder", "scores alone", remedy)
-        everything = _read_scores(scores, scenarios, methods, seeds, left_out)
-        numbers = Numbers(everything=everything, baseline="", studies={study: one}, known_studies=studies)
-    else:
-        numbers = Numbers.load(results / tables, results)
-        if study not in numbers.by_study:
-            known = ", ".join(numbers.by_study) or "none"
-            raise InputError(
-                "--study", f"must be in {results / tables}", study, f"There: {known}. Make it: tables --studies {study}."
-            )
-    found = numbers.by_study[study]
-    print(write_study(found, output) if isinstance(found, StudyNumbers) else found.write(output))
+    one = _study(table, extra_rows, study)
+    if scores and one.kind:
+        remedy = "Leave out --scores and name --results."
+        raise InputError(f"study {study}", f"a study of the kind {one.kind} needs a results folder", "scores alone", remedy)
+    found = _read_scores(scores or results / tables / "scores.csv", scenarios, methods, seeds, left_out, current=not scores)
+    print(write_study(study, one, found, results, output))
 
 
 def explain(
     what: Annotated[
-        Positional[str],
-        arg(help="METHOD/TASK/METRIC, STUDY/ROW/TASK/METRIC, SCENARIO/METHOD/SEED, or a folder; lists what there is by default"),
-    ] = "",
+        Positional[str], arg(help="names of a method, scenario, seed, task or metric, with / between: neuspring/future/TE")
+    ],
     results: Results = Path("results"),
     tables: Tables = "tables",
-    json: bool = False,
-) -> int:
-    """A number or a run -> the runs and records behind it; 1 if one is missing, failed, or newer than the table."""
-    from neuspring.report.explain import explain, known, run_text, runs_of, text
+) -> None:
+    """A number -> the rows of scores.csv behind it, and the records of their runs."""
+    from neuspring.core.table import lay_out
+    from neuspring.report.tables import behind
+    from neuspring.scores.table import read_scores
 
-    folder = results / tables
-    if not what:
-        print(known(results, folder))
-        return 0
-    if runs := runs_of(what, results):
-        if json:
-            raise InputError("--json", "is for a number", what, "The records of a run are JSON themselves: its run.json.")
-        found = [run_text(path) for path in runs]
-        print("\n\n".join(lines for lines, _ in found))
-        return 0 if all(good for _, good in found) else 1
-    if what.count("/") < 2:
-        rule = "must be METHOD/TASK/METRIC, STUDY/ROW/TASK/METRIC, or a run that there is"
-        raise InputError(f"explain {what}", rule, remedy="`neuspring explain` lists what there is.")
-    explanation = explain(what, results, folder)
-    print(explanation.as_json() if json else text(explanation), end="")
-    return 1 if explanation.problems else 0
+    found = behind(read_scores(results / tables / "scores.csv", current=True), what.split("/"), results)
+    print(f"{found.caption}\n\n{lay_out(found, 'text')}")
 
 
 def report(
@@ -196,7 +162,7 @@ def report(
 ) -> None:
     """Results folder -> one self-contained HTML file."""
     from neuspring.report import page
-    from neuspring.scores.numbers import shown_names
+    from neuspring.report.tables import shown_names
 
     options = page.Options(
         scenarios=scenarios,

@@ -1,54 +1,42 @@
-"""A table is one value: cells of text, marks and sorting keys, as Markdown and LaTeX; the report's page draws it as HTML."""
+"""A table is one value, laid out as terminal text, Markdown, LaTeX or HTML by `lay_out`."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
+from markupsafe import Markup, escape
+
 Tone = Literal["", "good", "bad", "warn", "mute"]
-LONG_GROUPS = {"Recon.": "Reconstruction & Resimulation", "Future": "Future Prediction"}
-"""Groups of columns as LaTeX names them, which has room above the columns."""
-MARKDOWN_MARKS = {"": "{}", "best": "**{}**", "second": "<ins>{}</ins>"}
-LATEX_MARKS = {"": "{}", "best": r"\textbf{{{}}}", "second": r"\underline{{{}}}"}
+Form = Literal["text", "markdown", "latex", "html"]
+MARKS = {
+    "text": {"": "{}", "best": "{}", "second": "{}"},
+    "markdown": {"": "{}", "best": "**{}**", "second": "<ins>{}</ins>"},
+    "latex": {"": "{}", "best": r"\textbf{{{}}}", "second": r"\underline{{{}}}"},
+    "html": {"": "{}", "best": "<b>{}</b>", "second": "<u>{}</u>"},
+}
 TEX = {
     **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"},
     **{character: f"\\{character}" for character in "{}%_&#$"},
-    **{"±": r"$\pm$", "↓": r"$\downarrow$", "↑": r"$\uparrow$", "–": "--", "<": r"$<$", ">": r"$>$", "|": r"$|$", "[": "{[}"},
+    **{"±": r"$\pm$", "↓": r"$\downarrow$", "↑": r"$\uparrow$", "–": "--", "…": "..."},
+    **{"<": r"$<$", ">": r"$>$", "|": r"$|$", "[": "{[}"},
 }
-LATEX_PREAMBLE = "% Needs \\usepackage{booktabs} and \\usepackage{graphicx}."
-
-
-@dataclass(frozen=True, kw_only=True)
-class Chip:
-    """A word on a colored ground, with a symbol, so that nothing is said by color alone."""
-
-    text: str
-    tone: Tone = ""
-    symbol: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """A cell: a main text, then smaller texts and chips."""
+    """A cell of a table."""
 
     text: str = ""
-    small: Sequence[str] = ()
-    chips: Sequence[Chip] = ()
     mark: Literal["", "best", "second"] = ""
     tone: Tone = ""
     value: float | str | None = None
-    """Key by which the column is sorted; None: the text."""
+    """Sorting key of the column; None: the text."""
     wrap: bool = False
     """May take several lines."""
     link: str = ""
-
-    @property
-    def plain(self) -> str:
-        """All of it in one line."""
-        text, chips = " ".join([self.text, *self.small]).strip(), ", ".join(chip.text for chip in self.chips)
-        return f"{text}: {chips}" if text and chips else text or chips
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,85 +46,75 @@ class Table:
     header: Sequence[str]
     rows: Sequence[Sequence[Cell]]
     caption: str = ""
-    groups: Sequence[str] = ()
-    """Group of each column behind the stub, for example a task; empty: columns are not grouped."""
-    stub: int = 1
-    sortable: bool = False
     note: str = ""
     """One paragraph."""
+    stub: int = 1
 
     @classmethod
-    def of_texts(cls, header: Sequence[str], rows: Iterable[Iterable[str]], caption: str = "") -> Table:
+    def of_texts(cls, header: Sequence[str], rows: Iterable[Iterable[object]], caption: str = "", note: str = "") -> Table:
         """A table of plain texts."""
-        return cls(caption=caption, header=header, rows=[[Cell(text=text) for text in row] for row in rows])
-
-    @property
-    def headings(self) -> list[str]:
-        """The header with the group before each heading."""
-        rest = self.header[self.stub :]
-        grouped = [f"{group} {text}" for group, text in zip(self.groups, rest, strict=True)] if self.groups else rest
-        return [*self.header[: self.stub], *grouped]
+        return cls(caption=caption, note=note, header=header, rows=[[Cell(text=str(text)) for text in row] for row in rows])
 
     def markdown(self) -> list[str]:
-        """Lines in which a row with a first cell alone is a heading, which widens no column."""
-        rows = [
-            [MARKDOWN_MARKS[cell.mark].format(cell.plain.replace("|", "\\|").replace("\n", " ")) for cell in row]
-            for row in self.rows
-        ]
-        several = len(self.header) > 1
-        alone = [several and bool(row[0]) and not any(row[1:]) for row in rows]
-        widening = [self.headings, *(row for row, heading in zip(rows, alone, strict=True) if not heading)]
-        widths = [max(map(len, column)) for column in zip(*widening, strict=True)]
-        lines = ["|" + "|".join("-" * (width + 2) for width in widths) + "|"]
-        for row, heading in zip(rows, alone, strict=True):
-            lines.append(f"| *{row[0]}* |{' |' * (len(row) - 1)}" if heading else _markdown_row(row, widths))
-        return [_markdown_row(self.headings, widths), *lines]
-
-    def latex(self, label: str, title: str) -> str:
-        """A float to \\input; `LATEX_PREAMBLE` says what it needs. One with groups or a stub of several is as wide as a line."""
-        count, stub, numbers = len(self.header), self.stub, bool(self.groups) or self.stub > 1
-        head, tail = ("\\small\n\\resizebox{\\linewidth}{!}{%", "}") if numbers else ("\\footnotesize", "")
-        spec = f"{'l' * stub} {'r' * (count - stub)}" if numbers else f"{'l' * (count - 1)} p{{0.75\\linewidth}}"
-        lines = [f"\\begin{{table*}}[t]\n\\centering\n{head}", f"\\begin{{tabular}}{{@{{}} {spec} @{{}}}}", "\\toprule"]
-        if self.groups:
-            spans, rules, first = [], [], stub + 1
-            for group in dict.fromkeys(self.groups):
-                width = list(self.groups).count(group)
-                spans.append(f"\\multicolumn{{{width}}}{{c}}{{{tex(LONG_GROUPS.get(group, group))}}}")
-                rules.append(f"\\cmidrule(lr){{{first}-{first + width - 1}}}")
-                first += width
-            lines += [_tex_row(["Task", *[""] * (stub - 1), *spans]), " ".join(rules)]
-        lines += [_tex_row([tex(text) for text in self.header]), "\\midrule"]
-        blocks = any(not row[0].text for row in self.rows)
-        for index, row in enumerate(self.rows):
-            # A row without a first cell belongs to the row above.
-            lines += ["\\addlinespace"] if index and blocks and row[0].text else []
-            lines.append(_tex_row([LATEX_MARKS[cell.mark].format(tex(cell.plain)) for cell in row]))
-        caption = f"\\caption{{\\textbf{{{tex(title)}.}} {tex(self.note)}}}"
-        lines += ["\\bottomrule", f"\\end{{tabular}}{tail}", caption, f"\\label{{tab:{label}}}", "\\end{table*}"]
-        return "\n".join(lines) + "\n"
-
-    @property
-    def parts(self) -> list[Table]:
-        """A table for each group of columns, for a page, which is narrower than paper on its side."""
-        return [self._of_group(group) for group in dict.fromkeys(self.groups)] or [self]
-
-    def _of_group(self, group: str) -> Table:
-        kept = [*range(self.stub), *(self.stub + k for k, name in enumerate(self.groups) if name == group)]
-        caption = f"{self.caption}: {LONG_GROUPS.get(group, group)}"
-        rows = [[row[k] for k in kept] for row in self.rows]
-        return replace(self, caption=caption, header=[self.header[k] for k in kept], rows=rows, groups=())
+        """Lines of the table in Markdown, without caption and note."""
+        return lay_out(self, "markdown").splitlines()
 
 
-def _markdown_row(cells: Sequence[str], widths: Sequence[int]) -> str:
-    return "| " + " | ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)) + " |"
+def lay_out(table: Table, form: Form, label: str = "") -> str:
+    """The table in one of four forms; `label` names the float in LaTeX, which needs booktabs and graphicx."""
+    change = {"latex": tex, "html": coded, "markdown": lambda text: text.replace("|", "\\|").replace("\n", " ")}.get(form, str)
+    head = [str(change(text)) for text in table.header]
+    rows = [[MARKS[form][cell.mark].format(change(cell.text)) for cell in row] for row in table.rows]
+    if form == "html":
+        return _html(table, head, rows)
+    if form == "latex":
+        return _latex(table, head, rows, label)
+    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
+    lines = []
+    for row in (head, ["-" * width for width in widths], *rows):
+        cells = [text.ljust(width) for text, width in zip(row, widths, strict=True)]
+        lines.append(f"| {' | '.join(cells)} |" if form == "markdown" else "  ".join(cells).rstrip())
+    return "\n".join(lines)
+
+
+def _latex(table: Table, head: Sequence[str], rows: Sequence[Sequence[str]], label: str) -> str:
+    wraps = any(cell.wrap for row in table.rows for cell in row)
+    count, begin, end = len(head), "\\footnotesize" if wraps else "\\small\n\\resizebox{\\linewidth}{!}{%", "" if wraps else "}"
+    spec = f"{'l' * (count - 1)} p{{0.75\\linewidth}}" if wraps else "l" * table.stub + "r" * (count - table.stub)
+    lines = [" & ".join(row) + r" \\" for row in (head, *rows)]
+    body = "\n".join(["\\toprule", lines[0], "\\midrule", *lines[1:], "\\bottomrule"])
+    caption = f"\\caption{{\\textbf{{{tex(table.caption)}.}} {tex(table.note)}}}\n\\label{{tab:{label}}}"
+    tabular = f"{begin}\n\\begin{{tabular}}{{@{{}}{spec}@{{}}}}\n{body}\n\\end{{tabular}}{end}"
+    return f"\\begin{{table*}}[t]\n\\centering\n{tabular}\n{caption}\n\\end{{table*}}\n"
+
+
+def _html(table: Table, head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = []
+    for cells, texts in zip(table.rows, rows, strict=True):
+        made = []
+        for k, (cell, text) in enumerate(zip(cells, texts, strict=True)):
+            tag, kinds = ("th", ' scope="row"') if k < table.stub else ("td", "")
+            if classes := " ".join(filter(None, [cell.tone, "wrap" * cell.wrap])):
+                kinds += f' class="{classes}"'
+            if cell.value is not None:
+                kinds += f' data-value="{escape(cell.value)}"'
+            shown = f'<a href="{escape(cell.link)}">{text}</a>' if cell.link else text
+            made.append(f"<{tag}{kinds}>{shown}</{tag}>")
+        lines.append(f"<tr>{''.join(made)}</tr>")
+    heads = "".join(f'<th scope="col">{text}</th>' if text else "<td></td>" for text in head)
+    caption = f"<caption><span>{coded(table.caption)}</span></caption>" if table.caption else ""
+    begin = f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(table.caption)}"><table class="sortable">'
+    note = f'\n<p class="note">{coded(table.note)}</p>' if table.note else ""
+    body = "\n".join(lines)
+    return Markup(f"{begin}{caption}\n<thead><tr>{heads}</tr></thead>\n<tbody>\n{body}\n</tbody></table></div>{note}")
+
+
+def coded(text: str) -> Markup:
+    """Escaped text with `code` between backticks."""
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
 def tex(text: str) -> str:
     """Plain text for LaTeX: special characters escaped, minus signs in mathematics."""
     escaped = "".join(TEX.get(character, character) for character in text)
     return re.sub(r"(?<![\w$.-])-(?=\d)", "$-$", escaped)
-
-
-def _tex_row(cells: Sequence[str]) -> str:
-    return " & ".join(cells) + r" \\"

@@ -116,8 +116,8 @@ def for_targets(values: Mapping[str, Any], targets: Collection[str], root: Path)
 
 
 def rows_of(studies: Mapping[str, Study], name: str) -> tuple[str, ...]:
-    """The methods in the rows of a study, and in those of the study beside it."""
-    shown = [studies[each] for each in (name, studies[name].beside) if each]
+    """The methods in the rows of a study."""
+    shown = [studies[name]]
     return tuple(dict.fromkeys(method for study in shown for method in study.rows.values()))
 
 
@@ -345,7 +345,7 @@ class Benchmark:
         return wanted if wanted in self.whole.methods else self.whole.methods[0]  # type: ignore[return-value]
 
     def methods_of(self, study: str) -> tuple[str, ...]:
-        """The chosen methods that stand in a study's rows, and in those of the study beside it."""
+        """The chosen methods that are in a study's rows."""
         return tuple(name for name in rows_of(self.studies, study) if name in self.methods)
 
     def _row(self, name: str) -> ScenarioRow:

@@ -65,12 +65,10 @@ def failed(graph: Graph, tasks: Tasks, begun: float) -> None:
 
 def finished(graph: Graph, begun: float) -> None:
     """After success: the verdict, a table, what to open, where the runs are in MLflow, how long it took."""
-    from neuspring.report.verdict import headline
-
     config, folder, neuspring = graph.config, f"{graph.results}/{graph.config.tables}", program("neuspring")
     summary = Path(folder) / "summary.md"
     if summary.exists():
-        print(f"\n{headline(summary.read_text())}\n")
+        print("\n" + summary.read_text().partition("\n## ")[0].removeprefix("# Scores").strip() + "\n")
         tell_findings(graph)
         page = f"{folder}/report.html"
         print(f"Open in a browser: {page}" if Path(page).exists() else "The report is made by the target `all`.")
@@ -81,7 +79,7 @@ def finished(graph: Graph, begun: float) -> None:
             print(f"{study}: {path}")
     if not summary.exists():
         return
-    print(f"What is behind a number: {neuspring} explain --results {shlex.quote(config.results)}")
+    print(f"What is behind a number: {neuspring} explain METHOD/future/TE --results {shlex.quote(config.results)}")
     if config.tracking.enabled:
         tracking = json.dumps({"tracking": plain(config.tracking)}, sort_keys=True)
         place = ["--results", config.results, *(["--settings", tracking] if config.tracking.uri else [])]

@@ -1,6 +1,6 @@
 """The jobs that look at many runs: tables, study, page (the report), perception_table; and those of a sweep.
 
-They concern the whole configuration, whatever part of it runs now. `tables` computes every number, once.
+They concern the whole configuration, whatever part of it runs now. `study` and `page` read what `tables` wrote, or the runs.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ class Tasks:
     # --- tables and pages
 
     def tables(self, name: str = "all") -> Unit:
-        """Every number, and the summary."""
+        """The long table of scores, and the summary."""
         given = {"output": self.folder, "baseline": self.known.compared_with, **self._runs(), **self._transfers()}
         given |= {"aims": json.dumps(plain(self.config)["aims"]), "objects": self.config.objects}
-        given |= {"studies": tuple(self.whole.studies), **self._row_tables()}
-        files = [self.folder / "summary.md", self.folder / "numbers.json"]
-        return self._unit("tables", name, given, self.graph.runs(), ("report.summary", "report.gallery"), files)
+        given |= {"method_table": self.root / self.config.method_table, "extra_rows": tuple(self.known.extra)}
+        files = [self.folder / "summary.md", self.folder / "scores.csv"]
+        return self._unit("tables", name, given, self.graph.runs(), ("report.tables",), files)
 
     def perception_table(self, name: str = "all") -> Unit:
         """Errors of perception, by category."""
@@ -58,9 +58,11 @@ class Tasks:
     def study(self, name: str) -> Unit:
         """One of the paper's tables."""
         given = {"study": name, "tables": self.config.tables, "output": self.folder / "studies"}
+        given |= {"table": self.root / self.config.study_table, "extra_rows": tuple(self.known.extra)}
+        given |= {"left_out": json.dumps(self.known.whole_left_out)}
         also = json.dumps(plain(self.known.studies[name]))
         needs = [self.graph.unit("tables", "all")]
-        return self._unit("study", name, given, needs, ("report.study", "report.clips"), [given["output"] / f"{name}.md"], also)
+        return self._unit("study", name, given, needs, ("report.study",), [given["output"] / f"{name}.md"], also)
 
     def page(self, name: str = "all") -> Unit:
         """The page with everything."""

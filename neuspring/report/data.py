@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
-import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,32 +12,26 @@ from urllib.parse import quote
 
 from markdown_it import MarkdownIt
 from markupsafe import Markup
-from PIL import Image
 
 from neuspring.config import Config
 from neuspring.core.errors import InputError
-from neuspring.core.job_records import JobRecord, read_jobs
+from neuspring.core.job_records import JobRecord
 from neuspring.core.run_record import RUN_RECORD, RunRecord
-from neuspring.report.blocks import PageSection, Picture, Prose
-from neuspring.scores.failures import LeftOut
-from neuspring.scores.metrics import DASH
-from neuspring.scores.numbers import Numbers
+from neuspring.report.blocks import PageSection, Prose
+from neuspring.report.tables import Benchmark
 from neuspring.scores.paper import Study
-from neuspring.scores.runs import DAMAGED, Collected, one_line
+from neuspring.scores.table import DAMAGED, LeftOut, ScoreTable, one_line
 
-UNREADABLE = (InputError, OSError, ValueError, KeyError, TypeError, AttributeError)
-"""Exceptions of a damaged record, table or picture."""
 Value = TypeVar("Value")
 PERCEPTION = "perception"
 """Kind of the pictures that perception left of a scenario, and their folder in it."""
 MOST_ROWS = 400
-"""At most so many failures of a kind are listed; the rest is counted."""
-METHOD_RECORDS = (RUN_RECORD, "rollout.json", "fit.json", "train.json")
+"""At most so many rows of a list are shown."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Subject of the report. What is left empty is taken from the settings, else from what lies in the results folder."""
+    """Subject of the report. What is left empty is taken from the settings, else from what is in the results folder."""
 
     scenarios: Sequence[str] = ()
     methods: Sequence[str] = ()
@@ -49,13 +41,13 @@ class Options:
     transfers: Sequence[str] = ()
     """Scenarios whose twins were rolled out on other recordings."""
     left_out: LeftOut = field(default_factory=dict)
-    """Method to the scenarios to which it does not apply, so that it has no runs there."""
+    """Method -> scenarios to which it does not apply -> reason."""
     shown: Sequence[str] = ()
-    """Methods whose curves and pictures are shown; empty: the baseline and the first rows of the studies, six in all."""
+    """Methods whose curves and pictures are shown; empty: the baseline and the first methods of the studies, six in all."""
     settings: Config | None = None
     studies: Mapping[str, Study] = field(default_factory=dict)
     names: Mapping[str, str] = field(default_factory=dict)
-    """Method to its name for people, of those that have one."""
+    """Method -> its name for people, of those that have one."""
     tables: str = "tables"
     """Folder of tables in the results folder."""
     megabytes: float = 25.0
@@ -72,29 +64,29 @@ class ReportData:
     output: Path
     choice: Options
     """With nothing left empty."""
-    collected: Collected
-    jobs: list[JobRecord]
+    numbers: Benchmark
+    jobs: Sequence[JobRecord]
     damaged: dict[str, str]
     """Files that cannot be read, relative to the results folder, and why."""
-    numbers: Numbers
-    """Numbers of the benchmark and its studies."""
     room: int = 0
     """Characters that pictures and films may take."""
 
     @property
+    def table(self) -> ScoreTable:
+        """The long table."""
+        return self.numbers.table
+
+    @property
     def runs(self) -> list[RunRecord]:
         """The runs whose records could be read."""
-        return list(self.collected.records.values())
+        return list(self.table.records.values())
 
     def folder(self, run: RunRecord) -> Path:
         """The folder of a run."""
         return self.results / run.name
 
     def file(self, run: RunRecord, kind: str, stem: str) -> Path | None:
-        """One of the files that a run's record names; None if there is none, or it is not there.
-
-        Of `PERCEPTION`: what it left of the scenario, of the first camera where each has its own.
-        """
+        """A file that a run's record names, or a picture of perception (of the first camera); None where there is none."""
         if kind == PERCEPTION:
             folder = self.results / run.scenario / PERCEPTION
             return next((path for path in (folder / f"{stem}.png", *sorted(folder.glob(f"*/{stem}.png"))) if path.is_file()), None)
@@ -106,72 +98,44 @@ class ReportData:
         place, results = path.resolve(), self.results.resolve()
         return place.relative_to(results).as_posix() if place.is_relative_to(results) else str(path)
 
-    def lost(self, path: Path, reason: Exception | str) -> None:
-        """Remember a damaged file, once."""
-        self.damaged.setdefault(self.relative(path), one_line(reason) if isinstance(reason, Exception) else reason)
-
     def read(self, path: Path, read: Callable[[Path], Value]) -> Value | None:
         """The content of a file, read by a function; None, and remembered, for a damaged one."""
         try:
             return read(path)
-        except UNREADABLE as error:
-            self.lost(path, error)
+        except (InputError, OSError, ValueError, KeyError, TypeError, AttributeError, SyntaxError) as error:
+            self.damaged.setdefault(self.relative(path), one_line(error))
             return None
 
-    def runs_of(self, scenario: str, method: str) -> list[RunRecord]:
-        """All seeds of a method on a scenario."""
-        return [run for run in self.runs if run.scenario == scenario and run.method == method]
-
     def first_runs(self, scenario: str) -> dict[str, RunRecord]:
-        """Shown method to its first run of a scenario, finished ones before failed ones."""
-        runs = {method: self.runs_of(scenario, method) for method in self.choice.shown}
-        return {method: min(own, key=lambda run: not run.ok) for method, own in runs.items() if own}
+        """Shown method -> its first run of a scenario, finished ones before failed ones."""
+        runs = [run for run in self.runs if run.scenario == scenario]
+        own = {method: [run for run in runs if run.method == method] for method in self.choice.shown}
+        return {method: min(found, key=lambda run: not run.ok) for method, found in own.items() if found}
 
 
 def traces(results: Path) -> tuple[list[str], list[str], list[int]]:
     """Scenarios, methods and seeds that have left a record of a stage."""
-    paths = [path for name in METHOD_RECORDS for path in results.glob(f"*/*/*/{name}")]
+    paths = [path for name in (RUN_RECORD, "rollout.json", "fit.json", "train.json") for path in results.glob(f"*/*/*/{name}")]
     paths += results.glob("*/search-*/*/search.json")
-    found = [path.relative_to(results).parts[:3] for path in paths]
-    found = [parts for parts in found if len(parts) == 3 and parts[2].isdigit()]
-    methods = {method for _, method, _ in found if not method.startswith("search-")}
-    return sorted({scenario for scenario, _, _ in found}), sorted(methods), sorted({int(seed) for _, _, seed in found})
+    found = [parts for path in paths if (parts := path.relative_to(results).parts)[2].isdigit()]
+    methods = {parts[1] for parts in found if not parts[1].startswith("search-")}
+    return sorted({parts[0] for parts in found}), sorted(methods), sorted({int(parts[2]) for parts in found})
 
 
-def damaged_files(results: Path, collected: Collected, transfers: Collected, messages: Sequence[str]) -> dict[str, str]:
+def damaged_files(table: ScoreTable, messages: Sequence[str], results: Path) -> dict[str, str]:
     """Records of runs, transfers and jobs that cannot be read, relative to the results folder, and why."""
-    # The messages on job records begin with the file.
+    # Messages on job records begin with the file.
     parts = (message.partition(": ") for message in messages)
     damaged = {Path(path).relative_to(results).as_posix(): reason for path, _, reason in parts}
-    for runs, name in ((collected.runs, RUN_RECORD), (transfers.runs, "transfer.json")):
-        rows: list[Any] = [row for row in runs.itertuples() if str(row.reason).startswith(DAMAGED)]
-        damaged |= {f"{row.scenario}/{row.method}/{row.seed}/{name}": row.reason.removeprefix(DAMAGED) for row in rows}
-    return damaged
-
-
-def job_records(results: Path) -> tuple[list[JobRecord], list[str]]:
-    """The job records that can be read, by name, and a message on each other one."""
-    messages: list[str] = []
-    return read_jobs(results, messages), messages
+    rows: list[Any] = list(table.runs.itertuples())
+    damaged |= {f"{row.run}/{RUN_RECORD}": row.reason.removeprefix(DAMAGED) for row in rows if row.reason.startswith(DAMAGED)}
+    moved = {f"{row.run}/transfer.json": row.notes.rpartition(DAMAGED)[2] for row in rows if DAMAGED in row.notes}
+    return damaged | moved
 
 
 def several(count: int, noun: str) -> str:
     """`1 run`, `2 runs`."""
     return f"{count:,} {noun}{'s' * (count != 1)}"
-
-
-def hours(seconds: float) -> str:
-    """Hours, with fewer decimals for larger values."""
-    value = seconds / 3600
-    digits = 0 if value >= 100 or not value else 1 if value >= 1 else 2
-    return "< 0.01" if 0 < value < 0.01 else f"{value:.{digits}f}"
-
-
-def memory(mebibytes: float | None) -> str:
-    """Mebibytes; gibibytes from 1024 MiB."""
-    if mebibytes is None or not math.isfinite(mebibytes):
-        return DASH
-    return f"{mebibytes / 1024:.1f} GiB" if mebibytes >= 1024 else f"{mebibytes:.0f} MiB"
 
 
 def link(path: Path, folder: Path) -> str:
@@ -182,11 +146,7 @@ def link(path: Path, folder: Path) -> str:
 def rendered(text: str) -> Markup:
     """Markdown as HTML with smaller headings, without links and pictures."""
     parser = MarkdownIt("commonmark", {"html": False}).enable("table").disable(["image", "link"])
-
-    def opened(*_: Any) -> str:
-        return '<div class="scroll" tabindex="0" role="region" aria-label="Table"><table>'
-
-    parser.add_render_rule("table_open", opened)
+    parser.add_render_rule("table_open", lambda *_: '<div class="scroll" tabindex="0" role="region" aria-label="Table"><table>')
     parser.add_render_rule("table_close", lambda *_: "</table></div>")
     tokens = parser.parse(text)
     for token in tokens:
@@ -205,17 +165,11 @@ class ReportSection:
     """A section of the report: the member of a registry that a module of `sections`, or of a package, declares."""
 
     order: int
-    """Its place on the page, by tens."""
+    """Its position on the page, by tens; behind 30 it is folded."""
     make: Callable[[ReportData], PageSection | None]
     """None where there is nothing to show."""
     phase: Literal[0, 1, 2] = 0
     """1: it takes the `room` that all others leave; 2: it lists the damaged files that all others found."""
-
-
-def embedded(data: bytes, caption: str) -> Picture:
-    """A PNG, drawn for white paper, as a wide picture of the page."""
-    size = Image.open(io.BytesIO(data)).size
-    return Picture(caption=caption, alt=caption, data=data_uri("image/png", data), size=size, wide=True, paper=True)
 
 
 def data_uri(kind: str, data: bytes) -> str:

@@ -1,21 +1,14 @@
-"""Notes of caution below tables: on on recordings that users filmed, and settings that differ between rows.
-
-No truth stands behind a table of own recordings, and a chain that went wrong still gives numbers. So: is a method better than the
-object frozen in frame 0 (`static`)? Do parameters lie at the ends of what was searched? Did training improve anything? Does a hand
-hold the object at all?
-"""
+"""Findings of finished runs: springs at a limit, a search at the end of its range, a training that improved nothing."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
-import pandas as pd
-
-from neuspring.baselines import REFERENCES
 from neuspring.checks import examine
 from neuspring.core.findings import Finding
 from neuspring.core.run_record import RunRecord
+<<<<<<< HEAD
 from neuspring.scenes.sources import SOURCES
 from neuspring.scores.metrics import METRICS
 from neuspring.scores.runs import Collected, finished_scores
@@ -76,26 +69,40 @@ def causes(runs: Iterable[RunRecord]) -> list[tuple[str, str]]:
         of = f" with {len(first)} of {len(facts)} seeds" if len(facts) > 1 else ""
         found.append((f"training improved nothing: the best epoch is the first{of}", "Lower fit.learning_rate."))
     return found
+=======
+>>>>>>> 0d0e3e2f (One long table of scores: summary, studies, failures, costs and the report are queries on it, laid out by one function)
 
 
 def of_fits(runs: Iterable[RunRecord]) -> list[tuple[str, Finding]]:
-    """Scenario and finding of all fits: springs at a limit of their stiffness, with the command that widens it."""
+    """Scenario and finding of all fits: springs at a limit of their stiffness, with the setting that widens it."""
     return [(run.scenario, one) for run in runs for one in examine("fit", f"{run.method}/{run.seed}", run)]
 
 
-def _grip(runs: Iterable[RunRecord]) -> list[tuple[str, str]]:
-    """Number of springs that hold the hands, if any do."""
-    counts = [held for record in runs if (held := _gripping(record.params))]
-    number = f"{min(counts)}" if len(set(counts)) == 1 else f"{min(counts)} to {max(counts)}" if counts else ""
-    return [(f"{number} springs join the hands to the object", "")] if counts else []
-
-
-def _gripping(values: Mapping[str, Any]) -> int | None:
-    """Number of springs that hold the hands: the fit's, else the search's. None where clamps hold it."""
-    for stage in ("fit", "search"):
-        if f"{stage}.result.vertices" in values:
-            return None
-        springs, inner = values.get(f"{stage}.result.springs"), values.get(f"{stage}.result.object_springs")
-        if springs is not None and inner is not None:
-            return int(springs - inner)
-    return None
+def of_runs(runs: Iterable[RunRecord]) -> list[tuple[str, Finding]]:
+    """Scenario and finding of searches and fits, those of `of_fits` included."""
+    runs = list(runs)
+    found = of_fits(runs)
+    for run in runs:
+        facts: dict[str, Any] = run.params
+        ends = str(facts.get("search.result.at_ends") or "")
+        springs, inner = (
+            facts.get(f"fit.result.{name}", facts.get(f"search.result.{name}")) for name in ("springs", "object_springs")
+        )
+        of_rods = "fit.result.vertices" in facts or "search.result.vertices" in facts
+        cases = [
+            (bool(ends), "search at an end of its range", ends, f"Widen search.variables for {ends}."),
+            (facts.get("fit.result.best_epoch", 1) <= 0, "training improved nothing", "best epoch 0", "Lower fit.learning_rate."),
+            (
+                springs is not None and springs == inner and not of_rods,
+                "no spring joins a controller to the object",
+                "nothing moves it",
+                "Look at the controllers in lifted.png.",
+            ),
+        ]
+        where = f"{run.method}/{run.seed}"
+        found += [
+            (run.scenario, Finding(name=name, level="warning", where=where, text=f"{text}. {remedy}", remedy=remedy))
+            for is_so, name, text, remedy in cases
+            if is_so
+        ]
+    return found

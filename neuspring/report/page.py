@@ -1,6 +1,6 @@
-"""The report: one HTML file that opens with the verdict in words, and shows everything a results folder holds.
+"""The report: one HTML file that opens with the verdict and shows everything that a results folder holds.
 
-It needs no network and no script. It is made from what is on disk, also while a benchmark runs, and lists the files that it cannot
+It needs no network and no script. It is made from files on disk, also while a benchmark runs, and lists the files that it cannot
 read.
 """
 
@@ -12,41 +12,38 @@ from pathlib import Path
 from neuspring.config import Config
 from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
-from neuspring.core.findings import warnings_of
-from neuspring.core.job_records import asked
+from neuspring.core.job_records import asked, read_jobs
 from neuspring.core.records import now
 from neuspring.core.text import listed
 from neuspring.registry import Registry, modules
 from neuspring.report.blocks import PageSection, html_page
-from neuspring.report.data import Options, ReportData, ReportSection, damaged_files, job_records, several, traces
-from neuspring.scores.numbers import Numbers, kept_studies
-from neuspring.scores.runs import Collected, as_asked, collect, collect_transfers
+from neuspring.report.data import Options, ReportData, ReportSection, damaged_files, several, traces
+from neuspring.report.tables import Benchmark
+from neuspring.scores.table import as_asked, collect
 
 __all__ = ["REPORT_SECTIONS", "Options", "write"]
 REPORT_SECTIONS: Registry[ReportSection] = Registry(
     "report_sections", modules("neuspring.report.sections", "section"), type=ReportSection
 )
-MEGABYTE = 1_000_000
-LAST_OPEN = 40
-"""Sections behind this place are folded."""
-MOST_SHOWN = 6
-"""Methods that are drawn unless others are asked for."""
+LAST_OPEN, MOST_SHOWN = 30, 6
 
 
 def write(results: Path, output: Path, options: Options, written: str | None = None) -> Path:
     """Write the report of a results folder as one HTML file; returns its path.
 
-    Numbers that were kept beside the page are taken, if they are of the same runs. Raises InputError without the folder, or if
-    a method to show or to compare with is not among the methods.
+    Raises InputError without the folder, or if a method to show or to compare with is not among the methods.
     """
     results = Path(results)
     if not results.is_dir():
         raise InputError(results, "the results folder must exist", "no such folder", "Run the workflow first, or name another.")
     material, written = gather(results, Path(output), options), written or now()
     choice = material.choice
-    seeds = f"seed{'s' * (len(choice.seeds) > 1)} {listed([*map(str, choice.seeds)])}" if choice.seeds else "no seeds"
-    numbers = f"{several(len(choice.scenarios), 'scenario')}, {several(len(choice.methods), 'method')}, {seeds}"
-    subtitle = f"{numbers}; {results.resolve().name}. Errors are in mm."
+    counts = [
+        several(len(choice.scenarios), "scenario"),
+        several(len(choice.methods), "method"),
+        several(len(choice.seeds), "seed"),
+    ]
+    subtitle = f"{', '.join(counts)}; {results.resolve().name}."
     ordered = sorted(REPORT_SECTIONS.items(), key=lambda pair: (pair[1].order, pair[0]))
     made: dict[str, PageSection | None] = {}
 
@@ -58,10 +55,10 @@ def write(results: Path, output: Path, options: Options, written: str | None = N
         sections = [replace(section, folded=order > LAST_OPEN) for order, section in there]
         return html_page("NeuSpring: report", subtitle, sections, written=written)
 
-    # Pictures take the room that all else leaves. What lists damaged files is made again last, because pictures may be damaged too.
+    # Pictures take the room that all else leaves. What lists damaged files is made again last: pictures may be damaged too.
     make(0)
     make(2)
-    material.room = int(MEGABYTE * choice.megabytes) - len(page().encode())
+    material.room = int(1e6 * choice.megabytes) - len(page().encode())
     make(1)
     make(2)
     write_text(material.output, page())
@@ -70,42 +67,21 @@ def write(results: Path, output: Path, options: Options, written: str | None = N
 
 def gather(results: Path, output: Path, options: Options) -> ReportData:
     """Read what the report is about."""
-    jobs, messages = job_records(results)
-    choice = _filled(results, options, traces(results))
-    everything = collect(results, choice.scenarios, choice.methods, choice.seeds, choice.left_out)
-    collected, part = as_asked(everything, asked(results))
-    transfers = collect_transfers(results, choice.transfers, choice.methods, choice.seeds)
-    damaged, config = damaged_files(results, collected, transfers, messages), choice.settings or Config()
-    kept = kept_studies(output.parent)
-    numbers = Numbers(
-        everything=collected,
-        baseline=choice.baseline or "",
-        objects=config.objects,
-        aims=config.aims,
-        transfers=transfers,
-        studies={name: one for name, one in choice.studies.items() if name in kept or _ran(collected, choice, name)},
-        known_studies=choice.studies,
-        results=results,
-        names=choice.names,
-        asked=part,
-        warnings=warnings_of(results, choice.scenarios),
-    )
-    numbers = numbers.take(output.parent)
-    return ReportData(
-        results=results, output=output, choice=choice, collected=collected, numbers=numbers, jobs=jobs, damaged=damaged
-    )
+    messages: list[str] = []
+    jobs = read_jobs(results, messages)
+    choice, about = _filled(results, options), asked(results)
+    table = collect(results, choice.scenarios, choice.methods, choice.seeds, choice.left_out, choice.transfers)
+    table, _ = as_asked(table, about)
+    config = choice.settings or Config()
+    more = {"objects": config.objects, "aims": config.aims, "names": choice.names, "results": results, "asked": about}
+    numbers = Benchmark(table=table, baseline=choice.baseline or "", **more)  # type: ignore[arg-type]
+    damaged = damaged_files(table, messages, results)
+    return ReportData(results=results, output=output, choice=choice, numbers=numbers, jobs=jobs, damaged=damaged)
 
 
-def _ran(collected: Collected, choice: Options, name: str) -> bool:
-    """True where a study was asked for, or several of its rows ran on the paper's data."""
-    runs = collected.runs[(collected.runs["status"] == "ok") & (collected.runs["source"] == "phystwin")]
-    paired = set(runs["method"]) & set(choice.studies[name].rows.values())
-    return len(paired) > 1 or (choice.settings is not None and name in choice.settings.studies)
-
-
-def _filled(results: Path, options: Options, there: tuple[list[str], list[str], list[int]]) -> Options:
-    """The options with nothing left empty; `there` is what lies in the results folder."""
-    settings = options.settings or Config()
+def _filled(results: Path, options: Options) -> Options:
+    """The options with nothing left empty."""
+    settings, there = options.settings or Config(), traces(results)
     in_studies = [method for study in options.studies.values() for method in study.rows.values()]
     on_disk = sorted(there[1], key=lambda name: in_studies.index(name) if name in in_studies else len(in_studies))
     scenarios = tuple(options.scenarios or settings.scenarios or there[0])
@@ -114,7 +90,6 @@ def _filled(results: Path, options: Options, there: tuple[list[str], list[str], 
     for name in (*options.shown, *([options.baseline] if options.baseline else [])):
         if name not in methods:
             raise InputError("report", "methods that are drawn or compared with must be among the methods", name, listed(methods))
-    # Unless it is given: what a study compares with, else the first method.
     offered = [options.baseline or settings.compare_with, *(study.rows[study.baseline] for study in options.studies.values())]
     baseline = next((name for name in [*offered, *methods] if name in methods), "")
     finished = {path.parts[-3] for path in results.glob("*/*/*/run.json")}

@@ -119,7 +119,7 @@ def _rows(name: str) -> list[dict[str, str]]:
 
 
 Text = Annotated[str, StringConstraints(pattern=r"^[^\n]*\S[^\n]*$")]
-TAKEN = ("summary", "scores", "runs", "numbers", "transfers", "perception", "pictures", "report")
+TAKEN = ("summary", "scores", "runs", "perception", "report")
 """Names of files that other commands write into the folder of tables."""
 
 
@@ -138,8 +138,6 @@ class Study:
 
     training: Text = "equal"
     """Training of the rows, in words."""
-    beside: Name | None = None
-    """A study of the same labels whose numbers this one shows next to its own: the same rows, trained in another way."""
     kind: Name | None = None
     """A kind of study that a package lays out (`STUDY_KINDS`); null: a table of methods like the paper's."""
 
@@ -172,23 +170,19 @@ class OwnStudy(ABC):
 
     published: ClassVar[Mapping[str, Callable[[], Values]]] = {}
     """Tables of published numbers by name."""
-    TABLES: ClassVar[tuple[str, ...]]
-    """Attributes that are tables, which numbers.json keeps."""
-    name: str
-    study: Study
 
     @classmethod
     @abstractmethod
-    def of(cls, name: str, study: Study, numbers: Any) -> Self:
-        """Those of a study on the `Numbers` of a benchmark."""
+    def of(cls, name: str, study: Study, table: Any, results: Path) -> Self:
+        """Those of a study, from the long table (`scores.table.ScoreTable`) and the results folder."""
 
     @abstractmethod
     def blocks(self) -> list[Any]:
-        """What the report shows: blocks of neuspring.report.blocks."""
+        """Blocks of neuspring.report.blocks, for the report and the study's files."""
 
     @abstractmethod
-    def write(self, folder: Path) -> str:
-        """Write all files; returns the Markdown."""
+    def files(self, folder: Path) -> list[str]:
+        """Write other files into the folder of studies; Markdown lines that show them."""
 
 
 STUDY_KINDS: Registry[type[OwnStudy]] = Registry("studies", {}, type)
@@ -202,10 +196,4 @@ def read_studies(path: Path, extra: Iterable[Path] = ()) -> dict[str, Study]:
         if not SAFE_NAME.fullmatch(name) or name in TAKEN:
             rule = f"letters, digits, _, . and - make the name of a study, and {', '.join(TAKEN)} are taken"
             raise InputError(f"{path}, study {name}", rule, name, "Rename it.")
-        beside = studies[name].beside
-        if beside is not None and (
-            beside == name or beside not in studies or not set(studies[beside].rows) & set(studies[name].rows)
-        ):
-            rule = "beside: must be another study of this table, with labels of this one"
-            raise InputError(f"{path}, study {name}", rule, beside, f"Known: {', '.join(studies)}")
     return studies

@@ -139,16 +139,6 @@ def t_interval(values: np.ndarray) -> tuple[float, float]:
     return float(values.mean() - reach), float(values.mean() + reach)
 
 
-def needed(low: float, high: float, count: int, most: int = 200) -> int | None:
-    """Number of objects that resolve a ratio with the interval [low, high] over `count`, if all scatter alike; None: too many."""
-    from scipy.stats import t
-
-    mean, reach = 0.5 * math.log(low * high), 0.5 * math.log(high / low)
-    scatter = reach * math.sqrt(count) / t.ppf(0.975, count - 1)
-    enough = (n for n in range(count, most + 1) if t.ppf(0.975, n - 1) * scatter / math.sqrt(n) < abs(mean))
-    return next(enough, None)
-
-
 def verdict(low: float, high: float) -> str:
     """Place of an interval with respect to 1."""
     if math.isnan(low):
@@ -156,16 +146,12 @@ def verdict(low: float, high: float) -> str:
     return BELOW if high < 1 else ABOVE if low > 1 else NOT_RESOLVED
 
 
-def judged_aims(scores: pd.DataFrame, transfers: pd.DataFrame, aims: Iterable[Aim], objects: Objects = "scenario") -> pd.DataFrame:
-    """A row per aim: its ratio as in `ratios`, what was aimed at, and whether it is reached, missed or not run.
-
-    `transfers` are the scores of twins on other recordings, for aims of the task transfer.
-    """
+def judged_aims(scores: pd.DataFrame, aims: Iterable[Aim], objects: Objects = "scenario") -> pd.DataFrame:
+    """A row per aim: its ratio as in `ratios`, what was aimed at, and whether it is reached, missed or not run."""
     rows = []
     for aim in aims:
-        table = transfers if aim.task == "transfer" else scores
-        methods = table["method"].isin([aim.method, aim.baseline]) & (table["task"] == aim.task) & (table["metric"] == aim.metric)
-        found = ratios(table[methods], aim.baseline, objects).to_dict("records")
+        part = scores["method"].isin([aim.method, aim.baseline]) & (scores["task"] == aim.task) & (scores["metric"] == aim.metric)
+        found = ratios(scores[part], aim.baseline, objects).to_dict("records")
         identity = {"method": aim.method, "baseline": aim.baseline, "task": aim.task, "metric": aim.metric}
         row: dict[Any, Any] = found[0] if found else identity | {"n": 0, "objects": objects, "pairs": 0, "verdict": NOT_RUN}
         reached = bool(found) and row["ratio"] <= aim.ratio and row["ratio_high"] < aim.below

@@ -25,7 +25,7 @@ from neuspring.extensions.gs_dynamics.settings import GsDynamics
 from neuspring.extensions.spring_gaus.model import SpringGausModel, SpringGausTraining
 from neuspring.extensions.spring_gaus.settings import SpringGaus
 from neuspring.scores import metrics
-from neuspring.scores.runs import collect
+from neuspring.scores.table import collect
 from neuspring.stages.predict import predict
 from neuspring.stages.score import score
 from neuspring.stages.train import train

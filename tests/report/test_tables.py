@@ -1,27 +1,227 @@
-"""Tables compare like with like, and never hide a gap."""
+"""Tables say who is ahead and whether that is resolved, compare like with like, and hide no gap."""
 
 import json
+import shlex
 
 import numpy as np
-import pandas as pd
 import pytest
 
-from neuspring.core.table import Cell, Chip, Table
-from neuspring.report.blocks import PageSection, html_page
-from neuspring.report.summary import detail_blocks, errors_table, score_blocks, summary_text
-from neuspring.scores.metrics import SCORE_COLUMNS
-from neuspring.scores.numbers import Numbers
-from neuspring.scores.runs import Collected, collect
+from neuspring.cli.main import main
+from neuspring.config import parse
+from neuspring.config.settings import Aim
+from neuspring.core.table import Cell, Table, lay_out, tex
+from neuspring.report.blocks import Code, markdown
+from neuspring.report.notes import of_runs
+from neuspring.report.tables import (
+    Benchmark,
+    again,
+    behind,
+    failure_blocks,
+    notes_table,
+    shown_names,
+    summary_blocks,
+    verdict,
+    write,
+)
+from neuspring.scores import statistics
 from neuspring.scores.statistics import paired_differences, resampled_means
-from tests.support.study_runs import collected, rows_of, summary, tables_in
+from neuspring.scores.table import ScoreTable, collect, read_scores
+from tests.support import report_tree
+from tests.support.runs import run_record
+from tests.support.study_runs import collected, rows_of, tables_in, write_run
+
+FUTURE = ("future", "track_error")
 
 
-def test_paired_differences_use_the_same_scenario_and_seed():
-    values = {("a", "x", 0): 0.010, ("a", "y", 0): 0.008, ("b", "x", 0): 0.100, ("b", "y", 0): 0.098}
-    row = paired_differences(collected(values).scores, "x").iloc[0]
-    assert row["difference"] == pytest.approx(-0.002)
-    assert row["low"] == pytest.approx(-0.002)
-    assert row["high"] == pytest.approx(-0.002)
+def benchmark(values, failed=(), baseline: str = "base", **facts) -> Benchmark:
+    return Benchmark(table=collected(values, failed, **facts), baseline=baseline)
+
+
+@pytest.mark.parametrize(
+    ("factors", "resolved", "ahead"),
+    [
+        ([0.5], statistics.TOO_FEW, "No method"),
+        ([0.80, 0.82, 0.78], statistics.BELOW, "ours"),
+        ([1.2, 1.25, 1.3], statistics.ABOVE, "base"),
+        ([0.5, 1.9, 1.0], statistics.NOT_RESOLVED, "No method"),
+    ],
+)
+def test_the_verdict_says_who_is_ahead_by_how_much_and_whether_it_is_resolved(factors, resolved, ahead):
+    values = {(f"s{i}", m, 0): 0.02 * f for i, factor in enumerate(factors) for m, f in (("ours", factor), ("base", 1.0))}
+    lead, table = verdict(benchmark(values))[:2]
+    mean = np.exp(np.log(factors).mean())
+    assert lead.text.startswith(f"{ahead} is ahead.") and f"{mean:.3f}" in lead.text and lead.text.endswith(f": {resolved}.")
+    row = rows_of(table)["ours"]
+    assert row["Resolved"].text == resolved and row["Ratio [95 %]"].text in lead.text
+    assert row["Better in"].text == f"{sum(f < 1 for f in factors)} of {len(factors)}"
+    assert row["Worst scenario"].text.startswith(f"s{int(np.argmax(factors))} (")
+
+
+def test_nobody_wins_alone_or_before_anything_has_finished():
+    assert "ours is alone" in verdict(benchmark({("a", "ours", 0): 0.01}))[0].text
+    (only,) = verdict(benchmark({}, failed=[("a", "ours", 0)]))
+    assert only.text == "Nothing can be compared yet: 0 of 1 runs have finished."
+
+
+def test_next_moves_are_commands_for_the_folder_in_use(tmp_path):
+    results = report_tree.make(tmp_path / "results", ["rope"], ["baseline", "neuspring"], [0], pictures=False)
+    command = ["snakemake", "--config", f"results={results}", "seeds=[0]", "--cores", "2"]
+    table = collect(results, ["rope"], ["baseline", "neuspring"], [0, 1])
+    blocks = verdict(Benchmark(table=table, baseline="baseline", results=results, asked={"command": command}))
+    first, last = (shlex.split(block.text) for block in blocks if isinstance(block, Code))
+    assert first == command and last[1] == "play" and len(last) == 4
+    assert again({"command": command}, "seeds", "[0,1,2]") == f"snakemake --config 'seeds=[0,1,2]' results={results} --cores 2"
+    assert again({"command": ["snakemake", "report"]}, "seeds", "[0,1]") == "snakemake report --config 'seeds=[0,1]'"
+    assert again({}, "seeds", "[0,1,2]") == ""
+
+
+def test_averages_mark_the_best_count_runs_and_keep_oracles_apart():
+    values = {("a", "x", 0): 0.010, ("a", "y", 0): 0.008, ("b", "x", 0): 0.5, ("a", "o", 0): 0.001}
+    table = collected(values, failed=[("b", "y", 0), ("a", "z", 0)])
+    table = ScoreTable(table.rows, table.runs.assign(oracle=table.runs["method"] == "o"))
+    numbers = Benchmark(table=table, baseline="x", names={"x": "The x (`x`)"})
+    rows = rows_of(tables_in(summary_blocks(numbers))["Errors, mm"])
+    assert {name: (row["Future TE ↓"].text, row["Future TE ↓"].mark, row["Runs"].text) for name, row in rows.items()} == {
+        "The x (`x`)": ("10.00", "", "2/2"),
+        "y": ("8.00", "best", "1/2 (1 failed)"),
+        "o (oracle)": ("1.00", "", "1/1"),
+    }
+    assert "Averages take the 1 of 2 pairs" in markdown(summary_blocks(numbers))
+    assert {row["Method"].text for row in rows_of(failure_blocks(numbers)[-1]).values()} == {"y", "z"}
+
+
+def test_spreads_ratios_breakdowns_and_pictures_have_tables():
+    facts = {"views": ["0"], "masks": "given", "lpips": "no AlexNet weights", "quirks": []}
+    values = {
+        (s, m, seed): {FUTURE: 0.01 * f * (1 + seed), ("future", "psnr"): 30.0 + f, ("start", "track_error"): 0.007}
+        for s in "abcdef" for m, f in (("x", 1.0), ("y", 0.9)) for seed in (0, 1)
+    }  # fmt: skip
+    numbers = benchmark(values, baseline="x", images=json.dumps(facts))
+    found = tables_in(summary_blocks(numbers))
+    assert rows_of(found["Errors, mm"])["y"]["Future TE ↓"].text == "13.50 ± 6.36"
+    assert "In frame 0, which is given: TE 7.00 mm." in found["Errors, mm"].note
+    assert rows_of(found["Ratio of the error to that of x"])["y"]["Future TE ↓"].text == "0.900 [0.900, 0.900] (n = 6): below 1"
+    assert rows_of(found["Pictures: difference to x"])["y"]["Future PSNR ↑"].text == "-0.100 [-0.100, -0.100]: worse"
+    assert rows_of(found["Spread over seeds"])["x"]["Future TE ↓"].text == "49.0 %"
+    assert "lpips: no AlexNet weights" in found["Scores of pictures"].note
+    assert len(found["Per scenario"].rows) == 12 and found["Per scenario"].rows[1][2].mark == "best"
+
+
+def test_aims_are_judged():
+    values = {(s, m, 0): v * (1 + 0.02 * i * (m == "y")) for i, s in enumerate("abcd") for m, v in (("x", 0.01), ("y", 0.007))}
+    aims = tuple(parse(Aim, {"method": "y", "baseline": "x", "ratio": ratio}, "here") for ratio in (0.85, 0.5))
+    numbers = Benchmark(table=collected(values), baseline="x", aims=aims)
+    rows = tables_in(summary_blocks(numbers))["Aims of the configuration"].rows
+    assert [row[-1].text for row in rows] == ["reached", "missed"]
+
+
+def test_failures_settings_and_notes_are_listed(tmp_path):
+    write_run(tmp_path, "a", "x", 0, {FUTURE: 0.01}, settings={"fit": {"horizon": 1}})
+    write_run(tmp_path, "a", "y", 0, {FUTURE: 0.02}, settings={"fit": {"horizon": 9}})
+    write_run(
+        tmp_path,
+        "b",
+        "y",
+        0,
+        {},
+        status="failed",
+        reason="rollout: node 3 | left",
+        frozen={FUTURE: 0.1},
+        settings={"fit": {"horizon": 9}},
+    )
+    table = collect(tmp_path, ["a", "b"], ["x", "y"], [0], {"x": {"b": "needs images"}})
+    notes = [f"fit: {10 + k}% at the bound; same" for k in range(len(table.runs))]
+    numbers = Benchmark(table=ScoreTable(table.rows, table.runs.assign(notes=notes), table.left_out), baseline="x")
+    text = write(numbers, tmp_path / "tables")
+    assert "| y      | all, failed held | 60.00" in text
+    assert "rollout: node 3 \\| left" in text and "| x      | does not apply | b " in text
+    assert "| fit.horizon | 1: x; 9: y" in text
+    (found,) = notes_table(numbers)
+    assert [[cell.text for cell in row] for row in found.rows] == [
+        ["x", "1", "fit: 10% at the bound"], ["x", "1", "same"], ["y", "2", "fit: …% at the bound"], ["y", "2", "same"],
+    ]  # fmt: skip
+    assert (tmp_path / "tables" / "summary.md").read_text().startswith("# Scores\n")
+    table = behind(read_scores(tmp_path / "tables" / "scores.csv"), ["y", "future", "TE"], tmp_path)
+    assert [row[5].text for row in table.rows] == ["0.02 m"] and (tmp_path / "a/y/0/run.json").samefile(table.rows[0][-1].text)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["tables", "--left-out", '{"x": "a"}'], "--left-out"),
+        (["tables", "--left-out", "{"], "--left-out"),
+        (["tables"], "with runs is required"),
+        (["explain", "nobody"], "scores.csv"),
+        (["study", "--study", "nothing"], "must be a row of"),
+    ],
+)
+def test_what_cannot_be_laid_out_is_refused(tmp_path, arguments, words, capsys):
+    output = [] if arguments[0] == "explain" else ["--output", str(tmp_path / "out")]
+    assert main([*arguments, "--results", str(tmp_path), *output]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_commands_make_tables_studies_and_explanations(tmp_path, capsys):
+    for number in range(6):
+        for method, factor in (("baseline", 1.0), ("neuspring", 0.8)):
+            write_run(tmp_path, f"cable_{number}", method, 0, {FUTURE: 0.01 * factor * (1 + number)}, source="mocap")
+    tables = tmp_path / "tables"
+    assert main(["tables", "--results", str(tmp_path), "--output", str(tables), "--baseline", "baseline", "--brief"]) == 0
+    assert "NeuSpring (`neuspring`) is ahead." in capsys.readouterr().out
+    assert main(["study", "--study", "table1", "--results", str(tmp_path), "--output", str(tables / "studies")]) == 0
+    assert main(["study", "--study", "table1", "--scores", str(tables / "scores.csv"), "--output", str(tmp_path / "other")]) == 0
+    assert (tables / "studies" / "table1.csv").read_text() == (tmp_path / "other" / "table1.csv").read_text()
+    assert main(["explain", "neuspring/future/TE", "--results", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "6 rows behind neuspring/future/TE" in out and f"{tmp_path}/cable_5/neuspring/0/run.json" in out
+    assert main(["explain", "neuspring/pst", "--results", str(tmp_path)]) == 2
+    assert "method: baseline, neuspring" in capsys.readouterr().err
+
+
+def test_findings_of_runs_name_the_next_move():
+    params = {"search.result.at_ends": "drag", "fit.result.best_epoch": 0, "fit.result.springs": 9, "fit.result.object_springs": 9}
+    found = of_runs([run_record(scenario="b", method="ours", params=params), run_record(scenario="c", method="ours")])
+    assert {one.name: one.remedy for _, one in found} == {
+        "search at an end of its range": "Widen search.variables for drag.",
+        "training improved nothing": "Lower fit.learning_rate.",
+        "no spring joins a controller to the object": "Look at the controllers in lifted.png.",
+    }
+
+
+def test_methods_have_names_for_people(tmp_path):
+    from pathlib import Path
+
+    names = shown_names(Path(__file__).resolve().parents[2] / "config" / "methods.yaml")
+    assert names["search_only"] == "CMA-ES alone (`search_only`)"
+    assert shown_names(tmp_path / "absent.yaml") == {}
+
+
+def test_a_table_is_laid_out_as_text_markdown_latex_and_html():
+    cell = Cell(text="1.5 ± 0.1: worse", mark="second", tone="bad", value=1.5)
+    table = Table(
+        caption="T & U",
+        header=["Method", "CD ↓"],
+        rows=[[Cell(text="a|`b`"), cell], [Cell(text="<3"), Cell(text="x")]],
+        note="50 %",
+    )
+    head, rule, first, _ = table.markdown()
+    assert first == "| a\\|`b` | <ins>1.5 ± 0.1: worse</ins> |" and len(head) == len(rule) == len(first)
+    latex = lay_out(table, "latex", "label")
+    assert r"a$|$`b` & \underline{1.5 $\pm$ 0.1: worse} \\" in latex and r"\caption{\textbf{T \& U.} 50 \%}" in latex
+    assert latex.count(r"\begin{") == latex.count(r"\end{") and latex.isascii()
+    page = lay_out(table, "html")
+    assert '<td class="bad" data-value="1.5"><u>1.5 ± 0.1: worse</u></td>' in page and "<code>b</code>" in page and "&lt;3" in page
+    assert lay_out(table, "text").splitlines()[2] == "a|`b`   1.5 ± 0.1: worse"
+    assert tex("50 % of a_b & #1 [-0.3, +2] {x} 0.1 ± 0.2 –") == r"50 \% of a\_b \& \#1 {[}$-$0.3, +2] \{x\} 0.1 $\pm$ 0.2 --"
+
+
+def test_paired_differences_weigh_scenarios_equally_on_the_same_seeds():
+    values = {("a", "x", 0): 0.1, ("a", "y", 0): 0.09}
+    values |= {("b", m, seed): v for m, v in (("x", 0.01), ("y", 0.009)) for seed in range(3)}
+    row = paired_differences(collected(values).rows, "x").iloc[0]
+    assert row["difference"] == pytest.approx(-0.0055) and row["low"] <= row["difference"] <= row["high"]
+    one = paired_differences(collected({key: value for key, value in values.items() if key[0] == "b"}).rows, "x").iloc[0]
+    assert one["scenarios"] == 1 and np.isnan(one["low"])
 
 
 def test_the_interval_covers_the_mean_of_noisy_differences():
@@ -30,156 +230,17 @@ def test_the_interval_covers_the_mean_of_noisy_differences():
     for _ in range(60):
         deltas = rng.normal(0.001, 0.002, 20)
         values = {(f"s{i}", m, 0): 0.05 + (d if m == "y" else 0.0) for i, d in enumerate(deltas) for m in ("x", "y")}
-        row = paired_differences(collected(values).scores, "x").iloc[0]
+        row = paired_differences(collected(values).rows, "x").iloc[0]
         hits += row["low"] <= 0.001 <= row["high"]
     # 95 % nominal; with 60 trials, below 50 has a probability under 1e-3 even at the bootstrap's usual 92 %.
     assert hits >= 50
 
 
-def test_seeds_of_one_scenario_are_not_independent():
-    values = {("a", m, seed): 0.01 + (0.001 if m == "y" else 0) for m in ("x", "y") for seed in range(5)}
-    row = paired_differences(collected(values).scores, "x").iloc[0]
-    assert row["scenarios"] == 1
-    assert np.isnan(row["low"])
-
-
-def test_the_difference_weighs_scenarios_equally():
-    values = {("a", "x", 0): 0.1, ("a", "y", 0): 0.09}
-    values |= {("b", m, seed): v for m, v in (("x", 0.01), ("y", 0.009)) for seed in range(3)}
-    row = paired_differences(collected(values).scores, "x").iloc[0]
-    assert row["difference"] == pytest.approx(-0.0055)
-
-
-def test_errors_of_a_pair_have_ratios_and_no_second_number():
-    values = {
-        (scenario, m, 0): v for scenario, v in zip("abc", (1.0, 0.02, 0.03), strict=True) for m, v in (("x", v), ("y", 0.9 * v))
-    }
-    assert "0.900 [0.900, 0.900]" in summary(collected(values)) and "aired difference" not in summary(collected(values))
-
-
-def test_the_interval_over_seeds_alone_has_the_width_of_their_mean():
-    """Twelve scenarios alike but for independent noise of three seeds: the variance of resampled means is that of both levels."""
+def test_the_bootstrap_has_the_variance_of_both_levels():
+    """Twelve scenarios alike but for independent noise of three seeds."""
     rng = np.random.default_rng(1)
     runs = [rng.normal(size=3) for _ in range(12)]
     within = np.mean([part.var() / 3 for part in runs]) / 12
     between = np.var([part.mean() for part in runs]) / 12
     means = resampled_means([part[None] for part in runs], np.random.default_rng(0))
     assert means.var() == pytest.approx(within + between, rel=0.05)
-
-
-def with_images(lpips: str = "computed") -> Collected:
-    """Two scenarios, two methods; the second scenario has no images."""
-    base = collected({(s, m, 0): 0.01 for s in ("a", "b") for m in ("x", "y")})
-    facts = {"backend": "warp", "masks": "given", "views": ["0"], "lpips": lpips, "unseen_surface": 0.25}
-    runs = base.runs.assign(images=[json.dumps(facts if s == "a" else None) for s in base.runs["scenario"]])
-    values = {"psnr": (30.0, 33.0), "ssim": (0.9, 0.95), "iou": (0.8, 0.9)}
-    values |= {"lpips": (0.1, 0.05)} if lpips == "computed" else {}
-    rows = [
-        ("a", "rope", m, 0, task, metric, pair[k], "1", 10)
-        for metric, pair in values.items()
-        for k, m in enumerate(("x", "y"))
-        for task in ("reconstruction", "future")
-    ]
-    return Collected(pd.concat([base.scores, pd.DataFrame(rows, columns=list(SCORE_COLUMNS))], ignore_index=True), runs)
-
-
-def test_pictures_have_a_table_of_their_own():
-    benchmark = Numbers(everything=with_images(), baseline="x")
-    found = tables_in([*score_blocks(benchmark), *detail_blocks(benchmark)])
-    table = found["Scores of pictures"]
-    row = rows_of(table)["y"]
-    assert row["Recon. PSNR"].text == "33.000" and row["Recon. LPIPS"].text == "0.0500"
-    assert row["Recon. SSIM"].plain == "0.9500" and row["Recon. SSIM"].mark == "best"
-    # Runs are those with images; a percentage of decibels would mean nothing.
-    assert row["Runs"].text == "1/1"
-    assert rows_of(found["Pictures: paired difference to x"])["y"]["Recon. PSNR"].plain == "+3.000"
-    assert "Of 2 scenarios 1 have scores of pictures. Cameras scored: 0; masks: given; rasterizer: warp." in table.note
-    assert "frame 0: a 25%." in summary(with_images())
-
-
-def test_what_was_not_computed_is_said_and_never_a_number():
-    runs = with_images("no AlexNet weights: x is not there")
-    table = tables_in(score_blocks(Numbers(everything=runs, baseline="x")))["Scores of pictures"]
-    assert not any("LPIPS" in heading for heading in table.header)
-    assert "LPIPS not computed: no AlexNet weights: x is not there" in summary(runs)
-
-
-@pytest.mark.parametrize(
-    ("images", "why"),
-    [
-        (None, "these scenarios have no images"),
-        ({"failed": "appearance: step 3 removed the last splat"}, "appearance: step 3 removed"),
-    ],
-)
-def test_where_no_picture_was_scored_the_reason_is_said(images, why):
-    one = collected({("a", "x", 0): 0.01})
-    assert f"No scores of pictures: {why}" in summary(Collected(one.scores, one.runs.assign(images=json.dumps(images))))
-
-
-def test_only_pairs_that_every_method_finished_are_averaged_and_the_others_listed():
-    """A method that has finished nothing does not empty the table."""
-    values = {("a", "x", 0): 0.010, ("a", "y", 0): 0.008, ("b", "x", 0): 0.500}
-    found = collected(values, failed=(("b", "y", 0), ("a", "z", 0)))
-    rows = rows_of(errors_table(Numbers(everything=found, baseline="x")))
-    assert [rows[name]["Future TE"].text for name in "xyz"] == ["10.00", "8.00", "–"]
-    assert [rows[name]["Runs"].text for name in "xyz"] == ["2/2", "1/2 (1 failed)", "0/1 (1 failed)"]
-    assert [rows[name]["Future TE"].mark for name in "xyz"] == ["", "best", ""]
-    text = summary_text(Numbers(everything=found, baseline="x"))
-    assert "- y, b / seed 0: failed: diverged\n- z, a / seed 0: failed: diverged\n" in text
-
-
-def test_many_missing_runs_are_counted_and_failures_named(tmp_path):
-    found = collect(tmp_path, [f"s{i}" for i in range(9)], ["x", "y"], [0])
-    found.runs.loc[0, ["status", "reason"]] = ["failed", "diverged"]
-    text = summary_text(Numbers(everything=found, baseline="x"))
-    assert "- x, s0 / seed 0: failed: diverged\n" in text and "- x, s1 / seed 0, " in text
-    assert "- y, s0 / seed 0, " in text and " and 2 more: missing" in text and " and 3 more: missing" in text
-
-
-def test_many_notes_are_counted_by_kind_with_the_range_of_their_numbers():
-    found = collected(dict.fromkeys([(f"s{i}", method, 0) for i in range(9) for method in ("x", "y")], 0.010))
-    of_x = found.runs["method"] == "x"
-    found.runs["notes"] = [
-        f"fit: {10 + i}% of the springs lie at the bound; search: at an end of its range: dashpot" if x else ""
-        for i, x in enumerate(of_x)
-    ]
-    assert "- s0 / x / seed 0: fit: 10% of the springs" in summary(found)
-    found.runs.loc[~of_x, "notes"] = "fit: no epoch was better than the search"
-    many = summary(found)
-    assert "- x, 9 of 9 runs: fit: 10 to 26% of the springs lie at the bound" in many
-    assert "- x, 9 of 9 runs: search: at an end of its range: dashpot" in many
-    assert "- y, 9 of 9 runs: fit: no epoch was better than the search" in many
-    assert "s0 / x / seed 0: fit" not in many
-
-
-def test_no_spread_is_shown_where_one_seed_of_several_has_finished():
-    found = collected({("a", "x", 0): 0.010})
-    rest = pd.DataFrame([{"scenario": "a", "method": "x", "seed": 1, "status": "missing", "reason": "", "notes": ""}])
-    table = errors_table(Numbers(everything=Collected(found.scores, pd.concat([found.runs, rest])), baseline="x"))
-    assert rows_of(table)["x"]["Future TE"].plain == "10.00"
-    assert "standard deviation" not in table.note
-
-
-def test_a_table_is_drawn_as_markdown_latex_and_html():
-    cell = Cell(text="1.5 ± 0.1", small=["(-2)"], chips=[Chip(text="worse", tone="bad", symbol="▼")], mark="second", value=1.5)
-    rows = [[Cell(text="a|b"), cell, Cell(text="<3")], [Cell(text="a long heading of rows"), Cell(), Cell()]]
-    table = Table(caption="C", header=["Method", "CD ↓", "CD ↓"], groups=["Recon.", "Future"], rows=rows, note="50 % of a_b")
-    head, rule, first, second = table.markdown()
-    assert first == "| a\\|b   | <ins>1.5 ± 0.1 (-2): worse</ins> | <3          |"
-    assert second == "| *a long heading of rows* | | |" and len(head) == len(rule) == len(first)
-    latex = table.latex("label", "T & U")
-    assert r"a$|$b & \underline{1.5 $\pm$ 0.1 ($-$2): worse} & $<$3 \\" in latex
-    assert r"\multicolumn{1}{c}{Reconstruction \& Resimulation}" in latex and r"\caption{\textbf{T \& U.} 50 \% of a\_b}" in latex
-    page = html_page("", "", [PageSection(key="a", title="A", blocks=[table])])
-    assert page.count("<table") == 2 and "<caption><span>C: Future Prediction</span></caption>" in page
-    assert '<td data-value="1.5"><b>1.5 ± 0.1</b><span class="hidden"> (second)</span><small>(-2)</small>' in page
-    assert '<span class="chip bad"><span aria-hidden="true">▼</span> worse</span>' in page and "&lt;3" in page
-
-
-def test_runs_of_different_settings_are_pointed_out():
-    found = collected({("a", "x", 0): 0.010, ("a", "x", 1): 0.011, ("a", "y", 0): 0.010, ("a", "y", 1): 0.011})
-    digests = [{"search": "s", "fit": "f"}, {"search": "s", "fit": "g"}, {"search": "s"}, {"search": "s"}]
-    found.runs["settings"] = [json.dumps(row) for row in digests]
-    assert "Runs were made with different settings (fit of x): make the older ones again" in summary(found)
-    found.runs["settings"] = json.dumps(digests[0])
-    assert "different settings" not in summary(found)

@@ -5,19 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
 from neuspring.core.artifacts import Trajectory
 from neuspring.data.camera import Camera
-from neuspring.report.summary import marked_blocks
 from neuspring.scores import metrics
 from neuspring.scores.carried import FAR_SIDE, carried_in_image, points_in_image, points_on_table
-from neuspring.scores.numbers import Numbers
-from neuspring.scores.runs import Collected
 from tests.support.colored import observed
-from tests.support.study_runs import rows_of
 
 K = np.array([[400.0, 0, 320], [0, 410.0, 240], [0, 0, 1]])
 DEPTH = 0.8
@@ -132,6 +127,3 @@ def test_scores_of_color_alone_have_the_errors_of_marked_points():
     assert set(found["unit"]) == {"px"}
     scores = metrics.score(Trajectory(positions=still, frame_count=len(still)), seen, "m", 0)
     assert not len(scores.query("metric == 'image_error'"))
-    runs = pd.DataFrame({"method": ["still"], "scenario": ["small"], "seed": [0], "status": ["ok"]})
-    (table,) = marked_blocks(Numbers(everything=Collected(rows, runs), baseline="still"))
-    assert rows_of(table)["still"]["Future Marked"].text == "12.0"

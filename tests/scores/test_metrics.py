@@ -15,12 +15,13 @@ import pytest
 from neuspring.config.settings import Aim
 from neuspring.core.artifacts import Trajectory
 from neuspring.core.errors import InputError
-from neuspring.report.summary import write
+from neuspring.report.tables import Benchmark, write
 from neuspring.scores import metrics, paper
 from neuspring.scores.metrics import require_metrics
-from neuspring.scores.numbers import Numbers
-from neuspring.scores.runs import Collected
+from neuspring.scores.statistics import ratios
+from neuspring.scores.study import cells, restricted
 from tests.support.scenarios import observations, scenario
+from tests.support.study_runs import collected
 
 GOLDEN = 1e-5
 """Relative; the golden README's tolerance (we compute in float64 and agree to rounding). Traps differ by 14 % or more."""
@@ -221,21 +222,19 @@ def test_a_packages_metric_is_one_entry_that_is_scored_shown_and_may_be_aimed_at
     monkeypatch.setitem(vars(metrics.METRICS), "_loaded", {})
     given = observations()
     positions = np.repeat(given.nodes[None], given.scenario.frame_count, axis=0)
-    scores = pd.concat(
-        metrics.score(rollout(factor * positions), given, name, 0).assign(scenario=scenario)
-        for name, factor in (("x", 1.0), ("y", 2.0))
-        for scenario in "abc"
-    )
-    runs = scores[["scenario", "method", "seed"]].drop_duplicates().assign(status="ok", reason="", notes="", source="", run_key="")
+    values = {}
+    for method, factor in (("x", 1.0), ("y", 2.0)):
+        rows = metrics.score(rollout(factor * positions), given, method, 0)
+        own = {(row.task, row.metric): row.value for row in rows.itertuples()}
+        values |= {(scenario, method, 0): own for scenario in "abcdef"}
+    table = collected(values)
     aim = Aim(method="y", baseline="x", metric="extent", ratio=2.5, below=3.0)
     require_metrics([aim])
+    assert ratios(table.rows, "x").set_index(["metric", "task"]).loc[("extent", "future"), "ratio"] == pytest.approx(2.0)
+    assert "Future Extent" in write(Benchmark(table=table, baseline="x", aims=(aim,)), tmp_path)
     study = paper.Study(title="T", reference=None, baseline="x", rows={"x": "x", "y": "y"})
-    found = Collected(scores, runs.assign(images="null"))
-    numbers = Numbers(everything=found, baseline="x", aims=(aim,), studies={"s": study}, known_studies={"s": study})
-    assert numbers.ratios.set_index(["metric", "task"]).loc[("extent", "future"), "ratio"] == pytest.approx(2.0)
-    assert "Future Extent" in write(numbers, tmp_path)
-    cells = numbers.by_study["s"].cells.set_index(["metric", "task", "label"])
-    assert cells.loc[("extent", "future", "y"), "relative"] == pytest.approx(1.0)
+    found = cells(study, restricted(study, table)).set_index(["metric", "task", "label"])
+    assert found.loc[("extent", "future", "y"), "change"] == pytest.approx(2.0)
     with pytest.raises(InputError, match=r"aims, metric: .*Known: .*extent"):
         require_metrics([dataclasses.replace(aim, metric="psnr")])
 

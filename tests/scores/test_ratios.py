@@ -108,13 +108,13 @@ def aim(**changes: object) -> Aim:
 )
 def test_an_aim_needs_its_mean_and_its_interval(center, spread, changes, verdict):
     values = logs({name: [center + spread * (-1) ** index] for index, name in enumerate("abcdef")})
-    assert judged_aims(table(values), table({}), [aim(**changes)]).iloc[0]["aim_verdict"] == verdict
+    assert judged_aims(table(values), [aim(**changes)]).iloc[0]["aim_verdict"] == verdict
 
 
 def test_an_aim_of_transfers_is_judged_by_transfers():
     good = logs({name: [-0.3 - 0.01 * index] for index, name in enumerate("abcd")})
     bad = logs({name: [0.3 + 0.01 * index] for index, name in enumerate("abcd")})
-    row = judged_aims(table(good), table(bad, task="transfer"), [aim(task="transfer")]).iloc[0]
+    row = judged_aims(pd.concat([table(good), table(bad, task="transfer")]), [aim(task="transfer")]).iloc[0]
     assert row["aim_verdict"] == "missed" and row["ratio"] > 1
 
 

@@ -14,14 +14,8 @@ from neuspring.core.records import StageRecord, digest_file
 from neuspring.core.run_record import key_of
 from neuspring.core.table import Cell, Table
 from neuspring.report.blocks import Block, Fold
-from neuspring.report.study import write_study
-from neuspring.report.summary import summary_text
-from neuspring.scores.failures import LeftOut
 from neuspring.scores.metrics import METRICS, SCORE_COLUMNS
-from neuspring.scores.numbers import Numbers
-from neuspring.scores.paper import Study
-from neuspring.scores.runs import Collected, collect
-from neuspring.scores.study import StudyNumbers
+from neuspring.scores.table import COLUMNS, RUN_COLUMNS, ScoreTable
 from tests.support.runs import run_record
 
 Scores = Mapping[tuple[str, str], float]
@@ -80,12 +74,24 @@ def write_run(
     return folder / "run.json"
 
 
-def collected(values: dict[tuple[str, str, int], float], failed: tuple[tuple[str, str, int], ...] = ()) -> Collected:
-    """Future track errors in meters by (scenario, method, seed), without files; the other runs failed."""
-    rows = [(s, "rope", m, seed, "future", "track_error", value, "m", 10) for (s, m, seed), value in values.items()]
-    runs = [(*run, "ok", "", "") for run in values] + [(*run, "failed", "diverged", "") for run in failed]
-    columns = ["scenario", "method", "seed", "status", "reason", "notes"]
-    return Collected(pd.DataFrame(rows, columns=list(SCORE_COLUMNS)), pd.DataFrame(runs, columns=columns))
+def collected(
+    values: Mapping[tuple[str, str, int], float | Scores], failed: Iterable[tuple[str, str, int]] = (), **facts: Any
+) -> ScoreTable:
+    """A table without files: scores (or a future track error, m) by scenario, method, seed; `failed` runs have none."""
+    rows, runs = [], []
+    for (scenario, method, seed), given in values.items():
+        scores = given if isinstance(given, Mapping) else {("future", "track_error"): given}
+        name = f"{scenario}/{method}/{seed}"
+        for (task, metric), value in scores.items():
+            unit = METRICS[metric].unit if metric in METRICS else "m"
+            rows.append((name, method, scenario, "rope", seed, task, metric, 10, value, unit))
+        runs.append({"run": name, "scenario": scenario, "method": method, "seed": seed, "status": "ok", "reason": ""})
+    for scenario, method, seed in failed:
+        name = f"{scenario}/{method}/{seed}"
+        runs.append({"run": name, "scenario": scenario, "method": method, "seed": seed, "status": "failed", "reason": "diverged"})
+    rest = {"notes": "", "images": "null", "source": "", "run_key": "", "oracle": False, "settings": "{}"} | facts
+    table = pd.DataFrame(runs).assign(**rest).reindex(columns=list(RUN_COLUMNS))
+    return ScoreTable(pd.DataFrame(rows, columns=list(COLUMNS)), table)
 
 
 def all_scores(factor: float = 1.0) -> dict[tuple[str, str], float]:
@@ -107,32 +113,6 @@ def write_benchmark(
                 write_run(results, scenario, method, seed, all_scores(size * factor * rng.uniform(0.99, 1.01)), **facts)
 
 
-def summary(found: Collected, baseline: str = "x") -> str:
-    """The scores of a benchmark in Markdown."""
-    return summary_text(Numbers(everything=found, baseline=baseline))
-
-
-def study_text(
-    name: str,
-    study: Study,
-    results: Path,
-    scenarios: Iterable[str],
-    seeds: Iterable[int],
-    methods: Iterable[str],
-    folder: Path,
-    left_out: LeftOut | None = None,
-    beside: Study | None = None,
-) -> str:
-    """Write the files of a study from the records in a results folder, and its numbers beside its folder; returns the Markdown."""
-    found = collect(results, scenarios, methods, seeds, left_out or {})
-    known = {name: study} | ({study.beside or "": beside} if beside else {})
-    numbers = Numbers(everything=found, baseline="", studies={name: study}, known_studies=known)
-    numbers.save(folder.parent)
-    made = numbers.by_study[name]
-    assert isinstance(made, StudyNumbers)
-    return write_study(made, folder)
-
-
 def tables_in(blocks: Sequence[Block]) -> dict[str, Table]:
     """Tables by their captions, folded ones too."""
     own = {block.caption: block for block in blocks if isinstance(block, Table)}
@@ -143,5 +123,5 @@ def rows_of(table: Table) -> dict[str, dict[str, Cell]]:
     """First cell of a row to its cells by heading; of several rows with the same first cell, the first."""
     rows: dict[str, dict[str, Cell]] = {}
     for row in table.rows:
-        rows.setdefault(row[0].text, dict(zip(table.headings, row, strict=True)))
+        rows.setdefault(row[0].text, dict(zip(table.header, row, strict=True)))
     return rows

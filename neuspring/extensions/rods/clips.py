@@ -18,13 +18,13 @@ from matplotlib.lines import Line2D
 
 from neuspring.core.files import write_text
 from neuspring.core.records import StageRecord
-from neuspring.core.table import LATEX_PREAMBLE, Cell, Table
+from neuspring.core.table import Cell, Table
 from neuspring.draw.sheet import save
 from neuspring.extensions.rods.metric import DEFORM_L1
-from neuspring.report.blocks import Block, Items, markdown
+from neuspring.report.blocks import Block, Items
 from neuspring.scores.metrics import DASH
 from neuspring.scores.paper import OwnStudy, Printed, Study, Values, printed
-from neuspring.scores.runs import DAMAGED, collect, read_transfers
+from neuspring.scores.table import DAMAGED, ScoreTable, collect, read_transfers
 
 EUCLID = "track_error"
 """Markers of cables are nodes, so it is the mean Euclidean error of free markers."""
@@ -65,9 +65,8 @@ def published() -> Values:
 
 @dataclass(frozen=True, kw_only=True)
 class ClipNumbers(OwnStudy):
-    """The predictions of a study's methods on other recordings; each table is computed once, or was read from numbers.json."""
+    """The predictions of a study's methods on other recordings; each table is computed once."""
 
-    TABLES: ClassVar = ("clips", "records", "cells", "growth")
     published: ClassVar = {"deform_published": published}
     name: str
     study: Study
@@ -79,17 +78,15 @@ class ClipNumbers(OwnStudy):
     seeds: Sequence[int]
 
     @classmethod
-    def of(cls, name: str, study: Study, numbers: Any) -> ClipNumbers:
-        runs = numbers.everything.runs
-        sources, methods, seeds = (list(dict.fromkeys(runs[column])) for column in ("scenario", "method", "seed"))
-        results = numbers.results or Path("results")
+    def of(cls, name: str, study: Study, table: ScoreTable, results: Path) -> ClipNumbers:
+        sources, methods, seeds = (list(dict.fromkeys(table.runs[column])) for column in ("scenario", "method", "seed"))
         return cls(name=name, study=study, results=results, sources=sources, methods=methods, seeds=seeds)
 
     def blocks(self) -> list[Any]:
         return list(clip_blocks(self))
 
-    def write(self, folder: Path) -> str:
-        return write_clips(self, folder)
+    def files(self, folder: Path) -> list[str]:
+        return clip_files(self, folder)
 
     @property
     def labels(self) -> dict[str, str]:
@@ -217,22 +214,16 @@ def _details(found: ClipNumbers) -> Table:
     return replace(Table.of_texts(header, rows, "Ours in detail"), note=note, stub=2)
 
 
-def write_clips(found: ClipNumbers, folder: Path) -> str:
-    """Write all files of a study of clips; returns the Markdown."""
-    name = found.name
+def clip_files(found: ClipNumbers, folder: Path) -> list[str]:
+    """Write the CSV files and the figure; Markdown lines that show them."""
     for suffix, rows in {"": found.cells, "_clips": found.clips}.items():
-        write_text(folder / f"{name}{suffix}.csv", rows.to_csv(index=False))
-    title, (first, *rest) = found.study.title, clip_blocks(found)
-    tables = [block for block in (first, *rest) if isinstance(block, Table)]
-    floats = [table.latex(f"{name}-{k}", f"{title}: {table.caption}") for k, table in enumerate(tables, 1)]
-    write_text(folder / f"{name}.tex", "\n".join([LATEX_PREAMBLE, *floats]))
-    parts = [f"# {title}\n", markdown([first])]
-    if len(found.growth):
-        path = save(growth_figure(found.growth, list(found.study.rows)), folder / f"{name}_growth.png")
-        parts.append(f"![Mean error of free markers over time, per cable]({path.name})\n")
-    text = "\n".join([*parts, markdown(rest)])
-    write_text(folder / f"{name}.md", text)
-    return text
+        write_text(folder / f"{found.name}{suffix}.csv", rows.to_csv(index=False))
+    path = folder / f"{found.name}_growth.png"
+    path.unlink(missing_ok=True)
+    if not len(found.growth):
+        return []
+    save(growth_figure(found.growth, list(found.study.rows)), path)
+    return [f"![Mean error of free markers over time, per cable]({path.name})"]
 
 
 def growth_figure(growth: pd.DataFrame, labels: Sequence[str]) -> Figure:

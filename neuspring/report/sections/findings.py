@@ -1,37 +1,39 @@
-"""Findings: what steps of perception and fits noticed of their own results."""
+"""Findings of perception, searches and fits on their own results; perception against the truth; sweeps."""
 
 from __future__ import annotations
 
-from neuspring.core.findings import Level, findings_of
-from neuspring.core.table import Cell, Chip, Table, Tone
-from neuspring.report.blocks import Block, Fold, PageSection, Text
-from neuspring.report.data import MOST_ROWS, ReportData, ReportSection, several
-from neuspring.report.notes import of_fits
+from neuspring.core.findings import findings_of
+from neuspring.core.table import Cell, Table, Tone
+from neuspring.report.blocks import Block, Fold, PageSection
+from neuspring.report.data import MOST_ROWS, ReportData, ReportSection, prose, several
+from neuspring.report.notes import of_runs
 
-TONES: dict[Level, Tone] = {"error": "bad", "warning": "warn", "note": "mute"}
+TONES: dict[str, Tone] = {"error": "bad", "warning": "warn", "note": "mute"}
 
 
 def findings(material: ReportData) -> PageSection | None:
-    """A table of warnings, and one of notes to unfold; None where nothing was found that is worth saying."""
+    """A table of warnings, and a folded one of notes; None where nothing was found."""
     found = [(name, one) for name in material.choice.scenarios for one in findings_of(material.results, name)]
-    found += of_fits(material.runs)
-    if not found:
-        return None
-    loud, quiet = ([pair for pair in found if (pair[1].level == "note") == noted] for noted in (False, True))
+    found += of_runs(material.runs)
     blocks: list[Block] = []
-    for caption, part in (("Warnings", loud), ("Notes", quiet)):
-        rows = []
-        for name, one in part[:MOST_ROWS]:
-            level = Chip(text=one.level, tone=TONES[one.level])
-            rows.append([Cell(text=name), Cell(text=one.where), Cell(text=one.name, chips=[level]), Cell(text=one.text, wrap=True)])
-        rest = f"{len(part) - MOST_ROWS} more are in the records." if len(part) > MOST_ROWS else ""
-        table = Table(caption=caption, header=["Scenario", "Where", "What", "Finding"], rows=rows, stub=1, note=rest)
-        if part:
-            blocks.append(table if part is loud else Fold(summary=several(len(part), "note"), blocks=[table]))
-    if not loud:
-        blocks.insert(0, Text(text="Nothing was noticed that makes results worse.", tone="good"))
-    about = "Each step looks at its own result: a warning says what may make all methods worse, or one, and what to do."
-    return PageSection(key="findings", title="Findings of perception and fits", about=about, blocks=blocks)
+    for noted in (False, True):
+        part = [pair for pair in found if (pair[1].level == "note") == noted]
+        rows = [
+            [
+                Cell(text=name),
+                Cell(text=one.level, tone=TONES[one.level]),
+                Cell(text=one.where),
+                Cell(text=one.name),
+                Cell(text=one.text, wrap=True),
+            ]
+            for name, one in part[:MOST_ROWS]
+        ]
+        table = Table(caption="Notes" if noted else "Warnings", header=["Scenario", "Level", "Where", "What", "Finding"], rows=rows)
+        blocks += [Fold(summary=several(len(part), "note"), blocks=[table]) if noted else table] if part else []
+    texts = {"Perception against the truth": material.results / material.choice.tables / "perception.md"}
+    texts |= {f"Sweep {path.parent.name}": path for path in sorted((material.results / "tune").glob("*/summary.md"))}
+    blocks += [Fold(summary=name, blocks=[text]) for name, path in texts.items() if (text := prose(material, path))]
+    return PageSection(key="findings", title="Findings of perception and fits", blocks=blocks) if blocks else None
 
 
 section = ReportSection(order=60, make=findings)

@@ -1,22 +1,20 @@
-"""The verdict in words, first of all."""
+"""The verdict: who is ahead, by how much, whether it is resolved, the next command."""
 
 from __future__ import annotations
 
-from neuspring.report import verdict as words
+from neuspring.report import tables
 from neuspring.report.blocks import Block, PageSection, Text
 from neuspring.report.data import ReportData, ReportSection, several
 
 
 def verdict(material: ReportData) -> PageSection:
-    """The answer, and how many jobs failed and files cannot be read."""
-    blocks: list[Block] = [*words.verdict(material.numbers)] if len(material.collected.runs) else []
-    if not blocks:
-        text = f"Nothing to report yet: {material.results.resolve().name} holds no run, and none was asked for."
-        blocks.append(Text(text=text, tone="warn"))
-    failed, damaged = sum(job.failed for job in material.jobs), len(material.damaged)
-    for count, noun, what in ((failed, "job", "failed"), (damaged, "file", "cannot be read")):
+    """The verdict, and how many jobs failed and files cannot be read."""
+    text = f"Nothing to report yet: {material.results.resolve().name} holds no run, and none was asked for."
+    blocks: list[Block] = tables.verdict(material.numbers) if len(material.table.runs) else [Text(text=text, tone="warn")]
+    failed = sum(job.failed for job in material.jobs)
+    for count, noun, what in ((failed, "job", "failed"), (len(material.damaged), "file", "cannot be read")):
         if count:
-            blocks.append(Text(text=f"{several(count, noun)} {what}: see Failures and missing runs.", tone="warn"))
+            blocks.append(Text(text=f"{several(count, noun)} {what}: see Failures.", tone="warn"))
     return PageSection(key="verdict", title="Verdict", blocks=blocks)
 
 

@@ -24,7 +24,7 @@ from neuspring.core.table import Table
 from neuspring.draw.sheet import save
 from neuspring.report.blocks import markdown
 from neuspring.scores.paper import released
-from neuspring.scores.runs import collect
+from neuspring.scores.table import collect
 
 CONFIG = Path(__file__).parents[3] / "config"
 ROWS = (CONFIG / "rows" / "ours.yaml",)

@@ -8,15 +8,13 @@ import pandas as pd
 import pytest
 
 from neuspring.cli.main import main
-from neuspring.config import parse
+from neuspring.config import Config, parse
 from neuspring.core.errors import InputError
 from neuspring.extensions.rods.clips import TAGS, ClipNumbers, clip_blocks, published
 from neuspring.report import page
 from neuspring.report.blocks import markdown
 from neuspring.scores.metrics import SCORE_COLUMNS
-from neuspring.scores.numbers import Numbers
 from neuspring.scores.paper import Study, read_studies
-from neuspring.scores.runs import collect
 from tests.extensions.rods.clip_runs import FRAMES, RATE, write_transfer
 from tests.support.study_runs import rows_of, tables_in, write_run
 
@@ -117,30 +115,28 @@ def test_the_command_writes_tables_growth_and_films(tmp_path, capsys, monkeypatc
         ["study", "--study", "deform", "--output", str(output)],
         ["--table", str(STUDY_TABLE), "--extra-rows", str(ROWS)],
     )
-    kept = ["--output", str(results / "tables"), "--studies", "deform", *known]
+    kept = ["--output", str(results / "tables")]
     assert main(["tables", "--results", str(results), *runs, *kept]) == 0
-    assert main([*command, "--results", str(results)]) == 0
+    assert main([*command, *known, "--results", str(results)]) == 0
     names = ["deform.csv", "deform.md", "deform.tex"]
     names += ["deform_clips.csv", "deform_growth.png"]
     assert sorted(path.name for path in output.iterdir()) == names
-    growth = Numbers.load(results / "tables", results).by_study["deform"].growth
+    growth = found(results, seeds=[0]).growth
     rod = growth[growth["label"] == "Rod"]
     np.testing.assert_allclose(rod["seconds"], np.arange(FRAMES) / RATE)
     np.testing.assert_allclose(rod["euclid_mm"], [0.0, *[12.0] * (FRAMES - 1)])
-    assert "\\begin{tabular}{@{} ll r @{}}" in (output / "deform.tex").read_text(), "numbers, and no paragraphs"
+    assert "\\begin{tabular}{@{}llr@{}}" in (output / "deform.tex").read_text(), "numbers, and no paragraphs"
     assert "7.7†" in capsys.readouterr().out
     pd.DataFrame(columns=list(SCORE_COLUMNS)).to_csv(tmp_path / "scores.csv")
     assert main([*command, *known, "--scores", str(tmp_path / "scores.csv")]) != 0
     assert "a study of the kind clips needs a results folder" in capsys.readouterr().err
 
 
-def test_the_page_shows_the_same_tables_once_the_study_was_made(tmp_path):
+def test_the_page_shows_the_same_tables_once_the_study_is_asked_for(tmp_path):
     write_transfer(tmp_path, "DLO3", "rod", 0, CLIPS)
     write_run(tmp_path, "DLO3_train", "rod", 0, {("future", "chamfer"): 0.01}, category="DLO3", source="mocap")
     options = page.Options(studies={"deform": STUDY})
     assert "Ours in detail" not in page.write(tmp_path, tmp_path / "report.html", options).read_text()
-    runs = collect(tmp_path, ["DLO3_train"], ["rod"], [0])
-    studies = {"deform": STUDY}
-    Numbers(everything=runs, baseline="rod", studies=studies, known_studies=studies, results=tmp_path).save(tmp_path)
+    options = page.Options(studies={"deform": STUDY}, settings=Config(studies=("deform",), seeds=(0,)))
     text = page.write(tmp_path, tmp_path / "report.html", options).read_text()
     assert "Ours in detail" in text and "7.7†" in text
