@@ -16,7 +16,7 @@ from neuspring.scores import paper, statistics
 from neuspring.scores.metrics import TASKS, Metric, averages, present
 from neuspring.scores.paper import Printed, Study
 from neuspring.scores.statistics import interval, resampled_means
-from neuspring.scores.table import ScoreTable, comparable
+from neuspring.scores.table import ScoreTable, comparable, of_kind
 
 LEAST_SCENARIOS = 6
 """A verdict on a change needs so many: all of n scenarios change in one direction by chance once in 2^(n-1) studies."""
@@ -119,7 +119,7 @@ def _estimates(scores: pd.DataFrame) -> Iterator[tuple[tuple[str, str, str], dic
 def _changes(study: Study, own: ScoreTable) -> dict[tuple[str, str, str], dict[str, float]]:
     """Ratios of errors, and differences of pictures, to the study's baseline."""
     scores, base = own.comparison.finished, study.rows[study.baseline]
-    pictures = scores[~scores["metric"].map(lambda name: paper.in_studies()[name].of == "positions")]
+    pictures = of_kind(scores, "pictures", "marks")
     tables = [
         statistics.ratios(scores, base).rename(columns={"ratio": "change", "ratio_low": "change_low", "ratio_high": "change_high"}),
         statistics.paired_differences(pictures, base).rename(
