@@ -1,8 +1,7 @@
-"""Tables, figures and pages for people.
+"""Tables, the report page, and studies beside the paper's numbers.
 
-- `blocks`: what pages are made of, as HTML and as Markdown.
-- `grid`, `summary`, `study`, `clips`, `verdict`, `notes`, `perception`: numbers laid out, once for files and for the page.
-- `page` with its `sections`: report.html and pictures.html.
-- `draw`, `video`: pictures of runs and for papers, H.264 videos.
-- `explain`: from a cell of a table to its runs.
+- `tables`, `study`: queries on the long table (`neuspring.scores.table`), laid out; summary.md and studies.
+- `blocks`: the parts of a page, as HTML and Markdown. `page` with its `sections`: report.html.
+- `notes`: findings of finished runs. `perception`: errors of perception against the truth.
+- `shown`: what a results folder holds, for `play`, exports and figures.
 """

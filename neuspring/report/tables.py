@@ -251,7 +251,7 @@ def _conditions(table: ScoreTable) -> str:
     """How pictures were scored, from the runs' records."""
     facts = [fact for text in dict.fromkeys(table.runs["images"]) if (fact := json.loads(text))]
     parts = []
-    for key in ("views", "masks", "backend", "quirks", "lpips", "failed"):
+    for key in ("views", "masks", "backend", "lpips", "failed"):
         values = {", ".join(fact[key]) if isinstance(fact[key], list) else str(fact[key]) for fact in facts if key in fact}
         parts += [f"{key}: {' or '.join(sorted(values - {''}))}"] if values - {"", "computed"} else []
     return f" Conditions: {'; '.join(parts)}." if parts else ""

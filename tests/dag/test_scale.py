@@ -60,7 +60,7 @@ def test_a_study_is_a_target_and_explain_names_its_runs(two_gpu_run):
     page = (project / "results" / "tables" / "studies" / "table2.md").read_text()
     assert "Model-A (PT)" in page
     assert "not run" not in page, "the rows that the configuration does not name are made too"
-    command = [sys.executable, "-m", "neuspring", "explain", "table2/Baseline/future/chamfer", "--results", "results"]
+    command = [sys.executable, "-m", "neuspring", "explain", "baseline/future/chamfer", "--results", "results"]
     assert f"results/{SCENE}/baseline/0/run.json" in output_of(start(command, project))
 
 

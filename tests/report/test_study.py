@@ -204,7 +204,7 @@ def test_failures_absent_methods_and_settings_are_named(written):
 
 
 def test_best_and_second_best_are_marked_where_the_paper_marks_them(written):
-    folder, table, text = written
+    folder, table, _ = written
     main = tables_in(blocks_of("table1", STUDIES["table1"], table, folder))["Ours beside the paper's"]
     ours = {row[0].text: row[3].mark for row in main.rows if row[2].text == "ours"}
     assert ours == {"Spring-Gaus": "", "GS-Dynamics": "", "PhysTwin": "second", "NeuSpring": "best"}

@@ -91,7 +91,7 @@ def test_averages_mark_the_best_count_runs_and_keep_oracles_apart():
 
 
 def test_spreads_ratios_breakdowns_and_pictures_have_tables():
-    facts = {"views": ["0"], "masks": "given", "lpips": "no AlexNet weights", "quirks": []}
+    facts = {"views": ["0"], "masks": "given", "lpips": "no AlexNet weights"}
     values = {
         (s, m, seed): {FUTURE: 0.01 * f * (1 + seed), ("future", "psnr"): 30.0 + f, ("start", "track_error"): 0.007}
         for s in "abcdef" for m, f in (("x", 1.0), ("y", 0.9)) for seed in (0, 1)
