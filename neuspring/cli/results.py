@@ -69,7 +69,7 @@ def tables(
         about = asked(results)
         found, _ = as_asked(collect(results, scenarios, methods, seeds, absent, transfers), about)
         common |= {"results": results, "asked": about}
-    numbers = tables.Benchmark(table=found, baseline=baseline or found.methods[0], **common)
+    numbers = tables.Compared(table=found, baseline=baseline or found.methods[0], **common)
     text = tables.write(numbers, output)
     print(markdown(tables.verdict(numbers)) if brief else text)
     print(f"Tables: {output / 'summary.md'}")

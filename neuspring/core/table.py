@@ -11,7 +11,7 @@ from markupsafe import Markup, escape
 
 Tone = Literal["", "good", "bad", "warn", "mute"]
 Form = Literal["text", "markdown", "latex", "html"]
-MARKS = {
+CELL_MARKS = {
     "text": {"": "{}", "best": "{}", "second": "{}"},
     "markdown": {"": "{}", "best": "**{}**", "second": "<ins>{}</ins>"},
     "latex": {"": "{}", "best": r"\textbf{{{}}}", "second": r"\underline{{{}}}"},
@@ -64,7 +64,7 @@ def lay_out(table: Table, form: Form, label: str = "") -> str:
     """The table in one of four forms; `label` names the float in LaTeX, which needs booktabs and graphicx."""
     change = {"latex": tex, "html": coded, "markdown": lambda text: text.replace("|", "\\|").replace("\n", " ")}.get(form, str)
     head = [str(change(text)) for text in table.header]
-    rows = [[MARKS[form][cell.mark].format(change(cell.text)) for cell in row] for row in table.rows]
+    rows = [[CELL_MARKS[form][cell.mark].format(change(cell.text)) for cell in row] for row in table.rows]
     if form == "html":
         return _html(table, head, rows)
     if form == "latex":

@@ -18,7 +18,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.job_records import JobRecord
 from neuspring.core.run_record import RUN_RECORD, RunRecord
 from neuspring.report.blocks import PageSection, Prose
-from neuspring.report.tables import Benchmark
+from neuspring.report.tables import Compared
 from neuspring.scores.paper import Study
 from neuspring.scores.table import DAMAGED, LeftOut, ScoreTable, one_line
 
@@ -64,7 +64,7 @@ class ReportData:
     output: Path
     choice: Options
     """With nothing left empty."""
-    numbers: Benchmark
+    numbers: Compared
     jobs: Sequence[JobRecord]
     damaged: dict[str, str]
     """Files that cannot be read, relative to the results folder, and why."""

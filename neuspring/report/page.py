@@ -18,7 +18,7 @@ from neuspring.core.text import listed
 from neuspring.registry import Registry, modules
 from neuspring.report.blocks import PageSection, html_page
 from neuspring.report.data import Options, ReportData, ReportSection, damaged_files, several, traces
-from neuspring.report.tables import Benchmark
+from neuspring.report.tables import Compared
 from neuspring.scores.table import as_asked, collect
 
 __all__ = ["REPORT_SECTIONS", "Options", "write"]
@@ -74,7 +74,7 @@ def gather(results: Path, output: Path, options: Options) -> ReportData:
     table, _ = as_asked(table, about)
     config = choice.settings or Config()
     more = {"objects": config.objects, "aims": config.aims, "names": choice.names, "results": results, "asked": about}
-    numbers = Benchmark(table=table, baseline=choice.baseline or "", **more)  # type: ignore[arg-type]
+    numbers = Compared(table=table, baseline=choice.baseline or "", **more)  # type: ignore[arg-type]
     damaged = damaged_files(table, messages, results)
     return ReportData(results=results, output=output, choice=choice, numbers=numbers, jobs=jobs, damaged=damaged)
 

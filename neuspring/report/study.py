@@ -13,7 +13,7 @@ from neuspring.core.table import Table, lay_out
 from neuspring.draw.benchmark import clusters_figure
 from neuspring.draw.sheet import save
 from neuspring.report.blocks import Block, Fold, Text, markdown
-from neuspring.report.tables import TONES, Benchmark, breakdown, failure_blocks, pivot, settings_table, texts
+from neuspring.report.tables import TONES, Compared, breakdown, failure_blocks, pivot, settings_table, texts
 from neuspring.scores import paper
 from neuspring.scores.metrics import DASH, METRICS, Metric
 from neuspring.scores.paper import STUDY_KINDS, Study
@@ -65,7 +65,7 @@ def blocks_of(name: str, study: Study, table: ScoreTable, results: Path) -> list
         parts = [released.assign(line=line, value=released[line]) for line in ("released", "ours")]
         shown = texts(pd.concat(parts).sort_values("scenario", kind="stable"), lambda row, metric: metric.shown(row.value))
         folds.append(pivot("Beside the released PhysTwin", shown, {"scenario": "Scenario", "line": ""}, "mm; mean over seeds."))
-    folds += failure_blocks(Benchmark(table=own, baseline="", names=labels), scale=False)
+    folds += failure_blocks(Compared(table=own, baseline="", names=labels), scale=False)
     folds += settings_table(own.runs, lambda method: labels[method])
     return [*blocks, Fold(summary="Scenarios, failures, settings", blocks=folds)] if folds else blocks
 

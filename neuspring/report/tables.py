@@ -32,12 +32,12 @@ TONES: dict[str, Tone] = {
     **dict.fromkeys((statistics.ABOVE, statistics.MISSED, "worse", "opposite", "failed"), "bad"),
 }
 """Verdict -> its color; all others are muted."""
-KINDS = {"positions": "Errors, mm", "pictures": "Scores of pictures", "marks": "Points marked in images"}
+AVERAGED = {"positions": "Errors, mm", "pictures": "Scores of pictures", "marks": "Points marked in images"}
 MOST_NAMED = 6
 
 
 @dataclass(frozen=True, kw_only=True)
-class Benchmark:
+class Compared:
     """A long table and what its tables compare."""
 
     table: ScoreTable
@@ -118,7 +118,7 @@ def again(about: Mapping[str, Any], key: str = "", value: str = "") -> str:
     return shlex.join(words)
 
 
-def verdict(numbers: Benchmark) -> list[Block]:
+def verdict(numbers: Compared) -> list[Block]:
     """Who is ahead, by how much, whether it is resolved; the table of all methods; commands to go on with."""
     runs, table = numbers.table.runs, queries.duels(numbers.table, numbers.baseline, numbers.objects)
     open_runs = (runs["status"] != "ok").any()
@@ -175,7 +175,7 @@ def _moves(moves: list[tuple[str, str]]) -> list[Block]:
     return [block for why, command in moves if command for block in (Text(text=why), Code(text=command, whole=True))]
 
 
-def summary_blocks(numbers: Benchmark) -> list[Block]:
+def summary_blocks(numbers: Compared) -> list[Block]:
     """Averages, breakdowns, aims, ratios, differences, spreads."""
     table, compared = numbers.table, numbers.table.comparison
     usable, finished = comparable(compared.finished), compared.finished
@@ -186,7 +186,7 @@ def summary_blocks(numbers: Benchmark) -> list[Block]:
     if pairs(usable) < pairs(compared.runs):
         text = f"Averages take the {pairs(usable)} of {pairs(compared.runs)} pairs of scenario and seed that every method finished."
         blocks.append(Text(text=text))
-    blocks += [average_table(numbers, kind) for kind in KINDS if len(of_kind(usable, kind))]
+    blocks += [average_table(numbers, kind) for kind in AVERAGED if len(of_kind(usable, kind))]
     blocks += _breakdowns(numbers, finished)
     blocks += _aims(numbers)
     ratios = statistics.ratios(finished, numbers.baseline, numbers.objects)
@@ -209,7 +209,7 @@ def summary_blocks(numbers: Benchmark) -> list[Block]:
     return blocks
 
 
-def average_table(numbers: Benchmark, kind: str) -> Table:
+def average_table(numbers: Compared, kind: str) -> Table:
     """Mean scores of every method for metrics of positions, pictures or marks; oracles are named."""
     table, usable = numbers.table, of_kind(comparable(numbers.table.comparison.finished), kind)
     means, oracles = of_kind(queries.means(table), kind), table.oracles
@@ -231,7 +231,7 @@ def average_table(numbers: Benchmark, kind: str) -> Table:
     note = f"{table.runs['scenario'].nunique()} scenarios, {table.runs['seed'].nunique()} seeds; mean over scenarios"
     note += ", ± standard deviation over seeds" * several + ", in brackets weighted by frames" * weighted + f". {explained}."
     note += {"positions": _floors(table), "pictures": _conditions(table)}.get(kind, "")
-    return pivot(KINDS[kind], shown, {"method": "Method", "runs_after": "Runs"}, note)
+    return pivot(AVERAGED[kind], shown, {"method": "Method", "runs_after": "Runs"}, note)
 
 
 def _runs(status: pd.Series) -> str:
@@ -264,11 +264,11 @@ def _difference(row: Any, metric: Metric) -> str:
     return f"{metric.text(row.difference, '+')} {interval}: {resolved(row.low, row.high, row.scenarios, metric)}"
 
 
-def _named(numbers: Benchmark, table: pd.DataFrame) -> pd.DataFrame:
+def _named(numbers: Compared, table: pd.DataFrame) -> pd.DataFrame:
     return table.assign(method=table["method"].map(numbers.name))
 
 
-def _breakdowns(numbers: Benchmark, finished: pd.DataFrame) -> Iterator[Fold]:
+def _breakdowns(numbers: Compared, finished: pd.DataFrame) -> Iterator[Fold]:
     """Per category and per scenario, of all finished runs, seeds averaged."""
     rows = of_kind(finished, "positions")
     counts = {column: rows[column].nunique() for column in ("category", "scenario")}
@@ -285,7 +285,7 @@ def breakdown(rows: pd.DataFrame, column: str, method: str = "method", scale: bo
     return pivot(f"Per {column}", shown, {column: column.capitalize(), method: "Method"}, "All finished runs, seeds averaged.")
 
 
-def _aims(numbers: Benchmark) -> Iterator[Table]:
+def _aims(numbers: Compared) -> Iterator[Table]:
     found = statistics.judged_aims(numbers.table.comparison.finished, numbers.aims, numbers.objects)
     rows = [
         [
@@ -306,7 +306,7 @@ def _rows(table: pd.DataFrame) -> list[Any]:
     return list(table.itertuples())
 
 
-def failure_blocks(numbers: Benchmark, scale: bool = True) -> list[Block]:
+def failure_blocks(numbers: Compared, scale: bool = True) -> list[Block]:
     """Means without and with failed runs; runs that do not count, by reason; scenarios that methods do not apply to."""
     table, blocks = numbers.table, list[Block]()
     if len(found := queries.with_failures(table.comparison)):
@@ -335,7 +335,7 @@ def failure_blocks(numbers: Benchmark, scale: bool = True) -> list[Block]:
     return blocks
 
 
-def notes_table(numbers: Benchmark) -> list[Table]:
+def notes_table(numbers: Compared) -> list[Table]:
     """Notes of the records, equal but for their numbers counted together."""
     notes = numbers.table.runs[numbers.table.runs["notes"] != ""]
     notes = notes.assign(note=notes["notes"].str.split("; ")).explode("note")
@@ -361,7 +361,7 @@ def settings_table(runs: pd.DataFrame, names: Callable[[str], str]) -> list[Tabl
     return [Table(caption="Settings that differ", header=["Setting", "Value: methods"], rows=rows, note=note)] if rows else []
 
 
-def cost_table(numbers: Benchmark) -> Table:
+def cost_table(numbers: Compared) -> Table:
     """Median wall time and peak memory of each stage per method."""
     time, memory = (
         numbers.table.task(task).pivot_table(index="method", columns="metric", values="value", aggfunc="median", sort=False)
@@ -378,7 +378,7 @@ def cost_table(numbers: Benchmark) -> Table:
     return Table.of_texts(["Method", *map(str, time)], rows, "Time and memory (medians)")
 
 
-def figures(numbers: Benchmark) -> Iterator[tuple[str, str, Figure]]:
+def figures(numbers: Compared) -> Iterator[tuple[str, str, Figure]]:
     """File, caption and figure: ratios with their intervals, and the error against the number of regions."""
     ratios = statistics.ratios(numbers.table.comparison.finished, numbers.baseline, numbers.objects)
     # Figures show no backticks.
@@ -390,7 +390,7 @@ def figures(numbers: Benchmark) -> Iterator[tuple[str, str, Figure]]:
         yield "clusters.png", "Chamfer distance against the number of regions K", figure
 
 
-def write(numbers: Benchmark, folder: Path) -> str:
+def write(numbers: Compared, folder: Path) -> str:
     """Write scores.csv, runs.csv, summary.md and its figures; returns the text of the summary."""
     folder.mkdir(parents=True, exist_ok=True)
     numbers.table.save(folder)
@@ -402,7 +402,7 @@ def write(numbers: Benchmark, folder: Path) -> str:
     return text
 
 
-def detail_blocks(numbers: Benchmark) -> list[Block]:
+def detail_blocks(numbers: Compared) -> list[Block]:
     """Failures, settings that differ, notes, costs."""
     settings = settings_table(numbers.table.runs, numbers.name)
     cost = [cost_table(numbers)] if len(numbers.table.task("time")) else []

@@ -7,7 +7,7 @@ import pandas as pd
 
 from neuspring.scores import statistics
 from neuspring.scores.metrics import TASKS, averages
-from neuspring.scores.table import HELD, ScoreTable, comparable, stacked
+from neuspring.scores.table import HELD_TASK, ScoreTable, comparable, stacked
 
 JUDGES = tuple((task, name) for task in ("future", "reconstruction") for name in ("track_error", "chamfer", "image_error"))
 """Task and metric that decide who is ahead: the first pair that the runs have."""
@@ -65,8 +65,8 @@ def with_failures(table: ScoreTable) -> pd.DataFrame:
     runs = table.runs[table.runs["status"].isin(["ok", "failed"])]
     failed = runs[runs["status"] == "failed"]
     finished = table.finished[table.finished["task"].isin(TASKS)]
-    held = table.task(*(task + HELD for task in TASKS))
-    held = held[held["run"].isin(failed["run"])].assign(task=held["task"].str.removesuffix(HELD))
+    held = table.task(*(task + HELD_TASK for task in TASKS))
+    held = held[held["run"].isin(failed["run"])].assign(task=held["task"].str.removesuffix(HELD_TASK))
     everything = stacked([finished, held])
     everything = everything[everything["method"].isin(failed["method"])]
     if not len(everything):

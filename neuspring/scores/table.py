@@ -29,8 +29,8 @@ from neuspring.core.run_record import RUN_RECORD, RunRecord, flat
 from neuspring.core.text import listed
 from neuspring.scores.metrics import METRICS, SCORE_COLUMNS, TASKS
 
-HELD, TRANSFER = "_held", "transfer"
-COLUMNS = ("run", "method", "scenario", "category", "seed", "task", "metric", "frames", "value", "unit")
+HELD_TASK, TRANSFER = "_held", "transfer"
+TABLE_COLUMNS = ("run", "method", "scenario", "category", "seed", "task", "metric", "frames", "value", "unit")
 RUN_COLUMNS = (
     "run",
     "scenario",
@@ -58,7 +58,7 @@ EMPTY_MAP: Mapping[str, Any] = MappingProxyType({})
 
 @dataclass(frozen=True)
 class ScoreTable:
-    """The long table (`COLUMNS`), and one row per run (`RUN_COLUMNS`) with its status: ok, failed or missing."""
+    """The long table (`TABLE_COLUMNS`), and one row per run (`RUN_COLUMNS`) with its status: ok, failed or missing."""
 
     rows: pd.DataFrame
     runs: pd.DataFrame
@@ -134,7 +134,7 @@ def comparable(scores: pd.DataFrame) -> pd.DataFrame:
 def stacked(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
     """One long table of several; empty ones carry no column types and are left out."""
     filled = [table for table in tables if len(table)]
-    return pd.concat(filled, ignore_index=True) if filled else pd.DataFrame(columns=list(COLUMNS))
+    return pd.concat(filled, ignore_index=True) if filled else pd.DataFrame(columns=list(TABLE_COLUMNS))
 
 
 def collect(
@@ -193,7 +193,7 @@ def _rows_of(record: RunRecord, folder: Path) -> pd.DataFrame:
     tables = [pd.read_parquet(folder / record.scores_file)[list(SCORE_COLUMNS)]] if record.scores_file else []
     if not record.ok and record.held_file:
         held = pd.read_parquet(folder / record.held_file)[list(SCORE_COLUMNS)]
-        tables.append(held.assign(task=held["task"] + HELD))
+        tables.append(held.assign(task=held["task"] + HELD_TASK))
     facts = [("start", name, value, "m", 1) for name, value in record.floors.items()]
     facts += [("time", stage, value, "s", 0) for stage, value in record.timings.items()]
     facts += [("memory", stage, value, "MB", 0) for stage, value in record.peak_memory_mb.items()]
@@ -203,7 +203,7 @@ def _rows_of(record: RunRecord, folder: Path) -> pd.DataFrame:
 
 
 def _with_run(rows: pd.DataFrame) -> pd.DataFrame:
-    return rows.assign(run=rows["scenario"] + "/" + rows["method"] + "/" + rows["seed"].astype(str))[list(COLUMNS)]
+    return rows.assign(run=rows["scenario"] + "/" + rows["method"] + "/" + rows["seed"].astype(str))[list(TABLE_COLUMNS)]
 
 
 def _filled(runs: pd.DataFrame) -> pd.DataFrame:

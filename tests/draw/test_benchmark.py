@@ -6,7 +6,7 @@ import pytest
 from matplotlib import pyplot as plt
 
 from neuspring.draw.benchmark import clusters_figure, ratios_figure
-from neuspring.report.tables import Benchmark, write
+from neuspring.report.tables import Compared, write
 from tests.support.study_runs import collected
 
 CD = ("future", "chamfer")
@@ -53,7 +53,7 @@ def test_ratios_are_drawn_with_their_intervals():
 def test_a_figure_of_ratios_needs_three_scenarios_and_is_not_left_over(tmp_path):
     def written(scenarios: str) -> str:
         values = {(s, m, 0): v for s in scenarios for m, v in (("x", 0.01), ("y", 0.008))}
-        write(Benchmark(table=collected(values), baseline="x"), tmp_path)
+        write(Compared(table=collected(values), baseline="x"), tmp_path)
         return (tmp_path / "summary.md").read_text()
 
     assert "](ratios.png)" in written("abc") and (tmp_path / "ratios.png").stat().st_size > 5000

@@ -13,7 +13,7 @@ from neuspring.core.table import Cell, Table, lay_out, tex
 from neuspring.report.blocks import Code, markdown
 from neuspring.report.notes import of_runs
 from neuspring.report.tables import (
-    Benchmark,
+    Compared,
     again,
     behind,
     failure_blocks,
@@ -33,8 +33,8 @@ from tests.support.study_runs import collected, rows_of, tables_in, write_run
 FUTURE = ("future", "track_error")
 
 
-def benchmark(values, failed=(), baseline: str = "base", **facts) -> Benchmark:
-    return Benchmark(table=collected(values, failed, **facts), baseline=baseline)
+def benchmark(values, failed=(), baseline: str = "base", **facts) -> Compared:
+    return Compared(table=collected(values, failed, **facts), baseline=baseline)
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_next_moves_are_commands_for_the_folder_in_use(tmp_path):
     results = report_tree.make(tmp_path / "results", ["rope"], ["baseline", "neuspring"], [0], pictures=False)
     command = ["snakemake", "--config", f"results={results}", "seeds=[0]", "--cores", "2"]
     table = collect(results, ["rope"], ["baseline", "neuspring"], [0, 1])
-    blocks = verdict(Benchmark(table=table, baseline="baseline", results=results, asked={"command": command}))
+    blocks = verdict(Compared(table=table, baseline="baseline", results=results, asked={"command": command}))
     first, last = (shlex.split(block.text) for block in blocks if isinstance(block, Code))
     assert first == command and last[1] == "play" and len(last) == 4
     assert again({"command": command}, "seeds", "[0,1,2]") == f"snakemake --config 'seeds=[0,1,2]' results={results} --cores 2"
@@ -79,7 +79,7 @@ def test_averages_mark_the_best_count_runs_and_keep_oracles_apart():
     values = {("a", "x", 0): 0.010, ("a", "y", 0): 0.008, ("b", "x", 0): 0.5, ("a", "o", 0): 0.001}
     table = collected(values, failed=[("b", "y", 0), ("a", "z", 0)])
     table = ScoreTable(table.rows, table.runs.assign(oracle=table.runs["method"] == "o"))
-    numbers = Benchmark(table=table, baseline="x", names={"x": "The x (`x`)"})
+    numbers = Compared(table=table, baseline="x", names={"x": "The x (`x`)"})
     rows = rows_of(tables_in(summary_blocks(numbers))["Errors, mm"])
     assert {name: (row["Future TE ↓"].text, row["Future TE ↓"].mark, row["Runs"].text) for name, row in rows.items()} == {
         "The x (`x`)": ("10.00", "", "2/2"),
@@ -110,7 +110,7 @@ def test_spreads_ratios_breakdowns_and_pictures_have_tables():
 def test_aims_are_judged():
     values = {(s, m, 0): v * (1 + 0.02 * i * (m == "y")) for i, s in enumerate("abcd") for m, v in (("x", 0.01), ("y", 0.007))}
     aims = tuple(parse(Aim, {"method": "y", "baseline": "x", "ratio": ratio}, "here") for ratio in (0.85, 0.5))
-    numbers = Benchmark(table=collected(values), baseline="x", aims=aims)
+    numbers = Compared(table=collected(values), baseline="x", aims=aims)
     rows = tables_in(summary_blocks(numbers))["Aims of the configuration"].rows
     assert [row[-1].text for row in rows] == ["reached", "missed"]
 
@@ -131,7 +131,7 @@ def test_failures_settings_and_notes_are_listed(tmp_path):
     )
     table = collect(tmp_path, ["a", "b"], ["x", "y"], [0], {"x": {"b": "needs images"}})
     notes = [f"fit: {10 + k}% at the bound; same" for k in range(len(table.runs))]
-    numbers = Benchmark(table=ScoreTable(table.rows, table.runs.assign(notes=notes), table.left_out), baseline="x")
+    numbers = Compared(table=ScoreTable(table.rows, table.runs.assign(notes=notes), table.left_out), baseline="x")
     text = write(numbers, tmp_path / "tables")
     assert "| y      | all, failed held | 60.00" in text
     assert "rollout: node 3 \\| left" in text and "| x      | does not apply | b " in text

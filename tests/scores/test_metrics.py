@@ -15,7 +15,7 @@ import pytest
 from neuspring.config.settings import Aim
 from neuspring.core.artifacts import Trajectory
 from neuspring.core.errors import InputError
-from neuspring.report.tables import Benchmark, write
+from neuspring.report.tables import Compared, write
 from neuspring.scores import metrics, paper
 from neuspring.scores.metrics import require_metrics
 from neuspring.scores.statistics import ratios
@@ -231,7 +231,7 @@ def test_a_packages_metric_is_one_entry_that_is_scored_shown_and_may_be_aimed_at
     aim = Aim(method="y", baseline="x", metric="extent", ratio=2.5, below=3.0)
     require_metrics([aim])
     assert ratios(table.rows, "x").set_index(["metric", "task"]).loc[("extent", "future"), "ratio"] == pytest.approx(2.0)
-    assert "Future Extent" in write(Benchmark(table=table, baseline="x", aims=(aim,)), tmp_path)
+    assert "Future Extent" in write(Compared(table=table, baseline="x", aims=(aim,)), tmp_path)
     study = paper.Study(title="T", reference=None, baseline="x", rows={"x": "x", "y": "y"})
     found = cells(study, restricted(study, table)).set_index(["metric", "task", "label"])
     assert found.loc[("extent", "future", "y"), "change"] == pytest.approx(2.0)

@@ -15,7 +15,7 @@ from neuspring.core.run_record import key_of
 from neuspring.core.table import Cell, Table
 from neuspring.report.blocks import Block, Fold
 from neuspring.scores.metrics import METRICS, SCORE_COLUMNS
-from neuspring.scores.table import COLUMNS, RUN_COLUMNS, ScoreTable
+from neuspring.scores.table import RUN_COLUMNS, TABLE_COLUMNS, ScoreTable
 from tests.support.runs import run_record
 
 Scores = Mapping[tuple[str, str], float]
@@ -91,7 +91,7 @@ def collected(
         runs.append({"run": name, "scenario": scenario, "method": method, "seed": seed, "status": "failed", "reason": "diverged"})
     rest = {"notes": "", "images": "null", "source": "", "run_key": "", "oracle": False, "settings": "{}"} | facts
     table = pd.DataFrame(runs).assign(**rest).reindex(columns=list(RUN_COLUMNS))
-    return ScoreTable(pd.DataFrame(rows, columns=list(COLUMNS)), table)
+    return ScoreTable(pd.DataFrame(rows, columns=list(TABLE_COLUMNS)), table)
 
 
 def all_scores(factor: float = 1.0) -> dict[tuple[str, str], float]:

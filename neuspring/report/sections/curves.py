@@ -27,13 +27,13 @@ PLOTS = {
 }
 DIVERGED_COST = 1e3
 """Costs above this are of candidates that could not be simulated."""
-MOST_PANELS = 12
+MOST_CURVES = 12
 
 
 def curves(material: ReportData) -> PageSection | None:
     """Curves of the shown methods; None where no run has left any."""
     scenarios = [name for name in material.choice.scenarios if material.first_runs(name)]
-    seen = {name: _observations(material, name) for name in scenarios[:MOST_PANELS]}
+    seen = {name: _observations(material, name) for name in scenarios[:MOST_CURVES]}
     blocks: list[Block] = []
     for what, title in PLOTS.items():
         lines = {name: _lines(material, name, what, observed) for name, observed in seen.items()}

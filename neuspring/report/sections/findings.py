@@ -8,7 +8,7 @@ from neuspring.report.blocks import Block, Fold, PageSection
 from neuspring.report.data import MOST_ROWS, ReportData, ReportSection, prose, several
 from neuspring.report.notes import of_runs
 
-TONES: dict[str, Tone] = {"error": "bad", "warning": "warn", "note": "mute"}
+LEVEL_TONES: dict[str, Tone] = {"error": "bad", "warning": "warn", "note": "mute"}
 
 
 def findings(material: ReportData) -> PageSection | None:
@@ -21,7 +21,7 @@ def findings(material: ReportData) -> PageSection | None:
         rows = [
             [
                 Cell(text=name),
-                Cell(text=one.level, tone=TONES[one.level]),
+                Cell(text=one.level, tone=LEVEL_TONES[one.level]),
                 Cell(text=one.where),
                 Cell(text=one.name),
                 Cell(text=one.text, wrap=True),
