@@ -549,7 +549,6 @@ def test_a_study_of_clips_is_made_of_transfers_of_its_rows_whose_numbers_are_kep
     steps = {f"{unit.name}/{step.stage.name}" for unit in graph.runs() for step in unit.steps}
     assert steps >= {f"{scene}/{name}/0/{stage}" for name in rows for stage in ("score", "transfer")}
     Tasks(graph, {})
-    assert graph.unit("tables", "all").options["studies"] == ("deform",)
 
 
 @pytest.mark.parametrize("overlays", [["synthetic"], ["synthetic", "paper"]], ids="-".join)
@@ -575,7 +574,6 @@ def test_a_target_of_a_table_means_its_rows_and_no_others_with_any_data(overlays
     assert (count["run"], count["search"], count["fit"], count["train"]) == (runs, searches, fits, trainings)
     # The table itself is the same whatever else the configuration names.
     Tasks(graph, {})
-    assert study in graph.unit("tables", "all").options["studies"]
 
 
 def test_targets_leave_a_part_that_was_asked_for_and_other_targets_as_they_are():

@@ -38,7 +38,7 @@ def report(results: Path, **options) -> str:
 def full(tmp_path_factory) -> Path:
     """Two scenarios, two methods, two seeds, with pictures, films, jobs, a sweep and judged perception."""
     results = report_tree.make(tmp_path_factory.mktemp("report") / "results")
-    report_tree.write_jobs(results, ["rope", "cloth"], ["baseline", "neuspring"], [0, 1], again=3, never=7)
+    report_tree.write_jobs(results, ["rope", "cloth"], ["baseline", "neuspring"], [0, 1], never=7)
     texts = {
         "tune/rates/summary.md": "Best trial 3.\n\n<b>raw</b>\n",
         "tables/perception.md": "# Perception\n\n|a|b|\n|-|-|\n|1|2|\n",
@@ -108,7 +108,9 @@ def test_the_verdict_comes_first_then_last_frames_and_films_and_the_rest_is_fold
     assert "systems: Systems" in section(page, "studies") and "other data" in section(page, "studies")
     assert "search.rollouts 220 44" in section(page, "setup") and "Full configuration" in section(page, "setup")
     assert "Best trial 3." in section(page, "findings") and "Perception against the truth" in section(page, "findings")
-    assert "CUDA error: out of memory" in section(page, "failures") and re.search(r'href="logs/fit/cloth/neuspring/\d\.log"', page)
+    assert "CUDA error: out of memory" in section(page, "failures") and re.search(
+        r'href="jobs/fit/cloth/neuspring/\d/0\.log"', page
+    )
 
 
 @needs_browser
@@ -181,7 +183,7 @@ def test_damaged_files_are_listed_and_stop_nothing(tmp_path):
     report_tree.write_jobs(results, ["rope"], ["baseline"], [0])
     broken = [
         *("rope/baseline/0/run.json", "rope/baseline/1/scores.parquet", "cloth/neuspring/0/history.parquet"),
-        *("cloth/neuspring/0/trajectory.npz", "cloth/neuspring/0/plots/motion.png", "jobs/fit/rope/baseline/0.json"),
+        *("cloth/neuspring/0/trajectory.npz", "cloth/neuspring/0/plots/motion.png", "jobs/fit/rope/baseline/0/0.json"),
     ]
     for path in (results / name for name in broken):
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
