@@ -572,8 +572,6 @@ def test_a_target_of_a_table_means_its_rows_and_no_others_with_any_data(overlays
     units = {unit.rule + unit.name: unit.rule for run in chosen for unit in (run, *behind(run))}
     count = Counter(units.values())
     assert (count["run"], count["search"], count["fit"], count["train"]) == (runs, searches, fits, trainings)
-    # The table itself is the same whatever else the configuration names.
-    Tasks(graph, {})
 
 
 def test_targets_leave_a_part_that_was_asked_for_and_other_targets_as_they_are():

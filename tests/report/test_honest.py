@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import pandas as pd
 import pytest
+from neuspring.scores.runs import Collected
 
 from neuspring.core.findings import finding, findings_as_facts
 from neuspring.core.records import Recorder
 from neuspring.report import page as report
 from neuspring.report.notes import honest_notes
-from neuspring.scores.runs import Collected
 from tests.support.report_tree import make
 from tests.support.runs import run_record
 
