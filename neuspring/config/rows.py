@@ -52,9 +52,9 @@ class Method(SettingsSection):
     """Fit of all frames, the future included, from the same search. Such a row predicts nothing: it says how much of an error
     fitting could remove at all, and stands outside every comparison. Its records say so, and it shares its fit with other oracles
     only."""
-    pool: Literal["all", "others"] | None = None
-    """Recordings of the object (`pools`) that one twin is judged on: the scenario's own and the others of its pool (all); those
-    alone, so that nothing of the scenario is seen but frame 0 and the hands (others); null: the scenario's own."""
+    pool: Literal["all"] | None = None
+    """Recordings of the object (`pools`) that one twin is judged on: the scenario's own and the others of its pool (all); null:
+    the scenario's own."""
 
     @property
     def searched(self) -> str:

@@ -35,31 +35,11 @@ class SpringFieldSettings(SettingsSection):
     triplane: bool = True
     """Three feature planes (xy, yz, xz), bilinear, summed; false: F is an MLP on Fourier features of the coordinates."""
     resolution: Annotated[int, Field(ge=2)] | Literal["adaptive"] = "adaptive"
-    """Texels N per side of a plane; adaptive: round(adaptive_factor sqrt(springs)), at least 2."""
-    adaptive_factor: Positive = 0.85
-    """Factor of the resolution where `resolution` is adaptive."""
-    channels: Count = 32
-    """Features per texel, C."""
-    hidden: Count = 128
-    """Units per hidden layer of the MLP."""
-    layers: Annotated[int, Field(ge=2)] = 3
-    """Layers of the MLP, the linear one at its end included."""
-    bands: Count = 4
-    """Number of frequencies (powers of two, times pi) of the Fourier transform."""
-    texel_scale: Positive = 0.1
-    """Standard deviation of the texels at the start, which are white noise."""
+    """Texels N per side of a plane; adaptive: round(0.85 sqrt(springs)), at least 2."""
     plane_learning_rate: Positive | None = None
     """Learning rate of the texels; null: that of the MLP."""
     shuffled: bool = False
     """Midpoints dealt out among the springs at random, so that F does not know which springs lie side by side."""
-    smoothness: NonNegative = 0.0
-    """Weight of the mean squared difference of F between each spring and the 8 nearest, in the loss unit."""
-    offsets: bool = False
-    """A number of its own for each spring, which is added to F."""
-    offset_prior: NonNegative = 0.0
-    """Weight of the mean square of these numbers, in the loss unit."""
-    offset_learning_rate: Positive = 0.03
-    """Learning rate of these numbers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,13 +56,10 @@ class Fit(SettingsSection):
     epsilon: Positive = 1e-15
     """Adam's epsilon, in the loss unit; released: 1e-8 m^2. Gradients far below it are not followed."""
     loss_unit: Literal["spacing", "meter"] = "spacing"
-    """Unit of the loss that is differentiated, and of its penalties: squared node spacings, or m^2, as released. Losses are
+    """Unit of the loss that is differentiated: squared node spacings, or m^2, as released. Losses are
     recorded in m^2 always."""
     horizon: Annotated[int, Field(ge=0)] = 1
     """Frames per optimizer step, with the gradient through all of them; 0: all training frames."""
-    adjoint_limit: Positive | None = 100.0
-    """Growth of the adjoint of the state, as a multiple of what losses have added to it, at which the gradient through several
-    frames ends; null: none. The record has the share of such frames."""
     output_bound: NonNegative = 0.0
     """Bound b of the change per spring: stiffness stays within exp(+-b) of the searched value, by b tanh(x / b).
     Common factors come on top. 0: no bound."""

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import torch
 
 
-CHECKPOINT_FORMAT = 2
+CHECKPOINT_FORMAT = 3
 """Raise it where what checkpoints hold changes: those of another version are refused by name."""
 
 
@@ -89,8 +89,7 @@ class TrainingLoop:
         """`what` is the training in messages, `label` in the progress line. A checkpoint is written to `partial` after each
         CHECKPOINT_EVERY epochs and after the last; one that lies there is continued from if it has the same `key`. `share` is the
         part of the time that counts for this training, where several run together."""
-        self._share, self._alone = share, share == 1.0
-        self._begun, self._processor_begun = time.monotonic(), time.process_time()
+        self._share, self._begun = share, time.monotonic()
         self._epochs, self._partial, self._key = epochs, partial, key
         self._progress = Progress(label, epochs)
         self.history: list[dict[str, Any]] = []
@@ -99,18 +98,12 @@ class TrainingLoop:
         """1, plus one for every time that the training continued from a checkpoint of a killed one."""
         self.earlier_seconds = 0.0
         """Wall time of earlier attempts, up to their last checkpoint; this training's share of what it had together with others."""
-        self.earlier_processor_seconds = 0.0
-        """Processor time of the same, of all threads."""
-        self.epochs_together = 0
-        """Number of epochs that ran together with those of other trainings."""
         self.restored = Checkpoint.load(partial, key, what)
         """The checkpoint to continue from."""
         if self.restored:
             run = self.restored.values.pop("run")
-            self.history, self.earlier_seconds, self.epochs_together = run["history"], run["seconds"], run["epochs_together"]
-            self.earlier_processor_seconds = run["processor_seconds"]
-            # To go on alone after what was planned to run together is no second attempt.
-            self.attempts = run["attempts"] + (self.epochs_together < len(self.history) or not self._alone)
+            self.history, self.earlier_seconds = run["history"], run["seconds"]
+            self.attempts = run["attempts"] + 1
             print(f"continuing {what} after epoch {len(self.history) - 1}")
 
     def __iter__(self) -> Iterator[int]:
@@ -121,7 +114,6 @@ class TrainingLoop:
     def record(self, row: dict[str, Any], note: str) -> None:
         """Add the row of a finished epoch to the history, and show progress."""
         self.history.append(row)
-        self.epochs_together += not self._alone
         self._progress.update(len(self.history), note)
 
     def save(self, checkpoint: Callable[[], Checkpoint]) -> None:
@@ -131,9 +123,7 @@ class TrainingLoop:
             return
         state = checkpoint()
         seconds = self.earlier_seconds + self._share * (time.monotonic() - self._begun)
-        processor = self.earlier_processor_seconds + self._share * (time.process_time() - self._processor_begun)
-        run = {"history": self.history, "attempts": self.attempts, "seconds": seconds, "epochs_together": self.epochs_together}
-        run["processor_seconds"] = processor
+        run = {"history": self.history, "attempts": self.attempts, "seconds": seconds}
         Checkpoint(state.arrays, {**state.values, "run": run}).save(self._partial, self._key)
 
 

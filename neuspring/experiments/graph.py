@@ -117,7 +117,6 @@ class Graph:
             method=method,
             search=known.searches[searched] if searched else None,
             pool=known.pools.get(scenario, ()) if kinds else (),
-            leave_out="others" in kinds,
             targets=known.transfers.get(scenario, ()),
         )
 

@@ -368,9 +368,14 @@ class FrameWindow:
         return self._solvers[(token - 1 - self._first) % self._room] if held else None
 
     @property
+    def overflows(self) -> list[int]:
+        """As `FrameSolver.overflows`."""
+        return [sum(counts) for counts in zip(*(solver.overflows for solver in self._solvers), strict=True)]
+
+    @property
     def collision_overflow(self) -> int:
         """As `FrameSolver.collision_overflow`."""
-        return sum(solver.collision_overflow for solver in self._solvers)
+        return sum(self.overflows)
 
 
 class AdjointLimit:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,10 +12,9 @@ from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.core.records import Before, Recorder
 from neuspring.stages.stage import Job, Rows, Written, physics, stage
-from neuspring.twin.body import BODIES, Learned, body_of, code
+from neuspring.twin.body import BODIES, FitTask, Learned, body_of, code
 
 if TYPE_CHECKING:
-    from neuspring.twin.batch import Lane
     from neuspring.twin.fit import FitProblem
 
 
@@ -39,25 +37,18 @@ def _alike(rows: Rows) -> tuple[Any, ...] | None:
 
 
 def _many(jobs: Sequence[Job]) -> list[Written | Exception]:
-    """Several fits; those of one physics and horizon share launches."""
-    from neuspring.twin.batch import physics_with, run_batch
-    from neuspring.twin.fit import fit as fit_one
-
-    def one(job: Job, problem: FitProblem, checkpoint: Path, key: str, lane: Lane) -> Written:
+    """Several fits of one body; those of one physics and horizon share launches."""
+    tasks = []
+    for job in jobs:
+        problem, checkpoint, key = prepared(**{name: value for name, value in job.arguments.items() if name != "threads"})
         checkpoint.parent.mkdir(parents=True, exist_ok=True)
-        return written(job.record, fit_one(problem, partial=checkpoint, key=key, lane=lane), checkpoint)
-
-    ready = [prepared(**{name: value for name, value in job.arguments.items() if name != "threads"}) for job in jobs]
-    groups: dict[Any, list[int]] = {}
-    for place, (problem, _, _) in enumerate(ready):
-        always = all(seen.controller_valid.all() for seen in (problem.observations, *problem.pool))
-        groups.setdefault((physics_with(problem.twin, always), problem.fit.horizon), []).append(place)
-    made: dict[int, Written | Exception] = {}
-    for places in groups.values():
-        works = [partial(one, jobs[place], *ready[place]) for place in places]
-        results = run_batch([ready[place][0].twin for place in places], jobs[0].values["device"], works)
-        made |= dict(zip(places, results, strict=True))
-    return [made[place] for place in range(len(jobs))]
+        tasks.append(FitTask(problem, checkpoint, key))
+    results = body_of(tasks[0].problem.twin).fit_many(tasks)
+    made: list[Written | Exception] = []
+    for job, task, one in zip(jobs, tasks, results, strict=True):
+        assert task.partial is not None
+        made.append(one if isinstance(one, Exception) else written(job.record, one, task.partial))
+    return made
 
 
 @stage(
@@ -68,7 +59,7 @@ def _many(jobs: Sequence[Job]) -> list[Written | Exception]:
     memory_mb=8000,
     minutes=480,
     when=lambda rows: bool(rows.method and rows.method.fit),
-    given=lambda rows: {"kind": rows.method.fit, "oracle": rows.method.oracle, "leave_out": rows.leave_out} if rows.method else {},
+    given=lambda rows: {"kind": rows.method.fit, "oracle": rows.method.oracle} if rows.method else {},
     settled=_settled,
     alike=_alike,
     many=_many,
@@ -81,7 +72,6 @@ def fit(
     settings: Config,
     run: Recorder,
     pool: Sequence[Observations] = (),
-    leave_out: Annotated[bool, "fit the pool alone"] = False,
     kind: Annotated[str, "springs: train each spring; field: the neural spring field; or a kind of another body"] = "springs",
     oracle: Annotated[bool, "fit all frames, the future included: what fitting could reach at best"] = False,
     device: str = "auto",
@@ -90,10 +80,10 @@ def fit(
     """Coarse twin -> fitted twin, by gradients: twin.npz, history.parquet (losses per epoch).
 
     A field's first weights follow the search's seed. An `oracle` fits all frames, the future included, and the record says so. With
-    a `pool` of other recordings the twin is fitted on all, or with `leave_out` on the others. A killed fit continues from its
+    a `pool` of other recordings the twin is fitted on all. A killed fit continues from its
     checkpoint. Another body may do without gradients, on `threads` cores, and begins anew.
     """
-    problem, checkpoint, key = prepared(observations, search, settings, run, pool, leave_out, kind, oracle, device)
+    problem, checkpoint, key = prepared(observations, search, settings, run, pool, kind, oracle, device)
     return written(run, body_of(problem.twin).fit(problem, partial=checkpoint, key=key, threads=threads), checkpoint)
 
 
@@ -115,7 +105,6 @@ def prepared(
     settings: Config,
     run: Recorder,
     pool: Sequence[Observations],
-    leave_out: bool,
     kind: str,
     oracle: bool,
     device: str,
@@ -131,7 +120,6 @@ def prepared(
     problem = FitProblem(
         observations=observations,
         pool=pool,
-        leave_out=leave_out,
         twin=twin,
         fit=settings.fit,
         simulation=settings.simulation,

@@ -34,7 +34,7 @@ NOTED: dict[str, tuple[Callable[[Any], bool], str]] = {
         "{at_bound:.0%} of the springs lie at the bound of their stiffness (fit.output_bound)",
     ),
     # Where more are left out, gradients say little about long motions.
-    "frames_left_out": (lambda v: v > 0.05, "{frames_left_out:.0%} of the frames left out of gradients (fit.adjoint_limit)"),
+    "frames_left_out": (lambda v: v > 0.05, "{frames_left_out:.0%} of the frames left out of gradients"),
     # Where fewer moved, the settings were in training's way.
     "texels_moved": (lambda v: v < 0.05, "only {texels_moved:.1%} of the texels moved by a tenth of their first scale"),
 }

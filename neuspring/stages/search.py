@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from neuspring.config import Config, Search
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.core.records import Recorder
 from neuspring.stages.stage import Job, Rows, Written, physics, stage
-from neuspring.twin.body import BODIES, Learned, SearchOptions, code
-
-if TYPE_CHECKING:
-    from neuspring.twin.batch import SearchLane
+from neuspring.twin.body import BODIES, Learned, SearchOptions, SearchTask, code
 
 READS = ("search", "simulation", "losses", "released_quirks")
 
@@ -30,26 +26,25 @@ def _settled(rows: Rows) -> Config:
 def _given(rows: Rows) -> dict[str, Any]:
     if rows.search is None:
         return {}
-    return {"clusters": rows.search.clusters, "body": rows.search.body, "leave_out": rows.leave_out}
+    return {"clusters": rows.search.clusters, "body": rows.search.body}
 
 
 def _alike(rows: Rows) -> tuple[Any, ...] | None:
     """None for a body whose search has no launches to share; those of one number of candidates end at about the same time."""
     search = rows.search
-    return (*physics(rows), rows.config.search.rollouts) if search and BODIES[search.body].by_gradients else None
+    return (*physics(rows), search.body, rows.config.search.rollouts) if search and BODIES[search.body].by_gradients else None
 
 
 def _many(jobs: Sequence[Job]) -> list[Written | Exception]:
-    """Several searches, whose generations share launches."""
-    from neuspring.twin.batch import run_searches
-
-    def one(job: Job, lane: SearchLane) -> Written:
+    """Several searches of one body, whose generations share launches."""
+    tasks = []
+    for job in jobs:
         given = job.arguments
-        names = ("settings", "run", "leave_out", "clusters", "seed", "device", "twins_per_launch")
-        options = prepared(**{name: given[name] for name in names}, threads=1, lane=lane)
-        return written(job.record, BODIES[given["body"]].search(given["observations"], given["pool"], given["settings"], options))
-
-    return run_searches(jobs[0].values["device"], [partial(one, job) for job in jobs])
+        names = ("settings", "run", "clusters", "seed", "device", "twins_per_launch")
+        options = prepared(**{name: given[name] for name in names}, threads=1)
+        tasks.append(SearchTask(given["observations"], given["pool"] or (), given["settings"], options))
+    results = BODIES[jobs[0].arguments["body"]].search_many(tasks)
+    return [one if isinstance(one, Exception) else written(job.record, one) for job, one in zip(jobs, results, strict=True)]
 
 
 @stage(
@@ -70,7 +65,6 @@ def search(
     settings: Config,
     run: Recorder,
     pool: Sequence[Observations] = (),
-    leave_out: Annotated[bool, "judge by the pool alone"] = False,
     clusters: int = 1,
     body: Annotated[str, "lattice, or a package's own"] = "lattice",
     seed: int = 0,
@@ -83,10 +77,10 @@ def search(
     `clusters` regions of the topology have values of their own (1: uniform). At most `twins_per_launch` candidates share a launch
     (auto: as many as pay), and `threads` launches run at the same time on a CPU; neither changes a number there. A trace of the
     same search is continued, so a larger `search.rollouts` costs only the difference. With a `pool` of other recordings a
-    candidate's cost is the mean over all, or with `leave_out` over the others. A `body` of a package
+    candidate's cost is the mean over all. A `body` of a package
     may search in another way, and have other rows in its trace.
     """
-    options = prepared(settings, run, leave_out, clusters, seed, device, threads, twins_per_launch)
+    options = prepared(settings, run, clusters, seed, device, threads, twins_per_launch)
     return written(run, BODIES[body].search(observations, pool, settings, options))
 
 
@@ -103,13 +97,11 @@ def written(run: Recorder, result: Learned) -> Written:
 def prepared(
     settings: Config,
     run: Recorder,
-    leave_out: bool,
     clusters: int,
     seed: int,
     device: str,
     threads: int,
     twins_per_launch: int | Literal["auto"],
-    lane: Any = None,
 ) -> SearchOptions:
     """The way a search runs, where its trace lies, and what one must match to be continued. Raises InputError."""
     from neuspring.core.checkpoint import checkpoint_key
@@ -120,14 +112,12 @@ def prepared(
     without_budget = {name: value for name, value in run.settings["search"].items() if name != "rollouts"}
     return SearchOptions(
         clusters=clusters,
-        leave_out=leave_out,
         seed=seed,
         device=device,
         threads=threads,
         together=launch_size(twins_per_launch),
         record=run.beside(trace="trace.parquet")["trace"],
         key=checkpoint_key(run.inputs, run.settings | {"search": without_budget}, device, "neuspring.twin.search"),
-        lane=lane,
     )
 
 

@@ -124,8 +124,6 @@ class Rows:
     """The row of the wildcard `search`, or of the method; None for models of baselines."""
     pool: tuple[str, ...] = ()
     """The other recordings of the pool, of a method that has one."""
-    leave_out: bool = False
-    """True where the own recording is judged by nothing but frame 0 (`pool: others`)."""
     targets: tuple[str, ...] = ()
     """Recordings to which the scenario's models are transferred."""
 

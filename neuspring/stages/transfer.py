@@ -46,8 +46,8 @@ def transfer(
 
     `learned` names a twin (search.json, fit.json), or a trained baseline that can be transferred (train.json). All frames after the
     first of a target count. With `simulation.initial_velocity: observed`, frames 1 and 2 also set the initial velocity. A twin's
-    rest lengths are re-based on the target's rest shape, unless they were trained. Other nodes are registered (twin/transfer.py),
-    and the record says how well they fit. A rollout that diverges leaves out its target.
+    rest lengths are re-based on the target's rest shape, unless they were trained. A target must have the
+    same nodes in the same order. A rollout that diverges leaves out its target.
     """
     import numpy as np
     import pandas as pd
@@ -59,13 +59,13 @@ def transfer(
 
     tables, diverged = [pd.DataFrame(columns=list(metrics.SCORE_COLUMNS))], []
     courses, lines = [pd.DataFrame(columns=["scenario", "frame", "seconds", "metric", "value"])], {}
-    updates, registered, record = 0, {}, learned.record
+    updates, record = 0, learned.record
     twin = Twin.load(learned.file("twin")) if learned.has("twin") else None
     for observations in targets if record.status == "ok" else ():
         if twin is None:
             trajectory = BASELINES[record.settings["model"]].predict(observations, learned.file("model"), None, device).trajectory
         else:
-            moved, registration = move(
+            moved = move(
                 twin,
                 observations,
                 safety=settings.simulation.safety,
@@ -76,8 +76,6 @@ def transfer(
             controllers, valid = observations.controller_points, observations.controller_valid
             trajectory = roll_out(moved, controllers, device, velocity=velocity, valid=valid)
             updates += (len(trajectory.positions) - 1) * moved.counts["springs"] * moved.counts["substeps"]
-            if registration:
-                registered[observations.scenario.name] = registration.facts
         if trajectory.diverged_frame is not None:
             diverged.append(observations.scenario.name)
         frames = range(1, observations.scenario.frame_count)
@@ -96,5 +94,4 @@ def transfer(
         files |= run.beside(lines="transfer_lines.npz")
         write_npz(files["lines"], lines, "{}", compress=True)
     facts: dict[str, Any] = {"diverged": diverged, "targets": len(targets)} | ({"spring_updates": updates} if updates else {})
-    facts |= {"registered": registered} if registered else {}
     return Written(files=files, facts=facts, failure=record.reason)

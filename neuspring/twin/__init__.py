@@ -7,5 +7,5 @@ field       the neural spring field
 fit         Adam through the simulation, on one recording or several: parameters (what is trained), batch (fits that share launches)
 losses      every term of the training loss, for search and fit
 rollout     prediction
-transfer    a twin on another recording, with register where its nodes are others
+transfer    a twin on another recording with the same nodes
 """

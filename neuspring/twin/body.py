@@ -43,8 +43,6 @@ class SearchOptions:
 
     clusters: int = 1
     """Regions of a topology, each with values of its own."""
-    leave_out: bool = False
-    """Judge by the pool alone; of the own recording frame 0 is read, and no other."""
     seed: int = 0
     device: str = "cpu"
     threads: int = 1
@@ -53,8 +51,28 @@ class SearchOptions:
     record: Path | None = None
     """File of the trace; one with the same `key` that is there already may be continued."""
     key: str = ""
-    lane: Any = None
-    """Serves the launches that it shares with other searches (batch.py); None: it shares none."""
+
+
+@dataclass(frozen=True)
+class SearchTask:
+    """A search and its inputs."""
+
+    observations: Observations
+    pool: Sequence[Observations]
+    settings: Config
+    options: SearchOptions
+
+
+@dataclass(frozen=True)
+class FitTask:
+    """A fit and where its checkpoints go."""
+
+    problem: Any
+    """A `fit.FitProblem`."""
+    partial: Path | None = None
+    """File of the checkpoints; one with the same `key` that is there already is continued."""
+    key: str = ""
+    threads: int = 1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -134,13 +152,21 @@ class Body(ABC):
     def fit(self, problem: Any, *, partial: Path | None = None, key: str = "", threads: int = 1) -> Learned:
         """The fitted twin of a `fit.FitProblem`; checkpoints go to the file `partial`."""
 
+    def search_many(self, tasks: Sequence[SearchTask]) -> list[Learned | Exception]:
+        """The result of each search, or the exception that ended it; searches may share launches."""
+        return [_tried(self.search, one.observations, one.pool, one.settings, one.options) for one in tasks]
+
+    def fit_many(self, tasks: Sequence[FitTask], most: int = 0) -> list[Learned | Exception]:
+        """The result of each fit, or the exception that ended it; at most `most` (0: as many as are fast) share launches."""
+        return [_tried(self.fit, one.problem, partial=one.partial, key=one.key, threads=one.threads) for one in tasks]
+
     @abstractmethod
     def require_pool(self, here: Observations, pool: Sequence[Observations]) -> None:
         """Raise InputError unless one twin can be judged on all recordings."""
 
     @abstractmethod
-    def on_recording(self, twin: Twin, observations: Observations) -> tuple[Twin, Any]:
-        """The twin in frame 0 of another recording of its object, and how its shape was registered, where it was.
+    def on_recording(self, twin: Twin, observations: Observations) -> Twin:
+        """The twin in frame 0 of another recording of its object.
 
         Its simulation is still the twin's. Raises InputError if the recording is of another body.
         """
@@ -184,6 +210,13 @@ class Body(ABC):
     def version(self, twin: Twin) -> int:
         """Version of the plain export's format that can say all of a twin."""
         return 1
+
+
+def _tried(function: Callable[..., Learned], *arguments: Any, **options: Any) -> Learned | Exception:
+    try:
+        return function(*arguments, **options)
+    except Exception as error:
+        return error
 
 
 BODIES: Registry[Body] = Registry("bodies", modules("neuspring.twin.bodies", "body"), type=Body)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -27,8 +27,8 @@ from neuspring.physics.parameters import homogeneous
 from neuspring.physics.topology import controller_reach, node_spacing, piecewise_topology, regions
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.rollout import initial_velocity
-from neuspring.twin.transfer import OutOfReach, move, require_pool
-from neuspring.twin.trials import Outcome, Rollouts, rolled
+from neuspring.twin.transfer import move, require_pool
+from neuspring.twin.trials import Outcome, Rollouts
 
 INTEGERS = ("object_neighbors", "controller_neighbors")
 REGIONAL = ("object_radius", "object_neighbors")
@@ -41,8 +41,6 @@ CMAES, OTHER_WAY = "cmaes", "hands"
 """Stages of candidates that CMA-ES proposes, and of its first generation in the other way of hands (`search.hands`)."""
 Map = Callable[..., Iterable[Any]]
 """As the builtin `map`."""
-Launch = Callable[[Rollouts], Any]
-"""As `rolled` of one; `batch.SearchLane` is one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,13 +76,10 @@ class SearchProblem:
 
     Its springs are made once, on the nodes of `observations` in frame 0 (or their rest shape), with that body's `spacing` and
     `reach`, and are moved to each recording, node i on node i. Radii measured in each recording's own lengths would join other
-    nodes there, and the material of one topology would be judged on another. A recording with other nodes has springs of its own
-    (`transfer.resampled`).
+    nodes there, and the material of one topology would be judged on another.
     """
-    leave_out: bool = False
-    """Judge candidates by the pool alone: of `observations` the nodes and hands of frame 0 are read, and no other frame."""
     recordings: tuple[Recording, ...] = field(init=False)
-    """Those that count: the scenario's own, unless it is left out, and those of the pool; a candidate has a twin on each."""
+    """The scenario's own and those of the pool; a candidate has a twin on each."""
     labels: np.ndarray = field(init=False)
     """Region of each node [N]."""
     spacing: float = field(init=False)
@@ -96,9 +91,8 @@ class SearchProblem:
         require_pool(self.observations, self.pool)
         canonical, count = self.observations.canonical, len(self.observations.nodes)
         nodes, hands = canonical[:count], canonical[count:]
-        counted = (*(() if self.leave_out else (self.observations,)), *self.pool)
         object.__setattr__(self, "labels", regions(nodes, self.clusters))
-        object.__setattr__(self, "recordings", tuple(map(self._recording, counted)))
+        object.__setattr__(self, "recordings", tuple(map(self._recording, (self.observations, *self.pool))))
         object.__setattr__(self, "spacing", node_spacing(nodes))
         object.__setattr__(self, "reach", controller_reach(nodes, hands))
 
@@ -242,9 +236,9 @@ def made(problem: SearchProblem, normalized: np.ndarray, push: bool = False) -> 
     try:
         twin = candidate(problem, values, push)
         row |= {"springs": len(twin.topology.springs), "substeps": twin.simulation.substeps}
-        moved = (move(twin, seen, keep_frame_time=released)[0] for seen in problem.pool)
-        family = (*(() if problem.leave_out else (twin,)), *(with_substeps(each, settings, released) for each in moved))
-    except (NumericalFailure, OutOfReach) as failure:
+        moved = (move(twin, seen, keep_frame_time=released) for seen in problem.pool)
+        family = (twin, *(with_substeps(each, settings, released) for each in moved))
+    except NumericalFailure as failure:
         row["reason"] = str(failure)
     except stability.Unstable as failure:
         # The candidate is too stiff for a fixed number of substeps.
@@ -254,32 +248,33 @@ def made(problem: SearchProblem, normalized: np.ndarray, push: bool = False) -> 
 
 
 def evaluate(
-    problem: SearchProblem,
-    population: Sequence[np.ndarray],
-    push: bool,
-    index: int,
-    generation: int,
-    each: Map = map,
-    lane: Launch | None = None,
-) -> list[dict[str, Any]]:
+    problem: SearchProblem, population: Sequence[np.ndarray], push: bool, index: int, generation: int, each: Map = map
+) -> Generator[list[Rollouts], list[tuple[list[Outcome], float]], list[dict[str, Any]]]:
     """Rows of the trace for the candidates of a generation, numbered from `index` on; `each` may work in several threads.
 
-    With a `lane` their launches are shared with other searches.
+    Yields the rollouts that it wants, of one group on one recording each, and is sent their outcomes and the seconds they took.
     """
     candidates = list(each(lambda normalized: made(problem, normalized, push), population))
     for number, (row, _) in enumerate(candidates):
         row |= {"rollout": index + number, "generation": generation}
     rows, families = [row for row, family in candidates if family], [family for _, family in candidates if family]
-    device, recordings = problem.device, problem.recordings
-
-    def simulate(members: list[int]) -> None:
-        start = time.perf_counter()
-        results = [
-            launch(problem, Rollouts([families[k][place] for k in members], one.hands, one.velocity, one.loss), lane)
-            for place, one in enumerate(recordings)
-        ]
-        share = (time.perf_counter() - start) / len(members)
-        for k, result in zip(members, map(mean_outcome, zip(*results, strict=True)), strict=True):
+    if not families:
+        return [row for row, _ in candidates]
+    recordings = problem.recordings
+    members = groups([family[0] for family in families], problem.device, problem.together, problem.threads)
+    answers = iter(
+        (
+            yield [
+                Rollouts([families[k][place] for k in group], one.hands, one.velocity, one.loss)
+                for group in members
+                for place, one in enumerate(recordings)
+            ]
+        )
+    )
+    for group in members:
+        results = [next(answers) for _ in recordings]
+        share = sum(seconds for _, seconds in results) / len(group)
+        for k, result in zip(group, map(mean_outcome, zip(*(own for own, _ in results), strict=True)), strict=True):
             rows[k]["collision_overflow"] = result.collision_overflow
             rows[k]["seconds"] += share
             if result.diverged_frame:
@@ -289,17 +284,7 @@ def evaluate(
                 rows[k]["reason"] = "its cost is not a number"
             else:
                 rows[k]["cost"] = min(result.cost, PENALTY)
-
-    twins = [family[0] for family in families]
-    # Threads would meet in the one stream of a GPU.
-    simulated = each if device == "cpu" else map
-    list(simulated(simulate, groups(twins, device, problem.together, problem.threads) if twins else []))
     return [row for row, _ in candidates]
-
-
-def launch(problem: SearchProblem, rollouts: Rollouts, lane: Launch | None) -> Any:
-    """The results of rollouts (trials.py)."""
-    return lane(rollouts) if lane else rolled([rollouts], problem.device)[0]
 
 
 def mean_outcome(results: Sequence[Outcome]) -> Outcome:

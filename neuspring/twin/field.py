@@ -17,7 +17,13 @@ from torch.nn.functional import embedding_bag
 
 from neuspring.config import SpringFieldSettings as Settings
 
-ALL_SPRINGS, NO_POINTS = slice(None), np.zeros((0, 3))
+TEXEL_SCALE = 0.1
+"""Standard deviation of the texels at the start, which are white noise."""
+FIELD_CHANNELS, FIELD_HIDDEN, FIELD_LAYERS, FIELD_BANDS = 32, 128, 3, 4
+"""Features per texel; units per hidden layer and layers of the MLP, the linear one at its end included; frequencies (powers of two,
+times pi) of the Fourier transform."""
+ADAPTIVE_FACTOR = 0.85
+"""Texels per side of a plane over the root of the number of springs, where `resolution` is adaptive."""
 PLANE_AXES = ((0, 1), (1, 2), (0, 2))
 """Coordinates that span the planes xy, yz, xz."""
 
@@ -60,9 +66,9 @@ class TriPlane(nn.Module):
         self.register_buffer("indices", torch.from_numpy(inverse.reshape(cells.shape)), persistent=False)
         self.register_buffer("weights", torch.from_numpy(weights.astype(np.float32)), persistent=False)
 
-    def forward(self, part: slice = ALL_SPRINGS) -> torch.Tensor:
-        """Summed features [S, C] of a part of the points."""
-        return embedding_bag(self.indices[part], self.texels, per_sample_weights=self.weights[part], mode="sum")
+    def forward(self) -> torch.Tensor:
+        """Summed features [S, C] of the points."""
+        return embedding_bag(self.indices, self.texels, per_sample_weights=self.weights, mode="sum")
 
 
 def bilinear(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
@@ -88,26 +94,21 @@ class SpringField(nn.Module):
 
     coordinates: torch.Tensor
 
-    def __init__(self, points: np.ndarray, settings: Settings, outputs: int, seed: int, beside: np.ndarray = NO_POINTS) -> None:
-        """`points` [S, 3], m: midpoints. Weights depend on `seed`, the settings and S alone, not on the order of springs.
-
-        `beside` [P, 3] are midpoints of the same body's springs in other recordings, which follow; planes are no finer for them.
-        """
+    def __init__(self, points: np.ndarray, settings: Settings, outputs: int, seed: int) -> None:
+        """`points` [S, 3], m: midpoints. Weights depend on `seed`, the settings and S alone, not on the order of springs."""
         super().__init__()
-        self.settings = settings
-        count, points = len(points), np.concatenate([points, beside])
         mapped = in_cube(points)
         if settings.shuffled:
             mapped = mapped[np.random.default_rng(seed).permutation(len(mapped))]
         self.register_buffer("coordinates", torch.from_numpy(mapped.astype(np.float32)), persistent=False)
         # At least 2, as bilinear interpolation needs.
-        adaptive = max(round(settings.adaptive_factor * math.sqrt(count)), 2)
+        adaptive = max(round(ADAPTIVE_FACTOR * math.sqrt(len(points))), 2)
         self.resolution = adaptive if settings.resolution == "adaptive" else settings.resolution
         generator = torch.Generator().manual_seed(seed)
         self.planes = None
         if settings.triplane:
-            self.planes = TriPlane(mapped, self.resolution, settings.channels, settings.texel_scale, generator)
-        widths = [self.encoded().shape[1], *[settings.hidden] * (settings.layers - 1), outputs]
+            self.planes = TriPlane(mapped, self.resolution, FIELD_CHANNELS, TEXEL_SCALE, generator)
+        widths = [self.encoded().shape[1], *[FIELD_HIDDEN] * (FIELD_LAYERS - 1), outputs]
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(widths))
         with torch.no_grad():
             for layer in self.layers:
@@ -118,15 +119,14 @@ class SpringField(nn.Module):
             for tensor in self.layers[-1].parameters():
                 tensor.zero_()
 
-    def encoded(self, part: slice = ALL_SPRINGS) -> torch.Tensor:
+    def encoded(self) -> torch.Tensor:
         """Inputs of the MLP [S, width]: the plane feature and the coordinates, transformed."""
-        here = self.coordinates[part]
-        parts = [here] if self.planes is None else [self.planes(part), here]
-        return torch.cat([fourier(part, self.settings.bands) for part in parts], dim=1)
+        parts = [self.coordinates] if self.planes is None else [self.planes(), self.coordinates]
+        return torch.cat([fourier(part, FIELD_BANDS) for part in parts], dim=1)
 
-    def forward(self, part: slice = ALL_SPRINGS) -> torch.Tensor:
-        """F [S, outputs] of a part of the springs."""
-        x = self.encoded(part)
+    def forward(self) -> torch.Tensor:
+        """F [S, outputs] of the springs."""
+        x = self.encoded()
         for layer in self.layers[:-1]:
             x = torch.relu(layer(x))
         result: torch.Tensor = self.layers[-1](x)

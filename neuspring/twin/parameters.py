@@ -1,7 +1,7 @@
 """Parameters that a first-order stage trains, and the physical quantities that follow from it.
 
-Every spring has an offset o on a log scale: its own number (`springs`), or the neural spring field at its midpoint (`field`), to
-which its own number may be added (`field.offsets`). With b(o) = bound tanh(o / bound), or o without a bound, its stiffness is
+Every spring has an offset o on a log scale: its own number (`springs`), or the neural spring field at its midpoint (`field`).
+With b(o) = bound tanh(o / bound), or o without a bound, its stiffness is
 
     Y = Y0 exp(b(o)), clamped to the stiffness range.
 
@@ -11,8 +11,7 @@ dashpots (`damping`). With `controller_factors` the springs of controllers, whic
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import fields, replace
 from typing import Any
 
@@ -24,8 +23,7 @@ from neuspring import config
 from neuspring.core.artifacts import Topology, Twin
 from neuspring.physics.parameters import CONTACT_LIMITS, Parameters, pack, twin_tensors
 from neuspring.physics.topology import node_spacing
-from neuspring.twin.field import NO_POINTS, SpringField, midpoints
-from neuspring.twin.roughness import SIDE_BY_SIDE, neighbors, roughness
+from neuspring.twin.field import TEXEL_SCALE, SpringField, midpoints
 
 CONTACT_SCALARS = tuple(CONTACT_LIMITS)
 DAMPING_FACTORS = ("drag", "dashpot")
@@ -71,28 +69,26 @@ def topology_spacing(topology: Topology) -> float:
     return node_spacing(nodes) if len(nodes) > 1 else float(np.median(topology.rest_lengths.astype(np.float64)))
 
 
+def start_values(twin: Twin, device: str) -> dict[str, torch.Tensor]:
+    """Physical values of a twin before the fit, by the keyword names of `physics.parameters.pack`."""
+    start = twin_tensors(twin, device)
+    start["stiffness"] = start["stiffness"].clamp_min(LOWEST_STIFFNESS)
+    return start
+
+
 class TwinParameters(nn.Module):
     """The trained tensors of a twin, as a module: `named_parameters` is the checkpoint's content."""
 
-    def __init__(
-        self, twin: Twin, settings: config.Fit, kind: str, device: str, seed: int = 0, beside: np.ndarray = NO_POINTS
-    ) -> None:
-        """`beside` [P, 3], m: midpoints of springs of other lattices of the body, in this one's rest shape (`on`)."""
+    def __init__(self, twin: Twin, settings: config.Fit, kind: str, device: str, seed: int = 0) -> None:
         super().__init__()
         self.settings, self.kind = settings, kind
-        self.start = twin_tensors(twin, device)
-        self.start["stiffness"] = self.start["stiffness"].clamp_min(LOWEST_STIFFNESS)
+        self.start = start_values(twin, device)
         topology = twin.topology
         count = len(topology.springs)
         self.on_controller = torch.arange(count, device=device) >= topology.object_spring_count
-        self.midpoints = midpoints(topology.canonical, topology.springs)
-        self.part = slice(0, count)
-        """The springs' places among all of the field."""
-        self.field = SpringField(self.midpoints, settings.field, 1, seed, beside) if kind == "field" else None
-        own = kind == "springs" or settings.field.offsets
-        self.offsets = nn.Parameter(torch.zeros(count, 1)) if own else None
-        smooth = kind == "field" and settings.field.smoothness > 0
-        self._near = torch.from_numpy(neighbors(self.midpoints, SIDE_BY_SIDE)).to(device) if smooth else None
+        points = midpoints(topology.canonical, topology.springs)
+        self.field = SpringField(points, settings.field, 1, seed) if kind == "field" else None
+        self.offsets = nn.Parameter(torch.zeros(count, 1)) if kind == "springs" else None
         self.scalars = nn.ParameterDict({name: nn.Parameter(self.start[name].clone()) for name in CONTACT_SCALARS})
         self.factors = nn.ParameterDict({name: nn.Parameter(torch.zeros(())) for name in self._factor_names()})
         self.to(device)
@@ -106,19 +102,13 @@ class TwinParameters(nn.Module):
         names += [name for name in DAMPING_FACTORS if s.damping != "fixed" and bool((self.start[name] > 0).any())]
         return names + [f"controller_{name}" for name in names if s.controller_factors and name in SPRING_FACTORS]
 
-    def on(self, other: TwinParameters, part: slice) -> TwinParameters:
-        """The same trained tensors on the springs of another lattice of the body, with its start: those at `part` of the field."""
-        shared = copy.copy(self)
-        shared.start, shared.on_controller, shared.part = other.start, other.on_controller, part
-        return shared
-
     def groups(self) -> list[dict[str, Any]]:
         """Parameter groups for the optimizer, each with its learning rate (`base_rate` is not changed later)."""
         s = self.settings
         rate = s.learning_rate
         groups: list[tuple[Iterable[nn.Parameter], float]] = []
         if self.offsets is not None:
-            groups.append(([self.offsets], rate if self.field is None else s.field.offset_learning_rate))
+            groups.append(([self.offsets], rate))
         if self.field is not None:
             groups.append((self.field.layers.parameters(), rate))
             if self.field.planes is not None:
@@ -130,8 +120,8 @@ class TwinParameters(nn.Module):
 
     def deviation(self) -> torch.Tensor:
         """Factor of each spring's stiffness [S], apart from common factors."""
-        parts = [*([] if self.field is None else [self.field(self.part)]), *([] if self.offsets is None else [self.offsets])]
-        return bounded(sum(parts)[:, 0], self.settings.output_bound).exp()
+        offsets: torch.Tensor = self.offsets if self.offsets is not None else self.field()  # type: ignore[misc]
+        return bounded(offsets[:, 0], self.settings.output_bound).exp()
 
     def _common(self, name: str) -> torch.Tensor | float:
         """The common factor of a physical value: one number, or a number per spring."""
@@ -142,33 +132,22 @@ class TwinParameters(nn.Module):
             factor = torch.where(self.on_controller, self.factors[f"controller_{name}"].exp(), factor)
         return factor
 
-    def physical(self) -> dict[str, torch.Tensor]:
-        """Every physical parameter, with the keyword names of `physics.parameters.pack`."""
-        s, values = self.settings, dict(self.start)
-        stiffness = self.start["stiffness"] * (self.deviation() * self._common("stiffness"))
+    def physical(self, start: Mapping[str, torch.Tensor] | None = None) -> dict[str, torch.Tensor]:
+        """Every physical parameter, with the keyword names of `physics.parameters.pack`, from `start` (none: the twin's)."""
+        s, start = self.settings, self.start if start is None else start
+        values = dict(start)
+        stiffness = start["stiffness"] * (self.deviation() * self._common("stiffness"))
         # The released baseline clamps plainly. Springs of a field move together, so one beyond a limit must be able to return.
         clamp = inward_clamp if self.kind == "field" else torch.clamp
         values["stiffness"] = clamp(stiffness, *s.stiffness_range)
         for name in DAMPING_FACTORS:
             if name in self.factors:
-                values[name] = self.start[name] * self._common(name)
+                values[name] = start[name] * self._common(name)
         return values | dict(self.scalars.items())
 
-    def pack(self, substep: float) -> Parameters:
+    def pack(self, substep: float, start: Mapping[str, torch.Tensor] | None = None) -> Parameters:
         """Packed for the solver, differentiably."""
-        return pack(**self.physical(), substep=substep)
-
-    def penalty(self) -> torch.Tensor:
-        """The regularizer of a step, in the loss unit, with its weights: mean squares of the field's differences between springs
-        side by side, and of the offsets beside it."""
-        s, total = self.settings.field, torch.zeros(())
-        if self._near is not None:
-            assert self.field is not None
-            values = self.field(self.part)[:, 0]
-            total = s.smoothness * (values[:, None] - values[self._near]).square().mean()
-        if self.field is not None and self.offsets is not None:
-            total = total + s.offset_prior * self.offsets.square().mean()
-        return total
+        return pack(**self.physical(start), substep=substep)
 
     def copy(self) -> dict[str, np.ndarray]:
         """The trained values as arrays."""
@@ -211,14 +190,14 @@ def movement(parameters: TwinParameters) -> dict[str, Any]:
 
     texels_moved: share of texels that moved by more than a tenth of their scale at the start. at_bound: share of springs whose
     stiffness lies within 5 % of the bound of its deviation (logarithm). at_stiffness_range: share at or beyond an end of the
-    stiffness range. roughness: of the body's log stiffness (roughness.py). factors: common factors.
+    stiffness range. factors: common factors.
     """
     s, figures = parameters.settings, dict[str, Any]()
     with torch.no_grad():
         if parameters.field is not None and parameters.field.planes is not None:
             first = torch.from_numpy(parameters.first["field.planes.texels"])
             change = (parameters.field.planes.texels.cpu() - first).abs()
-            figures["texels_moved"] = _share(change > MOVED_TEXEL * s.field.texel_scale)
+            figures["texels_moved"] = _share(change > MOVED_TEXEL * TEXEL_SCALE)
         if s.output_bound:
             deviation = parameters.deviation().log()
             figures["at_bound"] = _share(deviation.abs() >= NEAR_BOUND * s.output_bound)
@@ -226,10 +205,6 @@ def movement(parameters: TwinParameters) -> dict[str, Any]:
         low, high = s.stiffness_range
         stiffness = physical["stiffness"]
         figures["at_stiffness_range"] = _share((stiffness >= high) | (stiffness <= low))
-        body = ~parameters.on_controller.cpu().numpy()
-        rough = roughness(parameters.midpoints[body], stiffness.double().log().cpu().numpy()[body])
-        if np.isfinite(rough):
-            figures["roughness"] = rough
         if parameters.factors:
             figures["factors"] = {name: float(value.exp()) for name, value in parameters.factors.items()}
     return figures

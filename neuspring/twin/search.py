@@ -11,7 +11,7 @@ recorded costs.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,19 +25,19 @@ import torch
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_atomically
 from neuspring.core.text import Progress
+from neuspring.twin.batch import lockstep, result_of, shared_physics
 from neuspring.twin.body import Learned
 from neuspring.twin.candidates import (
-    CMAES,
     OTHER_WAY,
     PENALTY,
     UNSTABLE,
-    Launch,
     Map,
     SearchProblem,
     candidate,
     evaluate,
     still_cost,
 )
+from neuspring.twin.trials import Rollouts, rolled
 
 if TYPE_CHECKING:
     import cma
@@ -101,7 +101,7 @@ class Proposals:
 
 
 def _strategy(start: np.ndarray, sigma: float, seed: int) -> cma.CMAEvolutionStrategy:
-    # Numbers of its own: searches that share launches are threads, and cma would draw from those that numpy has for all.
+    # Each search owns its random generator: searches advance in turns, and cma would otherwise share NumPy's global one.
     import cma
 
     numbers = np.random.RandomState(seed + 1)
@@ -119,61 +119,109 @@ class SearchResult(Learned):
     trace: pd.DataFrame
 
 
-Judge = Callable[[Sequence[np.ndarray], bool, int, int], list[dict[str, Any]]]
-"""Rows of candidates [V], given also True where hands only push, the number of the first candidate, and the generation."""
+@dataclass(frozen=True)
+class SearchRun:
+    """A search, its seed, and the file of its trace, which is continued where it has the same `key`."""
+
+    problem: SearchProblem
+    seed: int
+    record: Path | None = None
+    key: str = ""
 
 
-def search(
-    problem: SearchProblem, seed: int, *, record: Path | None = None, key: str = "", lane: Launch | None = None
-) -> SearchResult:
-    """Run the search within its budget of rollouts; with a `lane` it shares launches with others (batch.py).
+def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key: str = "") -> SearchResult:
+    """Run the search within its budget of rollouts.
 
     The trace is written to `record` after every generation. A trace with the same `key` that is there already is continued,
     whatever its budget was. Raises NumericalFailure if no candidate could be simulated.
     """
-    clock, settings, variables = time.perf_counter(), problem.search, problem.variables
-    rows, attempts, earlier = recorded_trace(record, key)
-    trace, other = ([row for row in rows if row["stage"] == stage] for stage in (CMAES, OTHER_WAY))
-    saved = len(trace)
-    # One candidate cannot be judged both ways.
-    ways = WAYS[settings.hands][: settings.rollouts]
-    push = ways[0]
+    result: SearchResult = result_of(search_many([SearchRun(problem, seed, record, key)]))
+    return result
+
+
+def search_many(runs: Sequence[SearchRun]) -> list[SearchResult | Exception]:
+    """The result of each search, or the exception that ended it.
+
+    The searches advance generation by generation. On a GPU their rollouts share launches; on a CPU `threads` of the first problem
+    simulate groups of candidates at the same time.
+    """
+    device = runs[0].problem.device
+    with _threads(runs[0].problem.threads) as each:
+        return lockstep([_course(run, each) for run in runs], partial(_roll_out, device, each, share=device != "cpu"))
+
+
+def _roll_out(device: str, each: Map, requests: Mapping[int, Sequence[Rollouts]], *, share: bool) -> dict[int, list[Any]]:
+    """Outcomes and seconds of each of the rollouts; those of several searches with one physics `share` a launch."""
+    wanted = [(k, number, one) for k, own in requests.items() for number, one in enumerate(own)]
+    launches: dict[Any, list[tuple[int, int, Rollouts]]] = {}
+    for entry in wanted:
+        one = entry[2]
+        together = shared_physics(one.twins[0], one.hands.shape[-1] == 3) if share and len(requests) > 1 else entry[:2]
+        launches.setdefault(together, []).append(entry)
+
+    def launch(entries: Sequence[tuple[int, int, Rollouts]]) -> list[tuple[int, int, Any]]:
+        start = time.perf_counter()
+        results = rolled([one for _, _, one in entries], device)
+        seconds = (time.perf_counter() - start) / len(entries)
+        return [(k, number, (result, seconds)) for (k, number, _), result in zip(entries, results, strict=True)]
+
+    # Threads would meet in the one stream of a GPU.
+    simulated = each if device == "cpu" else map
+    found = {(k, number): answer for answers in simulated(launch, launches.values()) for k, number, answer in answers}
+    return {k: [found[k, number] for number in range(len(own))] for k, own in requests.items()}
+
+
+def _course(run: SearchRun, each: Map) -> Generator[Any, Any, SearchResult]:
+    """A search that yields the rollouts of its generations."""
+    clock, problem = time.perf_counter(), run.problem
+    settings, variables = problem.search, problem.variables
+    recorded, attempts, earlier = recorded_trace(run.record, run.key)
+    budget = settings.rollouts
     tied = settings.tied_rollouts if problem.clusters > 1 else 0
-    proposals = Proposals(problem.encode(), variables, tied, seed)
-    budget, name = settings.rollouts, problem.observations.scenario.name
-    progress = Progress(f"search {name}, regions: {problem.clusters}, seed {seed}", settings.rollouts)
+    proposals = Proposals(problem.encode(), variables, tied, run.seed)
+    label = f"search {problem.observations.scenario.name}, regions: {problem.clusters}, seed {run.seed}"
+    progress = Progress(label, budget)
+    trace: list[dict[str, Any]] = []
 
-    def save(kept: list[dict[str, Any]]) -> None:
-        if record is not None:
-            save_trace(record, key, kept, attempts - (lane is not None), earlier + time.perf_counter() - clock)
+    def judge(population: Sequence[np.ndarray], push: bool) -> Generator[Any, Any, list[dict[str, Any]]]:
+        """Rows of the first candidates of a generation: those that are recorded, then new ones."""
+        nonlocal recorded, attempts, earlier
+        generation, start = proposals.generation, len(trace)
+        known = [row for row in recorded if row["generation"] == generation and row["push"] == push][: len(population)]
+        if not replays(known, population, variables):
+            print(f"{run.record}: does not replay on this machine; the search continues afresh from rollout {start}")
+            known, recorded = [], []
+            attempts, earlier = (attempts, earlier) if start else (1, 0.0)
+        fresh = yield from evaluate(problem, population[len(known) :], push, start + len(known), generation, each)
+        return known + fresh
 
-    start = 0
-    with _threads(problem.threads) as each:
-        judge = partial(evaluate, problem, each=each, lane=lane)
+    # One candidate cannot be judged both ways.
+    ways, push = WAYS[settings.hands][:budget], WAYS[settings.hands][0]
+    while len(trace) < budget:
         # The last generation may be cut short, so that searches of any population size use exactly the same budget.
-        while start < budget:
-            population = proposals.ask()[: budget - start]
-            if not start:
-                population = population[: budget // len(ways)]
-            stop = start + len(population)
-            if not replays(trace[start:stop], population, variables):
-                print(f"{record}: does not replay on this machine; the search continues afresh from rollout {start}")
-                trace, saved = trace[:start], start
-                if not start:
-                    other, attempts, earlier = [], 1, 0.0
-            if not start and len(ways) > 1:
-                if len(trace) < stop or len(other) < len(population):
-                    trace, other = _ways(judge, population, ways, MUST_MOVE * still_cost(problem.recordings))
-                budget -= len(other)
-                push = bool(trace[0]["push"])
-            if fresh := population[max(len(trace) - start, 0) :]:
-                trace += judge(fresh, push, len(other) + len(trace), proposals.generation)
-            progress.update(len(other) + len(trace), f"best cost {min(row['cost'] for row in trace):.3e}")
-            proposals.tell([row["cost"] for row in trace[start:stop]])
-            start = stop
-            if len(trace) > saved:
-                save(other + trace)
-    return _best(problem, other + trace[:budget], push, attempts, earlier)
+        population = proposals.ask()[: budget - len(trace)]
+        if not trace and len(ways) > 1:
+            population = population[: budget // len(ways)]
+            hold = yield from judge(population, False)
+            pushing = yield from judge(population, True)
+            push = _pushes(hold, pushing, problem)
+            own, other = (pushing, hold) if push else (hold, pushing)
+            trace = [row | {"stage": OTHER_WAY} for row in other] + own
+            trace = [row | {"rollout": number} for number, row in enumerate(trace)]
+        else:
+            own = yield from judge(population, push)
+            trace += own
+        progress.update(len(trace), f"best cost {min(row['cost'] for row in trace):.3e}")
+        proposals.tell([row["cost"] for row in own])
+        if run.record is not None and len(trace) > len(recorded):
+            save_trace(run.record, run.key, trace, attempts, earlier + time.perf_counter() - clock)
+    return _best(problem, trace, push, attempts, earlier)
+
+
+def _pushes(hold: Sequence[dict[str, Any]], pushing: Sequence[dict[str, Any]], problem: SearchProblem) -> bool:
+    """True if hands push: that must cost less than hands that hold, and than a part of a body that stays."""
+    least = min(row["cost"] for row in pushing)
+    return least < min(row["cost"] for row in hold) and least < MUST_MOVE * still_cost(problem.recordings)
 
 
 def _best(problem: SearchProblem, rows: Sequence[dict[str, Any]], push: bool, attempts: int, earlier: float) -> SearchResult:
@@ -235,23 +283,6 @@ def at_ends(trace: pd.DataFrame, variables: Sequence[str]) -> list[str]:
     best = _least(trace)
     decisive = [name for name in variables if not name.startswith(SURFACES)]
     return [name for name in decisive if not END <= best[f"normalized.{name}"] <= 1 - END]
-
-
-def _ways(
-    judge: Judge, population: Sequence[np.ndarray], ways: Sequence[bool], most: float
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Rows of the first generation in the way that is chosen, and those in the other ways, which were judged first.
-
-    Hands push only if that costs less than `most`.
-    """
-    judged = {push: judge(population, push, 0, 0) for push in ways}
-    costs = {push: min(row["cost"] for row in rows) for push, rows in judged.items()}
-    if costs[True] >= most:
-        costs[True] = np.inf
-    chosen = min(ways, key=lambda push: costs[push])
-    other = [row | {"stage": OTHER_WAY} for push, rows in judged.items() if push != chosen for row in rows]
-    numbered = [row | {"rollout": number} for number, row in enumerate(other + judged[chosen])]
-    return numbered[len(other) :], numbered[: len(other)]
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from neuspring.config.effort import EFFORT_SIZES, EFFORTS, sizes
 from neuspring.core import artifacts
 from neuspring.core.errors import InputError
 from neuspring.core.text import listed
+from neuspring.twin import field
 
 ROOT = Path(__file__).parents[2]
 
@@ -120,7 +121,7 @@ MISTAKES = {
     "isolated nodes": ("search: {isolated_nodes: ignore}", "search.isolated_nodes", "received 'ignore'"),
     "resolution word": ("fit: {field: {resolution: fine}}", "fit.field.resolution", "'adaptive'"),
     "no texels": ("fit: {field: {resolution: 0}}", "fit.field.resolution", "received 0"),
-    "unknown field key": ("fit: {field: {chanels: 3}}", "fit.field.chanels: unknown key (did you mean channels?)"),
+    "unknown field key": ("fit: {field: {shufled: true}}", "fit.field.shufled: unknown key (did you mean shuffled?)"),
     "unknown key in a list": (
         "aims: [{method: a, baseline: b, ratio: 1.0, bellow: 1}]",
         "aims.0.bellow: unknown key (did you mean below?)",
@@ -190,8 +191,8 @@ def commanded(*entries: str) -> dict[str, Any]:
 
 def test_values_of_the_command_line_are_what_yaml_says() -> None:
     """Snakemake hands `--config 'fit={epochs: 60}'` over with the number as text, and true, false and null everywhere."""
-    values = commanded("fit={epochs: 60, field: {triplane: false, hidden: 8}, learning_rate: 5.0e-5, loss_unit: m}")
-    assert values == {"fit": {"epochs": 60, "field": {"triplane": False, "hidden": 8}, "learning_rate": 5e-5, "loss_unit": "m"}}
+    values = commanded("fit={epochs: 60, field: {triplane: false, resolution: 8}, learning_rate: 5.0e-5, loss_unit: m}")
+    assert values == {"fit": {"epochs": 60, "field": {"triplane": False, "resolution": 8}, "learning_rate": 5e-5, "loss_unit": "m"}}
     entries = ["transfers=null", "data_root=null", "compare_with=null", "tune=null", "scenarios=[0, rope, 2020-01-01]", "seeds=0,1"]
     made = parse(Config, commanded(*entries), "--config")
     assert (made.transfers, made.data_root, made.compare_with, made.tune) == (None, None, None, None)
@@ -231,8 +232,13 @@ def test_an_effort_sets_its_sizes_and_nothing_else(effort):
 
 def test_the_sizes_of_the_paper_are_the_defaults_but_for_synthetic_pictures():
     assert plain(load("effort: paper\nsynthetic: {size: demo}\n")) == plain(load("")) | {"effort": "paper"}
-    field = Config().fit.field
-    assert (Config().clusters, field.adaptive_factor, field.channels, field.hidden, field.layers) == (5, 0.85, 32, 128, 3)
+    assert (Config().clusters, field.ADAPTIVE_FACTOR, field.FIELD_CHANNELS, field.FIELD_HIDDEN, field.FIELD_LAYERS) == (
+        5,
+        0.85,
+        32,
+        128,
+        3,
+    )
 
 
 def test_a_key_that_is_given_wins_over_the_effort():

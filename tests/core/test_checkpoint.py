@@ -46,7 +46,7 @@ def test_a_killed_loop_continues_after_its_last_checkpoint(tmp_path, capsys, mon
     second = loop()
     assert "continuing the training after epoch 1" in capsys.readouterr().out
     assert second.restored.values == {"state": 2} and second.attempts == 2
-    assert second.earlier_seconds > 0 and second.earlier_processor_seconds > 0
+    assert second.earlier_seconds > 0
     for number in second:
         second.record({"step": number}, "")
     assert second.history == [{"step": number} for number in range(5)]

@@ -68,12 +68,12 @@ def write(path: Path, text: str) -> Path:
 def test_rows_lie_on_top_of_the_configuration(tmp_path: Path) -> None:
     found = tables.read_methods(write(tmp_path / "methods.yaml", METHODS))
     assert [found[name].fit for name in ("full", "coarse", "long", "ours")] == ["springs", None, "springs", "field"]
-    made = load("fit: {epochs: 3, learning_rate: 0.5, field: {hidden: 8}}\nsearch: {rollouts: 44, tied_rollouts: 5}")
+    made = load("fit: {epochs: 3, learning_rate: 0.5, field: {resolution: 8}}\nsearch: {rollouts: 44, tied_rollouts: 5}")
     merged = tables.with_method(made, found["long"], "long").fit
     assert (merged.horizon, merged.epochs, merged.learning_rate) == (0, 7, 0.5)
     assert tables.with_method(made, found["full"], "full") == made
     ours = tables.with_method(made, found["ours"], "ours").fit
-    assert (ours.epochs, ours.output_bound, ours.field.triplane, ours.field.hidden) == (3, 1.5, False, 8)
+    assert (ours.epochs, ours.output_bound, ours.field.triplane, ours.field.resolution) == (3, 1.5, False, 8)
     rows = read_searches(write(tmp_path / "searches.yaml", SEARCHES))
     assert {name: row.clusters for name, row in rows.items()} == {"uniform": 1, "pieces": 5}
     searched = tables.with_search(made, rows["pieces"], "pieces").search
@@ -357,7 +357,7 @@ def test_rows_that_cannot_be(row: str, message: str, tmp_path: Path) -> None:
 def pooled(folder: Path, **changes: object) -> Benchmark:
     """A method on the pool of a rope, and the same alone."""
     row = "search: uniform, fit: springs, pool: all, description: x"
-    others = "unseen: {extends: one, pool: others}\nmean: {mean_of: unseen, description: x}\n"
+    others = "unseen: {extends: one, pool: all}\nmean: {mean_of: unseen, description: x}\n"
     write(folder / "pooled.yaml", f"{METHODS}one: {{{row}}}\noracle: {{{row}, oracle: true}}\n{others}")
     toys = "".join(f"{name}\ttoy\trope\trope/lift/smooth\tfalse\ttrue\n" for name in ("a", "b", "c"))
     write(folder / "toys.tsv", HEADER + toys + "cloth\ttoy\tcloth\tcloth/lift/smooth\tfalse\ttrue\n")
@@ -399,7 +399,7 @@ def test_a_new_stage_s_options_have_their_defaults_and_a_required_one_is_a_wildc
         graph.options(extent, SimpleNamespace(scenario="rope"))
 
 
-def test_a_mean_reads_the_predictions_of_all_seeds_of_a_row_that_may_leave_its_own_recording_out(tmp_path: Path) -> None:
+def test_a_mean_reads_the_predictions_of_all_seeds_of_a_row(tmp_path: Path) -> None:
     made = pooled(tmp_path, methods=["mean"], seeds=[0, 1], only="seed=1 method=mean")
     assert made.whole.methods == ("unseen", "mean"), "the row is run and shown too"
     graph, job = Graph(made), SimpleNamespace(scenario="a", method="mean", seed=1)

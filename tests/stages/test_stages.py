@@ -148,7 +148,7 @@ def test_a_method_without_second_stage_shares_the_search(finished):
 
 
 def test_regions_and_a_field_pass_through_every_stage(tmp_path):
-    fit = config.Fit(epochs=2, selection="tail", field=config.SpringFieldSettings(channels=4, hidden=16, bands=2))
+    fit = config.Fit(epochs=2, selection="tail", field=config.SpringFieldSettings())
     run = run_all(tmp_path, method="neuspring", settings=replace(SETTINGS, fit=fit))
     record = tracking.RunRecord.load(run)
     assert record.status == "ok"
@@ -173,7 +173,7 @@ def test_a_fit_that_its_settings_held_says_so_in_the_notes():
     notes = _notes({"rollout": StageRecord(stage="rollout", status="ok"), "fit": held})
     assert notes == [
         "fit: 25% of the springs lie at the bound of their stiffness (fit.output_bound)",
-        "fit: 20% of the frames left out of gradients (fit.adjoint_limit)",
+        "fit: 20% of the frames left out of gradients",
         "fit: only 1.2% of the texels moved by a tenth of their first scale",
     ]
     facts = {"at_bound": 0.05, "texels_moved": 0.05, "frames_left_out": 0.05}

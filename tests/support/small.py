@@ -16,10 +16,11 @@ import torch
 from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.scenes.synthetic import toy
-from neuspring.twin.candidates import SearchProblem, candidate
+from neuspring.twin.batch import Course, SharedFrames, lockstep, result_of
+from neuspring.twin.candidates import SearchProblem, candidate, evaluate
 from neuspring.twin.fit import FitProblem, FitResult
 from neuspring.twin.losses import FrameLoss
-from neuspring.twin.trials import Outcome, outcomes
+from neuspring.twin.trials import Outcome, outcomes, rolled
 
 FRAMES = 8
 
@@ -95,6 +96,17 @@ def judge(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> lis
     """What becomes of candidates that are rolled out together over the training frames."""
     own = problem.recordings[0]
     return outcomes(twins, own.hands, own.velocity, loss, problem.device)
+
+
+def done(course: Course) -> Any:
+    """The result of a part of a fit that yields frames and gradients."""
+    return result_of(lockstep([course], SharedFrames().serve))
+
+
+def evaluated(problem: SearchProblem, population: Sequence[np.ndarray]) -> list[dict[str, Any]]:
+    """Rows of candidates whose hands hold."""
+    course = evaluate(problem, population, False, 0, 0)
+    return result_of(lockstep([course], lambda asked: {0: [(rolled([one], problem.device)[0], 0.0) for one in asked[0]]}))
 
 
 def rollout_loss(loss: FrameLoss, states: Iterable[tuple[int, torch.Tensor, torch.Tensor]], velocity: torch.Tensor) -> float:

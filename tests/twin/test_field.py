@@ -14,7 +14,6 @@ EXACT = 1e-12
 """Absolute, for values of order 1 in float64: the same sums in another order."""
 STEPS = 1e-8
 """Absolute, for weights of order 1 after optimizer steps in float64: Adam divides by gradients, which magnifies rounding."""
-SMALL = {"channels": 3, "hidden": 8, "bands": 2}
 
 
 def points(count: int = 30, seed: int = 0) -> np.ndarray:
@@ -24,7 +23,7 @@ def points(count: int = 30, seed: int = 0) -> np.ndarray:
 
 def field_of(at: np.ndarray | None = None, outputs: int = 2, seed: int = 0, **settings) -> SpringField:
     """A small field in float64."""
-    return SpringField(points() if at is None else at, config.SpringFieldSettings(**(SMALL | settings)), outputs, seed).double()
+    return SpringField(points() if at is None else at, config.SpringFieldSettings(**settings), outputs, seed).double()
 
 
 def train(field: SpringField, target: torch.Tensor, steps: int = 5) -> None:
@@ -140,7 +139,7 @@ def test_a_shuffled_field_is_the_field_of_midpoints_that_are_dealt_out_anew():
 def test_without_planes_only_coordinates_count():
     field = field_of(triplane=False)
     assert field.planes is None
-    torch.testing.assert_close(field.encoded(), fourier(field.coordinates, 2), rtol=0, atol=0)
+    torch.testing.assert_close(field.encoded(), fourier(field.coordinates, 4), rtol=0, atol=0)
     assert {name.partition(".")[0] for name, _ in field.named_parameters()} == {"layers"}
     # Springs at the same place have the same F.
     twice = field_of(np.concatenate([points(), points()]), triplane=False)

@@ -13,7 +13,7 @@ from tests.support import small
 
 SINGLE = 1e-5
 """Relative: sums of gradients in float32."""
-FIELD = config.SpringFieldSettings(channels=4, hidden=16, bands=2, offsets=True, offset_prior=0.1, smoothness=0.1)
+FIELD = config.SpringFieldSettings()
 SETTINGS = {"springs": {}, "field": {"output_bound": 1.5, "horizon": 2}}
 
 
@@ -57,7 +57,7 @@ def test_another_unit_of_length_gives_the_same_fit(kind, factor, losses):
         rows = []
         for run in (here, there):
             run.set_rate(1.0)
-            rows.append(run.epoch())
+            rows.append(small.done(run.epoch()))
         assert rows[1]["loss"] == rows[0]["loss"] * factor**2
         assert rows[1]["gradient_norm"] == rows[0]["gradient_norm"] > 0
     start = here.parameters.first
@@ -73,7 +73,7 @@ def test_the_released_unit_depends_on_the_unit():
     moved = []
     for factor in (1.0, 2.0**-10):
         run = TwinFit(in_unit(factor, "springs", config.Losses(), **released))
-        run.epoch()
+        small.done(run.epoch())
         moved.append(float(run.parameters.offsets.detach().abs().median()))
     assert moved[1] < 0.01 * moved[0]
 
@@ -82,7 +82,7 @@ def test_gradients_are_those_of_the_loss_in_its_unit():
     first = {}
     for unit in ("meter", "spacing"):
         run = TwinFit(small.fit_problem(fit=config.Fit(epochs=1, loss_unit=unit, horizon=0)))
-        row = run.epoch()
+        row = small.done(run.epoch())
         first[unit] = (run.parameters.offsets.grad.numpy(), row["loss"])
     spacing = topology_spacing(small.fit_problem().twin.topology)
     atol = SINGLE * np.abs(first["spacing"][0]).max()
@@ -94,7 +94,7 @@ def test_epsilon_shortens_steps_of_small_gradients():
     """The first step of Adam is rate g / (|g| + epsilon)."""
     epsilon = 1e-6
     run = TwinFit(small.fit_problem(fit=config.Fit(epochs=1, epsilon=epsilon, loss_unit="meter", horizon=0, learning_rate=0.1)))
-    run.epoch()
+    small.done(run.epoch())
     gradient = run.parameters.offsets.grad
     expected = -0.1 * gradient / (gradient.abs() + epsilon)
     torch.testing.assert_close(run.parameters.offsets.detach(), expected, rtol=SINGLE, atol=1e-9)

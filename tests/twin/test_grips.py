@@ -37,10 +37,11 @@ def test_a_fit_simulates_what_a_rollout_does():
     positions = torch.tensor(outcome(problem.twin, seen))
     loss = FrameLoss.of(seen, config.Losses(), "cpu")
     for horizon in (1, 2, 4):
-        state, start = (trained.rest, trained.velocity, None), 1
+        (own,) = trained.recordings
+        state, start = own.rest, 1
         while start < seen.scenario.train_end:
             window = range(start, min(start + horizon, seen.scenario.train_end))
-            state, mean = trained._simulate(state, window, trained.stable_parameters())
+            state, mean = small.done(own.simulate(state, window, own.stable(trained.parameters)))
             wanted = torch.stack([loss(frame, positions[frame]) for frame in window]).mean()
             assert float(mean.detach()) == pytest.approx(float(wanted), rel=SINGLE)
             state, start = (state[0].detach(), state[1].detach(), None if state[2] is None else state[2].detach()), window.stop

@@ -8,7 +8,7 @@ import torch
 
 from neuspring import config
 from neuspring.config import Losses
-from neuspring.twin.candidates import SearchProblem, candidate, evaluate
+from neuspring.twin.candidates import SearchProblem, candidate
 from neuspring.twin.fit import TwinFit
 from neuspring.twin.losses import BETA, FrameLoss
 from neuspring.twin.search import search
@@ -124,8 +124,8 @@ def test_gradients_of_stiffness_through_projection_and_simulator(name):
         run = TwinFit(small.fit_problem(problem.observations, twin=twin, fit=settings, simulation=simulation, losses=weights))
         with torch.no_grad():
             run.parameters.factors["stiffness"] += shift
-        packed = run.stable_parameters()
-        mean = run._simulate((run.rest, run.velocity, None), range(1, run.fitted_end), packed)[1]
+        (own,) = run.recordings
+        mean = small.done(own.simulate(own.rest, range(1, own.fitted_end), own.stable(run.parameters)))[1]
         mean.backward()
         return float(mean.detach()), float(run.parameters.factors["stiffness"].grad)
 
@@ -149,9 +149,9 @@ def test_a_search_reads_training_frames_alone():
 def test_recordings_of_color_alone_form_a_pool():
     alone, other = problem_of(losses=ALL), colored.observed("rope/shake/smooth")
     each = (alone, replace(alone, pool=(other,)))
-    one, mean = (evaluate(problem, [alone.encode()], False, 0, 0)[0]["cost"] for problem in each)
+    one, mean = (small.evaluated(problem, [alone.encode()])[0]["cost"] for problem in each)
     # The cost of the other recording is its own error in the image.
-    twin = move(candidate(alone, alone.decode(alone.encode())), other, keep_frame_time=False)[0]
+    twin = move(candidate(alone, alone.decode(alone.encode())), other, keep_frame_time=False)
     moved = small.judge(small.search_problem(other), [twin], FrameLoss.of(other, ALL, "cpu"))[0].cost
     assert mean == pytest.approx((one + moved) / 2, rel=1e-12)
     assert moved != one

@@ -173,5 +173,5 @@ def test_a_new_term_is_a_weight_and_a_function(monkeypatch: pytest.MonkeyPatch) 
     expected = float((x[:, 0, :, 2].double() - 0.1).square().mean())
     assert searched.cost == pytest.approx(expected, rel=1e-5)
     assert small.rollout_loss(loss, zip(range(1, len(own.hands)), x[:, 0], v[:, 0], strict=True), start) == pytest.approx(expected)
-    fitted = TwinFit(small.fit_problem(losses=weights, twin=twin, fit=config.Fit(horizon=0))).epoch()["loss"]
+    fitted = small.done(TwinFit(small.fit_problem(losses=weights, twin=twin, fit=config.Fit(horizon=0))).epoch())["loss"]
     assert fitted == pytest.approx(expected, rel=1e-5)

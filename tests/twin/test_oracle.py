@@ -1,4 +1,4 @@
-"""The oracle reads the future, says so in its records, and is the same in shared launches."""
+"""The oracle reads the future, and its records state it."""
 
 from pathlib import Path
 

@@ -24,7 +24,6 @@ TRUNCATION = 1e-7
 """The same, relative to the largest derivative: STEP^2 = 1e-12 times third derivatives, which networks and contact make large."""
 SINGLE = 1e-6
 """Relative: a few operations in float32, whose rounding is 6e-8."""
-SMALL = {"channels": 3, "hidden": 8, "bands": 2}
 DIFFERENCES = 2e-6
 """Relative: differences of positions in float32, some ten times longer than a spring."""
 ALL = {"damping": "homogeneous", "output_bound": 1.5}
@@ -38,7 +37,7 @@ def twin() -> Twin:
 
 def parameters(kind: str = "field", start: Twin | None = None, field: dict | None = None, **settings) -> TwinParameters:
     """Trained values of the small twin."""
-    fit = config.Fit(field=config.SpringFieldSettings(**(SMALL | (field or {}))), **settings)
+    fit = config.Fit(field=config.SpringFieldSettings(**(field or {})), **settings)
     return TwinParameters(start or twin(), fit, kind, "cpu")
 
 
@@ -65,7 +64,6 @@ TRAINED = {
     "field": ("field", {}, ALL | {"global_stiffness": True, "controller_factors": True}),
     "field of coordinates": ("field", {"triplane": False}, ALL),
     "springs": ("springs", {}, ALL | {"global_stiffness": True}),
-    "field and offsets": ("field", {"offsets": True}, ALL),
 }
 
 
@@ -242,9 +240,8 @@ def test_stiffness_of_zero_can_grow():
 
 def test_learning_rates_of_each_group():
     rates = {"learning_rate": 0.1, "factor_learning_rate": 0.4}
-    beside = {"offsets": True, "offset_learning_rate": 0.5}
-    trained = parameters(field={"plane_learning_rate": 0.3} | beside, damping="homogeneous", **rates)
-    expected = {"field.layers": 0.1, "field.planes": 0.3, "factors": 0.4, "offsets": 0.5}
+    trained = parameters(field={"plane_learning_rate": 0.3}, damping="homogeneous", **rates)
+    expected = {"field.layers": 0.1, "field.planes": 0.3, "factors": 0.4}
     names = {tensor: name for name, tensor in trained.named_parameters()}
     for group in trained.groups():
         assert group["lr"] == group["base_rate"]
@@ -253,25 +250,6 @@ def test_learning_rates_of_each_group():
             wanted = next((values for start, values in expected.items() if name.startswith(start)), 0.1)
             assert group["lr"] == wanted, name
     assert not names, "every trained value belongs to one group"
-
-
-def test_offsets_beside_a_field_are_added_to_it():
-    values = torch.linspace(-1, 1, len(twin().topology.springs))
-    both, alone = (disturb(parameters(field={"offsets": own}), seed=4) for own in (True, False))
-    alone.restore({name: value for name, value in both.copy().items() if name != "offsets"})
-    torch.testing.assert_close(offsets(both, values[:, None]).deviation(), alone.deviation() * values.exp(), rtol=SINGLE, atol=0)
-
-
-def test_penalties_are_mean_squares_of_differences_of_neighbors_and_of_offsets():
-    trained = disturb(parameters(field={"offsets": True, "smoothness": 3.0, "offset_prior": 2.0}))
-    values = trained.field().detach().numpy()[:, 0].astype(float)
-    apart = np.linalg.norm(trained.midpoints[:, None] - trained.midpoints, axis=2)
-    nearest = np.argsort(apart + np.diag(np.full(len(apart), np.inf)), axis=1)[:, :8]
-    smooth = np.square(values[:, None] - values[nearest]).mean()
-    expected = 3.0 * smooth + 2.0 * float(trained.offsets.detach().square().mean())
-    assert trained.penalty().item() == pytest.approx(expected, rel=1e-4)
-    assert smooth > 0
-    assert parameters(field={"offsets": True}).penalty() == 0 == parameters("springs").penalty()
 
 
 @pytest.mark.parametrize("kind", ["springs", "field"])
@@ -304,11 +282,9 @@ def test_the_twin_is_what_is_simulated(kind):
 
 # What moved -----------------------------------------------------------------------------------------------------------
 
-OF_TEXELS = config.SpringFieldSettings(channels=4, hidden=8, bands=2, texel_scale=0.02)
-
 
 def of_scene(kind: str, **settings: object) -> TwinParameters:
-    return TwinParameters(small.fit_problem().twin, config.Fit(field=OF_TEXELS, **settings), kind, "cpu")
+    return TwinParameters(small.fit_problem().twin, config.Fit(**settings), kind, "cpu")
 
 
 def test_shares_count_springs_at_the_bound_and_at_the_range():
@@ -320,18 +296,16 @@ def test_shares_count_springs_at_the_bound_and_at_the_range():
         trained.offsets[10:30] = -3.0  # at the bound, within the range
         trained.offsets[30:70] = 0.5  # above the range, not at the bound
     figures = movement(trained)
-    assert 0 < figures.pop("roughness") < 1.5
     assert figures == pytest.approx({"at_bound": 30 / count, "at_stiffness_range": 50 / count})
 
 
 def test_a_texel_has_moved_by_a_tenth_of_the_scale_at_the_start():
     trained = of_scene("field")
     texels = trained.field.planes.texels
-    assert texels.detach().std() == pytest.approx(0.02, rel=0.1), "the scale is a setting"
     assert movement(trained)["texels_moved"] == 0
     with torch.no_grad():
-        texels[0] += 0.0021
-        texels[1] += 0.0019
+        texels[0] += 0.0105
+        texels[1] += 0.0095
     assert movement(trained)["texels_moved"] == pytest.approx(1 / len(texels))
     assert "at_bound" not in movement(trained), "no bound"
 
@@ -351,7 +325,7 @@ def test_gradients_are_compared_with_epsilon():
     assert coarse > 1
     run = TwinFit(small.fit_problem(kind="springs", fit=config.Fit(epochs=1, horizon=0)))
     run.gradients = []
-    run.epoch()
+    small.done(run.epoch())
     assert run.gradients == [float(run.parameters.offsets.grad.abs().median())]
 
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,13 +18,15 @@ from neuspring.config.simulation import SimulationSettings
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.physics.parameters import packed
-from neuspring.physics.solver import solver_of
+from neuspring.physics.solver import FrameSolver, solver_of
 from neuspring.physics.union import Union
-from neuspring.twin import batch
-from neuspring.twin.batch import run_batch, run_searches
+from neuspring.twin import fit as fit_module
+from neuspring.twin import search as module
+from neuspring.twin.batch import SharedFrames, lockstep
+from neuspring.twin.body import FitTask
 from neuspring.twin.candidates import SearchProblem, candidate
-from neuspring.twin.fit import FitProblem, fit
-from neuspring.twin.search import search
+from neuspring.twin.fit import FitProblem, fit, fit_many
+from neuspring.twin.search import SearchRun, search, search_many
 from tests.support import small
 from tests.support.devices import COST_LARGEST, COST_MEDIAN, CUDA, DEVICES, LOSS
 
@@ -39,29 +45,25 @@ def problems(collide: bool = False, **changes: object) -> list[SearchProblem]:
     return [small.search_problem(seen(path, frames=count, collide=collide), search=settings, **changes) for path, count in each]
 
 
-@pytest.mark.parametrize("collide", [False, True])
-def test_searches_of_several_scenes_end_as_each_alone(collide: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    given, sizes = problems(collide), []
+@pytest.mark.parametrize("share", [False, True])
+def test_searches_of_several_scenes_end_as_each_alone(share: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In turns, as on a CPU, or with shared launches, as on a GPU."""
+    given, sizes = problems(collide=share), []
     assert len({len(one.observations.nodes) for one in given}) == 2
     alone = [search(problem, seed=k).trace for k, problem in enumerate(given)]
-    original = batch.rolled
-
-    def counted(each, device):
-        sizes.append(len(each))
-        return original(each, device)
-
-    monkeypatch.setattr(batch, "rolled", counted)
-    works = [lambda lane, k=k, problem=problem: search(problem, seed=k, lane=lane) for k, problem in enumerate(given)]
-    together = run_searches("cpu", works)
+    original = module.rolled
+    monkeypatch.setattr(module, "rolled", lambda each, device: sizes.append(len(each)) or original(each, device))
+    courses = [module._course(SearchRun(problem, k), map) for k, problem in enumerate(given)]
+    together = lockstep(courses, partial(module._roll_out, "cpu", map, share=share))
     for got, wanted in zip(together, alone, strict=True):
         pd.testing.assert_frame_equal(got.trace.drop(columns="seconds"), wanted.drop(columns="seconds"), check_exact=True)
-    assert max(sizes) == 3
+    assert max(sizes) >= 3 if share else set(sizes) == {1}
 
 
-def test_a_search_that_fails_holds_nobody_up() -> None:
+def test_a_search_that_fails_does_not_stop_the_others() -> None:
     good, other, _ = problems()
     bad = replace(other, simulation=SimulationSettings(substeps=1))
-    together = run_searches("cpu", [lambda lane, one=one: search(one, seed=0, lane=lane) for one in (good, bad)])
+    together = search_many([SearchRun(good, 0), SearchRun(bad, 0)])
     pd.testing.assert_series_equal(together[0].trace["cost"], search(good, seed=0).trace["cost"], check_exact=True)
     assert isinstance(together[1], InputError | NumericalFailure)
 
@@ -74,11 +76,89 @@ def fits(device: str = "cpu") -> list[FitProblem]:
     return [replace(base, observations=problem.observations, twin=twin) for problem, twin in started]
 
 
+def together(given: Sequence[FitProblem], tasks: Sequence[FitTask] = ()) -> list[Any]:
+    """Fits in one lockstep, whether they are in step or not."""
+    courses = [fit_module._course(task, share=0.5) for task in tasks or [FitTask(problem) for problem in given]]
+    return lockstep(courses, SharedFrames().serve)
+
+
 def test_fits_of_several_scenes_end_as_each_alone() -> None:
     given = fits()
-    together = run_batch([one.twin for one in given], "cpu", [lambda lane, one=one: fit(one, lane=lane) for one in given])
-    for got, problem in zip(together, given, strict=True):
+    for got, problem in zip(together(given), given, strict=True):
         small.assert_same_fit(got, fit(problem))
+
+
+def several() -> list[FitProblem]:
+    """Springs and fields, topologies, substeps and horizons of their own: out of step, and some end before others."""
+    values = small.start_values()
+    base = small.fit_problem()
+    coarse = small.fit_problem(values=values | {"object_neighbors": 7.0, "stiffness": 2e4})
+    return [
+        base,
+        replace(base, fit=replace(base.fit, learning_rate=0.5)),
+        replace(coarse, kind="field", seed=3, fit=replace(base.fit, learning_rate=5e-3)),
+        replace(base, fit=replace(base.fit, horizon=3, epochs=4)),
+        replace(coarse, fit=replace(base.fit, horizon=0, selection="tail", epochs=2)),
+    ]
+
+
+def test_fits_in_and_out_of_step_equal_those_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the others do: more substeps, another horizon, an earlier end, an error. Each continues from its checkpoint."""
+    problems = several()
+    alone = [fit(problem) for problem in problems]
+    assert alone[1].twin.simulation.substeps > problems[1].twin.simulation.substeps
+    monkeypatch.setattr("neuspring.core.checkpoint.CHECKPOINT_EVERY", 1)
+    broken = replace(problems[0], simulation=replace(problems[0].simulation, substeps=1))
+    broken = replace(broken, twin=replace(broken.twin, simulation=replace(broken.twin.simulation, substeps=1)))
+    tasks = [FitTask(problem, tmp_path / f"{k}.npz", "k") for k, problem in enumerate([*problems, broken])]
+    *got, failed = together((), tasks)
+    assert isinstance(failed, NumericalFailure)
+    for k, wanted in enumerate(alone):
+        small.assert_same_fit(got[k], wanted)
+        continued = fit(problems[k], partial=tmp_path / f"{k}.npz", key="k")
+        small.assert_same_fit(continued, wanted)
+        assert continued.attempts == 2
+
+
+@pytest.mark.parametrize("factor", [1e-9, 2.0])
+def test_adjoints_are_limited_for_each_fit_that_shares_launches(factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fit_module, "ADJOINT_LIMIT", factor)
+    base = small.fit_problem()
+    problems = [replace(base, fit=replace(base.fit, horizon=0, learning_rate=rate)) for rate in (1e-2, 5e-2)]
+    for got, problem in zip(together(problems), problems, strict=True):
+        wanted = fit(problem)
+        small.assert_same_fit(got, wanted)
+        assert got.facts["frames_left_out"] == wanted.facts["frames_left_out"] > 0
+
+
+def test_self_collision_with_shared_launches() -> None:
+    base, seen = small.fit_problem(), small.observations()
+    crowded = replace(seen, scenario=replace(seen.scenario, self_collision=True))
+    problems = [small.fit_problem(crowded, fit=replace(base.fit, learning_rate=rate)) for rate in (1e-2, 5e-2)]
+    for got, problem in zip(together(problems), problems, strict=True):
+        small.assert_same_fit(got, fit(problem))
+
+
+def test_fits_in_step_share_their_launches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three alike make as many frames as one, and each keeps what it computed: no frame is simulated again."""
+    frames: list[int] = []
+    original = FrameSolver.forward
+    monkeypatch.setattr(FrameSolver, "forward", lambda self, *a: frames.append(len(a[0])) or original(self, *a))
+    problem = small.fit_problem()
+    fit(problem)
+    alone = len(frames)
+    frames.clear()
+    results = fit_many([FitTask(replace(problem, fit=replace(problem.fit, learning_rate=rate))) for rate in (1e-2, 2e-2, 5e-2)])
+    assert not any(isinstance(result, Exception) for result in results)
+    assert (len(frames), frames[0]) == (alone, 3)
+
+
+def test_an_error_in_a_shared_launch_ends_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("no memory")
+
+    monkeypatch.setattr(FrameSolver, "forward", fail)
+    assert [str(result) for result in together(several()[:3])] == ["no memory"] * 3
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -112,13 +192,13 @@ def test_a_frame_and_its_gradients_by_a_thread_per_node(device: str, collide: bo
 def test_searches_and_fits_share_launches_on_a_gpu(device: str) -> None:
     """The first generation of each search judges what it does alone."""
     given = problems(device=device)
-    together = run_searches(device, [lambda lane, one=one: search(one, seed=0, lane=lane) for one in given])
+    together = search_many([SearchRun(one, 0) for one in given])
     for got, problem in zip(together, given, strict=True):
         first = got.trace["generation"] == 0
         wanted = search(problem, seed=0).trace
         errors = (got.trace["cost"][first] / wanted["cost"][first] - 1).abs()
         assert (errors.median() <= COST_MEDIAN) and (errors.max() <= COST_LARGEST)
     trained = fits(device)
-    ended = run_batch([one.twin for one in trained], device, [lambda lane, one=one: fit(one, lane=lane) for one in trained])
+    ended = fit_many([FitTask(one) for one in trained])
     for got, problem in zip(ended, trained, strict=True):
         np.testing.assert_allclose(got.history["loss"], fit(problem).history["loss"], rtol=LOSS)

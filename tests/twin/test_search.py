@@ -1,7 +1,6 @@
 """The zero-order stage: coding of variables, budget, failure handling, and exact continuation."""
 
 import re
-import threading
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +10,6 @@ import cma
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.sparse import coo_array
@@ -24,6 +22,7 @@ from neuspring.physics import stability
 from neuspring.physics.lanes import LANE_WIDTHS
 from neuspring.physics.topology import distances, regions, uniform_topology
 from neuspring.twin import candidates
+from neuspring.twin import search as module
 from neuspring.twin.candidates import PENALTY, SearchProblem, candidate, groups, made, still_cost
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.search import FREED_SIGMA, search
@@ -337,7 +336,8 @@ def test_hands_that_push_must_move_the_object(part, pushes, monkeypatch):
     # Half a square, and the mean over three axes.
     assert still == pytest.approx((way[1:] ** 2).sum(axis=2).mean() / 6, rel=1e-5)
 
-    def evaluated(judged: SearchProblem, population: list[np.ndarray], push: bool, *_: Any, **__: Any) -> list[dict[str, Any]]:
+    def evaluated(judged: SearchProblem, population: list[np.ndarray], push: bool, *_: Any) -> Any:
+        yield from ()
         rows = [made(judged, normalized, push)[0] for normalized in population]
         return [row | {"cost": still * (part if push else 3.0)} for row in rows]
 
@@ -382,10 +382,6 @@ def test_tied_regions_are_the_uniform_search_and_are_then_freed_around_its_best(
     assert len(inside) > 8
     for name in inside:
         assert trace[name][15:27].mean() == pytest.approx(start[re.sub(r"\.\d$", "", name)], abs=4 * sigma / np.sqrt(12))
-
-
-def test_one_region_has_nothing_to_tie():
-    assert_same_trace(search(tied(22, clusters=1), seed=0).trace, search(budget(22), seed=0).trace)
 
 
 @pytest.mark.parametrize(("evaluated", "kept"), [(13, 11), (20, 15)])
@@ -515,68 +511,6 @@ def test_the_search_is_the_same_where_lists_of_partners_are_full():
     assert 0 < (slow["collision_overflow"] > 0).sum() < len(slow)
 
 
-def test_a_killed_search_continues_in_another_batch(tmp_path, monkeypatch):
-    """Killed in the second generation, while its candidates are simulated."""
-    record = tmp_path / "trace.parquet"
-    function, calls = candidates.launch, 0
-
-    def dying(*arguments):
-        nonlocal calls
-        calls += 1
-        if len(pd.read_parquet(record)) if record.exists() else 0:
-            raise KeyboardInterrupt
-        return function(*arguments)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(candidates, "launch", dying)
-        with pytest.raises(KeyboardInterrupt):
-            search(small.search_problem(threads=2), 5, record=record, key="k")
-    assert calls > 1
-    assert len(pd.read_parquet(record)) == 11
-    continued = search(small.search_problem(together=4), seed=5, record=record, key="k")
-    assert continued.attempts == 2
-    assert continued.earlier_seconds > 0
-    assert_same_trace(continued.trace, search(small.search_problem(together=1), seed=5).trace)
-
-
-@pytest.mark.parametrize(("where", "threads"), [("made", 1), ("launch", 2)])
-def test_what_goes_wrong_in_a_thread_comes_out(tmp_path, monkeypatch, where, threads):
-    """And the record has whole generations alone."""
-    record = tmp_path / "trace.parquet"
-    function = getattr(candidates, where)
-
-    def broken(*arguments):
-        if record.exists():
-            raise MemoryError(f"no room in {where}")
-        return function(*arguments)
-
-    monkeypatch.setattr(candidates, where, broken)
-    with pytest.raises(MemoryError, match=f"no room in {where}"):
-        search(small.search_problem(threads=threads, together=4), 5, record=record, key="k")
-    assert len(pd.read_parquet(record)) == 11
-
-
-def test_threads_of_a_search_have_none_of_torch(monkeypatch):
-    """`threads` cores are busy, not its square; afterwards torch has what it had."""
-    before, seen = torch.get_num_threads(), set()
-    function = candidates.launch
-
-    def watched(*arguments):
-        seen.add((threading.get_ident(), torch.get_num_threads()))
-        return function(*arguments)
-
-    monkeypatch.setattr(candidates, "launch", watched)
-    torch.set_num_threads(3)
-    try:
-        search(small.search_problem(threads=2, together=1), seed=0)
-        assert torch.get_num_threads() == 3
-    finally:
-        torch.set_num_threads(before)
-    assert {count for _, count in seen} == {1}
-    assert len(seen) == 2
-    assert not any(thread.ident in dict(seen) for thread in threading.enumerate())
-
-
 def test_candidates_of_every_fate_in_one_generation(monkeypatch):
     """Some diverge, some are unstable, and the others are judged as if they were alone."""
     # About the spacing of the nodes.
@@ -603,13 +537,14 @@ def test_candidates_of_every_fate_in_one_generation(monkeypatch):
 
 @pytest.mark.parametrize("first", [0, 3])
 def test_a_cost_that_is_no_number_is_penalized_and_never_the_best(monkeypatch, first):
-    simulate = candidates.launch
+    simulate = module.rolled
     lost = iter(range(1000))
 
     def spoiled(*arguments):
-        return [replace(one, cost=float("nan")) if next(lost) % 4 == first else one for one in simulate(*arguments)]
+        (own,) = simulate(*arguments)
+        return [[replace(one, cost=float("nan")) if next(lost) % 4 == first else one for one in own]]
 
-    monkeypatch.setattr(candidates, "launch", spoiled)
+    monkeypatch.setattr(module, "rolled", spoiled)
     result = search(small.search_problem(search=small.released(rollouts=12)), seed=0)
     named = result.trace["reason"] == "its cost is not a number"
     assert named.sum() == 3 and (result.trace["cost"][named] == PENALTY).all()
@@ -642,3 +577,22 @@ def test_cuda_takes_as_many_as_it_is_told(together, sizes):
     made = groups([stand_in(20 + k) for k in range(11)], "cuda:0", together, 1)
     assert [len(members) for members in made] == sizes
     assert [k for members in made for k in members] == list(range(11))
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_search_that_fails_in_a_launch_keeps_whole_generations_and_continues(tmp_path, monkeypatch, threads):
+    record, function = tmp_path / "trace.parquet", module.rolled
+
+    def broken(*arguments):
+        if record.exists():
+            raise MemoryError("no room")
+        return function(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "rolled", broken)
+        with pytest.raises(MemoryError, match="no room"):
+            search(small.search_problem(threads=threads, together=4), 5, record=record, key="k")
+    assert len(pd.read_parquet(record)) == 11
+    continued = search(small.search_problem(together=4), seed=5, record=record, key="k")
+    assert continued.attempts == 2 and continued.earlier_seconds > 0
+    assert_same_trace(continued.trace, search(small.search_problem(together=1), seed=5).trace)

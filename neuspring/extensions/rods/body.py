@@ -10,7 +10,6 @@ import numpy as np
 
 from neuspring.config import Config
 from neuspring.core.artifacts import Observations, Twin
-from neuspring.core.errors import InputError
 from neuspring.extensions.rods.rod import Rod, rod_of
 from neuspring.extensions.rods.settings import RodFit
 from neuspring.twin.body import Body, Lines, SearchOptions
@@ -76,9 +75,6 @@ v_x, c v_y, -ground_elasticity v_z), c = max(0, 1 - ground_friction (1 + ground_
         """The constants of a rod; see `rod_fit.search_rod`. It has no regions and no chance, and begins anew."""
         from neuspring.extensions.rods.fit import search_rod
 
-        if options.leave_out:
-            name = f"pool of {observations.scenario.name}"
-            raise InputError(name, "a rod is judged on its own recording too", "pool: others", "Choose pool: all, or transfers.")
         device, threads = options.device, options.threads
         return search_rod(observations, pool, settings, device=device, threads=threads, record=options.record)
 
@@ -95,11 +91,11 @@ v_x, c v_y, -ground_elasticity v_z), c = max(0, 1 - ground_friction (1 + ground_
 
         require_pool(here, pool)
 
-    def on_recording(self, twin: Twin, observations: Observations) -> tuple[Twin, None]:
+    def on_recording(self, twin: Twin, observations: Observations) -> Twin:
         """The rod on the line of frame 0; see `rod.on_recording`."""
         from neuspring.extensions.rods.made import on_recording
 
-        return on_recording(twin, observations), None
+        return on_recording(twin, observations)
 
     def solver(self, twin: Twin, device: str = "cpu") -> RodFrames:
         from neuspring.extensions.rods.nodes import RodFrames

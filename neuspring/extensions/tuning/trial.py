@@ -25,7 +25,7 @@ from neuspring.core.provenance import code_digest
 from neuspring.core.records import StageRecord, canonical, digest_file
 from neuspring.extensions.tuning.space import SWEEP_SEED, Plan
 from neuspring.stages.search import search as search_stage
-from neuspring.twin.fit import FitProblem, NonFinite, TwinFit, eligible, fit, tail_start
+from neuspring.twin.fit import FitProblem, NonFinite, eligible, fit, start_tail_loss, tail_start
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def value_of(trial: optuna.Trial, plan: Plan, scenes: Sequence[TrainingScene], f
                 report(history[-1]["epoch"], loss)
 
         try:
-            losses.append(_fitted(problem, settings, report_epoch) if plan.method.fit else TwinFit(problem).tail_loss())
+            losses.append(_fitted(problem, settings, report_epoch) if plan.method.fit else start_tail_loss(problem))
         except (NonFinite, NumericalFailure) as failure:
             raise NumericalFailure(f"{scene.name}, fit: {failure}") from failure
         if len(scenes) > 1:

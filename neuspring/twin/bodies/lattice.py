@@ -12,12 +12,12 @@ import numpy as np
 from neuspring.config import Config
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.physics import stability
-from neuspring.twin.body import Body, Lines, SearchOptions
+from neuspring.twin.body import Body, FitTask, Learned, Lines, SearchOptions, SearchTask
 
 if TYPE_CHECKING:
     from neuspring.physics.solver import FrameSolver
+    from neuspring.twin.candidates import SearchProblem
     from neuspring.twin.fit import FitProblem, FitResult
-    from neuspring.twin.register import Registration
     from neuspring.twin.search import SearchResult
 
 
@@ -63,23 +63,17 @@ and it goes on for the rest of dt.
         self, observations: Observations, pool: Sequence[Observations], settings: Config, options: SearchOptions
     ) -> SearchResult:
         """CMA-ES over topology and a homogeneous material; see `search.search`."""
-        from neuspring.twin.candidates import SearchProblem
         from neuspring.twin.search import search
 
-        problem = SearchProblem(
-            observations=observations,
-            pool=tuple(pool),
-            search=settings.search,
-            simulation=settings.simulation,
-            losses=settings.losses,
-            quirks=settings.released_quirks,
-            clusters=options.clusters,
-            leave_out=options.leave_out,
-            device=options.device,
-            threads=options.threads,
-            together=options.together,
+        return search(_problem(observations, pool, settings, options), options.seed, record=options.record, key=options.key)
+
+    def search_many(self, tasks: Sequence[SearchTask]) -> list[Learned | Exception]:
+        from neuspring.twin.search import SearchRun, search_many
+
+        made = [_problem(one.observations, one.pool, one.settings, one.options) for one in tasks]
+        return search_many(
+            [SearchRun(own, one.options.seed, one.options.record, one.options.key) for own, one in zip(made, tasks, strict=True)]
         )
-        return search(problem, options.seed, record=options.record, key=options.key, lane=options.lane)
 
     def fit(self, problem: FitProblem, *, partial: Path | None = None, key: str = "", threads: int = 1) -> FitResult:
         """Adam, with gradients through the simulation; see `fit.fit`. It has one thread."""
@@ -87,14 +81,19 @@ and it goes on for the rest of dt.
 
         return fit(problem, partial=partial, key=key)
 
+    def fit_many(self, tasks: Sequence[FitTask], most: int = 0) -> list[Learned | Exception]:
+        from neuspring.twin.fit import fit_many
+
+        return fit_many(tasks, most)
+
     def require_pool(self, here: Observations, pool: Sequence[Observations]) -> None:
         """Other recordings with as many nodes and hands, node i on node i; see `transfer.require_pool`."""
         from neuspring.twin.transfer import require_pool
 
         require_pool(here, pool)
 
-    def on_recording(self, twin: Twin, observations: Observations) -> tuple[Twin, Registration | None]:
-        """Springs with their ends on the same nodes, or springs of their own on others; see `transfer.on_nodes`."""
+    def on_recording(self, twin: Twin, observations: Observations) -> Twin:
+        """Springs with their ends on the same nodes; see `transfer.on_nodes`."""
         from neuspring.twin.transfer import on_nodes
 
         return on_nodes(twin, observations)
@@ -150,6 +149,23 @@ and it goes on for the rest of dt.
 
     def mass_at(self, twin: Twin, node: int) -> float:
         return float(twin.material.mass[node]) if len(twin.material.mass) else 1.0
+
+
+def _problem(observations: Observations, pool: Sequence[Observations], settings: Config, options: SearchOptions) -> SearchProblem:
+    from neuspring.twin.candidates import SearchProblem
+
+    return SearchProblem(
+        observations=observations,
+        pool=tuple(pool),
+        search=settings.search,
+        simulation=settings.simulation,
+        losses=settings.losses,
+        quirks=settings.released_quirks,
+        clusters=options.clusters,
+        device=options.device,
+        threads=options.threads,
+        together=options.together,
+    )
 
 
 body = Lattice()
