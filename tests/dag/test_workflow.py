@@ -20,6 +20,7 @@ from neuspring.scores.metrics import TASKS, metrics_of
 from tests.support.project import (
     ROOT,
     SCENE,
+    add_scenario,
     arguments,
     copy_project,
     copy_workflow,
@@ -106,12 +107,12 @@ def test_one_step_alone_from_another_folder_into_a_path_with_spaces_and_quotes(p
 
 
 def test_a_failing_job_is_named_with_its_log_and_stops_no_other(project):
-    """The second recording is not there when its job begins."""
-    rows = (project / "config" / "scenarios.tsv").read_text()
-    (project / "config" / "scenarios.tsv").write_text(f"{rows}gone\tpoints\ttoy\tgone\tfalse\ttrue\n")
+    """The files of the second recording are there, which is all that a plan looks at, and damaged."""
+    add_scenario(project, "gone", "phystwin")
     data = project / "data" / "gone"
     data.mkdir(parents=True)
-    (data / "capture.json").write_text("{}")
+    (data / "final_data.pkl").write_text("no pickle")
+    (data / "split.json").write_text("{}")
     changes = {
         "scenarios": [SCENE, "gone"],
         "methods": ["static"],
