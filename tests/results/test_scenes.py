@@ -70,8 +70,6 @@ def test_rows_of_film_differ_in_what_teaches_and_share_the_hands(tmp_path):
     assert [len(space.nodes) for space in spaces.values()] == [0, len(scene.NODES)]
     # In both rows the points are there to be scored.
     assert all(capture.tracks().shape == (10, 4, 3) for capture in made.values())
-    # How the object lies need not be supposed where nodes say it.
-    assert ["lying" in " ".join(serious(check_layout(capture.folder))) for capture in made.values()] == [True, False]
     names = [json.loads((capture.folder / CAPTURE).read_text())["name"] for capture in made.values()]
     assert names == ["thing_film", "thing_both"]
 
