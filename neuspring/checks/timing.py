@@ -145,8 +145,9 @@ class Watched:
         if last is None or last[0] != frame - 1:
             return
         self.repeated["color"] += [frame] if np.array_equal(picture, last[1]) else []
-        if near is not None and last[2] is not None and near.any():
-            self.repeated["depth"] += [frame] if np.array_equal(near, last[2]) else []
+        before = last[2]
+        if near is not None and before is not None and near.any():
+            self.repeated["depth"] += [frame] if np.array_equal(near, before) else []
         change = np.clip(np.abs(picture - last[1]).max(axis=-1) - COLOR_STILL, 0, COLOR_MOST).astype(np.float32)
         self.color[frame] = _cells(change)
         if near is not None and last[2] is not None:

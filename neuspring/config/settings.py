@@ -197,7 +197,8 @@ class Config(SettingsSection):
 
 def select(config: Config, keys: Iterable[str]) -> dict[str, Any]:
     """The values under dotted keys (`images.backend`), nested as in a configuration file, as plain values."""
-    values, part = plain(config), {}
+    values = plain(config)
+    part: dict[str, Any] = {}
     for key in keys:
         merge(part, nested(key, functools.reduce(dict.__getitem__, key.split("."), values)))
     return part

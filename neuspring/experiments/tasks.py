@@ -42,7 +42,7 @@ class Tasks:
 
     def tables(self, name: str = "all") -> Unit:
         """The long table of scores, and the summary."""
-        given = {"output": self.folder, "baseline": self.known.compared_with, **self._runs(), **self._transfers()}
+        given: dict[str, Any] = {"output": self.folder, "baseline": self.known.compared_with, **self._runs(), **self._transfers()}
         given |= {"aims": json.dumps(plain(self.config)["aims"]), "objects": self.config.objects}
         given |= {"method_table": self.root / self.config.method_table, "extra_rows": tuple(self.known.extra)}
         files = [self.folder / "summary.md", self.folder / "scores.csv"]
@@ -51,13 +51,14 @@ class Tasks:
     def perception_table(self, name: str = "all") -> Unit:
         """Errors of perception, by category."""
         judged = self.graph.judged(self.whole.scenarios)
-        given = {"output": self.folder / "perception.md", "scenarios": json.dumps(judged)}
+        output = self.folder / "perception.md"
+        given: dict[str, Any] = {"output": output, "scenarios": json.dumps(judged)}
         needs = [self.graph.unit("perceive", scenario) for scenario in self.graph.judged(self.config.scenarios)]
-        return self._unit("perception_table", name, given, needs, ("report.perception",), [given["output"]])
+        return self._unit("perception_table", name, given, needs, ("report.perception",), [output])
 
     def study(self, name: str) -> Unit:
         """One of the paper's tables."""
-        given = {"study": name, "tables": self.config.tables, "output": self.folder / "studies"}
+        given: dict[str, Any] = {"study": name, "tables": self.config.tables, "output": self.folder / "studies"}
         given |= {"table": self.root / self.config.study_table, "extra_rows": tuple(self.known.extra)}
         given |= {"left_out": json.dumps(self.known.whole_left_out)}
         also = json.dumps(plain(self.known.studies[name]))
@@ -69,7 +70,11 @@ class Tasks:
         settings = plain(self.whole) | {"only": ""}
         # Where MLflow and the results are concerns nothing that the report shows.
         del settings["tracking"], settings["results"]
-        given = {"output": self.folder / "report.html", "settings": json.dumps(settings, sort_keys=True), **self._row_tables()}
+        given: dict[str, Any] = {
+            "output": self.folder / "report.html",
+            "settings": json.dumps(settings, sort_keys=True),
+            **self._row_tables(),
+        }
         given |= {"tables": self.config.tables}
         given |= {"baseline": self.known.compared_with, **self._transfers(), "left_out": json.dumps(self.known.whole_left_out)}
         own = [place.partition(":")[0].removeprefix("neuspring.") for place in modules("neuspring.report.sections").values()]
@@ -106,7 +111,9 @@ class Tasks:
         """A worker."""
         jobs, folder = self._tuning()
         needs = [self.graph.unit("perceive", scenario) for scenario in self.known.tuned]
-        given = {"observations": tuple(self.results / scenario / "observations.npz" for scenario in self.known.tuned)}
+        given: dict[str, Any] = {
+            "observations": tuple(self.results / scenario / "observations.npz" for scenario in self.known.tuned)
+        }
         given |= {"settings": jobs.settings(self.known), "worker": int(name), "output": folder / f"worker-{name}.json"}
         code = (f"{jobs.__package__}.trial",)
         return self._unit("tune", name, given, needs, code, [given["output"]], jobs.rows(self.known), where=("device", "threads"))
@@ -115,7 +122,7 @@ class Tasks:
         """The results of a sweep. Raises InputError if the configuration has none."""
         jobs, folder = self._tuning()
         assert self.config.tune
-        given = {"settings": jobs.settings(self.known), "output": folder / "summary.md"}
+        given: dict[str, Any] = {"settings": jobs.settings(self.known), "output": folder / "summary.md"}
         workers = [self.graph.unit("tune", str(worker)) for worker in range(self.config.tune.workers)]
         return self._unit("sweep_report", name, given, workers, (f"{jobs.__package__}.report",), [given["output"]])
 

@@ -117,7 +117,7 @@ def arrays_of(path: Path) -> dict[str, np.ndarray]:
     }
     for rule, kept in rules.items():
         _require(kept, path, rule, "another array")
-    return data
+    return dict(data)
 
 
 def _require(kept: object, path: Path, rule: str, received: object) -> None:
@@ -134,8 +134,9 @@ def metadata_of(case: Path) -> dict[str, Any]:
 
 def rate_of(path: Path, metadata: dict[str, Any], default: float | None = None) -> float:
     """fps of metadata.json. Raises InputError."""
-    fps: Any = metadata.get("fps", default)
-    _require(type(fps) in (int, float) and 0 < fps < 1e6, path, "fps: a positive number of frames per second is required", fps)
+    fps = metadata.get("fps", default)
+    if type(fps) not in (int, float) or not 0 < fps < 1e6:
+        raise InputError(path, "fps: a positive number of frames per second is required", fps)
     return float(fps)
 
 

@@ -49,10 +49,9 @@ def convert(name: str, category: str, case: Path, folder: Path) -> Capture:
     case = Path(case)
     metadata, cameras = read_calibration(case)
     frames, has_masks, missing = int(metadata["frame_num"]), (case / "mask").is_dir(), dict[str, tuple[int, ...]]()
-    kinds: tuple[Literal["color", "depth"], ...] = ("color", "depth")
-    endings = {"color": ".png", "depth": ".npy"}
+    endings: dict[Literal["color", "depth"], str] = {"color": ".png", "depth": ".npy"}
     for camera in cameras:
-        files = {frame: [case / kind / camera.name / f"{frame}{endings[kind]}" for kind in kinds] for frame in range(frames)}
+        files = {frame: [case / kind / camera.name / f"{frame}{endings[kind]}" for kind in endings] for frame in range(frames)}
         missing[camera.name] = tuple(frame for frame, paths in files.items() if not all(path.is_file() for path in paths))
     unit = metadata.get(UNIT_KEY, 0.001)
     description = Description(
@@ -78,8 +77,8 @@ def convert(name: str, category: str, case: Path, folder: Path) -> Capture:
     for camera in cameras:
         ids = detections(case, camera.name) if has_masks else {}
         for frame in (frame for frame in range(frames) if writer.capture.has(camera.name, frame)):
-            for kind in kinds:
-                writer.link(kind, camera.name, frame, case / kind / camera.name / f"{frame}{endings[kind]}")
+            for kind, ending in endings.items():
+                writer.link(kind, camera.name, frame, case / kind / camera.name / f"{frame}{ending}")
             if has_masks:
                 writer.mask(camera.name, frame, labels_of(case, camera, frame, ids))
     return writer.finish(annotated(case, frames))

@@ -169,7 +169,7 @@ def by_board(board: BoardEntry, view: SeenCamera, folder: Path | None) -> tuple[
             corners, ids, _, _ = detector.detectBoard(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY))
             seen += [] if ids is None else list(zip(np.ravel(ids), corners.reshape(-1, 2), strict=True))
         if len(seen) > len(pixels):
-            points = np.asarray(pattern.getChessboardCorners(), np.float32)[[int(number) for number, _ in seen]]
+            points = np.asarray(pattern.getChessboardCorners(), np.float32)[np.array([number for number, _ in seen], int)]
             pixels = np.array([corner for _, corner in seen], np.float32)
     where, matrix = folder or view.path, view.lens.matrix
     if len(pixels) < FEWEST_CORNERS:

@@ -176,7 +176,7 @@ class Straightener:
     """Removes the distortion of one camera's images; K stays."""
 
     def __init__(self, lens: Lens, size: tuple[int, int]) -> None:
-        self.maps: tuple[np.ndarray, np.ndarray] | None = None
+        self.maps: Any = None
         k, coefficients = lens.matrix, lens.distortion
         if coefficients.any():
             module = cv2.fisheye if lens.model == "fisheye" else cv2

@@ -116,7 +116,7 @@ def _scores(case: Released, observations: Observations, published: Values) -> It
 def _means(table: pd.DataFrame, published: Values) -> Iterator[Row]:
     scores = table[table["quantity"].isin(METRICS)]
     for (task, metric), values in scores.groupby(["task", "quantity"])["ours"]:
-        yield _score(MEAN, task, metric, values.mean(), published)
+        yield _score(MEAN, str(task), str(metric), values.mean(), published)
 
 
 def _score(scenario: str, task: str, metric: str, ours: float, published: Values) -> Row:

@@ -141,6 +141,7 @@ class ClipNumbers(OwnStudy):
         asked: dict[Any, int] = self.records.groupby("scenario")["targets"].max().to_dict()
         rows: list[dict[str, Any]] = []
         for (label, cable, _), value in self.study.values.items():
+            assert isinstance(value, PublishedError)
             facts = {"source": value.source, "tag": value.tag, "text": value.text, "ranked": value.tag != "reference"}
             rows += [{"cable": cable, "label": label, "l1_mm": value.value, **facts}] if cable in self.cables else []
         for key, part in self.clips.groupby(["cable", "label"], sort=False):

@@ -465,7 +465,8 @@ def axis_for(lines: Sequence[np.ndarray]) -> np.ndarray:
     """`Rod.axis` [3] for lines [V, 3] in frame 0: y, or x where the end of one lies along y."""
     ends = np.concatenate([np.diff(line, axis=0)[[0, -1]] for line in lines] or [np.eye(3)[:1]])
     ends /= np.linalg.norm(ends, axis=1, keepdims=True)
-    return np.eye(3)[1 if np.abs(ends[:, 1]).max() <= PARALLEL else 0]
+    axis: np.ndarray = np.eye(3)[1 if np.abs(ends[:, 1]).max() <= PARALLEL else 0]
+    return axis
 
 
 def _result(twin: Twin, value: float, history: list[dict[str, Any]]) -> RodResult:

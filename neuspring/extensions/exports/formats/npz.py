@@ -76,7 +76,7 @@ def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Pat
         "about": f"{body.about}, and moved by controllers.",
         "mass": {"value": source.total_mass, "unit": "kg", "about": source.weight},
         "units": "SI: m, kg, s, N. Coordinates are right-handed; z is vertical.",
-        "sizes": SIZE_MEANINGS | body.sizes,
+        "sizes": SIZE_MEANINGS | dict(body.sizes),
         "arrays": described,
         "settings": {name: {"value": values[name], "unit": unit, "about": about} for name, (unit, about) in settings.items()},
         "equations": [" ".join(paragraph.split()) for paragraph in body.equations.strip().split("\n\n")],
