@@ -70,7 +70,7 @@ def _tile(capture: Capture, controllers: np.ndarray, annotated: np.ndarray, name
             cv2.drawContours(image, outlines, -1, tint, 1)
     _dots(image, camera, scale, controllers, (255, 255, 255), 3)
     _dots(image, camera, scale, annotated, (0, 255, 255), 2)
-    image[:24, :170] >>= 2
+    image[:24, :170] = np.right_shift(image[:24, :170], 2)
     cv2.putText(image, f"camera {name}, frame {frame}", (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
     return image
 

@@ -134,7 +134,7 @@ def metadata_of(case: Path) -> dict[str, Any]:
 
 def rate_of(path: Path, metadata: dict[str, Any], default: float | None = None) -> float:
     """fps of metadata.json. Raises InputError."""
-    fps = metadata.get("fps", default)
+    fps: Any = metadata.get("fps", default)
     if type(fps) not in (int, float) or not 0 < fps < 1e6:
         raise InputError(path, "fps: a positive number of frames per second is required", fps)
     return float(fps)

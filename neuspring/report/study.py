@@ -109,7 +109,7 @@ def _ours(row: Any, metric: Metric) -> str:
 
 def _change(row: Any, metric: Metric) -> str:
     if np.isnan(row.change):
-        return row.direction
+        return str(row.direction)
     show = "{:.3f}".format if metric.of == "positions" else lambda value: metric.shown(value, "+")
     interval = f" [{show(row.change_low)}, {show(row.change_high)}]" if np.isfinite(row.change_low) else ""
     return f"{show(row.change)}{interval}: {row.direction}"

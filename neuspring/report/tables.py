@@ -146,16 +146,16 @@ def verdict(numbers: Compared) -> list[Block]:
         if folders := dict.fromkeys(str(path.parent) for paths in found for path in paths):
             moves.append((f"Look at the worst scenario, {first['worst']}:", shlex.join([program("neuspring"), "play", *folders])))
     rows = []
-    for row in table.itertuples():
-        error: Any = row.worst_error
+    each: Iterator[Any] = table.itertuples()
+    for row in each:
         counted = f"{row.better:.0f} of {row.of:.0f}" if row.rival else ""
         cells = [
             numbers.name(str(row.method)),
             metric.text(row.error),
             numbers.name(str(row.rival)),
             ratio_text(row) if row.rival else "",
-        ]  # type: ignore[arg-type]
-        texts = [*cells, counted, f"{row.worst} ({metric.text(error)})"]
+        ]
+        texts = [*cells, counted, f"{row.worst} ({metric.text(row.worst_error)})"]
         verdict = Cell(text=str(row.verdict), tone=TONES.get(str(row.verdict), "mute"))
         rows.append([*(Cell(text=text) for text in texts), verdict])
     header = [
@@ -328,7 +328,7 @@ def failure_blocks(numbers: Compared, scale: bool = True) -> list[Block]:
         rows += [(method, "does not apply", name, why) for name, why in where.items()]
     if rows:
         made = [
-            [Cell(text=numbers.name(m)), Cell(text=s, tone=TONES.get(s, "mute")), *(Cell(text=t, wrap=True) for t in rest)]
+            [Cell(text=numbers.name(m)), Cell(text=s, tone=TONES.get(str(s), "mute")), *(Cell(text=t, wrap=True) for t in rest)]
             for m, s, *rest in rows
         ]
         blocks.append(Table(caption="Runs that do not count", header=["Method", "Status", "Scenario/seed", "Reason"], rows=made))
@@ -341,7 +341,7 @@ def notes_table(numbers: Compared) -> list[Table]:
     notes = notes.assign(note=notes["notes"].str.split("; ")).explode("note")
     notes = notes.assign(kind=notes["note"].str.replace(r"(?<![\w.])\d+(?:\.\d+)?(?!\w)", "…", regex=True))
     rows = [
-        (numbers.name(method), len(part), part["note"].iloc[0] if len(part) == 1 else kind)
+        (numbers.name(str(method)), len(part), part["note"].iloc[0] if len(part) == 1 else kind)
         for (method, kind), part in notes.groupby(["method", "kind"], sort=False)
     ]
     return [Table.of_texts(["Method", "Runs", "Note"], rows, "Notes", "runs.csv has the notes of every run.")] if rows else []
@@ -371,8 +371,9 @@ def cost_table(numbers: Compared) -> Table:
     for method in time.index:
         own = [numbers.name(method)]
         for stage in time:
-            megabytes = memory.at[method, stage] if stage in memory and method in memory.index else float("nan")
-            text = DASH if pd.isna(time.at[method, stage]) else f"{time.at[method, stage]:.1f} s"
+            seconds: Any = time.at[method, stage]
+            megabytes: Any = memory.at[method, stage] if stage in memory and method in memory.index else float("nan")
+            text = DASH if pd.isna(seconds) else f"{seconds:.1f} s"
             own.append(text if pd.isna(megabytes) else f"{text}, {megabytes:.0f} MB")
         rows.append(own)
     return Table.of_texts(["Method", *map(str, time)], rows, "Time and memory (medians)")

@@ -175,7 +175,7 @@ def collect(
         kept = moved.merge(ended.loc[ended["status"] == "ok", RUN_KEYS].rename(columns={"scenario": "source"}))
         mean = kept.groupby(keys, sort=False).agg(value=("value", "mean"), frames=("frames", "sum")).reset_index()
         tables.append(_with_run(mean.rename(columns={"source": "scenario"})))
-    failed = {(run.scenario, run.method, run.seed): run.reason for run in ended[ended["status"] != "ok"].itertuples()}
+    failed = ended[ended["status"] != "ok"].set_index(RUN_KEYS)["reason"].to_dict()
     for row in rows:
         if reason := failed.get((row["scenario"], row["method"], row["seed"])):
             row["notes"] = "; ".join(filter(None, [row.get("notes", ""), f"transfer: {reason}"]))

@@ -184,8 +184,11 @@ class Straightener:
 
     def color(self, image: np.ndarray) -> np.ndarray:
         """Interpolated."""
-        return cv2.remap(np.ascontiguousarray(image), *self.maps, cv2.INTER_LINEAR) if self.maps else image
+        return self._moved(image, cv2.INTER_LINEAR)
 
     def depth(self, image: np.ndarray) -> np.ndarray:
         """The nearest value: the mean of two depths is a depth where nothing is."""
-        return cv2.remap(np.ascontiguousarray(image), *self.maps, cv2.INTER_NEAREST) if self.maps else image
+        return self._moved(image, cv2.INTER_NEAREST)
+
+    def _moved(self, image: np.ndarray, interpolation: int) -> np.ndarray:
+        return image if self.maps is None else cv2.remap(np.ascontiguousarray(image), self.maps[0], self.maps[1], interpolation)

@@ -103,7 +103,11 @@ def pictures(material: ReportData) -> PageSection | None:
             command = shlex.join([program("neuspring"), "play", *(str(material.folder(run)) for run in runs.values())])
             seeds = ", ".join(map(str, sorted({run.seed for run in runs.values()})))
             more: list[Block] = [Fold(summary=title, blocks=[grid]) for title, grid in grids[1:]]
-            blocks = [grids[0][1], *([Fold(summary="More pictures", blocks=more)] if more else []), Code(text=command, whole=True)]
+            blocks: list[Block] = [
+                grids[0][1],
+                *([Fold(summary="More pictures", blocks=more)] if more else []),
+                Code(text=command, whole=True),
+            ]
             summary = f"{scenario}: {several(len(runs), 'method')}, seed {seeds}"
             folds.append(Fold(summary=summary, blocks=blocks, open=len(folds) < MOST_OPEN))
     about = (
