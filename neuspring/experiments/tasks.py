@@ -90,8 +90,10 @@ class Tasks:
     def so_far(self, folder: Path) -> Path:
         """Tables and report of the runs that are there, in a folder of their own; returns the page."""
         unit, page = self.graph.unit("tables", "all"), self.graph.unit("page", "all")
-        self._call("tables", unit.options | {"output": folder, "brief": True})
-        self._call("report", page.options | {"output": folder / "report.html", "tables": f"{self.config.tables}/{folder.name}"})
+        self._call("tables", dict(unit.options) | {"output": folder, "brief": True})
+        self._call(
+            "report", dict(page.options) | {"output": folder / "report.html", "tables": f"{self.config.tables}/{folder.name}"}
+        )
         return folder / "report.html"
 
     def _runs(self) -> dict[str, Any]:

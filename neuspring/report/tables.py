@@ -328,7 +328,11 @@ def failure_blocks(numbers: Compared, scale: bool = True) -> list[Block]:
         rows += [(method, "does not apply", name, why) for name, why in where.items()]
     if rows:
         made = [
-            [Cell(text=numbers.name(m)), Cell(text=s, tone=TONES.get(str(s), "mute")), *(Cell(text=t, wrap=True) for t in rest)]
+            [
+                Cell(text=numbers.name(str(m))),
+                Cell(text=str(s), tone=TONES.get(str(s), "mute")),
+                *(Cell(text=t, wrap=True) for t in rest),
+            ]
             for m, s, *rest in rows
         ]
         blocks.append(Table(caption="Runs that do not count", header=["Method", "Status", "Scenario/seed", "Reason"], rows=made))

@@ -152,11 +152,11 @@ class Body(ABC):
     def fit(self, problem: Any, *, partial: Path | None = None, key: str = "", threads: int = 1) -> Learned:
         """The fitted twin of a `fit.FitProblem`; checkpoints go to the file `partial`."""
 
-    def search_many(self, tasks: Sequence[SearchTask]) -> list[Learned | Exception]:
+    def search_many(self, tasks: Sequence[SearchTask]) -> Sequence[Learned | Exception]:
         """The result of each search, or the exception that ended it; searches may share launches."""
         return [_tried(self.search, one.observations, one.pool, one.settings, one.options) for one in tasks]
 
-    def fit_many(self, tasks: Sequence[FitTask], most: int = 0) -> list[Learned | Exception]:
+    def fit_many(self, tasks: Sequence[FitTask], most: int = 0) -> Sequence[Learned | Exception]:
         """The result of each fit, or the exception that ended it; at most `most` (0: as many as are fast) share launches."""
         return [_tried(self.fit, one.problem, partial=one.partial, key=one.key, threads=one.threads) for one in tasks]
 

@@ -221,7 +221,7 @@ def _course(run: SearchRun, each: Map) -> Generator[Any, Any, SearchResult]:
 def _pushes(hold: Sequence[dict[str, Any]], pushing: Sequence[dict[str, Any]], problem: SearchProblem) -> bool:
     """True if hands push: that must cost less than hands that hold, and than a part of a body that stays."""
     least = min(row["cost"] for row in pushing)
-    return least < min(row["cost"] for row in hold) and least < MUST_MOVE * still_cost(problem.recordings)
+    return bool(least < min(row["cost"] for row in hold) and least < MUST_MOVE * still_cost(problem.recordings))
 
 
 def _best(problem: SearchProblem, rows: Sequence[dict[str, Any]], push: bool, attempts: int, earlier: float) -> SearchResult:
@@ -332,7 +332,7 @@ def recorded_trace(path: Path | None, key: str) -> tuple[list[dict[str, Any]], i
     return records, int(table.attrs["attempts"]) + 1, float(table.attrs["seconds"])
 
 
-def replays(rows: list[dict[str, Any]], population: list[np.ndarray], variables: tuple[str, ...]) -> bool:
+def replays(rows: list[dict[str, Any]], population: Sequence[np.ndarray], variables: tuple[str, ...]) -> bool:
     """True where recorded candidates are those that CMA-ES proposes now."""
     return all(
         np.array_equal(np.array([row.get(f"normalized.{name}", np.nan) for name in variables]), normalized)

@@ -67,7 +67,7 @@ and it goes on for the rest of dt.
 
         return search(_problem(observations, pool, settings, options), options.seed, record=options.record, key=options.key)
 
-    def search_many(self, tasks: Sequence[SearchTask]) -> list[Learned | Exception]:
+    def search_many(self, tasks: Sequence[SearchTask]) -> Sequence[Learned | Exception]:
         from neuspring.twin.search import SearchRun, search_many
 
         made = [_problem(one.observations, one.pool, one.settings, one.options) for one in tasks]
@@ -81,7 +81,7 @@ and it goes on for the rest of dt.
 
         return fit(problem, partial=partial, key=key)
 
-    def fit_many(self, tasks: Sequence[FitTask], most: int = 0) -> list[Learned | Exception]:
+    def fit_many(self, tasks: Sequence[FitTask], most: int = 0) -> Sequence[Learned | Exception]:
         from neuspring.twin.fit import fit_many
 
         return fit_many(tasks, most)

@@ -75,8 +75,8 @@ def open_streams(intake: Intake) -> list[CameraStreams]:
         rule = "as many folders or videos of depth as of color are required, one each per camera"
         raise InputError("--color, --depth", rule, f"{len(intake.color)} of color, {len(intake.depth)} of depth")
     colors = [open_images(path, "color") for path in intake.color]
-    depths = [open_images(path, "depth") for path in intake.depth] or [None] * len(colors)
-    return [CameraStreams(str(k), *pair) for k, pair in enumerate(zip(colors, depths, strict=True))]
+    depths: list[ImageSource | None] = [open_images(path, "depth") for path in intake.depth]
+    return [CameraStreams(str(k), *pair) for k, pair in enumerate(zip(colors, depths or [None] * len(colors), strict=True))]
 
 
 def require_kind(path: Path, kind: Kind, image: np.ndarray) -> np.ndarray:
