@@ -331,7 +331,7 @@ def failure_blocks(numbers: Compared, scale: bool = True) -> list[Block]:
             [
                 Cell(text=numbers.name(str(m))),
                 Cell(text=str(s), tone=TONES.get(str(s), "mute")),
-                *(Cell(text=t, wrap=True) for t in rest),
+                *(Cell(text=str(t), wrap=True) for t in rest),
             ]
             for m, s, *rest in rows
         ]
