@@ -27,7 +27,7 @@ from neuspring.splats.model import Splats
 Kind = TypeVar("Kind", bound=Artifact)
 OBSERVATIONS, ROLLOUT = "observations.npz", "rollout.json"
 SEED = re.compile(r"\d{1,9}")
-SHOWN_FIRST = ("neuspring_plus", "neuspring", "baseline")
+SHOWN_FIRST = ("neuspring", "baseline")
 """Methods that are shown first."""
 MOST_RUNS = 200
 """Runs that are looked at in a scenario's folder."""

@@ -359,7 +359,7 @@ class TwinFit:
             if self.one_step and recording.tail:
                 values = {name: value.detach() for name, value in packed.items()}
                 _, tail = yield from recording.simulate(state, recording.tail, values)
-                row["tail_loss"] = float(tail)
+                row["tail_loss"] = float(tail.detach())
             largest = max(largest, self._step(window, gradients))
         return row | {"loss": total / (end - 1), "gradient_norm": largest, "frames_left_out": left_out}
 
@@ -375,9 +375,9 @@ class TwinFit:
             for frame in range(1, one.fitted_end):
                 state = yield from one.frame(state, frame, packed)
             _, mean = yield from one.simulate(state, one.tail, packed)
-            if not math.isfinite(float(mean)):
+            losses.append(float(mean.detach()))
+            if not math.isfinite(losses[-1]):
                 raise NonFinite("the loss of the held-back frames is not finite")
-            losses.append(float(mean))
         return sum(losses) / len(losses)
 
     def _step(self, window: range, gradients: Sequence[torch.Tensor | None]) -> float:

@@ -220,8 +220,8 @@ def _course(run: SearchRun, each: Map) -> Generator[Any, Any, SearchResult]:
 
 def _pushes(hold: Sequence[dict[str, Any]], pushing: Sequence[dict[str, Any]], problem: SearchProblem) -> bool:
     """True if hands push: that must cost less than hands that hold, and than a part of a body that stays."""
-    least = min(row["cost"] for row in pushing)
-    return bool(least < min(row["cost"] for row in hold) and least < MUST_MOVE * still_cost(problem.recordings))
+    least, held = (float(min(row["cost"] for row in rows)) for rows in (pushing, hold))
+    return least < held and least < MUST_MOVE * still_cost(problem.recordings)
 
 
 def _best(problem: SearchProblem, rows: Sequence[dict[str, Any]], push: bool, attempts: int, earlier: float) -> SearchResult:

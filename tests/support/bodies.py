@@ -21,7 +21,7 @@ def require_answers(name: str, twin: Twin, seen: Observations) -> None:
     assert body.node_stiffness(twin).shape == (len(nodes),)
     assert lines.masses.sum() > 0 and body.mass_at(twin, 0) > 0
     body.check(body.stable(twin, 0.8))
-    np.testing.assert_array_equal(body.on_recording(twin, seen)[0].topology.nodes, nodes)
+    np.testing.assert_array_equal(body.on_recording(twin, seen).topology.nodes, nodes)
 
 
 def differing(before: Any, after: Any, prefix: str = "") -> set[str]:

@@ -71,9 +71,8 @@ and it goes on for the rest of dt.
         from neuspring.twin.search import SearchRun, search_many
 
         made = [_problem(one.observations, one.pool, one.settings, one.options) for one in tasks]
-        return search_many(
-            [SearchRun(own, one.options.seed, one.options.record, one.options.key) for own, one in zip(made, tasks, strict=True)]
-        )
+        runs = [SearchRun(own, one.options.seed, one.options.record, one.options.key) for own, one in zip(made, tasks, strict=True)]
+        return [*search_many(runs)]
 
     def fit(self, problem: FitProblem, *, partial: Path | None = None, key: str = "", threads: int = 1) -> FitResult:
         """Adam, with gradients through the simulation; see `fit.fit`. It has one thread."""
@@ -84,7 +83,7 @@ and it goes on for the rest of dt.
     def fit_many(self, tasks: Sequence[FitTask], most: int = 0) -> Sequence[Learned | Exception]:
         from neuspring.twin.fit import fit_many
 
-        return fit_many(tasks, most)
+        return [*fit_many(tasks, most)]
 
     def require_pool(self, here: Observations, pool: Sequence[Observations]) -> None:
         """Other recordings with as many nodes and hands, node i on node i; see `transfer.require_pool`."""

@@ -84,7 +84,7 @@ def way(twin: Twin, folder: Path, trajectory: int, settings: Config) -> np.ndarr
     stride = round(RATE * twin.simulation.frame_time)
     here = observed(folder, trajectory, settings, stride)
     body = body_of(twin)
-    moved = body.for_prediction(move(twin, here)[0])
+    moved = body.for_prediction(move(twin, here))
     positions = roll_out(moved, here.controller_points).positions[:, END].astype(np.float64)
     last = stride * (len(positions) - 1)
     return np.asarray(CubicSpline(np.arange(0, last + 1, stride), positions)(np.arange(last + 1)))

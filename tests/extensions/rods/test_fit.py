@@ -50,7 +50,7 @@ def cable(name: str, seed: int, frames: int = 21) -> Observations:
 
 def recorded(twin: Twin, observations: Observations) -> Observations:
     """The recording as a twin moves."""
-    points = roll_out(move(twin, observations)[0], observations.controller_points).positions
+    points = roll_out(move(twin, observations), observations.controller_points).positions
     return replace(observations, object_points=points, tracks=points)
 
 
@@ -70,7 +70,7 @@ def fitted(twin: Twin, seen: list[Observations], **settings: object) -> RodResul
 
 def error(twin: Twin, seen: list[Observations]) -> float:
     """Mean distance, m."""
-    found = [roll_out(move(twin, each)[0], each.controller_points).positions - each.object_points for each in seen]
+    found = [roll_out(move(twin, each), each.controller_points).positions - each.object_points for each in seen]
     return float(np.mean([np.linalg.norm(each, axis=2).mean() for each in found]))
 
 
@@ -107,9 +107,9 @@ def test_markers_beside_the_line_are_found():
     assert error(with_markers, seen) < 0.5 * error(without, seen)
     # The twin is in frame 0 of its own recording, and rolls out as it was fitted.
     own = roll_out(with_markers, seen[0].controller_points).positions
-    np.testing.assert_allclose(own, roll_out(move(with_markers, seen[0])[0], seen[0].controller_points).positions, atol=1e-5)
+    np.testing.assert_allclose(own, roll_out(move(with_markers, seen[0]), seen[0].controller_points).positions, atol=1e-5)
     # In frame 0 markers lie where they were seen, whatever the line is.
-    moved = move(with_markers, new)[0]
+    moved = move(with_markers, new)
     np.testing.assert_allclose(moved.topology.nodes, new.nodes, atol=1e-6)
     assert np.abs(moved.body.vertices[2:-2] - new.nodes).max() > 1e-3
 

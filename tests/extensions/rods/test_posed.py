@@ -50,7 +50,7 @@ def seen(folder: Path, rows: pd.DataFrame, name: str = "swing", **settings: obje
 
 def recorded(twin: Twin, here: Observations) -> Observations:
     """The recording as a twin moves."""
-    points = roll_out(move(twin, here)[0], here.controller_points).positions[:, :2]
+    points = roll_out(move(twin, here), here.controller_points).positions[:, :2]
     return replace(here, object_points=points, tracks=points)
 
 
@@ -107,7 +107,7 @@ def test_a_rod_hangs_from_the_hand_in_frame_0_and_follows_its_turns(tmp_path: Pa
     assert sag[1, 2] > sag[0, 2] > 0.005, "it hangs below the unloaded shape"
     moved = roll_out(twin, here.controller_points).positions
     np.testing.assert_array_equal(moved[0], twin.topology.nodes)
-    again = roll_out(move(twin, here)[0], here.controller_points).positions
+    again = roll_out(move(twin, here), here.controller_points).positions
     np.testing.assert_allclose(again, moved, atol=1e-5)
     # A hand that stays leaves it where it is: it began at rest.
     still = roll_out(twin, np.tile(here.controller_points[:1], (20, 1, 1))).positions
