@@ -27,7 +27,6 @@ for RULE in (*STAGES_OF, *(name for name in RULES if name not in STAGES_OF)):
         resources:
             **needed_by(RULE),
         params:
-            root=str(ROOT),
             digest=lambda wildcards: wildcards.digest,
         script:
             "../scripts/job.py"

@@ -12,7 +12,7 @@ except ModuleNotFoundError:
 
 run(
     snakemake.config,  # noqa: F821 - Snakemake's
-    Path(snakemake.params.root),  # noqa: F821
+    Path(__file__).absolute().parents[2],
     COMMANDS,
     SWEEPS,
     snakemake.rule,  # noqa: F821
