@@ -21,7 +21,7 @@ from neuspring.twin.body import code, lines_of
 
 PICTURE_ROLES = ("strip", "video", "turntable")
 """Files of the render stage to look at."""
-PICTURE_FACTS = ("backend", "masks", "views", "lpips", "quirks", "unseen_surface")
+PICTURE_FACTS = ("backend", "masks", "views", "lpips", "unseen_surface")
 """Facts that a reader of image scores must know."""
 
 NOTED: dict[str, tuple[Callable[[Any], bool], str]] = {
