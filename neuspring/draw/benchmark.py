@@ -24,7 +24,7 @@ MOST_PANELS = 4
 
 def ratios_figure(ratios: pd.DataFrame, baseline: str) -> Figure | None:
     """Draw `scores.statistics.ratios`, a panel per task; filled markers: the interval leaves out 1. None without any interval."""
-    rows = ratios[np.isfinite(ratios["ratio_low"])]
+    rows = ratios[ratios["ratio_low"].notna()]
     tasks = [task for task in TITLES if (rows["task"] == task).any()]
     if not tasks:
         return None

@@ -133,11 +133,6 @@ def damaged_files(table: ScoreTable, messages: Sequence[str], results: Path) -> 
     return damaged | moved
 
 
-def several(count: int, noun: str) -> str:
-    """`1 run`, `2 runs`."""
-    return f"{count:,} {noun}{'s' * (count != 1)}"
-
-
 def link(path: Path, folder: Path) -> str:
     """A relative link from a page in `folder`."""
     return quote(Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix())

@@ -17,8 +17,8 @@ from neuspring.core.records import now
 from neuspring.core.text import listed
 from neuspring.registry import Registry, modules
 from neuspring.report.blocks import PageSection, html_page
-from neuspring.report.data import Options, ReportData, ReportSection, damaged_files, several, traces
-from neuspring.report.tables import Compared
+from neuspring.report.data import Options, ReportData, ReportSection, damaged_files, traces
+from neuspring.report.tables import Compared, several
 from neuspring.scores.table import as_asked, collect
 
 __all__ = ["REPORT_SECTIONS", "Options", "write"]

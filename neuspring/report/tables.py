@@ -62,6 +62,11 @@ def shown_names(method_table: Path, extra: Iterable[Path] = ()) -> dict[str, str
     return {name: f"{row.title} (`{name}`)" for name, row in rows.items() if row.title}
 
 
+def several(count: int, noun: str) -> str:
+    """`1 run`, `2 runs`."""
+    return f"{count:,} {noun}{'s' * (count != 1)}"
+
+
 def pivot(caption: str, cells: pd.DataFrame, index: Mapping[str, str], note: str = "") -> Table:
     """A table with a column per task and metric.
 
@@ -130,7 +135,8 @@ def verdict(numbers: Compared) -> list[Block]:
     pair = table.iloc[1] if first["rival"] == "" and len(table) > 1 else first
     method, rival = numbers.name(pair["method"]), numbers.name(pair["rival"])
     seeds = runs["seed"].nunique()
-    what = f"{SHORT[first['task']].lower()} {metric.title}, {len(runs['scenario'].unique())} scenarios, {seeds} seeds"
+    size = f"{several(runs['scenario'].nunique(), 'scenario')}, {several(seeds, 'seed')}"
+    what = f"{SHORT[first['task']].lower()} {metric.title}, {size}"
     if not pair["rival"]:
         sentence = f"{method} is alone ({what})."
     else:
@@ -167,7 +173,7 @@ def verdict(numbers: Compared) -> list[Block]:
         "Worst scenario",
         "Resolved",
     ]
-    note = f"{metric.shown_unit}, mean over scenarios. Ratio: geometric mean over {numbers.objects} of paired ratios, t interval."
+    note = f"{metric.shown_unit}, mean over scenarios. Ratio: geometric mean of paired ratios, t interval; per {numbers.objects}."
     return [Text(text=sentence, tone="lead"), Table(caption="Verdict", header=header, rows=rows, note=note), *_moves(moves)]
 
 
@@ -213,11 +219,11 @@ def average_table(numbers: Compared, kind: str) -> Table:
     """Mean scores of every method for metrics of positions, pictures or marks; oracles are named."""
     table, usable = numbers.table, of_kind(comparable(numbers.table.comparison.finished), kind)
     means, oracles = of_kind(queries.means(table), kind), table.oracles
-    several = usable["seed"].nunique() > 1
+    spread_known = usable["seed"].nunique() > 1
     weighted = bool((usable.groupby(["task", "metric"])["frames"].nunique() > 1).any())
 
     def text(row: Any, metric: Metric) -> str:
-        spread = f" ± {metric.text(row.seed_std)}" if several else ""
+        spread = f" ± {metric.text(row.seed_std)}" if spread_known else ""
         return f"{metric.text(row.equal)}{spread}" + (f" ({metric.text(row.frames)})" if weighted else "")
 
     shown = best(means[~means["method"].isin(oracles)], "equal")
@@ -228,8 +234,9 @@ def average_table(numbers: Compared, kind: str) -> Table:
     shown = shown.sort_values("method", key=lambda column: column.map(order), kind="stable")
     shown = shown.assign(method=shown["method"].map(names), runs_after=shown["method"].map(runs))
     explained = "; ".join(f"{m.heading}: {m.explained or m.title}" for m in METRICS.values() if m.name in set(shown["metric"]))
-    note = f"{table.runs['scenario'].nunique()} scenarios, {table.runs['seed'].nunique()} seeds; mean over scenarios"
-    note += ", ± standard deviation over seeds" * several + ", in brackets weighted by frames" * weighted + f". {explained}."
+    counts = ", ".join(several(table.runs[name].nunique(), name) for name in ("scenario", "seed"))
+    note = f"{counts}; mean over scenarios"
+    note += ", ± standard deviation over seeds" * spread_known + ", in brackets weighted by frames" * weighted + f". {explained}."
     note += {"positions": _floors(table), "pictures": _conditions(table)}.get(kind, "")
     return pivot(AVERAGED[kind], shown, {"method": "Method", "runs_after": "Runs"}, note)
 

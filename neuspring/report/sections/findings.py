@@ -5,8 +5,9 @@ from __future__ import annotations
 from neuspring.core.findings import findings_of
 from neuspring.core.table import Cell, Table, Tone
 from neuspring.report.blocks import Block, Fold, PageSection
-from neuspring.report.data import MOST_ROWS, ReportData, ReportSection, prose, several
+from neuspring.report.data import MOST_ROWS, ReportData, ReportSection, prose
 from neuspring.report.notes import of_runs
+from neuspring.report.tables import several
 
 LEVEL_TONES: dict[str, Tone] = {"error": "bad", "warning": "warn", "note": "mute"}
 

@@ -16,7 +16,8 @@ from neuspring.core.run_record import RunRecord
 from neuspring.core.text import program
 from neuspring.draw.sheet import TIME_BAR, TITLE_LINE
 from neuspring.report.blocks import Block, Code, Fold, Grid, PageSection, Picture
-from neuspring.report.data import PERCEPTION, ReportData, ReportSection, data_uri, link, several
+from neuspring.report.data import PERCEPTION, ReportData, ReportSection, data_uri, link
+from neuspring.report.tables import several
 
 MARKUP = 400
 """Characters around an embedded picture."""

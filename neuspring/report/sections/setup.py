@@ -13,8 +13,8 @@ from neuspring.config import Config
 from neuspring.core.run_record import flat
 from neuspring.core.table import Cell, Table
 from neuspring.report.blocks import Block, Code, Fold, PageSection, Text
-from neuspring.report.data import ReportData, ReportSection, link, several
-from neuspring.report.tables import settings_table
+from neuspring.report.data import ReportData, ReportSection, link
+from neuspring.report.tables import settings_table, several
 
 PACKAGES = (
     "torch",

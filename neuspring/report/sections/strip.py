@@ -11,8 +11,9 @@ from PIL import Image
 
 from neuspring.draw.sheet import TIME_BAR, TITLE_LINE
 from neuspring.report.blocks import Block, Fold, Grid, PageSection, Picture, Text
-from neuspring.report.data import ReportData, ReportSection, several
+from neuspring.report.data import ReportData, ReportSection
 from neuspring.report.sections.pictures import MOST_OPEN, NO_ROOM, webp
+from neuspring.report.tables import several
 
 STRIP_WIDTH = 424
 """Largest width of a picture, px."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from neuspring.report import tables
 from neuspring.report.blocks import Block, PageSection, Text
-from neuspring.report.data import ReportData, ReportSection, several
+from neuspring.report.data import ReportData, ReportSection
+from neuspring.report.tables import several
 
 
 def verdict(material: ReportData) -> PageSection:
