@@ -28,7 +28,7 @@ def test_a_step_by_hand_with_yaml_settings(tmp_path, monkeypatch):
     assert Observations.load(output).scenario.frame_count == 5
 
 
-TINY = {"toy": {"frames": 5}, "search": {"rollouts": 2}, "fit": {"epochs": 1, "field": {"channels": 2, "hidden": 4}}}
+TINY = {"toy": {"frames": 5}, "search": {"rollouts": 2}, "fit": {"epochs": 1}}
 
 
 def observed(folder):
