@@ -557,7 +557,7 @@ def test_a_study_of_clips_is_made_of_transfers_of_its_rows_whose_numbers_are_kep
     [
         pytest.param("table1", 24, 12, 12, 12, marks=with_extensions),
         ("table2", 24, 12, 24, 0),
-        ("table2_ours", 48, 12, 48, 0),
+        ("table2_ours", 24, 12, 24, 0),
         ("table3", 18, 6, 18, 0),
         ("clusters", 48, 48, 48, 0),
     ],
