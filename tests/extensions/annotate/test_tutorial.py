@@ -48,7 +48,7 @@ def shown(title: str) -> list[list[str]]:
 
 
 def camera_files(folder: Path) -> Capture:
-    """What step 1 of the page asks for: color and depth (mm) as numbered PNG, intrinsics; returns the film with its true masks."""
+    """What step 1 of the page asks for: color and depth (mm) as numbered PNG, rig.json; returns the film with its true masks."""
     filmed = film(folder / "film", cameras=1, sizes=[SIZE])
     for kind in ("color", "depth"):
         (folder / "FILES" / kind).mkdir(parents=True)
@@ -57,8 +57,9 @@ def camera_files(folder: Path) -> Capture:
         for kind, image in (("color", filmed.color("0", frame)[..., ::-1]), ("depth", depth)):
             assert cv2.imwrite(str(folder / "FILES" / kind / f"{frame:06d}.png"), image)
     k = filmed.cameras["0"].intrinsics
-    named = {"fx": k[0, 0], "fy": k[1, 1], "cx": k[0, 2], "cy": k[1, 2]}
-    (folder / "FILES" / "intrinsics.json").write_text(json.dumps(named))
+    lens = {"fx": k[0, 0], "fy": k[1, 1], "cx": k[0, 2], "cy": k[1, 2], "width": SIZE[0], "height": SIZE[1]}
+    stated = {"frame_rate": 30, "depth_unit": 0.001, "poses": "table", "cameras": [lens | {"distortion_model": "none"}]}
+    (folder / "FILES" / "rig.json").write_text(json.dumps(stated))
     return filmed
 
 
@@ -114,7 +115,7 @@ def test_the_last_command_is_the_one_that_was_planned_and_begun():
     """It takes minutes, and is tried in its parts: perception below, the dry run and the rest in tests/dag."""
     [asked], [look], [made] = (shown(title) for title in ("Ask what it costs", "Look at what was perceived", "Make the twin"))
     assert asked == [*made, "--dry-run"]
-    assert look == [*made, "--until", "observe"]
+    assert look == [*made, "--until", "perceive"]
 
 
 def test_the_capture_is_what_was_filmed_and_the_masks_are_right(followed):
@@ -139,7 +140,7 @@ def test_the_capture_is_what_was_filmed_and_the_masks_are_right(followed):
 def test_perception_makes_the_pictures(followed):
     project, _, _ = followed
     [look] = shown("Look at what was perceived")
-    assert jobs_in(run(look, project)) == {"segment": 1, "track": 1, "lift": 1, "observe": 1}
+    assert jobs_in(run(look, project)) == {"perceive": 1}
     folder = project / "results" / "own" / "my_toy"
     assert (folder / "observations.npz").exists()
     pictures = re.findall(r"^\| `([\w/]+\.png)` \|", PAGE, re.MULTILINE)

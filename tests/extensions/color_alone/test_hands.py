@@ -139,7 +139,7 @@ def test_sheets_alone_are_held_by_fingers_alone(tmp_path, monkeypatch, category,
     pixels = np.repeat(np.stack([x, y], axis=1)[None, ::50].astype(np.float32), 3, axis=0)
     tracks = PixelTracks(pixels=pixels, visible=np.ones(pixels.shape[:2], bool), backend="test")
     monkeypatch.setattr("neuspring.extensions.color_alone.lift.GRIP_LENGTH", 3 * first.pixel_size)
-    _, image = lift_color(capture, labels, tracks, first, 30, read(capture))
+    _, image = lift_color(capture, labels, tracks, first, read(capture))
     assert (len(image.hand_of) < 30) == fingers
 
 
