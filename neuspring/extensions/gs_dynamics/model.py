@@ -390,8 +390,8 @@ def turns(graph: ParticleGraph, before: torch.Tensor, after: torch.Tensor) -> to
     arrays = [points.cpu().numpy().astype(np.float32) for points in (before, after)]
     positions: list[Any] = [wp.array(points, dtype=wp.vec3, device="cpu") for points in arrays]
     table: Any = wp.array(neighbors, dtype=int, device="cpu")
-    rotations, ranks = wp.zeros(count, dtype=wp.mat33, device="cpu"), wp.zeros(count, dtype=int, device="cpu")
-    wp.launch(load(turn_nodes, "cpu"), count, [*positions, table, rotations, ranks], device="cpu")
+    rotations = wp.zeros(count, dtype=wp.mat33, device="cpu")
+    wp.launch(load(turn_nodes, "cpu"), count, [*positions, table, rotations], device="cpu")
     return torch.tensor(rotations.numpy(), dtype=before.dtype, device=before.device)
 
 
