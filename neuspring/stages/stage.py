@@ -29,6 +29,7 @@ import dataclasses
 import functools
 import inspect
 import re
+import sys
 import types
 import typing
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -170,6 +171,7 @@ class Job:
 
     def run(self) -> None:
         """Run the function, and write the record. A numerical failure is recorded, its own or that of an earlier stage."""
+        reset_opencv()
         if "run" not in self.stage.signature:
             self.stage.function(**self.arguments)
             self.record.save()
@@ -405,6 +407,12 @@ def read_row(text: str, settings: Config) -> ScenarioRow:
         rule = f"must be a row of {settings.scenario_table}, a capture or recording in data_root, or JSON"
         raise InputError("--scenario", rule, text)
     return rows[text]
+
+
+def reset_opencv() -> None:
+    """Set OpenCV's random generator as in a new process: grabCut draws from it, and other stages may have run before this one."""
+    if cv2 := sys.modules.get("cv2"):
+        cv2.setRNGSeed(0)
 
 
 def physics(rows: Rows) -> tuple[Any, ...]:

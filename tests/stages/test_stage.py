@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import pkgutil
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
+import cv2
+import numpy as np
 import pytest
 
 from neuspring import config, stages
@@ -128,6 +132,22 @@ def test_every_stage_has_a_command_and_tells_its_inputs_from_earlier_stages(name
     with pytest.raises(SystemExit) as ended:
         declared.parse(["--help"])
     assert ended.value.code == 0
+
+
+def test_a_stage_draws_the_numbers_of_a_new_process_whatever_ran_before_it(given):
+    """Cameras of a capture are segmented one after the other in one process; grabCut draws from OpenCV's generator."""
+    drawn = []
+
+    @stage(output="{scenario}/drawn.json")
+    def draw(run: Recorder) -> Written:
+        drawn.append(cv2.randu(np.zeros(4), 0, 1).tolist())
+        return Written()
+
+    for _ in range(2):
+        draw(output=given["output"])
+    assert drawn[0] == drawn[1]
+    code = "import cv2, numpy as np; print(cv2.randu(np.zeros(4), 0, 1).tolist())"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == f"{drawn[0]}\n"
 
 
 def test_every_module_is_listed_in_the_flow():
