@@ -219,7 +219,7 @@ def damage(kind: str, path: Path, values: dict[str, torch.Tensor], whole: bytes)
         "nan": values | {name: values[name] * float("nan")},
     }
     torch.save(changed[kind], path)
-    return f"`{name}` must be {'finite' if kind == 'nan' else 'a float tensor'}"
+    return f"`{name}` must be a finite float tensor"
 
 
 @pytest.mark.parametrize("at", [0, 1])
