@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import replace
 from types import SimpleNamespace
@@ -12,7 +11,7 @@ import pandas as pd
 import pytest
 
 from neuspring.config.parse import read_yaml
-from neuspring.core.records import RECORD_FORMAT
+from neuspring.core.job_records import JobRecord
 from neuspring.data.capture import HANDS, OBJECT, THIN, Capture
 from neuspring.intake.check import check_layout
 from neuspring.intake.phystwin import released_cases
@@ -130,17 +129,12 @@ def test_means_compare_the_same_scenes_only():
     assert [cell.strip() for cell in first.split("|")[1:-1]] == ["mean, all (2)", "0.550", "0.800", "0.300"]
 
 
-def test_hours_are_of_the_last_good_attempt_of_each_job(tmp_path):
-    def job(name: str, *attempts: tuple[str, float]) -> None:
-        made = [{"started": "2026-01-01T00:00:00+00:00", "outcome": what, "cpu_seconds": 3600.0 * cpu} for what, cpu in attempts]
-        path = tmp_path / "jobs" / f"{name}.json"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        values = {"format": RECORD_FORMAT, "rule": name.split("/")[0], "name": name, "log": "x", "attempts": made}
-        path.write_text(json.dumps(values))
-
-    job("search/a", ("killed", 50.0), ("ok", 2.0), ("ok", 3.0), ("running", 9.0))
-    job("search/b", ("ok", 0.5))
-    job("fit/a", ("transient", 70.0))
+def test_hours_are_of_finished_jobs(tmp_path):
+    for name, outcome, spent in (("search/a", "ok", 3.0), ("search/b", "ok", 0.5), ("fit/a", "failed", 70.0)):
+        record = JobRecord(rule=name.split("/")[0], name=name, outcome=outcome, seconds=3600 * spent)
+        path = tmp_path / "jobs" / name / ("failed.json" if outcome == "failed" else "0123456789abcdef.json")
+        path.parent.mkdir(parents=True)
+        record.save(path)
     lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in hours(tmp_path)]
     assert ["search", "2", "3.50"] in lines and ["all", "2", "3.50"] in lines
     assert not any("fit" in line for line in lines)

@@ -249,12 +249,13 @@ def test_points_beside_a_hand_or_a_person_become_no_splats(scene, tmp_path, caps
     away = cv2.distanceTransform((labels[0] != label).astype(np.uint8), cv2.DIST_L2, 5)[y, x]
     points = camera.lift(np.stack([x, y], axis=1).astype(float), capture.depth("0", 0)[y, x])
     one = Capture(capture.folder, dataclasses.replace(capture.description, cameras=capture.description.cameras[:1]))
-    found = beside_hands(one, masks, points)
+    depths = {"0": capture.depth("0", 0)}
+    found = beside_hands(one, masks, depths, points)
     assert found[away <= 1].all() and found.any()
     assert not found[away > 3].any()
     # What the camera sees something else before is not judged by that pixel.
     behind = camera.lift(np.stack([x, y], axis=1).astype(float), capture.depth("0", 0)[y, x] + 0.05)
-    assert not beside_hands(one, masks, behind).any()
+    assert not beside_hands(one, masks, depths, behind).any()
     made = changed(scene, appearance=tmp_path / "appearance.json")
     made.masks = with_masks(scene, tmp_path / "masks", labels)
     assert made.learn(settings(appearance=SHORT)).facts["points_beside_hands"] > 0

@@ -260,15 +260,14 @@ def lines_of(scores: pd.DataFrame) -> Iterator[str]:
 
 
 def hours(results: Path) -> Iterator[str]:
-    """Processor hours of the good attempts of all jobs, by stage."""
+    """Hours of all finished jobs, which have a core each, by rule."""
     spent: dict[str, list[float]] = {}
     for record in read_jobs(results, damaged=[]):
-        good = [attempt.cpu_seconds for attempt in record.attempts if attempt.outcome == "ok"]
-        if good:
-            spent.setdefault(record.rule, []).append(good[-1] / 3600)
+        if not record.failed:
+            spent.setdefault(record.rule, []).append(record.seconds / 3600)
     rows = [[rule, str(len(own)), f"{sum(own):.2f}"] for rule, own in sorted(spent.items(), key=lambda item: -sum(item[1]))]
     rows.append(["all", str(sum(map(len, spent.values()))), f"{sum(map(sum, spent.values())):.2f}"])
-    yield from ("\n## Processor hours\n", *Table.of_texts(["stage", "jobs", "hours"], rows).markdown())
+    yield from ("\n## Hours of jobs, on a core each\n", *Table.of_texts(["rule", "jobs", "hours"], rows).markdown())
 
 
 def strip(scene: Scene, folder: Path, shown: int = 6, width: int = 320) -> None:
