@@ -148,6 +148,6 @@ def needed_by(rule):
         "mem_mb": lambda wildcards, attempt: memory * attempt,
         "runtime": lambda wildcards, attempt: minutes * attempt,
     }
-    if rule == "tune" or any(one.gpu for one in stages):
+    if any(one.gpu for one in stages) or "tune" == rule:
         resources["gpu"] = lambda wildcards: jobs()[0].gpus(unit_of(rule, wildcards))
     return resources
