@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from neuspring.core.errors import InputError
+from neuspring.data.unpickle import load_pickle
 from neuspring.extensions.released import commands, fetch
 from neuspring.extensions.released.files import Released, read_checkpoint, read_parameters
 from neuspring.extensions.released.verify import verify_released
@@ -63,13 +64,13 @@ def outcomes(case: Released, tmp_path: Path) -> dict[str, str]:
 
 
 def shift_future(case: Released) -> None:
-    positions = np.load(case.prediction, allow_pickle=True)
+    positions = load_pickle(case.prediction)
     positions[7:] += np.float32(0.002)
     dump(case.prediction, positions)
 
 
 def move_first_frame(case: Released) -> None:
-    positions = np.load(case.prediction, allow_pickle=True)
+    positions = load_pickle(case.prediction)
     positions[0, 3] += np.float32(1e-6)
     dump(case.prediction, positions)
 
@@ -84,7 +85,7 @@ def narrow_radius(case: Released) -> None:
 
 
 def cut_prediction(case: Released) -> None:
-    dump(case.prediction, np.load(case.prediction, allow_pickle=True)[:, :5])
+    dump(case.prediction, load_pickle(case.prediction)[:, :5])
 
 
 SPRINGS = {"springs of the checkpoint", "object springs of the checkpoint"}
