@@ -178,7 +178,7 @@ class Benchmark:
 
     def __init__(self, values: Mapping[str, Any], root: Path, *, plan_only: bool = False) -> None:
         self.root, self.on_gpu = root, False
-        """`on_gpu`: True where jobs take GPUs; the workflow sets it."""
+        """`on_gpu`: True where jobs take GPUs; `with_gpus` of jobs sets it."""
         self.gpu_slots = 0
         """Jobs that may hold a GPU at once, which the workflow sets; 0: a cluster decides."""
         given = parse(Config, values, "configuration").expanded()

@@ -36,6 +36,15 @@ JOB_POLL = 0.5
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
+def with_gpus(benchmark: Benchmark) -> Benchmark:
+    """The benchmark, told which GPUs its jobs share: the plan and each job must see equal batches."""
+    pool, config = os.environ.get(POOL, ""), benchmark.config
+    benchmark.on_gpu = config.device == "cuda" or (config.device == "auto" and bool(pool))
+    names = [] if pool == GIVEN else list(filter(None, pool.split(",")))
+    benchmark.gpu_slots = len(names) * config.gpus.jobs_per_gpu
+    return benchmark
+
+
 def run(
     values: Mapping[str, Any],
     root: Path,
@@ -49,7 +58,7 @@ def run(
     gpus: int = 0,
 ) -> None:
     """Run a job of the configuration `values`; ends the process with status 2 for bad input, 1 for another error."""
-    graph = Graph(Benchmark(values, root))
+    graph = Graph(with_gpus(Benchmark(values, root)))
     Tasks(graph, commands, sweeps)
     folder = Path(graph.results) / FOLDER / rule / name
     with logged(folder / f"{digest}.log") as say, alone(folder, say):

@@ -49,9 +49,6 @@ POOL = (
     if CLUSTER
     else or_workflow_error(gpus.pool_of, CONFIG.gpus, CONFIG.device, plan_only=DRY)
 )
-ON_GPU = CONFIG.device == "cuda" or (
-    CONFIG.device == "auto" and (CLUSTER or bool(POOL))
-)
 if not CLUSTER:
     # Without a limit Snakemake would run jobs at once that then wait for a GPU.
     limit = workflow.global_resources.get("gpu")
@@ -60,8 +57,8 @@ if not CLUSTER:
     )
     if slots:
         workflow.register_resource("gpu", slots)
-# Jobs inherit it. Inside a job that a cluster started, the cluster has chosen the devices.
-os.environ[job.POOL] = job.GIVEN if workflow.remote_exec else ",".join(POOL)
+# Jobs inherit it. A cluster chooses the devices of its jobs.
+os.environ[job.POOL] = job.GIVEN if CLUSTER else ",".join(POOL)
 
 
 @functools.cache
@@ -79,11 +76,7 @@ def jobs():
         given = workflow.config_settings.config_args or []
         workflow.config_settings.config_args = [*given, *words]
         benchmark = or_workflow_error(checked, config, ROOT, plan_only=DRY)
-    benchmark.on_gpu, benchmark.gpu_slots = (
-        ON_GPU,
-        len(POOL) * CONFIG.gpus.jobs_per_gpu,
-    )
-    graph = Graph(benchmark)
+    graph = Graph(job.with_gpus(benchmark))
     return graph, Tasks(graph, COMMANDS, SWEEPS)
 
 
@@ -140,14 +133,20 @@ def priority_of(rule):
 
 
 def needed_by(rule):
-    """Memory, time and GPUs of a rule's jobs: those that its stages declare, more at every attempt."""
-    stages = STAGES_OF.get(rule, [])
-    memory = max([one.memory_mb for one in stages], default=4000)
-    minutes = sum(one.minutes for one in stages) or RULES[rule]
-    resources = {
-        "mem_mb": lambda wildcards, attempt: memory * attempt,
-        "runtime": lambda wildcards, attempt: minutes * attempt,
-    }
-    if any(one.gpu for one in stages) or "tune" == rule:
+    """Memory, time and GPUs of a rule's jobs: those that the stages of a job declare, more at every attempt."""
+
+    def stages(wildcards):
+        # Members of a batch share launches: they take the time and the memory of one.
+        unit = unit_of(rule, wildcards)
+        return [step.stage for step in (unit.members or (unit,))[0].steps]
+
+    def memory(wildcards, attempt):
+        return attempt * max((one.memory_mb for one in stages(wildcards)), default=4000)
+
+    def minutes(wildcards, attempt):
+        return attempt * (sum(one.minutes for one in stages(wildcards)) or RULES[rule])
+
+    resources = {"mem_mb": memory, "runtime": minutes}
+    if any(one.gpu for one in STAGES_OF.get(rule, [])) or rule == "tune":
         resources["gpu"] = lambda wildcards: jobs()[0].gpus(unit_of(rule, wildcards))
     return resources
