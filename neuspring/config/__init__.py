@@ -11,7 +11,7 @@
 Nothing here imports torch, Warp or MLflow, because the workflow reads the configuration before any job exists.
 """
 
-from neuspring.config.data import Synthetic, Toy
+from neuspring.config.data import Toy
 from neuspring.config.parse import merge, of_command_line, parse, plain, read_text, read_yaml
 from neuspring.config.rows import Method, ScenarioRow, SearchRow
 from neuspring.config.search import Search, SearchVariables, Variable
@@ -31,7 +31,6 @@ __all__ = [
     "SearchVariables",
     "SimulationSettings",
     "SpringFieldSettings",
-    "Synthetic",
     "Toy",
     "Tracking",
     "Variable",

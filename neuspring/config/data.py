@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field
 
-from neuspring.core.section import Count, SettingsSection
+from neuspring.core.section import SettingsSection
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,17 +16,3 @@ class Toy(SettingsSection):
 
     frames: Annotated[int, Field(ge=5)] = 60
     """Frames per scene; the first 70 % are for training."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Synthetic(SettingsSection):
-    """Synthetic captures: finite elements seen by a ray caster through a model of a depth sensor."""
-
-    size: Literal["tiny", "small", "demo", "full"] = "demo"
-    """Size of the images, with meshes to match: 120 x 68, 424 x 240 (small: with coarser bodies) or 848 x 480 pixels."""
-    frames: Annotated[int, Field(ge=5)] | None = None
-    """Number of frames that are kept, the first ones; null keeps all."""
-    certified_frames: Count = 20
-    """Number of first frames in which twice the substeps must not move the clip; more of them cost time and change no picture."""
-    sensor: Literal["model", "clean"] = "model"
-    """Depth sensor: with noise, dropouts and holes (model), or only quantized (clean)."""

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, StringConstraints
 
-from neuspring.config.data import Synthetic, Toy
+from neuspring.config.data import Toy
 from neuspring.config.effort import EFFORTS, Effort, sizes
 from neuspring.config.extensions import Baselines, with_extensions
 from neuspring.config.images import Images
@@ -160,7 +160,6 @@ class Config(SettingsSection):
     fit: Fit = field(default_factory=Fit)
     released_quirks: ReleasedQuirks = field(default_factory=ReleasedQuirks)
     toy: Toy = field(default_factory=Toy)
-    synthetic: Synthetic = field(default_factory=Synthetic)
     perception: Perception = field(default_factory=Perception)
     images: Images = field(default_factory=Images)
     baselines: Baselines = field(default_factory=Baselines)

@@ -117,8 +117,7 @@ def for_targets(values: Mapping[str, Any], targets: Collection[str], root: Path)
 
 def rows_of(studies: Mapping[str, Study], name: str) -> tuple[str, ...]:
     """The methods in the rows of a study."""
-    shown = [studies[name]]
-    return tuple(dict.fromkeys(method for study in shown for method in study.rows.values()))
+    return tuple(dict.fromkeys(studies[name].rows.values()))
 
 
 def overlaid(settings: T, own: Mapping[str, Any], where: str) -> T:
@@ -130,11 +129,9 @@ def overlaid(settings: T, own: Mapping[str, Any], where: str) -> T:
 
 def with_search(config: Config, row: SearchRow, name: str) -> Config:
     """The configuration of a search: with the row's settings and quirks on top; those hold for its fits too."""
-    own = {"search": row.settings, "released_quirks": row.released_quirks}
-    keys = {section: "settings" if section == "search" else section for section in own}
-    return dataclasses.replace(
-        config, **{key: overlaid(getattr(config, key), own[key], f"search {name}, {keys[key]}") for key in own}
-    )
+    search = overlaid(config.search, row.settings, f"search {name}, settings")
+    quirks = overlaid(config.released_quirks, row.released_quirks, f"search {name}, released_quirks")
+    return dataclasses.replace(config, search=search, released_quirks=quirks)
 
 
 def with_method(config: Config, method: Method, name: str) -> Config:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -407,8 +406,3 @@ def _stamp(path: Any) -> str:
 
 def _digest(values: Any) -> str:
     return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()[:16]
-
-
-def one_of(names: Collection[str]) -> str:
-    """A pattern of exactly these names; of none, one that matches nothing."""
-    return "|".join(map(re.escape, names)) or "(?!)"

@@ -5,7 +5,6 @@ They concern the whole configuration, whatever part of it runs now. `study` and 
 
 from __future__ import annotations
 
-import functools
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -36,7 +35,7 @@ class Tasks:
         self.root, self.results = graph.benchmark.root, Path(graph.results)
         self.folder = self.results / self.config.tables
         """Folder of tables and report."""
-        graph.tasks = {name: functools.partial(getattr(self, name)) for name in RULES}
+        graph.tasks = {name: getattr(self, name) for name in RULES}
 
     # --- tables and pages
 
@@ -44,7 +43,7 @@ class Tasks:
         """The long table of scores, and the summary."""
         given: dict[str, Any] = {"output": self.folder, "baseline": self.known.compared_with, **self._runs(), **self._transfers()}
         given |= {"aims": json.dumps(plain(self.config)["aims"]), "objects": self.config.objects}
-        given |= {"method_table": self.root / self.config.method_table, "extra_rows": tuple(self.known.extra)}
+        given |= self._rows(method_table=self.config.method_table)
         files = [self.folder / "summary.md", self.folder / "scores.csv"]
         return self._unit("tables", name, given, self.graph.runs(), ("report.tables",), files)
 
@@ -59,7 +58,7 @@ class Tasks:
     def study(self, name: str) -> Unit:
         """One of the paper's tables."""
         given: dict[str, Any] = {"study": name, "tables": self.config.tables, "output": self.folder / "studies"}
-        given |= {"table": self.root / self.config.study_table, "extra_rows": tuple(self.known.extra)}
+        given |= self._rows(table=self.config.study_table)
         given |= {"left_out": json.dumps(self.known.whole_left_out)}
         also = json.dumps(plain(self.known.studies[name]))
         needs = [self.graph.unit("tables", "all")]
@@ -73,9 +72,9 @@ class Tasks:
         given: dict[str, Any] = {
             "output": self.folder / "report.html",
             "settings": json.dumps(settings, sort_keys=True),
-            **self._row_tables(),
+            **self._rows(table=self.config.study_table, method_table=self.config.method_table),
+            "tables": self.config.tables,
         }
-        given |= {"tables": self.config.tables}
         given |= {"baseline": self.known.compared_with, **self._transfers(), "left_out": json.dumps(self.known.whole_left_out)}
         own = [place.partition(":")[0].removeprefix("neuspring.") for place in modules("neuspring.report.sections").values()]
         also = "".join(file_stamp(path) for path in sorted(TEMPLATES.iterdir()))
@@ -100,9 +99,8 @@ class Tasks:
         names = {name: tuple(getattr(self.whole, name)) for name in ("scenarios", "methods", "seeds")}
         return names | {"left_out": json.dumps(self.known.whole_left_out)}
 
-    def _row_tables(self) -> dict[str, Any]:
-        tables = {"table": self.root / self.config.study_table, "method_table": self.root / self.config.method_table}
-        return tables | {"extra_rows": tuple(self.known.extra)}
+    def _rows(self, **tables: str) -> dict[str, Any]:
+        return {name: self.root / path for name, path in tables.items()} | {"extra_rows": tuple(self.known.extra)}
 
     def _transfers(self) -> dict[str, Any]:
         return {"transfers": tuple(name for name in self.whole.transfers or {} if name in self.whole.scenarios)}

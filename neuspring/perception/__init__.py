@@ -8,7 +8,7 @@
 | shape prior | `shape` (visual hull, a mesh from elsewhere, or none): what no camera sees |
 | sample | `sample`: the structure points of a twin, and observations |
 | color alone | `color`, `color_hands`: lift and shape prior of one camera without depth |
-| look, judge | `figures`: pictures; `judge`: errors against the truth; `truth`: exact tracks and surface |
+| look | `figures`: pictures |
 
 `backends`: `SEGMENTERS` and `TRACKERS` declare the backends. What the steps hand on (`Masks`, `PixelTracks`, `LiftedTracks`,
 `ShapePrior`) is in `neuspring.data.results`, and what they notice about it in `neuspring.checks`. `marks`: masks from a few marks

@@ -105,6 +105,11 @@ class Backend:
         tracks: Followed = self._call("track", (capture, camera, labels, settings.track), device)
         return tracks
 
+    def surface(self, capture: Capture) -> ShapePrior:
+        """The surface of frame 0, where the backend knows it."""
+        surface: ShapePrior = import_module(self.module).surface(capture)
+        return surface
+
     def lift(self, capture: Capture, masks: Mapping[str, Masks], tracks: Mapping[str, PixelTracks], settings: Perception) -> Lifted:
         """Object and hands in the world, from masks and tracks by camera."""
         lifted: Lifted = import_module(self.module).lift(capture, masks, tracks, settings)
@@ -133,7 +138,6 @@ TRACKERS = Registry(
     {
         "opencv": Backend(module="neuspring.perception.track_opencv"),
         "cotracker3": Backend(module="neuspring.perception.track_cotracker", gpu=True),
-        "truth": Backend(module="neuspring.perception.truth", truth=True),
     },
     Backend,
 )

@@ -39,8 +39,8 @@ from neuspring.core.errors import InputError
 from neuspring.data.camera import Camera
 from neuspring.data.capture import HANDS, NOTHING, OBJECT, THIN, Capture
 from neuspring.data.results import Masks, ShapePrior
+from neuspring.perception.backends import TRACKERS
 from neuspring.perception.sample import on_surface
-from neuspring.perception.truth import surface
 
 CARVED_MARGIN = 0.02
 """m around the cloud of frame 0 within which voxels are carved."""
@@ -87,7 +87,7 @@ def shape_prior(
     if backend == "mesh":
         prior = align(capture, masks, cloud, settings)
     elif backend == "truth":
-        prior = surface(capture)
+        prior = TRACKERS["truth"].surface(capture)
     else:
         prior = visual_hull(capture, masks, cloud, settings, end) if backend == "visual_hull" else no_prior()
     if not len(prior.faces):

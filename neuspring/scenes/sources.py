@@ -185,16 +185,7 @@ IN_SPACE = (*capture.CONTROLLERS, *capture.NODES)
 SOURCES = Registry(
     "sources",
     {
-        "toy": Source(module="neuspring.scenes.synthetic.toy", reads=("toy",), needs_data=False),
-        "synthetic": Source(
-            module="neuspring.scenes.synthetic.make",
-            reads=("synthetic",),
-            films=True,
-            write_capture="neuspring.scenes.synthetic.make",
-            needs_data=False,
-            has_truth=True,
-            cameras=lambda folder, config: ("0", "1", "2"),
-        ),
+        "toy": Source(module="neuspring.scenes.toy", reads=("toy",), needs_data=False),
         "capture": Source(
             module="neuspring.data.capture",
             reads=("data_root",),

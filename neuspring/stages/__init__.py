@@ -14,7 +14,7 @@ from neuspring.stages.stage import Stage
 LEARNED = "learned"
 """The input that is the record of whatever learned the run's model."""
 FLOW = """
-    capture segment track lift judge observe
+    capture segment track lift observe
     search fit appearance train
     rollout predict average render score transfer
 """

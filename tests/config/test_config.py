@@ -20,6 +20,7 @@ from neuspring.core import artifacts
 from neuspring.core.errors import InputError
 from neuspring.core.text import listed
 from neuspring.twin import field
+from tests.support.extensions import with_extensions
 
 ROOT = Path(__file__).parents[2]
 
@@ -230,6 +231,7 @@ def test_an_effort_sets_its_sizes_and_nothing_else(effort):
     assert parse(Config, plain(made), "again") == made
 
 
+@with_extensions
 def test_the_sizes_of_the_paper_are_the_defaults_but_for_synthetic_pictures():
     assert plain(load("effort: paper\nsynthetic: {size: demo}\n")) == plain(load("")) | {"effort": "paper"}
     assert (Config().clusters, field.ADAPTIVE_FACTOR, field.FIELD_CHANNELS, field.FIELD_HIDDEN, field.FIELD_LAYERS) == (

@@ -462,7 +462,7 @@ STUDIES = {
 @pytest.mark.parametrize(
     ("data", "studies"),
     [
-        pytest.param(data, text, marks=[with_extensions] if text == "baselines" else [])
+        pytest.param(data, text, marks=[with_extensions] if text == "baselines" or data in ("demo", "synthetic") else [])
         for data, texts in STUDIES.items()
         for text in texts
     ],
@@ -508,6 +508,7 @@ def test_the_default_configuration_names_the_tables_alone():
         Benchmark(default, ROOT)
 
 
+@with_extensions
 def test_the_synthetic_benchmark_sees_what_studies_of_the_demo_see():
     synthetic = parse(Config, shipped("synthetic"), "synthetic.yaml")
     for study in ("heldout", "perception"):
@@ -551,6 +552,7 @@ def test_a_study_of_clips_is_made_of_transfers_of_its_rows_whose_numbers_are_kep
     Tasks(graph, {})
 
 
+@with_extensions
 @pytest.mark.parametrize("overlays", [["synthetic"], ["synthetic", "paper"]], ids="-".join)
 @pytest.mark.parametrize(
     ("study", "runs", "searches", "fits", "trainings"),

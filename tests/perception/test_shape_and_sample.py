@@ -13,7 +13,7 @@ from neuspring.data.capture import HANDS
 from neuspring.data.results import Masks, ShapePrior
 from neuspring.perception import shape
 from neuspring.perception.sample import assemble, inside, structure, voxel_for
-from neuspring.scenes.synthetic.meshes import capsule, smooth_union, sphere
+from neuspring.scenes.shapes import capsule, smooth_union, sphere
 from tests.support.still import overlap, still, tracked
 
 BODY = smooth_union([sphere((0, 0, 0.06), 0.05), capsule((0, 0, 0.06), (0.1, 0, 0.04), 0.03)], 0.005)

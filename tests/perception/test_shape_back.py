@@ -11,7 +11,7 @@ from neuspring.data.capture import OBJECT
 from neuspring.data.results import ShapePrior
 from neuspring.perception.figures import lifted_figure
 from neuspring.perception.shape import front, round_chord, shape_prior, visual_hull
-from neuspring.scenes.synthetic.meshes import capsule, sphere
+from neuspring.scenes.shapes import capsule, sphere
 from tests.support.still import overlap, still, tracked
 
 RADIUS = 0.05

@@ -19,13 +19,13 @@ PLACES = {
 }
 """Of drag, with `decay`, what the kernels take of it: files of the package that a force with one trained parameter needs."""
 VALUES = {
-    "scenes/synthetic/toy.py": "the drag of the toy's truth",
+    "scenes/toy.py": "the drag of the toy's truth",
     "twin/search.py": "the released rounding of drag",
     "extensions/exports/formats/mujoco.py": "drag in MuJoCo",
     "extensions/exports/newton_twin.py": "drag in Newton",
 }
 """Files that give or translate the value that drag, which has no default, has in their case. A new parameter has a default."""
-OTHERS = {"scenes/synthetic/fem.py", "scenes/synthetic/kernels.py", "extensions/play/page.py"}
+OTHERS = {"extensions/synthetic/fem.py", "extensions/synthetic/kernels.py", "extensions/play/page.py"}
 """Drag of another simulator; dragging with a mouse."""
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from neuspring.scenes.synthetic import toy
+from neuspring.scenes import toy
 from results.published.identifiability import make as study
 from tests.support import small
 

@@ -8,7 +8,7 @@ import torch
 
 from neuspring.config.images import Appearance
 from neuspring.core.errors import InputError, NumericalFailure
-from neuspring.scenes.synthetic.make import looking
+from neuspring.scenes.render import looking
 from neuspring.scores.pictures import psnr
 from neuspring.splats.draw import prune_by_opacity
 from neuspring.splats.losses import Shot, loss

@@ -14,11 +14,11 @@ from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
 from neuspring.data.capture import Capture
 from neuspring.data.results import Masks
-from neuspring.scenes.synthetic.make import outlines
 from neuspring.stages.capture import capture
 from neuspring.stages.lift import lift
 from neuspring.stages.observe import observe
 from neuspring.stages.segment import segment
+from tests.support.extensions import with_extensions
 from tests.support.filmed import FLIP, FRAMES, SIZE, STEP, film, write_raw
 from tests.support.perceived import ROW, SETTINGS, perceived
 
@@ -80,7 +80,10 @@ def test_opencv_finds_what_the_given_masks_show(tmp_path, whole):
     assert StageRecord.load(tmp_path / "0" / "masks.json").settings["perception"]["segment"]["backend"] == "opencv"
 
 
+@with_extensions
 def test_marks_of_a_capture_take_the_place_of_opencv(tmp_path):
+    from neuspring.extensions.synthetic.make import outlines
+
     settings = replace(SETTINGS, perception=replace(SETTINGS.perception, segment=Segmentation(backend="opencv")))
     capture = film(tmp_path / "capture", cameras=1)
     (capture.folder / "marks.json").write_text(json.dumps({"format": 1, "cameras": outlines(capture)}))

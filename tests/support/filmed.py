@@ -16,10 +16,8 @@ import trimesh
 
 from neuspring.data.camera import CameraEntry
 from neuspring.data.capture import HANDS, NOTHING, OBJECT, Capture, Writer
-from neuspring.scenes.synthetic.make import looking
-from neuspring.scenes.synthetic.meshes import capsule, smooth_union, sphere, surface
-from neuspring.scenes.synthetic.render import Part, Renderer, quantized
-from neuspring.scenes.synthetic.scenes import SKIN_COLOR
+from neuspring.scenes.render import SKIN_COLOR, Part, Renderer, looking, quantized
+from neuspring.scenes.shapes import capsule, smooth_union, sphere, surface
 from tests.support.captures import describe
 from tests.support.phystwin_case import dump, write_json
 

@@ -15,7 +15,7 @@ import torch
 
 from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
-from neuspring.scenes.synthetic import toy
+from neuspring.scenes import toy
 from neuspring.twin.batch import Course, SharedFrames, lockstep, result_of
 from neuspring.twin.candidates import SearchProblem, candidate, evaluate
 from neuspring.twin.fit import FitProblem, FitResult

@@ -11,9 +11,8 @@ from neuspring.data.camera import CameraEntry
 from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
 from neuspring.data.results import LiftedTracks, Masks, ShapePrior
 from neuspring.perception.sample import inside
-from neuspring.scenes.synthetic.make import looking
-from neuspring.scenes.synthetic.meshes import sphere, surface
-from neuspring.scenes.synthetic.render import Part, Renderer, quantized
+from neuspring.scenes.render import Part, Renderer, looking, quantized
+from neuspring.scenes.shapes import sphere, surface
 from tests.support.captures import FRAMES, K, describe
 from tests.support.filmed import rows
 

@@ -50,8 +50,8 @@ from neuspring.core.table import Table
 from neuspring.draw.scene import ShownRun, ShownScene
 from neuspring.draw.sheet import save
 from neuspring.draw.twin import STIFFNESS_COLORS, TwinPicture
+from neuspring.scenes import toy
 from neuspring.scenes.sources import read_scenarios
-from neuspring.scenes.synthetic import toy
 from neuspring.scores import metrics
 from neuspring.scores.statistics import paired_differences
 from neuspring.twin.fit import FitProblem, fit

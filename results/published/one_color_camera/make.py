@@ -28,8 +28,8 @@ from scipy.spatial import cKDTree
 from neuspring.core.artifacts import Observations
 from neuspring.core.table import Table
 from neuspring.data.capture import Capture, Writer
+from neuspring.extensions.synthetic.truth import Truth, truth_of
 from neuspring.scenes.sources import read_scenarios
-from neuspring.scenes.synthetic.truth import Truth, truth_of
 
 ARMS = ("three", "one", "color")
 """Three RGBD cameras, the first of them alone, and its color alone."""

@@ -30,7 +30,7 @@ from neuspring.core.table import Table
 from neuspring.draw.scene import ShownRun, ShownScene
 from neuspring.draw.sheet import save
 from neuspring.draw.twin import STIFFNESS_COLORS, TwinPicture
-from neuspring.scenes.synthetic.truth import Truth, truth_path
+from neuspring.extensions.synthetic.truth import Truth, truth_path
 from neuspring.twin.body import body_of
 
 METHODS = ["search_only", "baseline_ten_frames", "model_b", "shuffled", "neuspring", "neuspring_plus", "baseline_plus"]

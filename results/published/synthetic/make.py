@@ -14,7 +14,7 @@ import pandas as pd
 
 from neuspring.core.job_records import FOLDER, JobRecord
 from neuspring.data.capture import CAPTURE, Capture
-from neuspring.scenes.synthetic.truth import Truth, truth_path
+from neuspring.extensions.synthetic.truth import Truth, truth_path
 
 SIZE = (212, 120)
 LABEL = 14

@@ -17,7 +17,7 @@ from neuspring.perception.lift import lift_tracks
 from neuspring.perception.sample import among, assemble, spacing
 from neuspring.perception.shape import no_prior
 from neuspring.perception.track_opencv import choose
-from neuspring.scenes.synthetic.meshes import sphere
+from neuspring.scenes.shapes import sphere
 from neuspring.scores import metrics
 from neuspring.twin.losses import FrameLoss
 from tests.support import small

@@ -7,16 +7,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from neuspring.config import ScenarioRow, Synthetic
+from neuspring.config import ScenarioRow
 from neuspring.config.perception import Lift, PointTracking, ShapePriorSettings
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.data.capture import OBJECT, Capture
 from neuspring.data.results import Masks, PixelTracks
-from neuspring.perception.judge import judge, lifted_quality, mask_quality, track_quality
+from neuspring.extensions.synthetic import make as making
+from neuspring.extensions.synthetic.errors import judge, lifted_quality, mask_quality, track_quality
+from neuspring.extensions.synthetic.exact import track
+from neuspring.extensions.synthetic.settings import Synthetic
+from neuspring.extensions.synthetic.truth import at_points, truth_of, truth_path, under_pixels
 from neuspring.perception.lift import lift_tracks
-from neuspring.perception.truth import track
-from neuspring.scenes.synthetic import make as making
-from neuspring.scenes.synthetic.truth import at_points, truth_of, truth_path, under_pixels
 from tests.support.filmed import film
 
 ROW = ScenarioRow(scenario="box", source="synthetic", category="package", path="weird_package", self_collision=True, ground=True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.scenes.synthetic import toy
+from neuspring.scenes import toy
 from tests.support import small
 
 SCENES = [f"{shape}/{motion}/{field}" for shape in toy.SHAPES for motion in toy.MOTIONS for field in toy.FIELDS]

@@ -13,12 +13,10 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from neuspring.scenes.synthetic import bodies
-from neuspring.scenes.synthetic.bodies import SoftBody
-from neuspring.scenes.synthetic.meshes import Sdf, capsule, ellipsoid, smooth_union, sphere, surface
+from neuspring.extensions.synthetic import bodies
+from neuspring.extensions.synthetic.bodies import SoftBody
+from neuspring.scenes.shapes import Sdf, capsule, ellipsoid, smooth_union, sphere, surface
 
-SKIN_COLOR = (0.75, 0.5, 0.4)
-"""Linear RGB."""
 FIST_RADIUS = 0.032
 KeyFrame = tuple[float, Sequence[float], Sequence[float]]
 """Time, s; position, m; rotation vector, rad."""

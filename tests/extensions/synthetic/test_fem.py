@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from neuspring.scenes.synthetic.bodies import SoftBody, Surface
-from neuspring.scenes.synthetic.fem import GRAVITY, Damping, FiniteElements, VertexBlockDescent, certify, stable_moduli
-from neuspring.scenes.synthetic.meshes import block, boundary, oriented
-from neuspring.scenes.synthetic.scenes import Hand, place
+from neuspring.extensions.synthetic.bodies import SoftBody, Surface
+from neuspring.extensions.synthetic.fem import GRAVITY, Damping, FiniteElements, VertexBlockDescent, certify, stable_moduli
+from neuspring.extensions.synthetic.meshes import block, boundary, oriented
+from neuspring.extensions.synthetic.scenes import Hand, place
 
 RATE = 60.0
 NO_DAMPING = Damping(deformation=0.0, drag=0.0, edges=0.0)

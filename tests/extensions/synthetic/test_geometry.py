@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neuspring.scenes.synthetic import bodies, meshes
-from neuspring.scenes.synthetic.scenes import Hand, minimum_jerk, place
+from neuspring.extensions.synthetic import bodies, meshes
+from neuspring.extensions.synthetic.scenes import Hand, minimum_jerk, place
+from neuspring.scenes import shapes
 
 
 def closed(faces: np.ndarray) -> bool:
@@ -26,28 +27,28 @@ POINTS = np.random.default_rng(0).uniform(-0.2, 0.2, (200, 3))
 
 
 def test_distances_by_hand():
-    assert meshes.sphere((0, 0, 0), 0.1)(np.array([0.3, 0.0, 0.0])) == pytest.approx(0.2)
-    assert meshes.capsule((0, 0, 0), (1, 0, 0), 0.1)(np.array([0.5, 0.3, 0.0])) == pytest.approx(0.2)
-    assert meshes.capsule((0, 0, 0), (1, 0, 0), 0.1)(np.array([1.5, 0.0, 0.0])) == pytest.approx(0.4)
-    np.testing.assert_allclose(meshes.ellipsoid((0, 0, 0), (0.1,) * 3)(POINTS), meshes.sphere((0, 0, 0), 0.1)(POINTS), atol=1e-12)
+    assert shapes.sphere((0, 0, 0), 0.1)(np.array([0.3, 0.0, 0.0])) == pytest.approx(0.2)
+    assert shapes.capsule((0, 0, 0), (1, 0, 0), 0.1)(np.array([0.5, 0.3, 0.0])) == pytest.approx(0.2)
+    assert shapes.capsule((0, 0, 0), (1, 0, 0), 0.1)(np.array([1.5, 0.0, 0.0])) == pytest.approx(0.4)
+    np.testing.assert_allclose(shapes.ellipsoid((0, 0, 0), (0.1,) * 3)(POINTS), shapes.sphere((0, 0, 0), 0.1)(POINTS), atol=1e-12)
 
 
 def test_a_smooth_union_is_the_union_but_for_the_blend():
-    parts = [meshes.sphere((0, 0, 0), 0.1), meshes.sphere((0.1, 0, 0), 0.05)]
-    union, least = meshes.smooth_union(parts, 0.006)(POINTS), np.min([part(POINTS) for part in parts], axis=0)
+    parts = [shapes.sphere((0, 0, 0), 0.1), shapes.sphere((0.1, 0, 0), 0.05)]
+    union, least = shapes.smooth_union(parts, 0.006)(POINTS), np.min([part(POINTS) for part in parts], axis=0)
     assert (union <= least + 1e-12).all()
     assert (union >= least - 0.006 * np.log(2) - 1e-12).all()
 
 
 def test_the_surface_of_a_sphere_is_closed_outward_and_as_large():
-    vertices, faces = meshes.surface(meshes.sphere((0.02, 0, 0), 0.05), (-0.1,) * 3, (0.1,) * 3, 0.004)
+    vertices, faces = shapes.surface(shapes.sphere((0.02, 0, 0), 0.05), (-0.1,) * 3, (0.1,) * 3, 0.004)
     assert closed(faces)
     np.testing.assert_allclose(np.linalg.norm(vertices - [0.02, 0, 0], axis=1), 0.05, atol=1e-4)
     assert enclosed(vertices, faces) == pytest.approx(4 / 3 * np.pi * 0.05**3, rel=0.01)
 
 
 def test_a_body_is_filled_to_its_surface():
-    sdf = meshes.ellipsoid((0, 0, 0), (0.06, 0.04, 0.03))
+    sdf = shapes.ellipsoid((0, 0, 0), (0.06, 0.04, 0.03))
     nodes, elements = meshes.fill(sdf, (-0.08,) * 3, (0.08,) * 3, 0.01)
     volumes = meshes.volumes(nodes, elements)
     assert (volumes > 0).all()

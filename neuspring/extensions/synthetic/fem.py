@@ -18,10 +18,10 @@ import warp as wp
 from neuspring.core.device import start_warp
 from neuspring.core.errors import NumericalFailure
 from neuspring.core.extras import needed
-from neuspring.scenes.synthetic import kernels
-from neuspring.scenes.synthetic.bodies import SoftBody
-from neuspring.scenes.synthetic.meshes import edges, volumes
-from neuspring.scenes.synthetic.scenes import FIST_RADIUS, Hand
+from neuspring.extensions.synthetic import kernels
+from neuspring.extensions.synthetic.bodies import SoftBody
+from neuspring.extensions.synthetic.meshes import edges, volumes
+from neuspring.extensions.synthetic.scenes import FIST_RADIUS, Hand
 
 if TYPE_CHECKING:
     import newton

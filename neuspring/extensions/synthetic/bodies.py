@@ -12,19 +12,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from neuspring.scenes.synthetic.meshes import (
-    Sdf,
-    block,
-    boundary,
-    capsule,
-    ellipsoid,
-    embed,
-    fill,
-    smooth_union,
-    sphere,
-    stick,
-    surface,
-)
+from neuspring.extensions.synthetic.meshes import block, boundary, embed, fill, stick
+from neuspring.scenes.shapes import Sdf, capsule, ellipsoid, smooth_union, sphere, surface
 
 NO_TETRAHEDRA = np.zeros((0, 4), dtype=int)
 NO_TRIANGLES = np.zeros((0, 3), dtype=int)

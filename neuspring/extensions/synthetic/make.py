@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from neuspring.config import Config, ScenarioRow
-from neuspring.config.data import Synthetic
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_text
 from neuspring.core.geometry import farthest
@@ -19,11 +18,12 @@ from neuspring.core.records import digest_file
 from neuspring.core.text import Progress
 from neuspring.data.camera import Camera
 from neuspring.data.capture import HANDS, OBJECT, Capture, Description, Writer
-from neuspring.scenes.synthetic.bodies import SoftBody
-from neuspring.scenes.synthetic.fem import Clip, Damping, FiniteElements, VertexBlockDescent, certify, settle
-from neuspring.scenes.synthetic.render import Part, Renderer, measured, quantized
-from neuspring.scenes.synthetic.scenes import SCENES, SKIN_COLOR, Hand, place
-from neuspring.scenes.synthetic.truth import Truth, truth_path
+from neuspring.extensions.synthetic.bodies import SoftBody
+from neuspring.extensions.synthetic.fem import Clip, Damping, FiniteElements, VertexBlockDescent, certify, settle
+from neuspring.extensions.synthetic.scenes import SCENES, Hand, place
+from neuspring.extensions.synthetic.settings import Synthetic
+from neuspring.extensions.synthetic.truth import Truth, truth_path
+from neuspring.scenes.render import SKIN_COLOR, Part, Renderer, looking, measured, quantized
 
 FRAME_RATE = 30.0
 DEPTH_UNIT = 0.001
@@ -73,7 +73,7 @@ SIZES = {
 
 def write_capture(row: ScenarioRow, path: Path, config: Config, folder: Path) -> None:
     """See `neuspring.scenes.sources`. Says how far the clip can be trusted."""
-    _, truth = make(row, config.synthetic, folder)
+    _, truth = make(row, config.section(Synthetic), folder)
     moved = f"{1e3 * truth.certificate:.2g} mm by twice as many, {1e3 * truth.sensitivity:.2g} mm by a start 1 um off"
     energy = truth.kinetic[-1] + truth.potential[-1]
     print(f"{row.scenario}: {truth.substeps} substeps per frame; mean node moved {moved}", flush=True)
@@ -177,16 +177,6 @@ def place_cameras(clip: Clip, hands: Sequence[Hand], size: CaptureSize) -> list[
             distance += 0.02
         cameras.append(camera)
     return cameras
-
-
-def looking(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Camera-to-world [4, 4]: z towards the target, y down."""
-    z = (target - eye) / np.linalg.norm(target - eye)
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    x /= np.linalg.norm(x)
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), eye
-    return pose
 
 
 def _film(

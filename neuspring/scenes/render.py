@@ -17,7 +17,7 @@ import warp as wp
 from scipy.sparse import coo_matrix
 
 from neuspring.data.camera import Camera
-from neuspring.scenes.synthetic.kernels import cast, shade_table
+from neuspring.scenes.rays import cast, shade_table
 
 LIGHT = np.array([0.35, -0.45, 0.85]) / np.linalg.norm([0.35, -0.45, 0.85])
 """Direction to the light."""
@@ -26,6 +26,8 @@ FARTHEST_HIT = 8.0
 SUBPIXELS = np.array([[0.0, 0.0], [0.25, 0.25], [-0.25, 0.25], [0.25, -0.25]])
 """The place where a pixel's color is sampled; depth and label are those of the first."""
 GAMMA = 1.0 / 2.2
+SKIN_COLOR = (0.75, 0.5, 0.4)
+"""Linear RGB."""
 
 
 @dataclass(frozen=True)
@@ -150,3 +152,13 @@ def measured(depth: np.ndarray, slope: np.ndarray, unit: float, rng: np.random.G
 def quantized(depth: np.ndarray, unit: float) -> np.ndarray:
     """Depth, m, as uint16 in units of `unit` m."""
     return np.clip(np.round(depth / unit), 0, np.iinfo(np.uint16).max).astype(np.uint16)
+
+
+def looking(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Camera-to-world [4, 4]: z towards the target, y down."""
+    z = (target - eye) / np.linalg.norm(target - eye)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), eye
+    return pose

@@ -5,9 +5,8 @@ import pytest
 
 from neuspring.data.camera import Camera
 from neuspring.data.capture import HANDS, OBJECT
-from neuspring.scenes.synthetic.make import looking
-from neuspring.scenes.synthetic.meshes import sphere, surface
-from neuspring.scenes.synthetic.render import Part, Renderer, measured, quantized
+from neuspring.scenes.render import Part, Renderer, looking, measured, quantized
+from neuspring.scenes.shapes import sphere, surface
 from tests.support.captures import K
 
 

@@ -21,8 +21,8 @@ def judge(
 ) -> Written:
     """Perception of a synthetic capture -> its errors against the truth, as facts of the record."""
     from neuspring.data.results import LiftedTracks, masks_of_cameras, tracks_of_cameras
-    from neuspring.perception import judge as errors_of
-    from neuspring.scenes.synthetic.truth import truth_of
+    from neuspring.extensions.synthetic import errors as errors_of
+    from neuspring.extensions.synthetic.truth import truth_of
 
     masks_of, tracks_of = masks_of_cameras(capture, paths(masks)), tracks_of_cameras(capture, paths(tracks))
     truth, points = truth_of(capture), LiftedTracks.load(lifted.file("lifted"))

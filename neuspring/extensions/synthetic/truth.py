@@ -19,7 +19,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
 from neuspring.data.camera import Camera
 from neuspring.data.capture import CAPTURE, Capture
-from neuspring.scenes.synthetic.kernels import first_hit, nearest
+from neuspring.extensions.synthetic.kernels import first_hit, nearest
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from neuspring.config.perception import PointTracking
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.data.results import ShapePrior
+from neuspring.extensions.synthetic.truth import truth_of, under_pixels
 from neuspring.perception.track_opencv import Followed, choose
-from neuspring.scenes.synthetic.truth import truth_of, under_pixels
 
 DEPTH_TOLERANCE = 0.01
 """m by which the depth image may differ from a point's depth for the point to count as seen."""

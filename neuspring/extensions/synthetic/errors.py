@@ -13,10 +13,10 @@ from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.data.frames import frames_of, overlap
 from neuspring.data.results import LiftedTracks, Masks, PixelTracks, ShapePrior
+from neuspring.extensions.synthetic.exact import carried
+from neuspring.extensions.synthetic.truth import Truth, at_points, under_pixels
 from neuspring.perception.sample import inside
 from neuspring.perception.shape import visual_hull
-from neuspring.perception.truth import carried
-from neuspring.scenes.synthetic.truth import Truth, at_points, under_pixels
 
 IN_MM = 1e3
 VOLUME_GRID = 0.003
