@@ -40,8 +40,7 @@ def with_gpus(benchmark: Benchmark) -> Benchmark:
     """The benchmark, told which GPUs its jobs share: the plan and each job must see equal batches."""
     pool, config = os.environ.get(POOL, ""), benchmark.config
     benchmark.on_gpu = config.device == "cuda" or (config.device == "auto" and bool(pool))
-    names = [] if pool == GIVEN else list(filter(None, pool.split(",")))
-    benchmark.gpu_slots = len(names) * config.gpus.jobs_per_gpu
+    benchmark.gpu_slots = len(set(pool.split(",")) - {"", GIVEN}) * config.gpus.jobs_per_gpu
     return benchmark
 
 
