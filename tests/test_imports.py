@@ -112,7 +112,7 @@ for name in {twin_and_simulator()}:
     assert run.returncode == 0, run.stderr
 
 
-def twin_and_simulator() -> list[str]:
+def twin_and_simulator():
     """Modules of both rooms, but the float64 reference, and what moves a twin to another recording: these stand on SciPy."""
     paths = [path for room in ("physics", "twin") for path in sorted((PACKAGE / room).glob("*.py"))]
     names = [".".join(["neuspring", *path.relative_to(PACKAGE).with_suffix("").parts]) for path in paths]
@@ -130,7 +130,7 @@ def test_no_test_imports_another_test_or_a_conftest():
     assert not wrong, "\n".join(sorted(wrong))
 
 
-def modules_named_in(path: Path) -> list[str]:
+def modules_named_in(path):
     """Every module or name that a file imports, with dots."""
     names = []
     for node in ast.walk(ast.parse(path.read_text())):

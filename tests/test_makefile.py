@@ -15,7 +15,7 @@ GOOD = '#!/bin/sh\n[ "$1" = -c ] && exit 0\necho "ran: $@"; exit 3\n'
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     shutil.copy(ROOT / "Makefile", tmp_path)
     (tmp_path / "workflow" / "envs").mkdir(parents=True)
     for name in ("pyproject.toml", "workflow/envs/constraints.txt"):
@@ -26,7 +26,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def install(folder: Path, python: str) -> str:
+def install(folder, python):
     clean = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
     command = ["make", "install", f"PYTHON={python}"]
     done = subprocess.run(command, cwd=folder, env=clean, capture_output=True, text=True, check=False)

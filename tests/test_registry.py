@@ -1,7 +1,5 @@
 """The registry: names without imports, packages that add members, and what is refused."""
 
-from __future__ import annotations
-
 import importlib.metadata
 from importlib.metadata import EntryPoint
 
@@ -13,21 +11,21 @@ from neuspring.registry import Registry
 from tests.support.extensions import with_extensions
 
 
-def entry(name: str, value: str, kind: str = "things") -> EntryPoint:
+def entry(name, value, kind="things"):
     return EntryPoint(name=name, value=value, group=f"neuspring.{kind}")
 
 
 @pytest.fixture
 def packages(monkeypatch):
     """Entry points of installed packages, as a list to fill."""
-    points: list[EntryPoint] = []
+    points = []
     monkeypatch.setattr(registry, "entry_points", lambda group: [point for point in points if point.group == group])
     return points
 
 
 def test_ours_come_first_and_a_package_adds_to_them(packages):
     packages += [entry("pi", "math:pi"), entry("e", "math:e"), entry("tau", "math:tau", "others")]
-    things: Registry[float] = Registry("things", {"two": 2.0, "inf": "math:inf"}, float)
+    things = Registry("things", {"two": 2.0, "inf": "math:inf"}, float)
     assert list(things) == ["two", "inf", "e", "pi"] and len(things) == 4
     assert things["inf"] == float("inf") and things["pi"] == pytest.approx(3.14159, abs=1e-5)
     assert "tau" not in things and things.module_of("pi") == "math"
@@ -35,14 +33,14 @@ def test_ours_come_first_and_a_package_adds_to_them(packages):
 
 def test_names_are_listed_without_an_import(packages):
     packages.append(entry("broken", "no_such_module:thing"))
-    things: Registry[float] = Registry("things", {"lazy": "no_module_either:thing"})
+    things = Registry("things", {"lazy": "no_module_either:thing"})
     assert list(things) == ["lazy", "broken"]
     with pytest.raises(InputError, match=r"things broken: must be importable; received ModuleNotFoundError"):
         things["broken"]
 
 
 def test_an_unknown_name_is_told_with_those_that_there_are(packages):
-    things: Registry[int] = Registry("things", {"one": 1, "two": 2})
+    things = Registry("things", {"one": 1, "two": 2})
     with pytest.raises(InputError, match=r"must be a registered name; received three. Known: one, two"):
         things["three"]
     assert things.get("three") is None

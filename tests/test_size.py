@@ -1,14 +1,11 @@
 """The size of the package in tokens of code per folder, against `size.toml`, and what keeps it readable."""
 
-from __future__ import annotations
-
 import ast
 import io
 import re
 import tokenize
 import tomllib
 from collections import Counter, defaultdict
-from collections.abc import Iterator
 from pathlib import Path
 
 import networkx as nx
@@ -22,10 +19,10 @@ BUDGET = tomllib.loads((ROOT / "tests" / "size.toml").read_text(encoding="utf-8"
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 
 
-def tokens_of(path: Path) -> int:
+def tokens_of(path):
     """Tokens of code, without docstrings, comments, line ends and indentation: joining lines does not change the count."""
     source = path.read_text(encoding="utf-8")
-    documents: set[int] = set()
+    documents = set()
     for node in ast.walk(ast.parse(source)):
         for item in node.body if isinstance(getattr(node, "body", None), list) else ():
             if isinstance(item, ast.Expr) and isinstance(item.value, ast.Constant) and isinstance(item.value.value, str):
@@ -34,7 +31,7 @@ def tokens_of(path: Path) -> int:
     return sum(token.type not in NO_CODE and token.start[0] not in documents for token in tokens)
 
 
-def folder_of(path: Path) -> str:
+def folder_of(path):
     """core, data, ...; extensions/play; a module of the package itself is of the folder `package`."""
     parts = path.relative_to(PACKAGE).parts
     return "package" if len(parts) == 1 else "/".join(parts[:2]) if parts[0] == "extensions" and len(parts) > 2 else parts[0]
@@ -58,11 +55,11 @@ def test_no_folder_is_larger_than_its_budget():
 
 
 @pytest.fixture(scope="module")
-def trees() -> dict[str, ast.Module]:
+def trees():
     return {path.relative_to(PACKAGE).as_posix(): ast.parse(path.read_text(encoding="utf-8")) for path in PACKAGE.rglob("*.py")}
 
 
-def assigned(node: ast.stmt) -> Iterator[str]:
+def assigned(node):
     targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
     for target in targets:
         names = target.elts if isinstance(target, ast.Tuple) else [target]
@@ -70,7 +67,7 @@ def assigned(node: ast.stmt) -> Iterator[str]:
 
 
 def test_a_class_or_constant_has_a_name_of_its_own(trees):
-    files: dict[str, set[str]] = defaultdict(set)
+    files = defaultdict(set)
     for name, tree in trees.items():
         for node in tree.body:
             found = (

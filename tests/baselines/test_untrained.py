@@ -6,12 +6,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neuspring.baselines import BASELINES, REFERENCES
-from neuspring.core.artifacts import Observations, Trajectory
+from neuspring.core.artifacts import Trajectory
 from neuspring.scores import metrics
 from tests.support import small
 
 
-def predicted(name: str, seen: Observations) -> np.ndarray:
+def predicted(name, seen):
     return BASELINES[name].predict(seen, None, None, "cpu").trajectory.positions
 
 

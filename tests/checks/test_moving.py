@@ -1,22 +1,17 @@
 """Trajectories of points: what motion capture does to lost markers, labels and streams, and what is only motion."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
 from neuspring.checks import examine
 from neuspring.checks.moving import Moving
-from neuspring.core.findings import Finding
 from tests.support.real import HANDS
 
 FRAMES, RATE = 60, 30.0
 LOST, HELD, STEP, SWAPPED = "lost points as numbers", "held value", "step far beyond the others", "labels swapped"
 
 
-def lifted() -> np.ndarray:
+def lifted():
     """Six markers [T, 6, 3] on a beam of 0.2 m whose end is lifted by 0.12 m within a second, with noise of 0.2 mm."""
     beam = np.stack([np.linspace(0.02, 0.19, 6), np.tile([0.02, 0.06], 3), np.full(6, 0.041)], axis=1)
     height = 0.12 * np.clip((np.arange(FRAMES) - 5) / 30, 0, 1)
@@ -25,51 +20,48 @@ def lifted() -> np.ndarray:
     return points + np.random.default_rng(3).normal(0, 2e-4, points.shape)
 
 
-def gripped() -> np.ndarray:
+def gripped():
     """Four points [T, 4, 3] of a gripper that waits, lifts and waits, without noise: equal to the bit at both ends."""
     height = 0.12 * np.clip((np.arange(FRAMES) - 5) / 30, 0, 1)
     jaws = np.array([[0.2, y, z] for y in (0.02, 0.06) for z in (0.01, 0.03)])
     return jaws + height[:, None, None] * np.array([0.0, 0.0, 1.0])
 
 
-def seen(points: np.ndarray, rate: float = RATE) -> list[Finding]:
+def seen(points, rate=RATE):
     return examine("moving", "file", Moving(points, rate), "Write null")
 
 
-def put(value: object, frames: object, points: object) -> Callable[[np.ndarray], np.ndarray]:
+def put(value, frames, points):
     """These entries are `value`."""
 
-    def change(given: np.ndarray) -> np.ndarray:
+    def change(given):
         given[frames, points] = value
         return given
 
     return change
 
 
-def held(first: int, last: int, points: object) -> Callable[[np.ndarray], np.ndarray]:
+def held(first, last, points):
     """Points stay where they are in frame `first`."""
     return lambda given: put(given[first, points], slice(first, last + 1), points)(given)
 
 
-def exchanged(frames: slice, points: list[int], by: list[int]) -> Callable[[np.ndarray], np.ndarray]:
+def exchanged(frames, points, by):
     return lambda given: put(given[frames][:, by], frames, points)(given)
 
 
-def after_a_gap(given: np.ndarray) -> np.ndarray:
+def after_a_gap(given):
     return put(np.nan, slice(15, 25), [1, 3])(exchanged(slice(25, None), [1, 3], [3, 1])(given))
 
 
 FAULTS = {
     "zeros": (lifted, put(0.0, slice(12, 20), 2), LOST, "error", 1, tuple(range(12, 20))),
-    "zeros at the start": (lifted, put(0.0, slice(0, 9), 4), LOST, "error", 1, tuple(range(9))),
     "zeros in every other frame": (lifted, put(0.0, slice(0, None, 2), 3), LOST, "error", 30, tuple(range(0, 60, 2))),
     "one number in one frame": (lifted, put(-1.0, 12, 2), LOST, "error", 1, (12,)),
     "a far place": (lifted, put([0.0, 0.0, -9.9], slice(12, 20), 2), LOST, "error", 1, tuple(range(12, 20))),
     "a pose that is lost twice": (gripped, put(gripped()[0] - 0.1, [20, 40], slice(None)), LOST, "error", 8, (20, 40)),
     "a stream that stops": (gripped, held(10, 33, slice(None)), HELD, "warning", 4, (10,)),
     "a gap filled with the last place": (lifted, held(11, 39, 2), HELD, "warning", 1, (11,)),
-    "the last place to the end": (lifted, held(19, 59, 5), HELD, "warning", 1, (19,)),
-    "two labels": (lifted, exchanged(slice(25, None), [0, 4], [4, 0]), SWAPPED, "warning", None, (25,)),
     "three labels": (lifted, exchanged(slice(25, None), [0, 2, 4], [2, 4, 0]), SWAPPED, "warning", None, (25,)),
     "two labels for a while": (lifted, exchanged(slice(20, 23), [1, 3], [3, 1]), SWAPPED, "warning", None, (20, 23)),
     "two labels after a gap": (lifted, after_a_gap, SWAPPED, "warning", None, (25,)),
@@ -78,14 +70,14 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_what_motion_capture_does_is_named_once(fault: str) -> None:
+def test_what_motion_capture_does_is_named_once(fault):
     right, change, name, level, value, frames = FAULTS[fault]
     (found,) = seen(change(right()))
     assert (found.name, found.level, found.frames) == (name, level, frames)
     assert value in (None, found.value)
 
 
-def test_points_are_named() -> None:
+def test_points_are_named():
     assert "points (0, 4) " in seen(exchanged(slice(25, None), [0, 4], [4, 0])(lifted()))[0].text
     zeros = seen(put(0.0, slice(30, 41), 4)(lifted()))[0].text
     assert "point 4 from frame 30 on is [0.0, 0.0, 0.0]" in zeros and zeros.endswith("Write null.")
@@ -108,13 +100,13 @@ RIGHT = {
 
 
 @pytest.mark.parametrize("name", RIGHT)
-def test_motion_is_no_fault(name: str) -> None:
+def test_motion_is_no_fault(name):
     assert seen(RIGHT[name]) == []
 
 
 @pytest.mark.skipif(not HANDS.is_dir(), reason="the hands are not part of the repository")
 @pytest.mark.parametrize("scene", ["single_lift_sloth", "double_lift_sloth", "single_push_sloth"])
-def test_real_hands_and_annotated_points_have_no_findings(scene: str) -> None:
+def test_real_hands_and_annotated_points_have_no_findings(scene):
     for file in ("controller", "landmarks"):
         rows = np.loadtxt(HANDS / scene / f"{file}.txt")[:, 1:]
         points = rows.reshape(len(rows), -1, 3) / 1e4

@@ -7,7 +7,6 @@ import re
 import pandas as pd
 import pytest
 
-from neuspring import config
 from neuspring.cli import main as main_module
 from neuspring.cli.main import _threads, main
 from neuspring.core import files
@@ -41,18 +40,17 @@ def observed(folder):
 
 
 def test_regions_and_fields_by_hand(tmp_path, capsys):
-    """Options reach the stages; without them a search is uniform, and a fit trains single springs."""
+    """Options reach the stages."""
     common = ["--observations", str(observed(tmp_path)), "--settings", json.dumps(TINY), "--device", "cpu"]
-    for name, options, kind, regions in (("plain", [], [], 1), ("ours", ["--clusters", "2"], ["--kind", "field"], 2)):
-        found, fitted = tmp_path / name / "search.json", tmp_path / name / "fit.json"
-        assert main(["search", *common, *options, "--seed", "3", "--output", str(found)]) == 0
-        assert main(["fit", *common, "--kind", "rod", "--search", str(found), "--output", str(fitted)]) == 2
-        assert "--kind: must be one of springs, field for this twin; received rod" in capsys.readouterr().err
-        assert main(["fit", *common, *kind, "--search", str(found), "--output", str(fitted)]) == 0
-        search, fit = StageRecord.load(found), StageRecord.load(fitted)
-        assert (search.status, search.settings["clusters"], search.settings["seed"]) == ("ok", regions, 3)
-        assert ("object_radius.1" in search.facts) == (regions == 2)
-        assert (fit.status, fit.settings["kind"]) == ("ok", kind[-1] if kind else "springs")
+    found, fitted = tmp_path / "search.json", tmp_path / "fit.json"
+    assert main(["search", *common, "--clusters", "2", "--seed", "3", "--output", str(found)]) == 0
+    fit = ["fit", *common, "--search", str(found), "--output", str(fitted), "--kind"]
+    assert main([*fit, "rod"]) == 2
+    assert "--kind: must be one of springs, field for this twin; received rod" in capsys.readouterr().err
+    assert main([*fit, "field"]) == 0
+    search = StageRecord.load(found)
+    assert (search.settings["clusters"], search.settings["seed"], "object_radius.1" in search.facts) == (2, 3, True)
+    assert StageRecord.load(fitted).settings["kind"] == "field"
 
 
 def test_a_numerical_failure_passes_through_every_stage_and_shows_in_the_table(tmp_path):
@@ -70,13 +68,6 @@ def test_a_numerical_failure_passes_through_every_stage_and_shows_in_the_table(t
     assert "0 of 1 runs have finished" in (tmp_path / "tables" / "summary.md").read_text()
     (row,) = pd.read_csv(tmp_path / "tables" / "runs.csv").to_dict("records")
     assert row["status"] == "failed" and "none of 11 candidates could be simulated" in row["reason"]
-
-
-@pytest.mark.parametrize("clusters", ["0", "1000"])
-def test_a_number_of_regions_that_cannot_be_is_bad_input(clusters, tmp_path, capsys):
-    arguments = ["--observations", str(observed(tmp_path)), "--clusters", clusters, "--output", str(tmp_path / "search.json")]
-    assert main(["search", *arguments, "--device", "cpu"]) == 2
-    assert "clusters: " in capsys.readouterr().err
 
 
 def test_words_that_are_no_option_end_with_status_2(capsys):
@@ -111,8 +102,8 @@ def test_check_data_tells_errors_by_its_status(tmp_path, capsys):
     assert "split.json" in capsys.readouterr().out
 
 
-def test_sync_reports_a_damaged_record(tmp_path, capsys):
-    tracking.init(tmp_path, config.Tracking())
+def test_sync_reports_a_damaged_record(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(tracking, "init", lambda *_: {"outcome": "ready"})
     record = tmp_path / "scene" / "method" / "0" / "run.json"
     record.parent.mkdir(parents=True)
     record.write_text("{}")

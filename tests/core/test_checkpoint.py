@@ -34,7 +34,7 @@ def test_a_foreign_or_damaged_checkpoint_is_left_alone(tmp_path, capsys):
 def test_a_killed_loop_continues_after_its_last_checkpoint(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("neuspring.core.checkpoint.CHECKPOINT_EVERY", 2)
 
-    def loop() -> TrainingLoop:
+    def loop():
         return TrainingLoop("the training", "train", 5, tmp_path / "c.npz", "key")
 
     first = loop()

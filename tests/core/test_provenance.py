@@ -36,12 +36,12 @@ def clear():
         function.cache_clear()
 
 
-def digest(*modules: str) -> str:
+def digest(*modules):
     clear()
     return provenance.code_digest(*modules)
 
 
-def edit(path: Path, old: str, new: str) -> None:
+def edit(path, old, new):
     text = path.read_text()
     assert text.count(old) >= 1
     path.write_text(text.replace(old, new, 1))
@@ -81,7 +81,7 @@ def test_modules_that_are_imported_by_name_count(copy):
     graph = Graph(Benchmark(values, ROOT))
     job = SimpleNamespace(scenario=graph.config.scenarios[0], camera="0", method=graph.config.methods[0], seed=0)
 
-    def now(stage: str) -> str:
+    def now(stage):
         clear()
         return graph.made_of(STAGES[stage], job)["code"]
 

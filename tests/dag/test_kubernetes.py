@@ -4,11 +4,9 @@ import importlib.util
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 import tomllib
-import zipfile
 
 import pytest
 import yaml
@@ -20,7 +18,7 @@ PODS = ROOT / "workflow/profiles/kubernetes/pods.py"
 GPU = "nvidia.com/gpu"
 
 
-def kubectl(folder, text: str) -> dict[str, str]:
+def kubectl(folder, text):
     """Variables of an environment in which kubectl is this shell script."""
     folder.mkdir()
     program = folder / "kubectl"
@@ -29,7 +27,7 @@ def kubectl(folder, text: str) -> dict[str, str]:
     return {"PATH": f"{folder}:{os.environ['PATH']}"}
 
 
-def search_in_pods(project, cores: int | None = None) -> list[str]:
+def search_in_pods(project, cores=None):
     """The command of a search in pods."""
     if importlib.util.find_spec("snakemake_executor_plugin_cluster_generic") is None:
         pytest.skip("needs snakemake-executor-plugin-cluster-generic: pip install 'neuspring[kubernetes]'")
@@ -37,6 +35,7 @@ def search_in_pods(project, cores: int | None = None) -> list[str]:
     return arguments(project, {"device": "auto"}, *extra, profile="kubernetes", cores=cores)
 
 
+@pytest.mark.slow
 def test_cores_are_refused_before_any_pod(project, tmp_path):
     variables = kubectl(tmp_path / "bin", f'touch "{tmp_path / "called"}"')
     output = output_of(start(search_in_pods(project, cores=2), project, **variables), fails=True)
@@ -92,22 +91,10 @@ def test_names_alone_are_jobs_to_cancel(tmp_path):
     assert calls.read_text() == "delete job --wait=false --ignore-not-found a b\n"
 
 
-def image_copies() -> list[str]:
+def image_copies():
     """What the image's recipe copies to /source."""
     lines = re.findall(r"^COPY (.+) /source\S*$", (ROOT / "workflow" / "envs" / "Dockerfile").read_text(), re.MULTILINE)
     return [name for line in lines for name in line.split()]
-
-
-def test_what_the_image_copies_can_be_installed_and_holds_the_workflow(tmp_path):
-    source = tmp_path / "source"
-    source.mkdir()
-    for name in image_copies():
-        kept = shutil.ignore_patterns("__pycache__")
-        shutil.copytree(ROOT / name, source / name, ignore=kept) if (ROOT / name).is_dir() else shutil.copy(ROOT / name, source)
-    pip = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
-    subprocess.run([*pip, "--wheel-dir", str(tmp_path), str(source)], check=True, capture_output=True)
-    (wheel,) = tmp_path.glob("*.whl")
-    assert any(name.endswith("share/neuspring/Snakefile") for name in zipfile.ZipFile(wheel).namelist())
 
 
 def test_the_image_is_built_of_files_and_extras_that_there_are():

@@ -98,27 +98,6 @@ def test_predictions_are_drawn_scored_and_filmed(perceived_run):
 
 
 @pytest.mark.slow
-@with_extensions
-def test_spring_gaus_has_splats_of_its_own_and_draws_with_them(perceived_run, tmp_path):
-    project = copy_project(perceived_run, tmp_path / "project")
-    small = {"anchors": 100, "iterations": 1}
-    changes = SYNTHETIC | {"methods": ["search_only", "spring_gaus"], "tracking": {"enabled": False}}
-    jobs = plan(project, changes | {"baselines": {"spring_gaus": small}})
-    # The splats of all methods are there.
-    assert (jobs["appearance"], jobs["train"], jobs["run"]) == (1, 1, 1)
-    run(project, changes | {"baselines": {"spring_gaus": small}})
-    folder = project / "results" / PACKAGE
-    assert (folder / "appearance-spring_gaus" / "0" / "splats.ply").is_file()
-    record = json.loads((folder / "spring_gaus" / "0" / "run.json").read_text())
-    assert record["status"] == "ok"
-    assert record["variant"]["model"] == "spring_gaus"
-    assert "../../appearance-spring_gaus/0/appearance.json" in record["artifacts"]["records"]
-    scores = pd.read_parquet(folder / "spring_gaus" / "0" / "scores.parquet")
-    assert set(scores["metric"]) >= {"chamfer", "track_error", "psnr", "ssim", "iou"}
-    assert (folder / "spring_gaus" / "0" / "centers.npz").is_file()
-
-
-@pytest.mark.slow
 def test_the_truth_lies_beside_the_capture_and_not_in_it(perceived_run):
     folder = perceived_run / "results" / PACKAGE
     assert (folder / "capture_truth.npz").is_file()
@@ -142,6 +121,27 @@ def test_a_folder_of_the_user_s_own_and_masks_that_the_user_repairs(project):
     path = capture.path("mask", "1", 2)
     path.write_bytes(path.read_bytes())
     assert plan(project, changes, "--until", "perceive") == {"perceive": 1}
+
+
+@pytest.mark.slow
+@with_extensions
+def test_spring_gaus_has_splats_of_its_own_and_draws_with_them(perceived_run, tmp_path):
+    project = copy_project(perceived_run, tmp_path / "project")
+    small = {"anchors": 100, "iterations": 1}
+    changes = SYNTHETIC | {"methods": ["search_only", "spring_gaus"], "tracking": {"enabled": False}}
+    jobs = plan(project, changes | {"baselines": {"spring_gaus": small}})
+    # The splats of all methods are there.
+    assert (jobs["appearance"], jobs["train"], jobs["run"]) == (1, 1, 1)
+    run(project, changes | {"baselines": {"spring_gaus": small}})
+    folder = project / "results" / PACKAGE
+    assert (folder / "appearance-spring_gaus" / "0" / "splats.ply").is_file()
+    record = json.loads((folder / "spring_gaus" / "0" / "run.json").read_text())
+    assert record["status"] == "ok"
+    assert record["variant"]["model"] == "spring_gaus"
+    assert "../../appearance-spring_gaus/0/appearance.json" in record["artifacts"]["records"]
+    scores = pd.read_parquet(folder / "spring_gaus" / "0" / "scores.parquet")
+    assert set(scores["metric"]) >= {"chamfer", "track_error", "psnr", "ssim", "iou"}
+    assert (folder / "spring_gaus" / "0" / "centers.npz").is_file()
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from tests.support.project import SCENE, copy_workflow, jobs_in, output_of, run,
 CHANGES = {"device": "auto", "seeds": [0, 1], "tracking": {"enabled": False}}
 
 
-def run_on_two_gpus(project, changes=None, *extra, fails=False, cores=2, visible="0,1") -> str:
+def run_on_two_gpus(project, changes=None, *extra, fails=False, cores=2, visible="0,1"):
     """Run with two GPUs that are not there: with `device: auto` torch takes the CPU, and leases do not look."""
     variables = {gpus.VISIBLE: visible, gpus.LOCKS: str(project / "locks")}
     return run(project, CHANGES | (changes or {}), *extra, fails=fails, cores=cores, **variables)
@@ -32,7 +32,7 @@ def two_gpu_run(tmp_path_factory):
 @pytest.mark.slow
 def test_jobs_lease_a_gpu_each_and_those_without_need_hold_none(two_gpu_run):
     project, _ = two_gpu_run
-    leases: dict[str, list[tuple[float, float]]] = {"0": [], "1": []}
+    leases = {"0": [], "1": []}
     for job in read_jobs(project / "results"):
         assert len(job.devices) == (job.rule in ("search", "fit", "run")), job.name
         start = datetime.fromisoformat(job.started).timestamp()
@@ -44,6 +44,7 @@ def test_jobs_lease_a_gpu_each_and_those_without_need_hold_none(two_gpu_run):
         assert all(later[0] >= earlier[1] - 1 for earlier, later in pairwise(sorted(times)))
 
 
+@pytest.mark.slow
 def test_more_gpus_than_there_are_end_the_run_before_its_first_job(project):
     output = run_on_two_gpus(project, {}, "--resources", "gpu=3", "--dry-run", fails=True)
     assert "must be 1 to 2 (2 GPUs, gpus.jobs_per_gpu 1); received 3" in output
@@ -65,28 +66,11 @@ def test_a_study_is_a_target_and_explain_names_its_runs(two_gpu_run):
 
 
 @pytest.mark.slow
-def test_a_part_of_the_runs_is_chosen_on_the_command_line(two_gpu_run):
-    project, _ = two_gpu_run
-    part = {"fit": {"epochs": 4}, "only": "method=baseline seed=1"}
-    expected = {"fit": 1, "run": 1, "tables": 1, "page": 1, "all": 1}
-    assert jobs_in(run_on_two_gpus(project, part, "--dry-run")) == expected
-    # Made for a part, tables still show all that is there.
-    output = run_on_two_gpus(project, {"only": "method=search_only seed=0"})
-    assert jobs_in(output) == {"tables": 1, "page": 1, "all": 1}
-    runs = pd.read_csv(project / "results" / "tables" / "runs.csv")
-    assert sorted(zip(runs["method"], runs["seed"], strict=True)) == [(m, s) for m in ("baseline", "search_only") for s in (0, 1)]
-    assert set(runs["status"]) == {"ok"}
-
-
 def test_a_study_named_like_another_target_is_refused(project):
     study = {"title": "t", "reference": None, "baseline": "a", "rows": {"a": "baseline"}}
     (project / "config" / "other.yaml").write_text(json.dumps({"fit": study}))
     output = run(project, {"study_table": "config/other.yaml"}, "--dry-run", fails=True)
     assert "study fit: this is the name of another target; rename the study" in output
-
-
-def test_a_sweep_without_a_study_is_explained(project):
-    assert "the target sweep needs a" in run(project, {}, "--dry-run", "--", "sweep", fails=True).lower()
 
 
 @pytest.mark.slow
@@ -98,3 +82,17 @@ def test_a_sweep_ends_with_its_best(project):
     # Two workers that look at the count at the same moment may make one more (Optuna counts trials that are finished).
     assert len((folder / "trials.csv").read_text().splitlines()) - 1 in (3, 4)
     assert "best" in (folder / "summary.md").read_text().lower()
+
+
+@pytest.mark.slow
+def test_a_part_of_the_runs_is_chosen_on_the_command_line(two_gpu_run):
+    project, _ = two_gpu_run
+    part = {"fit": {"epochs": 4}, "only": "method=baseline seed=1"}
+    expected = {"fit": 1, "run": 1, "tables": 1, "page": 1, "all": 1}
+    assert jobs_in(run_on_two_gpus(project, part, "--dry-run")) == expected
+    # Made for a part, tables still show all that is there.
+    output = run_on_two_gpus(project, {"only": "method=search_only seed=0"})
+    assert jobs_in(output) == {"tables": 1, "page": 1, "all": 1}
+    runs = pd.read_csv(project / "results" / "tables" / "runs.csv")
+    assert sorted(zip(runs["method"], runs["seed"], strict=True)) == [(m, s) for m in ("baseline", "search_only") for s in (0, 1)]
+    assert set(runs["status"]) == {"ok"}

@@ -90,5 +90,5 @@ def test_baselines_pass_through_the_same_workflow_and_say_where_they_do_not_appl
     assert "search" not in jobs
 
 
-def names(folder: Path) -> list[str]:
+def names(folder):
     return [path.name for path in folder.iterdir()]

@@ -108,6 +108,7 @@ def test_one_step_alone_from_another_folder_into_a_path_with_spaces_and_quotes(p
     assert [path.name for path in elsewhere.iterdir()] == [".snakemake"]
 
 
+@pytest.mark.slow
 def test_a_failing_job_is_named_with_its_log_and_stops_no_other(project):
     """The files of the second recording are there, which is all that a plan looks at, and damaged."""
     add_scenario(project, "gone", "phystwin")

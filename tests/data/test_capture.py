@@ -15,7 +15,7 @@ from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture, Writer
 from tests.support.captures import FRAMES, POSE, describe, entry, write
 
 
-def edit(folder, **changes) -> None:
+def edit(folder, **changes):
     path = folder / CAPTURE
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
@@ -54,14 +54,6 @@ def test_the_optical_axis_by_hand():
     # Forty pixels to the right at a focal length of forty: as far as deep. Down in the image is down the camera's y.
     np.testing.assert_allclose(camera.lift(np.array([55.5, 11.5]), np.array(0.5)), [0.6, 0.2, 0.4], atol=1e-12)
     np.testing.assert_allclose(camera.lift(np.array([15.5, 51.5]), np.array(0.5)), [0.1, -0.3, 0.4], atol=1e-12)
-
-
-def test_cameras_may_differ_in_size_and_miss_frames(tmp_path):
-    write(tmp_path, describe(cameras=(entry("left"), entry("right", 40, 20, missing=(2,)))))
-    capture = Capture.load(tmp_path)
-    assert list(capture.cameras) == ["left", "right"]
-    assert capture.color("right", 1).shape == (20, 40, 3)
-    assert [capture.has("right", frame) for frame in range(FRAMES)] == [True, True, False, True, True]
 
 
 SKEWED = [list(row) for row in POSE]

@@ -9,7 +9,7 @@ from neuspring.data.frames import without_islands
 from tests.support.moving import FRAMES, SIZE, moving
 
 
-def labelled(*islands: tuple[int, int]) -> np.ndarray:
+def labelled(*islands):
     """Labels [T, H, W] with a body of 26 x 20 pixels on the near square, and islands of 3 x 3 at (row, column) of frame 0."""
     labels = np.zeros((FRAMES, *SIZE[::-1]), np.uint8)
     labels[:, 48:74, 32:52] = OBJECT

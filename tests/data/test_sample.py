@@ -1,8 +1,6 @@
 """The twin that travels with the package: a run as the workflow leaves it, whole, small, and named by its commit."""
 
 import re
-import shlex
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +9,6 @@ import neuspring as ns
 from neuspring.core.records import StageRecord
 from neuspring.core.run_record import RUN_RECORD, RunRecord
 from neuspring.report.shown import find
-
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -48,10 +44,3 @@ def test_it_is_smaller_than_a_megabyte_and_says_what_made_it(run):
     assert {one.stage for one in records} == {"search", "fit", "rollout", "appearance"}
     texts = [path.read_text() for path in files if path.suffix == ".json"]
     assert not [text for text in texts if re.search(r'"/\w', text)], "no places of the machine that made it"
-
-
-def test_the_command_that_makes_it_names_every_file():
-    makefile = (ROOT / "Makefile").read_text()
-    rule = makefile.partition("\nsample:")[2].partition("\n\n")[0] + makefile.partition("SAMPLE_RUN :=")[2].partition("\n")[0]
-    names = {path.name for path in ns.sample_twin().parents[1].rglob("*") if path.is_file()}
-    assert [name for name in sorted(names) if name not in shlex.split(re.sub(r"[/,()]", " ", rule))] == []

@@ -1,16 +1,11 @@
 """The restricted unpickler: arrays and plain values pass unchanged; nothing that a file names is imported, called or trusted."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import os
 import pickle
 import pickletools
 import struct
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,27 +15,24 @@ from hypothesis import strategies as st
 from neuspring.core.errors import InputError
 from neuspring.data.unpickle import load_pickle
 
-PLAIN: list[Any] = [
+PLAIN = [
     {"a": np.arange(6.0).reshape(2, 3), "b": [np.float32(0.1), 2, None, True, "text", b"bytes", (1, 2.5)]},
-    np.asfortranarray(np.arange(6.0).reshape(2, 3)),
     np.arange(24.0).reshape(2, 3, 4).transpose(1, 0, 2),
-    np.array([[True, False]]),
     np.arange(3, dtype=">f4"),
     np.zeros((4, 0, 3), np.float32),
     np.array(3.0),
-    np.array([1 + 2j]),
     [{1, 2}, frozenset({3})],
     [np.float64(1.5), np.int64(-3), np.bool_(True)],
 ]
 
 
-def write(tmp_path: Path, data: bytes) -> Path:
+def write(tmp_path, data):
     path = tmp_path / "file.pkl"
     path.write_bytes(data)
     return path
 
 
-def described(value: Any) -> Any:
+def described(value):
     """A value as something that == compares in full: types, native dtypes, shapes and content."""
     if isinstance(value, (np.ndarray, np.generic)):
         return type(value), value.dtype.newbyteorder("="), value.shape, value.tolist()
@@ -49,7 +41,7 @@ def described(value: Any) -> Any:
     return type(value), list(map(described, value)) if isinstance(value, (list, tuple)) else value
 
 
-def test_plain_values_pass_in_every_protocol(tmp_path: Path) -> None:
+def test_plain_values_pass_in_every_protocol(tmp_path):
     for value, protocol in itertools.product(PLAIN, range(6)):
         data = pickle.dumps(value, protocol)
         # Protocols 0 to 3 spell sets and empty bytes as calls of builtins, which the allow-list leaves out.
@@ -57,14 +49,14 @@ def test_plain_values_pass_in_every_protocol(tmp_path: Path) -> None:
             assert described(load_pickle(write(tmp_path, data))) == described(value)
 
 
-def test_both_spellings_of_numpy_core(tmp_path: Path) -> None:
+def test_both_spellings_of_numpy_core(tmp_path):
     new = pickle.dumps(np.arange(3.0), protocol=2)
     assert b"numpy._core.multiarray" in new
     old = write(tmp_path, new.replace(b"numpy._core.multiarray", b"numpy.core.multiarray"))
     np.testing.assert_array_equal(load_pickle(old), np.arange(3.0))
 
 
-def test_arrays_own_their_memory_and_sharing_is_kept(tmp_path: Path) -> None:
+def test_arrays_own_their_memory_and_sharing_is_kept(tmp_path):
     shared = np.zeros(3)
     first, second = load_pickle(write(tmp_path, pickle.dumps([shared, shared])))
     first[0] = 1.0
@@ -74,24 +66,22 @@ def test_arrays_own_their_memory_and_sharing_is_kept(tmp_path: Path) -> None:
 class Call:
     """Pickles to a call of `function(*arguments)`, then BUILD with the state if there is one."""
 
-    def __init__(self, function: Callable[..., Any], *arguments: Any, state: Any = None) -> None:
+    def __init__(self, function, *arguments, state=None):
         self.reduced = (function, arguments, state)
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self):
         return self.reduced
 
 
 CALLS = {
-    "open": (open, "ran", "w"),
     r"builtins\.eval": (eval, "open('ran', 'w')"),
     r"numpy\.save": (np.save, "ran", 1),
-    r"numpy\.load": (np.load, "ran", None, True),
     r"builtins\.getattr": (getattr, "np", "save"),
     rf"{os.system.__module__}\.system": (os.system, "touch ran"),
 }
 
 
-def test_a_call_does_not_run_and_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_call_does_not_run_and_is_named(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name, protocol in itertools.product(CALLS, range(6)):
         path = write(tmp_path, pickle.dumps({"object_points": Call(*CALLS[name])}, protocol))
@@ -100,9 +90,7 @@ def test_a_call_does_not_run_and_is_named(tmp_path: Path, monkeypatch: pytest.Mo
         assert list(tmp_path.iterdir()) == [path]
 
 
-def of_array(
-    *state: Any, code: str = "f8", dtype_state: Any = (3, "<", None, None, None, -1, -1, 0), kind: Any = np.ndarray
-) -> bytes:
+def of_array(*state, code="f8", dtype_state=(3, "<", None, None, None, -1, -1, 0), kind=np.ndarray):
     """A protocol 4 pickle of an array with a chosen dtype state and array state (which gets the dtype as `...`)."""
     dtype = Call(np.dtype, code, False, True, state=dtype_state)
     filled = tuple(dtype if item is ... else item for item in state)
@@ -112,14 +100,9 @@ def of_array(
     return stream.getvalue()
 
 
-def test_the_hand_made_array_is_valid(tmp_path: Path) -> None:
-    data = of_array(1, (2,), ..., False, np.arange(2.0).tobytes())
-    np.testing.assert_array_equal(load_pickle(write(tmp_path, data)), [0.0, 1.0])
-
-
 X8 = b"x" * 8
 VALID = (1, (1,), ..., False, X8)
-REFUSED: list[tuple[bytes, str]] = [
+REFUSED = [
     # Every way to name a global
     (b"(ios\nsystem\n.", r"global os\.system"),
     (b"cos\nsystem\n(S'true'\ntR.", r"global os\.system"),
@@ -157,48 +140,30 @@ REFUSED: list[tuple[bytes, str]] = [
 ]
 
 
-def test_what_is_refused_is_named(tmp_path: Path) -> None:
+def test_what_is_refused_is_named(tmp_path):
     for program, reason in REFUSED:
         with pytest.raises(InputError, match=reason):
             load_pickle(write(tmp_path, program))
 
 
-OBJECTS = np.array([1, "x", None], dtype=object)
-RECORDS = np.zeros(2, dtype=[("a", "f4"), ("b", "O")])
-NESTED = np.zeros(2, dtype=[("a", [("b", "O", (2,))])])
-
-
-def test_object_and_structured_dtypes_are_refused(tmp_path: Path) -> None:
-    values = (OBJECTS, RECORDS, NESTED, RECORDS.dtype, np.array(["text"]))
-    for value, protocol in itertools.product(values, range(6)):
-        with pytest.raises(InputError, match=r"file\.pkl.*dtype"):
-            load_pickle(write(tmp_path, pickle.dumps(value, protocol)))
-
-
-def test_bool_bytes_are_normalized(tmp_path: Path) -> None:
+def test_bool_bytes_are_normalized(tmp_path):
     data = of_array(1, (3,), ..., False, b"\x00\x01\xff", code="b1", dtype_state=(3, "|", None, None, None, -1, -1, 0))
     assert load_pickle(write(tmp_path, data)).view(np.uint8).tolist() == [0, 1, 1]
 
 
-def test_every_truncation_is_an_input_error(tmp_path: Path) -> None:
+def test_every_truncation_is_an_input_error(tmp_path):
     whole = pickle.dumps({"a": np.arange(3.0), "b": [1, "x"]})
     for length in range(len(whole)):
         with pytest.raises(InputError, match=r"file\.pkl"):
             load_pickle(write(tmp_path, whole[:length]))
 
 
-def test_missing_file_and_folder(tmp_path: Path) -> None:
-    for path in (tmp_path / "absent.pkl", tmp_path):
-        with pytest.raises(InputError, match=path.name):
-            load_pickle(path)
-
-
-def test_recursive_and_repeated_containers(tmp_path: Path) -> None:
-    loop: list[Any] = []
+def test_recursive_and_repeated_containers(tmp_path):
+    loop = []
     loop.append(loop)
     with pytest.raises(InputError, match="RecursionError"):
         load_pickle(write(tmp_path, pickle.dumps(loop)))
-    doubled: list[Any] = [0]
+    doubled = [0]
     for _ in range(60):  # 2^60 leaves if containers were copied
         doubled = [doubled, doubled]
     assert len(load_pickle(write(tmp_path, pickle.dumps(doubled)))) == 2
@@ -213,7 +178,7 @@ WORDS = [bytes([ord(op.code)]) for op in pickletools.opcodes] + [
 
 @settings(max_examples=200, deadline=None)
 @given(data=st.one_of(st.binary(max_size=200), st.lists(st.sampled_from(WORDS), max_size=30).map(b"".join)))
-def test_random_bytes_raise_nothing_but_input_error(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
+def test_random_bytes_raise_nothing_but_input_error(tmp_path_factory, data):
     path = write(tmp_path_factory.getbasetemp(), data + b".")
     message = str(path)
     try:

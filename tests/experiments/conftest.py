@@ -1,7 +1,6 @@
 """Fixtures that several files share."""
 
 import shutil
-from pathlib import Path
 
 import pytest
 
@@ -11,7 +10,7 @@ from neuspring.experiments.tracking import log as tracking
 
 
 @pytest.fixture
-def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def results(tmp_path, monkeypatch):
     """A results folder; no GPU is leased to anybody."""
     for name in (job.POOL, gpus.VISIBLE):
         monkeypatch.delenv(name, raising=False)
@@ -21,7 +20,7 @@ def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture(scope="session")
-def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def template(tmp_path_factory):
     """A migrated MLflow database. Making one takes seconds, copying it does not; it holds no experiment of a test."""
     results = tmp_path_factory.mktemp("template")
     assert tracking.init(results, Tracking(experiment="template"))["outcome"] == "ready"
@@ -29,7 +28,7 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def tracked(tmp_path: Path, template: Path) -> Path:
+def tracked(tmp_path, template):
     """A results folder with a migrated MLflow database."""
     folder = tmp_path / "results"
     folder.mkdir()

@@ -100,13 +100,6 @@ def test_the_devices_that_the_user_allows_are_the_pool():
     assert gpus.visible_devices({gpus.VISIBLE: "-1"}) == ()
 
 
-def test_a_folder_of_leases_that_cannot_be_used_is_named(tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv(gpus.LOCKS, str(tmp_path / "file"))
-    with pytest.raises(InputError, match="Set NEUSPRING_GPU_LOCKS"):
-        gpus.lock_folder()
-
-
 @pytest.fixture
 def run(tmp_path):
     """`acquire` as the jobs of one run of the workflow call it."""
@@ -201,12 +194,6 @@ def test_gpus_that_are_not_there_are_refused_before_any_job(call, message, monke
     with pytest.raises(InputError, match=message):
         call()
     assert gpus.pool_of(Gpus(), "cuda", plan_only=True) == gpus.visible_devices()
-
-
-def test_damaged_notes_count_for_nothing(tmp_path, run):
-    for text in ("", "{", "lost\n", "gone 0\n"):
-        (tmp_path / "notes").write_text(text)
-        run(1, ("0",), timeout=0).release()
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="acts as two users")

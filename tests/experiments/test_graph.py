@@ -1,12 +1,9 @@
 """The jobs of a benchmark: what they are made of, which are finished, and why one is made again."""
 
-from __future__ import annotations
-
 import json
 import os
 import random
 import shutil
-from pathlib import Path
 
 import pytest
 
@@ -14,9 +11,10 @@ from neuspring import config
 from neuspring.config.parse import read_yaml
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import JobRecord
-from neuspring.experiments import plan
+from neuspring.experiments import messages, plan
 from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.graph import Graph
+from neuspring.experiments.tasks import Tasks
 from neuspring.stages.stage import _stamps
 from tests.support.captures import describe
 from tests.support.extensions import with_extensions
@@ -27,14 +25,14 @@ THREE_SEEDS = {"seeds": [0, 1, 2], "methods": ["baseline", "neuspring"]}
 
 
 @pytest.fixture
-def finished(tmp_path: Path) -> Path:
+def finished(tmp_path):
     """A results folder in which all jobs have run, as far as their records tell."""
     graph = planned(tmp_path / "results")
     finish(graph, graph.todo(targets(graph)))
     return tmp_path / "results"
 
 
-def todo(results: Path, **changes: object) -> dict[str, int]:
+def todo(results, **changes):
     graph = planned(results, **changes)
     return counted(graph.todo(targets(graph)))
 
@@ -96,7 +94,7 @@ def test_an_image_of_the_user_that_was_changed_is_noticed(tmp_path):
     (tmp_path / "mine" / "capture.json").write_text(json.dumps(config.plain(describe(masks=True))))
     given = {"perception": {"segment": {"backend": "given"}}, "data_root": str(tmp_path), "scenario_table": str(table)}
 
-    def digest() -> str:
+    def digest():
         _stamps.cache_clear()  # a plan looks once
         return planned(tmp_path / "results", scenarios=["mine"], **given).unit("perceive", "mine").digest
 
@@ -133,13 +131,18 @@ def test_batches_on_gpus_are_as_large_as_one_another_and_every_gpu_has_one(tmp_p
     assert len(set(names)) == len(names)
 
 
-def test_a_unit_that_there_is_not_is_an_error():
+def test_what_cannot_be_planned_is_an_error(tmp_path):
+    graph = planned(tmp_path)
     with pytest.raises(InputError, match="must be scenario/method/seed"):
-        planned().unit("run", "nothing")
+        graph.unit("run", "nothing")
+    with pytest.raises(InputError, match="the target sweep needs a sweep"):
+        graph.unit("sweep_report", "all")
+    with pytest.raises(InputError, match="--cores: a cluster's scheduler counts cores itself"):
+        messages.begin(graph, 1, local=False, cores=2, cluster=False)
 
 
-def shipped(*names: str, **values: object) -> Graph:
-    given: dict[str, object] = {}
+def shipped(*names, **values):
+    given = {}
     for name in ("config.yaml", *(f"data/{name}.yaml" for name in names)):
         config.merge(given, read_yaml(ROOT / "config" / name))
     return Graph(Benchmark(given | values, ROOT, plan_only=True))
@@ -147,8 +150,6 @@ def shipped(*names: str, **values: object) -> Graph:
 
 @with_extensions
 def test_the_demo_has_thirty_jobs_and_the_whole_benchmark_less_than_two_thousand(tmp_path):
-    from neuspring.experiments.tasks import Tasks
-
     demo = shipped("demo", results=str(tmp_path / "demo"))
     Tasks(demo, {})
     found = counted(demo.todo(targets(demo)))

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import JobRecord, read_jobs
 from neuspring.core.records import StageRecord
 from neuspring.experiments import gpus
-from neuspring.experiments.graph import Graph
 from neuspring.experiments.job import GIVEN, POOL, Runner
 from neuspring.stages.stage import Written
 from tests.support.planned import planned
@@ -23,21 +23,21 @@ from tests.support.project import SCENE
 STATIC = {"methods": ["static"], "tracking": {"enabled": False}}
 
 
-def run(graph: Graph, rule: str, name: str) -> str:
+def run(graph, rule, name):
     """Run a job in this process; returns its log."""
     unit = graph.unit(rule, name)
     Runner(graph, graph.folder(unit) / f"{unit.digest}.log", 1).run(unit)
     return graph.record(unit).read_text()
 
 
-def moments(results: Path) -> dict[str, str]:
+def moments(results):
     """When each record of a stage was written."""
     found = [path for name in ("rollout", "score.record") for path in results.rglob(f"{name}.json")]
     return {path.relative_to(results).as_posix(): str(path.stat().st_mtime_ns) for path in found}
 
 
 @pytest.fixture
-def own(results: Path) -> Graph:
+def own(results):
     """A method that learns nothing: two jobs of a tenth of a second."""
     return planned(results, **STATIC)
 
@@ -76,6 +76,7 @@ def test_other_settings_replace_the_record_of_the_job(own):
     assert not changed.finished(changed.unit("perceive", SCENE))
     run(changed, "perceive", SCENE)
     assert not first.exists() and changed.finished(changed.unit("perceive", SCENE))
+    assert Observations.load(Path(own.results, SCENE, "observations.npz")).scenario.frame_count == 9, "the step ran again"
 
 
 def test_a_job_without_its_inputs_says_which(own):
@@ -83,7 +84,7 @@ def test_a_job_without_its_inputs_says_which(own):
         run(own, "run", f"{SCENE}/static/0")
 
 
-def batched(results: Path, calls: list[list[int]], **changes: object) -> Graph:
+def batched(results, calls, **changes):
     """Three searches in a batch, which write their seed in place of a twin. Seed 1 fails in the batch, seed 2 wherever it runs."""
     given = {"methods": ["search_only"], "seeds": [0, 1, 2], "gpus": {"batch": 3}} | changes
     graph = planned(results, **given)
@@ -108,7 +109,7 @@ def batched(results: Path, calls: list[list[int]], **changes: object) -> Graph:
 
 
 def test_a_failing_member_of_a_batch_stops_no_other_and_is_alone_what_is_left(results):
-    calls: list[list[int]] = []
+    calls = []
     graph = batched(results, calls)
     run(graph, "perceive", SCENE)
     run(graph, "search", "together/0")

@@ -42,10 +42,10 @@ def test_an_installation_brings_all_that_the_workflow_reads_and_the_sample_twin(
 class Placed:
     """A file of an installation."""
 
-    def __init__(self, place: Path) -> None:
+    def __init__(self, place):
         self.name, self._place = place.name, place
 
-    def locate(self) -> Path:
+    def locate(self):
         return self._place
 
 

@@ -5,7 +5,7 @@ from neuspring.cli.main import main
 from neuspring.extensions.doctor import machine as doctor
 
 
-def findings(tmp_path, **values) -> dict[str, doctor.MachineCheck]:
+def findings(tmp_path, **values):
     settings = config.parse(config.Config, {"results": str(tmp_path), "device": "cpu"} | values, "test")
     return {finding.subject: finding for finding in doctor.examine(settings)}
 

@@ -40,7 +40,7 @@ MASKS = replace(POINTS, supervision="masks", anchors=150)
 NETWORK = GsDynamics(width=8, batch=2, epochs=1, updates_per_epoch=2, step=0.002)
 
 
-def settings(**models: object) -> config.Config:
+def settings(**models):
     return config.Config(baselines=Baselines(**{"spring_gaus": POINTS, "gs_dynamics": NETWORK} | models), device="cpu")
 
 
@@ -51,7 +51,7 @@ def seen(tmp_path):
     return path
 
 
-def run_all(seen, model: str, chosen: config.Config):
+def run_all(seen, model, chosen):
     """Train, predict and score; returns the path of run.json."""
     folder = seen.parent / model / "0"
     trained = None
@@ -224,13 +224,13 @@ def test_silhouettes_train_and_both_outputs_are_written(filmed):
         ("{model: spring_gaus, description: x}", "at least one method must apply to a scenario"),
     ],
 )
-def test_rows_with_settings_that_cannot_be(row: str, message: str, tmp_path: Path) -> None:
+def test_rows_with_settings_that_cannot_be(row, message, tmp_path):
     (tmp_path / "bad.yaml").write_text(f"bad: {row}\n")
     with pytest.raises(InputError, match=re.compile(message, re.DOTALL)):
         Benchmark({"scenarios": ["toy_rope_lift_smooth"], "methods": ["bad"], "method_table": str(tmp_path / "bad.yaml")}, ROOT)
 
 
-def test_what_is_trained_on_silhouettes_needs_images_and_is_left_out_elsewhere(tmp_path: Path) -> None:
+def test_what_is_trained_on_silhouettes_needs_images_and_is_left_out_elsewhere(tmp_path):
     names = ["spring_gaus", "spring_gaus_points", "gs_dynamics", "static", "spring_gaus_few"]
     rows = config.read_yaml(ROOT / "config" / "methods.yaml")
     few = rows["spring_gaus"] | {"settings": {"anchors": 100}}

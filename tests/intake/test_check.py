@@ -1,9 +1,7 @@
 """check-data on cases, C3D files and folders: what the readers refuse, with file and key."""
 
-from __future__ import annotations
-
+import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,29 +19,29 @@ from tests.support.phystwin_case import dump, stored, write_case, write_json
 K = [[60.0, 0.0, 30.0], [0.0, 60.0, 20.0], [0.0, 0.0, 1.0]]
 
 
-def put(key: str, index: Any, value: Any) -> Any:
-    def change(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def put(key, index, value):
+    def change(data):
         data[key][index] = value
         return data
 
     return change
 
 
-def trust_hidden(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def trust_hidden(data):
     frame, point = np.argwhere(~data["object_visibilities"])[0]
     data["object_motions_valid"][frame - 1, point] = True
     return data
 
 
-def of_data(change: Any) -> Any:
+def of_data(change):
     return lambda folder: dump(folder / "final_data.pkl", change(stored(folder)))
 
 
-def of_json(name: str, value: Any) -> Any:
+def of_json(name, value):
     return lambda folder: write_json(folder / name, value)
 
 
-def of_pickle(name: str, value: Any) -> Any:
+def of_pickle(name, value):
     return lambda folder: dump(folder / name, value)
 
 
@@ -60,32 +58,26 @@ FAULTS = [
     (of_data(lambda d: d | {"object_visibilities": d["object_visibilities"].astype(int)}), "final_data.pkl", "a bool array"),
     (of_data(lambda _: [1, 2]), "final_data.pkl", "dict of arrays"),
     (of_json("split.json", {"train": [0, 7], "test": [7, 11]}), "split.json", "test: whole numbers"),
-    (of_json("split.json", {"train": [0, 7]}), "split.json", "test: whole numbers"),
     (of_json("split.json", {"train": [0, 1], "test": [1, 10]}), "split.json", "train: whole numbers"),
-    (of_json("split.json", [0, 7]), "split.json", "train"),
     (of_pickle("calibrate.pkl", [np.eye(4)] * 2), "calibrate.pkl", "a list of 3"),
     (of_pickle("calibrate.pkl", [np.eye(4)] * 2 + [np.diag([1.0, 1.0, 2.0, 1.0])]), "calibrate.pkl", "camera 2: .*rotation"),
     (of_json("metadata.json", {"intrinsics": [K] * 3, "WH": [64], "frame_num": 10, "fps": 30}), "metadata.json", "WH"),
-    (of_json("metadata.json", {"intrinsics": K, "WH": [64, 48], "frame_num": 10, "fps": 30}), "metadata.json", "intrinsics"),
     (of_json("metadata.json", {"intrinsics": [K] * 3, "WH": [64, 48], "frame_num": 10, "fps": -1}), "metadata.json", "fps"),
     (of_pickle("gt_track_3d.pkl", np.zeros((10, 5, 2))), "gt_track_3d.pkl", r"\[10, K, 3\]"),
-    (of_pickle("gt_track_3d.pkl", np.zeros((9, 5, 3))), "gt_track_3d.pkl", r"\[10, K, 3\]"),
     (of_pickle("gt_track_3d.pkl", np.full((10, 5, 3), np.inf)), "gt_track_3d.pkl", "NaN where unseen"),
     (lambda folder: (folder / "calibrate.pkl").write_bytes(b"cos\nsystem\n(S'true'\ntR."), "calibrate.pkl", "global os.system"),
 ]
 
 
 @pytest.mark.parametrize(("damage", "file", "words"), FAULTS, ids=[f"{k}-{f[1]}" for k, f in enumerate(FAULTS)])
-def test_what_a_reader_refuses_is_an_error_with_file_and_key(tmp_path: Path, damage: Any, file: str, words: str) -> None:
-    import re
-
+def test_what_a_reader_refuses_is_an_error_with_file_and_key(tmp_path, damage, file, words):
     folder = write_case(tmp_path)
     damage(folder)
     (found,) = of_level(check_layout(folder), "error")
     assert found.startswith(f"{file}: ") and re.search(words, found)
 
 
-def test_a_conforming_case_has_only_notes_and_optional_files_may_be_missing(tmp_path: Path) -> None:
+def test_a_conforming_case_has_only_notes_and_optional_files_may_be_missing(tmp_path):
     folder = write_case(tmp_path)
     assert serious(check_layout(folder)) == [] and render(check_layout(folder)).endswith("0 errors, 0 warnings")
     for name in ("gt_track_3d.pkl", "calibrate.pkl", "metadata.json"):
@@ -93,7 +85,7 @@ def test_a_conforming_case_has_only_notes_and_optional_files_may_be_missing(tmp_
     assert serious(check_layout(folder)) == []
 
 
-def test_a_case_a_folder_of_cases_and_a_root(tmp_path: Path) -> None:
+def test_a_case_a_folder_of_cases_and_a_root(tmp_path):
     first, second = write_case(tmp_path, "a"), write_case(tmp_path, "b", frames=20)
     (second / "final_data.pkl").unlink()
     assert of_level(check_layout(first), "error") == []
@@ -101,7 +93,7 @@ def test_a_case_a_folder_of_cases_and_a_root(tmp_path: Path) -> None:
         assert [d.where for d in check_layout(folder) if d.level == "error"] == [str(second / "final_data.pkl")]
 
 
-def test_folders_without_data_are_refused(tmp_path: Path) -> None:
+def test_folders_without_data_are_refused(tmp_path):
     with pytest.raises(InputError, match="nothing there"):
         check_layout(tmp_path / "absent")
     with pytest.raises(InputError, match=r"final_data\.pkl"):
@@ -111,14 +103,14 @@ def test_folders_without_data_are_refused(tmp_path: Path) -> None:
         check_layout(tmp_path)
 
 
-def test_a_package_adds_a_layout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_package_adds_a_layout(tmp_path, monkeypatch):
     mine = Layout(lambda path: path.suffix == ".mine", lambda path, config: [note(path, f"read with {config.data_root}")])
     monkeypatch.setattr(check, "LAYOUTS", Registry("layouts", {"mine": mine}, Layout))
     (tmp_path / "a.mine").write_text("")
     assert [one.text for one in check_layout(tmp_path / "a.mine")] == [f"read with {Config().data_root}"]
 
 
-def test_markers_of_c3d_files_one_by_one_with_labels_and_as_a_folder(tmp_path: Path) -> None:
+def test_markers_of_c3d_files_one_by_one_with_labels_and_as_a_folder(tmp_path):
     rest = np.array([[0.0, 0, 0], [300, 0, 0], [300, 200, 0], [0, 200, 100]])
     way = rest + 50 * np.sin(np.arange(60) / 5)[:, None, None]
     way[30, 1] += 400
@@ -134,7 +126,7 @@ def test_markers_of_c3d_files_one_by_one_with_labels_and_as_a_folder(tmp_path: P
     assert holds(check_layout(Path(f"{path}#hand")), "error", "take.c3d#hand", "There are: base")
 
 
-def test_render_groups_by_file() -> None:
+def test_render_groups_by_file():
     one, two = Path("b.pkl"), Path("a.pkl")
     text = render([broken(one, "", "x"), note(two, "y"), unusual(one, "", "z")])
     assert text == "a.pkl\n  note     y\nb.pkl\n  error    x\n  warning  z\n1 error, 1 warning"

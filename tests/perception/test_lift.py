@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from neuspring.config.perception import Lift
 from neuspring.core.errors import InputError
 from neuspring.core.geometry import farthest
-from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
+from neuspring.data.capture import HANDS, OBJECT, Writer
 from neuspring.data.results import Masks, PixelTracks
 from neuspring.perception import lift as lifting
 from neuspring.perception.controllers import GRASP_REACH, choose_controllers, fill_rigidly, hands_of, rigid_motion
@@ -30,7 +30,7 @@ NEAR = np.zeros((1, 3))
 
 
 @pytest.fixture
-def scene(tmp_path) -> Capture:
+def scene(tmp_path):
     """One camera that looks straight down at 0.9 m: an object on the left, a hand on the right, both half a pixel further right
     in every frame. Depth is 0.8 m there, 0.9 m on the table."""
     writer = Writer(tmp_path, describe())
@@ -43,11 +43,11 @@ def scene(tmp_path) -> Capture:
     return writer.finish()
 
 
-def masks_of(capture: Capture) -> dict[str, Masks]:
+def masks_of(capture):
     return {"0": Masks(labels=np.stack([capture.mask("0", f) for f in range(FRAMES)]), backend="given")}
 
 
-def tracks_of(capture: Capture) -> dict[str, PixelTracks]:
+def tracks_of(capture):
     y, x = np.nonzero(capture.mask("0", 0))
     start = np.stack([x, y], axis=1).astype(float)
     pixels = start + np.arange(FRAMES)[:, None, None] // 2 * [1.0, 0.0]
@@ -102,30 +102,7 @@ def test_no_object_and_no_hand_are_named(scene):
             lifting.lift_tracks(scene, {"0": Masks(labels=labels, backend="x")}, tracks_of(scene), SETTINGS)
 
 
-def still(folder, camera) -> tuple[Capture, np.ndarray]:
-    """A capture in which object and hand stand still at 0.8 m, and its labels [H, W]."""
-    writer = Writer(folder, describe(cameras=(camera,)))
-    labels = np.zeros((24, 32), np.uint8)
-    labels[6:16, 4:14], labels[6:16, 18:28] = OBJECT, HANDS
-    for frame in set(range(FRAMES)) - set(camera.missing):
-        writer.frame("0", frame, np.zeros((24, 32, 3), np.uint8), np.full((24, 32), 800, np.uint16), labels)
-    return writer.finish(), labels
-
-
-def test_a_missing_frame_leaves_points_invisible(tmp_path):
-    capture, labels = still(tmp_path, entry(missing=(2,)))
-    masks = Masks(labels=np.stack([labels * capture.has("0", f) for f in range(FRAMES)]), backend="x")
-    y, x = np.nonzero(labels)
-    pixels = np.repeat(np.stack([x, y], axis=1)[None].astype(float), FRAMES, axis=0)
-    visible = np.ones(pixels.shape[:2], bool)
-    visible[2] = False
-    tracks = {"0": PixelTracks(pixels=pixels, visible=visible, backend="x")}
-    lifted = lifting.lift_tracks(capture, {"0": masks}, tracks, replace(SETTINGS, controller_gaps="rigid"))
-    np.testing.assert_array_equal(lifted.object_visibility.all(axis=1), [True, True, False, True, True])
-    np.testing.assert_allclose(lifted.controller_points, np.repeat(lifted.controller_points[:1], FRAMES, axis=0), atol=1e-6)
-
-
-def grid(count: int = 6) -> np.ndarray:
+def grid(count=6):
     return np.stack(np.meshgrid(*[np.arange(count) * 0.004] * 2, [0.0]), axis=-1).reshape(-1, 3)
 
 
@@ -173,7 +150,7 @@ def test_rigid_motions_are_recovered_and_fill_gaps():
     np.testing.assert_allclose(fill_rigidly(damaged, trusted), points, atol=1e-9)
 
 
-def grasp(frames: int = 8) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Rotation]]:
+def grasp(frames=8):
     """Two hands of 150 points each that turn and move in their own ways, [T, 300, 3]; the object's cloud; the hands' turns. Each
     hand reaches 15 cm away from the object."""
     rng = np.random.default_rng(1)
@@ -212,16 +189,11 @@ def test_patches_lie_near_the_object_and_move_rigidly_with_their_hand():
     assert cKDTree(cloud).query(spread[0])[0].max() > 0.1, "forearm and all"
 
 
-def test_patches_average_the_noise_of_the_tracks():
+def test_the_misfit_of_patches_is_the_noise_in_mm():
     points, cloud, _, _ = grasp()
-    seen = np.ones(points.shape[:2], bool)
-    noisy = points + np.random.default_rng(2).normal(0, 0.002, points.shape)
-    noisy[0] = points[0]
-    controllers, facts = choose_controllers(noisy, seen, seen, cloud, PATCH, "here")
-    own = cKDTree(points[0]).query(controllers[0])[1]
-    # 150 points fix six numbers: sqrt(6 / 150 / 3) of the noise per coordinate at the middle, some times as much at the rim.
-    assert np.abs(controllers - points[:, own]).max() < 0.002
-    assert np.std(controllers[1:] - points[1:, own]) < 0.0005
+    seen, noise = np.ones(points.shape[:2], bool), np.random.default_rng(2).normal(0, 0.002, points.shape)
+    noise[0] = 0
+    _, facts = choose_controllers(points + noise, seen, seen, cloud, PATCH, "here")
     # Seven of eight frames have three coordinates of noise, less what the six fitted numbers take up.
     assert facts["patch_misfit_mm"] == pytest.approx(2.0 * np.sqrt(3 * 7 / 8), rel=0.05)
 

@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 from neuspring.cli.main import main
-from neuspring.config.perception import Perception, Segmentation
 from neuspring.core.errors import InputError
 from neuspring.data import frames
 from neuspring.data.capture import HANDS, OBJECT, Capture
-from neuspring.perception.backends import BACKENDS
 from neuspring.perception.film import CameraFilm, Carried
 from neuspring.perception.marks import Marks
 from neuspring.perception.masks import MasksFile, has_masks, save_carried, save_masks
@@ -115,18 +113,6 @@ def test_marks_become_the_masks_of_a_capture(folder, capsys):
     out = capsys.readouterr().out
     assert "camera 0: marks, images and settings are unchanged" in out
     assert "camera 1: masks are in" in out
-
-
-@with_extensions
-def test_the_workflow_segments_from_marks(folder):
-    capture, settings = Capture.load(folder), Perception(segment=Segmentation(backend="marks"))
-    labels = BACKENDS["segment"]["marks"].segment(capture, "1", settings, "cpu")
-    truth = cv2.imread(str(folder / "truth" / "1" / "00004.png"), cv2.IMREAD_UNCHANGED)
-    assert not labels[3].any()
-    assert overlap(labels[4], truth, OBJECT) > 0.85
-    (folder / "marks.json").unlink()
-    with pytest.raises(InputError, match=r"marks of object and hands are required.*neuspring annotate"):
-        BACKENDS["segment"]["marks"].segment(capture, "1", settings, "cpu")
 
 
 def test_masks_are_announced_when_every_camera_has_them(folder):

@@ -1,14 +1,9 @@
 """Hands that let go: seen going away, out of view, or back again."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from neuspring.core.artifacts import Observations
-from neuspring.core.errors import InputError
-from neuspring.perception.controllers import ALWAYS, Grips, SeenBody, holding
-from tests.support.small import observations
+from neuspring.perception.controllers import ALWAYS, SeenBody, holding
 
 FRAMES = 30
 RELEASE = 0.05
@@ -20,7 +15,7 @@ def soon(monkeypatch):
     monkeypatch.setattr("neuspring.perception.controllers.RELEASE_AFTER", 5)
 
 
-def scene(away: np.ndarray):
+def scene(away):
     """A body at the origin and two hands of four points, the second far to the side and always near it; the first `away` [T], m,
     from where it holds."""
     body = np.random.default_rng(0).uniform(-0.05, 0.05, (60, 3))
@@ -35,24 +30,24 @@ def scene(away: np.ndarray):
     return points, seen, bodies, np.ones(bodies.shape[:2], bool), np.ones(FRAMES, bool)
 
 
-def grips(away: np.ndarray, train_end: int = FRAMES, pixels: list[np.ndarray] | None = None, **changes: np.ndarray) -> Grips:
+def grips(away, train_end=FRAMES, pixels=None, **changes):
     points, seen, bodies, shown, in_view = scene(away)
     seen, in_view, bodies = changes.get("seen", seen), changes.get("in_view", in_view), changes.get("bodies", bodies)
     body = SeenBody(list(bodies[:train_end]), pixels or list(points[:train_end]), bodies, changes.get("shown", shown))
     return holding(points[:, [0, 3, 4]], (points, seen), body, in_view, RELEASE)
 
 
-def held(away: np.ndarray, train_end: int = FRAMES, **changes: np.ndarray) -> np.ndarray:
+def held(away, train_end=FRAMES, **changes):
     found = grips(away, train_end, **changes)
     assert found.elsewhere is None and not found.strays
     return found.holds
 
 
-def leaving(at: int) -> np.ndarray:
+def leaving(at):
     return 0.03 * np.maximum(np.arange(FRAMES) - at, 0)
 
 
-def back_at(frame: int) -> np.ndarray:
+def back_at(frame):
     away = leaving(10)
     away[frame:] = 0.0
     return away
@@ -160,17 +155,3 @@ def test_a_hand_out_of_view_lets_go_after_some_frames():
     assert not valid[16:].any()
     # Tracks that are lost while masks still show a hand say nothing.
     assert held(np.zeros(FRAMES), seen=seen) is ALWAYS
-
-
-def test_observations_keep_when_controllers_hold_and_older_files_load(tmp_path):
-    plain = observations()
-    plain.save(tmp_path / "plain.npz")
-    assert "controller_valid" not in np.load(tmp_path / "plain.npz").files
-    assert Observations.load(tmp_path / "plain.npz").controller_valid.size == 0
-    valid = np.ones(plain.controller_points.shape[:2], bool)
-    valid[-1] = False
-    some = replace(plain, controller_valid=valid)
-    some.save(tmp_path / "some.npz")
-    np.testing.assert_array_equal(Observations.load(tmp_path / "some.npz").controller_valid, valid)
-    with pytest.raises(InputError, match=r"controller_valid: the shape must be \[T, C\] bool"):
-        replace(plain, controller_valid=np.ones((3, 99), bool))

@@ -119,16 +119,6 @@ def capture(tmp_path_factory):
     return film(tmp_path_factory.mktemp("film"), cameras=1, missing={0: (2,)})
 
 
-def test_sam2_carries_boxes_through_the_video(capture):
-    torch.manual_seed(0)
-    model, processor = video_models()
-    images = [capture.color("0", frame) for frame in range(FRAMES) if capture.has("0", frame)]
-    boxes = {0: {"obj_ids": [0, 1], "input_boxes": [[[30.0, 20.0, 90.0, 70.0], [60.0, 5.0, 100.0, 40.0]]]}}
-    logits = segment_sam2.propagate(images, boxes, Models(None, None, model, processor), "cpu")
-    assert sorted(logits) == list(range(FRAMES - 1))
-    assert all(one.shape == (2, 90, 160) for one in logits.values())
-
-
 def test_sam2_carries_marks_both_ways_and_skips_missing_frames(capture):
     torch.manual_seed(0)
     model, processor = video_models()

@@ -23,7 +23,7 @@ def capture(tmp_path_factory):
     return film(tmp_path_factory.mktemp("film"), cameras=2, missing={1: (3,)})
 
 
-def agreement(capture, labels, camera: str, frame: int, label: int) -> float:
+def agreement(capture, labels, camera, frame, label):
     return overlap(labels[frame] == label, capture.mask(camera, frame) == label)
 
 
@@ -96,7 +96,7 @@ def scene(folder):
     return writer.finish(), labels
 
 
-def wrong(capture, labels: np.ndarray) -> list[str]:
+def wrong(capture, labels):
     """Names of the findings of masks that cannot be right."""
     return [one.name for one in look_at_masks(capture, "0", labels, mask_facts(capture, "0", labels)) if one.name in WRONG]
 

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 from neuspring.config import ScenarioRow
 from neuspring.config.perception import Perception, Sampling, ShapePriorSettings
 from neuspring.core.errors import InputError
-from neuspring.core.geometry import on_table
 from neuspring.data.capture import HANDS
 from neuspring.data.results import Masks, ShapePrior
 from neuspring.perception import shape
@@ -20,13 +19,13 @@ BODY = smooth_union([sphere((0, 0, 0.06), 0.05), capsule((0, 0, 0.06), (0.1, 0, 
 EYES = ((0.45, -0.35, 0.4), (-0.2, 0.55, 0.4), (-0.4, -0.4, 0.45))
 
 
-def film(folder, cameras: int, with_hand: bool = False):
+def film(folder, cameras, with_hand=False):
     """BODY, and perhaps a ball before the first camera that is a hand."""
     hand = (0.12, -0.1, 0.16) if with_hand else None
     return still(folder, BODY, ((-0.08, -0.08, -0.01), (0.15, 0.08, 0.13)), EYES[:cameras], (0.03, 0, 0.06), hand=hand)
 
 
-def closed(faces: np.ndarray) -> bool:
+def closed(faces):
     directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     return {tuple(e) for e in directed.tolist()} == {tuple(e[::-1]) for e in directed.tolist()}
 
@@ -111,12 +110,7 @@ def test_without_a_prior_only_what_was_seen_remains():
     assert not len(inner)
 
 
-@pytest.mark.parametrize(("up", "expected"), [(1.0, 0.0), (-1.0, -0.01)])
-def test_points_below_the_table_are_lifted_to_it(up, expected):
-    assert on_table(np.array([[0.0, 0.0, -0.01]]), up)[0, 2] == expected
-
-
-def line_and_ball() -> tuple[np.ndarray, np.ndarray]:
+def line_and_ball():
     """A rope of 0.6 m and a ball of 8 cm, 3000 points each."""
     rng = np.random.default_rng(3)
     rope = rng.uniform([0, 0, 0.1], [0.6, 0.01, 0.11], (3000, 3))

@@ -8,7 +8,6 @@ import pytest
 
 from neuspring.config.perception import ShapePriorSettings
 from neuspring.data.capture import OBJECT
-from neuspring.data.results import ShapePrior
 from neuspring.perception.figures import lifted_figure
 from neuspring.perception.shape import front, round_chord, shape_prior, visual_hull
 from neuspring.scenes.shapes import capsule, sphere
@@ -20,7 +19,7 @@ SETTINGS = ShapePriorSettings()
 
 
 @pytest.fixture(autouse=True)
-def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+def coarse(monkeypatch):
     """Voxels of 4 mm, which are faster."""
     monkeypatch.setattr("neuspring.perception.shape.HULL_VOXEL", 0.004)
 
@@ -34,7 +33,7 @@ def ball(folder, eyes=(EYE,)):
     return film(folder, sphere((0, 0, 0.2), RADIUS), ((-0.07, -0.07, 0.13), (0.07, 0.07, 0.27)), eyes)
 
 
-def volume(prior: ShapePrior) -> float:
+def volume(prior):
     corners = prior.vertices[prior.faces].astype(float)
     return float((np.cross(corners[:, 0], corners[:, 1]) * corners[:, 2]).sum() / 6.0)
 

@@ -7,7 +7,7 @@ from neuspring.core.errors import InputError
 from neuspring.splats.model import Gaussians, Splats
 
 
-def some(count: int = 7, axes: int = 1, coefficients: int = 4) -> Splats:
+def some(count=7, axes=1, coefficients=4):
     rng = np.random.default_rng(0)
     shapes = {
         "means": (count, 3),

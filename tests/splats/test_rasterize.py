@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 import torch
 
-from neuspring.config.images import Appearance
 from neuspring.core.errors import InputError
 from neuspring.splats.blend import blend, tiles
 from neuspring.splats.rasterize import _gsplat_fault, choose_backend, rasterize
-from neuspring.splats.train import Statistics, densify
+from neuspring.splats.train import Statistics
 from neuspring.splats.view import DEFAULT_LIMITS, Limits, View, boxes, harmonic_colors, project, radii
 from tests.support.devices import DEVICES
 from tests.support.golden_splats import CASES, Golden, random_splats, small_view
@@ -30,7 +29,7 @@ PRECISIONS = {"float32": torch.float32, "float64": torch.float64}
 ISOTROPIC = ("r01_single_iso", "r07_sh0_iso", "r10_sh_partial")
 
 
-def tolerances(case: str, dtype: torch.dtype) -> dict[str, float]:
+def tolerances(case, dtype):
     return DOUBLE if dtype == torch.float64 else SINGLE_CLOSE if case == CLOSE else SINGLE
 
 
@@ -84,15 +83,6 @@ def test_nothing_in_view_is_an_empty_picture_with_zero_gradients():
     assert torch.allclose(picture.rgb, torch.tensor([0.1, 0.2, 0.3]).expand_as(picture.rgb))
     picture.rgb.sum().backward()
     assert not splats[0].grad.any()
-
-
-def test_a_camera_among_the_splats_gives_a_finite_picture_and_finite_gradients():
-    splats = random_splats(1, 300, torch.float32)
-    picture = rasterize(*[splats[0] - torch.tensor([0.0, 0.0, 1.0]), *splats[1:]], small_view())
-    (picture.rgb.sum() + picture.depth.sum()).backward()
-    assert torch.isfinite(picture.rgb).all()
-    assert all(torch.isfinite(tensor.grad).all() for tensor in splats)
-    assert picture.alpha.max() > 0.5
 
 
 def test_splats_that_are_not_finite_or_of_a_wrong_shape_are_named():
@@ -160,28 +150,12 @@ def test_pictures_and_gradients_are_handed_on(stand_in, degree):
     gradients = [torch.autograd.grad(one.rgb.sum() + one.alpha.sum(), splats, retain_graph=True) for one in (ours, theirs)]
     for mine, other in zip(*gradients, strict=True):
         assert torch.allclose(mine, other, atol=1e-3 * float(mine.abs().max()) + 1e-6)
-
-
-def test_density_adapts_alike(stand_in, monkeypatch):
-    changes = []
-    for backend in ("warp", "gsplat"):
-        splats = [tensor.detach().requires_grad_() for tensor in random_splats(4, 50, torch.float32)]
-        picture = rasterize(*splats, small_view(), backend=backend)
-        picture.rgb.sum().backward()
-        statistics = Statistics.empty(splats[0])
+    # Density adapts by the same statistics.
+    own, found = (Statistics.empty(splats[0]) for _ in "ab")
+    for picture, statistics in ((ours, own), (theirs, found)):
+        picture.rgb.sum().backward(retain_graph=True)
         statistics.add(picture, 37, 29)
-        named = {
-            "means": splats[0].detach(),
-            "quaternions": splats[1].detach(),
-            "log_scales": splats[2].detach().log(),
-            "opacity_logits": torch.logit(splats[3].detach(), 1e-6),
-        }
-        threshold = float((statistics.pull / statistics.seen.clamp_min(1)).median())
-        monkeypatch.setattr("neuspring.splats.train.DENSIFY_GRADIENT", threshold)
-        stay, added = densify(named, statistics, Appearance(), 1.0, False, torch.Generator().manual_seed(0))
-        changes.append((stay, len(added["means"])))
-    assert changes[0][1] == changes[1][1] > 5
-    assert torch.equal(changes[0][0], changes[1][0])
+    assert own.pull.max() > 0 and torch.allclose(own.pull, found.pull, rtol=1e-3, atol=1e-5) and torch.equal(own.seen, found.seen)
 
 
 def test_thresholds_that_gsplat_would_not_keep_are_refused(stand_in):

@@ -26,18 +26,18 @@ FAST = SplatRates(iterations=300, degree=0)
 def dense(monkeypatch):
     """Sets when and where density adapts: `dense(FROM=5)` sets train.DENSIFY_FROM."""
 
-    def change(**values: float) -> None:
+    def change(**values):
         for name, value in values.items():
             monkeypatch.setattr(f"neuspring.splats.train.{name}", value)
 
     return change
 
 
-def view_from(eye, size=SIZE) -> View:
+def view_from(eye, size=SIZE):
     return View.of(looking(np.array(eye), np.array([0.0, 0.0, 0.06])), intrinsics(size), *size)
 
 
-def known_splats(count: int = 200) -> Splats:
+def known_splats(count=200):
     rng = np.random.default_rng(0)
     towards = rng.normal(size=(count, 3))
     means = 0.06 * towards / np.linalg.norm(towards, axis=1, keepdims=True) * [1.3, 1, 0.8] + [0, 0, 0.06]
@@ -51,7 +51,7 @@ def known_splats(count: int = 200) -> Splats:
     )
 
 
-def shot_of(splats: Splats, view: View, name: str = "0", hands: np.ndarray | None = None) -> Shot:
+def shot_of(splats, view, name="0", hands=None):
     """What a camera sees of splats; the mask is where they cover half."""
     with torch.no_grad():
         rendered = Gaussians.of(splats).draw(view)
@@ -61,11 +61,11 @@ def shot_of(splats: Splats, view: View, name: str = "0", hands: np.ndarray | Non
     return Shot.of(name, view, color, mask & ~covered, covered, rendered.depth.numpy(), 0.0)
 
 
-def shots_of(splats: Splats) -> list[Shot]:
+def shots_of(splats):
     return [shot_of(splats, view_from(eye), str(k)) for k, eye in enumerate(EYES)]
 
 
-def quality(splats: Splats, shot: Shot) -> float:
+def quality(splats, shot):
     with torch.no_grad():
         rendered = Gaussians.of(splats).draw(shot.view)
     return float(psnr((rendered.rgb * shot.mask[..., None]).permute(2, 0, 1), shot.color.permute(2, 0, 1)))
@@ -110,7 +110,7 @@ def test_the_number_of_splats_grows_where_they_are_too_coarse(dense):
     assert grown.history["splats"][-1] == len(grown.splats.means)
 
 
-def named(splats: Splats) -> dict[str, torch.Tensor]:
+def named(splats):
     return dict(vars(Gaussians.of(splats)))
 
 

@@ -1,7 +1,5 @@
 """Search and fit on several recordings, through their stages: what their records name, and that fits share nothing wrong."""
 
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -20,7 +18,7 @@ SETTINGS = config.Config(
 
 
 @pytest.fixture(scope="module")
-def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def seen(tmp_path_factory):
     """Observations of one rope, moved in two ways."""
     folder = tmp_path_factory.mktemp("pool")
     paths = {name: folder / f"{name}.npz" for name in ("lift", "shake")}
@@ -29,7 +27,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return paths
 
 
-def run(seen: dict[str, Path], folder: Path, **pool) -> tuple[StageRecord, StageRecord]:
+def run(seen, folder, **pool):
     """Search and fit of the lifted rope."""
     found, fitted = folder / "search.json", folder / "fit" / "fit.json"
     search(observations=seen["lift"], settings=SETTINGS, clusters=1, seed=0, device="cpu", output=found, **pool)

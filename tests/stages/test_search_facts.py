@@ -1,7 +1,5 @@
 """What the record of a search says beside its values."""
 
-from __future__ import annotations
-
 import pandas as pd
 
 from neuspring.twin.candidates import CMAES
@@ -10,7 +8,7 @@ from neuspring.twin.search import at_ends
 VARIABLES = ("stiffness", "dashpot", "drag", "contact_friction")
 
 
-def trace(*rows: tuple[str, float, float, float, float, float]) -> pd.DataFrame:
+def trace(*rows):
     """Rows of stage, cost, and the normalized variables."""
     return pd.DataFrame(rows, columns=["stage", "cost", *(f"normalized.{name}" for name in VARIABLES)])
 

@@ -1,11 +1,7 @@
 """Recordings of ROS, written message by message: ROS 1, ROS 2 in both storages, and what librealsense writes."""
 
-from __future__ import annotations
-
 import struct
-from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -24,20 +20,20 @@ COLOR, DEPTH = "/camera/color/image_raw", "/camera/aligned_depth_to_color/image_
 class Recording:
     """An open recording; topics come into being with their first message."""
 
-    def __init__(self, writer: Any, old: bool) -> None:
+    def __init__(self, writer, old):
         self.writer, self.old, self.topics = writer, old, dict[str, Any]()
         self.store = get_typestore(Stores.ROS1_NOETIC if old else Stores.ROS2_HUMBLE)
 
-    def made(self, kind: str, **fields: Any) -> Any:
+    def made(self, kind, **fields):
         """A message of a type like sensor_msgs/Image."""
         return self.store.types[kind.replace("/", "/msg/")](**fields)
 
-    def header(self, stamp: int) -> Any:
+    def header(self, stamp):
         """A header with a stamp, ns."""
         time = self.made("builtin_interfaces/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
         return self.made("std_msgs/Header", stamp=time, frame_id="1", **({"seq": 0} if self.old else {}))
 
-    def put(self, topic: str, kind: str, log: int, more: bytes = b"", **fields: Any) -> None:
+    def put(self, topic, kind, log, more=b"", **fields):
         """Write a message at a time of the log, ns, with bytes that its definition does not have."""
         name = kind.replace("/", "/msg/")
         if topic not in self.topics:
@@ -46,11 +42,11 @@ class Recording:
         raw = self.store.serialize_ros1(message, name) if self.old else self.store.serialize_cdr(message, name)
         self.writer.write(self.topics[topic], log, self.packed(bytes(raw) + more))
 
-    def packed(self, raw: bytes) -> bytes:
+    def packed(self, raw):
         """A message as it is stored."""
         return raw
 
-    def image(self, topic: str, stamp: int, data: np.ndarray, encoding: str, log: int | None = None, **options: Any) -> None:
+    def image(self, topic, stamp, data, encoding, log=None, **options):
         """An image as stored [H, W, ...]; `pad`: bytes at the end of each row; `big`: of big endian."""
         big = options.get("big", False)
         rows = np.ascontiguousarray(data.astype(data.dtype.newbyteorder(">")) if big else data).view(np.uint8)
@@ -59,12 +55,12 @@ class Recording:
         fields = about | {"header": self.header(stamp), "encoding": encoding, "data": rows.ravel()}
         self.put(topic, "sensor_msgs/Image", stamp if log is None else log, options.get("more", b""), **fields)
 
-    def compressed(self, topic: str, stamp: int, data: bytes, form: str) -> None:
+    def compressed(self, topic, stamp, data, form):
         """A compressed image."""
         packed = np.frombuffer(data, np.uint8)
         self.put(topic, "sensor_msgs/CompressedImage", stamp, header=self.header(stamp), format=form, data=packed)
 
-    def info(self, topic: str, matrix: np.ndarray = K, size: tuple[int, int] = SIZE, **changes: Any) -> None:
+    def info(self, topic, matrix=K, size=SIZE, **changes):
         """A camera_info."""
         roi = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False} | changes.pop("roi", {})
         said = {"d": np.zeros(5), "k": matrix.ravel(), "r": np.eye(3).ravel(), "p": np.zeros(12)} | changes
@@ -75,7 +71,7 @@ class Recording:
 
 
 @contextmanager
-def recorded(path: Path, form: str = "mcap") -> Iterator[Recording]:
+def recorded(path, form="mcap"):
     """A recording at a path, .bag for ROS 1."""
     if form == "ros1":
         writer = rosbag1.Writer(path)
@@ -87,7 +83,7 @@ def recorded(path: Path, form: str = "mcap") -> Iterator[Recording]:
         yield Recording(writer, False)
 
 
-def desk(bag: Recording, view: int = 0, prefix: str = "", late: int = 2_000_000) -> None:
+def desk(bag, view=0, prefix="", late=2_000_000):
     """A film of the desk by one of its cameras: depth is stamped a little later."""
     bag.info(f"{prefix}/camera/color/camera_info")
     for frame in range(FRAMES):
@@ -96,6 +92,6 @@ def desk(bag: Recording, view: int = 0, prefix: str = "", late: int = 2_000_000)
         bag.image(prefix + DEPTH, START + frame * STEP + late, counts(depth), "16UC1")
 
 
-def packed_depth(depth: np.ndarray, scale: float = 0.0, shift: float = 0.0) -> bytes:
+def packed_depth(depth, scale=0.0, shift=0.0):
     """Counts [H, W] as compressedDepth has them."""
     return struct.pack("<iff", 0, scale, shift) + cv2.imencode(".png", depth)[1].tobytes()

@@ -1,17 +1,14 @@
 """What every kind of body must answer, whoever brings it."""
 
-from __future__ import annotations
-
 from dataclasses import fields
-from typing import Any
 
 import numpy as np
 
-from neuspring.core.artifacts import Artifact, Observations, Twin
+from neuspring.core.artifacts import Artifact
 from neuspring.twin.body import BODIES, body_of, lines_of
 
 
-def require_answers(name: str, twin: Twin, seen: Observations) -> None:
+def require_answers(name, twin, seen):
     """Assert that the body of this name answers for its twin, which was made on these observations."""
     body = body_of(twin)
     assert body is BODIES[name] and body.name == name
@@ -24,7 +21,7 @@ def require_answers(name: str, twin: Twin, seen: Observations) -> None:
     np.testing.assert_array_equal(body.on_recording(twin, seen).topology.nodes, nodes)
 
 
-def differing(before: Any, after: Any, prefix: str = "") -> set[str]:
+def differing(before, after, prefix=""):
     """Fields whose values differ, by name."""
     found = set()
     for spec in fields(before):

@@ -11,8 +11,7 @@ import shutil
 import subprocess
 import tempfile
 import time
-from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 PATIENCE = 60.0
@@ -34,7 +33,7 @@ CHECK = """
 """
 
 
-def chromium() -> str | None:
+def chromium():
     """The browser, if there is one."""
     return next((found for name in NAMES if (found := shutil.which(name))), None)
 
@@ -42,10 +41,10 @@ def chromium() -> str | None:
 class Browser:
     """`with Browser() as browser:`; pages are opened without network, or with `served=True` from this machine alone."""
 
-    def __init__(self, *, served: bool = False, webgl: bool = False, patience: float = PATIENCE) -> None:
+    def __init__(self, *, served=False, webgl=False, patience=PATIENCE):
         self._served, self._webgl, self._patience = served, webgl, patience
 
-    def __enter__(self) -> Self:
+    def __enter__(self):
         program = chromium()
         assert program is not None
         self._folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
@@ -74,7 +73,7 @@ class Browser:
         self.online(self._served)
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         self._process.terminate()
         try:
             self._process.wait(10)
@@ -84,10 +83,10 @@ class Browser:
         os.close(self._read)
         self._folder.cleanup()
 
-    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+    def call(self, method, **parameters):
         """Send a command of the DevTools protocol; returns its result."""
         number = next(self._numbers)
-        message: dict[str, Any] = {"id": number, "method": method, "params": parameters}
+        message = {"id": number, "method": method, "params": parameters}
         if getattr(self, "_session", None) and not method.startswith("Target."):
             message["sessionId"] = self._session
         os.write(self._write, json.dumps(message).encode() + b"\0")
@@ -95,10 +94,10 @@ class Browser:
             answer = self._message()
             if answer.get("id") == number:
                 assert "error" not in answer, answer
-                result: dict[str, Any] = answer["result"]
+                result = answer["result"]
                 return result
 
-    def _message(self) -> dict[str, Any]:
+    def _message(self):
         while b"\0" not in self._buffer:
             ready, _, _ = select.select([self._read], [], [], self._patience)
             assert ready, "the browser does not answer"
@@ -106,37 +105,31 @@ class Browser:
             assert part, "the browser has ended"
             self._buffer += part
         text, _, self._buffer = self._buffer.partition(b"\0")
-        message: dict[str, Any] = json.loads(text)
+        message = json.loads(text)
         if "method" in message:
             self.events.append(message)
         return message
 
-    def online(self, yes: bool) -> None:
+    def online(self, yes):
         """Give pages the network, or take it."""
         limits = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
         self.call("Network.emulateNetworkConditions", offline=not yes, **limits)
 
-    def open(self, page: Path | str, width: int, height: int = 900, *, dark: bool = False, print_view: bool = False) -> None:
+    def open(self, page, width, height=900):
         """Show a file or an address in a window of a size in CSS pixels; below 600 as a phone does."""
         self.events.clear()
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600)
-        scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
-        self.call("Emulation.setEmulatedMedia", features=scheme, media="print" if print_view else "")
         self.call("Page.navigate", url=page if isinstance(page, str) else page.resolve().as_uri())
         while not any(event["method"] == "Page.loadEventFired" for event in self.events):
             self._message()
 
-    def close(self) -> None:
-        """Close the tab as a person does."""
-        self.call("Target.closeTarget", targetId=self._target)
-
-    def run(self, script: str) -> Any:
+    def run(self, script):
         """The value of an expression in the page."""
         answer = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
-    def wait(self, script: str, seconds: float = PATIENCE) -> Any:
+    def wait(self, script, seconds=PATIENCE):
         """The value of an expression in the page, once it is true."""
         end = time.monotonic() + seconds
         while not (value := self.run(script)):
@@ -144,49 +137,48 @@ class Browser:
             time.sleep(0.05)
         return value
 
-    def drag(self, *places: tuple[float, float], modifiers: int = 0) -> None:
+    def drag(self, *places):
         """Press the mouse at the first place of the window, CSS pixels, move it over the others, release it at the last one."""
         for kind, (x, y) in [("mouseMoved", places[0]), ("mousePressed", places[0])]:
-            self._mouse(kind, x, y, modifiers)
+            self._mouse(kind, x, y)
         for x, y in places[1:]:
-            self._mouse("mouseMoved", x, y, modifiers, buttons=1)
-        self._mouse("mouseReleased", *places[-1], modifiers)
+            self._mouse("mouseMoved", x, y, 1)
+        self._mouse("mouseReleased", *places[-1])
 
-    def click(self, selector: str) -> None:
+    def click(self, selector):
         """Click the middle of an element."""
         box = self.run(f"JSON.parse(JSON.stringify(document.querySelector({json.dumps(selector)}).getBoundingClientRect()))")
         self.drag((box["x"] + box["width"] / 2, box["y"] + box["height"] / 2))
 
-    def _mouse(self, kind: str, x: float, y: float, modifiers: int, buttons: int = 0) -> None:
+    def _mouse(self, kind, x, y, buttons=0):
         pressed = {
             "button": "none" if kind == "mouseMoved" else "left",
             "clickCount": int(kind != "mouseMoved"),
             "buttons": buttons,
         }
-        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, modifiers=modifiers, **pressed)
+        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **pressed)
 
-    def key(self, key: str, modifiers: int = 0) -> None:
+    def key(self, key, modifiers=0):
         """Press and release a key, as `KeyboardEvent.key` names it; modifiers: 2 control, 8 shift."""
         text = {"text": key} if len(key) == 1 and not modifiers & 2 else {}
         for kind in ("keyDown", "keyUp"):
             self.call("Input.dispatchKeyEvent", type=kind, key=key, modifiers=modifiers, **(text if kind == "keyDown" else {}))
 
-    def check(self) -> dict[str, Any]:
+    def check(self):
         """What is wrong with the page: `CHECK`, once all pictures are decoded, with what it logged as `errors`."""
         self.run("document.querySelectorAll('details').forEach((fold) => (fold.open = true))")
         self.run("document.querySelectorAll('img').forEach((one) => (one.loading = 'eager'))")
         self.run("Promise.allSettled([...document.images].map((one) => one.decode()))")
-        found: dict[str, Any] = self.run(CHECK)
+        found = self.run(CHECK)
         logged = [event["params"]["entry"]["text"] for event in self.events if event["method"] == "Log.entryAdded"]
         raised = [str(event["params"]) for event in self.events if event["method"] == "Runtime.exceptionThrown"]
         asked = [event["params"]["request"]["url"] for event in self.events if event["method"] == "Network.requestWillBeSent"]
         return found | {"errors": logged + raised, "asked": [url for url in asked if not url.startswith(("data:", "file:"))]}
 
-    def screenshot(self, path: Path, top: int | None = None, height: int = 900) -> None:
-        """The window as PNG, or from `top` on, CSS pixels, beyond the window."""
-        size = self.run("[document.documentElement.clientWidth, document.documentElement.scrollHeight]")
-        clip = {"x": 0, "y": top or 0, "width": size[0], "height": min(height, size[1]), "scale": 1}
+    def screenshot(self, path):
+        """The window as PNG."""
+        width, height = self.run("[document.documentElement.clientWidth, document.documentElement.scrollHeight]")
+        clip = {"x": 0, "y": 0, "width": width, "height": min(900, height), "scale": 1}
         # A scene that is drawn by software is not drawn again for a picture of the window alone.
-        options: dict[str, Any] = {"format": "png", "captureBeyondViewport": top is not None or not self._webgl}
-        answer = self.call("Page.captureScreenshot", **options, clip=clip)
+        answer = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=not self._webgl, clip=clip)
         path.write_bytes(base64.b64decode(answer["data"]))

@@ -1,17 +1,10 @@
 """C3D files."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from pathlib import Path
-
 import ezc3d
 import numpy as np
 
 
-def write_c3d(
-    path: Path, points: np.ndarray, labels: Sequence[str], unit: str = "mm", rate: float = 30.0, lost: np.ndarray | None = None
-) -> Path:
+def write_c3d(path, points, labels, unit="mm", rate=30.0, lost=None):
     """Markers [T, K, 3] in a unit, empty: none said; `lost` [T, K] bool: whose residual is -1."""
     content = ezc3d.c3d()
     about = content["parameters"]["POINT"]

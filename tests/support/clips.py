@@ -1,7 +1,5 @@
 """The released simulator's recorded clips (tests/golden/sim_*.npz) as twins with targets."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -45,11 +43,11 @@ class Clip(SimpleNamespace):
     """
 
     @property
-    def frames(self) -> range:
+    def frames(self):
         """Simulated frames; frame 0 is the rest state."""
         return range(1, len(self.controllers))
 
-    def frame_loss(self, device: str, dtype: torch.dtype) -> FrameLoss:
+    def frame_loss(self, device, dtype):
         """The clip's targets as a FrameLoss."""
         points = torch.tensor(self.points, dtype=dtype, device=device)
         seen = (torch.tensor(values.astype(bool), device=device) for values in (self.visible, self.motion_valid))
@@ -57,7 +55,7 @@ class Clip(SimpleNamespace):
 
 
 @cache
-def clip(name: str) -> Clip:
+def clip(name):
     """The clip of sim_{name}.npz."""
     with np.load(FOLDER / f"sim_{name}.npz", allow_pickle=False) as stored:
         d = {key: stored[key] for key in stored.files}

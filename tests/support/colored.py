@@ -1,25 +1,22 @@
 """Toy scenes as one camera without depth sees them, and painted captures of color alone."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 
-from neuspring.core.artifacts import ImageObservations, Observations
+from neuspring.core.artifacts import ImageObservations
 from neuspring.data.camera import Camera
-from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
+from neuspring.data.capture import HANDS, OBJECT, Writer
 from tests.support import small
 from tests.support.captures import describe
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 180.0
-UP, DOWN = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])
+UP = np.array([0.0, 0.0, 1.0])
 
 
-def camera(target: np.ndarray, distance: float = 0.8, elevation: float = 40.0) -> Camera:
+def camera(target, distance=0.8, elevation=40.0):
     """A camera that looks at a point from `distance`, m, `elevation` degrees above the table, along y."""
     angle = np.deg2rad(elevation)
     forward = np.array([0.0, np.cos(angle), -np.sin(angle)])
@@ -31,7 +28,7 @@ def camera(target: np.ndarray, distance: float = 0.8, elevation: float = 40.0) -
     return Camera("0", WIDTH, HEIGHT, intrinsics, pose)
 
 
-def silhouettes(labels: np.ndarray) -> dict[str, np.ndarray]:
+def silhouettes(labels):
     """60 pixels inside the object per frame, and the distance of cells of 4 x 4 pixels from object and hands."""
     rng = np.random.default_rng(0)
     inside, outside = [], []
@@ -44,7 +41,7 @@ def silhouettes(labels: np.ndarray) -> dict[str, np.ndarray]:
 
 
 @functools.cache
-def observed(path: str = "rope/lift/smooth") -> Observations:
+def observed(path="rope/lift/smooth"):
     """A toy scene without depth: exact tracks and hands, silhouettes of discs around the nodes."""
     scene = small.scene(path)
     seen, truth = scene.observations, scene.motion
@@ -80,7 +77,7 @@ def observed(path: str = "rope/lift/smooth") -> Observations:
     return replace(seen, object_points=points, object_visibility=known, object_motion_valid=np.zeros_like(known), image=image)
 
 
-def paint(folder: Path, category: str = "cloth", frames: int = 8, spoiled: bool = False) -> Capture:
+def paint(folder, category="cloth", frames=8, spoiled=False):
     """A capture of color alone: a speckled square on the table, and a speckled hand at its far edge that rises.
 
     `spoiled`: all that is not hand is another color in future frames, and the object's masks are empty there.

@@ -1,9 +1,6 @@
 """A small desk by arithmetic alone, for tests of intake: a table, a ball on it, seen by cameras; written as a camera's files."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import av
 import cv2
@@ -19,7 +16,7 @@ RADIUS = 0.05
 FRAMES = 7
 
 
-def looking(eye: np.ndarray, target: np.ndarray, upright: tuple[float, float, float] = (0, 0, 1)) -> np.ndarray:
+def looking(eye, target, upright=(0, 0, 1)):
     """Camera to world [4, 4] with z towards the target and y as far down as can be."""
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross(z, upright)
@@ -29,12 +26,12 @@ def looking(eye: np.ndarray, target: np.ndarray, upright: tuple[float, float, fl
     return pose
 
 
-def camera(index: int = 0, name: str = "") -> Camera:
+def camera(index=0, name=""):
     """One of the cameras around the desk."""
     return Camera(name or str(index), *SIZE, K, looking(np.array(EYES[index]), TARGET))
 
 
-def seen(view: Camera, frame: int = 0, noise: float = 0.0005) -> tuple[np.ndarray, np.ndarray]:
+def seen(view, frame=0, noise=0.0005):
     """RGB [H, W, 3] and depth [H, W], m: the table z = 0 with squares, and a red ball that moves along x by 5 mm per frame."""
     y, x = np.mgrid[: view.height, : view.width]
     ones = np.ones(x.shape)
@@ -56,12 +53,12 @@ def seen(view: Camera, frame: int = 0, noise: float = 0.0005) -> tuple[np.ndarra
     return color, np.where(depth > 0, depth + rough, 0.0)
 
 
-def counts(depth: np.ndarray, unit: float = 0.001) -> np.ndarray:
+def counts(depth, unit=0.001):
     """Depth, m, as 16-bit counts."""
     return np.round(depth / unit).astype(np.uint16)
 
 
-def write_folders(root: Path, cameras: int = 1, frames: int = FRAMES, first: int = 0, unit: float = 0.001) -> Path:
+def write_folders(root, cameras=1, frames=FRAMES, first=0, unit=0.001):
     """`color_K/frame_N.png` and `depth_K/frame_N.png` of each camera, numbers without leading zeros, and rig.json."""
     for index in range(cameras):
         for frame in range(frames):
@@ -78,20 +75,20 @@ LENS = {"width": SIZE[0], "height": SIZE[1], "fx": 70.0, "fy": 70.0, "cx": 39.5,
 POSED = {"poses": "camera_to_world", "axes": "opencv", "up": "+z"}
 
 
-def write_rig(path: Path, count: int = 1, motion: np.ndarray | None = None, **changes: object) -> Path:
+def write_rig(path, count=1, motion=None, **changes):
     """What a user states about the cameras, in a world that `motion` [4, 4] moved; keys that are changed to None are left out."""
     poses = [(np.eye(4) if motion is None else motion) @ camera(index).camera_to_world for index in range(count)]
     rig = {"frame_rate": 30, "depth_unit": 0.001, **POSED, "cameras": [LENS | {"pose": pose.tolist()} for pose in poses]} | changes
     return write_json(path, {key: value for key, value in rig.items() if value is not None})
 
 
-def write_json(path: Path, value: object) -> Path:
+def write_json(path, value):
     """A JSON file."""
     path.write_text(json.dumps(value))
     return path
 
 
-def write_video(path: Path, images: list[np.ndarray], codec: str, stored: str, rate: int = 15) -> Path:
+def write_video(path, images, codec, stored, rate=15):
     """A video of RGB or 16-bit gray images by a codec and pixel format of FFmpeg."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=rate)

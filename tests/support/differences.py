@@ -1,15 +1,9 @@
 """Central differences, against which adjoints are tested in float64."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import torch
 
 from neuspring.physics import reference
-from neuspring.physics.reference import ReferenceTwin
 from tests.support.scenes import tensors, with_values
 
 # Central differences with step h of a smooth function: truncation h^2 f''' / 6 plus rounding 1e-16 f / h. With h = 1e-6 of
@@ -20,7 +14,7 @@ EXACT = 1e-12
 Arrays = dict[str, np.ndarray]
 
 
-def differences(function: Callable[[Arrays], float], at: Arrays, **steps: float) -> Arrays:
+def differences(function, at, **steps):
     """Central differences of a scalar function of named arrays, entry by entry; `steps` by name, else STEP."""
     result = {}
     for name, values in at.items():
@@ -34,9 +28,7 @@ def differences(function: Callable[[Arrays], float], at: Arrays, **steps: float)
     return result
 
 
-def compared(
-    name: str, body: ReferenceTwin, state: Arrays, hands: np.ndarray, simulated: Callable, valid: Any = None, **steps: float
-) -> tuple[Arrays, Arrays]:
+def compared(name, body, state, hands, simulated, valid=None, **steps):
     """Gradients of a weighted sum of the last positions by one parameter or by x or v of `state`: the solver's, and differences.
 
     `simulated` gives the last positions for the parameters by name, x and v; differences are those of the reference.
@@ -46,7 +38,7 @@ def compared(
     every[name] = every[name].clone().requires_grad_()
     (simulated({key: every[key] for key in values}, every["x"], every["v"]) * torch.tensor(weights)).sum().backward()
 
-    def loss(changed: Arrays) -> float:
+    def loss(changed):
         other = with_values(body, {name: changed[name]}) if name in values else body
         start = (state | changed)["x"], (state | changed)["v"]
         return float((reference.rollout(other, *start, hands, valid)[0][-1] * weights).sum())
@@ -54,7 +46,7 @@ def compared(
     return {name: every[name].grad.numpy()}, differences(loss, {name: every[name].detach().numpy()}, **steps)
 
 
-def assert_gradients(got: Arrays, wanted: Arrays, tolerance: float) -> None:
+def assert_gradients(got, wanted, tolerance):
     """Each gradient agrees to `tolerance` of its largest entry."""
     assert got.keys() >= wanted.keys()
     for name, expected in wanted.items():

@@ -1,14 +1,10 @@
 """A small film with known motion for tests: a body and a hand's ball above it move together, seen by cameras around them."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -33,7 +29,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """From a world with z up to one with z down, as PhysTwin's."""
 
 
-def intrinsics(size: tuple[int, int]) -> np.ndarray:
+def intrinsics(size):
     focal = 0.85 * size[0]
     return np.array([[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1.0]])
 
@@ -41,7 +37,7 @@ def intrinsics(size: tuple[int, int]) -> np.ndarray:
 KEPT = tempfile.TemporaryDirectory(prefix="neuspring-films-")
 
 
-def film(folder: Path, **options: Any) -> Capture:
+def film(folder, **options):
     """The capture that `rendered` makes. Each film is rendered once per process; later calls copy its folder."""
     kept = Path(KEPT.name) / hashlib.sha256(repr(sorted(options.items())).encode()).hexdigest()[:16]
     if not kept.exists():
@@ -51,14 +47,14 @@ def film(folder: Path, **options: Any) -> Capture:
 
 
 def rendered(
-    folder: Path,
-    cameras: int = 3,
-    sizes: Sequence[tuple[int, int]] = (SIZE, SIZE, SIZE),
-    missing: Mapping[int, tuple[int, ...]] | None = None,
-    up: str = "+z",
-    stand: float = 0.0,
-    **changes: object,
-) -> Capture:
+    folder,
+    cameras=3,
+    sizes=(SIZE, SIZE, SIZE),
+    missing=None,
+    up="+z",
+    stand=0.0,
+    **changes,
+):
     """A capture with masks; `missing` frames by camera. Annotated tracks: twenty vertices of the body.
 
     The body begins on a box that is `stand` m high, turned by TURNED degrees.
@@ -105,7 +101,7 @@ def rendered(
     return writer.finish((annotated + np.arange(FRAMES)[:, None, None] * STEP) @ turn[:3, :3].T)
 
 
-def write_raw(capture: Capture, case: Path) -> Path:
+def write_raw(capture, case):
     """The capture in PhysTwin's raw layout: one mask per detection, depth as npy in millimeters, poses as a pickle."""
     case.mkdir(parents=True)
     first = next(iter(capture.cameras.values()))
@@ -134,5 +130,5 @@ def write_raw(capture: Capture, case: Path) -> Path:
     return case
 
 
-def rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
+def rows(matrix):
     return tuple(tuple(map(float, row)) for row in matrix)

@@ -13,7 +13,7 @@ INPUTS = ("means", "quats", "scales", "opacities", "colors")
 
 
 class Golden:
-    def __init__(self, name: str, dtype: torch.dtype, device: str = "cpu") -> None:
+    def __init__(self, name, dtype, device="cpu"):
         with np.load(FOLDER / f"{name}.npz") as stored:
             self.values = {key: stored[key] for key in stored.files}
         v = self.values
@@ -36,19 +36,19 @@ class Golden:
         )
 
     @property
-    def options(self) -> dict[str, object]:
+    def options(self):
         return {"degree": self.degree, "background": self.background, "limits": self.limits}
 
-    def expected_gradient(self, which: str, name: str) -> np.ndarray:
+    def expected_gradient(self, which, name):
         return self.values[f"grad{which}_{self.color_key if name == 'colors' else name}"]
 
-    def loss(self, which: str, rgb: torch.Tensor, alpha: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
+    def loss(self, which, rgb, alpha, depth):
         weights = {key: torch.tensor(self.values[f"w_{key}"]).to(rgb) for key in ("rgb", "alpha", "depth")}
         total = (weights["rgb"] * rgb).sum() + (weights["alpha"] * alpha).sum()
         return total if which == "A" else total + (weights["depth"] * depth).sum()
 
 
-def random_splats(seed: int, count: int, dtype: torch.dtype) -> list[torch.Tensor]:
+def random_splats(seed, count, dtype):
     """Means, quaternions, scales, opacities and colors, as `rasterize` takes them, before `small_view`."""
     rng = np.random.default_rng(seed)
     arrays = [
@@ -61,6 +61,6 @@ def random_splats(seed: int, count: int, dtype: torch.dtype) -> list[torch.Tenso
     return [torch.tensor(a, dtype=dtype).requires_grad_() for a in arrays]
 
 
-def small_view(width: int = 37, height: int = 29) -> View:
+def small_view(width=37, height=29):
     intrinsics = torch.tensor([[30.0, 0, width / 2 + 1.3], [0, 28.0, height / 2 - 0.7], [0, 0, 1]], dtype=torch.float64)
     return View(torch.eye(4, dtype=torch.float64), intrinsics, width, height)

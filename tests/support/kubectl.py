@@ -12,7 +12,7 @@ from pathlib import Path
 FOLDER = Path(os.environ["KUBECTL_FOLDER"])
 
 
-def create() -> None:
+def create():
     manifest = json.load(sys.stdin)
     number = len(list(FOLDER.glob("*.json")))
     name = f"{manifest['metadata']['generateName']}{number}"
@@ -37,7 +37,7 @@ def create() -> None:
     print(f"job.batch/{name}")
 
 
-def get(name: str) -> None:
+def get(name):
     ended = FOLDER / f"{name}.exit"
     if not ended.exists():
         print(json.dumps({"status": {"active": 1}}))

@@ -23,27 +23,27 @@ class Painted:
     """[T, H, W]."""
 
     @property
-    def count(self) -> int:
+    def count(self):
         return len(self.frames)
 
-    def color(self, frame: int, /) -> np.ndarray:
+    def color(self, frame, /):
         return self.frames[frame]
 
-    def depth(self, frame: int, /) -> None:
+    def depth(self, frame, /):
         return None
 
-    def height(self, frame: int, /) -> None:
+    def height(self, frame, /):
         return None
 
 
-def table(seed: int = 0) -> np.ndarray:
+def table(seed=0):
     """A table [H, W, 3], lit from the left and a little grained."""
     columns = np.indices(SIZE)[1]
     light = (200 - 0.3 * columns)[..., None] * np.array([1.0, 0.97, 0.92])
     return light + cv2.GaussianBlur(np.random.default_rng(seed).normal(0, 6, (*SIZE, 3)), (0, 0), 1.0)
 
 
-def painted(count: int = 8, hand: bool = True, step: float = 3.0) -> Painted:
+def painted(count=8, hand=True, step=3.0):
     """A square of 24 pixels, of blue and green, goes right; a hand comes down over its corner and goes up again."""
     rows, columns = np.indices(SIZE)
     # A grain of two pixels: flow follows it.
@@ -66,7 +66,7 @@ def painted(count: int = 8, hand: bool = True, step: float = 3.0) -> Painted:
     return Painted(frames, truth)
 
 
-def rope(count: int = 6) -> Painted:
+def rope(count=6):
     """A red rope of three pixels, bent, goes down a pixel per frame."""
     frames, truth = [], np.zeros((count, *SIZE), np.uint8)
     along = np.linspace(0, 1, 60)
@@ -79,9 +79,9 @@ def rope(count: int = 6) -> Painted:
     return Painted(frames, truth)
 
 
-def mark(label: str, kind: str, points: list[tuple[float, float]], frame: int = 0, radius: float = 3.0) -> Mark:
+def mark(label, kind, points, frame=0, radius=3.0):
     """A mark."""
-    return Mark(frame=frame, label=label, kind=kind, points=tuple(points), radius=radius)  # type: ignore[arg-type]
+    return Mark(frame=frame, label=label, kind=kind, points=tuple(points), radius=radius)
 
 
 SQUARE = [
@@ -91,7 +91,7 @@ SQUARE = [
 """Marks on frame 0 of `painted`."""
 
 
-def overlap(labels: np.ndarray, truth: np.ndarray, label: int) -> float:
+def overlap(labels, truth, label):
     """Intersection over union of one label."""
     own, true = labels == label, truth == label
     return float((own & true).sum() / max((own | true).sum(), 1))

@@ -1,13 +1,9 @@
 """A capture with exactly known motion: a textured square moves before a wall, at a known depth, seen by two cameras."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import cv2
 import numpy as np
 
-from neuspring.data.capture import Capture, Writer
+from neuspring.data.capture import Writer
 from tests.support.captures import describe, entry
 
 FRAMES, SIZE = 12, (128, 96)
@@ -22,15 +18,13 @@ COVERED = (5, 6)
 """Frames in which a plain bar hides the square, for the camera "covered"."""
 
 
-def texture(size: int, seed: int) -> np.ndarray:
+def texture(size, seed):
     """Smooth noise [size, size] uint8."""
     noise = cv2.GaussianBlur(np.random.default_rng(seed).normal(size=(size, size)), (0, 0), 1.6)
-    return cv2.normalize(noise, None, 20, 235, cv2.NORM_MINMAX).astype(np.uint8)  # type: ignore[call-overload,no-any-return]
+    return cv2.normalize(noise, None, 20, 235, cv2.NORM_MINMAX).astype(np.uint8)
 
 
-def moving(
-    folder: Path, *, missing: tuple[int, ...] = (), depth: bool = True, tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
-) -> Capture:
+def moving(folder, *, missing=(), depth=True, tint=(1.0, 1.0, 1.0)):
     """The capture, cameras "0" and "covered"; "0" lacks the frames `missing`. All is gray, but for the square's tint."""
     cameras = (entry("0", *SIZE, missing=missing), entry("covered", *SIZE))
     writer = Writer(folder, describe(frame_count=FRAMES, cameras=cameras, masks=False))
@@ -53,6 +47,6 @@ def moving(
     return writer.finish()
 
 
-def truth(point: tuple[float, float]) -> np.ndarray:
+def truth(point):
     """Places [T, 2] of a point of frame 0 that lies on the square."""
     return np.array(point) + np.arange(FRAMES)[:, None] * SHIFT

@@ -1,7 +1,5 @@
 """A plugin of pytest that adds a metric of positions and one of pictures to ours: `pytest -p tests.support.one_metric_more`."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from neuspring.scores.metrics import METRICS, Metric

@@ -1,13 +1,10 @@
 """All perception steps on a small film, through their records as the workflow calls them."""
 
-from pathlib import Path
-
 import numpy as np
 
 from neuspring.config import Config, ScenarioRow
 from neuspring.config.perception import Lift, Perception, Sampling
 from neuspring.core.artifacts import Observations
-from neuspring.data.capture import Capture
 from neuspring.stages.lift import lift
 from neuspring.stages.observe import observe
 from neuspring.stages.segment import segment
@@ -23,7 +20,7 @@ SETTINGS = Config(
 )
 
 
-def perceived(capture: Capture, folder: Path, row: ScenarioRow = ROW, settings: Config = SETTINGS) -> Observations:
+def perceived(capture, folder, row=ROW, settings=SETTINGS):
     """What perception finds in a capture; its records and files are in the folder."""
     masks, tracks = [], []
     own = {"capture": capture.folder / "capture.json", "settings": settings}
@@ -38,7 +35,7 @@ def perceived(capture: Capture, folder: Path, row: ScenarioRow = ROW, settings: 
     return Observations.load(folder / "observations.npz")
 
 
-def final_data(observations: Observations) -> dict[str, np.ndarray]:
+def final_data(observations):
     """Observations as the contents of PhysTwin's `final_data.pkl`."""
     visible = observations.object_visibility
     return {

@@ -1,24 +1,20 @@
 """A small case in exactly the layout of the released data, for tests: a hanging sheet, held and moved by thirty points."""
 
-from __future__ import annotations
-
 import json
 import pickle
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 WIDTH, HEIGHT = 64, 48
 
 
-def dump(path: Path, value: Any, protocol: int = 4) -> None:
+def dump(path, value, protocol=4):
     """Write a pickle as the released code does (protocol 4). Tests may; the package never does."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(pickle.dumps(value, protocol=protocol))
 
 
-def final_data(frames: int, points: int, surface: int, interior: int, controllers: int, seed: int) -> dict[str, np.ndarray]:
+def final_data(frames, points, surface, interior, controllers, seed):
     """The arrays of final_data.pkl, obeying every rule of the released processing."""
     rng = np.random.default_rng(seed)
     rest = np.unique(rng.uniform([-0.05, -0.05, -0.1], [0.05, 0.05, -0.02], (points, 3)), axis=0)
@@ -41,7 +37,7 @@ def final_data(frames: int, points: int, surface: int, interior: int, controller
     }
 
 
-def camera() -> tuple[np.ndarray, np.ndarray]:
+def camera():
     """Camera-to-world matrix of a camera 0.5 m above the table looking down, and intrinsics with an off-center c_x."""
     pose = np.eye(4)
     pose[:3, 3] = [0.0, 0.0, -0.5]
@@ -49,17 +45,17 @@ def camera() -> tuple[np.ndarray, np.ndarray]:
 
 
 def write_case(
-    root: Path,
-    name: str = "single_lift_thing",
+    root,
+    name="single_lift_thing",
     *,
-    frames: int = 10,
-    points: int = 40,
-    surface: int = 12,
-    interior: int = 6,
-    controllers: int = 30,
-    tracks: int = 5,
-    seed: int = 0,
-) -> Path:
+    frames=10,
+    points=40,
+    surface=12,
+    interior=6,
+    controllers=30,
+    tracks=5,
+    seed=0,
+):
     """Write root/data/different_types/{name} (processed files, calibration, metadata) and return that folder."""
     folder = root / "data" / "different_types" / name
     data = final_data(frames, points, surface, interior, controllers, seed)
@@ -76,12 +72,12 @@ def write_case(
     return folder
 
 
-def write_json(path: Path, value: Any) -> None:
+def write_json(path, value):
     """Write a JSON file."""
     path.write_text(json.dumps(value), encoding="utf-8")
 
 
-def edit(folder: Path, **changes: Any) -> None:
+def edit(folder, **changes):
     """Replace keys of final_data.pkl (None removes a key)."""
     path = folder / "final_data.pkl"
     data = pickle.loads(path.read_bytes())
@@ -93,7 +89,7 @@ def edit(folder: Path, **changes: Any) -> None:
     dump(path, data)
 
 
-def stored(folder: Path) -> dict[str, np.ndarray]:
+def stored(folder):
     """The arrays of final_data.pkl."""
-    data: dict[str, np.ndarray] = pickle.loads((folder / "final_data.pkl").read_bytes())
+    data = pickle.loads((folder / "final_data.pkl").read_bytes())
     return data

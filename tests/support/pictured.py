@@ -5,11 +5,9 @@ import dataclasses
 import numpy as np
 import pandas as pd
 
-from neuspring.config import Config
 from neuspring.config.images import Images
 from neuspring.core.artifacts import Trajectory
 from neuspring.core.records import Recorder, StageRecord
-from neuspring.data.capture import Capture
 from neuspring.splats.train import SplatRates
 from neuspring.stages.appearance import appearance
 from neuspring.stages.render import render
@@ -19,31 +17,31 @@ from tests.support.perceived import SETTINGS, perceived
 IMAGES = Images(appearance=SplatRates(iterations=90, degree=0, spacing=2.0, color_rate=0.02, opacity_rate=0.05))
 
 
-def pictured(**changes: object) -> Config:
+def pictured(**changes):
     return dataclasses.replace(SETTINGS, images=dataclasses.replace(IMAGES, **changes))
 
 
 class Scene:
     """A filmed scene with its perception, and what the steps of appearance make of it."""
 
-    def __init__(self, capture: Capture, folder) -> None:
+    def __init__(self, capture, folder):
         self.capture, self.folder = capture, folder
         self.observations = perceived(capture, folder)
         self.masks = [folder / camera / "masks.json" for camera in capture.cameras]
         self.appearance = folder / "appearance" / "appearance.json"
 
     @property
-    def before(self) -> dict[str, object]:
+    def before(self):
         """Inputs of both steps; tests put other parts into the scene."""
         return {"capture": self.capture.folder / "capture.json", "masks": self.masks}
 
-    def learn(self, chosen: Config, seed: int = 0) -> StageRecord:
+    def learn(self, chosen, seed=0):
         self.appearance.parent.mkdir(exist_ok=True)
         before = self.before | {"lifted": self.folder / "lifted.json"}
         appearance(**before, settings=chosen, seed=seed, device="cpu", output=self.appearance)
         return StageRecord.load(self.appearance)
 
-    def roll(self, step: np.ndarray, name: str, frames: int = FRAMES) -> object:
+    def roll(self, step, name, frames=FRAMES):
         """The record of a rollout that moves all nodes by `step` a frame, and diverges after `frames`."""
         path = self.folder / name / "rollout.json"
         path.parent.mkdir(exist_ok=True)
@@ -54,7 +52,7 @@ class Scene:
         Recorder("rollout", path).save({"trajectory": path.with_name("trajectory.npz")}, failure=failure)
         return path
 
-    def render(self, rollout, chosen: Config) -> tuple[StageRecord, pd.DataFrame]:
+    def render(self, rollout, chosen):
         output = rollout.with_name("render.json")
         before = self.before | {"appearance": self.appearance, "rollout": rollout}
         render(**before, observations=self.folder / "observations.npz", settings=chosen, device="cpu", output=output)

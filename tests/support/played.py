@@ -1,13 +1,9 @@
 """A small scenario's results folder with runs that have real twins, as the workflow leaves it: for tests of the playground."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
-from neuspring.core.artifacts import Twin
 from neuspring.core.files import write_text
 from neuspring.core.records import Recorder
 from neuspring.splats.model import Splats
@@ -15,7 +11,7 @@ from neuspring.twin.rollout import roll_out
 from tests.support import small
 
 
-def results(folder: Path, methods: tuple[str, ...] = ("baseline", "neuspring")) -> Path:
+def results(folder, methods=("baseline", "neuspring")):
     """results/<scenario> of a toy rope whose twins differ in stiffness; returns the scenario's folder."""
     problem = small.scene()
     seen, scenario = problem.observations, folder / "small"
@@ -29,26 +25,26 @@ def results(folder: Path, methods: tuple[str, ...] = ("baseline", "neuspring")) 
     return scenario
 
 
-def record(run: Path) -> None:
+def record(run):
     """Write the records of a run's twin and trajectory as they lie there."""
     Recorder("fit", run / "fit.json").save({"twin": run / "twin.npz"})
     rollout = Recorder("rollout", run / "rollout.json", inputs={"learned": run / "fit.json"})
     rollout.save({"trajectory": run / "trajectory.npz"})
 
 
-def softer(twin: Twin, factor: float) -> Twin:
+def softer(twin, factor):
     """The twin with its stiffness times a factor."""
     return replace(twin, material=replace(twin.material, stiffness=twin.material.stiffness * np.float32(factor)))
 
 
-def spoil(path: Path, old: str, new: str) -> None:
+def spoil(path, old, new):
     """Replace text in a file that has it."""
     text = path.read_text()
     assert old in text
     write_text(path, text.replace(old, new))
 
 
-def dressed(scenario: Path, degree: int = 0, count: int = 300) -> Splats:
+def dressed(scenario, degree=0, count=300):
     """Give a scenario of `results` splats of seed 0, around the nodes of frame 0; returns them."""
     nodes = small.observations().nodes
     rng = np.random.default_rng(1)

@@ -1,18 +1,11 @@
 """The mouse over a scene that viser draws: where a point is in the window, and drags that are held."""
 
-from __future__ import annotations
-
 import time
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
-
-from tests.support.browser import Browser
 
 WINDOW = (1100, 720)
 SMALL = (800, 480)
@@ -22,7 +15,7 @@ COLORED = 40
 """Least difference of the channels of a pixel that is no shade of gray."""
 
 
-def until(what: Callable[[], Any], seconds: float = 180.0) -> Any:
+def until(what, seconds=180.0):
     """The value once it is true; a busy machine draws slowly."""
     end = time.monotonic() + seconds
     while not (value := what()):
@@ -31,11 +24,11 @@ def until(what: Callable[[], Any], seconds: float = 180.0) -> Any:
     return value
 
 
-def settled(server: Any, browser: Browser) -> Any:
+def settled(server, browser):
     """The camera of the first browser, once the server knows the view that is drawn: its size, and a place that stays."""
     camera = next(iter(server.get_clients().values())).camera
 
-    def steady() -> bool:
+    def steady():
         before = (camera.image_width, *camera.position)
         time.sleep(0.5)
         return before == (browser.run("document.querySelector('canvas').clientWidth"), *camera.position)
@@ -44,7 +37,7 @@ def settled(server: Any, browser: Browser) -> Any:
     return camera
 
 
-def pixel(camera: Any, point: np.ndarray) -> tuple[float, float]:
+def pixel(camera, point):
     """Where a point [3] is in the window, whose left part is the scene."""
     local = Rotation.from_quat(camera.wxyz, scalar_first=True).inv().apply(point - camera.position)
     wide, high = camera.image_width, camera.image_height
@@ -52,7 +45,7 @@ def pixel(camera: Any, point: np.ndarray) -> tuple[float, float]:
     return wide / 2 + focal * local[0] / local[2], high / 2 + focal * local[1] / local[2]
 
 
-def colored(browser: Browser, path: Path) -> np.ndarray:
+def colored(browser, path):
     """Which pixels of the window [H, W] have a color, in a picture that is written to a path."""
     browser.screenshot(path)
     image = cv2.imread(str(path))
@@ -60,24 +53,24 @@ def colored(browser: Browser, path: Path) -> np.ndarray:
     return np.ptp(image.astype(int), axis=2) > COLORED
 
 
-def until_drawn(browser: Browser, x: float, y: float, path: Path) -> None:
+def until_drawn(browser, x, y, path):
     """Wait until something with a color is drawn at a place of the window: a browser draws later than it is told."""
     rows, columns = (slice(round(value) - 1, round(value) + 2) for value in (y, x))
     until(lambda: colored(browser, path)[rows, columns].any())
 
 
 @contextmanager
-def pull(browser: Browser, x: float, y: float, right: float, down: float) -> Iterator[None]:
+def pull(browser, x, y, right, down):
     """Hold the left button from a place on, moved by so many pixels, while the block runs."""
     press(browser, x, y, right, down)
     yield
-    browser._mouse("mouseReleased", x + right, y + down, 0)
+    browser._mouse("mouseReleased", x + right, y + down)
 
 
-def press(browser: Browser, x: float, y: float, right: float, down: float) -> None:
+def press(browser, x, y, right, down):
     """Press the left button, and move the mouse."""
-    browser._mouse("mouseMoved", x, y, 0)
-    browser._mouse("mousePressed", x, y, 0)
+    browser._mouse("mouseMoved", x, y)
+    browser._mouse("mousePressed", x, y)
     for step in range(1, STEPS + 1):
-        browser._mouse("mouseMoved", x + right * step / STEPS, y + down * step / STEPS, 0, buttons=1)
+        browser._mouse("mouseMoved", x + right * step / STEPS, y + down * step / STEPS, 1)
         time.sleep(0.05)

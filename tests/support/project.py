@@ -26,7 +26,7 @@ PATIENCE = 600
 """s for one run of the workflow; the longest takes about 100 on two idle cores."""
 
 
-def copy_workflow(project: Path) -> Path:
+def copy_workflow(project):
     """A new project folder with the workflow's own files, so that locks and records of two tests do not meet."""
     project.mkdir()
     for name in ("Snakefile", "workflow", "config"):
@@ -35,27 +35,25 @@ def copy_workflow(project: Path) -> Path:
     return project
 
 
-def copy_project(project: Path, copy: Path) -> Path:
+def copy_project(project, copy):
     """A copy of a project to change at will. File times are kept, so that nothing in it has to run again."""
     return Path(shutil.copytree(project, copy))
 
 
-def add_scenario(project: Path, name: str, source: str) -> None:
+def add_scenario(project, name, source):
     """A row in the project's table of scenarios; its data are in the folder `name` of data_root."""
     table = project / "config" / "scenarios.tsv"
     table.write_text(table.read_text() + f"{name}\t{source}\ttoy\t{name}\tfalse\ttrue\n")
 
 
-def config_with(changes: dict) -> dict:
+def config_with(changes):
     """The tiny configuration with some of its values changed."""
     values = json.loads(json.dumps(TINY))
     config.merge(values, changes)
     return values
 
 
-def arguments(
-    project: Path, changes: dict | None = None, *extra: str, profile: str = "default", cores: int | None = 2
-) -> list[str]:
+def arguments(project, changes=None, *extra, profile="default", cores=2):
     """The command line of a run. `cores` None: a cluster's scheduler counts them."""
     overlay = project / "overlay.yaml"
     overlay.write_text(yaml.safe_dump(config_with(changes or {})))
@@ -64,18 +62,18 @@ def arguments(
     return [*command, "--configfile", "config/data/demo.yaml", str(overlay), *extra]
 
 
-def environment(**variables: str) -> dict[str, str]:
+def environment(**variables):
     """The environment of a run, in which jobs import the package from here."""
     return os.environ | {"PYTHONPATH": str(ROOT)} | variables
 
 
-def start(command: list[str], project: Path, **variables: str) -> subprocess.Popen[str]:
+def start(command, project, **variables):
     """Start a run; its output is that of stdout and stderr."""
     told = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     return subprocess.Popen(command, cwd=project, env=environment(**variables), **told)
 
 
-def output_of(process: subprocess.Popen[str], fails: bool = False) -> str:
+def output_of(process, fails=False):
     """What a run says until its end. Asserts that it succeeds, or that it fails if `fails`."""
     try:
         output, _ = process.communicate(timeout=PATIENCE)
@@ -86,24 +84,24 @@ def output_of(process: subprocess.Popen[str], fails: bool = False) -> str:
 
 
 def run(
-    project: Path,
-    changes: dict | None = None,
-    *extra: str,
-    fails: bool = False,
-    cores: int = 2,
-    profile: str = "default",
-    **variables: str,
-) -> str:
+    project,
+    changes=None,
+    *extra,
+    fails=False,
+    cores=2,
+    profile="default",
+    **variables,
+):
     """Run the workflow to its end; returns its output. Asserts that it succeeds, or that it fails if `fails`."""
     return output_of(start(arguments(project, changes, *extra, profile=profile, cores=cores), project, **variables), fails)
 
 
-def plan(project: Path, changes: dict | None = None, *extra: str, **options) -> dict[str, int]:
+def plan(project, changes=None, *extra, **options):
     """How many jobs of each rule a dry run plans."""
     return jobs_in(run(project, changes, "--dry-run", *extra, **options))
 
 
-def jobs_in(output: str) -> dict[str, int]:
+def jobs_in(output):
     """How many jobs of each rule Snakemake's output names; none where nothing is to be done."""
     if "Nothing to be done" in output:
         return {}

@@ -1,14 +1,10 @@
 """Recordings that are not part of the repository. Tests on them skip where they are absent."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
 FOLDER = Path(os.environ.get("NEUSPRING_TEST_DATA") or Path(__file__).parents[2].parent / "shared" / "data")
 """Where they are looked for: beside the repository, or where the environment says."""
-PLUSH = FOLDER / "rgbd_plush"
-"""Color and depth of a plush animal on a cluttered table, one camera, 320 x 240, frames 160 to 349."""
 FOOTAGE = FOLDER / "phystwin_camera0"
 """Real color film of one camera, 848 x 480, 30 Hz: videos, masks and points of four frames drawn by hand."""
 FILMS = FOLDER / "phystwin22_films"

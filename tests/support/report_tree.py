@@ -1,23 +1,19 @@
 """A results folder as the workflow leaves it, with invented numbers: for tests of the report."""
 
-from __future__ import annotations
-
 import html
 import itertools
 import os
 import re
 import zlib
-from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pandas as pd
 
 from neuspring import config
-from neuspring.core.artifacts import Observations, Scenario, Trajectory
+from neuspring.core.artifacts import Trajectory
 from neuspring.core.files import write_table, write_text
 from neuspring.core.job_records import JobRecord
 from neuspring.core.records import StageRecord, digest_file
@@ -34,17 +30,17 @@ SCORED = ("chamfer", "track_error")
 
 
 def make(
-    results: Path,
-    scenarios: Sequence[str] = ("rope", "cloth"),
-    methods: Sequence[str] = ("baseline", "neuspring"),
-    seeds: Sequence[int] = (0, 1),
+    results,
+    scenarios=("rope", "cloth"),
+    methods=("baseline", "neuspring"),
+    seeds=(0, 1),
     *,
-    source: str = "synthetic",
-    pictures: bool = True,
-    curves: bool = True,
-    nodes: int = 30,
-    commit: str = "0123456789abcdef",
-) -> Path:
+    source="synthetic",
+    pictures=True,
+    curves=True,
+    nodes=30,
+    commit="0123456789abcdef",
+):
     """Finished runs of every combination; returns `results`."""
     drawn = _pictures(results / "drawn") if pictures else {}
     for scenario in scenarios:
@@ -56,9 +52,7 @@ def make(
     return results
 
 
-def write_run(
-    results: Path, seen: Observations, method: str, seed: int, drawn: dict[str, bytes], *, curves: bool = True, **changes: Any
-) -> Path:
+def write_run(results, seen, method, seed, drawn, *, curves=True, **changes):
     """One finished run with the records of its stages; `changes` replace entries of run.json. Returns its path.
 
     Without `curves` it has no histories and no trajectory.
@@ -71,7 +65,7 @@ def write_run(
         place.mkdir(parents=True, exist_ok=True)
     chosen = config.plain(config.Config(fit=config.Fit(epochs=5), search=config.Search(rollouts=30)))
     own = {name: chosen[name] for name in ("simulation", "losses", "released_quirks")}
-    settings: dict[str, dict[str, Any]] = {"search": own | {"search": chosen["search"]}, "rollout": {}}
+    settings = {"search": own | {"search": chosen["search"]}, "rollout": {}}
     write_history(search / "history.parquet", "best_cost", np.minimum.accumulate(rng.uniform(1e-5, 2e-3, 30)))
     StageRecord(stage="search", status="ok", settings=settings["search"]).save(search / "search.json")
     records, histories = {"search": search / "search.json"}, {"search": search / "history.parquet"}
@@ -115,15 +109,15 @@ def write_run(
     return folder / "run.json"
 
 
-def write_jobs(results: Path, scenarios: Iterable[str], methods: Iterable[str], seeds: Iterable[int], *, never: int = 25) -> None:
+def write_jobs(results, scenarios, methods, seeds, *, never=25):
     """Job records of fits on a GPU; every `never`-th failed."""
     for count, (scenario, method, seed) in enumerate(itertools.product(scenarios, methods, seeds)):
         save_job(results, f"fit/{scenario}/{method}/{seed}", failed=count % never == never - 1, seconds=200.0 + 37 * (count % 7))
 
 
-def save_job(results: Path, name: str, *, failed: bool = False, **changes: Any) -> None:
+def save_job(results, name, *, failed=False, **changes):
     """A job record and its log."""
-    values: dict[str, Any] = {"started": "2026-01-05T00:00:00+00:00", "seconds": 5.0, "host": "server", "devices": ["0"]}
+    values = {"started": "2026-01-05T00:00:00+00:00", "seconds": 5.0, "host": "server", "devices": ["0"]}
     values |= {"device_names": ["NVIDIA H100"], "peak_memory_mb": 2100.0, "log": f"jobs/{name}/0.log"} | changes
     if failed:
         values |= {"outcome": "failed", "message": "CUDA error: out of memory"}
@@ -132,7 +126,7 @@ def save_job(results: Path, name: str, *, failed: bool = False, **changes: Any) 
     write_text(folder / "0.log", "what it said\n")
 
 
-def observations(name: str, source: str, nodes: int) -> Observations:
+def observations(name, source, nodes):
     rng = np.random.default_rng(zlib.crc32(name.encode()))
     category = name.removeprefix("synthetic_").split("_")[-1] if not name[-1].isdigit() else name.split("_")[-2]
     points = rng.uniform(-0.1, 0.1, (nodes, 3)) + np.zeros((FRAMES, 1, 1))
@@ -140,7 +134,7 @@ def observations(name: str, source: str, nodes: int) -> Observations:
     return scenarios.seen(points, points[:, :1], about, tracks=points[:, :5])
 
 
-def _scores(scenario: Scenario, method: str, seed: int, pictured: bool, rng: np.random.Generator) -> pd.DataFrame:
+def _scores(scenario, method, seed, pictured, rng):
     better = 0.85 if method == "neuspring" else 1.0
     rows = []
     for task, factor, frames in (("reconstruction", 1.0, TRAIN - 1), ("future", 1.8, FRAMES - TRAIN)):
@@ -155,11 +149,11 @@ def _scores(scenario: Scenario, method: str, seed: int, pictured: bool, rng: np.
     return pd.DataFrame(rows, columns=list(SCORE_COLUMNS))
 
 
-def write_history(path: Path, metric: str, values: np.ndarray) -> None:
+def write_history(path, metric, values):
     write_table(pd.DataFrame({"step": np.arange(len(values)), "metric": metric, "value": values}), path)
 
 
-def _pictures(folder: Path) -> dict[str, bytes]:
+def _pictures(folder):
     """Name in a run's folder -> bytes of a picture or film of that kind."""
     folder.mkdir(parents=True)
     across = np.linspace(0, 255, 1300).astype(np.uint8)
@@ -178,12 +172,12 @@ def _pictures(folder: Path) -> dict[str, bytes]:
     return found
 
 
-def page_section(page: str, key: str) -> str:
+def page_section(page, key):
     """The text of a section of a report, without tags; what cells and lines hold is separated by spaces."""
     match = re.search(rf'<section id="{key}">(.*?)</section>', page, re.DOTALL)
     assert match, key
     return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", match[1])).split())
 
 
-def _relative(path: Path, folder: Path) -> str:
+def _relative(path, folder):
     return Path(os.path.relpath(path, folder)).as_posix()

@@ -1,17 +1,13 @@
 """Records of runs that never ran."""
 
-from __future__ import annotations
-
-from typing import Any
-
 from neuspring.core.run_record import RunRecord
 
 STARTED, ENDED = "2026-11-21T10:00:00+00:00", "2026-11-21T10:05:00+00:00"
 
 
-def run_record(**changes: Any) -> RunRecord:
+def run_record(**changes):
     """A record with plausible facts; `changes` replace them."""
-    facts: dict[str, Any] = {
+    facts = {
         "run_key": "0" * 64,
         "scenario": "rope",
         "source": "toy",

@@ -1,25 +1,20 @@
 """Small hand-made Observations for tests that need the noun, not a scene."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 
 from neuspring.core.artifacts import Observations, Scenario
 
 
-def scenario(**changes: Any) -> Scenario:
-    values: dict[str, Any] = {"name": "scene", "source": "toy", "category": "toy", "frame_count": 5, "train_end": 3}
+def scenario(**changes):
+    values = {"name": "scene", "source": "toy", "category": "toy", "frame_count": 5, "train_end": 3}
     return Scenario(**(values | {"frame_rate": 30.0, "up": "+z"} | changes))
 
 
-def seen(points: np.ndarray, hands: np.ndarray, about: Mapping[str, Any] = {}, **changes: Any) -> Observations:
+def seen(points, hands, about=(), **changes):
     """Tracked points [T, N, 3] that are always visible, beside hands [T, C, 3], and nothing else; `about` changes the scenario."""
     frames, shown = len(points), np.ones(points.shape[:2], bool)
-    values: dict[str, Any] = {
-        "scenario": scenario(**({"frame_count": frames, "train_end": frames} | about)),
+    values = {
+        "scenario": scenario(**({"frame_count": frames, "train_end": frames} | dict(about))),
         "object_points": points,
         "object_visibility": shown,
         "object_motion_valid": shown,
@@ -31,9 +26,9 @@ def seen(points: np.ndarray, hands: np.ndarray, about: Mapping[str, Any] = {}, *
     return Observations(**(values | changes))
 
 
-def observations(frames: int = 5, points: int = 3, **changes: Any) -> Observations:
+def observations(frames=5, points=3, **changes):
     """Points at rest on the x axis; everything visible and valid; one hand, one surface node, one interior node."""
-    values: dict[str, Any] = {
+    values = {
         "points": np.tile(np.arange(points)[:, None] * [1.0, 0, 0], (frames, 1, 1)),
         "hands": np.zeros((frames, 1, 3)) + 9,
         "surface_points": np.array([[0.0, 5, 0]]),

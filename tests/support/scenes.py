@@ -1,11 +1,8 @@
 """Small scenes shared by the physics tests, and the two engines that simulate them: the NumPy reference and Warp."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +11,7 @@ import torch
 from neuspring.core.artifacts import Material, Simulation, Topology, Twin
 from neuspring.physics import reference
 from neuspring.physics.controllers import waypoints
-from neuspring.physics.parameters import Parameters, pack
+from neuspring.physics.parameters import pack
 from neuspring.physics.reference import ReferenceTwin
 from neuspring.physics.solver import FrameSolver
 from tests.support.devices import CUDA
@@ -28,7 +25,7 @@ WAYS = [
 """(device, threads): the CPU also runs the kernels of a GPU, so that every machine tests them."""
 MASSES = np.array([0.3, 1.7, 0.8, 2.1, 0.5, 0.6])
 """Of the six nodes of lively scenes, kg."""
-VARIANTS: dict[str, dict[str, Any]] = {
+VARIANTS = {
     "free": {"on_ground": False},
     "ground": {},
     "self-collision": {"self_collision": True},
@@ -43,24 +40,24 @@ Engine = Callable[[ReferenceTwin, np.ndarray, np.ndarray, np.ndarray], tuple[np.
 
 
 def scene(
-    nodes: int,
-    springs: Any = (),
-    rest_lengths: Any = (),
+    nodes,
+    springs=(),
+    rest_lengths=(),
     *,
-    stiffness: Any = 1.0,
-    dashpot: Any = 0.0,
-    drag: float = 0.0,
-    ground: tuple[float, float] = (0.5, 0.3),
-    contact: tuple[float, float] = (0.7, 0.3),
-    contact_distance: float = 0.02,
-    mass: Any = 1.0,
-    pushes: bool = False,
-    on_ground: bool = False,
-    **simulation: Any,
-) -> ReferenceTwin:
+    stiffness=1.0,
+    dashpot=0.0,
+    drag=0.0,
+    ground=(0.5, 0.3),
+    contact=(0.7, 0.3),
+    contact_distance=0.02,
+    mass=1.0,
+    pushes=False,
+    on_ground=False,
+    **simulation,
+):
     """A twin in float64; `ground` and `contact` are (e, mu). Defaults: no gravity, no ground, one substep per frame of 1 ms."""
     pairs = np.array(springs, np.int32).reshape(-1, 2)
-    options: dict[str, Any] = {"frame_time": 1e-3, "substeps": 1, "gravity": 0.0, "ground": on_ground} | simulation
+    options = {"frame_time": 1e-3, "substeps": 1, "gravity": 0.0, "ground": on_ground} | simulation
     return ReferenceTwin(
         nodes=nodes,
         springs=pairs,
@@ -77,7 +74,7 @@ def scene(
     )
 
 
-def tensors(scene: ReferenceTwin, device: str = "cpu", dtype: torch.dtype = torch.float64) -> dict[str, torch.Tensor]:
+def tensors(scene, device="cpu", dtype=torch.float64):
     """A scene's physical parameters with the keyword names of `pack`."""
     values = {
         "stiffness": scene.stiffness,
@@ -95,7 +92,7 @@ def tensors(scene: ReferenceTwin, device: str = "cpu", dtype: torch.dtype = torc
     return {name: torch.tensor(np.array(value), dtype=dtype, device=device) for name, value in values.items()}
 
 
-def with_values(scene: ReferenceTwin, values: dict[str, Any]) -> ReferenceTwin:
+def with_values(scene, values):
     """A scene with parameters replaced by name (those of `pack`)."""
     arrays = {k: np.asarray(v, np.float64) for k, v in values.items() if k in ("stiffness", "rest_lengths", "dashpot")}
     ground = (values.get("ground_elasticity", scene.ground[0]), values.get("ground_friction", scene.ground[1]))
@@ -104,23 +101,23 @@ def with_values(scene: ReferenceTwin, values: dict[str, Any]) -> ReferenceTwin:
     return replace(scene, **arrays, drag=drag, ground=tuple(map(float, ground)), contact=tuple(map(float, contact)))
 
 
-def packed(scene: ReferenceTwin, device: str = "cpu", dtype: torch.dtype = torch.float64) -> Parameters:
+def packed(scene, device="cpu", dtype=torch.float64):
     """A scene's parameters, packed."""
     return pack(**tensors(scene, device, dtype), substep=scene.simulation.substep)
 
 
 def solver_for(
-    scene: ReferenceTwin | Sequence[ReferenceTwin],
-    controllers: int,
-    device: str = "cpu",
-    dtype: torch.dtype = torch.float64,
+    scene,
+    controllers,
+    device="cpu",
+    dtype=torch.float64,
     *,
-    differentiable: bool = True,
-    threads: bool | None = None,
-    block: int = 0,
-) -> FrameSolver:
+    differentiable=True,
+    threads=None,
+    block=0,
+):
     """A FrameSolver with the scene's parameters set, or one of several scenes on the graph of the first."""
-    options: dict[str, Any] = {"device": device, "dtype": dtype, "differentiable": differentiable}
+    options = {"device": device, "dtype": dtype, "differentiable": differentiable}
     options |= {"threads": threads, "block": block}
     if isinstance(scene, ReferenceTwin):
         solver = FrameSolver(scene.springs, scene.nodes, controllers, scene.simulation, **options)
@@ -133,20 +130,20 @@ def solver_for(
 
 
 def warp(
-    scene: ReferenceTwin,
-    x: np.ndarray,
-    v: np.ndarray,
-    controllers: np.ndarray,
-    device: str = "cpu",
-    dtype: torch.dtype = torch.float64,
+    scene,
+    x,
+    v,
+    controllers,
+    device="cpu",
+    dtype=torch.float64,
     *,
-    differentiable: bool = False,
-    threads: bool | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
+    differentiable=False,
+    threads=None,
+):
     """`reference.rollout` with the Warp solver."""
     solver = solver_for(scene, controllers.shape[1], device, dtype, differentiable=differentiable, threads=threads)
 
-    def tensor(values: np.ndarray) -> torch.Tensor:
+    def tensor(values):
         return torch.tensor(np.asarray(values), dtype=dtype, device=device)
 
     hands = waypoints(tensor(controllers))
@@ -160,12 +157,12 @@ def warp(
 ENGINES = [pytest.param(reference.rollout, id="reference"), pytest.param(warp, id="warp")]
 
 
-def no_hands(frames: int) -> np.ndarray:
+def no_hands(frames):
     """Controllers [frames + 1, 0, 3] for scenes that nothing holds."""
     return np.zeros((frames + 1, 0, 3))
 
 
-def random_scene(seed: int, nodes: int = 10, controllers: int = 2, frames: int = 3, **simulation: Any) -> tuple[ReferenceTwin, ...]:
+def random_scene(seed, nodes=10, controllers=2, frames=3, **simulation):
     """(scene, x0, v0, hands): a random net above and just in the ground, held and dragged, away from its rest lengths."""
     rng = np.random.default_rng(seed)
     up = -1.0 if simulation.get("up") == "-z" else 1.0
@@ -180,7 +177,7 @@ def random_scene(seed: int, nodes: int = 10, controllers: int = 2, frames: int =
     springs = np.array(inner + outer, np.int32)
     ends = np.concatenate([x, start])[springs]
     rest = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) * rng.uniform(0.8, 1.2, len(springs))
-    options: dict[str, Any] = {"frame_time": 0.02, "substeps": 20, "gravity": 9.8, "on_ground": True} | simulation
+    options = {"frame_time": 0.02, "substeps": 20, "gravity": 9.8, "on_ground": True} | simulation
     body = scene(
         nodes,
         springs,
@@ -196,7 +193,7 @@ def random_scene(seed: int, nodes: int = 10, controllers: int = 2, frames: int =
     return body, x, v, hands
 
 
-def twin_of(scene: ReferenceTwin, x: np.ndarray, controllers: np.ndarray) -> Twin:
+def twin_of(scene, x, controllers):
     """The scene as a Twin (rounded to float32), at rest positions x [N, 3] and controllers [C, 3]."""
     topology = Topology(
         nodes=x, controllers=controllers, springs=scene.springs, rest_lengths=scene.rest_lengths, labels=np.zeros(len(x), np.int32)

@@ -1,12 +1,9 @@
 """Searches of several budgets, and what is equal between two of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pandas as pd
 
-from neuspring.twin.candidates import SearchProblem
 from tests.support import small
 
 LOGARITHMIC = {
@@ -16,12 +13,12 @@ LOGARITHMIC = {
 """Variables on logarithmic scales."""
 
 
-def budget(rollouts: int, clusters: int = 1) -> SearchProblem:
+def budget(rollouts, clusters=1):
     """The small search with another budget."""
     problem = small.search_problem(clusters=clusters)
     return replace(problem, search=replace(problem.search, rollouts=rollouts))
 
 
-def assert_same_trace(trace: pd.DataFrame, expected: pd.DataFrame) -> None:
+def assert_same_trace(trace, expected):
     """Equal bit for bit, but for the time that each candidate took."""
     pd.testing.assert_frame_equal(trace.drop(columns="seconds"), expected.drop(columns="seconds"), check_exact=True)

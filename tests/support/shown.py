@@ -1,10 +1,5 @@
 """A scenario of `played.results` with splats and a video of them, and what paints it: for tests of pictures for papers."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from pathlib import Path
-
 import numpy as np
 
 from neuspring.config.images import Images
@@ -25,17 +20,17 @@ CORNER = 12
 METHODS = ("baseline", "neuspring")
 
 
-def takes(scenario: Path) -> list[SplatRun]:
+def takes(scenario):
     """The runs of a scenario: that of METHODS[0] moves as the object does."""
     found = {run.method: run for run in find([scenario]).runs}
     return [SplatRun(name, found[name].trajectory.positions, found[name].twin, found[name].splats) for name in METHODS]
 
 
-def observed(scenario: Path) -> Observations:
+def observed(scenario):
     return Observations.load(scenario / "observations.npz")
 
 
-def filmed(folder: Path, missing: tuple[int, ...] = ()) -> Path:
+def filmed(folder, missing=()):
     """A scenario whose video shows the splats as the first method moves them, over black, with exact masks."""
     scenario = results(folder, METHODS)
     dressed(scenario)
@@ -64,7 +59,7 @@ def filmed(folder: Path, missing: tuple[int, ...] = ()) -> Path:
     return scenario
 
 
-def painter(scenario: Path, frames: Sequence[int], **manner: object) -> PhotoPainter:
+def painter(scenario, frames, **manner):
     """What paints a scenario: from the camera of its video where it has one."""
     seen, shown = observed(scenario), takes(scenario)
     if (scenario / "capture").is_dir():

@@ -1,10 +1,6 @@
 """A small capture of points alone: a block of nodes on the table, a hand of four points that lifts it, annotated points on top."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,12 +14,12 @@ MARKED = np.array([[0.01, 0.01, 0.03], [0.09, 0.01, 0.03], [0.05, 0.05, 0.03], [
 GRIP = np.array([[0.0, 0.0, 0.03], [0.0, 0.06, 0.03], [0.02, 0.0, 0.04], [0.02, 0.06, 0.04]])
 
 
-def risen(points: np.ndarray, frames: int) -> np.ndarray:
+def risen(points, frames):
     """Points [T, n, 3] that rise by 5 mm a frame."""
     return points + np.arange(frames)[:, None, None] * np.array([0.0, 0.0, 0.005])
 
 
-def spaced(folder: Path, frames: int = 8, *, up: float = 1.0, **changes: Any) -> Capture:
+def spaced(folder, frames=8, *, up=1.0, **changes):
     """The capture, written; `changes` are of its description."""
     kept = {"cameras": (), "depth": "none", "tracks": "train", "masks": False, "frame_count": frames, "train_end": 5}
     described = describe(**(kept | {"name": folder.name, "up": "+z" if up > 0 else "-z"} | changes))
@@ -35,7 +31,7 @@ def spaced(folder: Path, frames: int = 8, *, up: float = 1.0, **changes: Any) ->
     return writer.finish(tracks)
 
 
-def describe_as(capture: Capture, **changes: Any) -> Capture:
+def describe_as(capture, **changes):
     """The capture with changed entries of capture.json."""
     path = capture.folder / CAPTURE
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))

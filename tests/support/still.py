@@ -1,14 +1,9 @@
 """Films of still bodies of known shape, seen by cameras around them."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Sequence
-from pathlib import Path
-
 import numpy as np
 
 from neuspring.data.camera import CameraEntry
-from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
+from neuspring.data.capture import HANDS, OBJECT, Writer
 from neuspring.data.results import LiftedTracks, Masks, ShapePrior
 from neuspring.perception.sample import inside
 from neuspring.scenes.render import Part, Renderer, looking, quantized
@@ -20,15 +15,15 @@ SIZE = (120, 68)
 
 
 def still(
-    folder: Path,
-    body: Callable[[np.ndarray], np.ndarray],
-    box: Sequence[Sequence[float]],
-    eyes: Sequence[Sequence[float]],
-    target: Sequence[float],
+    folder,
+    body,
+    box,
+    eyes,
+    target,
     *,
-    scale: int = 1,
-    hand: Sequence[float] | None = None,
-) -> tuple[Capture, dict[str, Masks], np.ndarray, ShapePrior]:
+    scale=1,
+    hand=None,
+):
     """Capture, masks, the cloud that the cameras saw, and the truth. Images are `scale` times SIZE; a ball at `hand` is a hand."""
     vertices, faces = surface(body, *box, 0.004)
     parts, moved = [Part(vertices, faces, np.full((len(vertices), 3), 0.5), OBJECT, (30.0, 0.3))], [vertices]
@@ -57,7 +52,7 @@ def still(
     return writer.finish(), masks, np.concatenate(cloud), ShapePrior(vertices=vertices, faces=faces, backend="truth")
 
 
-def overlap(first: ShapePrior, second: ShapePrior) -> float:
+def overlap(first, second):
     """Intersection over union of the volumes of two shapes, from random points around the first."""
     low, high = first.vertices.min(axis=0) - 0.02, first.vertices.max(axis=0) + 0.02
     low, high = np.minimum(low, second.vertices.min(axis=0)), np.maximum(high, second.vertices.max(axis=0))
@@ -66,7 +61,7 @@ def overlap(first: ShapePrior, second: ShapePrior) -> float:
     return float((a & b).sum() / (a | b).sum())
 
 
-def tracked(points: np.ndarray, frames: int = FRAMES) -> LiftedTracks:
+def tracked(points, frames=FRAMES):
     """Lifted tracks of points [n, 3] that stand still, beside one controller."""
     count = len(points)
     return LiftedTracks(

@@ -1,19 +1,14 @@
 """Results of runs without the runs: records, scores and stand-ins for the files that stages leave."""
 
-from __future__ import annotations
-
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.core.run_record import key_of
-from neuspring.core.table import Cell, Table
-from neuspring.report.blocks import Block, Fold
+from neuspring.core.table import Table
+from neuspring.report.blocks import Fold
 from neuspring.scores.metrics import METRICS, SCORE_COLUMNS
 from neuspring.scores.table import RUN_COLUMNS, TABLE_COLUMNS, ScoreTable
 from tests.support.runs import run_record
@@ -23,21 +18,21 @@ Scores = Mapping[tuple[str, str], float]
 
 
 def write_run(
-    results: Path,
-    scenario: str,
-    method: str,
-    seed: int,
-    scores: Scores,
+    results,
+    scenario,
+    method,
+    seed,
+    scores,
     *,
-    frames: int = 10,
-    category: str = "rope",
-    source: str = "phystwin",
-    status: str = "ok",
-    reason: str = "",
-    images: Mapping[str, Any] | None = None,
-    settings: Mapping[str, Any] | None = None,
-    frozen: Scores | None = None,
-) -> Path:
+    frames=10,
+    category="rope",
+    source="phystwin",
+    status="ok",
+    reason="",
+    images=None,
+    settings=None,
+    frozen=None,
+):
     """A finished (or failed) run as `stages.score` leaves it; returns the path of run.json.
 
     `frozen`: of a failed run, the scores of a prediction that stays at its last finite frame.
@@ -74,9 +69,7 @@ def write_run(
     return folder / "run.json"
 
 
-def collected(
-    values: Mapping[tuple[str, str, int], float | Scores], failed: Iterable[tuple[str, str, int]] = (), **facts: Any
-) -> ScoreTable:
+def collected(values, failed=(), **facts):
     """A table without files: scores (or a future track error, m) by scenario, method, seed; `failed` runs have none."""
     rows, runs = [], []
     for (scenario, method, seed), given in values.items():
@@ -94,34 +87,22 @@ def collected(
     return ScoreTable(pd.DataFrame(rows, columns=list(TABLE_COLUMNS)), table)
 
 
-def all_scores(factor: float = 1.0) -> dict[tuple[str, str], float]:
+def all_scores(factor=1.0):
     """Every metric of both tasks; `factor` scales the errors, and what is better when higher falls with it."""
     one = {"chamfer": 0.01 * factor, "track_error": 0.02 * factor, "psnr": 30 / factor, "ssim": 0.9 / factor}
     one |= {"lpips": 0.05 * factor, "iou": 0.8 / factor}
     return {(task, metric): value for task in ("reconstruction", "future") for metric, value in one.items()}
 
 
-def write_benchmark(
-    results: Path, scenarios: Iterable[str], methods: Mapping[str, float], seeds: Iterable[int] = (0, 1), **facts: Any
-) -> None:
-    """Runs of every scenario, method and seed; `methods` maps each to the factor of its errors, which scenarios and seeds vary."""
-    rng = np.random.default_rng(0)
-    for scenario in scenarios:
-        size = rng.uniform(0.5, 1.5)
-        for seed in seeds:
-            for method, factor in methods.items():
-                write_run(results, scenario, method, seed, all_scores(size * factor * rng.uniform(0.99, 1.01)), **facts)
-
-
-def tables_in(blocks: Sequence[Block]) -> dict[str, Table]:
+def tables_in(blocks):
     """Tables by their captions, folded ones too."""
     own = {block.caption: block for block in blocks if isinstance(block, Table)}
     return own | {name: table for block in blocks if isinstance(block, Fold) for name, table in tables_in(block.blocks).items()}
 
 
-def rows_of(table: Table) -> dict[str, dict[str, Cell]]:
+def rows_of(table):
     """First cell of a row to its cells by heading; of several rows with the same first cell, the first."""
-    rows: dict[str, dict[str, Cell]] = {}
+    rows = {}
     for row in table.rows:
         rows.setdefault(row[0].text, dict(zip(table.header, row, strict=True)))
     return rows

@@ -2,7 +2,6 @@
 
 import pytest
 
-from neuspring.data.capture import Capture
 from tests.extensions.annotate.painted import Painted
 from tests.extensions.annotate.served import served
 from tests.support.browser import Browser
@@ -10,12 +9,12 @@ from tests.support.moving import moving
 
 
 @pytest.fixture
-def capture(tmp_path) -> Capture:
+def capture(tmp_path):
     return moving(tmp_path / "capture", missing=(4,))
 
 
 @pytest.fixture
-def painted(monkeypatch) -> Painted:
+def painted(monkeypatch):
     return Painted(monkeypatch)
 
 

@@ -1,33 +1,27 @@
 """Quick masks for tests of the page: boxes are filled, in all frames alike."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Sequence
 from threading import Event
 
 import numpy as np
-import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.data.capture import Capture
 from neuspring.extensions.annotate import masks
 from neuspring.perception.film import Carried
-from neuspring.perception.marks import Mark
 
 
 class Painted:
     """Stands in for the segmenter of marks. `gate` holds work back after its first report until it is set."""
 
-    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+    def __init__(self, patch):
         self.gate = Event()
         self.gate.set()
         patch.setattr(masks, "SEGMENTERS", {"marks": self})
 
-    def outline(self, capture: Capture, camera: str, frame: int, marks: Sequence[Mark]) -> np.ndarray:
+    def outline(self, capture, camera, frame, marks):
         view = capture.cameras[camera]
         return self.fill([mark for mark in marks if mark.frame == frame], (view.height, view.width))
 
-    def fill(self, marks: Sequence[Mark], size: tuple[int, ...]) -> np.ndarray:
+    def fill(self, marks, size):
         if not marks:
             raise InputError("frame", "an object or a hand must be marked on it")
         labels = np.zeros(size, np.uint8)
@@ -36,9 +30,7 @@ class Painted:
             labels[y0 : y1 + 1, x0 : x1 + 1] = mark.value
         return labels
 
-    def carry(
-        self, capture: Capture, camera: str, marks: Sequence[Mark], _: object, device: str, progress: Callable[[int, int], None]
-    ) -> Carried:
+    def carry(self, capture, camera, marks, _, device, progress):
         first = min(mark.frame for mark in marks)
         view, count = capture.cameras[camera], capture.frame_count
         labels = self.fill([mark for mark in marks if mark.frame == first], (view.height, view.width))

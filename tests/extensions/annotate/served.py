@@ -1,21 +1,15 @@
 """The server of `neuspring annotate` in a thread, and requests to it."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import time
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from threading import Thread
-from typing import Any
 
 import cv2
 import numpy as np
 
-from neuspring.data.capture import Capture
 from neuspring.extensions.annotate.server import TOKEN_HEADER, Server
-from tests.support.browser import Browser
 
 TOKEN = "the-token"
 
@@ -23,10 +17,10 @@ TOKEN = "the-token"
 class Client:
     """Requests to a server."""
 
-    def __init__(self, server: Server) -> None:
+    def __init__(self, server):
         self.server, self.port = server, server.port
 
-    def raw(self, method: str, path: str, body: bytes | None = None, **headers: str | None) -> tuple[int, dict[str, str], bytes]:
+    def raw(self, method, path, body=None, **headers):
         """Status, headers and body; the token is sent, and underscores in names of headers are dashes; None leaves one out."""
         sent = {TOKEN_HEADER: TOKEN} | {name.replace("_", "-"): value for name, value in headers.items()}
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30)
@@ -44,24 +38,24 @@ class Client:
         connection.close()
         return answer.status, dict(answer.getheaders()), content
 
-    def get(self, path: str) -> Any:
+    def get(self, path):
         """JSON of an answer that must be good."""
         status, _, content = self.raw("GET", path)
         assert status == 200, content
         return json.loads(content)
 
-    def image(self, path: str) -> np.ndarray:
+    def image(self, path):
         """An image of an answer that must be good, as OpenCV has it."""
         status, _, content = self.raw("GET", path)
         assert status == 200, content
         return decoded(content)
 
-    def post(self, path: str, **values: Any) -> tuple[int, Any]:
+    def post(self, path, **values):
         """Status and JSON of an answer."""
         status, _, content = self.raw("POST", path, json.dumps(values).encode())
         return status, json.loads(content)
 
-    def wait(self, condition: Callable[[], Any], seconds: float = 30.0) -> Any:
+    def wait(self, condition, seconds=30.0):
         """What a condition gives once it is true."""
         end = time.monotonic() + seconds
         while not (value := condition()):
@@ -70,14 +64,14 @@ class Client:
         return value
 
 
-def decoded(content: bytes) -> np.ndarray:
+def decoded(content):
     """The image of some bytes."""
     image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     assert image is not None
     return image
 
 
-def show(browser: Browser, client: Client, width: int = 1280, height: int = 800) -> None:
+def show(browser, client, width=1280, height=800):
     """Open the page of a server, and wait until it can be used."""
     browser.open("about:blank", width, height)
     browser.open(f"http://127.0.0.1:{client.port}/#{TOKEN}", width, height)
@@ -85,7 +79,7 @@ def show(browser: Browser, client: Client, width: int = 1280, height: int = 800)
 
 
 @contextmanager
-def served(capture: Capture) -> Iterator[Client]:
+def served(capture):
     """A server for a capture, while the block runs."""
     server = Server(capture, token=TOKEN)
     thread = Thread(target=server.serve_forever, daemon=True)

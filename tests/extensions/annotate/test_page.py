@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.extensions.annotate.served import show
-from tests.support.browser import Browser, chromium
+from tests.support.browser import chromium
 
 pytestmark = pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome is installed")
 CONTROL, SHIFT = 2, 8
@@ -15,42 +15,42 @@ CONTROL, SHIFT = 2, 8
 class Page:
     """What a user does on the page."""
 
-    def __init__(self, browser: Browser, client) -> None:
+    def __init__(self, browser, client):
         self.browser, self.client = browser, client
         show(browser, client)
 
-    def at(self, *point: float) -> tuple[float, float]:
+    def at(self, *point):
         """Where a pixel of the frame is in the window."""
         return tuple(self.browser.run(f"annotate.view.toWindow({[float(value) for value in point]})"))
 
-    def drag(self, *points: tuple[float, float]) -> None:
+    def drag(self, *points):
         self.browser.drag(*[self.at(*point) for point in points])
 
-    def text(self, selector: str) -> str:
+    def text(self, selector):
         return self.browser.run(f"document.querySelector({json.dumps(selector)}).textContent")
 
-    def saved(self) -> None:
+    def saved(self):
         self.shown("#saved", "Marks saved")
 
-    def marks(self, camera: str = "0") -> list:
+    def marks(self, camera="0"):
         return self.client.get("/api/masks")["marks"]["cameras"].get(camera, [])
 
-    def told(self, text: str) -> None:
+    def told(self, text):
         """Wait until the page says something."""
         self.browser.wait(f"document.getElementById('messages').textContent.includes({json.dumps(text)})")
 
-    def press(self, choice: str) -> None:
+    def press(self, choice):
         """Press a button of a message."""
         found = f"[...document.querySelectorAll('#messages button')].find((one) => one.textContent === '{choice}')"
         self.browser.run(f"{found}.click()")
 
-    def shown(self, selector: str, text: str) -> None:
+    def shown(self, selector, text):
         """Wait until an element has a text."""
         self.browser.wait(f"document.querySelector({json.dumps(selector)}).textContent === {json.dumps(text)}")
 
 
 @pytest.fixture
-def page(browser, client) -> Page:
+def page(browser, client):
     return Page(browser, client)
 
 

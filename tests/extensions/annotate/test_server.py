@@ -5,21 +5,22 @@ import json
 import numpy as np
 import pytest
 
+from neuspring.cli.main import main
 from neuspring.core.errors import InputError
-from neuspring.extensions.annotate.server import LABEL_COLORS, Server, overlay_png
+from neuspring.extensions.annotate.server import LABEL_COLORS, overlay_png
 from neuspring.perception.masks import MasksFile
-from tests.extensions.annotate.served import decoded, served
+from tests.extensions.annotate.served import decoded
 from tests.support.moving import FRAMES
 
 BOX = {"frame": 1, "label": "object", "kind": "box", "points": [[40, 50], [60, 70]], "radius": 3.0}
 HAND = BOX | {"label": "hand", "points": [[80, 50], [100, 70]]}
 
 
-def marks(*marks, camera="0") -> dict:
+def marks(*marks, camera="0"):
     return {"format": 1, "cameras": {camera: list(marks)}}
 
 
-def revision(client) -> str:
+def revision(client):
     return client.get("/api/masks")["revision"]
 
 
@@ -55,20 +56,6 @@ def test_marks_that_break_a_rule_are_refused_and_change_nothing(client, capture)
     status, answer = client.post("/api/marks", revision="none", marks=marks(*[BOX] * 2001))
     assert (status, "at most 2000 marks a camera; received 2001" in answer["error"]) == (422, True)
     assert not (capture.folder / "marks.json").exists()
-
-
-def test_work_goes_on_after_a_new_start(capture):
-    with served(capture) as client:
-        write_marks(client, BOX)
-    with served(capture) as client:
-        state = client.get("/api/state")
-    assert state["masks"]["marks"] == marks(BOX)
-
-
-def test_a_damaged_file_is_refused_at_the_start(capture):
-    (capture.folder / "marks.json").write_text("{")
-    with pytest.raises(InputError, match=r"marks\.json"):
-        Server(capture)
 
 
 def test_the_preview_shows_the_marks_of_the_frame(client):
@@ -152,3 +139,12 @@ def test_borders_of_an_overlay_are_strong_and_its_inside_is_clear():
     assert opacity[5, 5] == opacity[14, 24] == 255
     assert 0 < opacity[10, 15] < 128
     assert opacity[0, 0] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["nowhere"], "capture.json: this file must be readable"), (["{capture}", "--port", "70000"], "--port: must be 0 to 65535")],
+)
+def test_what_cannot_be_served_is_bad_input(capture, capsys, arguments, message):
+    assert main(["annotate", *[word.replace("{capture}", str(capture.folder)) for word in arguments]]) == 2
+    assert message in capsys.readouterr().err

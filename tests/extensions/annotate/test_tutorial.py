@@ -6,11 +6,9 @@ What a user does in the browser is done by a stand-in: it draws an outline of th
 import json
 import re
 import shlex
-import sys
 from contextlib import redirect_stdout
 from importlib.resources import files
 from io import StringIO
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -21,7 +19,7 @@ from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.extensions.annotate.server import Server
 from neuspring.perception.marks import MARKS, Mark, Marks
 from tests.support.filmed import film
-from tests.support.project import copy_workflow, jobs_in, output_of, start
+from tests.support.project import copy_workflow
 
 PAGE = files("neuspring.perception").joinpath("README.md").read_text()
 STEPS = re.split(r"^## \d+\. ", PAGE.split("\n## What to know")[0], flags=re.MULTILINE)[1:]
@@ -31,23 +29,23 @@ OUTLINE = 2.0
 """How far, pixels, the drawn outline may be off."""
 
 
-def step(title: str) -> str:
+def step(title):
     """The step with this title."""
     [found] = [step for step in STEPS if step.startswith(title)]
     return found
 
 
-def blocks(text: str) -> list[str]:
+def blocks(text):
     """What stands in a step between fences."""
     return re.findall(r"```\n(.*?)```", text, re.DOTALL)
 
 
-def shown(title: str) -> list[list[str]]:
+def shown(title):
     """The commands of a step, in words; a backslash at the end of a line continues it."""
     return [shlex.split(line) for block in blocks(step(title)) for line in block.replace("\\\n", " ").splitlines()]
 
 
-def camera_files(folder: Path) -> Capture:
+def camera_files(folder):
     """What step 1 of the page asks for: color and depth (mm) as numbered PNG, rig.json; returns the film with its true masks."""
     filmed = film(folder / "film", cameras=1, sizes=[SIZE])
     for kind in ("color", "depth"):
@@ -63,7 +61,7 @@ def camera_files(folder: Path) -> Capture:
     return filmed
 
 
-def draw(folder: Path, mask: np.ndarray) -> None:
+def draw(folder, mask):
     """Marks on frame 0, as a user draws them: an outline of the object, a line along the hand."""
     contours, _ = cv2.findContours((mask == OBJECT).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     outline = cv2.approxPolyDP(max(contours, key=cv2.contourArea), OUTLINE, True)[:, 0]
@@ -77,18 +75,12 @@ def draw(folder: Path, mask: np.ndarray) -> None:
     Marks(cameras={"0": tuple(own)}).save(folder / MARKS)
 
 
-def run(words: list[str], folder: Path) -> str:
-    """Run the workflow as a command of the page says."""
-    assert words[0] == ".venv/bin/snakemake"
-    return output_of(start([sys.executable, "-m", "snakemake", *words[1:]], folder))
-
-
 @pytest.fixture(scope="module")
 def followed(tmp_path_factory):
     """The project's folder after steps 1 to 6, with what they said."""
     project = copy_workflow(tmp_path_factory.mktemp("tutorial") / "project")
     filmed = camera_files(project)
-    said: dict[str, str] = {}
+    said = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(project)
         patch.delenv("DISPLAY", raising=False)
@@ -134,15 +126,3 @@ def test_the_capture_is_what_was_filmed_and_the_masks_are_right(followed):
         for label in (OBJECT, HANDS):
             ours, true = (masks.mask("0", frame) == label for masks in (capture, filmed))
             assert (ours & true).sum() / (ours | true).sum() > 0.9, (frame, label)
-
-
-@pytest.mark.slow
-def test_perception_makes_the_pictures(followed):
-    project, _, _ = followed
-    [look] = shown("Look at what was perceived")
-    assert jobs_in(run(look, project)) == {"perceive": 1}
-    folder = project / "results" / "own" / "my_toy"
-    assert (folder / "observations.npz").exists()
-    pictures = re.findall(r"^\| `([\w/]+\.png)` \|", PAGE, re.MULTILINE)
-    assert set(pictures) == {"0/masks.png", "0/tracks.png", "lifted.png"}
-    assert all((folder / "perception" / name).exists() for name in pictures)

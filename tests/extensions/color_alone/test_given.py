@@ -6,7 +6,6 @@ import torch
 from neuspring.config import Config, ScenarioRow
 from neuspring.config.perception import Lift, Perception, Sampling
 from neuspring.core.provenance import image_stamps
-from neuspring.data.camera import Camera
 from neuspring.data.capture import CAPTURE, TRACKS, write_tracks
 from neuspring.data.results import Masks, PixelTracks
 from neuspring.extensions.color_alone.given import GivenFrame, facing
@@ -148,7 +147,7 @@ def test_hidden_nodes_say_nothing_of_depth():
 
 
 def test_a_pixel_between_nodes_is_as_deep_as_they_are():
-    view: Camera = camera(np.zeros(3), elevation=40.0)
+    view = camera(np.zeros(3), elevation=40.0)
     slope = NODES * [1, 1, 0] + NODES[:, :1] * [0, 0, 0.5] + 0.08 * UP
     nothing = {"filled": np.zeros((1, 1), bool), "heights": np.zeros((1, 1)), "lower": np.zeros((1, 1)), "facts": {}}
     known = {"front": facing(view, slope), "apart": spacing(slope), "pixel_size": 0.004}

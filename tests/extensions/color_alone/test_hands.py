@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from neuspring.config import Config
-from neuspring.core.artifacts import ImageObservations
 from neuspring.data.capture import HANDS, OBJECT
 from neuspring.data.results import PixelTracks
 from neuspring.extensions.color_alone.first_frame import FirstFrame
@@ -28,7 +27,7 @@ PIXEL32 = 1e-4
 class Film:
     """A speckled hand that moves, turns and grows before a still background."""
 
-    def __init__(self, frames: int = 14) -> None:
+    def __init__(self, frames=14):
         rng = np.random.default_rng(0)
         texture = cv2.GaussianBlur(rng.integers(0, 256, (SIZE, SIZE, 3)).astype(np.uint8), (0, 0), 2.0)
         texture = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)
@@ -47,17 +46,17 @@ class Film:
             self.colors.append(np.where(labels[..., None] == HANDS, moved, self.background).astype(np.uint8))
             self.true.append((matrix @ [120, 125, 1], angle, size))
 
-    def has(self, camera: str, frame: int) -> bool:
+    def has(self, camera, frame):
         return True
 
-    def color(self, camera: str, frame: int) -> np.ndarray:
+    def color(self, camera, frame):
         return self.colors[frame]
 
 
 def test_a_hand_is_followed_with_its_turn_and_size():
     film = Film()
     grip = np.array([[120, 125]])
-    motion = follow_hands(film, "0", np.stack(film.labels), [grip], radius=60)  # type: ignore[arg-type]
+    motion = follow_hands(film, "0", np.stack(film.labels), [grip], radius=60)
     places, angles, sizes = (np.array([one[k] for one in film.true]) for k in range(3))
     assert motion.lost == 0
     np.testing.assert_allclose(motion.centers[:, 0], places, atol=1.0)
@@ -70,7 +69,7 @@ def test_only_pixels_of_hands_are_read():
     pairs = zip(film.colors, film.labels, strict=True)
     other.colors = [np.where(labels[..., None] == HANDS, color, 255 - color) for color, labels in pairs]
     grip = np.array([[120, 125]])
-    one, two = (follow_hands(each, "0", np.stack(film.labels), [grip], radius=60) for each in (film, other))  # type: ignore[arg-type]
+    one, two = (follow_hands(each, "0", np.stack(film.labels), [grip], radius=60) for each in (film, other))
     np.testing.assert_array_equal(one.centers, two.centers)
     np.testing.assert_array_equal(one.sizes, two.sizes)
 
@@ -79,7 +78,7 @@ def test_a_hand_that_disappears_goes_on_for_a_moment_and_is_counted():
     film = Film()
     labels = np.stack(film.labels)
     labels[8:] = 0
-    motion = follow_hands(film, "0", labels, [np.array([[120, 125]])], radius=60)  # type: ignore[arg-type]
+    motion = follow_hands(film, "0", labels, [np.array([[120, 125]])], radius=60)
     assert motion.lost == 6
     assert np.isfinite(motion.centers).all()
     assert np.abs(motion.centers[-1] - motion.centers[7]).max() < 10
@@ -143,7 +142,7 @@ def test_sheets_alone_are_held_by_fingers_alone(tmp_path, monkeypatch, category,
     assert (len(image.hand_of) < 30) == fingers
 
 
-def seen_on(path: np.ndarray) -> ImageObservations:
+def seen_on(path):
     """What a camera sees of one hand of four points that goes along `path` [T, 3], m, without turning."""
     view, frames = camera(path[0]), len(path)
     return replace(
@@ -160,7 +159,7 @@ def seen_on(path: np.ndarray) -> ImageObservations:
     )
 
 
-def way(direction: tuple[float, float, float]) -> np.ndarray:
+def way(direction):
     """A wavy way of 20 cm in a direction."""
     share = np.linspace(0, 1, 12)[:, None]
     return np.array([0.05, 0.1, 0.02]) + 0.2 * share * direction + 0.02 * np.sin(3 * share) * [1.0, 0.0, 0.0]
@@ -202,14 +201,6 @@ def test_a_patch_is_rigid_and_turns_about_the_ray():
     turned = np.arctan2(end[:, 1], end[:, 0]) - np.arctan2(start[:, 1], start[:, 0])
     # Perspective bends angles by less than a tenth of a radian over 2 cm.
     np.testing.assert_allclose(np.angle(np.exp(1j * (turned - 1.0))), 0.0, atol=0.1)
-
-
-def test_observations_of_color_alone_are_kept(tmp_path):
-    seen = colored.observed()
-    seen.save(tmp_path / "seen.npz")
-    kept = type(seen).load(tmp_path / "seen.npz")
-    np.testing.assert_array_equal(kept.image.pixels, seen.image.pixels)
-    assert kept.image.cell == seen.image.cell
 
 
 def test_silhouettes_of_frames():

@@ -1,16 +1,11 @@
 """Results folders of a tiny rope, as the workflow leaves them, for tests of exports."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from neuspring.core.artifacts import Material, Observations, Simulation, Topology, Twin
+from neuspring.core.artifacts import Material, Simulation, Topology, Twin
 from neuspring.core.records import Recorder
 from neuspring.extensions.exports.formats import npz
 from neuspring.splats.model import Splats
@@ -21,7 +16,7 @@ NODES, FRAMES = 6, 7
 SPACING = 0.02
 
 
-def rope(**simulation: object) -> Twin:
+def rope(**simulation):
     """A rope of six nodes along x, 5 cm above the ground, with springs to neighbors and next ones; one controller holds its end."""
     nodes = np.stack([np.arange(NODES) * SPACING, np.zeros(NODES), np.full(NODES, 0.05)], axis=1)
     controllers = np.array([[-0.01, 0.0, 0.055]])
@@ -29,7 +24,7 @@ def rope(**simulation: object) -> Twin:
     springs = np.array([*near, (0, NODES), (1, NODES)], np.int32)
     ends = np.concatenate([nodes, controllers])[springs]
     rng = np.random.default_rng(3)
-    options: dict[str, object] = {"frame_time": 1 / 30, "substeps": 60, "gravity": 9.8} | simulation
+    options = {"frame_time": 1 / 30, "substeps": 60, "gravity": 9.8} | simulation
     return Twin(
         topology=Topology(
             nodes=nodes,
@@ -49,11 +44,11 @@ def rope(**simulation: object) -> Twin:
             contact_distance=0.01,
             mass=rng.uniform(0.5, 1.5, NODES),
         ),
-        simulation=Simulation(**options),  # type: ignore[arg-type]
+        simulation=Simulation(**options),
     )
 
 
-def seen(twin: Twin) -> Observations:
+def seen(twin):
     """Observations in which the hand moves up and aside."""
     times = np.arange(FRAMES)[:, None, None]
     nodes = twin.topology.nodes
@@ -68,7 +63,7 @@ def seen(twin: Twin) -> Observations:
     )
 
 
-def splats(count: int = 40, degree: int = 1) -> Splats:
+def splats(count=40, degree=1):
     """Splats around the rope."""
     rng = np.random.default_rng(5)
     return Splats(
@@ -81,12 +76,12 @@ def splats(count: int = 40, degree: int = 1) -> Splats:
 
 
 def run_folder(
-    results: Path,
-    twin: Twin | None = None,
+    results,
+    twin=None,
     *,
-    with_splats: bool = True,
-    change: Callable[[Observations], Observations] = lambda observations: observations,
-) -> Path:
+    with_splats=True,
+    change=lambda observations: observations,
+):
     """A run's folder with fit.json and rollout.json, its scenario's observations and, if wanted, splats."""
     twin = twin or rope()
     scenario = results / "scene"
@@ -106,12 +101,12 @@ def run_folder(
     return folder
 
 
-def described(folder: Path) -> tuple[dict[str, Any], dict[str, np.ndarray], dict[str, int]]:
+def described(folder):
     """What the description of exported arrays says, the arrays, and the sizes by their symbols; every shape is as described."""
     said = json.loads((folder / npz.DESCRIPTION_FILE).read_text())
     with np.load(folder / npz.ARRAYS_FILE, allow_pickle=False) as file:
         arrays = dict(file)
-    sizes: dict[str, int] = {}
+    sizes = {}
     for name, entry in said["arrays"].items():
         assert list(arrays[name].shape) == entry["shape"]
         for symbol, size in zip(entry["dimensions"], entry["shape"], strict=True):
@@ -120,6 +115,6 @@ def described(folder: Path) -> tuple[dict[str, Any], dict[str, np.ndarray], dict
     return said, arrays, sizes
 
 
-def stretched(twin: Twin, factor: float) -> Twin:
+def stretched(twin, factor):
     """The twin with other rest lengths, so that it swings from the start."""
     return replace(twin, topology=replace(twin.topology, rest_lengths=twin.topology.rest_lengths * factor))

@@ -22,7 +22,7 @@ ERROR = 2e-7
 """m, of the script on the page to our rollout in float32. Measured: 2.4e-8."""
 
 
-def script() -> str:
+def script():
     """The Python script on the page."""
     (found,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
     assert "neuspring." not in found and "import neuspring" not in found

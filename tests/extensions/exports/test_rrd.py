@@ -127,14 +127,6 @@ def test_the_film_stands_where_its_cameras_stood(filmed, tmp_path):
     assert np.abs(cv2.imdecode(blob, cv2.IMREAD_COLOR)[..., ::-1].astype(int) - RED).max() <= JPEG_LOSS
 
 
-def test_a_film_that_cannot_be_used_is_named_and_the_rest_is_written(filmed, tmp_path, capsys):
-    folder, capture = filmed
-    (capture.folder / "capture.json").write_text("{}")
-    rrd.write(read_source(folder), [0], tmp_path / "run.rrd")
-    assert "The film is left out: no cameras" in capsys.readouterr().out
-    assert 0 in read(tmp_path / "run.rrd")["/world/predicted/nodes"]
-
-
 def test_an_image_that_is_missing_leaves_no_half_file(filmed, tmp_path):
     folder, capture = filmed
     capture.path("color", "right", 2).unlink()

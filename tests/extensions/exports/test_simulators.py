@@ -17,12 +17,10 @@ from tests.extensions.exports import exported
 
 NEWTON = 2e-6
 """m, over six frames of 60 steps, float32 on both sides. Measured: 2.6e-7."""
-SWING, DRAG, SOFT = 5e-7, 2e-5, 5e-4
-"""m, of MuJoCo, over six frames of 60 steps: without drag; with a drag of 1.5 / s, whose steps are of first order in MuJoCo; how
-deep nodes sink into the ground. Measured: 3.3e-8, 5.7e-6 (1.9e-6 with 240 steps) and 1.6e-4."""
-LARGEST, MEAN, BOUNCING = 0.003, 0.0008, 0.006
-"""m, of nodes on MuJoCo's ground in frame 12, and the largest of the frames after a fall, whose bounce MuJoCo leaves out.
-Measured: 3.6e-4, 2.2e-4 and 3.1e-3."""
+SWING = 5e-7
+"""m, of MuJoCo without drag, over six frames of 60 steps. Measured: 3.3e-8."""
+LARGEST, MEAN = 0.003, 0.0008
+"""m, of nodes on MuJoCo's ground in frame 12. Measured: 3.6e-4 and 2.2e-4."""
 
 
 def swinging(tmp_path, material=None, **options):
@@ -87,12 +85,6 @@ def test_hands_that_only_push(tmp_path):
         newton_format.write(source, range(exported.FRAMES), tmp_path / "newton")
 
 
-def test_drag_in_mujoco_differs_by_the_time_step(tmp_path):
-    each = [swinging(tmp_path / str(substeps), ground=False, substeps=substeps) for substeps in (60, 240)]
-    coarse, fine = (np.abs(one.positions - by_mujoco(one, tmp_path / f"out{k}")).max() for k, one in enumerate(each))
-    assert fine < coarse < DRAG and fine < coarse / 2
-
-
 @pytest.mark.parametrize("up", [1, -1], ids=["+z up", "-z up"])
 def test_a_rope_that_is_dragged_slides_on_the_ground_of_mujoco_as_on_ours(tmp_path, up):
     """Aslant, since a pyramid of friction brakes otherwise there: 4.3 mm. With MuJoCo's own friction it is 14 mm."""
@@ -107,14 +99,6 @@ def test_a_rope_that_is_dragged_slides_on_the_ground_of_mujoco_as_on_ours(tmp_pa
     assert (np.abs(source.positions[12, :, 2]) < 1e-3).sum() > exported.NODES / 2, "most nodes touch the ground"
     apart = np.linalg.norm(source.positions - by_mujoco(source, tmp_path / "out"), axis=2)[12]
     assert apart.max() < LARGEST and apart.mean() < MEAN
-
-
-def test_the_ground_of_mujoco_holds_but_bounces_differently(tmp_path):
-    source = swinging(tmp_path, ground=True)
-    theirs = by_mujoco(source, tmp_path / "out")
-    assert source.positions[:, :, 2].min() < 0.005, "our rope reaches the ground"
-    assert theirs[:, :, 2].min() > -SOFT
-    assert np.abs(source.positions - theirs).max() < BOUNCING
 
 
 def test_frictions_of_mujocos_contacts_are_ours(tmp_path):

@@ -79,12 +79,6 @@ def test_every_format_holds_the_mass_of_the_capture_or_the_given_one(tmp_path, c
     np.testing.assert_allclose(arrays["stiffness"], stiffness * factor, rtol=1e-6)
 
 
-def test_a_run_without_a_prediction_has_the_mass_too(tmp_path):
-    folder = exported.run_folder(tmp_path, change=weighed())
-    (folder / "rollout.json").unlink()
-    assert read_source(folder).total_mass == pytest.approx(TOTAL, rel=1e-6)
-
-
 @pytest.mark.parametrize("mass", ["0", "-1", "nan", "inf"])
 def test_a_mass_that_is_none_is_refused(folder, tmp_path, capsys, mass):
     assert main(["export", str(folder), "--to", "npz", f"--mass={mass}", "--output", str(tmp_path / "out")]) == 2
@@ -163,12 +157,6 @@ def test_what_cannot_be_exported(folder, kind):
     spoil(folder)
     with pytest.raises(InputError, match=message):
         read_source(folder)
-
-
-def test_the_command_says_what_is_wrong_and_writes_nothing(folder, tmp_path, capsys):
-    (folder / "trajectory.npz").unlink()
-    assert main(["export", str(folder), "--to", "npz", "--output", str(tmp_path / "out")]) == 2
-    assert "run again" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
 def test_without_output_no_format_writes_over_another(folder, tmp_path, monkeypatch):

@@ -85,14 +85,6 @@ def test_newton_reads_the_splats_of_frame_0_where_no_time_is_asked_for(stage):
         assert all(attribute.Get() == attribute.Get(0) for attribute in sampled)
 
 
-def test_newton_imports_the_stage(stage):
-    newton = pytest.importorskip("newton", reason="newton is not installed (extra `synthetic`)")
-    pytest.importorskip("newton_usd_schemas", reason="newton-usd-schemas is not installed (extra `dev`)")
-    builder = newton.ModelBuilder()
-    builder.add_usd(stage[0])
-    assert builder.shape_label == ["/Twin/Splats"]
-
-
 def test_up_is_up_and_another_suffix_is_refused(tmp_path):
     source = read_source(exported.run_folder(tmp_path, exported.rope(up="-z", ground=False), with_splats=False))
     usd.write(source, [0, 2], tmp_path / "twin.usda")

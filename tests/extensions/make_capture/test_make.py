@@ -1,7 +1,6 @@
 """From files to a capture: what is stored, the table and the board as poses, resuming, points in space, and a real recording."""
 
 import json
-import shutil
 
 import cv2
 import numpy as np
@@ -20,8 +19,7 @@ from tests.support import spaced as scene
 from tests.support.c3d_files import write_c3d
 from tests.support.desk import FRAMES, LENS, K, camera, looking, seen, write_folders, write_json, write_rig
 from tests.support.filmed import film, write_raw
-from tests.support.findings import holds, serious
-from tests.support.real import PLUSH
+from tests.support.findings import serious
 
 
 @pytest.fixture(scope="module")
@@ -49,17 +47,6 @@ def test_images_are_stored_as_they_are_with_what_was_stated(desk, tmp_path):
     assert said["frames"] == "6 frames, numbers 1 to 6 of the source" and said["rig file"].startswith("sha256:")
     assert report[0].startswith("frames: 6 frames") and "depth: 0.001 m per count" in report
     assert not (capture.folder / RECIPE).exists()
-
-
-def test_depth_in_meters_is_stored_as_npy(desk, tmp_path):
-    (tmp_path / "npy").mkdir()
-    for frame in range(FRAMES):
-        depth = seen(camera(), frame)[1].astype(np.float32)
-        np.save(tmp_path / "npy" / f"frame_{frame}.npy", np.where(depth > 0, depth, np.nan))
-    rig = write_rig(tmp_path / "rig.json", depth_unit=1)
-    capture, _ = make_capture(given(desk, tmp_path, depth=(tmp_path / "npy",), rig=rig))
-    assert (capture.description.depth_format, capture.path("depth", "0", 0).suffix) == ("npy", ".npy")
-    np.testing.assert_allclose(capture.depth("0", 3), seen(camera(), 3)[1], atol=1e-6)
 
 
 def test_the_table_gives_the_pose_of_one_camera(desk, tmp_path):
@@ -273,30 +260,3 @@ def test_markers_of_c3d_files_are_controllers_and_tracks(tmp_path):
     assert made.description.frame_rate == 50 and np.isnan(made.tracks()[3, 1]).all()
     with pytest.raises(InputError, match="one rate for all files; received 50"):
         make_capture(of_points(tmp_path, **take | {"rate": 25.0, "output": tmp_path / "other"}))
-
-
-def test_cameras_and_points_make_one_capture(desk, tmp_path):
-    files = brought(tmp_path / "files")
-    capture, _ = make_capture(given(desk, tmp_path, teach=True, **files))
-    assert capture.description.tracks == "train" and len(read(capture).nodes) == len(scene.NODES)
-    shutil.rmtree(tmp_path / "capture")
-    np.savez(files["controllers"], points=1000 * scene.risen(scene.GRIP, FRAMES))
-    with pytest.raises(InputError, match=r"controllers\.npz: points: largest coordinate.*divide by 1000"):
-        make_capture(given(desk, tmp_path, **files))
-    assert not (tmp_path / "capture").exists()
-
-
-@pytest.mark.skipif(not PLUSH.is_dir(), reason="the recording is not part of the repository")
-def test_the_table_of_a_real_recording(tmp_path):
-    lens = {"width": 320, "height": 240, "fx": 275.0, "fy": 275.0, "cx": 160.0, "cy": 120.0, "distortion_model": "none"}
-    rig = write_json(tmp_path / "rig.json", {"frame_rate": 30, "depth_unit": 0.001, "poses": "table", "cameras": [lens]})
-    streams = {"color": (PLUSH / "color",), "depth": (PLUSH / "depth",), "rig": rig}
-    capture, _ = make_capture(Intake(output=tmp_path / "plush", category="plush bear", frames="250-335", **streams))
-    assert capture.frame_count == 86
-    # The pose that was made manually, up to the position of the origin: its height and its axes.
-    by_hand = np.array(json.loads((PLUSH / "capture_250_335.json").read_text())["cameras"][0]["camera_to_world"])
-    pose = capture.cameras["0"].camera_to_world
-    assert pose[2, 3] == pytest.approx(by_hand[2, 3], abs=0.004)
-    assert np.degrees(np.arccos((np.trace(pose[:3, :3].T @ by_hand[:3, :3]) - 1) / 2)) < 0.5
-    found = check_layout(tmp_path / "plush")
-    assert serious(found) == [] and holds(found, "note", "contact_sheet.jpg", "look at it")

@@ -13,22 +13,12 @@ from neuspring.extensions.make_capture.options import Intake
 from neuspring.extensions.make_capture.rig import KEYS, Straightener, read_rig
 from tests.support.desk import LENS, SIZE, K, camera, write_folders, write_json, write_rig
 
-F, X, Y = 407.25, 211.5, 119.5
-PLAIN = {"fx": F, "fy": F, "cx": X, "cy": Y}
+PLAIN = {"fx": 407.25, "fy": 407.25, "cx": 211.5, "cy": 119.5}
 POSE = np.linalg.inv(camera().camera_to_world)
 OTHERS = {
-    "open3d": {"width": 424, "height": 240, "intrinsic_matrix": [F, 0, 0, 0, F, 0, X, Y, 1]},
-    "record3d": {"w": 424, "h": 240, "K": [F, 0, 0, 0, F, 0, X, Y, 1]},
-    "realsense": {"width": 424, "height": 240, "ppx": X, "ppy": Y, "fx": F, "fy": F, "model": 4, "coeffs": [0.1] * 5},
-    "depth_scale": {**PLAIN, "depth_scale": 0.00025},
-    "opencv": {"camera_matrix": [[F, 0, X], [0, F, Y], [0, 0, 1]], "distortion": [0.1] * 5, "image_size": [1280, 720]},
-    "two sensors": {"color_intrinsics": PLAIN, "depth_intrinsics": PLAIN},
-    "a product": {**PLAIN, "camera_model": "ZED-M"},
-    "ffx": {"ffx": F, "ffy": F, "ppx": X, "ppy": Y},
+    "open3d": {"width": 424, "height": 240, "intrinsic_matrix": [407.25, 0, 0, 0, 407.25, 0, 211.5, 119.5, 1]},
     "numbers as text": {"cameras": [{key: str(value) for key, value in PLAIN.items()}]},
-    "isaac": {"focal_length": 17.0, "horizontal_aperture": 17.7, "K": [[F, 0, X], [0, F, Y], [0, 0, 1]]},
-    "nerfstudio": {"fl_x": F, "fl_y": F, "w": 424, "h": 240, "frames": [{"transform_matrix": POSE.tolist()}]},
-    "opencv poses": {"cam0": {"R": POSE[:3, :3].tolist(), "T": POSE[:3, 3].tolist()}},
+    "nerfstudio": {"fl_x": 407.25, "frames": [{"transform_matrix": POSE.tolist()}]},
     "flat pose": {"cameras": [{"pose": POSE.ravel().tolist()}]},
     "a list": [PLAIN],
 }

@@ -21,7 +21,7 @@ HEIGHT = 0.03
 pytestmark = pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome is installed")
 
 
-def text(words: str) -> str:
+def text(words):
     """A script that tells whether the page says this."""
     return f"document.body.innerText.includes({words!r})"
 
@@ -83,7 +83,7 @@ def begun(server, page, browser, folder):
     return live, place
 
 
-def later(live, frames: int) -> None:
+def later(live, frames):
     """Let the twin go on for some frames."""
     wanted = live.simulator.frame + frames
     until(lambda: live.simulator.frame >= wanted)

@@ -12,9 +12,8 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from neuspring.core.artifacts import SplatCenters, Trajectory
+from neuspring.core.artifacts import SplatCenters
 from neuspring.core.files import read_npz, write_npz
-from neuspring.core.records import digest_file
 from neuspring.data.capture import Capture
 from neuspring.extensions.play.layers import NOT_SEEN_COLOR, SPLAT_UNIT, SplatLayer, unseen
 from neuspring.extensions.play.page import Page
@@ -44,7 +43,7 @@ def opened(server):
         server.gui.reset()
 
 
-def until(what) -> None:
+def until(what):
     end = time.monotonic() + 120
     while not what():
         assert time.monotonic() < end, "it did not come true"
@@ -100,7 +99,7 @@ def test_the_first_view_contains_all_runs_and_no_more_room_than_needed(opened, s
     assert max(np.abs(x).max(), (np.abs(y - covered) / (1 - covered)).max()) > 0.85
 
 
-def looked_at(scenario, folder, eye: tuple[float, float, float]):
+def looked_at(scenario, folder, eye):
     """The scenario as a camera at `eye`, m from the body's middle, saw it."""
     found = find([scenario])
     pose = np.vstack([np.column_stack([np.eye(3), found.observations.nodes.mean(axis=0) + eye]), [0, 0, 0, 1]])
@@ -157,29 +156,11 @@ def test_a_run_of_an_older_format_is_shown_as_far_as_it_goes(opened, scenario):
     assert page.live is None and "must be of kind twin" in page.text.content
 
 
-def test_a_prediction_with_other_nodes_than_its_twin_has_no_springs(opened, scenario):
-    place = scenario / "baseline" / "0"
-    path, old = place / "trajectory.npz", digest_file(place / "trajectory.npz")
-    x = Trajectory.load(path).positions
-    Trajectory(positions=x[:, :5], frame_count=len(x)).save(path)
-    spoil(place / "rollout.json", old, digest_file(path))
-    page = opened(scenario)
-    assert page.player._bodies[RUN].springs is None and "no springs" in page.notes.content
-
-
 def test_names_of_runs_cannot_put_markup_on_the_page(opened, scenario):
     (scenario / "baseline").rename(scenario / "<img src=x onerror=alert(1)>")
     spoil(scenario / "<img src=x onerror=alert(1)>" / "0" / "rollout.json", '"ok"', '"failed"')
     page = opened(scenario)
     assert "&lt;img" in page.notes.content and "<img" not in page.notes.content
-
-
-def test_damaged_splats_are_a_note_and_the_run_is_shown(scenario, server):
-    dressed(scenario)
-    (scenario / "appearance" / "0" / "splats.ply").write_bytes(b"ply\n")
-    run = find([scenario]).runs[0]
-    assert "splats" not in run.paths and any("no splats" in note for note in run.notes)
-    assert Player(server.scene, find([scenario]))._bodies[RUN].splats is None
 
 
 def test_what_the_browser_gets_are_their_colors_and_sizes(scenario, server):

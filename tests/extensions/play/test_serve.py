@@ -21,7 +21,7 @@ UPGRADE = {
 }
 
 
-def status(server, path="/", **headers: str) -> int:
+def status(server, path="/", **headers):
     connection = http.client.HTTPConnection("127.0.0.1", server.get_port(), timeout=20)
     try:
         connection.putrequest("GET", path, skip_host="Host" in headers)
@@ -68,7 +68,7 @@ LINK = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch
 
 
 def test_a_link_of_a_report_opens_a_frame_of_its_own_scenario_and_nothing_else():
-    asked: list[int] = []
+    asked = []
     one = start("127.0.0.1", 0, asked.append, "rope")
     try:
         for path, answer in {

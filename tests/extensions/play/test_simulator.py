@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neuspring.core.artifacts import Twin
 from neuspring.extensions.play.colors import Scale, linear
 from neuspring.extensions.play.live import FASTEST_GRAB, Grab, nearest_to_ray
 from neuspring.extensions.play.player import Clock
@@ -18,11 +17,11 @@ NODE, STEP = 3, 0.008
 
 
 @pytest.fixture(scope="module")
-def twin() -> Twin:
+def twin():
     return small.scene().truth
 
 
-def pulled(simulator: Simulator, frames: int) -> np.ndarray:
+def pulled(simulator, frames):
     """Positions [frames + 1, N, 3] under a pull along x, released at half of the frames."""
     seen, start = [simulator.positions.copy()], simulator.positions[NODE].copy()
     for frame in range(frames):
@@ -50,7 +49,7 @@ def test_a_twin_whose_hands_only_push_can_be_grabbed(twin):
     assert grabbed.pushes.tolist() == [*led.tolist(), False], "the mouse pulls"
 
 
-def grab() -> Grab:
+def grab():
     return Grab(5, np.zeros((3, 3), np.float32), np.array([0, 0, 1]))
 
 

@@ -15,7 +15,7 @@ RATE = 60.0
 NO_DAMPING = Damping(deformation=0.0, drag=0.0, edges=0.0)
 
 
-def bar(height: float = 0.5, youngs: float = 2e4, viscosity: float = 0.0, friction: float = 0.5, cells=(6, 2, 2)) -> SoftBody:
+def bar(height=0.5, youngs=2e4, viscosity=0.0, friction=0.5, cells=(6, 2, 2)):
     """A bar of 0.12 x 0.03 x 0.03 m along x, its lower side at `height`."""
     nodes, tetrahedra = block((-0.06, -0.015, height), (0.06, 0.015, height + 0.03), cells)
     skin = boundary(tetrahedra)
@@ -76,7 +76,7 @@ def test_free_vibration_keeps_its_energy():
 
 
 def test_the_maxwell_branch_damps_and_leaves_rigid_motion_alone():
-    def swing(viscosity: float) -> float:
+    def swing(viscosity):
         body = bar(height=3.0, viscosity=viscosity)
         start = body.nodes.copy()
         start[:, 0] *= 1.02
@@ -145,12 +145,12 @@ def test_moduli_of_the_engine_s_energy():
     """Uniaxial stretch of the stable neo-Hookean energy has the wanted Young's modulus at small strain."""
     mu, lame = stable_moduli(np.array(1e4), np.array(0.3))
 
-    def energy(axial: float, lateral: float) -> float:
+    def energy(axial, lateral):
         f = np.diag([axial, lateral, lateral])
         square, volume, alpha = (f**2).sum(), np.linalg.det(f), 1 + 0.75 * mu / lame
         return float(0.5 * mu * (square - 3) - 0.5 * mu * np.log(square + 1) + 0.5 * lame * (volume - alpha) ** 2)
 
-    def relaxed(axial: float) -> float:
+    def relaxed(axial):
         return float(
             minimize_scalar(
                 lambda lateral: energy(axial, lateral), bounds=(0.9, 1.1), method="bounded", options={"xatol": 1e-12}

@@ -2,22 +2,20 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from neuspring.extensions.synthetic import bodies, meshes
-from neuspring.extensions.synthetic.scenes import Hand, minimum_jerk, place
+from neuspring.extensions.synthetic.scenes import Hand, place
 from neuspring.scenes import shapes
 
 
-def closed(faces: np.ndarray) -> bool:
+def closed(faces):
     """Every edge is used once in each direction."""
     directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     forward, backward = {tuple(e) for e in directed.tolist()}, {tuple(e[::-1]) for e in directed.tolist()}
     return len(forward) == len(directed) and forward == backward
 
 
-def enclosed(vertices: np.ndarray, faces: np.ndarray) -> float:
+def enclosed(vertices, faces):
     """Volume by the divergence theorem; positive if faces point outward."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return float((np.cross(a, b) * c).sum() / 6.0)
@@ -31,13 +29,6 @@ def test_distances_by_hand():
     assert shapes.capsule((0, 0, 0), (1, 0, 0), 0.1)(np.array([0.5, 0.3, 0.0])) == pytest.approx(0.2)
     assert shapes.capsule((0, 0, 0), (1, 0, 0), 0.1)(np.array([1.5, 0.0, 0.0])) == pytest.approx(0.4)
     np.testing.assert_allclose(shapes.ellipsoid((0, 0, 0), (0.1,) * 3)(POINTS), shapes.sphere((0, 0, 0), 0.1)(POINTS), atol=1e-12)
-
-
-def test_a_smooth_union_is_the_union_but_for_the_blend():
-    parts = [shapes.sphere((0, 0, 0), 0.1), shapes.sphere((0.1, 0, 0), 0.05)]
-    union, least = shapes.smooth_union(parts, 0.006)(POINTS), np.min([part(POINTS) for part in parts], axis=0)
-    assert (union <= least + 1e-12).all()
-    assert (union >= least - 0.006 * np.log(2) - 1e-12).all()
 
 
 def test_the_surface_of_a_sphere_is_closed_outward_and_as_large():
@@ -58,22 +49,6 @@ def test_a_body_is_filled_to_its_surface():
     assert closed(skin)
     assert enclosed(nodes, skin) == pytest.approx(volumes.sum())
     assert np.abs(sdf(nodes[np.unique(skin)])).mean() < 0.0015
-
-
-@pytest.mark.parametrize(
-    ("mesh", "volume"),
-    [
-        (meshes.block((0, 0, 0), (0.3, 0.2, 0.1), (4, 3, 2)), 0.006),
-        (meshes.stick(0.5, np.full(11, 0.01), 8), 0.5 * 8 * 0.5 * 0.01**2 * np.sin(np.pi / 4)),
-    ],
-)
-def test_boxes_and_rods_fit_together(mesh, volume):
-    nodes, elements = mesh
-    assert (meshes.volumes(nodes, elements) > 0).all()
-    assert meshes.volumes(nodes, elements).sum() == pytest.approx(volume)
-    skin = meshes.boundary(elements)
-    assert closed(skin)
-    assert enclosed(nodes, skin) == pytest.approx(volume)
 
 
 def test_embedded_points_follow_affine_motion_exactly():
@@ -106,11 +81,6 @@ def test_goods_show_where_their_material_is(body):
     assert material.max() > 2 * material.min()
     assert ((body.surface.colors >= 0) & (body.surface.colors <= 1)).all()
     np.testing.assert_allclose(body.surface.weights.sum(axis=1), 1.0)
-
-
-@given(st.floats(0, 1))
-def test_minimum_jerk_is_symmetric(u):
-    assert minimum_jerk(np.array(u)) + minimum_jerk(np.array(1 - u)) == pytest.approx(1.0)
 
 
 def test_a_hand_reaches_its_keys_and_carries_its_mesh_rigidly():

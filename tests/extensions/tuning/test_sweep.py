@@ -1,18 +1,15 @@
 """Sweeps: what they refuse, their trials, workers that are killed, the report."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from optuna.trial import FrozenTrial, TrialState
+from optuna.trial import TrialState
 
 from neuspring import config
 from neuspring.config.settings import read_settings
@@ -45,18 +42,18 @@ FAST = {"fit.learning_rate": {"low": 1.0e-4, "high": 1.0e-1, "log": True}, "fit.
 RANGE = {"low": 1, "high": 2}
 
 
-def settings(**changes: Any) -> config.Config:
+def settings(**changes):
     """The configuration whose method is varied."""
     values = json.loads(json.dumps(BASE))
     config.merge(values, changes)
     return config.parse(config.Config, values, "test")
 
 
-def sweep(**changes: Any) -> Tune:
+def sweep(**changes):
     return config.parse(Tune, {"study": "small", "method": "baseline", "trials": 3, "space": FAST} | changes, "tune")
 
 
-def furnish(root: Path, observations: Observations | None = None) -> Path:
+def furnish(root, observations=None):
     """Write the tables and observations that a sweep reads; returns its folder."""
     tables = {"methods": METHODS, "searches": {"uniform": {"clusters": 1, "description": "One region"}}}
     (root / "config").mkdir()
@@ -66,25 +63,25 @@ def furnish(root: Path, observations: Observations | None = None) -> Path:
     return root / "study"
 
 
-def work(folder: Path, tune: Tune, base: config.Config | None = None, number: int = 0) -> list[FrozenTrial]:
+def work(folder, tune, base=None, number=0):
     """Run a worker; returns all trials of the sweep."""
     base, root = base or settings(), folder.parent
     worker.work(base, tune, [root / "observations.npz"], number, "cpu", folder / f"worker-{number}.json", root)
     return trials(folder, tune, base)
 
 
-def trials(folder: Path, tune: Tune, base: config.Config | None = None) -> list[FrozenTrial]:
+def trials(folder, tune, base=None):
     return worker.study_of(folder, tune, Plan.of(base or settings(), tune, folder.parent).facts()).get_trials()
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     """The folder of a sweep that has not begun."""
     return furnish(tmp_path)
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Tune]:
+def finished(tmp_path_factory):
     """A sweep of four trials, reported. Tests leave its trials as they are."""
     folder = furnish(tmp_path_factory.mktemp("tune"))
     tune = sweep(trials=4, space=FAST | {"fit.damping": {"choices": ["fixed", "homogeneous"]}})
@@ -140,15 +137,6 @@ def test_what_a_sweep_cannot_go_on_with_is_refused(finished, tmp_path):
         work(folder, tune, number=1)
     with pytest.raises(InputError, match="must have been begun"):
         report(settings(), tune, tmp_path / "summary.md", folder.parent)
-
-
-@pytest.mark.parametrize("data", ["toy", "phystwin"])
-def test_the_shipped_sweep_is_valid(data):
-    values: dict = {}
-    for name in ("config", f"data/{data}", "studies/tune"):
-        config.merge(values, config.read_yaml(ROOT / "config" / f"{name}.yaml"))
-    parsed = config.parse(config.Config, values, "shipped")
-    assert Plan.of(parsed, parsed.tune, ROOT)
 
 
 def test_the_workflow_plans_what_a_worker_varies_and_refuses_sqlite_across_machines():
