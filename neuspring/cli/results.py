@@ -66,9 +66,7 @@ def tables(
         scenarios, methods, seeds = scenarios or tuple(there[0]), methods or tuple(there[1]), seeds or tuple(there[2])
         if not (scenarios and methods and seeds):
             raise InputError(results, "a results folder with runs is required", "none", "Run the workflow first, or name another.")
-        about = asked(results)
-        found, _ = as_asked(collect(results, scenarios, methods, seeds, absent, transfers), about)
-        common |= {"results": results, "asked": about}
+        found = as_asked(collect(results, scenarios, methods, seeds, absent, transfers), asked(results))
     numbers = tables.Compared(table=found, baseline=baseline or found.methods[0], **common)
     text = tables.write(numbers, output)
     print(markdown(tables.verdict(numbers)) if brief else text)
@@ -83,12 +81,10 @@ def _study(table: Path, extra: Sequence[Path], name: str) -> Study:
     return studies[name]
 
 
-def _read_scores(
-    path: Path, scenarios: Sequence[str], methods: Sequence[str], seeds: Sequence[int], left_out: str, current: bool = False
-) -> ScoreTable:
+def _read_scores(path: Path, scenarios: Sequence[str], methods: Sequence[str], seeds: Sequence[int], left_out: str) -> ScoreTable:
     from neuspring.scores.table import read_scores
 
-    found = read_scores(path, current).named(scenario=scenarios, method=methods, seed=seeds)
+    found = read_scores(path).named(scenario=scenarios, method=methods, seed=seeds)
     return replace(found, left_out=_read_left_out(left_out))
 
 
@@ -122,7 +118,7 @@ def study(
     if scores and one.kind:
         remedy = "Leave out --scores and name --results."
         raise InputError(f"study {study}", f"a study of the kind {one.kind} needs a results folder", "scores alone", remedy)
-    found = _read_scores(scores or results / tables / "scores.csv", scenarios, methods, seeds, left_out, current=not scores)
+    found = _read_scores(scores or results / tables / "scores.csv", scenarios, methods, seeds, left_out)
     print(write_study(study, one, found, results, output))
 
 
@@ -138,7 +134,7 @@ def explain(
     from neuspring.report.tables import behind
     from neuspring.scores.table import read_scores
 
-    found = behind(read_scores(results / tables / "scores.csv", current=True), what.split("/"), results)
+    found = behind(read_scores(results / tables / "scores.csv"), what.split("/"), results)
     print(f"{found.caption}\n\n{lay_out(found, 'text')}")
 
 

@@ -1,5 +1,6 @@
-"""Pictures: of runs (`run`, `images`), of benchmarks (`benchmark`), for papers (`strip`, `twin`, `film`),
+"""Pictures: of runs (`run`, `images`), of numbers (`benchmark`), for papers (`strip`, `twin`, `film`),
 and in a notebook (`show`).
 
-All that shows the world is drawn by one camera model (`scene`) and one painter of panels (`painter`, `twin`).
+All of them have one style and one layout of panels (`sheet`), one camera model (`scene`), and one painter of panels
+(`painter`, `twin`).
 """

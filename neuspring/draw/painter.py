@@ -68,8 +68,7 @@ class Painter:
         values = np.concatenate(kept) if kept else np.zeros(0)
         value = max(DRAWN_MM * float(np.quantile(values, 0.98)) if len(values) else 0.0, LEAST_MM)
         power = 10.0 ** np.floor(np.log10(value))
-        # The next of these steps times a power of ten.
-        return float(next(step for step in (1, 2, 3, 5, 8, 10) if step * power >= value * (1 - 1e-9)) * power)
+        return float(np.ceil(value / power * (1 - 1e-9)) * power)
 
     error_name, error_label = "distance", "distance [mm]"
     """Name of the rows of errors, and the label of their color bar."""

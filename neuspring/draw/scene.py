@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
@@ -69,21 +70,13 @@ def box_around(pixels: np.ndarray, camera: Camera, *, clip: bool) -> tuple[int, 
 
     A part that is too flat or too tall grows. `clip` keeps it inside of the picture, which a camera's photo has to fill.
     """
-    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    low, high, whole = pixels.min(axis=0), pixels.max(axis=0), (camera.width, camera.height)
     size = np.maximum(high - low, 1.0)
     size = size + 2 * VIEW_MARGIN * size.max()
     size[1] = max(size[1], FLATTEST_PANEL * size[0])
     size[0] = max(size[0], size[1] / TALLEST_PANEL)
-    whole = np.array([camera.width, camera.height], float)
-    if clip:
-        size = np.minimum(size, whole)
-    start = 0.5 * (low + high) - 0.5 * size
-    if clip:
-        start = np.clip(start, 0, whole - size)
-    left, top = np.floor(start).astype(int)
-    right, bottom = np.ceil(start + size).astype(int)
-    if clip:
-        left, top, right, bottom = max(left, 0), max(top, 0), min(right, camera.width), min(bottom, camera.height)
+    ends = np.floor(0.5 * (low + high - size)), np.ceil(0.5 * (low + high + size))
+    (left, top), (right, bottom) = (np.clip(end, 0, whole) if clip else end for end in ends)
     return int(left), int(top), int(right), int(bottom)
 
 
@@ -121,7 +114,7 @@ class ShownScene:
         frames: Sequence[int],
         azimuth: float | None = None,
         elevation: float = VIEW_ELEVATION,
-    ) -> ShownScene:
+    ) -> Self:
         """The content of these frames from any side, degrees (`seen_from`); without an azimuth from the broad side."""
         points, up = shown_points(observations, takes, frames), observations.scenario.up
         camera = seen_from(points, up, broad_side(points, up) if azimuth is None else azimuth, elevation)

@@ -1,8 +1,8 @@
-"""Common parts of all pictures: sizes of text, colors, panels placed in inches, color bars, and how files are written."""
+"""The style and the layout of all pictures: sizes, colors, the grid of panels, color bars, and how files are written."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import matplotlib
@@ -28,6 +28,10 @@ TRAINING, FUTURE = (110, 160, 240), (240, 150, 50)
 """Colors of the two parts of the time."""
 WORST = 0.5
 """Color difference, of 1, at the end of error pictures."""
+EDGE, PANEL_GAP, HEAD, BAR = 0.03, 0.04, 0.2, 0.62
+"""Margins at the sides, between panels, above them for names, and for a color bar, inches."""
+PICTURE_WIDTH = 3.2
+"""Width of a picture of a contact sheet, inches."""
 TIME_BAR = 6
 """Height of the bar that shows the time in a run's film, px."""
 TITLE_LINE = 20
@@ -37,16 +41,52 @@ MOST_SPRINGS = 20_000
 """More springs than this are not drawn: lines would cover each other."""
 
 
-def rgb(color: Sequence[int], shade: float = 1.0) -> tuple[float, float, float]:
-    """A color of 0 to 255 as matplotlib takes it, darker by a factor."""
-    red, green, blue = (shade * value / 255 for value in color)
-    return red, green, blue
+def panels(
+    width: float, shapes: Sequence[float], rows: int, *, left: float = EDGE, right: float = EDGE, head: float = HEAD
+) -> tuple[Figure, np.ndarray]:
+    """A figure `width` inches wide and its axes [rows, columns]: the layout of strips, films, twins and contact sheets.
+
+    All panels have one height; `shapes` are the columns' widths over it. Margins `left`, `right` and `head` are inches.
+    """
+    high = (width - left - right - PANEL_GAP * (len(shapes) - 1)) / sum(shapes)
+    total = head + rows * (high + PANEL_GAP)
+    figure = plt.figure(figsize=(width, total), facecolor="white")
+    sides = {"left": left / width, "right": 1 - right / width, "top": 1 - head / total, "bottom": PANEL_GAP / total}
+    gaps = {"wspace": PANEL_GAP * len(shapes) / (high * sum(shapes)), "hspace": PANEL_GAP / high, "width_ratios": shapes}
+    return figure, figure.add_gridspec(rows, len(shapes), **sides, **gaps).subplots(squeeze=False)
 
 
-def place(figure: Figure, left: float, bottom: float, width: float, height: float) -> Axes:
-    """New axes in a figure; all in inches from the lower left corner."""
-    across, high = figure.get_size_inches()
-    return figure.add_axes((left / across, bottom / high, width / across, height / high))
+def picture_sheet(rows: Sequence[Sequence[tuple[str, np.ndarray]]], path: Path) -> Path:
+    """Write rows of titled pictures [H, W, 3] of one shape."""
+    high, wide = rows[0][0][1].shape[:2]
+    figure, axes = panels(PICTURE_WIDTH * len(rows[0]), [wide / (high + 0.1 * wide)] * len(rows[0]), len(rows), head=0)
+    for axis, (title, picture) in zip(axes.flat, [pair for row in rows for pair in row], strict=True):
+        axis.imshow(picture)
+        axis.set_title(title, fontsize=TEXT)
+        axis.set_anchor("S")
+        axis.axis("off")
+    return save(figure, path)
+
+
+def time_bar(frame: int, frames: int, train_end: int, width: int) -> np.ndarray:
+    """A bar [TIME_BAR, width, 3] uint8 filled up to a frame: training and future in their colors, their border in white."""
+    bar = np.zeros((TIME_BAR, width, 3), np.uint8)
+    border, now = (round(width * k / frames) for k in (train_end, frame + 1))
+    for start, stop, shade in ((0, border, TRAINING), (border, width, FUTURE)):
+        bar[:, start:stop] = np.array(shade) // 4
+        bar[:, start : min(stop, now)] = shade
+    bar[:, max(border - 1, 0) : border + 1] = 255
+    return bar
+
+
+def false_colors(difference: np.ndarray) -> np.ndarray:
+    """Color differences [H, W] of 0 to WORST as a picture [H, W, 3] uint8."""
+    return (255 * matplotlib.colormaps["inferno"](np.clip(difference / WORST, 0, 1))[..., :3]).astype(np.uint8)
+
+
+def dark(color: Sequence[int]) -> tuple[float, ...]:
+    """A color of 0 to 255 for text on white."""
+    return tuple(0.75 * value / 255 for value in color)
 
 
 def points_across(axis: Axes) -> float:
@@ -56,12 +96,18 @@ def points_across(axis: Axes) -> float:
     return 72 * figure.get_figwidth() * axis.get_position().width
 
 
-def color_bar(figure: Figure, axis: Axes, norm: Normalize, colors: str, label: str, extend: str = "neither") -> None:
-    """A color bar with thin lines and small numbers."""
-    bar = figure.colorbar(ScalarMappable(norm, colors), cax=axis, extend=extend, extendfrac=0.03)
+def color_bar(axes: Iterable[Axes], norm: Normalize, colors: str, label: str, extend: str = "max") -> None:
+    """A color bar at the right of panels that stand below each other."""
+    axes = list(axes)
+    figure, low, high = axes[0].get_figure(root=True), axes[-1].get_position(), axes[0].get_position()
+    assert figure is not None
+    width, total = figure.get_size_inches()
+    tall = min(high.y1 - low.y0 - 0.1 / total, 2.4 / total)
+    cax = figure.add_axes((low.x1 + 0.07 / width, (low.y0 + high.y1 - tall) / 2, 0.09 / width, tall))
+    bar = figure.colorbar(ScalarMappable(norm, colors), cax=cax, extend=extend, extendfrac=0.03)
     bar.set_label(label, fontsize=TEXT - 1, labelpad=2)
     bar.outline.set_linewidth(0.4)
-    axis.tick_params(labelsize=TEXT - 1.5, width=0.4, length=2, pad=1.5, which="both")
+    cax.tick_params(labelsize=TEXT - 1.5, width=0.4, length=2, pad=1.5, which="both")
 
 
 def sample(count: int, most: int = MOST_SPRINGS) -> np.ndarray:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import base64
 import mimetypes
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
 from neuspring.core.artifacts import Observations, Scenario, Trajectory, Twin, Up
@@ -19,11 +19,12 @@ from neuspring.draw.film import write_film
 from neuspring.draw.painter import DrawingStyle, Painter
 from neuspring.draw.run import RUN_WIDTH, motion_figure, stiffness_figure
 from neuspring.draw.scene import ShownRun, ShownScene
-from neuspring.draw.sheet import TEXT, place, save
+from neuspring.draw.sheet import save
+from neuspring.draw.strip import strip_figure
 
 PICTURE_KINDS, FILM_KINDS = (".png", ".jpg", ".svg", ".pdf"), (".gif", ".mp4")
-PANELS, PANEL_HEAD = 5, 0.25
-"""Frames of a picture of nodes alone, and the room above them, inches."""
+PANELS = 5
+"""Frames of a picture of nodes alone."""
 CELL_PIXELS, CELL_RATE, CELL_MEGABYTES = 480, 15.0, 4.0
 """Width of each panel of a film, pictures per second at most, and its size at most."""
 ALONE_RATE = 30.0
@@ -79,19 +80,11 @@ def _figure(subject: Twin | Trajectory, observations: Observations | None) -> Fi
         return stiffness_figure(seen, ShownRun("twin", nodes, subject), None)
     if observations is not None:
         return motion_figure(observations, subject, "predicted")
-    painter = _painter(subject, None)
-    frames = np.unique(np.linspace(0, len(subject.positions) - 1, PANELS).astype(int))
-    across = RUN_WIDTH / PANELS
-    high = across * painter.scene.view.height / painter.scene.view.width
-    figure = plt.figure(figsize=(RUN_WIDTH, high + PANEL_HEAD))
-    for column, frame in enumerate(frames):
-        axis = place(figure, column * across, 0.0, across, high)
-        axis.set_title(f"frame {frame}", fontsize=TEXT)
-        painter.draw_predicted(axis, 0, int(frame))
-    return figure
+    frames = np.unique(np.linspace(0, len(subject.positions) - 1, PANELS).astype(int)).tolist()
+    return strip_figure(_painter(subject, None, frames), RUN_WIDTH)
 
 
-def _painter(trajectory: Trajectory, observations: Observations | None) -> Painter:
+def _painter(trajectory: Trajectory, observations: Observations | None, frames: Sequence[int] | None = None) -> Painter:
     """Paints the nodes beside what was seen; alone where that is not given."""
     positions, alone = trajectory.positions, observations is None
     seen = _alone(positions) if observations is None else observations
@@ -99,7 +92,7 @@ def _painter(trajectory: Trajectory, observations: Observations | None) -> Paint
         rule = f"the observations have {len(seen.controller_points)} frames"
         raise InputError("observations", rule, len(positions), "Show a trajectory under other hands without them.")
     take = ShownRun("predicted", positions)
-    frames = range(0, len(positions), max(round(seen.scenario.frame_rate / CELL_RATE), 1))
+    frames = range(0, len(positions), max(round(seen.scenario.frame_rate / CELL_RATE), 1)) if frames is None else frames
     return Painter(ShownScene.from_side(seen, [take], frames), [take], frames, DrawingStyle(error="none", together=alone))
 
 

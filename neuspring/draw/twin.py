@@ -5,22 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm, to_rgba_array
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from neuspring.core.artifacts import Twin
 from neuspring.draw.painter import empty, hands
 from neuspring.draw.scene import ShownRun, ShownScene
-from neuspring.draw.sheet import CONTROLLER, TEXT, color_bar, place, points_across, sample
+from neuspring.draw.sheet import CONTROLLER, TEXT, color_bar, panels, points_across, sample
 from neuspring.twin.body import Lines, body_of, lines_of
 
 Quantity = Literal["stiffness", "region"]
@@ -28,8 +26,8 @@ STIFFNESS_COLORS = "viridis"
 PALETTE = [f"tab:{name}" for name in ("blue", "orange", "green", "purple", "brown", "pink", "olive", "cyan")] + ["navy", "gold"]
 CROSSING = (0.35, 0.35, 0.35, 1.0)
 """Springs between regions."""
-TWIN_TITLE, TWIN_GAP, LEGEND_ROOM, TWIN_EDGE = 0.22, 0.05, 0.75, 0.03
-"""Room for names of methods, between panels, for a color bar or names of regions, and at the edges, inches."""
+LEGEND_ROOM = 0.75
+"""Room for a color bar or names of regions, inches."""
 MOST_VECTORS = 2500
 """More lines than this are stored as pixels: a page would open slowly."""
 LEAST_RATIO, DEEPEST = 2.0, 1e4
@@ -73,8 +71,6 @@ class TwinPicture:
     quantities: Sequence[Quantity]
     limits: tuple[float, float] | None = None
     """Range of stiffness, N; None: that of the twins."""
-
-    as_springs: ClassVar = True
 
     @cached_property
     def norm(self) -> LogNorm:
@@ -142,85 +138,54 @@ class TwinPicture:
 def twin_figure(body: TwinPicture, width: float, room: float = LEGEND_ROOM) -> Figure:
     """The picture, `width` inches wide: columns from left to right, quantities from top to bottom, each with its legend.
 
-    `room` is kept for legends on the right, inches; with more than a legend needs, that of regions counts nodes and springs.
+    `room` is kept on the right, inches.
     """
     shapes = [scene.view.width / scene.view.height for scene, _ in body.columns]
-    high = (width - 2 * TWIN_EDGE - room - TWIN_GAP * (len(shapes) - 1)) / sum(shapes)
-    total = TWIN_TITLE + len(body.quantities) * (high + TWIN_GAP) + TWIN_EDGE
-    figure = plt.figure(figsize=(width, total))
-    lefts = TWIN_EDGE + np.cumsum([0.0, *(high * shape + TWIN_GAP for shape in shapes[:-1])])
-    for left, shape, (_, take) in zip(lefts, shapes, body.columns, strict=True):
-        where = ((left + high * shape / 2) / width, (total - TWIN_TITLE + 0.05) / total)
-        figure.text(*where, take.label, ha="center", va="bottom", fontsize=TEXT)
-    legend, top = width - TWIN_EDGE - room, total - TWIN_TITLE
-    for quantity in body.quantities:
-        for left, shape, (scene, take) in zip(lefts, shapes, body.columns, strict=True):
-            body.paint(place(figure, left, top - high, high * shape, high), scene, take, quantity)
+    figure, axes = panels(width, shapes, len(body.quantities), right=room)
+    for row, quantity in zip(axes, body.quantities, strict=True):
+        for axis, (scene, take) in zip(row, body.columns, strict=True):
+            body.paint(axis, scene, take, quantity)
         if quantity == "stiffness":
-            tall = min(high, 1.8)
-            cax = place(figure, legend + 0.1, top - 0.5 * (high + tall) + 0.06, 0.09, tall - 0.12)
-            color_bar(figure, cax, body.norm, STIFFNESS_COLORS, "stiffness [N]", extend="both")
+            color_bar(row[-1:], body.norm, STIFFNESS_COLORS, "stiffness [N]", extend="both")
         else:
-            _regions(figure, body, legend, top - high / 2, counted=room > LEGEND_ROOM)
-        top -= high + TWIN_GAP
+            _regions(row[-1], body)
+    for axis, (_, take) in zip(axes[0], body.columns, strict=True):
+        axis.set_title(take.label, fontsize=TEXT, pad=3)
     return figure
 
 
-def _regions(figure: Figure, body: TwinPicture, left: float, middle: float, *, counted: bool) -> None:
+def _regions(axis: Axes, body: TwinPicture) -> None:
     """Names of the regions; twins of one scene are divided alike, and the one with most regions names them all."""
-    twin = max((_twin(take) for _, take in body.columns), key=lambda found: len(np.unique(found.topology.labels)))
-    topology, lines = twin.topology, lines_of(twin)
-    labels, sizes = np.unique(topology.labels, return_counts=True)
-    count, between, joined = len(labels), _between(lines), len(lines.pairs) - lines.inner
+    count = max(len(np.unique(_twin(take).topology.labels)) for _, take in body.columns)
     names = [f"region {k}" for k in range(count)] if count > 1 else ["one region"]
     dots = [Line2D([], [], ls="", marker="o", ms=4, color=color) for color in region_colors(count)]
-    extra: list[tuple[Any, str, int, str]] = []
-    if count > 1 and body.as_springs:
-        extra.append((CROSSING, "between", int(between.sum()), "springs"))
-    if counted:
-        ends = lines.labels[lines.pairs[: lines.inner]]
-        springs = [int(((ends == label).all(axis=1)).sum()) for label in labels]
-        names = [f"{name}: {n} nodes, {s} {lines.kind}" for name, n, s in zip(names, sizes, springs, strict=True)]
-        loose = [("white", "without spring", lines.loose, "nodes")] if lines.loose else []
-        extra += [(CONTROLLER, "of hands", joined, "springs"), *loose]
-    for color, name, number, what in extra:
-        dots.append(Line2D([], [], color=color, linewidth=1.0))
-        names.append(f"{name}: {number} {what}" if counted else name)
-    style = {"fontsize": TEXT - 1.5, "frameon": False, "handlelength": 0.8, "handletextpad": 0.3, "borderaxespad": 0.1}
-    across, total = figure.get_size_inches()
-    figure.legend(dots, names, loc="center left", bbox_to_anchor=(left / across, middle / total), labelspacing=0.25, **style)
+    if count > 1:
+        names.append("between")
+        dots.append(Line2D([], [], color=CROSSING, linewidth=1.0))
+    style = {"fontsize": TEXT - 1.5, "frameon": False, "handlelength": 0.8, "handletextpad": 0.3, "borderaxespad": 0.3}
+    axis.legend(dots, names, loc="center left", bbox_to_anchor=(1.0, 0.5), labelspacing=0.25, **style)
 
 
 def histogram(axis: Axes, stiffness: np.ndarray, norm: LogNorm, searched: float | None) -> None:
     """Springs over log stiffness [S], N, in the colors of the body; the searched stiffness, N, is marked.
 
-    Values below the largest / 10^6 stand there, so that none is left out.
+    Values below the largest / 10^6 are counted there, so that none is left out.
     """
     shown = np.maximum(stiffness, (stiffness.max() or 1.0) / 1e6)
     low, high = _widened(float(shown.min()), float(shown.max()))
     # Rounding must not push the extremes out of the outer bins.
-    edges = np.geomspace(low * (1 - 1e-6), high * (1 + 1e-6), STIFFNESS_BINS + 1)
-    counts, _ = np.histogram(shown, edges)
-    middles = np.clip(np.sqrt(edges[1:] * edges[:-1]), norm.vmin, norm.vmax)
-    colors = colormaps[STIFFNESS_COLORS](norm(middles))
-    axis.bar(edges[:-1], counts, np.diff(edges), align="edge", color=colors, edgecolor="0.4", lw=0.3)
-    middle = float(np.median(stiffness))
-    text = f"median {_newtons(middle)}"
+    found: Any = axis.hist(shown, np.geomspace(low * (1 - 1e-6), high * (1 + 1e-6), STIFFNESS_BINS + 1).tolist())
+    _, edges, bars = found
+    colors = colormaps[STIFFNESS_COLORS](norm(np.clip(np.sqrt(edges[1:] * edges[:-1]), norm.vmin, norm.vmax)))
+    for bar, color in zip(bars, colors, strict=True):
+        bar.set_facecolor(color)
+    text = f"stiffness [N], median {np.median(stiffness):.4g}"
     if searched:
         axis.axvline(searched, color=CONTROLLER, ls="--", lw=1.3)
-        text += f" = {middle / searched:.2f} $S_0$\ndashed: searched $S_0$ = {_newtons(searched)}"
+        text += f"\ndashed: searched, {searched:.4g}"
     axis.set(xscale="log", ylabel="springs")
-    axis.set_xlabel(f"stiffness [N]\n{text}", fontsize=TEXT - 1)
+    axis.set_xlabel(text, fontsize=TEXT - 1)
     axis.tick_params(labelsize=TEXT - 1, which="both")
-    # Matplotlib labels the ticks between powers of ten when few powers are in view; over half a decade they would overlap.
-    if edges[-1] / edges[0] > 3:
-        axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
-        axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
-        axis.xaxis.set_minor_formatter(NullFormatter())
-
-
-def _newtons(value: float) -> str:
-    return f"{value:,.0f} N" if value >= 100 else f"{value:.3g} N"
 
 
 def _between(lines: Lines) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import tempfile
 from fractions import Fraction
 from pathlib import Path
@@ -18,23 +17,16 @@ BT709 = 1
 """Code of BT.709 (ITU-T H.273) for matrix, primaries and transfer alike."""
 LIMITED_RANGE = 1
 """Code of studio levels (16 to 235), which every player expects."""
-LARGEST_RATE = 1000.0
-"""Hz."""
-WORST_QUALITY = 51
 
 
 class Video:
     """Writes pictures one at a time: `with Video(path, rate) as video: video.add(picture)`.
 
     The file appears at `path` when the block ends, and not at all if it fails. `quality` is the constant rate factor of x264: 0
-    (best) to 51, 6 more halve the file. Raises InputError for a bad rate or quality, and at the end for no pictures at all.
+    (best) to 51, 6 more halve the file. Raises InputError for a bad picture, and at the end for none at all.
     """
 
     def __init__(self, path: Path, rate: float, quality: int = 20) -> None:
-        if not (math.isfinite(rate) and 0 < rate <= LARGEST_RATE):
-            raise InputError(path, f"the frame rate of a video must be above 0 and at most {LARGEST_RATE:g} Hz", rate)
-        if not 0 <= quality <= WORST_QUALITY:
-            raise InputError(path, f"the quality of a video must be 0 to {WORST_QUALITY}", quality)
         self._path, self._rate, self._quality = path, Fraction(rate).limit_denominator(1001), quality
         self._shape: tuple[int, ...] = ()
         self._count = 0

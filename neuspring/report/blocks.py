@@ -54,13 +54,6 @@ class Picture:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Prose:
-    """HTML that was rendered from Markdown."""
-
-    html: Markup
-
-
-@dataclass(frozen=True, kw_only=True)
 class Code:
     """Preformatted text."""
 
@@ -91,7 +84,7 @@ class Fold:
     open: bool = False
 
 
-Block = Table | Text | Items | Picture | Prose | Code | Grid | Fold
+Block = Table | Text | Items | Picture | Code | Grid | Fold
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +100,7 @@ class PageSection:
 
 
 def markdown(blocks: Sequence[Block]) -> str:
-    """Tables, paragraphs, lists and code as Markdown; folds are open. Pictures and prose are left out."""
+    """Tables, paragraphs, lists and code as Markdown; folds are open. Pictures are left out."""
     parts = []
     for block in blocks:
         if isinstance(block, Table):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,14 +11,16 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 from urllib.parse import quote
 
-from markdown_it import MarkdownIt
-from markupsafe import Markup
+from matplotlib import pyplot as plt
+from matplotlib.figure import Figure
+from PIL import Image
 
 from neuspring.config import Config
+from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import JobRecord
 from neuspring.core.run_record import RUN_RECORD, RunRecord
-from neuspring.report.blocks import PageSection, Prose
+from neuspring.report.blocks import PageSection, Picture
 from neuspring.report.tables import Compared
 from neuspring.scores.paper import Study
 from neuspring.scores.table import DAMAGED, LeftOut, ScoreTable, one_line
@@ -25,6 +28,9 @@ from neuspring.scores.table import DAMAGED, LeftOut, ScoreTable, one_line
 Value = TypeVar("Value")
 PERCEPTION = "perception"
 """Kind of the pictures that perception left of a scenario, and their folder in it."""
+MARKUP = 400
+"""Characters around an embedded picture."""
+NO_ROOM = "not embedded, to keep this page small"
 MOST_ROWS = 400
 """At most so many rows of a list are shown."""
 
@@ -70,6 +76,16 @@ class ReportData:
     """Files that cannot be read, relative to the results folder, and why."""
     room: int = 0
     """Characters that pictures and films may take."""
+    film_room: int = 0
+    """Characters of these that films may take."""
+
+    def take(self, size: int, film: bool = False) -> bool:
+        """True, and the room is taken, where a picture or film of this size still fits."""
+        if size + MARKUP > (min(self.room, self.film_room) if film else self.room):
+            return False
+        self.room -= size + MARKUP
+        self.film_room -= size * film
+        return True
 
     @property
     def table(self) -> ScoreTable:
@@ -106,6 +122,11 @@ class ReportData:
             self.damaged.setdefault(self.relative(path), one_line(error))
             return None
 
+    def observations(self, scenario: str) -> Observations | None:
+        """What was observed of a scenario; None where that is not there or damaged."""
+        path = self.results / scenario / "observations.npz"
+        return self.read(path, Observations.load) if path.is_file() else None
+
     def first_runs(self, scenario: str) -> dict[str, RunRecord]:
         """Shown method -> its first run of a scenario, finished ones before failed ones."""
         runs = [run for run in self.runs if run.scenario == scenario]
@@ -138,23 +159,6 @@ def link(path: Path, folder: Path) -> str:
     return quote(Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix())
 
 
-def rendered(text: str) -> Markup:
-    """Markdown as HTML with smaller headings, without links and pictures."""
-    parser = MarkdownIt("commonmark", {"html": False}).enable("table").disable(["image", "link"])
-    parser.add_render_rule("table_open", lambda *_: '<div class="scroll" tabindex="0" role="region" aria-label="Table"><table>')
-    parser.add_render_rule("table_close", lambda *_: "</table></div>")
-    tokens = parser.parse(text)
-    for token in tokens:
-        if token.type in ("heading_open", "heading_close"):
-            token.tag = "h3" if token.tag in ("h1", "h2") else "h4"
-    return Markup(parser.renderer.render(tokens, parser.options, {}))
-
-
-def prose(material: ReportData, path: Path) -> Prose | None:
-    """A Markdown file; None if it is not there or cannot be read."""
-    return material.read(path, lambda path: Prose(html=rendered(path.read_text(encoding="utf-8")))) if path.is_file() else None
-
-
 @dataclass(frozen=True, kw_only=True)
 class ReportSection:
     """A section of the report: the member of a registry that a module of `sections`, or of a package, declares."""
@@ -165,6 +169,23 @@ class ReportSection:
     """None where there is nothing to show."""
     phase: Literal[0, 1, 2] = 0
     """1: it takes the `room` that all others leave; 2: it lists the damaged files that all others found."""
+
+
+def shown_figure(figure: Figure, caption: str) -> Picture:
+    """A figure as SVG in the page; closes it."""
+    stream = io.BytesIO()
+    with plt.rc_context({"svg.hashsalt": caption}):
+        figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
+    plt.close(figure)
+    return Picture(caption="", alt=caption, data=data_uri("image/svg+xml", stream.getvalue()), wide=True, paper=True)
+
+
+def webp(picture: Image.Image, width: int) -> str:
+    """Data URI of a picture, not wider than `width`."""
+    picture, stream = picture.convert("RGB"), io.BytesIO()
+    picture.thumbnail((width, 10 * width))
+    picture.save(stream, "WEBP", quality=75)
+    return data_uri("image/webp", stream.getvalue())
 
 
 def data_uri(kind: str, data: bytes) -> str:

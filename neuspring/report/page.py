@@ -58,7 +58,7 @@ def write(results: Path, output: Path, options: Options, written: str | None = N
     # Pictures take the room that all else leaves. What lists damaged files is made again last: pictures may be damaged too.
     make(0)
     make(2)
-    material.room = int(1e6 * choice.megabytes) - len(page().encode())
+    material.room, material.film_room = int(1e6 * choice.megabytes) - len(page().encode()), int(1e6 * choice.video_megabytes)
     make(1)
     make(2)
     write_text(material.output, page())
@@ -69,11 +69,11 @@ def gather(results: Path, output: Path, options: Options) -> ReportData:
     """Read what the report is about."""
     messages: list[str] = []
     jobs = read_jobs(results, messages)
-    choice, about = _filled(results, options), asked(results)
+    choice = _filled(results, options)
     table = collect(results, choice.scenarios, choice.methods, choice.seeds, choice.left_out, choice.transfers)
-    table, _ = as_asked(table, about)
+    table = as_asked(table, asked(results))
     config = choice.settings or Config()
-    more = {"objects": config.objects, "aims": config.aims, "names": choice.names, "results": results, "asked": about}
+    more = {"objects": config.objects, "aims": config.aims, "names": choice.names}
     numbers = Compared(table=table, baseline=choice.baseline or "", **more)  # type: ignore[arg-type]
     damaged = damaged_files(table, messages, results)
     return ReportData(results=results, output=output, choice=choice, numbers=numbers, jobs=jobs, damaged=damaged)

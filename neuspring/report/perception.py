@@ -10,6 +10,7 @@ import pandas as pd
 from neuspring.core.files import write_text
 from neuspring.core.records import StageRecord
 from neuspring.core.table import Table
+from neuspring.scores.metrics import DASH
 
 JUDGED_COLUMNS = {
     "mask_iou_object": ("Object IoU", ".3f"),
@@ -47,16 +48,16 @@ def write(table: pd.DataFrame, folder: Path) -> str:
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / "perception.csv", table.to_csv(index=False))
     columns = {key: value for key, value in JUDGED_COLUMNS.items() if key in table}
-    groups = [(str(name), rows) for name, rows in table.groupby("category", sort=True)]
+    groups = {str(name): rows for name, rows in table.groupby("category", sort=True)}
     rows = []
-    for name, part in [*groups, ("all", table)] if len(groups) > 1 else groups:
+    for name, part in (groups | {"all": table} if len(groups) > 1 else groups).items():
         means = part[list(columns)].mean()
-        cells = ["–" if pd.isna(means[key]) else format(means[key], style) for key, (_, style) in columns.items()]
-        rows.append([name, str(len(part)), *cells])
-    sensors = ", ".join(sorted(set(table["sensor"]))) if "sensor" in table else "?"
-    backends = " and ".join(f"{step}: {', '.join(sorted(set(table[step])))}" for step in ("segment", "track"))
+        rows.append(
+            [name, len(part), *(DASH if pd.isna(means[key]) else format(means[key], form) for key, (_, form) in columns.items())]
+        )
+    used = [f"{step}: {', '.join(sorted(set(table[step])))}" for step in ("segment", "track", "sensor") if step in table]
     note = (
-        f"Means over scenes ({backends}; depth: {sensors}). Track: error of points on the object while they are followed.\n"
+        f"Means over scenes ({'; '.join(used)}). Track: error of points on the object while they are followed.\n"
         "Lifted: of the same points in the world; trusted: of those that move as their neighbors do, which losses use."
     )
     header = ["", "Scenes", *(heading for heading, _ in columns.values())]

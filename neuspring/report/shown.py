@@ -82,11 +82,6 @@ class Run:
         """The centers at which the method's own model puts its splats, if it does. Raises InputError."""
         return self._read("centers", SplatCenters)
 
-    @cached_property
-    def twin_digest(self) -> str:
-        """SHA-256 of the twin's file."""
-        return digest_file(self.paths["twin"]) if "twin" in self.paths else ""
-
     def _read(self, role: str, kind: type[Kind]) -> Kind | None:
         if (path := self.paths.get(role)) is None:
             return None

@@ -58,8 +58,6 @@ LAYERS = (0, 3, 6, 8, 10)
 """Indices of the convolutions in torchvision's `features`."""
 POOLED = (1, 2)
 """Convolutions that follow a max-pooling of 3 px, stride 2."""
-SMALLEST_PICTURE = 31
-"""px: below it nothing is left after the second pooling."""
 RGB_SHIFT = (-0.030, -0.088, -0.188)
 RGB_SCALE = (0.458, 0.448, 0.450)
 """ImageNet's means and deviations of R, G, B, for pictures in [-1, 1]."""
@@ -116,15 +114,9 @@ class Lpips:
         """Distances [...] of pictures [..., 3, H, W] in [0, 1], at least 31 px wide and high; 0 for equal ones. Differentiable.
 
         LPIPS is made for [-1, 1], to which pictures are mapped; `released_range` leaves them in [0, 1] (PhysTwin's quirk).
-        Raises InputError for bad shapes.
         """
         import torch
 
-        shapes = f"{tuple(a.shape)}, {tuple(b.shape)}"
-        if a.ndim < 3 or a.shape != b.shape or a.shape[-3] != 3:
-            raise InputError("LPIPS", "two pictures [..., 3, H, W] of the same shape are needed", shapes)
-        if min(a.shape[-2:]) < SMALLEST_PICTURE:
-            raise InputError("LPIPS", f"AlexNet takes pictures of at least {SMALLEST_PICTURE} x {SMALLEST_PICTURE} px", shapes)
         pictures = torch.cat([p.reshape(-1, *p.shape[-3:]).to(self.heads[0]) for p in (a, b)])
         if not released_range:
             pictures = 2 * pictures - 1

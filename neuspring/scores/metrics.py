@@ -86,11 +86,6 @@ class Metric:
         return (resolve_name(self.function) if isinstance(self.function, str) else self.function)(*given)
 
     @property
-    def other_average(self) -> Literal["equal", "frames"]:
-        """The average that the paper does not use for this metric."""
-        return "frames" if self.average == "equal" else "equal"
-
-    @property
     def label(self) -> str:
         """For an axis: heading and unit."""
         return self.heading if self.unit == "1" else f"{self.heading} [{self.unit}]"
@@ -338,21 +333,12 @@ def score_images(frames: pd.DataFrame, scenario: Scenario, drawn: int, method: s
     return _table(rows)
 
 
-def in_order(table: pd.DataFrame, ranks: Mapping[str, Iterable[str]]) -> pd.DataFrame:
-    """The table sorted by columns, each in the order of its names."""
-    import pandas as pd
-
-    places = {column: table[column].map({name: rank for rank, name in enumerate(names)}) for column, names in ranks.items()}
-    return table.loc[pd.DataFrame(places).sort_values(list(places)).index].reset_index(drop=True)
-
-
 def averages(scores: pd.DataFrame, by: Iterable[str] = ("method", "task", "metric")) -> pd.DataFrame:
     """Both averages over scenarios: `equal` weighs scenarios equally, `frames` weighs them by their frames.
 
-    The paper uses the first for distances and the second for pictures: that is `mean`, where metrics are told apart, and the other
-    one is `other`. Seeds are averaged within each scenario first. `seed_std` is
-    the standard deviation over seeds of the equal average, of the seeds that have every scenario: 0 for one seed, NaN where there
-    are several seeds and fewer than two of them have every scenario.
+    The paper uses the first for distances and the second for pictures: that is `mean`, where metrics are told apart. Seeds are
+    averaged within each scenario first. `seed_std` is the standard deviation over seeds of the equal average, of the seeds
+    that have every scenario: 0 for one seed, NaN where there are several seeds and fewer than two of them have every scenario.
     """
     keys = list(by)
     groups = scores.groupby([*keys, "scenario"], sort=False)
@@ -372,5 +358,4 @@ def averages(scores: pd.DataFrame, by: Iterable[str] = ("method", "task", "metri
     if "metric" not in keys:
         return result
     framed = result["metric"].map(lambda name: METRICS[name].average == "frames")
-    mean, other = np.where(framed, result["frames"], result["equal"]), np.where(framed, result["equal"], result["frames"])
-    return result.assign(mean=mean, other=other)
+    return result.assign(mean=np.where(framed, result["frames"], result["equal"]))

@@ -27,12 +27,6 @@ if TYPE_CHECKING:
 
 PAPER_TASKS = {"reconstruction": "reconstruction_resimulation", "future": "future_prediction"}
 """Our tasks to the paper's."""
-UNDERLINED = ("table1_comparison", "table3_network")
-"""Tables in which the paper underlines the second best; in all of them the best is bold."""
-CLUSTER_CLAIM = (
-    "The paper shows the Chamfer distance of two scenarios as curves, without numbers: in both tasks it mostly falls as K grows. "
-    "It takes K = 5 everywhere."
-)
 MEANS = "MEAN22"
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from neuspring.config.images import Images
-from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.data.results import Masks
 from neuspring.scores.lpips import Lpips
@@ -36,18 +35,8 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 
     Of masks in perception it is `data.frames.overlap`.
     """
-    if a.dtype != bool or b.dtype != bool or a.shape != b.shape:
-        received = f"{a.dtype.name} {a.shape}, {b.dtype.name} {b.shape}"
-        raise InputError("iou", "two bool masks of the same shape are needed", received)
     union = np.count_nonzero(a | b)
     return np.count_nonzero(a & b) / union if union else 1.0
-
-
-def _check_bytes(shape: tuple[int, ...], **pictures: np.ndarray) -> None:
-    for name, pixels in pictures.items():
-        wanted = {"observed": (*shape, 3), "rendered": (*shape, 4)}.get(name, shape)
-        if pixels.dtype != np.uint8 or pixels.shape != wanted:
-            raise InputError(name, f"a picture {list(wanted)} uint8 is needed", f"{pixels.dtype.name} {pixels.shape}")
 
 
 def masked_pair(
@@ -58,7 +47,6 @@ def masked_pair(
     Takes bytes: observed [H, W, 3], object mask [H, W], rendered over black [H, W, 4], hand mask [H, W]. The observed picture is
     cut to the object, the rendered one is not. Both lose what the hand hides. Masks weigh by their value / 255.
     """
-    _check_bytes(observed.shape[:2], observed=observed, object_mask=object_mask, rendered=rendered, hand_mask=hand_mask)
     shown = 1.0 - hand_mask / 255.0
     truth = observed * (object_mask / 255.0 * shown / 255.0)[..., None]
     prediction = rendered[..., :3] * (shown / 255.0)[..., None]
@@ -74,7 +62,6 @@ def silhouettes(
     An alpha of at least `covered` counts as object; PhysTwin counts any but 0. Only the rendered silhouette loses what the hand
     hides, so a part of the observed mask under the hand lowers the IoU.
     """
-    _check_bytes(object_mask.shape, object_mask=object_mask, rendered=rendered, hand_mask=hand_mask)
     return object_mask > 0, (rendered[..., 3] >= covered) & (hand_mask < 255)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from neuspring.scores import statistics
-from neuspring.scores.metrics import TASKS, averages
+from neuspring.scores.metrics import TASKS, averages, present
 from neuspring.scores.table import HELD_TASK, ScoreTable, comparable, stacked
 
 JUDGES = tuple((task, name) for task in ("future", "reconstruction") for name in ("track_error", "chamfer", "image_error"))
@@ -32,7 +32,7 @@ def duels(table: ScoreTable, baseline: str, objects: statistics.Objects = "scena
     """
     finished = table.comparison.finished
     usable = comparable(finished)
-    there = set(zip(usable["task"], usable["metric"], strict=True))
+    there = present(usable)
     key = next((key for key in JUDGES if key in there), None)
     if key is None:
         return pd.DataFrame()

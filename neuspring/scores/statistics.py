@@ -24,6 +24,7 @@ import pandas as pd
 
 from neuspring.config.settings import Aim
 from neuspring.scores.metrics import metrics_of
+from neuspring.scores.table import of_kind, stacked
 
 RESAMPLES = 10_000
 
@@ -160,14 +161,16 @@ def judged_aims(scores: pd.DataFrame, aims: Iterable[Aim], objects: Objects = "s
     return pd.DataFrame(rows, columns=[*RATIO_COLUMNS, "aim", "below", "aim_verdict"])
 
 
-def seed_spread(scores: pd.DataFrame) -> pd.DataFrame:
-    """A row per method, task and distance: standard deviation of the log error over seeds, mean over scenarios of several seeds.
+def changes(scores: pd.DataFrame, baseline: str, objects: Objects = "scenario") -> pd.DataFrame:
+    """A row per method, task and metric: `change` against the baseline with `change_low`, `change_high`, `n`, `verdict`.
 
-    0.1 means that another seed typically changes an error by 10 %.
+    Errors have their ratio (`ratios`); pictures and marks have the difference (`paired_differences`), without a verdict.
     """
-    rows = scores[scores["metric"].isin([metric.name for metric in metrics_of("positions")]) & (scores["value"] > 0)]
-    rows = rows.assign(log=np.log(rows["value"].astype(float)))
-    keys = ["method", "task", "metric"]
-    each = rows.groupby([*keys, "scenario"], sort=False)["log"].std(ddof=1).dropna()
-    table = each.groupby(level=keys, sort=False).agg(spread="mean", scenarios="count")
-    return table.reset_index().reindex(columns=[*keys, "spread", "scenarios"])
+    errors = ratios(scores, baseline, objects)
+    others = paired_differences(of_kind(scores, "pictures", "marks"), baseline)
+    names = ["change", "change_low", "change_high", "n"]
+    tables = [
+        errors.rename(columns=dict(zip(("ratio", "ratio_low", "ratio_high"), names, strict=False))),
+        others.rename(columns=dict(zip(("difference", "low", "high", "scenarios"), names, strict=True))).assign(verdict=""),
+    ]
+    return stacked(tables).reindex(columns=["method", "task", "metric", *names, "verdict"])

@@ -231,38 +231,38 @@ def _varied(settings: Iterable[Mapping[str, Any]]) -> list[str]:
     return sorted(name for name, seen in values.items() if len(seen) > 1)
 
 
-def differing(runs: pd.DataFrame) -> dict[str, dict[str, str]]:
-    """Settings of predictions that differ between methods: setting -> method -> its value, or values joined by "or"."""
+def recorded(runs: pd.DataFrame) -> dict[str, dict[str, list[str]]]:
+    """Setting of predictions -> method -> the values that its runs recorded, sorted."""
     found: dict[str, dict[str, set[str]]] = {}
     for method, text in set(zip(runs["method"], runs["settings"], strict=True)):
         for name, value in json.loads(text).items():
             if name.split(".")[0] in (*PREDICTING_STAGES, "stages", "method"):
                 shown = value if isinstance(value, str) else json.dumps(value)
                 found.setdefault(name, {}).setdefault(method, set()).add(shown)
-    joined = {name: {method: " or ".join(sorted(values)) for method, values in own.items()} for name, own in found.items()}
-    return {name: own for name, own in sorted(joined.items()) if len(set(own.values())) > 1}
+    return {name: {method: sorted(values) for method, values in own.items()} for name, own in sorted(found.items())}
+
+
+def differing(runs: pd.DataFrame) -> dict[str, dict[str, str]]:
+    """Settings that differ between methods: setting -> method -> its value, or values joined by "or"."""
+    joined = {name: {method: " or ".join(values) for method, values in own.items()} for name, own in recorded(runs).items()}
+    return {name: own for name, own in joined.items() if len(set(own.values())) > 1}
 
 
 def mixed_settings(runs: pd.DataFrame) -> list[str]:
     """`stage of method` wherever finished runs of one method were made with different settings."""
-    found = dict[str, None]()
-    for method, part in runs[runs["status"] == "ok"].groupby("method", sort=False):
-        seen: dict[str, str] = {}
-        for text in dict.fromkeys(part["settings"]):
-            for name, value in json.loads(text).items():
-                if seen.setdefault(name, json.dumps(value)) != json.dumps(value):
-                    found[f"{name.split('.')[0]} of {method}"] = None
-    return list(found)
+    found = recorded(runs[runs["status"] == "ok"])
+    mixed = [
+        f"{name.split('.')[0]} of {method}" for name, own in found.items() for method, values in own.items() if len(values) > 1
+    ]
+    return list(dict.fromkeys(mixed))
 
 
-def as_asked(table: ScoreTable, asked: Mapping[str, Any]) -> tuple[ScoreTable, str]:
-    """The runs without those that are missing because the last workflow run asked for a part (`only=...`), and that part."""
-    runs = table.runs
+def as_asked(table: ScoreTable, asked: Mapping[str, Any]) -> ScoreTable:
+    """The table without runs that are missing because the last workflow run asked for a part (`only=...`)."""
     if not asked.get("only"):
-        return table, ""
-    inside = [runs[name].isin(asked.get(f"{name}s", [])) for name in RUN_KEYS]
-    kept = (runs["status"] != "missing") | np.logical_and.reduce(inside)
-    return replace(table, runs=runs[kept]), "" if kept.all() else f"only={asked['only']}"
+        return table
+    inside = [table.runs[name].isin(asked.get(f"{name}s", [])) for name in RUN_KEYS]
+    return replace(table, runs=table.runs[(table.runs["status"] != "missing") | np.logical_and.reduce(inside)])
 
 
 def one_line(error: Exception) -> str:
@@ -270,39 +270,25 @@ def one_line(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def read_scores(path: Path, current: bool = False) -> ScoreTable:
+def read_scores(path: Path) -> ScoreTable:
     """The table of a scores.csv; the runs.csv beside it says how runs ended. Raises InputError.
 
-    `current`: only a table of this version, which has failed runs, transfers and times too, is accepted.
-    Without runs.csv a run counts as finished if it has a Chamfer distance of every task that any run has. A diverged run has fewer.
+    Without runs.csv every run counts as finished.
     """
     try:
         rows = pd.read_csv(path)
-        columns = list(rows)
         rows = _with_run(rows[list(SCORE_COLUMNS)].astype({"value": float, "seed": int}))
     except (OSError, ValueError, KeyError) as error:
         rule = f"must be a scores.csv with the columns {', '.join(SCORE_COLUMNS)}"
         remedy = "Run the command that made it again (fits are reused), or take the file from a folder of tables."
         raise InputError(path, rule, one_line(error), remedy) from error
-    if current and "run" not in columns:
-        remedy = "Run the workflow's command again; fits are reused."
-        raise InputError(path, "must be a table of this version, with the column run", listed(columns), remedy)
     beside = path.with_name("runs.csv")
     if beside.is_file():
         runs = pd.read_csv(beside)
         runs = runs.assign(run=runs["scenario"] + "/" + runs["method"] + "/" + runs["seed"].astype(str))
-        floors = runs["floors"] if "floors" in runs else pd.Series("{}", index=runs.index)
-        start = [(*key, "start", name, value, "m", 1)
-                 for key, text in zip(runs[RUN_KEYS].itertuples(index=False), floors.fillna("{}"), strict=True)
-                 for name, value in json.loads(text).items()]  # fmt: skip
-        first = pd.DataFrame(start, columns=[*RUN_KEYS, "task", "metric", "value", "unit", "frames"]).assign(category="")
-        return ScoreTable(stacked([rows, _with_run(first)]), _filled(runs.reindex(columns=list(RUN_COLUMNS))))
-    runs = rows[["run", *RUN_KEYS]].drop_duplicates(ignore_index=True)
-    errors = rows[(rows["metric"] == "chamfer") & rows["task"].isin(TASKS)]
-    counts = errors.groupby("run")["task"].nunique().reindex(runs["run"], fill_value=0)
-    good = counts.to_numpy() == errors["task"].nunique()
-    status = {"status": np.where(good, "ok", "failed"), "reason": np.where(good, "", "its scores are not complete")}
-    return ScoreTable(rows, _filled(runs.assign(**status, source=path.name).reindex(columns=list(RUN_COLUMNS))))
+        return ScoreTable(rows, _filled(runs.reindex(columns=list(RUN_COLUMNS))))
+    runs = rows[["run", *RUN_KEYS]].drop_duplicates(ignore_index=True).assign(status="ok", source=path.name)
+    return ScoreTable(rows, _filled(runs.reindex(columns=list(RUN_COLUMNS))))
 
 
 def read_transfers(

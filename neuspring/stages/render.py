@@ -99,7 +99,7 @@ def render(
             progress.update(frame + 1)
     table = pd.DataFrame(rows, columns=["frame", "camera", "metric", "value"])
     files |= run.beside(frames="frames.parquet", strip="images.png")
-    figures.pairs_figure(scenario, shown, pairs, files["strip"])
+    figures.pairs_figure(shown, pairs, files["strip"])
     write_table(table, files["frames"])
     facts = {
         "backend": scored.backend,

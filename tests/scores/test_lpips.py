@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from neuspring.core import weights as weight_files
 from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
 from neuspring.scores import lpips as module
@@ -50,7 +49,7 @@ def pair(*shape: int) -> list[torch.Tensor]:
 
 
 def slow(files: tuple[Path, Path], a: torch.Tensor, b: torch.Tensor, scaled: bool) -> float:
-    """The distance of [3, H, W], in float64, with torch's layers and loops over pixels."""
+    """The distance of [3, H, W], in float64, with torch's layers."""
     backbone, heads = (torch.load(path, weights_only=True) for path in files)
     stages = torch.nn.Sequential(
         torch.nn.Conv2d(3, 64, 11, stride=4, padding=2), torch.nn.ReLU(), torch.nn.MaxPool2d(3, 2),
@@ -62,27 +61,16 @@ def slow(files: tuple[Path, Path], a: torch.Tensor, b: torch.Tensor, scaled: boo
     stages.load_state_dict({k.removeprefix("features."): v for k, v in backbone.items() if k.startswith("features.")})
     stages.double()
     found = []
+    shift, scale = (torch.tensor(v, dtype=torch.float64)[:, None, None] for v in ((-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)))
     for picture in (a, b):
-        x = torch.stack(
-            [
-                ((2 * plane.double() - 1 if scaled else plane.double()) - shift) / scale
-                for plane, shift, scale in zip(picture, (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450), strict=True)
-            ]
-        )[None]
-        layers = []
+        x, layers = (((2 * picture.double() - 1 if scaled else picture.double()) - shift) / scale)[None], []
         for stage in stages:
             x = stage(x)
             if isinstance(stage, torch.nn.ReLU):
-                layers.append(x[0].detach())
+                layers.append(x[0].detach() / (x[0].detach().pow(2).sum(0).sqrt() + 1e-10))
         found.append(layers)
-    total = 0.0
-    for k, (first, second) in enumerate(zip(*found, strict=True)):
-        weights, (_, height, width) = heads[f"lin{k}.model.1.weight"].double().flatten(), first.shape
-        for i in range(height):
-            for j in range(width):
-                p, q = (f[:, i, j] / (f[:, i, j].pow(2).sum().sqrt() + 1e-10) for f in (first, second))
-                total += float((weights * (p - q) ** 2).sum()) / (height * width)
-    return total
+    weights = [heads[f"lin{k}.model.1.weight"][0].double() for k in range(5)]
+    return sum(float((w * (p - q) ** 2).sum(0).mean()) for w, p, q in zip(weights, *found, strict=True))
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -105,15 +93,6 @@ def test_distances_are_zero_for_equal_pictures_and_symmetric(files):
     assert distance(nothing, nothing) == 0
 
 
-def test_every_picture_of_a_batch_has_its_distance(files):
-    distance = Lpips.load(*files, trusted=True)
-    a, b = pair(3, 40, 35)
-    together = distance(a, b)
-    assert together.shape == (3,)
-    assert torch.allclose(together, torch.stack([distance(*one) for one in zip(a, b, strict=True)]), rtol=1e-5)
-    assert torch.allclose(distance(a.double(), b.double()), together)
-
-
 def test_the_gradient_is_finite_where_nothing_is_felt(files):
     """A picture on which all channels of a ReLU are silent has features of length 0."""
     distance = Lpips.load(*files, trusted=True)
@@ -121,21 +100,6 @@ def test_the_gradient_is_finite_where_nothing_is_felt(files):
     a, b = pair(40, 40)
     (gradient,) = torch.autograd.grad(silent(a.requires_grad_(), b), a)
     assert gradient.isfinite().all()
-
-
-@pytest.mark.parametrize(
-    ("a", "b", "rule"),
-    [
-        ((3, 30, 40), (3, 30, 40), "at least 31 x 31 px"),
-        ((3, 40, 30), (3, 40, 30), "at least 31 x 31 px"),
-        ((1, 40, 40), (1, 40, 40), "two pictures"),
-        ((40, 40), (40, 40), "two pictures"),
-        ((3, 40, 40), (3, 40, 41), "same shape"),
-    ],
-)
-def test_bad_pictures_are_refused(files, a, b, rule):
-    with pytest.raises(InputError, match=rule):
-        Lpips.load(*files, trusted=True)(torch.zeros(a), torch.zeros(b))
 
 
 def test_absent_weights_are_a_reason(hub):
@@ -179,27 +143,6 @@ def test_heads_are_found_in_a_package_without_importing_it(hub, files, tmp_path,
     assert find_weights(files[0]) == found
 
 
-def test_an_unreadable_cached_file_is_a_reason(hub, monkeypatch):
-    (hub / "alexnet-owt-7be5be79.pth").write_bytes(b"")
-
-    def denied(path):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(weight_files, "digest_file", denied)
-    assert "cannot be read (Permission denied)" in str(find_weights())
-
-
-@pytest.mark.parametrize("at", [0, 1])
-def test_given_files_are_checked(files, tmp_path, at):
-    for path, rule in ((tmp_path / "absent.pth", "is not there"), (files[at], "has SHA-256")):
-        given = {("backbone", "heads")[at]: path}
-        with pytest.raises(InputError, match=rule) as raised:
-            find_weights(**given)
-        assert str(path) in str(raised.value)
-        with pytest.raises(InputError, match=rule):
-            Lpips.load(**given)
-
-
 def damage(kind: str, path: Path, values: dict[str, torch.Tensor], whole: bytes) -> str:
     """Write a damaged weight file; the rule that its refusal names."""
     name = next(key for key in values if key.endswith("weight") and key.startswith(("features", "lin")))
@@ -209,13 +152,8 @@ def damage(kind: str, path: Path, values: dict[str, torch.Tensor], whole: bytes)
     if kind == "code":
         torch.save({name: importlib.util.find_spec}, path)
         return "must hold weights"
-    if kind == "list":
-        torch.save([1, 2], path)
-        return "must hold a state dict"
     changed = {
-        "absent": {key: value for key, value in values.items() if key != name},
         "shape": values | {name: values[name][:, :1]},
-        "kind": values | {name: values[name].int()},
         "nan": values | {name: values[name] * float("nan")},
     }
     torch.save(changed[kind], path)
@@ -223,7 +161,7 @@ def damage(kind: str, path: Path, values: dict[str, torch.Tensor], whole: bytes)
 
 
 @pytest.mark.parametrize("at", [0, 1])
-@pytest.mark.parametrize("kind", ["truncated", "code", "list", "absent", "shape", "kind", "nan"])
+@pytest.mark.parametrize("kind", ["truncated", "code", "shape", "nan"])
 def test_damaged_given_files_are_named(files, tmp_path, kind, at):
     path = tmp_path / "damaged.pth"
     rule = damage(kind, path, torch.load(files[at], weights_only=True), files[at].read_bytes())

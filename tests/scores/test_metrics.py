@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import subprocess
-import sys
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -20,7 +18,7 @@ from neuspring.scores import metrics, paper
 from neuspring.scores.metrics import require_metrics
 from neuspring.scores.statistics import ratios
 from neuspring.scores.study import cells, restricted
-from tests.support.scenarios import observations, scenario
+from tests.support.scenarios import observations
 from tests.support.study_runs import collected
 
 GOLDEN = 1e-5
@@ -142,12 +140,6 @@ def test_a_diverged_rollout_gives_no_row_for_the_tasks_it_missed(end: int, tasks
     assert not rows["value"].isna().any()
 
 
-def test_a_scenario_without_future_has_one_task() -> None:
-    given = observations(scenario=scenario(train_end=5))
-    rows = metrics.score(rollout(np.tile(given.nodes, (5, 1, 1))), given, "ours", 0)
-    assert rows.loc[rows["metric"] == "chamfer", "task"].tolist() == ["reconstruction"] and rows["task"].nunique() == 1
-
-
 # Averages -------------------------------------------------------------------------------------------------------------
 
 
@@ -168,13 +160,6 @@ def test_both_averages() -> None:
     assert row["seed_std"] == pytest.approx(np.std([3.0, 5.0], ddof=1))
 
 
-def test_averages_keep_groups_apart() -> None:
-    scores = table(("ours", "a", 0, 1.0, 10), ("theirs", "a", 0, 2.0, 10), ("theirs", "b", 0, 4.0, 30))
-    found = metrics.averages(scores).set_index("method")
-    assert found.loc["ours", ["equal", "frames", "scenarios", "seed_std"]].tolist() == [1.0, 1.0, 1, 0.0]
-    assert found.loc["theirs", ["equal", "frames", "scenarios", "seed_std"]].tolist() == [3.0, 3.5, 2, 0.0]
-
-
 def test_scenarios_with_different_numbers_of_seeds() -> None:
     """Seeds are averaged first, so that a scenario with more of them weighs no more; no spread from scenarios that seeds lack."""
     scores = table(("ours", "a", 0, 9.0, 10), *(("ours", "b", seed, 1.0, 10) for seed in range(3)))
@@ -183,12 +168,6 @@ def test_scenarios_with_different_numbers_of_seeds() -> None:
     assert np.isnan(row["seed_std"])
     more = metrics.averages(pd.concat([scores, table(("ours", "a", 1, 8.0, 10))])).iloc[0]
     assert more["seed_std"] == pytest.approx(np.std([5.0, 4.5], ddof=1))
-
-
-def test_averages_of_nothing_are_empty() -> None:
-    given = observations()
-    empty = metrics.score(rollout(given.nodes[None], frame_count=5, diverged_frame=1, reason="x"), given, "ours", 0)
-    assert metrics.averages(empty).empty
 
 
 # Declarations -----
@@ -237,14 +216,3 @@ def test_a_packages_metric_is_one_entry_that_is_scored_shown_and_may_be_aimed_at
     assert found.loc[("extent", "future", "y"), "change"] == pytest.approx(2.0)
     with pytest.raises(InputError, match=r"aims, metric: .*Known: .*extent"):
         require_metrics([dataclasses.replace(aim, metric="psnr")])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("rooms", [("scores", "report"), ("stages", "draw")], ids="+".join)
-def test_with_one_metric_more_the_tests_of_tables_pass(rooms) -> None:
-    """A new metric is one entry of the registry: no test and no table writes all names out."""
-    root = Path(__file__).parents[2]
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "tests.support.one_metric_more"]
-    places = [f"tests/{room}" for room in rooms]
-    ran = subprocess.run([*command, "-m", "not slow", *places], cwd=root, capture_output=True, text=True)
-    assert ran.returncode == 0, ran.stdout[-3000:]

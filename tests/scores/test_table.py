@@ -44,7 +44,7 @@ def test_a_table_is_read_from_records_and_from_its_files(results, tmp_path):
     assert status == {"a/x/0": "ok", "a/y/0": "ok", "b/x/0": "ok", "b/y/0": "failed", "c/x/0": "missing", "c/y/0": "missing"}
     assert set(table.rows["task"]) == {"future", "reconstruction", "future_held"}
     table.save(tmp_path / "tables")
-    again = read_scores(tmp_path / "tables" / "scores.csv", current=True)
+    again = read_scores(tmp_path / "tables" / "scores.csv")
     pd.testing.assert_frame_equal(again.rows, table.rows, check_dtype=False)
     pd.testing.assert_frame_equal(queries.means(again), queries.means(table))
     assert differing(again.runs) == differing(table.runs) == {"fit.horizon": {"x": "1", "y": "2"}}
@@ -54,17 +54,13 @@ def test_a_table_is_read_from_records_and_from_its_files(results, tmp_path):
         again.named(scenario=["z"])
 
 
-def test_older_files_are_read_as_scores_and_refused_as_tables(results, tmp_path):
+def test_older_files_are_read_and_others_refused(results, tmp_path):
     table = collect(results, ["a", "b"], ["x"], [0])
     old = tmp_path / "scores.csv"
     table.finished[list(SCORE_COLUMNS)].to_csv(old, index=False)
-    assert set(read_scores(old).runs["status"]) == {"ok"}, "no run has more"
-    floors = [json.dumps({"track_error": 0.007})] * 2
-    table.runs.drop(columns="run").assign(floors=floors).to_csv(old.with_name("runs.csv"), index=False)
-    found = read_scores(old)
-    assert set(found.runs["status"]) == {"ok"} and found.task("start")["value"].tolist() == [0.007] * 2
-    with pytest.raises(InputError, match=r"this version.*fits are reused"):
-        read_scores(old, current=True)
+    assert set(read_scores(old).runs["status"]) == {"ok"}
+    table.runs.drop(columns="run").to_csv(old.with_name("runs.csv"), index=False)
+    assert set(read_scores(old).runs["status"]) == {"ok"}
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")
     with pytest.raises(InputError, match=r"must be a scores.csv with the columns scenario"):
         read_scores(tmp_path / "other.csv")
@@ -144,9 +140,8 @@ def test_settings_differ_between_methods_and_must_not_within_one():
 def test_runs_that_a_part_left_out_are_not_missing(results):
     whole = collect(results, ["a", "c"], ["x"], [0])
     about = {"only": "scenario=a", "scenarios": ["a"], "methods": ["x"], "seeds": [0]}
-    found, part = as_asked(whole, about)
-    assert part == "only=scenario=a" and set(found.runs["scenario"]) == {"a"}
-    assert as_asked(whole, {}) == (whole, "") and as_asked(found, about)[1] == ""
+    found = as_asked(whole, about)
+    assert set(found.runs["scenario"]) == {"a"} and as_asked(whole, {}) is whole
 
 
 def test_a_duel_has_the_ratio_of_the_table_of_ratios_and_names_the_worst_scenario():

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations
 from neuspring.data.camera import CameraEntry
 from neuspring.data.capture import HANDS, OBJECT, Capture, Description, Writer
@@ -47,7 +46,7 @@ def filmed(folder, missing=()):
     facts = {"format": 1, "name": "small", "category": "rope", "frame_count": count, "frame_rate": seen.scenario.frame_rate}
     writer = Writer(scenario / "capture", Description(**facts, cameras=(entry,), train_end=seen.scenario.train_end, masks=True))
     view = view_of(writer.capture.cameras["0"], "cpu")
-    for frame, gaussians in take.gaussians(range(count), Images(), "cpu"):
+    for frame, gaussians in take.gaussians(range(count), "cpu"):
         if frame in missing:
             continue
         rgba = picture(gaussians, view, "warp")
@@ -68,5 +67,5 @@ def painter(scenario, frames, **manner):
     else:
         points = shown_points(seen, shown, frames)
         scene = FilmedScene.of(seen, seen_from(points, seen.scenario.up, 250.0, 20.0), shown, frames)
-    plain = {"style": "nodes", "error": "distance", "ground": "white"}
-    return PhotoPainter(scene, shown, frames, PhotoStyle(**(plain | manner)), Images(), "cpu")
+    plain = {"style": "nodes", "error": "distance"}
+    return PhotoPainter(scene, shown, frames, PhotoStyle(**(plain | manner)), "cpu")

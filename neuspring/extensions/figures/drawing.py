@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from neuspring.cli.options import read_settings
-from neuspring.config.images import Images
 from neuspring.core.device import resolve_device
 from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
@@ -20,7 +17,7 @@ from neuspring.data.results import Masks
 from neuspring.draw import sheet
 from neuspring.draw.film import write_film
 from neuspring.draw.painter import DRAWN_MM, Error, distances
-from neuspring.draw.scene import VIEW_ELEVATION, broad_side, chosen_frames, seen_from, shown_points
+from neuspring.draw.scene import VIEW_ELEVATION, chosen_frames
 from neuspring.draw.strip import strip_figure
 from neuspring.draw.twin import twin_figure
 from neuspring.extensions.figures.filmed import FilmedScene, PhotoPainter, PhotoStyle, SplatRun, Style, SurfacePicture
@@ -37,7 +34,6 @@ class Chosen:
     found: Found
     runs: list[Run]
     takes: list[SplatRun]
-    images: Images
     device: str
 
 
@@ -61,13 +57,12 @@ def film(picture: FilmOptions) -> None:
     """Observed beside predicted, moving -> MP4 or GIF of limited size."""
     require_ending(picture.output, FILM_ENDINGS)
     require_between("--width", picture.width, 160, 1920)
-    require_between("--speed", picture.speed, 0.05, 8)
     require_between("--megabytes", picture.megabytes, 1e-3, 100)
     chosen = _choose(picture)
     count = chosen.found.observations.scenario.frame_count
     frames = sorted(set(_frames(picture.frames, count) or range(count)))
     painter = _painter(picture, chosen, frames, "none")
-    made = write_film(painter, picture.output, picture.width, picture.speed, picture.megabytes)
+    made = write_film(painter, picture.output, picture.width, picture.megabytes)
     print(f"Wrote {picture.output}: {made}, {painter.manner.style}")
 
 
@@ -85,18 +80,13 @@ def twin(picture: TwinOptions) -> None:
         if picture.frame >= len(take.positions):
             rule = f"{run.name} is predicted up to frame {len(take.positions) - 1}, then it diverged"
             raise InputError("--frame", rule, picture.frame)
-    if picture.style == "splats":
-        _require_splats(chosen, "Leave out --as splats to draw springs.")
+    _without_splats(chosen, picture.style == "splats", "Leave out --as splats to draw springs.")
     scene = _scene(picture, chosen, [picture.frame], chosen.takes)
-    if picture.background == "image" and scene.photo(picture.frame) is None:
-        raise InputError("--background image", "needs a photo of this camera and frame", "none", "Leave it out.")
     body = SurfacePicture(
         [(scene, take) for take in chosen.takes],
         picture.frame,
         tuple(dict.fromkeys(picture.by)),
         style=picture.style,
-        ground=picture.background,
-        images=chosen.images,
         device=chosen.device,
     )
     sheet.save(twin_figure(body, picture.width), picture.output, picture.dpi)
@@ -110,16 +100,10 @@ def require_ending(path: Path, endings: Sequence[str]) -> None:
     """Raise InputError for a file that these pictures cannot be written to, before they are drawn."""
     if path.suffix.lower() not in endings:
         rule = f"the file must end in {', '.join(endings[:-1])} or {endings[-1]}"
-        other = FILM_ENDINGS if endings == PICTURE_ENDINGS else PICTURE_ENDINGS
-        kind = "neuspring draw film" if other == FILM_ENDINGS else "neuspring draw strip"
-        remedy = f"{kind} writes {path.suffix}." if path.suffix.lower() in other else ""
-        raise InputError("--output", rule, path.name, remedy)
+        raise InputError("--output", rule, path.name, "neuspring draw film writes films, strip and twin write pictures.")
     if path.is_dir():
         raise InputError("--output", "must be a file", f"the folder {path}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(path.parent, "this folder must be writable", error.strerror, "Choose another --output.") from error
+    path.parent.mkdir(parents=True, exist_ok=True)
 
 
 def require_between(name: str, value: float, least: float, most: float) -> None:
@@ -131,54 +115,39 @@ def require_between(name: str, value: float, least: float, most: float) -> None:
 def caption(painter: PhotoPainter) -> str:
     """Words for the text below the picture: what is shown, and the mean error of each method over its frames."""
     scene, scenario, manner = painter.scene, painter.scene.observations.scenario, painter.manner
-    future = [frame for frame in painter.frames if frame >= scenario.train_end]
-    text = f"{scenario.name}, camera {scene.camera.name}, frames {_listed(painter.frames)}"
-    text += f"; future (from frame {scenario.train_end}): {_listed(future)}." if future else "; all of training."
-    if manner.style == "nodes" or scene.capture is None:
-        text += " Dark: predicted nodes. Blue: observed points. Red: controllers, where the hands hold."
+    text = f"{scenario.name}, camera {scene.camera.name}, frames {', '.join(map(str, painter.frames))}"
+    text += f"; future from frame {scenario.train_end}."
+    text += " Dark: predicted nodes. Blue: observed points. Red: controllers." if manner.style == "nodes" else ""
     if manner.error == "color":
         text += f" Difference: mean absolute color difference of object pixels, 0 to {painter.norm.vmax:g}; hands left out; PSNR."
     elif manner.error == "distance":
-        text += f" Distance of nodes to their observed points, 0 to {painter.norm.vmax:g} mm; gray: not seen; in panels: the mean."
-        text += f" Mean of these frames: {', '.join(f'{t.label} {_mean(painter, k):.1f} mm' for k, t in enumerate(painter.takes))}."
+        text += f" Distance of nodes to their observed points, 0 to {painter.norm.vmax:g} mm; gray: not seen."
+        means = {take.label: [distances(take, scene.observations, frame)[1].mean() for frame in painter.frames
+                              if frame < len(take.positions)] for take in painter.takes}  # fmt: skip
+        text += f" Mean: {', '.join(f'{name} {DRAWN_MM * np.mean(own):.1f} mm' for name, own in means.items())}."
     return text
-
-
-def _mean(painter: PhotoPainter, which: int) -> float:
-    take = painter.takes[which]
-    frames = [frame for frame in painter.frames if frame < len(take.positions)]
-    means = [DRAWN_MM * float(distances(take, painter.scene.observations, frame)[1].mean()) for frame in frames]
-    return sum(means) / len(means) if means else float("nan")
-
-
-def _listed(frames: Sequence[int]) -> str:
-    return ", ".join(map(str, frames))
 
 
 def _choose(a: RunOptions, *, positions: bool = True) -> Chosen:
     """The runs that are named, read. Raises InputError."""
-    device, images, found = resolve_device(a.device), read_settings(a.settings).images, find(a.results)
+    found = find(a.results)
     runs = _named(a, found)
     labels = list(a.labels) or [run.method if len({r.method for r in runs}) == len(runs) else run.name for run in runs]
     if len(labels) != len(runs):
         raise InputError("--labels", f"one name for each of {len(runs)} methods is required", len(labels))
-    return Chosen(found, runs, [_take(run, label, positions) for run, label in zip(runs, labels, strict=True)], images, device)
+    return Chosen(
+        found, runs, [_take(run, label, positions) for run, label in zip(runs, labels, strict=True)], resolve_device(a.device)
+    )
 
 
 def _named(a: RunOptions, found: Found) -> list[Run]:
     """The runs of --methods in their order; of a method without seed the first one. Without --methods those to begin with."""
-    by_name = {run.name: run for run in found.runs}
-    if not a.methods:
-        return [by_name[name] for name in found.shown]
-    first: dict[str, Run] = {}
-    for run in found.runs:
-        first.setdefault(run.method, run)
-    chosen = [by_name.get(name) or first.get(name) for name in a.methods]
-    unknown = [name for name, run in zip(a.methods, chosen, strict=True) if run is None]
-    if unknown:
-        rule = f"{found.folder} has the methods {', '.join(first)}"
-        raise InputError("--methods", rule, ", ".join(unknown), "Name METHOD or METHOD/SEED.")
-    return [run for run in chosen if run is not None]
+    names = a.methods or found.shown
+    chosen = [run for name in names if (run := next((one for one in found.runs if name in (one.name, one.method)), None))]
+    if len(chosen) < len(names):
+        rule = f"{found.folder} has the methods {', '.join(dict.fromkeys(run.method for run in found.runs))}"
+        raise InputError("--methods", rule, ", ".join(a.methods), "Name METHOD or METHOD/SEED.")
+    return chosen
 
 
 def _take(run: Run, label: str, positions: bool) -> SplatRun:
@@ -196,22 +165,18 @@ def _frames(wanted: Sequence[int] | None, count: int, option: str = "--frames") 
     return list(wanted or ())
 
 
-def _without_splats(chosen: Chosen) -> str:
-    """The runs that have no splats, and why where that is known; empty if all have some."""
-    return "; ".join(", ".join([run.name, *run.notes]) for run in chosen.runs if run.splats is None)
-
-
-def _require_splats(chosen: Chosen, remedy: str) -> None:
-    if without := _without_splats(chosen):
+def _without_splats(chosen: Chosen, required: bool, remedy: str = "") -> str:
+    """The runs that have no splats, and why where that is known; empty if all have some. Raises InputError if `required`."""
+    without = "; ".join(", ".join([run.name, *run.notes]) for run in chosen.runs if run.splats is None)
+    if required and without:
         rule = f"needs {chosen.found.folder / 'appearance'}/<seed>/splats.ply, of a scenario with images"
         raise InputError("--as splats", rule, f"none for {without}", remedy)
+    return without
 
 
 def _painter(a: ComparedOptions, chosen: Chosen, frames: list[int], error: Error | None) -> PhotoPainter:
     """The painter of a strip or a film; `error` is drawn where the options ask for none, None stands for the best there is."""
-    if a.style == "splats":
-        _require_splats(chosen, "Leave out --as splats to draw nodes.")
-    without = _without_splats(chosen)
+    without = _without_splats(chosen, a.style == "splats", "Leave out --as splats to draw nodes.")
     style: Style = a.style or ("nodes" if without else "splats")
     if without and a.style is None and chosen.found.capture is not None:
         print(f"Nodes are drawn, since there are no splats for {without}")
@@ -221,17 +186,13 @@ def _painter(a: ComparedOptions, chosen: Chosen, frames: list[int], error: Error
         what = "nodes" if style == "nodes" else f"camera {scene.camera.name} without photos or masks"
         rule = "needs splats, and photos with masks of the same camera"
         raise InputError("--error color", rule, what, "Take --error distance.")
-    if a.most is not None and not (math.isfinite(a.most) and a.most > 0):
-        raise InputError("--most", "must be above 0", a.most)
-    if a.background == "image" and scene.capture is None:
-        raise InputError("--background image", "needs a camera of a capture", scene.camera.name, "Leave it out.")
+    require_between("--most", 1.0 if a.most is None else a.most, 1e-6, 1e6)
     manner = PhotoStyle(
         style=style,
         error=(error if a.error == "best" else a.error) or ("color" if comparable else "distance"),
-        ground=a.background or ("image" if style == "nodes" else "white"),
         most=a.most,
     )
-    return PhotoPainter(scene, chosen.takes, frames, manner, chosen.images, chosen.device)
+    return PhotoPainter(scene, chosen.takes, frames, manner, chosen.device)
 
 
 def _scene(a: RunOptions, chosen: Chosen, frames: list[int], takes: list[SplatRun]) -> FilmedScene:
@@ -247,10 +208,8 @@ def _scene(a: RunOptions, chosen: Chosen, frames: list[int], takes: list[SplatRu
     if cameras and not turned:
         camera = cameras[a.camera or next(iter(cameras))]
         return FilmedScene.of(observations, camera, takes, frames, found.capture, _labels(found.folder, found.capture, camera))
-    points, up = shown_points(observations, takes, frames), observations.scenario.up
-    azimuth = broad_side(points, up) if a.azimuth is None else a.azimuth
-    camera = seen_from(points, up, azimuth, VIEW_ELEVATION if a.elevation is None else a.elevation)
-    return FilmedScene.of(observations, camera, takes, frames)
+    elevation = VIEW_ELEVATION if a.elevation is None else a.elevation
+    return FilmedScene.from_side(observations, takes, frames, a.azimuth, elevation)
 
 
 def _labels(folder: Path, capture: Capture | None, camera: Camera) -> np.ndarray | None:

@@ -7,13 +7,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import cv2
 import numpy as np
 import torch
 from matplotlib.axes import Axes
 from scipy.spatial import cKDTree
 
-from neuspring.config.images import Images
 from neuspring.core.artifacts import Observations
 from neuspring.data.camera import Camera
 from neuspring.data.capture import HANDS, OBJECT, Capture
@@ -27,7 +25,6 @@ from neuspring.splats.rasterize import choose_backend
 from neuspring.splats.view import C0
 
 Style = Literal["splats", "nodes"]
-Ground = Literal["white", "image"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +35,7 @@ class SplatRun(ShownRun):
     centers: np.ndarray | None = None
     """Centers [F, G, 3], m, at which the method's own model puts its splats; else the nodes carry them."""
 
-    def gaussians(self, frames: Iterable[int], images: Images, device: str) -> Iterator[tuple[int, Gaussians]]:
+    def gaussians(self, frames: Iterable[int], device: str) -> Iterator[tuple[int, Gaussians]]:
         """The splats in these frames, in rising order; frames behind a divergence are left out."""
         assert self.splats is not None
         wanted = {frame for frame in frames if frame < len(self.positions)}
@@ -115,10 +112,9 @@ class Drawn:
 
 @dataclass(frozen=True, kw_only=True)
 class PhotoStyle(DrawingStyle):
-    """Style in which predictions are drawn, and what is behind them."""
+    """Style in which predictions are drawn: splats on white beside the masked photo, or nodes on the pale photo."""
 
     style: Style
-    ground: Ground
 
 
 class PhotoPainter(Painter):
@@ -129,17 +125,17 @@ class PhotoPainter(Painter):
     takes: Sequence[SplatRun]
 
     def __init__(
-        self, scene: FilmedScene, takes: Sequence[SplatRun], frames: Sequence[int], manner: PhotoStyle, images: Images, device: str
+        self, scene: FilmedScene, takes: Sequence[SplatRun], frames: Sequence[int], manner: PhotoStyle, device: str
     ) -> None:
         super().__init__(scene, takes, frames, manner)
-        self._drawn = [self._splats(take, images, device) if manner.style == "splats" else {} for take in takes]
+        self._drawn = [self._splats(take, device) if manner.style == "splats" else {} for take in takes]
         if manner.error == "color":
             self.error_name, self.error_label = "difference", "color difference"
 
-    def _splats(self, take: SplatRun, images: Images, device: str) -> dict[int, Drawn]:
-        view, backend = view_of(self.scene.camera, device), choose_backend(images.backend, device)
+    def _splats(self, take: SplatRun, device: str) -> dict[int, Drawn]:
+        view, backend = view_of(self.scene.camera, device), choose_backend("auto", device)
         made = {}
-        for frame, gaussians in take.gaussians(self.frames, images, device):
+        for frame, gaussians in take.gaussians(self.frames, device):
             rgba = picture(gaussians, view, backend)
             made[frame] = self._compared(rgba, frame) if self.manner.error == "color" else Drawn(self.scene.cut(rgba))
         return made
@@ -161,7 +157,7 @@ class PhotoPainter(Painter):
         photo, labels = self.scene.photo(frame), self.scene.mask(frame)
         if photo is not None:
             empty(axis, self.scene.view)
-            self._image(axis, photo if self.manner.ground == "image" or labels is None else masked(photo, labels))
+            self._image(axis, photo if self.manner.style == "nodes" or labels is None else masked(photo, labels))
             return
         super().draw_observed(axis, frame)
         if self.scene.capture is not None:
@@ -173,8 +169,7 @@ class PhotoPainter(Painter):
             super().draw_predicted(axis, which, frame)
             return
         empty(axis, self.scene.view)
-        below = self._pale(frame)
-        self._image(axis, over_white(self._drawn[which][frame].rgba, None if below is None else self.scene.cut(below)), cut=False)
+        self._image(axis, over_white(self._drawn[which][frame].rgba), cut=False)
 
     def draw_error(self, axis: Axes, which: int, frame: int) -> None:
         """The error in false colors, and its mean: PSNR of pictures, or the mean distance."""
@@ -185,15 +180,11 @@ class PhotoPainter(Painter):
         if frame < len(self.takes[which].positions):
             self._difference(axis, self._drawn[which][frame])
 
-    def _pale(self, frame: int) -> np.ndarray | None:
-        photo = self.scene.photo(frame)
-        return faded(photo) if photo is not None and self.manner.ground == "image" else None
-
     def _below(self, axis: Axes, frame: int) -> None:
-        if (below := self._pale(frame)) is None:
+        if (photo := self.scene.photo(frame)) is None:
             super()._below(axis, frame)
         else:
-            self._image(axis, below)
+            self._image(axis, faded(photo))
 
     def _difference(self, axis: Axes, drawn: Drawn) -> None:
         if drawn.difference is None or drawn.hands is None:
@@ -217,34 +208,21 @@ def _extent(shape: Sequence[int]) -> tuple[float, float, float, float]:
 
 @dataclass(frozen=True, eq=False)
 class SurfacePicture(TwinPicture):
-    """Twins as springs, or as the surface that their splats show, on white or on the pale photo."""
+    """Twins as springs, or as the surface that their splats show."""
 
     style: Literal["springs", "splats"] = "springs"
-    ground: Ground = "white"
-    images: Images = Images()
     device: str = "cpu"
-
-    @property
-    def as_springs(self) -> bool:  # type: ignore[override]
-        """True where springs are drawn as lines."""
-        return self.style == "springs"
 
     def paint(self, axis: Axes, scene: ShownScene, take: ShownRun, quantity: Quantity) -> None:
         """One panel."""
+        if self.style == "springs":
+            super().paint(axis, scene, take, quantity)
+            return
         assert isinstance(scene, FilmedScene)
         assert isinstance(take, SplatRun)
-        view, photo = scene.view, scene.photo(self.frame)
-        empty(axis, view, framed=self.ground == "image")
-        shown = scene.cut(faded(photo)) if photo is not None and self.ground == "image" else None
-        if self.style == "splats":
-            surface = self._surface(scene, take, quantity)
-            ground = None if shown is None else cv2.resize(shown, surface.shape[1::-1], interpolation=cv2.INTER_CUBIC)
-            shown = over_white(surface, ground)
-        if shown is not None:
-            extent = (-0.5, view.width - 0.5, view.height - 0.5, -0.5)
-            axis.imshow(shown, extent=extent, aspect="auto", interpolation="antialiased")
-        if self.style == "springs":
-            self._lines(axis, scene, take, quantity)
+        empty(axis, scene.view, framed=False)
+        extent = _extent((scene.view.height, scene.view.width))
+        axis.imshow(over_white(self._surface(scene, take, quantity)), extent=extent, aspect="auto", interpolation="antialiased")
         hands(axis, scene, self.frame)
 
     def _surface(self, scene: FilmedScene, take: SplatRun, quantity: Quantity) -> np.ndarray:
@@ -253,12 +231,12 @@ class SurfacePicture(TwinPicture):
         outer = take.positions[0][: scene.observations.surface_count]
         nearest = cKDTree(outer).query(take.splats.means)[1]
         rgb = self.node_colors(take, quantity)[nearest, :3]
-        (gaussians,) = (found for _, found in take.gaussians([self.frame], self.images, self.device))
+        (gaussians,) = (found for _, found in take.gaussians([self.frame], self.device))
         plain = torch.tensor((rgb - 0.5) / C0, dtype=torch.float32, device=self.device)[:, None]
         painted: Gaussians = replace(gaussians, harmonics=plain)
         # Nothing is compared with it, so it need not have the camera's pixels.
         view = view_of(finer(scene.view, 900), self.device)
-        return picture(painted, view, choose_backend(self.images.backend, self.device))
+        return picture(painted, view, choose_backend("auto", self.device))
 
 
 def finer(camera: Camera, least: int) -> Camera:
@@ -275,11 +253,9 @@ FADE = 0.6
 """Part of white in a photo behind a drawing."""
 
 
-def over_white(rgba: np.ndarray, below: np.ndarray | None = None) -> np.ndarray:
-    """RGB [H, W, 3] uint8 of a picture drawn over black [H, W, 4], laid over white or over the picture `below`."""
-    ground = 255.0 if below is None else below.astype(float)
-    mixed = rgba[..., :3] + (1 - rgba[..., 3:] / 255.0) * ground
-    return np.asarray(np.clip(mixed + 0.5, 0, 255), np.uint8)
+def over_white(rgba: np.ndarray) -> np.ndarray:
+    """RGB [H, W, 3] uint8 of a picture drawn over black [H, W, 4], laid over white."""
+    return np.asarray(np.clip(rgba[..., :3] + (255.0 - rgba[..., 3:]) + 0.5, 0, 255), np.uint8)
 
 
 def masked(photo: np.ndarray, labels: np.ndarray) -> np.ndarray:

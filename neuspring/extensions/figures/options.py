@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from neuspring.cli.options import Device, Positional, Settings, arg
+from neuspring.cli.options import Device, Positional, arg
 
 README_FILM_MEGABYTES = 2.0
 """Size of a film that a README loads at once."""
@@ -24,7 +24,6 @@ class RunOptions:
     camera: Annotated[str | None, arg(help="a camera of the capture; the first by default, or a view of the broad side")] = None
     azimuth: Annotated[float | None, arg(help="instead of a camera: degrees around the vertical axis, 0 from +x")] = None
     elevation: Annotated[float | None, arg(help="degrees above the horizon; 25 by default")] = None
-    settings: Settings = "{}"
     device: Device = "auto"
     output: Annotated[Path, arg(help="file to write, for example picture.pdf or film.gif")]
 
@@ -40,10 +39,6 @@ class ComparedOptions(RunOptions):
         arg(help="difference of pictures, distance of nodes to observed points, or no errors; best: what can be drawn"),
     ] = "best"
     most: Annotated[float | None, arg(help="upper end of the range of errors: of 1 for color, mm for distance")] = None
-    background: Annotated[
-        Literal["white", "image"] | None,
-        arg(help="white paper, or the photo (pale behind a prediction); white for splats, image for nodes by default"),
-    ] = None
 
 
 Inches = Annotated[float, arg(help="inches on paper, where text has 8 points")]
@@ -60,10 +55,9 @@ class StripOptions(ComparedOptions):
 
 @dataclass(kw_only=True)
 class FilmOptions(ComparedOptions):
-    """Size and speed."""
+    """The size."""
 
     width: Annotated[int, arg(help="pixels")] = 800
-    speed: Annotated[float, arg(help="1: as fast as it was; 0.5: half as fast")] = 1.0
     megabytes: Annotated[float, arg(help="largest file; a film beyond it is made coarser")] = README_FILM_MEGABYTES
 
 
@@ -79,6 +73,5 @@ class TwinOptions(RunOptions):
     style: Annotated[Literal["springs", "splats"], arg(name="as", help="springs as lines, or the surface that splats show")] = (
         "springs"
     )
-    background: Annotated[Literal["white", "image"], arg(help="what is behind: white paper, or the photo, pale")] = "white"
     width: Inches = 7.0
     dpi: Dots = 300.0

@@ -6,7 +6,7 @@ from neuspring.core.table import Cell, Table
 from neuspring.core.text import duration
 from neuspring.report.blocks import Block, PageSection, Text
 from neuspring.report.data import MOST_ROWS, ReportData, ReportSection, link
-from neuspring.report.tables import failure_blocks, notes_table
+from neuspring.report.tables import failure_blocks
 
 
 def failures(material: ReportData) -> PageSection:
@@ -29,7 +29,7 @@ def failures(material: ReportData) -> PageSection:
         damaged = [[Cell(text=path), Cell(text=why, wrap=True)] for path, why in list(material.damaged.items())[:MOST_ROWS]]
         note = "Delete a damaged file and run the same command again."
         blocks.append(Table(caption="Damaged files", header=["File", "Why"], rows=damaged, note=note))
-    blocks += [*failure_blocks(material.numbers), *notes_table(material.numbers)]
+    blocks += failure_blocks(material.numbers)
     return PageSection(key="failures", title="Failures", blocks=blocks or [Text(text="Nothing has failed.", tone="good")])
 
 

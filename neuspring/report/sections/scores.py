@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import io
-
-from neuspring.draw.sheet import DPI
-from neuspring.report.blocks import Block, PageSection, Picture, Text
-from neuspring.report.data import ReportData, ReportSection, data_uri
-from neuspring.report.tables import figures, summary_blocks
+from neuspring.report.blocks import Block, PageSection, Text
+from neuspring.report.data import ReportData, ReportSection, shown_figure
+from neuspring.report.tables import ratios_drawn, summary_blocks
 
 
 def scores(material: ReportData) -> PageSection:
@@ -15,10 +12,8 @@ def scores(material: ReportData) -> PageSection:
     if not len(material.table.finished):
         return PageSection(key="scores", title="Scores", blocks=[Text(text="No run has finished.", tone="mute")])
     blocks: list[Block] = summary_blocks(material.numbers)
-    for _, caption, figure in figures(material.numbers):
-        stream = io.BytesIO()
-        figure.savefig(stream, dpi=DPI, format="png")
-        blocks.append(Picture(caption=caption, alt=caption, data=data_uri("image/png", stream.getvalue()), wide=True, paper=True))
+    if drawn := ratios_drawn(material.numbers):
+        blocks.append(shown_figure(drawn[1], drawn[0]))
     return PageSection(key="scores", title="Scores", blocks=blocks)
 
 

@@ -1,18 +1,18 @@
-"""Settings that differ, versions, machines, and files beside the page."""
+"""Settings that differ, versions, machines, MLflow, and files beside the page."""
 
 from __future__ import annotations
 
 import json
+import shlex
 from collections import Counter
 from importlib import metadata
-
-import yaml
 
 from neuspring import config
 from neuspring.config import Config
 from neuspring.core.run_record import flat
 from neuspring.core.table import Cell, Table
-from neuspring.report.blocks import Block, Code, Fold, PageSection, Text
+from neuspring.core.text import program
+from neuspring.report.blocks import Block, Code, PageSection, Text
 from neuspring.report.data import ReportData, ReportSection, link
 from neuspring.report.tables import settings_table, several
 
@@ -48,8 +48,6 @@ def setup(material: ReportData) -> PageSection:
             [key, *(json.dumps(one, ensure_ascii=False) for one in (defaults.get(key), changed[key]))] for key in sorted(changed)
         ]
         blocks.append(Table.of_texts(["Setting", "Default", "Here"], rows, "Settings that differ from the defaults"))
-        text = yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, width=120)
-        blocks.append(Fold(summary="Full configuration", blocks=[Code(text=text)]))
     installed = {found.name: found.version for found in metadata.distributions() if found.name in PACKAGES}
     blocks.append(Table.of_texts(["Package", "Version"], sorted(installed.items()), "Versions where this page was written"))
     machines = Counter(f"{run.machine}; {run.device}" for run in runs)
@@ -58,6 +56,8 @@ def setup(material: ReportData) -> PageSection:
     files = [path for path in sorted(folder.rglob("*")) if path.suffix in (".md", ".csv", ".tex") and "so_far" not in path.parts]
     links = [[Cell(text=material.relative(path), link=link(path, here.parent))] for path in files]
     blocks += [Table(caption="Files of the tables", header=["File"], rows=links)] if links else []
+    command = shlex.join([program("neuspring"), "ui", "--results", str(material.results)])
+    blocks += [Text(text="All runs in MLflow:"), Code(text=command, whole=True)]
     return PageSection(key="setup", title="Settings and versions", blocks=blocks)
 
 

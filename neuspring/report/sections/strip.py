@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -11,8 +10,8 @@ from PIL import Image
 
 from neuspring.draw.sheet import TIME_BAR, TITLE_LINE
 from neuspring.report.blocks import Block, Fold, Grid, PageSection, Picture, Text
-from neuspring.report.data import ReportData, ReportSection
-from neuspring.report.sections.pictures import MOST_OPEN, NO_ROOM, webp
+from neuspring.report.data import NO_ROOM, ReportData, ReportSection, webp
+from neuspring.report.sections.pictures import MOST_OPEN
 from neuspring.report.tables import several
 
 STRIP_WIDTH = 424
@@ -22,30 +21,28 @@ DARK, CUT_MARGIN = 40, 0.15
 
 
 def last_frame(path: Path) -> tuple[int, np.ndarray]:
-    """Number of frames of a run's film, and its last one [H, W, 3] uint8, RGB, without names and time. Raises ValueError."""
+    """Number of frames of a run's film, and the panels [3, H, W, 3] uint8, RGB, of its last one. Raises ValueError."""
     film = cv2.VideoCapture(str(path))
     count = int(film.get(cv2.CAP_PROP_FRAME_COUNT))
     film.set(cv2.CAP_PROP_POS_FRAMES, count - 1)
     good, picture = film.read()
     if not good or len(picture) <= TITLE_LINE + TIME_BAR:
         raise ValueError("damaged: no film of a run")
-    return count, cv2.cvtColor(picture[TITLE_LINE + TIME_BAR :], cv2.COLOR_BGR2RGB)
+    across = picture.shape[1] // 3
+    rgb = cv2.cvtColor(picture[TITLE_LINE + TIME_BAR :, : 3 * across], cv2.COLOR_BGR2RGB)
+    return count, rgb.reshape(len(rgb), 3, across, 3).swapaxes(0, 1)
 
 
-def around(pictures: Sequence[np.ndarray]) -> tuple[slice, slice]:
-    """Rows and columns that hold what any of these frames [H, 3 W, 3] predicts or observes, in the proportions of a panel."""
-    height, width = pictures[0].shape[0], pictures[0].shape[1] // 3
+def around(panels: np.ndarray) -> tuple[slice, slice]:
+    """Rows and columns of panels [methods, 3, H, W, 3] that hold what any method predicts, or what differs in color."""
     # Controllers are gray in differences, which have colors.
-    bright = [picture[:, width : 2 * width].max(axis=2) > DARK for picture in pictures]
-    colored = [np.ptp(picture[:, 2 * width : 3 * width], axis=2) > DARK for picture in pictures]
-    shown = np.argwhere(np.any([*bright, *colored], axis=0))
-    if not len(shown):
-        return slice(0, height), slice(0, width)
-    low, high, size = shown.min(axis=0), shown.max(axis=0) + 1, np.array([height, width])
-    share = min(float(((high - low) / size).max()) * (1 + 2 * CUT_MARGIN), 1.0)
-    part = np.ceil(share * size).astype(int)
-    top, left = np.clip((low + high - part) // 2, 0, size - part)
-    return slice(top, top + part[0]), slice(left, left + part[1])
+    shown = (panels[:, 1].max(axis=-1) > DARK) | (np.ptp(panels[:, 2], axis=-1) > DARK)
+    where = np.argwhere(shown.any(axis=0))
+    size = np.array(shown.shape[1:])
+    low, high = (where.min(axis=0), where.max(axis=0) + 1) if len(where) else (0 * size, size)
+    room = round(CUT_MARGIN * float((high - low).max()))
+    (top, left), (bottom, right) = np.maximum(low - room, 0), np.minimum(high + room, size)
+    return slice(top, bottom), slice(left, right)
 
 
 def strip(material: ReportData) -> PageSection | None:
@@ -57,22 +54,23 @@ def strip(material: ReportData) -> PageSection | None:
         if not ends:
             continue
         longest = max(count for count, _ in ends.values())
-        # Films of one scenario have the same size unless a run was made otherwise.
-        alike = len({picture.shape for _, picture in ends.values()}) == 1
-        box = around([picture for _, picture in ends.values()]) if alike else (slice(None), slice(None))
         ordered = sorted(ends.items(), key=lambda pair: pair[1][0] < longest)
-        shown = [(f"Observed: {scenario}, frame {longest - 1}", 0, ordered[0][1][1])]
-        for name, (count, picture) in ordered:
-            shown.append((f"{material.numbers.name(name)}{f', ends at frame {count - 1}' * (count < longest)}", 1, picture))
-        figures = []
-        for caption, panel, picture in shown:
-            across = picture.shape[1] // 3
-            cut = np.ascontiguousarray(picture[:, panel * across : (panel + 1) * across][box])
-            alt = f"Last frame of {scenario}: {caption}"
-            figures.append(Picture(caption=caption, alt=alt, data=webp(Image.fromarray(cut), STRIP_WIDTH)))
-        size = sum(len(one.data) for one in figures)
-        rows.append(Grid(blocks=figures, least=10) if size <= material.room else Text(text=f"{scenario}: {NO_ROOM}.", tone="mute"))
-        material.room -= size * (size <= material.room)
+        # Films of one scenario have the same size unless a run was made otherwise.
+        alike = [panels for _, (_, panels) in ordered if panels.shape == ordered[0][1][1].shape]
+        box = around(np.stack(alike)) if len(alike) == len(ordered) else (slice(None), slice(None))
+        shown = [(f"Observed: {scenario}, frame {longest - 1}", ordered[0][1][1][0])]
+        for name, (count, panels) in ordered:
+            shown.append((f"{material.numbers.name(name)}{f', ends at frame {count - 1}' * (count < longest)}", panels[1]))
+        figures = [
+            Picture(
+                caption=text,
+                alt=f"Last frame of {scenario}: {text}",
+                data=webp(Image.fromarray(np.ascontiguousarray(panel[box])), STRIP_WIDTH),
+            )
+            for text, panel in shown
+        ]
+        fits = material.take(sum(len(one.data) for one in figures))
+        rows.append(Grid(blocks=figures, least=10) if fits else Text(text=f"{scenario}: {NO_ROOM}.", tone="mute"))
     rest = rows[MOST_OPEN:]
     more = [Fold(summary=f"{several(len(rest), 'scenario')} more", blocks=rest)] if rest else []
     about = "What was filmed and what each method predicts, in the last frame of the future, first camera, cut out; one seed."

@@ -9,8 +9,6 @@ from PIL import Image
 from neuspring.core.errors import InputError
 from neuspring.draw.film import HOLD, film_pictures, write_film
 from neuspring.draw.sheet import FUTURE, TRAINING
-from neuspring.extensions.figures.drawing import film
-from neuspring.extensions.figures.options import FilmOptions
 from tests.support.shown import painter
 
 ALL = range(8)
@@ -44,31 +42,26 @@ def test_a_gif_loops_keeps_the_time_and_holds_its_end(video, tmp_path):
     # 7 of 30 frames per second take 0.23 s, in hundredths.
     assert sum(times[:-1]) == pytest.approx(1000 * 7 / RATE, abs=10) and times[-1] == 1000 * HOLD
     assert (tmp_path / "film.gif").stat().st_size == made.bytes
-    # Paper is white, and the bar of time has its two colors, in all frames.
-    assert all((picture[-20:, 1] == 255).all() for picture in pictures)
-    assert tuple(pictures[-1][6, 310]) == FUTURE and tuple(pictures[-1][6, 120]) == TRAINING
-    assert tuple(pictures[0][6, 310]) != FUTURE
+    # Paper is white, and the bar of time has its two colors.
+    assert all((picture[20:, 1] == 255).all() for picture in pictures)
+    assert (
+        np.abs(pictures[-1][2, 310].astype(int) - FUTURE).max() < 8
+        and np.abs(pictures[-1][2, 120].astype(int) - TRAINING).max() < 8
+    )
+    assert np.abs(pictures[0][2, 310].astype(int) - FUTURE).max() > 50
     assert not any(name.name.startswith(".") for name in tmp_path.iterdir())
     assert not plt.get_fignums()
 
 
-def test_an_mp4_has_all_frames_at_its_speed(video, tmp_path):
+def test_an_mp4_has_all_frames_at_their_rate(video, tmp_path):
     paints = painter(video, ALL, style="splats", error="color")
-    made = write_film(paints, tmp_path / "film.mp4", 400, speed=0.5)
+    made = write_film(paints, tmp_path / "film.mp4", 400)
     pictures, rate = mp4(tmp_path / "film.mp4")
-    assert (len(pictures), rate, made.rate) == (8, RATE / 2, RATE / 2)
+    assert (len(pictures), rate, made.rate) == (8, RATE, RATE)
     expected = list(film_pictures(paints, ALL, 400))
     assert pictures[0].shape == expected[0].shape and expected[0].shape[1] == 400
     difference = np.abs(pictures[3].astype(int) - expected[3])
     assert np.median(difference) <= 2 and np.quantile(difference, 0.9) < COLOR_DIFFERENCE
-
-
-def test_the_panels_move_and_the_observed_is_the_photo(video):
-    first, last = (next(film_pictures(painter(video, ALL, style="splats", error="none"), (k,), 480)) for k in (0, 7))
-    third = first.shape[1] // 3
-    for panel in range(3):
-        part = slice(panel * third + 4, (panel + 1) * third - 4)
-        assert (first[40:, part] != last[40:, part]).any()
 
 
 def test_a_film_that_is_too_large_is_made_coarser_or_refused(video, tmp_path):
@@ -88,17 +81,3 @@ def test_a_scene_without_video_is_filmed_as_points(plain):
     assert len(pictures) == 3 and all(side % 2 == 0 for side in pictures[0].shape[:2])
     blue = (np.abs(pictures[0].astype(int) - [31, 119, 180]).max(axis=2) < 30)[40:, :100]
     assert blue.any()
-
-
-@pytest.mark.parametrize(
-    ("values", "text"),
-    [
-        ({"width": 40}, "--width: must be 160 to 1920; received 40"),
-        ({"width": 300, "speed": 0.0}, "--speed: must be 0.05 to 8"),
-        ({"width": 300, "megabytes": 0.0}, "--megabytes: must be 0.001 to 100"),
-        ({"width": 300, "megabytes": float("nan")}, "--megabytes"),
-    ],
-)
-def test_sizes_that_no_film_has(video, tmp_path, values, text):
-    with pytest.raises(InputError, match=text):
-        film(FilmOptions(results=(video,), output=tmp_path / "film.gif", **values))
