@@ -325,9 +325,9 @@ class Buffers:
             made.append(struct)
         return tuple(made)
 
-    def launch(self, kernel: Any, size: int | tuple[int, int], *arguments: Any, block: int = 256) -> None:
-        """Run a kernel on `size` threads, in blocks of so many."""
-        wp.launch(kernel, size, [*arguments], device=self.device, block_dim=block)
+    def launch(self, kernel: Any, size: int | tuple[int, int], *arguments: Any) -> None:
+        """Run a kernel on `size` threads."""
+        wp.launch(kernel, size, [*arguments], device=self.device)
 
 
 class Graphs:

@@ -12,7 +12,7 @@ once, at its lower node, rows one after the other; threads have each pair at bot
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 import warp as wp
@@ -266,19 +266,12 @@ def kernels(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
     return unique(place), unique(find), unique(agree), unique(find_pairs)
 
 
-class Contacts(NamedTuple):
-    """Calls of a frame. A thread per node gathers (`collided`); one thread for all adds each pair to both of its nodes."""
-
-    collided: Any
-    add_pairs: Any
-    after_pairs: Any
-    collided_adjoint: Any
-    add_pairs_adjoint: Any
-
-
 @functools.cache
-def functions(real: Any, width: int) -> Contacts:
-    """The functions for a scalar type, wp.float32 or wp.float64, and a number of lanes."""
+def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any, Any]:
+    """(collided, add_pairs, after_pairs, adjoint of collided, of add_pairs) for a scalar type, wp.float32 or wp.float64, and lanes.
+
+    A thread per node gathers (`collided`); one thread for all adds each pair to both of its nodes.
+    """
     lane = lanes(real, width)
     Number, Vector, plain = lane.Number, lane.Vector, lane.plain
     Model, State, Adjoint = structs(real, width)
@@ -486,4 +479,4 @@ def functions(real: Any, width: int) -> Contacts:
         adjoint.contact_e[i, g] = e
         adjoint.contact_mu[i, g] = mu
 
-    return Contacts(collided, add_pairs, after_pairs, collided_adjoint, add_pairs_adjoint)
+    return collided, add_pairs, after_pairs, collided_adjoint, add_pairs_adjoint

@@ -11,8 +11,6 @@ through them, exactly. Springs that only push keep their lengths.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 import torch
 
@@ -68,13 +66,6 @@ class ControllerSprings:
         apart = (row[..., self.leaders, :3] - x[..., self.nodes, :]).norm(dim=-1).clamp(min=MIN_SPRING_LENGTH)
         before = torch.zeros_like(apart) if lengths is None else lengths
         return torch.where(now[..., self.leaders], apart, before)
-
-    def taken_before(self, rows: Iterable[torch.Tensor], positions: Iterable[torch.Tensor]) -> torch.Tensor | None:
-        """The same after several frames, from the rows and the nodes' positions in each."""
-        lengths = None
-        for row, x in zip(rows, positions, strict=False):
-            lengths = self.taken(lengths, x, row)
-        return lengths
 
     def applied(self, packed: torch.Tensor, lengths: torch.Tensor | None) -> torch.Tensor:
         """Parameters [..., S, 3] of springs with rest lengths [..., L], and the stiffness that goes with them."""

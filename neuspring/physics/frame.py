@@ -2,8 +2,7 @@
 
 `serial`: one thread goes through all nodes and all substeps, each spring once, the way of a CPU, whose width is in the lanes.
 `threads`: a thread per node of each twin and a launch per substep, each spring gathered at both ends without atomics, the way of
-a GPU. `blocks`: the same by a block of threads per twin, which goes through all substeps of a frame in one launch and waits for its
-threads in between. All sum a node's forces in the same order.
+a GPU. Both sum a node's forces in the same order.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
@@ -15,16 +14,6 @@ import warp as wp
 from neuspring.physics import collision, motion, springs
 from neuspring.physics.arrays import UNFUSED, structs
 from neuspring.physics.lanes import lanes
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    __syncthreads();
-#endif
-""")
-def wait_for_all() -> None:
-    """Wait until all threads of a block have written what they write; on a CPU a block has one."""
-    ...
 
 
 class Kernels(NamedTuple):
@@ -47,9 +36,6 @@ class Kernels(NamedTuple):
     """Adjoint of the impulses."""
     slow: Any
     """Adjoint of the velocity update, after `hit`."""
-    block_forward: Any
-    """A frame by a block per twin."""
-    block_backward: Any
 
 
 @functools.cache
@@ -164,29 +150,6 @@ def kernels(real: Any, width: int, pushes: bool = False) -> Kernels:
         move_controller(model, state, 0, 0, c, g)
 
     @wp.func
-    def go(model: Model, state: State, step: int, i: int, g: int):
-        """A substep of a point; with self-collision without its second half."""
-        slot = step % model.slots
-        if i >= model.nodes:
-            # The controllers' place in the next substep, which nobody reads in this one.
-            move_controller(model, state, step + 1, (step + 1) % model.slots, i - model.nodes, g)
-            return
-        inner = step % model.history
-        force = gathered(model, state, slot, i, g)
-        after = update(model, state, slot, i, g, force)
-        state.after[inner, i, g] = after
-        if model.collide == 0:
-            advance(model, state, step, i, g, after)
-
-    @wp.func
-    def meet(model: Model, state: State, step: int, i: int, g: int):
-        """The second half: impulses, motion."""
-        inner = step % model.history
-        moving = collided(model, state, step % model.slots, inner, i, g)
-        state.moving[inner, i, g] = moving
-        advance(model, state, step, i, g, moving)
-
-    @wp.func
     def settled(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
         advance_adjoint(model, state, adjoint, step, i, g)
         if model.collide == 0:
@@ -194,19 +157,25 @@ def kernels(real: Any, width: int, pushes: bool = False) -> Kernels:
         else:
             adjoint.after[i, g] = Vector()
 
-    @wp.func
-    def pulled(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
-        gathered_adjoint(model, state, adjoint, step, step % 2, i, g)
-        if model.collide == 0 and step > 0:
-            settled(model, state, adjoint, step - 1, i, g)
-
     def substep(model: Model, state: State, step: int):
         i, g = wp.tid()
-        go(model, state, step, i, g)
+        slot = step % model.slots
+        if i >= model.nodes:
+            # The controllers' place in the next substep, which nobody reads in this one.
+            move_controller(model, state, step + 1, (step + 1) % model.slots, i - model.nodes, g)
+            return
+        force = gathered(model, state, slot, i, g)
+        after = update(model, state, slot, i, g, force)
+        state.after[step % model.history, i, g] = after
+        if model.collide == 0:
+            advance(model, state, step, i, g, after)
 
     def collide(model: Model, state: State, step: int):
         i, g = wp.tid()
-        meet(model, state, step, i, g)
+        inner = step % model.history
+        moving = collided(model, state, step % model.slots, inner, i, g)
+        state.moving[inner, i, g] = moving
+        advance(model, state, step, i, g, moving)
 
     def settle(model: Model, state: State, adjoint: Adjoint, step: int):
         i, g = wp.tid()
@@ -222,49 +191,9 @@ def kernels(real: Any, width: int, pushes: bool = False) -> Kernels:
 
     def pull(model: Model, state: State, adjoint: Adjoint, step: int):
         i, g = wp.tid()
-        pulled(model, state, adjoint, step, i, g)
-
-    def block_forward(model: Model, state: State):
-        g, t = wp.tid()
-        size = wp.block_dim()
-        count = int(model.counts[g][0])
-        for c in range(t, model.controllers, size):
-            move_controller(model, state, 0, 0, c, g)
-        wait_for_all()
-        for step in range(count):
-            for i in range(t, model.nodes + model.controllers, size):
-                go(model, state, step, i, g)
-            wait_for_all()
-            if model.collide != 0:
-                for i in range(t, model.nodes, size):
-                    meet(model, state, step, i, g)
-                wait_for_all()
-        # Another twin may have more substeps, and all have their end in the same slot.
-        for i in range(t, model.nodes, size):
-            state.x[model.substeps % model.slots, i, g] = state.x[count % model.slots, i, g]
-            state.v[model.substeps % model.slots, i, g] = state.v[count % model.slots, i, g]
-
-    def block_backward(model: Model, state: State, adjoint: Adjoint):
-        g, t = wp.tid()
-        size = wp.block_dim()
-        count = int(model.counts[g][0])
-        for done in range(count):
-            step = count - 1 - done
-            if model.collide != 0 or done == 0:
-                for i in range(t, model.nodes, size):
-                    settled(model, state, adjoint, step, i, g)
-                wait_for_all()
-            if model.collide != 0:
-                for i in range(t, model.nodes, size):
-                    collided_adjoint(model, state, adjoint, step, i, g)
-                wait_for_all()
-                for i in range(t, model.nodes, size):
-                    update_adjoint(model, state, adjoint, step, i, g)
-                wait_for_all()
-            for i in range(t, model.nodes, size):
-                pulled(model, state, adjoint, step, i, g)
-            wait_for_all()
+        gathered_adjoint(model, state, adjoint, step, step % 2, i, g)
+        if model.collide == 0 and step > 0:
+            settled(model, state, adjoint, step - 1, i, g)
 
     made = wp.kernel(**UNFUSED)
-    kept = (forward, backward, begin, substep, collide, settle, pull, hit, slow, block_forward, block_backward)
-    return Kernels(*map(made, kept))
+    return Kernels(*map(made, (forward, backward, begin, substep, collide, settle, pull, hit, slow)))

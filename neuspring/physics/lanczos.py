@@ -22,12 +22,12 @@ RESTARTS = 200
 
 def largest(
     springs: np.ndarray, direction: np.ndarray, scale: np.ndarray, each: Sequence[np.ndarray], tolerance: float
-) -> list[tuple[float, int] | None]:
+) -> list[tuple[float, int]]:
     """The largest eigenvalue of A = D B^T diag(w) B D for `each` w [S], and the point that moves most in its mode.
 
     springs [S, 2] of points P have unit vectors `direction` [S, 3]. Row e of B maps velocities of points to the rate of change of
-    spring e's length; D = diag(`scale` [P]), 0 for points that do not move. The residual is at most `tolerance` times the value;
-    None where it stays larger.
+    spring e's length; D = diag(`scale` [P]), 0 for points that do not move. The residual is at most `tolerance` times the value.
+    Where it stays larger it is added to the value.
     """
     start_warp()
     kernel, moves = load(subspace, "cpu"), scale > 0
@@ -37,7 +37,7 @@ def largest(
     kinds = wp.int32, wp.vec3d, wp.float64, wp.vec3d, wp.vec3d, wp.float64, wp.float64, wp.float64
     views: list[Any] = [wp.array(one, dtype=kind, copy=False, device="cpu") for one, kind in zip(numbers, kinds, strict=True)]
 
-    def found(weights: np.ndarray) -> tuple[float, int] | None:
+    def found(weights: np.ndarray) -> tuple[float, int]:
         arguments = wp.array(weights, dtype=wp.float64, copy=False, device="cpu"), *views
         # ARPACK begins with the product of A and a random vector.
         basis[STEPS - 1, moves], linked[:] = np.random.default_rng(0).standard_normal((moves.sum(), 3)), 0.0
@@ -45,20 +45,24 @@ def largest(
         basis[0] = diagonal[-1] * basis[STEPS - 1] + beside[-1] * basis[STEPS]
         basis[0] /= max(np.linalg.norm(basis[0]), np.finfo(float).tiny)
         known = 0
-        for _ in range(RESTARTS):
+        for restart in range(RESTARTS):
             wp.launch(kernel, 1, [known, *arguments], device="cpu")
             projected = np.diag(diagonal)
             projected[range(known, STEPS - 1), range(known + 1, STEPS)] = beside[known:-1]
             projected[:known, known] = linked[:known]
             values, vectors = np.linalg.eigh(projected, UPLO="U")
-            if beside[-1] * abs(vectors[-1, -1]) <= tolerance * values[-1]:
-                mode = np.tensordot(vectors[:, -1], basis[:STEPS], axes=1)
-                return float(values[-1]), int(np.argmax(np.linalg.norm(mode, axis=1)))
+            residual = beside[-1] * abs(vectors[-1, -1])
+            if residual <= tolerance * values[-1]:
+                residual = 0.0
+                break
+            if restart + 1 == RESTARTS:
+                break
             known = KEPT
             basis[:known] = np.tensordot(vectors[:, -known:].T, basis[:STEPS], axes=1)
             basis[known] = basis[STEPS]
             diagonal[:known], linked[:known] = values[-known:], beside[-1] * vectors[-1, -known:]
-        return None
+        mode = np.tensordot(vectors[:, -1], basis[:STEPS], axes=1)
+        return float(values[-1] + residual), int(np.argmax(np.linalg.norm(mode, axis=1)))
 
     return [found(weights) for weights in each]
 

@@ -5,7 +5,8 @@ Everything is written one equation a line, forward only; gradients are checked a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -31,8 +32,6 @@ class ReferenceTwin:
     simulation: Simulation
     mass: np.ndarray | float = 1.0
     """Mass of each node [N], or of all, kg."""
-    pushes: np.ndarray | bool = False
-    """True where each spring [S], or every one, acts only while it is shorter than at rest."""
 
     @classmethod
     def of(cls, twin: Twin) -> ReferenceTwin:
@@ -50,44 +49,17 @@ class ReferenceTwin:
             contact_distance=m.contact_distance,
             simulation=twin.simulation,
             mass=m.mass.astype(np.float64) if len(m.mass) else 1.0,
-            pushes=t.pushes if len(t.pushes) else np.zeros(len(t.springs), bool),
         )
 
 
-def rollout(
-    scene: ReferenceTwin, x: np.ndarray, v: np.ndarray, controllers: np.ndarray, valid: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """States at frame ends, x and v, each [F, N, 3]; frame 0 is the given state. controllers [F, C, 3].
-
-    Where `valid` [F, C] is false at either end of a frame, the springs of that controller do not act in it. When it begins to
-    hold, they take the lengths of that moment.
-    """
+def rollout(scene: ReferenceTwin, x: np.ndarray, v: np.ndarray, controllers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """States at frame ends, x and v, each [F, N, 3]; frame 0 is the given state. controllers [F, C, 3]."""
     xs, vs = [np.asarray(x, np.float64)], [np.asarray(v, np.float64)]
-    hands = controllers.astype(np.float64)
-    for k in range(len(hands) - 1):
-        if valid is not None and k:
-            scene = gripped(scene, xs[-1], hands[k], valid[k] & ~valid[k - 1])
-        held = scene if valid is None else holding(scene, valid[k] & valid[k + 1])
-        x, v = frame(held, xs[-1], vs[-1], hands[k], hands[k + 1])
+    for begin, end in pairwise(controllers.astype(np.float64)):
+        x, v = frame(scene, xs[-1], vs[-1], begin, end)
         xs.append(x)
         vs.append(v)
     return np.stack(xs), np.stack(vs)
-
-
-def holding(scene: ReferenceTwin, holds: np.ndarray) -> ReferenceTwin:
-    """The scene in which only controllers with `holds` [C] pull."""
-    led = np.concatenate([np.ones(scene.nodes, bool), holds])
-    acts = led[scene.springs].all(axis=1)
-    return replace(scene, stiffness=scene.stiffness * acts, dashpot=scene.dashpot * acts)
-
-
-def gripped(scene: ReferenceTwin, x: np.ndarray, hands: np.ndarray, begin: np.ndarray) -> ReferenceTwin:
-    """The scene after controllers with `begin` [C] took hold: l0' = |x_c - x_n|, and Y' / l0' = Y / l0."""
-    taken = np.concatenate([np.zeros(scene.nodes, bool), begin])[scene.springs].any(axis=1) & ~np.asarray(scene.pushes)
-    points = np.concatenate([x, hands])
-    apart = np.linalg.norm(points[scene.springs[:, 1]] - points[scene.springs[:, 0]], axis=1)
-    lengths = np.where(taken, np.maximum(apart, MIN_SPRING_LENGTH), scene.rest_lengths)
-    return replace(scene, rest_lengths=lengths, stiffness=scene.stiffness * (lengths / scene.rest_lengths))
 
 
 def frame(scene: ReferenceTwin, x: np.ndarray, v: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -135,15 +107,13 @@ def substep(
 
 
 def spring_forces(scene: ReferenceTwin, x: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Force [S, 3] on the first end of each spring: (Y (l / l0 - 1) + gamma (v_j - v_i) . d) d; none where one that only pushes is
-    longer than at rest."""
+    """Force [S, 3] on the first end of each spring: (Y (l / l0 - 1) + gamma (v_j - v_i) . d) d."""
     i, j = scene.springs[:, 0], scene.springs[:, 1]
     offset = x[j] - x[i]
     length = np.linalg.norm(offset, axis=1)
     d = offset / np.maximum(length, MIN_SPRING_LENGTH)[:, None]
     closing = np.einsum("ek,ek->e", v[j] - v[i], d)
     magnitude = scene.stiffness * (length / scene.rest_lengths - 1.0) + scene.dashpot * closing
-    magnitude = np.where(scene.pushes & (length > scene.rest_lengths), 0.0, magnitude)
     forces: np.ndarray = magnitude[:, None] * d
     return forces
 

@@ -63,8 +63,7 @@ class FrameSolver:
     simulations (else InputError); then every tensor has a leading axis [B]. A twin's numbers are the same, bit for bit, alone and
     in company. They may have `tables` of springs: `spring_pairs` are then several, and `sizes` the nodes of each twin (`Union`).
 
-    `threads` chooses how a frame is computed (frame.py): by a thread per node, as on CUDA, or by one thread, as on a CPU. `block`
-    threads go through a twin's nodes instead, in one launch for all substeps; 0: a launch for each.
+    `threads` chooses how a frame is computed (frame.py): by a thread per node, as on CUDA, or by one thread, as on a CPU.
     """
 
     def __init__(
@@ -78,17 +77,15 @@ class FrameSolver:
         dtype: torch.dtype = torch.float32,
         differentiable: bool = True,
         threads: bool | None = None,
-        block: int = 0,
         tables: Sequence[int] = (),
         sizes: Sequence[int] = (),
     ) -> None:
-        self.block = block
         each = [spring_pairs] if isinstance(spring_pairs, np.ndarray) else list(spring_pairs)
         self.together = not isinstance(simulation, Simulation)
         simulations = [simulation] if isinstance(simulation, Simulation) else list(simulation)
         _check(simulations)
         self.nodes, self.simulation, self.device, self.dtype = nodes, simulations[0], device, dtype
-        threads = device != "cpu" or block > 0 if threads is None else threads
+        threads = device != "cpu" if threads is None else threads
         options: dict[str, Any] = {"differentiable": differentiable, "threads": threads, "tables": tables, "sizes": sizes}
         self.buffers = Buffers(nodes, controllers, simulations, device, dtype, **options)
         self.buffers.add_parameters(max(map(len, each)))
@@ -219,17 +216,6 @@ class FrameSolver:
         own = self.grips.applied(self._plain, self._held)
         self.buffers.set_parameter("springs", own if self._factor is None else own * self._factor)
 
-    def resume(self, rows: torch.Tensor, positions: Sequence[np.ndarray]) -> None:
-        """Hold what was held after the frames of `rows` [T, C, K] of waypoints, in which the nodes were at `positions` [N, 3], m.
-
-        For a rollout that does not begin in frame 0; more positions than rows may be given. It makes no difference where all hold.
-        """
-        assert self.grips is not None, "a rollout of one scene"
-        known = torch.nonzero(begins(rows).any(dim=-1)).flatten().tolist()
-        states = [torch.tensor(positions[number], dtype=self.dtype, device=self.device) for number in known]
-        lengths = self.grips.taken_before([rows[number] for number in known], states)
-        self._held = None if lengths is None else lengths.expand(self.buffers.twins, -1)
-
     def follow(self, other: FrameSolver) -> None:
         """Take the state of another solver: none, since a frame is given it."""
 
@@ -285,7 +271,7 @@ class FrameSolver:
         return values if self.together else values[0]
 
     def _run(self, name: str, launch: Callable[[], None]) -> None:
-        if self.buffers.threads and not self.block:
+        if self.buffers.threads:
             self._graphs.run(name, self._needed(name), launch)
             return
         # One launch needs no graph. Warp would record it with whatever other threads of the process launch meanwhile.
@@ -296,8 +282,6 @@ class FrameSolver:
     def _needed(self, name: str) -> Iterator[Any]:
         """The kernels of a frame forward or backward."""
         k, b = self._kernels, self.buffers
-        if self.block:
-            return iter([k.block_forward if name == "forward" else k.block_backward])
         if not b.threads:
             return iter([k.forward if name == "forward" else k.backward])
         if name == "forward":
@@ -308,9 +292,6 @@ class FrameSolver:
         """A frame (`frame.py`)."""
         b, k = self.buffers, self._kernels
         model, state, _ = b.arguments
-        if self.block:
-            b.launch(k.block_forward, (b.groups, self.block), model, state, block=self.block)
-            return
         if not b.threads:
             b.launch(k.forward, b.groups, model, state)
             return
@@ -324,9 +305,6 @@ class FrameSolver:
         """The adjoint of a frame."""
         b, k = self.buffers, self._kernels
         arguments, size = b.arguments, (b.nodes, b.groups)
-        if self.block:
-            b.launch(k.block_backward, (b.groups, self.block), *arguments, block=self.block)
-            return
         if not b.threads:
             b.launch(k.backward, b.groups, *arguments)
             return
@@ -345,14 +323,14 @@ class FrameWindow:
     `make` makes a solver of the graph; there will be `frames` of them, or as many as fit into `FRAME_WINDOW_BYTES`, one at least.
     """
 
-    def __init__(self, make: Callable[[], FrameSolver], frames: int, frame_token: int = 0) -> None:
+    def __init__(self, make: Callable[[], FrameSolver], frames: int) -> None:
         self._make, self._solvers = make, [make()]
         self._room = max(1, min(frames, FRAME_WINDOW_BYTES // self._solvers[0].nbytes))
-        self._first = self.frame_token = frame_token
+        self.frame_token = 0
 
     def turn(self) -> FrameSolver:
         """The solver that takes the next frame: that of the oldest."""
-        place = (self.frame_token - self._first) % self._room
+        place = self.frame_token % self._room
         if place == len(self._solvers):
             self._solvers.append(self._make())
         self.frame_token += 1
@@ -364,8 +342,8 @@ class FrameWindow:
 
     def holding(self, token: int) -> FrameSolver | None:
         """As `FrameSolver.holding`."""
-        held = max(self._first, self.frame_token - self._room) < token <= self.frame_token
-        return self._solvers[(token - 1 - self._first) % self._room] if held else None
+        held = max(0, self.frame_token - self._room) < token <= self.frame_token
+        return self._solvers[(token - 1) % self._room] if held else None
 
     @property
     def overflows(self) -> list[int]:
@@ -473,10 +451,9 @@ def solver_for(
     dtype: torch.dtype = torch.float32,
     *,
     differentiable: bool = True,
-    block: int = 0,
 ) -> FrameSolver:
     """A solver with parameters set: of a lattice, or of several: tensors have an axis [B]."""
-    options: dict[str, Any] = {"device": device, "dtype": dtype, "differentiable": differentiable, "block": block}
+    options: dict[str, Any] = {"device": device, "dtype": dtype, "differentiable": differentiable}
     if isinstance(twins, Twin):
         first = twins.topology
         solver = FrameSolver(first.springs, len(first.nodes), len(first.controllers), twins.simulation, **options)

@@ -6,8 +6,7 @@ quotients of the same vector, it suffices that the largest eigenvalue of M(dt) =
 K = sum_e (Y / l0) d d^T and C = sum_e gamma d d^T over the springs' direction blocks. Drag only helps and is ignored.
 With other masses M, M^-1/2 K M^-1/2 and M^-1/2 C M^-1/2 stand for K and C: a spring's row over the root of each end's mass.
 
-Two estimates, cheap first: Gershgorin's bound per node, valid for any directions; then the eigenvalue itself in the rest
-configuration (Lanczos). Deformation turns directions but hardly raises the eigenvalue; `safety` covers that.
+Eigenvalues are those of the rest configuration (Lanczos). Deformation turns directions but hardly raises them: `safety` covers it.
 """
 
 from __future__ import annotations
@@ -29,8 +28,6 @@ RELEASED_FRAME_TIME = RELEASED_SUBSTEPS * 5e-5
 """s, whatever the frame rate (released_quirks.frame_time_667)."""
 TOLERANCE = 1e-3
 """Relative residual of the eigenvalues of a spectrum."""
-ONE_KG = np.zeros(0)
-"""Masses of no nodes, which stand for 1 kg each."""
 
 
 class Unstable(InputError):
@@ -57,31 +54,8 @@ class Spectrum:
         return float((-b + np.sqrt(b * b + 4 * a * STABILITY_LIMIT * safety)) / (2 * a))
 
 
-def gershgorin(springs: np.ndarray, nodes: int, stiffness: np.ndarray, damping: np.ndarray, mass: np.ndarray = ONE_KG) -> Spectrum:
-    """Per-node bound: twice the sum over springs to nodes, once over springs to controllers, over the mass [N].
-
-    stiffness is Y / l0 [S]. These are the rows of M^-1 K, which has the eigenvalues of M^-1/2 K M^-1/2.
-    """
-    weight = np.where((springs < nodes).all(axis=1), 2.0, 1.0)
-    total = int(max(nodes, springs.max(initial=0) + 1))
-
-    def rows(values: np.ndarray) -> np.ndarray:
-        ends = np.concatenate([springs[:, 0], springs[:, 1]])
-        sums = np.bincount(ends, np.tile(weight * values, 2), total)[:nodes]
-        return sums / mass.astype(np.float64) if len(mass) else sums
-
-    k, c = rows(stiffness), rows(damping)
-    node = int(np.argmax(k / max(k.max(initial=0), 1e-30) + c / max(c.max(initial=0), 1e-30)))
-    return Spectrum(float(k.max(initial=0)), float(c.max(initial=0)), node)
-
-
 def rest_spectrum(
-    springs: np.ndarray,
-    nodes: np.ndarray,
-    controllers: np.ndarray,
-    stiffness: np.ndarray,
-    damping: np.ndarray,
-    mass: np.ndarray = ONE_KG,
+    springs: np.ndarray, nodes: np.ndarray, controllers: np.ndarray, stiffness: np.ndarray, damping: np.ndarray, mass: np.ndarray
 ) -> Spectrum:
     """Largest eigenvalues in the rest configuration. stiffness is Y / l0 [S], damping gamma [S], mass [N], kg, or empty: 1 each."""
     from neuspring.physics import lanczos
@@ -90,21 +64,15 @@ def rest_spectrum(
     offset = ends[:, 1] - ends[:, 0]
     direction = offset / np.maximum(np.linalg.norm(offset, axis=1, keepdims=True), 1e-12)
     scale = np.append(1 / np.sqrt(mass.astype(np.float64)) if len(mass) else np.ones(len(nodes)), np.zeros(len(controllers)))
-    k, c = lanczos.largest(springs, direction, scale, (stiffness, damping), TOLERANCE)
-    if k is None or c is None:
-        return gershgorin(springs, len(nodes), stiffness, damping, mass)
-    return Spectrum(k[0], c[0], k[1])
+    (k, node), (c, _) = lanczos.largest(springs, direction, scale, (stiffness, damping), TOLERANCE)
+    return Spectrum(k, c, node)
 
 
 def twin_spectrum(twin: Twin) -> Spectrum:
     """The spectrum of a twin at rest."""
     topology, material = twin.topology, twin.material
-    return rest_spectrum(topology.springs, topology.nodes, topology.controllers, *_strengths(twin), material.mass)
-
-
-def _strengths(twin: Twin) -> tuple[np.ndarray, np.ndarray]:
-    """Y / l0 and gamma of each spring [S]."""
-    return twin.material.stiffness.astype(np.float64) / twin.topology.rest_lengths, twin.material.dashpot.astype(np.float64)
+    stiffness, damping = material.stiffness.astype(np.float64) / topology.rest_lengths, material.dashpot.astype(np.float64)
+    return rest_spectrum(topology.springs, topology.nodes, topology.controllers, stiffness, damping, material.mass)
 
 
 def smallest_safe_substeps(spectrum: Spectrum, frame_time: float, safety: float) -> int:
@@ -128,11 +96,7 @@ def for_prediction(twin: Twin) -> Twin:
 
 def check(twin: Twin) -> None:
     """Raise Unstable, naming node, bound and remedy, if the twin's substep is beyond the stability limit."""
-    topology, simulation = twin.topology, twin.simulation
-    bound = gershgorin(topology.springs, len(topology.nodes), *_strengths(twin), twin.material.mass)
-    if bound.load(simulation.substep) < STABILITY_LIMIT:
-        return
-    spectrum = twin_spectrum(twin)
+    simulation, spectrum = twin.simulation, twin_spectrum(twin)
     if spectrum.load(simulation.substep) >= STABILITY_LIMIT:
         largest = spectrum.largest_substep(1.0)
         needed = smallest_safe_substeps(spectrum, simulation.frame_time, 1.0)

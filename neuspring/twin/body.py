@@ -225,7 +225,8 @@ BODIES: Registry[Body] = Registry("bodies", modules("neuspring.twin.bodies", "bo
 TERMS: Registry[Any] = Registry(
     "losses", {name: f"neuspring.twin.losses:{name}" for name in ("chamfer", "track", "acceleration", "image_track", "silhouette")}
 )
-"""Every term of the training loss, by the name of its weight: from a `FrameLoss` and a `FrameState` to a list of `Errors`."""
+"""Every term of the training loss, by the name of its weight: a function of a `FrameLoss` and a `FrameState` that returns the
+weighted loss, or None where it does not apply."""
 
 
 def code(*bodies: str) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""The training loss, in one place: a term is a function that says a frame's errors, and search and fit sum their squares.
+"""The training loss, in one place: a term is a function that returns its weighted loss of a frame.
 
 A term's loss is weight / divisor times the sum of s(e)^2 over its errors e, m; `config.Losses` has the weight under its name:
 
@@ -12,17 +12,17 @@ A term's loss is weight / divisor times the sum of s(e)^2 over its errors e, m; 
 The last two are of one camera without depth, with the projection u(x) = K R^T (x - c) / depth, pixels, and p, m per pixel at the
 object in frame 0. The first three are those of the released PhysTwin code. The fit takes `FrameLoss.__call__`. The search takes the
 first three on the lanes of its solver (trials.py, tested against this file) and what else there is from here: a term needs its
-function, its name in `body.TERMS`, and its weight. A package's term weighs its errors itself.
+function, its name in `body.TERMS`, and its weight.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Collection
-from dataclasses import dataclass, replace
+from collections.abc import Collection
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch.nn.functional import grid_sample, smooth_l1_loss
 
@@ -30,7 +30,6 @@ from neuspring.config import Losses
 from neuspring.core.artifacts import Observations
 from neuspring.twin.body import TERMS
 
-Evidence = TypeVar("Evidence", "ImageEvidence", "FrameLoss")
 CHUNK_ENTRIES = 1 << 22
 """Distances computed at once in the nearest-node search; bounds memory."""
 BETA = 0.03
@@ -45,44 +44,22 @@ def frames_seen(observations: Observations, *, oracle: bool) -> int:
     return scenario.frame_count if oracle else scenario.train_end
 
 
-class Penalty(NamedTuple):
-    """s, and the sum of s(e)^2 where it is not summed as it stands: rounded as the released losses are."""
-
-    root: Callable[[torch.Tensor], torch.Tensor]
-    total: Callable[[torch.Tensor], torch.Tensor] | None = None
+def _smooth_l1(e: torch.Tensor) -> torch.Tensor:
+    return smooth_l1_loss(e, torch.zeros_like(e), reduction="sum", beta=1.0)
 
 
-def _smooth_root(e: torch.Tensor, beta: float) -> torch.Tensor:
-    """s(e), whose square is e^2 / 2 below beta and beta (|e| - beta / 2) beyond; its slope is continuous."""
+def _smooth_root(e: torch.Tensor) -> torch.Tensor:
+    """s(e), whose square is e^2 / 2 below BETA and BETA (|e| - BETA / 2) beyond; its slope is continuous."""
     size = e.abs()
     # The unused branch must have a finite slope too.
-    linear = (beta * (size.clamp_min(beta) - beta / 2)).sqrt()
-    return torch.where(size < beta, e / 2**0.5, e.sign() * linear)
+    linear = (BETA * (size.clamp_min(BETA) - BETA / 2)).sqrt()
+    return torch.where(size < BETA, e / 2**0.5, e.sign() * linear)
 
 
-SQUARES = Penalty(lambda e: e, lambda e: e.square().sum())
-SMOOTH_L1 = Penalty(lambda e: _smooth_root(e, 1.0), lambda e: smooth_l1_loss(e, torch.zeros_like(e), reduction="sum", beta=1.0))
-IMAGE_SQUARES = Penalty(lambda e: e)
-IMAGE_SMOOTH_L1 = Penalty(lambda e: _smooth_root(e, BETA))
-
-
-class Errors(NamedTuple):
-    """Errors of a term in a frame: weight / divisor times the sum of s(e)^2 over `values`."""
-
-    values: torch.Tensor
-    """[k, d]."""
-    weight: float
-    divisor: int | torch.Tensor
-    """At least 1."""
-    penalty: Penalty
-
-    def loss(self) -> torch.Tensor:
-        """The sum."""
-        if self.penalty.total is not None:
-            return self.weight * (self.penalty.total(self.values) / self.divisor)
-        scale = self.weight / self.divisor
-        root = scale.sqrt() if isinstance(scale, torch.Tensor) else math.sqrt(scale)
-        return (self.penalty.root(self.values) * root).square().sum()
+def _mean_square(s: torch.Tensor, weight: float, count: torch.Tensor | int) -> torch.Tensor:
+    """weight / count times the sum of the squares of s [k, d]; the count is at least 1."""
+    scale = weight / torch.as_tensor(count, dtype=s.dtype, device=s.device).clamp_min(1)
+    return (s * scale.sqrt()).square().sum()
 
 
 class FrameState(NamedTuple):
@@ -112,77 +89,51 @@ def nearest(points: torch.Tensor, nodes: torch.Tensor) -> torch.Tensor:
     return torch.cat(found)
 
 
-def _near(loss: FrameLoss, state: FrameState, term: str) -> torch.Tensor:
-    """Index of the surface node that each point of a term is assigned to."""
-    with torch.no_grad():
-        return ASSIGNED[term](loss, state.frame, state.x)
-
-
-def chamfer(loss: FrameLoss, state: FrameState) -> list[Errors]:
+def chamfer(loss: FrameLoss, state: FrameState) -> torch.Tensor:
     """From visible points to nearest surface nodes, over the points that are visible."""
-    visible = loss.visible[state.frame]
-    values = state.x[_near(loss, state, "chamfer")] - loss.points[state.frame][visible]
-    return [Errors(values, loss.weights.chamfer, max(loss.counts[state.frame][0], 1), SQUARES)]
+    points = loss.points[state.frame][loss.visible[state.frame]]
+    e = state.x[nearest(points, state.x.detach()[: loss.surface])] - points
+    return loss.weights.chamfer * (e.square().sum() / max(loss.counts[state.frame][0], 1))
 
 
-def track(loss: FrameLoss, state: FrameState) -> list[Errors]:
+def track(loss: FrameLoss, state: FrameState) -> torch.Tensor:
     """From tracks to their nodes, over valid tracks and axes. Frame t uses the validity of t - 1."""
     target, valid = loss.points[state.frame], loss.motion_valid[state.frame - 1]
-    values = state.x[: len(target)][valid] - target[valid]
-    return [Errors(values, loss.weights.track, 3 * max(loss.counts[state.frame][1], 1), SMOOTH_L1)]
+    e = state.x[: len(target)][valid] - target[valid]
+    return loss.weights.track * (_smooth_l1(e) / (3 * max(loss.counts[state.frame][1], 1)))
 
 
-def acceleration(loss: FrameLoss, state: FrameState) -> list[Errors]:
+def acceleration(loss: FrameLoss, state: FrameState) -> torch.Tensor | None:
     """Smoothness of motion, over nodes and axes."""
-    if state.jerk is None:
-        return []
-    return [Errors(state.jerk, loss.weights.acceleration, state.jerk.numel(), SMOOTH_L1)]
+    return None if state.jerk is None else loss.weights.acceleration * (_smooth_l1(state.jerk) / state.jerk.numel())
 
 
-def image_track(loss: FrameLoss, state: FrameState) -> list[Errors]:
+def image_track(loss: FrameLoss, state: FrameState) -> torch.Tensor | None:
     """From tracked pixels to the projections of their nodes, over those that are seen and over x and y."""
     image, u = loss.image, state.u
     if image is None or u is None:
-        return []
+        return None
     seen = image.visible[state.frame]
-    error = image.size * (u[: len(seen)] - image.pixels[state.frame])
-    return [image.errors(error * seen[:, None], loss.weights.image_track, 2 * seen.sum(), IMAGE_SMOOTH_L1)]
+    e = image.size * (u[: len(seen)] - image.pixels[state.frame])
+    return _mean_square(_smooth_root(e * seen[:, None]), loss.weights.image_track, 2 * seen.sum())
 
 
-def silhouette(loss: FrameLoss, state: FrameState) -> list[Errors]:
+def silhouette(loss: FrameLoss, state: FrameState) -> torch.Tensor | None:
     """From points of the mask to projected surface nodes, and of nodes from object and hands, the mean of each."""
     image, u = loss.image, state.u
     if image is None or u is None:
-        return []
+        return None
     inside = ~torch.isnan(image.inside[state.frame, :, 0])
     points = torch.nan_to_num(image.inside[state.frame])
-    away = image.size * (u[_near(loss, state, "silhouette")] - points) * inside[:, None]
+    near = torch.cdist(points, image.project(state.x.detach()[: loss.surface])).argmin(dim=1)
+    away = image.size * (u[near] - points) * inside[:, None]
     left = image.size * image.distance(state.frame, u)[:, None]
     weight = loss.weights.silhouette
-    return [image.errors(away, weight, inside.sum(), IMAGE_SQUARES), image.errors(left, weight, len(u), IMAGE_SQUARES)]
-
-
-def _nearest_in_image(loss: FrameLoss, frame: int, x: torch.Tensor) -> torch.Tensor:
-    assert loss.image is not None
-    points, u = torch.nan_to_num(loss.image.inside[frame]), loss.image.project(x[: loss.surface])
-    found: torch.Tensor = torch.cdist(points, u).argmin(dim=1)
-    return found
+    return _mean_square(away, weight, inside.sum()) + _mean_square(left, weight, len(u))
 
 
 OF_IMAGES = ("image_track", "silhouette")
 """Terms of one camera without depth."""
-ASSIGNED: dict[str, Callable[[FrameLoss, int, torch.Tensor], torch.Tensor]] = {
-    "chamfer": lambda loss, frame, x: nearest(loss.points[frame][loss.visible[frame]], x[: loss.surface]),
-    "silhouette": _nearest_in_image,
-}
-"""Functions by which terms that compare with a nearest node find it."""
-
-
-def moved(evidence: Evidence, device: str, dtype: torch.dtype) -> Evidence:
-    """The same tensors on another device, those of real numbers in another precision."""
-    tensors = {name: value for name, value in vars(evidence).items() if isinstance(value, torch.Tensor)}
-    changed: dict[str, Any] = {n: t.to(device, dtype if t.is_floating_point() else t.dtype) for n, t in tensors.items()}
-    return replace(evidence, **changed)
 
 
 @dataclass(frozen=True)
@@ -209,12 +160,19 @@ class ImageEvidence:
         image = observations.image
         if image is None:
             return None
-        pose = torch.linalg.inv(torch.tensor(image.camera_to_world, dtype=torch.float64))
-        kept: dict[str, Any] = {
-            name: torch.tensor(getattr(image, name)[: len(image.inside)]) for name in ("pixels", "visible", "inside", "outside")
-        }
-        known: dict[str, Any] = {"intrinsics": torch.tensor(image.intrinsics), "cell": image.cell, "size": image.pixel_size}
-        return moved(cls(world_to_camera=pose, **kept, **known), device, dtype)
+
+        def kept(values: np.ndarray) -> torch.Tensor:
+            tensor = torch.tensor(values)
+            return tensor.to(device, dtype if tensor.is_floating_point() else tensor.dtype)
+
+        frames = {name: kept(getattr(image, name)[: len(image.inside)]) for name in ("pixels", "visible", "inside", "outside")}
+        return cls(
+            world_to_camera=torch.linalg.inv(torch.tensor(image.camera_to_world, dtype=torch.float64)).to(device, dtype),
+            intrinsics=kept(image.intrinsics),
+            cell=image.cell,
+            size=image.pixel_size,
+            **frames,
+        )
 
     def project(self, x: torch.Tensor) -> torch.Tensor:
         """Pixels [..., 2] of points [..., 3], m."""
@@ -232,11 +190,6 @@ class ImageEvidence:
             self.outside[frame][None, None], grid[None, None], mode="bilinear", padding_mode="border", align_corners=False
         )
         return sampled[0, 0, 0]
-
-    @staticmethod
-    def errors(values: torch.Tensor, weight: float, count: torch.Tensor | int, penalty: Penalty) -> Errors:
-        """Errors whose squares are to be averaged over `count`, in the precision of the values."""
-        return Errors(values, weight, torch.as_tensor(count, dtype=values.dtype, device=values.device).clamp_min(1), penalty)
 
 
 @dataclass(frozen=True)
@@ -277,10 +230,6 @@ class FrameLoss:
         image = ImageEvidence.of(observations, device, dtype)
         return cls(points, visible, valid, observations.surface_count, weights, frozen_counts, image)
 
-    def to(self, device: str, dtype: torch.dtype) -> FrameLoss:
-        """The same on another device, in another precision."""
-        return replace(moved(self, device, dtype), image=self.image and moved(self.image, device, dtype))
-
     @cached_property
     def counts(self) -> list[tuple[int, int]]:
         """(visible points, points whose motion is valid) that each frame's terms are divided by; none in frame 0."""
@@ -296,24 +245,13 @@ class FrameLoss:
         there = [name for name in TERMS if self.image is not None or name not in OF_IMAGES]
         return tuple(name for name in there if getattr(self.weights, name, 1.0))
 
-    def errors(
-        self,
-        frame: int,
-        x: torch.Tensor,
-        jerk: torch.Tensor | None = None,
-        without: Collection[str] = (),
-    ) -> dict[str, list[Errors]]:
-        """Errors of a frame >= 1 by term, for what `FrameState` holds; terms named in `without` are left out."""
-        state = FrameState(frame, x, jerk, self.image.project(x) if self.image else None)
-        found = {name: TERMS[name](self, state) for name in self.names if name not in without}
-        return {name: parts for name, parts in found.items() if parts}
-
     def terms(
         self, frame: int, x: torch.Tensor, jerk: torch.Tensor | None = None, without: Collection[str] = ()
     ) -> dict[str, torch.Tensor]:
-        """Weighted losses of a frame >= 1 by term, for nodes x [N, 3], m."""
-        errors = self.errors(frame, x, jerk=jerk, without=without)
-        return {name: torch.stack([part.loss() for part in parts]).sum() for name, parts in errors.items()}
+        """Weighted losses of a frame >= 1 by term, for nodes x [N, 3], m; terms named in `without` are left out."""
+        state = FrameState(frame, x, jerk, self.image.project(x) if self.image else None)
+        found = {name: TERMS[name](self, state) for name in self.names if name not in without}
+        return {name: value for name, value in found.items() if value is not None}
 
     def __call__(self, frame: int, x: torch.Tensor) -> torch.Tensor:
         """The sum of a frame's terms, without acceleration."""

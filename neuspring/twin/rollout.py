@@ -26,13 +26,13 @@ class Diverged(Exception):
 
 
 def frames(
-    twin: Twin, solver: FrameSolver, hands: torch.Tensor, velocity: np.ndarray | None = None, positions: np.ndarray | None = None
+    twin: Twin, solver: FrameSolver, hands: torch.Tensor, velocity: np.ndarray | None = None
 ) -> Iterator[tuple[int, torch.Tensor, torch.Tensor]]:
     """Yield (frame, x [N, 3] m, v [N, 3] m/s) for frames 1, 2, ... of hands [T, C, 3] (controllers.waypoints). Raises Diverged.
 
-    `velocity` [N, 3], m/s, and `positions` [N, 3], m, are those of frame 0; none means at rest, and where the twin's nodes are.
+    `velocity` [N, 3], m/s, is that of frame 0; none means at rest.
     """
-    x = torch.tensor(twin.topology.nodes if positions is None else positions, dtype=solver.dtype, device=solver.device)
+    x = torch.tensor(twin.topology.nodes, dtype=solver.dtype, device=solver.device)
     v = torch.zeros_like(x) if velocity is None else torch.tensor(velocity, dtype=x.dtype, device=x.device)
     for frame in range(1, len(hands)):
         x, v = solver.forward(x, v, hands[frame - 1], hands[frame])

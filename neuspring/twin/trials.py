@@ -46,24 +46,23 @@ class Outcome:
 class Rollouts:
     """Twins of the same nodes on a recording, to be rolled out from velocity [N, 3], m/s.
 
-    hands are the controllers' positions [T, C, 3], or `controllers.waypoints` of them. With a loss each twin is judged (`Outcome`)
-    in the frames that it holds; without one their motion is kept: positions, m, and velocities, m/s, [T - 1, B, N, 3] at the end
-    of each frame, on the CPU.
+    hands are the controllers' positions [T, C, 3], or `controllers.waypoints` of them. Each twin is judged (`Outcome`) in the
+    frames that the loss holds.
     """
 
     twins: Sequence[Twin]
     hands: torch.Tensor
     velocity: torch.Tensor
-    loss: FrameLoss | None = None
+    loss: FrameLoss
 
 
-def rolled(each: Sequence[Rollouts], device: str) -> list[Any]:
-    """Results of several `Rollouts`, whose launches are shared: one physics, and, of several scenes, hands that always hold."""
+def rolled(each: Sequence[Rollouts], device: str) -> list[list[Outcome]]:
+    """Outcomes of several `Rollouts`, whose launches are shared: one physics, and, of several scenes, hands that always hold."""
     twins = [twin for one in each for twin in one.twins]
     solver = narrowing_solver(twins, device)
     firsts = accumulate((len(one.twins) for one in each), initial=0)
     seen = [
-        (LossSums if one.loss else Motions)(solver, one.loss, one.velocity, slice(first, first + len(one.twins)))
+        LossSums(solver, one.loss, one.velocity, slice(first, first + len(one.twins)))
         for one, first in zip(each, firsts, strict=False)
     ]
     for frame in _frames(solver, each, max(len(one.hands) for one in each)):
@@ -73,18 +72,6 @@ def rolled(each: Sequence[Rollouts], device: str) -> list[Any]:
         if frame % CHECK_EVERY[device.partition(":")[0]] == 0 and all(sums.ended for sums in seen):
             break
     return [sums.result(len(one.hands) - 1) for one, sums in zip(each, seen, strict=True)]
-
-
-def outcomes(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor, loss: FrameLoss, device: str) -> list[Outcome]:
-    """`Rollouts` that are judged, alone."""
-    judged: list[Outcome] = rolled([Rollouts(twins, hands, velocity, loss)], device)[0]
-    return judged
-
-
-def motions(twins: Sequence[Twin], hands: torch.Tensor, velocity: torch.Tensor, device: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """`Rollouts` whose motion is kept, alone."""
-    kept: tuple[torch.Tensor, torch.Tensor] = rolled([Rollouts(twins, hands, velocity)], device)[0]
-    return kept
 
 
 def _frames(solver: FrameSolver, each: Sequence[Rollouts], count: int) -> Iterator[int]:
@@ -99,25 +86,6 @@ def _frames(solver: FrameSolver, each: Sequence[Rollouts], count: int) -> Iterat
         solver.advance(hands[frame - 1], hands[frame])
         yield frame
         solver.go_on()
-
-
-class Motions:
-    """The motion of some twins of a solver."""
-
-    ended = False
-
-    def __init__(self, solver: FrameSolver, loss: None, velocity: torch.Tensor, twins: slice) -> None:
-        self._solver, self._part = solver, solver.buffers.part(twins)
-        self._kept: dict[str, list[torch.Tensor]] = {"x": [], "v": []}
-
-    def add(self, frame: int) -> None:
-        """Keep the end of a frame, which the solver holds."""
-        for name, states in self._kept.items():
-            states.append(self._part.get_vectors(name, self._solver.last, self._part.nodes).cpu())
-
-    def result(self, frames: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Positions and velocities [T - 1, B, N, 3]."""
-        return torch.stack(self._kept["x"]), torch.stack(self._kept["v"])
 
 
 class LossSums:

@@ -187,6 +187,15 @@ def test_receding_or_distant_pairs_do_not_collide(engine: Engine) -> None:
         np.testing.assert_array_equal(engine(body, x, speed, no_hands(1))[1][1], speed)
 
 
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_dashpot_feels_the_speed_of_its_hand_only_if_hands_have_one(engine: Engine, moving: bool) -> None:
+    """One substep from rest, with a spring that hardly pulls: v' = dt gamma V."""
+    body = scene(1, [(1, 0)], [0.1], stiffness=1e-12, dashpot=2.0, controller_velocity=moving)
+    hands = np.array([[[0.1, 0, 0]], [[0.1005, 0, 0]]])
+    v = engine(body, np.zeros((1, 3)), np.zeros((1, 3)), hands)[1][1]
+    np.testing.assert_allclose(v, [[1e-3 * 2.0 * 0.5 * moving, 0, 0]], atol=ROUNDING)
+
+
 # Ground ---------------------------------------------------------------------------------------------------------------
 
 

@@ -9,15 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from neuspring.core.artifacts import Trajectory, Twin
 from neuspring.core.errors import InputError
 from neuspring.physics import reference
 from neuspring.physics.solver import FrameSolver
 from neuspring.twin import rollout
-from tests.support.scenes import DEVICES, no_hands, random_scene, scene, solver_for, twin_of
+from tests.support.scenes import WAYS, no_hands, random_scene, scene, solver_for, twin_of, warp
 
 SINGLE, DOUBLE = torch.float32, torch.float64
 DISTANCE = 0.02
@@ -36,10 +34,10 @@ def clump(crowded: int, pairs: int) -> np.ndarray:
     return np.stack([others, lonely], axis=1).reshape(-1, 3)
 
 
-def lists(x: np.ndarray, capacity: int, frames: int, device: str) -> tuple[list[list[int]], int]:
+def lists(x: np.ndarray, capacity: int, frames: int, device: str, threads: bool) -> tuple[list[list[int]], int]:
     """Partner lists after `frames` frames that do not move anything, and the overflow reported."""
     body = scene(len(x), self_collision=True, contact_distance=DISTANCE, collision_capacity=capacity)
-    solver = solver_for(body, 0, device)
+    solver = solver_for(body, 0, device, threads=threads)
     state, nobody = torch.tensor(x, device=device), torch.zeros(0, 3, dtype=torch.float64, device=device)
     if solver.buffers.threads:
         solver.buffers.indices["near"].fill_(-1)
@@ -75,33 +73,16 @@ def listed(solver: FrameSolver, twin: int) -> list[list[int]]:
     return [sorted(row) for row in found]
 
 
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("capacity", [1, 2, 5, 500])
-def test_full_lists_are_reported_and_never_overrun(capacity: int, device: str) -> None:
+@pytest.mark.parametrize(("device", "threads"), WAYS)
+@pytest.mark.parametrize("capacity", [1, 5, 500])
+def test_full_lists_are_reported_and_never_overrun(capacity: int, device: str, threads: bool) -> None:
     """Every list holds those of the first `capacity` partners in node order who list the node as well."""
     x = clump(7, 4)
-    partners, overflow = lists(x, capacity, frames=3, device=device)
+    partners, overflow = lists(x, capacity, frames=3, device=device, threads=threads)
     wanted = expected(x, DOUBLE, DISTANCE)
     assert sorted(len(row) for row in wanted) == [0] * 15 + [1] * 8 + [6] * 7
     assert partners == mutual([row[:capacity] for row in wanted])
     assert overflow == 3 * 7 * max(6 - capacity, 0)
-
-
-def test_a_full_list_still_collides_with_its_partners() -> None:
-    """Nodes whose lists are complete move as with room to spare; the others stay finite."""
-    x = clump(7, 4)
-    # Towards the middle of each group: all pairs approach.
-    v = 100 * (x.round() - x)
-    states = []
-    for capacity in (1, 500):
-        body = scene(len(x), self_collision=True, contact_distance=DISTANCE, collision_capacity=capacity)
-        solver = solver_for(body, 0)
-        nobody = torch.zeros(0, 3, dtype=torch.float64)
-        states.append(solver.forward(torch.tensor(x), torch.tensor(v), nobody, nobody)[1].numpy())
-    complete = np.array([len(row) == 1 for row in expected(x, DOUBLE, DISTANCE)])
-    np.testing.assert_array_equal(states[0][complete], states[1][complete])
-    assert (states[1][complete] != v[complete]).any()
-    assert np.isfinite(states[0]).all()
 
 
 def test_candidates_come_from_the_frame_start() -> None:
@@ -109,13 +90,8 @@ def test_candidates_come_from_the_frame_start() -> None:
     body = scene(2, self_collision=True, contact_distance=DISTANCE, substeps=10, frame_time=0.01)
     x, v = np.array([[0.0, 0, 0], [0.021, 0, 0]]), np.array([[0.5, 0, 0], [-0.5, 0, 0]])
     for engine_frames in (1, 2):
-        _, speed = reference.rollout(body, x, v, no_hands(engine_frames))
+        _, speed = warp(body, x, v, no_hands(engine_frames))
         assert (speed[-1, 0, 0] < 0) == (engine_frames == 2)
-        solver = solver_for(body, 0)
-        state, nobody = (torch.tensor(x), torch.tensor(v)), torch.zeros(0, 3, dtype=torch.float64)
-        for _ in range(engine_frames):
-            state = solver.forward(*state, nobody, nobody)
-        np.testing.assert_allclose(state[1], speed[-1], atol=1e-14)
 
 
 # Lists of collision partners ------------------------------------------------------------------------------------------
@@ -173,15 +149,6 @@ def test_the_grid_finds_all_pairs(kind: str, dtype: torch.dtype) -> None:
     assert overflow == [0]
 
 
-@settings(max_examples=25, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.floats(0.005, 0.1), st.floats(-3.0, 3.0), st.sampled_from([SINGLE, DOUBLE]))
-def test_the_grid_finds_all_pairs_of_any_cloud(seed: int, distance: float, decades: float, dtype: torch.dtype) -> None:
-    """Random clouds of random extent, at random distances of up to a kilometer from the origin."""
-    rng = np.random.default_rng(seed)
-    x = rng.uniform(-2, 2, (30, 3)) * distance + rng.uniform(-1, 1, 3) * 10.0**decades
-    assert partners([x], dtype, 500, distance)[0] == [expected(x, dtype, distance)]
-
-
 def crowds(count: int, nodes: int = 24) -> list[np.ndarray]:
     """Twins in which different nodes, 3 to 8 of them, are all near each other; the others are lonely."""
     clouds = []
@@ -197,7 +164,7 @@ def crowds(count: int, nodes: int = 24) -> list[np.ndarray]:
 @pytest.mark.parametrize("dtype", [SINGLE, DOUBLE])
 def test_a_crowded_twin_takes_no_room_from_others(dtype: torch.dtype, capacity: int) -> None:
     """Twins whose crowds are other nodes fill one list far beyond what one of them may keep."""
-    clouds = crowds(17 if dtype == SINGLE else 4)
+    clouds = crowds(17)
     clouds[2][:20] = np.random.default_rng(2).uniform(-0.004, 0.004, (20, 3))
     lists, overflow = partners(clouds, dtype, capacity, DISTANCE)
     wanted = [expected(x, dtype, DISTANCE) for x in clouds]
@@ -209,12 +176,13 @@ def test_a_crowded_twin_takes_no_room_from_others(dtype: torch.dtype, capacity: 
 def test_contact_distances_are_those_of_each_twin() -> None:
     """The grid's cells are as wide as the largest; a twin with a smaller one lists no more than its own."""
     x = cloud("around the origin")
-    scenes = [scene(len(x), self_collision=True, contact_distance=distance) for distance in (0.005, 0.02, 0.011)]
-    solver, nobody = solver_for(scenes, 0), torch.zeros(3, 0, 3, dtype=DOUBLE)
-    stacked = torch.tensor(np.stack([x] * 3))
+    distances = (0.005, 0.02, 0.011, 0.013, 0.017)
+    scenes = [scene(len(x), self_collision=True, contact_distance=distance) for distance in distances]
+    solver, nobody = solver_for(scenes, 0), torch.zeros(5, 0, 3, dtype=DOUBLE)
+    stacked = torch.tensor(np.stack([x] * 5))
     solver.forward(stacked, 0 * stacked, nobody, nobody)
-    counts = [sum(map(len, listed(solver, lane))) for lane in range(3)]
-    assert counts == [len(reference.candidates(x, distance)) for distance in (0.005, 0.02, 0.011)]
+    counts = [sum(map(len, listed(solver, lane))) for lane in range(5)]
+    assert counts == [len(reference.candidates(x, distance)) for distance in distances]
 
 
 @pytest.mark.parametrize("apart", [0.0, 0.2, 0.49, 0.51, 3.0])
@@ -280,11 +248,10 @@ def test_a_rollout_starts_at_rest_and_reports_progress() -> None:
     body, x, _, hands = random_scene(42)
     twin, seen = twin_of(body, x, hands[0]), []
     result = rollout.roll_out(twin, hands, progress=seen.append)
-    np.testing.assert_array_equal(result.positions[0], twin.topology.nodes)
     assert seen == [1, 2, 3]
     assert result.diverged_frame is None
-    expected, _ = reference.rollout(reference.ReferenceTwin.of(twin), twin.topology.nodes, 0 * twin.topology.nodes, hands)
-    # float32 against float64 over 60 substeps, as in test_reference.
+    expected, _ = warp(body, x.astype(np.float32), 0 * x, hands)
+    # float32 against float64 over 60 substeps.
     np.testing.assert_allclose(result.positions, expected, atol=2e-5)
 
 

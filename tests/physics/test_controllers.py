@@ -10,20 +10,15 @@ import pytest
 import torch
 
 from neuspring.core.errors import InputError
-from neuspring.physics import reference
-from neuspring.physics import solver as frame_solver
 from neuspring.physics.controllers import ControllerSprings, waypoints
 from neuspring.physics.parameters import pack
 from neuspring.physics.solver import simulate_frame
-from neuspring.twin.rollout import frames, roll_out
-from neuspring.twin.trials import motions
-from tests.support.differences import assert_gradients, compared
+from neuspring.physics.solver import solver_for as frame_solver
+from neuspring.twin.rollout import roll_out
 from tests.support.scenes import WAYS, random_scene, scene, solver_for, tensors, twin_of
 
 ROUNDING = 1e-12
 """m and m/s: float64 over a few hundred substeps."""
-FRAMES = 1e-5
-"""Relative to the largest entry, of gradients against central differences, as in test_gradients."""
 GRIP = 40
 """The frame, of one substep, in which the hand catches the body."""
 DT = 1e-3
@@ -129,19 +124,6 @@ def late_scene():
     return body, x, v, hands, valid
 
 
-@pytest.mark.parametrize(("device", "threads"), WAYS)
-def test_the_solver_agrees_with_the_reference(device, threads):
-    body, x, v, hands, valid = late_scene()
-    xs, vs = run(body, x, v, waypoints(torch.tensor(hands), valid), device, threads)
-    expected, speeds = reference.rollout(body, x, v, hands, valid)
-    np.testing.assert_allclose(xs, expected, atol=ROUNDING)
-    np.testing.assert_allclose(vs, speeds, atol=1e-9)
-    # And the lengths of then matter: with those of frame 0 the motion is another.
-    kept = valid.copy()
-    kept[0, 1] = kept[2, 0] = True
-    assert np.abs(reference.rollout(body, x, v, hands, kept)[0] - expected).max() > 1e-3
-
-
 def simulated(body, rows, x, v, values):
     """The last positions, differentiable in values, x and v: as a fit simulates."""
     solver, grips = solver_for(body, rows.shape[1]), ControllerSprings(body.springs, body.nodes, "cpu")
@@ -157,15 +139,13 @@ def simulated(body, rows, x, v, values):
 def test_gradients_through_grips_are_exact(name):
     """Rest lengths of grips depend on the state in which they begin, and so on everything before: no part is left out."""
     body, x, v, hands, valid = late_scene()
-    rows = waypoints(torch.tensor(hands), valid)
+    rows, every = waypoints(torch.tensor(hands), valid), tensors(body) | {"x": torch.tensor(x), "v": torch.tensor(v)}
 
-    def last(values, x, v):
-        end = simulated(body, rows, x, v, values)
-        np.testing.assert_allclose(end.detach(), expected, atol=ROUNDING)
-        return end
+    def last(value):
+        values = every | {name: value}
+        return simulated(body, rows, values.pop("x"), values.pop("v"), values)
 
-    expected = reference.rollout(body, x, v, hands, valid)[0][-1]
-    assert_gradients(*compared(name, body, {"x": x, "v": v}, hands, last, valid), FRAMES)
+    assert torch.autograd.gradcheck(last, (every[name].clone().requires_grad_(),), eps=1e-6, atol=1e-6, rtol=1e-5)
 
 
 def test_rows_of_another_width_and_gradients_of_grips_that_a_solver_took_itself_are_refused():
@@ -181,22 +161,21 @@ def test_rows_of_another_width_and_gradients_of_grips_that_a_solver_took_itself_
 
 
 def test_all_ways_to_roll_out_take_the_same_grips():
-    """`roll_out`, `trials.motions` (search, on lanes), a fit's frames, and a rollout that goes on from a frame after the grips."""
+    """`roll_out`, a solver of several twins, and a fit's frames."""
     body, x, v, hands, valid = late_scene()
     twin = twin_of(body, x, hands[0])
     alone = roll_out(twin, hands, velocity=v, valid=valid).positions
     rows = waypoints(torch.tensor(hands, dtype=torch.float32), valid)
     stiffer = replace(twin, material=replace(twin.material, stiffness=2.0 * twin.material.stiffness))
-    judged, speeds = motions([twin, stiffer], rows, torch.tensor(v, dtype=torch.float32), "cpu")
-    np.testing.assert_array_equal(judged[:, 0].numpy(), alone[1:])
-    np.testing.assert_array_equal(judged[:, 1].numpy(), roll_out(stiffer, hands, velocity=v, valid=valid).positions[1:])
+    solver = frame_solver([twin, stiffer], differentiable=False)
+    state = tuple(torch.tensor(values, dtype=torch.float32).expand(2, -1, -1) for values in (x, v))
+    for begin, end in pairwise(rows):
+        state = solver.forward(*state, begin.expand(2, -1, -1), end.expand(2, -1, -1))
+    np.testing.assert_array_equal(state[0][0].numpy(), alone[-1])
+    np.testing.assert_array_equal(state[0][1].numpy(), roll_out(stiffer, hands, velocity=v, valid=valid).positions[-1])
     double = torch.tensor(hands), torch.tensor(x), torch.tensor(v)
     fitted = simulated(body, waypoints(double[0], valid), *double[1:], tensors(body))
     assert np.abs(fitted.numpy() - alone[-1]).max() < 1e-5
-    solver = frame_solver.solver_for(twin, differentiable=False)
-    solver.resume(rows[:5], list(alone))
-    later = frames(twin, solver, rows[5:], speeds[4, 0].numpy(), positions=alone[5])
-    np.testing.assert_array_equal(np.stack([at.numpy() for _, at, _ in later]), alone[6:])
 
 
 def test_stiffness_per_length_stays_however_near_the_hand():

@@ -15,10 +15,8 @@ from hypothesis import strategies as st
 
 from neuspring.core.errors import InputError
 from neuspring.physics.controllers import waypoints
-from neuspring.physics.parameters import pack
-from neuspring.physics.reference import ReferenceTwin
-from neuspring.physics.solver import FrameSolver, simulate_frame
-from tests.support.scenes import DEVICES, VARIANTS, WAYS, random_scene, solver_for, tensors
+from neuspring.physics.solver import FrameSolver
+from tests.support.scenes import VARIANTS, WAYS, Scene, random_scene, solver_for
 
 SINGLE, DOUBLE = torch.float32, torch.float64
 ROUNDING = 1e-5
@@ -26,14 +24,14 @@ ROUNDING = 1e-5
 then carried through tens of substeps."""
 SUBSTEPS = (10, 13, 11, 15, 10, 12, 7)
 """Of the first twins; then again."""
-SIZES = [(SINGLE, count) for count in (1, 3, 4, 8, 16, 17)] + [(DOUBLE, count) for count in (1, 3, 4)]
-"""Less than, as many as, and more than a width of lanes."""
+SIZES = [(SINGLE, 7), (SINGLE, 17), (DOUBLE, 6)]
+"""Less than, and more than the eight lanes."""
 
 
 class Member(NamedTuple):
     """A twin of a population: its scene, start and hands."""
 
-    body: ReferenceTwin
+    body: Scene
     x: np.ndarray
     v: np.ndarray
     hands: np.ndarray
@@ -128,23 +126,22 @@ def test_twins_differ_and_are_lively(variant: str) -> None:
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize("dtype", [SINGLE, DOUBLE])
-def test_twins_have_graphs_of_their_own(dtype: torch.dtype, variant: str) -> None:
+def test_twins_have_graphs_of_their_own(variant: str) -> None:
     """The solver holds the union of their springs; absent ones have neither stiffness nor dashpot, and change nothing."""
-    members, rng = [member(number, variant) for number in range(3)], np.random.default_rng(1)
-    present = rng.random((3, len(members[0].body.springs))) < 0.6
-    assert len({row.tobytes() for row in present}) == 3
+    members, rng = [member(number, variant) for number in range(6)], np.random.default_rng(1)
+    present = rng.random((6, len(members[0].body.springs))) < 0.6
+    assert len({row.tobytes() for row in present}) == 6
     union = [
         one._replace(body=replace(one.body, stiffness=one.body.stiffness * own, dashpot=one.body.dashpot * own))
         for one, own in zip(members, present, strict=True)
     ]
-    got = together(union, dtype)
+    got = together(union, SINGLE)
     for number, (one, own) in enumerate(zip(members, present, strict=True)):
         names = ("springs", "stiffness", "rest_lengths", "dashpot", "pushes")
         body = replace(one.body, **{name: getattr(one.body, name)[own] for name in names})
         in_union = of(got, number)
         in_union["adjoint springs"] = in_union["adjoint springs"][own]
-        assert_same(in_union, alone(one._replace(body=body), dtype), number)
+        assert_same(in_union, alone(one._replace(body=body), SINGLE), number)
 
 
 def assert_same_by_threads(got: Results, wanted: Results, variant: str) -> None:
@@ -167,24 +164,10 @@ def test_a_thread_per_node_gives_what_it_gives_alone_and_what_one_thread_gives(v
         assert_same_by_threads(got, together(members, SINGLE), variant)
 
 
-@pytest.mark.parametrize("dtype", [SINGLE, DOUBLE])
-@pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize("device", DEVICES)
-def test_a_block_per_twin_gives_what_launches_give(device: str, variant: str, dtype: torch.dtype) -> None:
-    """All substeps in one launch, of twins that have different numbers of them: the same bits, without atomics at least."""
-    members = [member(number, variant) for number in range(5)]
-    got = together(members, dtype, device=device, block=64 if device != "cpu" else 1)
-    wanted = together(members, dtype, device=device, threads=True)
-    if device == "cpu":
-        assert_same(got, wanted, variant)
-    for number in range(5):
-        assert_same_by_threads(of(got, number), of(wanted, number), variant)
-
-
 @pytest.mark.parametrize("broken", [0, 3])
 @pytest.mark.parametrize("how", ["nan", "infinite speed", "far away", "divergence"])
 def test_a_broken_twin_breaks_no_other(how: str, broken: int) -> None:
-    members = [member(number, "all") for number in range(4)]
+    members = [member(number, "all") for number in range(7)]
     one = members[broken]
     members[broken] = {
         "nan": one._replace(x=np.where(np.arange(6)[:, None] == 2, np.nan, one.x)),
@@ -195,7 +178,7 @@ def test_a_broken_twin_breaks_no_other(how: str, broken: int) -> None:
     got = together(members, SINGLE)
     sick = of(got, broken)["second x"]
     assert not np.isfinite(sick).all() or np.abs(sick).max() > 1e6
-    for number in set(range(4)) - {broken}:
+    for number in set(range(7)) - {broken}:
         assert_same(of(got, number), member_alone(number, "all", SINGLE), number)
 
 
@@ -224,29 +207,3 @@ def test_order_and_direction_of_springs_do_not_matter(data: st.DataObject) -> No
     wanted, got = alone(one, SINGLE), alone(one._replace(body=other), SINGLE)
     wanted["adjoint springs"] = wanted["adjoint springs"][order]
     assert_same(got, wanted)
-
-
-# Gradients ------------------------------------------------------------------------------------------------------------
-
-LEARNED = ("stiffness", "rest_lengths", "dashpot", "drag", "ground_elasticity", "contact_friction")
-
-
-def test_gradcheck_of_two_twins() -> None:
-    """torch.autograd.gradcheck over pack and simulate_frame of a batch; a twin's results depend on no other's inputs."""
-    members = [member(number, "all") for number in (0, 1)]
-    solver = solver_for([one.body for one in members], members[0].hands.shape[1])
-    values = [tensors(one.body) for one in members]
-    begin, end = (torch.tensor(np.stack([one.hands[k] for one in members])) for k in (0, 1))
-
-    def run(x: torch.Tensor, v: torch.Tensor, *learned: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        packs = []
-        for k, one in enumerate(members):
-            own = {name: batch[k] for name, batch in zip(LEARNED, learned, strict=True)}
-            packs.append(pack(**(values[k] | own), substep=one.body.simulation.substep))
-        return simulate_frame(solver, {name: torch.stack([one[name] for one in packs]) for name in packs[0]}, x, v, begin, end)
-
-    inputs = [torch.tensor(np.stack([getattr(one, name) for one in members])) for name in ("x", "v")]
-    inputs += [torch.stack([own[name] for own in values]) for name in LEARNED]
-    inputs = [value.clone().requires_grad_() for value in inputs]
-    # As for one twin in test_gradients.
-    assert torch.autograd.gradcheck(run, inputs, eps=1e-6, atol=1e-6, rtol=1e-5)

@@ -11,10 +11,9 @@ from scipy.sparse.linalg import eigsh
 
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
-from neuspring.physics import reference, stability
-from neuspring.physics.reference import ReferenceTwin
+from neuspring.physics import lanczos, stability
 from neuspring.physics.stability import STABILITY_LIMIT, Spectrum
-from tests.support.scenes import random_scene, scene, twin_of
+from tests.support.scenes import Scene, random_scene, scene, twin_of, warp
 
 MARGIN = 0.01
 """Relative distance of dt from the bound on either side."""
@@ -26,7 +25,7 @@ LANCZOS = 2e-3
 LENGTH = 0.5
 
 
-def held_node(substep: float, stiffness: float, dashpot: float) -> ReferenceTwin:
+def held_node(substep: float, stiffness: float, dashpot: float) -> Scene:
     """One node on a spring to a controller: lambda = Y / l0, c = gamma."""
     return scene(1, [(1, 0)], [LENGTH], stiffness=stiffness, dashpot=dashpot, frame_time=substep)
 
@@ -40,7 +39,7 @@ def test_the_bound_is_sharp_for_an_oscillator(stiffness: float, dashpot: float) 
     for factor in (1 - MARGIN, 1 + MARGIN):
         body = held_node(factor * largest, stiffness, dashpot)
         hands = np.tile([[[LENGTH, 0.0, 0.0]]], (401, 1, 1))
-        x, _ = reference.rollout(body, np.array([[start, 0.0, 0.0]]), np.array([[start / largest, 0.0, 0.0]]), hands)
+        x, _ = warp(body, np.array([[start, 0.0, 0.0]]), np.array([[start / largest, 0.0, 0.0]]), hands)
         reached.append(np.abs(x[:, 0, 0]).max() / start)
     assert reached[0] < GROWTH
     assert reached[1] > GROWTH
@@ -65,24 +64,14 @@ def random_twin(seed: int, **simulation: object) -> Twin:
     return twin_of(body, x, hands[0])
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_spectrum_of_a_net(seed: int) -> None:
-    """Lanczos finds the eigenvalues of the dense matrices, from below; Gershgorin bounds them from above."""
+    """Lanczos finds the eigenvalues of the dense matrices, from below."""
     twin = random_twin(seed)
-    k, c = (np.linalg.eigvalsh(matrix)[-1] for matrix in matrices(twin))
-    spectrum, t = stability.twin_spectrum(twin), twin.topology
-    stiffness = twin.material.stiffness / t.rest_lengths
-    bound = stability.gershgorin(t.springs, len(t.nodes), stiffness, twin.material.dashpot)
-    for value, exact, above in ((spectrum.stiffness, k, bound.stiffness), (spectrum.damping, c, bound.damping)):
+    spectrum = stability.twin_spectrum(twin)
+    for value, matrix in zip((spectrum.stiffness, spectrum.damping), matrices(twin), strict=True):
+        exact = np.linalg.eigvalsh(matrix)[-1]
         assert exact * (1 - LANCZOS) <= value <= exact * (1 + 1e-9)
-        assert above >= exact
-
-
-def test_gershgorin_names_the_loaded_node() -> None:
-    """A star: node 2 holds all springs."""
-    springs = np.array([[2, 0], [2, 1], [2, 3], [4, 2]])
-    spectrum = stability.gershgorin(springs, 4, np.full(4, 10.0), np.full(4, 1.0))
-    assert (spectrum.stiffness, spectrum.damping, spectrum.node) == (2 * 3 * 10.0 + 10.0, 7.0, 2)
 
 
 def test_no_springs_are_always_stable() -> None:
@@ -97,7 +86,7 @@ def refused(twin: Twin) -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_check_names_node_bound_and_remedy(seed: int) -> None:
     twin = random_twin(seed, frame_time=0.5, substeps=2)
     spectrum, message = stability.twin_spectrum(twin), refused(twin)
@@ -111,14 +100,6 @@ def test_check_names_node_bound_and_remedy(seed: int) -> None:
     needed = int(match[1])
     stability.check(with_substeps(twin, needed))
     refused(with_substeps(twin, needed - 1))
-
-
-def test_the_remedy_works_on_the_bound() -> None:
-    """dt = 1 s is exactly on the bound of lambda = 4 / s^2; the check refuses it, so the remedy must ask for more."""
-    twin = twin_of(held_node(1.0, 4.0 * LENGTH, 0.0), np.zeros((1, 3)), np.array([[LENGTH, 0.0, 0.0]]))
-    match = re.search(r"at least (\d+) substeps", refused(twin))
-    assert match
-    stability.check(with_substeps(twin, int(match[1])))
 
 
 def with_substeps(twin: Twin, count: int) -> Twin:
@@ -146,7 +127,7 @@ def test_a_prediction_keeps_the_sign_of_a_damped_mode(load: float) -> None:
 
     def relative_velocity(twin: Twin) -> np.ndarray:
         one = replace(body, simulation=replace(body.simulation, frame_time=twin.simulation.substep, substeps=1))
-        _, v = reference.rollout(one, x, np.array([[0.01, 0.0, 0.0], [-0.01, 0.0, 0.0]]), np.zeros((5, 0, 3)))
+        _, v = warp(one, x, np.array([[0.01, 0.0, 0.0], [-0.01, 0.0, 0.0]]), np.zeros((5, 0, 3)))
         return v[:, 0, 0] - v[:, 1, 0]
 
     twin = twin_of(body, x, np.zeros((0, 3)))
@@ -156,22 +137,14 @@ def test_a_prediction_keeps_the_sign_of_a_damped_mode(load: float) -> None:
     assert stability.for_prediction(predicted) == predicted
 
 
-def test_a_prediction_leaves_bodies_that_cannot_meet_themselves() -> None:
-    twin = random_twin(0, substeps=3, frame_time=1e-3)
-    assert stability.for_prediction(twin) is twin
-
-
-def test_a_spectrum_that_does_not_converge_is_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_spectrum_that_does_not_converge_is_above_the_value(monkeypatch: pytest.MonkeyPatch) -> None:
+    twin, value = random_twin(0), stability.twin_spectrum(random_twin(0)).stiffness
+    monkeypatch.setattr(lanczos, "RESTARTS", 1)
     monkeypatch.setattr(stability, "TOLERANCE", -1.0)
-    twin = random_twin(0)
-    t, m = twin.topology, twin.material
-    bound = stability.gershgorin(
-        t.springs, len(t.nodes), m.stiffness.astype(np.float64) / t.rest_lengths, m.dashpot.astype(np.float64)
-    )
-    assert stability.twin_spectrum(twin) == bound
+    assert value < stability.twin_spectrum(twin).stiffness < 1.5 * value
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_spectrum_is_arpack_s(seed: int) -> None:
     """Not only near it: the number of substeps of a candidate hangs on its last digits."""
     twin = random_twin(seed)
@@ -182,10 +155,8 @@ def test_a_spectrum_is_arpack_s(seed: int) -> None:
 
 
 def test_masses_change_the_spectrum() -> None:
-    """Two nodes on a spring: lambda = k (1/m_1 + 1/m_2), and Gershgorin's bound 2 k / least mass is above it."""
+    """Two nodes on a spring: lambda = k (1/m_1 + 1/m_2)."""
     points, pairs = np.array([[0.0, 0, 0], [0.1, 0.1, 0]]), np.array([[0, 1]])
     k, c, mass = np.array([30.0]), np.array([4.0]), np.array([0.25, 2.0])
     found = stability.rest_spectrum(pairs, points, np.zeros((0, 3)), k, c, mass)
     assert (found.stiffness, found.damping) == (pytest.approx(30.0 * 4.5, rel=1e-3), pytest.approx(4.0 * 4.5, rel=1e-3))
-    bound = stability.gershgorin(pairs, 2, k, c, mass)
-    assert (bound.stiffness, bound.damping, bound.node) == (240.0, 32.0, 0)

@@ -1,8 +1,11 @@
 """Small scenes shared by the physics tests, and the two engines that simulate them: the NumPy reference and Warp."""
 
-from collections.abc import Callable
-from dataclasses import replace
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +14,7 @@ import torch
 from neuspring.core.artifacts import Material, Simulation, Topology, Twin
 from neuspring.physics import reference
 from neuspring.physics.controllers import waypoints
-from neuspring.physics.parameters import pack
+from neuspring.physics.parameters import Parameters, pack
 from neuspring.physics.reference import ReferenceTwin
 from neuspring.physics.solver import FrameSolver
 from tests.support.devices import CUDA
@@ -25,7 +28,7 @@ WAYS = [
 """(device, threads): the CPU also runs the kernels of a GPU, so that every machine tests them."""
 MASSES = np.array([0.3, 1.7, 0.8, 2.1, 0.5, 0.6])
 """Of the six nodes of lively scenes, kg."""
-VARIANTS = {
+VARIANTS: dict[str, dict[str, Any]] = {
     "free": {"on_ground": False},
     "ground": {},
     "self-collision": {"self_collision": True},
@@ -36,29 +39,39 @@ VARIANTS = {
 """Options of `random_scene` that together reach every term."""
 SCALARS = ("drag", "ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction", "contact_distance")
 """Of the arguments of `Material`, those that have no default."""
-Engine = Callable[[ReferenceTwin, np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True)
+class Scene(ReferenceTwin):
+    """A twin in float64 for both engines; the reference has no springs that only push."""
+
+    pushes: np.ndarray | bool = False
+    """True where each spring [S], or every one, acts only while it is shorter than at rest."""
+
+
+Engine = Callable[[Scene, np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 def scene(
-    nodes,
-    springs=(),
-    rest_lengths=(),
+    nodes: int,
+    springs: Any = (),
+    rest_lengths: Any = (),
     *,
-    stiffness=1.0,
-    dashpot=0.0,
-    drag=0.0,
-    ground=(0.5, 0.3),
-    contact=(0.7, 0.3),
-    contact_distance=0.02,
-    mass=1.0,
-    pushes=False,
-    on_ground=False,
-    **simulation,
-):
+    stiffness: Any = 1.0,
+    dashpot: Any = 0.0,
+    drag: float = 0.0,
+    ground: tuple[float, float] = (0.5, 0.3),
+    contact: tuple[float, float] = (0.7, 0.3),
+    contact_distance: float = 0.02,
+    mass: Any = 1.0,
+    pushes: bool = False,
+    on_ground: bool = False,
+    **simulation: Any,
+) -> Scene:
     """A twin in float64; `ground` and `contact` are (e, mu). Defaults: no gravity, no ground, one substep per frame of 1 ms."""
     pairs = np.array(springs, np.int32).reshape(-1, 2)
-    options = {"frame_time": 1e-3, "substeps": 1, "gravity": 0.0, "ground": on_ground} | simulation
-    return ReferenceTwin(
+    options: dict[str, Any] = {"frame_time": 1e-3, "substeps": 1, "gravity": 0.0, "ground": on_ground} | simulation
+    return Scene(
         nodes=nodes,
         springs=pairs,
         rest_lengths=np.broadcast_to(np.asarray(rest_lengths, np.float64), len(pairs)),
@@ -74,7 +87,7 @@ def scene(
     )
 
 
-def tensors(scene, device="cpu", dtype=torch.float64):
+def tensors(scene: Scene, device: str = "cpu", dtype: torch.dtype = torch.float64) -> dict[str, torch.Tensor]:
     """A scene's physical parameters with the keyword names of `pack`."""
     values = {
         "stiffness": scene.stiffness,
@@ -87,39 +100,28 @@ def tensors(scene, device="cpu", dtype=torch.float64):
         "contact_friction": scene.contact[1],
         "contact_distance": scene.contact_distance,
         "mass": np.atleast_1d(scene.mass),
-        "pushes": np.asarray(scene.pushes),
+        "pushes": np.broadcast_to(scene.pushes, len(scene.springs)),
     }
     return {name: torch.tensor(np.array(value), dtype=dtype, device=device) for name, value in values.items()}
 
 
-def with_values(scene, values):
-    """A scene with parameters replaced by name (those of `pack`)."""
-    arrays = {k: np.asarray(v, np.float64) for k, v in values.items() if k in ("stiffness", "rest_lengths", "dashpot")}
-    ground = (values.get("ground_elasticity", scene.ground[0]), values.get("ground_friction", scene.ground[1]))
-    contact = (values.get("contact_elasticity", scene.contact[0]), values.get("contact_friction", scene.contact[1]))
-    drag = float(values.get("drag", scene.drag))
-    return replace(scene, **arrays, drag=drag, ground=tuple(map(float, ground)), contact=tuple(map(float, contact)))
-
-
-def packed(scene, device="cpu", dtype=torch.float64):
+def packed(scene: Scene, device: str = "cpu", dtype: torch.dtype = torch.float64) -> Parameters:
     """A scene's parameters, packed."""
     return pack(**tensors(scene, device, dtype), substep=scene.simulation.substep)
 
 
 def solver_for(
-    scene,
-    controllers,
-    device="cpu",
-    dtype=torch.float64,
+    scene: Scene | Sequence[Scene],
+    controllers: int,
+    device: str = "cpu",
+    dtype: torch.dtype = torch.float64,
     *,
-    differentiable=True,
-    threads=None,
-    block=0,
-):
+    differentiable: bool = True,
+    threads: bool | None = None,
+) -> FrameSolver:
     """A FrameSolver with the scene's parameters set, or one of several scenes on the graph of the first."""
-    options = {"device": device, "dtype": dtype, "differentiable": differentiable}
-    options |= {"threads": threads, "block": block}
-    if isinstance(scene, ReferenceTwin):
+    options: dict[str, Any] = {"device": device, "dtype": dtype, "differentiable": differentiable, "threads": threads}
+    if isinstance(scene, Scene):
         solver = FrameSolver(scene.springs, scene.nodes, controllers, scene.simulation, **options)
         solver.set_parameters(packed(scene, device, dtype))
         return solver
@@ -130,20 +132,20 @@ def solver_for(
 
 
 def warp(
-    scene,
-    x,
-    v,
-    controllers,
-    device="cpu",
-    dtype=torch.float64,
+    scene: Scene,
+    x: np.ndarray,
+    v: np.ndarray,
+    controllers: np.ndarray,
+    device: str = "cpu",
+    dtype: torch.dtype = torch.float64,
     *,
-    differentiable=False,
-    threads=None,
-):
+    differentiable: bool = False,
+    threads: bool | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
     """`reference.rollout` with the Warp solver."""
     solver = solver_for(scene, controllers.shape[1], device, dtype, differentiable=differentiable, threads=threads)
 
-    def tensor(values):
+    def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.tensor(np.asarray(values), dtype=dtype, device=device)
 
     hands = waypoints(tensor(controllers))
@@ -157,12 +159,12 @@ def warp(
 ENGINES = [pytest.param(reference.rollout, id="reference"), pytest.param(warp, id="warp")]
 
 
-def no_hands(frames):
+def no_hands(frames: int) -> np.ndarray:
     """Controllers [frames + 1, 0, 3] for scenes that nothing holds."""
     return np.zeros((frames + 1, 0, 3))
 
 
-def random_scene(seed, nodes=10, controllers=2, frames=3, **simulation):
+def random_scene(seed: int, nodes: int = 10, controllers: int = 2, frames: int = 3, **simulation: Any) -> tuple[Scene, ...]:
     """(scene, x0, v0, hands): a random net above and just in the ground, held and dragged, away from its rest lengths."""
     rng = np.random.default_rng(seed)
     up = -1.0 if simulation.get("up") == "-z" else 1.0
@@ -177,7 +179,7 @@ def random_scene(seed, nodes=10, controllers=2, frames=3, **simulation):
     springs = np.array(inner + outer, np.int32)
     ends = np.concatenate([x, start])[springs]
     rest = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) * rng.uniform(0.8, 1.2, len(springs))
-    options = {"frame_time": 0.02, "substeps": 20, "gravity": 9.8, "on_ground": True} | simulation
+    options: dict[str, Any] = {"frame_time": 0.02, "substeps": 20, "gravity": 9.8, "on_ground": True} | simulation
     body = scene(
         nodes,
         springs,
@@ -193,7 +195,7 @@ def random_scene(seed, nodes=10, controllers=2, frames=3, **simulation):
     return body, x, v, hands
 
 
-def twin_of(scene, x, controllers):
+def twin_of(scene: Scene, x: np.ndarray, controllers: np.ndarray) -> Twin:
     """The scene as a Twin (rounded to float32), at rest positions x [N, 3] and controllers [C, 3]."""
     topology = Topology(
         nodes=x, controllers=controllers, springs=scene.springs, rest_lengths=scene.rest_lengths, labels=np.zeros(len(x), np.int32)

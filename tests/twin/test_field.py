@@ -8,7 +8,7 @@ import torch
 from torch.nn.functional import grid_sample
 
 from neuspring import config
-from neuspring.twin.field import PLANE_AXES, SpringField, TriPlane, bilinear, fourier, in_cube, midpoints
+from neuspring.twin.field import PLANE_AXES, SpringField, TriPlane, bilinear, fourier, in_cube
 
 EXACT = 1e-12
 """Absolute, for values of order 1 in float64: the same sums in another order."""
@@ -65,23 +65,6 @@ def test_the_adaptive_resolution_follows_the_number_of_springs(springs, resoluti
     assert field_of(points(springs)).resolution == max(2, math.floor(0.85 * math.sqrt(springs) + 0.5)) == resolution
 
 
-def test_the_resolution_is_adaptive_or_fixed():
-    assert field_of(points(50)).resolution == 6
-    fixed = field_of(points(50), resolution=256)
-    assert fixed.resolution == 256
-    assert fixed.planes is not None
-    # Of 3 x 256 x 256 texels only those that some midpoint reads can change.
-    assert len(fixed.planes.texels) <= 12 * 50
-
-
-def test_the_network_has_three_layers_of_the_paper_s_width():
-    field = SpringField(points(), config.SpringFieldSettings(), 1, 0)
-    # 32 channels and 3 coordinates, each as sine and cosine of 4 bands.
-    assert [tuple(layer.weight.shape) for layer in field.layers] == [(128, (32 + 3) * 8), (128, 128), (1, 128)]
-    assert field.planes is not None
-    assert field.planes.texels.shape[1] == 32
-
-
 def test_the_fourier_transform_by_hand():
     u = torch.tensor([[0.25, -0.5]])
     pi = math.pi
@@ -91,11 +74,6 @@ def test_the_fourier_transform_by_hand():
 
 
 # Where springs are ----------------------------------------------------------------------------------------------------
-
-
-def test_midpoints_lie_between_nodes_and_controllers():
-    nodes, hands = np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([[0.0, 4, 2]])
-    np.testing.assert_array_equal(midpoints(np.concatenate([nodes, hands]), np.array([[0, 1], [2, 1]])), [[0.5, 0, 0], [0.5, 2, 1]])
 
 
 def test_the_bounding_cube_has_the_longest_side_and_one_scale_for_all_axes():
@@ -136,30 +114,7 @@ def test_a_shuffled_field_is_the_field_of_midpoints_that_are_dealt_out_anew():
     assert {tuple(row) for row in shuffled} == rows == {tuple(row) for row in other}
 
 
-def test_without_planes_only_coordinates_count():
-    field = field_of(triplane=False)
-    assert field.planes is None
-    torch.testing.assert_close(field.encoded(), fourier(field.coordinates, 4), rtol=0, atol=0)
-    assert {name.partition(".")[0] for name, _ in field.named_parameters()} == {"layers"}
-    # Springs at the same place have the same F.
-    twice = field_of(np.concatenate([points(), points()]), triplane=False)
-    train(twice, torch.randn(60, 2, generator=torch.Generator().manual_seed(0)))
-    torch.testing.assert_close(twice()[30:], twice()[:30], rtol=0, atol=EXACT)
-
-
 # Planes ---------------------------------------------------------------------------------------------------------------
-
-
-def test_the_bilinear_lookup_by_hand():
-    """N = 3: texels at -1, 0, 1. The point (0.5, -1, 0.2) lies on column 1.5 and row 0 of xy, and so on."""
-    cells, weights = bilinear(np.array([[0.5, -1.0, 0.2]]), 3)
-    texels = dict.fromkeys(range(27), 0.0)
-    for cell, weight in zip(cells[0], weights[0], strict=True):
-        texels[int(cell)] += weight
-    xy = {1: 0.5, 2: 0.5}  # row 0 (y = -1), columns 1 and 2
-    yz = {9 + 3: 0.8, 9 + 6: 0.2}  # rows 1 and 2 (z = 0.2), column 0
-    xz = {18 + 4: 0.4, 18 + 5: 0.4, 18 + 7: 0.1, 18 + 8: 0.1}
-    assert {cell: weight for cell, weight in texels.items() if weight} == pytest.approx(xy | yz | xz)
 
 
 def dense(at: np.ndarray, resolution: int, channels: int, scale: float) -> tuple[TriPlane, torch.Tensor]:
@@ -191,26 +146,3 @@ def test_the_lookup_equals_grid_sample_on_the_full_planes(resolution):
     torch.testing.assert_close(planes.weights, weights.float().double(), rtol=0, atol=0)
     planes.weights = weights
     torch.testing.assert_close(planes(), sample(full, at), rtol=0, atol=EXACT)
-
-
-def test_texels_in_use_take_the_same_steps_as_full_planes():
-    """Three steps of Adam towards random features; texels that no point reads keep their first values."""
-    at, resolution = scattered(), 16
-    planes, full = dense(at, resolution, 4, 0.1)
-    planes.weights = torch.from_numpy(bilinear(at, resolution)[1])
-    first = full.clone()
-    full.requires_grad_()
-    target = torch.randn(len(at), 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    for parameter, features in ((planes.texels, planes), (full, lambda: sample(full, at))):
-        optimizer = torch.optim.AdamW([parameter], lr=1e-2, weight_decay=0.0)
-        for _ in range(3):
-            optimizer.zero_grad()
-            (features() - target).square().mean().backward()
-            optimizer.step()
-    active = np.unique(bilinear(at, resolution)[0])
-    flat, start = (values.detach().permute(0, 2, 3, 1).reshape(-1, 4) for values in (full, first))
-    assert 0 < len(active) == len(planes.texels) < 3 * resolution**2
-    torch.testing.assert_close(planes.texels.detach(), flat[active], rtol=0, atol=STEPS)
-    assert (planes.texels.detach() - start[active]).abs().max() > 1e-3
-    unread = np.setdiff1d(np.arange(3 * resolution**2), active)
-    assert torch.equal(flat[unread], start[unread])

@@ -11,17 +11,15 @@ from scipy.stats import pearsonr
 
 from neuspring import config
 from neuspring.core.artifacts import SCALARS, Observations, Twin
-from neuspring.core.errors import InputError, NumericalFailure
+from neuspring.core.errors import NumericalFailure
 from neuspring.physics import stability
 from neuspring.twin import batch
 from neuspring.twin import fit as module
-from neuspring.twin.fit import FitProblem, NonFinite, TwinFit, fit
+from neuspring.twin.fit import FitProblem, TwinFit, fit
 from neuspring.twin.losses import FrameLoss
 from neuspring.twin.rollout import roll_out
 from tests.support import small
 
-RATE = 1e-12
-"""Relative: learning rates are a few operations in float64."""
 MEAN = 1e-6
 """Relative: a mean of losses in float32, summed in another order."""
 FIELD = config.SpringFieldSettings()
@@ -174,14 +172,6 @@ def test_frames_beyond_the_limit_of_adjoints_are_left_out_and_counted(limit, hor
     assert np.any(result.twin.material.stiffness != problem.twin.material.stiffness) == (left_out == 0)
 
 
-def test_a_dashpot_beyond_all_numbers_is_rolled_back_not_a_crash():
-    run = TwinFit(small.fit_problem(fit=config.Fit(damping="homogeneous")))
-    with torch.no_grad():
-        run.parameters.factors["dashpot"].fill_(100.0)
-    with pytest.raises(NonFinite, match="stiffness, rest length or dashpot is not finite"):
-        run.require_stable()
-
-
 @pytest.mark.parametrize("kind", ["springs", "field"])
 def test_substeps_grow_within_an_epoch(kind):
     """One epoch of four steps, so long that the last frames could not be integrated with the first substeps."""
@@ -212,17 +202,6 @@ def test_growing_dashpots_get_more_substeps():
     stability.check(run.parameters.as_twin(run.twin))
 
 
-def test_overflow_is_counted_although_solvers_are_rebuilt():
-    seen = small.observations()
-    crowded = small.fit_problem(replace(seen, scenario=replace(seen.scenario, self_collision=True)))
-    start = replace(crowded.twin, simulation=replace(crowded.twin.simulation, collision_capacity=1))
-    slow, fast = (fit(replace(crowded, twin=start, fit=config.Fit(epochs=2, learning_rate=rate))) for rate in (1e-4, 0.5))
-    assert slow.twin.simulation.substeps == start.simulation.substeps < fast.twin.simulation.substeps
-    # Every node of the rope has about the same neighbors in both.
-    dropped = [each.facts["collision_overflow"] for each in (slow, fast)]
-    assert dropped[1] > 0.9 * dropped[0] > 0
-
-
 @pytest.mark.parametrize("kind", ["fixed", "auto"])
 def test_stiffness_beyond_the_allowed_substeps_rolls_back_and_recovers(kind, monkeypatch):
     count = small.fit_problem(**GROWING).twin.simulation.substeps
@@ -237,14 +216,6 @@ def test_stiffness_beyond_the_allowed_substeps_rolls_back_and_recovers(kind, mon
     # ... and what comes out can be rolled out as it is.
     assert result.twin.simulation.substeps == problem.twin.simulation.substeps
     stability.check(result.twin)
-
-
-def test_the_best_epoch_by_training_loss_wins_and_the_quirk_looks_every_20_epochs():
-    result = fit(small.fit_problem())
-    assert result.facts["best_epoch"] == result.history["loss"].idxmin()
-    quirks = config.ReleasedQuirks(sparse_checkpoints=True)
-    eligible = [e for e in range(30) if module.eligible(e, small.fit_problem(quirks=quirks, fit=config.Fit(epochs=30)))]
-    assert eligible == [0, 20, 29]
 
 
 def test_the_future_is_never_read():
@@ -292,21 +263,6 @@ def test_the_held_back_tail_selects_and_is_not_trained_on(kind, horizon, monkeyp
     # What selected is the loss of the twin that comes out, over the frames held back.
     assert learned.facts["best_loss"] == pytest.approx(loss_of(learned.twin, small.observations(), range(3, 5)), rel=MEAN)
     assert learned.facts["best_loss"] == learned.history["tail_loss"].min()
-
-
-def test_at_least_one_frame_is_held_back_and_one_trained_on(monkeypatch):
-    for fraction, fitted_end in ((0.01, 4), (0.5, 3), (0.99, 2)):
-        monkeypatch.setattr(module, "TAIL_FRACTION", fraction)
-        assert TwinFit(small.fit_problem(fit=config.Fit(selection="tail"))).recordings[0].fitted_end == fitted_end
-    assert TwinFit(small.fit_problem()).recordings[0].fitted_end == 5
-
-
-def test_a_single_training_frame_cannot_be_held_back_and_trained_on():
-    seen = small.observations()
-    short = replace(seen, scenario=replace(seen.scenario, train_end=2))
-    with pytest.raises(InputError, match=r"selection.*two training frames"):
-        fit(small.fit_problem(short, fit=config.Fit(epochs=1, selection="tail")))
-    fit(small.fit_problem(short, fit=config.Fit(epochs=1)))
 
 
 def test_the_loss_of_a_one_step_epoch_belongs_to_the_values_before_the_step():

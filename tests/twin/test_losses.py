@@ -15,7 +15,7 @@ from neuspring.twin import losses
 from neuspring.twin.candidates import candidate
 from neuspring.twin.fit import TwinFit
 from neuspring.twin.losses import FrameLoss
-from neuspring.twin.trials import motions
+from neuspring.twin.rollout import roll_out
 from tests.support import small
 
 GOLDEN = {float: 1e-12, "float32": 1e-5}
@@ -64,16 +64,6 @@ def test_golden_terms(golden: dict[str, np.ndarray], k: int, dtype: torch.dtype)
         assert_close(gradient, golden[f"exp_{short}_grad{k}"], tolerance(dtype))
     assert_close(terms["acceleration"], golden[f"exp_acc{k}"], tolerance(dtype))
     assert_close(sum(terms.values()), golden[f"exp_total{k}"], tolerance(dtype))
-
-
-@pytest.mark.parametrize("k", CASES)
-def test_golden_nearest(golden: dict[str, np.ndarray], k: int, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same nodes, whatever the chunk size."""
-    c, surface = case(golden, k, dtype), int(golden[f"num_surface_points{k}"])
-    expected = golden[f"exp_nn{k}"][golden[f"visible{k}"]]
-    for chunk in (losses.CHUNK_ENTRIES, 7 * surface, 1):
-        monkeypatch.setattr(losses, "CHUNK_ENTRIES", chunk)
-        np.testing.assert_array_equal(losses.nearest(c["gt"][c["visible"]], c["pred"][:surface]), expected)
 
 
 def test_ties_go_to_the_lowest_index() -> None:
@@ -129,13 +119,6 @@ def test_frozen_counts_divide_by_frame_one() -> None:
         assert got.item() == pytest.approx(wanted.item() / 2)
 
 
-def test_weights() -> None:
-    plain, nodes = frame_loss()
-    weighted, _ = frame_loss(weights=Losses(chamfer=3.0, track=0.5))
-    near, moved = plain.terms(1, nodes).values()
-    assert weighted(1, nodes).item() == pytest.approx(3 * near.item() + 0.5 * moved.item())
-
-
 def test_every_term_has_a_weight_of_its_name_and_a_weight_of_zero_leaves_it_out() -> None:
     assert set(losses.TERMS) == {spec.name for spec in fields(Losses)}
     for name in ("chamfer", "track"):
@@ -154,9 +137,9 @@ class Weights(Losses):
     height: float = 1.0
 
 
-def height(loss: FrameLoss, state: losses.FrameState) -> list[losses.Errors]:
+def height(loss: FrameLoss, state: losses.FrameState) -> torch.Tensor:
     """The second place, with its line in TERMS: nodes are wanted in the plane z = 0.1 m."""
-    return [losses.Errors(state.x[:, 2:] - 0.1, loss.weights.height, len(state.x), losses.SQUARES)]
+    return loss.weights.height * (state.x[:, 2] - 0.1).square().mean()
 
 
 def test_a_new_term_is_a_weight_and_a_function(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -167,11 +150,8 @@ def test_a_new_term_is_a_weight_and_a_function(monkeypatch: pytest.MonkeyPatch) 
     twin = candidate(problem, small.start_values())
     loss = FrameLoss.of(problem.observations, weights, "cpu")
     (searched,) = small.judge(problem, [twin], loss)
-    own = problem.recordings[0]
-    start = own.velocity
-    x, v = motions([twin], own.hands, start, "cpu")
-    expected = float((x[:, 0, :, 2].double() - 0.1).square().mean())
+    x = roll_out(twin, problem.recordings[0].hands.numpy()).positions[1:]
+    expected = float(np.square(x[..., 2].astype(float) - 0.1).mean())
     assert searched.cost == pytest.approx(expected, rel=1e-5)
-    assert small.rollout_loss(loss, zip(range(1, len(own.hands)), x[:, 0], v[:, 0], strict=True), start) == pytest.approx(expected)
     fitted = small.done(TwinFit(small.fit_problem(losses=weights, twin=twin, fit=config.Fit(horizon=0))).epoch())["loss"]
     assert fitted == pytest.approx(expected, rel=1e-5)

@@ -3,12 +3,10 @@
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from neuspring import config
 from neuspring.core.artifacts import Twin
-from neuspring.core.errors import InputError
 from neuspring.core.records import StageRecord
 from neuspring.physics.parameters import twin_tensors
 from neuspring.stages.fit import fit as fit_stage
@@ -16,7 +14,6 @@ from neuspring.stages.fit import prepared
 from neuspring.stages.rollout import rollout
 from neuspring.stages.search import search as search_stage
 from neuspring.twin.fit import fit
-from neuspring.twin.losses import FrameLoss
 from tests.support import small
 
 SETTINGS = config.Config(
@@ -33,19 +30,6 @@ def parameters(twin: Twin) -> np.ndarray:
 def test_an_oracle_reads_what_comes_after_the_split():
     results = [fit(small.fit_problem(seen, oracle=True)).twin for seen in (small.observations(), small.spoiled_future())]
     assert not np.array_equal(*map(parameters, results))
-
-
-def test_only_an_oracles_loss_holds_the_future():
-    seen = small.observations()
-    scenario = seen.scenario
-    kept = [len(FrameLoss.of(seen, config.Losses(), "cpu", **asked).points) for asked in ({}, {"oracle": True})]
-    assert kept == [scenario.train_end, scenario.frame_count]
-    assert [small.fit_problem(oracle=oracle).frame_end for oracle in (False, True)] == kept
-
-
-def test_an_oracle_holds_no_tail_back():
-    with pytest.raises(InputError, match=r"fit\.selection: an oracle is fitted on all frames"):
-        small.fit_problem(oracle=True, fit=config.Fit(selection="tail"))
 
 
 @pytest.fixture(scope="module")
@@ -80,18 +64,3 @@ def test_records_of_fit_and_rollout_say_oracle_and_digests_differ(started, tmp_p
     frames = [StageRecord.load(tmp_path / f"{oracle}" / "fit.json").facts["spring_updates"] for oracle in (False, True)]
     scenario = small.observations().scenario
     assert frames[1] * (scenario.train_end - 1) == frames[0] * (scenario.frame_count - 1)
-
-
-def test_an_oracle_in_shared_launches_is_the_oracle_alone(started, tmp_path):
-    seen, found = started / "observations.npz", started / "search.json"
-    given = {"observations": seen, "search": found, "settings": SETTINGS, "device": "cpu"}
-    outputs = {name: tmp_path / name / "fit.json" for name in ("normal", "oracle", "oracle_again")}
-    jobs = [fit_stage.job(output=output, oracle=name != "normal", **given) for name, output in outputs.items()]
-    for job, made in zip(jobs, fit_stage.many(jobs), strict=True):
-        job.keep(made)
-    twins = []
-    fitted(started, tmp_path / "alone" / "fit.json", True)
-    for folder in (tmp_path / "oracle", tmp_path / "alone"):
-        twins.append(Twin.load(folder / "twin.npz"))
-        assert len(pd.read_parquet(folder / "history.parquet"))
-    np.testing.assert_array_equal(*map(parameters, twins))

@@ -9,20 +9,15 @@ import torch
 
 from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
-from neuspring.core.errors import InputError
 from neuspring.twin.body import FitTask
 from neuspring.twin.candidates import SearchProblem, made, mean_outcome
 from neuspring.twin.fit import FitProblem, FitResult, TwinFit, fit, fit_many
-from neuspring.twin.search import search
-from neuspring.twin.trials import Outcome, outcomes
+from neuspring.twin.trials import Outcome, Rollouts, rolled
 from tests.support import small
 from tests.support.searches import LOGARITHMIC
 
-MEAN = 1e-6
-"""Relative: a mean of two losses in float32."""
 SINGLE_POSITIONS = 3e-6
 """Relative: lengths of 0.02 m between positions at 0.2 m in float32, whose rounding is 1.2e-8 m, at both ends of both lengths."""
-TIMES = ["seconds"]
 PLACES = ("object_points", "surface_points", "controller_points")
 LIFTED, SHAKEN = "rope/lift/smooth", "rope/shake/smooth"
 
@@ -43,22 +38,7 @@ def on_pool(alone: SearchProblem, *others: str, **changes) -> SearchProblem:
     return replace(alone, pool=tuple(map(seen, others)), **changes)
 
 
-def traced(problem: SearchProblem) -> pd.DataFrame:
-    """The trace of a search, without times."""
-    return search(problem, 0).trace.drop(columns=TIMES)
-
-
-def searched(here: str, *others: str, **options) -> pd.DataFrame:
-    """The trace of a short search."""
-    return traced(on_pool(small.search_problem(seen(here)), *others, **options))
-
-
 # Search ---------------------------------------------------------------------------------------------------------------
-
-
-def test_a_recording_beside_itself_changes_nothing():
-    alone = short(seen(LIFTED))
-    pd.testing.assert_frame_equal(traced(on_pool(alone, LIFTED)), traced(alone), check_exact=True)
 
 
 def test_costs_are_means_over_the_recordings():
@@ -70,7 +50,8 @@ def test_costs_are_means_over_the_recordings():
     costs = [np.array([row["cost"] for row in small.evaluated(each, population)]) for each in problems]
     families = [made(both, normalized)[1] for normalized in population]
     there = both.recordings[1]
-    moved = [judged.cost for judged in outcomes([pair[1] for pair in families], there.hands, there.velocity, there.loss, "cpu")]
+    (judged,) = rolled([Rollouts([pair[1] for pair in families], there.hands, there.velocity, there.loss)], "cpu")
+    moved = [one.cost for one in judged]
     np.testing.assert_allclose(costs[1], (costs[0] + moved) / 2, rtol=1e-12)
     np.testing.assert_allclose(costs[2], (costs[0] + moved + moved) / 3, rtol=1e-12)
 
@@ -83,10 +64,6 @@ def test_springs_and_radii_are_the_same_on_all_recordings():
     _, (here, there) = made(replace(alone, pool=(stretched,)), alone.encode())
     np.testing.assert_array_equal(here.topology.springs, there.topology.springs)
     np.testing.assert_allclose(there.topology.rest_lengths, 1.1 * here.topology.rest_lengths, rtol=SINGLE_POSITIONS)
-
-
-def test_threads_and_launches_change_nothing_in_a_pool():
-    pd.testing.assert_frame_equal(searched(LIFTED, SHAKEN, threads=2, together=3), searched(LIFTED, SHAKEN))
 
 
 def test_a_twin_that_leaves_one_recording_has_left():
@@ -132,14 +109,6 @@ def require_equal_twins(one: Twin, other: Twin) -> None:
     assert one.material.ground_friction == other.material.ground_friction
 
 
-def test_an_oracle_on_a_pool_reads_the_future_of_what_counts():
-    problem, late = problem_of(LIFTED, oracle=True, epochs=1), small.spoiled_future()
-    one, other = (pooled(problem, seen).twin.material.stiffness for seen in (late, problem.observations))
-    assert not np.array_equal(one, other)
-    plain = problem_of(LIFTED, epochs=1)
-    require_equal(pooled(plain, late), pooled(plain, plain.observations))
-
-
 def test_recordings_share_one_material_and_one_unit():
     problem = problem_of(LIFTED, epochs=1)
     larger = replace(seen(SHAKEN), **{name: 2 * getattr(seen(SHAKEN), name) for name in PLACES})
@@ -168,35 +137,10 @@ def test_one_material_comes_nearer_to_two_recordings():
     assert result.facts["rollbacks"] == []
 
 
-def test_a_killed_fit_continues_exactly(tmp_path, monkeypatch):
-    monkeypatch.setattr("neuspring.core.checkpoint.CHECKPOINT_EVERY", 1)
-    problem = problem_of(LIFTED, epochs=3)
-    whole = pooled(problem, seen(SHAKEN))
-
-    class Killed(Exception):
-        pass
-
-    def kill(history) -> None:
-        if len(history) == 2:
-            raise Killed
-
-    path = tmp_path / "partial.npz"
-    with pytest.raises(Killed):
-        pooled(problem, seen(SHAKEN), partial=path, key="k", on_epoch=kill)
-    continued = pooled(problem, seen(SHAKEN), partial=path, key="k")
-    assert continued.attempts == 2
-    require_equal(continued, whole)
-
-
+@pytest.mark.slow
 def test_fits_on_a_pool_that_share_launches_have_the_numbers_of_each_alone():
     problem = replace(problem_of(LIFTED, epochs=2, horizon=2, learning_rate=3e-3), kind="field", pool=[seen(SHAKEN)])
     problems = [problem, replace(problem, seed=1)]
     for got, each in zip(fit_many([FitTask(one) for one in problems]), problems, strict=True):
         assert not isinstance(got, Exception), got
         require_equal(got, fit(each))
-
-
-def test_recordings_need_the_same_nodes():
-    other = replace(seen(SHAKEN), surface_points=seen(SHAKEN).surface_points[1:])
-    with pytest.raises(InputError, match=r"as many nodes and controllers: \(124, 3\); received \(123, 3\) in small"):
-        replace(problem_of(LIFTED), pool=[other])

@@ -102,6 +102,7 @@ def several() -> list[FitProblem]:
     ]
 
 
+@pytest.mark.slow
 def test_fits_in_and_out_of_step_equal_those_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the others do: more substeps, another horizon, an earlier end, an error. Each continues from its checkpoint."""
     problems = several()
@@ -131,14 +132,6 @@ def test_adjoints_are_limited_for_each_fit_that_shares_launches(factor: float, m
         assert got.facts["frames_left_out"] == wanted.facts["frames_left_out"] > 0
 
 
-def test_self_collision_with_shared_launches() -> None:
-    base, seen = small.fit_problem(), small.observations()
-    crowded = replace(seen, scenario=replace(seen.scenario, self_collision=True))
-    problems = [small.fit_problem(crowded, fit=replace(base.fit, learning_rate=rate)) for rate in (1e-2, 5e-2)]
-    for got, problem in zip(together(problems), problems, strict=True):
-        small.assert_same_fit(got, fit(problem))
-
-
 def test_fits_in_step_share_their_launches(monkeypatch: pytest.MonkeyPatch) -> None:
     """Three alike make as many frames as one, and each keeps what it computed: no frame is simulated again."""
     frames: list[int] = []
@@ -151,14 +144,6 @@ def test_fits_in_step_share_their_launches(monkeypatch: pytest.MonkeyPatch) -> N
     results = fit_many([FitTask(replace(problem, fit=replace(problem.fit, learning_rate=rate))) for rate in (1e-2, 2e-2, 5e-2)])
     assert not any(isinstance(result, Exception) for result in results)
     assert (len(frames), frames[0]) == (alone, 3)
-
-
-def test_an_error_in_a_shared_launch_ends_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> None:
-        raise RuntimeError("no memory")
-
-    monkeypatch.setattr(FrameSolver, "forward", fail)
-    assert [str(result) for result in together(several()[:3])] == ["no memory"] * 3
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -17,10 +17,9 @@ from scipy.sparse.csgraph import connected_components
 
 from neuspring import config
 from neuspring.config.search import LENGTHS
-from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.physics import stability
 from neuspring.physics.lanes import LANE_WIDTHS
-from neuspring.physics.topology import distances, regions, uniform_topology
+from neuspring.physics.topology import uniform_topology
 from neuspring.twin import candidates
 from neuspring.twin import search as module
 from neuspring.twin.candidates import PENALTY, SearchProblem, candidate, groups, made, still_cost
@@ -69,18 +68,6 @@ def test_one_region_has_the_twelve_variables_of_the_released_search_and_its_star
     assert problem.variables == tuple(RELEASED)
     np.testing.assert_allclose(problem.encode(), [start for *_, start in RELEASED.values()], rtol=CODING)
     assert not problem.labels.any()
-
-
-@pytest.mark.parametrize("clusters", [2, 5])
-def test_k_regions_have_2k_plus_10_variables(clusters):
-    problem = plain(clusters=clusters)
-    assert len(problem.variables) == 2 * clusters + 10
-    regional = [name for name in problem.variables if "." in name]
-    assert regional == [f"object_{name}.{region}" for name in ("radius", "neighbors") for region in range(clusters)]
-    # Every region starts where the uniform search does.
-    start = dict(zip(problem.variables, problem.encode(), strict=True))
-    assert start == pytest.approx({name: RELEASED[name.partition(".")[0]][2] for name in start}, rel=CODING)
-    assert np.unique(problem.labels).tolist() == list(range(clusters))
 
 
 @given(st.lists(st.floats(0, 1), min_size=16, max_size=16), st.sampled_from(["linear", "log"]))
@@ -143,24 +130,6 @@ def test_small_and_large_units_have_the_same_variables_and_springs():
         np.testing.assert_array_equal(*springs)
 
 
-def test_fixed_variables_keep_their_start():
-    problem = ours(rollouts=11, fixed=["drag", "object_radius"], variables={"drag": {"start": 0.0}})
-    assert len(problem.variables) == len(problem.encode()) == 10
-    assert set(problem.names) - set(problem.variables) == {"drag", "object_radius"}
-    result = search(problem, seed=0)
-    # Outside the range, where no search would go.
-    assert (result.trace["drag"] == 0).all()
-    assert (result.trace["object_radius"] == 2.5 * problem.spacing).all()
-    assert result.twin.material.drag == 0
-    assert not {"normalized.drag", "normalized.object_radius"} & set(result.trace)
-
-
-def test_a_fixed_radius_is_that_of_every_region():
-    problem = small.search_problem(search=small.released(fixed=["object_radius"]), clusters=3)
-    assert len(problem.variables) == 2 * 3 + 10 - 3
-    assert [problem.decode(problem.encode())[f"object_radius.{region}"] for region in range(3)] == [0.02] * 3
-
-
 @pytest.mark.parametrize("clusters", [1, 3])
 def test_the_released_row_is_the_search_as_it_was(clusters):
     """Bit for bit: the linear formula on the released ranges, and CMA-ES from the released start, told the same costs."""
@@ -194,20 +163,6 @@ def test_a_region_s_values_reach_its_own_nodes():
     assert longest[0] < 0.03 < longest[1] < 0.045
     degree = np.bincount(inner.ravel(), minlength=len(problem.labels))
     assert degree[problem.labels == 0].mean() < degree[problem.labels == 1].mean() / 2
-
-
-def test_regions_and_candidates_are_made_on_the_rest_shape():
-    seen = small.observations()
-    # A rope whose second half was compressed in frame 0 to half its length; a rollout still starts there.
-    shape = seen.canonical.astype(np.float64)
-    shape[:, 0] += np.maximum(shape[:, 0] - shape[:, 0].mean(), 0)
-    problem = small.search_problem(replace(seen, rest_shape=shape), clusters=3)
-    np.testing.assert_array_equal(problem.labels, regions(problem.observations.canonical[: len(seen.nodes)], 3))
-    assert (problem.labels != small.search_problem(clusters=3).labels).any()
-    regional = {f"object_{name}.{r}": small.start_values()[f"object_{name}"] for name in ("radius", "neighbors") for r in range(3)}
-    topology = candidate(problem, small.start_values() | regional).topology
-    np.testing.assert_array_equal(topology.nodes, seen.nodes)
-    np.testing.assert_allclose(topology.rest_lengths, distances(shape, topology.springs), rtol=FLOAT32_LENGTHS)
 
 
 def loosely(**changes: object) -> SearchProblem:
@@ -263,15 +218,6 @@ def die_after(evaluated: int, problem: SearchProblem, seed: int, record: Path, m
             search(problem, seed, record=record, key="k")
 
 
-@pytest.mark.parametrize(("rollouts", "clusters", "population"), [(5, 1, 11), (11, 1, 11), (15, 3, 12)])
-def test_every_search_uses_exactly_its_budget(rollouts, clusters, population):
-    trace = search(budget(rollouts, clusters), seed=0).trace
-    assert len(trace) == rollouts
-    assert trace["rollout"].tolist() == list(range(rollouts))
-    # The population is that of CMA-ES for so many variables, so the last generation is cut where it does not divide the budget.
-    assert trace["generation"].value_counts().max() == min(rollouts, population)
-
-
 def test_a_larger_budget_continues_as_if_it_had_been_there_from_the_start(tmp_path):
     """15 rollouts end in the middle of the second generation of 11."""
     record = tmp_path / "trace.parquet"
@@ -313,18 +259,6 @@ def test_the_first_generation_says_whether_hands_hold_or_push():
     np.testing.assert_array_equal(topology.pushes, led)
     assert topology.rest_lengths[led].max() <= result.values["contact_distance"] + 1e-9
     assert search(pushed("hold"), seed=0).cost > 1.3 * result.cost
-
-
-@pytest.mark.parametrize("rollouts", [2, 9, 14])
-def test_of_fewer_candidates_than_two_generations_half_are_judged_each_way(rollouts):
-    """Else the best may be of one way, and the twin of the other."""
-    result = search(pushed(rollouts=rollouts), seed=0)
-    trace = result.trace
-    assert len(trace) == rollouts
-    assert (trace["stage"] == "hands").sum() == rollouts // 2
-    best = trace.iloc[int(trace["cost"].to_numpy().argmin())]
-    assert bool(best["push"]) == bool(result.twin.topology.pushes.any())
-    assert result.cost == best["cost"]
 
 
 @pytest.mark.parametrize(("part", "pushes"), [(0.5, True), (0.98, False)])
@@ -384,15 +318,6 @@ def test_tied_regions_are_the_uniform_search_and_are_then_freed_around_its_best(
         assert trace[name][15:27].mean() == pytest.approx(start[re.sub(r"\.\d$", "", name)], abs=4 * sigma / np.sqrt(12))
 
 
-@pytest.mark.parametrize(("evaluated", "kept"), [(13, 11), (20, 15)])
-def test_a_search_with_tied_regions_continues_exactly(tmp_path, monkeypatch, evaluated, kept):
-    """Killed while the regions are tied, and in the first generation after it."""
-    record = tmp_path / "trace.parquet"
-    die_after(evaluated, tied(30), 1, record, monkeypatch)
-    assert len(pd.read_parquet(record)) == kept
-    assert_same_trace(search(tied(30), seed=1, record=record, key="k").trace, search(tied(30), seed=1).trace)
-
-
 def test_a_checkpoint_of_another_problem_or_that_does_not_replay_is_ignored(tmp_path, capsys):
     record = tmp_path / "trace.parquet"
     first = search(small.search_problem(), seed=0, record=record, key="one")
@@ -407,40 +332,6 @@ def test_a_checkpoint_of_another_problem_or_that_does_not_replay_is_ignored(tmp_
     assert (forged.attempts, forged.cost) == (1, first.cost)
 
 
-def test_a_record_that_replays_in_part_is_continued_from_there(tmp_path, capsys):
-    record = tmp_path / "trace.parquet"
-    whole = search(budget(15), seed=0, record=record, key="k")
-    table = pd.read_parquet(record)
-    table.loc[12, "normalized.drag"] += 0.01
-    table.to_parquet(record)
-    mended = search(budget(15), seed=0, record=record, key="k")
-    assert "continues afresh from rollout 11" in capsys.readouterr().out
-    assert_same_trace(mended.trace, whole.trace)
-    assert_same_trace(pd.read_parquet(record), whole.trace)
-    assert mended.trace["seconds"].tolist()[:11] == whole.trace["seconds"].tolist()[:11]
-
-
-def test_a_fixed_count_that_no_candidate_can_use_is_an_error_with_the_remedy():
-    problem = small.search_problem(simulation=config.SimulationSettings(substeps=1))
-    named = r"simulation.substeps: at least one of 22 candidates must be stable.*; received 1.*unstable.*Use at least \d+ substeps"
-    with pytest.raises(InputError, match=named):
-        search(problem, seed=0)
-
-
-def test_a_search_whose_candidates_all_fail_is_a_named_failure():
-    problem = small.search_problem(simulation=config.SimulationSettings(safety=1e-6))
-    with pytest.raises(NumericalFailure, match=r"none of 22 candidates could be simulated; the first: needs \d+ substeps"):
-        search(problem, seed=0)
-
-
-def test_bad_input_is_not_mistaken_for_a_bad_candidate():
-    seen = small.observations()
-    hands = seen.controller_points.copy()
-    hands[:, 0] += seen.object_points[0, 0] - hands[0, 0]
-    with pytest.raises(InputError, match="controller may not coincide"):
-        search(small.search_problem(replace(seen, controller_points=hands)), seed=0)
-
-
 def test_the_future_is_never_read():
     changes = {
         "clusters": 3,
@@ -449,13 +340,6 @@ def test_the_future_is_never_read():
     }
     first, second = (search(small.search_problem(o, **changes), seed=0) for o in (small.observations(), small.spoiled_future()))
     assert first.trace["cost"].tolist() == second.trace["cost"].tolist()
-
-
-def test_a_search_started_on_a_damaged_checkpoint_starts_afresh(tmp_path, capsys):
-    record = tmp_path / "trace.parquet"
-    record.write_bytes(b"PAR1 not really")
-    assert search(small.search_problem(), seed=0, record=record, key="k").attempts == 1
-    assert "starts afresh" in capsys.readouterr().out
 
 
 def test_released_quirks_of_the_search():
@@ -501,14 +385,6 @@ def test_the_search_is_the_same_bit_for_bit_however_candidates_are_simulated(mak
         assert_same_trace(fast.trace, slow.trace)
         assert (fast.values, fast.cost) == (slow.values, slow.cost)
         np.testing.assert_array_equal(fast.twin.topology.springs, slow.twin.topology.springs)
-
-
-def test_the_search_is_the_same_where_lists_of_partners_are_full():
-    """Then a candidate is judged by what it finds alone."""
-    settings = config.SimulationSettings(collision_capacity=6)
-    slow, fast = (search(crowded(simulation=settings, together=together), seed=3).trace for together in (1, 16))
-    assert_same_trace(fast, slow)
-    assert 0 < (slow["collision_overflow"] > 0).sum() < len(slow)
 
 
 def test_candidates_of_every_fate_in_one_generation(monkeypatch):
@@ -570,29 +446,3 @@ def test_groups_are_a_partition_by_substeps_with_one_for_each_thread(substeps, t
     else:
         assert max(map(len, made)) - min(map(len, made)) <= 1
     assert len(made) >= len(substeps) // -(-len(substeps) // threads)
-
-
-@pytest.mark.parametrize(("together", "sizes"), [(0, [11]), (4, [4, 4, 3]), (1, [1] * 11), (20, [11])])
-def test_cuda_takes_as_many_as_it_is_told(together, sizes):
-    made = groups([stand_in(20 + k) for k in range(11)], "cuda:0", together, 1)
-    assert [len(members) for members in made] == sizes
-    assert [k for members in made for k in members] == list(range(11))
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_a_search_that_fails_in_a_launch_keeps_whole_generations_and_continues(tmp_path, monkeypatch, threads):
-    record, function = tmp_path / "trace.parquet", module.rolled
-
-    def broken(*arguments):
-        if record.exists():
-            raise MemoryError("no room")
-        return function(*arguments)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(module, "rolled", broken)
-        with pytest.raises(MemoryError, match="no room"):
-            search(small.search_problem(threads=threads, together=4), 5, record=record, key="k")
-    assert len(pd.read_parquet(record)) == 11
-    continued = search(small.search_problem(together=4), seed=5, record=record, key="k")
-    assert continued.attempts == 2 and continued.earlier_seconds > 0
-    assert_same_trace(continued.trace, search(small.search_problem(together=1), seed=5).trace)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,7 +10,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from neuspring.core.errors import InputError
 from neuspring.physics import topology as graphs
 from tests.support.clips import NAMES, clip
 
@@ -103,38 +100,6 @@ def test_the_radius_is_strict() -> None:
     assert len(graphs.controller_springs(nodes[:1], nodes[1:], np.nextafter(0.5, 1), 5)) == 1
 
 
-def test_springs_must_be_longer_than_the_minimum() -> None:
-    """Nearly coincident nodes get no spring between them, and the node itself uses up one of its neighbors."""
-    nodes = np.array([[0.0, 0, 0], [graphs.MIN_LENGTH / 2, 0, 0], [0.3, 0, 0]])
-    assert undirected(same(nodes, 1.0, 3)) == {(0, 2), (1, 2)}
-    assert undirected(same(nodes, 1.0, 1)) == set()
-
-
-@pytest.mark.parametrize("copies", [2, 4])
-def test_duplicate_nodes_are_not_joined(copies: int) -> None:
-    nodes = np.concatenate([np.zeros((copies, 3)), [[0.3, 0, 0]]])
-    assert undirected(same(nodes, 1.0, copies + 1)) == {(i, copies) for i in range(copies)}
-
-
-def test_controllers_ask_for_nodes_only_and_without_a_minimum_length() -> None:
-    nodes, hands = np.array([[0.0, 0, 0], [0.2, 0, 0], [9, 0, 0]]), np.array([[graphs.MIN_LENGTH / 2, 0, 0], [0.01, 0, 0]])
-    assert graphs.controller_springs(nodes, hands, 1.0, 5).tolist() == [[3, 0], [3, 1], [4, 0], [4, 1]]
-    assert graphs.controller_springs(nodes, hands, 1.0, 1).tolist() == [[3, 0], [4, 0]]
-    assert graphs.controller_springs(nodes, hands, 1e-6, 5).shape == (0, 2)
-
-
-def test_a_controller_on_a_node_is_refused() -> None:
-    nodes = np.array([[0.0, 0, 0], [0.2, 0, 0]])
-    with pytest.raises(InputError, match=r"controller may not coincide.*zero-length spring \[2, 1\]"):
-        graphs.uniform_topology(nodes, nodes[1:], 0.5, 5, 0.5, 5)
-
-
-def test_a_topology_may_have_no_springs() -> None:
-    topology = graphs.uniform_topology(np.array([[0.0, 0, 0]]), np.array([[5.0, 0, 0]]), 0.1, 5, 0.1, 5)
-    assert topology.springs.shape == (0, 2)
-    assert topology.object_spring_count == 0
-
-
 # Regions --------------------------------------------------------------------------------------------------------------
 
 
@@ -147,21 +112,6 @@ def blocks(counts: tuple[int, ...] = (6, 9, 4)) -> np.ndarray:
 
 def test_regions_are_found_and_numbered_by_centroid() -> None:
     assert graphs.regions(blocks(), 3).tolist() == [2] * 4 + [1] * 9 + [0] * 6
-
-
-@pytest.mark.parametrize("count", [1, 2, 5, 25])
-def test_every_region_has_a_node_and_numbers_have_no_gaps(count: int) -> None:
-    labels = graphs.regions(cloud(1), count)
-    assert (labels.shape, labels.dtype) == ((25,), np.int32)
-    assert np.unique(labels).tolist() == list(range(count))
-
-
-def test_equal_coordinates_of_centroids_are_ties() -> None:
-    """Groups whose centroids differ in x by rounding alone are ordered by y, then by z."""
-    corner = np.array([[0.0, 0, 0], [0.01, 0, 0], [0, 0.01, 0]])
-    places = np.array([[0.1, 1, 0], [0.1 + 1e-9, 0, 1], [0.1, 0, 0]])
-    labels = graphs.regions(np.concatenate([corner + place for place in places]), 3)
-    assert labels.tolist() == [2] * 3 + [1] * 3 + [0] * 3
 
 
 def lattices() -> dict[str, np.ndarray]:
@@ -189,31 +139,7 @@ def test_regions_depend_neither_on_the_unit_nor_on_the_order_of_nodes(name: str,
         np.testing.assert_array_equal(graphs.regions((nodes * np.float32(unit))[order], count), labels[order])
 
 
-def test_more_regions_than_nodes_are_refused() -> None:
-    with pytest.raises(InputError, match=r"clusters: .* need at least 5 nodes; received 4 nodes"):
-        graphs.regions(cloud(0, 4), 5)
-    graphs.regions(cloud(0, 5), 5)
-
-
-@pytest.mark.parametrize("count", [0, -1])
-def test_less_than_one_region_is_refused(count: int) -> None:
-    with pytest.raises(InputError, match=r"clusters"):
-        graphs.regions(cloud(0), count)
-
-
 # Piecewise ------------------------------------------------------------------------------------------------------------
-
-
-@settings(max_examples=20, deadline=None)
-@given(seed=seeds, count=st.integers(2, 5))
-def test_equal_regions_are_the_uniform_topology(seed: int, count: int) -> None:
-    nodes, hands = cloud(seed), cloud(seed + 1, 2) + 0.3
-    labels = graphs.regions(nodes, count)
-    pieces = graphs.piecewise_topology(nodes, hands, labels, [0.3] * count, [6] * count, 0.5, 4)
-    whole = graphs.uniform_topology(nodes, hands, 0.3, 6, 0.5, 4)
-    np.testing.assert_array_equal(pieces.springs, whole.springs)
-    np.testing.assert_array_equal(pieces.rest_lengths, whole.rest_lengths)
-    np.testing.assert_array_equal(pieces.labels, labels)
 
 
 @settings(max_examples=20, deadline=None)
@@ -272,12 +198,6 @@ def test_calibrated_controller_springs_rest_in_frame_0_and_body_springs_in_the_r
     np.testing.assert_allclose(calibrated.rest_lengths[body:], graphs.distances(frame0, plain.springs[body:]), rtol=LENGTH)
 
 
-def test_another_place_of_rest_is_refused() -> None:
-    made = graphs.piecewise_topology(cloud(3), cloud(4, 3), np.zeros(25, np.int32), [0.5], [6], 0.6, 4)
-    with pytest.raises(InputError, match=r"rest_shape.*first_frame.*'hands'"):
-        replace(made, controller_rest="hands")
-
-
 # One piece ------------------------------------------------------------------------------------------------------------
 
 TWO = np.array([[0, 1], [2, 1]])
@@ -313,38 +233,11 @@ def test_a_part_behind_a_gap_is_joined_along_its_seam() -> None:
     assert len(seam) == graphs.REPAIR_SPRINGS * len(small)
 
 
-def test_a_seam_is_no_longer_than_the_part_that_is_near() -> None:
-    """A row that leads away from the body is joined by its end alone."""
-    body = np.stack(np.meshgrid(np.arange(4.0), np.arange(4.0), [0.0], indexing="ij"), -1).reshape(-1, 3)
-    nodes = np.concatenate([body, np.array([[6.0 + k, 0, 0] for k in range(5)])])
-    mended = graphs.joined(nodes, same(nodes, 1.2, 5))
-    assert pieces(len(nodes), mended) == 1
-    long = mended[graphs.distances(nodes, mended) > 1.2]
-    assert set(long.ravel().tolist()) & set(range(16, 21)) == {16, 17}
-
-
 def test_many_parts_become_one_whatever_is_near_to_what() -> None:
     """Pairs that are nearer to each other than to the body join first, and then the body."""
     nodes = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [20, 0, 0], [21, 0, 0], [23, 0, 0], [24, 0, 0]])
     assert pieces(8, graphs.joined(nodes, np.array([[0, 1], [1, 2], [2, 3], [4, 5], [6, 7]]))) == 1
     assert pieces(6, graphs.joined(nodes[:6], np.zeros((0, 2), int))) == 1, "from no spring at all"
-
-
-def test_repair_joins_what_hangs_on_a_hand_alone() -> None:
-    nodes, hands = np.array([[0.0, 0, 0], [0.1, 0, 0], [1, 0, 0], [2, 0, 0]]), np.array([[2.0, 0.05, 0]])
-    one, values = np.zeros(4, np.int32), ([0.2], [5], 0.1, 5)
-    assert undirected(graphs.piecewise_topology(nodes, hands, one, *values).springs) == {(0, 1), (3, 4)}
-    mended = graphs.piecewise_topology(nodes, hands, one, *values, repair=True)
-    assert undirected(mended.springs) == {(0, 1), (3, 4), (1, 2), (2, 3), (0, 2), (0, 3), (1, 3)}
-    assert mended.object_spring_count == 6
-
-
-@pytest.mark.parametrize("copies", [2, 5])
-def test_nodes_at_the_same_place_are_no_partners(copies: int) -> None:
-    nodes = np.concatenate([np.zeros((copies, 3)), np.eye(3), 2 * np.eye(3)])
-    chain = np.array([[copies + i, copies + j] for i in range(6) for j in range(i)])
-    mended = graphs.joined(nodes, chain)
-    assert undirected(mended) == undirected(chain) | {(i, copies + j) for i in range(copies) for j in range(3)}
 
 
 # The spacing of nodes -------------------------------------------------------------------------------------------------
@@ -379,22 +272,6 @@ def test_it_scales_with_the_body_and_forgets_the_order_of_its_nodes():
     expected = graphs.node_spacing(nodes)
     assert graphs.node_spacing(1000 * nodes) == pytest.approx(1000 * expected, rel=DOUBLE)
     assert graphs.node_spacing(nodes[rng.permutation(144)]) == pytest.approx(expected, rel=DOUBLE)
-
-
-def test_holes_and_nodes_at_the_same_place_do_not_count():
-    rope = lattice(60, 1, 1)
-    assert graphs.node_spacing(np.delete(rope, [10, 11, 30], axis=0)) == pytest.approx(1.0, rel=DOUBLE)
-    assert graphs.node_spacing(np.concatenate([rope, rope[::3]])) == pytest.approx(1.0, rel=DOUBLE)
-
-
-def test_parts_that_lie_farther_than_any_neighbor_are_a_forest():
-    body = lattice(8, 8, 1)
-    assert graphs.node_spacing(np.concatenate([body, body + 1000])) == pytest.approx(1.0, rel=DOUBLE)
-
-
-def test_one_place_has_no_spacing():
-    with pytest.raises(InputError, match="two nodes at different places"):
-        graphs.node_spacing(np.ones((3, 3)))
 
 
 def test_the_reach_is_that_of_the_nearest_controller():

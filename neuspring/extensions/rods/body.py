@@ -72,27 +72,27 @@ v_x, c v_y, -ground_elasticity v_z), c = max(0, 1 - ground_friction (1 + ground_
     def search(
         self, observations: Observations, pool: Sequence[Observations], settings: Config, options: SearchOptions
     ) -> RodResult:
-        """The constants of a rod; see `rod_fit.search_rod`. It has no regions and no chance, and begins anew."""
+        """The constants of a rod; see `fit.search_rod`. It has no regions and no chance, and begins anew."""
         from neuspring.extensions.rods.fit import search_rod
 
         device, threads = options.device, options.threads
         return search_rod(observations, pool, settings, device=device, threads=threads, record=options.record)
 
     def fit(self, problem: FitProblem, *, partial: Path | None = None, key: str = "", threads: int = 1) -> RodResult:
-        """All that is unknown of a rod; see `rod_fit.fit_rod`. It begins anew."""
+        """All that is unknown of a rod; see `fit.fit_rod`. It begins anew."""
         from neuspring.extensions.rods.fit import fit_rod
 
         settings, read = problem.fit.section(RodFit), (problem.observations, problem.pool, problem.twin)
         return fit_rod(*read, settings, oracle=problem.oracle, device=problem.device, threads=threads)
 
     def require_pool(self, here: Observations, pool: Sequence[Observations]) -> None:
-        """Recordings of one center line; see `rod_fit.require_pool`. Nodes around the line are free."""
+        """Recordings of one center line; see `fit.require_pool`. Nodes around the line are free."""
         from neuspring.extensions.rods.fit import require_pool
 
         require_pool(here, pool)
 
     def on_recording(self, twin: Twin, observations: Observations) -> Twin:
-        """The rod on the line of frame 0; see `rod.on_recording`."""
+        """The rod on the line of frame 0; see `made.on_recording`."""
         from neuspring.extensions.rods.made import on_recording
 
         return on_recording(twin, observations)

@@ -4,6 +4,8 @@ With errors e of all coordinates of tracked points in the frames of the horizon,
 
     mean(sqrt(e^2 + b^2) - b) + PRIOR sum((q / s)^2).
 
+With the weighted residuals r and their derivatives J, a step d solves (J'J + damping diag J'J) d = -J'r within bounds, for several
+dampings at once. The best step is taken if it lowers the objective, and the damping follows it.
 Derivatives are finite differences: a rollout per variable and recording, all of them lanes of one solver in double precision.
 Positive numbers are varied on logarithmic scales, and those along the arc as fields (`RodFit`) or joint by joint.
 
@@ -29,7 +31,6 @@ from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.core.files import write_table
 from neuspring.core.text import Progress
 from neuspring.extensions.rods import made
-from neuspring.extensions.rods.levenberg import LevenbergMarquardt
 from neuspring.extensions.rods.nodes import PARALLEL, RodFrames, settled
 from neuspring.extensions.rods.rod import Rod, rod_of
 from neuspring.extensions.rods.settings import RodFit
@@ -52,6 +53,8 @@ LEAST_GAIN = 2e-3
 """A step that lowers the objective by less than this part of it is a stage's last."""
 DAMPINGS = (0.1, 1.0, 10.0, 100.0)
 """Factors on the damping, for each step that is tried."""
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-6, 1e6
+"""Damping of a stage's first step, and its range. It grows while no step lowers the objective."""
 LAUNCHED = 16
 """Frames kept of a launch."""
 STIFFNESS_TRIED = np.arange(-2.0, 9.0, 0.5)
@@ -358,28 +361,49 @@ class Levenberg:
         scale, b = variables.scale, self.settings.robust
         errors = self.errors(variables, [q], frames, every)[0]
         value = float(self.objective(errors, q, scale))
-        descent = LevenbergMarquardt(
-            base=q, cost=value, damping=1e-2, factors=DAMPINGS, raised=DAMPINGS[-1] * 10, least=1e-6, most=1e6, tolerance=LEAST_GAIN
-        )
+        damping = FIRST_DAMPING
         for _ in range(self.settings.rounds):
-            q, steps, bound = descent.base, np.diag(SCALED_STEP * scale), np.ones(len(scale))
             # In the units of their scales, so that bounds and damping mean the same for all.
-            slopes = (self.errors(variables, list(q + steps), frames, every) - errors) / SCALED_STEP
+            slopes = (self.errors(variables, list(q + np.diag(SCALED_STEP * scale)), frames, every) - errors) / SCALED_STEP
             weights = 1 / np.sqrt(errors**2 + b**2) / len(errors)
             products = (slopes * weights) @ slopes.T + 2 * PRIOR * np.eye(len(q))
             gradient = slopes @ (weights * errors) + 2 * PRIOR * q / scale
-            best = None
-            while best is None and descent.damping <= descent.most:
-                tried = [q + scale * move for move in descent.moves(products, gradient, -bound, bound)]
+            best, before = None, value
+            while best is None and damping <= MOST_DAMPING:
+                tried = [q + scale * damped_step(products, gradient, damping * factor) for factor in DAMPINGS]
                 found = self.errors(variables, tried, frames, every)
-                best = descent.take(tried, list(self.objective(found, np.array(tried), scale)))
+                costs = self.objective(found, np.array(tried), scale)
+                best = int(np.argmin(costs))
+                if not costs[best] < value:
+                    best, damping = None, damping * (DAMPINGS[-1] * 10)
             if best is None:
                 break
-            errors, norm = found[best], float(np.linalg.norm(gradient))
-            report({"loss": float(3 * np.mean(errors**2)), "gradient_norm": norm, "learning_rate": descent.damping})
-            if descent.finished:
+            q, value, errors = tried[best], float(costs[best]), found[best]
+            damping = max(damping * DAMPINGS[best], LEAST_DAMPING)
+            norm = float(np.linalg.norm(gradient))
+            report({"loss": float(3 * np.mean(errors**2)), "gradient_norm": norm, "learning_rate": damping})
+            if before - value < LEAST_GAIN * before:
                 break
-        return descent.base
+        return q
+
+
+def damped_step(products: np.ndarray, gradient: np.ndarray, damping: float) -> np.ndarray:
+    """d that solves (A + damping diag A) d = -g for A [V, V], g [V], and -1 <= d <= 1; what leaves is held at its bound."""
+    scale = np.diag(products)
+    # A variable without effect stays where it is.
+    matrix = products + damping * np.diag(np.maximum(scale, 1e-12 * scale.max()))
+    step, free = np.zeros(len(gradient)), scale > 1e-12 * scale.max()
+    while free.any():
+        rest = -(gradient + matrix[:, ~free] @ step[~free])
+        step[free] = np.linalg.solve(matrix[np.ix_(free, free)], rest[free])
+        beyond = np.where(free, np.abs(step) - 1, 0.0)
+        if beyond.max() <= 0:
+            break
+        # One at a time: where it is held, others may not leave any more.
+        worst = int(np.argmax(beyond))
+        step[worst] = np.clip(step[worst], -1, 1)
+        free[worst] = False
+    return step
 
 
 @dataclass(frozen=True, kw_only=True)

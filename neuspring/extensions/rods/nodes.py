@@ -20,7 +20,7 @@ from neuspring.core.artifacts import Simulation, Twin
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.extensions.rods.rod import Rod, rod_of
 from neuspring.extensions.rods.solver import RodHands, RodLanes, RodSolver
-from neuspring.physics.controllers import ControllerSprings, begins
+from neuspring.physics.controllers import ControllerSprings
 from neuspring.physics.parameters import CONTACT_LIMITS
 
 PARALLEL = 0.99
@@ -285,12 +285,6 @@ class RodFrames:
         edge, place = (values.repeat(len(x), 1, *[1] * (values.dim() - 2)) for values in (self._edge, self._place))
         nodes: torch.Tensor = placed(x.flatten(0, 1), m1.flatten(0, 1), edge, place).unflatten(0, x.shape[:2])
         return nodes
-
-    def resume(self, rows: torch.Tensor, positions: Sequence[np.ndarray]) -> None:
-        """As `FrameSolver.resume`, of one twin."""
-        known = torch.nonzero(begins(rows).any(dim=-1)).flatten().tolist()
-        states = [self._tensor([positions[number]]) for number in known]
-        self._lengths = self.grips.taken_before([rows[number][None].double() for number in known], states)
 
     def follow(self, other: RodFrames) -> None:
         """Take the state of another solver of the same rods, whose springs may be others."""

@@ -27,7 +27,7 @@ class RodSettings(SettingsSection):
 
 @dataclass(frozen=True, kw_only=True)
 class RodFit(SettingsSection):
-    """Levenberg-Marquardt on whole recordings (twin/rod_fit.py), for methods whose `fit` is rod."""
+    """Levenberg-Marquardt on whole recordings (rods/fit.py), for methods whose `fit` is rod."""
 
     stiffness: Literal["constant", "knots", "free"] = "constant"
     """EI and GJ along the arc: one value each; a smooth field, cubic between `knots`; free at each joint."""

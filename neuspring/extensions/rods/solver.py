@@ -1,7 +1,7 @@
 """Discrete elastic rods (Bergou et al. 2008, 2010) in lanes: many rods of as many vertices advance together, one thread each.
 
-`reference.py` is the specification: energies, and forces as their gradients. Here the same forces are written out, and a
-substep is implicit, so that it stays stable for the stiffest cable. With BDF2 (backward Euler in the first substep and after a
+Forces are the gradients of the energies in README.md, written out. A substep is implicit, so that it stays stable for the stiffest
+cable. With BDF2 (backward Euler in the first substep and after a
 contact)
 
     x1 = x* + g v1,   v1 = v* + g a(x1, v1),   x* = (4 x0 - x_) / 3,   v* = (4 v0 - v_) / 3,   g = 2 h / 3,
@@ -720,24 +720,6 @@ def advance(
             turned[frame, lane, i] = s.m1[lane, i]
 
 
-ROD_LANE_FIELDS = (
-    "lengths",
-    "mass",
-    "bending",
-    "twisting",
-    "curvature",
-    "axis",
-    "stretching",
-    "damping",
-    "drag_quadratic",
-    "roll",
-    "slip",
-    "slip_twist",
-    "by_angle",
-)
-"""Fields of a `Rod` that lanes have one value of each."""
-
-
 @dataclass(frozen=True)
 class RodLanes:
     """Parameters of B rods with as many vertices, float64 on the CPU: those of `Rod` with a leading axis [B].
@@ -765,9 +747,9 @@ class RodLanes:
     @classmethod
     def of(cls, rods: Sequence[Rod], drags: Sequence[float]) -> "RodLanes":
         """Lanes of rods and their linear drags, 1/s."""
-        values = {name: np.array([getattr(rod, name) for rod in rods], dtype=np.float64) for name in ROD_LANE_FIELDS}
+        values = {each.name: np.array([getattr(rod, each.name) for rod in rods]) for each in fields(cls) if each.name != "drag"}
         values["axis"] = np.repeat(values["axis"][:, None], 2, axis=1)
-        return cls(**values, drag=np.array(drags, dtype=np.float64), held=np.array([rod.held for rod in rods], dtype=np.int32))
+        return cls(**values, drag=np.array(drags, dtype=np.float64))
 
 
 @dataclass(frozen=True)
@@ -783,24 +765,9 @@ class RodHands:
     friction: np.ndarray
 
 
-STATE = (
-    "x",
-    "v",
-    "x_before",
-    "v_before",
-    "t",
-    "u",
-    "m1",
-    "m2",
-    "theta",
-    "theta_before",
-    "reference",
-    "tension",
-    "k",
-    "k_before",
-    "z",
-    "history",
-)
+OF_HANDS = ("spring_edge", "spring_place", "law", "hands")
+"""State of springs, which another solver of the same rods may have others of."""
+STATE = [name for name in RodState.vars if name not in (*OF_HANDS, *(each.name for each in (*fields(RodLanes), *fields(RodHands))))]
 """State that `RodSolver.follow` takes over."""
 
 
@@ -811,46 +778,19 @@ class RodSolver:
         self.lanes, self.simulation, self.device, self.hands = lanes, simulation, device, hands
         count, vertices = lanes.mass.shape
         self.count, self.vertices = count, vertices
-        kinds: dict[str, Any] = {
-            "x": vec3,
-            "v": vec3,
-            "x_before": vec3,
-            "v_before": vec3,
-            "p": vec3,
-            "t": vec3,
-            "u": vec3,
-            "m1": vec3,
-            "m2": vec3,
-        }
-        kinds |= {"kb": vec3, "theta": real, "theta_before": real, "reference": real, "tension": real, "k": vec2, "k_before": vec2}
-        kinds |= {"lower": real, "diagonal": real, "rest": real}
-        self._state = RodState()
-        for name, dtype in kinds.items():
-            setattr(self._state, name, wp.zeros((count, vertices), dtype=dtype, device=device))
-        self._state.z = wp.zeros((count, vertices, lanes.slip.shape[1]), dtype=vec3, device=device)
-        self._state.history = wp.zeros(count, dtype=wp.int32, device=device)
-        self._state.a = wp.zeros((count, 4 * vertices, 11), dtype=real, device=device)
-        self._state.w = wp.zeros((count, 3, 11), dtype=real, device=device)
-        self._state.b = wp.zeros((count, 4 * vertices), dtype=real, device=device)
-        vectors: dict[str, Any] = {"curvature": vec2, "axis": vec3, "slip": vec2}
-        for each in fields(RodLanes):
-            kind: Any = wp.int32 if each.name == "held" else vectors.get(each.name, real)
-            values = np.ascontiguousarray(getattr(lanes, each.name))
-            setattr(self._state, each.name, wp.array(values, dtype=kind, device=device))
-        self._add_hands(hands)
-
-    def _add_hands(self, hands: RodHands | None) -> None:
-        """Buffers of springs and ground; sizes of 0 where there are none."""
         springs, controllers = (hands.leader.shape[1], hands.controllers) if hands else (0, 0)
-        shapes: dict[str, tuple[Any, int]] = {"spring_edge": (wp.int32, springs), "spring_place": (vec3, springs)}
-        shapes |= {"law": (vec3, springs), "hands": (vec3, controllers)}
-        for name, (dtype, size) in shapes.items():
-            setattr(self._state, name, wp.zeros((self.count, size), dtype=dtype, device=self.device))
-        if hands is not None:
-            kinds: dict[str, Any] = {"leader": wp.int32, "clearance": real, "elasticity": real, "friction": real}
-            for name, dtype in kinds.items():
-                values = np.ascontiguousarray(getattr(hands, name))
-                setattr(self._state, name, wp.array(values, dtype=dtype, device=self.device))
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("spring_edge", "spring_place", "law", "leader"), (count, springs))
+        shapes |= dict.fromkeys(("history", "elasticity", "friction"), (count,))
+        shapes |= {"hands": (count, controllers), "z": (count, vertices, lanes.slip.shape[1])}
+        shapes |= {"a": (count, 4 * vertices, 11), "w": (count, 3, 11), "b": (count, 4 * vertices)}
+        self._state = RodState()
+        for name, variable in RodState.vars.items():
+            given, kind = getattr(lanes, name, getattr(hands, name, None)), variable.type.dtype
+            if given is None:
+                array = wp.zeros(shapes.get(name, (count, vertices)), dtype=kind, device=device)
+            else:
+                array = wp.array(np.ascontiguousarray(given), dtype=kind, device=device)
+            setattr(self._state, name, array)
         self._ends = wp.to_torch(self._state.hands)[None]
 
     def bind(self, edge: torch.Tensor, place: torch.Tensor) -> None:

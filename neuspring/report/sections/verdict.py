@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import shlex
+
+from neuspring.core.job_records import asked
 from neuspring.report import tables
-from neuspring.report.blocks import Block, PageSection, Text
+from neuspring.report.blocks import Block, Code, PageSection, Text
 from neuspring.report.data import ReportData, ReportSection
 from neuspring.report.tables import several
 
@@ -12,6 +15,9 @@ def verdict(material: ReportData) -> PageSection:
     """The verdict, and how many jobs failed and files cannot be read."""
     text = f"Nothing to report yet: {material.results.resolve().name} holds no run, and none was asked for."
     blocks: list[Block] = tables.verdict(material.numbers) if len(material.table.runs) else [Text(text=text, tone="warn")]
+    command = asked(material.results).get("command")
+    if command and (material.table.runs["status"] != "ok").any():
+        blocks += [Text(text="Finish what is missing; finished runs are kept:"), Code(text=shlex.join(command), whole=True)]
     failed = sum(job.failed for job in material.jobs)
     for count, noun, what in ((failed, "job", "failed"), (len(material.damaged), "file", "cannot be read")):
         if count:

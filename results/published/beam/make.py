@@ -41,10 +41,10 @@ from neuspring.data.c3d import Markers
 from neuspring.extensions.rods.rod import Rod
 from neuspring.extensions.rods.solver import RodLanes, RodSolver
 from neuspring.physics.parameters import homogeneous
-from neuspring.physics.statics import at_rest, young
 from neuspring.physics.topology import build, object_springs
 from neuspring.twin.body import body_of
 from neuspring.twin.rollout import roll_out
+from results.published.beam.statics import at_rest, young
 
 NAME = re.compile(r"(?:gravity|load(?P<grams>\d+))_V2_(?P<take>\w+)\.c3d")
 LENGTH, WIDTH, DENSITY, GRAVITY = 0.1, 0.03, 1070.0, 9.81

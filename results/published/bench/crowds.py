@@ -65,9 +65,6 @@ def by_topologies(bench: Bench) -> list[Row]:
             Entry(first, twins[0], one_by_one(bench, twins, hands, gradient), "", count, own),
             Entry(second, twins[0], crowd, first, count, own),
         ]
-        if bench.on_gpu:
-            blocks = bench.blocks.together(twins, hands, gradient=gradient)
-            entries.append(Entry(f"{count} topologies, a block each, {kind}", twins[0], blocks, first, count, own))
         rows += timed(bench, "topologies", entries)
         agree(bench, entries)
     return rows

@@ -21,12 +21,12 @@ class Ours:
 
     name = "ours"
 
-    def __init__(self, device: str = "cpu", block: int = 0) -> None:
-        self.device, self.block = device, block
+    def __init__(self, device: str = "cpu") -> None:
+        self.device = device
 
     def forward(self, twin: Twin, hands: np.ndarray) -> Frame:
         """One frame of one twin, by a solver that keeps no substeps."""
-        solver = solver_for(twin, self.device, block=self.block, differentiable=False)
+        solver = solver_for(twin, self.device, differentiable=False)
         x, v, begin, end = self._start(twin, hands)
         last: list[torch.Tensor] = []
 
@@ -37,7 +37,7 @@ class Ours:
 
     def forward_backward(self, twin: Twin, hands: np.ndarray) -> Frame:
         """One frame of one twin and the gradient of its loss."""
-        solver = solver_for(twin, self.device, block=self.block, differentiable=True)
+        solver = solver_for(twin, self.device, differentiable=True)
         x, v, begin, end = self._start(twin, hands)
         parameters = self._packed(twin)
         last: list[torch.Tensor] = []
@@ -58,7 +58,7 @@ class Ours:
 
         Their topologies may differ. Positions [N, 3] and gradient [S] of the frame are those of the first twin.
         """
-        solver = solver_for(twins, self.device, block=self.block, differentiable=gradient)
+        solver = solver_for(twins, self.device, differentiable=gradient)
         union = Union([twin.topology for twin in twins])
         parameters = union.parameters([packed(twin, self.device) for twin in twins])
         x, v, begin, end = (values.expand(len(twins), -1, -1).contiguous() for values in self._start(twins[0], hands))
@@ -83,7 +83,7 @@ class Ours:
 
     def chain(self, twin: Twin, path: np.ndarray) -> Callable[[], object]:
         """The gradient of the loss after all frames of a path of the hands [F + 1, C, 3]."""
-        solver = solver_for(twin, self.device, block=self.block, differentiable=True)
+        solver = solver_for(twin, self.device, differentiable=True)
         steps = torch.tensor(path, dtype=torch.float32, device=self.device)
         start, rest, *_ = self._start(twin, path[:2])
         parameters = self._packed(twin)

@@ -14,8 +14,6 @@ from results.published.bench.table import Row
 
 KINDS = (("forward", False), ("forward + backward", True))
 """What is timed of a frame, and whether with its gradient."""
-BLOCK = 256
-"""Threads of a block that has a twin to itself."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +26,6 @@ class Bench:
     quick: bool = False
     notes: list[str] = field(default_factory=list)
     """What a reader of the table should know of this run."""
-
-    @property
-    def blocks(self) -> Ours:
-        """Ours with a block of threads per twin."""
-        return Ours(self.device, BLOCK)
 
     @property
     def on_gpu(self) -> bool:

@@ -22,8 +22,6 @@ from results.published.bench.table import Row
 
 TOGETHER = 16
 """Twins of one call in the first section: the lanes of a vector."""
-EVERY_MULTIPROCESSOR = 132
-"""Twins of one call that fill an H100 or H200 with blocks."""
 
 
 def frames(bench: Bench) -> list[Row]:
@@ -45,11 +43,6 @@ def _company(bench: Bench, case: str, twin: Twin, hands: np.ndarray) -> Iterator
         yield Entry(alone, twin, frame_of(bench.ours, twin, hands, gradient))
         crowd = bench.ours.together(softer(twin, TOGETHER), hands, gradient=gradient)
         yield Entry(f"{alone}, {TOGETHER} together", twin, crowd, alone, TOGETHER)
-        if bench.on_gpu:
-            yield Entry(f"{alone}, a block", twin, frame_of(bench.blocks, twin, hands, gradient), alone)
-            for count in (TOGETHER, EVERY_MULTIPROCESSOR):
-                crowd = bench.blocks.together(softer(twin, count), hands, gradient=gradient)
-                yield Entry(f"{alone}, {count} blocks", twin, crowd, alone, count)
         if bench.peer:
             yield Entry(f"{alone}, {bench.peer.name}", twin, frame_of(bench.peer, twin, hands, gradient), alone)
 

@@ -53,43 +53,6 @@ def crooked(vertices: int = 8, spacing: float = 0.05, bend: float = 0.2, seed: i
     return straight(vertices, spacing * (vertices - 1)) + noise
 
 
-def helix(vertices: int, radius: float, rise: float, turn: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] of a helix about z, `turn` rad and `rise` m from each to the next, and the curvatures [V, 2] that it has.
-
-    A joint bends by the angle phi, and the plane of bending turns by psi about the edge from a joint to the next; a frame without
-    twist sees kb = 2 tan(phi / 2) turn by psi. Curvatures belong to directors whose m2 is, at joint 1, along kb.
-    """
-    angles = turn * np.arange(vertices)
-    points = np.stack([radius * np.cos(angles), radius * np.sin(angles), rise * np.arange(vertices)], axis=1)
-    edges = np.diff(points, axis=0)
-    t = edges / np.linalg.norm(edges, axis=1, keepdims=True)
-    normals = np.cross(t[:-1], t[1:])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    phi = np.arccos(t[0] @ t[1])
-    psi = np.arctan2(np.cross(normals[0], normals[1]) @ t[1], normals[0] @ normals[1])
-    around = psi * (np.arange(vertices) - 1)
-    return points, 2 * np.tan(phi / 2) * np.stack([np.cos(around), np.sin(around)], axis=1)
-
-
-def coil(vertices: int, held: Any) -> Rod:
-    """A rod at rest in a helix of 5 cm radius."""
-    points, curvature = helix(vertices, radius=0.05, rise=0.02, turn=0.7)
-    first, second = points[1] - points[0], points[2] - points[1]
-    # m2 of edge 0 is along kb, so m1 is along kb x t.
-    return rod(points, held, curvature=curvature, axis=np.cross(np.cross(first, second), first))
-
-
-SAG = 1e-3
-"""Of the end of `cantilever` in theory, q L^4 / (8 EI), m."""
-
-
-def cantilever(vertices: int) -> Rod:
-    """A beam of 1 m and 1 kg/m for 9.8 m/s^2. A clamp holds the middle of an edge: there the free length ends."""
-    spacing = 1 / (vertices - 1.5)
-    bending = 9.8 / (8 * SAG)
-    return rod(straight(vertices, spacing * (vertices - 1)), (0, 1), bending=bending, twisting=bending, stretching=1e7)
-
-
 def column(segments: int, load: float, stretching: float = 1e7) -> Rod:
     """A column of 1 m and EI = 1 N m^2 between two hinges; its length at rest is so much longer that it carries `load`, N."""
     lengths = np.full(segments, 1 / segments / (1 - load / stretching))
@@ -110,6 +73,26 @@ def twisted(segments: int, moment: float, **changes: Any) -> Rod:
     points = straight(segments + 2, 1 + 1 / segments)
     values = {"bending": 1.0, "twisting": 2.0, "stretching": 1e4, "roll": moment / 2.0}
     return rod(points, (0, 1, segments, segments + 1), **(values | changes))
+
+
+LENGTH = 0.5
+JAWS = np.array([[-0.05, 0, 0], [0, 0, 0], [-0.05, 0, 0.02]])
+"""Outer and inner controller on the line, and the one that says the roll, m in the frame of the hand."""
+
+
+def clamped(vertices: int, length: float = LENGTH, **changes: Any) -> Rod:
+    """A straight rod along x whose first edge a hand with a pose clamps in its middle, at the origin."""
+    edge = length / (vertices - 1.5)
+    x = edge * (np.arange(vertices) - 0.5)[:, None] * np.array([1.0, 0, 0])
+    values = {
+        "bending": 0.02,
+        "twisting": 0.02,
+        "stretching": 1e4,
+        "axis": np.array([0, 0, 1.0]),
+        "tilts": np.zeros((2, 2)),
+        "by_angle": 1.0,
+    }
+    return rod(x, (0, 1), rolls=np.array([2, -1], np.int32), **(values | changes))
 
 
 def simulation(**changes: Any) -> Simulation:

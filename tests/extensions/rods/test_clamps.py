@@ -10,35 +10,15 @@ import torch
 from scipy.integrate import solve_bvp
 from scipy.spatial.transform import Rotation
 
-from neuspring.core.errors import NumericalFailure
 from neuspring.extensions.rods.nodes import Clamps, hanging
 from neuspring.extensions.rods.rod import Rod
 from neuspring.extensions.rods.solver import RodLanes, RodSolver
 from tests.extensions.rods import make
 
-LENGTH = 0.5
-JAWS = np.array([[-0.05, 0, 0], [0, 0, 0], [-0.05, 0, 0.02]])
-"""Outer and inner controller on the line, and the one that says the roll, m in the frame of the hand."""
-
-
-def held(vertices: int, length: float = LENGTH, **changes: object) -> Rod:
-    """A straight rod along x whose first edge a hand with a pose clamps in its middle, at the origin."""
-    edge = length / (vertices - 1.5)
-    x = edge * (np.arange(vertices) - 0.5)[:, None] * np.array([1.0, 0, 0])
-    values = {
-        "bending": 0.02,
-        "twisting": 0.02,
-        "stretching": 1e4,
-        "axis": np.array([0, 0, 1.0]),
-        "tilts": np.zeros((2, 2)),
-        "by_angle": 1.0,
-    }
-    return make.rod(x, (0, 1), rolls=np.array([2, -1], np.int32), **(values | changes))
-
 
 def moved(rod: Rod, turns: Rotation, shifts: np.ndarray, drag: float = 0.0, **changes: object) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [F, V, 3] and m1 [F, E, 3] behind each frame of a hand with rotations [F + 1] and positions [F + 1, 3]."""
-    hands = np.stack([turns.apply(jaw) for jaw in JAWS], axis=1) + shifts[:, None]
+    hands = np.stack([turns.apply(jaw) for jaw in make.JAWS], axis=1) + shifts[:, None]
     paths, axes = Clamps.of([rod]).paths(make.real(hands)[:, None])
     solver = RodSolver(RodLanes.of([rod], [drag]), make.simulation(**changes))
     solver.start(make.real(turns[0].apply(np.array(rod.vertices)) + shifts[0])[None], torch.zeros(1, len(rod.mass), 3), axes[0])
@@ -48,7 +28,9 @@ def moved(rod: Rod, turns: Rotation, shifts: np.ndarray, drag: float = 0.0, **ch
 
 @pytest.mark.parametrize("jolt", [0.0, 0.05])
 def test_turned_and_shifted_paths_of_a_hand_move_the_rod_alike(jolt: float) -> None:
-    rod = held(9, damping=0.01, curvature=np.full((9, 2), 0.1), tilts=np.array([[0.1, -0.2], [0, 0]]), clamps=np.full((2, 3), 0.01))
+    rod = make.clamped(
+        9, damping=0.01, curvature=np.full((9, 2), 0.1), tilts=np.array([[0.1, -0.2], [0, 0]]), clamps=np.full((2, 3), 0.01)
+    )
     path = Rotation.from_rotvec(np.linspace(0, 1, 12)[:, None] * [1.0, 0.5, -0.8])
     shifts = jolt * np.sin(np.arange(12))[:, None] * [1, 2, 3]
     turn = Rotation.from_rotvec([0.4, -1.0, 0.7])
@@ -72,22 +54,22 @@ def elastica(length: float, bending: float, weight: float) -> np.ndarray:
 
 
 def test_a_rod_at_rest_is_the_elastica() -> None:
-    wanted, apart = elastica(LENGTH, 0.1, 9.8), []
+    wanted, apart = elastica(make.LENGTH, 0.1, 9.8), []
     for vertices in (9, 17, 33):
-        rod = held(vertices, bending=0.1, stretching=1e6)
-        x = hanging([rod], JAWS[None], make.simulation(gravity=9.8))[0][0]
+        rod = make.clamped(vertices, bending=0.1, stretching=1e6)
+        x = hanging([rod], make.JAWS[None], make.simulation(gravity=9.8))[0][0]
         apart.append(np.linalg.norm(x[-1, [0, 2]] - wanted))
-    assert wanted[1] < -0.2 * LENGTH, "it bends far"
-    assert apart[1] < 0.003 * LENGTH
+    assert wanted[1] < -0.2 * make.LENGTH, "it bends far"
+    assert apart[1] < 0.003 * make.LENGTH
     # Second order in the length of an edge.
     assert np.log2(apart[0] / apart[1]) == pytest.approx(2, abs=0.25)
     assert np.log2(apart[1] / apart[2]) == pytest.approx(2, abs=0.25)
 
 
 def test_a_rod_at_rest_stays_and_lanes_do_not_mix() -> None:
-    rods = [held(9, bending=each, curvature=np.full((9, 2), 0.05)) for each in (0.01, 0.05)]
-    x, m1, axes = hanging(rods, np.stack([JAWS, JAWS + 1.0]), make.simulation(gravity=9.8))
-    np.testing.assert_allclose(hanging(rods[1:], JAWS[None] + 1.0, make.simulation(gravity=9.8))[0][0], x[1], atol=1e-12)
+    rods = [make.clamped(9, bending=each, curvature=np.full((9, 2), 0.05)) for each in (0.01, 0.05)]
+    x, m1, axes = hanging(rods, np.stack([make.JAWS, make.JAWS + 1.0]), make.simulation(gravity=9.8))
+    np.testing.assert_allclose(hanging(rods[1:], make.JAWS[None] + 1.0, make.simulation(gravity=9.8))[0][0], x[1], atol=1e-12)
     solver = RodSolver(
         RodLanes.of([replace(rod, vertices=own) for rod, own in zip(rods, x, strict=True)], [0, 0]), make.simulation(gravity=9.8)
     )
@@ -95,8 +77,3 @@ def test_a_rod_at_rest_stays_and_lanes_do_not_mix() -> None:
     np.testing.assert_array_equal(solver.directors().numpy(), m1)
     later, _ = solver.frames(solver.x.expand(51, -1, -1, -1))
     np.testing.assert_allclose(later[-1].numpy(), x, atol=1e-6)
-
-
-def test_a_rod_that_never_rests_is_named() -> None:
-    with pytest.raises(NumericalFailure, match="does not come to rest"):
-        hanging([held(9, curvature=np.full((9, 2), 40.0))], JAWS[None], make.simulation(gravity=9.8))

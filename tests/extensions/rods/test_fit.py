@@ -3,11 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from neuspring import config
 from neuspring.core.artifacts import Observations, Twin
-from neuspring.core.errors import InputError
 from neuspring.extensions.rods.fit import (
     Levenberg,
     Recordings,
@@ -18,7 +16,6 @@ from neuspring.extensions.rods.fit import (
     search_rod,
 )
 from neuspring.extensions.rods.made import RodStart, rod_twin
-from neuspring.twin.fit import FitProblem
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.transfer import move
 from tests.extensions.rods import ropes
@@ -86,19 +83,6 @@ def test_a_planted_rod_is_found_and_predicts_another_recording():
     assert losses[-1] < losses[0]
 
 
-def changed(seen: Observations, matrix: np.ndarray) -> Observations:
-    """The recording in other axes."""
-    names = ("object_points", "controller_points", "tracks")
-    return replace(seen, **{name: (getattr(seen, name) @ matrix.T).astype(np.float32) for name in names})
-
-
-def uneven(seen: Observations) -> Observations:
-    """The recording at rest, its inner markers nearer to the first end."""
-    points, hands = seen.object_points.copy(), np.repeat(seen.controller_points[:1], len(seen.controller_points), axis=0)
-    points[:, 1:] -= 0.3 * np.diff(seen.object_points, axis=1)
-    return replace(seen, object_points=points, controller_points=hands)
-
-
 def test_markers_beside_the_line_are_found():
     truth, seen, _, _ = planted(SETTINGS.fit.rod, 3, 0.3)
     start = rod_twin(seen[0], SETTINGS, AXIS)
@@ -124,26 +108,6 @@ def test_a_hand_that_lets_go_does_not_pull_in_the_fit_either():
     rolled = roll_out(twin, seen.controller_points, valid=valid).positions[1 : 1 + len(found)]
     np.testing.assert_allclose(found, rolled, atol=1e-5)
     assert np.abs(roll_out(twin, seen.controller_points).positions[1 : 1 + len(found)] - rolled).max() > 1e-3
-
-
-def test_what_a_rod_cannot_be_fitted_to_is_refused():
-    rope = ropes.rope()
-    with pytest.raises(InputError, match=r"markers along the line.*rod_single"):
-        search_rod(rope, [rope], ropes.SETTINGS)
-    twin = rod_twin(cable("one", 0), SETTINGS, AXIS)
-    settings = {name: getattr(SETTINGS, name) for name in ("fit", "simulation", "losses")} | {"quirks": SETTINGS.released_quirks}
-    with pytest.raises(InputError, match="a rod is fitted as rod; received field"):
-        FitProblem(observations=cable("one", 0), twin=twin, kind="field", **settings)
-
-
-def test_slopes_are_derivatives_of_rollouts():
-    """Those of half the step agree within the step's own error, in all variables."""
-    _, seen, variables, q = planted(replace(SETTINGS.fit.rod, stiffness="knots", knots=4), 5, 0.2)
-    solver = Levenberg(Recordings.of(seen, variables.twin), SETTINGS.fit.rod)
-    base = solver.errors(variables, [q], 10, 1)[0]
-    slopes = [(solver.errors(variables, list(q + step * np.diag(variables.scale)), 10, 1) - base) / step for step in (1e-3, 5e-4)]
-    apart = np.abs(slopes[1] - slopes[0]).max(axis=1) / (np.abs(slopes[0]).max(axis=1) + 1e-6)
-    assert apart.max() < 0.02, dict(zip(np.repeat(list(variables.sizes), list(variables.sizes.values())), apart, strict=False))
 
 
 def test_recordings_share_a_launch_and_shorter_ones_count_less():

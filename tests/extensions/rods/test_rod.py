@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 
 from neuspring import config
-from neuspring.core.errors import InputError
 from neuspring.extensions.rods.center_line import center_line
-from neuspring.extensions.rods.made import rod_twin
 from neuspring.twin.rollout import roll_out
 from neuspring.twin.transfer import move
 from tests.extensions.rods import ropes
-from tests.support import colored
 
 SINGLE = 1e-6
 """m: rounding of float32 nodes."""
@@ -35,29 +32,6 @@ def test_a_line_is_found_in_unordered_nodes():
     ends = {tuple(np.round(point, 2)) for point in (arc(2)[0], arc(2)[1])}
     assert {tuple(np.round(point, 2)) for point in line[[0, -1]]} == ends
     assert np.array_equal(center_line(nodes, 20), line)
-
-
-def test_points_beside_the_body_and_gaps_do_not_bend_the_line():
-    nodes = ropes.tube(ropes.straight(80))
-    gap = nodes[(nodes[:, 0] < 0.1) | (nodes[:, 0] > 0.2)]
-    beside = np.random.default_rng(1).uniform([0.25, 0.03, 0.1], [0.3, 0.06, 0.12], (len(gap) // 20, 3))
-    line = center_line(np.concatenate([gap, beside]), 12)
-    assert np.linalg.norm(line[:, 1:] - [0, ropes.HEIGHT], axis=1).max() < 0.1 * ropes.RADIUS
-    np.testing.assert_allclose(line[[0, -1], 0], [0, ropes.LENGTH], atol=0.2 * ropes.RADIUS)
-
-
-@pytest.mark.parametrize("shape", ["ball", "cross", "ring"])
-def test_what_is_no_rod_is_refused(shape):
-    circle = 2 * np.pi * np.arange(60) / 60
-    shapes = {
-        "ball": np.random.default_rng(0).normal(size=(300, 3)),
-        "cross": np.concatenate(
-            [ropes.tube(ropes.straight(40)), ropes.tube(ropes.straight(40) - [0.2, 0, 0])[:, [1, 0, 2]] + [0.2, 0, 0]]
-        ),
-        "ring": ropes.tube(0.1 * np.stack([np.cos(circle), np.sin(circle), 0 * circle], axis=1)),
-    }
-    with pytest.raises(InputError, match=r"long and thin.*lattice"):
-        center_line(shapes[shape], 12)
 
 
 def test_markers_along_a_cable_are_the_vertices_and_clamps_move_theirs():
@@ -104,28 +78,6 @@ def test_a_hand_lifts_a_rope_and_lets_it_go():
     assert fallen[:, 2].min() > -ropes.RADIUS
 
 
-def test_a_rod_that_nothing_holds_is_refused():
-    seen = ropes.rope()
-    away = replace(seen, controller_points=seen.controller_points)
-    variables = config.SearchVariables(controller_radius=config.Variable(0.0, 1.0, 0.0))
-    none = replace(ropes.SETTINGS, search=config.Search(variables=variables))
-    with pytest.raises(InputError, match=r"a hand must hold the rod.*controller_radius"):
-        rod_twin(away, none, ropes.AXIS)
-
-
-def test_a_body_that_was_seen_without_depth_is_refused():
-    with pytest.raises(InputError, match=r"tracked in space.*without depth.*lattice"):
-        ropes.twin(colored.observed())
-
-
-def test_a_scene_with_self_collision_is_refused_before_it_is_simulated():
-    seen = ropes.rope()
-    twin = ropes.twin(seen)
-    touching = replace(twin, simulation=replace(twin.simulation, self_collision=True))
-    with pytest.raises(InputError, match=r"twin\.body.*ground alone.*lattice"):
-        roll_out(touching, seen.controller_points)
-
-
 @pytest.mark.parametrize("body", [ropes.rope, ropes.cable])
 def test_another_recording_moves_the_same_elsewhere(body):
     here = body(frames=5, move=(0.0, 0.01, 0.004))
@@ -139,20 +91,3 @@ def test_another_recording_moves_the_same_elsewhere(body):
     expected = roll_out(twin, here.controller_points).positions + shift
     # The line is found anew, in float32 coordinates.
     np.testing.assert_allclose(roll_out(moved, there.controller_points).positions, expected, atol=1e-4)
-
-
-def test_lengths_belong_to_the_cable_and_not_to_a_recording():
-    here = ropes.cable(frames=3)
-    longer = replace(here, object_points=here.object_points + np.array([0, 0, 0.002]))
-    moved = move(ropes.twin(here), longer)
-    np.testing.assert_array_equal(moved.body.lengths, ropes.twin(here).body.lengths)
-    np.testing.assert_allclose(moved.body.vertices[2:5], longer.nodes, atol=SINGLE)
-
-
-def test_recordings_of_another_body_are_refused():
-    here = ropes.cable(frames=3)
-    double = replace(here, object_points=2 * here.object_points, controller_points=2 * here.controller_points)
-    with pytest.raises(InputError, match="as long as the twin's"):
-        move(ropes.twin(here), double)
-    with pytest.raises(InputError, match=r"center line of 7 vertices.*no line"):
-        move(ropes.twin(here), ropes.rope())

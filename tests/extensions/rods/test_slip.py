@@ -12,7 +12,6 @@ import torch
 import warp as wp
 from scipy.integrate import solve_bvp
 
-from neuspring.core.errors import InputError
 from neuspring.extensions.rods.rod import Rod
 from neuspring.extensions.rods.solver import RodLanes, RodSolver
 from tests.extensions.rods import make
@@ -46,53 +45,6 @@ def energy(body: Rod, solver: RodSolver) -> float:
     """Kinetic energy and all that joints and edges have stored, those of branches among them, J."""
     mass = make.real(body.mass * (body.held < 0))
     return make.stored(solver) + float((mass * solver.v[0].square().sum(1)).sum() / 2)
-
-
-def pendulum(share: float, most: float, stiffness: float = 1.0) -> Rod:
-    """One joint that turns a mass of 1 kg at 1 m: for small angles a x'' = -stiffness (x + share e), where |e| slips at `most`."""
-    # Edges of 1 m: l is 1 m.
-    return make.rod(
-        make.straight(3, 2.0), (0, 1), bending=stiffness, twisting=stiffness, stretching=1e4, mass=np.ones(3), slip=[[share, most]]
-    )
-
-
-def half_swing(amplitude: np.ndarray, share: float, most: float) -> tuple[np.ndarray, np.ndarray]:
-    """Next amplitude and time until then of `pendulum`: it sticks as far as 2 most, then slips. Energy and two harmonic motions.
-
-    The loss is share most (A + A' - 2 most) = (A^2 - A'^2) / 2.
-    """
-    push, fast = share * most, np.sqrt(1 + share)
-    after = np.sqrt(push**2 + amplitude**2 - 2 * push * amplitude + 4 * push * most) - push
-    middle = share * (amplitude - most) / (1 + share)
-    sticking = np.arccos((amplitude - 2 * most - middle) / (amplitude - middle)) / fast
-    return after, sticking + np.pi - np.arccos((amplitude - 2 * most - push) / (after + push))
-
-
-def test_a_pendulum_swings_as_prandtl_says_and_is_damped_most_at_a_middle_amplitude() -> None:
-    share, most, h = 0.5, 1e-3, 0.01
-    first = most * np.array([1.2, 2.0, 4.0, 20.0])
-    # v^2 / 2 is what joint and branch have at the first turn, and what slipped until then.
-    speeds = np.sqrt(first**2 + share * (2 * most * first - most**2))
-    solver = started([pendulum(share, most)] * 5, frame_time=h)
-    v = torch.zeros((5, 3, 3), dtype=torch.float64)
-    v[:4, 2, 1], v[4, 2, 1] = make.real(speeds), 0.5 * most * np.sqrt(1 + share)
-    solver.start(solver.x.clone(), v)
-    rows = []
-    for _ in range(900):
-        solver.frame(solver.x, solver.x)
-        rows.append(solver.x[:, 2, 1].clone())
-    x = torch.stack(rows).numpy()
-    turns = [np.flatnonzero(np.diff(np.sign(np.diff(lane)))) + 1 for lane in x.T]
-    found, expected, times = x[[turn[0] for turn in turns[:4]], range(4)], *half_swing(first, share, most)
-    # A turn lies between samples: h^2 / 8 of it, and times are whole steps.
-    np.testing.assert_allclose(found, first, rtol=1e-3)
-    np.testing.assert_allclose([-lane[turn[1]] for lane, turn in zip(x.T[:4], turns, strict=False)], expected, rtol=1e-3)
-    np.testing.assert_allclose([h * (turn[1] - turn[0]) for turn in turns[:4]], times, atol=1.5 * h)
-    decrements = np.log(first / expected)
-    assert decrements[0] < 0.7 * decrements[1] > 0.7 * decrements[2] > 2 * decrements[3] > 0
-    # Below the curvature at which it slips, it has the frequency of the stiff rod, and no damping.
-    assert np.diff(turns[4]) * h == pytest.approx(np.pi / np.sqrt(1 + share), abs=h)
-    assert np.abs(x[:, 4]).max() == pytest.approx(-x[turns[4][-2:], 4].min(), rel=1e-3)
 
 
 def test_a_joint_goes_round_masings_loop_and_turns_as_it_slips() -> None:
@@ -158,27 +110,6 @@ def test_energy_never_grows_even_where_modes_are_fast_for_a_substep(branches: np
     assert energies[-1] < 0.6 * energies[0]
 
 
-def smooth(frames: int) -> np.ndarray:
-    """A path [T, 1, 3] of all hands."""
-    return 0.02 * np.sin(0.5 * np.arange(frames))[:, None, None] * np.array([0.3, 1.0, 0.0])
-
-
-def halvings(ends: list[torch.Tensor]) -> np.ndarray:
-    """Order of convergence from each three ends, with steps that are halved."""
-    apart = [float((before - after).norm()) for before, after in pairwise(ends)]
-    return np.log2(np.array(apart[:-1]) / apart[1:])
-
-
-@pytest.mark.parametrize(("twist", "by_angle"), [(0.0, 0.0), (0.7, 1.0)])
-def test_steps_converge_out_of_a_plane(twist: float, by_angle: float) -> None:
-    body = make.rod(make.crooked(7), (0, 1, 5, 6), slip=BRANCHES, slip_twist=twist, by_angle=by_angle, **LIVELY)
-    v, options = make.real([0.2, -0.1, 0.3]), {"frame_time": 0.005, "gravity": 9.8}
-    hands = 5 * smooth(3)
-    hands[..., 2] = 0.5 * hands[..., 1] ** 2
-    ends = [rolled(body, hands, v, substeps=n, **options) for n in (10, 20, 40)]
-    assert halvings(ends)[0] > 1.8
-
-
 def beam(vertices: int, bending: float, **changes: Any) -> Rod:
     """A beam of 1 m and 1 kg/m. A clamp holds the middle of its first edge."""
     spacing = 1 / (vertices - 1.5)
@@ -188,7 +119,7 @@ def beam(vertices: int, bending: float, **changes: Any) -> Rod:
 
 # What the end of the bent beam is off, of its length, times squared edges: angles are better than 2 tan of their half.
 @pytest.mark.parametrize(("by_angle", "off"), [(0.0, 0.58), (1.0, 0.29)])
-@pytest.mark.parametrize("vertices", [9, 17, 33])
+@pytest.mark.parametrize("vertices", [9, 17])
 def test_a_beam_is_the_elastica_and_swings_as_theory_says_with_any_number_of_vertices(
     vertices: int, by_angle: float, off: float
 ) -> None:
@@ -218,9 +149,3 @@ def test_a_beam_is_the_elastica_and_swings_as_theory_says_with_any_number_of_ver
     crossings = np.flatnonzero(np.diff(np.sign(x)))
     times = 0.002 * (crossings + x[crossings] / (x[crossings] - x[crossings + 1]))
     assert np.pi / np.diff(times).mean() / wave**2 == pytest.approx(1, abs=0.22 / (vertices - 1.5) ** 2)
-
-
-@pytest.mark.parametrize("slip", [[[-0.1, 0.3]], [[0.1, -0.3]], [[0.1, 0.2, 0.3]]])
-def test_what_is_no_branch_is_refused(slip: Any) -> None:
-    with pytest.raises(InputError, match=r"rod\.slip"):
-        make.rod(make.straight(4), (0, 1), slip=np.array(slip))

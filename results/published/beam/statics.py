@@ -35,8 +35,8 @@ UNBALANCED = 1e-6
 def at_rest(twin: Twin) -> Twin:
     """The twin in equilibrium under gravity: such are its nodes. Its rest shape stays, and controllers are where frame 0 has them.
 
-    Minimizes sum Y l0 (l / l0 - 1)^2 / 2 - sum m g x by Newton steps in a trust region. Raises InputError for another body
-    and for one that would be below the ground, NumericalFailure where nothing holds a part.
+    Hands hold in all frames. Minimizes sum Y l0 (l / l0 - 1)^2 / 2 - sum m g x by Newton steps in a trust region. Raises InputError
+    for another body and for one that would be below the ground, NumericalFailure where nothing holds a part.
     """
     from scipy.optimize import minimize
 
@@ -52,8 +52,7 @@ def at_rest(twin: Twin) -> Twin:
         points = np.concatenate([x.reshape(-1, 3), hands])
         along = points[second] - points[first]
         length = np.linalg.norm(along, axis=1)
-        slack = topology.pushes & (length > lengths) if topology.pushes.size else False
-        return along / length[:, None], length[:, None], np.where(slack, 0.0, twin.material.stiffness.astype(np.float64))[:, None]
+        return along / length[:, None], length[:, None], twin.material.stiffness.astype(np.float64)[:, None]
 
     def at_nodes(values: np.ndarray) -> np.ndarray:
         """Sums over the springs that end at each node less those that begin there [3 N], of values [S, 3]."""
