@@ -39,11 +39,11 @@ def curves_figure(panels: Mapping[str, Mapping[str, pd.Series]], seen: Mapping[s
             axis.plot(values.index, values, color=f"C{place % 10}", ls=("-", "--", ":")[place // 10 % 3], lw=1.4, label=label)
         if scenario := (seen or {}).get(title):
             axis.axvspan(scenario.train_end / scenario.frame_rate, scenario.frame_count / scenario.frame_rate, color="0.9", lw=0)
-        low, high = (np.nanmin([values.min() for values in own.values()]), np.nanmax([values.max() for values in own.values()]))
-        if seen is None and 0 < 2 * low <= high:
+        ends = np.array([(values.min(), values.max()) for values in own.values()]).reshape(-1, 2)
+        if seen is None and 0 < 2 * ends[:, 0].min(initial=np.inf) <= ends[:, 1].max(initial=0):
             axis.set_yscale("log")
         else:
-            axis.set_ylim(min(low, 0), None)
+            axis.set_ylim(np.nanmin(ends[:, 0], initial=0), None)
         axis.tick_params(labelsize=8)
     handles = {text: handle for axis in axes.flat for handle, text in zip(*axis.get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), [text.replace("`", "") for text in handles], ncols=3, **LEGEND)
