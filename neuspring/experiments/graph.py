@@ -65,7 +65,7 @@ class Unit:
     @functools.cached_property
     def digest(self) -> str:
         """Of everything that its results follow from."""
-        return _digest([self.made_of, *(one.digest for one in self.members)])
+        return digest_of([self.made_of, *(one.digest for one in self.members)])
 
 
 class Graph:
@@ -225,7 +225,7 @@ class Graph:
         """Of everything that the result of a step follows from."""
         output = self.output_of(stage, job)
         if output not in self._digests:
-            self._digests[output] = _digest(self.made_of(stage, job))
+            self._digests[output] = digest_of(self.made_of(stage, job))
         return self._digests[output]
 
     def job(self, step: Step, **places: Any) -> Job:
@@ -238,7 +238,7 @@ class Graph:
         output.parent.mkdir(parents=True, exist_ok=True)
         made = stage.job(output=output, settings=settings, **given, **self.options(stage, step.job))
         if data := self.data(stage, step.job):
-            made.record.inputs["data"] = _digest(data)
+            made.record.inputs["data"] = digest_of(data)
         return made
 
     # --- units
@@ -404,5 +404,6 @@ def _stamp(path: Any) -> str:
     return file_stamp(Path(path)) if Path(path).is_file() else ""
 
 
-def _digest(values: Any) -> str:
+def digest_of(values: Any) -> str:
+    """A digest of values that JSON can hold."""
     return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()[:16]

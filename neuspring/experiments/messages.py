@@ -17,8 +17,9 @@ from neuspring.core.findings import warnings_of
 from neuspring.core.job_records import FOLDER, keep_asked, read_jobs
 from neuspring.core.run_record import RUN_RECORD, RunRecord
 from neuspring.core.text import duration, program
+from neuspring.experiments.claim import claim
 from neuspring.experiments.gpus import NOTES
-from neuspring.experiments.graph import Graph
+from neuspring.experiments.graph import Graph, digest_of
 from neuspring.experiments.tasks import Tasks
 from neuspring.experiments.tracking.log import OUTCOME
 
@@ -35,6 +36,7 @@ def begin(graph: Graph, jobs: int, *, local: bool, cores: int | None, cluster: b
         reason = "a cluster's scheduler counts cores itself, and gives each job its GPU"
         raise InputError("--cores", reason, cores, "Leave it out; --jobs limits how many jobs there are at once.")
     config = graph.config
+    claim(Path(config.results), digest_of(plain(config)))
     (Path(config.results) / FOLDER / NOTES).unlink(missing_ok=True)
     chosen = {name: list(getattr(config, name)) for name in ("scenarios", "methods", "seeds")}
     keep_asked(

@@ -86,7 +86,6 @@ def test_a_killed_run_continues_in_the_middle_of_the_fit_and_ends_the_same(tiny_
     process.wait()
     assert json.loads((folder / "fit.json").read_text())["settings"]["fit"]["epochs"] == 3
 
-    run(project, changes, "--unlock")
     run(project, changes, "--until", "fit")
     [log] = (project / "results" / "jobs" / "fit").rglob("*.log")
     assert "continuing the fit after epoch" in log.read_text()
