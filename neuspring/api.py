@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neuspring.config import Config, parse
+from neuspring.config import Config, parse, plain
 from neuspring.config.settings import read_settings as settings_of
 from neuspring.core.artifacts import Observations, Topology, Trajectory, Twin
 from neuspring.core.errors import InputError, NumericalFailure
@@ -207,8 +207,9 @@ def fit(
     Another body has fits of its own kinds (`Body.fits`).
 
     The result has the best `twin`, of this `mass`, kg, where it is given (`with_mass`), and the `history` of losses. With a
-    `checkpoint`, a fit that was stopped goes on. Raises InputError, NumericalFailure.
+    `checkpoint`, a fit of the same twin, observations and settings that was stopped goes on. Raises InputError, NumericalFailure.
     """
+    from neuspring.core.checkpoint import checkpoint_key
     from neuspring.core.device import resolve_device
     from neuspring.twin.body import body_of
     from neuspring.twin.fit import FitProblem
@@ -225,7 +226,12 @@ def fit(
         kind=kind,
         seed=seed,
     )
-    learned = body_of(twin).fit(problem, partial=checkpoint)
+    # The number of epochs is not part of it: a longer fit begins with the same ones.
+    made_of = {name: plain(getattr(read, name)) for name in ("fit", "simulation", "losses", "released_quirks")}
+    made_of["fit"].pop("epochs")
+    inputs = {"twin": twin.digest, "observations": observations.digest}
+    key = checkpoint_key(inputs, made_of | {"kind": kind, "seed": seed}, problem.device, "neuspring.twin.fit")
+    learned = body_of(twin).fit(problem, partial=checkpoint, key=key)
     return learned if mass is None else dataclasses.replace(learned, twin=with_mass(learned.twin, mass))
 
 

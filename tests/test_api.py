@@ -1,5 +1,6 @@
 """`import neuspring as ns`: the page's blocks run, and give what the workflow gives."""
 
+import dataclasses
 import importlib
 import importlib.util
 import io
@@ -111,6 +112,24 @@ def test_pictures_leave_a_notebooks_backend_alone():
         environment |= {"MPLBACKEND": backend} if backend and importlib.util.find_spec("matplotlib_inline") else {}
         ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
         assert ("inline" if "MPLBACKEND" in environment else "agg") in ran.stdout.lower()
+
+
+def test_a_checkpoint_of_another_fit_is_not_continued(folder, tmp_path, capsys):
+    run, checkpoint = ns.load_run(folder / OWN), tmp_path / "fit.npz"
+    soft = dataclasses.replace(
+        run.twin, material=dataclasses.replace(run.twin.material, stiffness=0.5 * run.twin.material.stiffness)
+    )
+
+    def losses(twin, rate, epochs, **kept):
+        return ns.fit(run.observations, twin, {"fit": {"epochs": epochs, "learning_rate": rate}}, **kept).history["loss"].tolist()
+
+    first = losses(run.twin, 0.01, 1, checkpoint=checkpoint)
+    for twin, rate in ((soft, 0.01), (run.twin, 0.05)):
+        assert losses(twin, rate, 1, checkpoint=checkpoint) == losses(twin, rate, 1)
+        assert "made with other inputs or settings; the fit starts afresh" in capsys.readouterr().out
+    losses(run.twin, 0.01, 1, checkpoint=checkpoint)
+    assert losses(run.twin, 0.01, 2, checkpoint=checkpoint)[0] == first[0]
+    assert "continuing the fit after epoch 0" in capsys.readouterr().out
 
 
 def test_a_mass_changes_forces_and_no_motion(folder):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
+import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -197,10 +200,13 @@ def sync(results: Results = Path("results"), settings: Settings = "{}") -> int:
 
 def ui(results: Results = Path("results"), settings: Settings = "{}", host: str = "127.0.0.1", port: int = 5000) -> None:
     """Open the MLflow UI of a results folder."""
+    from neuspring.experiments.tracking.log import sync
     from neuspring.experiments.tracking.store import ENVIRONMENT, default_uri, page
 
     tracking = read_settings(settings).tracking
-    uri, place = tracking.uri or default_uri(results), page(results, tracking)
+    uri, (place, empty) = tracking.uri or default_uri(results), page(results, tracking)
+    if empty and tracking.uri is None:
+        sync(results, tracking, print)
     if uri.startswith("http"):
         print(f"The tracking server is at {uri}/{place}")
         return
@@ -208,8 +214,15 @@ def ui(results: Results = Path("results"), settings: Settings = "{}", host: str 
         socket.create_server((host, port)).close()
     except OSError as error:
         raise InputError("--port", "must be free", f"{port} ({error.strerror})", f"Give another: --port {port + 1}.") from error
-    print(f"MLflow UI: http://{host}:{port}/{place} (stop with Ctrl-C)", flush=True)
     command = [sys.executable, "-m", "mlflow", "ui", "--backend-store-uri", uri, "--host", host, "--port", str(port)]
     # Each of MLflow's four processes imports all of it, and opens the index anew for the page that asks it first.
     command += ["--workers", "1"]
-    os.execve(sys.executable, command, ENVIRONMENT | {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"} | os.environ)
+    server = subprocess.Popen(command, env=ENVIRONMENT | {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"} | os.environ)
+    with contextlib.suppress(KeyboardInterrupt):
+        while server.poll() is None:
+            with contextlib.suppress(OSError):
+                socket.create_connection((host, port), timeout=1).close()
+                print(f"MLflow UI: http://{host}:{port}/{place} (stop with Ctrl-C)", flush=True)
+                break
+            time.sleep(0.5)
+        server.wait()

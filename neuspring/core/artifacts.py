@@ -9,6 +9,7 @@ a killed job never leaves a half file that looks whole.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import re
 from dataclasses import dataclass, field
@@ -113,6 +114,15 @@ class Artifact:
 
     def check(self) -> None:
         """Raise InputError if fields contradict each other."""
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of all that a file of it would hold."""
+        arrays: dict[str, np.ndarray] = {}
+        whole = hashlib.sha256(json.dumps(self._flatten(arrays, ""), sort_keys=True, default=dataclasses.asdict).encode())
+        for name in sorted(arrays):
+            whole.update(name.encode() + arrays[name].tobytes())
+        return whole.hexdigest()
 
     def save(self, path: Path) -> None:
         """Write this artifact to `path` (.npz) atomically."""

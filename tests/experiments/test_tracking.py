@@ -81,7 +81,8 @@ def test_parameters_are_what_has_not_its_default_under_the_names_of_the_configur
 
 def test_the_page_opens_with_scores_as_columns_and_says_what_is_missing(results, tmp_path):
     assert tracking.log_run(write_run(results), results, SETTINGS) == "logged"
-    place = tracking_store.page(results, SETTINGS)
+    place, empty = tracking_store.page(results, SETTINGS)
+    assert not empty
     client, experiment = tracking_store.connect(results, SETTINGS)
     assert place == f"#/experiments/{experiment}/runs?viewStateShareKey=scores"
     view = json.loads(client.get_experiment(experiment).tags["mlflow.sharedViewState.scores"])
@@ -99,11 +100,8 @@ def test_the_page_opens_with_scores_as_columns_and_says_what_is_missing(results,
     with contextlib.closing(sqlite3.connect(results / "mlflow.db")) as connection:
         counted = {table for (table,) in connection.execute("SELECT tbl FROM sqlite_stat1")}
     assert {"runs", "latest_metrics"} <= counted, "SQLite plans with statistics"
-    for missing in ("mlartifacts", "mlflow.db"):
-        (results / missing).rename(tmp_path / missing)
-        with pytest.raises(InputError, match=r"must hold mlflow\.db and mlartifacts.* delete mlflow\.db and run `neuspring sync"):
-            tracking_store.page(results, SETTINGS)
-        (tmp_path / missing).rename(results / missing)
+    with pytest.raises(InputError, match=r"must hold runs .*--results"):
+        tracking_store.page(tmp_path / "elsewhere", SETTINGS)
 
 
 def test_a_database_of_another_version_is_named_with_what_to_do(results):
@@ -111,7 +109,7 @@ def test_a_database_of_another_version_is_named_with_what_to_do(results):
     (results / "mlartifacts").mkdir()
     with contextlib.closing(sqlite3.connect(results / "mlflow.db")) as connection, connection:
         connection.execute("UPDATE alembic_version SET version_num = 'ffffffffffff'")
-    message = r"out-of-date database schema .*delete mlflow\.db and mlartifacts in .* and run `neuspring sync`"
+    message = r"out-of-date database schema .*rename .*mlflow\.db; `neuspring sync`"
     with pytest.raises(InputError, match=message):
         tracking_store.page(results, SETTINGS)
     assert re.search(message, tracking.init(results, SETTINGS)["outcome"])
@@ -225,12 +223,18 @@ def test_init_twice_and_by_two_processes_at_once(tmp_path):
     assert tracking.log_run(write_run(tmp_path), tmp_path, SETTINGS) == "logged"
 
 
-def test_a_moved_results_folder_is_refused_with_a_way_out(results, tmp_path):
-    """Its index would write artifacts to the old place."""
+def test_a_moved_results_folder_gets_a_new_index_and_keeps_the_old_one(results, tmp_path):
+    """The old one would write artifacts to the old place; it may hold tags and notes that no record has."""
     tracking.log_run(write_run(results), results, SETTINGS)
-    ((word, _),) = tracking.sync(results.rename(tmp_path / "moved"), SETTINGS).items()
-    assert word.startswith("unreachable: ") and "has moved" in word
-    assert not results.exists()
+    moved = results.rename(tmp_path / "moved")
+    assert list(tracking.sync(moved, SETTINGS)) == ["logged"]
+    assert not results.exists() and len(list(moved.glob("mlflow-*.db"))) == 1
+
+
+@pytest.mark.parametrize("error", ["(sqlite3.OperationalError) database or disk is full", "attempt to write a readonly database"])
+def test_an_index_that_cannot_be_written_says_why_and_asks_to_delete_nothing(tmp_path, error):
+    text = tracking_store.explained(RuntimeError(error), tmp_path, SETTINGS)
+    assert text.startswith(("no space left", str(tmp_path))) and "neuspring sync" in text and "delete" not in text
 
 
 def test_disabled_touches_nothing(tmp_path):

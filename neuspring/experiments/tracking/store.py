@@ -8,12 +8,14 @@ from __future__ import annotations
 import json
 import os
 import sqlite3
+import time
 from contextlib import closing, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuspring.config import Tracking
 from neuspring.core.errors import InputError
+from neuspring.core.run_record import RUN_RECORD
 from neuspring.core.text import masked, readable
 
 if TYPE_CHECKING:
@@ -33,7 +35,16 @@ ENVIRONMENT = {
 and a server that is away costs seconds. With MLflow's own defaults (7 retries of 120 s) it would cost minutes."""
 DATABASE_RETRIES = 2
 """In place of MLflow's ten, which take two minutes where nobody is at the address."""
-ARTIFACTS = "mlartifacts"
+ARTIFACTS, DATABASE = "mlartifacts", "mlflow.db"
+REASONS = {
+    "disk is full": "no space left on the disk of {results}; free some, then run `neuspring sync`",
+    "no space left": "no space left on the disk of {results}; free some, then run `neuspring sync`",
+    "readonly database": "{results} cannot be written; make it writable, then run `neuspring sync`",
+    "read-only file system": "{results} cannot be written; make it writable, then run `neuspring sync`",
+    "permission denied": "{results} cannot be written; make it writable, then run `neuspring sync`",
+    "database is locked": "another program keeps the index of {results} locked; close it, then run `neuspring sync`",
+}
+"""Part of an error of SQLite or of the system, in lower case -> what it means."""
 VIEW = "scores"
 """Name of the view of the table of runs, names and scores first; a tag of the experiment holds it, as its page would."""
 RUN_TAGS = ("method", "scenario", "seed")
@@ -46,7 +57,7 @@ LOCK_PATIENCE = 600.0
 
 def default_uri(results: Path) -> str:
     """The tracking URI of a results folder that has no server: a SQLite file in it."""
-    return f"sqlite:///{Path(results).resolve() / 'mlflow.db'}"
+    return f"sqlite:///{Path(results).resolve() / DATABASE}"
 
 
 def lock(results: Path, name: str) -> BaseFileLock:
@@ -74,20 +85,33 @@ def connect(results: Path, settings: Tracking) -> tuple[MlflowClient, str]:
         location = (Path(results).resolve() / ARTIFACTS / settings.experiment).as_uri()
     # MLflow breaks a new database for good when several processes create it at once.
     with lock(results, "init") if is_database else nullcontext():
+        if settings.uri is None and location:
+            _keep_moved(Path(results), settings.experiment, location)
         client = MlflowClient(tracking_uri=uri)
         experiment = client.get_experiment_by_name(settings.experiment)
         if experiment is None:
             return client, client.create_experiment(settings.experiment, artifact_location=location)
-    if settings.uri is None and experiment.artifact_location != location:
-        raise RuntimeError(f"{results} has moved, but its index keeps artifacts at {experiment.artifact_location}")
     return client, experiment.experiment_id
 
 
+def _keep_moved(results: Path, experiment: str, location: str) -> None:
+    """Rename the index of a results folder that was moved or copied: it holds places of artifacts, and perhaps tags and notes."""
+    database = results / DATABASE
+    with suppress(sqlite3.Error), closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True)) as db:
+        rows = db.execute("SELECT artifact_location FROM experiments WHERE name = ?", [experiment]).fetchall()
+        if rows and rows[0][0] != location:
+            kept = database.with_name(f"mlflow-{time.strftime('%Y%m%d-%H%M%S')}.db")
+            database.rename(kept)
+            print(f"{results} was moved: its MLflow index is made anew; the old one is kept as {kept.name}.", flush=True)
+
+
 def explained(error: Exception, results: Path, settings: Tracking) -> str:
-    """The first line of an error of MLflow, short and without passwords; and how to make an index anew that is no server's."""
+    """The first line of an error of MLflow, short and without passwords; of a results folder's own index, with a way out."""
     line = masked((str(error).strip().splitlines() or [""])[0] or type(error).__name__)[:300]
-    again = f"if that stays, delete mlflow.db and {ARTIFACTS} in {results} and run `neuspring sync`, which makes them again"
-    return f"{line} ({again})" if settings.uri is None else line
+    if settings.uri is not None:
+        return line
+    reason = next((words for part, words in REASONS.items() if part in line.lower()), "")
+    return reason.format(results=results) or f"{line} (if that stays, rename {results}/{DATABASE}; `neuspring sync` makes another)"
 
 
 def _count_rows(database: Path) -> None:
@@ -115,17 +139,20 @@ def _view() -> dict[str, Any]:
     return {"selectedColumns": [*tags, *scores], "columnOrder": order, "columnWidths": widths}
 
 
-def page(results: Path, settings: Tracking) -> str:
-    """The place in MLflow's pages where the runs are, names and scores first. Raises InputError where it cannot be shown."""
-    if settings.uri is None and not all((Path(results) / name).exists() for name in ("mlflow.db", ARTIFACTS)):
-        remedy = f"Name a folder with runs (--results), or delete mlflow.db and run `neuspring sync --results {results}`."
-        raise InputError(results, f"must hold mlflow.db and {ARTIFACTS}, the index of its runs", "not both", remedy)
+def page(results: Path, settings: Tracking) -> tuple[str, bool]:
+    """The place in MLflow's pages where the runs are, names and scores first; and whether the index is empty.
+
+    Raises InputError where it cannot be shown.
+    """
+    if settings.uri is None and not any(Path(results).glob(f"*/*/*/{RUN_RECORD}")):
+        rule = f"must hold runs (SCENARIO/METHOD/SEED/{RUN_RECORD})"
+        raise InputError(results, rule, "none", "Name a folder with runs: --results.")
     try:
         client, experiment = connect(results, settings)
         client.set_experiment_tag(experiment, f"mlflow.sharedViewState.{VIEW}", json.dumps(_view()))
         if settings.uri is None:
-            _count_rows(Path(results).resolve() / "mlflow.db")
+            _count_rows(Path(results).resolve() / DATABASE)
     except Exception as error:
         uri = masked(settings.uri or default_uri(results))
         raise InputError(uri, "MLflow must be able to open it", explained(error, results, settings)) from error
-    return f"#/experiments/{experiment}/runs?viewStateShareKey={VIEW}"
+    return f"#/experiments/{experiment}/runs?viewStateShareKey={VIEW}", not client.search_runs([experiment], max_results=1)
