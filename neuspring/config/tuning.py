@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -61,7 +62,7 @@ class Tune(SettingsSection):
     """Number of trials over all workers: finished, pruned and failed ones. With a larger number the sweep continues."""
     workers: Count = 1
     """Number of jobs that share the sweep."""
-    storage: Annotated[str, StringConstraints(pattern=r"^postgresql(\+\w+)?://\S+$")] | None = None
+    storage: str | None = None
     """PostgreSQL URI, for workers on several machines. It must hold no password: libpq reads PGPASSWORD or ~/.pgpass. null: SQLite
     in the sweep's folder, for workers of one machine."""
 
@@ -69,4 +70,7 @@ class Tune(SettingsSection):
         if not self.space:
             raise ValueError("space: at least one setting is required")
         if self.storage:
+            if not re.fullmatch(r"postgresql(\+\w+)?://\S+", self.storage):
+                rule = "must be postgresql://HOST/DATABASE, or null: SQLite in the sweep's folder, for workers of one machine"
+                raise ValueError(f"storage: {rule}; received {self.storage!r}")
             refuse_password("storage", self.storage, "PGPASSWORD or ~/.pgpass")
