@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -28,6 +29,7 @@ FILES = (FINAL_DATA, SPLIT, GT_TRACKS, METADATA)
 """The files that the reader looks for in a processed case's folder."""
 RAW_FILES = (METADATA, CALIBRATION, SPLIT, GT_TRACKS)
 """The files beside images that the importer looks for in a raw case's folder."""
+RATE_KEYS = ("fps", "record_hz")
 RELEASED_FRAME_RATE = 30.0
 """Frames per second of every released recording; used where metadata.json is absent."""
 CASE_ARRAYS = {
@@ -133,11 +135,17 @@ def metadata_of(case: Path) -> dict[str, Any]:
 
 
 def rate_of(path: Path, metadata: dict[str, Any], default: float | None = None) -> float:
-    """fps of metadata.json. Raises InputError."""
-    fps: Any = metadata.get("fps", default)
-    if type(fps) not in (int, float) or not 0 < fps < 1e6:
-        raise InputError(path, "fps: a positive number of frames per second is required", fps)
-    return float(fps)
+    """Frames per second by metadata.json: `fps`, or `record_hz` as forks call it. Raises InputError."""
+    return stated(path, metadata, RATE_KEYS, "a positive number of frames per second", default)
+
+
+def stated(path: Path, metadata: dict[str, Any], keys: Sequence[str], rule: str, default: float | None = None) -> float:
+    """The one positive number that keys of metadata.json state, for all cameras or for each. Raises InputError."""
+    given = {key: metadata[key] for key in keys if key in metadata}
+    values = [one for value in given.values() for one in (value if isinstance(value, list) else [value])] or [default]
+    if len(set(map(str, values))) != 1 or type(values[0]) not in (int, float) or not 0 < values[0] < 1e6:
+        raise InputError(path, f"{' or '.join(keys)}: {rule} is required, one for all cameras", given or None)
+    return float(values[0])
 
 
 def has_images(case: Path) -> bool:

@@ -31,7 +31,7 @@ from neuspring.data.capture import (
 )
 from neuspring.data.images import read_array, read_image
 from neuspring.data.unpickle import load_pickle
-from neuspring.intake.phystwin import CALIBRATION, METADATA, SPLIT, annotated, metadata_of, rate_of, train_end_of
+from neuspring.intake.phystwin import CALIBRATION, METADATA, SPLIT, annotated, metadata_of, rate_of, stated, train_end_of
 
 BINARY_TOLERANCE = 1e-5
 """Allowed deviation from R^T R = 1 in a pickle of float64 products of OpenCV rotations."""
@@ -53,7 +53,7 @@ def convert(name: str, category: str, case: Path, folder: Path) -> Capture:
     for camera in cameras:
         files = {frame: [case / kind / camera.name / f"{frame}{endings[kind]}" for kind in endings] for frame in range(frames)}
         missing[camera.name] = tuple(frame for frame, paths in files.items() if not all(path.is_file() for path in paths))
-    unit = metadata.get(UNIT_KEY, 0.001)
+    unit = stated(case / METADATA, metadata, [UNIT_KEY], "a positive number of m per count", 0.001)
     description = Description(
         format=1,
         name=name,
@@ -114,7 +114,9 @@ def detections(case: Path, camera: str) -> dict[int, list[str]]:
     path = case / "mask" / f"mask_info_{camera}.json"
     info = load_json(path)
     if not isinstance(info, dict) or not all(isinstance(v, str) for v in info.values()):
-        raise InputError(path, "an object of detection ids and phrases is required", type(info).__name__)
+        folders = sorted(folder.name for folder in (case / "mask" / camera).glob("*/"))
+        rule = f'detections by phrase are required, one for each folder of mask/{camera}, as {{"0": "plush", "1": "hand"}}'
+        raise InputError(path, rule, info, f"Name these folders: {', '.join(folders)}.")
     objects = [key for key, phrase in info.items() if phrase != "hand"]
     if len(objects) != 1:
         rule = "exactly one detection must not be 'hand': the object"

@@ -189,14 +189,15 @@ def test_a_raw_case_is_converted_with_frames_that_a_camera_misses(tmp_path):
     np.testing.assert_allclose(capture.depth("0", 2), whole.depth("0", 2), atol=1e-9)
     metadata = json.loads((case / "metadata.json").read_text())
     for change, words in (
-        ({"fps": None}, "fps: a positive number"),
+        ({"fps": None}, "fps or record_hz: a positive number"),
+        ({"record_hz": 29}, "fps or record_hz: a positive number .* one for all cameras"),
         ({"WH": [64]}, "WH: two positive"),
         ({"frame_num": 1}, "frame_num"),
     ):
         (case / "metadata.json").write_text(json.dumps(metadata | change))
         with pytest.raises(InputError, match=rf"metadata\.json: {words}"):
             make_capture(Intake(output=tmp_path / "none", category="toy", recording=(case,)))
-    (case / "metadata.json").write_text(json.dumps(metadata | {"depth_scale_m_per_unit": 0.00025}))
+    (case / "metadata.json").write_text(json.dumps(metadata | {"depth_scale_m_per_unit": [0.00025, 0.00025]}))
     assert make_capture(Intake(output=tmp_path / "quarter", category="toy", recording=(case,)))[0].description.depth_unit == 0.00025
     np.save(case / "depth" / "0" / "0.npy", np.zeros((90, 160), np.float32))
     with pytest.raises(InputError, match=r"0\.npy: depth must be 16-bit counts; received float32.*depth_scale_m_per_unit"):
