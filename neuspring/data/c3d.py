@@ -20,7 +20,9 @@ FORM = re.compile(r"(?P<file>.+?\.c3d)(#(unit=(?P<unit>\w+)(,|$))?(?P<labels>.*)
 C3D_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "meters": 1.0, "millimeters": 0.001}
 """m per unit."""
 C3D_BLOCK = 512
-"""Bytes: data begin and end at multiples."""
+"""Bytes: data begin and end at multiples. Word 4 of the header is the first frame's number, word 9 the block where data start."""
+SGI = 86
+"""Processor of a file, byte 4 of its parameters; 84: Intel, 85: DEC."""
 
 
 def is_c3d(path: Path) -> bool:
@@ -43,19 +45,22 @@ class Markers:
     labels: tuple[str, ...]
     rate: float
     """Frames per second."""
+    first: int = 1
+    """Number of its first frame in the take, from 1."""
 
     @classmethod
     def read(cls, path: Path) -> Markers:
         """Those that `path` names. Raises InputError."""
         ezc3d, form, file = needed("ezc3d"), FORM.fullmatch(str(path)), plain_file(path)
         assert form is not None, "asked for by is_c3d"
+        head = _head(file)
         try:
             content = ezc3d.c3d(str(file))
         except (OSError, RuntimeError, ValueError, IndexError) as error:
             raise InputError(file, "a C3D file is required", str(error)) from error
         data, about = content["data"], content["parameters"]["POINT"]
         points = np.moveaxis(data["points"][:3], -1, 0).swapaxes(1, 2)
-        _require_whole(file, content, *points.shape[:2])
+        _require_whole(file, head, content, *points.shape[:2])
         keys = takewhile(lambda key: key in about, (f"LABELS{k}" if k > 1 else "LABELS" for k in count(1)))
         labels = [label.strip() for key in keys for label in about[key]["value"]][: points.shape[1]]
         said = next(iter(about.get("UNITS", {}).get("value", [])), "").strip().lower()
@@ -72,10 +77,11 @@ class Markers:
             if labels.count(name) != 1:
                 raise InputError(path, "labels of one marker each are required", repr(name), f"There are: {' '.join(labels)}.")
         rate = float(about["RATE"]["value"][0])
+        # ezc3d 1.7.2 exchanges residual and camera byte of a point, but a lost one is -1 in both.
         lost = ~(data["meta_points"]["residuals"][0].T >= 0) | ~np.isfinite(points).all(axis=2)
         points = np.where(lost[..., None], np.nan, points * C3D_UNITS[unit])
         chosen = [labels.index(name) for name in names] if form["labels"] else slice(None)
-        return cls(points[:, chosen], tuple(names), rate)
+        return cls(points[:, chosen], tuple(names), rate, int.from_bytes(head[6:8], "little"))
 
     def whole(self, path: Path) -> np.ndarray:
         """Their points, if none is lost. Raises InputError."""
@@ -87,14 +93,28 @@ class Markers:
         return self.points
 
 
-def _require_whole(file: Path, content: dict, frames: int, points: int) -> None:
+def _head(file: Path) -> bytes:
+    """The header. Raises InputError for a file of an SGI processor, whose numbers have the other order of bytes."""
+    try:
+        with file.open("rb") as stream:
+            head = stream.read(C3D_BLOCK)
+            stream.seek(C3D_BLOCK * (head[0] - 1) + 3)
+            processor = stream.read(1)
+    except (OSError, IndexError) as error:
+        raise InputError(file, "a C3D file is required", str(error)) from error
+    if processor == bytes([SGI]):
+        raise InputError(file, "numbers of Intel or DEC processors are required", "SGI (MIPS)", "Export it for Intel (PC).")
+    return head
+
+
+def _require_whole(file: Path, head: bytes, content: dict, frames: int, points: int) -> None:
     """Raise InputError where the file holds more frames than it counts: the format's counter ends at 65,535."""
     about, data = content["parameters"]["POINT"], content["data"]
     if not frames or not points or np.size(data.get("rotations", ())):
         return
     width = 4 if about["SCALE"]["value"][0] < 0 else 2
     each = width * (4 * points + np.size(data["analogs"]) // frames)
-    held = (file.stat().st_size - C3D_BLOCK * (int(about["DATA_START"]["value"][0]) - 1)) // each
+    held = (file.stat().st_size - C3D_BLOCK * (int.from_bytes(head[16:18], "little") - 1)) // each
     if (held - frames) * each > C3D_BLOCK:
         rule = "the frames that the file counts must be all that it holds: its counter ends at 65,535"
         raise InputError(file, rule, f"{frames} of {held}", "Export it in parts.")

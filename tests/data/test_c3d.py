@@ -72,6 +72,29 @@ def test_frames_beyond_the_counter_of_the_format_are_missed(tmp_path):
     assert len(Markers.read(write_c3d(tmp_path / "b.c3d", frames[:65_535], ["A"])).points) == 65_535
 
 
+def test_the_header_says_where_data_start_and_which_frame_is_first(tmp_path):
+    """OptiTrack leaves POINT:DATA_START 0; a cut of a take begins at a later frame."""
+    path = write_c3d(tmp_path / "a.c3d", POINTS, LABELS)
+    whole = bytearray(path.read_bytes())
+    place = whole.index(b"DATA_START") + len(b"DATA_START") + 4
+    assert whole[place : place + 2] == whole[16:18]
+    whole[place : place + 2] = bytes(2)
+    whole[6:8] = (101).to_bytes(2, "little")
+    whole[8:10] = (110).to_bytes(2, "little")
+    path.write_bytes(whole)
+    read = Markers.read(path)
+    assert (read.first, len(read.points)) == (101, 10)
+
+
+def test_a_file_of_an_sgi_processor_is_refused_with_the_way_out(tmp_path):
+    path = write_c3d(tmp_path / "a.c3d", POINTS, LABELS)
+    whole = bytearray(path.read_bytes())
+    whole[512 * (whole[0] - 1) + 3] = 86
+    path.write_bytes(whole)
+    with pytest.raises(InputError, match=r"received SGI .* Export it for Intel"):
+        Markers.read(path)
+
+
 def test_paths_with_and_without_labels():
     assert [is_c3d(Path(name)) for name in ("a.c3d", "b/A.C3D#L", "a.c3d#unit=mm", "a.csv", "c3d", "a.c3d/tracks.json")] == [
         True

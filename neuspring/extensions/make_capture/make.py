@@ -255,7 +255,12 @@ def _of_points(intake: Intake) -> tuple[Capture, list[str]]:
         raise InputError(given[0], "is for cameras, and there is no --color", "points", "Leave it out: a row is a frame.")
     if intake.up is None:
         raise InputError("--up", "is required for points in space", "none", "State the axis that points up, --up +z or --up -z.")
-    known = {Markers.read(path).rate for path in brought.values() if is_c3d(path)}
+    read = {path: Markers.read(path) for path in brought.values() if is_c3d(path)}
+    known = {one.rate for one in read.values()}
+    if len({one.first for one in read.values()}) > 1:
+        firsts = ", ".join(f"{path.name} {one.first}" for path, one in read.items())
+        rule = "C3D files of one capture must begin at one frame of their take"
+        raise InputError("make-capture", rule, firsts, "Export the same frames of all.")
     rate = intake.rate or (known.pop() if len(known) == 1 else None)
     if rate is None or (known and known != {rate}):
         received = " and ".join(f"{one:g}" for one in sorted(known)) or "none"
